@@ -1,0 +1,51 @@
+# Set-up and every routine job. `make demo` and `make test` install what they need first.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+
+export OMP_NUM_THREADS = 1
+
+.PHONY: help setup demo test test-slow lint format benchmark wheel-test clean
+
+help:  ## Show this list.
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
+
+setup: $(READY)  ## Make the virtual environment with pinned packages.
+
+$(READY): pyproject.toml constraints.txt
+	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed, this is " + sys.version)'
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	# torch first and pinned: a looser request may bring gigabytes of GPU libraries.
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt torch
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	touch $@
+
+demo: setup  ## Evaluate the query schedules on held-out traffic; results/demo.
+	$(BIN)/python scripts/evaluate.py --output results/demo
+
+test: setup  ## Run the tests, without the slow ones.
+	$(BIN)/python -m pytest -m 'not slow' -n 2
+
+test-slow: setup  ## Run the slow tests.
+	$(BIN)/python -m pytest -m slow
+
+lint: setup  ## Check style, types and import rules.
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+format: setup  ## Format the code.
+	$(BIN)/ruff check --fix
+	$(BIN)/ruff format
+
+benchmark: setup  ## Time the environment and the estimators.
+	$(BIN)/python benchmarks/bench_estimators.py
+	$(BIN)/python benchmarks/bench_env.py
+
+wheel-test: setup  ## Build the wheel, install it elsewhere and use it there.
+	$(BIN)/python tests/wheel/run.py
+
+clean:  ## Remove what the other targets made, the virtual environment included.
+	rm -rf $(VENV) build dist results .mypy_cache .pytest_cache .ruff_cache .hypothesis
