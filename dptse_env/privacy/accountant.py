@@ -1,0 +1,179 @@
+"""What the releases of an episode cost, and which guarantee may be claimed for them."""
+
+from dataclasses import asdict, dataclass
+from typing import Any, Literal, get_args
+
+import numpy as np
+import numpy.typing as npt
+
+from dptse_env.privacy.calibration import PRESETS, PrivacySettings, noise_std
+from dptse_env.privacy.gaussian import compose, epsilon_of
+from dptse_env.privacy.reasons import VOID_REASONS, VoidReason
+from dptse_env.privacy.sensitivity import Sensitivity
+
+__all__ = ["STRICT_DELTA", "Accountant", "BoundaryInputs", "PrivacyReport", "ReleaseReport"]
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.integer]
+
+BoundaryInputs = Literal["true", "nominal"]
+"""Where the estimator's inputs at the boundary come from: measured traffic, or public demand."""
+
+STRICT_DELTA = 1e-4
+"""A delta at which epsilon is reported beside the one asked for, which is often weak."""
+
+
+@dataclass(frozen=True)
+class ReleaseReport:
+    """One released quantity: how far a vehicle may move it, and the noise that hides it.
+
+    Attributes:
+        quantity: what is released.
+        unit: unit of `sensitivity` and `noise_std`.
+        sensitivity: L2, over a whole episode.
+        noise_std: standard deviation of the noise on each value.
+        mu: sensitivity / noise_std.
+    """
+
+    quantity: str
+    unit: str
+    sensitivity: float
+    noise_std: float
+    mu: float
+
+
+@dataclass(frozen=True)
+class PrivacyReport:
+    """Public account of a configuration; nothing in it depends on the traffic of an episode.
+
+    `mu`, `epsilon` and `epsilon_strict` are what an episode's releases reveal together *if the
+    sensitivities hold*, and if nothing but the releases is used. They are no guarantee while
+    `void_reasons` has an entry.
+
+    Attributes:
+        preset: name of the preset.
+        guarantee: what may be claimed, or "none".
+        void_reasons: why not; empty if and only if something may be claimed.
+        protects: whose data is protected, and what counts as a change of it.
+        claimed_epsilon: the epsilon asked for.
+        claimed_delta: the delta asked for.
+        assumptions: the public numbers the sensitivities were computed from, by name with unit.
+        boundary_inputs: where the estimator's inputs at the boundary come from.
+        releases: one for each released quantity.
+        mu: of all releases together.
+        epsilon: of all releases together, at `claimed_delta`.
+        epsilon_strict: of all releases together, at `strict_delta`.
+        strict_delta: a delta that is worth the name.
+    """
+
+    preset: str
+    guarantee: str
+    void_reasons: tuple[VoidReason, ...]
+    protects: str
+    claimed_epsilon: float
+    claimed_delta: float
+    assumptions: tuple[tuple[str, int | float], ...]
+    boundary_inputs: BoundaryInputs
+    releases: tuple[ReleaseReport, ...]
+    mu: float
+    epsilon: float
+    epsilon_strict: float
+    strict_delta: float = STRICT_DELTA
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return a fresh dict of plain str, float, int, dict and list, equal to its own JSON."""
+        report = asdict(self)
+        report["void_reasons"] = list(self.void_reasons)
+        report["assumptions"] = dict(self.assumptions)
+        report["releases"] = [asdict(release) for release in self.releases]
+        return report
+
+
+class Accountant:
+    """Keeps account of what a configuration's releases reveal."""
+
+    def __init__(
+        self,
+        settings: PrivacySettings,
+        sensitivity: Sensitivity,
+        *,
+        boundary_inputs: BoundaryInputs,
+    ) -> None:
+        """Work out the account of a configuration.
+
+        Args:
+            settings: preset, epsilon and delta.
+            sensitivity: of the released quantities.
+            boundary_inputs: "true" if the estimator is fed the measured state of the boundary,
+                "nominal" if it is fed the published demand only.
+
+        Raises:
+            ValueError: if `boundary_inputs` is neither.
+        """
+        if boundary_inputs not in get_args(BoundaryInputs):
+            allowed = list(get_args(BoundaryInputs))
+            raise ValueError(
+                f"privacy.boundary_inputs must be one of {allowed}, got {boundary_inputs!r}"
+            )
+        self.report = _report(settings, sensitivity, boundary_inputs)
+
+    def spent(self, steps: IntArray) -> tuple[FloatArray, FloatArray]:
+        """What episodes have revealed at most, if the sensitivities hold.
+
+        The sensitivities of these presets bound a whole episode and say nothing of a part of it:
+        a vehicle may have made all its contributions in the first steps. So the whole is charged
+        from the start, and the result is the same at every step.
+
+        Args:
+            steps: (k,) steps released so far in each of k episodes.
+
+        Returns:
+            mu (k,) and epsilon at the delta asked for (k,), of all releases together.
+        """
+        return (
+            np.full(steps.shape, self.report.mu),
+            np.full(steps.shape, self.report.epsilon),
+        )
+
+
+def _report(
+    settings: PrivacySettings, sensitivity: Sensitivity, boundary_inputs: BoundaryInputs
+) -> PrivacyReport:
+    releases = tuple(
+        ReleaseReport(release.quantity, release.unit, release.bound, std, release.bound / std)
+        for release, std in zip(
+            sensitivity.releases, noise_std(settings, sensitivity).tolist(), strict=True
+        )
+    )
+    mu = compose(release.mu for release in releases)
+    epsilon = epsilon_of(mu, settings.delta)
+
+    found = {*PRESETS[settings.preset].void_reasons, *sensitivity.void_reasons}
+    if boundary_inputs == "true":
+        found.add("boundary_inputs")
+    # Le Ny's kappa is loose enough at times that even two releases stay below epsilon together.
+    if epsilon > settings.epsilon:
+        found.add("releases_not_composed")
+
+    return PrivacyReport(
+        preset=settings.preset,
+        guarantee="none" if found else _guarantee(settings, sensitivity),
+        void_reasons=tuple(reason for reason in VOID_REASONS if reason in found),
+        protects=sensitivity.protects,
+        claimed_epsilon=settings.epsilon,
+        claimed_delta=settings.delta,
+        assumptions=sensitivity.assumptions,
+        boundary_inputs=boundary_inputs,
+        releases=releases,
+        mu=mu,
+        epsilon=epsilon,
+        epsilon_strict=epsilon_of(mu, STRICT_DELTA),
+    )
+
+
+def _guarantee(settings: PrivacySettings, sensitivity: Sensitivity) -> str:
+    quantities = " and ".join(release.quantity for release in sensitivity.releases)
+    return (
+        f"({settings.epsilon:g}, {settings.delta:g})-differential privacy of {quantities} "
+        f"together, for {sensitivity.protects}"
+    )

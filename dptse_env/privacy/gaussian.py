@@ -1,0 +1,199 @@
+r"""Exact relations of Gaussian differential privacy.
+
+Everything a Gaussian release reveals is one number, $\mu = \Delta / \sigma$: the L2 sensitivity of
+what is released over the standard deviation of the noise. A release with parameter $\mu$ is
+$(\varepsilon, \delta)$-private exactly for the pairs with (Balle and Wang 2018, theorem 8)
+
+$$\delta = \Phi(\mu/2 - \varepsilon/\mu) - e^{\varepsilon}\,\Phi(-\mu/2 - \varepsilon/\mu),$$
+
+and releases compose as $\mu^2 = \sum_i \mu_i^2$, also without loss (Dong, Roth and Su 2022,
+corollary 3.3).
+
+All numbers here are dimensionless floats. `epsilon` is finite and above zero, `delta` lies in
+(0, 0.5), `mu` is finite and above zero. The difference above is never formed in that shape:
+`e^epsilon` overflows from epsilon 710, and both terms underflow together in the tail. With the
+normal density $\varphi$, $\varphi(a) = e^{\varepsilon} \varphi(b)$ for the two arguments $a$ and
+$b$, so the second term is $\varphi(a)$ times a ratio that stays of order one.
+"""
+
+import math
+from collections.abc import Iterable
+
+from scipy.optimize import brentq
+from scipy.special import erfcx, log_ndtr, ndtri
+
+from dptse_env.privacy.checks import finite_positive, inside
+
+__all__ = ["analytic_multiplier", "compose", "delta_of", "epsilon_of", "le_ny_kappa", "mu_of"]
+
+_RELATIVE_TOLERANCE = 4 * 2.0**-52  # the tightest that brentq accepts
+_SQRT_TWO = math.sqrt(2.0)
+_SQRT_HALF_PI = math.sqrt(0.5 * math.pi)
+_LOG_SQRT_TWO_PI = 0.5 * math.log(2.0 * math.pi)
+_ZERO_BELOW = -40.0  # delta < Phi(-40) = 4e-350, less than the smallest float
+_SMALL_MU = 1e-3  # below it the two terms of delta agree in too many digits to be subtracted
+
+
+def delta_of(mu: float, epsilon: float) -> float:
+    """Smallest delta for which a release of parameter `mu` is (epsilon, delta)-private.
+
+    Zero when the exact value is below the smallest positive float.
+
+    Args:
+        mu: sensitivity over noise standard deviation.
+        epsilon: privacy parameter; 0 is allowed here and gives the total variation distance.
+
+    Returns:
+        delta in [0, 1] (Balle and Wang 2018, theorem 8).
+
+    Raises:
+        ValueError: if `mu` is not finite and above zero, or `epsilon` is negative or infinite.
+    """
+    mu = finite_positive("mu", mu)
+    if epsilon != 0:
+        epsilon = finite_positive("epsilon", epsilon)
+    return math.exp(_log_delta(mu, epsilon))
+
+
+def epsilon_of(mu: float, delta: float) -> float:
+    """Smallest epsilon >= 0 for which a release of parameter `mu` is (epsilon, delta)-private.
+
+    Zero when the release is (0, delta)-private already.
+
+    Args:
+        mu: sensitivity over noise standard deviation.
+        delta: in (0, 0.5).
+
+    Returns:
+        epsilon, to ten digits or better up to a mu of 1e3.
+
+    Raises:
+        ValueError: if `mu` or `delta` is out of range.
+        OverflowError: if epsilon is beyond the largest float, from a mu of about 1e154.
+    """
+    mu = finite_positive("mu", mu)
+    delta = _checked_delta(delta)
+    log_delta = math.log(delta)
+
+    def excess(epsilon: float) -> float:
+        return _log_delta(mu, epsilon) - log_delta
+
+    if excess(0.0) <= 0.0:
+        return 0.0
+    # Dropping the subtracted term of delta gives an epsilon that is too large, in closed form.
+    # The margin keeps the bracket valid where that term is lost to rounding.
+    high = (0.5 * mu - float(ndtri(delta))) * mu * (1.0 + 1e-9)
+    if math.isinf(high):
+        raise OverflowError(f"epsilon is beyond the largest float at mu {mu!r}")
+    return float(brentq(excess, 0.0, high, xtol=1e-16 * high, rtol=_RELATIVE_TOLERANCE))
+
+
+def mu_of(epsilon: float, delta: float) -> float:
+    """Largest parameter mu of a release that is (epsilon, delta)-private.
+
+    Args:
+        epsilon: above zero.
+        delta: in (0, 0.5).
+
+    Returns:
+        mu, to ten digits or better; the inverse of `delta_of` in its first argument.
+
+    Raises:
+        ValueError: if `epsilon` or `delta` is out of range.
+    """
+    epsilon, delta = _checked_epsilon(epsilon), _checked_delta(delta)
+    log_delta = math.log(delta)
+
+    def excess(mu: float) -> float:
+        return _log_delta(mu, epsilon) - log_delta
+
+    # Le Ny's closed form drops the subtracted term, and so bounds mu from below. The margin keeps
+    # the bracket valid where that term is lost to rounding.
+    low = (1.0 - 1e-9) / le_ny_kappa(epsilon, delta)
+    high = 2.0 * low
+    while excess(high) < 0.0:
+        low, high = high, 2.0 * high
+    return float(brentq(excess, low, high, xtol=1e-16 * low, rtol=_RELATIVE_TOLERANCE))
+
+
+def compose(mus: Iterable[float]) -> float:
+    """Parameter of several Gaussian releases of the same data taken together.
+
+    Args:
+        mus: the parameter of each release; none at all composes to 0, nothing released.
+
+    Returns:
+        The root of the sum of squares (Dong, Roth and Su 2022, corollary 3.3).
+
+    Raises:
+        ValueError: if one of them is not finite and above zero.
+    """
+    return math.hypot(*(finite_positive("mu", mu) for mu in mus))
+
+
+def analytic_multiplier(epsilon: float, delta: float) -> float:
+    """Least noise standard deviation per unit of sensitivity for (epsilon, delta)-privacy.
+
+    Args:
+        epsilon: above zero.
+        delta: in (0, 0.5).
+
+    Returns:
+        1 / mu_of(epsilon, delta), the analytic calibration of Balle and Wang (2018).
+
+    Raises:
+        ValueError: if `epsilon` or `delta` is out of range.
+    """
+    return 1.0 / mu_of(epsilon, delta)
+
+
+def le_ny_kappa(epsilon: float, delta: float) -> float:
+    """Noise standard deviation per unit of sensitivity that suffices, in closed form.
+
+    Always above `analytic_multiplier`: it bounds delta by the first of its two terms, and is the
+    exact root of that bound.
+
+    Args:
+        epsilon: above zero.
+        delta: in (0, 0.5).
+
+    Returns:
+        (K + sqrt(K^2 + 2 epsilon)) / (2 epsilon) with K the upper delta-quantile of the standard
+        normal (Le Ny and Pappas 2014, theorem 3; section III of the paper).
+
+    Raises:
+        ValueError: if `epsilon` or `delta` is out of range.
+    """
+    epsilon, delta = _checked_epsilon(epsilon), _checked_delta(delta)
+    quantile = -float(ndtri(delta))
+    return (quantile + math.sqrt(quantile * quantile + 2.0 * epsilon)) / (2.0 * epsilon)
+
+
+def _checked_epsilon(epsilon: float) -> float:
+    return finite_positive("epsilon", epsilon)
+
+
+def _checked_delta(delta: float) -> float:
+    return inside("delta", delta, 0.0, 0.5)
+
+
+def _log_delta(mu: float, epsilon: float) -> float:
+    """Natural logarithm of delta, without overflow or underflow; see the head of this module."""
+    upper = 0.5 * mu - epsilon / mu
+    if upper < _ZERO_BELOW:
+        return -math.inf
+    if mu < _SMALL_MU:
+        # Difference of the Mills ratio over mu around t, by its first and third derivatives.
+        t = epsilon / mu
+        ratio = _mills_ratio(t)
+        first = t * ratio - 1.0
+        third = 2.0 * first + t * (ratio + t * first)
+        difference = -mu * (first + mu * mu / 24.0 * third)
+        return math.log(difference) - 0.5 * upper * upper - _LOG_SQRT_TWO_PI
+    lower_over_upper = _mills_ratio(0.5 * mu + epsilon / mu) / _mills_ratio(-upper)
+    return float(log_ndtr(upper)) + math.log1p(-lower_over_upper)
+
+
+def _mills_ratio(t: float) -> float:
+    """Phi(-t) / phi(t): 1/t far to the right, and infinite in floats from t = -37 down."""
+    return _SQRT_HALF_PI * float(erfcx(t / _SQRT_TWO))

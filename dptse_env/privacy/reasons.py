@@ -1,0 +1,45 @@
+"""Why a guarantee fails: the words that `info["privacy"]` may carry, and what each means."""
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Literal
+
+__all__ = ["VOID_REASONS", "VoidReason"]
+
+VoidReason = Literal[
+    "literal_variance",
+    "average_dwell",
+    "adaptive_queries",
+    "speed_sensitivity",
+    "boundary_inputs",
+    "releases_not_composed",
+]
+
+VOID_REASONS: Mapping[VoidReason, str] = MappingProxyType(
+    {
+        "literal_variance": (
+            "the noise has variance kappa^2 Delta where the theorem needs a standard deviation of "
+            "kappa Delta; the result depends on the units"
+        ),
+        "average_dwell": (
+            "the sensitivity takes the average time on a segment for a bound on it: slower "
+            "vehicles are seen more often than it counts"
+        ),
+        "adaptive_queries": (
+            "the sensitivity counts static sensors that a vehicle passes once; a set of queried "
+            "segments that moves, or that a policy chooses, may follow a vehicle"
+        ),
+        "speed_sensitivity": (
+            "the sensitivity of the mean speed follows from an equilibrium relation; a vehicle "
+            "that is nearly alone on its segment changes the mean by far more"
+        ),
+        "boundary_inputs": (
+            "the estimator is fed the true state of the boundary segments without noise"
+        ),
+        "releases_not_composed": (
+            "density and speed are calibrated one by one, and the two together reveal more than "
+            "the epsilon asked for"
+        ),
+    }
+)
+"""Each reason with one sentence for people, in the order in which reports list them."""

@@ -1,0 +1,156 @@
+import dataclasses
+import json
+import math
+
+import numpy as np
+import pytest
+from dp_accounting import get_epsilon_gaussian
+
+from dptse_env.privacy.accountant import STRICT_DELTA, Accountant
+from dptse_env.privacy.calibration import PrivacySettings
+from dptse_env.privacy.gaussian import epsilon_of
+from dptse_env.privacy.sensitivity import paper_sensitivity
+
+SENSITIVITY_REASONS = ("average_dwell", "adaptive_queries", "speed_sensitivity")
+
+
+def highway(n_sensors=8, average_dwell=8.0):
+    return paper_sensitivity(
+        n_sensors=n_sensors,
+        average_dwell=average_dwell,
+        segment_length=0.1,
+        free_flow_speed=102.0,
+        jam_density=333.0,
+    )
+
+
+def report(preset="paper", epsilon=1.0, delta=0.05, sensitivity=None, boundary_inputs="true"):
+    settings = PrivacySettings(preset, epsilon, delta)
+    sensitivity = sensitivity or highway()
+    return Accountant(settings, sensitivity, boundary_inputs=boundary_inputs).report
+
+
+# --- what the releases cost ------------------------------------------------------------------
+
+
+def test_the_printed_noise_gives_thirty_where_one_is_claimed():
+    found = report("paper")
+    assert found.claimed_epsilon == 1.0
+    assert found.epsilon == pytest.approx(29.9, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("n_sensors", "average_dwell", "epsilon"), [(8, 4.0, 22), (8, 8.0, 30), (14, 8.0, 38)]
+)
+def test_golden_range_of_the_printed_noise(n_sensors, average_dwell, epsilon):
+    """From few sensors and brisk traffic to the most sensors of the paper's figures."""
+    found = report("paper", sensitivity=highway(n_sensors, average_dwell))
+    assert round(found.epsilon) == epsilon
+    assert found.epsilon == pytest.approx(get_epsilon_gaussian(1.0 / found.mu, 0.05), rel=1e-10)
+
+
+def test_the_corrected_noise_stays_below_its_claim_at_one():
+    assert report("corrected").epsilon == pytest.approx(0.982, abs=5e-4)
+
+
+def test_the_corrected_cost_does_not_depend_on_the_sensitivities():
+    assert report("corrected", sensitivity=highway(14, 12.0)).mu == pytest.approx(
+        report("corrected").mu, rel=1e-14
+    )
+
+
+@pytest.mark.parametrize("preset", ["paper", "corrected"])
+def test_the_numbers_of_a_report_follow_from_one_another(preset):
+    found = report(preset)
+    for release, bound in zip(found.releases, highway().releases, strict=True):
+        assert (release.quantity, release.unit) == (bound.quantity, bound.unit)
+        assert release.sensitivity == bound.bound
+        assert release.mu == pytest.approx(release.sensitivity / release.noise_std, rel=1e-15)
+    assert found.mu == pytest.approx(math.hypot(*(r.mu for r in found.releases)), rel=1e-14)
+    assert found.epsilon == epsilon_of(found.mu, 0.05)
+    assert found.epsilon_strict == epsilon_of(found.mu, STRICT_DELTA)
+    assert found.epsilon_strict > found.epsilon
+    assert found.strict_delta == 1e-4
+    assert ("average_dwell_steps", 8.0) in found.assumptions
+
+
+@pytest.mark.parametrize("preset", ["paper", "corrected"])
+def test_the_whole_episode_is_charged_from_the_first_step(preset):
+    accountant = Accountant(PrivacySettings(preset), highway(), boundary_inputs="true")
+    mu, epsilon = accountant.spent(np.array([0, 1, 350, 700]))
+    assert mu.shape == epsilon.shape == (4,)
+    assert mu.tolist() == [accountant.report.mu] * 4
+    assert epsilon.tolist() == [accountant.report.epsilon] * 4
+
+
+# --- what may be claimed ---------------------------------------------------------------------
+
+
+def test_the_paper_preset_lists_every_way_in_which_it_fails():
+    found = report("paper")
+    assert found.guarantee == "none"
+    assert found.void_reasons == (
+        "literal_variance",
+        *SENSITIVITY_REASONS,
+        "boundary_inputs",
+        "releases_not_composed",
+    )
+
+
+def test_the_corrected_preset_mends_the_variance_only():
+    found = report("corrected")
+    assert found.guarantee == "none"
+    assert found.void_reasons == (*SENSITIVITY_REASONS, "boundary_inputs")
+
+
+@pytest.mark.parametrize("preset", ["paper", "corrected"])
+def test_nominal_boundary_inputs_lift_one_reason_and_no_other(preset):
+    true, nominal = (report(preset, boundary_inputs=where) for where in ("true", "nominal"))
+    assert set(true.void_reasons) - set(nominal.void_reasons) == {"boundary_inputs"}
+    assert set(nominal.void_reasons) < set(true.void_reasons)
+    assert nominal.guarantee == "none"
+
+
+@pytest.mark.parametrize("epsilon", [0.1, 0.5, 1.0, 2.0, 5.0, 10.0])
+@pytest.mark.parametrize("delta", [0.05, 0.001, 1e-6])
+def test_composition_is_a_reason_just_where_two_releases_exceed_the_claim(epsilon, delta):
+    found = report("corrected", epsilon, delta)
+    assert ("releases_not_composed" in found.void_reasons) == (found.epsilon > epsilon)
+
+
+def test_composition_fails_at_a_large_epsilon():
+    assert "releases_not_composed" in report("corrected", epsilon=5.0).void_reasons
+
+
+def test_a_claim_is_made_only_when_nothing_voids_it():
+    sound = dataclasses.replace(highway(), void_reasons=())
+    found = report("corrected", sensitivity=sound, boundary_inputs="nominal")
+    assert found.void_reasons == ()
+    assert found.guarantee == (
+        "(1, 0.05)-differential privacy of density and speed together, "
+        "for one vehicle's trip, replaced by another"
+    )
+    assert report("corrected", sensitivity=sound).guarantee == "none"
+    assert report("paper", sensitivity=sound, boundary_inputs="nominal").guarantee == "none"
+
+
+@pytest.mark.parametrize("value", ["True", "", None, True])
+def test_an_unknown_boundary_is_refused(value):
+    with pytest.raises(ValueError, match=r"^privacy\.boundary_inputs must be one of \['true', "):
+        report(boundary_inputs=value)
+
+
+# --- the form it takes in info ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize("preset", ["paper", "corrected"])
+def test_the_dict_is_its_own_json_and_fresh_each_time(preset):
+    found = report(preset, sensitivity=highway(average_dwell=np.float64(8.0)))
+    first = found.to_dict()
+    assert json.loads(json.dumps(first, allow_nan=False)) == first
+    assert set(first) == {field.name for field in dataclasses.fields(found)}
+    first["void_reasons"].clear()
+    first["releases"][0]["mu"] = 0.0
+    first["assumptions"].clear()
+    assert found.to_dict() != first
+    assert found.to_dict()["assumptions"] == {"n_sensors": 8, "average_dwell_steps": 8.0}

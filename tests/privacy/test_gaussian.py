@@ -1,0 +1,237 @@
+import math
+from statistics import NormalDist
+
+import mpmath
+import pytest
+from dp_accounting import get_epsilon_gaussian, get_sigma_gaussian
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from dptse_env.privacy.gaussian import (
+    analytic_multiplier,
+    compose,
+    delta_of,
+    epsilon_of,
+    le_ny_kappa,
+    mu_of,
+)
+
+relaxed = settings(deadline=None)
+
+
+def close(expected: float, rel: float):
+    """Equal to a relative tolerance only: pytest's own absolute one hides any small delta."""
+    return pytest.approx(expected, rel=rel, abs=0.0)
+
+
+def logarithmic(low: float, high: float) -> st.SearchStrategy[float]:
+    return st.floats(math.log(low), math.log(high)).map(math.exp)
+
+
+mus = logarithmic(1e-4, 1e3)
+epsilons = logarithmic(1e-3, 1e3)
+deltas = logarithmic(1e-30, 0.499)
+
+
+def exact_delta(mu: float, epsilon: float) -> mpmath.mpf:
+    """The definition as it stands, in 60 digits."""
+    with mpmath.workdps(60):
+        mu, epsilon = mpmath.mpf(mu), mpmath.mpf(epsilon)
+        first = mpmath.ncdf(mu / 2 - epsilon / mu)
+        return first - mpmath.exp(epsilon) * mpmath.ncdf(-mu / 2 - epsilon / mu)
+
+
+# --- known numbers ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("epsilon", "delta", "kappa", "analytic", "rounding"),
+    [
+        (0.1, 0.05, 16.75, 4.487, 5e-3),
+        (0.5, 0.05, 3.570, 2.033, 5e-4),
+        (1.0, 0.05, 1.907, 1.333, 5e-4),
+        (1.0, 0.001, 3.244, 2.575, 5e-4),
+        (2.0, 0.05, 1.059, 0.855, 5e-4),
+        (5.0, 0.05, 0.521, 0.472, 5e-4),
+    ],
+)
+def test_golden_multipliers(epsilon, delta, kappa, analytic, rounding):
+    assert le_ny_kappa(epsilon, delta) == pytest.approx(kappa, abs=rounding)
+    assert analytic_multiplier(epsilon, delta) == pytest.approx(analytic, abs=5e-4)
+
+
+def test_golden_multiplier_in_nine_digits():
+    assert analytic_multiplier(1.0, 0.05) == pytest.approx(1.33277831, abs=5e-9)
+
+
+def test_golden_composition_of_two_releases():
+    le_ny = 1.0 / le_ny_kappa(1.0, 0.05)
+    assert epsilon_of(compose([le_ny, le_ny]), 0.05) == pytest.approx(0.982, abs=5e-4)
+    analytic = mu_of(1.0, 0.05)
+    assert epsilon_of(compose([analytic, analytic]), 0.05) == pytest.approx(1.720, abs=5e-4)
+
+
+@pytest.mark.parametrize(
+    ("epsilon", "stds"), [(1.0, (53, 107, 213)), (5.0, (19, 38, 76)), (10.0, (12, 24, 49))]
+)
+def test_golden_joint_calibration_at_equal_shares(epsilon, stds):
+    """Density noise [veh/km] of two releases that share mu, a vehicle in 4, 16 or 64 steps."""
+    for exposures, std in zip((4, 16, 64), stds, strict=True):
+        sensitivity = math.sqrt(2.0 * exposures) / 0.1
+        found = sensitivity * analytic_multiplier(epsilon, 0.05) / math.sqrt(0.5)
+        assert found == pytest.approx(std, abs=0.5)
+
+
+# --- against independent computations --------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "mu", [1e-9, 1e-6, 1e-4, 9.9e-4, 1.01e-3, 1e-2, 0.7, 1.0, 3.0, 10.0, 30.0, 100.0, 1e3]
+)
+@pytest.mark.parametrize("deviations", [-20.0, -1.0, 0.0, 1e-3, 0.3, 1.0, 5.0, 20.0, 37.0])
+def test_delta_matches_the_definition_in_many_digits(mu, deviations):
+    """Over the whole of its range: `deviations` is minus the argument of the leading term."""
+    epsilon = max(mu * (deviations + mu / 2.0), 0.0)
+    assert delta_of(mu, epsilon) == close(float(exact_delta(mu, epsilon)), 2e-11)
+
+
+@pytest.mark.parametrize("delta", [0.4, 0.05, 1e-3, 1e-6, 1e-12])
+@pytest.mark.parametrize("epsilon", [0.01, 0.1, 0.5, 1.0, 2.0, 5.0, 10.0, 50.0])
+def test_multiplier_matches_dp_accounting(epsilon, delta):
+    oracle = get_sigma_gaussian(epsilon, delta, tol=1e-15)
+    assert analytic_multiplier(epsilon, delta) == close(oracle, 1e-12)
+
+
+@pytest.mark.parametrize("delta", [0.4, 0.05, 1e-3, 1e-6, 1e-12])
+@pytest.mark.parametrize("mu", [0.01, 0.1, 0.5, 1.0, 2.0, 6.4, 20.0])
+def test_epsilon_matches_dp_accounting(mu, delta):
+    oracle = get_epsilon_gaussian(1.0 / mu, delta, tol=1e-15)
+    assert epsilon_of(mu, delta) == pytest.approx(oracle, rel=1e-11, abs=1e-13)
+
+
+# --- properties ------------------------------------------------------------------------------
+
+
+@relaxed
+@given(epsilon=epsilons, delta=deltas)
+def test_delta_of_inverts_mu_of(epsilon, delta):
+    assert delta_of(mu_of(epsilon, delta), epsilon) == close(delta, 1e-9)
+
+
+@relaxed
+@given(epsilon=epsilons, delta=deltas)
+def test_epsilon_of_inverts_mu_of(epsilon, delta):
+    # Near the total variation distance delta hardly depends on epsilon: nothing to invert there.
+    mu = mu_of(epsilon, delta)
+    assume(delta < 0.99 * delta_of(mu, 0.0))
+    assert epsilon_of(mu, delta) == close(epsilon, 1e-8)
+
+
+@relaxed
+@given(mu=mus, delta=deltas)
+def test_epsilon_is_the_smallest_that_keeps_delta(mu, delta):
+    epsilon = epsilon_of(mu, delta)
+    if epsilon == 0.0:
+        assert delta_of(mu, 0.0) <= delta
+    else:
+        assert delta_of(mu, epsilon) == close(delta, 1e-8)
+
+
+@relaxed
+@given(mu=mus, epsilon=epsilons, factor=st.floats(1.001, 10.0))
+def test_delta_rises_with_mu_and_falls_with_epsilon(mu, epsilon, factor):
+    delta = delta_of(mu, epsilon)
+    assert 0.0 <= delta <= 1.0
+    assert delta_of(mu * factor, epsilon) >= delta
+    assert delta_of(mu, epsilon * factor) <= delta
+    if 1e-300 < delta < 0.999:
+        assert delta_of(mu * factor, epsilon) > delta
+
+
+@relaxed
+@given(mu=mus, delta=deltas, factor=st.floats(1.001, 10.0))
+def test_epsilon_rises_with_mu_and_falls_with_delta(mu, delta, factor):
+    epsilon = epsilon_of(mu, delta)
+    assert 0.0 <= epsilon < math.inf
+    assert epsilon_of(mu / factor, delta) <= epsilon
+    assert epsilon_of(mu, delta / factor) >= epsilon
+    if epsilon > 0.0:
+        assert epsilon_of(mu * factor, delta) > epsilon
+
+
+@relaxed
+@given(epsilon=epsilons, delta=deltas)
+def test_le_ny_is_enough_and_more_than_the_analytic_noise(epsilon, delta):
+    kappa = le_ny_kappa(epsilon, delta)
+    assert kappa >= analytic_multiplier(epsilon, delta) * (1.0 - 1e-12)
+    assert delta_of(1.0 / kappa, epsilon) <= delta * (1.0 + 1e-9)
+
+
+@given(parts=st.lists(mus, min_size=1, max_size=6), more=mus)
+def test_composition_adds_squares_in_any_order_and_grouping(parts, more):
+    whole = compose(parts)
+    assert whole**2 == close(sum(part**2 for part in parts), 1e-12)
+    assert compose(reversed(parts)) == close(whole, 1e-14)
+    assert compose([whole, more]) == close(compose([*parts, more]), 1e-14)
+    assert whole >= max(parts)
+
+
+def test_composing_nothing_reveals_nothing():
+    assert compose([]) == 0.0
+
+
+# --- the far ends ----------------------------------------------------------------------------
+
+
+def test_no_overflow_where_the_exponential_of_epsilon_would():
+    assert delta_of(1e3, 4e5) == pytest.approx(1.0, abs=1e-12)
+    assert delta_of(1.0, 1e6) == 0.0
+    assert delta_of(1e-4, 1e300) == 0.0
+    # Large mu: epsilon = mu^2 / 2 + O(mu).
+    assert epsilon_of(1e3, 1e-300) == pytest.approx(5e5, rel=0.08)
+    assert epsilon_of(1e6, 0.05) == close(5e11, 1e-5)
+
+
+def test_an_epsilon_beyond_the_floats_is_an_error():
+    with pytest.raises(OverflowError, match=r"^epsilon is beyond the largest float at mu 1e\+160$"):
+        epsilon_of(1e160, 0.05)
+
+
+def test_epsilon_zero_from_where_the_total_variation_allows_it():
+    edge = 2.0 * NormalDist().inv_cdf(0.525)
+    assert delta_of(edge, 0.0) == close(0.05, 1e-12)
+    assert epsilon_of(0.99 * edge, 0.05) == 0.0
+    assert epsilon_of(1.01 * edge, 0.05) > 0.0
+
+
+@pytest.mark.parametrize(("epsilon", "delta"), [(1e-12, 0.49), (1e-12, 1e-12), (1e6, 1e-300)])
+def test_calibration_at_extreme_settings(epsilon, delta):
+    assert delta_of(mu_of(epsilon, delta), epsilon) == close(delta, 1e-9)
+
+
+# --- bad input -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("relation", [mu_of, analytic_multiplier, le_ny_kappa])
+def test_settings_out_of_range_are_named(relation):
+    with pytest.raises(ValueError, match=r"^epsilon must be > 0, got -1$"):
+        relation(-1, 0.05)
+    with pytest.raises(ValueError, match=r"^epsilon must be > 0, got 0$"):
+        relation(0, 0.05)
+    for delta in (0.0, 0.5, 1.0, math.nan):
+        with pytest.raises(ValueError, match=r"^delta must be in \(0, 0\.5\), got "):
+            relation(1.0, delta)
+
+
+def test_arguments_out_of_range_are_named():
+    for relation in (lambda mu: delta_of(mu, 1.0), lambda mu: epsilon_of(mu, 0.05)):
+        with pytest.raises(ValueError, match=r"^mu must be > 0, got 0\.0$"):
+            relation(0.0)
+        with pytest.raises(ValueError, match=r"^mu must be finite, got inf$"):
+            relation(math.inf)
+    with pytest.raises(ValueError, match=r"^epsilon must be > 0, got -0\.1$"):
+        delta_of(1.0, -0.1)
+    with pytest.raises(ValueError, match=r"^delta must be in \(0, 0\.5\), got 0\.5$"):
+        epsilon_of(1.0, 0.5)
+    with pytest.raises(ValueError, match=r"^mu must be > 0, got -1\.0$"):
+        compose([1.0, -1.0])

@@ -1,0 +1,67 @@
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dptse_env.privacy.sensitivity import paper_sensitivity
+
+NOMINAL = {
+    "n_sensors": 8,
+    "average_dwell": 8.0,
+    "segment_length": 0.1,
+    "free_flow_speed": 102.0,
+    "jam_density": 333.0,
+}
+
+
+def bounds(**changes):
+    density, speed = paper_sensitivity(**{**NOMINAL, **changes}).releases
+    return density.bound, speed.bound
+
+
+def test_golden_values_of_the_paper_highway():
+    density, speed = bounds()
+    assert density == pytest.approx(113.1, abs=0.05)  # veh/km
+    assert speed == pytest.approx(density * 102 / 333, rel=1e-15)  # km/h
+
+
+def test_releases_are_named_in_the_order_of_the_last_axis():
+    density, speed = paper_sensitivity(**NOMINAL).releases
+    assert (density.quantity, density.unit) == ("density", "veh/km")
+    assert (speed.quantity, speed.unit) == ("speed", "km/h")
+
+
+def test_the_assumptions_are_kept_and_the_ways_they_fail_are_listed():
+    sensitivity = paper_sensitivity(**NOMINAL)
+    assert sensitivity.assumptions == (("n_sensors", 8), ("average_dwell_steps", 8.0))
+    assert sensitivity.void_reasons == ("average_dwell", "adaptive_queries", "speed_sensitivity")
+    assert "one vehicle" in sensitivity.protects
+
+
+@given(
+    n_sensors=st.integers(1, 40),
+    average_dwell=st.floats(1.0, 60.0),
+    segment_length=st.floats(0.05, 1.0),
+)
+def test_density_bound_equals_a_count_of_what_one_vehicle_changes(
+    n_sensors, average_dwell, segment_length
+):
+    """Twice per sensor (once in either record) for the dwell, 1 / length each time."""
+    density, _ = bounds(
+        n_sensors=n_sensors, average_dwell=average_dwell, segment_length=segment_length
+    )
+    squares = sum(2.0 * average_dwell * (1.0 / segment_length) ** 2 for _ in range(n_sensors))
+    assert density == pytest.approx(math.sqrt(squares), rel=1e-12)
+
+
+@pytest.mark.parametrize("name", list(NOMINAL))
+@pytest.mark.parametrize("value", [0, -1.0, math.nan, math.inf, "8"])
+def test_bad_arguments_are_named(name, value):
+    with pytest.raises(ValueError, match=rf"^{name} must be .*, got {value!r}$"):
+        bounds(**{name: value})
+
+
+def test_a_fraction_of_a_sensor_is_refused():
+    with pytest.raises(ValueError, match=r"^n_sensors must be a whole number >= 1, got 7\.5$"):
+        bounds(n_sensors=7.5)
