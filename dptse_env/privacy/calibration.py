@@ -8,10 +8,10 @@ from types import MappingProxyType
 import numpy as np
 import numpy.typing as npt
 
-from dptse_env.privacy.checks import finite_positive, inside
 from dptse_env.privacy.gaussian import le_ny_kappa
 from dptse_env.privacy.reasons import VoidReason
 from dptse_env.privacy.sensitivity import Sensitivity
+from dptse_env.validation import inside, positive
 
 __all__ = ["PRESETS", "Preset", "PrivacySettings", "noise_std"]
 
@@ -37,7 +37,7 @@ class PrivacySettings:
         """Check each field, and keep the numbers as plain floats."""
         if self.preset not in list(PRESETS):
             raise ValueError(f"privacy.preset must be one of {list(PRESETS)}, got {self.preset!r}")
-        object.__setattr__(self, "epsilon", finite_positive("privacy.epsilon", self.epsilon))
+        object.__setattr__(self, "epsilon", positive("privacy.epsilon", self.epsilon))
         object.__setattr__(self, "delta", inside("privacy.delta", self.delta, 0.0, 0.5))
 
 

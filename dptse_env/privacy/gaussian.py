@@ -22,7 +22,7 @@ from collections.abc import Iterable
 from scipy.optimize import brentq
 from scipy.special import erfcx, log_ndtr, ndtri
 
-from dptse_env.privacy.checks import finite_positive, inside
+from dptse_env.validation import inside, positive
 
 __all__ = ["analytic_multiplier", "compose", "delta_of", "epsilon_of", "le_ny_kappa", "mu_of"]
 
@@ -49,9 +49,9 @@ def delta_of(mu: float, epsilon: float) -> float:
     Raises:
         ValueError: if `mu` is not finite and above zero, or `epsilon` is negative or infinite.
     """
-    mu = finite_positive("mu", mu)
+    mu = positive("mu", mu)
     if epsilon != 0:
-        epsilon = finite_positive("epsilon", epsilon)
+        epsilon = positive("epsilon", epsilon)
     return math.exp(_log_delta(mu, epsilon))
 
 
@@ -71,7 +71,7 @@ def epsilon_of(mu: float, delta: float) -> float:
         ValueError: if `mu` or `delta` is out of range.
         OverflowError: if epsilon is beyond the largest float, from a mu of about 1e154.
     """
-    mu = finite_positive("mu", mu)
+    mu = positive("mu", mu)
     delta = _checked_delta(delta)
     log_delta = math.log(delta)
 
@@ -128,7 +128,7 @@ def compose(mus: Iterable[float]) -> float:
     Raises:
         ValueError: if one of them is not finite and above zero.
     """
-    return math.hypot(*(finite_positive("mu", mu) for mu in mus))
+    return math.hypot(*(positive("mu", mu) for mu in mus))
 
 
 def analytic_multiplier(epsilon: float, delta: float) -> float:
@@ -170,7 +170,7 @@ def le_ny_kappa(epsilon: float, delta: float) -> float:
 
 
 def _checked_epsilon(epsilon: float) -> float:
-    return finite_positive("epsilon", epsilon)
+    return positive("epsilon", epsilon)
 
 
 def _checked_delta(delta: float) -> float:

@@ -6,7 +6,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from dptse_env.privacy.checks import positive_count
+from dptse_env.validation import integer
 
 __all__ = ["GaussianMechanism", "Mechanism"]
 
@@ -68,9 +68,9 @@ class GaussianMechanism:
         std = np.array(sigma, dtype=np.float64)
         if std.shape != (2,) or not (np.isfinite(std).all() and (std > 0.0).all()):
             raise ValueError(f"sigma must be two finite numbers > 0, got {sigma!r}")
-        n_episodes = positive_count("n_episodes", n_episodes)
-        n_segments = positive_count("n_segments", n_segments)
-        block = positive_count("block", block)
+        n_episodes = integer("n_episodes", n_episodes, 1)
+        n_segments = integer("n_segments", n_segments, 1)
+        block = integer("block", block, 1)
         std.flags.writeable = False
         self._sigma = std
         self._block = block

@@ -8,8 +8,8 @@ records that differ in one vehicle.
 import math
 from dataclasses import dataclass
 
-from dptse_env.privacy.checks import finite_positive, positive_count
 from dptse_env.privacy.reasons import VoidReason
+from dptse_env.validation import integer, positive
 
 __all__ = ["ReleaseSensitivity", "Sensitivity", "paper_sensitivity"]
 
@@ -76,11 +76,11 @@ def paper_sensitivity(
     Raises:
         ValueError: if an argument is not finite and above zero, or `n_sensors` is not whole.
     """
-    n_sensors = positive_count("n_sensors", n_sensors)
-    average_dwell = finite_positive("average_dwell", average_dwell)
-    segment_length = finite_positive("segment_length", segment_length)
-    free_flow_speed = finite_positive("free_flow_speed", free_flow_speed)
-    jam_density = finite_positive("jam_density", jam_density)
+    n_sensors = integer("n_sensors", n_sensors, 1)
+    average_dwell = positive("average_dwell", average_dwell)
+    segment_length = positive("segment_length", segment_length)
+    free_flow_speed = positive("free_flow_speed", free_flow_speed)
+    jam_density = positive("jam_density", jam_density)
 
     density = math.sqrt(2.0 * n_sensors * average_dwell) / segment_length
     speed = free_flow_speed / jam_density * density

@@ -68,7 +68,7 @@ def test_settings_default_to_the_paper_and_survive_json():
         ("preset", [], "privacy.preset must be one of ['paper', 'corrected'], got []"),
         ("epsilon", -1, "privacy.epsilon must be > 0, got -1"),
         ("epsilon", 0.0, "privacy.epsilon must be > 0, got 0.0"),
-        ("epsilon", math.nan, "privacy.epsilon must be > 0, got nan"),
+        ("epsilon", math.nan, "privacy.epsilon must be finite, got nan"),
         ("epsilon", math.inf, "privacy.epsilon must be finite, got inf"),
         ("epsilon", "1", "privacy.epsilon must be a number, got '1'"),
         ("delta", 0.5, "privacy.delta must be in (0, 0.5), got 0.5"),

@@ -284,5 +284,5 @@ def test_a_bad_sigma_is_refused(sigma):
 
 @pytest.mark.parametrize("size", ["n_episodes", "n_segments", "block"])
 def test_a_bad_size_is_named(size):
-    with pytest.raises(ValueError, match=rf"^{size} must be a whole number >= 1, got 0$"):
+    with pytest.raises(ValueError, match=rf"^{size} must be an integer >= 1, got 0$"):
         make(**{size: 0})

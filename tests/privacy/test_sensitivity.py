@@ -63,5 +63,5 @@ def test_bad_arguments_are_named(name, value):
 
 
 def test_a_fraction_of_a_sensor_is_refused():
-    with pytest.raises(ValueError, match=r"^n_sensors must be a whole number >= 1, got 7\.5$"):
+    with pytest.raises(ValueError, match=r"^n_sensors must be an integer >= 1, got 7\.5$"):
         bounds(n_sensors=7.5)

@@ -1,0 +1,219 @@
+"""The road: its geometry, who wants to use it, what goes wrong on it, and two presets.
+
+Segments are numbered from 0: the mainline first, then the on-ramps, then the off-ramps. A ramp at
+face j sits between the mainline segments j-1 and j. Around these S segments lie boundary segments
+that are recorded but not estimated: one upstream and one downstream of the mainline, one before
+every on-ramp and one after every off-ramp.
+"""
+
+import dataclasses
+import hashlib
+import json
+import re
+from dataclasses import dataclass
+from functools import cached_property
+
+from dptse_env.traffic.demand import Demand, DemandDistribution
+from dptse_env.traffic.incident import Incident, IncidentDistribution
+from dptse_env.traffic.scenario import Scenario, draw_scenario
+from dptse_env.validation import integer, positive, require, sequence
+
+NOT_TRAFFIC = ("name", "fixed_sensors", "density_scale", "speed_scale", "average_dwell")
+"""Fields that describe how the traffic is observed and leave the traffic itself alone."""
+
+
+@dataclass(frozen=True)
+class Corridor:
+    """A stretch of highway with ramps, its demand and its incident.
+
+    Attributes:
+        name: lower-case letters, digits and hyphens.
+        n_mainline: number N of mainline segments, at least 2.
+        on_ramps: face of each on-ramp, in 1..N-1, increasing.
+        off_ramps: face of each off-ramp, in 1..N-1, increasing, none shared with an on-ramp.
+        exit_shares: share in (0, 1) of the vehicles passing each off-ramp that take it.
+        demand: arrival rates, fixed or drawn per traffic seed.
+        incident: a temporary speed limit, fixed or drawn per traffic seed; None for free traffic.
+        fixed_sensors: indices of the segments measured at every step.
+        duration: length of a record [s].
+        lanes: number of lanes of the mainline.
+        ramp_lanes: number of lanes of every ramp, at most `lanes`.
+        segment_length: length of a segment [km].
+        speed_limit: speed limit outside incidents [km/h].
+        density_scale: constant that scales densities in rewards and observations [veh/km].
+        speed_scale: constant that scales speeds in rewards and observations [km/h].
+        average_dwell: T_avg of the paper's eq. (6): how long a vehicle stays on a mainline segment
+            on average [s], measured from records (`dptse_env.traffic.record.mean_dwell`).
+
+    Raises:
+        ValueError: if the geometry is impossible, or demand, incident or sensors do not fit it.
+    """
+
+    name: str
+    n_mainline: int
+    on_ramps: tuple[int, ...]
+    off_ramps: tuple[int, ...]
+    exit_shares: tuple[float, ...]
+    demand: Demand | DemandDistribution
+    incident: Incident | IncidentDistribution | None
+    fixed_sensors: tuple[int, ...]
+    duration: int
+    lanes: int = 3
+    ramp_lanes: int = 1
+    segment_length: float = 0.1
+    speed_limit: float = 102.0
+    density_scale: float = 333.0
+    speed_scale: float = 102.0
+    average_dwell: float = 8.0
+
+    def __post_init__(self) -> None:
+        """Check the fields and bring them to their declared types."""
+        require(
+            bool(re.fullmatch(r"[a-z0-9][a-z0-9-]*", str(self.name))),
+            "corridor.name",
+            "lower-case letters, digits and hyphens",
+            self.name,
+        )
+        for field, low in (("n_mainline", 2), ("duration", 1), ("lanes", 1)):
+            self._set(field, integer(f"corridor.{field}", getattr(self, field), low))
+        ramp_lanes = integer("corridor.ramp_lanes", self.ramp_lanes, 1, self.lanes)
+        self._set("ramp_lanes", ramp_lanes)
+        for field in (
+            "segment_length",
+            "speed_limit",
+            "density_scale",
+            "speed_scale",
+            "average_dwell",
+        ):
+            self._set(field, positive(f"corridor.{field}", getattr(self, field)))
+        # SUMO cannot drive an edge shorter than about a vehicle and its gap.
+        require(
+            self.segment_length >= 0.04,
+            "corridor.segment_length",
+            "at least 0.04 km",
+            self.segment_length,
+        )
+        self._check_ramps()
+        self._check_sensors()
+        self._check_demand()
+        self._check_incident()
+
+    def _set(self, field: str, value: object) -> None:
+        object.__setattr__(self, field, value)
+
+    def _check_ramps(self) -> None:
+        last_face = self.n_mainline - 1
+        for field in ("on_ramps", "off_ramps"):
+            path = f"corridor.{field}"
+            faces = tuple(
+                integer(f"{path}[{i}]", face, 1, last_face)
+                for i, face in enumerate(sequence(path, getattr(self, field)))
+            )
+            require(list(faces) == sorted(set(faces)), path, "increasing", faces)
+            self._set(field, faces)
+        require(
+            not set(self.on_ramps) & set(self.off_ramps),
+            "corridor.off_ramps",
+            f"at other faces than the on-ramps {self.on_ramps}",
+            self.off_ramps,
+        )
+        path = "corridor.exit_shares"
+        shares = tuple(
+            positive(f"{path}[{i}]", share)
+            for i, share in enumerate(sequence(path, self.exit_shares, len(self.off_ramps)))
+        )
+        for i, share in enumerate(shares):
+            require(share < 1.0, f"{path}[{i}]", "in (0, 1)", share)
+        self._set("exit_shares", shares)
+
+    def _check_sensors(self) -> None:
+        path = "corridor.fixed_sensors"
+        sensors = tuple(
+            integer(f"{path}[{i}]", sensor, 0, self.n_segments - 1)
+            for i, sensor in enumerate(sequence(path, self.fixed_sensors))
+        )
+        require(len(set(sensors)) == len(sensors), path, "free of duplicates", sensors)
+        self._set("fixed_sensors", sensors)
+
+    def _check_demand(self) -> None:
+        demand = self.demand.base if isinstance(self.demand, DemandDistribution) else self.demand
+        require(
+            isinstance(demand, Demand), "corridor.demand", "a Demand or DemandDistribution", demand
+        )
+        require(
+            len(demand.on_ramps) == self.n_on_ramps,
+            "corridor.demand.on_ramps",
+            f"one rate for each of the {self.n_on_ramps} on-ramps",
+            demand.on_ramps,
+        )
+
+    def _check_incident(self) -> None:
+        incident = self.incident
+        if incident is None:
+            return
+        require(
+            isinstance(incident, Incident | IncidentDistribution),
+            "corridor.incident",
+            "an Incident, an IncidentDistribution or None",
+            incident,
+        )
+        if isinstance(incident, Incident):
+            segments, start = [incident.segment], incident.start
+        else:
+            segments, start = list(incident.segments), incident.start[1]
+        for segment in segments:
+            integer("corridor.incident.segment", segment, 0, self.n_mainline - 1)
+        require(start < self.duration, "corridor.incident.start", f"< {self.duration} s", start)
+
+    @property
+    def n_on_ramps(self) -> int:
+        """Number I of on-ramps."""
+        return len(self.on_ramps)
+
+    @property
+    def n_off_ramps(self) -> int:
+        """Number O of off-ramps."""
+        return len(self.off_ramps)
+
+    @property
+    def n_segments(self) -> int:
+        """Number S = N + I + O of segments that are estimated."""
+        return self.n_mainline + self.n_on_ramps + self.n_off_ramps
+
+    @property
+    def n_boundaries(self) -> int:
+        """Number R = 2 + I + O of boundary segments around them."""
+        return 2 + self.n_on_ramps + self.n_off_ramps
+
+    @property
+    def segment_lanes(self) -> tuple[int, ...]:
+        """Lanes of each of the S segments."""
+        n_ramps = self.n_on_ramps + self.n_off_ramps
+        return (self.lanes,) * self.n_mainline + (self.ramp_lanes,) * n_ramps
+
+    @property
+    def segment_names(self) -> tuple[str, ...]:
+        """Names of the S segments, counted from 1 as in the paper."""
+        return (
+            *(f"mainline {i + 1}" for i in range(self.n_mainline)),
+            *(f"on-ramp {i + 1}" for i in range(self.n_on_ramps)),
+            *(f"off-ramp {i + 1}" for i in range(self.n_off_ramps)),
+        )
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 (hex) of everything that shapes the traffic, stable across processes.
+
+        Name, sensors, scales and the measured dwell are left out: corridors that differ only in
+        how they are observed share their records.
+        """
+        content = dataclasses.asdict(self)
+        for field in NOT_TRAFFIC:
+            del content[field]
+        content["kinds"] = [type(self.demand).__name__, type(self.incident).__name__]
+        text = json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)
+        return hashlib.sha256(text.encode()).hexdigest()
+
+    def draw(self, seed: int) -> Scenario:
+        """Draw the scenario of a traffic seed (`dptse_env.traffic.scenario.draw_scenario`)."""
+        return draw_scenario(self, integer("traffic seed", seed, 0))

@@ -1,0 +1,77 @@
+"""The corridors that come with the package.
+
+Their `average_dwell` is measured on the training seeds 0..15, by
+``python scripts/record.py --corridor NAME --seeds 0:16``; a test repeats the measurement.
+"""
+
+import dataclasses
+
+from dptse_env.traffic.corridor import Corridor
+from dptse_env.traffic.demand import Demand, DemandDistribution
+from dptse_env.traffic.incident import Incident, IncidentDistribution
+
+PAPER_HIGHWAY = Corridor(
+    name="paper-highway",
+    n_mainline=15,
+    on_ramps=(3, 9),
+    off_ramps=(6, 12),
+    exit_shares=(0.1, 0.1),
+    demand=Demand(
+        mainline=((0.0, 2050.0), (200.0, 6050.0), (400.0, 2050.0)), on_ramps=(320.0, 300.0)
+    ),
+    incident=Incident(segment=10, phases=((200.0, 400.0, 10.08), (400.0, 500.0, 50.95))),
+    fixed_sensors=(14, 17, 18),
+    duration=700,
+    average_dwell=10.25,
+)
+"""The paper's 1.5 km stretch (section IV), its demand and its incident on segment 11.
+
+The paper leaves open, and this fixes: three lanes, exit shares of 10 % and an end after 700 s.
+"""
+
+SHORT_HIGHWAY = Corridor(
+    name="short-highway",
+    n_mainline=6,
+    on_ramps=(2,),
+    off_ramps=(4,),
+    exit_shares=(0.1,),
+    demand=Demand(mainline=((0.0, 1800.0), (60.0, 3000.0), (150.0, 1500.0)), on_ramps=(300.0,)),
+    incident=Incident(segment=4, phases=((60.0, 140.0, 12.0), (140.0, 170.0, 50.0))),
+    fixed_sensors=(5, 7),
+    duration=240,
+    lanes=2,
+    density_scale=222.0,
+    average_dwell=9.95,
+)
+"""A 0.6 km stretch with one ramp of each kind and a jam of its own, for tests and first trials."""
+
+CORRIDORS: dict[str, Corridor] = {
+    corridor.name: corridor for corridor in (PAPER_HIGHWAY, SHORT_HIGHWAY)
+}
+"""The presets by name."""
+
+
+def randomised(corridor: Corridor) -> Corridor:
+    """Return `corridor` with a demand level and an incident drawn anew for every traffic seed.
+
+    The demand varies by a fifth either way. The incident may block any mainline segment but the
+    last, at any time that leaves a third of the record for the jam, with ranges in proportion to
+    the record's duration.
+
+    Args:
+        corridor: a corridor; its incident is dropped, its demand is kept as the base. Everything
+            else stays, `average_dwell` included: measure it again where it matters.
+
+    Returns:
+        The corridor with a `DemandDistribution` and an `IncidentDistribution`.
+    """
+    demand = corridor.demand
+    base = demand.base if isinstance(demand, DemandDistribution) else demand
+    total = corridor.duration
+    incident = IncidentDistribution(
+        segments=tuple(range(corridor.n_mainline - 1)),
+        start=(0.1 * total, 0.65 * total),
+        duration=(0.1 * total, 0.4 * total),
+        recovery_duration=(0.05 * total, 0.2 * total),
+    )
+    return dataclasses.replace(corridor, demand=DemandDistribution(base), incident=incident)

@@ -1,0 +1,285 @@
+"""A record: which vehicle was where, how fast, at every second. Everything else derives from it."""
+
+import errno
+import hashlib
+import json
+import os
+import shutil
+import uuid
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dptse_env.validation import integer, require
+
+FORMAT = "dptse-record"
+VERSION = 1
+"""Raise it whenever a recording changes in content or layout: older records are then made again."""
+
+COLUMNS: dict[str, np.dtype[Any]] = {
+    "step": np.dtype("<i4"),
+    "vehicle": np.dtype("<i4"),
+    "segment": np.dtype("<i2"),
+    "speed": np.dtype("<f4"),
+}
+"""Columns of the vehicle table and how they are stored."""
+
+MANIFEST = "manifest.json"
+
+
+class InvalidRecordError(ValueError):
+    """A stored record is damaged, incomplete, or not the one that was asked for."""
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """The vehicle table of one simulated scenario, one row per vehicle and step.
+
+    Step k is the state of the road k seconds after the start, so step 0 is the empty road. Within a
+    step, a recording lists the vehicles segment by segment.
+
+    Attributes:
+        step: (rows,) int32, non-decreasing, in 0..n_steps-1.
+        vehicle: (rows,) int32, index of the vehicle in its scenario.
+        segment: (rows,) int16, record column: the S segments, then the boundary segments.
+        speed: (rows,) float32 [km/h].
+        n_steps: number of steps.
+        n_columns: number of record columns, S + R.
+
+    Raises:
+        ValueError: if the columns differ in length, are not ordered by step, or leave their range.
+    """
+
+    step: NDArray[np.int32]
+    vehicle: NDArray[np.int32]
+    segment: NDArray[np.int16]
+    speed: NDArray[np.float32]
+    n_steps: int
+    n_columns: int
+
+    def __post_init__(self) -> None:
+        """Check the fields and bring them to their declared types."""
+        object.__setattr__(self, "n_steps", integer("record.n_steps", self.n_steps, 1))
+        object.__setattr__(self, "n_columns", integer("record.n_columns", self.n_columns, 1))
+        for name, dtype in COLUMNS.items():
+            column = np.asarray(getattr(self, name), dtype=dtype)
+            require(column.ndim == 1, f"record.{name}", "one-dimensional", column.shape)
+            require(
+                len(column) == len(self.step),
+                f"record.{name}",
+                f"as long as record.step ({len(self.step)})",
+                len(column),
+            )
+            if column.flags.writeable:
+                column = column.copy()
+                column.flags.writeable = False
+            object.__setattr__(self, name, column)
+        if len(self.step):
+            self._check_rows()
+
+    def _check_rows(self) -> None:
+        require(bool(np.all(np.diff(self.step) >= 0)), "record.step", "non-decreasing", self.step)
+        for name, bound in (("step", self.n_steps), ("segment", self.n_columns)):
+            low, high = int(getattr(self, name).min()), int(getattr(self, name).max())
+            require(low >= 0 and high < bound, f"record.{name}", f"in 0..{bound - 1}", (low, high))
+        require(int(self.vehicle.min()) >= 0, "record.vehicle", ">= 0", int(self.vehicle.min()))
+        valid = bool(np.isfinite(self.speed).all() and self.speed.min() >= 0.0)
+        require(valid, "record.speed", "finite and >= 0", self.speed.min())
+
+    @property
+    def n_rows(self) -> int:
+        """Number of rows of the vehicle table."""
+        return len(self.step)
+
+    @cached_property
+    def n_vehicles(self) -> int:
+        """One more than the largest vehicle index: the length of any array with one entry each."""
+        return int(self.vehicle.max()) + 1 if self.n_rows else 0
+
+    @cached_property
+    def counts(self) -> NDArray[np.int64]:
+        """(n_steps, n_columns) number of vehicles on each segment at each step."""
+        return self._per_cell(None, np.int64)
+
+    @cached_property
+    def speed_sums(self) -> NDArray[np.float64]:
+        """(n_steps, n_columns) sum of the vehicles' speeds on each segment at each step [km/h].
+
+        Divided by `counts` it is the mean speed over vehicles. SUMO's own mean speed of an edge
+        counts an empty lane as a vehicle at the limit, and is not used anywhere.
+        """
+        return self._per_cell(self.speed, np.float64)
+
+    def _per_cell(self, weights: NDArray[np.float32] | None, dtype: type) -> NDArray[Any]:
+        cells = self.step.astype(np.int64) * self.n_columns + self.segment
+        flat = np.bincount(cells, weights, minlength=self.n_steps * self.n_columns)
+        grid: NDArray[Any] = flat.reshape(self.n_steps, self.n_columns).astype(dtype, copy=False)
+        grid.flags.writeable = False
+        return grid
+
+    @cached_property
+    def offsets(self) -> NDArray[np.int64]:
+        """(n_steps + 1,) first row of each step; the last entry is the number of rows."""
+        offsets = np.searchsorted(self.step, np.arange(self.n_steps + 1)).astype(np.int64)
+        offsets.flags.writeable = False
+        return offsets
+
+    def rows(self, step: int) -> slice:
+        """Return the rows of one step, for use as ``record.vehicle[record.rows(step)]``."""
+        integer("step", step, 0, self.n_steps - 1)
+        return slice(int(self.offsets[step]), int(self.offsets[step + 1]))
+
+    def without(self, vehicle: int) -> "Record":
+        """Return the adjacent record in the sense of differential privacy: one vehicle removed.
+
+        The other vehicles move as they did; they are not simulated again.
+        """
+        keep = self.vehicle != vehicle
+        columns = {name: getattr(self, name)[keep] for name in COLUMNS}
+        return Record(**columns, n_steps=self.n_steps, n_columns=self.n_columns)
+
+    def in_memory(self) -> "Record":
+        """Return the same record, independent of the files it was mapped from."""
+        columns = {name: np.array(getattr(self, name)) for name in COLUMNS}
+        return Record(**columns, n_steps=self.n_steps, n_columns=self.n_columns)
+
+    def save(self, path: Path, source: Mapping[str, object]) -> None:
+        """Write the record to the directory `path`, completely or not at all.
+
+        A record that is already there stays: recording is deterministic, so it is the same.
+
+        Args:
+            path: directory to create; its parents are created too.
+            source: JSON-able description of what was recorded, checked again by `load`.
+
+        Raises:
+            OSError: if it cannot be written; `path` is then left as it was.
+        """
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = path.parent / f".{path.name}-{uuid.uuid4().hex}"
+        temporary.mkdir()
+        try:
+            for name in COLUMNS:
+                with _column_path(temporary, name).open("wb") as file:
+                    np.save(file, getattr(self, name), allow_pickle=False)
+                    _sync(file.fileno())
+            header = {
+                "format": FORMAT,
+                "version": VERSION,
+                "n_steps": self.n_steps,
+                "n_columns": self.n_columns,
+                "source": dict(source),
+            }
+            manifest = header | {"sha256": _checksum(temporary, header)}
+            with (temporary / MANIFEST).open("w", encoding="utf-8") as text:
+                json.dump(manifest, text, indent=2)
+                text.flush()
+                _sync(text.fileno())
+            _publish(temporary, path)
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
+
+    @classmethod
+    def load(cls, path: Path, source: Mapping[str, object]) -> "Record":
+        """Open a stored record; its columns are mapped into memory, read-only.
+
+        Args:
+            path: the record's directory.
+            source: what the record is expected to hold, as given to `save`.
+
+        Raises:
+            FileNotFoundError: if there is no such directory.
+            InvalidRecordError: if the record is damaged, incomplete, of another format version, or
+                of another source.
+        """
+        if not path.is_dir():
+            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path))
+        try:
+            manifest = json.loads((path / MANIFEST).read_text(encoding="utf-8"))
+            checksum = manifest.pop("sha256")
+            for key, expected in (
+                ("format", FORMAT),
+                ("version", VERSION),
+                ("source", dict(source)),
+            ):
+                if manifest[key] != expected:
+                    found = manifest[key]
+                    raise InvalidRecordError(f"{path}: {key} is {found!r}, not {expected!r}")
+            if _checksum(path, manifest) != checksum:
+                raise InvalidRecordError(f"{path}: the checksum does not match")
+            columns = {name: np.load(_column_path(path, name), mmap_mode="r") for name in COLUMNS}
+            return cls(**columns, n_steps=manifest["n_steps"], n_columns=manifest["n_columns"])
+        except InvalidRecordError:
+            raise
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            raise InvalidRecordError(f"{path}: {error!r}") from error
+
+
+def mean_dwell(records: Iterable[Record], n_mainline: int) -> float:
+    """Measure T_avg of the paper's eq. (6): how long a vehicle stays on a mainline segment.
+
+    Args:
+        records: records of one corridor.
+        n_mainline: the corridor's number of mainline segments, those that can be queried.
+
+    Returns:
+        The mean, over all passages of a vehicle over a mainline segment, of the number of
+        consecutive steps [s] at which it is there. A passage between two steps is not counted.
+
+    Raises:
+        ValueError: if no vehicle was ever on the mainline.
+    """
+    n_rows = n_passages = 0
+    for record in records:
+        mainline = record.segment < n_mainline
+        step, vehicle, segment = (
+            column[mainline].astype(np.int64)
+            for column in (record.step, record.vehicle, record.segment)
+        )
+        order = np.lexsort((step, segment, vehicle))
+        same_vehicle = np.diff(vehicle[order]) == 0
+        same_segment = np.diff(segment[order]) == 0
+        next_step = np.diff(step[order]) == 1
+        n_rows += len(step)
+        n_passages += len(step) - int(np.sum(same_vehicle & same_segment & next_step))
+    require(n_passages > 0, "records", "records with a vehicle on the mainline", n_passages)
+    return n_rows / n_passages
+
+
+def _column_path(directory: Path, name: str) -> Path:
+    return directory / f"{name}.npy"
+
+
+def _checksum(directory: Path, header: Mapping[str, object]) -> str:
+    """SHA-256 (hex) over the manifest's other entries and the column files."""
+    digest = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
+    for name in COLUMNS:
+        with _column_path(directory, name).open("rb") as file:
+            digest.update(hashlib.file_digest(file, "sha256").digest())
+    return digest.hexdigest()
+
+
+def _sync(descriptor: int) -> None:
+    """Have the operating system write a file's content out before its name appears."""
+    os.fsync(descriptor)
+
+
+def _publish(temporary: Path, path: Path) -> None:
+    """Give the finished directory its name, unless another process was faster."""
+    try:
+        temporary.rename(path)
+    except OSError as error:
+        if error.errno not in (errno.EEXIST, errno.ENOTEMPTY):
+            raise
+        return
+    if os.name == "posix":
+        parent = os.open(path.parent, os.O_RDONLY)
+        try:
+            _sync(parent)
+        finally:
+            os.close(parent)

@@ -1,0 +1,111 @@
+"""One realisation of a corridor's traffic: who departs when, from where to where, and the incident.
+
+All of it comes from numpy generators seeded by the traffic seed, so a scenario does not depend on
+SUMO; SUMO only adds how the vehicles then drive.
+"""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dptse_env.traffic.demand import Demand, DemandDistribution
+from dptse_env.traffic.incident import Incident, IncidentDistribution
+
+if TYPE_CHECKING:
+    from dptse_env.traffic.corridor import Corridor
+
+MAINLINE = -1
+"""Origin or exit of a vehicle that enters or leaves by the mainline instead of a ramp."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scenario:
+    """What happens on a corridor under one traffic seed.
+
+    Attributes:
+        seed: the traffic seed.
+        demand: the realised mean rates.
+        incident: the realised incident, or None.
+        departures: (V,) wanted departure times [s], non-decreasing; a vehicle's index is its id.
+        origins: (V,) index of the on-ramp, or `MAINLINE`.
+        exits: (V,) index of the off-ramp, or `MAINLINE`.
+        sumo_seed: seed of SUMO's own randomness (desired speeds).
+    """
+
+    seed: int
+    demand: Demand
+    incident: Incident | None
+    departures: NDArray[np.float64]
+    origins: NDArray[np.int64]
+    exits: NDArray[np.int64]
+    sumo_seed: int
+
+    @property
+    def n_vehicles(self) -> int:
+        """Number of vehicles that want to depart."""
+        return len(self.departures)
+
+
+def draw_scenario(corridor: "Corridor", seed: int) -> Scenario:
+    """Draw the scenario of a traffic seed; the same seed gives the same scenario.
+
+    Demand, incident, arrivals and SUMO have a stream each, so that changing one of them leaves the
+    others as they are.
+
+    Args:
+        corridor: the road and its demand and incident, fixed or as distributions.
+        seed: a non-negative integer.
+    """
+    demand_seed, incident_seed, arrival_seed, sumo_seed = np.random.SeedSequence(seed).spawn(4)
+    demand, incident = corridor.demand, corridor.incident
+    if isinstance(demand, DemandDistribution):
+        demand = demand.draw(np.random.default_rng(demand_seed))
+    if isinstance(incident, IncidentDistribution):
+        incident = incident.draw(np.random.default_rng(incident_seed))
+    generator = np.random.default_rng(arrival_seed)
+    departures, origins = _arrivals(demand, corridor.duration, generator)
+    return Scenario(
+        seed=seed,
+        demand=demand,
+        incident=incident,
+        departures=departures,
+        origins=origins,
+        exits=_exits(corridor, origins, generator),
+        sumo_seed=int(np.random.default_rng(sumo_seed).integers(2**31 - 1)),
+    )
+
+
+def _arrivals(
+    demand: Demand, duration: float, generator: np.random.Generator
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Poisson arrivals of every entry, merged in order of time."""
+    profiles = [(MAINLINE, demand.mainline)]
+    profiles += [(ramp, ((0.0, rate),)) for ramp, rate in enumerate(demand.on_ramps)]
+    times, origins = [np.empty(0)], [np.empty(0, dtype=np.int64)]
+    for origin, profile in profiles:
+        ends = [*(time for time, _ in profile[1:]), duration]
+        for (start, rate), end in zip(profile, ends, strict=True):
+            length = max(min(end, duration) - start, 0.0)
+            count = int(generator.poisson(rate * length / 3600.0))
+            times.append(start + length * generator.random(count))
+            origins.append(np.full(count, origin, dtype=np.int64))
+    # SUMO's clock counts milliseconds; rounding here keeps its files and this array the same.
+    departures = np.concatenate(times).round(3)
+    order = np.argsort(departures, kind="stable")
+    return departures[order], np.concatenate(origins)[order]
+
+
+def _exits(
+    corridor: "Corridor", origins: NDArray[np.int64], generator: np.random.Generator
+) -> NDArray[np.int64]:
+    """Let each vehicle choose at each diverge that it passes, until it has left."""
+    entry_face = np.array([*corridor.on_ramps, 0], dtype=np.int64)[origins]
+    exits = np.full(len(origins), MAINLINE, dtype=np.int64)
+    for ramp, (face, share) in enumerate(
+        zip(corridor.off_ramps, corridor.exit_shares, strict=True)
+    ):
+        leaves = generator.random(len(origins)) < share
+        exits[leaves & (exits == MAINLINE) & (entry_face < face)] = ramp
+    return exits

@@ -1,0 +1,255 @@
+"""Running SUMO: one scenario in, one record out.
+
+libsumo is one simulation per process: starting a second one silently replaces the first. A
+recording therefore moves to a child process when another simulation lives in this one.
+
+Two settings were chosen by measurement on the paper's corridor (W99, 12 seeds):
+
+- internal links are off. With them, a vehicle of the ramp and one of the mainline can block each
+  other inside a merge for the rest of the run, which silenced a ramp in half of the runs;
+- collisions have no consequence. About six vehicles of 730 overlap another for a moment while
+  merging; SUMO's default would take it off the road and put it down elsewhere.
+"""
+
+import contextlib
+import importlib.metadata
+import os
+import sys
+import tempfile
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+from xml.etree import ElementTree
+
+import numpy as np
+
+from dptse_env.traffic.corridor import Corridor
+from dptse_env.traffic.network import edge_ids, network_xml
+from dptse_env.traffic.record import Record
+from dptse_env.traffic.scenario import MAINLINE, Scenario
+
+SUPPORTED_SUMO = "1.28"
+"""Release series that records are made with: another one drives the same scenario differently."""
+
+STEP_LENGTH = 0.5
+"""SUMO's time step [s]: at 1 s, W99 brakes in emergency four times as often (377 against 85 times
+per run of 730 vehicles on the paper's corridor) and overlaps twice as often."""
+
+SUBSTEPS = round(1.0 / STEP_LENGTH)
+KMH = 3.6
+"""Factor from m/s to km/h."""
+
+OPTIONS = (
+    "--step-length",
+    str(STEP_LENGTH),
+    "--no-internal-links",
+    "--collision.action",
+    "none",
+    # Nobody is taken off the road for standing still: standing still is what a jam is.
+    "--time-to-teleport",
+    "-1",
+    "--no-step-log",
+    "--duration-log.disable",
+    "--no-warnings",
+    # Validation would look for schemas under SUMO_HOME, which is not needed otherwise.
+    "--xml-validation",
+    "never",
+    "--xml-validation.net",
+    "never",
+    "--xml-validation.routes",
+    "never",
+)
+
+_one_at_a_time = threading.Lock()
+
+
+class RecordingError(RuntimeError):
+    """A scenario could not be recorded; the message names corridor, seed and cause."""
+
+    @classmethod
+    def of(cls, corridor: Corridor, seed: int, cause: str) -> "RecordingError":
+        """Name what was being recorded and why it failed."""
+        return cls(f"recording {corridor.name} with traffic seed {seed} failed: {cause}")
+
+
+class SumoVersionError(RuntimeError):
+    """The installed libsumo is not of the release series that records are made with."""
+
+
+def sumo_version() -> str:
+    """Return the version of the installed libsumo, without importing it.
+
+    Raises:
+        SumoVersionError: if libsumo is missing or of another release series.
+    """
+    try:
+        version = importlib.metadata.version("libsumo")
+    except importlib.metadata.PackageNotFoundError as error:
+        raise SumoVersionError(
+            f"libsumo is not installed: pip install 'libsumo=={SUPPORTED_SUMO}.*'"
+        ) from error
+    _check_series(version)
+    return version
+
+
+def simulation_is_loaded() -> bool:
+    """Tell whether libsumo already holds a simulation in this process."""
+    libsumo = sys.modules.get("libsumo")
+    return libsumo is not None and bool(libsumo.isLoaded())
+
+
+def simulate(corridor: Corridor, seed: int) -> Record:
+    """Simulate one scenario in this process and record it.
+
+    The same corridor and seed give the same record, bit for bit, in any process.
+
+    Raises:
+        RecordingError: if SUMO fails, with its own words; or if libsumo already holds a
+            simulation here, which is left alone (see `dptse_env.traffic.worker`).
+        NetworkError: if the corridor has to be compiled and cannot be.
+        SumoVersionError: if libsumo is missing or of another release series.
+    """
+    network = network_xml(corridor)
+    scenario = corridor.draw(seed)
+    with _one_at_a_time, tempfile.TemporaryDirectory(prefix="dptse-sumo-") as directory:
+        if simulation_is_loaded():
+            cause = "libsumo holds another simulation in this process"
+            raise RecordingError.of(corridor, seed, cause)
+        libsumo = _import_libsumo()
+        folder = Path(directory)
+        messages = folder / "messages.txt"
+        try:
+            with _stderr_to(messages):
+                libsumo.start(_command(folder, network, corridor, scenario))
+            return _drive(libsumo, corridor, scenario)
+        except Exception as error:
+            said = messages.read_text(encoding="utf-8", errors="replace").strip()
+            cause = f"{type(error).__name__}: {error}" + (f"\n{said}" if said else "")
+            raise RecordingError.of(corridor, seed, cause) from error
+        finally:
+            if libsumo.isLoaded():
+                libsumo.close()
+
+
+def _import_libsumo() -> ModuleType:
+    """Import libsumo and check what is really there: libtraci's wheel overwrites it with 1.18."""
+    expected = sumo_version()
+    import libsumo  # noqa: PLC0415  (heavy, and only a recording needs it)
+
+    version = str(libsumo.getVersion()[1]).removeprefix("SUMO ")
+    _check_series(version)
+    if version != expected:
+        raise SumoVersionError(
+            f"libsumo calls itself {version} but is installed as {expected}: reinstall libsumo"
+        )
+    return libsumo  # type: ignore[no-any-return]
+
+
+def _check_series(version: str) -> None:
+    if version.split(".")[:2] != SUPPORTED_SUMO.split("."):
+        raise SumoVersionError(
+            f"libsumo must be of the series {SUPPORTED_SUMO}, found {version}: "
+            f"pip install --force-reinstall 'libsumo=={SUPPORTED_SUMO}.*'"
+        )
+
+
+@contextlib.contextmanager
+def _stderr_to(path: Path) -> Iterator[None]:
+    """Divert the process's stderr to a file.
+
+    libsumo's exception often says only "Process Error"; the reason goes to stderr, and SUMO's own
+    error log is not flushed before the process ends. Loading takes a few milliseconds.
+    """
+    sys.stderr.flush()
+    original = os.dup(2)
+    try:
+        with path.open("wb") as file:
+            os.dup2(file.fileno(), 2)
+        yield
+    finally:
+        os.dup2(original, 2)
+        os.close(original)
+
+
+def _command(folder: Path, network: str, corridor: Corridor, scenario: Scenario) -> list[str]:
+    """Write SUMO's input files and return its command line."""
+    network_file, route_file = folder / "corridor.net.xml", folder / "scenario.rou.xml"
+    network_file.write_text(network, encoding="utf-8")
+    route_file.write_bytes(ElementTree.tostring(_routes(corridor, scenario)))
+    files = ["-n", str(network_file), "-r", str(route_file)]
+    return ["sumo", *files, "--seed", str(scenario.sumo_seed), *OPTIONS]
+
+
+def _routes(corridor: Corridor, scenario: Scenario) -> ElementTree.Element:
+    """Describe the vehicles and their routes in SUMO's XML."""
+    root = ElementTree.Element("routes")
+    ElementTree.SubElement(root, "vType", id="car", carFollowModel="W99")
+    for origin in range(MAINLINE, corridor.n_on_ramps):
+        for end in range(MAINLINE, corridor.n_off_ramps):
+            first = 0 if origin == MAINLINE else corridor.on_ramps[origin]
+            last = corridor.n_mainline if end == MAINLINE else corridor.off_ramps[end]
+            if first >= last:
+                continue
+            edges = (
+                *(["upstream"] if origin == MAINLINE else [f"before_on_{origin}", f"on_{origin}"]),
+                *(f"main_{i}" for i in range(first, last)),
+                *(["downstream"] if end == MAINLINE else [f"off_{end}", f"after_off_{end}"]),
+            )
+            ElementTree.SubElement(root, "route", id=f"{origin}:{end}", edges=" ".join(edges))
+    for vehicle, (departure, origin, end) in enumerate(
+        zip(scenario.departures, scenario.origins, scenario.exits, strict=True)
+    ):
+        ElementTree.SubElement(
+            root,
+            "vehicle",
+            id=str(vehicle),
+            type="car",
+            route=f"{origin}:{end}",
+            depart=f"{departure:.3f}",
+            # As fast as is safe, on the lane that suits the route, and by default at the start of
+            # the boundary segment, so that it is measured there. About 4,700 veh/h can enter the
+            # paper's mainline so; what exceeds it queues outside. `departPos="last"` lets 9 % more
+            # in, but drops a vehicle at the far end of an empty boundary segment.
+            departSpeed="max",
+            departLane="best",
+        )
+    return root
+
+
+def _drive(libsumo: ModuleType, corridor: Corridor, scenario: Scenario) -> Record:
+    """Run the loaded simulation to its end and collect the vehicle table."""
+    edges = edge_ids(corridor)
+    vehicles_on, speed_of = libsumo.edge.getLastStepVehicleIDs, libsumo.vehicle.getSpeed
+    changes: list[tuple[float, float]] = []
+    blocked_edge = ""
+    if scenario.incident is not None:
+        changes = scenario.incident.limit_changes(corridor.speed_limit)
+        blocked_edge = f"main_{scenario.incident.segment}"
+    n_rows: list[int] = []
+    vehicle: list[int] = []
+    segment: list[int] = []
+    speed: list[float] = []
+    for step in range(corridor.duration + 1):
+        n_before = len(vehicle)
+        for column, edge in enumerate(edges):
+            ids = vehicles_on(edge)
+            vehicle += map(int, ids)
+            segment += [column] * len(ids)
+            speed += map(speed_of, ids)
+        n_rows.append(len(vehicle) - n_before)
+        if step == corridor.duration:
+            break
+        for substep in range(SUBSTEPS):
+            while changes and changes[0][0] <= step + substep * STEP_LENGTH:
+                _, limit = changes.pop(0)
+                libsumo.edge.setMaxSpeed(blocked_edge, limit / KMH)
+            libsumo.simulationStep()
+    return Record(
+        step=np.repeat(np.arange(corridor.duration + 1, dtype=np.int32), n_rows),
+        vehicle=np.array(vehicle, dtype=np.int32),
+        segment=np.array(segment, dtype=np.int16),
+        speed=(KMH * np.array(speed, dtype=np.float64)).astype(np.float32),
+        n_steps=corridor.duration + 1,
+        n_columns=corridor.n_segments + corridor.n_boundaries,
+    )

@@ -1,0 +1,17 @@
+import os
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture(scope="session", autouse=True)
+def record_cache(tmp_path_factory):
+    """Keep every record that the tests make in a folder of their own, child processes too."""
+    folder: Path = tmp_path_factory.mktemp("records")
+    before = os.environ.get("DPTSE_CACHE")
+    os.environ["DPTSE_CACHE"] = str(folder)
+    yield folder
+    if before is None:
+        del os.environ["DPTSE_CACHE"]
+    else:
+        os.environ["DPTSE_CACHE"] = before

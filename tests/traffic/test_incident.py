@@ -1,0 +1,66 @@
+import numpy as np
+import pytest
+
+from dptse_env.traffic import Incident, IncidentDistribution
+
+
+@pytest.mark.parametrize(
+    ("segment", "phases", "message"),
+    [
+        (-1, ((0, 1, 1),), r"incident\.segment must be an integer >= 0, got -1"),
+        (0, (), r"incident\.phases must be at least one phase"),
+        (0, ((5, 5, 1),), r"incident\.phases\[0\] must be after 0\.0 s with start < end"),
+        (0, ((0, 9, 1), (8, 12, 1)), r"incident\.phases\[1\] must be after 9\.0 s"),
+        (0, ((0, 9, 0),), r"incident\.phases\[0\] speed limit must be > 0, got 0"),
+        (0, ((0, 9),), r"incident\.phases\[0\] must be a sequence of 3"),
+    ],
+)
+def test_bad_incidents_are_refused_by_path(segment, phases, message):
+    with pytest.raises(ValueError, match=message):
+        Incident(segment, phases)
+
+
+def test_limits_return_to_normal_between_phases_only_where_there_is_a_gap():
+    touching = Incident(0, ((10, 20, 5), (20, 30, 50)))
+    apart = Incident(0, ((10, 20, 5), (25, 30, 50)))
+    assert touching.limit_changes(100.0) == [(10, 5), (20, 50), (30, 100)]
+    assert apart.limit_changes(100.0) == [(10, 5), (20, 100), (25, 50), (30, 100)]
+
+
+def test_drawn_incidents_stay_in_the_declared_ranges_and_fill_them():
+    distribution = IncidentDistribution(
+        segments=(2, 5),
+        start=(0, 100),
+        duration=(10, 20),
+        speed_limit=(5, 6),
+        recovery_duration=(30, 40),
+        recovery_speed_limit=(50, 60),
+    )
+    drawn = [distribution.draw(np.random.default_rng(seed)) for seed in range(300)]
+    assert {incident.segment for incident in drawn} == {2, 5}
+    ranges = [(0, 100), (10, 20), (5, 6), (30, 40), (50, 60)]
+    values = np.array(
+        [
+            (start, middle - start, limit, end - middle, recovery)
+            for (start, middle, limit), (_, end, recovery) in (each.phases for each in drawn)
+        ]
+    )
+    for (low, high), column in zip(ranges, values.T, strict=True):
+        margin = 0.05 * (high - low)
+        assert low - 1e-9 <= column.min() < low + margin
+        assert high - margin < column.max() <= high + 1e-9
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"segments": ()}, r"incident\.segments must be at least one segment"),
+        ({"segments": (0.5,)}, r"incident\.segments\[0\] must be an integer"),
+        ({"segments": (1,), "start": (-1, 5)}, r"incident\.start\[0\] must be >= 0"),
+        ({"segments": (1,), "duration": (9, 5)}, r"incident\.duration must be a pair"),
+        ({"segments": (1,), "speed_limit": (0, 5)}, r"incident\.speed_limit\[0\] must be"),
+    ],
+)
+def test_bad_ranges_are_refused_by_path(fields, message):
+    with pytest.raises(ValueError, match=message):
+        IncidentDistribution(**fields)

@@ -1,0 +1,90 @@
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dptse_env.traffic import MAINLINE, PAPER_HIGHWAY, Demand, Incident, randomised
+
+SEEDS = range(200)
+
+
+def test_the_same_seed_draws_the_same_scenario_and_another_seed_another():
+    first, again, other = (PAPER_HIGHWAY.draw(seed) for seed in (3, 3, 4))
+    for field in ("departures", "origins", "exits"):
+        np.testing.assert_array_equal(getattr(first, field), getattr(again, field))
+    assert first.sumo_seed == again.sumo_seed != other.sumo_seed
+    assert not np.array_equal(first.departures, other.departures)
+
+
+@given(seed=st.integers(0, 2**63))
+def test_departures_are_ordered_and_every_exit_lies_ahead_of_its_origin(seed):
+    scenario = PAPER_HIGHWAY.draw(seed)
+    assert np.all(np.diff(scenario.departures) >= 0)
+    assert scenario.departures.min() >= 0
+    assert scenario.departures.max() <= PAPER_HIGHWAY.duration
+    second_ramp = scenario.origins == 1  # joins at face 9, past the first off-ramp at face 6
+    assert not np.any(scenario.exits[second_ramp] == 0)
+
+
+def test_arrivals_are_poisson_with_the_declared_rates():
+    counts = np.array(
+        [
+            [
+                np.sum((scenario.origins == MAINLINE) & (scenario.departures < 200)),
+                np.sum(
+                    (scenario.origins == MAINLINE)
+                    & (scenario.departures >= 200)
+                    & (scenario.departures < 400)
+                ),
+                np.sum(scenario.origins == 0),
+                np.sum(scenario.origins == 1),
+            ]
+            for scenario in map(PAPER_HIGHWAY.draw, SEEDS)
+        ]
+    )
+    expected = np.array([2050 * 200, 6050 * 200, 320 * 700, 300 * 700]) / 3600
+    # Mean and variance of a Poisson count agree; the bounds are four standard errors.
+    assert np.all(np.abs(counts.mean(0) - expected) < 4 * np.sqrt(expected / len(SEEDS)))
+    ratio = counts.var(0, ddof=1) / expected
+    assert np.all(np.abs(ratio - 1) < 4 * np.sqrt(2 / len(SEEDS)))
+
+
+def test_each_diverge_loses_its_share_of_those_who_pass_it():
+    scenarios = [PAPER_HIGHWAY.draw(seed) for seed in SEEDS]
+    origins = np.concatenate([scenario.origins for scenario in scenarios])
+    exits = np.concatenate([scenario.exits for scenario in scenarios])
+    passed_first = origins != 1
+    passed_second = exits != 0
+    assert np.mean(exits[passed_first] == 0) == pytest.approx(0.1, abs=0.004)
+    assert np.mean(exits[passed_second] == 1) == pytest.approx(0.1, abs=0.004)
+
+
+def test_a_profile_longer_than_the_record_is_cut():
+    demand = Demand(((0, 3600.0), (50, 7200.0), (100, 9e9)), (0.0, 0.0))
+    corridor = dataclasses.replace(PAPER_HIGHWAY, demand=demand, incident=None, duration=80)
+    scenario = corridor.draw(0)
+    assert scenario.departures.max() <= 80
+    assert 60 < scenario.n_vehicles < 160  # 50 + 60 expected
+
+
+def test_the_streams_are_independent_of_one_another():
+    corridor = randomised(PAPER_HIGHWAY)
+    fixed = dataclasses.replace(corridor, incident=Incident(2, ((10, 20, 10),)))
+    random_scenario, fixed_scenario = corridor.draw(5), fixed.draw(5)
+    assert random_scenario.incident != fixed_scenario.incident
+    assert random_scenario.demand == fixed_scenario.demand
+    np.testing.assert_array_equal(random_scenario.departures, fixed_scenario.departures)
+
+
+def test_random_traffic_differs_between_seeds():
+    scenarios = [randomised(PAPER_HIGHWAY).draw(seed) for seed in range(30)]
+    assert len({scenario.incident for scenario in scenarios}) == 30
+    assert len({scenario.demand for scenario in scenarios}) == 30
+
+
+@pytest.mark.parametrize("seed", [-1, 0.5, None])
+def test_a_bad_seed_is_refused(seed):
+    with pytest.raises(ValueError, match=r"traffic seed must be an integer >= 0"):
+        PAPER_HIGHWAY.draw(seed)

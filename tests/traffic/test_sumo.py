@@ -1,0 +1,202 @@
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from dptse_env.traffic import (
+    CORRIDORS,
+    MAINLINE,
+    PAPER_HIGHWAY,
+    SHORT_HIGHWAY,
+    RecordingError,
+    SumoVersionError,
+    mean_dwell,
+    simulate,
+    sumo,
+)
+from dptse_env.traffic.network import packaged_network
+from dptse_env.traffic.record import COLUMNS
+
+N = PAPER_HIGHWAY.n_mainline
+INCIDENT = PAPER_HIGHWAY.incident.segment
+
+
+def assert_same(first, second):
+    for name in COLUMNS:
+        np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
+
+
+def mean_speed(record, steps, columns):
+    """Mean speed over vehicles [km/h]."""
+    return record.speed_sums[steps, columns].sum() / record.counts[steps, columns].sum()
+
+
+def outflow(record, column, start, end):
+    """Flow [veh/h] out of a record column between two steps."""
+    here = record.segment == column
+    seen = record.vehicle[here & (record.step >= start) & (record.step < end)]
+    left = len(np.unique(seen)) - record.counts[end - 1, column]
+    return 3600.0 * left / (end - start)
+
+
+def test_the_table_is_ordered_by_step_then_segment_and_starts_empty(short_record):
+    order = short_record.step.astype(int) * short_record.n_columns + short_record.segment
+    assert np.all(np.diff(order) >= 0)
+    assert short_record.n_steps == SHORT_HIGHWAY.duration + 1
+    assert short_record.n_columns == SHORT_HIGHWAY.n_segments + SHORT_HIGHWAY.n_boundaries
+    assert short_record.counts[0].sum() == 0
+    assert short_record.counts[-1].sum() > 0
+
+
+@pytest.mark.parametrize("name", CORRIDORS)
+def test_vehicles_follow_their_routes_without_a_gap(name, short_record, paper_records):
+    """No vehicle vanishes, reappears, turns back, or is somewhere off its route."""
+    corridor = CORRIDORS[name]
+    record = short_record if name == "short-highway" else paper_records[0]
+    scenario = corridor.draw(0)
+    n, s = corridor.n_mainline, corridor.n_segments
+    for vehicle in range(0, record.n_vehicles, 5):
+        rows = record.vehicle == vehicle
+        if not rows.any():
+            continue
+        assert np.all(np.diff(record.step[rows]) == 1)
+        origin, end = scenario.origins[vehicle], scenario.exits[vehicle]
+        first = 0 if origin == MAINLINE else corridor.on_ramps[origin]
+        last = n if end == MAINLINE else corridor.off_ramps[end]
+        entry = [s] if origin == MAINLINE else [s + 2 + origin, n + origin]
+        off = n + corridor.n_on_ramps + end
+        leave = [s + 1] if end == MAINLINE else [off, s + 2 + corridor.n_on_ramps + end]
+        route = [*entry, *range(first, last), *leave]
+        places = [route.index(column) for column in record.segment[rows]]
+        assert np.all(np.diff(places) >= 0)
+        assert np.all(np.diff(places) <= 1)
+
+
+def test_nobody_departs_early_and_nearly_everybody_gets_in(paper_records):
+    for seed, record in enumerate(paper_records):
+        departures = PAPER_HIGHWAY.draw(seed).departures
+        vehicles, rows = np.unique(record.vehicle, return_index=True)
+        assert np.all(record.step[rows] >= departures[vehicles])
+        assert len(vehicles) > 0.95 * len(departures)
+
+
+def test_traffic_is_free_before_the_incident_on_road_and_ramps(paper_records):
+    for record in paper_records:
+        assert 85 < mean_speed(record, slice(30, 200), slice(0, N)) < 105
+        assert 85 < mean_speed(record, slice(30, 200), slice(N, N + 4)) < 105
+        assert record.counts[:200, :N].max() <= 12
+
+
+def test_the_incident_jams_its_segment_and_the_queue_reaches_the_entry(paper_records):
+    for record in paper_records:
+        assert 7 < mean_speed(record, slice(230, 400), INCIDENT) < 11
+        assert 1_200 < outflow(record, INCIDENT, 230, 400) < 1_800
+        # 150 veh/km is a jam; three lanes at standstill hold 400.
+        jammed = record.counts[:, :N].max(axis=0) >= 15
+        assert jammed[1 : INCIDENT + 1].all()
+        assert not jammed[INCIDENT + 2 :].any()
+        assert record.counts[:, :N].max() <= 40
+
+
+def test_the_road_recovers_after_the_incident(paper_records):
+    for record in paper_records:
+        assert 3_900 < outflow(record, INCIDENT, 420, 500) < 5_500
+        assert mean_speed(record, slice(660, 700), slice(0, N)) > 40
+        assert mean_speed(record, slice(600, 700), INCIDENT) > 40
+
+
+def test_ramps_flow_and_no_merge_locks(paper_records):
+    """With internal links, pairs of vehicles lock a merge for the rest of half of the runs."""
+    for record in paper_records:
+        for on_ramp in (N, N + 1):
+            assert outflow(record, on_ramp, 450, 700) > 100
+        for off_ramp in (N + 2, N + 3):
+            assert outflow(record, off_ramp, 450, 700) > 100
+        order = np.lexsort((record.step, record.vehicle))
+        standing = record.speed[order] < 0.5
+        changes = np.flatnonzero(np.diff(standing.astype(int)) | np.diff(record.vehicle[order]))
+        runs = np.diff([0, *(changes + 1), len(standing)])
+        longest = runs[standing[[0, *(changes + 1)]]].max()
+        assert longest < 150
+
+
+def test_a_vehicle_dwells_as_long_as_the_preset_says(paper_records):
+    """The preset's value is the mean over seeds 0..15; these four come close to it."""
+    measured = mean_dwell(paper_records, N)
+    assert measured == pytest.approx(PAPER_HIGHWAY.average_dwell, rel=0.06)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("corridor", CORRIDORS.values(), ids=CORRIDORS)
+def test_the_presets_dwell_is_that_of_seeds_0_to_15(corridor):
+    records = [simulate(corridor, seed) for seed in range(16)]
+    assert mean_dwell(records, corridor.n_mainline) == pytest.approx(
+        corridor.average_dwell, abs=0.005
+    )
+
+
+def test_the_same_seed_gives_the_same_record_and_another_seed_another(short_record):
+    assert_same(simulate(SHORT_HIGHWAY, 0), short_record)
+    other = simulate(SHORT_HIGHWAY, 1)
+    assert not np.array_equal(other.counts, short_record.counts)
+
+
+def test_sumo_writes_nothing_to_stdout_or_stderr(capfd):
+    simulate(SHORT_HIGHWAY, 0)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_sumos_own_words_are_in_the_error_and_not_on_stdout(monkeypatch, capfd, short_record):
+    cut = packaged_network("short-highway")[:500]
+    monkeypatch.setattr(sumo, "network_xml", lambda _corridor: cut)
+    with pytest.raises(RecordingError, match=r"failed: .*Process Error\n.*input ended before"):
+        simulate(SHORT_HIGHWAY, 7)
+    # Another road's network: its on-ramp joins elsewhere, so SUMO refuses the ramp's route.
+    wrong = packaged_network("paper-highway")
+    monkeypatch.setattr(sumo, "network_xml", lambda _corridor: wrong)
+    with pytest.raises(
+        RecordingError, match=r"short-highway with traffic seed 7 failed: .*no valid route"
+    ):
+        simulate(SHORT_HIGHWAY, 7)
+    assert capfd.readouterr() == ("", "")
+    monkeypatch.undo()
+    assert_same(simulate(SHORT_HIGHWAY, 0), short_record)
+
+
+def test_no_sumo_home_is_needed(monkeypatch, short_record):
+    monkeypatch.delenv("SUMO_HOME", raising=False)
+    assert_same(simulate(SHORT_HIGHWAY, 0), short_record)
+
+
+@pytest.mark.parametrize("version", ["1.18.0", "1.29.0", "2.28.0"])
+def test_another_release_series_is_refused(monkeypatch, version):
+    import libsumo
+
+    monkeypatch.setattr(libsumo, "getVersion", lambda: (22, f"SUMO {version}"))
+    with pytest.raises(SumoVersionError, match=rf"series 1\.28, found {version}"):
+        simulate(SHORT_HIGHWAY, 0)
+
+
+def test_a_library_that_is_not_what_is_installed_is_refused(monkeypatch):
+    import libsumo
+
+    monkeypatch.setattr(libsumo, "getVersion", lambda: (22, "SUMO 1.28.9"))
+    with pytest.raises(SumoVersionError, match=r"calls itself 1\.28\.9 but is installed as 1\.28"):
+        simulate(SHORT_HIGHWAY, 0)
+
+
+def test_a_missing_libsumo_is_named(monkeypatch):
+    def missing(name):
+        raise sumo.importlib.metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(sumo.importlib.metadata, "version", missing)
+    with pytest.raises(SumoVersionError, match="libsumo is not installed"):
+        sumo.sumo_version()
+
+
+def test_importing_the_room_does_not_import_libsumo():
+    code = "import sys, dptse_env.traffic.library; sys.exit('libsumo' in sys.modules)"
+    environment = {name: value for name, value in os.environ.items() if name != "SUMO_HOME"}
+    subprocess.run([sys.executable, "-c", code], check=True, env=environment)
