@@ -1,0 +1,12 @@
+"""Array type aliases shared by the rooms above the ground floor."""
+
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray: TypeAlias = NDArray[np.float64]
+IntArray: TypeAlias = NDArray[np.int64]
+BoolArray: TypeAlias = NDArray[np.bool_]
+Observation: TypeAlias = NDArray[np.float32]
+Action: TypeAlias = NDArray[Any]

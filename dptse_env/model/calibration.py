@@ -1,0 +1,202 @@
+"""Fit the ARZ parameters to recorded traffic.
+
+Two stages. Densities are binned and the equilibrium speed `V_e = v_f (1 - (rho/rho_m)^gamma)` is
+fitted to the bins: a start. Then (v_f, rho_m, gamma, tau) are moved to where the model, started
+from the true state, predicts the next 5 to 30 s best.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import optimize
+
+from dptse_env.model.compiled import CompiledARZModel
+from dptse_env.model.network import FloatArray, RoadNetwork
+from dptse_env.model.parameters import ARZParameters
+from dptse_env.model.prediction import (
+    HORIZONS,
+    PredictionError,
+    TrafficSeries,
+    persistence_error,
+    prediction_error,
+)
+
+__all__ = [
+    "HORIZONS",
+    "Calibration",
+    "PredictionError",
+    "TrafficSeries",
+    "calibrate",
+    "persistence_error",
+    "prediction_error",
+    "starting_parameters",
+]
+
+# Bounds of the search: v_f [km/h], rho_m as a multiple of the least admissible one, gamma, tau [s].
+_LOWEST = np.array([30.0, 1.0, 0.1, 5.0])
+_HIGHEST = np.array([250.0, 4.0, 5.0, 500.0])
+_WIDTH = 0.2  # first steps of the search, as shares of the values
+_REFUSED = 1e3  # loss of parameters that violate the CFL condition; persistence has 1
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Outcome of `calibrate`.
+
+    Attributes:
+        parameters: The fitted parameters.
+        start: Where the search began.
+        error: Prediction error of the fit on the data it was fitted to.
+        persistence: That of persistence on the same data.
+        loss: Mean over horizons of error over persistence's; below 1 the model is the better one.
+        n_evaluations: Models tried.
+        at_bounds: Parameters that ended where the search may not go further: the data do not
+            tell them apart from larger or smaller ones. v_f and gamma often trade off so.
+    """
+
+    parameters: ARZParameters
+    start: ARZParameters
+    error: PredictionError
+    persistence: PredictionError
+    loss: float
+    n_evaluations: int
+    at_bounds: tuple[str, ...]
+
+
+def starting_parameters(
+    network: RoadNetwork,
+    data: Sequence[TrafficSeries],
+    name: str = "start",
+    bin_width: float = 10.0,
+) -> ARZParameters:
+    """Fit the equilibrium speed to density-binned mean speeds of the mainline.
+
+    Args:
+        network: The road; its `lanes` are the lanes of the parameters.
+        data: Runs of traffic.
+        name: Name of the parameters.
+        bin_width: Width of a bin [veh/km].
+
+    Raises:
+        ValueError: if the data fill fewer than four bins.
+    """
+    n = network.n_mainline
+    density = np.concatenate([series.density[:, :n].ravel() for series in data])
+    speed = np.concatenate([series.speed[:, :n].ravel() for series in data])
+    density, speed = density[density > 0.0], speed[density > 0.0]
+    bins = np.floor(density / bin_width).astype(np.int64)
+    counts = np.bincount(bins)
+    filled = counts >= min(10, density.size)
+    if filled.sum() < 4:
+        raise ValueError(
+            f"data must fill at least 4 density bins of {bin_width} veh/km, got {filled.sum()}"
+        )
+    centre = np.bincount(bins, density)[filled] / counts[filled]
+    mean_speed = np.bincount(bins, speed)[filled] / counts[filled]
+    least_jam = _least_jam_density(network, data)
+
+    def residual(values: FloatArray) -> FloatArray:
+        v_f, scale, gamma = values
+        return np.asarray(v_f * (1.0 - (centre / (scale * least_jam)) ** gamma) - mean_speed)
+
+    start = np.clip([1.1 * mean_speed.max(), 1.2, 1.0], _LOWEST[:3], _HIGHEST[:3])
+    fit = optimize.least_squares(residual, start, bounds=(_LOWEST[:3], _HIGHEST[:3]))
+    v_f, scale, gamma = (float(value) for value in fit.x)
+    return ARZParameters(name, v_f, scale * least_jam, gamma, 60.0, network.lanes)
+
+
+def calibrate(
+    network: RoadNetwork,
+    data: Sequence[TrafficSeries],
+    name: str,
+    start: ARZParameters | None = None,
+    horizons: Sequence[int] = HORIZONS,
+    stride: int = 5,
+    time_step: float = 1.0,
+    max_evaluations: int = 400,
+) -> Calibration:
+    """Fit (v_f, rho_m, gamma, tau) to runs of traffic; report on other runs than these.
+
+    The jam density stays above the largest density in the data, and the CFL condition holds.
+
+    Args:
+        network: The road that the data are from.
+        data: Training runs.
+        name: Name of the fitted set.
+        start: Where the search begins; by default `starting_parameters`.
+        horizons: Steps ahead whose errors count, ascending.
+        stride: Steps between two starts of a prediction.
+        time_step: Seconds between two rows of the data.
+        max_evaluations: Models to try at most.
+    """
+    start = start or starting_parameters(network, data)
+    least_jam = _least_jam_density(network, data)
+    persistence = persistence_error(data, network.n_mainline, horizons, stride)
+
+    def parameters_at(values: FloatArray) -> ARZParameters:
+        v_f, scale, gamma, tau = np.clip(np.exp(values), _LOWEST, _HIGHEST).tolist()
+        return ARZParameters(name, v_f, scale * least_jam, gamma, tau, network.lanes)
+
+    def loss(values: FloatArray) -> float:
+        try:
+            model = CompiledARZModel(network, parameters_at(values), time_step)
+        except ValueError:  # the CFL condition: not a model, so not a candidate
+            return _REFUSED
+        return _relative(prediction_error(model, data, horizons, stride), persistence)
+
+    jam = start.jam_density / start.lanes * network.lanes
+    first = [start.free_flow_speed, jam / least_jam, start.gamma, start.relaxation_time]
+    simplex = _simplex(np.log(first))
+    found = optimize.minimize(
+        loss,
+        simplex[0],
+        method="Nelder-Mead",
+        bounds=list(zip(np.log(_LOWEST), np.log(_HIGHEST), strict=True)),
+        options={
+            "maxfev": max_evaluations,
+            "xatol": 1e-3,
+            "fatol": 1e-5,
+            "initial_simplex": simplex,
+        },
+    )
+    parameters = parameters_at(found.x)
+    error = prediction_error(
+        CompiledARZModel(network, parameters, time_step), data, horizons, stride
+    )
+    names = ("free_flow_speed", "jam_density", "gamma", "relaxation_time")
+    room = np.minimum(found.x - np.log(_LOWEST), np.log(_HIGHEST) - found.x)
+    return Calibration(
+        parameters,
+        start,
+        error,
+        persistence,
+        loss=float(found.fun),
+        n_evaluations=int(found.nfev),
+        at_bounds=tuple(name for name, gap in zip(names, room, strict=True) if gap < 0.01),
+    )
+
+
+def _simplex(start: FloatArray) -> FloatArray:
+    """Corners of a search in logarithms, wide in every direction, a start on a bound included."""
+    low, high = np.log(_LOWEST), np.log(_HIGHEST)
+    first = np.clip(start, low, high - _WIDTH)
+    return np.vstack([first, first + _WIDTH * np.eye(first.size)])
+
+
+def _least_jam_density(network: RoadNetwork, data: Sequence[TrafficSeries]) -> float:
+    """Just above the largest density seen, per lane, on a road of `network.lanes` lanes."""
+    lanes = np.asarray(network.segment_lanes, dtype=np.float64)
+    largest = max(float(np.max(series.density / lanes)) for series in data)
+    return 1.01 * largest * network.lanes
+
+
+def _relative(error: PredictionError, reference: PredictionError) -> float:
+    ratios = [
+        np.divide(error.density, np.maximum(reference.density, 1e-9)),
+        np.divide(error.speed, np.maximum(reference.speed, 1e-9)),
+    ]
+    value = float(np.mean(ratios))
+    return value if np.isfinite(value) else _REFUSED

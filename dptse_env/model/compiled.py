@@ -1,0 +1,65 @@
+"""The ARZ model with compiled dynamics: same interface and same numbers as `ARZModel`."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from dptse_env.model.arz import ARZModel
+from dptse_env.model.kernels import advance, scratch_of
+from dptse_env.model.network import FloatArray, RoadNetwork
+from dptse_env.model.parameters import ARZParameters
+from dptse_env.model.road import Road, road_of
+
+
+class CompiledARZModel(ARZModel):
+    """`ARZModel` with `step` and `jacobian` compiled; the rest is inherited.
+
+    Attributes:
+        road: The model in the form that the kernels of `dptse_env.model.kernels` take.
+    """
+
+    def __init__(
+        self, network: RoadNetwork, parameters: ARZParameters, time_step: float = 1.0
+    ) -> None:
+        """See `ARZModel`."""
+        super().__init__(network, parameters, time_step)
+        self.road = road_of(self)
+
+    def step(self, states: FloatArray, inputs: FloatArray) -> FloatArray:
+        """States `(n, 2 S)` one time step later."""
+        after = np.empty(states.shape)
+        _step_batch(self.road, np.ascontiguousarray(states), np.ascontiguousarray(inputs), after)
+        return after
+
+    def jacobian(self, states: FloatArray, inputs: FloatArray) -> FloatArray:
+        """Analytic derivative of `step` by the state; see `ARZModel.jacobian`."""
+        jacobian = np.zeros((states.shape[0], self.n_states, self.n_states))
+        _jacobian_batch(
+            self.road, np.ascontiguousarray(states), np.ascontiguousarray(inputs), jacobian
+        )
+        return jacobian
+
+
+@njit(cache=True, error_model="numpy")
+def _step_batch(road: Road, states: FloatArray, inputs: FloatArray, after: FloatArray) -> None:
+    scratch = scratch_of(road)
+    blocks = np.empty((*road.neighbours.shape, 4))
+    for i in range(states.shape[0]):
+        advance(road, states[i], inputs[i], after[i], blocks, scratch)
+
+
+@njit(cache=True, error_model="numpy")
+def _jacobian_batch(
+    road: Road, states: FloatArray, inputs: FloatArray, jacobian: FloatArray
+) -> None:
+    scratch = scratch_of(road)
+    blocks = np.empty((*road.neighbours.shape, 4))
+    after = np.empty(states.shape[1])
+    for i in range(states.shape[0]):
+        advance(road, states[i], inputs[i], after, blocks, scratch)
+        for c in range(road.jam.size):
+            for slot in range(road.degree[c]):
+                b = road.neighbours[c, slot]
+                for k in range(4):
+                    jacobian[i, 2 * c + k // 2, 2 * b + k % 2] = blocks[c, slot, k]

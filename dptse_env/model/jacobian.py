@@ -1,0 +1,170 @@
+"""Analytic derivative of one step of the ARZ model by its state.
+
+The outflow of a cell depends on the cells at its downstream face only. Its derivative is kept as
+`by[n, cell, other, (rho, psi)]`; the step's Jacobian is then the balance of these, as the step is
+the balance of the flows. At a kink (demand = supply) the branch of the demand is taken.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from dptse_env.model.network import BoolArray, FloatArray
+from dptse_env.model.relations import STANDING, VACUUM
+
+if TYPE_CHECKING:
+    from dptse_env.model.arz import ARZModel, Cells
+
+
+class Gradients(NamedTuple):
+    """Derivatives of a cell's w, speed and demand by its own (rho, psi), `(n, S, 2)` each."""
+
+    w: FloatArray
+    speed: FloatArray
+    demand: FloatArray
+
+
+def step_jacobian(model: ARZModel, states: FloatArray, inputs: FloatArray) -> FloatArray:
+    """Derivative `(n, 2 S, 2 S)` of `model.step`."""
+    layout = model.layout
+    cells = model.cells(states)
+    own = _gradients(model, states, cells)
+    flux = model.fluxes(states, inputs)
+    by = _outflow_gradient(model, cells, own, inputs)
+    source_by = _source_gradient(model, cells, own, inputs)
+
+    each = np.arange(model.n_segments)
+    relative_by = cells.w[:, :, None, None] * by
+    relative_by[:, each, each] += flux.outflow[:, :, None] * own.w
+
+    balance = model.step_ratio * (layout.routing - np.eye(model.n_segments))
+    blocks = np.empty((*by.shape[:3], 2, 2))  # n, row's cell, column's cell, row, column
+    blocks[..., 0, :] = np.einsum("cd,ndek->ncek", balance, by)
+    blocks[..., 1, :] = np.einsum("cd,ndek->ncek", balance, relative_by)
+
+    entries = layout.entries
+    w_in = inputs[:, layout.entry_inputs + 1, None]
+    blocks[:, entries, entries, 0] += model.step_ratio * source_by
+    blocks[:, entries, entries, 1] += model.step_ratio * w_in * source_by
+
+    blocks[:, each, each, 0, 0] += 1.0
+    blocks[:, each, each, 1, 0] += model.relaxation * model.parameters.free_flow_speed
+    blocks[:, each, each, 1, 1] += 1.0 - model.relaxation
+    return blocks.transpose(0, 1, 3, 2, 4).reshape(-1, model.n_states, model.n_states)
+
+
+def _gradients(model: ARZModel, states: FloatArray, cells: Cells) -> Gradients:
+    jam, relations = model.jam_density, model.relations
+    rho = cells.density
+    empty = rho <= VACUUM * jam
+    held = np.where(empty, 1.0, rho)
+    moving = ~empty & (states[..., 1::2] > 0.0)
+    w = np.stack([np.where(moving, -cells.w / held, 0.0), np.where(moving, 1.0 / held, 0.0)], -1)
+
+    pressure = relations.pressure(rho, jam)
+    speed = w.copy()
+    speed[..., 0] -= np.where(empty, 0.0, model.parameters.gamma * pressure / held)
+    speed[cells.w - pressure <= -STANDING * model.parameters.free_flow_speed] = 0.0
+
+    by_density, by_w = relations.demand_gradient(rho, cells.w, jam)
+    demand = by_w[..., None] * w
+    demand[..., 0] += by_density
+    demand[empty] = 0.0
+    return Gradients(w, speed, demand)
+
+
+def _outflow_gradient(
+    model: ARZModel, cells: Cells, own: Gradients, inputs: FloatArray
+) -> FloatArray:
+    n, s = cells.density.shape
+    by = np.zeros((n, s, s, 2))
+    _links(model, cells, own, by)
+    _merges(model, cells, own, by)
+    _diverges(model, cells, own, by)
+    _exits(model, cells, own, inputs, by)
+    return by
+
+
+def _links(model: ARZModel, cells: Cells, own: Gradients, by: FloatArray) -> None:
+    up, down = model.layout.links
+    jam = model.jam_density[down]
+    w, speed = cells.w[:, up], cells.speed[:, down]
+    sends = cells.demand[:, up] <= model.relations.supply(w, speed, jam)
+    by_w, by_speed = model.relations.supply_gradient(w, speed, jam)
+    by[:, up, up] = _choose(sends, own.demand[:, up], by_w[..., None] * own.w[:, up])
+    by[:, up, down] = _choose(sends, 0.0, by_speed[..., None] * own.speed[:, down])
+
+
+def _merges(model: ARZModel, cells: Cells, own: Gradients, by: FloatArray) -> None:
+    main, ramp, down = model.layout.merges
+    jam, demand, speed = model.jam_density[down], cells.demand, cells.speed[:, down]
+    total, mixed_w = model.merged(cells)
+    supply = model.relations.supply(mixed_w, speed, jam)
+    by_w, by_speed = model.relations.supply_gradient(mixed_w, speed, jam)
+    serves_all = total <= supply
+    held = np.where(total > 0.0, total, 1.0)
+
+    # q_i = (D_i / total) S(w_mixed, v): the share and the supply both move with both branches.
+    for cell in (main, ramp):
+        share = demand[:, cell] / held
+        for other in (main, ramp):
+            other_share = (demand[:, other] / held)[..., None]
+            surplus_w = (cells.w[:, other] - mixed_w) / held
+            mixed_by = other_share * own.w[:, other] + surplus_w[..., None] * own.demand[:, other]
+            same = 1.0 if cell is other else 0.0
+            share_by = ((same - share) / held)[..., None] * own.demand[:, other]
+            limited = share[..., None] * by_w[..., None] * mixed_by + supply[..., None] * share_by
+            by[:, cell, other] = _choose(serves_all, same * own.demand[:, other], limited)
+        limited = (share * by_speed)[..., None] * own.speed[:, down]
+        by[:, cell, down] = _choose(serves_all, 0.0, limited)
+
+
+def _diverges(model: ARZModel, cells: Cells, own: Gradients, by: FloatArray) -> None:
+    up, main, off = model.layout.diverges
+    share = model.layout.exit_shares
+    on_main, on_ramp = model.diverge_supplies(cells)
+    sends = cells.demand[:, up] <= np.minimum(on_main, on_ramp)
+    # Two blocked branches tie: rounding must not choose between them.
+    tie = STANDING * model.jam_density[main] * model.parameters.free_flow_speed
+    by_main = on_main - tie <= on_ramp
+    by[:, up, up] = _choose(sends, own.demand[:, up], 0.0)
+    for branch, allows, part in ((main, by_main, 1.0 - share), (off, ~by_main, share)):
+        limits = (~sends & allows).astype(np.float64) / np.where(part > 0.0, part, 1.0)
+        by_w, by_speed = model.relations.supply_gradient(
+            cells.w[:, up], cells.speed[:, branch], model.jam_density[branch]
+        )
+        by[:, up, up] += (limits * by_w)[..., None] * own.w[:, up]
+        by[:, up, branch] = (limits * by_speed)[..., None] * own.speed[:, branch]
+
+
+def _exits(
+    model: ARZModel, cells: Cells, own: Gradients, inputs: FloatArray, by: FloatArray
+) -> None:
+    exits, jam = model.layout.exits, model.exit_jam_density
+    w = cells.w[:, exits]
+    speed = model.exit_speed(w, inputs[:, model.layout.exit_inputs])
+    sends = cells.demand[:, exits] <= model.relations.supply(w, speed, jam)
+    by_w, by_speed = model.relations.supply_gradient(w, speed, jam)
+    # The speed behind the exit is w - p(rho_out): it moves with w unless the exit is blocked.
+    total = by_w + np.where(speed > 0.0, by_speed, 0.0)
+    by[:, exits, exits] = _choose(sends, own.demand[:, exits], total[..., None] * own.w[:, exits])
+
+
+def _source_gradient(
+    model: ARZModel, cells: Cells, own: Gradients, inputs: FloatArray
+) -> FloatArray:
+    layout = model.layout
+    entries, jam = layout.entries, model.jam_density[layout.entries]
+    demand, w_in = inputs[:, layout.entry_inputs], inputs[:, layout.entry_inputs + 1]
+    speed = cells.speed[:, entries]
+    _, by_speed = model.relations.supply_gradient(w_in, speed, jam)
+    unlimited = demand <= model.relations.supply(w_in, speed, jam)
+    return _choose(unlimited, 0.0, by_speed[..., None] * own.speed[:, entries])
+
+
+def _choose(
+    condition: BoolArray, chosen: FloatArray | float, otherwise: FloatArray | float
+) -> FloatArray:
+    return np.where(condition[..., None], chosen, otherwise)

@@ -1,0 +1,291 @@
+"""Compiled kernels of the ARZ model: one state vector, its next state and its sparse Jacobian.
+
+The equations are those of `dptse_env.model.arz`, written for one cell at a time. A cell's outflow
+depends on at most three cells, its parties: itself and those at its downstream face. A step's
+Jacobian is a weighted sum of the outflows' gradients; which goes where is a table of the road.
+
+numba caches compiled code by the file it stands in, not by what it calls: after a change here,
+delete the `*.nbi` files of the packages that call these kernels.
+
+Nothing here allocates: callers bring scratch space (`scratch_of`), so that a kernel can run
+inside another one, once a step and episode.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from dptse_env.model.network import FloatArray
+from dptse_env.model.relations import STANDING, VACUUM
+from dptse_env.model.road import EXIT, LINK, MERGE, Road
+
+# Columns of the table of cells: values, then partial derivatives by the cell's own rho and psi.
+_W, _V, _D, _W_RHO, _W_PSI, _V_RHO, _V_PSI, _D_RHO, _D_PSI = range(9)
+
+Outflow = tuple[float, float, float, float, float, float, float]
+
+
+class Scratch(NamedTuple):
+    """Working space of `advance`.
+
+    Attributes:
+        cells: `(S, 9)` w, speed and demand of each cell and their derivatives.
+        outflow: `(S, 2)` q and phi out of each cell.
+        gradient: `(S, 3, 4)` derivatives of (q, phi) by each party's (rho, psi).
+    """
+
+    cells: FloatArray
+    outflow: FloatArray
+    gradient: FloatArray
+
+
+@njit(cache=True, error_model="numpy")
+def scratch_of(road: Road) -> Scratch:
+    """Allocate the working space for a road."""
+    n = road.jam.size
+    return Scratch(np.empty((n, 9)), np.empty((n, 2)), np.zeros((n, 3, 4)))
+
+
+@njit(cache=True, error_model="numpy")
+def pressure(density: float, jam: float, v_f: float, gamma: float) -> float:
+    """p(rho) [km/h]."""
+    return float(v_f * (max(density, 0.0) / jam) ** gamma)
+
+
+@njit(cache=True, error_model="numpy")
+def supply(
+    w: float, speed: float, jam: float, v_f: float, gamma: float
+) -> tuple[float, float, float]:
+    """Supply [veh/h] and its partial derivatives by w and by the cell's speed [veh/km]."""
+    share = gamma / (1.0 + gamma)
+    if speed >= w * share:
+        critical = jam * (w / ((1.0 + gamma) * v_f)) ** (1.0 / gamma)
+        return critical * w * share, critical, 0.0
+    gap = w - speed
+    settled = jam * (gap / v_f) ** (1.0 / gamma)
+    slope = settled / (gamma * gap)
+    return settled * speed, speed * slope, settled - speed * slope
+
+
+@njit(cache=True, error_model="numpy")
+def _tabulate(road: Road, state: FloatArray, cells: FloatArray) -> None:
+    """Fill the table of cells: w, speed, demand and their derivatives."""
+    v_f, gamma = road.free_flow_speed, road.gamma
+    for c in range(road.jam.size):
+        jam = road.jam[c]
+        rho = max(state[2 * c], 0.0)
+        psi = max(state[2 * c + 1], 0.0)
+        p = pressure(rho, jam, v_f, gamma)
+        if rho <= VACUUM * jam:
+            cells[c, :] = 0.0
+            cells[c, _W], cells[c, _V] = v_f, max(v_f - p, 0.0)
+            continue
+        w = psi / rho
+        w_rho, w_psi = (-w / rho, 1.0 / rho) if psi > 0.0 else (0.0, 0.0)
+        cells[c, _W], cells[c, _W_RHO], cells[c, _W_PSI] = w, w_rho, w_psi
+        moving = w - p > -STANDING * v_f
+        cells[c, _V] = max(w - p, 0.0)
+        cells[c, _V_RHO] = w_rho - gamma * p / rho if moving else 0.0
+        cells[c, _V_PSI] = w_psi if moving else 0.0
+        if (1.0 + gamma) * p <= w:
+            cells[c, _D] = rho * (w - p)
+            cells[c, _D_RHO] = w - (1.0 + gamma) * p + rho * w_rho
+            cells[c, _D_PSI] = rho * w_psi
+        else:
+            critical = jam * (w / ((1.0 + gamma) * v_f)) ** (1.0 / gamma)
+            cells[c, _D] = critical * w * (gamma / (1.0 + gamma))
+            cells[c, _D_RHO] = critical * w_rho
+            cells[c, _D_PSI] = critical * w_psi
+
+
+# The four faces. Each returns q, then its derivatives by (rho, psi) of the cell's three parties.
+# They take cells by index and numbers instead of the road: a view or a tuple of arrays would cost
+# more in reference counts than the arithmetic does.
+
+
+@njit(cache=True, error_model="numpy")
+def _link(cells: FloatArray, a: int, b: int, jam: float, v_f: float, gamma: float) -> Outflow:
+    s, by_w, by_v = supply(cells[a, _W], cells[b, _V], jam, v_f, gamma)
+    if cells[a, _D] <= s:
+        return cells[a, _D], cells[a, _D_RHO], cells[a, _D_PSI], 0.0, 0.0, 0.0, 0.0
+    return (
+        s,
+        by_w * cells[a, _W_RHO],
+        by_w * cells[a, _W_PSI],
+        by_v * cells[b, _V_RHO],
+        by_v * cells[b, _V_PSI],
+        0.0,
+        0.0,
+    )
+
+
+@njit(cache=True, error_model="numpy")
+def _merge(
+    cells: FloatArray, a: int, b: int, other: int, jam: float, v_f: float, gamma: float
+) -> Outflow:
+    total = cells[a, _D] + cells[other, _D]
+    if total <= 0.0:
+        return cells[a, _D], cells[a, _D_RHO], cells[a, _D_PSI], 0.0, 0.0, 0.0, 0.0
+    share, other_share = cells[a, _D] / total, cells[other, _D] / total
+    relative = cells[a, _D] * cells[a, _W] + cells[other, _D] * cells[other, _W]
+    mixed_w = relative / total
+    s, by_w, by_v = supply(mixed_w, cells[b, _V], jam, v_f, gamma)
+    if total <= s:
+        return cells[a, _D], cells[a, _D_RHO], cells[a, _D_PSI], 0.0, 0.0, 0.0, 0.0
+    # q = share * s, with w_mixed and the share moving with both branches.
+    by_w *= share
+    by_v *= share
+    own_d = (by_w * (cells[a, _W] - mixed_w) + s * (1.0 - share)) / total
+    other_d = (by_w * (cells[other, _W] - mixed_w) - s * share) / total
+    return (
+        share * s,
+        by_w * share * cells[a, _W_RHO] + own_d * cells[a, _D_RHO],
+        by_w * share * cells[a, _W_PSI] + own_d * cells[a, _D_PSI],
+        by_v * cells[b, _V_RHO],
+        by_v * cells[b, _V_PSI],
+        by_w * other_share * cells[other, _W_RHO] + other_d * cells[other, _D_RHO],
+        by_w * other_share * cells[other, _W_PSI] + other_d * cells[other, _D_PSI],
+    )
+
+
+@njit(cache=True, error_model="numpy")
+def _diverge(
+    cells: FloatArray,
+    a: int,
+    main: int,
+    off: int,
+    main_jam: float,
+    off_jam: float,
+    share: float,
+    v_f: float,
+    gamma: float,
+) -> Outflow:
+    s, by_w, by_v = supply(cells[a, _W], cells[main, _V], main_jam, v_f, gamma)
+    s, by_w, by_v = s / (1.0 - share), by_w / (1.0 - share), by_v / (1.0 - share)
+    by_off = 0.0
+    if share > 0.0:
+        s_off, by_w_off, by_v_off = supply(cells[a, _W], cells[off, _V], off_jam, v_f, gamma)
+        if s_off / share < s - STANDING * main_jam * v_f:
+            by_w, by_v, by_off = by_w_off / share, 0.0, by_v_off / share
+        s = min(s, s_off / share)
+    if cells[a, _D] <= s:
+        return cells[a, _D], cells[a, _D_RHO], cells[a, _D_PSI], 0.0, 0.0, 0.0, 0.0
+    return (
+        s,
+        by_w * cells[a, _W_RHO],
+        by_w * cells[a, _W_PSI],
+        by_v * cells[main, _V_RHO],
+        by_v * cells[main, _V_PSI],
+        by_off * cells[off, _V_RHO],
+        by_off * cells[off, _V_PSI],
+    )
+
+
+@njit(cache=True, error_model="numpy")
+def _exit(
+    cells: FloatArray, a: int, density: float, jam: float, v_f: float, gamma: float
+) -> Outflow:
+    speed = max(cells[a, _W] - pressure(density, jam, v_f, gamma), 0.0)
+    s, by_w, by_v = supply(cells[a, _W], speed, jam, v_f, gamma)
+    if cells[a, _D] <= s:
+        return cells[a, _D], cells[a, _D_RHO], cells[a, _D_PSI], 0.0, 0.0, 0.0, 0.0
+    # The speed behind the exit is w - p(rho_out): it moves with w unless the exit is blocked.
+    slope = by_w + by_v if speed > 0.0 else by_w
+    return s, slope * cells[a, _W_RHO], slope * cells[a, _W_PSI], 0.0, 0.0, 0.0, 0.0
+
+
+@njit(cache=True, error_model="numpy")
+def _flows_out(
+    road: Road, cells: FloatArray, inputs: FloatArray, outflow: FloatArray, gradient: FloatArray
+) -> None:
+    """Outflow of every cell and its gradient by the cell's parties."""
+    v_f, gamma = road.free_flow_speed, road.gamma
+    jam, parties = road.jam, road.parties
+    for c in range(jam.size):
+        kind, b, third = road.kind[c], parties[c, 1], parties[c, 2]
+        if kind == LINK:
+            flow = _link(cells, c, b, jam[b], v_f, gamma)
+        elif kind == EXIT:
+            flow = _exit(cells, c, inputs[road.exit[c]], road.outside_jam[c], v_f, gamma)
+        elif kind == MERGE:
+            flow = _merge(cells, c, b, third, jam[b], v_f, gamma)
+        else:
+            flow = _diverge(cells, c, b, third, jam[b], jam[third], road.share[c], v_f, gamma)
+        w = cells[c, _W]
+        outflow[c, 0], outflow[c, 1] = flow[0], flow[0] * w
+        for party in range(3):
+            by_rho, by_psi = flow[1 + 2 * party], flow[2 + 2 * party]
+            gradient[c, party, 0], gradient[c, party, 1] = by_rho, by_psi
+            gradient[c, party, 2], gradient[c, party, 3] = w * by_rho, w * by_psi
+        gradient[c, 0, 2] += flow[0] * cells[c, _W_RHO]
+        gradient[c, 0, 3] += flow[0] * cells[c, _W_PSI]
+
+
+@njit(cache=True, error_model="numpy")
+def _sources(
+    road: Road, cells: FloatArray, inputs: FloatArray, after: FloatArray, blocks: FloatArray
+) -> None:
+    """Add what enters from outside; demand that is not served vanishes."""
+    for c in range(road.jam.size):
+        column = road.entry[c]
+        if column < 0:
+            continue
+        source, w_in = inputs[column], inputs[column + 1]
+        s, _, by_v = supply(w_in, cells[c, _V], road.jam[c], road.free_flow_speed, road.gamma)
+        if source > s:
+            source = s
+            slope = road.step_ratio * by_v
+            blocks[c, 0, 0] += slope * cells[c, _V_RHO]
+            blocks[c, 0, 1] += slope * cells[c, _V_PSI]
+            blocks[c, 0, 2] += slope * w_in * cells[c, _V_RHO]
+            blocks[c, 0, 3] += slope * w_in * cells[c, _V_PSI]
+        after[2 * c] += road.step_ratio * source
+        after[2 * c + 1] += road.step_ratio * source * w_in
+
+
+@njit(cache=True, error_model="numpy")
+def advance(
+    road: Road,
+    state: FloatArray,
+    inputs: FloatArray,
+    after: FloatArray,
+    blocks: FloatArray,
+    scratch: Scratch,
+) -> None:
+    """Write the state one step later and the step's Jacobian.
+
+    Args:
+        road: The `Road`.
+        state: `(2 S,)` state.
+        inputs: `(n_u,)` inputs.
+        after: `(2 S,)` where the next state goes; may be `state` itself.
+        blocks: `(S, K, 4)` where the Jacobian goes: the derivatives of a cell's next (rho, psi)
+            by a neighbour's (rho, psi), row by row; the slots are those of `road.neighbours`.
+        scratch: From `scratch_of`.
+    """
+    cells, outflow, gradient = scratch.cells, scratch.outflow, scratch.gradient
+    v_f, ratio, relaxation = road.free_flow_speed, road.step_ratio, road.relaxation
+    _tabulate(road, state, cells)
+    _flows_out(road, cells, inputs, outflow, gradient)
+
+    blocks[:] = 0.0
+    for c in range(road.jam.size):
+        rho, psi = state[2 * c], state[2 * c + 1]
+        after[2 * c] = rho - ratio * outflow[c, 0]
+        after[2 * c + 1] = psi - ratio * outflow[c, 1] + relaxation * (v_f * rho - psi)
+        blocks[c, 0, 0] = 1.0
+        blocks[c, 0, 2], blocks[c, 0, 3] = relaxation * v_f, 1.0 - relaxation
+    _sources(road, cells, inputs, after, blocks)
+
+    for e in range(road.edges.shape[0]):
+        start, end, weight = road.edges[e, 0], road.edges[e, 1], ratio * road.edge_share[e]
+        after[2 * end] += weight * outflow[start, 0]
+        after[2 * end + 1] += weight * outflow[start, 1]
+    for m in range(road.terms.shape[0]):
+        row, slot = road.terms[m, 0], road.terms[m, 1]
+        start, party = road.terms[m, 2], road.terms[m, 3]
+        for k in range(4):
+            blocks[row, slot, k] += road.term_weight[m] * gradient[start, party, k]

@@ -1,0 +1,211 @@
+"""The road as the model sees it: who flows into whom, and how many lanes each cell has."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+
+class RoadNetwork(Protocol):
+    """What the model needs to know of a corridor.
+
+    Segments are ordered: mainline 0..N-1, then on-ramps, then off-ramps (S in all). On-ramp
+    `on_ramps[i] = j` joins at the face between mainline segments j-1 and j; off-ramp
+    `off_ramps[o] = j` leaves at the face between j-1 and j and takes `exit_shares[o]` of the flow.
+    """
+
+    @property
+    def n_mainline(self) -> int:
+        """Number of mainline segments N."""
+
+    @property
+    def on_ramps(self) -> Sequence[int]:
+        """For each on-ramp the mainline segment it feeds."""
+
+    @property
+    def off_ramps(self) -> Sequence[int]:
+        """For each off-ramp the mainline segment behind its nose."""
+
+    @property
+    def exit_shares(self) -> Sequence[float]:
+        """For each off-ramp the share of the flow that takes it."""
+
+    @property
+    def segment_length(self) -> float:
+        """Length of every segment [km]."""
+
+    @property
+    def segment_lanes(self) -> Sequence[int]:
+        """Lanes of each of the S segments."""
+
+    @property
+    def lanes(self) -> int:
+        """Lanes of the boundary cells at both ends of the mainline."""
+
+    @property
+    def ramp_lanes(self) -> int:
+        """Lanes of the boundary cells at the outer ends of the ramps."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Index arrays of a road network, each face in exactly one group.
+
+    Attributes:
+        links: `(2, L)` cells (upstream, downstream) of 1-to-1 faces.
+        merges: `(3, I)` cells (mainline, on-ramp, downstream).
+        diverges: `(3, O)` cells (upstream, mainline, off-ramp).
+        exit_shares: `(O,)` share of the flow that leaves at each diverge.
+        entries: `(1 + I,)` cells fed from outside: segment 0, then the on-ramps.
+        entry_inputs: `(1 + I,)` input column of each entry's demand; its w follows.
+        exits: `(1 + O,)` cells that flow outside: segment N-1, then the off-ramps.
+        exit_inputs: `(1 + O,)` input column of each exit's downstream density.
+        routing: `(S, S)` share of the outflow of a column's cell that enters a row's cell.
+        lanes: `(S,)` lanes of the segments.
+        entry_lanes: `(1 + I,)` lanes of the boundary cells before the entries.
+        exit_lanes: `(1 + O,)` lanes of the boundary cells after the exits.
+    """
+
+    links: IntArray
+    merges: IntArray
+    diverges: IntArray
+    exit_shares: FloatArray
+    entries: IntArray
+    entry_inputs: IntArray
+    exits: IntArray
+    exit_inputs: IntArray
+    routing: FloatArray
+    lanes: FloatArray
+    entry_lanes: FloatArray
+    exit_lanes: FloatArray
+
+    @property
+    def n_segments(self) -> int:
+        """Number of segments S."""
+        return self.lanes.size
+
+    @property
+    def n_inputs(self) -> int:
+        """Length of the input vector: 3 + 2 I + O."""
+        return 2 * self.entries.size + self.exits.size
+
+    @property
+    def n_boundaries(self) -> int:
+        """Number of boundary cells R."""
+        return self.entries.size + self.exits.size
+
+    @property
+    def entry_boundaries(self) -> IntArray:
+        """`(1 + I,)` boundary cell before each entry, in the order of a record."""
+        return np.array([0, *range(2, 1 + self.entries.size)], dtype=np.int64)
+
+    @property
+    def exit_boundaries(self) -> IntArray:
+        """`(1 + O,)` boundary cell after each exit, in the order of a record."""
+        first = 1 + self.entries.size
+        return np.array([1, *range(first, self.n_boundaries)], dtype=np.int64)
+
+    def sparsity(self) -> BoolArray:
+        """`(S, S)`: whether a row's cell after one step depends on a column's cell before it."""
+        # The outflow of a cell depends on every cell at its downstream face.
+        outflow = np.eye(self.n_segments, dtype=bool)
+        for cells in (*self.links.T, *self.diverges.T):
+            outflow[cells[0], cells] = True
+        for main, ramp, down in self.merges.T:
+            outflow[[[main], [ramp]], [main, ramp, down]] = True
+        inflow = (self.routing > 0) @ outflow
+        return np.asarray(inflow | outflow, dtype=np.bool_)
+
+
+def layout_of(network: RoadNetwork) -> Layout:
+    """Derive the index arrays of a network.
+
+    Raises:
+        ValueError: for a geometry the model cannot hold, naming the offending field.
+    """
+    _check(network)
+    n, n_on, n_off = network.n_mainline, len(network.on_ramps), len(network.off_ramps)
+    on_cells = {face: n + i for i, face in enumerate(network.on_ramps)}
+    off_cells = {face: n + n_on + o for o, face in enumerate(network.off_ramps)}
+    shares = np.asarray(network.exit_shares, dtype=np.float64)
+
+    merges = [(face - 1, cell, face) for face, cell in on_cells.items()]
+    diverges = [(face - 1, face, cell) for face, cell in off_cells.items()]
+    links = [(j - 1, j) for j in range(1, n) if j not in on_cells and j not in off_cells]
+
+    routing = np.zeros((n + n_on + n_off,) * 2)
+    for up, down in links:
+        routing[down, up] = 1.0
+    for main, ramp, down in merges:
+        routing[down, [main, ramp]] = 1.0
+    for (up, main, off), share in zip(diverges, shares, strict=True):
+        routing[[main, off], up] = 1.0 - share, share
+
+    return Layout(
+        links=_columns(links, 2),
+        merges=_columns(merges, 3),
+        diverges=_columns(diverges, 3),
+        exit_shares=shares,
+        entries=np.array([0, *on_cells.values()], dtype=np.int64),
+        entry_inputs=np.array([0, *range(3, 3 + 2 * n_on, 2)], dtype=np.int64),
+        exits=np.array([n - 1, *off_cells.values()], dtype=np.int64),
+        exit_inputs=np.array(
+            [2, *range(3 + 2 * n_on, 3 + 2 * n_on + n_off)],
+            dtype=np.int64,
+        ),
+        routing=routing,
+        lanes=np.asarray(network.segment_lanes, dtype=np.float64),
+        entry_lanes=np.array([network.lanes, *[network.ramp_lanes] * n_on], dtype=np.float64),
+        exit_lanes=np.array([network.lanes, *[network.ramp_lanes] * n_off], dtype=np.float64),
+    )
+
+
+def _columns(rows: Sequence[tuple[int, ...]], width: int) -> IntArray:
+    return np.array(rows, dtype=np.int64).reshape(-1, width).T
+
+
+def _check(network: RoadNetwork) -> None:
+    n = network.n_mainline
+    if n < 1:
+        raise ValueError(f"network.n_mainline must be >= 1, got {n}")
+    taken: set[int] = set()
+    for field, faces in (("on_ramps", network.on_ramps), ("off_ramps", network.off_ramps)):
+        for i, face in enumerate(faces):
+            path = f"network.{field}[{i}]"
+            if not 1 <= face <= n - 1:
+                raise ValueError(f"{path} must be in 1..{n - 1}, got {face}")
+            if face in taken:
+                raise ValueError(f"{path} must be a face without another ramp, got {face}")
+            taken.add(face)
+    if len(network.exit_shares) != len(network.off_ramps):
+        raise ValueError(
+            f"network.exit_shares must have {len(network.off_ramps)} entries, one an off-ramp, "
+            f"got {len(network.exit_shares)}"
+        )
+    for i, share in enumerate(network.exit_shares):
+        if not 0.0 <= share < 1.0:
+            raise ValueError(f"network.exit_shares[{i}] must be in [0, 1), got {share}")
+    if not (np.isfinite(network.segment_length) and network.segment_length > 0.0):
+        raise ValueError(f"network.segment_length must be > 0 km, got {network.segment_length}")
+    n_segments = n + len(network.on_ramps) + len(network.off_ramps)
+    if len(network.segment_lanes) != n_segments:
+        raise ValueError(
+            f"network.segment_lanes must have {n_segments} entries, "
+            f"got {len(network.segment_lanes)}"
+        )
+    lanes = {f"segment_lanes[{i}]": count for i, count in enumerate(network.segment_lanes)}
+    for field, count in {
+        **lanes,
+        "lanes": network.lanes,
+        "ramp_lanes": network.ramp_lanes,
+    }.items():
+        if count < 1:
+            raise ValueError(f"network.{field} must be >= 1, got {count}")

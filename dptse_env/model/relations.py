@@ -1,0 +1,85 @@
+"""Constitutive relations of the ARZ model (Aw-Rascle 2000, Zhang 2002): pressure, demand, supply.
+
+Along drivers of one characteristic w the flow is `q_w(rho) = rho (w - p(rho))`. Demand is what a
+cell can send, supply what the cell behind a face can take in from drivers w. Arrays broadcast.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dptse_env.model.network import FloatArray
+
+# Below this share of its jam density a cell is a vacuum: it sends nothing, and w is v_f there.
+VACUUM = 1e-12
+# A speed of zero is a kink, and projection puts states right on it. Within this share of v_f the
+# derivative of moving traffic is taken (and that of the mainline where both branches of a diverge
+# stand), so that rounding does not decide.
+STANDING = 1e-9
+
+
+@dataclass(frozen=True)
+class Relations:
+    """The relations of one parameter set; a cell brings its own jam density.
+
+    Attributes:
+        free_flow_speed: v_f [km/h].
+        gamma: Exponent of the pressure [-].
+    """
+
+    free_flow_speed: float
+    gamma: float
+
+    def pressure(self, density: FloatArray, jam: FloatArray) -> FloatArray:
+        """Pressure v_f (rho / rho_m)^gamma [km/h], the only one with V_e + p = v_f for eq. (1b)."""
+        return self.free_flow_speed * (np.maximum(density, 0.0) / jam) ** self.gamma
+
+    def inverse_pressure(self, pressure: FloatArray, jam: FloatArray) -> FloatArray:
+        """The density [veh/km] at which the pressure [km/h] is reached."""
+        return jam * (np.maximum(pressure, 0.0) / self.free_flow_speed) ** (1.0 / self.gamma)
+
+    def critical_density(self, w: FloatArray, jam: FloatArray) -> FloatArray:
+        """sigma(w) [veh/km], where the flow of drivers w is largest."""
+        return self.inverse_pressure(w / (1.0 + self.gamma), jam)
+
+    def capacity(self, w: FloatArray, jam: FloatArray) -> FloatArray:
+        """q_max(w) = sigma(w) w gamma / (1 + gamma) [veh/h]."""
+        return self.critical_density(w, jam) * w * (self.gamma / (1.0 + self.gamma))
+
+    def demand(self, density: FloatArray, w: FloatArray, jam: FloatArray) -> FloatArray:
+        """Flow a cell can send [veh/h]: q_w(rho) up to the critical density, q_max(w) beyond."""
+        pressure = self.pressure(density, jam)
+        free = (1.0 + self.gamma) * pressure <= w
+        return np.where(free, density * (w - pressure), self.capacity(w, jam))
+
+    def demand_gradient(
+        self, density: FloatArray, w: FloatArray, jam: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Partial derivatives of `demand` by density [km/h] and by w [veh/km]."""
+        pressure = self.pressure(density, jam)
+        free = (1.0 + self.gamma) * pressure <= w
+        by_density = np.where(free, w - (1.0 + self.gamma) * pressure, 0.0)
+        return by_density, np.where(free, density, self.critical_density(w, jam))
+
+    def supply(self, w: FloatArray, speed: FloatArray, jam: FloatArray) -> FloatArray:
+        """Flow of drivers w [veh/h] that a cell of the given speed can take in.
+
+        Entering drivers settle at the density `rho_M = p^-1(w - v)` of the cell's own speed, and
+        that wave runs upstream, unless their critical density comes before it.
+        """
+        settled = self.inverse_pressure(w - speed, jam)
+        ample = speed >= w * (self.gamma / (1.0 + self.gamma))
+        return np.where(ample, self.capacity(w, jam), settled * speed)
+
+    def supply_gradient(
+        self, w: FloatArray, speed: FloatArray, jam: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Partial derivatives of `supply` by w and by the speed of the cell [veh/km]."""
+        gap = w - speed
+        settled = self.inverse_pressure(gap, jam)
+        ample = speed >= w * (self.gamma / (1.0 + self.gamma))
+        slope = settled / (self.gamma * np.where(ample, 1.0, gap))
+        by_w = np.where(ample, self.critical_density(w, jam), speed * slope)
+        return by_w, np.where(ample, 0.0, settled - speed * slope)

@@ -1,0 +1,78 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dptse_env.model.arz import ARZModel
+from dptse_env.model.compiled import CompiledARZModel
+from dptse_env.model.kernels import advance, scratch_of
+
+from .roads import HIGHWAY, NO_RELAXATION, PAPER, STRAIGHT, W99, Road, random_inputs, random_states
+
+ROADS = {
+    "highway": HIGHWAY,
+    "straight": STRAIGHT,
+    "one cell": Road(n_mainline=1),
+    "ramps side by side": Road(on_ramps=(3, 5), off_ramps=(4,), exit_shares=(0.0,)),
+}
+
+
+@pytest.mark.parametrize("parameters", [PAPER, W99, NO_RELAXATION], ids=lambda p: p.name)
+@pytest.mark.parametrize("road", ROADS.values(), ids=ROADS.keys())
+@given(seed=st.integers(0, 2**32 - 1))
+def test_equals_numpy(road, parameters, seed):
+    plain, compiled = ARZModel(road, parameters), CompiledARZModel(road, parameters)
+    rng = np.random.default_rng(seed)
+    states, inputs = random_states(plain, 8, rng), random_inputs(plain, 8, rng)
+    scale = np.tile(
+        [plain.density_scale, plain.density_scale * plain.speed_scale], plain.n_segments
+    )
+    np.testing.assert_allclose(
+        compiled.step(states, inputs) / scale, plain.step(states, inputs) / scale, atol=1e-12
+    )
+    by_scale = scale[None, :] / scale[:, None]
+    expected = plain.jacobian(states, inputs) * by_scale
+    got = compiled.jacobian(states, inputs) * by_scale
+    np.testing.assert_allclose(got, expected, rtol=1e-12, atol=1e-12)
+
+
+def test_stays_equal_over_an_episode():
+    plain, compiled = ARZModel(HIGHWAY, W99), CompiledARZModel(HIGHWAY, W99)
+    rng = np.random.default_rng(7)
+    a = b = random_states(plain, 2, rng)
+    for _ in range(700):
+        inputs = random_inputs(plain, 2, rng)
+        a, b = plain.step(a, inputs), compiled.step(b, inputs)
+    np.testing.assert_allclose(b, a, rtol=1e-9, atol=1e-9)
+
+
+def test_a_batch_equals_a_loop_to_the_bit():
+    model = CompiledARZModel(HIGHWAY, PAPER)
+    rng = np.random.default_rng(8)
+    states, inputs = random_states(model, 16, rng), random_inputs(model, 16, rng)
+    after, jacobian = model.step(states, inputs), model.jacobian(states, inputs)
+    for i in range(16):
+        one = slice(i, i + 1)
+        np.testing.assert_array_equal(model.step(states[one], inputs[one]), after[one])
+        np.testing.assert_array_equal(model.jacobian(states[one], inputs[one]), jacobian[one])
+
+
+def test_inputs_need_not_be_contiguous_and_are_left_alone():
+    model = CompiledARZModel(HIGHWAY, PAPER)
+    rng = np.random.default_rng(9)
+    states, inputs = random_states(model, 6, rng), random_inputs(model, 6, rng)
+    kept = states.copy()
+    every_other = model.step(states[::2], inputs[::2])
+    np.testing.assert_array_equal(every_other, model.step(states, inputs)[::2])
+    np.testing.assert_array_equal(states, kept)
+
+
+def test_kernel_may_overwrite_its_state():
+    model = CompiledARZModel(HIGHWAY, PAPER)
+    rng = np.random.default_rng(10)
+    states, inputs = random_states(model, 1, rng), random_inputs(model, 1, rng)
+    expected = model.step(states, inputs)[0]
+    state = states[0].copy()
+    blocks = np.empty((*model.road.neighbours.shape, 4))
+    advance(model.road, state, inputs[0], state, blocks, scratch_of(model.road))
+    np.testing.assert_array_equal(state, expected)
