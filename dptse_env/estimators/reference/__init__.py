@@ -1,0 +1,1 @@
+"""Estimators on filterpy: what a reader checks the equations against."""

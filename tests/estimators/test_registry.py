@@ -1,0 +1,56 @@
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from dptse_env.estimators import BACKENDS, ESTIMATORS, make_estimator
+from dptse_env.model import ARZModel, load_parameters
+from dptse_env.traffic import PAPER_HIGHWAY
+
+MODEL = ARZModel(PAPER_HIGHWAY, load_parameters("paper"))
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_every_name_and_backend_follows_the_protocol(name, backend):
+    estimator = make_estimator(name, backend, MODEL, 3)
+    everyone = np.arange(3)
+    states = MODEL.states(np.full((3, 19), 30.0), np.full((3, 19), 80.0))
+    estimator.reset(everyone, states, [np.random.default_rng(i) for i in everyone])
+    estimator.predict(everyone, np.zeros((3, 9)))
+    estimator.update(everyone, np.ones((3, 19), bool), MODEL.measure(states), np.ones(2))
+    assert estimator.n_episodes == 3
+    assert estimator.innovations.shape == (3, 19, 2)
+    assert estimator.diverged.tolist() == [False] * 3
+    first, second = estimator.estimate(), estimator.estimate()
+    for field in ("density", "speed", "density_std", "speed_std"):
+        a, b = getattr(first, field), getattr(second, field)
+        assert a.shape == (3, 19)
+        assert np.isfinite(a).all()
+        assert not np.shares_memory(a, b)
+        assert (a >= 0.0).all()
+
+
+def test_unknown_names_say_what_is_allowed():
+    with pytest.raises(
+        ValueError, match="estimator must be one of ekf, random_walk, open_loop, got 'kf'"
+    ):
+        make_estimator("kf", "compiled", MODEL, 1)
+    with pytest.raises(ValueError, match="backend must be one of compiled, reference, got 'torch'"):
+        make_estimator("ekf", "torch", MODEL, 1)
+    with pytest.raises(ValueError, match="n_episodes must be >= 1, got 0"):
+        make_estimator("ekf", "compiled", MODEL, 0)
+
+
+@pytest.mark.parametrize(
+    ("modules", "absent"),
+    [
+        ("dptse_env.estimators", ("numba", "filterpy")),
+        ("dptse_env.estimators.reference.ekf", ("numba",)),
+        ("dptse_env.estimators.compiled.ekf", ("filterpy",)),
+    ],
+)
+def test_each_backend_imports_only_its_own_library(modules, absent):
+    code = f"import sys, {modules}; sys.exit(any(m in sys.modules for m in {absent!r}))"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
