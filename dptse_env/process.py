@@ -1,0 +1,255 @@
+"""One step of the decision process, for a batch of episodes. The only place where it is written."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from dptse_env.arrays import Action, BoolArray, FloatArray, IntArray, Observation
+from dptse_env.config import EnvConfig
+from dptse_env.estimators import Estimate, make_estimator
+from dptse_env.interface import QueryInterface
+from dptse_env.observations import AGE_CAP, Knowledge
+from dptse_env.options import ResetOptions
+from dptse_env.prior import nominal_state
+from dptse_env.privacy import Accountant, GaussianMechanism, Mechanism, noise_std
+from dptse_env.rewards import EstimationError, estimation_error
+from dptse_env.sensing import Sensing
+from dptse_env.traffic import RecordLibrary
+
+TRUTH_INFO = ("rmse_density", "rmse_speed", "n_occupied", "truth")
+"""Keys of ``info`` that come from the true traffic."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a step or a reset gives back for k episodes.
+
+    Attributes:
+        observation: Shape (k, size).
+        reward: Shape (k,); zero while a sequential decision is not complete.
+        truncated: Whether the horizon is reached, shape (k,).
+    """
+
+    observation: Observation
+    reward: FloatArray
+    truncated: BoolArray
+
+
+class QueryProcess:
+    """The decision process: traffic moves by itself, a policy picks whom to ask.
+
+    Queries never change the traffic, so an episode replays a record of SUMO. Every array has a
+    leading axis over the episodes; ``episodes`` names the k of them that a call concerns.
+
+    Attributes:
+        config: The configuration.
+        interface: Encodings of actions, observations and reward.
+        n_episodes: Size of the batch.
+        time: Second of the record that each episode stands at, shape (n,).
+        slot: Index into ``config.traffic_seeds`` of each episode's traffic, shape (n,).
+        queried: The last query of each episode, shape (n, n_mainline).
+        boundary_inputs: What the estimator is told of the road's surroundings, by slot and second,
+            shape (n_slots, T + 1, n_u); a slot is filled when its traffic is first used.
+        estimate: The present estimates, arrays of shape (n, S).
+        error: Their error, arrays of shape (n,).
+    """
+
+    def __init__(
+        self,
+        config: EnvConfig,
+        interface: QueryInterface,
+        n_episodes: int,
+        library: RecordLibrary | None = None,
+    ) -> None:
+        """Assemble the rooms; nothing is recorded or compiled before `reset`.
+
+        Args:
+            config: The configuration.
+            interface: The interface made of the same configuration.
+            n_episodes: Size of the batch n.
+            library: Where records come from; the user's cache if None.
+        """
+        corridor = config.corridor
+        n, s = n_episodes, corridor.n_segments
+        self.config, self.interface, self.n_episodes = config, interface, n
+        self.model = config.model()
+        self.sensing = Sensing(corridor, config.traffic_seeds, library or RecordLibrary())
+        sensitivity = config.sensitivity()
+        self.accountant = Accountant(config.privacy, sensitivity, boundary_inputs="true")
+        self.mechanism: Mechanism = GaussianMechanism(
+            noise_std(config.privacy, sensitivity), n_episodes=n, n_segments=s
+        )
+        self.estimator = make_estimator(
+            config.estimator, config.backend, self.model, n, config.settings()
+        )
+        interface.actions.start(n)
+        self._observed_always = np.zeros(s, dtype=bool)
+        self._observed_always[list(corridor.fixed_sensors)] = True
+        seconds = corridor.duration + 1
+        # np.empty takes address space, not memory, until traffic is loaded into its slot.
+        self.boundary_inputs = np.empty((len(config.traffic_seeds), seconds, self.model.n_inputs))
+        self.slot = np.zeros(n, dtype=np.int64)
+        self.time = np.zeros(n, dtype=np.int64)
+        self.end = np.zeros(n, dtype=np.int64)
+        self.queried = np.zeros((n, corridor.n_mainline), dtype=bool)
+        self.n_dropped = np.zeros(n, dtype=np.int64)
+        self.age = np.zeros((n, corridor.n_mainline), dtype=np.int64)
+        self.released = np.zeros((n, s, 2))
+        self.estimate = self.estimator.estimate()
+        self.error = EstimationError(np.zeros(n), np.zeros(n), np.zeros(n, dtype=np.int64))
+
+    def reset(
+        self,
+        episodes: IntArray,
+        generators: Sequence[np.random.Generator],
+        options: Mapping[str, Any] | None = None,
+    ) -> Outcome:
+        """Begin new episodes.
+
+        Args:
+            episodes: Which episodes, shape (k,).
+            generators: One generator per episode; each gives a seed for the traffic, the noise and
+                the estimator, whatever else is configured.
+            options: ``traffic_seed`` fixes the traffic (one of ``config.traffic_seeds``) and
+                ``start`` the first second of the record.
+
+        Raises:
+            ValueError: An option is unknown or out of range.
+            RecordingError: SUMO could not make a record.
+        """
+        choice = ResetOptions.of(options, self.config)
+        streams = [
+            [np.random.default_rng(seed) for seed in generator.integers(2**63, size=3)]
+            for generator in generators
+        ]
+        for episode, (traffic, _, _) in zip(episodes, streams, strict=True):
+            slot, start = choice.draw(traffic)
+            self._load(slot)
+            self.slot[episode], self.time[episode] = slot, start
+            self.end[episode] = start + self.config.horizon_steps
+        self.interface.actions.reset(episodes)
+        self.mechanism.reset(episodes, [noise for _, noise, _ in streams])
+        prior = [nominal_state(self.config.corridor, self.model, t) for t in self.time[episodes]]
+        self.estimator.reset(episodes, np.array(prior), [own for _, _, own in streams])
+        self.queried[episodes] = False
+        self.n_dropped[episodes] = 0
+        self.age[episodes] = AGE_CAP
+        self.released[episodes] = 0.0
+        self._score(episodes)
+        return self._outcome(episodes, np.zeros(len(episodes)))
+
+    def step(self, episodes: IntArray, actions: Action) -> Outcome:
+        """Carry out one action in each of ``episodes``.
+
+        Args:
+            episodes: Which episodes, shape (k,).
+            actions: Their actions, shape (k, *action space).
+
+        Raises:
+            ValueError: An action has a wrong shape, dtype or value.
+        """
+        decision = self.interface.actions.decode(episodes, actions)
+        ready = decision.complete
+        self.n_dropped[episodes] = decision.n_dropped
+        reward = np.zeros(len(episodes))
+        if ready.any():
+            reward[ready] = self._advance(episodes[ready], decision.queried[ready])
+        return self._outcome(episodes, reward)
+
+    @property
+    def over(self) -> BoolArray:
+        """Whether each episode is at its end, or was never begun, shape (n,)."""
+        return self.time >= self.end
+
+    def _advance(self, episodes: IntArray, queried: BoolArray) -> FloatArray:
+        """Let one second pass: sense, release, estimate, score."""
+        observed = np.tile(self._observed_always, (len(episodes), 1))
+        observed[:, : queried.shape[1]] |= queried
+        inputs = self.boundary_inputs[self.slot[episodes], self.time[episodes]]
+        self.time[episodes] += 1
+        truth = self.sensing.aggregates(self.slot[episodes], self.time[episodes])
+        released = self.mechanism.release(episodes, truth)
+        self.estimator.predict(episodes, inputs)
+        self.estimator.update(episodes, observed, released, self.mechanism.sigma)
+        self._remember(episodes, queried, observed, released)
+        return self._score(episodes)
+
+    def _remember(
+        self, episodes: IntArray, queried: BoolArray, observed: BoolArray, released: FloatArray
+    ) -> None:
+        self.queried[episodes] = queried
+        self.released[episodes] = np.where(observed[:, :, None], released, self.released[episodes])
+        self.age[episodes] = np.where(observed[:, : queried.shape[1]], 0, self.age[episodes] + 1)
+
+    def _score(self, episodes: IntArray) -> FloatArray:
+        """Compare the present estimates with the truth; return the rewards."""
+        n = self.config.corridor.n_mainline
+        truth = self.sensing.aggregates(self.slot[episodes], self.time[episodes])
+        self.estimate = self.estimator.estimate()
+        error = estimation_error(
+            truth[:, :n, 0],
+            truth[:, :n, 1],
+            self.estimate.density[episodes, :n],
+            self.estimate.speed[episodes, :n],
+        )
+        self.error.density[episodes] = error.density
+        self.error.speed[episodes] = error.speed
+        self.error.n_occupied[episodes] = error.n_occupied
+        return self.interface.reward.value(error)
+
+    def _load(self, slot: int) -> None:
+        """Make sure that the traffic of ``slot`` and its boundary inputs are in memory."""
+        if self.sensing.load(slot):
+            boundary = self.sensing.traffic(slot)[:, self.config.corridor.n_segments :]
+            self.boundary_inputs[slot] = self.model.boundary_inputs(
+                boundary[..., 0], boundary[..., 1]
+            )
+
+    def _outcome(self, episodes: IntArray, reward: FloatArray) -> Outcome:
+        estimate = self.estimate
+        knowledge = Knowledge(
+            estimate=Estimate(
+                estimate.density[episodes],
+                estimate.speed[episodes],
+                estimate.density_std[episodes],
+                estimate.speed_std[episodes],
+            ),
+            released=self.released[episodes],
+            innovations=self.estimator.innovations[episodes],
+            age=self.age[episodes],
+            queried=self.queried[episodes],
+            picked=self.interface.actions.picked[episodes],
+        )
+        observation = self.interface.observations.encode(knowledge)
+        return Outcome(observation, reward, self.over[episodes])
+
+    def info(self, episode: int) -> dict[str, Any]:
+        """Return what is said about one episode beside its observation.
+
+        The keys in `TRUTH_INFO` come from the true traffic. They are training and evaluation
+        signals like the reward, never a release.
+        """
+        mu, epsilon = self.accountant.spent(self.time[[episode]])
+        info: dict[str, Any] = {
+            "rmse_density": float(self.error.density[episode]),
+            "rmse_speed": float(self.error.speed[episode]),
+            "n_occupied": float(self.error.n_occupied[episode]),
+            "n_dropped": float(self.n_dropped[episode]),
+            "diverged": float(self.estimator.diverged[episode]),
+            "mu": float(mu[0]),
+            "epsilon": float(epsilon[0]),
+            "queried": self.queried[episode].copy(),
+        }
+        if self.config.truth_in_info:
+            truth = self.sensing.aggregates(self.slot[[episode]], self.time[[episode]])[0]
+            info["truth"] = {
+                "density": truth[:, 0].copy(),
+                "speed": truth[:, 1].copy(),
+                "traffic_seed": self.config.traffic_seeds[self.slot[episode]],
+                "time": int(self.time[episode]),
+            }
+        return info

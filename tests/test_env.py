@@ -1,0 +1,314 @@
+import json
+import multiprocessing
+import pickle
+import subprocess
+import sys
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from stable_baselines3.common.env_checker import check_env as sb3_check_env
+
+from dptse_env.actions import ACTION_ENCODINGS
+from dptse_env.process import TRUTH_INFO
+from dptse_env.registration import ENVIRONMENTS, register_environments
+
+SHORT = "dptse_env:dptse/ShortHighway-v0"
+IDS = [f"dptse_env:{env_id}" for env_id in ENVIRONMENTS]
+
+
+def short(**keywords):
+    return gym.make(SHORT, **{"traffic_seeds": "0:3", **keywords})
+
+
+def play(env, n_steps, seed=0):
+    """Reset and act at random; return everything that came back."""
+    env.action_space.seed(seed)
+    seen = [env.reset(seed=seed)]
+    seen += [env.step(env.action_space.sample()) for _ in range(n_steps)]
+    return seen
+
+
+def assert_same(first, second):
+    assert type(first) is type(second)
+    if isinstance(first, dict):
+        assert first.keys() == second.keys()
+        for key in first:
+            assert_same(first[key], second[key])
+    elif isinstance(first, tuple | list):
+        assert len(first) == len(second)
+        for one, other in zip(first, second, strict=True):
+            assert_same(one, other)
+    else:
+        np.testing.assert_array_equal(first, second)
+
+
+@pytest.mark.parametrize("action", ACTION_ENCODINGS)
+@pytest.mark.parametrize("env_id", IDS)
+def test_the_checkers_find_nothing(env_id, action):
+    env = gym.make(env_id, action=action, render_mode="rgb_array", traffic_seeds="0:2")
+    check_env(env.unwrapped)
+    sb3_check_env(env.unwrapped)
+    env.close()
+    env.close()
+
+
+@pytest.mark.parametrize("action", ACTION_ENCODINGS)
+def test_two_environments_in_lock_step_are_identical(action):
+    first, second = short(action=action), short(action=action)
+    for env in (first, second):
+        env.reset(seed=3)
+    first.action_space.seed(1)
+    for _ in range(40):
+        chosen = first.action_space.sample()
+        assert_same(first.step(chosen), second.step(chosen))
+
+
+def test_a_seed_fixes_the_episodes_and_no_seed_goes_on():
+    env = short()
+    first = [env.reset(seed=5)[0], env.reset()[0], env.reset()[0]]
+    again = [env.reset(seed=5)[0], env.reset()[0], env.reset()[0]]
+    assert_same(first, again)
+    assert_same(play(env, 30, seed=5), play(env, 30, seed=5))
+    rewards = {tuple(step[1] for step in play(env, 30, seed=s)[1:]) for s in range(5)}
+    assert len(rewards) == 5
+
+
+def test_all_traffic_seeds_are_used():
+    env = short(truth_in_info=True)
+    env.reset(seed=0)
+    assert {env.reset()[1]["truth"]["traffic_seed"] for _ in range(40)} == {0, 1, 2}
+
+
+def test_an_episode_ends_by_truncation_at_the_horizon():
+    env = short(horizon=20)
+    *_, before_last, last = play(env, 20)
+    assert before_last[2:4] == (False, False)
+    assert last[2:4] == (False, True)
+    assert type(last[1]) is float
+    assert type(last[2]) is bool
+    assert type(last[3]) is bool
+    with pytest.raises(gym.error.ResetNeeded, match="call reset"):
+        env.step(env.action_space.sample())
+
+
+def test_the_whole_record_is_the_default_horizon():
+    env = short()
+    env.reset(seed=0)
+    count, truncated = 0, False
+    while not truncated:
+        *_, truncated, _ = env.step(env.action_space.sample())
+        count += 1
+    assert count == 240
+
+
+def test_sequential_actions_move_the_traffic_on_their_last_pick():
+    env = short(action="sequential", bandwidth=3, horizon=5, truth_in_info=True)
+    env.reset(seed=0)
+    times, rewards, masks = [], [], []
+    truncated = False
+    while not truncated:
+        free = env.unwrapped.action_masks()
+        _, reward, _, truncated, info = env.step(np.flatnonzero(free)[0])
+        times.append(info["truth"]["time"])
+        rewards.append(reward)
+        masks.append(int(free.sum()))
+    assert times == [0, 0, 1, 1, 1, 2, 2, 2, 3, 3, 3, 4, 4, 4, 5]
+    assert masks == [6, 5, 4] * 5
+    assert [reward == 0 for reward in rewards] == [True, True, False] * 5
+
+
+def test_action_masks_are_for_sequential_actions():
+    with pytest.raises(ValueError, match="needs action='sequential', this is 'mask'"):
+        short().unwrapped.action_masks()
+
+
+def test_info_has_the_same_finite_numbers_at_every_step():
+    env = short()
+    (_, at_reset), *steps = play(env, 30)
+    assert at_reset.pop("privacy")["guarantee"] == "none"
+    for info in [at_reset, *(step[4] for step in steps)]:
+        assert info.keys() == at_reset.keys()
+        flags = info.pop("queried")
+        assert flags.dtype == bool
+        assert flags.sum() <= 2
+        for key, value in info.items():
+            assert type(value) is float, key
+            assert np.isfinite(value), key
+        info["queried"] = flags
+
+
+def test_what_is_returned_is_not_touched_later():
+    env = short(truth_in_info=True)
+    seen = play(env, 10)
+    kept = pickle.loads(pickle.dumps(seen))
+    for _ in range(10):
+        env.step(env.action_space.sample())
+    assert_same(seen, kept)
+
+
+def test_privacy_report_is_plain_json():
+    report = short().reset(seed=0)[1]["privacy"]
+    assert json.loads(json.dumps(report)) == report
+    assert "boundary_inputs" in report["void_reasons"]
+
+
+def test_truth_is_shown_only_when_asked_for():
+    assert "truth" not in short().reset(seed=0)[1]
+    info = short(truth_in_info=True).reset(seed=0)[1]
+    assert set(info["truth"]) == {"density", "speed", "traffic_seed", "time"}
+    assert set(TRUTH_INFO) <= set(info)
+
+
+def test_reset_options_choose_the_traffic_and_the_start():
+    env = short(horizon=50, random_start=True, truth_in_info=True)
+    truth = env.reset(seed=0, options={"traffic_seed": 2, "start": 100})[1]["truth"]
+    assert (truth["traffic_seed"], truth["time"]) == (2, 100)
+    starts = {env.reset()[1]["truth"]["time"] for _ in range(30)}
+    assert len(starts) > 10
+    assert max(starts) <= 190
+
+
+def test_fixing_the_traffic_leaves_the_noise_as_it_was():
+    env = short(traffic_seeds=[0])
+    free = play(env, 10, seed=9)
+    env.action_space.seed(9)
+    fixed = [env.reset(seed=9, options={"traffic_seed": 0})]
+    fixed += [env.step(env.action_space.sample()) for _ in range(10)]
+    assert_same(free, fixed)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"seed": 1}, r"options\.seed is unknown; allowed: traffic_seed, start"),
+        ({"traffic_seed": 7}, r"options\.traffic_seed must be one of .* 3 traffic_seeds, got 7"),
+        ({"start": 191}, r"options\.start must be an integer in 0\.\.190, got 191"),
+        ({"start": 1.5}, r"options\.start must be an integer in 0\.\.190, got 1\.5"),
+    ],
+)
+def test_bad_reset_options_are_refused_and_the_episode_goes_on(options, message):
+    env, undisturbed = short(horizon=50), short(horizon=50)
+    play(env, 3), play(undisturbed, 3)
+    with pytest.raises(ValueError, match=message):
+        env.reset(options=options)
+    action = np.zeros(6, dtype=np.int8)
+    assert_same(env.step(action), undisturbed.step(action))
+
+
+def test_a_pickled_environment_goes_on_where_it_was():
+    env = short(render_mode="rgb_array")
+    play(env, 10)
+    copy = pickle.loads(pickle.dumps(env))
+    for _ in range(10):
+        chosen = env.action_space.sample()
+        assert_same(env.step(chosen), copy.step(chosen))
+    assert_same(env.render(), copy.render())
+
+
+def test_a_spec_survives_json():
+    env = short(
+        action="slots",
+        privacy={"preset": "corrected", "epsilon": 5.0},
+        corridor={"demand": {"mainline": [[0.0, 1500.0]], "on_ramps": [200.0]}},
+        incident={"segment": 3, "phases": [[60.0, 120.0, 20.0]]},
+        parameters={
+            "name": "mine", "free_flow_speed": 120.0, "jam_density": 350.0, "gamma": 1.0,
+            "relaxation_time": 40.0,
+        },
+    )  # fmt: skip
+    again = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
+    assert again.unwrapped.config == env.unwrapped.config
+    assert_same(play(env, 5), play(again, 5))
+
+
+def _first_observation(env_id):
+    env = gym.make(env_id, traffic_seeds="0:3")
+    return env.reset(seed=0)[0]
+
+
+@pytest.mark.parametrize("method", ["forkserver", "spawn"])
+def test_ids_are_known_in_subprocesses(method):
+    with multiprocessing.get_context(method).Pool(1) as pool:
+        there = pool.apply(_first_observation, (SHORT,))
+    np.testing.assert_array_equal(there, _first_observation(SHORT))
+
+
+def test_importing_the_package_is_light():
+    code = (
+        "import dptse_env, sys; "
+        "print({'libsumo', 'numba', 'torch', 'matplotlib'} & set(sys.modules) or 'light')"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False
+    )
+    assert result.stdout.strip() == "light", result.stderr
+
+
+def test_registering_twice_changes_nothing():
+    before = dict(gym.registry)
+    register_environments()
+    assert gym.registry == before
+
+
+def test_rendering():
+    env = short(render_mode="rgb_array")
+    with pytest.raises(gym.error.ResetNeeded):
+        env.unwrapped.render()
+    env.reset(seed=0)
+    empty = env.render()
+    for _ in range(100):
+        env.step(env.action_space.sample())
+    picture = env.render()
+    assert picture.dtype == np.uint8
+    assert picture.shape == empty.shape
+    assert picture.shape[2] == 3
+    assert (picture != empty).mean() > 0.05
+
+
+def test_a_sequential_episode_renders_one_column_a_second():
+    env = short(action="sequential", bandwidth=3, render_mode="rgb_array")
+    play(env, 30)
+    assert len(env.unwrapped.history.truth) == 11
+
+
+@pytest.mark.parametrize(
+    ("keywords", "message"),
+    [
+        ({"bandwith": 2}, r"^bandwith is unknown; allowed: corridor, estimator"),
+        ({"bandwidth": 7}, r"^bandwidth must be in 1\.\.6, got 7"),
+        ({"bandwidth": 0}, r"^bandwidth must be in 1\.\.6, got 0"),
+        ({"bandwidth": 2.5}, r"^bandwidth must be of type int, got 2\.5"),
+        ({"estimator": "kf"}, r"^estimator must be one of ekf, .*, got 'kf'"),
+        ({"backend": "gpu"}, r"^backend must be one of compiled, reference, got 'gpu'"),
+        ({"action": "flags"}, r"^action must be one of mask, scores, slots, sequential, got"),
+        ({"reward": "rmse"}, r"^reward must be one of joint, density, speed, got 'rmse'"),
+        ({"privacy": "none"}, r"^privacy\.preset must be one of"),
+        ({"privacy": {"sigma": 1.0}}, r"^privacy\.sigma is unknown; allowed: preset, epsilon"),
+        ({"epsilon": -1}, r"^privacy\.epsilon must be > 0, got -1"),
+        ({"delta": 0.7}, r"^privacy\.delta must be in \(0, 0\.5\), got 0\.7"),
+        ({"corridor": "long"}, r"^corridor must be one of paper-highway, short-highway, got 'long"),
+        ({"corridor": {"on_ramps": [9]}}, r"^corridor\.on_ramps\[0\] must be an integer in 1\.\.5"),
+        ({"incident": "fog"}, r"^incident must be one of preset, random, none, got 'fog'"),
+        ({"incident": {"segment": 9, "phases": [[1, 2, 3]]}}, r"ident\.segment must be .*0\.\.5"),
+        ({"horizon": 241}, r"^horizon must be in 1\.\.240, got 241"),
+        ({"random_start": True}, r"^random_start needs a horizon below the record's 240 s"),
+        ({"traffic_seeds": []}, r"^traffic_seeds must not be empty"),
+        ({"traffic_seeds": "3:1"}, r"^traffic_seeds must not be empty, got '3:1'"),
+        ({"traffic_seeds": [1, 1]}, r"^traffic_seeds must be >= 0 and distinct"),
+        ({"parameters": "fast"}, r"^parameters must be one of .*w99-3lane.*, got 'fast'"),
+        (
+            {"parameters": {"name": "f", "free_flow_speed": 400.0, "jam_density": 300.0,
+                            "gamma": 1.0, "relaxation_time": 50.0}},
+            r"^model\.time_step must be > 0 and at most 0\.\d+ s \(CFL",
+        ),
+        ({"preset": "none"}, r"^preset must be one of paper-highway, short-highway, got 'none'"),
+        ({"render_mode": "human"}, r"HumanRendering"),
+    ],
+)  # fmt: skip
+def test_bad_keywords_name_themselves(keywords, message):
+    from dptse_env.env import SensorQueryEnv
+
+    with pytest.raises(ValueError, match=message):
+        SensorQueryEnv(**{"preset": "short-highway", **keywords})

@@ -1,0 +1,69 @@
+import numpy as np
+import pytest
+
+from dptse_env.estimators import Estimate
+from dptse_env.observations import AGE_CAP, Knowledge, ObservationEncoding
+
+N, S, FIXED = 4, 6, (3, 5)
+
+
+def encoding(with_picked=False):
+    return ObservationEncoding(
+        N, S, FIXED, density_scale=100.0, speed_scale=50.0, bandwidth=2, epsilon=0.1,
+        with_picked=with_picked,
+    )  # fmt: skip
+
+
+def knowledge(k=2, fill=1.0):
+    def full(*shape):
+        return np.full((k, *shape), fill)
+
+    return Knowledge(
+        estimate=Estimate(50 * full(S), 25 * full(S), 10 * full(S), 5 * full(S)),
+        released=np.dstack([20 * full(S), 10 * full(S)]),
+        innovations=np.dstack([np.arange(S) * full(S), -np.arange(S) * full(S)]),
+        age=np.array([[0, 3, AGE_CAP, 10 * AGE_CAP]] * k),
+        queried=np.array([[True, False, True, False]] * k),
+        picked=np.array([[False, True, False, False]] * k),
+    )
+
+
+def test_blocks_hold_what_their_names_say():
+    encoder = encoding(with_picked=True)
+    observation = encoder.encode(knowledge())
+    expected = {
+        "density": [0.5] * S,
+        "speed": [0.5] * S,
+        "density_log_std": [np.log(0.1)] * S,
+        "speed_log_std": [np.log(0.1)] * S,
+        "released_density": [0.2] * N,
+        "released_speed": [0.2] * N,
+        "density_innovation": [0, 1, 2, 3],
+        "speed_innovation": [0, -1, -2, -3],
+        "age": [0, 0.05, 1, 1],
+        "queried": [1, 0, 1, 0],
+        "fixed_density_innovation": [3, 5],
+        "fixed_speed_innovation": [-3, -5],
+        "bandwidth": [0.5],
+        "epsilon": [-1],
+        "picked": [0, 1, 0, 0],
+    }
+    assert list(encoder.slices) == list(expected)
+    for name, values in expected.items():
+        block = encoder.block(observation, name)
+        np.testing.assert_allclose(block, [values, values], rtol=1e-6, err_msg=name)
+    assert sum(map(len, expected.values())) == observation.shape[1]
+
+
+@pytest.mark.parametrize("fill", [0.0, 1.0, -1e9, 1e9])
+def test_observations_stay_inside_the_space(fill):
+    encoder = encoding()
+    with np.errstate(invalid="ignore"):
+        observation = encoder.encode(knowledge(1, abs(fill)))
+    assert observation.dtype == np.float32
+    assert encoder.space.contains(observation[0])
+
+
+def test_an_unknown_block_is_named():
+    with pytest.raises(ValueError, match="unknown observation block 'clock'; known: density"):
+        encoding().block(np.zeros(1, dtype=np.float32), "clock")

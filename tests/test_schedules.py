@@ -1,0 +1,152 @@
+import gymnasium as gym
+import numpy as np
+import pytest
+from stable_baselines3.common.evaluation import evaluate_policy
+
+from dptse_env.actions import ACTION_ENCODINGS
+from dptse_env.config import resolve
+from dptse_env.interface import QueryInterface
+from dptse_env.schedules import SCHEDULES, Shifting, make_schedule
+
+
+class Bare:
+    """As much of an environment as a schedule needs."""
+
+    def __init__(self, preset="paper-highway", **keywords):
+        self.unwrapped = self
+        self.interface = QueryInterface.of(resolve(preset, keywords))
+
+    def observation(self, k=1, **blocks):
+        observations = self.interface.observations
+        flat = np.zeros((k, observations.space.shape[0]), dtype=np.float32)
+        for name, values in blocks.items():
+            flat[:, observations.slices[name]] = values
+        return flat
+
+
+def asked(name, n_steps, **keywords):
+    """Return the segments that a schedule asks for over some steps."""
+    env = Bare(**keywords)
+    schedule, state, sets = make_schedule(name, env, seed=0), None, []
+    for _ in range(n_steps):
+        action, state = schedule.predict(env.observation()[0], state)
+        sets.append(np.flatnonzero(action).tolist())
+    return sets
+
+
+def test_the_paper_shifts_one_segment_every_four_steps():
+    sets = asked("paper", 61)
+    assert sets[:4] == [[0, 3, 6, 9, 12]] * 4
+    assert sets[4:8] == [[1, 4, 7, 10, 13]] * 4
+    assert sets[8] == [2, 5, 8, 11, 14]
+    assert sets[12] == [0, 3, 6, 9, 12]
+    assert sets[60] == sets[0]
+
+
+def test_the_last_segment_wraps_to_the_first():
+    sets = asked("paper", 9, bandwidth=2)
+    assert sets[0] == [0, 7]
+    wide = asked("round-robin", 9, bandwidth=2)
+    assert wide[8] == [0, 8]
+
+
+def test_sets_start_as_far_apart_as_possible():
+    for bandwidth in (5, 7, 11):
+        (start,) = asked("static", 1, bandwidth=bandwidth)
+        assert start == [15 * i // bandwidth for i in range(bandwidth)]
+
+
+def test_round_robin_shifts_every_step_and_static_never():
+    assert asked("round-robin", 3) == [[0, 3, 6, 9, 12], [1, 4, 7, 10, 13], [2, 5, 8, 11, 14]]
+    assert asked("static", 9) == [[0, 3, 6, 9, 12]] * 9
+
+
+def test_random_draws_different_sets_of_full_size():
+    sets = asked("random", 200)
+    assert all(len(chosen) == 5 for chosen in sets)
+    assert len({tuple(chosen) for chosen in sets}) > 150
+    counts = np.bincount(np.concatenate(sets), minlength=15)
+    assert counts.min() > 40
+    assert asked("random", 5) == asked("random", 5)
+
+
+def test_none_and_all():
+    assert asked("none", 1) == [[]]
+    assert asked("all", 1, bandwidth=15) == [list(range(15))]
+    with pytest.raises(ValueError, match="'all' needs bandwidth 15, the environment has 5"):
+        asked("all", 1)
+
+
+def test_oldest_first_asks_the_oldest():
+    env = Bare()
+    age = np.linspace(0, 1, 15)[[3, 1, 14, 0, 2, 5, 4, 13, 12, 6, 7, 8, 11, 10, 9]]
+    action, _ = make_schedule("oldest-first", env).predict(env.observation(age=age)[0])
+    assert np.flatnonzero(action).tolist() == [2, 7, 8, 12, 13]
+
+
+def test_oldest_first_asks_all_but_the_fixed_segment_equally_often():
+    env = gym.make("dptse_env:dptse/PaperHighway-v0", traffic_seeds="0:1", estimator="random_walk")
+    schedule, counts = make_schedule("oldest-first", env), np.zeros(15)
+    observation, _ = env.reset(seed=0)
+    state = None
+    for _ in range(280):
+        action, state = schedule.predict(observation, state)
+        observation, *_, info = env.step(action)
+        counts += info["queried"]
+    assert counts[14] == 0
+    np.testing.assert_allclose(counts[:14], 100, atol=3)
+
+
+def test_a_batch_keeps_one_clock_per_episode():
+    env = Bare()
+    schedule = make_schedule("round-robin", env)
+    _, state = schedule.predict(env.observation(2))
+    action, _ = schedule.predict(env.observation(2), state, np.array([True, False]))
+    assert [np.flatnonzero(row)[0] for row in action] == [0, 1]
+
+
+def test_a_schedule_does_not_change_the_state_it_is_given():
+    env = Bare()
+    schedule = make_schedule("round-robin", env)
+    _, state = schedule.predict(env.observation())
+    copies = [part.copy() for part in state]
+    schedule.predict(env.observation(), state, np.array([True]))
+    for part, copy in zip(state, copies, strict=True):
+        np.testing.assert_array_equal(part, copy)
+
+
+@pytest.mark.parametrize("action", ACTION_ENCODINGS)
+@pytest.mark.parametrize("name", ["static", "paper", "round-robin", "random", "oldest-first"])
+def test_a_schedule_asks_the_same_in_every_encoding(name, action):
+    def queried(kind):
+        env = gym.make(
+            "dptse_env:dptse/ShortHighway-v0", action=kind, bandwidth=3, traffic_seeds="0:1"
+        )
+        schedule = make_schedule(name, env, seed=1)
+        observation, _ = env.reset(seed=0)
+        state, sets = None, []
+        for _ in range(12 * env.unwrapped.interface.actions.actions_per_step):
+            chosen, state = schedule.predict(observation, state, np.array([state is None]))
+            observation, reward, *_, info = env.step(chosen)
+            if reward != 0:
+                sets.append(np.flatnonzero(info["queried"]).tolist())
+        return sets
+
+    expected = queried("mask")
+    assert len(expected) == 12
+    assert queried(action) == expected
+
+
+@pytest.mark.parametrize("name", sorted(set(SCHEDULES) - {"all"}))
+def test_stable_baselines3_evaluates_a_schedule(name):
+    env = gym.make("dptse_env:dptse/ShortHighway-v0", horizon=20, traffic_seeds="0:1")
+    schedule = make_schedule(name, env, seed=0)
+    mean, _ = evaluate_policy(schedule, env, n_eval_episodes=2, warn=False)
+    assert mean < 0
+
+
+def test_bad_schedules_are_named():
+    with pytest.raises(ValueError, match="unknown schedule 'best'; known: none, static, paper"):
+        make_schedule("best", Bare())
+    with pytest.raises(ValueError, match=r"schedule\.period must be None or >= 1, got 0"):
+        Shifting(Bare().interface, period=0)
