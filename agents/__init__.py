@@ -1,0 +1,1 @@
+"""Recipes and evaluation on top of dptse_env."""

@@ -1,0 +1,135 @@
+"""Fit the ARZ parameters to recorded traffic and compare predictions on held-out seeds.
+
+python scripts/calibrate.py --train 0:16 --held-out 1000:1008
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from dataclasses import dataclass
+from datetime import date
+from importlib.metadata import version
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from dptse_env.config import parse_seeds
+from dptse_env.model import ARZParameters, available_parameters, load_parameters
+from dptse_env.model.calibration import (
+    PredictionError,
+    TrafficSeries,
+    calibrate,
+    persistence_error,
+    prediction_error,
+)
+from dptse_env.model.compiled import CompiledARZModel
+from dptse_env.sensing import Sensing
+from dptse_env.traffic import CORRIDORS, Corridor, RecordLibrary, mean_dwell
+from scripts.cli import run
+
+
+@dataclass(frozen=True)
+class Args:
+    """Fit the ARZ parameters."""
+
+    corridor: str = "paper-highway"
+    """Name of the corridor."""
+    train: str = "0:16"
+    """Traffic seeds to fit, first:stop."""
+    held_out: str = "1000:1008"
+    """Traffic seeds to report on; none of the above."""
+    name: str = "fitted"
+    """Name of the fitted set."""
+    max_evaluations: int = 400
+    """Models to try at most."""
+    workers: int | None = None
+    """Processes that record missing traffic; all cores if not given."""
+    records: Path | None = None
+    """Folder of the record cache; the user's cache if not given."""
+    output: Path = Path("results/calibration")
+    """Folder for the fitted set and the errors."""
+
+
+def load_series(
+    corridor: Corridor, seeds: tuple[int, ...], library: RecordLibrary
+) -> list[TrafficSeries]:
+    """Return the aggregates of the recorded traffic of ``seeds``."""
+    sensing, s = Sensing(corridor, seeds, library), corridor.n_segments
+    series = []
+    for slot in range(len(seeds)):
+        sensing.load(slot)
+        density, speed = sensing.traffic(slot)[..., 0], sensing.traffic(slot)[..., 1]
+        series.append(TrafficSeries(density[:, :s], speed[:, :s], density[:, s:], speed[:, s:]))
+    return series
+
+
+def compare(
+    corridor: Corridor, candidates: list[ARZParameters], data: list[TrafficSeries]
+) -> dict[str, PredictionError]:
+    """Return the prediction errors of persistence and of every candidate on ``data``."""
+    errors = {"persistence": persistence_error(data, corridor.n_mainline)}
+    for parameters in candidates:
+        errors[parameters.name] = prediction_error(CompiledARZModel(corridor, parameters), data)
+    return errors
+
+
+def print_errors(errors: dict[str, PredictionError], title: str) -> None:
+    """Print density and speed errors by horizon."""
+    horizons = next(iter(errors.values())).horizons
+    table = Table(title=f"{title}: density [veh/km] / speed [km/h] RMSE")
+    table.add_column("prediction")
+    for horizon in horizons:
+        table.add_column(f"{horizon} s", justify="right")
+    for name, error in errors.items():
+        pairs = zip(error.density, error.speed, strict=True)
+        table.add_row(name, *(f"{density:.1f} / {speed:.1f}" for density, speed in pairs))
+    Console().print(table)
+
+
+def main(args: Args) -> None:
+    """Record what is missing, fit on the training seeds, report on the held-out ones."""
+    train, held_out = parse_seeds(args.train, "train"), parse_seeds(args.held_out, "held_out")
+    shared = sorted(set(train) & set(held_out))
+    if shared:
+        raise ValueError(f"held_out must not share seeds with train, both have {shared}")
+    if args.corridor not in CORRIDORS:
+        raise ValueError(f"corridor must be one of {', '.join(CORRIDORS)}, got {args.corridor!r}")
+    corridor, library = CORRIDORS[args.corridor], RecordLibrary(args.records)
+    library.ensure(corridor, (*train, *held_out), workers=args.workers, progress=True)
+    dwell = mean_dwell((library.get(corridor, seed) for seed in train), corridor.n_mainline)
+    fit = calibrate(
+        corridor, load_series(corridor, train, library), args.name,
+        max_evaluations=args.max_evaluations,
+    )  # fmt: skip
+    known = [load_parameters(name) for name in available_parameters()]
+    errors = compare(corridor, [*known, fit.parameters], load_series(corridor, held_out, library))
+    print_errors(errors, f"{corridor.name}, held-out seeds {args.held_out}")
+    Console().print(f"fitted: {fit.parameters}")
+    if fit.at_bounds:
+        Console().print(f"at the bounds of the search: {', '.join(fit.at_bounds)}")
+    Console().print(f"mean time on a mainline segment: {dwell:.2f} s")
+    args.output.mkdir(parents=True, exist_ok=True)
+    report = {
+        "parameters": dataclasses.asdict(fit.parameters),
+        "provenance": {
+            "corridor": corridor.name,
+            "train": args.train,
+            "held_out": args.held_out,
+            "loss": fit.loss,
+            "at_bounds": fit.at_bounds,
+            "n_evaluations": fit.n_evaluations,
+            "date": date.today().isoformat(),
+            "versions": {name: version(name) for name in ("dptse-env", "libsumo", "scipy")},
+        },
+        "mean_dwell": dwell,
+        "held_out_errors": {name: dataclasses.asdict(error) for name, error in errors.items()},
+    }
+    path = args.output / f"{args.name}.json"
+    path.write_text(json.dumps(report, indent=2) + "\n")
+    Console().print(f"written to {path}")
+
+
+if __name__ == "__main__":
+    run(main, Args, __doc__)

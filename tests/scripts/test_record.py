@@ -1,0 +1,56 @@
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from dptse_env.traffic import SHORT_HIGHWAY, RecordLibrary, randomised
+from scripts.record import Args, main
+
+ROOT = Path(__file__).parents[2]
+
+
+def run(*arguments):
+    return subprocess.run(
+        [sys.executable, str(ROOT / "scripts" / "record.py"), *arguments],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=ROOT,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+    )
+
+
+def test_the_command_records_into_the_library_and_reports_the_dwell(tmp_path):
+    result = run(
+        "--corridor",
+        "short-highway",
+        "--seeds",
+        "3:5",
+        "--workers",
+        "1",
+        "--records",
+        str(tmp_path),
+    )
+    assert result.returncode == 0, result.stderr
+    assert f"short-highway: 2 record(s) in {tmp_path}" in result.stdout
+    assert "T_avg" in result.stdout
+    records = RecordLibrary(tmp_path)
+    made = [seed for seed in range(10) if records.record_path(SHORT_HIGHWAY, seed).is_dir()]
+    assert made == [3, 4]
+
+
+def test_random_traffic_is_recorded_on_request(tmp_path, capsys):
+    main(Args("short-highway", "0:1", random=True, workers=1, records=tmp_path))
+    assert RecordLibrary(tmp_path).record_path(randomised(SHORT_HIGHWAY), 0).is_dir()
+    assert "1 record(s)" in capsys.readouterr().out
+
+
+def test_mistakes_end_in_one_line_on_stderr():
+    for arguments, message in (
+        (["--seeds", "x"], "error: seeds must be 'first:stop'"),
+        (["--corridor", "nowhere"], "error: corridor must be one of"),
+    ):
+        result = run(*arguments)
+        assert result.returncode == 2
+        assert result.stderr.strip().splitlines()[-1].startswith(message)
+        assert "Traceback" not in result.stderr
