@@ -1,0 +1,43 @@
+"""Use an installed wheel as another project would: no checkout, no extras, no SUMO_HOME."""
+
+import importlib.util
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+
+
+def main() -> None:
+    """Run an episode of every id and of every estimator."""
+    import dptse_env
+
+    assert Path(sys.prefix) in Path(dptse_env.__file__).parents, dptse_env.__file__
+    assert importlib.util.find_spec("torch") is None, "the core must not need torch"
+    heavy = {"libsumo", "numba", "torch", "matplotlib"} & set(sys.modules)
+    assert not heavy, f"import dptse_env must not import {heavy}"
+    for env_id in ("dptse/PaperHighway-v0", "dptse/ShortHighway-v0"):
+        env = gym.make(f"dptse_env:{env_id}", render_mode="rgb_array")
+        env.reset(seed=0)
+        env.action_space.seed(0)
+        for _ in range(30):
+            observation, reward, *_ = env.step(env.action_space.sample())
+            assert np.isfinite(observation).all()
+            assert np.isfinite(reward)
+        assert env.render().std() > 0
+        env.close()
+    for estimator, backend in (("random_walk", "compiled"), ("ekf", "reference")):
+        env = gym.make(
+            "dptse_env:dptse/ShortHighway-v0",
+            estimator=estimator,
+            backend=backend,
+            parameters="w99-3lane",
+        )
+        env.reset(seed=0)
+        env.step(env.action_space.sample())
+        env.close()
+    print(f"the wheel works with gymnasium {gym.__version__}")
+
+
+if __name__ == "__main__":
+    main()
