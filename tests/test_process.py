@@ -1,0 +1,153 @@
+import numpy as np
+import pytest
+from scipy import stats
+
+from dptse_env.actions import ACTION_ENCODINGS
+from dptse_env.config import resolve
+from dptse_env.interface import QueryInterface
+from dptse_env.process import QueryProcess
+
+SEEDS = (11, 12, 13)
+ALL = np.arange(3)
+
+
+def make(n_episodes, **keywords):
+    keywords = {"traffic_seeds": "0:3", "horizon": 60, "random_start": True, **keywords}
+    config = resolve("short-highway", keywords)
+    return QueryProcess(config, QueryInterface.of(config), n_episodes)
+
+
+def generators(seeds):
+    return [np.random.default_rng(seed) for seed in seeds]
+
+
+def sampled(process, n_steps):
+    """Return actions (n_steps, 3, *space) for a batch of three."""
+    space = process.interface.actions.space
+    space.seed(5)
+    return [np.array([space.sample() for _ in SEEDS]) for _ in range(n_steps)]
+
+
+@pytest.mark.parametrize("estimator", ["ekf", "random_walk", "open_loop"])
+@pytest.mark.parametrize("action", ACTION_ENCODINGS)
+def test_a_batch_is_so_many_single_episodes(estimator, action):
+    batch = make(3, estimator=estimator, action=action)
+    singles = [make(1, estimator=estimator, action=action) for _ in SEEDS]
+    together = [batch.reset(ALL, generators(SEEDS))]
+    apart = [
+        [one.reset(ALL[:1], generators([seed])) for one, seed in zip(singles, SEEDS, strict=True)]
+    ]
+    for actions in sampled(batch, 40):
+        together.append(batch.step(ALL, actions))
+        apart.append([one.step(ALL[:1], a[None]) for one, a in zip(singles, actions, strict=True)])
+    for outcome, rows in zip(together, apart, strict=True):
+        for field in ("observation", "reward", "truncated"):
+            expected = np.concatenate([getattr(row, field) for row in rows])
+            np.testing.assert_array_equal(getattr(outcome, field), expected)
+    for e, one in enumerate(singles):
+        np.testing.assert_equal(batch.info(e), one.info(0))
+
+
+def test_episodes_step_and_reset_on_their_own():
+    mixed, whole = make(3), make(3)
+    mixed.reset(ALL, generators(SEEDS))
+    whole.reset(ALL, generators(SEEDS))
+    actions = sampled(whole, 30)
+    expected = [whole.step(ALL, step) for step in actions]
+    # Episode 1 pauses for ten steps and catches up; episode 2 is begun again at step 20.
+    for k, step in enumerate(actions[:20]):
+        some = ALL if k < 10 else np.array([0, 2])
+        mixed.step(some, step[some])
+    for step in actions[10:20]:
+        mixed.step(ALL[1:2], step[1:2])
+    mixed.reset(ALL[2:], generators([99]))
+    for k in range(20, 30):
+        outcome = mixed.step(ALL, actions[k])
+        np.testing.assert_array_equal(outcome.observation[:2], expected[k].observation[:2])
+        np.testing.assert_array_equal(outcome.reward[:2], expected[k].reward[:2])
+        assert (outcome.observation[2] != expected[k].observation[2]).any()
+
+
+def test_residuals_are_the_noise_that_is_declared():
+    """Released minus true over sigma: unit variance, uncorrelated over time and quantities."""
+    process = make(1, estimator="random_walk", random_start=False, horizon=240)
+    residuals = []
+    release = process.mechanism.release
+
+    def spy(episodes, values):
+        released = release(episodes, values)
+        residuals.append((released - values)[0] / process.mechanism.sigma)
+        return released
+
+    process.mechanism.release = spy
+    for seed in range(4):
+        process.reset(ALL[:1], generators([seed]))
+        for action in sampled(process, 240):
+            process.step(ALL[:1], action[:1])
+    r = np.array(residuals)  # seconds, segments, quantities
+    n = r.size
+    assert n > 10_000
+    low, high = stats.chi2.interval(1 - 1e-4, n) / np.array(n)
+    assert low < np.mean(r**2) < high
+    bound = 4.0 / np.sqrt(n / 2)
+    assert abs(np.mean(r[1:, :, :] * r[:-1, :, :])) < bound
+    assert abs(np.mean(r[..., 0] * r[..., 1])) < bound
+
+
+def test_what_is_asked_does_not_change_the_noise():
+    released = []
+    for actions in (np.zeros((1, 6), dtype=np.int8), np.ones((1, 6), dtype=np.int8)):
+        process = make(1)
+        process.reset(ALL[:1], generators([4]))
+        for _ in range(50):
+            process.step(ALL[:1], actions)
+        released.append(process.released[0, 5])  # a fixed sensor's
+    np.testing.assert_array_equal(*released)
+
+
+def test_released_values_are_kept_until_asked_again():
+    process = make(1)
+    process.reset(ALL[:1], generators([4]))
+    first = np.array([[1, 1, 0, 0, 0, 0]], dtype=np.int8)
+    process.step(ALL[:1], first)
+    kept = process.released[0].copy()
+    assert (kept[:2] != 0).all()
+    assert (kept[2:5] == 0).all()
+    process.step(ALL[:1], np.roll(first, 2))
+    np.testing.assert_array_equal(process.released[0, :2], kept[:2])
+    assert process.age[0].tolist() == [1, 1, 0, 0, 62, 0]
+
+
+def test_a_step_from_t_predicts_with_t_and_measures_at_t_plus_one():
+    process = make(1, random_start=False, horizon=240)
+    process.reset(ALL[:1], generators([4]), {"traffic_seed": 1})
+    seen = {}
+
+    def predict(episodes, inputs):
+        seen["inputs"] = inputs.copy()
+
+    def release(episodes, values):
+        seen["values"] = values.copy()
+        return values
+
+    process.estimator.predict = predict
+    process.mechanism.release = release
+    for t in range(100):
+        process.step(ALL[:1], np.zeros((1, 6), dtype=np.int8))
+        record = process.sensing.library.get(process.config.corridor, 1)
+        np.testing.assert_array_equal(seen["inputs"][0], process.boundary_inputs[1, t])
+        np.testing.assert_allclose(seen["values"][0, :, 0], record.counts[t + 1, :8] / 0.1)
+
+
+def test_a_diverging_filter_is_flagged_and_the_episode_goes_on():
+    process = make(1)
+    process.reset(ALL[:1], generators([4]))
+    release = process.mechanism.release
+    process.mechanism.release = lambda episodes, values: np.full_like(values, np.nan)
+    outcome = process.step(ALL[:1], np.ones((1, 6), dtype=np.int8))
+    assert process.info(0)["diverged"] == 1.0
+    assert np.isfinite(process.estimate.density).all()
+    process.mechanism.release = release
+    outcome = process.step(ALL[:1], np.ones((1, 6), dtype=np.int8))
+    assert process.info(0)["diverged"] == 0.0
+    assert np.isfinite(outcome.reward).all()
