@@ -21,11 +21,11 @@ from dptse_env.model.relations import VACUUM, Relations
 Bounds = Literal["cone", "box"]
 
 SECONDS_PER_HOUR = 3600.0
-# The cone of physical states: 1 veh/km <= rho <= rho_m, v >= 0 and 0.3 v_f <= w <= 1.1 v_f. The
+# The cone of physical states: 1 veh/km <= rho <= rho_m, v >= 0 and 0.4 v_f <= w <= 1.1 v_f. The
 # lower bound on w keeps a nearly empty cell from standing still: there the supply changes with the
 # state as w / rho, and a filter that believes it diverges.
 LEAST_DENSITY = 1.0
-LEAST_W = 0.3
+LEAST_W = 0.4
 LARGEST_W = 1.1
 # Share of the jam density below which a measurement takes the density for constant: dv/drho
 # grows as psi / rho^2, and a filter that believes it diverges.
@@ -269,7 +269,7 @@ class ARZModel:
     def project(self, states: FloatArray, bounds: Bounds = "cone") -> FloatArray:
         """Nearest component-wise states within bounds.
 
-        `cone`: rho in [1 veh/km, rho_m], v >= 0 and w in [0.3 v_f, 1.1 v_f].
+        `cone`: rho in [1 veh/km, rho_m], v >= 0 and w in [0.4 v_f, 1.1 v_f].
         `box`: rho in [0, rho_m], psi in [0, rho_m v_f], the paper's, which leaves w unbounded.
         """
         v_f, jam = self.parameters.free_flow_speed, self.jam_density

@@ -63,7 +63,7 @@ def test_cone_holds_speed_and_w(parameters):
     backwards = model.relations.pressure(density, model.jam_density) - w
     assert np.all(backwards <= 1e-9)
     assert np.all(w <= 1.1 * parameters.free_flow_speed * (1.0 + 1e-12))
-    assert np.all(w >= 0.3 * parameters.free_flow_speed * (1.0 - 1e-12))
+    assert np.all(w >= 0.4 * parameters.free_flow_speed * (1.0 - 1e-12))
     np.testing.assert_array_equal(model.project(states), states)
 
 
@@ -78,7 +78,7 @@ def test_box_is_the_papers():
 def test_projection_leaves_states_inside_alone():
     model = model_of(HIGHWAY)
     states = random_states(model, 50, np.random.default_rng(4))
-    inside = (model.density(states) >= 1.0) & (model.cells(states).w >= 0.3 * 102.0)
+    inside = (model.density(states) >= 1.0) & (model.cells(states).w >= 0.4 * 102.0)
     assert 0.5 < inside.mean() < 1.0
     moved = np.abs(model.project(states) - states).reshape(50, 19, 2)[inside]
     assert moved.max() < 1e-9
