@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 
 export OMP_NUM_THREADS = 1
 
-.PHONY: help setup demo test test-slow lint format benchmark wheel-test clean
+.PHONY: help setup demo test test-slow lint format benchmark wheel-test clean clean-kernels
 
 help:  ## Show this list.
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -46,6 +46,9 @@ benchmark: setup  ## Time the environment and the estimators.
 
 wheel-test: setup  ## Build the wheel, install it elsewhere and use it there.
 	$(BIN)/python tests/wheel/run.py
+
+clean-kernels:  ## Drop numba's compiled kernels, as needed after a change to one.
+	find dptse_env -name '*.nb[ic]' -delete
 
 clean:  ## Remove what the other targets made, the virtual environment included.
 	rm -rf $(VENV) build dist results .mypy_cache .pytest_cache .ruff_cache .hypothesis

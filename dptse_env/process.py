@@ -10,7 +10,7 @@ import numpy as np
 
 from dptse_env.arrays import Action, BoolArray, FloatArray, IntArray, Observation
 from dptse_env.config import EnvConfig
-from dptse_env.estimators import Estimate, make_estimator
+from dptse_env.estimators import make_estimator
 from dptse_env.interface import QueryInterface
 from dptse_env.observations import AGE_CAP, Knowledge
 from dptse_env.options import ResetOptions
@@ -65,7 +65,7 @@ class QueryProcess:
         n_episodes: int,
         library: RecordLibrary | None = None,
     ) -> None:
-        """Assemble the rooms; nothing is recorded or compiled before `reset`.
+        """Assemble the rooms; nothing is recorded or loaded before `reset`.
 
         Args:
             config: The configuration.
@@ -139,7 +139,7 @@ class QueryProcess:
         self.n_dropped[episodes] = 0
         self.age[episodes] = AGE_CAP
         self.released[episodes] = 0.0
-        self._score(episodes)
+        self._score(episodes, self.truth(episodes))
         return self._outcome(episodes, np.zeros(len(episodes)))
 
     def step(self, episodes: IntArray, actions: Action) -> Outcome:
@@ -161,6 +161,11 @@ class QueryProcess:
         return self._outcome(episodes, reward)
 
     @property
+    def elapsed(self) -> IntArray:
+        """Seconds since each episode began, shape (n,)."""
+        return self.time - self.end + self.config.horizon_steps
+
+    @property
     def over(self) -> BoolArray:
         """Whether each episode is at its end, or was never begun, shape (n,)."""
         return self.time >= self.end
@@ -171,12 +176,12 @@ class QueryProcess:
         observed[:, : queried.shape[1]] |= queried
         inputs = self.boundary_inputs[self.slot[episodes], self.time[episodes]]
         self.time[episodes] += 1
-        truth = self.sensing.aggregates(self.slot[episodes], self.time[episodes])
+        truth = self.truth(episodes)
         released = self.mechanism.release(episodes, truth)
         self.estimator.predict(episodes, inputs)
         self.estimator.update(episodes, observed, released, self.mechanism.sigma)
         self._remember(episodes, queried, observed, released)
-        return self._score(episodes)
+        return self._score(episodes, truth)
 
     def _remember(
         self, episodes: IntArray, queried: BoolArray, observed: BoolArray, released: FloatArray
@@ -185,10 +190,9 @@ class QueryProcess:
         self.released[episodes] = np.where(observed[:, :, None], released, self.released[episodes])
         self.age[episodes] = np.where(observed[:, : queried.shape[1]], 0, self.age[episodes] + 1)
 
-    def _score(self, episodes: IntArray) -> FloatArray:
-        """Compare the present estimates with the truth; return the rewards."""
-        n = self.config.corridor.n_mainline
-        truth = self.sensing.aggregates(self.slot[episodes], self.time[episodes])
+    def _score(self, episodes: IntArray, truth: FloatArray) -> FloatArray:
+        """Compare the present estimates with the truth (k, S, 2); return the rewards."""
+        n = self.interface.n_mainline
         self.estimate = self.estimator.estimate()
         error = estimation_error(
             truth[:, :n, 0],
@@ -201,6 +205,10 @@ class QueryProcess:
         self.error.n_occupied[episodes] = error.n_occupied
         return self.interface.reward.value(error)
 
+    def truth(self, episodes: IntArray) -> FloatArray:
+        """Return the present true (density [veh/km], speed [km/h]) of ``episodes``, (k, S, 2)."""
+        return self.sensing.aggregates(self.slot[episodes], self.time[episodes])
+
     def _load(self, slot: int) -> None:
         """Make sure that the traffic of ``slot`` and its boundary inputs are in memory."""
         if self.sensing.load(slot):
@@ -210,14 +218,8 @@ class QueryProcess:
             )
 
     def _outcome(self, episodes: IntArray, reward: FloatArray) -> Outcome:
-        estimate = self.estimate
         knowledge = Knowledge(
-            estimate=Estimate(
-                estimate.density[episodes],
-                estimate.speed[episodes],
-                estimate.density_std[episodes],
-                estimate.speed_std[episodes],
-            ),
+            estimate=self.estimate.at(episodes),
             released=self.released[episodes],
             innovations=self.estimator.innovations[episodes],
             age=self.age[episodes],
@@ -233,7 +235,7 @@ class QueryProcess:
         The keys in `TRUTH_INFO` come from the true traffic. They are training and evaluation
         signals like the reward, never a release.
         """
-        mu, epsilon = self.accountant.spent(self.time[[episode]])
+        mu, epsilon = self.accountant.spent(self.elapsed[[episode]])
         info: dict[str, Any] = {
             "rmse_density": float(self.error.density[episode]),
             "rmse_speed": float(self.error.speed[episode]),
@@ -245,7 +247,7 @@ class QueryProcess:
             "queried": self.queried[episode].copy(),
         }
         if self.config.truth_in_info:
-            truth = self.sensing.aggregates(self.slot[[episode]], self.time[[episode]])[0]
+            truth = self.truth(np.array([episode]))[0]
             info["truth"] = {
                 "density": truth[:, 0].copy(),
                 "speed": truth[:, 1].copy(),

@@ -51,15 +51,14 @@ class History:
     def append(self, process: QueryProcess) -> None:
         """Add the present second; a second that is there already is replaced."""
         n = process.interface.n_mainline
-        second = int(process.time[0] - (process.end[0] - self.horizon))
-        truth = process.sensing.aggregates(process.slot[:1], process.time[:1])[0, :n, 0]
-        self.truth[second:] = [truth.copy()]
+        second = int(process.elapsed[0])
+        self.truth[second:] = [process.truth(np.zeros(1, dtype=np.int64))[0, :n, 0]]
         self.estimate[second:] = [process.estimate.density[0, :n].copy()]
         self.queried[second:] = [process.queried[0].copy()]
         self.rmse[second:] = [float(process.error.density[0])]
 
 
-def draw(figure: Any, history: History, title: str = "") -> None:
+def draw(figure: Any, history: History) -> None:
     """Draw ``history`` into an empty matplotlib figure: four panels over one time axis."""
     axes = figure.subplots(4, 1, sharex=True, gridspec_kw={"height_ratios": [3, 3, 3, 1.3]})
     truth, estimate, queried = (
@@ -87,8 +86,6 @@ def draw(figure: Any, history: History, title: str = "") -> None:
     bar = figure.colorbar(image, ax=axes.tolist(), fraction=0.03, pad=0.02, extend="max")
     bar.set_label("density [veh/km]", fontsize=8)
     bar.ax.tick_params(labelsize=8)
-    if title:
-        figure.suptitle(title, fontsize=10, x=0.02, ha="left")
 
 
 def render_rgb(history: History) -> NDArray[np.uint8]:

@@ -108,7 +108,7 @@ def test_an_emptiness_mask_would_show(monkeypatch):
     update = process.estimator.update
 
     def update_occupied(episodes, observed, values, sigma):
-        truth = process.sensing.aggregates(process.slot[episodes], process.time[episodes])
+        truth = process.truth(episodes)
         update(episodes, observed & (truth[..., 0] > 0), values, sigma)
 
     monkeypatch.setattr(process.estimator, "update", update_occupied)

@@ -37,6 +37,15 @@ class Estimate:
     density_std: FloatArray
     speed_std: FloatArray
 
+    def at(self, episodes: IntArray) -> Estimate:
+        """Return a copy of the rows of `episodes` `(k,)`, `(k, S)` each."""
+        return Estimate(
+            self.density[episodes],
+            self.speed[episodes],
+            self.density_std[episodes],
+            self.speed_std[episodes],
+        )
+
 
 class Estimator(Protocol):
     """Estimates the traffic state of a batch of episodes, S segments each.

@@ -16,7 +16,7 @@ def test_errors_are_pooled_over_segments_and_seconds():
     pairs = []
 
     def note():
-        truth = process.sensing.aggregates(process.slot, process.time)[0, :6]
+        truth = process.truth(np.arange(1))[0, :6]
         pairs.append((truth, process.estimate.density[0, :6], process.estimate.speed[0, :6]))
 
     schedule = make_schedule("paper", env)
