@@ -6,14 +6,10 @@ python scripts/calibrate.py --train 0:16 --held-out 1000:1008
 from __future__ import annotations
 
 import dataclasses
-import json
 from dataclasses import dataclass
 from datetime import date
 from importlib.metadata import version
 from pathlib import Path
-
-from rich.console import Console
-from rich.table import Table
 
 from dptse_env.config import parse_seeds
 from dptse_env.model import ARZParameters, available_parameters, load_parameters
@@ -25,6 +21,7 @@ from dptse_env.model.calibration import (
     prediction_error,
 )
 from dptse_env.model.compiled import CompiledARZModel
+from dptse_env.model.parameters import write_parameters
 from dptse_env.sensing import Sensing
 from dptse_env.traffic import CORRIDORS, Corridor, RecordLibrary, mean_dwell
 from scripts.cli import run
@@ -78,14 +75,12 @@ def compare(
 def print_errors(errors: dict[str, PredictionError], title: str) -> None:
     """Print density and speed errors by horizon."""
     horizons = next(iter(errors.values())).horizons
-    table = Table(title=f"{title}: density [veh/km] / speed [km/h] RMSE")
-    table.add_column("prediction")
-    for horizon in horizons:
-        table.add_column(f"{horizon} s", justify="right")
+    print(f"{title}: density [veh/km] / speed [km/h] RMSE")
+    print(f"{'prediction':14}" + "".join(f"{f'{horizon} s':>14}" for horizon in horizons))
     for name, error in errors.items():
         pairs = zip(error.density, error.speed, strict=True)
-        table.add_row(name, *(f"{density:.1f} / {speed:.1f}" for density, speed in pairs))
-    Console().print(table)
+        cells = (f"{density:.1f} / {speed:.1f}" for density, speed in pairs)
+        print(f"{name:14}" + "".join(f"{cell:>14}" for cell in cells))
 
 
 def main(args: Args) -> None:
@@ -106,29 +101,26 @@ def main(args: Args) -> None:
     known = [load_parameters(name) for name in available_parameters()]
     errors = compare(corridor, [*known, fit.parameters], load_series(corridor, held_out, library))
     print_errors(errors, f"{corridor.name}, held-out seeds {args.held_out}")
-    Console().print(f"fitted: {fit.parameters}")
+    print(f"fitted: {fit.parameters}")
     if fit.at_bounds:
-        Console().print(f"at the bounds of the search: {', '.join(fit.at_bounds)}")
-    Console().print(f"mean time on a mainline segment: {dwell:.2f} s")
+        print(f"at the bounds of the search: {', '.join(fit.at_bounds)}")
+    print(f"mean time on a mainline segment: {dwell:.2f} s")
     args.output.mkdir(parents=True, exist_ok=True)
-    report = {
-        "parameters": dataclasses.asdict(fit.parameters),
-        "provenance": {
-            "corridor": corridor.name,
-            "train": args.train,
-            "held_out": args.held_out,
-            "loss": fit.loss,
-            "at_bounds": fit.at_bounds,
-            "n_evaluations": fit.n_evaluations,
-            "date": date.today().isoformat(),
-            "versions": {name: version(name) for name in ("dptse-env", "libsumo", "scipy")},
-        },
+    path = args.output / f"{args.name}.json"
+    provenance = {
+        "corridor": corridor.name,
+        "train": args.train,
+        "held_out": args.held_out,
+        "loss": fit.loss,
+        "n_evaluations": fit.n_evaluations,
+        "at_bounds": fit.at_bounds,
         "mean_dwell": dwell,
+        "date": date.today().isoformat(),
+        "versions": {name: version(name) for name in ("dptse-env", "libsumo", "scipy")},
         "held_out_errors": {name: dataclasses.asdict(error) for name, error in errors.items()},
     }
-    path = args.output / f"{args.name}.json"
-    path.write_text(json.dumps(report, indent=2) + "\n")
-    Console().print(f"written to {path}")
+    write_parameters(path, fit.parameters, provenance)
+    print(f"written to {path}")
 
 
 if __name__ == "__main__":

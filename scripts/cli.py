@@ -17,13 +17,13 @@ ArgsT = TypeVar("ArgsT")
 def run(main: Callable[[ArgsT], None], arguments: type[ArgsT], description: str | None) -> None:
     """Parse the command line into ``arguments`` and call ``main`` with them.
 
-    Bad input and a failed recording end the program with status 2 and their one message; anything
+    Bad input, an unreadable or unwritable file and a failed recording end the program with status 2 and their one message; anything
     else is a fault of the program and keeps its traceback.
     """
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(message)s")
     args = tyro.cli(arguments, description=description)
     try:
         main(args)
-    except (ValueError, NetworkError, RecordingError, SumoVersionError) as problem:
+    except (OSError, ValueError, NetworkError, RecordingError, SumoVersionError) as problem:
         print(f"error: {problem}", file=sys.stderr)
         raise SystemExit(2) from problem

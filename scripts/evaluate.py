@@ -17,6 +17,7 @@ from agents.evaluation import EpisodeScore, run_episode, watch_episode
 from agents.figures import save_space_time
 from agents.report import Report
 from dptse_env.config import parse_seeds
+from dptse_env.model.parameters import read_parameters
 from dptse_env.schedules import SCHEDULES, Schedule, make_schedule
 from dptse_env.traffic import RecordLibrary
 from scripts.cli import run
@@ -39,7 +40,7 @@ class Args:
     bandwidth: int | None = None
     """Most segments to query a second; the environment's own if not given."""
     parameters: str = "w99-3lane"
-    """ARZ parameter set of the model-based estimators."""
+    """ARZ parameters: the name of a set, or a JSON file as scripts/calibrate.py writes it."""
     privacy: str = "paper"
     """Privacy preset."""
     epsilon: float = 1.0
@@ -58,9 +59,12 @@ class Args:
 
 def make_cell(args: Args, estimator: str, name: str) -> tuple[gym.Env[Any, Any], Schedule]:
     """Make the environment and the schedule of one cell of the table."""
+    parameters: str | dict[str, Any] = args.parameters
+    if args.parameters.endswith(".json"):
+        parameters = dataclasses.asdict(read_parameters(args.parameters))
     keywords: dict[str, Any] = {
         "estimator": estimator,
-        "parameters": args.parameters,
+        "parameters": parameters,
         "privacy": args.privacy,
         "epsilon": args.epsilon,
         "delta": args.delta,

@@ -36,8 +36,9 @@ __all__ = [
 ]
 
 # Bounds of the search: v_f [km/h], rho_m as a multiple of the least admissible one, gamma, tau [s].
+# Beyond 150 km/h predictions still gain a little from a higher v_f, and a filter loses.
 _LOWEST = np.array([30.0, 1.0, 0.1, 5.0])
-_HIGHEST = np.array([250.0, 4.0, 5.0, 500.0])
+_HIGHEST = np.array([150.0, 4.0, 5.0, 500.0])
 _WIDTH = 0.2  # first steps of the search, as shares of the values
 _REFUSED = 1e3  # loss of parameters that violate the CFL condition; persistence has 1
 

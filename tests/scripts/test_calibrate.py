@@ -1,0 +1,38 @@
+import json
+
+import pytest
+
+from dptse_env.model.parameters import read_parameters
+from scripts.calibrate import Args, main
+
+
+def test_it_fits_on_some_seeds_and_reports_on_others(tmp_path, capsys):
+    main(
+        Args(
+            corridor="short-highway", train="0:2", held_out="1000:1001", max_evaluations=20,
+            workers=1, output=tmp_path,
+        )
+    )  # fmt: skip
+    printed = capsys.readouterr().out
+    assert read_parameters(tmp_path / "fitted.json").lanes == 2
+    provenance = json.loads((tmp_path / "fitted.json").read_text())["provenance"]
+    errors = provenance["held_out_errors"]
+    for name in ("persistence", "paper", "w99-3lane", "fitted"):
+        assert name in printed
+        assert len(errors[name]["density"]) == len(errors[name]["horizons"])
+    assert errors["fitted"]["density"][-1] < errors["persistence"]["density"][-1]
+    assert provenance["train"] == "0:2"
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"held_out": "1:3"}, r"held_out must not share seeds with train, both have \[1\]"),
+        ({"corridor": "long"}, "corridor must be one of paper-highway, short-highway, got 'long'"),
+        ({"train": "x"}, "train must be 'first:stop' or one seed, got 'x'"),
+    ],
+)
+def test_bad_arguments_are_named(changes, message, tmp_path):
+    with pytest.raises(ValueError, match=message):
+        main(Args(**{"train": "0:2", "output": tmp_path / "out", **changes}))
+    assert not (tmp_path / "out").exists()
