@@ -9,9 +9,11 @@ truth, a clock, or anything that tells an empty segment from an occupied one.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
+from numpy.typing import NDArray
 
 from dptse_env.arrays import BoolArray, FloatArray, IntArray, Observation
 from dptse_env.estimators import Estimate
@@ -110,8 +112,9 @@ class ObservationEncoding:
         """
         self.n_mainline = n_mainline
         self.fixed_sensors = np.array(fixed_sensors, dtype=np.int64)
-        self._scales = np.array([density_scale, speed_scale])
-        self._settings = (bandwidth / n_mainline, float(np.log10(epsilon)))
+        self._scales = density_scale, speed_scale
+        self._bandwidth_share = bandwidth / n_mainline
+        self._log_epsilon = float(np.log10(epsilon))
         n, s, f = n_mainline, n_segments, len(fixed_sensors)
         blocks = [
             _Block("density", s, 0, 4),
@@ -145,33 +148,33 @@ class ObservationEncoding:
         """Return the observations of k episodes, shape (k, size), always inside the space."""
         n = self.n_mainline
         density_scale, speed_scale = self._scales
-        estimate = knowledge.estimate
-        released = knowledge.released[:, :n] / self._scales
-        innovations = knowledge.innovations
-        fixed = innovations[:, self.fixed_sensors]
-        with np.errstate(divide="ignore"):  # a zero deviation is clipped to the lower bound
-            log_std = (
-                np.log(estimate.density_std / density_scale),
-                np.log(estimate.speed_std / speed_scale),
-            )
-        blocks = [
-            estimate.density / density_scale,
-            estimate.speed / speed_scale,
-            *log_std,
-            released[:, :, 0],
-            released[:, :, 1],
-            innovations[:, :n, 0],
-            innovations[:, :n, 1],
-            np.minimum(knowledge.age, AGE_CAP) / AGE_CAP,
-            knowledge.queried,
-            fixed[:, :, 0],
-            fixed[:, :, 1],
-            np.broadcast_to(self._settings, (len(released), 2)),
-        ]
-        if "picked" in self.slices:
-            blocks.append(knowledge.picked)
-        flat = np.concatenate(blocks, axis=1, dtype=np.float32, casting="unsafe")
-        return np.clip(flat, self.space.low, self.space.high, out=flat)
+        estimate, released, innovations = (
+            knowledge.estimate,
+            knowledge.released,
+            knowledge.innovations,
+        )
+        flat = np.empty((len(released), self.space.shape[0]), dtype=np.float32)
+        values: dict[str, NDArray[Any] | float] = {
+            "density": estimate.density / density_scale,
+            "speed": estimate.speed / speed_scale,
+            "density_log_std": _log(estimate.density_std / density_scale),
+            "speed_log_std": _log(estimate.speed_std / speed_scale),
+            "released_density": released[:, :n, 0] / density_scale,
+            "released_speed": released[:, :n, 1] / speed_scale,
+            "density_innovation": innovations[:, :n, 0],
+            "speed_innovation": innovations[:, :n, 1],
+            "age": knowledge.age / AGE_CAP,
+            "queried": knowledge.queried,
+            "fixed_density_innovation": innovations[:, self.fixed_sensors, 0],
+            "fixed_speed_innovation": innovations[:, self.fixed_sensors, 1],
+            "bandwidth": self._bandwidth_share,
+            "epsilon": self._log_epsilon,
+            "picked": knowledge.picked,
+        }
+        for name, place in self.slices.items():
+            flat[:, place] = values[name]
+        np.maximum(flat, self.space.low, out=flat)
+        return np.minimum(flat, self.space.high, out=flat)
 
     def block(self, observation: Observation, name: str) -> Observation:
         """Return the block ``name`` of observations of shape (..., size).
@@ -182,3 +185,8 @@ class ObservationEncoding:
         if name not in self.slices:
             raise ValueError(f"unknown observation block {name!r}; known: {', '.join(self.slices)}")
         return observation[..., self.slices[name]]
+
+
+def _log(deviation: FloatArray) -> FloatArray:
+    # A zero has no logarithm; the smallest number ends at the lower bound just as well.
+    return np.log(np.maximum(deviation, np.finfo(np.float64).tiny))

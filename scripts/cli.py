@@ -17,8 +17,8 @@ ArgsT = TypeVar("ArgsT")
 def run(main: Callable[[ArgsT], None], arguments: type[ArgsT], description: str | None) -> None:
     """Parse the command line into ``arguments`` and call ``main`` with them.
 
-    Bad input, an unreadable or unwritable file and a failed recording end the program with status 2 and their one message; anything
-    else is a fault of the program and keeps its traceback.
+    Bad input, a file that cannot be read or written and a failed recording end the program with
+    status 2 and their one message; anything else is a fault of the program and keeps its traceback.
     """
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(message)s")
     args = tyro.cli(arguments, description=description)
