@@ -270,7 +270,10 @@ def test_rendering():
 def test_a_sequential_episode_renders_one_column_a_second():
     env = short(action="sequential", bandwidth=3, render_mode="rgb_array")
     play(env, 30)
-    assert len(env.unwrapped.history.truth) == 11
+    history = env.unwrapped.history
+    for series in (history.truth, history.estimate, history.queried, history.rmse):
+        assert len(series) == 11
+    assert [int(flags.sum()) for flags in history.queried] == [0] + [3] * 10
 
 
 @pytest.mark.parametrize(
