@@ -7,10 +7,9 @@ concern; the others stay as they are.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, Protocol, get_args
+from typing import Literal, Protocol, get_args
 
 import numpy as np
 
@@ -126,58 +125,3 @@ class EstimatorSettings:
         object.__setattr__(self, "initial_variance", variance)
         if self.bounds not in get_args(Bounds):
             raise ValueError(f"estimator.bounds must be 'cone' or 'box', got {self.bounds!r}")
-
-
-class Measurements(NamedTuple):
-    """Checked arguments of `Estimator.update`."""
-
-    episodes: IntArray
-    observed: BoolArray
-    values: FloatArray
-    sigma: FloatArray
-
-
-def checked_episodes(episodes: IntArray, n_episodes: int) -> IntArray:
-    """Indices as contiguous int64, refused where there is no such episode."""
-    indices = np.ascontiguousarray(episodes, dtype=np.int64)
-    if indices.ndim != 1:
-        raise ValueError(f"episodes must be a vector of indices, got shape {indices.shape}")
-    # A list of Python ints compares faster than numpy reduces, as long as it is short.
-    for index in indices.tolist():
-        if not 0 <= index < n_episodes:
-            raise ValueError(f"episodes must be in 0..{n_episodes - 1}, got {index}")
-    return indices
-
-
-def checked_rows(name: str, rows: FloatArray, shape: tuple[int, ...]) -> FloatArray:
-    """An array as contiguous float64, refused if its shape is not the one expected."""
-    array = np.ascontiguousarray(rows, dtype=np.float64)
-    if array.shape != shape:
-        raise ValueError(f"{name} must have shape {shape}, got {array.shape}")
-    return array
-
-
-def checked_measurements(
-    n_episodes: int,
-    n_segments: int,
-    episodes: IntArray,
-    observed: BoolArray,
-    values: FloatArray,
-    sigma: FloatArray,
-) -> Measurements:
-    """Check what `Estimator.update` is given.
-
-    Raises:
-        ValueError: naming the argument, what is wrong with it and what is allowed.
-    """
-    indices = checked_episodes(episodes, n_episodes)
-    mask = np.ascontiguousarray(observed, dtype=np.bool_)
-    if mask.shape != (indices.size, n_segments):
-        raise ValueError(f"observed must have shape {(indices.size, n_segments)}, got {mask.shape}")
-    noise = checked_rows("sigma", sigma, (2,))
-    for i, value in enumerate(noise.tolist()):
-        if not 0.0 <= value < math.inf:
-            raise ValueError(f"sigma[{i}] must be finite and >= 0, got {value}")
-    return Measurements(
-        indices, mask, checked_rows("values", values, (indices.size, n_segments, 2)), noise
-    )

@@ -6,35 +6,26 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from dptse_env.estimators.base import (
-    Estimate,
-    EstimatorSettings,
-    checked_episodes,
-    checked_measurements,
-    checked_rows,
-)
+from dptse_env.estimators.base import Estimate, EstimatorSettings
+from dptse_env.estimators.batch import BatchEstimator, Measurements
 from dptse_env.estimators.compiled import kernels
 from dptse_env.estimators.compiled.algebra import padded
 from dptse_env.model import ARZModel
-from dptse_env.model.network import BoolArray, FloatArray, IntArray
+from dptse_env.model.network import FloatArray, IntArray
 from dptse_env.model.road import road_of
 
 
-class CompiledEKF:
+class CompiledEKF(BatchEstimator):
     """Extended Kalman filter on the ARZ model, analytic Jacobians, sequential Joseph updates.
 
     All rows of a step are linearised at its prediction, which makes the sequence of scalar
     updates equal to one update by all rows. Means are projected after predict and update;
-    covariances are not touched by it. See `Estimator` for the methods.
+    covariances are not touched by it.
     """
 
     def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
         """See `make_estimator`."""
-        self.model = model
-        self.settings = settings
-        self.n_episodes = n_episodes
-        self.innovations = np.zeros((n_episodes, model.n_segments, 2))
-        self.diverged = np.zeros(n_episodes, dtype=np.bool_)
+        super().__init__(model, n_episodes, settings)
         n_states = model.n_states
         start = model.project(np.zeros((n_episodes, n_states)), settings.bounds)
         self._filters = kernels.Filters(
@@ -61,32 +52,16 @@ class CompiledEKF:
         """Covariances `(n, 2 S, 2 S)`, rho normalised by rho_m and psi by rho_m v_f, a copy."""
         return self._filters.covariances[:, :, : self.model.n_states].copy()
 
-    def reset(
-        self,
-        episodes: IntArray,
-        states: FloatArray,
-        generators: Sequence[np.random.Generator],
+    def _reset(
+        self, episodes: IntArray, states: FloatArray, generators: Sequence[np.random.Generator]
     ) -> None:
-        """Start episodes over from prior means `(k, 2 S)`."""
-        indices = checked_episodes(episodes, self.n_episodes)
-        states = checked_rows("states", states, (indices.size, self.model.n_states))
-        self._filters.priors[indices] = self.model.project(states, self.settings.bounds)
-        self._restart(indices)
-        self.diverged[indices] = False
+        self._filters.priors[episodes] = self.model.project(states, self.settings.bounds)
+        self._restart(episodes)
 
-    def predict(self, episodes: IntArray, inputs: FloatArray) -> None:
-        """Move episodes one step ahead under inputs `(k, n_u)`."""
-        indices = checked_episodes(episodes, self.n_episodes)
-        inputs = checked_rows("inputs", inputs, (indices.size, self.model.n_inputs))
-        kernels.predict(*self._packed, indices, inputs)
+    def _predict(self, episodes: IntArray, inputs: FloatArray) -> None:
+        kernels.predict(*self._packed, episodes, inputs)
 
-    def update(
-        self, episodes: IntArray, observed: BoolArray, values: FloatArray, sigma: FloatArray
-    ) -> None:
-        """Take in measurements; what is not finite where observed makes the filter diverge."""
-        given = checked_measurements(
-            self.n_episodes, self.model.n_segments, episodes, observed, values, sigma
-        )
+    def _update(self, given: Measurements) -> None:
         observed, values, sigma = given.observed, given.values, given.sigma
         kernels.update(*self._packed, given.episodes, observed, values, sigma)
 

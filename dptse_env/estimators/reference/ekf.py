@@ -9,13 +9,8 @@ import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 from scipy.linalg import LinAlgError, LinAlgWarning
 
-from dptse_env.estimators.base import (
-    Estimate,
-    EstimatorSettings,
-    checked_episodes,
-    checked_measurements,
-    checked_rows,
-)
+from dptse_env.estimators.base import Estimate, EstimatorSettings
+from dptse_env.estimators.batch import BatchEstimator, Measurements
 from dptse_env.estimators.open_loop import estimated_traffic
 from dptse_env.model import ARZModel
 from dptse_env.model.network import BoolArray, FloatArray, IntArray
@@ -86,18 +81,12 @@ class _Filter(ExtendedKalmanFilter):  # type: ignore[misc]
         return bool(np.all(variance >= 0.0) and np.all(allowed >= self.P**2))
 
 
-class ReferenceEKF:
-    """Extended Kalman filter on the ARZ model by filterpy, one filter an episode.
-
-    See `Estimator` for the methods.
-    """
+class ReferenceEKF(BatchEstimator):
+    """Extended Kalman filter on the ARZ model by filterpy, one filter an episode."""
 
     def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
         """See `make_estimator`."""
-        self.model = model
-        self.n_episodes = n_episodes
-        self.innovations = np.zeros((n_episodes, model.n_segments, 2))
-        self.diverged = np.zeros(n_episodes, dtype=np.bool_)
+        super().__init__(model, n_episodes, settings)
         self._filters = [_Filter(model, settings) for _ in range(n_episodes)]
 
     @property
@@ -110,36 +99,19 @@ class ReferenceEKF:
         """Covariances `(n, 2 S, 2 S)`, rho normalised by rho_m and psi by rho_m v_f."""
         return np.stack([one.P for one in self._filters])
 
-    def reset(
-        self,
-        episodes: IntArray,
-        states: FloatArray,
-        generators: Sequence[np.random.Generator],
+    def _reset(
+        self, episodes: IntArray, states: FloatArray, generators: Sequence[np.random.Generator]
     ) -> None:
-        """Start episodes over from prior means `(k, 2 S)`."""
-        indices = checked_episodes(episodes, self.n_episodes)
-        states = checked_rows("states", states, (indices.size, self.model.n_states))
-        for episode, state in zip(indices.tolist(), states, strict=True):
+        for episode, state in zip(episodes.tolist(), states, strict=True):
             self._filters[episode].prior = state
             self._filters[episode].restart()
-        self.innovations[indices] = 0.0
-        self.diverged[indices] = False
 
-    def predict(self, episodes: IntArray, inputs: FloatArray) -> None:
-        """Move episodes one step ahead under inputs `(k, n_u)`."""
-        indices = checked_episodes(episodes, self.n_episodes)
-        inputs = checked_rows("inputs", inputs, (indices.size, self.model.n_inputs))
+    def _predict(self, episodes: IntArray, inputs: FloatArray) -> None:
         with np.errstate(all="ignore"):  # what overflows here is found by the update
-            for episode, u in zip(indices.tolist(), inputs, strict=True):
+            for episode, u in zip(episodes.tolist(), inputs, strict=True):
                 self._filters[episode].predict(u)
 
-    def update(
-        self, episodes: IntArray, observed: BoolArray, values: FloatArray, sigma: FloatArray
-    ) -> None:
-        """Take in measurements; what is not finite where observed makes the filter diverge."""
-        given = checked_measurements(
-            self.n_episodes, self.model.n_segments, episodes, observed, values, sigma
-        )
+    def _update(self, given: Measurements) -> None:
         with np.errstate(all="ignore"), warnings.catch_warnings():
             warnings.simplefilter("error", LinAlgWarning)
             for episode, mask, row in zip(

@@ -1,0 +1,124 @@
+"""What the estimators share: the batch, its flags, and the checks of what they are given."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from dptse_env.estimators.base import Estimate, EstimatorSettings
+from dptse_env.model import ARZModel
+from dptse_env.model.network import BoolArray, FloatArray, IntArray
+
+
+class Measurements(NamedTuple):
+    """Checked arguments of `Estimator.update`."""
+
+    episodes: IntArray
+    observed: BoolArray
+    values: FloatArray
+    sigma: FloatArray
+
+
+def checked_episodes(episodes: IntArray, n_episodes: int) -> IntArray:
+    """Indices as contiguous int64, refused where there is no such episode."""
+    indices = np.ascontiguousarray(episodes, dtype=np.int64)
+    if indices.ndim != 1:
+        raise ValueError(f"episodes must be a vector of indices, got shape {indices.shape}")
+    # A list of Python ints compares faster than numpy reduces, as long as it is short.
+    for index in indices.tolist():
+        if not 0 <= index < n_episodes:
+            raise ValueError(f"episodes must be in 0..{n_episodes - 1}, got {index}")
+    return indices
+
+
+def checked_rows(name: str, rows: FloatArray, shape: tuple[int, ...]) -> FloatArray:
+    """An array as contiguous float64, refused if its shape is not the one expected."""
+    array = np.ascontiguousarray(rows, dtype=np.float64)
+    if array.shape != shape:
+        raise ValueError(f"{name} must have shape {shape}, got {array.shape}")
+    return array
+
+
+def checked_measurements(
+    n_episodes: int,
+    n_segments: int,
+    episodes: IntArray,
+    observed: BoolArray,
+    values: FloatArray,
+    sigma: FloatArray,
+) -> Measurements:
+    """Check what `Estimator.update` is given.
+
+    Raises:
+        ValueError: naming the argument, what is wrong with it and what is allowed.
+    """
+    indices = checked_episodes(episodes, n_episodes)
+    mask = np.ascontiguousarray(observed, dtype=np.bool_)
+    if mask.shape != (indices.size, n_segments):
+        raise ValueError(f"observed must have shape {(indices.size, n_segments)}, got {mask.shape}")
+    noise = checked_rows("sigma", sigma, (2,))
+    for i, value in enumerate(noise.tolist()):
+        if not 0.0 <= value < math.inf:
+            raise ValueError(f"sigma[{i}] must be finite and >= 0, got {value}")
+    return Measurements(
+        indices, mask, checked_rows("values", values, (indices.size, n_segments, 2)), noise
+    )
+
+
+class BatchEstimator(ABC):
+    """An estimator of a batch of episodes; subclasses get checked, contiguous arguments.
+
+    `Estimator` documents the public methods. A subclass writes `innovations` and `diverged` of
+    the episodes that it updates.
+    """
+
+    def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
+        """See `make_estimator`."""
+        self.model = model
+        self.n_episodes = n_episodes
+        self.settings = settings
+        self.innovations = np.zeros((n_episodes, model.n_segments, 2))
+        self.diverged = np.zeros(n_episodes, dtype=np.bool_)
+
+    def reset(
+        self, episodes: IntArray, states: FloatArray, generators: Sequence[np.random.Generator]
+    ) -> None:
+        """Start episodes over from prior means `(k, 2 S)`."""
+        indices = checked_episodes(episodes, self.n_episodes)
+        states = checked_rows("states", states, (indices.size, self.model.n_states))
+        self.innovations[indices] = 0.0
+        self.diverged[indices] = False
+        self._reset(indices, states, generators)
+
+    def predict(self, episodes: IntArray, inputs: FloatArray) -> None:
+        """Move episodes one step ahead under inputs `(k, n_u)`."""
+        indices = checked_episodes(episodes, self.n_episodes)
+        self._predict(indices, checked_rows("inputs", inputs, (indices.size, self.model.n_inputs)))
+
+    def update(
+        self, episodes: IntArray, observed: BoolArray, values: FloatArray, sigma: FloatArray
+    ) -> None:
+        """Take in measurements; what is not finite where observed makes a filter diverge."""
+        n_segments = self.model.n_segments
+        self._update(
+            checked_measurements(self.n_episodes, n_segments, episodes, observed, values, sigma)
+        )
+
+    @abstractmethod
+    def estimate(self) -> Estimate:
+        """Current estimate of all episodes."""
+
+    @abstractmethod
+    def _reset(
+        self, episodes: IntArray, states: FloatArray, generators: Sequence[np.random.Generator]
+    ) -> None: ...
+
+    @abstractmethod
+    def _predict(self, episodes: IntArray, inputs: FloatArray) -> None: ...
+
+    @abstractmethod
+    def _update(self, given: Measurements) -> None: ...
