@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 DENSITY_MAP = "viridis"
 ERROR_COLOUR = "#c1272d"
 QUERY_COLOUR = "#1b2a41"
+SMOOTH_FROM = 500
+"""Seconds from which on the query panel has no pixel for each."""
 
 
 @dataclass
@@ -66,13 +68,14 @@ def draw(figure: Any, history: History) -> None:
     )
     road = len(truth) * history.segment_length
     extent = (-0.5, truth.shape[1] - 0.5, 0.0, road)
-    place = {"origin": "lower", "aspect": "auto", "extent": extent}
-    # Crisp cells; the queries change every second and would flicker, so matplotlib smooths them.
-    shades: dict[str, Any] = {"interpolation": "nearest", "cmap": DENSITY_MAP}
-    shades |= {"vmin": 0.0, "vmax": history.density_scale}
-    image = axes[0].imshow(truth, **place, **shades)
-    axes[1].imshow(estimate, **place, **shades)
-    axes[2].imshow(queried, **place, cmap=_two_colours(), vmin=0, vmax=1)
+    place: dict[str, Any] = {"origin": "lower", "aspect": "auto", "extent": extent}
+    crisp = {"interpolation": "nearest"}
+    shades = {"cmap": DENSITY_MAP, "vmin": 0.0, "vmax": history.density_scale}
+    image = axes[0].imshow(truth, **place, **crisp, **shades)
+    axes[1].imshow(estimate, **place, **crisp, **shades)
+    # More seconds than pixels would leave an arbitrary choice of the queries; smooth those.
+    flags = crisp if queried.shape[1] < SMOOTH_FROM else {"interpolation": "antialiased"}
+    axes[2].imshow(queried, **place, **flags, cmap=_two_colours(), vmin=0, vmax=1)
     axes[3].plot(history.rmse, color=ERROR_COLOUR, linewidth=1.0)
     for axis, name in zip(axes, ("true density", "estimate", "queried", "error"), strict=True):
         axis.set_title(name, loc="left", fontsize=9, pad=3)
