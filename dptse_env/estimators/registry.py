@@ -2,14 +2,27 @@
 
 from __future__ import annotations
 
+import importlib
 from typing import get_args
 
 from dptse_env.estimators.base import Backend, Estimator, EstimatorSettings
-from dptse_env.estimators.open_loop import OpenLoop
-from dptse_env.estimators.random_walk import RandomWalk
 from dptse_env.model import ARZModel
 
-ESTIMATORS = ("ekf", "random_walk", "open_loop")
+# Each backend brings its own library, which the other must not need: modules load when asked for.
+_MODELS = {
+    "compiled": "dptse_env.model.compiled:CompiledARZModel",
+    "reference": "dptse_env.model.arz:ARZModel",
+}
+_CLASSES = {
+    "ekf": {
+        "compiled": "dptse_env.estimators.compiled.ekf:CompiledEKF",
+        "reference": "dptse_env.estimators.reference.ekf:ReferenceEKF",
+    },
+    "random_walk": dict.fromkeys(_MODELS, "dptse_env.estimators.random_walk:RandomWalk"),
+    "open_loop": dict.fromkeys(_MODELS, "dptse_env.estimators.open_loop:OpenLoop"),
+}
+
+ESTIMATORS = tuple(_CLASSES)
 BACKENDS = get_args(Backend)
 
 
@@ -39,34 +52,14 @@ def make_estimator(
         raise ValueError(f"backend must be one of {', '.join(BACKENDS)}, got {backend!r}")
     if n_episodes < 1:
         raise ValueError(f"n_episodes must be >= 1, got {n_episodes}")
-    settings = settings or EstimatorSettings()
-    if name == "random_walk":
-        return RandomWalk(model, n_episodes, settings)
-    # Each backend brings its own library, which the other must not need.
-    if backend == "reference":
-        return _reference(name, model, n_episodes, settings)
-    return _compiled(name, model, n_episodes, settings)
+    own = _load(_MODELS[backend])(model.network, model.parameters, model.time_step)
+    estimator: Estimator = _load(_CLASSES[name][backend])(
+        own, n_episodes, settings or EstimatorSettings()
+    )
+    return estimator
 
 
-def _reference(
-    name: str, model: ARZModel, n_episodes: int, settings: EstimatorSettings
-) -> Estimator:
-    plain = ARZModel(model.network, model.parameters, model.time_step)
-    if name == "open_loop":
-        return OpenLoop(plain, n_episodes, settings)
-    from dptse_env.estimators.reference.ekf import ReferenceEKF  # noqa: PLC0415
-
-    return ReferenceEKF(plain, n_episodes, settings)
-
-
-def _compiled(
-    name: str, model: ARZModel, n_episodes: int, settings: EstimatorSettings
-) -> Estimator:
-    if name == "open_loop":
-        from dptse_env.model.compiled import CompiledARZModel  # noqa: PLC0415
-
-        fast = CompiledARZModel(model.network, model.parameters, model.time_step)
-        return OpenLoop(fast, n_episodes, settings)
-    from dptse_env.estimators.compiled.ekf import CompiledEKF  # noqa: PLC0415
-
-    return CompiledEKF(model, n_episodes, settings)
+def _load(path: str) -> type:
+    module, _, name = path.partition(":")
+    loaded: type = getattr(importlib.import_module(module), name)
+    return loaded
