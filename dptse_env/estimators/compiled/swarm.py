@@ -1,0 +1,331 @@
+"""The ARZ model for many states of one road at once: sigma points, members of an ensemble.
+
+The equations are those of `dptse_env.model.kernels` without derivatives. A swarm is stored by
+component, `(2 S, width)`, one column a state, so that every inner loop runs over contiguous
+memory without a branch and compiles to vector instructions. Columns beyond the states in use are
+computed along and must hold some state.
+
+Powers are computed here, as a loop around the C library's would not be vectorised.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from llvmlite import ir  # type: ignore[import-untyped]
+from numba import njit, types
+from numba.extending import intrinsic
+
+from dptse_env.model.arz import LARGEST_W, LEAST_DENSITY, LEAST_W, MEASUREMENT_FLOOR
+from dptse_env.model.network import FloatArray
+from dptse_env.model.relations import VACUUM
+from dptse_env.model.road import EXIT, LINK, MERGE, Road
+
+_ROOT_HALF = 0x3FE6A09E667F3BCD  # bits of sqrt(1/2)
+_SHIFT = 6755399441055744.0  # 1.5 * 2^52: adding it rounds, and leaves the integer in the low bits
+_SHIFT_BITS = 0x4338000000000000
+_LN2 = 0.6931471805599453
+_LEAST_BASE, _LARGEST_BASE = 1e-30, 1e30
+
+
+def _bits_of(context: Any, x: Any) -> Any:
+    """Bits of a float64 as int64."""
+    del context, x
+
+    def code(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
+        return builder.bitcast(arguments[0], ir.IntType(64))
+
+    return types.int64(types.float64), code
+
+
+def _float_of(context: Any, x: Any) -> Any:
+    """The float64 of an int64's bits."""
+    del context, x
+
+    def code(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
+        return builder.bitcast(arguments[0], ir.DoubleType())
+
+    return types.float64(types.int64), code
+
+
+# Not as decorators: a type checker would see the arguments of the function that makes the code.
+_bits: Any = intrinsic(_bits_of)
+_float: Any = intrinsic(_float_of)
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def power(base: float, exponent: float) -> float:
+    """`base ** exponent` to a few units of the last place, for exponents from 0.05 to 10.
+
+    What lies outside [1e-30, 1e30], zero, infinity and NaN among it, is returned as it is.
+    """
+    x = base if _LEAST_BASE < base < _LARGEST_BASE else 1.0
+    # x = 2^k z with z in [sqrt(1/2), sqrt(2)); log z = 2 atanh((z - 1) / (z + 1)).
+    shifted = _bits(x) - np.int64(_ROOT_HALF) + (np.int64(1024) << np.int64(52))
+    k_bits = (shifted >> np.int64(52)) - np.int64(1024)
+    z = _float(_bits(x) - (k_bits << np.int64(52)))
+    k = _float(k_bits + np.int64(_SHIFT_BITS)) - _SHIFT
+    s = (z - 1.0) / (z + 1.0)
+    t = s * s
+    series = 1.0 / 21.0
+    series = series * t + 1.0 / 19.0
+    series = series * t + 1.0 / 17.0
+    series = series * t + 1.0 / 15.0
+    series = series * t + 1.0 / 13.0
+    series = series * t + 1.0 / 11.0
+    series = series * t + 1.0 / 9.0
+    series = series * t + 1.0 / 7.0
+    series = series * t + 1.0 / 5.0
+    series = series * t + 1.0 / 3.0
+    y = exponent * (k + (2.0 / _LN2) * (s + s * t * series))
+    # 2^y = 2^n exp(r) with |r| <= ln(2) / 2.
+    rounded = y + _SHIFT
+    r = (y - (rounded - _SHIFT)) * _LN2
+    e = 1.0 / 6227020800.0
+    e = e * r + 1.0 / 479001600.0
+    e = e * r + 1.0 / 39916800.0
+    e = e * r + 1.0 / 3628800.0
+    e = e * r + 1.0 / 362880.0
+    e = e * r + 1.0 / 40320.0
+    e = e * r + 1.0 / 5040.0
+    e = e * r + 1.0 / 720.0
+    e = e * r + 1.0 / 120.0
+    e = e * r + 1.0 / 24.0
+    e = e * r + 1.0 / 6.0
+    e = e * r + 0.5
+    e = e * r + 1.0
+    e = e * r + 1.0
+    n = _bits(rounded) - np.int64(_SHIFT_BITS)
+    result = _float(_bits(e) + (n << np.int64(52)))
+    return result if _LEAST_BASE < base < _LARGEST_BASE else base
+
+
+class Flock(NamedTuple):
+    """Working space of `advance_swarm`, `(S, width)` each but the last.
+
+    Attributes:
+        w: [km/h].
+        speed: [km/h].
+        demand: [veh/h].
+        root: `(w / ((1 + gamma) v_f)) ** (1 / gamma)`: critical density over jam density.
+        flow: q out of each cell [veh/h].
+        row: `(4, width)`.
+    """
+
+    w: FloatArray
+    speed: FloatArray
+    demand: FloatArray
+    root: FloatArray
+    flow: FloatArray
+    row: FloatArray
+
+
+@njit(cache=True, error_model="numpy")
+def flock_of(road: Road, width: int) -> Flock:
+    """Allocate the working space for a road and a swarm."""
+    n = road.jam.size
+    table = np.empty((5, n, width))
+    return Flock(table[0], table[1], table[2], table[3], table[4], np.empty((4, width)))
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _tabulate(
+    rho_row: FloatArray,
+    psi_row: FloatArray,
+    jam: float,
+    v_f: float,
+    gamma: float,
+    w_row: FloatArray,
+    speed: FloatArray,
+    demand: FloatArray,
+    root: FloatArray,
+) -> None:
+    """Write w, speed, demand and critical density over jam density of one cell."""
+    share, empty_below, one_more = gamma / (1.0 + gamma), VACUUM * jam, 1.0 + gamma
+    by_jam, by_w = 1.0 / jam, 1.0 / (one_more * v_f)
+    for j in range(rho_row.size):
+        rho = 0.0 if rho_row[j] < 0.0 else rho_row[j]
+        psi = 0.0 if psi_row[j] < 0.0 else psi_row[j]
+        p = v_f * power(rho * by_jam, gamma)
+        is_empty = rho <= empty_below
+        w = v_f if is_empty else psi / rho
+        v = w - p
+        critical = power(w * by_w, 1.0 / gamma)
+        d = rho * v if one_more * p <= w else jam * critical * w * share
+        w_row[j] = w
+        speed[j] = 0.0 if v < 0.0 else v
+        demand[j] = 0.0 if is_empty else d
+        root[j] = critical
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _supplies(
+    w_row: FloatArray,
+    root: FloatArray,
+    speed: FloatArray,
+    jam: float,
+    v_f: float,
+    gamma: float,
+    out: FloatArray,
+) -> None:
+    """Write what a cell moving at `speed` takes in of drivers w [veh/h]."""
+    share, exponent, by_v_f = gamma / (1.0 + gamma), 1.0 / gamma, 1.0 / v_f
+    congested = 0
+    for j in range(w_row.size):
+        congested += 0 if speed[j] >= w_row[j] * share else 1
+        out[j] = jam * root[j] * w_row[j] * share
+    if congested == 0:
+        return
+    for j in range(w_row.size):
+        settled = jam * power((w_row[j] - speed[j]) * by_v_f, exponent) * speed[j]
+        out[j] = out[j] if speed[j] >= w_row[j] * share else settled
+
+
+@njit(cache=True, error_model="numpy")
+def _minimum(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
+    for j in range(out.size):
+        out[j] = a[j] if a[j] <= b[j] else b[j]
+
+
+@njit(cache=True, error_model="numpy")
+def _merge(
+    flock: Flock, c: int, down: int, other: int, jam: float, v_f: float, gamma: float
+) -> None:
+    demand, other_demand = flock.demand[c], flock.demand[other]
+    w, other_w, flow = flock.w[c], flock.w[other], flock.flow[c]
+    mixed, root, supply = flock.row[0], flock.row[1], flock.row[2]
+    by_w, exponent = 1.0 / ((1.0 + gamma) * v_f), 1.0 / gamma
+    for j in range(mixed.size):
+        total = demand[j] + other_demand[j]
+        relative = demand[j] * w[j] + other_demand[j] * other_w[j]
+        mixed[j] = v_f if total <= 0.0 else relative / total
+        root[j] = power(mixed[j] * by_w, exponent)
+    _supplies(mixed, root, flock.speed[down], jam, v_f, gamma, supply)
+    for j in range(mixed.size):
+        total = demand[j] + other_demand[j]
+        served = demand[j] / total * supply[j]
+        flow[j] = demand[j] if total <= supply[j] or total <= 0.0 else served
+
+
+@njit(cache=True, error_model="numpy")
+def _flow_out(road: Road, flock: Flock, c: int, inputs: FloatArray) -> None:
+    v_f, gamma = road.free_flow_speed, road.gamma
+    kind, down, third = road.kind[c], road.parties[c, 1], road.parties[c, 2]
+    w, root, demand, flow = flock.w[c], flock.root[c], flock.demand[c], flock.flow[c]
+    supply = flock.row[2]
+    if kind == MERGE:
+        _merge(flock, c, down, third, road.jam[down], v_f, gamma)
+        return
+    if kind == EXIT:
+        jam, speed = road.outside_jam[c], flock.row[0]
+        density = inputs[road.exit[c]]
+        p = v_f * (max(density, 0.0) / jam) ** gamma if np.isfinite(density) else np.nan
+        for j in range(speed.size):
+            v = w[j] - p
+            speed[j] = 0.0 if v < 0.0 else v
+        _supplies(w, root, speed, jam, v_f, gamma, supply)
+    else:
+        _supplies(w, root, flock.speed[down], road.jam[down], v_f, gamma, supply)
+        if kind != LINK:
+            share, off = road.share[c], flock.row[1]
+            for j in range(supply.size):
+                supply[j] = supply[j] / (1.0 - share)
+            if share > 0.0:
+                _supplies(w, root, flock.speed[third], road.jam[third], v_f, gamma, off)
+                for j in range(supply.size):
+                    branch = off[j] / share
+                    supply[j] = branch if branch < supply[j] else supply[j]
+    _minimum(demand, supply, flow)
+
+
+@njit(cache=True, error_model="numpy")
+def _enter(road: Road, flock: Flock, c: int, inputs: FloatArray, swarm: FloatArray) -> None:
+    """Add what enters a cell from outside; demand that is not served vanishes."""
+    v_f, gamma = road.free_flow_speed, road.gamma
+    source, w_in = inputs[road.entry[c]], inputs[road.entry[c] + 1]
+    w, root, supply = flock.row[0], flock.row[1], flock.row[2]
+    w[:] = w_in
+    root[:] = (w_in / ((1.0 + gamma) * v_f)) ** (1.0 / gamma)
+    _supplies(w, root, flock.speed[c], road.jam[c], v_f, gamma, supply)
+    rho, psi = swarm[2 * c], swarm[2 * c + 1]
+    for j in range(supply.size):
+        entered = road.step_ratio * (supply[j] if source > supply[j] else source)
+        rho[j] += entered
+        psi[j] += entered * w_in
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _leave(
+    rho: FloatArray, psi: FloatArray, flow: FloatArray, w: FloatArray, ratio: float, pull: float,
+    v_f: float,
+) -> None:  # fmt: skip
+    for j in range(rho.size):
+        gone = ratio * flow[j]
+        psi[j] += pull * (v_f * rho[j] - psi[j]) - gone * w[j]
+        rho[j] -= gone
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _arrive(
+    rho: FloatArray, psi: FloatArray, flow: FloatArray, w: FloatArray, ratio: float
+) -> None:
+    for j in range(rho.size):
+        come = ratio * flow[j]
+        rho[j] += come
+        psi[j] += come * w[j]
+
+
+@njit(cache=True, error_model="numpy")
+def advance_swarm(road: Road, swarm: FloatArray, inputs: FloatArray, flock: Flock) -> None:
+    """Move every column of `swarm` `(2 S, width)` one step ahead under inputs `(n_u,)`."""
+    v_f, gamma, ratio = road.free_flow_speed, road.gamma, road.step_ratio
+    for c in range(road.jam.size):
+        _tabulate(
+            swarm[2 * c], swarm[2 * c + 1], road.jam[c], v_f, gamma,
+            flock.w[c], flock.speed[c], flock.demand[c], flock.root[c],
+        )  # fmt: skip
+    for c in range(road.jam.size):
+        _flow_out(road, flock, c, inputs)
+    for c in range(road.jam.size):
+        rho, psi = swarm[2 * c], swarm[2 * c + 1]
+        _leave(rho, psi, flock.flow[c], flock.w[c], ratio, road.relaxation, v_f)
+        if road.entry[c] >= 0:
+            _enter(road, flock, c, inputs, swarm)
+    for e in range(road.edges.shape[0]):
+        start, end = road.edges[e, 0], road.edges[e, 1]
+        part = ratio * road.edge_share[e]
+        _arrive(swarm[2 * end], swarm[2 * end + 1], flock.flow[start], flock.w[start], part)
+
+
+@njit(cache=True, error_model="numpy")
+def project_swarm(road: Road, swarm: FloatArray, is_box: bool) -> None:
+    """Hold every column to its bounds, as `ARZModel.project` does; a NaN stays one."""
+    v_f, gamma = road.free_flow_speed, road.gamma
+    for c in range(road.jam.size):
+        rho_row, psi_row, jam = swarm[2 * c], swarm[2 * c + 1], road.jam[c]
+        least = 0.0 if is_box else LEAST_DENSITY
+        least_w = 0.0 if is_box else LEAST_W * v_f
+        by_jam = 1.0 / jam
+        for j in range(rho_row.size):
+            rho = least if rho_row[j] < least else rho_row[j]
+            rho = jam if rho > jam else rho
+            rho_row[j] = rho
+            if is_box:
+                low, high = 0.0, jam * v_f
+            else:
+                p = v_f * power(rho * by_jam, gamma)
+                low, high = (p if p > least_w else least_w) * rho, LARGEST_W * v_f * rho
+            psi = low if psi_row[j] < low else psi_row[j]
+            psi_row[j] = high if psi > high else psi
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def measured_speeds(
+    rho_row: FloatArray, psi_row: FloatArray, jam: float, v_f: float, gamma: float, out: FloatArray
+) -> None:
+    """Write the speeds [km/h] that a sensor sees, density floored as in `ARZModel.measure`."""
+    floor, by_jam = MEASUREMENT_FLOOR * jam, 1.0 / jam
+    for j in range(rho_row.size):
+        rho = floor if rho_row[j] < floor else rho_row[j]
+        out[j] = psi_row[j] / rho - v_f * power(rho * by_jam, gamma)
