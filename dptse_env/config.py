@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from dptse_env.actions import ACTION_ENCODINGS
-from dptse_env.estimators import BACKENDS, ESTIMATORS, EstimatorSettings
+from dptse_env.estimators import EstimatorSettings, check_estimator
 from dptse_env.mapping import from_mapping
 from dptse_env.model import ARZModel, ARZParameters, load_parameters
 from dptse_env.privacy import PrivacySettings, Sensitivity, paper_sensitivity
@@ -40,7 +40,8 @@ class EnvConfig:
 
     Attributes:
         corridor: The road, its demand, incident and fixed sensors.
-        estimator: Name of the estimator: ``ekf``, ``random_walk`` or ``open_loop``.
+        estimator: Name of the estimator: ``ekf``, ``ukf``, ``enkf``, ``mhe``, ``random_walk`` or
+            ``open_loop``.
         backend: ``compiled`` or ``reference``.
         parameters: ARZ parameters, or the name of a set.
         estimator_settings: Process noise, prior variance and bounds of the estimator; None for
@@ -76,8 +77,7 @@ class EnvConfig:
         """Check everything that needs no traffic."""
         _require_name("action", self.action, ACTION_ENCODINGS)
         _require_name("reward", self.reward, REWARD_TERMS)
-        _require_name("estimator", self.estimator, ESTIMATORS)
-        _require_name("backend", self.backend, BACKENDS)
+        check_estimator(self.estimator, self.backend)
         n, duration = self.corridor.n_mainline, self.corridor.duration
         if not 1 <= self.bandwidth <= n:
             raise ValueError(f"bandwidth must be in 1..{n}, got {self.bandwidth}")

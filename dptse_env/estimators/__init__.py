@@ -1,7 +1,7 @@
 """Traffic state estimators behind one protocol."""
 
-from dptse_env.estimators.base import Estimate, Estimator, EstimatorSettings
-from dptse_env.estimators.registry import BACKENDS, ESTIMATORS, make_estimator
+from dptse_env.estimators.base import Estimate, Estimator, EstimatorSettings, HorizonSettings
+from dptse_env.estimators.registry import BACKENDS, ESTIMATORS, check_estimator, make_estimator
 
 __all__ = [
     "BACKENDS",
@@ -9,5 +9,7 @@ __all__ = [
     "Estimate",
     "Estimator",
     "EstimatorSettings",
+    "HorizonSettings",
+    "check_estimator",
     "make_estimator",
 ]

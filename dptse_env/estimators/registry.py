@@ -18,6 +18,15 @@ _CLASSES = {
         "compiled": "dptse_env.estimators.compiled.ekf:CompiledEKF",
         "reference": "dptse_env.estimators.reference.ekf:ReferenceEKF",
     },
+    "ukf": {
+        "compiled": "dptse_env.estimators.compiled.ukf:CompiledUKF",
+        "reference": "dptse_env.estimators.reference.ukf:ReferenceUKF",
+    },
+    "enkf": {"compiled": "dptse_env.estimators.compiled.enkf:CompiledEnKF"},
+    "mhe": {
+        "compiled": "dptse_env.estimators.compiled.mhe:CompiledMHE",
+        "reference": "dptse_env.estimators.reference.mhe:ReferenceMHE",
+    },
     "random_walk": dict.fromkeys(_MODELS, "dptse_env.estimators.random_walk:RandomWalk"),
     "open_loop": dict.fromkeys(_MODELS, "dptse_env.estimators.open_loop:OpenLoop"),
 }
@@ -36,9 +45,10 @@ def make_estimator(
     """Build an estimator for a batch of episodes.
 
     Args:
-        name: `ekf`, `random_walk` (no traffic model) or `open_loop` (no measurements).
-        backend: `compiled` (numba) or `reference` (numpy and filterpy); the random walk is
-            plain numpy under both.
+        name: `ekf`, `ukf`, `enkf`, `mhe`, `random_walk` (no traffic model) or `open_loop` (no
+            measurements).
+        backend: `compiled` (numba) or `reference` (numpy, filterpy, qpsolvers); the random walk
+            is plain numpy under both, the EnKF is compiled only.
         model: The traffic model.
         n_episodes: Episodes to follow, >= 1.
         settings: Tuning; defaults if left out.
@@ -46,17 +56,29 @@ def make_estimator(
     Raises:
         ValueError: for an unknown name or backend, or no episodes; says what is allowed.
     """
-    if name not in ESTIMATORS:
-        raise ValueError(f"estimator must be one of {', '.join(ESTIMATORS)}, got {name!r}")
-    if backend not in BACKENDS:
-        raise ValueError(f"backend must be one of {', '.join(BACKENDS)}, got {backend!r}")
     if n_episodes < 1:
         raise ValueError(f"n_episodes must be >= 1, got {n_episodes}")
+    check_estimator(name, backend)
     own = _load(_MODELS[backend])(model.network, model.parameters, model.time_step)
     estimator: Estimator = _load(_CLASSES[name][backend])(
         own, n_episodes, settings or EstimatorSettings()
     )
     return estimator
+
+
+def check_estimator(name: str, backend: str) -> None:
+    """Check that there is such an estimator, without loading it.
+
+    Raises:
+        ValueError: for an unknown name or backend, or a pair that does not exist.
+    """
+    if name not in ESTIMATORS:
+        raise ValueError(f"estimator must be one of {', '.join(ESTIMATORS)}, got {name!r}")
+    if backend not in BACKENDS:
+        raise ValueError(f"backend must be one of {', '.join(BACKENDS)}, got {backend!r}")
+    if backend not in _CLASSES[name]:
+        allowed = ", ".join(_CLASSES[name])
+        raise ValueError(f"backend of estimator {name!r} must be {allowed}, got {backend!r}")
 
 
 def _load(path: str) -> type:

@@ -1,0 +1,165 @@
+"""Moving horizon estimation, compiled."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from dptse_env.estimators.base import Estimate, EstimatorSettings
+from dptse_env.estimators.batch import BatchEstimator, Measurements
+from dptse_env.estimators.compiled import kernels, mhe_kernels
+from dptse_env.estimators.compiled.algebra import padded
+from dptse_env.estimators.compiled.kernels import Filters
+from dptse_env.estimators.compiled.mhe_kernels import Horizons
+from dptse_env.estimators.horizon import (
+    LEAST_DEVIATION,
+    Window,
+    assemble,
+    normalised_bounds,
+    process_variance,
+    solve,
+)
+from dptse_env.model import ARZModel
+from dptse_env.model.network import FloatArray, IntArray
+from dptse_env.model.road import Road, road_of
+
+
+class CompiledMHE(BatchEstimator):
+    """Moving horizon estimation (paper, eq. 14 to 17), compiled.
+
+    `dptse_env.estimators.reference.mhe.ReferenceMHE` says what the estimate, its deviations and
+    the model are. Here the program is solved exactly: a filter's forward pass factorises H and an
+    active set, begun with the last step's, finds what lies at a bound. Where it finds no optimum
+    within its rounds, the reference's solver is asked, then the prediction taken.
+
+    Attributes:
+        fallback: `(n,)` whether the last update's program was not solved and the prediction
+            taken instead.
+        n_passed_on: Programs so far that went to the reference's solver.
+    """
+
+    def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
+        """See `make_estimator`."""
+        super().__init__(model, n_episodes, settings)
+        self.horizon = own = settings.mhe
+        self.fallback = np.zeros(n_episodes, dtype=np.bool_)
+        self.n_passed_on = 0
+        n, s, width = model.n_states, model.n_segments, padded(model.n_states)
+        start = model.project(np.zeros((n_episodes, n)), own.bounds)
+        self._road: Road = road_of(model)
+        self._filters = Filters(
+            means=start,
+            covariances=np.zeros((n_episodes, n, width)),
+            priors=start.copy(),
+            innovations=self.innovations,
+            diverged=self.diverged,
+            process_variance=process_variance(settings),
+            initial_variance=float(settings.initial_variance),
+            density_scale=float(model.density_scale),
+            is_box=own.bounds == "box",
+        )
+        shape = (n_episodes, own.horizon + 1)
+        lower, upper = normalised_bounds(model, own.bounds)
+        self._horizons = Horizons(
+            length=np.ones(n_episodes, dtype=np.int64),
+            arrival_variance=np.ones((n_episodes, 2)),
+            predicted=np.zeros((*shape, n)),
+            inputs=np.zeros((*shape, model.n_inputs)),
+            observed=np.zeros((*shape, s), dtype=np.bool_),
+            values=np.zeros((*shape, s, 2)),
+            noise=np.ones((*shape, 2)),
+            blocks=np.zeros((*shape, *self._road.neighbours.shape, 4)),
+            offsets=np.zeros((*shape, n)),
+            rows=np.zeros((*shape, s, 2)),
+            constants=np.zeros((*shape, s)),
+            solution=np.zeros((*shape, width)),
+            side=np.zeros((*shape, width), dtype=np.int64),
+            unsolved=np.zeros(n_episodes, dtype=np.bool_),
+            moving_variance=np.square(np.array(own.arrival_noise, dtype=np.float64)),
+            lower=lower,
+            upper=upper,
+            along=own.linearisation == "trajectory",
+        )
+        self._packed = tuple(self._road), tuple(self._filters), tuple(self._horizons)
+        self._scales = np.array([model.density_scale, model.speed_scale])
+        self._restart(np.arange(n_episodes))
+
+    @property
+    def states(self) -> FloatArray:
+        """Means `(n, 2 S)` [veh/km, veh/h], a copy."""
+        return self._filters.means.copy()
+
+    @property
+    def covariances(self) -> FloatArray:
+        """Covariances `(n, 2 S, 2 S)`, rho normalised by rho_m and psi by rho_m v_f, a copy."""
+        return self._filters.covariances[:, :, : self.model.n_states].copy()
+
+    def window(self, episode: int) -> Window:
+        """The linearised problem of one episode, dense, as `assemble` takes it."""
+        horizons, length = self._horizons, int(self._horizons.length[episode])
+        n, road = self.model.n_states, self._road
+        transitions = np.zeros((length - 1, n, n))
+        for c in range(self.model.n_segments):
+            for slot in range(road.degree[c]):
+                b = road.neighbours[c, slot]
+                block = horizons.blocks[episode, : length - 1, c, slot].reshape(-1, 2, 2)
+                transitions[:, 2 * c : 2 * c + 2, 2 * b : 2 * b + 2] = block
+        targets = horizons.values[episode, :length].copy()
+        targets[..., 1] -= horizons.constants[episode, :length]
+        return Window(
+            arrival=horizons.predicted[episode, 0],
+            arrival_variance=horizons.arrival_variance[episode],
+            transitions=transitions,
+            offsets=horizons.offsets[episode, : length - 1],
+            process_variance=self._filters.process_variance,
+            observed=horizons.observed[episode, :length],
+            rows=horizons.rows[episode, :length],
+            targets=targets,
+            noise=horizons.noise[episode, :length],
+        )
+
+    def _reset(
+        self, episodes: IntArray, states: FloatArray, generators: Sequence[np.random.Generator]
+    ) -> None:
+        self.fallback[episodes] = False
+        self._filters.priors[episodes] = self.model.project(states, self.horizon.bounds)
+        self._restart(episodes)
+
+    def _predict(self, episodes: IntArray, inputs: FloatArray) -> None:
+        mhe_kernels.predict(*self._packed, episodes, inputs)
+
+    def _update(self, given: Measurements) -> None:
+        self.fallback[given.episodes] = False
+        sigma = np.maximum(given.sigma, LEAST_DEVIATION * self._scales)
+        mhe_kernels.update(*self._packed, given.episodes, given.observed, given.values, sigma)
+        unsolved = given.episodes[self._horizons.unsolved[given.episodes]]
+        for episode in unsolved.tolist():
+            self._pass_on(episode)
+
+    def _pass_on(self, episode: int) -> None:
+        """Let the reference's solver have a program that the active set did not solve."""
+        self.n_passed_on += 1
+        horizons, n = self._horizons, self.model.n_states
+        length = int(horizons.length[episode])
+        lower, upper = np.tile(horizons.lower, length), np.tile(horizons.upper, length)
+        z = solve(*assemble(self.window(episode)), lower, upper, self.horizon.solver)
+        self.fallback[episode] = z is None
+        horizons.side[episode] = 0
+        if z is None:
+            return
+        at_upper, at_lower = (z >= upper).astype(np.int64), (z <= lower).astype(np.int64)
+        horizons.side[episode, :length, :n] = (at_upper - at_lower).reshape(length, n)
+        solution = horizons.solution[episode].copy()
+        solution[:length, :n] = z.reshape(length, n)
+        mhe_kernels.accept(self._road, self._filters, horizons, episode, solution)
+
+    def estimate(self) -> Estimate:
+        """Current estimate of all episodes; deviations are those of the last update."""
+        out = np.empty((4, self.n_episodes, self.model.n_segments))
+        kernels.summarise(*self._packed[:2], out)
+        return Estimate(*out)
+
+    def _restart(self, episodes: IntArray) -> None:
+        for episode in episodes.tolist():
+            mhe_kernels.restart(*self._packed, episode)

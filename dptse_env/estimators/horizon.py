@@ -1,0 +1,164 @@
+"""What both moving horizon estimators share: their settings and the window's quadratic program.
+
+All quantities here are normalised, rho by rho_m, psi by rho_m v_f and speeds by v_f. A window
+holds L = T + 1 stages; z stacks their states. The program is the paper's, eq. 17:
+`minimise z' H z + q' z with lower <= z <= upper`.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.sparse.linalg import spsolve
+
+from dptse_env.estimators.base import EstimatorSettings
+from dptse_env.model import ARZModel, Bounds
+from dptse_env.model.arz import LARGEST_W, LEAST_DENSITY, LEAST_W
+from dptse_env.model.network import BoolArray, FloatArray
+from dptse_env.validation import positive
+
+# Largest natural residual of an optimum, in normalised states.
+RESIDUAL = 1e-8
+# What is so near to a bound is put there: a speed is a quotient of two numbers that may vanish.
+AT_BOUND = 1e-13
+# How often an answer is polished; the second time mostly finds what the first one missed.
+POLISHES = 10
+# Least deviation of a measurement, normalised: an exact one would weigh infinitely much.
+LEAST_DEVIATION = 1e-3
+
+
+def process_variance(settings: EstimatorSettings) -> FloatArray:
+    """Variances `(2,)` behind w_2, refused if there is none."""
+    for i, value in enumerate(settings.process_noise):
+        positive(f"estimator.process_noise[{i}]", value)
+    return np.square(np.array(settings.process_noise, dtype=np.float64))
+
+
+def normalised_bounds(model: ARZModel, bounds: Bounds) -> tuple[FloatArray, FloatArray]:
+    """Least and largest normalised state `(2 S,)` of the program."""
+    share = model.jam_density / model.density_scale
+    lower, upper = np.zeros(model.n_states), np.repeat(share, 2)
+    if bounds == "cone":
+        lower = np.tile([1.0, LEAST_W], model.n_segments) * LEAST_DENSITY / model.density_scale
+        upper[1::2] *= LARGEST_W
+    return lower, upper
+
+
+class Window(NamedTuple):
+    """A window's linearised problem: L stages, S segments, normalised.
+
+    Attributes:
+        arrival: `(2 S,)` mean of the first state.
+        arrival_variance: `(2,)` its variances, of rho and of psi.
+        transitions: `(L - 1, 2 S, 2 S)` A of each step.
+        offsets: `(L - 1, 2 S)` B u + c_1 of each step.
+        process_variance: `(2,)`.
+        observed: `(L, S)`.
+        rows: `(L, S, 2)` derivatives of the speed by the segment's rho and psi.
+        targets: `(L, S, 2)` density, and speed less the linearisation's constant c_2.
+        noise: `(L, 2)` variances of measured density and speed.
+    """
+
+    arrival: FloatArray
+    arrival_variance: FloatArray
+    transitions: FloatArray
+    offsets: FloatArray
+    process_variance: FloatArray
+    observed: BoolArray
+    rows: FloatArray
+    targets: FloatArray
+    noise: FloatArray
+
+
+def assemble(window: Window) -> tuple[FloatArray, FloatArray]:
+    """H `(L 2 S, L 2 S)` and q `(L 2 S,)` of the paper's eq. 17."""
+    n_stages, n_segments = window.observed.shape
+    n = 2 * n_segments
+    H, q = np.zeros((n_stages * n, n_stages * n)), np.zeros(n_stages * n)
+    mu = np.tile(1.0 / window.arrival_variance, n_segments)
+    H[:n, :n] += np.diag(mu)
+    q[:n] -= 2.0 * mu * window.arrival
+    for i in range(n_stages):
+        here = slice(i * n, (i + 1) * n)
+        C = measurement_matrix(window.observed[i], window.rows[i])
+        w_1 = np.tile(1.0 / window.noise[i], len(C) // 2)
+        H[here, here] += C.T @ (w_1[:, None] * C)
+        q[here] -= 2.0 * C.T @ (w_1 * window.targets[i][window.observed[i]].ravel())
+    w_2 = np.tile(1.0 / window.process_variance, n_segments)
+    for i, (A, c) in enumerate(zip(window.transitions, window.offsets, strict=True)):
+        here, after = slice(i * n, (i + 1) * n), slice((i + 1) * n, (i + 2) * n)
+        H[here, here] += A.T @ (w_2[:, None] * A)
+        H[after, after] += np.diag(w_2)
+        H[after, here] -= w_2[:, None] * A
+        H[here, after] -= A.T * w_2
+        q[here] += 2.0 * A.T @ (w_2 * c)
+        q[after] -= 2.0 * w_2 * c
+    return H, q
+
+
+def measurement_matrix(observed: BoolArray, rows: FloatArray) -> FloatArray:
+    """C `(m, 2 S)` of one stage: density and speed of each observed segment in turn."""
+    segments = np.flatnonzero(observed)
+    C = np.zeros((segments.size, 2, 2 * observed.size))
+    C[np.arange(segments.size), 0, 2 * segments] = 1.0
+    C[np.arange(segments.size), 1, 2 * segments] = rows[segments, 0]
+    C[np.arange(segments.size), 1, 2 * segments + 1] = rows[segments, 1]
+    return C.reshape(-1, 2 * observed.size)
+
+
+def natural_residual(
+    H: FloatArray, q: FloatArray, lower: FloatArray, upper: FloatArray, z: FloatArray
+) -> float:
+    """Largest |z - clip(z - g / diag(2 H), lower, upper)|, g = 2 H z + q; 0 at the optimum only.
+
+    The gradient is scaled by the diagonal so that the residual is in units of z, whatever the
+    weights are. It is NaN where z is.
+    """
+    step = (2.0 * H @ z + q) / (2.0 * np.diag(H))
+    return float(np.max(np.abs(z - np.clip(z - step, lower, upper))))
+
+
+def solve(
+    H: FloatArray, q: FloatArray, lower: FloatArray, upper: FloatArray, solver: str
+) -> FloatArray | None:
+    """Minimise z' H z + q' z within bounds by qpsolvers; None where it finds no optimum.
+
+    An interior point method stops short of the bounds. The answer is polished: what is nearly at
+    a bound and pressed on to it is put there and the rest solved for, a few times over, and the
+    best of all is taken.
+    Whether the result is an optimum is judged by its `natural_residual` alone, not by what the
+    solver says.
+    """
+    # qpsolvers is needed where this is called, which in compiled code is nearly never.
+    import qpsolvers  # noqa: PLC0415
+
+    P = sp.csc_matrix(2.0 * H)  # qpsolvers minimises z' P z / 2 + q' z
+    problem = qpsolvers.Problem(P, q, lb=lower, ub=upper)
+    options: dict[str, Any] = {"eps_abs": 1e-9, "eps_rel": 1e-9} if solver == "piqp" else {}
+    try:
+        z = qpsolvers.solve_problem(problem, solver=solver, **options).x
+    except (qpsolvers.SolverNotFound, qpsolvers.SolverError):
+        return None
+    if z is None or not np.isfinite(z).all():
+        return None
+    best = z = np.clip(z, lower, upper)
+    for _ in range(POLISHES):
+        z = _polish(P, q, lower, upper, z)
+        pair = best, np.clip(z, lower, upper)
+        best = min(pair, key=lambda one: natural_residual(H, q, lower, upper, one))
+    best = np.where(best < lower + AT_BOUND, lower, np.where(best > upper - AT_BOUND, upper, best))
+    return best if natural_residual(H, q, lower, upper, best) <= RESIDUAL else None
+
+
+def _polish(
+    P: sp.csc_matrix, q: FloatArray, lower: FloatArray, upper: FloatArray, z: FloatArray
+) -> FloatArray:
+    """Solve for what is free when variables found pressed on to their bounds are put there."""
+    step = (P @ z + q) / P.diagonal()
+    at_lower, at_upper = z - lower <= step, upper - z <= -step
+    free = ~(at_lower | at_upper)
+    exact: FloatArray = np.where(at_lower, lower, np.where(at_upper, upper, 0.0))
+    exact[free] = spsolve(P[free][:, free], -(q + P @ exact)[free])
+    return exact
