@@ -21,6 +21,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from dptse_env.estimators import ESTIMATORS
 from dptse_env.traffic.sumo import simulate
 
 
@@ -81,7 +82,7 @@ def main() -> None:
     corridor = env.config.corridor  # type: ignore[attr-defined]
     live = per_call(lambda: simulate(corridor, 0), corridor.duration, max(repeats // 2, 1))
     print(f"{'':14}{'step [us]':>10}{'estimator':>11}{'beside it':>11}{'SUMO / step':>13}")
-    for estimator in ("ekf", "random_walk", "open_loop"):
+    for estimator in ESTIMATORS:
         total, own = env_step(estimator, repeats)
         print(f"{estimator:14}{total:10.1f}{own:11.1f}{total - own:11.1f}{live / total:13.1f}")
     print(f"{'live SUMO':14}{live:10.1f}   per simulated second, recorded")

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from dptse_env.actions import ACTION_ENCODINGS
+from dptse_env.estimators import ESTIMATORS
 from dptse_env.process import TRUTH_INFO
 from dptse_env.schedules import SCHEDULES, make_schedule
 
@@ -76,7 +77,7 @@ def make(**keywords):
     return gym.make("dptse_env:dptse/ShortHighway-v0", traffic_seeds=SEEDS, **keywords)
 
 
-@pytest.mark.parametrize("estimator", ["ekf", "random_walk", "open_loop"])
+@pytest.mark.parametrize("estimator", ESTIMATORS)
 @pytest.mark.parametrize("action", ACTION_ENCODINGS)
 def test_traffic_does_not_show(estimator, action):
     env = blind(make(estimator=estimator, action=action))

@@ -4,6 +4,7 @@ from scipy import stats
 
 from dptse_env.actions import ACTION_ENCODINGS
 from dptse_env.config import resolve
+from dptse_env.estimators import ESTIMATORS
 from dptse_env.interface import QueryInterface
 from dptse_env.process import QueryProcess
 
@@ -28,7 +29,7 @@ def sampled(process, n_steps):
     return [np.array([space.sample() for _ in SEEDS]) for _ in range(n_steps)]
 
 
-@pytest.mark.parametrize("estimator", ["ekf", "random_walk", "open_loop"])
+@pytest.mark.parametrize("estimator", ESTIMATORS)
 @pytest.mark.parametrize("action", ACTION_ENCODINGS)
 def test_a_batch_is_so_many_single_episodes(estimator, action):
     batch = make(3, estimator=estimator, action=action)

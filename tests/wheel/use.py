@@ -26,7 +26,15 @@ def main() -> None:
             assert np.isfinite(reward)
         assert env.render().std() > 0
         env.close()
-    for estimator, backend in (("random_walk", "compiled"), ("ekf", "reference")):
+    for estimator, backend in (
+        ("random_walk", "compiled"),
+        ("ekf", "reference"),
+        ("ukf", "compiled"),
+        ("ukf", "reference"),
+        ("enkf", "compiled"),
+        ("mhe", "compiled"),
+        ("mhe", "reference"),
+    ):
         env = gym.make(
             "dptse_env:dptse/ShortHighway-v0",
             estimator=estimator,
