@@ -1,0 +1,65 @@
+"""What the compiled filters with a covariance share: their state and its summary."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from dptse_env.estimators.base import Estimate, EstimatorSettings
+from dptse_env.estimators.batch import BatchEstimator
+from dptse_env.estimators.compiled import kernels
+from dptse_env.estimators.compiled.algebra import padded
+from dptse_env.model import ARZModel
+from dptse_env.model.network import FloatArray, IntArray
+from dptse_env.model.road import road_of
+
+
+class CompiledFilter(BatchEstimator):
+    """Mean and covariance of each episode, kept where kernels can reach them."""
+
+    def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
+        """See `make_estimator`."""
+        super().__init__(model, n_episodes, settings)
+        n_states = model.n_states
+        start = model.project(np.zeros((n_episodes, n_states)), settings.bounds)
+        self._filters = kernels.Filters(
+            means=start,
+            covariances=np.zeros((n_episodes, n_states, padded(n_states))),
+            priors=start.copy(),
+            innovations=self.innovations,
+            diverged=self.diverged,
+            process_variance=np.array(settings.process_noise, dtype=np.float64) ** 2,
+            initial_variance=float(settings.initial_variance),
+            density_scale=float(model.density_scale),
+            is_box=settings.bounds == "box",
+        )
+        self._packed = tuple(road_of(model)), tuple(self._filters)
+        for episode in range(n_episodes):
+            kernels.restart(self._filters, episode)
+
+    @property
+    def states(self) -> FloatArray:
+        """Means `(n, 2 S)` [veh/km, veh/h], a copy."""
+        return self._filters.means.copy()
+
+    @property
+    def covariances(self) -> FloatArray:
+        """Covariances `(n, 2 S, 2 S)`, rho normalised by rho_m and psi by rho_m v_f, a copy."""
+        return self._filters.covariances[:, :, : self.model.n_states].copy()
+
+    def estimate(self) -> Estimate:
+        """Current estimate of all episodes."""
+        out = np.empty((4, self.n_episodes, self.model.n_segments))
+        kernels.summarise(*self._packed, out)
+        return Estimate(*out)
+
+    def _reset(
+        self, episodes: IntArray, states: FloatArray, generators: Sequence[np.random.Generator]
+    ) -> None:
+        self._filters.priors[episodes] = self.model.project(states, self.settings.bounds)
+        self._restart(episodes)
+
+    def _restart(self, episodes: IntArray) -> None:
+        for episode in episodes.tolist():
+            kernels.restart(self._filters, episode)
