@@ -6,7 +6,7 @@ import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 
 from dptse_env.estimators.base import EstimatorSettings
-from dptse_env.estimators.reference.kalman import EpisodeFilter, ReferenceFilter
+from dptse_env.estimators.reference.kalman import EpisodeFilter, ReferenceFilter, linearise
 from dptse_env.model import ARZModel
 from dptse_env.model.network import BoolArray, FloatArray
 
@@ -49,21 +49,12 @@ class _Filter(ExtendedKalmanFilter):  # type: ignore[misc]
     def move(self, u: FloatArray) -> None:
         self.predict(u)
 
-    def linearise(self, observed: BoolArray) -> FloatArray:
-        """Jacobian `(m, 2 S)` of what the observed segments measure."""
-        blocks = self.model.measurement_jacobian(self.state)[0]
-        jacobian = np.zeros((self.model.n_segments, 2, self.dim_x))
-        for s in range(self.model.n_segments):
-            jacobian[s, :, 2 * s : 2 * s + 2] = blocks[s]
-        jacobian *= self.scale / self.measurement_scale[:, None]
-        return jacobian[observed].reshape(-1, self.dim_x)
-
     def take_in(self, observed: BoolArray, values: FloatArray, sigma: FloatArray) -> FloatArray:
         """Update by the observed segments; returns their normalised innovations `(m, 2)`."""
         if not observed.any():
             return np.zeros((0, 2))
         predicted = self.model.measure(self.state)[0] / self.measurement_scale
-        jacobian = self.linearise(observed)
+        jacobian = linearise(self.model, self, observed)
         measured = (values[observed] / self.measurement_scale).ravel()
         noise = np.diag(np.tile(np.square(sigma / self.measurement_scale), int(observed.sum())))
         self.update(measured, lambda _: jacobian, lambda _: predicted[observed].ravel(), R=noise)

@@ -23,6 +23,7 @@ class EpisodeFilter(Protocol):
     x: FloatArray
     P: FloatArray
     prior: FloatArray
+    scale: FloatArray
     measurement_scale: FloatArray
 
     @property
@@ -38,9 +39,6 @@ class EpisodeFilter(Protocol):
     def take_in(self, observed: BoolArray, values: FloatArray, sigma: FloatArray) -> FloatArray:
         """Update by the observed segments; returns their normalised innovations `(m, 2)`."""
 
-    def linearise(self, observed: BoolArray) -> FloatArray:
-        """Jacobian `(m, 2 S)` of what the observed segments measure."""
-
 
 def is_sound(one: EpisodeFilter) -> bool:
     """Whether the mean is finite and no variance is negative and no correlation above one."""
@@ -49,6 +47,16 @@ def is_sound(one: EpisodeFilter) -> bool:
     variance = np.diag(one.P)
     allowed = (1.0 + 1e-9) * np.outer(variance, variance) + 1e-24
     return bool(np.all(variance >= 0.0) and np.all(allowed >= one.P**2))
+
+
+def linearise(model: ARZModel, one: EpisodeFilter, observed: BoolArray) -> FloatArray:
+    """Jacobian `(m, 2 S)` at the mean of what the observed segments measure, normalised."""
+    blocks = model.measurement_jacobian(one.x[None] * one.scale)[0]
+    jacobian = np.zeros((model.n_segments, 2, model.n_states))
+    for s in range(model.n_segments):
+        jacobian[s, :, 2 * s : 2 * s + 2] = blocks[s]
+    jacobian *= one.scale / one.measurement_scale[:, None]
+    return np.asarray(jacobian[observed].reshape(-1, model.n_states))
 
 
 class ReferenceFilter(BatchEstimator):
@@ -79,7 +87,7 @@ class ReferenceFilter(BatchEstimator):
         variance = np.empty((self.n_episodes, self.model.n_segments, 2))
         everywhere = np.ones(self.model.n_segments, dtype=np.bool_)
         for episode, one in enumerate(self._filters):
-            jacobian = one.linearise(everywhere)
+            jacobian = linearise(self.model, one, everywhere)
             spread = np.einsum("ij,jk,ik->i", jacobian, one.P, jacobian).reshape(-1, 2)
             variance[episode] = np.maximum(spread, 0.0) * one.measurement_scale**2
         deviation = np.sqrt(variance)

@@ -96,15 +96,6 @@ class _Filter(UnscentedKalmanFilter):  # type: ignore[misc]
         self.predict(inputs=inputs)
         self.has_moved = True
 
-    def linearise(self, observed: BoolArray) -> FloatArray:
-        """Jacobian `(m, 2 S)` of the measurement of the observed segments at the mean."""
-        blocks = self.model.measurement_jacobian(self.x[None] * self.scale)[0]
-        jacobian = np.zeros((self.model.n_segments, 2, self._dim_x))
-        for s in range(self.model.n_segments):
-            jacobian[s, :, 2 * s : 2 * s + 2] = blocks[s]
-        jacobian *= self.scale / self.measurement_scale[:, None]
-        return np.asarray(jacobian[observed].reshape(-1, self._dim_x))
-
     def take_in(self, observed: BoolArray, values: FloatArray, sigma: FloatArray) -> FloatArray:
         """Update by the observed segments; returns their normalised innovations `(m, 2)`."""
         if not observed.any():
