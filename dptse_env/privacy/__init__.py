@@ -1,7 +1,14 @@
 """Differential privacy: mechanisms, sensitivity, accounting."""
 
-from dptse_env.privacy.accountant import Accountant, BoundaryInputs, PrivacyReport, ReleaseReport
-from dptse_env.privacy.calibration import PRESETS, PrivacySettings, noise_std
+from dptse_env.privacy.accountant import Accountant, PrivacyReport, ReleaseReport
+from dptse_env.privacy.calibration import (
+    PRESETS,
+    BoundaryInputs,
+    PrivacySettings,
+    SpeedRelease,
+    Unit,
+    noise_std,
+)
 from dptse_env.privacy.gaussian import (
     analytic_multiplier,
     compose,
@@ -12,12 +19,19 @@ from dptse_env.privacy.gaussian import (
 )
 from dptse_env.privacy.mechanism import GaussianMechanism, Mechanism
 from dptse_env.privacy.reasons import VOID_REASONS, VoidReason
-from dptse_env.privacy.sensitivity import ReleaseSensitivity, Sensitivity, paper_sensitivity
+from dptse_env.privacy.sensitivity import (
+    Adjacency,
+    ReleaseSensitivity,
+    Sensitivity,
+    contribution_sensitivity,
+    paper_sensitivity,
+)
 
 __all__ = [
     "PRESETS",
     "VOID_REASONS",
     "Accountant",
+    "Adjacency",
     "BoundaryInputs",
     "GaussianMechanism",
     "Mechanism",
@@ -26,9 +40,12 @@ __all__ = [
     "ReleaseReport",
     "ReleaseSensitivity",
     "Sensitivity",
+    "SpeedRelease",
+    "Unit",
     "VoidReason",
     "analytic_multiplier",
     "compose",
+    "contribution_sensitivity",
     "delta_of",
     "epsilon_of",
     "le_ny_kappa",

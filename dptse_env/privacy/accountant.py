@@ -1,23 +1,20 @@
 """What the releases of an episode cost, and which guarantee may be claimed for them."""
 
 from dataclasses import asdict, dataclass
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from dptse_env.privacy.calibration import PRESETS, PrivacySettings, noise_std
-from dptse_env.privacy.gaussian import compose, epsilon_of
+from dptse_env.privacy.calibration import PRESETS, BoundaryInputs, PrivacySettings, noise_std
+from dptse_env.privacy.gaussian import epsilon_of
 from dptse_env.privacy.reasons import VOID_REASONS, VoidReason
 from dptse_env.privacy.sensitivity import Sensitivity
 
-__all__ = ["STRICT_DELTA", "Accountant", "BoundaryInputs", "PrivacyReport", "ReleaseReport"]
+__all__ = ["STRICT_DELTA", "Accountant", "PrivacyReport", "ReleaseReport"]
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.integer]
-
-BoundaryInputs = Literal["true", "nominal"]
-"""Where the estimator's inputs at the boundary come from: measured traffic, or public demand."""
 
 STRICT_DELTA = 1e-4
 """A delta at which epsilon is reported beside the one asked for, which is often weak."""
@@ -92,37 +89,27 @@ class PrivacyReport:
 class Accountant:
     """Keeps account of what a configuration's releases reveal."""
 
-    def __init__(
-        self,
-        settings: PrivacySettings,
-        sensitivity: Sensitivity,
-        *,
-        boundary_inputs: BoundaryInputs,
-    ) -> None:
+    def __init__(self, settings: PrivacySettings, sensitivity: Sensitivity) -> None:
         """Work out the account of a configuration.
 
         Args:
-            settings: preset, epsilon and delta.
+            settings: what was asked for.
             sensitivity: of the released quantities.
-            boundary_inputs: "true" if the estimator is fed the measured state of the boundary,
-                "nominal" if it is fed the published demand only.
-
-        Raises:
-            ValueError: if `boundary_inputs` is neither.
         """
-        if boundary_inputs not in get_args(BoundaryInputs):
-            allowed = list(get_args(BoundaryInputs))
-            raise ValueError(
-                f"privacy.boundary_inputs must be one of {allowed}, got {boundary_inputs!r}"
-            )
-        self.report = _report(settings, sensitivity, boundary_inputs)
+        self.report = _report(settings, sensitivity)
+        n = sensitivity.contributions
+        charged = self.report.mu * np.sqrt(np.arange(n + 1) / n) if n else [self.report.mu]
+        self._mu = np.asarray(charged, dtype=np.float64)
+        self._epsilon = np.array(
+            [epsilon_of(mu, settings.delta) if mu > 0.0 else 0.0 for mu in self._mu]
+        )
 
     def spent(self, steps: IntArray) -> tuple[FloatArray, FloatArray]:
-        """What episodes have revealed at most, if the sensitivities hold.
+        """What episodes have revealed of a vehicle at most, if the sensitivities hold.
 
-        The sensitivities of these presets bound a whole episode and say nothing of a part of it:
-        a vehicle may have made all its contributions in the first steps. So the whole is charged
-        from the start, and the result is the same at every step.
+        Where contributions are bounded, a vehicle has made at most one a step. The paper's
+        sensitivities bound a whole episode and say nothing of a part of it: the whole is charged
+        from the start.
 
         Args:
             steps: (k,) steps released so far in each of k episodes.
@@ -130,29 +117,24 @@ class Accountant:
         Returns:
             mu (k,) and epsilon at the delta asked for (k,), of all releases together.
         """
-        return (
-            np.full(steps.shape, self.report.mu),
-            np.full(steps.shape, self.report.epsilon),
-        )
+        charged = np.minimum(steps, len(self._mu) - 1)
+        return self._mu[charged], self._epsilon[charged]
 
 
-def _report(
-    settings: PrivacySettings, sensitivity: Sensitivity, boundary_inputs: BoundaryInputs
-) -> PrivacyReport:
+def _report(settings: PrivacySettings, sensitivity: Sensitivity) -> PrivacyReport:
+    stds = noise_std(settings, sensitivity).tolist()
     releases = tuple(
         ReleaseReport(release.quantity, release.unit, release.bound, std, release.bound / std)
-        for release, std in zip(
-            sensitivity.releases, noise_std(settings, sensitivity).tolist(), strict=True
-        )
+        for release, std in zip(sensitivity.releases, stds, strict=True)
     )
-    mu = compose(release.mu for release in releases)
+    mu = sensitivity.joint_mu(stds)
     epsilon = epsilon_of(mu, settings.delta)
 
     found = {*PRESETS[settings.preset].void_reasons, *sensitivity.void_reasons}
-    if boundary_inputs == "true":
+    if settings.boundary == "true":
         found.add("boundary_inputs")
     # Le Ny's kappa is loose enough at times that even two releases stay below epsilon together.
-    if epsilon > settings.epsilon:
+    if epsilon > settings.epsilon * (1.0 + 1e-9):
         found.add("releases_not_composed")
 
     return PrivacyReport(
@@ -163,7 +145,7 @@ def _report(
         claimed_epsilon=settings.epsilon,
         claimed_delta=settings.delta,
         assumptions=sensitivity.assumptions,
-        boundary_inputs=boundary_inputs,
+        boundary_inputs=settings.boundary,
         releases=releases,
         mu=mu,
         epsilon=epsilon,

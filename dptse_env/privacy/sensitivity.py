@@ -1,17 +1,28 @@
 """How far one vehicle can move what is released: the L2 sensitivities of the transcript.
 
-A transcript is everything released in one episode: at every step the density and the speed of each
-observed segment. Its sensitivity is the largest L2 distance between the transcripts of two traffic
-records that differ in one vehicle.
+A transcript is everything released in one episode: at every step the density and the speed, or the
+flow, of each observed segment. Its sensitivity is the largest L2 distance between the transcripts
+of two traffic records that differ in one vehicle.
 """
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Literal
 
 from dptse_env.privacy.reasons import VoidReason
 from dptse_env.validation import integer, positive
 
-__all__ = ["ReleaseSensitivity", "Sensitivity", "paper_sensitivity"]
+__all__ = [
+    "Adjacency",
+    "ReleaseSensitivity",
+    "Sensitivity",
+    "contribution_sensitivity",
+    "paper_sensitivity",
+]
+
+Adjacency = Literal["replace", "add_remove"]
+"""How two records differ: one vehicle's data replaced by another's, or one vehicle more."""
 
 
 @dataclass(frozen=True)
@@ -38,12 +49,33 @@ class Sensitivity:
         protects: whose data the two adjacent records differ in, and how.
         assumptions: the public numbers the bounds were computed from, by name with unit.
         void_reasons: why the bounds fail to hold, in the environment's own setting.
+        extremes: the bounds that can be met together, each with one number for each release in its
+            unit; left out, all bounds can be met at once.
+        contributions: C, released steps that a vehicle's data can enter; None if not bounded.
     """
 
     releases: tuple[ReleaseSensitivity, ...]
     protects: str
     assumptions: tuple[tuple[str, int | float], ...]
     void_reasons: tuple[VoidReason, ...] = ()
+    extremes: tuple[tuple[float, ...], ...] = ()
+    contributions: int | None = None
+
+    def joint_mu(self, noise_std: Iterable[float]) -> float:
+        """Parameter of all releases together, the L2 sensitivity in units of the noise.
+
+        Args:
+            noise_std: one standard deviation for each release, in its unit.
+
+        Returns:
+            The largest over what can be met together of the root of the sum of squares.
+        """
+        stds = tuple(noise_std)
+        extremes = self.extremes or (tuple(release.bound for release in self.releases),)
+        return max(
+            math.hypot(*(bound / std for bound, std in zip(bounds, stds, strict=True)))
+            for bounds in extremes
+        )
 
 
 def paper_sensitivity(
@@ -92,4 +124,60 @@ def paper_sensitivity(
         protects="one vehicle's trip, replaced by another",
         assumptions=(("n_sensors", n_sensors), ("average_dwell_steps", average_dwell)),
         void_reasons=("average_dwell", "adaptive_queries", "speed_sensitivity"),
+    )
+
+
+def contribution_sensitivity(
+    *,
+    contributions: int,
+    adjacency: Adjacency,
+    segment_length: float,
+    largest_speed: float,
+    protects: str,
+    mean_speed_slope: float | None = None,
+) -> Sensitivity:
+    """Sensitivities of density and centred flow where a vehicle counts in so many steps at most.
+
+    A vehicle is on one segment at a step. Whatever policy asks, both worlds see the same queries
+    given the same answers, so a vehicle's data enters at most `contributions` released steps of
+    one segment each. There it adds 1 / l to the density and (v - v_0) / l to the flow, with its
+    speed v clipped to [0, v_max] and v_0 = v_max / 2: at most v_0 / l in size.
+
+    One vehicle more: sqrt(C) times that. One vehicle replaced by another: the two may be counted
+    on different segments, sqrt(2 C) times that in both quantities; or on the same segments at
+    opposite speeds, where densities agree and flows differ by v_max / l, in all 2 sqrt(C) v_0 / l.
+
+    Args:
+        contributions: C, released steps that a vehicle's data can enter, >= 1.
+        adjacency: how two records differ.
+        segment_length: l [km].
+        largest_speed: v_max [km/h], a public constant that recorded speeds are clipped to.
+        protects: whose data the two adjacent records differ in, and how.
+        mean_speed_slope: where mean speeds are released in place of flows, the paper's relation
+            Delta_v / Delta_rho [km/h per veh/km], which does not hold.
+
+    Raises:
+        ValueError: if a number is out of range.
+    """
+    # One vehicle more or less; a replaced one is there in both worlds, on two segments or on one.
+    c = math.sqrt(integer("contributions", contributions, 1))
+    density = c / positive("segment_length", segment_length)
+    flow = density * positive("largest_speed", largest_speed) / 2.0
+    same_segment = 0.0
+    if adjacency == "replace":
+        same_segment = 2.0 * flow
+        density, flow = math.sqrt(2.0) * density, math.sqrt(2.0) * flow
+    extremes: tuple[tuple[float, ...], ...] = ((density, flow), (0.0, same_segment))
+    second = ReleaseSensitivity("flow", "veh/h", max(flow, same_segment))
+    void_reasons: tuple[VoidReason, ...] = ()
+    if mean_speed_slope is not None:
+        second = ReleaseSensitivity("speed", "km/h", mean_speed_slope * density)
+        extremes, void_reasons = (), ("speed_sensitivity",)
+    return Sensitivity(
+        releases=(ReleaseSensitivity("density", "veh/km", density), second),
+        protects=protects,
+        assumptions=(("contributions", contributions), ("largest_speed_km_h", largest_speed)),
+        void_reasons=void_reasons,
+        extremes=extremes,
+        contributions=contributions,
     )
