@@ -79,7 +79,7 @@ class QueryProcess:
         self.model = config.model()
         self.sensing = Sensing(corridor, config.traffic_seeds, library or RecordLibrary())
         sensitivity = config.sensitivity()
-        self.accountant = Accountant(config.privacy, sensitivity, boundary_inputs="true")
+        self.accountant = Accountant(config.privacy, sensitivity)
         self.mechanism: Mechanism = GaussianMechanism(
             noise_std(config.privacy, sensitivity), n_episodes=n, n_segments=s
         )
@@ -242,6 +242,7 @@ class QueryProcess:
             "n_occupied": float(self.error.n_occupied[episode]),
             "n_dropped": float(self.n_dropped[episode]),
             "diverged": float(self.estimator.diverged[episode]),
+            "fallback": float(self.estimator.fallback[episode]),
             "mu": float(mu[0]),
             "epsilon": float(epsilon[0]),
             "queried": self.queried[episode].copy(),

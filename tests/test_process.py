@@ -1,12 +1,16 @@
 import numpy as np
 import pytest
+import qpsolvers
 from scipy import stats
 
 from dptse_env.actions import ACTION_ENCODINGS
 from dptse_env.config import resolve
 from dptse_env.estimators import ESTIMATORS
+from dptse_env.estimators.compiled import mhe_kernels
 from dptse_env.interface import QueryInterface
 from dptse_env.process import QueryProcess
+
+from .estimators.solvers import lying, missing, silent, unsolved
 
 SEEDS = (11, 12, 13)
 ALL = np.arange(3)
@@ -152,3 +156,46 @@ def test_a_diverging_filter_is_flagged_and_the_episode_goes_on():
     outcome = process.step(ALL[:1], np.ones((1, 6), dtype=np.int8))
     assert process.info(0)["diverged"] == 0.0
     assert np.isfinite(outcome.reward).all()
+
+
+@pytest.mark.parametrize("backend", ["compiled", "reference"])
+@pytest.mark.parametrize("solver", [lying, silent, missing])
+def test_a_step_that_is_not_solved_for_keeps_the_prediction_and_says_so(
+    backend, solver, monkeypatch
+):
+    process, nobody = make(2, estimator="mhe", backend=backend), np.zeros((2, 6), dtype=np.int8)
+    process.reset(ALL[:2], generators(SEEDS[:2]))
+    for _ in range(12):
+        process.step(ALL[:2], nobody)
+    assert [process.info(e)["fallback"] for e in range(2)] == [0.0, 0.0]
+    monkeypatch.setattr(qpsolvers, "solve_problem", solver)
+    monkeypatch.setattr(mhe_kernels, "update", unsolved)  # the active set gives up
+    predicted, update = {}, process.estimator.update
+
+    def spy(*given):
+        predicted["density"] = process.estimator.estimate().density
+        update(*given)
+
+    process.estimator.update = spy
+    for _ in range(3):
+        outcome = process.step(ALL[:1], nobody[:1])
+        np.testing.assert_array_equal(process.estimate.density[0], predicted["density"][0])
+        assert [process.info(e)["fallback"] for e in range(2)] == [1.0, 0.0]
+        assert process.info(0)["diverged"] == 0.0
+        assert np.isfinite(outcome.reward).all()
+    monkeypatch.undo()
+    process.step(ALL[:1], nobody[:1])
+    assert process.info(0)["fallback"] == 0.0
+    assert (process.estimate.density[0] != predicted["density"][0]).any()
+
+
+def test_a_solver_that_is_not_installed_is_said_at_once_and_at_every_step():
+    settings = {"mhe": {"solver": "gurobi"}}
+    with pytest.warns(RuntimeWarning, match=r"'gurobi' is not installed"):
+        process = make(1, estimator="mhe", backend="reference", estimator_settings=settings)
+    process.reset(ALL[:1], generators([4]))
+    assert process.info(0)["fallback"] == 0.0
+    for _ in range(3):
+        outcome = process.step(ALL[:1], np.ones((1, 6), dtype=np.int8))
+        assert process.info(0)["fallback"] == 1.0
+        assert np.isfinite(outcome.reward).all()

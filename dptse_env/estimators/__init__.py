@@ -1,15 +1,23 @@
 """Traffic state estimators behind one protocol."""
 
-from dptse_env.estimators.base import Estimate, Estimator, EstimatorSettings, HorizonSettings
+from dptse_env.estimators.base import Estimate, Estimator
 from dptse_env.estimators.registry import BACKENDS, ESTIMATORS, check_estimator, make_estimator
+from dptse_env.estimators.settings import (
+    EnsembleSettings,
+    EstimatorSettings,
+    HorizonSettings,
+    SigmaPointSettings,
+)
 
 __all__ = [
     "BACKENDS",
     "ESTIMATORS",
+    "EnsembleSettings",
     "Estimate",
     "Estimator",
     "EstimatorSettings",
     "HorizonSettings",
+    "SigmaPointSettings",
     "check_estimator",
     "make_estimator",
 ]

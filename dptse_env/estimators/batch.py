@@ -9,7 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dptse_env.estimators.base import Estimate, EstimatorSettings
+from dptse_env.estimators.base import Estimate
+from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
 from dptse_env.model.network import BoolArray, FloatArray, IntArray
 
@@ -73,7 +74,7 @@ class BatchEstimator(ABC):
     """An estimator of a batch of episodes; subclasses get checked, contiguous arguments.
 
     `Estimator` documents the public methods. A subclass writes `innovations` and `diverged` of
-    the episodes that it updates.
+    the episodes that it updates, and `fallback` where its update can fail.
     """
 
     def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
@@ -83,6 +84,7 @@ class BatchEstimator(ABC):
         self.settings = settings
         self.innovations = np.zeros((n_episodes, model.n_segments, 2))
         self.diverged = np.zeros(n_episodes, dtype=np.bool_)
+        self.fallback = np.zeros(n_episodes, dtype=np.bool_)
 
     def reset(
         self, episodes: IntArray, states: FloatArray, generators: Sequence[np.random.Generator]
@@ -92,6 +94,7 @@ class BatchEstimator(ABC):
         states = checked_rows("states", states, (indices.size, self.model.n_states))
         self.innovations[indices] = 0.0
         self.diverged[indices] = False
+        self.fallback[indices] = False
         self._reset(indices, states, generators)
 
     def predict(self, episodes: IntArray, inputs: FloatArray) -> None:
@@ -104,9 +107,9 @@ class BatchEstimator(ABC):
     ) -> None:
         """Take in measurements; what is not finite where observed makes a filter diverge."""
         n_segments = self.model.n_segments
-        self._update(
-            checked_measurements(self.n_episodes, n_segments, episodes, observed, values, sigma)
-        )
+        given = checked_measurements(self.n_episodes, n_segments, episodes, observed, values, sigma)
+        self.fallback[given.episodes] = False
+        self._update(given._replace(sigma=self.settings.noise_scale * given.sigma))
 
     @abstractmethod
     def estimate(self) -> Estimate:

@@ -1,19 +1,38 @@
-"""Episodes of synthetic traffic for the tests of estimators."""
+"""Episodes for the tests of estimators, synthetic and recorded, and what runs them."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
+from dptse_env.estimators import EstimatorSettings, make_estimator
+from dptse_env.estimators.base import Estimator
 from dptse_env.model.arz import ARZModel
 from dptse_env.model.compiled import CompiledARZModel
 from dptse_env.model.network import BoolArray, FloatArray
 from dptse_env.model.parameters import load_parameters
 from dptse_env.traffic import PAPER_HIGHWAY
+from dptse_env.traffic.record import Record
 
 SIGMA = np.array([15.0, 6.0])  # [veh/km, km/h]
 FIXED_SENSORS = (14, 17, 18)
+
+
+@dataclass(frozen=True)
+class Road:
+    """A road as the model asks for it; the paper's lanes and lengths."""
+
+    n_mainline: int = 1
+    on_ramps: tuple[int, ...] = ()
+    off_ramps: tuple[int, ...] = ()
+    exit_shares: tuple[float, ...] = ()
+    segment_length: float = 0.1
+    segment_lanes: tuple[int, ...] = (3,)
+    lanes: int = 3
+    ramp_lanes: int = 1
 
 
 @dataclass(frozen=True)
@@ -65,5 +84,88 @@ def simulate(
     return Episodes(model, start, inputs, observed, values, truth)
 
 
+def replay(record: Record, parameters: str = "w99-3lane", seed: int = 0) -> Episodes:
+    """Recorded traffic of the paper's highway, five sensors going round; seed of the noise."""
+    model = CompiledARZModel(PAPER_HIGHWAY, load_parameters(parameters))
+    s, v_f = model.n_segments, model.parameters.free_flow_speed
+    density = record.counts / PAPER_HIGHWAY.segment_length
+    sums, counts = record.speed_sums, record.counts
+    speed = np.divide(sums, counts, out=np.full(sums.shape, np.nan), where=counts > 0)
+    inputs = model.boundary_inputs(density[:-1, s:], speed[:-1, s:])
+    traffic = np.stack([density[1:, :s], np.nan_to_num(speed[1:, :s], nan=102.0)], axis=-1)
+    values = traffic + SIGMA * np.random.default_rng(seed).normal(size=traffic.shape)
+    observed = np.zeros((len(traffic), s), bool)
+    for k, row in enumerate(observed):
+        row[[*((3 * np.arange(5) + k) % 15), *FIXED_SENSORS]] = True
+    start = model.states(0.05 * model.jam_density[None], np.full((1, s), 0.64 * v_f))
+    truth = model.states(traffic[..., 0], traffic[..., 1])
+    return Episodes(
+        model, start, inputs[:, None], observed[:, None], values[:, None], truth[:, None]
+    )
+
+
 def random_streams(n: int, seed: int = 0) -> list[np.random.Generator]:
     return [np.random.default_rng([seed, i]) for i in range(n)]
+
+
+def started(
+    name: str,
+    backend: str,
+    episodes: Episodes,
+    settings: EstimatorSettings | None = None,
+    start: FloatArray | None = None,
+    seed: int = 0,
+) -> Estimator:
+    """An estimator that is reset to the episodes' prior, or to another one."""
+    n = len(episodes.start)
+    estimator = make_estimator(name, backend, episodes.model, n, settings)
+    start = episodes.start if start is None else start
+    estimator.reset(episodes.everyone, start, random_streams(n, seed))
+    return estimator
+
+
+def run(
+    estimator: Estimator,
+    episodes: Episodes,
+    steps: Iterable[int],
+    sigma: FloatArray = SIGMA,
+    watch: Callable[[int], None] = lambda _: None,
+) -> None:
+    """Take the steps k of all episodes."""
+    for k in steps:
+        estimator.predict(episodes.everyone, episodes.inputs[k])
+        estimator.update(episodes.everyone, episodes.observed[k], episodes.values[k], sigma)
+        watch(k)
+
+
+def scale_of(model: ARZModel) -> FloatArray:
+    """Units `(2 S,)` of the normalised state."""
+    rho_m, v_f = model.density_scale, model.speed_scale
+    return np.tile([rho_m, rho_m * v_f], model.n_segments)
+
+
+class Snapshot(NamedTuple):
+    """All that an estimator shows."""
+
+    density: np.ndarray
+    speed: np.ndarray
+    density_std: np.ndarray
+    speed_std: np.ndarray
+    innovations: np.ndarray
+    diverged: np.ndarray
+    fallback: np.ndarray
+    states: np.ndarray
+
+
+def show(estimator: Estimator) -> Snapshot:
+    shown = estimator.estimate()
+    inner = estimator.means if hasattr(estimator, "means") else estimator.states
+    flags = estimator.diverged.copy(), estimator.fallback.copy()
+    four = shown.density, shown.speed, shown.density_std, shown.speed_std
+    return Snapshot(*four, estimator.innovations.copy(), *flags, inner.copy())
+
+
+def assert_same(one: Snapshot, other: Snapshot, episodes=slice(None), of=slice(None)) -> None:
+    for field in Snapshot._fields:
+        a, b = getattr(one, field)[episodes], getattr(other, field)[of]
+        np.testing.assert_array_equal(a, b, err_msg=field)

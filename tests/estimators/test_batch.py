@@ -1,7 +1,10 @@
 import numpy as np
 import pytest
 
+from dptse_env.estimators import BACKENDS, ESTIMATORS
 from dptse_env.estimators.batch import checked_episodes, checked_measurements
+
+from .episodes import random_streams, simulate, started
 
 
 def test_episodes_out_of_range_are_refused():
@@ -32,3 +35,15 @@ def test_bad_measurements_are_named(changes, message):
     }
     with pytest.raises(ValueError, match=message):
         checked_measurements(2, 5, **{**good, **changes})
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_every_estimator_checks_what_it_is_given(name, backend):
+    estimator, one = started(name, backend, simulate(n_steps=1)), np.arange(1)
+    with pytest.raises(ValueError, match=r"states must have shape \(1, 38\), got \(1, 37\)"):
+        estimator.reset(one, np.zeros((1, 37)), random_streams(1))
+    with pytest.raises(ValueError, match=r"inputs must have shape \(1, 9\), got \(9,\)"):
+        estimator.predict(one, np.zeros(9))
+    with pytest.raises(ValueError, match=r"episodes must be in 0\.\.0, got 1"):
+        estimator.predict(np.array([1]), np.zeros((1, 9)))

@@ -1,23 +1,30 @@
 """The ensemble Kalman filter: against the Kalman filter where all is linear, and by statistics."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from filterpy.kalman import EnsembleKalmanFilter
 
-from dptse_env.estimators import EstimatorSettings
-from dptse_env.estimators.compiled.enkf import CompiledEnKF, streams_of
+from dptse_env.estimators import EnsembleSettings, EstimatorSettings
+from dptse_env.estimators.compiled.enkf import CompiledEnKF
+from dptse_env.estimators.compiled.normals import bits_for, fill
+from dptse_env.estimators.reference.enkf import ReferenceEnKF
 from dptse_env.model import ARZModel, load_parameters
 
 from .episodes import SIGMA, random_streams, simulate
 
 both_sets = pytest.mark.parametrize("parameters", ["paper", "w99-3lane"])
+both_backends = pytest.mark.parametrize("backend", [CompiledEnKF, ReferenceEnKF])
 both_bounds = pytest.mark.parametrize("bounds", ["cone", "box"])
 
+FIELDS = ("density", "speed", "density_std", "speed_std")
 
-def started(episodes, seed=0, **settings):
+
+def started(episodes, seed=0, backend=CompiledEnKF, **settings):
     n = len(episodes.start)
-    filters = CompiledEnKF(episodes.model, n, EstimatorSettings(**settings))
+    filters = backend(episodes.model, n, EstimatorSettings(**settings))
     filters.reset(episodes.everyone, episodes.start, random_streams(n, seed))
     return filters
 
@@ -46,40 +53,59 @@ class BlockedCell:
     ramp_lanes: int = 1
 
 
-def linear_errors(n_members, n_seeds, monkeypatch, steps=20):
-    """Errors of mean and covariance against the Kalman filter, over its deviations, by seed."""
-    monkeypatch.setattr(CompiledEnKF, "n_members", n_members)
+def linear_system(n_steps=20):
+    """The blocked cell between an empty road and a jam: x = F x + w, z = H x + offset + v."""
     v_f, rho_m, tau, noise, initial = 102.0, 333.0, 60.0, 2e-5, 1e-8
-    settings = EstimatorSettings(process_noise=(noise, noise), initial_variance=initial)
-    model = ARZModel(BlockedCell(), load_parameters("paper"))
-    filters, everyone = CompiledEnKF(model, n_seeds, settings), np.arange(n_seeds)
     floor, unit = 0.01 * rho_m, np.array([rho_m, rho_m * v_f])
-    f = np.array([[1.0, 0.0], [v_f / tau, 1.0 - 1.0 / tau]])
-    q, h = np.diag((noise * unit) ** 2), np.array([[1.0, 0.0], [0.0, 1.0 / floor]])
     offset, sigma = np.array([0.0, -v_f * 0.01**2]), np.array([0.05, 2.0])
-    x, p = np.array([2.0, 160.0]), np.diag(initial * unit**2)
-    filters.reset(everyone, np.tile(x, (n_seeds, 1)), random_streams(n_seeds))
-    rng, inputs = np.random.default_rng(0), np.tile([0.0, v_f, 1.2 * rho_m], (n_seeds, 1))
-    for _ in range(steps):
-        z = np.array([2.0, 1.6 * v_f / floor]) + offset + sigma * rng.normal(size=2)
-        filters.predict(everyone, inputs)
-        values = np.broadcast_to(z, (n_seeds, 1, 2))
-        filters.update(everyone, np.ones((n_seeds, 1), bool), values, sigma)
-        x, p = f @ x, f @ p @ f.T + q
-        s = h @ p @ h.T + np.diag(sigma**2)
-        gain = p @ h.T @ np.linalg.inv(s)
-        x, p = x + gain @ (z - h @ x - offset), p - gain @ s @ gain.T
-    deviation = np.sqrt(np.diag(p))
-    covariances = filters.covariances * np.outer(unit, unit)
-    return (filters.states - x) / deviation, covariances / np.outer(deviation, deviation) - (
-        p / np.outer(deviation, deviation)
+    disturbance = sigma * np.random.default_rng(0).normal(size=(n_steps, 2))
+    return SimpleNamespace(
+        settings=EstimatorSettings(process_noise=(noise, noise), initial_variance=initial),
+        f=np.array([[1.0, 0.0], [v_f / tau, 1.0 - 1.0 / tau]]),
+        h=np.array([[1.0, 0.0], [0.0, 1.0 / floor]]),
+        q=np.diag((noise * unit) ** 2),
+        x=np.array([2.0, 160.0]),
+        p=np.diag(initial * unit**2),
+        z=np.array([2.0, 1.6 * v_f / floor]) + offset + disturbance,
+        offset=offset,
+        sigma=sigma,
+        unit=unit,
+        inputs=np.array([0.0, v_f, 1.2 * rho_m]),
     )
 
 
-def test_approaches_the_kalman_filter_as_one_over_the_root_of_the_members(monkeypatch):
+def run_linear(system, backend, n_members, n_seeds):
+    settings = replace(system.settings, enkf=EnsembleSettings(n_members=n_members))
+    model = ARZModel(BlockedCell(), load_parameters("paper"))
+    filters, everyone = backend(model, n_seeds, settings), np.arange(n_seeds)
+    filters.reset(everyone, np.tile(system.x, (n_seeds, 1)), random_streams(n_seeds))
+    for z in system.z:
+        filters.predict(everyone, np.tile(system.inputs, (n_seeds, 1)))
+        values = np.broadcast_to(z, (n_seeds, 1, 2))
+        filters.update(everyone, np.ones((n_seeds, 1), bool), values, system.sigma)
+    return filters
+
+
+def linear_errors(backend, n_members, n_seeds):
+    """Errors of mean and covariance against the Kalman filter, over its deviations, by seed."""
+    system = linear_system()
+    filters = run_linear(system, backend, n_members, n_seeds)
+    f, h, x, p = system.f, system.h, system.x, system.p
+    for z in system.z:
+        x, p = f @ x, f @ p @ f.T + system.q
+        s = h @ p @ h.T + np.diag(system.sigma**2)
+        gain = p @ h.T @ np.linalg.inv(s)
+        x, p = x + gain @ (z - h @ x - system.offset), p - gain @ s @ gain.T
+    deviation = np.sqrt(np.diag(p))
+    covariances = filters.covariances * np.outer(system.unit, system.unit)
+    return (filters.states - x) / deviation, (covariances - p) / np.outer(deviation, deviation)
+
+
+@both_backends
+def test_approaches_the_kalman_filter_as_one_over_the_root_of_the_members(backend):
     spreads = {}
-    for n_members in (25, 100, 400, 1600):
-        mean, covariance = linear_errors(n_members, 200, monkeypatch)
+    for n_members in (25, 100, 400):
+        mean, covariance = linear_errors(backend, n_members, 200)
         spreads[n_members] = np.sqrt(np.mean(mean**2)), np.sqrt(np.mean(covariance**2))
     for i in range(2):
         logs = np.log([spread[i] for spread in spreads.values()])
@@ -89,12 +115,34 @@ def test_approaches_the_kalman_filter_as_one_over_the_root_of_the_members(monkey
     assert spreads[100][0] < 0.2
 
 
-def test_mean_over_seeds_is_the_kalman_filters(monkeypatch):
-    mean, covariance = linear_errors(400, 200, monkeypatch)
+@both_backends
+def test_mean_over_seeds_is_the_kalman_filters(backend):
+    mean, covariance = linear_errors(backend, 400, 200)
     for errors in (mean, covariance.reshape(200, 4)):
         standard_error = errors.std(axis=0) / np.sqrt(len(errors))
         # The bias of a finite ensemble falls as 1 / M.
         assert (np.abs(errors.mean(axis=0)) < 4.0 * standard_error + 3.0 / 400).all()
+
+
+def test_means_are_spread_over_seeds_as_filterpys_where_all_is_linear():
+    system, n_members, n_seeds = linear_system(8), 50, 150
+    ours = run_linear(system, CompiledEnKF, n_members, n_seeds).states
+    theirs = np.empty_like(ours)
+    np.random.seed(0)  # noqa: NPY002, filterpy's draws
+    for seed in range(n_seeds):
+        plain = EnsembleKalmanFilter(
+            system.x, system.p, 2, 1.0, n_members,
+            lambda x: system.h @ x + system.offset, lambda x, _: system.f @ x,
+        )  # fmt: skip
+        plain.Q, plain.R = system.q, np.diag(system.sigma**2)
+        for z in system.z:
+            plain.predict()
+            plain.update(z)
+        theirs[seed] = plain.x
+    error = np.sqrt((ours.var(axis=0) + theirs.var(axis=0)) / n_seeds)
+    assert (np.abs(ours.mean(axis=0) - theirs.mean(axis=0)) < 4.0 * error).all()
+    # The logarithm of a ratio of two deviations is off by 1 / sqrt(150), about.
+    assert (np.abs(np.log(ours.std(axis=0) / theirs.std(axis=0))) < 0.33).all()
 
 
 def test_seeds_differ_by_what_an_ensemble_leaves_open():
@@ -114,166 +162,211 @@ def test_seeds_differ_by_what_an_ensemble_leaves_open():
     assert (scatter < claimed).all()
 
 
-def test_worthless_measurements_equal_none():
-    episodes = simulate(n_steps=100)
-    filters, blind = started(episodes), started(episodes)
-    run(filters, episodes, range(100), sigma=np.array([1e12, 1e12]))
-    for k in range(100):
-        blind.predict(episodes.everyone, episodes.inputs[k])
-    np.testing.assert_allclose(filters.states, blind.states, rtol=1e-6)
+# Backends -----------------------------------------------------------------------------------------
 
 
-def test_without_noise_worthless_measurements_leave_the_model_alone():
-    episodes = simulate(n_steps=100)
-    filters = started(episodes, process_noise=(0.0, 0.0), initial_variance=1e-18)
-    run(filters, episodes, range(100), sigma=np.array([1e12, 1e12]))
-    states, model = episodes.start, episodes.model
-    for k in range(100):
-        states = model.project(model.step(states, episodes.inputs[k]))
-    np.testing.assert_allclose(filters.states, states, rtol=1e-4)
+class Replay:
+    """Draws what a compiled stream is about to draw, a member a row."""
+
+    def __init__(self, stream):
+        self.stream = stream.copy()
+
+    def standard_normal(self, shape):
+        out = np.empty(shape[0] * shape[1], dtype=np.float32)
+        fill(self.stream, out, bits_for(out.size))
+        return out.reshape(shape[1], shape[0]).T.astype(float)
 
 
-def test_an_empty_set_of_measurements_changes_nothing():
-    episodes = simulate(n_steps=50)
-    filters = started(episodes)
-    run(filters, episodes, range(49))
-    filters.predict(episodes.everyone, episodes.inputs[49])
-    members = filters.members
-    nothing = np.zeros((1, 19), bool)
-    filters.update(episodes.everyone, nothing, np.full((1, 19, 2), np.nan), SIGMA)
-    np.testing.assert_allclose(filters.members, members, rtol=1e-12)
-    np.testing.assert_array_equal(filters.innovations, 0.0)
-    assert not filters.diverged.any()
+@both_sets
+@both_bounds
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"inflation": 1.1}, {"taper": 0.35}, {"inflation": 1.1, "taper": 0.35, "n_members": 30}],
+    ids=str,
+)
+def test_given_the_same_draws_backends_agree(parameters, bounds, options):
+    episodes = simulate(parameters, n_steps=60)
+    settings = {"bounds": bounds, "enkf": EnsembleSettings(**options)}
+    compiled = started(episodes, **settings)
+    reference = started(episodes, backend=ReferenceEnKF, **settings)
+    reference.members[:] = compiled.members
+    process, measurement = (Replay(stream) for stream in compiled._ensembles.streams[0])
+    reference._streams[0] = SimpleNamespace(process=process, measurement=measurement)
+    unit = np.tile([1.0, compiled.model.speed_scale], 19) * compiled.model.density_scale
+
+    for k in range(60):
+        for filters in (compiled, reference):
+            run(filters, episodes, [k])
+        np.testing.assert_allclose(compiled.members / unit, reference.members / unit, atol=1e-9)
+        np.testing.assert_allclose(compiled.innovations, reference.innovations, atol=1e-6)
+        np.testing.assert_allclose(compiled.covariances, reference.covariances, atol=1e-9)
+        a, b = compiled.estimate(), reference.estimate()
+        for field in FIELDS:
+            np.testing.assert_allclose(getattr(a, field), getattr(b, field), rtol=1e-6, atol=1e-6)
+        if bounds == "box":  # leaves psi / rho without a bound, and there rounding grows
+            reference.members[:] = compiled.members
 
 
-def test_values_of_unobserved_segments_are_not_looked_at():
+def test_backends_are_equal_in_distribution():
+    """Estimates and what they claim, over 200 seeds each on the same traffic."""
+    one, n = simulate(n_steps=10), 200
+    everyone, drawn = np.arange(n), {}
+    for backend in (CompiledEnKF, ReferenceEnKF):
+        filters = backend(one.model, n, EstimatorSettings())
+        filters.reset(everyone, np.repeat(one.start, n, axis=0), random_streams(n))
+        drawn[backend] = []
+        for k in range(10):
+            filters.predict(everyone, np.repeat(one.inputs[k], n, axis=0))
+            observed, values = (np.repeat(a[k], n, axis=0) for a in (one.observed, one.values))
+            filters.update(everyone, observed, values, SIGMA)
+            if k in (0, 4, 9):
+                estimate = filters.estimate()
+                drawn[backend].append([getattr(estimate, field) for field in FIELDS])
+    a, b = (np.array(drawn[backend]) for backend in drawn)
+    error = np.sqrt((a.var(axis=2, ddof=1) + b.var(axis=2, ddof=1)) / n)
+    scores = (a.mean(axis=2) - b.mean(axis=2)) / error
+    assert np.abs(scores).max() < 4.5
+    assert np.sqrt(np.mean(scores**2)) < 1.3
+    ratios = a.var(axis=2) / b.var(axis=2)  # each off by sqrt(2 / 200), about
+    assert abs(np.log(ratios).mean()) < 0.1
+    assert np.abs(np.log(ratios)).max() < 0.8
+
+
+# Options ------------------------------------------------------------------------------------------
+
+
+@both_backends
+def test_inflation_widens_what_the_members_claim(backend):
     episodes = simulate(n_steps=30)
-    a, b = started(episodes), started(episodes)
-    hidden = np.where(episodes.observed[..., None], episodes.values, np.nan)
-    for k in range(30):
-        for filters, values in ((a, episodes.values), (b, hidden)):
+    plain = started(episodes, backend=backend)
+    wide = started(episodes, backend=backend, enkf=EnsembleSettings(inflation=1.2))
+    for filters in (plain, wide):
+        run(filters, episodes, range(30))
+    ratio = wide.estimate().density_std / plain.estimate().density_std
+    assert np.median(ratio) > 1.1
+
+
+def test_inflation_waits_for_measurements_and_keeps_members_within_bounds():
+    episodes = simulate(n_steps=20)
+    model = episodes.model
+    plain, wide = (
+        started(episodes, enkf=EnsembleSettings(inflation=factor)) for factor in (1.0, 3.0)
+    )
+    nothing = np.zeros((1, 19), bool)
+    for k in range(10):
+        for filters in (plain, wide):
             filters.predict(episodes.everyone, episodes.inputs[k])
-            filters.update(episodes.everyone, episodes.observed[k], values[k], SIGMA)
-    np.testing.assert_array_equal(a.members, b.members)
-    np.testing.assert_array_equal(b.innovations[~episodes.observed[29]], 0.0)
+            filters.update(episodes.everyone, nothing, episodes.values[k], SIGMA)
+    np.testing.assert_array_equal(plain.members, wide.members)
+    run(wide, episodes, range(10, 20))
+    members = wide.members[0]
+    np.testing.assert_allclose(model.project(members), members, rtol=1e-9)
+
+
+def test_inflation_alone_scales_distances_from_the_mean():
+    """With worthless measurements and room to the bounds nothing else moves the members."""
+    episodes = simulate(n_steps=1)
+    filters = started(
+        episodes, initial_variance=1e-8, bounds="box", enkf=EnsembleSettings(inflation=1.5)
+    )
+    before, covariances = filters.states, filters.covariances
+    filters.update(episodes.everyone, episodes.observed[0], episodes.values[0], 1e12 * SIGMA)
+    np.testing.assert_allclose(filters.states, before, rtol=1e-9)
+    np.testing.assert_allclose(filters.covariances, 1.5**2 * covariances, rtol=1e-6)
+
+
+@both_backends
+def test_a_taper_keeps_measurements_from_acting_far_away(backend):
+    episodes = simulate(n_steps=20)
+    filters = started(episodes, backend=backend, enkf=EnsembleSettings(taper=0.25))
+    run(filters, episodes, range(19))
+    filters.predict(episodes.everyone, episodes.inputs[19])
+    before = filters.members.copy()
+    only = np.arange(19)[None] == 5
+    filters.update(episodes.everyone, only, episodes.values[19], SIGMA)
+    moved = np.abs(filters.members - before).max(axis=(0, 1)).reshape(19, 2).max(axis=1) > 1e-6
+    # Segments of 0.1 km; face 6, where the first off-ramp leaves, is half of one away.
+    near = [3, 4, 5, 6, 7, 17]
+    assert np.flatnonzero(moved).tolist() == near
+
+
+def test_a_taper_beyond_the_road_changes_little():
+    episodes = simulate(n_steps=20)
+    plain, wide = started(episodes), started(episodes, enkf=EnsembleSettings(taper=1e6))
+    for filters in (plain, wide):
+        run(filters, episodes, range(20))
+    np.testing.assert_allclose(plain.members, wide.members, rtol=1e-6)
 
 
 # Soundness ----------------------------------------------------------------------------------------
 
 
-@both_sets
-def test_covariance_is_one_and_no_episode_diverges(parameters):
-    episodes = simulate(parameters, n=2)
-    filters = started(episodes)
-
-    def check(_):
-        covariances = filters.covariances
-        np.testing.assert_array_equal(covariances, covariances.swapaxes(1, 2))
-        assert np.linalg.eigvalsh(covariances).min() >= -1e-10
-        assert not filters.diverged.any()
-
-    run(filters, episodes, range(700), watch=check)
-
-
-@both_sets
-@both_bounds
-@pytest.mark.parametrize("filling", [0.0, 1.0], ids=["empty", "jam"])
-def test_adversarial_starts_and_noise_stay_finite_and_within_bounds(parameters, bounds, filling):
-    episodes = simulate(parameters, n=2, noise=10.0)
-    model = episodes.model
-    filters = started(episodes, bounds=bounds)
-    density = np.full((2, 19), filling) * model.jam_density
-    filters.reset(episodes.everyone, model.states(density, np.zeros((2, 19))), random_streams(2))
-
-    def check(_):
-        for states in (filters.states, filters.members[0]):
-            np.testing.assert_allclose(model.project(states, bounds), states, rtol=1e-9, atol=1e-9)
-        estimate = filters.estimate()
-        for field in ("density", "speed", "density_std", "speed_std"):
-            assert np.isfinite(getattr(estimate, field)).all()
-        assert np.isfinite(filters.innovations).all()
-
-    run(filters, episodes, range(700), watch=check)
-
-
-@pytest.mark.parametrize("poison", ["values", "inputs", "members"])
-def test_divergence_is_flagged_and_ends_at_the_prior(poison):
-    episodes = simulate(n=3, n_steps=20)
-    filters, healthy = started(episodes), started(episodes)
-    run(filters, episodes, range(10))
-    run(healthy, episodes, range(10))
-    values, inputs = episodes.values[10].copy(), episodes.inputs[10].copy()
-    if poison == "values":
-        values[1, 14, 0] = np.nan
-    elif poison == "inputs":
-        inputs[1] = np.nan
+@both_backends
+@pytest.mark.parametrize("measured", [True, False])
+def test_a_member_that_is_not_finite_is_found_and_its_episode_drawn_anew(backend, measured):
+    episodes = simulate(n=3, n_steps=12)
+    filters, healthy = (started(episodes, backend=backend) for _ in range(2))
+    for each in (filters, healthy):
+        run(each, episodes, range(10))
+        each.predict(episodes.everyone, episodes.inputs[10])
+    if backend is CompiledEnKF:
+        filters._ensembles.swarms[1, 4, 3] = np.nan
     else:
-        filters._swarms[1, 4, 3] = np.nan
-    filters.predict(episodes.everyone, inputs)
-    filters.update(episodes.everyone, episodes.observed[10], values, SIGMA)
-    run(healthy, episodes, [10])
+        filters.members[1, 3, 4] = np.nan
+    observed = episodes.observed[10] & measured
+    for each in (filters, healthy):
+        each.update(episodes.everyone, observed, episodes.values[10], SIGMA)
     assert filters.diverged.tolist() == [False, True, False]
-    away = (filters.states[1] - episodes.start[1]) / np.tile([400.0, 400.0 * 140.0], 19)
-    assert (np.abs(away) < 5.0 * np.sqrt(1e-3 / 100)).all()
     np.testing.assert_array_equal(filters.innovations[1], 0.0)
-    for i in (0, 2):
-        np.testing.assert_array_equal(filters.members[i], healthy.members[i])
+    np.testing.assert_allclose(filters.members[1].mean(axis=0), episodes.start[1], rtol=0.3)
+    np.testing.assert_array_equal(filters.members[[0, 2]], healthy.members[[0, 2]])
     run(filters, episodes, [11])
     assert not filters.diverged.any()
 
 
-# Streams and batches ------------------------------------------------------------------------------
+@both_backends
+@both_bounds
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_a_measurement_that_is_not_finite_is_not_projected_away(backend, bounds, bad):
+    episodes = simulate(n_steps=1)
+    filters = started(episodes, backend=backend, bounds=bounds)
+    filters.predict(episodes.everyone, episodes.inputs[0])
+    values = episodes.values[0].copy()
+    values[0, 14, 0] = bad
+    filters.update(episodes.everyone, np.arange(19)[None] == 14, values, SIGMA)
+    assert filters.diverged.all()
+    np.testing.assert_array_equal(filters.innovations, 0.0)
 
 
-def test_a_batch_equals_a_loop_to_the_bit():
-    episodes = simulate(n=4, n_steps=60)
-    batch = started(episodes)
-    run(batch, episodes, range(60))
-    for i in range(4):
-        one, alone, row = CompiledEnKF(episodes.model, 1, EstimatorSettings()), np.arange(1), [i]
-        one.reset(alone, episodes.start[row], [random_streams(4)[i]])
-        for k in range(60):
-            one.predict(alone, episodes.inputs[k, row])
-            one.update(alone, episodes.observed[k, row], episodes.values[k, row], SIGMA)
-        np.testing.assert_array_equal(one.members[0], batch.members[i])
-        np.testing.assert_array_equal(one.innovations[0], batch.innovations[i])
+@both_backends
+def test_outputs_that_are_known_exactly_and_twice_over_diverge(backend):
+    """Without noise more outputs than members leave no definite S: flagged, not solved."""
+    episodes = simulate(n_steps=1)
+    filters = started(episodes, backend=backend, enkf=EnsembleSettings(n_members=4))
+    filters.predict(episodes.everyone, episodes.inputs[0])
+    everything = np.ones((1, 19), bool)
+    filters.update(episodes.everyone, everything, episodes.values[0], np.zeros(2))
+    assert filters.diverged.all()
+    assert np.isfinite(filters.members).all()
 
 
-def test_only_the_episodes_named_are_touched():
-    episodes = simulate(n=4, n_steps=20)
-    filters, other = started(episodes), started(episodes)
-    for each in (filters, other):
-        run(each, episodes, range(10))
-    some = np.array([3, 1])
-    filters.predict(some, episodes.inputs[10, some])
-    filters.update(some, episodes.observed[10, some], episodes.values[10, some], SIGMA)
-    filters.reset(np.array([1]), episodes.start[[1]], random_streams(1))
-    for i in (0, 2):
-        np.testing.assert_array_equal(filters.members[i], other.members[i])
-        np.testing.assert_array_equal(filters.innovations[i], other.innovations[i])
-    assert not np.array_equal(filters.members[3], other.members[3])
-    # Nor were the streams of the others: they go on alike.
-    both = np.array([0, 2])
-    for each in (filters, other):
-        each.predict(both, episodes.inputs[11, both])
-    np.testing.assert_array_equal(filters.members[both], other.members[both])
+# Streams ------------------------------------------------------------------------------------------
 
 
-def test_the_seed_decides_and_the_global_generator_is_left_alone():
-    episodes = simulate(n_steps=50)
-    first, second, third = started(episodes), started(episodes), started(episodes, seed=1)
-    np.random.seed(1)  # noqa: NPY002
-    state = np.random.get_state()[1].copy()  # noqa: NPY002
-    run(first, episodes, range(50))
-    np.testing.assert_array_equal(np.random.get_state()[1], state)  # noqa: NPY002
-    np.random.seed(2)  # noqa: NPY002
-    run(second, episodes, range(50))
-    run(third, episodes, range(50))
-    np.testing.assert_array_equal(first.members, second.members)
-    assert not np.array_equal(first.members, third.members)
-
-
-def test_the_streams_of_an_episode_are_independent():
-    a, b = streams_of(np.random.default_rng(0))
-    x, y = a.standard_normal(20_000), b.standard_normal(20_000)
-    assert abs(np.corrcoef(x, y)[0, 1]) < 0.03
+@both_backends
+def test_what_is_measured_does_not_change_how_members_are_disturbed(backend):
+    episodes = simulate(n_steps=12)
+    seeing, blind = (started(episodes, backend=backend) for _ in range(2))
+    nothing = np.zeros((1, 19), bool)
+    for k in range(11):
+        for filters, observed in ((seeing, episodes.observed[k]), (blind, nothing)):
+            filters.predict(episodes.everyone, episodes.inputs[k])
+            filters.update(episodes.everyone, observed, episodes.values[k], SIGMA)
+    assert not np.array_equal(seeing.members, blind.members)
+    for filters in (seeing, blind):  # from the same members
+        if backend is CompiledEnKF:
+            filters._ensembles.swarms[:] = episodes.start[:, :, None]
+        else:
+            filters.members[:] = episodes.start[:, None]
+        filters.predict(episodes.everyone, episodes.inputs[11])
+    np.testing.assert_array_equal(seeing.members, blind.members)

@@ -1,198 +1,300 @@
-"""Compiled kernels of the ensemble Kalman filter: one episode at a time, members in columns."""
+"""Compiled kernels of the ensemble Kalman filter: a batch of episodes, one after the other.
+
+With D the outputs' distances from their mean and X the states', one member a column, the update
+is `x += X D' (D D' + (M - 1) R)^-1 (z + noise - y)` for every member: S is factorised and solved
+for the gain, which has fewer columns than there are members. Products of matrices are BLAS's,
+small enough to stay on one thread.
+"""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from dptse_env.estimators.compiled.cholesky import solve
 from dptse_env.estimators.compiled.kernels import Packed
+from dptse_env.estimators.compiled.normals import Bits, Draws, bits_for, fill
 from dptse_env.estimators.compiled.swarm import (
     advance_swarm,
     flock_of,
     measured_speeds,
     project_swarm,
 )
-from dptse_env.estimators.compiled.ukf_kernels import factor, products
 from dptse_env.model.arz import LARGEST_W
-from dptse_env.model.network import BoolArray, FloatArray
+from dptse_env.model.network import BoolArray, FloatArray, IntArray
 from dptse_env.model.road import Road
 
-Draws = NDArray[np.float32]
+
+class Ensembles(NamedTuple):
+    """Members of n episodes and what moves them.
+
+    Attributes:
+        swarms: `(n, 2 S, width)` a member a column [veh/km, veh/h]; columns beyond the members
+            repeat the first one or are moved along with it.
+        n_members: M.
+        priors: `(n, 2 S)` means to go back to.
+        streams: `(n, 2, 4, LANES)` of process noise and of measurement noise.
+        innovations: `(n, S, 2)`.
+        diverged: `(n,)`.
+        process_deviation: `(2,)` of what disturbs rho and psi in a step [veh/km, veh/h].
+        initial_deviation: `(2,)` of the members around a prior [veh/km, veh/h].
+        density_scale: rho_m [veh/km].
+        inflation: Factor on distances from the mean ahead of an update.
+        tapers: `(S, S)` weights of covariances between segments; `(0, 0)` for none.
+        is_box: Whether members are held to the paper's box instead of the cone.
+    """
+
+    swarms: FloatArray
+    n_members: int
+    priors: FloatArray
+    streams: NDArray[np.uint64]
+    innovations: FloatArray
+    diverged: BoolArray
+    process_deviation: FloatArray
+    initial_deviation: FloatArray
+    density_scale: float
+    inflation: float
+    tapers: FloatArray
+    is_box: bool
 
 
 @njit(cache=True, error_model="numpy")
-def scatter(
-    road_: Packed, swarm: FloatArray, n: int, deviation: FloatArray, draws: Draws, is_box: bool
-) -> None:
-    """Add noise of `deviation` `(2,)` [veh/km, veh/h] to the first n columns and project all.
+def restart(road_: Packed, ensembles_: Packed, episodes: IntArray) -> None:
+    """Draw the members of episodes around their priors."""
+    road, ensembles = Road(*road_), Ensembles(*ensembles_)
+    for e in episodes:
+        _restart(road, ensembles, e)
 
-    Columns beyond n repeat the first.
-    """
-    road = Road(*road_)
+
+@njit(cache=True, error_model="numpy")
+def _restart(road: Road, ensembles: Ensembles, e: int) -> None:
+    swarm, n = ensembles.swarms[e], ensembles.n_members
     for i in range(swarm.shape[0]):
-        row, draw, size = swarm[i], draws[i], deviation[i % 2]
+        swarm[i] = ensembles.priors[e, i]
+    draws = np.empty(swarm.shape[0] * n, dtype=np.float32)
+    fill(ensembles.streams[e, 0], draws, bits_for(draws.size))
+    _disturb(swarm, n, ensembles.initial_deviation, draws)
+    project_swarm(road, swarm, ensembles.is_box)
+
+
+@njit(cache=True, error_model="numpy")
+def _disturb(swarm: FloatArray, n: int, deviation: FloatArray, draws: Draws) -> None:
+    """Add noise to the first n columns; those beyond repeat the first."""
+    for i in range(swarm.shape[0]):
+        row, draw, size = swarm[i], draws[i * n : (i + 1) * n], deviation[i % 2]
         for j in range(n):
             row[j] += size * draw[j]
         row[n:] = row[0]
-    project_swarm(road, swarm, is_box)
 
 
 @njit(cache=True, error_model="numpy")
-def predict(
-    road_: Packed,
-    swarm: FloatArray,
-    n: int,
-    inputs: FloatArray,
-    deviation: FloatArray,
-    draws: Draws,
-    is_box: bool,
-) -> None:
-    """Move the members of one episode, disturb each and project it."""
-    road = Road(*road_)
-    advance_swarm(road, swarm, inputs, flock_of(road, swarm.shape[1]))
-    scatter(road_, swarm, n, deviation, draws, is_box)
+def predict(road_: Packed, ensembles_: Packed, episodes: IntArray, inputs: FloatArray) -> None:
+    """Move the members one step ahead under inputs `(k, n_u)`, disturb each and project it."""
+    road, ensembles = Road(*road_), Ensembles(*ensembles_)
+    n = ensembles.n_members
+    size, width = ensembles.swarms.shape[1:]
+    flock = flock_of(road, width)
+    draws = np.empty(size * n, dtype=np.float32)
+    bits = bits_for(draws.size)
+    for k in range(episodes.size):
+        swarm = ensembles.swarms[episodes[k]]
+        advance_swarm(road, swarm, inputs[k], flock)
+        fill(ensembles.streams[episodes[k], 0], draws, bits)
+        _disturb(swarm, n, ensembles.process_deviation, draws)
+        project_swarm(road, swarm, ensembles.is_box)
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
-def _centre(row: FloatArray, n: int, unit: float, out: FloatArray) -> float:
-    """Write distances from the mean, zero beyond n, and return the mean, both over `unit`."""
+def _mean(row: FloatArray, n: int) -> float:
+    """Mean of the first n, from the first: equal numbers have no spread to rounding."""
     first, total = row[0], 0.0
     for j in range(n):
         total += row[j] - first
-    mean = first + total / n
+    return float(first + total / n)
+
+
+@njit(cache=True, error_model="numpy")
+def _centre(row: FloatArray, n: int, unit: float, out: FloatArray) -> float:
+    """Write distances from the mean, zero beyond n, and return the mean, both over `unit`."""
+    mean, inverse = _mean(row, n), 1.0 / unit
     for j in range(n):
-        out[j] = (row[j] - mean) / unit
+        out[j] = (row[j] - mean) * inverse
     out[n:] = 0.0
-    return float(mean / unit)
+    return mean * inverse
+
+
+@njit(cache=True, error_model="numpy")
+def _inflate(swarm: FloatArray, n: int, factor: float) -> None:
+    for i in range(swarm.shape[0]):
+        row, mean = swarm[i], _mean(swarm[i], n)
+        for j in range(row.size):
+            row[j] = mean + factor * (row[j] - mean)
 
 
 @njit(cache=True, error_model="numpy")
 def update(
     road_: Packed,
-    swarm: FloatArray,
-    n: int,
-    density_scale: float,
+    ensembles_: Packed,
+    episodes: IntArray,
     observed: BoolArray,
     values: FloatArray,
     sigma: FloatArray,
-    draws: Draws,
-    innovations: FloatArray,
-    is_box: bool,
-) -> bool:
-    """Take the measurements of one episode in, perturbed for each member by `draws`.
+) -> None:
+    """Take in measurements, perturbed for each member; see `Estimator.update`."""
+    road, ensembles = Road(*road_), Ensembles(*ensembles_)
+    n_segments = road.jam.size
+    draws = np.empty(2 * n_segments * ensembles.n_members, dtype=np.float32)
+    bits = bits_for(draws.size)
+    segments = np.empty(n_segments, dtype=np.int64)
+    for k in range(episodes.size):
+        e, n_seen = episodes[k], 0
+        for s in range(n_segments):
+            if observed[k, s]:
+                segments[n_seen] = s
+                n_seen += 1
+        ensembles.innovations[e] = 0.0
+        swarm, sound = ensembles.swarms[e], True
+        if n_seen > 0:
+            sound = _take_in(road, ensembles, e, segments[:n_seen], values[k], sigma, draws, bits)
+            project_swarm(road, swarm, ensembles.is_box)
+        ensembles.diverged[e] = not (sound and _is_finite(swarm))
+        if ensembles.diverged[e]:
+            ensembles.innovations[e] = 0.0
+            _restart(road, ensembles, e)
 
-    Returns:
-        Whether the members are finite and the predicted covariance was definite.
-    """
-    road = Road(*road_)
-    innovations[:] = 0.0
-    if observed.any() and not _take_in(
-        road, swarm, n, density_scale, observed, values, sigma, draws, innovations
-    ):
-        return False
-    project_swarm(road, swarm, is_box)
-    return bool(np.isfinite(swarm).all())
+
+@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
+def _is_finite(swarm: FloatArray) -> bool:
+    total = 0.0
+    for i in range(swarm.shape[0]):
+        row = swarm[i]
+        for j in range(row.size):
+            total += 0.0 * row[j]
+    return total == 0.0
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@njit(cache=True, error_model="numpy")
 def _take_in(
     road: Road,
-    swarm: FloatArray,
-    n: int,
-    density_scale: float,
-    observed: BoolArray,
+    ensembles: Ensembles,
+    e: int,
+    segments: IntArray,
     values: FloatArray,
     sigma: FloatArray,
     draws: Draws,
-    innovations: FloatArray,
+    bits: Bits,
 ) -> bool:
-    width, m, v_f = swarm.shape[1], 2 * observed.sum(), road.free_flow_speed
-    start = (m + 7) // 8 * 8
-    # Rows are outputs: S, then the residuals of the members.
-    joint = np.zeros((m, start + width))
-    distances, means = np.empty((m, width)), np.empty(m)
-    speed = np.empty(width)
-    units = np.array([density_scale, v_f])
-    r = 0
-    for s in range(observed.size):
-        if not observed[s]:
-            continue
-        measured_speeds(swarm[2 * s], swarm[2 * s + 1], road.jam[s], v_f, road.gamma, speed)
-        for kind in range(2):
-            row, unit = (swarm[2 * s], units[0]) if kind == 0 else (speed, units[1])
-            residual, draw, noise = joint[r, start:], draws[r], sigma[kind] / unit
-            means[r] = _centre(row, n, unit, distances[r])
-            centre = values[s, kind] / unit - means[r]
-            for j in range(n):
-                residual[j] = centre + noise * draw[j] - distances[r, j]
-            innovations[s, kind] = centre
-            r += 1
-    products(distances, m, distances, m, True, joint)
-    r = 0
-    for i in range(m):
-        noise = sigma[i % 2] / units[i % 2]
-        for j in range(i + 1):
-            joint[j, i] = joint[i, j] / (n - 1)
-        joint[i, i] += noise**2
-    for s in range(observed.size):
-        if observed[s]:
-            innovations[s, 0] /= np.sqrt(joint[r, r])
-            innovations[s, 1] /= np.sqrt(joint[r + 1, r + 1])
-            r += 2
-    if not factor(joint, m):
-        return False
-    _back(joint, m, start)
-    states, cross = np.empty(swarm.shape), np.empty((swarm.shape[0], m + 1))
+    """Move the members of one episode by what was measured.
+
+    Returns:
+        Whether S was definite and the members are finite, ahead of a projection that would bring
+        infinities back into the bounds.
+    """
+    swarm, n = ensembles.swarms[e], ensembles.n_members
+    if ensembles.inflation != 1.0:
+        _inflate(swarm, n, ensembles.inflation)
+        project_swarm(road, swarm, ensembles.is_box)
+    m, width = 2 * segments.size, swarm.shape[1]
+    used = draws[: m * n]
+    fill(ensembles.streams[e, 1], used, bits)
+    distances, residuals = np.empty((m, width)), np.empty((m, width))
+    units = np.array([ensembles.density_scale, road.free_flow_speed])
+    noise = sigma / units
+    centres = _compare(
+        road, ensembles, e, segments, values, units, noise, used, distances, residuals
+    )
+    # Whole vector registers for the solution; the rows beyond the states are zero.
+    states = np.zeros(((swarm.shape[0] + 7) // 8 * 8, width))
     for i in range(swarm.shape[0]):
-        _centre(swarm[i], n, float(n - 1), states[i])
-    products(states, swarm.shape[0], distances, m, False, cross)
-    _shift(swarm, cross, joint, m, start)
-    return True
+        _centre(swarm[i], n, 1.0, states[i])
+    joint, gain = np.dot(distances, distances.T), np.dot(distances, states.T)
+    if ensembles.tapers.size > 0:
+        _taper(ensembles.tapers, segments, joint, gain)
+    inverse = 1.0 / (n - 1)
+    for i in range(m):
+        for j in range(i):
+            joint[i, j] *= inverse
+        joint[i, i] = inverse * joint[i, i] + noise[i % 2] ** 2
+        deviation = np.sqrt(joint[i, i])
+        ensembles.innovations[e, segments[i // 2], i % 2] = centres[i] / deviation
+    if not solve(joint, gain):
+        return False
+    shift = np.dot(gain.T, residuals)
+    for i in range(swarm.shape[0]):
+        row, step = swarm[i], shift[i]
+        for j in range(width):
+            row[j] += inverse * step[j]
+    return _is_finite(swarm)
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _back(joint: FloatArray, m: int, start: int) -> None:
-    """Solve U x = z for the residuals, in place."""
-    for i in range(m - 1, -1, -1):
-        row = joint[i, start:]
-        inverse = 1.0 / joint[i, i]
-        for j in range(row.size):
-            row[j] *= inverse
-        for k in range(i):
-            other, head = joint[k, start:], joint[k, i]
-            for j in range(row.size):
-                other[j] -= head * row[j]
+def _compare(
+    road: Road,
+    ensembles: Ensembles,
+    e: int,
+    segments: IntArray,
+    values: FloatArray,
+    units: FloatArray,
+    noise: FloatArray,
+    draws: Draws,
+    distances: FloatArray,
+    residuals: FloatArray,
+) -> FloatArray:
+    """Write outputs' distances from their mean and members' residuals; residuals of the mean."""
+    swarm, n, v_f = ensembles.swarms[e], ensembles.n_members, road.free_flow_speed
+    centres, speed = np.empty(2 * segments.size), np.empty(swarm.shape[1])
+    for i in range(segments.size):
+        s = segments[i]
+        rho, psi = swarm[2 * s], swarm[2 * s + 1]
+        measured_speeds(rho, psi, road.jam[s], v_f, road.gamma, speed)
+        for kind in range(2):
+            r, row = 2 * i + kind, rho if kind == 0 else speed
+            distance, residual, draw = distances[r], residuals[r], draws[r * n : (r + 1) * n]
+            centre = values[s, kind] / units[kind] - _centre(row, n, units[kind], distance)
+            size = noise[kind]
+            for j in range(n):
+                residual[j] = centre + size * draw[j] - distance[j]
+            residual[n:] = 0.0
+            centres[r] = centre
+    return centres
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _shift(swarm: FloatArray, cross: FloatArray, joint: FloatArray, m: int, start: int) -> None:
-    """Add `cross` times the solved residuals to the members, two outputs at a time."""
-    width = swarm.shape[1]
-    for r in range(0, m, 2):
-        first, second = joint[r, start:], joint[r + 1, start:]
-        for i in range(swarm.shape[0]):
-            row, a, b = swarm[i], cross[i, r], cross[i, r + 1]
-            for j in range(width):
-                row[j] += a * first[j] + b * second[j]
+@njit(cache=True, error_model="numpy")
+def _taper(tapers: FloatArray, segments: IntArray, joint: FloatArray, gain: FloatArray) -> None:
+    """Weigh covariances of outputs among themselves and with the states by distance."""
+    for i in range(joint.shape[0]):
+        weights = tapers[segments[i // 2]]
+        for j in range(joint.shape[1]):
+            joint[i, j] *= weights[segments[j // 2]]
+        for j in range(2 * weights.size):
+            gain[i, j] *= weights[j // 2]
 
 
 @njit(cache=True, error_model="numpy")
 def summarise(road_: Packed, swarms: FloatArray, n: int, out: FloatArray) -> None:
     """Write density and speed of the mean and the members' deviations to `out` `(4, E, S)`."""
     road = Road(*road_)
-    v_f, width = road.free_flow_speed, swarms.shape[2]
-    rest, speed, mean_speed = np.empty(width), np.empty(width), np.empty(width)
-    rho_row, psi_row = np.empty(width), np.empty(width)
+    v_f, gamma, width = road.free_flow_speed, road.gamma, swarms.shape[2]
+    speed, mean = np.empty(width), np.empty((3, 1))
     for e in range(swarms.shape[0]):
         for s in range(road.jam.size):
             rho, psi = swarms[e, 2 * s], swarms[e, 2 * s + 1]
-            rho_row[:] = _centre(rho, n, 1.0, rest)
-            out[2, e, s] = np.sqrt((rest**2).sum() / (n - 1))
-            psi_row[:] = _centre(psi, n, 1.0, rest)
-            measured_speeds(rho_row, psi_row, road.jam[s], v_f, road.gamma, mean_speed)
-            measured_speeds(rho, psi, road.jam[s], v_f, road.gamma, speed)
-            _centre(speed, n, 1.0, rest)
-            out[0, e, s] = rho_row[0]
-            out[1, e, s] = min(max(mean_speed[0], 0.0), LARGEST_W * v_f)
-            out[3, e, s] = np.sqrt((rest**2).sum() / (n - 1))
+            mean[0, 0], out[2, e, s] = _moments(rho, n)
+            mean[1, 0] = _mean(psi, n)
+            measured_speeds(mean[0], mean[1], road.jam[s], v_f, gamma, mean[2])
+            measured_speeds(rho, psi, road.jam[s], v_f, gamma, speed)
+            _, out[3, e, s] = _moments(speed, n)
+            out[0, e, s] = min(mean[0, 0], road.jam[s])
+            out[1, e, s] = min(max(mean[2, 0], 0.0), LARGEST_W * v_f)
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
+def _moments(row: FloatArray, n: int) -> tuple[float, float]:
+    """Mean and deviation of the first n."""
+    mean, total = _mean(row, n), 0.0
+    for j in range(n):
+        total += (row[j] - mean) ** 2
+    return mean, np.sqrt(total / (n - 1))

@@ -21,6 +21,7 @@ from dptse_env.estimators.compiled.algebra import (
 from dptse_env.model.arz import LARGEST_W, LEAST_DENSITY, LEAST_W, MEASUREMENT_FLOOR
 from dptse_env.model.kernels import advance, pressure, scratch_of
 from dptse_env.model.network import BoolArray, FloatArray, IntArray
+from dptse_env.model.relations import VACUUM
 from dptse_env.model.road import Road
 
 # A `Road` or `Filters` as a plain tuple: calling compiled code from Python with a named one costs
@@ -211,7 +212,7 @@ def summarise(road_: Packed, filters_: Packed, out: FloatArray) -> None:
         for s in range(road.jam.size):
             rho, psi, jam = mean[2 * s], mean[2 * s + 1], road.jam[s]
             p = pressure(rho, jam, v_f, road.gamma)
-            w = psi / rho if rho > 0.0 else v_f
+            w = psi / rho if rho > VACUUM * jam else v_f
             _, by_rho, by_psi = measured(rho, psi, jam, v_f, road.gamma)
             by_rho, by_psi = by_rho * scale, by_psi * scale * v_f
             a, b, c = (

@@ -2,30 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
-from dptse_env.estimators.base import Estimate, EstimatorSettings
-from dptse_env.estimators.batch import BatchEstimator, Measurements
-from dptse_env.estimators.compiled import kernels, mhe_kernels
+from dptse_env.estimators.batch import Measurements
+from dptse_env.estimators.compiled import mhe_kernels
 from dptse_env.estimators.compiled.algebra import padded
-from dptse_env.estimators.compiled.kernels import Filters
+from dptse_env.estimators.compiled.kalman import CompiledFilter
 from dptse_env.estimators.compiled.mhe_kernels import Horizons
 from dptse_env.estimators.horizon import (
     LEAST_DEVIATION,
     Window,
     assemble,
     normalised_bounds,
+    own_settings,
     process_variance,
     solve,
 )
+from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
 from dptse_env.model.network import FloatArray, IntArray
 from dptse_env.model.road import Road, road_of
 
 
-class CompiledMHE(BatchEstimator):
+class CompiledMHE(CompiledFilter):
     """Moving horizon estimation (paper, eq. 14 to 17), compiled.
 
     `dptse_env.estimators.reference.mhe.ReferenceMHE` says what the estimate, its deviations and
@@ -34,31 +33,17 @@ class CompiledMHE(BatchEstimator):
     within its rounds, the reference's solver is asked, then the prediction taken.
 
     Attributes:
-        fallback: `(n,)` whether the last update's program was not solved and the prediction
-            taken instead.
         n_passed_on: Programs so far that went to the reference's solver.
     """
 
     def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
         """See `make_estimator`."""
-        super().__init__(model, n_episodes, settings)
+        process_variance(settings)  # refused before anything is built
+        super().__init__(model, n_episodes, own_settings(settings))
         self.horizon = own = settings.mhe
-        self.fallback = np.zeros(n_episodes, dtype=np.bool_)
         self.n_passed_on = 0
         n, s, width = model.n_states, model.n_segments, padded(model.n_states)
-        start = model.project(np.zeros((n_episodes, n)), own.bounds)
         self._road: Road = road_of(model)
-        self._filters = Filters(
-            means=start,
-            covariances=np.zeros((n_episodes, n, width)),
-            priors=start.copy(),
-            innovations=self.innovations,
-            diverged=self.diverged,
-            process_variance=process_variance(settings),
-            initial_variance=float(settings.initial_variance),
-            density_scale=float(model.density_scale),
-            is_box=own.bounds == "box",
-        )
         shape = (n_episodes, own.horizon + 1)
         lower, upper = normalised_bounds(model, own.bounds)
         self._horizons = Horizons(
@@ -81,19 +66,9 @@ class CompiledMHE(BatchEstimator):
             upper=upper,
             along=own.linearisation == "trajectory",
         )
-        self._packed = tuple(self._road), tuple(self._filters), tuple(self._horizons)
+        self._windows_packed = (*self._packed, tuple(self._horizons))
         self._scales = np.array([model.density_scale, model.speed_scale])
         self._restart(np.arange(n_episodes))
-
-    @property
-    def states(self) -> FloatArray:
-        """Means `(n, 2 S)` [veh/km, veh/h], a copy."""
-        return self._filters.means.copy()
-
-    @property
-    def covariances(self) -> FloatArray:
-        """Covariances `(n, 2 S, 2 S)`, rho normalised by rho_m and psi by rho_m v_f, a copy."""
-        return self._filters.covariances[:, :, : self.model.n_states].copy()
 
     def window(self, episode: int) -> Window:
         """The linearised problem of one episode, dense, as `assemble` takes it."""
@@ -119,20 +94,14 @@ class CompiledMHE(BatchEstimator):
             noise=horizons.noise[episode, :length],
         )
 
-    def _reset(
-        self, episodes: IntArray, states: FloatArray, generators: Sequence[np.random.Generator]
-    ) -> None:
-        self.fallback[episodes] = False
-        self._filters.priors[episodes] = self.model.project(states, self.horizon.bounds)
-        self._restart(episodes)
-
     def _predict(self, episodes: IntArray, inputs: FloatArray) -> None:
-        mhe_kernels.predict(*self._packed, episodes, inputs)
+        mhe_kernels.predict(*self._windows_packed, episodes, inputs)
 
     def _update(self, given: Measurements) -> None:
-        self.fallback[given.episodes] = False
         sigma = np.maximum(given.sigma, LEAST_DEVIATION * self._scales)
-        mhe_kernels.update(*self._packed, given.episodes, given.observed, given.values, sigma)
+        mhe_kernels.update(
+            *self._windows_packed, given.episodes, given.observed, given.values, sigma
+        )
         unsolved = given.episodes[self._horizons.unsolved[given.episodes]]
         for episode in unsolved.tolist():
             self._pass_on(episode)
@@ -154,12 +123,6 @@ class CompiledMHE(BatchEstimator):
         solution[:length, :n] = z.reshape(length, n)
         mhe_kernels.accept(self._road, self._filters, horizons, episode, solution)
 
-    def estimate(self) -> Estimate:
-        """Current estimate of all episodes; deviations are those of the last update."""
-        out = np.empty((4, self.n_episodes, self.model.n_segments))
-        kernels.summarise(*self._packed[:2], out)
-        return Estimate(*out)
-
     def _restart(self, episodes: IntArray) -> None:
         for episode in episodes.tolist():
-            mhe_kernels.restart(*self._packed, episode)
+            mhe_kernels.restart(*self._windows_packed, episode)

@@ -4,101 +4,20 @@ The equations are those of `dptse_env.model.kernels` without derivatives. A swar
 component, `(2 S, width)`, one column a state, so that every inner loop runs over contiguous
 memory without a branch and compiles to vector instructions. Columns beyond the states in use are
 computed along and must hold some state.
-
-Powers are computed here, as a loop around the C library's would not be vectorised.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from llvmlite import ir  # type: ignore[import-untyped]
-from numba import njit, types
-from numba.extending import intrinsic
+from numba import njit
 
+from dptse_env.estimators.compiled.power import power
 from dptse_env.model.arz import LARGEST_W, LEAST_DENSITY, LEAST_W, MEASUREMENT_FLOOR
 from dptse_env.model.network import FloatArray
 from dptse_env.model.relations import VACUUM
 from dptse_env.model.road import EXIT, LINK, MERGE, Road
-
-_ROOT_HALF = 0x3FE6A09E667F3BCD  # bits of sqrt(1/2)
-_SHIFT = 6755399441055744.0  # 1.5 * 2^52: adding it rounds, and leaves the integer in the low bits
-_SHIFT_BITS = 0x4338000000000000
-_LN2 = 0.6931471805599453
-_LEAST_BASE, _LARGEST_BASE = 1e-30, 1e30
-
-
-def _bits_of(context: Any, x: Any) -> Any:
-    """Bits of a float64 as int64."""
-    del context, x
-
-    def code(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
-        return builder.bitcast(arguments[0], ir.IntType(64))
-
-    return types.int64(types.float64), code
-
-
-def _float_of(context: Any, x: Any) -> Any:
-    """The float64 of an int64's bits."""
-    del context, x
-
-    def code(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
-        return builder.bitcast(arguments[0], ir.DoubleType())
-
-    return types.float64(types.int64), code
-
-
-# Not as decorators: a type checker would see the arguments of the function that makes the code.
-_bits: Any = intrinsic(_bits_of)
-_float: Any = intrinsic(_float_of)
-
-
-@njit(cache=True, error_model="numpy", inline="always")
-def power(base: float, exponent: float) -> float:
-    """`base ** exponent` to a few units of the last place, for exponents from 0.05 to 10.
-
-    What lies outside [1e-30, 1e30], zero, infinity and NaN among it, is returned as it is.
-    """
-    x = base if _LEAST_BASE < base < _LARGEST_BASE else 1.0
-    # x = 2^k z with z in [sqrt(1/2), sqrt(2)); log z = 2 atanh((z - 1) / (z + 1)).
-    shifted = _bits(x) - np.int64(_ROOT_HALF) + (np.int64(1024) << np.int64(52))
-    k_bits = (shifted >> np.int64(52)) - np.int64(1024)
-    z = _float(_bits(x) - (k_bits << np.int64(52)))
-    k = _float(k_bits + np.int64(_SHIFT_BITS)) - _SHIFT
-    s = (z - 1.0) / (z + 1.0)
-    t = s * s
-    series = 1.0 / 21.0
-    series = series * t + 1.0 / 19.0
-    series = series * t + 1.0 / 17.0
-    series = series * t + 1.0 / 15.0
-    series = series * t + 1.0 / 13.0
-    series = series * t + 1.0 / 11.0
-    series = series * t + 1.0 / 9.0
-    series = series * t + 1.0 / 7.0
-    series = series * t + 1.0 / 5.0
-    series = series * t + 1.0 / 3.0
-    y = exponent * (k + (2.0 / _LN2) * (s + s * t * series))
-    # 2^y = 2^n exp(r) with |r| <= ln(2) / 2.
-    rounded = y + _SHIFT
-    r = (y - (rounded - _SHIFT)) * _LN2
-    e = 1.0 / 6227020800.0
-    e = e * r + 1.0 / 479001600.0
-    e = e * r + 1.0 / 39916800.0
-    e = e * r + 1.0 / 3628800.0
-    e = e * r + 1.0 / 362880.0
-    e = e * r + 1.0 / 40320.0
-    e = e * r + 1.0 / 5040.0
-    e = e * r + 1.0 / 720.0
-    e = e * r + 1.0 / 120.0
-    e = e * r + 1.0 / 24.0
-    e = e * r + 1.0 / 6.0
-    e = e * r + 0.5
-    e = e * r + 1.0
-    e = e * r + 1.0
-    n = _bits(rounded) - np.int64(_SHIFT_BITS)
-    result = _float(_bits(e) + (n << np.int64(52)))
-    return result if _LEAST_BASE < base < _LARGEST_BASE else base
 
 
 class Flock(NamedTuple):
@@ -298,26 +217,39 @@ def advance_swarm(road: Road, swarm: FloatArray, inputs: FloatArray, flock: Floc
         _arrive(swarm[2 * end], swarm[2 * end + 1], flock.flow[start], flock.w[start], part)
 
 
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _into_cone(
+    rho_row: FloatArray, psi_row: FloatArray, jam: float, v_f: float, gamma: float
+) -> None:
+    by_jam, least_w, largest_w = 1.0 / jam, LEAST_W * v_f, LARGEST_W * v_f
+    for j in range(rho_row.size):
+        rho = LEAST_DENSITY if rho_row[j] < LEAST_DENSITY else rho_row[j]
+        rho = jam if rho > jam else rho
+        p = v_f * power(rho * by_jam, gamma)
+        low, high = (p if p > least_w else least_w) * rho, largest_w * rho
+        psi = low if psi_row[j] < low else psi_row[j]
+        rho_row[j] = rho
+        psi_row[j] = high if psi > high else psi
+
+
+@njit(cache=True, error_model="numpy")
+def _into_box(row: FloatArray, largest: float) -> None:
+    for j in range(row.size):
+        value = 0.0 if row[j] < 0.0 else row[j]
+        row[j] = largest if value > largest else value
+
+
 @njit(cache=True, error_model="numpy")
 def project_swarm(road: Road, swarm: FloatArray, is_box: bool) -> None:
     """Hold every column to its bounds, as `ARZModel.project` does; a NaN stays one."""
     v_f, gamma = road.free_flow_speed, road.gamma
     for c in range(road.jam.size):
-        rho_row, psi_row, jam = swarm[2 * c], swarm[2 * c + 1], road.jam[c]
-        least = 0.0 if is_box else LEAST_DENSITY
-        least_w = 0.0 if is_box else LEAST_W * v_f
-        by_jam = 1.0 / jam
-        for j in range(rho_row.size):
-            rho = least if rho_row[j] < least else rho_row[j]
-            rho = jam if rho > jam else rho
-            rho_row[j] = rho
-            if is_box:
-                low, high = 0.0, jam * v_f
-            else:
-                p = v_f * power(rho * by_jam, gamma)
-                low, high = (p if p > least_w else least_w) * rho, LARGEST_W * v_f * rho
-            psi = low if psi_row[j] < low else psi_row[j]
-            psi_row[j] = high if psi > high else psi
+        rho, psi, jam = swarm[2 * c], swarm[2 * c + 1], road.jam[c]
+        if is_box:
+            _into_box(rho, jam)
+            _into_box(psi, jam * v_f)
+        else:
+            _into_cone(rho, psi, jam, v_f, gamma)
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from dptse_env.estimators.base import EstimatorSettings
 from dptse_env.estimators.batch import Measurements
 from dptse_env.estimators.compiled import ukf_kernels
 from dptse_env.estimators.compiled.algebra import padded
 from dptse_env.estimators.compiled.kalman import CompiledFilter
+from dptse_env.estimators.compiled.sigma_points import Points
+from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
 from dptse_env.model.network import FloatArray, IntArray
+from dptse_env.validation import require
 
 
 class CompiledUKF(CompiledFilter):
@@ -20,34 +22,23 @@ class CompiledUKF(CompiledFilter):
     measured are all computed from these same points, never redrawn. The step's process noise is
     added to P after the points have moved, and first carried by those of the next step. Means
     are projected after predict and update, too.
-
-    Attributes:
-        alpha: Spread of the points.
-        kappa: Secondary spread; n + kappa must be positive.
-        beta: Weight of the first point in covariances; 2 suits normal distributions.
     """
 
-    alpha: float = 0.1
-    kappa: float = -4.0
-    beta: float = 2.0
-
     def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
-        """See `make_estimator`.
-
-        Raises:
-            ValueError: The model has too few states for kappa.
-        """
+        """See `make_estimator`."""
         super().__init__(model, n_episodes, settings)
         n_states = model.n_states
-        if n_states + self.kappa <= 0.0:
-            raise ValueError(f"kappa must be > -{n_states}, minus the states, got {self.kappa}")
-        spread = self.alpha**2 * (n_states + self.kappa)
-        self._points = ukf_kernels.Points(
+        own = settings.ukf
+        require(
+            n_states + own.kappa > 0.0, "estimator_settings.ukf.kappa", f"> -{n_states}", own.kappa
+        )
+        spread = own.alpha**2 * (n_states + own.kappa)
+        self._points = Points(
             swarms=np.zeros((n_episodes, n_states, padded(2 * n_states + 1))),
             centres=np.zeros((n_episodes, n_states)),
             moved=np.zeros(n_episodes, dtype=np.bool_),
             weight=0.5 / spread,
-            surplus=self.beta - self.alpha**2,
+            surplus=own.beta - own.alpha**2,
             spread=float(np.sqrt(spread)),
         )
         self._points_packed = tuple(self._points)

@@ -1,14 +1,9 @@
 """Compiled kernels of the unscented Kalman filter: a batch of episodes, one after the other.
 
-With d_i the points' distances from the first one, d = W sum d_i and W the weight of all points
-but the first, the weighted covariance is `W sum d_i d_i' + (beta - alpha^2) d d'`: the large
-negative weights of the first point cancel, nothing is lost to rounding, and what the points say
-of a state and its measurement is a covariance by construction, projected or not.
-
 The points of a step carry the process noise of earlier steps, not its own: P gets Q after they
 have moved, and the next points are drawn from that. On a linear system this is the Kalman filter
 of x' = F (x + w), noise ahead of the motion. Adding the derivative's `H Q H'` to what is measured
-would put it behind; on synthetic traffic that filter amplified rounding far more.
+would put it behind; on recorded traffic that filter is no better, and much worse at small alpha.
 """
 
 from __future__ import annotations
@@ -19,7 +14,14 @@ import numpy as np
 from numba import njit
 
 from dptse_env.estimators.compiled.algebra import is_covariance, mirror
+from dptse_env.estimators.compiled.dense import eliminate, factor, products
 from dptse_env.estimators.compiled.kernels import Filters, Packed, project, restart
+from dptse_env.estimators.compiled.sigma_points import (
+    Points,
+    distances_from_first,
+    draw,
+    gather,
+)
 from dptse_env.estimators.compiled.swarm import (
     advance_swarm,
     flock_of,
@@ -28,103 +30,6 @@ from dptse_env.estimators.compiled.swarm import (
 )
 from dptse_env.model.network import BoolArray, FloatArray, IntArray
 from dptse_env.model.road import Road
-
-
-class Points(NamedTuple):
-    """Sigma points of n episodes.
-
-    Attributes:
-        swarms: `(n, 2 S, width)` projected points after the last motion [veh/km, veh/h]; the
-            mean's image first, then pairs; columns beyond 4 S + 1 repeat the first.
-        centres: `(n, 2 S)` their weighted means, before any projection.
-        moved: `(n,)` whether they moved since they last took in a measurement.
-        weight: W of every point but the first.
-        surplus: beta - alpha^2.
-        spread: Points are the mean plus and minus `spread` times columns of a root of P.
-    """
-
-    swarms: FloatArray
-    centres: FloatArray
-    moved: BoolArray
-    weight: float
-    surplus: float
-    spread: float
-
-
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
-def factor(matrix: FloatArray, n: int) -> bool:
-    """Replace the upper half of a symmetric `(n, width)` matrix by U with U' U = matrix.
-
-    Returns:
-        Whether all pivots were positive.
-    """
-    width = matrix.shape[1]
-    for k in range(n):
-        pivot = matrix[k, k]
-        if not 0.0 < pivot < np.inf:
-            return False
-        inverse = 1.0 / np.sqrt(pivot)
-        start = k // 8 * 8
-        for j in range(start, width):
-            matrix[k, j] *= inverse
-        for i in range(k + 1, n):
-            head = matrix[k, i]
-            start = i // 8 * 8
-            for j in range(start, width):
-                matrix[i, j] -= head * matrix[k, j]
-    return True
-
-
-@njit(cache=True, error_model="numpy")
-def _draw(
-    mean: FloatArray, root: FloatArray, spread: float, scale: FloatArray, swarm: FloatArray
-) -> None:
-    """Write the points of a mean and the upper root of its covariance."""
-    n = mean.size
-    for i in range(n):
-        row, centre = swarm[i], mean[i]
-        row[:] = centre
-        step = spread * scale[i % 2]
-        for k in range(i + 1):
-            shift = step * root[k, i]
-            row[1 + k] += shift
-            row[1 + n + k] -= shift
-
-
-@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
-def _distances(row: FloatArray, scale: float, weight: float, out: FloatArray) -> float:
-    """Write normalised distances from the first point and return their weighted sum."""
-    first, inverse, total = row[0], 1.0 / scale, 0.0
-    for j in range(row.size):
-        out[j] = (row[j] - first) * inverse
-        total += out[j]
-    return weight * total
-
-
-@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
-def products(
-    left: FloatArray, n_left: int, right: FloatArray, n_right: int, is_lower: bool, out: FloatArray
-) -> None:
-    """Write inner products of rows; where `is_lower`, those up to the diagonal and a few more."""
-    width = left.shape[1]
-    for i in range(0, n_left, 2):
-        a0, a1 = left[i], left[min(i + 1, n_left - 1)]
-        last = min(i + 2, n_right) if is_lower else n_right
-        for j in range(0, last, 2):
-            b0, b1 = right[j], right[min(j + 1, n_right - 1)]
-            s00 = s01 = s10 = s11 = 0.0
-            for k in range(width):
-                s00 += a0[k] * b0[k]
-                s01 += a0[k] * b1[k]
-                s10 += a1[k] * b0[k]
-                s11 += a1[k] * b1[k]
-            out[i, j] = s00
-            if j + 1 < n_right:
-                out[i, j + 1] = s01
-            if i + 1 < n_left:
-                out[i + 1, j] = s10
-                if j + 1 < n_right:
-                    out[i + 1, j + 1] = s11
 
 
 @njit(cache=True, error_model="numpy")
@@ -143,38 +48,15 @@ def predict(
         root[:] = covariance
         if not factor(root, n):
             mean[:] = np.nan  # the update finds it and starts over
-        _draw(mean, root, points.spread, scale, swarm)
+        draw(mean, root, points.spread, scale, swarm)
         advance_swarm(road, swarm, inputs[k], flock)
         project_swarm(road, swarm, filters.is_box)
-        _gather(points, e, scale, distances, shift, covariance)
+        gather(points, e, scale, distances, shift, covariance)
         for i in range(n):
             covariance[i, i] += filters.process_variance[i % 2]
         mean[:] = points.centres[e]
         project(road, mean, filters.is_box)
         points.moved[e] = True
-
-
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _gather(
-    points: Points,
-    e: int,
-    scale: FloatArray,
-    distances: FloatArray,
-    shift: FloatArray,
-    covariance: FloatArray,
-) -> None:
-    """Write mean and covariance of one episode's points."""
-    swarm, n = points.swarms[e], shift.size
-    for i in range(n):
-        shift[i] = _distances(swarm[i], scale[i % 2], points.weight, distances[i])
-        points.centres[e, i] = swarm[i, 0] + shift[i] * scale[i % 2]
-    products(distances, n, distances, n, True, covariance)
-    for i in range(n):
-        for j in range(i + 1):
-            covariance[i, j] = (
-                points.weight * covariance[i, j] + points.surplus * shift[i] * shift[j]
-            )
-    mirror(covariance)
 
 
 class Outputs(NamedTuple):
@@ -257,9 +139,9 @@ def _stay(
     root[:] = covariance
     if not factor(root, n):
         return False
-    _draw(filters.means[e], root, points.spread, scale, points.swarms[e])
+    draw(filters.means[e], root, points.spread, scale, points.swarms[e])
     project_swarm(road, points.swarms[e], filters.is_box)
-    _gather(points, e, scale, work.distances, work.shift, covariance)
+    gather(points, e, scale, work.distances, work.shift, covariance)
     return True
 
 
@@ -289,7 +171,7 @@ def _take_in(
         if not joint[i, i] >= noise[i // m] * (1.0 - 1e-9):
             return False
     # Elimination turns [S, C, y] into [U, V, z] with U' U = S, V' V = C' S^-1 C, V' z = K y.
-    if not factor(joint[:width, :padded], width):
+    if not eliminate(joint, width, padded):
         return False
     _reduce(joint, width, start, covariance)
     mirror(covariance)
@@ -335,13 +217,15 @@ def _measure(
     start = (2 * m + 7) // 8 * 8
     v_f, swarm, joint = road.free_flow_speed, points.swarms[e], work.joint
     for i in range(n):
-        work.shift[i] = _distances(swarm[i], scale[i % 2], points.weight, work.distances[i])
+        work.shift[i] = distances_from_first(
+            swarm[i], scale[i % 2], points.weight, work.distances[i]
+        )
     for i in range(m):
         s = segments[i]
         speeds = work.speeds[i]
         measured_speeds(swarm[2 * s], swarm[2 * s + 1], road.jam[s], v_f, road.gamma, speeds)
         joint[m + i, start + n] = speeds[0] / v_f
-        work.speed_shift[i] = _distances(speeds, v_f, points.weight, speeds)
+        work.speed_shift[i] = distances_from_first(speeds, v_f, points.weight, speeds)
         joint[m + i, start + n] += work.speed_shift[i]
     products(work.speeds, m, work.distances, n, False, work.cross)
     covariance = filters.covariances[e]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 
-from dptse_env.estimators.base import EstimatorSettings
 from dptse_env.estimators.reference.kalman import EpisodeFilter, ReferenceFilter, linearise
+from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
 from dptse_env.model.network import BoolArray, FloatArray
 

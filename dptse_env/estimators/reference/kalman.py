@@ -10,9 +10,10 @@ from typing import Protocol
 import numpy as np
 from scipy.linalg import LinAlgError, LinAlgWarning
 
-from dptse_env.estimators.base import Estimate, EstimatorSettings
+from dptse_env.estimators.base import Estimate
 from dptse_env.estimators.batch import BatchEstimator, Measurements
 from dptse_env.estimators.open_loop import estimated_traffic
+from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
 from dptse_env.model.network import BoolArray, FloatArray, IntArray
 

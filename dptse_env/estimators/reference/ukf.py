@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter, unscented_transform
 
-from dptse_env.estimators.base import EstimatorSettings
 from dptse_env.estimators.reference.kalman import EpisodeFilter, ReferenceFilter
+from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
 from dptse_env.model.network import BoolArray, FloatArray
 
@@ -35,15 +35,9 @@ class _Filter(UnscentedKalmanFilter):  # type: ignore[misc]
     belong to the mean and the covariance, and P loses definiteness within a few steps.
     """
 
-    def __init__(
-        self,
-        model: ARZModel,
-        settings: EstimatorSettings,
-        alpha: float,
-        beta: float,
-        kappa: float,
-    ) -> None:
-        points = _Points(model.n_states, alpha=alpha, beta=beta, kappa=kappa)
+    def __init__(self, model: ARZModel, settings: EstimatorSettings) -> None:
+        own = settings.ukf
+        points = _Points(model.n_states, alpha=own.alpha, beta=own.beta, kappa=own.kappa)
         super().__init__(
             model.n_states,
             2 * model.n_segments,
@@ -115,17 +109,7 @@ class _Filter(UnscentedKalmanFilter):  # type: ignore[misc]
 
 
 class ReferenceUKF(ReferenceFilter):
-    """Unscented Kalman filter on the ARZ model by filterpy, one filter an episode.
-
-    Attributes:
-        alpha: Spread of the points.
-        kappa: Secondary spread.
-        beta: Weight of the first point in covariances.
-    """
-
-    alpha: float = 0.1
-    kappa: float = -4.0
-    beta: float = 2.0
+    """Unscented Kalman filter on the ARZ model by filterpy, one filter an episode."""
 
     def _filter(self) -> EpisodeFilter:
-        return _Filter(self.model, self.settings, self.alpha, self.beta, self.kappa)
+        return _Filter(self.model, self.settings)

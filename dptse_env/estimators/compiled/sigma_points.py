@@ -1,0 +1,87 @@
+"""Compiled sigma points of n episodes: drawn around a mean, and gathered to mean and covariance.
+
+With d_i the points' distances from the first one, d = W sum d_i and W the weight of all points
+but the first, the weighted covariance is `W sum d_i d_i' + (beta - alpha^2) d d'`: the large
+negative weights of the first point cancel, nothing is lost to rounding, and what the points say
+of a state and its measurement is a covariance by construction, projected or not.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from numba import njit
+
+from dptse_env.estimators.compiled.algebra import mirror
+from dptse_env.estimators.compiled.dense import products
+from dptse_env.model.network import BoolArray, FloatArray
+
+
+class Points(NamedTuple):
+    """Sigma points of n episodes.
+
+    Attributes:
+        swarms: `(n, 2 S, width)` projected points after the last motion [veh/km, veh/h]; the
+            mean's image first, then pairs; columns beyond 4 S + 1 repeat the first.
+        centres: `(n, 2 S)` their weighted means, before any projection.
+        moved: `(n,)` whether they moved since they last took in a measurement.
+        weight: W of every point but the first.
+        surplus: beta - alpha^2.
+        spread: Points are the mean plus and minus `spread` times columns of a root of P.
+    """
+
+    swarms: FloatArray
+    centres: FloatArray
+    moved: BoolArray
+    weight: float
+    surplus: float
+    spread: float
+
+
+@njit(cache=True, error_model="numpy")
+def draw(
+    mean: FloatArray, root: FloatArray, spread: float, scale: FloatArray, swarm: FloatArray
+) -> None:
+    """Write the points of a mean and the upper root of its covariance."""
+    n = mean.size
+    for i in range(n):
+        row, centre = swarm[i], mean[i]
+        row[:] = centre
+        step = spread * scale[i % 2]
+        for k in range(i + 1):
+            shift = step * root[k, i]
+            row[1 + k] += shift
+            row[1 + n + k] -= shift
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
+def distances_from_first(row: FloatArray, scale: float, weight: float, out: FloatArray) -> float:
+    """Write normalised distances from the first point and return their weighted sum."""
+    first, inverse, total = row[0], 1.0 / scale, 0.0
+    for j in range(row.size):
+        out[j] = (row[j] - first) * inverse
+        total += out[j]
+    return weight * total
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def gather(
+    points: Points,
+    e: int,
+    scale: FloatArray,
+    distances: FloatArray,
+    shift: FloatArray,
+    covariance: FloatArray,
+) -> None:
+    """Write mean and covariance of one episode's points."""
+    swarm, n = points.swarms[e], shift.size
+    for i in range(n):
+        shift[i] = distances_from_first(swarm[i], scale[i % 2], points.weight, distances[i])
+        points.centres[e, i] = swarm[i, 0] + shift[i] * scale[i % 2]
+    products(distances, n, distances, n, True, covariance)
+    for i in range(n):
+        for j in range(i + 1):
+            covariance[i, j] = (
+                points.weight * covariance[i, j] + points.surplus * shift[i] * shift[j]
+            )
+    mirror(covariance)

@@ -1,0 +1,159 @@
+"""The ensemble Kalman filter in plain numpy: what the compiled one is checked against.
+
+filterpy's `EnsembleKalmanFilter` cannot serve: it draws from numpy's global generator, fixes the
+number of outputs when it is built and moves members one by one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
+
+from dptse_env.estimators.base import Estimate
+from dptse_env.estimators.batch import BatchEstimator, Measurements
+from dptse_env.estimators.localisation import tapers
+from dptse_env.estimators.settings import EstimatorSettings
+from dptse_env.model import ARZModel
+from dptse_env.model.network import BoolArray, FloatArray, IntArray
+
+
+class _Streams(NamedTuple):
+    """Generators of one episode; measurements do not change how members are disturbed."""
+
+    process: np.random.Generator
+    measurement: np.random.Generator
+
+
+class ReferenceEnKF(BatchEstimator):
+    """Ensemble Kalman filter with perturbed observations (Evensen, 2003; Burgers et al., 1998).
+
+    Equal to `CompiledEnKF` in distribution; it draws other numbers.
+
+    Attributes:
+        members: `(n, M, 2 S)` [veh/km, veh/h].
+    """
+
+    def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
+        """See `make_estimator`."""
+        super().__init__(model, n_episodes, settings)
+        own = settings.enkf
+        self.n_members, self._inflation = own.n_members, own.inflation
+        everywhere = np.ones((model.n_segments, model.n_segments))
+        self._tapers = everywhere if own.taper is None else tapers(model.network, own.taper)
+        rho_m, v_f = model.density_scale, model.speed_scale
+        self._state_unit = np.tile([rho_m, rho_m * v_f], model.n_segments)
+        self._output_unit = np.array([rho_m, v_f])
+        process_noise = np.tile(settings.process_noise, model.n_segments)
+        self._process_deviation = process_noise * self._state_unit
+        self._initial_deviation = np.sqrt(settings.initial_variance) * self._state_unit
+        self._priors = model.project(np.zeros((n_episodes, model.n_states)), settings.bounds)
+        self.members = np.repeat(self._priors[:, None], self.n_members, axis=1)
+        self._streams = [_streams_of(np.random.default_rng(0)) for _ in range(n_episodes)]
+
+    @property
+    def states(self) -> FloatArray:
+        """Means of the members `(n, 2 S)` [veh/km, veh/h]."""
+        return np.asarray(self.members.mean(axis=1))
+
+    @property
+    def covariances(self) -> FloatArray:
+        """Of the members, `(n, 2 S, 2 S)`, rho normalised by rho_m and psi by rho_m v_f."""
+        rest = (self.members - self.states[:, None]) / self._state_unit
+        return np.asarray(rest.swapaxes(1, 2) @ rest / (self.n_members - 1))
+
+    def estimate(self) -> Estimate:
+        """Current estimate of all episodes: of the mean, and how the members' outputs spread."""
+        # Both sets of bounds are convex: the projection takes nothing but rounding from a mean.
+        mean = self.model.measure(self._projected(self.states))
+        outputs = self.model.measure(self.members)
+        spread = outputs.std(axis=1, ddof=1)
+        speed = np.clip(mean[..., 1], 0.0, self.model.largest_speed)
+        return Estimate(mean[..., 0].copy(), speed, spread[..., 0].copy(), spread[..., 1].copy())
+
+    def _reset(
+        self, episodes: IntArray, states: FloatArray, generators: Sequence[np.random.Generator]
+    ) -> None:
+        self._priors[episodes] = self.model.project(states, self.settings.bounds)
+        for episode, generator in zip(episodes.tolist(), generators, strict=True):
+            self._streams[episode] = _streams_of(generator)
+            self._restart(episode)
+
+    def _restart(self, episode: int) -> None:
+        """Draw the members of one episode around its prior."""
+        prior = np.repeat(self._priors[episode, None], self.n_members, axis=0)
+        self.members[episode] = self._disturbed(episode, prior, self._initial_deviation)
+
+    def _disturbed(self, episode: int, members: FloatArray, deviation: FloatArray) -> FloatArray:
+        noise = self._streams[episode].process.standard_normal(members.shape)
+        return self._projected(members + deviation * noise)
+
+    def _projected(self, members: FloatArray) -> FloatArray:
+        return self.model.project(members, self.settings.bounds)
+
+    def _predict(self, episodes: IntArray, inputs: FloatArray) -> None:
+        """Move all members of all episodes at once, then disturb them."""
+        with np.errstate(all="ignore"):  # what overflows here is found by the update
+            states = self.members[episodes].reshape(-1, self.model.n_states)
+            moved = self.model.step(states, np.repeat(inputs, self.n_members, axis=0))
+            shape = (self.n_members, self.model.n_states)
+            for episode, members in zip(episodes.tolist(), moved.reshape(-1, *shape), strict=True):
+                self.members[episode] = self._disturbed(episode, members, self._process_deviation)
+
+    def _update(self, given: Measurements) -> None:
+        with np.errstate(all="ignore"):
+            for episode, mask, row in zip(
+                given.episodes.tolist(), given.observed, given.values, strict=True
+            ):
+                self._update_one(episode, mask, row, given.sigma)
+
+    def _update_one(
+        self, episode: int, observed: BoolArray, values: FloatArray, sigma: FloatArray
+    ) -> None:
+        self.innovations[episode] = 0.0
+        sound = True
+        if observed.any():
+            try:
+                self.innovations[episode, observed] = self._take_in(
+                    episode, observed, values[observed], sigma
+                )
+            except LinAlgError:  # something is not finite, or S not definite
+                sound = False
+        self.diverged[episode] = not (sound and np.isfinite(self.members[episode]).all())
+        if self.diverged[episode]:
+            self.innovations[episode] = 0.0
+            self._restart(episode)
+
+    def _take_in(
+        self, episode: int, observed: BoolArray, values: FloatArray, sigma: FloatArray
+    ) -> FloatArray:
+        """Move members by measurements `(m, 2)`; returns their normalised innovations."""
+        members = self.members[episode]
+        if self._inflation != 1.0:
+            mean = members.mean(axis=0)
+            members = self._projected(mean + self._inflation * (members - mean))
+        outputs = self.model.measure(members)[:, observed] / self._output_unit
+        outputs = outputs.reshape(self.n_members, -1)
+        mean, noise = outputs.mean(axis=0), np.tile(sigma / self._output_unit, len(values))
+        states, rest = members - members.mean(axis=0), outputs - mean
+        segment = np.repeat(np.flatnonzero(observed), 2)
+        everything = np.repeat(np.arange(self.model.n_segments), 2)
+        cross = states.T @ rest / (self.n_members - 1) * self._tapers[np.ix_(everything, segment)]
+        joint = rest.T @ rest / (self.n_members - 1) * self._tapers[np.ix_(segment, segment)]
+        joint += np.diag(noise**2)
+        if not (np.isfinite(joint).all() and np.isfinite(values).all()):
+            raise LinAlgError("the update is not finite")  # a projection would hide it
+        measured = (values / self._output_unit).ravel()
+        draws = self._streams[episode].measurement.standard_normal(outputs.shape)
+        factor = cho_factor(joint, check_finite=False)
+        gain = cho_solve(factor, cross.T, check_finite=False).T
+        residuals = measured + noise * draws - outputs
+        self.members[episode] = self._projected(members + residuals @ gain.T)
+        return np.asarray(((measured - mean) / np.sqrt(np.diag(joint))).reshape(-1, 2))
+
+
+def _streams_of(generator: np.random.Generator) -> _Streams:
+    seeds = generator.integers(0, 2**63, size=(2, 2))
+    return _Streams(*(np.random.default_rng(seed.tolist()) for seed in seeds))

@@ -1,0 +1,34 @@
+"""Solvers that fail, to stand in for `qpsolvers.solve_problem` and for the active set."""
+
+import numpy as np
+import qpsolvers
+
+from dptse_env.estimators.compiled.kernels import Filters
+from dptse_env.estimators.compiled.mhe_kernels import Horizons, update
+
+
+def lying(problem, **_):
+    """A solver that calls a feasible point an optimum."""
+    return qpsolvers.Solution(problem, x=0.5 * problem.ub, found=True)
+
+
+def mad(problem, **_):
+    return qpsolvers.Solution(problem, x=np.full_like(problem.ub, np.nan), found=True)
+
+
+def silent(problem, **_):
+    return qpsolvers.Solution(problem, x=None, found=False)
+
+
+def missing(problem, **_):
+    raise qpsolvers.SolverNotFound("no such solver")
+
+
+def unsolved(road, filters, horizons, *given):
+    """The update's kernel with its solution taken away."""
+    mine = Horizons(*horizons)
+    kept = [(array, array.copy()) for array in (Filters(*filters).means, mine.solution, mine.side)]
+    update(road, filters, horizons, *given)
+    for array, before in kept:
+        array[:] = before
+    mine.unsolved[:] = True

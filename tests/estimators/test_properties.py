@@ -1,0 +1,296 @@
+"""What holds for every estimator: any name, either backend, both sets of bounds."""
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+
+from dptse_env.estimators import (
+    BACKENDS,
+    ESTIMATORS,
+    EstimatorSettings,
+    HorizonSettings,
+    make_estimator,
+)
+from dptse_env.model import ARZModel, Bounds
+
+from .episodes import (
+    SIGMA,
+    Road,
+    Snapshot,
+    assert_same,
+    random_streams,
+    run,
+    scale_of,
+    show,
+    simulate,
+    started,
+)
+
+PAIRS = [(name, backend) for name in ESTIMATORS for backend in BACKENDS]
+WITH_COVARIANCE = [pair for pair in PAIRS if pair[0] not in ("random_walk", "open_loop")]
+EXCHANGED = [*range(15), 16, 15, 17, 18]  # segments, the on-ramps exchanged
+SLOW = {("mhe", "reference"), ("enkf", "reference")}  # milliseconds a step
+
+every_pair = pytest.mark.parametrize(("name", "backend"), PAIRS)
+both_bounds = pytest.mark.parametrize("bounds", ["cone", "box"])
+
+
+def held_to(bounds: Bounds) -> EstimatorSettings:
+    return EstimatorSettings(bounds=bounds, mhe=HorizonSettings(bounds=bounds))
+
+
+def steps_of(name, backend, compiled, reference, slow):
+    if (name, backend) in SLOW:
+        return slow
+    return compiled if backend == "compiled" else reference
+
+
+# Streams ------------------------------------------------------------------------------------------
+
+
+@every_pair
+def test_the_seed_decides_and_the_global_generator_is_left_alone(name, backend):
+    n_steps = steps_of(name, backend, 50, 50, 14)
+    episodes = simulate(n_steps=n_steps)
+    first, second = (started(name, backend, episodes) for _ in range(2))
+    np.random.seed(1)  # noqa: NPY002
+    state = np.random.get_state()[1].copy()  # noqa: NPY002
+    run(first, episodes, range(n_steps))
+    np.testing.assert_array_equal(np.random.get_state()[1], state)  # noqa: NPY002
+    np.random.seed(2)  # noqa: NPY002
+    run(second, episodes, range(n_steps))
+    assert_same(show(first), show(second))
+    second.reset(episodes.everyone, episodes.start, random_streams(1))
+    run(second, episodes, range(n_steps))
+    assert_same(show(first), show(second))
+    third = started(name, backend, episodes, seed=1)
+    run(third, episodes, range(n_steps))
+    draws = name == "enkf"
+    assert np.array_equal(show(first).density, show(third).density) != draws
+
+
+# Soundness ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("name", "backend"), WITH_COVARIANCE)
+@both_bounds
+def test_covariance_is_one_over_recorded_traffic(name, backend, bounds, recorded):
+    """And no episode was put back to its prior, which would be a repair."""
+    estimator = started(name, backend, recorded, held_to(bounds))
+
+    def check(_):
+        covariance = estimator.covariances[0]
+        gap = np.abs(covariance - covariance.T).max()
+        assert gap == 0.0 if backend == "compiled" else gap < 1e-6 * covariance.max()
+        assert np.linalg.eigvalsh(0.5 * (covariance + covariance.T)).min() >= -1e-10
+        assert not estimator.diverged.any()
+
+    n_steps = steps_of(name, backend, 700, 700, 60)
+    run(estimator, recorded, range(n_steps), watch=check)
+
+
+@every_pair
+@both_bounds
+@pytest.mark.parametrize("parameters", ["paper", "w99-3lane"])
+@pytest.mark.parametrize("filling", [0.0, 1.0], ids=["empty", "jam"])
+def test_poor_starts_and_ten_times_the_noise_stay_finite_and_within_bounds(
+    name, backend, bounds, parameters, filling
+):
+    n_steps = steps_of(name, backend, 200, 60, 14)
+    episodes = simulate(parameters, n=2, n_steps=n_steps, noise=10.0)
+    model = episodes.model
+    density = np.full((2, 19), filling) * model.jam_density
+    start = model.states(density, np.zeros((2, 19)))
+    estimator = started(name, backend, episodes, held_to(bounds), start)
+
+    def check(_):
+        shown = show(estimator)
+        for field in Snapshot._fields:
+            assert np.isfinite(getattr(shown, field)).all(), field
+        assert (np.minimum(shown.density, shown.speed) >= 0.0).all()
+        assert (shown.density <= model.jam_density * (1.0 + 1e-12)).all()
+        assert (shown.speed <= model.largest_speed * (1.0 + 1e-12)).all()
+        if name != "random_walk":
+            within = model.project(shown.states, bounds)
+            np.testing.assert_allclose(within, shown.states, rtol=1e-9, atol=1e-9)
+
+    run(estimator, episodes, range(n_steps), watch=check)
+
+
+# A walk does not look at the inputs, the model alone not at what is measured.
+POISONS = [
+    (*pair, poison)
+    for pair in PAIRS
+    for poison in ("values", "inputs")
+    if (pair[0], poison) not in {("random_walk", "inputs"), ("open_loop", "values")}
+]
+
+
+@pytest.mark.parametrize(("name", "backend", "poison"), POISONS)
+def test_what_is_no_number_diverges_that_episode_only(name, backend, poison):
+    episodes = simulate(n=3, n_steps=12)
+    estimator, healthy = (started(name, backend, episodes) for _ in range(2))
+    prior = show(estimator)
+    for one in (estimator, healthy):
+        run(one, episodes, range(8))
+    inputs, values = episodes.inputs[8].copy(), episodes.values[8].copy()
+    if poison == "values":
+        values[1, 14, 1] = np.nan
+    else:
+        inputs[1] = np.nan
+    estimator.predict(episodes.everyone, inputs)
+    estimator.update(episodes.everyone, episodes.observed[8], values, SIGMA)
+    run(healthy, episodes, [8])
+    found = show(estimator)
+    assert found.diverged.tolist() == [False, True, False]
+    assert not found.fallback.any()
+    np.testing.assert_array_equal(found.innovations[1], 0.0)
+    if name == "enkf":  # members are drawn anew: their mean is off by 1 / sqrt(M) deviations
+        off = (found.states[1] - episodes.start[1]) / scale_of(episodes.model)
+        assert np.abs(off).max() < 5.0 * np.sqrt(1e-3 / 100)
+    else:
+        for field in ("density", "speed", "density_std", "speed_std"):
+            a, b = getattr(found, field)[1], getattr(prior, field)[1]
+            np.testing.assert_allclose(a, b, rtol=1e-12, err_msg=field)
+    assert_same(found, show(healthy), [0, 2], [0, 2])
+    run(estimator, episodes, range(9, 12))
+    assert not estimator.diverged.any()
+    assert np.isfinite(show(estimator).states).all()
+
+
+# Measurements -------------------------------------------------------------------------------------
+
+# Settings under which worthless measurements leave nothing but the model. A mean over points is
+# the model's own path if they lie close together; a window is if it is linearised along it.
+WITHOUT_NOISE = EstimatorSettings(process_noise=(1e-9, 1e-9), initial_variance=1e-18)
+ALONG = HorizonSettings(linearisation="trajectory", bounds="cone")
+BLIND = {
+    "ekf": (EstimatorSettings(), 1e-9),
+    "ukf": (WITHOUT_NOISE, 1e-4),
+    "enkf": (WITHOUT_NOISE, 1e-4),
+    "mhe": (EstimatorSettings(mhe=ALONG), 1e-8),
+}
+
+
+@pytest.mark.parametrize(("name", "backend"), WITH_COVARIANCE)
+def test_worthless_measurements_leave_the_model_alone(name, backend):
+    n_steps = steps_of(name, backend, 100, 100, 30)
+    episodes = simulate(n_steps=n_steps)
+    settings, tolerance = BLIND[name]
+    estimator = started(name, backend, episodes, settings)
+    alone = started("open_loop", backend, episodes)
+    for one in (estimator, alone):
+        run(one, episodes, range(n_steps), sigma=np.array([1e12, 1e12]))
+    np.testing.assert_allclose(estimator.states, alone.states, rtol=tolerance)
+
+
+@every_pair
+def test_an_empty_set_of_measurements_leaves_the_prediction(name, backend):
+    episodes = simulate(n_steps=14)
+    estimator = started(name, backend, episodes)
+    run(estimator, episodes, range(12))
+    nothing, unread = np.zeros((1, 19), bool), np.full((1, 19, 2), np.nan)
+    for k in (12, 13):
+        estimator.predict(episodes.everyone, episodes.inputs[k])
+        before = show(estimator)
+        kept = estimator.covariances if name in ("ekf", "ukf", "enkf") else None
+        estimator.update(episodes.everyone, nothing, unread, SIGMA)
+        after = show(estimator)
+        np.testing.assert_allclose(after.states, before.states, rtol=1e-12)
+        np.testing.assert_array_equal(after.innovations, 0.0)
+        assert not np.any(after.diverged | after.fallback)
+        if kept is not None:
+            np.testing.assert_allclose(estimator.covariances, kept, rtol=1e-9, atol=1e-15)
+        if name != "open_loop":
+            assert after.density_std.mean() > 0.0
+
+
+@every_pair
+def test_values_of_unobserved_segments_are_not_looked_at(name, backend):
+    episodes = simulate(n_steps=14)
+    hidden = np.where(episodes.observed[..., None], episodes.values, np.nan)
+    a, b = (started(name, backend, episodes) for _ in range(2))
+    run(a, episodes, range(14))
+    run(b, replace(episodes, values=hidden), range(14))
+    assert_same(show(a), show(b))
+    np.testing.assert_array_equal(b.innovations[~episodes.observed[13]], 0.0)
+
+
+def renumbered(episodes):
+    """The same road and traffic with its two on-ramps, segments 15 and 16, exchanged."""
+    same = episodes.model.network
+    road = Road(**{field.name: getattr(same, field.name) for field in fields(Road)})
+    model = ARZModel(replace(road, on_ramps=road.on_ramps[::-1]), episodes.model.parameters)
+    inputs, start = episodes.inputs.copy(), episodes.start.copy()
+    inputs[..., [3, 4, 5, 6]] = inputs[..., [5, 6, 3, 4]]
+    start[:, 30:34] = start[:, [32, 33, 30, 31]]
+    seen, values = episodes.observed[..., EXCHANGED], episodes.values[..., EXCHANGED, :]
+    return replace(episodes, model=model, start=start, inputs=inputs, observed=seen, values=values)
+
+
+@pytest.mark.parametrize(("name", "backend"), [pair for pair in PAIRS if pair[0] != "enkf"])
+def test_the_numbering_of_segments_and_rows_changes_nothing(name, backend):
+    """The EnKF gives its draws out in this order, so that it is the same in distribution only.
+
+    The root of the UKF's covariance depends on the order, too: not in the first step, as the
+    prior has no correlations.
+    """
+    n_steps = 1 if name == "ukf" else 14
+    episodes = simulate("paper", n_steps=n_steps)
+    episodes.observed[..., [15, 16]] = True
+    other = renumbered(episodes)
+    assert not np.array_equal(other.values[0, 0], episodes.values[0, 0])
+    a, b = started(name, backend, episodes), started(name, backend, other)
+    run(a, episodes, range(n_steps))
+    run(b, other, range(n_steps))
+    first, second = show(a), show(b)
+    for field in ("density", "speed", "density_std", "speed_std", "innovations"):
+        mine, its = getattr(first, field), getattr(second, field)[:, EXCHANGED]
+        np.testing.assert_allclose(mine, its, rtol=1e-6, atol=1e-7, err_msg=field)
+
+
+# Batches ------------------------------------------------------------------------------------------
+
+
+@every_pair
+def test_a_batch_equals_single_episodes_to_the_bit_in_any_order(name, backend):
+    n_steps = steps_of(name, backend, 60, 30, 14)
+    episodes = simulate(n=3, n_steps=n_steps, noise=2.0)
+    batch, shuffled = (started(name, backend, episodes) for _ in range(2))
+    run(batch, episodes, range(n_steps))
+    order = np.array([2, 0, 1])
+    for k in range(n_steps):
+        shuffled.predict(order, episodes.inputs[k, order])
+        seen, values = episodes.observed[k, order], episodes.values[k, order]
+        shuffled.update(order, seen, values, SIGMA)
+    assert_same(show(batch), show(shuffled))
+    for i, stream in enumerate(random_streams(3)):
+        one, alone, row = make_estimator(name, backend, episodes.model, 1), np.arange(1), [i]
+        one.reset(alone, episodes.start[row], [stream])
+        for k in range(n_steps):
+            one.predict(alone, episodes.inputs[k, row])
+            one.update(alone, episodes.observed[k, row], episodes.values[k, row], SIGMA)
+        assert_same(show(one), show(batch), [0], [i])
+
+
+@every_pair
+def test_episodes_that_are_not_named_stay_as_they_are(name, backend):
+    episodes = simulate(n=4, n_steps=16)
+    estimator, other = (started(name, backend, episodes) for _ in range(2))
+    for one in (estimator, other):
+        run(one, episodes, range(12))
+    before = show(estimator)
+    some, rest = np.array([3, 1]), np.array([0, 2])
+    estimator.predict(some, episodes.inputs[12, some])
+    estimator.update(some, episodes.observed[12, some], episodes.values[12, some], SIGMA)
+    estimator.reset(np.array([1]), episodes.start[[1]], random_streams(1))
+    after = show(estimator)
+    assert_same(after, before, rest, rest)
+    for i in some:
+        assert not np.array_equal(after.states[i], before.states[i])
+    # What is hidden of the others, streams and windows, goes on as if nothing had happened.
+    for one in (estimator, other):
+        one.predict(rest, episodes.inputs[13, rest])
+        one.update(rest, episodes.observed[13, rest], episodes.values[13, rest], SIGMA)
+    assert_same(show(estimator), show(other), rest, rest)

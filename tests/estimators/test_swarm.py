@@ -1,0 +1,157 @@
+"""The model of many states at once against `ARZModel`."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dptse_env.estimators.compiled.swarm import (
+    advance_swarm,
+    flock_of,
+    measured_speeds,
+    project_swarm,
+)
+from dptse_env.model import ARZModel, load_parameters
+from dptse_env.model.road import road_of
+from dptse_env.traffic import PAPER_HIGHWAY, SHORT_HIGHWAY
+
+WIDTH = 104
+
+everywhere = pytest.mark.parametrize(
+    ("corridor", "parameters"),
+    [
+        (corridor, load_parameters(name))
+        for corridor in (PAPER_HIGHWAY, SHORT_HIGHWAY)
+        for name in ("paper", "w99-3lane")
+    ],
+    ids=lambda value: value.name,
+)
+
+
+class UnusedExits:
+    """A corridor whose off-ramps nobody takes, which its own checks refuse."""
+
+    def __init__(self, corridor):
+        self._corridor, self.exit_shares = corridor, (0.0,) * len(corridor.exit_shares)
+
+    def __getattr__(self, name):
+        return getattr(self._corridor, name)
+
+
+def random_states(model, rng):
+    """States all over the cone and beyond, with empty, jammed and standing cells among them."""
+    shape, jam, v_f = (WIDTH, model.n_segments), model.jam_density, model.speed_scale
+    density = rng.uniform(0.0, 1.0, shape) ** rng.choice([0.5, 2.0], (WIDTH, 1)) * jam
+    speed = rng.uniform(0.0, 1.2, shape) * v_f
+    kind = rng.random(shape)
+    density[kind < 0.05] = 0.0
+    speed[kind > 0.95] = 0.0
+    states = model.states(density, speed)
+    crowded = (kind > 0.05) & (kind < 0.1)
+    states[:, 0::2] = np.where(crowded, jam, states[:, 0::2])
+    states[0], states[1] = 0.0, model.states(jam[None], np.zeros((1, jam.size)))[0]
+    return states
+
+
+def random_inputs(model, rng):
+    lanes = np.array([3.0, 3.0, *[1.0] * (model.n_boundaries - 2)]) / 3.0
+    density = rng.uniform(0.0, 1.2, (1, model.n_boundaries)) * lanes * model.density_scale
+    density[rng.random(density.shape) < 0.1] = 0.0
+    speed = rng.uniform(0.0, 1.0, density.shape) * model.speed_scale
+    return model.boundary_inputs(density, speed)[0]
+
+
+def advanced(model, states, inputs):
+    road, swarm = road_of(model), states.T.copy()
+    advance_swarm(road, swarm, inputs, flock_of(road, len(states)))
+    return swarm.T
+
+
+def unit(model):
+    return np.tile([1.0, model.speed_scale], model.n_segments) * model.density_scale
+
+
+@everywhere
+def test_advances_as_the_model_steps(corridor, parameters):
+    model, rng = ARZModel(corridor, parameters), np.random.default_rng(0)
+    for _ in range(50):
+        states, inputs = random_states(model, rng), random_inputs(model, rng)
+        expected = model.step(states, np.repeat(inputs[None], WIDTH, axis=0))
+        actual = advanced(model, states, inputs)
+        np.testing.assert_allclose(actual / unit(model), expected / unit(model), atol=1e-12)
+
+
+@everywhere
+def test_an_off_ramp_that_nobody_takes_does_not_hold_traffic_up(corridor, parameters):
+    nobody = UnusedExits(corridor)
+    model, rng = ARZModel(nobody, parameters), np.random.default_rng(0)
+    states, inputs = random_states(model, rng), random_inputs(model, rng)
+    expected = model.step(states, np.repeat(inputs[None], WIDTH, axis=0))
+    actual = advanced(model, states, inputs)
+    np.testing.assert_allclose(actual / unit(model), expected / unit(model), atol=1e-12)
+
+
+@everywhere
+@pytest.mark.parametrize("bounds", ["cone", "box"])
+def test_projects_as_the_model_does(corridor, parameters, bounds):
+    model, rng = ARZModel(corridor, parameters), np.random.default_rng(0)
+    for _ in range(20):
+        scatter = 1.0 + 0.5 * rng.normal(size=(WIDTH, model.n_states))
+        states = random_states(model, rng) * scatter + 0.1 * unit(model) * rng.normal(
+            size=scatter.shape
+        )
+        swarm = states.T.copy()
+        project_swarm(road_of(model), swarm, bounds == "box")
+        expected = model.project(states, bounds)
+        np.testing.assert_allclose(swarm.T / unit(model), expected / unit(model), atol=1e-13)
+
+
+@everywhere
+def test_measures_as_the_model_does(corridor, parameters):
+    model, rng = ARZModel(corridor, parameters), np.random.default_rng(0)
+    states = random_states(model, rng)
+    expected = model.measure(states)[..., 1]
+    out = np.empty(WIDTH)
+    for s in range(model.n_segments):
+        rho, psi = (np.ascontiguousarray(states[:, 2 * s + i]) for i in range(2))
+        jam, v_f, gamma = model.jam_density[s], parameters.free_flow_speed, parameters.gamma
+        measured_speeds(rho, psi, jam, v_f, gamma, out)
+        np.testing.assert_allclose(out, expected[:, s], atol=1e-9 * v_f)
+
+
+@everywhere
+def test_what_is_not_finite_stays_so_in_its_column(corridor, parameters):
+    model, rng = ARZModel(corridor, parameters), np.random.default_rng(0)
+    states, inputs = random_states(model, rng), random_inputs(model, rng)
+    clean = advanced(model, states, inputs)
+    rows = np.arange(model.n_states)
+    poisoned = states[: rows.size].copy()
+    poisoned[rows, rows] = np.nan
+    after = advanced(model, np.concatenate([poisoned, states[rows.size :]]), inputs)
+    assert np.isnan(after[: rows.size]).any(axis=1).all()
+    np.testing.assert_array_equal(after[rows.size :], clean[rows.size :])
+    for is_box in (False, True):
+        swarm = poisoned.T.copy()
+        project_swarm(road_of(model), swarm, is_box)
+        assert np.isnan(swarm[rows, rows]).all()
+
+
+@everywhere
+@pytest.mark.parametrize("column", range(5))
+def test_inputs_that_are_not_finite_reach_every_column(corridor, parameters, column):
+    """Demand, w, the density behind the exit, and an on-ramp's: NaN in, NaN out."""
+    model, rng = ARZModel(corridor, parameters), np.random.default_rng(0)
+    inputs = random_inputs(model, rng)
+    inputs[column] = np.nan
+    after = advanced(model, random_states(model, rng), inputs)
+    assert np.isnan(after).any(axis=1).mean() > 0.5
+
+
+def test_widths_that_are_no_whole_vector_agree():
+    model = ARZModel(PAPER_HIGHWAY, replace(load_parameters("paper"), name="other", gamma=1.7))
+    rng = np.random.default_rng(0)
+    states, inputs = random_states(model, rng), random_inputs(model, rng)
+    whole = advanced(model, states, inputs)
+    for width in (1, 3, 7, 77):
+        part = advanced(model, states[:width], inputs)
+        np.testing.assert_allclose(part / unit(model), whole[:width] / unit(model), atol=1e-13)
