@@ -11,9 +11,15 @@ from typing import Any
 
 from dptse_env.actions import ACTION_ENCODINGS
 from dptse_env.estimators import EstimatorSettings, check_estimator
+from dptse_env.estimators.tuning import available_settings, load_settings, settings_name
 from dptse_env.mapping import from_mapping
 from dptse_env.model import ARZModel, ARZParameters, load_parameters
-from dptse_env.privacy import PrivacySettings, Sensitivity, paper_sensitivity
+from dptse_env.privacy import (
+    PrivacySettings,
+    Sensitivity,
+    contribution_sensitivity,
+    paper_sensitivity,
+)
 from dptse_env.rewards import REWARD_TERMS
 from dptse_env.traffic import CORRIDORS, Corridor, randomised
 
@@ -23,9 +29,6 @@ VALIDATION_SEEDS = range(1_000, 2_000)
 """Traffic seeds meant for choosing among trained policies."""
 TEST_SEEDS = range(2_000, 3_000)
 """Traffic seeds meant for the numbers that are reported."""
-
-PROCESS_NOISE = {"paper": (0.014, 0.02), "w99-3lane": (0.007, 0.01)}
-"""Process noise of the EKF by ARZ parameter set, the best of a coarse grid on training seeds."""
 
 
 def _require_name(path: str, name: object, known: Iterable[str]) -> None:
@@ -44,8 +47,9 @@ class EnvConfig:
             ``open_loop``.
         backend: ``compiled`` or ``reference``.
         parameters: ARZ parameters, or the name of a set.
-        estimator_settings: Process noise, prior variance and bounds of the estimator; None for
-            the process noise that suits the ARZ parameters (`PROCESS_NOISE`).
+        estimator_settings: Tuning of the estimator, or the name of a shipped set
+            (`dptse_env.estimators.tuning`), whichever estimator it was tuned for. None for the
+            set ``<estimator>-<ARZ parameters>-<privacy preset>`` if one ships, else the defaults.
         bandwidth: Most mainline segments to query a step.
         action: Name of the action encoding: ``mask``, ``scores``, ``slots`` or ``sequential``.
         privacy: Preset, epsilon and delta of the mechanism.
@@ -63,7 +67,7 @@ class EnvConfig:
     estimator: str = "ekf"
     backend: str = "compiled"
     parameters: str | ARZParameters = "paper"
-    estimator_settings: EstimatorSettings | None = None
+    estimator_settings: str | EstimatorSettings | None = None
     bandwidth: int = 5
     action: str = "mask"
     privacy: PrivacySettings = field(default_factory=PrivacySettings)
@@ -92,6 +96,7 @@ class EnvConfig:
         if min(self.traffic_seeds) < 0 or len(set(self.traffic_seeds)) < len(self.traffic_seeds):
             raise ValueError(f"traffic_seeds must be >= 0 and distinct, got {self.traffic_seeds}")
         self.model()
+        self.settings()
 
     @property
     def horizon_steps(self) -> int:
@@ -112,16 +117,27 @@ class EnvConfig:
 
     def settings(self) -> EstimatorSettings:
         """Return the settings of the estimator."""
-        if self.estimator_settings is not None:
+        if isinstance(self.estimator_settings, EstimatorSettings):
             return self.estimator_settings
-        name = self.parameters if isinstance(self.parameters, str) else self.parameters.name
-        if name in PROCESS_NOISE:
-            return EstimatorSettings(process_noise=PROCESS_NOISE[name])
-        return EstimatorSettings()
+        if self.estimator_settings is not None:
+            return load_settings(self.estimator_settings)
+        parameters = self.parameters if isinstance(self.parameters, str) else self.parameters.name
+        name = settings_name(self.estimator, parameters, self.privacy.preset)
+        return load_settings(name) if name in available_settings() else EstimatorSettings()
 
     def sensitivity(self) -> Sensitivity:
         """Return how far one vehicle can move the releases, by the rule of the privacy preset."""
-        corridor = self.corridor
+        corridor, privacy = self.corridor, self.privacy
+        if privacy.is_bounded:
+            slope = corridor.speed_scale / corridor.density_scale
+            return contribution_sensitivity(
+                contributions=privacy.contributions(self.horizon_steps),
+                adjacency=privacy.adjacency,
+                segment_length=corridor.segment_length,
+                largest_speed=corridor.speed_limit,
+                protects=privacy.protected(),
+                mean_speed_slope=slope if privacy.speed == "mean" else None,
+            )
         return paper_sensitivity(
             n_sensors=self.bandwidth + len(corridor.fixed_sensors),
             average_dwell=corridor.average_dwell,
@@ -134,6 +150,11 @@ class EnvConfig:
 
 PRESETS = {
     "paper-highway": EnvConfig(corridor=CORRIDORS["paper-highway"]),
+    "private-highway": EnvConfig(
+        corridor=randomised(CORRIDORS["paper-highway"]),
+        parameters="w99-3lane",
+        privacy=PrivacySettings("guaranteed", epsilon=5.0, cap=64),
+    ),
     "short-highway": EnvConfig(corridor=CORRIDORS["short-highway"], bandwidth=2),
 }
 """Configurations by name."""
@@ -149,7 +170,9 @@ def resolve(preset: str, overrides: Mapping[str, Any]) -> EnvConfig:
             preset. Shortcuts: ``epsilon`` and ``delta`` of ``privacy``, ``incident`` of
             ``corridor`` (``"preset"``, ``"none"``, ``"random"`` or a mapping) and ``demand`` of
             ``corridor`` (the same without ``"none"``); random means drawn anew for every traffic
-            seed. ``traffic_seeds`` may be a string ``"first:stop"``.
+            seed. ``traffic_seeds`` may be a string ``"first:stop"``. In a mapping
+            ``estimator_settings``, fields left out keep what None would have given: the tuned set
+            of the resolved estimator, parameters and privacy preset, or else the defaults.
 
     Raises:
         ValueError: A key is unknown or a value out of range; the message starts with its path.
@@ -160,7 +183,13 @@ def resolve(preset: str, overrides: Mapping[str, Any]) -> EnvConfig:
     base = replace(base, privacy=_privacy(base.privacy, values))
     if isinstance(values.get("traffic_seeds"), str):
         values["traffic_seeds"] = parse_seeds(values["traffic_seeds"], "traffic_seeds")
-    return from_mapping(EnvConfig, values, "", base)
+    settings = values.get("estimator_settings")
+    if not isinstance(settings, Mapping):
+        return from_mapping(EnvConfig, values, "", base)
+    del values["estimator_settings"]
+    config = from_mapping(EnvConfig, values, "", base)
+    settings = from_mapping(EstimatorSettings, settings, "estimator_settings", config.settings())
+    return replace(config, estimator_settings=settings)
 
 
 def parse_seeds(text: str, path: str = "seeds") -> tuple[int, ...]:

@@ -1,18 +1,20 @@
 import dataclasses
+import itertools
 import json
 
+import gymnasium as gym
 import pytest
 
 from dptse_env.config import (
     PRESETS,
-    PROCESS_NOISE,
     TEST_SEEDS,
     TRAINING_SEEDS,
     VALIDATION_SEEDS,
     parse_seeds,
     resolve,
 )
-from dptse_env.estimators import EstimatorSettings
+from dptse_env.estimators import EstimatorSettings, HorizonSettings
+from dptse_env.estimators.tuning import available_settings, load_settings
 from dptse_env.traffic import PAPER_HIGHWAY, SHORT_HIGHWAY, DemandDistribution, IncidentDistribution
 
 
@@ -71,15 +73,64 @@ def test_incident_and_demand_by_name():
     assert moved.corridor.incident.phases == PAPER_HIGHWAY.incident.phases
 
 
-def test_process_noise_follows_the_parameters_unless_given():
-    for name, noise in PROCESS_NOISE.items():
-        assert resolve("paper-highway", {"parameters": name}).settings().process_noise == noise
-    given = {"process_noise": [0.5, 0.25]}
-    config = resolve("paper-highway", {"estimator_settings": given})
-    assert config.settings() == EstimatorSettings(process_noise=(0.5, 0.25))
+def test_tuned_settings_are_found_by_estimator_parameters_and_privacy():
+    for estimator, parameters, privacy in itertools.product(
+        ("ekf", "open_loop"), ("paper", "w99-3lane"), ("paper", "corrected")
+    ):
+        keywords = {"estimator": estimator, "parameters": parameters, "privacy": privacy}
+        settings = resolve("paper-highway", keywords).settings()
+        name = f"{estimator}-{parameters}-{privacy}"
+        known = name in available_settings()
+        assert settings == (load_settings(name) if known else EstimatorSettings())
+    assert "ekf-w99-3lane-paper" in available_settings()
     own = {"name": "mine", "free_flow_speed": 100.0, "jam_density": 350.0, "gamma": 1.0,
            "relaxation_time": 40.0}  # fmt: skip
     assert resolve("paper-highway", {"parameters": own}).settings() == EstimatorSettings()
+
+
+def test_a_tuned_set_by_name_serves_any_estimator():
+    keywords = {"estimator": "ukf", "estimator_settings": "ekf-w99-3lane-paper"}
+    config = resolve("paper-highway", keywords)
+    assert config.estimator_settings == "ekf-w99-3lane-paper"
+    assert config.settings() == load_settings("ekf-w99-3lane-paper")
+    with pytest.raises(
+        ValueError, match=r"^estimator_settings must be one of .*ekf-w99-3lane-paper.*, got 'best'$"
+    ):
+        resolve("paper-highway", {"estimator_settings": "best"})
+
+
+def test_a_mapping_of_settings_keeps_what_would_have_been_chosen():
+    keywords = {"parameters": "w99-3lane", "estimator_settings": {"mhe": {"horizon": 3}}}
+    tuned = load_settings("ekf-w99-3lane-paper")
+    assert tuned.process_noise != EstimatorSettings().process_noise
+    expected = dataclasses.replace(tuned, mhe=dataclasses.replace(tuned.mhe, horizon=3))
+    assert resolve("paper-highway", keywords).settings() == expected
+    keywords["estimator"] = "open_loop"
+    assert resolve("paper-highway", keywords).settings() == EstimatorSettings(
+        mhe=HorizonSettings(horizon=3)
+    )
+    given = EstimatorSettings(noise_scale=2.0)
+    keywords["estimator_settings"] = given
+    assert resolve("paper-highway", keywords).settings() is given
+    for bad, message in (
+        ({"noise": 1.0}, r"^estimator_settings\.noise is unknown; allowed: "),
+        ({"mhe": {"horizon": 0}}, r"^estimator_settings\.mhe\.horizon must be an integer >= 1"),
+        (3, r"^estimator_settings must be "),
+    ):
+        with pytest.raises(ValueError, match=message):
+            resolve("paper-highway", {"estimator_settings": bad})
+
+
+@pytest.mark.parametrize(
+    "settings", ["ekf-paper-paper", {"process_noise": [0.5, 0.25], "ukf": {"alpha": 1.0}}]
+)
+def test_settings_survive_the_spec_of_an_environment(settings):
+    env = gym.make("dptse_env:dptse/PaperHighway-v0", estimator_settings=settings)
+    again = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
+    config, other = env.unwrapped.config, again.unwrapped.config
+    assert other == config
+    plain = json.loads(json.dumps(dataclasses.asdict(config)))
+    assert resolve("short-highway", plain) == config
 
 
 @pytest.mark.parametrize(("text", "seeds"), [("3:6", (3, 4, 5)), ("7", (7,)), ("0:1", (0,))])

@@ -1,0 +1,193 @@
+"""Tune the estimators' settings on training traffic, one set per configuration.
+
+python scripts/tune.py --estimators ekf ukf --privacy paper corrected --seeds 0:8 --workers 2
+
+Each set is left in <output>/<estimator>-<ARZ parameters>-<privacy preset>.json. To ship one, copy
+it to dptse_env/estimators/tuned/: environments of that configuration then choose it by themselves.
+
+Trials are kept in a journal beside it. After an interruption, or a kill, the same command goes on
+where it stopped, and with more --trials it searches on; other arguments need another folder.
+"""
+
+from __future__ import annotations
+
+import itertools
+import multiprocessing
+import os
+import signal
+import threading
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import optuna
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from tqdm import tqdm
+
+from agents.search_space import SPACE
+from agents.tuning import TuningStudy, scores_of
+from agents.tuning_task import NOISE_SEED, TuningTask
+from dptse_env.model import ARZParameters
+from dptse_env.model.parameters import read_parameters
+from dptse_env.traffic import RecordLibrary
+from dptse_env.validation import integer
+from scripts.cli import run
+
+
+@dataclass(frozen=True)
+class Args:
+    """Tune the estimators' settings."""
+
+    env: str = "dptse_env:dptse/PaperHighway-v0"
+    """Environment id."""
+    estimators: tuple[str, ...] = tuple(SPACE)
+    """State estimators."""
+    parameters: tuple[str, ...] = ("w99-3lane", "paper")
+    """ARZ parameters: names of sets, or JSON files as scripts/calibrate.py writes them."""
+    privacy: tuple[str, ...] = ("paper",)
+    """Privacy presets."""
+    seeds: str = "0:8"
+    """Traffic seeds, first:stop; training seeds only."""
+    trials: int = 60
+    """Trials per configuration, those of earlier runs included."""
+    workers: int = 1
+    """Processes, each with a trial of its own; results depend on the number."""
+    schedule: str = "paper"
+    """Query schedule."""
+    bandwidth: int | None = None
+    """Most segments to query a second; the environment's own if not given."""
+    epsilon: float = 1.0
+    """Privacy parameter epsilon."""
+    delta: float = 0.05
+    """Privacy parameter delta."""
+    noise_seed: int = NOISE_SEED
+    """Noise and estimators are seeded with this plus the traffic seed."""
+    noise_scale: bool = False
+    """Whether to search the scale of R, too, which the mechanism's noise makes known."""
+    sampler_seed: int = 0
+    """Seeds the search."""
+    records: Path | None = None
+    """Folder of the record cache; the user's cache if not given."""
+    output: Path = Path("results/tuning")
+    """Folder for the sets and the journals."""
+
+
+def make_tasks(args: Args) -> list[TuningTask]:
+    """Return one task per configuration, all of them checked.
+
+    Raises:
+        ValueError: An argument is out of range.
+    """
+    integer("trials", args.trials, 1)
+    integer("workers", args.workers, 1)
+    tasks: dict[str, TuningTask] = {}
+    for estimator, source, privacy in itertools.product(
+        args.estimators, args.parameters, args.privacy
+    ):
+        parameters: str | ARZParameters = source
+        if source.endswith(".json"):
+            parameters = read_parameters(source)
+        task = TuningTask(
+            env=args.env,
+            estimator=estimator,
+            parameters=parameters,
+            privacy=privacy,
+            epsilon=args.epsilon,
+            delta=args.delta,
+            bandwidth=args.bandwidth,
+            seeds=args.seeds,
+            schedule=args.schedule,
+            noise_seed=args.noise_seed,
+            records=None if args.records is None else str(args.records),
+            with_noise_scale=args.noise_scale,
+        )
+        task.config()
+        if task.name in tasks:
+            raise ValueError(f"{task.name} must be asked for once")
+        tasks[task.name] = task
+    if not tasks:
+        raise ValueError("estimators, parameters and privacy must not be empty")
+    return list(tasks.values())
+
+
+def make_pool(n_workers: int) -> ProcessPoolExecutor:
+    """Return processes that end with this one, however it ends."""
+    context = multiprocessing.get_context("spawn")
+    return ProcessPoolExecutor(n_workers, context, initializer=_start_worker)
+
+
+def _start_worker() -> None:
+    # Ctrl-C reaches the whole process group; the parent decides what becomes of the workers.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+    if parent is None:
+        raise RuntimeError("a worker needs a parent process")
+
+    def follow() -> None:
+        parent.join()
+        os._exit(1)  # the parent was killed, and nobody waits for a result
+
+    threading.Thread(target=follow, daemon=True).start()
+
+
+def tune(study: TuningStudy, args: Args, pool: ProcessPoolExecutor) -> None:
+    """Run the trials that a study lacks, with a progress bar."""
+    done = study.n_finished()
+    with tqdm(
+        total=max(args.trials, done), initial=done, desc=study.task.name, unit="trial"
+    ) as bar:
+
+        def show() -> None:
+            best = study.best()
+            if best is not None:
+                bar.set_postfix_str(f"best reward {best.value:.5f}", refresh=False)
+            bar.update(study.n_finished() - bar.n)
+
+        show()
+        study.run(args.trials, pool, args.workers, show)
+
+
+def add_rows(table: Table, study: TuningStudy) -> None:
+    """Add what a study began with and what it found to the table of all."""
+    best = study.best()
+    if best is None:
+        raise ValueError(f"{study.task.name}: no trial ran to its end with a finite score")
+    trials = {"defaults": study.labelled("defaults"), "shipped": study.labelled("shipped")}
+    for label, trial in {**trials, "tuned": best}.items():
+        if trial is not None:
+            score = scores_of(trial)
+            numbers = f"{score['score']:.5f}", f"{score['rmse_density']:.2f}"
+            name = study.task.name if label == "defaults" else ""
+            table.add_row(name, label, *numbers, f"{score['rmse_speed']:.2f}")
+    table.add_section()
+
+
+def main(args: Args) -> None:
+    """Record what is missing, tune every configuration, and leave the sets."""
+    tasks = make_tasks(args)
+    corridor = tasks[0].config().corridor
+    library = RecordLibrary(args.records)
+    library.ensure(corridor, tasks[0].traffic_seeds, workers=args.workers, progress=True)
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    table = Table(box=box.SIMPLE_HEAD, title="on the traffic tuned on", title_justify="left")
+    table.add_column("set", no_wrap=True)
+    for header in ("settings", "reward", "density RMSE\n[veh/km]", "speed RMSE\n[km/h]"):
+        table.add_column(header, justify="left" if header == "settings" else "right")
+    with make_pool(args.workers) as pool:
+        for task in tasks:
+            with TuningStudy.open(task, args.output, args.sampler_seed) as study:
+                tune(study, args, pool)
+                study.write(args.output / f"{task.name}.json")
+                add_rows(table, study)
+    Console().print(table)
+    print(f"tuned sets are in {args.output}/; copy to dptse_env/estimators/tuned/ to ship one")
+
+
+if __name__ == "__main__":
+    try:
+        run(main, Args, __doc__)
+    except KeyboardInterrupt:
+        print("\nstopped; the same command goes on from here")
+        raise SystemExit(130) from None
