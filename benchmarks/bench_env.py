@@ -3,8 +3,7 @@
 python benchmarks/bench_env.py
 
 All figures come from one run on one core; compare the ratios, absolute times drift between
-machines and moments. The estimator alone meets one measurement over and over, which is less work
-than traffic for the MHE, whose time beside it then reads too long.
+machines and moments. The estimator alone follows the same traffic under the paper's schedule.
 """
 
 from __future__ import annotations
@@ -14,27 +13,18 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import argparse
-import statistics
-import time
-from collections.abc import Callable
-from typing import Any
+import dataclasses
 
 import gymnasium as gym
 import numpy as np
 
+from benchmarks.replay import recorded
+from benchmarks.timing import Steps, interleave, per_call
+from dptse_env.config import EnvConfig
 from dptse_env.estimators import ESTIMATORS
 from dptse_env.traffic.sumo import simulate
 
-
-def per_call(run: Callable[[], Any], calls: int, repeats: int) -> float:
-    """Return the median time of a call [us]; ``run`` makes ``calls`` of them."""
-    run()
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        run()
-        times.append((time.perf_counter() - start) / calls)
-    return statistics.median(times) * 1e6
+PARAMETERS, STEPS = "w99-3lane", 600
 
 
 def env_step(estimator: str, repeats: int) -> tuple[float, float]:
@@ -42,36 +32,24 @@ def env_step(estimator: str, repeats: int) -> tuple[float, float]:
     env = gym.make(
         "dptse_env:dptse/PaperHighway-v0",
         estimator=estimator,
-        parameters="w99-3lane",
+        parameters=PARAMETERS,
         traffic_seeds="0:1",
     ).unwrapped
-    steps = 600
-    actions = np.zeros((steps, 15), dtype=np.int8)
-    for k in range(steps):
-        actions[k, (np.arange(5) * 3 + k) % 15] = 1
+    config: EnvConfig = env.config  # type: ignore[attr-defined]
+    replay = recorded(PARAMETERS, (0,), 1, config.bandwidth, STEPS)
+    replay = dataclasses.replace(replay, settings=config.settings())
+    actions = replay.observed[:, 0, : config.corridor.n_mainline].astype(np.int8)
+    actions[:, np.intersect1d(np.arange(actions.shape[1]), config.corridor.fixed_sensors)] = 0
 
     def episode() -> None:
         env.reset(seed=0)
         for action in actions:
             env.step(action)
 
-    total = per_call(episode, steps, repeats)
-    process = env.process  # type: ignore[attr-defined]
-    only = np.zeros(1, dtype=np.int64)
-    inputs = process.boundary_inputs[0, 100:101]
-    observed = np.zeros((1, 19), dtype=bool)
-    observed[0, [0, 3, 6, 9, 12, 14, 17, 18]] = True
-    values = process.released.copy()
-    sigma = process.mechanism.sigma
-    own = process.estimator
-
-    def estimates() -> None:
-        for _ in range(steps):
-            own.predict(only, inputs)
-            own.update(only, observed, values, sigma)
-            own.estimate()
-
-    return total, per_call(estimates, steps, repeats)
+    total = per_call(episode, STEPS, repeats)
+    own = Steps(estimator, "compiled", "compiled", replay)
+    interleave([own], STEPS, STEPS, repeats)
+    return total, own.mean + own.reading.mean
 
 
 def main() -> None:

@@ -1,116 +1,170 @@
-"""Time of an EKF step: compiled, alone and in batches, beside filterpy, all in one run.
+"""Time of an estimator's step: compiled, the reference, their peers and the arithmetic floor.
 
-    OMP_NUM_THREADS=1 python benchmarks/bench_estimators.py
+python benchmarks/bench_estimators.py
 
-A step is `predict` plus `update` of one episode with 14 measured segments, 28 outputs, on the
-paper's highway. filterpy runs twice: alone, with its matrices given, and as the reference
-estimator, which also evaluates the numpy model and its Jacobian.
+A step is `predict` and `update` of one episode, 28 outputs, on one core; all rows are measured in
+turns in one run. Compare the ratios: absolute times drift between machines and moments.
 """
 
 from __future__ import annotations
 
-import argparse
 import os
-import time
-from collections.abc import Callable
 
-import numpy as np
-from filterpy.kalman import ExtendedKalmanFilter
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-from dptse_env.estimators import EstimatorSettings, make_estimator
-from dptse_env.estimators.base import Estimator
-from dptse_env.model import ARZModel, load_parameters
-from dptse_env.traffic import PAPER_HIGHWAY
+from dataclasses import dataclass
+from typing import NamedTuple
 
-SIGMA = np.array([15.0, 6.0])
-STEPS = 200
+from benchmarks.compile_time import cold_and_warm
+from benchmarks.floor_rows import floor_of
+from benchmarks.peers import SolverPeer, peers
+from benchmarks.replay import Replay, recorded
+from benchmarks.timing import Row, Steps, interleave
+from dptse_env.config import parse_seeds
+from dptse_env.estimators import check_estimator
+from scripts.cli import run
 
 
-def main() -> None:
-    arguments = parse()
-    model = ARZModel(PAPER_HIGHWAY, load_parameters(arguments.parameters))
-    rows = [
-        ("filterpy alone", 1, bare_filterpy(model, arguments.segments)),
-        ("reference (filterpy)", 1, episode("reference", model, 1, arguments.segments)),
-        *(
-            (f"compiled, batch of {n}", n, episode("compiled", model, n, arguments.segments))
-            for n in (1, 64, 1024)
-        ),
+@dataclass(frozen=True)
+class Args:
+    """Time a step of each estimator."""
+
+    parameters: str = "w99-3lane"
+    """ARZ parameter set."""
+    traffic_seeds: str = "0:4"
+    """Traffic seeds of the episodes, first:stop; single episodes replay the first."""
+    queried: int = 11
+    """Segments queried a step beside the three with a sensor."""
+    batch: int = 64
+    """Episodes in a batch."""
+    steps: int = 700
+    """Steps of an episode, from the empty road on."""
+    block: int = 50
+    """Steps of one row before the next one has its turn."""
+    passes: int = 3
+    """Times that all rows go through the steps; a step's time is the median."""
+    compile_time: bool = True
+    """Whether to measure what compiling costs, too."""
+    quick: bool = False
+    """Smallest sizes: whether it runs, not how fast."""
+
+
+class Aim(NamedTuple):
+    """Times [us] to reach."""
+
+    target: float
+    goal: float
+
+
+AIMS = {
+    "ekf": Aim(20.0, 14.0),
+    "ukf": Aim(60.0, 50.0),
+    "enkf": Aim(120.0, 90.0),
+    "mhe": Aim(700.0, 200.0),
+}
+
+
+class Group(NamedTuple):
+    """The rows of one estimator; the first one is the compiled one, alone."""
+
+    steps: list[Steps]
+    peers: list[Row]
+    floor: Row
+
+    @property
+    def rows(self) -> list[Row]:
+        """All that run."""
+        return [*self.steps, *self.peers, self.floor]
+
+
+def group_of(estimator: str, replay: Replay, block: int) -> Group:
+    """Build the rows of an estimator."""
+    one, n = replay.first(1), len(replay.start)
+    steps = [
+        Steps(estimator, "compiled", "compiled, one episode", one),
+        Steps(estimator, "compiled", f"compiled, batch of {n}", replay),
     ]
-    times = interleaved([run for _, _, run in rows], arguments.seconds)
-    alone = times[0] / STEPS
-    threads = os.environ.get("OMP_NUM_THREADS", "not set")
-    print(f"{2 * arguments.segments} outputs, OMP_NUM_THREADS {threads}, best of several runs")
-    print(f"{'':24}{'us per step':>12}{'filterpy alone / it':>21}")
-    for (name, n, _), seconds in zip(rows, times, strict=True):
-        each = seconds / STEPS / n
-        print(f"{name:24}{1e6 * each:12.1f}{alone / each:20.1f}x")
+    if has_reference(estimator):
+        steps.append(Steps(estimator, "reference", "reference", one))
+    return Group(steps, peers(estimator, one, block), floor_of(estimator, one, block))
 
 
-def parse() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--parameters", default="w99-3lane", help="ARZ parameter set")
-    parser.add_argument("--segments", type=int, default=14, help="measured segments a step")
-    parser.add_argument("--seconds", type=float, default=10.0, help="time to spend, about")
-    return parser.parse_args()
+def has_reference(estimator: str) -> bool:
+    """Whether the package has a reference of an estimator."""
+    try:
+        check_estimator(estimator, "reference")
+    except ValueError:
+        return False
+    return True
 
 
-def episode(backend: str, model: ARZModel, n: int, n_measured: int) -> Callable[[], None]:
-    """A run of STEPS steps over n episodes with traffic that moves and other sets every step."""
-    rng = np.random.default_rng(0)
-    estimator: Estimator = make_estimator("ekf", backend, model, n, EstimatorSettings())
-    everyone, streams = np.arange(n), [np.random.default_rng(i) for i in range(n)]
-    start = model.states(
-        np.full((n, model.n_segments), 0.1) * model.jam_density,
-        np.full((n, model.n_segments), 0.6 * model.speed_scale),
+def print_table(groups: dict[str, Group]) -> None:
+    """Print a line a row; ratios are to the quickest peer and to the floor."""
+    print(
+        f"{'':6}{'':24}{'us/step':>9}{'95 %':>9}{'peer/it':>9}{'it/floor':>9}"
+        f"{'target':>8}{'':>5}{'goal':>7}{'':>5}{'estimate()':>12}"
     )
-    density = np.full((n, model.n_boundaries), 8.0) * (1.0 + rng.random((n, model.n_boundaries)))
-    inputs = model.boundary_inputs(density, np.full(density.shape, 0.7 * model.speed_scale))
-    observed = rng.random((STEPS, n, model.n_segments)).argsort(axis=-1) < n_measured
-    noise = SIGMA * rng.normal(size=(8, n, model.n_segments, 2))
-    values = model.measure(start) + noise
-
-    def run() -> None:
-        estimator.reset(everyone, start, streams)
-        for k in range(STEPS):
-            estimator.predict(everyone, inputs)
-            estimator.update(everyone, observed[k], values[k % 8], SIGMA)
-
-    return run
+    for estimator, group in groups.items():
+        peer, floor = min(row.mean for row in group.peers), group.floor.mean
+        for row in group.rows:
+            line = f"{estimator:6}{row.label:24}{row.mean:9.1f}{row.percentile_95:9.1f}"
+            line += f"{peer / row.mean:9.2f}{row.mean / floor:9.2f}"
+            if isinstance(row, Steps):
+                if row.label.startswith("compiled"):
+                    for aim in AIMS[estimator]:
+                        line += f"{aim:7.0f}{'met' if row.mean <= aim else 'no':>5} "
+                line = f"{line:88}{row.reading.mean:12.1f}"
+            print(line)
 
 
-def bare_filterpy(model: ARZModel, n_measured: int) -> Callable[[], None]:
-    """A run of STEPS steps of filterpy's filter with F, H and the measurement function given."""
-    rng = np.random.default_rng(0)
-    size, outputs = model.n_states, 2 * n_measured
-    jacobian, noise = rng.normal(size=(outputs, size)), np.eye(outputs)
-    measured = rng.normal(size=(STEPS, outputs))
-    plain = ExtendedKalmanFilter(dim_x=size, dim_z=outputs)
-    plain.F = np.eye(size) + 0.01 * rng.normal(size=(size, size)) / size
-    plain.x = np.zeros(size)
-
-    def run() -> None:
-        plain.P = np.eye(size)
-        for k in range(STEPS):
-            plain.predict()
-            plain.update(measured[k], lambda _: jacobian, lambda x: jacobian @ x, R=noise)
-
-    return run
+def print_remarks(groups: dict[str, Group]) -> None:
+    """Print what became of the filters and the programs while they were timed."""
+    for estimator, group in groups.items():
+        for row in group.steps:
+            if row.n_diverged:
+                print(f"{estimator}, {row.label}: diverged {row.n_diverged} times")
+    if "mhe" in groups:
+        alone, batch = groups["mhe"].steps[:2]
+        print(f"MHE: programs passed on to piqp: {alone.n_passed_on} alone, "
+              f"{batch.n_passed_on} in the batch")  # fmt: skip
+        for row in groups["mhe"].peers:
+            if isinstance(row, SolverPeer):
+                print(f"{row.label}: bounds bind in {row.n_bound} of {row.n_solved} programs")
 
 
-def interleaved(runs: list[Callable[[], None]], seconds: float) -> list[float]:
-    """Shortest time of each run [s], taken in turns so that all meet the same weather."""
-    for run in runs:  # compiles, warms caches
-        run()
-    shortest = [float("inf")] * len(runs)
-    end = time.perf_counter() + seconds
-    while time.perf_counter() < end:
-        for i, run in enumerate(runs):
-            start = time.perf_counter()
-            run()
-            shortest[i] = min(shortest[i], time.perf_counter() - start)
-    return shortest
+def print_compile_times() -> None:
+    """Print the first step of each estimator without numba's cache and with it."""
+    print(
+        f"\nfirst step [s]  {'cold':>8}{'cached':>8}   a process each, an empty cache for the first"
+    )
+    for estimator in AIMS:
+        cold, warm = cold_and_warm(estimator)
+        print(f"{estimator:16}{cold:8.1f}{warm:8.2f}")
+
+
+def main(args: Args) -> None:
+    """Measure and print."""
+    batch, steps, block, passes = args.batch, args.steps, args.block, args.passes
+    if args.quick:
+        batch, steps, block, passes = 2, 16, 8, 1
+    seeds = parse_seeds(args.traffic_seeds, "traffic_seeds")
+    if args.quick:
+        seeds = seeds[:1]
+    replay = recorded(args.parameters, seeds, batch, args.queried, steps)
+    groups = {estimator: group_of(estimator, replay, block) for estimator in AIMS}
+    interleave([row for group in groups.values() for row in group.rows], steps, block, passes)
+    settings = replay.settings
+    print(
+        f"{replay.n_outputs} outputs, {settings.enkf.n_members} members, N = "
+        f"{settings.mhe.horizon}; seconds 0 to {steps} of SUMO records, traffic seeds "
+        f"{args.traffic_seeds}, paper's schedule, OMP_NUM_THREADS "
+        f"{os.environ['OMP_NUM_THREADS']}, median of {passes}"
+    )
+    print_table(groups)
+    print_remarks(groups)
+    if args.compile_time and not args.quick:
+        print_compile_times()
 
 
 if __name__ == "__main__":
-    main()
+    run(main, Args, __doc__)
