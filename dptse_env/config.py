@@ -113,7 +113,9 @@ class EnvConfig:
         parameters = self.parameters
         if isinstance(parameters, str):
             parameters = load_parameters(parameters)
-        return ARZModel(self.corridor, parameters)
+        # The centre of the speeds that a flow is clipped to.
+        centre = 0.5 * self.corridor.speed_limit if self.privacy.speed == "flow" else None
+        return ARZModel(self.corridor, parameters, reference_speed=centre)
 
     def settings(self) -> EstimatorSettings:
         """Return the settings of the estimator."""

@@ -47,6 +47,7 @@ class QueryInterface:
                 bandwidth=config.bandwidth,
                 epsilon=config.privacy.epsilon,
                 with_picked=config.action == "sequential",
+                releases_flow=config.privacy.speed == "flow",
                 **scales,
             ),
             reward=Reward(config.reward, corridor.n_mainline, **scales),

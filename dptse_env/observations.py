@@ -28,8 +28,8 @@ class Knowledge:
 
     Attributes:
         estimate: Densities [veh/km], speeds [km/h] and their standard deviations, each (k, S).
-        released: Last released (density [veh/km], speed [km/h]) per segment, shape (k, S, 2);
-            zero before the first release.
+        released: Last released (density [veh/km], speed [km/h] or flow [veh/h]) per segment,
+            shape (k, S, 2); zero before the first release.
         innovations: Normalised innovations of the last update, shape (k, S, 2); zero where
             nothing was observed.
         age: Steps since each mainline segment was last observed, shape (k, n_mainline).
@@ -67,7 +67,8 @@ class ObservationEncoding:
     density_log_std           S    log of (standard deviation / scale)          [-10, 5]
     speed_log_std             S    the same for speed                           [-10, 5]
     released_density          n    last released density / scale                [-5, 5]
-    released_speed            n    last released speed / scale                  [-5, 5]
+    released_speed            n    last released speed / scale, or, under its   [-5, 5]
+                                   name, ``released_flow``
     density_innovation        n    normalised innovation, 0 if not observed     [-10, 10]
     speed_innovation          n    the same for speed                           [-10, 10]
     age                       n    steps since last observed / 60, at most 1    [0, 1]
@@ -97,6 +98,7 @@ class ObservationEncoding:
         bandwidth: int,
         epsilon: float,
         with_picked: bool,
+        releases_flow: bool = False,
     ) -> None:
         """Lay out the blocks for a road.
 
@@ -109,10 +111,13 @@ class ObservationEncoding:
             bandwidth: Queries a step.
             epsilon: Privacy parameter epsilon.
             with_picked: Whether to show the picks of an unfinished decision.
+            releases_flow: Whether the mechanism releases centred flows in place of mean speeds.
         """
         self.n_mainline = n_mainline
         self.fixed_sensors = np.array(fixed_sensors, dtype=np.int64)
         self._scales = density_scale, speed_scale
+        self._second = "released_flow" if releases_flow else "released_speed"
+        self._second_scale = density_scale * speed_scale if releases_flow else speed_scale
         self._bandwidth_share = bandwidth / n_mainline
         self._log_epsilon = float(np.log10(epsilon))
         n, s, f = n_mainline, n_segments, len(fixed_sensors)
@@ -122,7 +127,7 @@ class ObservationEncoding:
             _Block("density_log_std", s, -10, 5),
             _Block("speed_log_std", s, -10, 5),
             _Block("released_density", n, -5, 5),
-            _Block("released_speed", n, -5, 5),
+            _Block(self._second, n, -5, 5),
             _Block("density_innovation", n, -10, 10),
             _Block("speed_innovation", n, -10, 10),
             _Block("age", n, 0, 1),
@@ -160,7 +165,7 @@ class ObservationEncoding:
             "density_log_std": _log(estimate.density_std / density_scale),
             "speed_log_std": _log(estimate.speed_std / speed_scale),
             "released_density": released[:, :n, 0] / density_scale,
-            "released_speed": released[:, :n, 1] / speed_scale,
+            self._second: released[:, :n, 1] / self._second_scale,
             "density_innovation": innovations[:, :n, 0],
             "speed_innovation": innovations[:, :n, 1],
             "age": knowledge.age / AGE_CAP,

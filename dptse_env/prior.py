@@ -38,10 +38,40 @@ def free_flow_density(model: ARZModel, flow: FloatArray) -> FloatArray:
     The smaller root of q = rho (v_f - p(rho)); a flow above the capacity gives the critical
     density.
     """
+    return _free_density(model, flow, model.jam_density)
+
+
+def _free_density(model: ARZModel, flow: FloatArray, jam: FloatArray) -> FloatArray:
     v_f, gamma = model.parameters.free_flow_speed, model.parameters.gamma
     filling = np.linspace(0.0, (1.0 + gamma) ** (-1.0 / gamma), 4096)
     scaled_flow = filling * (1.0 - filling**gamma)
-    return model.jam_density * np.interp(flow / (model.jam_density * v_f), scaled_flow, filling)
+    density: FloatArray = jam * np.interp(flow / (jam * v_f), scaled_flow, filling)
+    return density
+
+
+def nominal_inputs(corridor: Corridor, model: ARZModel) -> FloatArray:
+    """Return the model's inputs at the published demand for every second, shape (T + 1, n_u).
+
+    What enters does so at free speed; behind the exits traffic flows freely, at the density of
+    the flow that reaches them. No incident is known.
+    """
+    layout, v_f = model.layout, model.parameters.free_flow_speed
+    n, n_on = corridor.n_mainline, len(corridor.on_ramps)
+    flows = np.array([nominal_flows(corridor, time) for time in range(corridor.duration + 1)])
+    demand = corridor.demand
+    if isinstance(demand, DemandDistribution):
+        demand = demand.base
+    inputs = np.empty((len(flows), model.n_inputs))
+    mainline = [
+        next(rate for start, rate in reversed(demand.mainline) if start <= time)
+        for time in range(corridor.duration + 1)
+    ]
+    inputs[:, layout.entry_inputs[0]] = mainline
+    inputs[:, layout.entry_inputs[1:]] = demand.on_ramps
+    inputs[:, layout.entry_inputs + 1] = v_f
+    leaving = flows[:, [n - 1, *range(n + n_on, corridor.n_segments)]]
+    inputs[:, layout.exit_inputs] = _free_density(model, leaving, model.exit_jam_density)
+    return inputs
 
 
 def nominal_state(corridor: Corridor, model: ARZModel, time: float) -> FloatArray:

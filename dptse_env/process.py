@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from dptse_env.arrays import Action, BoolArray, FloatArray, IntArray, Observation
+from dptse_env.boundary import make_boundary
 from dptse_env.config import EnvConfig
 from dptse_env.estimators import make_estimator
 from dptse_env.interface import QueryInterface
@@ -17,7 +18,7 @@ from dptse_env.options import ResetOptions
 from dptse_env.prior import nominal_state
 from dptse_env.privacy import Accountant, GaussianMechanism, Mechanism, noise_std
 from dptse_env.rewards import EstimationError, estimation_error
-from dptse_env.sensing import Sensing
+from dptse_env.sensing import Sensing, make_answers
 from dptse_env.traffic import RecordLibrary
 
 TRUTH_INFO = ("rmse_density", "rmse_speed", "n_occupied", "truth")
@@ -52,8 +53,8 @@ class QueryProcess:
         time: Second of the record that each episode stands at, shape (n,).
         slot: Index into ``config.traffic_seeds`` of each episode's traffic, shape (n,).
         queried: The last query of each episode, shape (n, n_mainline).
-        boundary_inputs: What the estimator is told of the road's surroundings, by slot and second,
-            shape (n_slots, T + 1, n_u); a slot is filled when its traffic is first used.
+        boundary: What the estimator is told of the road's surroundings.
+        answers: What the observed segments answer before noise is added.
         estimate: The present estimates, arrays of shape (n, S).
         error: Their error, arrays of shape (n,).
     """
@@ -80,18 +81,18 @@ class QueryProcess:
         self.sensing = Sensing(corridor, config.traffic_seeds, library or RecordLibrary())
         sensitivity = config.sensitivity()
         self.accountant = Accountant(config.privacy, sensitivity)
+        self.boundary = make_boundary(config.privacy.boundary, self.sensing, self.model, n)
+        columns = s + self.boundary.n_released
+        self.answers = make_answers(config.privacy, self.sensing, columns, n)
         self.mechanism: Mechanism = GaussianMechanism(
-            noise_std(config.privacy, sensitivity), n_episodes=n, n_segments=s
+            noise_std(config.privacy, sensitivity), n_episodes=n, n_segments=columns
         )
         self.estimator = make_estimator(
             config.estimator, config.backend, self.model, n, config.settings()
         )
         interface.actions.start(n)
-        self._observed_always = np.zeros(s, dtype=bool)
-        self._observed_always[list(corridor.fixed_sensors)] = True
-        seconds = corridor.duration + 1
-        # np.empty takes address space, not memory, until traffic is loaded into its slot.
-        self.boundary_inputs = np.empty((len(config.traffic_seeds), seconds, self.model.n_inputs))
+        self._observed_always = np.zeros(columns, dtype=bool)
+        self._observed_always[[*corridor.fixed_sensors, *range(s, columns)]] = True
         self.slot = np.zeros(n, dtype=np.int64)
         self.time = np.zeros(n, dtype=np.int64)
         self.end = np.zeros(n, dtype=np.int64)
@@ -133,6 +134,8 @@ class QueryProcess:
             self.end[episode] = start + self.config.horizon_steps
         self.interface.actions.reset(episodes)
         self.mechanism.reset(episodes, [noise for _, noise, _ in streams])
+        self.answers.reset(episodes)
+        self.boundary.reset(episodes)
         prior = [nominal_state(self.config.corridor, self.model, t) for t in self.time[episodes]]
         self.estimator.reset(episodes, np.array(prior), [own for _, _, own in streams])
         self.queried[episodes] = False
@@ -174,14 +177,17 @@ class QueryProcess:
         """Let one second pass: sense, release, estimate, score."""
         observed = np.tile(self._observed_always, (len(episodes), 1))
         observed[:, : queried.shape[1]] |= queried
-        inputs = self.boundary_inputs[self.slot[episodes], self.time[episodes]]
+        slots, n_segments = self.slot[episodes], self.config.corridor.n_segments
+        inputs = self.boundary.inputs(episodes, slots, self.time[episodes])
         self.time[episodes] += 1
-        truth = self.truth(episodes)
-        released = self.mechanism.release(episodes, truth)
+        answers = self.answers.collect(episodes, slots, self.time[episodes], observed)
+        released = self.mechanism.release(episodes, answers)
+        self.boundary.take_in(episodes, released[:, n_segments:])
+        observed, released = observed[:, :n_segments], released[:, :n_segments]
         self.estimator.predict(episodes, inputs)
         self.estimator.update(episodes, observed, released, self.mechanism.sigma)
         self._remember(episodes, queried, observed, released)
-        return self._score(episodes, truth)
+        return self._score(episodes, self.truth(episodes))
 
     def _remember(
         self, episodes: IntArray, queried: BoolArray, observed: BoolArray, released: FloatArray
@@ -210,12 +216,10 @@ class QueryProcess:
         return self.sensing.aggregates(self.slot[episodes], self.time[episodes])
 
     def _load(self, slot: int) -> None:
-        """Make sure that the traffic of ``slot`` and its boundary inputs are in memory."""
+        """Make sure that the traffic of ``slot`` is in memory, in every form that is needed."""
         if self.sensing.load(slot):
-            boundary = self.sensing.traffic(slot)[:, self.config.corridor.n_segments :]
-            self.boundary_inputs[slot] = self.model.boundary_inputs(
-                boundary[..., 0], boundary[..., 1]
-            )
+            self.answers.load(slot)
+            self.boundary.load(slot)
 
     def _outcome(self, episodes: IntArray, reward: FloatArray) -> Outcome:
         knowledge = Knowledge(
@@ -255,4 +259,10 @@ class QueryProcess:
                 "traffic_seed": self.config.traffic_seeds[self.slot[episode]],
                 "time": int(self.time[episode]),
             }
+            if self.answers.contributions is not None:
+                exposures = self.answers.contributions.exposures[episode].copy()
+                info["truth"]["exposures"] = exposures
+                # A vehicle that has counted k times has spent what one of cap k has in all.
+                _, individual = self.accountant.spent(exposures)
+                info["truth"]["individual_epsilon"] = individual
         return info

@@ -4,6 +4,7 @@ from gymnasium.envs.registration import register, registry
 
 ENVIRONMENTS = {
     "dptse/PaperHighway-v0": "paper-highway",
+    "dptse/PrivateHighway-v0": "private-highway",
     "dptse/ShortHighway-v0": "short-highway",
 }
 """Environment ids and the preset behind each."""

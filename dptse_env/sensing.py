@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import numpy as np
 
-from dptse_env.arrays import FloatArray, IntArray
-from dptse_env.traffic import Corridor, RecordLibrary
+from dptse_env.arrays import BoolArray, FloatArray, IntArray
+from dptse_env.contributions import Contributions
+from dptse_env.privacy import PrivacySettings, SpeedRelease
+from dptse_env.traffic import Corridor, Record, RecordLibrary
 
 
 class Sensing:
@@ -30,7 +34,7 @@ class Sensing:
         """Read or make the record of ``traffic_seeds[slot]``; return whether it was new."""
         if self._loaded[slot]:
             return False
-        record = self.library.get(self.corridor, self.traffic_seeds[slot])
+        record = self.record(slot)
         counts = record.counts
         self._table[slot, ..., 0] = counts / self.corridor.segment_length
         mean = record.speed_sums / np.maximum(counts, 1)
@@ -38,14 +42,21 @@ class Sensing:
         self._loaded[slot] = True
         return True
 
-    def aggregates(self, slots: IntArray, times: IntArray) -> FloatArray:
+    def record(self, slot: int) -> Record:
+        """Return the record of ``traffic_seeds[slot]``, made now if there is none."""
+        return self.library.get(self.corridor, self.traffic_seeds[slot])
+
+    def aggregates(
+        self, slots: IntArray, times: IntArray, n_columns: int | None = None
+    ) -> FloatArray:
         """Return (density [veh/km], speed [km/h]) of every segment, shape (k, S, 2).
 
         Args:
             slots: Which traffic, shape (k,); loaded before.
             times: Which second of it, shape (k,).
+            n_columns: How many columns, if not the S segments.
         """
-        rows: FloatArray = self._table[slots, times, : self.corridor.n_segments]
+        rows: FloatArray = self._table[slots, times, : n_columns or self.corridor.n_segments]
         return rows
 
     def traffic(self, slot: int) -> FloatArray:
@@ -55,3 +66,110 @@ class Sensing:
         """
         traffic: FloatArray = self._table[slot]
         return traffic
+
+
+class Answers(Protocol):
+    """What the observed segments answer, ahead of the mechanism.
+
+    Attributes:
+        contributions: Who counted how often; None where vehicles count without bound.
+    """
+
+    contributions: Contributions | None
+
+    def load(self, slot: int) -> None:
+        """Prepare for the traffic of a slot, which `Sensing` has loaded."""
+
+    def reset(self, episodes: IntArray) -> None:
+        """Begin new episodes, shape (k,)."""
+
+    def collect(
+        self, episodes: IntArray, slots: IntArray, times: IntArray, observed: BoolArray
+    ) -> FloatArray:
+        """Return what is to be released, shape (k, n_columns, 2): density [veh/km] and speed.
+
+        Args:
+            episodes: Which episodes, shape (k,).
+            slots: Which traffic each replays, shape (k,).
+            times: Which second of it, shape (k,).
+            observed: Which segments were asked, shape (k, n_columns); others answer anything.
+        """
+
+
+class AggregateAnswers:
+    """Density and mean speed [km/h] of all vehicles of a segment, as in the paper."""
+
+    def __init__(self, sensing: Sensing, n_columns: int) -> None:
+        """Answer for the first `n_columns` record columns."""
+        self.contributions: Contributions | None = None
+        self._sensing, self._n_columns = sensing, n_columns
+
+    def load(self, slot: int) -> None:
+        """Nothing to prepare: `Sensing` holds the aggregates."""
+
+    def reset(self, episodes: IntArray) -> None:
+        """Nothing is counted."""
+
+    def collect(
+        self, episodes: IntArray, slots: IntArray, times: IntArray, observed: BoolArray
+    ) -> FloatArray:
+        """Return true density and mean speed of all segments."""
+        return self._sensing.aggregates(slots, times, self._n_columns)
+
+
+class BoundedAnswers:
+    """Density of the vehicles that count, and their centred flow [veh/h] or mean speed [km/h].
+
+    The centred flow is the sum of v - v_0 over the vehicles that count, per length, with v clipped
+    to [0, 2 v_0]: it changes by at most v_0 / l when a vehicle comes or goes.
+    """
+
+    def __init__(
+        self,
+        sensing: Sensing,
+        n_columns: int,
+        n_episodes: int,
+        cap: int | None,
+        speed_release: SpeedRelease,
+    ) -> None:
+        """Answer for the first `n_columns` record columns; a vehicle counts `cap` times."""
+        corridor = sensing.corridor
+        self._sensing, self._n_columns, self._speed_release = sensing, n_columns, speed_release
+        self._length, self._limit = corridor.segment_length, corridor.speed_limit
+        seconds = corridor.duration + 1
+        self._counted = Contributions(
+            len(sensing.traffic_seeds), seconds, n_episodes, corridor.speed_limit, cap
+        )
+        self.contributions: Contributions | None = self._counted
+
+    def load(self, slot: int) -> None:
+        """Take in the vehicle table of a slot."""
+        self._counted.load(slot, self._sensing.record(slot))
+
+    def reset(self, episodes: IntArray) -> None:
+        """Let nobody have counted yet."""
+        self._counted.reset(episodes)
+
+    def collect(
+        self, episodes: IntArray, slots: IntArray, times: IntArray, observed: BoolArray
+    ) -> FloatArray:
+        """Return density and flow, or mean speed, of the vehicles that count."""
+        counts, speeds = self._counted.collect(episodes, slots, times, observed)
+        answers = np.empty((*counts.shape, 2))
+        answers[..., 0] = counts / self._length
+        if self._speed_release == "flow":
+            answers[..., 1] = (speeds - 0.5 * self._limit * counts) / self._length
+        else:
+            empty = counts == 0.0
+            answers[..., 1] = np.where(empty, self._limit, speeds / np.where(empty, 1.0, counts))
+        return answers
+
+
+def make_answers(
+    privacy: PrivacySettings, sensing: Sensing, n_columns: int, n_episodes: int
+) -> Answers:
+    """Return what the observed segments answer under a privacy preset."""
+    if not privacy.is_bounded:
+        return AggregateAnswers(sensing, n_columns)
+    cap = privacy.contribution_cap
+    return BoundedAnswers(sensing, n_columns, n_episodes, cap, privacy.speed)

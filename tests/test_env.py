@@ -306,7 +306,7 @@ def test_a_sequential_episode_renders_one_column_a_second():
                             "gamma": 1.0, "relaxation_time": 50.0}},
             r"^model\.time_step must be > 0 and at most 0\.\d+ s \(CFL",
         ),
-        ({"preset": "none"}, r"^preset must be one of paper-highway, short-highway, got 'none'"),
+        ({"preset": "none"}, r"^preset must be one of paper-highway, private-highway, short-highway, got 'none'"),
         ({"render_mode": "human"}, r"HumanRendering"),
     ],
 )  # fmt: skip

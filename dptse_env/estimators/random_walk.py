@@ -11,7 +11,8 @@ from dptse_env.estimators.batch import BatchEstimator, Measurements
 from dptse_env.estimators.open_loop import estimated_traffic
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
-from dptse_env.model.network import FloatArray, IntArray
+from dptse_env.model.arz import MEASUREMENT_FLOOR
+from dptse_env.model.network import BoolArray, FloatArray, IntArray
 
 
 class RandomWalk(BatchEstimator):
@@ -27,6 +28,7 @@ class RandomWalk(BatchEstimator):
         self._process_variance = (np.array(settings.walk_noise) * scale) ** 2
         self._initial_variance = settings.initial_variance * scale**2
         speeds = np.full(model.n_segments, model.largest_speed)
+        self._least_density = MEASUREMENT_FLOOR * model.jam_density[:, None]
         self._upper = np.stack([model.jam_density, speeds], axis=-1)
 
         shape = (n_episodes, model.n_segments, 2)
@@ -46,19 +48,34 @@ class RandomWalk(BatchEstimator):
         self.variances[episodes] += self._process_variance
 
     def _update(self, given: Measurements) -> None:
+        self._take_in(given, slice(0, 1), given.values[..., :1], given.sigma[:1])
+        speeds, sigma = given.values[..., 1:], given.sigma[1:]
+        if self.model.reference_speed is not None:
+            # A flow says a speed at the density just estimated.
+            density = np.maximum(self.means[given.episodes, :, :1], self._least_density)
+            speeds = self.model.reference_speed + speeds / density
+            sigma = sigma / density
+        self._take_in(given, slice(1, 2), speeds, sigma)
+        finite = np.isfinite(given.values).all(axis=2) | ~given.observed
+        self._restart(given.episodes, np.all(finite, axis=1))
+
+    def _take_in(
+        self, given: Measurements, which: slice, values: FloatArray, sigma: FloatArray
+    ) -> None:
+        """Update densities or speeds `(k, S, 1)`."""
         episodes, seen = given.episodes, given.observed[:, :, None]
-        mean, variance = self.means[episodes], self.variances[episodes]
-        noise = given.sigma**2
+        mean, variance = self.means[episodes, :, which], self.variances[episodes, :, which]
+        noise = sigma**2
         total = variance + noise
         informative = seen & (total > 0.0)
         held = np.where(informative, total, 1.0)
-        residual = np.where(informative, given.values, mean) - mean
+        residual = np.where(informative, values, mean) - mean
         gain = np.where(informative, variance / held, 0.0)
-        self.innovations[episodes] = residual / np.sqrt(held)
-        self.means[episodes] = np.clip(mean + gain * residual, 0.0, self._upper)
+        self.innovations[episodes, :, which] = residual / np.sqrt(held)
+        upper = self._upper[:, which]
+        self.means[episodes, :, which] = np.clip(mean + gain * residual, 0.0, upper)
         # Joseph form: no difference of nearly equal numbers.
-        self.variances[episodes] = (1.0 - gain) ** 2 * variance + gain**2 * noise
-        self._restart(episodes)
+        self.variances[episodes, :, which] = (1.0 - gain) ** 2 * variance + gain**2 * noise
 
     def estimate(self) -> Estimate:
         """Current estimate of all episodes."""
@@ -70,9 +87,10 @@ class RandomWalk(BatchEstimator):
             deviations[..., 1].copy(),
         )
 
-    def _restart(self, episodes: IntArray) -> None:
-        """Put episodes that have become non-finite back to their prior, and flag them."""
-        self.diverged[episodes] = ~np.all(np.isfinite(self.means[episodes]), axis=(1, 2))
+    def _restart(self, episodes: IntArray, sound: BoolArray) -> None:
+        """Put episodes that are not sound or not finite back to their prior, and flag them."""
+        finite = np.isfinite(self.means[episodes]).all(axis=(1, 2))
+        self.diverged[episodes] = ~(sound & finite)
         lost = episodes[self.diverged[episodes]]
         self.means[lost] = self._prior[lost]
         self.variances[lost] = self._initial_variance

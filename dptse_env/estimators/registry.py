@@ -63,7 +63,9 @@ def make_estimator(
     if n_episodes < 1:
         raise ValueError(f"n_episodes must be >= 1, got {n_episodes}")
     check_estimator(name, backend)
-    own = _load(_MODELS[backend])(model.network, model.parameters, model.time_step)
+    own = _load(_MODELS[backend])(
+        model.network, model.parameters, model.time_step, model.reference_speed
+    )
     estimator: Estimator = _load(_CLASSES[name][backend])(
         own, n_episodes, settings or EstimatorSettings()
     )

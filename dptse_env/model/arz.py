@@ -64,13 +64,19 @@ class ARZModel:
         network: The road.
         parameters: Parameters of the model; each cell's jam density follows its lanes.
         time_step: T [s].
+        reference_speed: v_0 [km/h], where sensors release the centred flow rho (v - v_0) [veh/h];
+            None where they release the speed.
 
     Raises:
         ValueError: for an impossible network or a time step that violates the CFL condition.
     """
 
     def __init__(
-        self, network: RoadNetwork, parameters: ARZParameters, time_step: float = 1.0
+        self,
+        network: RoadNetwork,
+        parameters: ARZParameters,
+        time_step: float = 1.0,
+        reference_speed: float | None = None,
     ) -> None:
         """Derive the arrays that the equations need and check the time step."""
         self.network = network
@@ -89,6 +95,9 @@ class ARZModel:
         # One scale for all cells, that of the mainline, so that equal numbers mean equal things.
         self.density_scale = per_lane * network.lanes
         self.speed_scale = parameters.free_flow_speed
+        self.reference_speed = reference_speed
+        second = 1.0 if reference_speed is None else self.density_scale
+        self.measurement_scale = np.array([self.density_scale, second * self.speed_scale])
         self.largest_speed = LARGEST_W * parameters.free_flow_speed
         if not 0.0 < time_step <= self.largest_time_step:
             # Rounded down, so that the number named is itself admissible.
@@ -247,14 +256,36 @@ class ARZModel:
     # Measurement and bounds ---------------------------------------------------------------------
 
     def measure(self, states: FloatArray) -> FloatArray:
-        """Density and speed of each segment `(n, S, 2)` (paper, eq. 3), density floored in v."""
+        """Density and speed of each segment `(n, S, 2)` (paper, eq. 3), density floored in v.
+
+        With a reference speed, density and centred flow psi - rho (p(rho) + v_0).
+        """
+        if self.reference_speed is None:
+            return self.traffic(states)
+        rho, psi = states[..., 0::2], states[..., 1::2]
+        carried = self.relations.pressure(rho, self.jam_density) + self.reference_speed
+        return np.stack([rho, psi - rho * carried], axis=-1)
+
+    def measurement_jacobian(self, states: FloatArray) -> FloatArray:
+        """Derivative of `measure`, `(n, S, 2, 2)`: by the segment's own (rho, psi), others zero."""
+        if self.reference_speed is None:
+            return self.traffic_jacobian(states)
+        pressure = self.relations.pressure(states[..., 0::2], self.jam_density)
+        jacobian = np.zeros((*pressure.shape, 2, 2))
+        jacobian[..., 0, 0] = 1.0
+        jacobian[..., 1, 0] = -(1.0 + self.parameters.gamma) * pressure - self.reference_speed
+        jacobian[..., 1, 1] = 1.0
+        return jacobian
+
+    def traffic(self, states: FloatArray) -> FloatArray:
+        """Density and speed of each segment `(n, S, 2)`, the density floored in the speed."""
         rho, psi = states[..., 0::2], states[..., 1::2]
         floored = np.maximum(rho, MEASUREMENT_FLOOR * self.jam_density)
         speed = psi / floored - self.relations.pressure(floored, self.jam_density)
         return np.stack([rho, speed], axis=-1)
 
-    def measurement_jacobian(self, states: FloatArray) -> FloatArray:
-        """Derivative of `measure`, `(n, S, 2, 2)`: by the segment's own (rho, psi), others zero."""
+    def traffic_jacobian(self, states: FloatArray) -> FloatArray:
+        """Derivative of `traffic`, `(n, S, 2, 2)`: by the segment's own (rho, psi)."""
         rho, psi = states[..., 0::2], states[..., 1::2]
         floor = MEASUREMENT_FLOOR * self.jam_density
         floored = np.maximum(rho, floor)

@@ -20,10 +20,14 @@ class CompiledARZModel(ARZModel):
     """
 
     def __init__(
-        self, network: RoadNetwork, parameters: ARZParameters, time_step: float = 1.0
+        self,
+        network: RoadNetwork,
+        parameters: ARZParameters,
+        time_step: float = 1.0,
+        reference_speed: float | None = None,
     ) -> None:
         """See `ARZModel`."""
-        super().__init__(network, parameters, time_step)
+        super().__init__(network, parameters, time_step, reference_speed)
         self.road = road_of(self)
 
     def step(self, states: FloatArray, inputs: FloatArray) -> FloatArray:

@@ -34,6 +34,9 @@ class Road(NamedTuple):
         degree: `(S,)` how many neighbours there are.
         terms: `(M, 4)` (row cell, slot of its neighbour, outflow's cell, its party).
         term_weight: `(M,)` weight of the outflow's gradient in the Jacobian [h/km].
+        reference_speed: v_0 [km/h] of the centred flow that sensors release; NaN where they
+            release the speed.
+        second_scale: unit of the second number that sensors release [km/h or veh/h].
     """
 
     free_flow_speed: float
@@ -53,6 +56,8 @@ class Road(NamedTuple):
     degree: IntArray
     terms: IntArray
     term_weight: FloatArray
+    reference_speed: float
+    second_scale: float
 
 
 def road_of(model: ARZModel) -> Road:
@@ -101,6 +106,8 @@ def road_of(model: ARZModel) -> Road:
         degree=degree,
         terms=terms,
         term_weight=model.step_ratio * weights,
+        reference_speed=np.nan if model.reference_speed is None else model.reference_speed,
+        second_scale=float(model.measurement_scale[1]),
     )
 
 

@@ -1,7 +1,12 @@
 import numpy as np
 import pytest
 
-from agents.statistics import Interval, mean_interval, paired_difference
+from agents.statistics import (
+    Interval,
+    geometric_mean_interval,
+    mean_interval,
+    paired_difference,
+)
 
 
 def test_the_interval_is_students():
@@ -38,3 +43,18 @@ def test_bad_values_are_refused():
         mean_interval([1.0, float("nan")])
     with pytest.raises(ValueError, match=r"one shape, got \(2,\) and \(3,\)"):
         paired_difference([1, 2], [1, 2, 3])
+
+
+def test_a_geometric_interval_is_the_same_for_inverse_ratios():
+    values = np.array([0.5, 1.0, 4.0, 3.0])
+    own, inverse = geometric_mean_interval(values), geometric_mean_interval(1.0 / values)
+    assert own.mean == pytest.approx(np.prod(values) ** 0.25)
+    assert 0.0 < own.low < own.mean < own.high
+    assert (inverse.low, inverse.high) == pytest.approx((1.0 / own.high, 1.0 / own.low))
+    assert own.n == 4
+
+
+@pytest.mark.parametrize("values", [[1.0, 0.0], [1.0, -1.0], [1.0, np.nan]])
+def test_a_geometric_mean_needs_positive_values(values):
+    with pytest.raises(ValueError, match="must be above zero"):
+        geometric_mean_interval(values)

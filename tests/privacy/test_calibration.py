@@ -63,9 +63,9 @@ def test_settings_default_to_the_paper_and_survive_json():
 @pytest.mark.parametrize(
     ("field", "value", "message"),
     [
-        ("preset", "Paper", "privacy.preset must be one of ['paper', 'corrected'], got 'Paper'"),
-        ("preset", None, "privacy.preset must be one of ['paper', 'corrected'], got None"),
-        ("preset", [], "privacy.preset must be one of ['paper', 'corrected'], got []"),
+        ("preset", "Paper", "privacy.preset must be one of ['paper', 'corrected', 'guaranteed'], got 'Paper'"),
+        ("preset", None, "privacy.preset must be one of ['paper', 'corrected', 'guaranteed'], got None"),
+        ("preset", [], "privacy.preset must be one of ['paper', 'corrected', 'guaranteed'], got []"),
         ("epsilon", -1, "privacy.epsilon must be > 0, got -1"),
         ("epsilon", 0.0, "privacy.epsilon must be > 0, got 0.0"),
         ("epsilon", math.nan, "privacy.epsilon must be finite, got nan"),

@@ -22,6 +22,7 @@ from dptse_env.estimators.compiled.swarm import (
     flock_of,
     measured_speeds,
     project_swarm,
+    released_swarm,
 )
 from dptse_env.model.arz import LARGEST_W
 from dptse_env.model.network import BoolArray, FloatArray, IntArray
@@ -201,7 +202,7 @@ def _take_in(
     used = draws[: m * n]
     fill(ensembles.streams[e, 1], used, bits)
     distances, residuals = np.empty((m, width)), np.empty((m, width))
-    units = np.array([ensembles.density_scale, road.free_flow_speed])
+    units = np.array([ensembles.density_scale, road.second_scale])
     noise = sigma / units
     centres = _compare(
         road, ensembles, e, segments, values, units, noise, used, distances, residuals
@@ -244,14 +245,14 @@ def _compare(
     residuals: FloatArray,
 ) -> FloatArray:
     """Write outputs' distances from their mean and members' residuals; residuals of the mean."""
-    swarm, n, v_f = ensembles.swarms[e], ensembles.n_members, road.free_flow_speed
-    centres, speed = np.empty(2 * segments.size), np.empty(swarm.shape[1])
+    swarm, n = ensembles.swarms[e], ensembles.n_members
+    centres, second = np.empty(2 * segments.size), np.empty(swarm.shape[1])
     for i in range(segments.size):
         s = segments[i]
         rho, psi = swarm[2 * s], swarm[2 * s + 1]
-        measured_speeds(rho, psi, road.jam[s], v_f, road.gamma, speed)
+        released_swarm(road, s, rho, psi, second)
         for kind in range(2):
-            r, row = 2 * i + kind, rho if kind == 0 else speed
+            r, row = 2 * i + kind, rho if kind == 0 else second
             distance, residual, draw = distances[r], residuals[r], draws[r * n : (r + 1) * n]
             centre = values[s, kind] / units[kind] - _centre(row, n, units[kind], distance)
             size = noise[kind]

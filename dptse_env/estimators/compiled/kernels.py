@@ -90,7 +90,7 @@ def update(
     noise = np.array(
         [
             (sigma[0] / filters.density_scale) ** 2,
-            (sigma[1] / road.free_flow_speed) ** 2,
+            (sigma[1] / road.second_scale) ** 2,
         ]
     )
     for k in range(episodes.size):
@@ -159,6 +159,17 @@ def measured(
 
 
 @njit(cache=True, error_model="numpy")
+def released(road: Road, s: int, rho: float, psi: float) -> tuple[float, float, float]:
+    """Speed or centred flow that a segment releases, and its derivatives by rho and psi."""
+    jam, v_f, gamma = road.jam[s], road.free_flow_speed, road.gamma
+    if np.isnan(road.reference_speed):
+        return measured(rho, psi, jam, v_f, gamma)
+    p = pressure(rho, jam, v_f, gamma)
+    flow = psi - rho * (p + road.reference_speed)
+    return flow, -(1.0 + gamma) * p - road.reference_speed, 1.0
+
+
+@njit(cache=True, error_model="numpy")
 def _linearise(
     road: Road,
     filters: Filters,
@@ -167,15 +178,16 @@ def _linearise(
     values: FloatArray,
     rows: FloatArray,
 ) -> None:
-    """Write the residuals of density and speed and the speed's row of H, all normalised."""
-    v_f, scale = road.free_flow_speed, filters.density_scale
+    """Write the residuals of both releases and the second one's row of H, all normalised."""
+    scale, unit = filters.density_scale, road.second_scale
     for s in range(road.jam.size):
         if observed[s]:
             rho, psi = mean[2 * s], mean[2 * s + 1]
-            speed, by_rho, by_psi = measured(rho, psi, road.jam[s], v_f, road.gamma)
+            second, by_rho, by_psi = released(road, s, rho, psi)
             rows[s, 0] = (values[s, 0] - rho) / scale
-            rows[s, 1] = (values[s, 1] - speed) / v_f
-            rows[s, 2], rows[s, 3] = by_rho * scale / v_f, by_psi * scale
+            rows[s, 1] = (values[s, 1] - second) / unit
+            rows[s, 2] = by_rho * scale / unit
+            rows[s, 3] = by_psi * scale * road.free_flow_speed / unit
 
 
 @njit(cache=True, error_model="numpy")

@@ -67,7 +67,7 @@ class CompiledMHE(CompiledFilter):
             along=own.linearisation == "trajectory",
         )
         self._windows_packed = (*self._packed, tuple(self._horizons))
-        self._scales = np.array([model.density_scale, model.speed_scale])
+        self._scales = model.measurement_scale
         self._restart(np.arange(n_episodes))
 
     def window(self, episode: int) -> Window:

@@ -9,7 +9,7 @@ from numba import njit
 
 from dptse_env.estimators.compiled import kernels
 from dptse_env.estimators.compiled.active_set import held_for, minimise
-from dptse_env.estimators.compiled.kernels import Filters, measured, project
+from dptse_env.estimators.compiled.kernels import Filters, project, released
 from dptse_env.estimators.compiled.window import Chain, factorise, space_for
 from dptse_env.model.kernels import advance, scratch_of
 from dptse_env.model.network import BoolArray, FloatArray, IntArray
@@ -174,14 +174,14 @@ def _linearise_step(
 def _linearise_measurement(
     road: Road, filters: Filters, horizons: Horizons, e: int, t: int, point: FloatArray
 ) -> None:
-    scale, v_f = filters.density_scale, road.free_flow_speed
+    scale, unit = filters.density_scale, road.second_scale
     state = _physical(road, filters, point)
     for s in range(road.jam.size):
         rho, psi = state[2 * s], state[2 * s + 1]
-        speed, by_rho, by_psi = measured(rho, psi, road.jam[s], v_f, road.gamma)
-        horizons.rows[e, t, s, 0] = by_rho * scale / v_f
-        horizons.rows[e, t, s, 1] = by_psi * scale
-        horizons.constants[e, t, s] = (speed - by_rho * rho - by_psi * psi) / v_f
+        second, by_rho, by_psi = released(road, s, rho, psi)
+        horizons.rows[e, t, s, 0] = by_rho * scale / unit
+        horizons.rows[e, t, s, 1] = by_psi * scale * road.free_flow_speed / unit
+        horizons.constants[e, t, s] = (second - by_rho * rho - by_psi * psi) / unit
 
 
 @njit(cache=True, error_model="numpy")
@@ -272,18 +272,18 @@ def accept(road: Road, filters: Filters, horizons: Horizons, e: int, z: FloatArr
 def _innovate(road: Road, filters: Filters, horizons: Horizons, e: int, before: FloatArray) -> None:
     """Write residuals at the prediction over the deviations that the window expects."""
     last = horizons.length[e] - 1
-    v_f, scale = road.free_flow_speed, filters.density_scale
+    scale, unit = filters.density_scale, road.second_scale
     innovations, noise = filters.innovations[e], horizons.noise[e, last]
     innovations[:] = 0.0
     for s in range(road.jam.size):
         if not horizons.observed[e, last, s]:
             continue
         rho, psi = filters.means[e, 2 * s], filters.means[e, 2 * s + 1]
-        speed, _, _ = measured(rho, psi, road.jam[s], v_f, road.gamma)
+        expected, _, _ = released(road, s, rho, psi)
         by_rho, by_psi = horizons.rows[e, last, s]
         a, b = before[2 * s, 2 * s], before[2 * s, 2 * s + 1]
         c = before[2 * s + 1, 2 * s + 1]
         variance = by_rho * by_rho * a + 2.0 * by_rho * by_psi * b + by_psi * by_psi * c
-        density, velocity = horizons.values[e, last, s]
+        density, second = horizons.values[e, last, s]
         innovations[s, 0] = (density - rho / scale) / np.sqrt(a + noise[0])
-        innovations[s, 1] = (velocity - speed / v_f) / np.sqrt(variance + noise[1])
+        innovations[s, 1] = (second - expected / unit) / np.sqrt(variance + noise[1])

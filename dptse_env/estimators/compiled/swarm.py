@@ -261,3 +261,18 @@ def measured_speeds(
     for j in range(rho_row.size):
         rho = floor if rho_row[j] < floor else rho_row[j]
         out[j] = psi_row[j] / rho - v_f * power(rho * by_jam, gamma)
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def released_swarm(
+    road: Road, s: int, rho_row: FloatArray, psi_row: FloatArray, out: FloatArray
+) -> None:
+    """Write the speeds [km/h] or centred flows [veh/h] that a segment releases."""
+    jam, v_f, v_0 = road.jam[s], road.free_flow_speed, road.reference_speed
+    if np.isnan(v_0):
+        measured_speeds(rho_row, psi_row, jam, v_f, road.gamma, out)
+        return
+    by_jam = 1.0 / jam
+    for j in range(rho_row.size):
+        rho = rho_row[j]
+        out[j] = psi_row[j] - rho * (v_f * power(rho * by_jam, road.gamma) + v_0)

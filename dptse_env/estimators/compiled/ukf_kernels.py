@@ -25,8 +25,8 @@ from dptse_env.estimators.compiled.sigma_points import (
 from dptse_env.estimators.compiled.swarm import (
     advance_swarm,
     flock_of,
-    measured_speeds,
     project_swarm,
+    released_swarm,
 )
 from dptse_env.model.network import BoolArray, FloatArray, IntArray
 from dptse_env.model.road import Road
@@ -64,18 +64,18 @@ class Outputs(NamedTuple):
 
     Attributes:
         distances: `(2 S, width)` of the points, normalised.
-        speeds: `(S, width)` distances of the speeds measured.
+        outputs: `(S, width)` distances of the speeds, or flows, measured.
         shift: `(2 S,)` weighted sums of `distances`.
-        speed_shift: `(S,)` weighted sums of `speeds`.
-        cross: `(2 S, padded)` covariance of speeds (rows) with states, then scratch.
+        output_shift: `(S,)` weighted sums of `outputs`.
+        cross: `(2 S, padded)` covariance of `outputs` (rows) with states, then scratch.
         joint: `(2 S, columns)` rows of outputs: S, then their covariance with states, then the
             residual in the last column.
     """
 
     distances: FloatArray
-    speeds: FloatArray
+    outputs: FloatArray
     shift: FloatArray
-    speed_shift: FloatArray
+    output_shift: FloatArray
     cross: FloatArray
     joint: FloatArray
 
@@ -100,9 +100,7 @@ def update(
         np.zeros((n, padded)), np.zeros((n, 2 * padded + 8)),
     )  # fmt: skip
     scale = np.array([filters.density_scale, filters.density_scale * road.free_flow_speed])
-    noise = np.array(
-        [(sigma[0] / filters.density_scale) ** 2, (sigma[1] / road.free_flow_speed) ** 2]
-    )
+    noise = np.array([(sigma[0] / filters.density_scale) ** 2, (sigma[1] / road.second_scale) ** 2])
     variances = np.empty(padded)
     for k in range(episodes.size):
         e = episodes[k]
@@ -215,36 +213,36 @@ def _measure(
     """
     n, m = filters.means.shape[1], segments.size
     start = (2 * m + 7) // 8 * 8
-    v_f, swarm, joint = road.free_flow_speed, points.swarms[e], work.joint
+    unit, swarm, joint = road.second_scale, points.swarms[e], work.joint
     for i in range(n):
         work.shift[i] = distances_from_first(
             swarm[i], scale[i % 2], points.weight, work.distances[i]
         )
     for i in range(m):
         s = segments[i]
-        speeds = work.speeds[i]
-        measured_speeds(swarm[2 * s], swarm[2 * s + 1], road.jam[s], v_f, road.gamma, speeds)
-        joint[m + i, start + n] = speeds[0] / v_f
-        work.speed_shift[i] = distances_from_first(speeds, v_f, points.weight, speeds)
-        joint[m + i, start + n] += work.speed_shift[i]
-    products(work.speeds, m, work.distances, n, False, work.cross)
+        outputs = work.outputs[i]
+        released_swarm(road, s, swarm[2 * s], swarm[2 * s + 1], outputs)
+        joint[m + i, start + n] = outputs[0] / unit
+        work.output_shift[i] = distances_from_first(outputs, unit, points.weight, outputs)
+        joint[m + i, start + n] += work.output_shift[i]
+    products(work.outputs, m, work.distances, n, False, work.cross)
     covariance = filters.covariances[e]
     q0 = filters.process_variance[0] if points.moved[e] else 0.0
     for i in range(m):
         s = segments[i]
-        speed_row, density_row = joint[m + i], joint[i]
+        output_row, density_row = joint[m + i], joint[i]
         for j in range(n):
             density_row[start + j] = covariance[2 * s, j] - (q0 if j == 2 * s else 0.0)
-            speed_row[start + j] = (
+            output_row[start + j] = (
                 points.weight * work.cross[i, j]
-                + points.surplus * work.speed_shift[i] * work.shift[j]
+                + points.surplus * work.output_shift[i] * work.shift[j]
             )
         density_row[start + n] = (values[s, 0] - points.centres[e, 2 * s]) / scale[0]
-        speed_row[start + n] = values[s, 1] / v_f - speed_row[start + n]
-    products(work.speeds, m, work.speeds, m, True, work.cross)
+        output_row[start + n] = values[s, 1] / unit - output_row[start + n]
+    products(work.outputs, m, work.outputs, m, True, work.cross)
     for i in range(m):
         for j in range(i + 1):
-            spread = points.surplus * work.speed_shift[i] * work.speed_shift[j]
+            spread = points.surplus * work.output_shift[i] * work.output_shift[j]
             joint[m + j, m + i] = points.weight * work.cross[i, j] + spread
         joint[m + i, m + i] += noise[1]
     for i in range(m):

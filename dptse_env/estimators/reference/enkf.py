@@ -45,7 +45,7 @@ class ReferenceEnKF(BatchEstimator):
         self._tapers = everywhere if own.taper is None else tapers(model.network, own.taper)
         rho_m, v_f = model.density_scale, model.speed_scale
         self._state_unit = np.tile([rho_m, rho_m * v_f], model.n_segments)
-        self._output_unit = np.array([rho_m, v_f])
+        self._output_unit = model.measurement_scale
         process_noise = np.tile(settings.process_noise, model.n_segments)
         self._process_deviation = process_noise * self._state_unit
         self._initial_deviation = np.sqrt(settings.initial_variance) * self._state_unit
@@ -65,11 +65,10 @@ class ReferenceEnKF(BatchEstimator):
         return np.asarray(rest.swapaxes(1, 2) @ rest / (self.n_members - 1))
 
     def estimate(self) -> Estimate:
-        """Current estimate of all episodes: of the mean, and how the members' outputs spread."""
+        """Current estimate of all episodes: of the mean, and how the members spread."""
         # Both sets of bounds are convex: the projection takes nothing but rounding from a mean.
-        mean = self.model.measure(self._projected(self.states))
-        outputs = self.model.measure(self.members)
-        spread = outputs.std(axis=1, ddof=1)
+        mean = self.model.traffic(self._projected(self.states))
+        spread = self.model.traffic(self.members).std(axis=1, ddof=1)
         speed = np.clip(mean[..., 1], 0.0, self.model.largest_speed)
         return Estimate(mean[..., 0].copy(), speed, spread[..., 0].copy(), spread[..., 1].copy())
 

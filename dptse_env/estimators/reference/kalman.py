@@ -19,7 +19,7 @@ from dptse_env.model.network import BoolArray, FloatArray, IntArray
 
 
 class EpisodeFilter(Protocol):
-    """One episode's filter, normalised: rho by rho_m, psi by rho_m v_f, speeds by v_f."""
+    """One episode's filter, normalised: rho by rho_m, psi by rho_m v_f, releases by their units."""
 
     x: FloatArray
     P: FloatArray
@@ -60,6 +60,15 @@ def linearise(model: ARZModel, one: EpisodeFilter, observed: BoolArray) -> Float
     return np.asarray(jacobian[observed].reshape(-1, model.n_states))
 
 
+def traffic_variance(model: ARZModel, one: EpisodeFilter) -> FloatArray:
+    """Variances `(S, 2)` of density [veh/km] and speed [km/h] that a covariance implies."""
+    jacobian = model.traffic_jacobian(one.x[None] * one.scale)[0] * one.scale[:2]
+    own = one.P.reshape(model.n_segments, 2, model.n_segments, 2)
+    blocks = own[np.arange(model.n_segments), :, np.arange(model.n_segments)]
+    variance = np.einsum("sij,sjk,sik->si", jacobian, blocks, jacobian)
+    return np.asarray(np.maximum(variance, 0.0))
+
+
 class ReferenceFilter(BatchEstimator):
     """A batch of filters, one an episode."""
 
@@ -85,13 +94,7 @@ class ReferenceFilter(BatchEstimator):
     def estimate(self) -> Estimate:
         """Current estimate of all episodes."""
         density, speed = estimated_traffic(self.model, self.states)
-        variance = np.empty((self.n_episodes, self.model.n_segments, 2))
-        everywhere = np.ones(self.model.n_segments, dtype=np.bool_)
-        for episode, one in enumerate(self._filters):
-            jacobian = linearise(self.model, one, everywhere)
-            spread = np.einsum("ij,jk,ik->i", jacobian, one.P, jacobian).reshape(-1, 2)
-            variance[episode] = np.maximum(spread, 0.0) * one.measurement_scale**2
-        deviation = np.sqrt(variance)
+        deviation = np.sqrt([traffic_variance(self.model, one) for one in self._filters])
         return Estimate(density, speed, deviation[..., 0].copy(), deviation[..., 1].copy())
 
     def _reset(

@@ -50,7 +50,7 @@ class _Horizon:
         self.model, self.settings, self.own = model, settings, settings.mhe
         rho_m, v_f = model.density_scale, model.speed_scale
         self.scale = np.tile([rho_m, rho_m * v_f], model.n_segments)
-        self.measurement_scale = np.array([rho_m, v_f])
+        self.measurement_scale = model.measurement_scale
         self.process_variance = process_variance(settings)
         self.bounds = normalised_bounds(model, self.own.bounds)
         self.prior = np.zeros(model.n_states)
@@ -156,13 +156,13 @@ class _Horizon:
         stage.c_1 = after - stage.A @ (state[0] / self.scale)
 
     def _linearise_measurement(self, stage: _Stage, point: FloatArray) -> None:
-        """The speed's rows of C and its c_2 at the physical state nearest to a point."""
+        """The second output's rows of C and its c_2 at the physical state nearest to a point."""
         state = self.model.project((point * self.scale)[None])
-        rho_m, v_f = self.measurement_scale
+        unit = self.measurement_scale[1]
         by_state = self.model.measurement_jacobian(state)[0, :, 1]
-        stage.rows = by_state * np.array([rho_m, rho_m * v_f]) / v_f
-        speed = self.model.measure(state)[0, :, 1] / v_f
-        stage.c_2 = speed - np.sum(stage.rows * (state[0] / self.scale).reshape(-1, 2), axis=1)
+        stage.rows = by_state * self.scale[:2] / unit
+        second = self.model.measure(state)[0, :, 1] / unit
+        stage.c_2 = second - np.sum(stage.rows * (state[0] / self.scale).reshape(-1, 2), axis=1)
 
 
 class ReferenceMHE(ReferenceFilter):

@@ -52,7 +52,7 @@ class _Filter(UnscentedKalmanFilter):  # type: ignore[misc]
         self.bounds = settings.bounds
         rho_m, v_f = model.density_scale, model.speed_scale
         self.scale = np.tile([rho_m, rho_m * v_f], model.n_segments)
-        self.measurement_scale = np.array([rho_m, v_f])
+        self.measurement_scale = model.measurement_scale
         self.Q = np.diag(np.tile(np.square(settings.process_noise), model.n_segments))
         self.prior = np.zeros(model.n_states)
         self.prior_covariance = settings.initial_variance * np.eye(model.n_states)
