@@ -45,6 +45,8 @@ class EpisodeScore:
         reward: Mean reward of a second.
         n_dropped: Requests that could not be served.
         n_diverged: Seconds in which the estimator had to start over.
+        n_fallback: Seconds in which the estimator could not solve for its update and kept the
+            prediction.
     """
 
     traffic_seed: int
@@ -53,6 +55,7 @@ class EpisodeScore:
     reward: float
     n_dropped: float
     n_diverged: float
+    n_fallback: float
 
 
 def run_episode(
@@ -121,6 +124,7 @@ def _score(
         reward=float(np.mean(rewards)),
         n_dropped=float(series("n_dropped").sum()),
         n_diverged=float(series("diverged").sum()),
+        n_fallback=float(series("fallback").sum()),
     )
 
 

@@ -1,0 +1,1 @@
+"""The paper's five results: planned, run, judged, drawn and reported."""

@@ -1,0 +1,145 @@
+"""Run cells in worker processes, and note each as soon as it is done."""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Generator, Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from multiprocessing.connection import wait
+from typing import Any
+
+import gymnasium as gym
+from tqdm import tqdm
+
+from agents.evaluation import EpisodeScore, run_episode
+from agents.reproduction.ledger import Ledger
+from agents.reproduction.plan import Cell, Design
+from dptse_env.schedules import make_schedule
+from dptse_env.validation import integer
+
+SCHEDULE = "paper"
+"""Query schedule of every episode."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """A cell on some traffic seeds.
+
+    Attributes:
+        env: Environment id.
+        cell: The cell.
+        seeds: Its traffic seeds.
+        records: Folder of the record cache; None for the user's cache.
+    """
+
+    env: str
+    cell: Cell
+    seeds: tuple[int, ...]
+    records: str | None
+
+
+def make_env(env: str, cell: Cell, seeds: Sequence[int], records: str | None) -> gym.Env[Any, Any]:
+    """Make the environment of a cell.
+
+    Raises:
+        ValueError: A value of the cell is out of range.
+    """
+    return gym.make(
+        env,
+        disable_env_checker=True,
+        estimator=cell.estimator,
+        parameters=cell.parameters,
+        privacy=cell.privacy,
+        epsilon=cell.epsilon,
+        delta=cell.delta,
+        bandwidth=cell.bandwidth,
+        traffic_seeds=list(seeds),
+        records=records,
+    )
+
+
+def run_task(task: Task) -> list[EpisodeScore]:
+    """Run a cell on its seeds; a seed gives the traffic and the noise, so cells are paired."""
+    env = make_env(task.env, task.cell, task.seeds, task.records)
+    schedule = make_schedule(SCHEDULE, env)
+    return [run_episode(env, schedule, traffic_seed=seed, seed=seed) for seed in task.seeds]
+
+
+def missing(design: Design, ledger: Ledger[EpisodeScore], records: str | None) -> list[Task]:
+    """Return what the ledger lacks, one task a cell."""
+    tasks = []
+    for cell in design.cells():
+        seeds = tuple(seed for seed in design.seeds if (cell, seed) not in ledger.rows)
+        if seeds:
+            tasks.append(Task(design.env, cell, seeds, records))
+    return tasks
+
+
+def run_all(
+    tasks: Sequence[Task], ledger: Ledger[EpisodeScore], workers: int, progress: bool = True
+) -> None:
+    """Run tasks and add what they find to the ledger as they end.
+
+    Args:
+        tasks: What to run.
+        ledger: Where scores go.
+        workers: Processes; 1 runs in this one.
+        progress: Whether to show a progress bar.
+
+    Raises:
+        ValueError: ``workers`` is below 1.
+    """
+    integer("workers", workers, 1)
+    total = sum(len(task.seeds) for task in tasks)
+    bar = tqdm(total=total, desc="episodes", unit="episode", mininterval=0.5, disable=not progress)
+    # Closed at once: an interrupt between two results must end the workers, too.
+    with bar, contextlib.closing(_done(tasks, workers)) as done:
+        for task, scores in done:
+            ledger.append(task.cell, scores)
+            bar.update(len(scores))
+
+
+def _done(
+    tasks: Iterable[Task], workers: int
+) -> Generator[tuple[Task, list[EpisodeScore]], None, None]:
+    """Yield tasks with their scores, in whatever order they end."""
+    if workers == 1:
+        for task in tasks:
+            yield task, run_task(task)
+        return
+    # Threads of the linear algebra would fight over the cores; children read this as they start.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    # Spawned, not forked: this process may hold threads and a loaded simulation.
+    pool = ProcessPoolExecutor(
+        workers, mp_context=multiprocessing.get_context("spawn"), initializer=_begin_worker
+    )
+    try:
+        running = {pool.submit(run_task, task): task for task in tasks}
+        for future in as_completed(running):
+            yield running.pop(future), future.result()
+    except BaseException:
+        # What runs is not waited for: it is redone from its seeds at the next start.
+        for process in list((pool._processes or {}).values()):
+            process.terminate()
+        raise
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _begin_worker() -> None:
+    """Leave interrupts to the parent, and end with it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    wait([parent.sentinel])
+    # The parent was killed: nobody takes results any more, and nothing is left to clean up.
+    os._exit(1)
