@@ -49,7 +49,7 @@ class Estimator(Protocol):
 
     Attributes:
         n_episodes: Episodes n in the batch.
-        innovations: `(n, S, 2)` residuals of density and speed before the last update, over their
+        innovations: `(n, S, 2)` residuals of both releases before the last update, over their
             predicted standard deviations; 0 where nothing was observed.
         diverged: `(n,)` whether the last update found the filter non-finite or indefinite and
             put it back to its prior.
@@ -87,8 +87,9 @@ class Estimator(Protocol):
         Args:
             episodes: `(k,)` distinct indices.
             observed: `(k, S)` which segments were measured.
-            values: `(k, S, 2)` density [veh/km] and speed [km/h]; ignored where not observed.
-            sigma: `(2,)` standard deviations of their noise [veh/km, km/h].
+            values: `(k, S, 2)` density [veh/km] and, as the model measures, speed [km/h] or
+                centred flow [veh/h]; ignored where not observed.
+            sigma: `(2,)` standard deviations of their noise, in the same units.
         """
 
     def estimate(self) -> Estimate:

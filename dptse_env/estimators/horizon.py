@@ -1,7 +1,7 @@
 """What both moving horizon estimators share: their settings and the window's quadratic program.
 
-All quantities here are normalised, rho by rho_m, psi by rho_m v_f and speeds by v_f. A window
-holds L = T + 1 stages; z stacks their states. The program is the paper's, eq. 17:
+All quantities here are normalised, rho by rho_m, psi and flows by rho_m v_f and speeds by v_f. A
+window holds L = T + 1 stages; z stacks their states. The program is the paper's, eq. 17:
 `minimise z' H z + q' z with lower <= z <= upper`.
 """
 
@@ -80,9 +80,10 @@ class Window(NamedTuple):
         offsets: `(L - 1, 2 S)` B u + c_1 of each step.
         process_variance: `(2,)`.
         observed: `(L, S)`.
-        rows: `(L, S, 2)` derivatives of the speed by the segment's rho and psi.
-        targets: `(L, S, 2)` density, and speed less the linearisation's constant c_2.
-        noise: `(L, 2)` variances of measured density and speed.
+        rows: `(L, S, 2)` derivatives of the second release, speed or flow, by the
+            segment's rho and psi.
+        targets: `(L, S, 2)` density, and the other less the linearisation's constant c_2.
+        noise: `(L, 2)` variances of both.
     """
 
     arrival: FloatArray
@@ -123,7 +124,7 @@ def assemble(window: Window) -> tuple[FloatArray, FloatArray]:
 
 
 def measurement_matrix(observed: BoolArray, rows: FloatArray) -> FloatArray:
-    """C `(m, 2 S)` of one stage: density and speed of each observed segment in turn."""
+    """C `(m, 2 S)` of one stage: both releases of each observed segment in turn."""
     segments = np.flatnonzero(observed)
     C = np.zeros((segments.size, 2, 2 * observed.size))
     C[np.arange(segments.size), 0, 2 * segments] = 1.0

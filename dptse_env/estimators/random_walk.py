@@ -18,7 +18,9 @@ from dptse_env.model.network import BoolArray, FloatArray, IntArray
 class RandomWalk(BatchEstimator):
     """Independent scalar Kalman filters on (rho, v) of each segment, plain numpy over the batch.
 
-    What any estimator with a model must beat. Means are held to [0, rho_m] and [0, 1.1 v_f].
+    What any estimator with a model must beat. Means are held to [0, rho_m] and [0, 1.1 v_f]. Where
+    sensors release the flow rho (v - v_0), it is read as a speed at the density just estimated,
+    with that density taken for exact and for a hundredth of rho_m at least.
     """
 
     def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
@@ -51,7 +53,6 @@ class RandomWalk(BatchEstimator):
         self._take_in(given, slice(0, 1), given.values[..., :1], given.sigma[:1])
         speeds, sigma = given.values[..., 1:], given.sigma[1:]
         if self.model.reference_speed is not None:
-            # A flow says a speed at the density just estimated.
             density = np.maximum(self.means[given.episodes, :, :1], self._least_density)
             speeds = self.model.reference_speed + speeds / density
             sigma = sigma / density
@@ -67,7 +68,8 @@ class RandomWalk(BatchEstimator):
         mean, variance = self.means[episodes, :, which], self.variances[episodes, :, which]
         noise = sigma**2
         total = variance + noise
-        informative = seen & (total > 0.0)
+        # What is not finite moves nothing here: the episode starts over.
+        informative = seen & (total > 0.0) & np.isfinite(values)
         held = np.where(informative, total, 1.0)
         residual = np.where(informative, values, mean) - mean
         gain = np.where(informative, variance / held, 0.0)

@@ -17,6 +17,7 @@ from dptse_env.model.jacobian import step_jacobian
 from dptse_env.model.network import FloatArray, Layout, RoadNetwork, layout_of
 from dptse_env.model.parameters import ARZParameters
 from dptse_env.model.relations import VACUUM, Relations
+from dptse_env.validation import non_negative
 
 Bounds = Literal["cone", "box"]
 
@@ -68,7 +69,8 @@ class ARZModel:
             None where they release the speed.
 
     Raises:
-        ValueError: for an impossible network or a time step that violates the CFL condition.
+        ValueError: for an impossible network, a time step that violates the CFL condition or a
+            reference speed that is negative or not finite.
     """
 
     def __init__(
@@ -95,8 +97,11 @@ class ARZModel:
         # One scale for all cells, that of the mainline, so that equal numbers mean equal things.
         self.density_scale = per_lane * network.lanes
         self.speed_scale = parameters.free_flow_speed
-        self.reference_speed = reference_speed
-        second = 1.0 if reference_speed is None else self.density_scale
+        self.reference_speed: float | None = None
+        second = 1.0
+        if reference_speed is not None:
+            self.reference_speed = non_negative("model.reference_speed", reference_speed)
+            second = self.density_scale
         self.measurement_scale = np.array([self.density_scale, second * self.speed_scale])
         self.largest_speed = LARGEST_W * parameters.free_flow_speed
         if not 0.0 < time_step <= self.largest_time_step:

@@ -18,6 +18,12 @@ from dptse_env.traffic import PAPER_HIGHWAY
 from dptse_env.traffic.record import Record
 
 SIGMA = np.array([15.0, 6.0])  # [veh/km, km/h]
+# What sensors release beside the density: the mean speed, or the flow rho (v - v_0), whose noise is
+# v_0 times the density's where both get the same share of the privacy.
+REFERENCE_SPEED = 51.0
+REFERENCE_SPEEDS = {"speed": None, "flow": REFERENCE_SPEED}
+SIGMAS = {"speed": SIGMA, "flow": SIGMA[0] * np.array([1.0, REFERENCE_SPEED])}  # [.., veh/h]
+RELEASES = tuple(SIGMAS)
 FIXED_SENSORS = (14, 17, 18)
 
 
@@ -45,6 +51,7 @@ class Episodes:
     observed: BoolArray  # (K, n, S)
     values: FloatArray  # (K, n, S, 2)
     truth: FloatArray  # (K, n, 2 S)
+    sigma: FloatArray  # (2,) deviations of the noise in `values`
 
     @property
     def everyone(self) -> np.ndarray:
@@ -52,10 +59,15 @@ class Episodes:
 
 
 def simulate(
-    parameters: str = "w99-3lane", n: int = 1, n_steps: int = 700, seed: int = 0, noise: float = 1.0
+    parameters: str = "w99-3lane",
+    n: int = 1,
+    n_steps: int = 700,
+    seed: int = 0,
+    noise: float = 1.0,
+    release: str = "speed",
 ) -> Episodes:
     """Demand that swells and a queue from the exit, disturbed, five roaming sensors, noise."""
-    model = CompiledARZModel(PAPER_HIGHWAY, load_parameters(parameters))
+    model, sigma = model_of(parameters, release), SIGMAS[release]
     rng = np.random.default_rng(seed)
     s, jam, v_f = model.n_segments, model.jam_density, model.parameters.free_flow_speed
     boundary_jam = model.density_scale * np.array([1.0, 1.0, *[1.0 / 3.0] * 4])
@@ -79,28 +91,37 @@ def simulate(
     observed = rng.random((n_steps, n, s)).argsort(axis=-1) < 5
     observed[..., list(FIXED_SENSORS)] = True
     values = np.stack([model.measure(x) for x in truth])
-    values += noise * SIGMA * rng.normal(size=values.shape)
+    values += noise * sigma * rng.normal(size=values.shape)
     start = model.states(np.full((n, s), 0.1) * jam, np.full((n, s), 0.5 * v_f))
-    return Episodes(model, start, inputs, observed, values, truth)
+    return Episodes(model, start, inputs, observed, values, truth, sigma)
 
 
-def replay(record: Record, parameters: str = "w99-3lane", seed: int = 0) -> Episodes:
-    """Recorded traffic of the paper's highway, five sensors going round; seed of the noise."""
-    model = CompiledARZModel(PAPER_HIGHWAY, load_parameters(parameters))
+def model_of(parameters: str, release: str) -> CompiledARZModel:
+    """The paper's highway, as its sensors release speeds or flows."""
+    speed = REFERENCE_SPEEDS[release]
+    return CompiledARZModel(PAPER_HIGHWAY, load_parameters(parameters), reference_speed=speed)
+
+
+def replay(record: Record, release: str = "speed") -> Episodes:
+    """Recorded traffic of the paper's highway, five sensors going round."""
+    model, sigma = model_of("w99-3lane", release), SIGMAS[release]
     s, v_f = model.n_segments, model.parameters.free_flow_speed
     density = record.counts / PAPER_HIGHWAY.segment_length
     sums, counts = record.speed_sums, record.counts
     speed = np.divide(sums, counts, out=np.full(sums.shape, np.nan), where=counts > 0)
     inputs = model.boundary_inputs(density[:-1, s:], speed[:-1, s:])
     traffic = np.stack([density[1:, :s], np.nan_to_num(speed[1:, :s], nan=102.0)], axis=-1)
-    values = traffic + SIGMA * np.random.default_rng(seed).normal(size=traffic.shape)
+    values = traffic.copy()
+    if release == "flow":
+        values[..., 1] = traffic[..., 0] * (traffic[..., 1] - REFERENCE_SPEED)
+    values += sigma * np.random.default_rng(0).normal(size=traffic.shape)
     observed = np.zeros((len(traffic), s), bool)
     for k, row in enumerate(observed):
         row[[*((3 * np.arange(5) + k) % 15), *FIXED_SENSORS]] = True
     start = model.states(0.05 * model.jam_density[None], np.full((1, s), 0.64 * v_f))
     truth = model.states(traffic[..., 0], traffic[..., 1])
     return Episodes(
-        model, start, inputs[:, None], observed[:, None], values[:, None], truth[:, None]
+        model, start, inputs[:, None], observed[:, None], values[:, None], truth[:, None], sigma
     )
 
 
@@ -128,10 +149,11 @@ def run(
     estimator: Estimator,
     episodes: Episodes,
     steps: Iterable[int],
-    sigma: FloatArray = SIGMA,
+    sigma: FloatArray | None = None,
     watch: Callable[[int], None] = lambda _: None,
 ) -> None:
-    """Take the steps k of all episodes."""
+    """Take the steps k of all episodes, with the noise that they have or with another one."""
+    sigma = episodes.sigma if sigma is None else sigma
     for k in steps:
         estimator.predict(episodes.everyone, episodes.inputs[k])
         estimator.update(episodes.everyone, episodes.observed[k], episodes.values[k], sigma)

@@ -5,7 +5,7 @@ import pytest
 
 from dptse_env.estimators import EstimatorSettings
 
-from .episodes import SIGMA, run, scale_of, simulate, started
+from .episodes import RELEASES, SIGMA, run, scale_of, simulate, started
 
 both_backends = pytest.mark.parametrize("backend", ["compiled", "reference"])
 both_sets = pytest.mark.parametrize("parameters", ["paper", "w99-3lane"])
@@ -14,19 +14,26 @@ both_bounds = pytest.mark.parametrize("bounds", ["cone", "box"])
 
 @both_sets
 @both_bounds
-def test_backends_agree_over_an_episode(parameters, bounds):
-    episodes = simulate(parameters)
+@pytest.mark.parametrize("release", RELEASES)
+def test_backends_agree_over_an_episode(parameters, bounds, release):
+    episodes = simulate(parameters, release=release)
     compiled = started("ekf", "compiled", episodes, EstimatorSettings(bounds=bounds))
     reference = started("ekf", "reference", episodes, EstimatorSettings(bounds=bounds))
     scale = scale_of(episodes.model)
-    # In the box w has no bound: states that break the CFL condition blow up rounding.
-    tolerance = {"rtol": 0.0, "atol": 1e-9 if bounds == "cone" else 1e-6}
+    tolerance = {"rtol": 0.0, "atol": 1e-9}
     for k in range(700):
+        if bounds == "box":
+            # There w has no bound, and states that break the CFL condition blow up rounding: both
+            # take each step from the same state, and P, near 100 on the way, keeps fewer digits.
+            one = reference._filters[0]
+            one.x, one.P = compiled.states[0] / scale, compiled.covariances[0]
         run(compiled, episodes, [k])
         run(reference, episodes, [k])
         np.testing.assert_allclose(compiled.states / scale, reference.states / scale, **tolerance)
         np.testing.assert_allclose(compiled.innovations, reference.innovations, **tolerance)
-    np.testing.assert_allclose(compiled.covariances, reference.covariances, **tolerance)
+        np.testing.assert_allclose(
+            compiled.covariances, reference.covariances, rtol=1e-9, atol=1e-6
+        )
     a, b = compiled.estimate(), reference.estimate()
     for field in ("density", "speed", "density_std", "speed_std"):
         np.testing.assert_allclose(getattr(a, field), getattr(b, field), rtol=1e-6, atol=1e-6)

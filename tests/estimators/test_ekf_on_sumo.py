@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from .episodes import run, scale_of, started
+from .episodes import RELEASES, run, scale_of, started
 
 
 def errors(name, backend, episodes):
@@ -20,7 +20,9 @@ def errors(name, backend, episodes):
     return np.sqrt(np.mean(squares)), estimator, peak
 
 
-def test_backends_agree_and_the_filter_beats_walk_and_model(recorded):
+@pytest.mark.parametrize("release", RELEASES)
+def test_backends_agree_and_the_filter_beats_walk_and_model(release, recordings):
+    recorded = recordings[release]
     compiled_error, compiled, _ = errors("ekf", "compiled", recorded)
     reference_error, reference, _ = errors("ekf", "reference", recorded)
     scale = scale_of(recorded.model)

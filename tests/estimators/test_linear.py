@@ -1,5 +1,6 @@
 """Where all is linear and Gaussian, every filter is the Kalman filter."""
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -16,19 +17,45 @@ from dptse_env.model import ARZModel, load_parameters
 
 from .episodes import Road, random_streams
 
-# One segment that nobody enters or leaves has linear dynamics. Below the density that a
-# measurement takes at least, the speed is linear in psi, too.
-MODEL = ARZModel(Road(), load_parameters("paper"))
-V_F, RHO_M, TAU = 102.0, 333.0, 60.0
+# One segment that nobody enters or leaves has linear dynamics.
+V_F, RHO_M, TAU, V_0 = 102.0, 333.0, 60.0, 51.0
 FLOOR, UNIT = 0.01 * RHO_M, np.array([RHO_M, RHO_M * V_F])
 F = np.array([[1.0, 0.0], [V_F / TAU, 1.0 - 1.0 / TAU]])
-H, OFFSET = np.array([[1.0, 0.0], [0.0, 1.0 / FLOOR]]), np.array([0.0, -V_F * 0.01**2])
-SIGMA = np.array([0.4, 6.0])
 NOISE, INITIAL, START = 2e-5, 1e-9, np.array([2.0, 200.0])
 Q = np.diag((NOISE * UNIT) ** 2)
 EVERYONE, INPUTS = np.arange(1), np.array([[0.0, V_F, 1.2 * RHO_M]])
 
+
+class Sensor(NamedTuple):
+    """A model whose measurement is H x + offset, and the deviations of its noise."""
+
+    model: ARZModel
+    H: np.ndarray
+    offset: np.ndarray
+    sigma: np.ndarray
+
+
+PAPER = load_parameters("paper")
+# Long segments, for the CFL condition; a pressure of (2 / 333)^10 is none.
+NO_PRESSURE = replace(PAPER, name="no pressure", gamma=10.0)
+SENSORS = {
+    # Below the density that a measurement takes at least, the speed is linear in psi.
+    "speed": Sensor(
+        ARZModel(Road(), PAPER),
+        np.array([[1.0, 0.0], [0.0, 1.0 / FLOOR]]),
+        np.array([0.0, -V_F * 0.01**2]),
+        np.array([0.4, 6.0]),
+    ),
+    "flow": Sensor(
+        ARZModel(Road(segment_length=1.0), NO_PRESSURE, reference_speed=V_0),
+        np.array([[1.0, 0.0], [-V_0, 1.0]]),
+        np.zeros(2),
+        np.array([0.4, 40.0]),
+    ),
+}
+
 both_backends = pytest.mark.parametrize("backend", BACKENDS)
+both_releases = pytest.mark.parametrize("sensor", SENSORS.values(), ids=SENSORS.keys())
 
 
 class Step(NamedTuple):
@@ -37,14 +64,16 @@ class Step(NamedTuple):
     innovations: np.ndarray
 
 
-def measurements(n_steps):
+def measurements(sensor, n_steps):
     """Values `(K, 1, 1, 2)` around the steady state."""
-    noise = SIGMA * np.random.default_rng(0).normal(size=(n_steps, 2))
-    return (np.array([2.0, 2.0 * V_F / FLOOR]) + OFFSET + noise)[:, None, None]
+    noise = sensor.sigma * np.random.default_rng(0).normal(size=(n_steps, 2))
+    steady = np.array([2.0, 2.0 * V_F])
+    return (sensor.H @ steady + sensor.offset + noise)[:, None, None]
 
 
-def textbook(values, noise_first):
+def textbook(sensor, values, noise_first):
     """The Kalman filter of x' = F x + w, or of x' = F (x + w)."""
+    H, R = sensor.H, np.diag(sensor.sigma**2)
     x, p, before = START, np.diag(INITIAL * UNIT**2), 0.0 * Q
     for z in values[:, 0, 0]:
         p = p + before
@@ -53,37 +82,39 @@ def textbook(values, noise_first):
             before = Q
         else:
             p = p + Q
-        s = H @ p @ H.T + np.diag(SIGMA**2)
-        residual, gain = z - H @ x - OFFSET, p @ H.T @ np.linalg.inv(s)
+        s = H @ p @ H.T + R
+        residual, gain = z - H @ x - sensor.offset, p @ H.T @ np.linalg.inv(s)
         x, p = x + gain @ residual, p - gain @ s @ gain.T
         assert 1.0 < x[0] < FLOOR
         assert x[1] < 1.1 * V_F * x[0]
         yield Step(x, p + before, residual / np.sqrt(np.diag(s)))
 
 
-def of_estimator(name, backend, values, **settings):
+def of_estimator(name, backend, sensor, values, **settings):
     noise = {"process_noise": (NOISE, NOISE), "initial_variance": INITIAL}
-    estimator = make_estimator(name, backend, MODEL, 1, EstimatorSettings(**noise, **settings))
+    given = EstimatorSettings(**noise, **settings)
+    estimator = make_estimator(name, backend, sensor.model, 1, given)
     estimator.reset(EVERYONE, START[None], random_streams(1))
     for z in values:
         estimator.predict(EVERYONE, INPUTS)
-        estimator.update(EVERYONE, np.ones((1, 1), bool), z, SIGMA)
+        estimator.update(EVERYONE, np.ones((1, 1), bool), z, sensor.sigma)
         covariance = estimator.covariances[0] * np.outer(UNIT, UNIT)
         yield Step(estimator.states[0], covariance, estimator.innovations[0, 0].copy())
 
 
 @both_backends
+@both_releases
 @pytest.mark.parametrize(
     ("name", "settings"),
     [("ekf", {}), ("ukf", {"ukf": SigmaPointSettings(kappa=1.0)})],  # two states allow no -4
     ids=["ekf", "ukf"],
 )
-def test_ekf_and_ukf_are_the_kalman_filter(name, settings, backend):
+def test_ekf_and_ukf_are_the_kalman_filter(name, settings, sensor, backend):
     """The UKF's points are drawn once a step: they carry its noise into the next motion."""
-    values = measurements(300)
+    values = measurements(sensor, 300)
     pairs = zip(
-        of_estimator(name, backend, values, **settings),
-        textbook(values, noise_first=name == "ukf"),
+        of_estimator(name, backend, sensor, values, **settings),
+        textbook(sensor, values, noise_first=name == "ukf"),
         strict=True,
     )
     for mine, right in pairs:
@@ -93,13 +124,16 @@ def test_ekf_and_ukf_are_the_kalman_filter(name, settings, backend):
 
 
 @both_backends
+@both_releases
 @pytest.mark.parametrize("linearisation", ["paper", "trajectory"])
-def test_the_mhe_ends_where_the_kalman_filter_does_while_its_window_grows(backend, linearisation):
+def test_the_mhe_ends_where_the_kalman_filter_does_while_its_window_grows(
+    backend, sensor, linearisation
+):
     """Full information ends at the filter's mean; a window that moves has another arrival."""
-    values = measurements(41)
+    values = measurements(sensor, 41)
     own = HorizonSettings(horizon=40, linearisation=linearisation)
-    steps = list(of_estimator("mhe", backend, values, mhe=own))
-    oracle = list(textbook(values, noise_first=False))
+    steps = list(of_estimator("mhe", backend, sensor, values, mhe=own))
+    oracle = list(textbook(sensor, values, noise_first=False))
     for mine, right in zip(steps[:40], oracle[:40], strict=True):
         np.testing.assert_allclose(mine.mean / UNIT, right.mean / UNIT, rtol=0.0, atol=1e-9)
         np.testing.assert_allclose(mine.covariance, right.covariance, rtol=1e-6)

@@ -7,10 +7,11 @@ from scipy.optimize import lsq_linear
 from dptse_env.estimators import EstimatorSettings, HorizonSettings
 from dptse_env.estimators.horizon import assemble, natural_residual, normalised_bounds, solve
 
-from .episodes import SIGMA, run, scale_of, simulate, started
+from .episodes import RELEASES, SIGMA, run, scale_of, simulate, started
 
 both_backends = pytest.mark.parametrize("backend", ["compiled", "reference"])
 both_bounds = pytest.mark.parametrize("bounds", ["cone", "box"])
+both_releases = pytest.mark.parametrize("release", RELEASES)
 both_linearisations = pytest.mark.parametrize("linearisation", ["paper", "trajectory"])
 
 
@@ -22,14 +23,14 @@ def mhe_of(backend, episodes, start=None, **horizon):
 # Against the oracles ------------------------------------------------------------------------------
 
 
-def agree(episodes, steps, sigma=SIGMA, tolerance=1e-9, **horizon):
+def agree(episodes, steps, tolerance=1e-9, **horizon):
     """Run both backends, compare every step; returns bounds held and programs passed on."""
     compiled = mhe_of("compiled", episodes, **horizon)
     reference = mhe_of("reference", episodes, **horizon)
     scale, held = scale_of(episodes.model), []
     for k in steps:
-        run(compiled, episodes, [k], sigma)
-        run(reference, episodes, [k], sigma)
+        run(compiled, episodes, [k])
+        run(reference, episodes, [k])
         gap = np.abs(compiled.states - reference.states) / scale
         assert gap.max() <= tolerance, (k, gap.max())
         np.testing.assert_allclose(
@@ -48,33 +49,39 @@ def agree(episodes, steps, sigma=SIGMA, tolerance=1e-9, **horizon):
 
 @both_bounds
 @both_linearisations
-def test_backends_agree(bounds, linearisation):
-    episodes = simulate(n_steps=80, noise=2.0)
+@both_releases
+def test_backends_agree(bounds, linearisation, release):
+    episodes = simulate(n_steps=80, noise=2.0, release=release)
     held, passed_on = agree(episodes, range(80), bounds=bounds, linearisation=linearisation)
     assert held.max() >= 3
     assert passed_on == 0
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("linearisation", "tolerance"), [("paper", 1e-9), ("trajectory", 5e-9)])
-def test_backends_agree_over_a_recorded_episode(linearisation, tolerance, recorded):
+@pytest.mark.parametrize(
+    ("release", "linearisation", "tolerance"),
+    [("speed", "paper", 1e-9), ("speed", "trajectory", 5e-9), ("flow", "paper", 1e-9)],
+)
+def test_backends_agree_over_a_recorded_episode(release, linearisation, tolerance, recordings):
     """Rounding is all: H has a condition of 1e7, and along the trajectory it feeds back."""
+    recorded = recordings[release]
     steps = range(len(recorded.inputs))
     held, _ = agree(recorded, steps, tolerance=tolerance, linearisation=linearisation)
     assert np.mean(held > 0) > 0.5
 
 
-def bounded_window(seed=0):
+def bounded_window(seed=0, release="speed"):
     """A window of which many bounds bind, and the estimator that has it."""
-    episodes = simulate(n_steps=14, noise=10.0, seed=seed)
+    episodes = simulate(n_steps=14, noise=10.0, seed=seed, release=release)
     empty = episodes.model.states(np.zeros((1, 19)), np.zeros((1, 19)))
     mhe = mhe_of("compiled", episodes, empty)
     run(mhe, episodes, range(11))
     return mhe
 
 
-def test_the_minimum_is_another_solvers():
-    mhe = bounded_window()
+@both_releases
+def test_the_minimum_is_another_solvers(release):
+    mhe = bounded_window(release=release)
     H, q = assemble(mhe.window(0))
     lower, upper = (np.tile(b, 11) for b in normalised_bounds(mhe.model, "box"))
     z = mhe._horizons.solution[0, :, :38].ravel()

@@ -1,4 +1,4 @@
-"""What holds for every estimator: any name, either backend, both sets of bounds."""
+"""What holds for every estimator: any name, either backend, both sets of bounds and releases."""
 
 from dataclasses import fields, replace
 
@@ -15,7 +15,6 @@ from dptse_env.estimators import (
 from dptse_env.model import ARZModel, Bounds
 
 from .episodes import (
-    SIGMA,
     Road,
     Snapshot,
     assert_same,
@@ -27,12 +26,15 @@ from .episodes import (
     started,
 )
 
-PAIRS = [(name, backend) for name in ESTIMATORS for backend in BACKENDS]
-WITH_COVARIANCE = [pair for pair in PAIRS if pair[0] not in ("random_walk", "open_loop")]
+# Flows are for the compiled ones: each is compared with its reference in a module of its own.
+CASES = [(name, backend, "speed") for name in ESTIMATORS for backend in BACKENDS]
+CASES += [(name, "compiled", "flow") for name in ESTIMATORS if name != "open_loop"]
+WITH_COVARIANCE = [case for case in CASES if case[0] not in ("random_walk", "open_loop")]
 EXCHANGED = [*range(15), 16, 15, 17, 18]  # segments, the on-ramps exchanged
 SLOW = {("mhe", "reference"), ("enkf", "reference")}  # milliseconds a step
 
-every_pair = pytest.mark.parametrize(("name", "backend"), PAIRS)
+every_case = pytest.mark.parametrize(("name", "backend", "release"), CASES)
+with_covariance = pytest.mark.parametrize(("name", "backend", "release"), WITH_COVARIANCE)
 both_bounds = pytest.mark.parametrize("bounds", ["cone", "box"])
 
 
@@ -49,10 +51,10 @@ def steps_of(name, backend, compiled, reference, slow):
 # Streams ------------------------------------------------------------------------------------------
 
 
-@every_pair
-def test_the_seed_decides_and_the_global_generator_is_left_alone(name, backend):
+@every_case
+def test_the_seed_decides_and_the_global_generator_is_left_alone(name, backend, release):
     n_steps = steps_of(name, backend, 50, 50, 14)
-    episodes = simulate(n_steps=n_steps)
+    episodes = simulate(n_steps=n_steps, release=release)
     first, second = (started(name, backend, episodes) for _ in range(2))
     np.random.seed(1)  # noqa: NPY002
     state = np.random.get_state()[1].copy()  # noqa: NPY002
@@ -73,11 +75,12 @@ def test_the_seed_decides_and_the_global_generator_is_left_alone(name, backend):
 # Soundness ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("name", "backend"), WITH_COVARIANCE)
+@with_covariance
 @both_bounds
-def test_covariance_is_one_over_recorded_traffic(name, backend, bounds, recorded):
+def test_covariance_is_one_over_recorded_traffic(name, backend, release, bounds, recordings):
     """And no episode was put back to its prior, which would be a repair."""
-    estimator = started(name, backend, recorded, held_to(bounds))
+    episodes = recordings[release]
+    estimator = started(name, backend, episodes, held_to(bounds))
 
     def check(_):
         covariance = estimator.covariances[0]
@@ -87,18 +90,18 @@ def test_covariance_is_one_over_recorded_traffic(name, backend, bounds, recorded
         assert not estimator.diverged.any()
 
     n_steps = steps_of(name, backend, 700, 700, 60)
-    run(estimator, recorded, range(n_steps), watch=check)
+    run(estimator, episodes, range(n_steps), watch=check)
 
 
-@every_pair
+@every_case
 @both_bounds
 @pytest.mark.parametrize("parameters", ["paper", "w99-3lane"])
 @pytest.mark.parametrize("filling", [0.0, 1.0], ids=["empty", "jam"])
 def test_poor_starts_and_ten_times_the_noise_stay_finite_and_within_bounds(
-    name, backend, bounds, parameters, filling
+    name, backend, release, bounds, parameters, filling
 ):
     n_steps = steps_of(name, backend, 200, 60, 14)
-    episodes = simulate(parameters, n=2, n_steps=n_steps, noise=10.0)
+    episodes = simulate(parameters, n=2, n_steps=n_steps, noise=10.0, release=release)
     model = episodes.model
     density = np.full((2, 19), filling) * model.jam_density
     start = model.states(density, np.zeros((2, 19)))
@@ -120,27 +123,27 @@ def test_poor_starts_and_ten_times_the_noise_stay_finite_and_within_bounds(
 
 # A walk does not look at the inputs, the model alone not at what is measured.
 POISONS = [
-    (*pair, poison)
-    for pair in PAIRS
-    for poison in ("values", "inputs")
-    if (pair[0], poison) not in {("random_walk", "inputs"), ("open_loop", "values")}
+    (*case, poison, bad)
+    for case in CASES
+    for poison, bad in (("values", np.nan), ("values", -np.inf), ("inputs", np.nan))
+    if (case[0], poison) not in {("random_walk", "inputs"), ("open_loop", "values")}
 ]
 
 
-@pytest.mark.parametrize(("name", "backend", "poison"), POISONS)
-def test_what_is_no_number_diverges_that_episode_only(name, backend, poison):
-    episodes = simulate(n=3, n_steps=12)
+@pytest.mark.parametrize(("name", "backend", "release", "poison", "bad"), POISONS)
+def test_what_is_no_number_diverges_that_episode_only(name, backend, release, poison, bad):
+    episodes = simulate(n=3, n_steps=12, release=release)
     estimator, healthy = (started(name, backend, episodes) for _ in range(2))
     prior = show(estimator)
     for one in (estimator, healthy):
         run(one, episodes, range(8))
     inputs, values = episodes.inputs[8].copy(), episodes.values[8].copy()
     if poison == "values":
-        values[1, 14, 1] = np.nan
+        values[1, 14, 1] = bad
     else:
-        inputs[1] = np.nan
+        inputs[1] = bad
     estimator.predict(episodes.everyone, inputs)
-    estimator.update(episodes.everyone, episodes.observed[8], values, SIGMA)
+    estimator.update(episodes.everyone, episodes.observed[8], values, episodes.sigma)
     run(healthy, episodes, [8])
     found = show(estimator)
     assert found.diverged.tolist() == [False, True, False]
@@ -173,10 +176,10 @@ BLIND = {
 }
 
 
-@pytest.mark.parametrize(("name", "backend"), WITH_COVARIANCE)
-def test_worthless_measurements_leave_the_model_alone(name, backend):
+@with_covariance
+def test_worthless_measurements_leave_the_model_alone(name, backend, release):
     n_steps = steps_of(name, backend, 100, 100, 30)
-    episodes = simulate(n_steps=n_steps)
+    episodes = simulate(n_steps=n_steps, release=release)
     settings, tolerance = BLIND[name]
     estimator = started(name, backend, episodes, settings)
     alone = started("open_loop", backend, episodes)
@@ -185,9 +188,9 @@ def test_worthless_measurements_leave_the_model_alone(name, backend):
     np.testing.assert_allclose(estimator.states, alone.states, rtol=tolerance)
 
 
-@every_pair
-def test_an_empty_set_of_measurements_leaves_the_prediction(name, backend):
-    episodes = simulate(n_steps=14)
+@every_case
+def test_an_empty_set_of_measurements_leaves_the_prediction(name, backend, release):
+    episodes = simulate(n_steps=14, release=release)
     estimator = started(name, backend, episodes)
     run(estimator, episodes, range(12))
     nothing, unread = np.zeros((1, 19), bool), np.full((1, 19, 2), np.nan)
@@ -195,7 +198,7 @@ def test_an_empty_set_of_measurements_leaves_the_prediction(name, backend):
         estimator.predict(episodes.everyone, episodes.inputs[k])
         before = show(estimator)
         kept = estimator.covariances if name in ("ekf", "ukf", "enkf") else None
-        estimator.update(episodes.everyone, nothing, unread, SIGMA)
+        estimator.update(episodes.everyone, nothing, unread, episodes.sigma)
         after = show(estimator)
         np.testing.assert_allclose(after.states, before.states, rtol=1e-12)
         np.testing.assert_array_equal(after.innovations, 0.0)
@@ -206,9 +209,9 @@ def test_an_empty_set_of_measurements_leaves_the_prediction(name, backend):
             assert after.density_std.mean() > 0.0
 
 
-@every_pair
-def test_values_of_unobserved_segments_are_not_looked_at(name, backend):
-    episodes = simulate(n_steps=14)
+@every_case
+def test_values_of_unobserved_segments_are_not_looked_at(name, backend, release):
+    episodes = simulate(n_steps=14, release=release)
     hidden = np.where(episodes.observed[..., None], episodes.values, np.nan)
     a, b = (started(name, backend, episodes) for _ in range(2))
     run(a, episodes, range(14))
@@ -221,7 +224,11 @@ def renumbered(episodes):
     """The same road and traffic with its two on-ramps, segments 15 and 16, exchanged."""
     same = episodes.model.network
     road = Road(**{field.name: getattr(same, field.name) for field in fields(Road)})
-    model = ARZModel(replace(road, on_ramps=road.on_ramps[::-1]), episodes.model.parameters)
+    model = ARZModel(
+        replace(road, on_ramps=road.on_ramps[::-1]),
+        episodes.model.parameters,
+        reference_speed=episodes.model.reference_speed,
+    )
     inputs, start = episodes.inputs.copy(), episodes.start.copy()
     inputs[..., [3, 4, 5, 6]] = inputs[..., [5, 6, 3, 4]]
     start[:, 30:34] = start[:, [32, 33, 30, 31]]
@@ -229,15 +236,17 @@ def renumbered(episodes):
     return replace(episodes, model=model, start=start, inputs=inputs, observed=seen, values=values)
 
 
-@pytest.mark.parametrize(("name", "backend"), [pair for pair in PAIRS if pair[0] != "enkf"])
-def test_the_numbering_of_segments_and_rows_changes_nothing(name, backend):
+@pytest.mark.parametrize(
+    ("name", "backend", "release"), [case for case in CASES if case[0] != "enkf"]
+)
+def test_the_numbering_of_segments_and_rows_changes_nothing(name, backend, release):
     """The EnKF gives its draws out in this order, so that it is the same in distribution only.
 
     The root of the UKF's covariance depends on the order, too: not in the first step, as the
     prior has no correlations.
     """
     n_steps = 1 if name == "ukf" else 14
-    episodes = simulate("paper", n_steps=n_steps)
+    episodes = simulate("paper", n_steps=n_steps, release=release)
     episodes.observed[..., [15, 16]] = True
     other = renumbered(episodes)
     assert not np.array_equal(other.values[0, 0], episodes.values[0, 0])
@@ -253,37 +262,37 @@ def test_the_numbering_of_segments_and_rows_changes_nothing(name, backend):
 # Batches ------------------------------------------------------------------------------------------
 
 
-@every_pair
-def test_a_batch_equals_single_episodes_to_the_bit_in_any_order(name, backend):
+@every_case
+def test_a_batch_equals_single_episodes_to_the_bit_in_any_order(name, backend, release):
     n_steps = steps_of(name, backend, 60, 30, 14)
-    episodes = simulate(n=3, n_steps=n_steps, noise=2.0)
+    episodes = simulate(n=3, n_steps=n_steps, noise=2.0, release=release)
     batch, shuffled = (started(name, backend, episodes) for _ in range(2))
     run(batch, episodes, range(n_steps))
     order = np.array([2, 0, 1])
     for k in range(n_steps):
         shuffled.predict(order, episodes.inputs[k, order])
         seen, values = episodes.observed[k, order], episodes.values[k, order]
-        shuffled.update(order, seen, values, SIGMA)
+        shuffled.update(order, seen, values, episodes.sigma)
     assert_same(show(batch), show(shuffled))
     for i, stream in enumerate(random_streams(3)):
         one, alone, row = make_estimator(name, backend, episodes.model, 1), np.arange(1), [i]
         one.reset(alone, episodes.start[row], [stream])
         for k in range(n_steps):
             one.predict(alone, episodes.inputs[k, row])
-            one.update(alone, episodes.observed[k, row], episodes.values[k, row], SIGMA)
+            one.update(alone, episodes.observed[k, row], episodes.values[k, row], episodes.sigma)
         assert_same(show(one), show(batch), [0], [i])
 
 
-@every_pair
-def test_episodes_that_are_not_named_stay_as_they_are(name, backend):
-    episodes = simulate(n=4, n_steps=16)
+@every_case
+def test_episodes_that_are_not_named_stay_as_they_are(name, backend, release):
+    episodes = simulate(n=4, n_steps=16, release=release)
     estimator, other = (started(name, backend, episodes) for _ in range(2))
     for one in (estimator, other):
         run(one, episodes, range(12))
     before = show(estimator)
     some, rest = np.array([3, 1]), np.array([0, 2])
     estimator.predict(some, episodes.inputs[12, some])
-    estimator.update(some, episodes.observed[12, some], episodes.values[12, some], SIGMA)
+    estimator.update(some, episodes.observed[12, some], episodes.values[12, some], episodes.sigma)
     estimator.reset(np.array([1]), episodes.start[[1]], random_streams(1))
     after = show(estimator)
     assert_same(after, before, rest, rest)
@@ -292,5 +301,5 @@ def test_episodes_that_are_not_named_stay_as_they_are(name, backend):
     # What is hidden of the others, streams and windows, goes on as if nothing had happened.
     for one in (estimator, other):
         one.predict(rest, episodes.inputs[13, rest])
-        one.update(rest, episodes.observed[13, rest], episodes.values[13, rest], SIGMA)
+        one.update(rest, episodes.observed[13, rest], episodes.values[13, rest], episodes.sigma)
     assert_same(show(estimator), show(other), rest, rest)

@@ -1,33 +1,45 @@
 import numpy as np
+import pytest
 
-from dptse_env.estimators import EstimatorSettings, make_estimator
+from dptse_env.estimators import EstimatorSettings
 
-from .episodes import SIGMA, random_streams, simulate
+from . import episodes as shared
+from .episodes import REFERENCE_SPEED, RELEASES, run, simulate
 
 SETTINGS = EstimatorSettings(walk_noise=(0.03, 0.02), initial_variance=2e-3)
+BOTH = np.array([333.0, 102.0])  # units of density and speed, the paper's
+LARGEST = np.array([333.0, 1.1 * 102.0])
 
 
-def started(episodes):
-    walk = make_estimator("random_walk", "compiled", episodes.model, len(episodes.start), SETTINGS)
-    walk.reset(episodes.everyone, episodes.start, random_streams(len(episodes.start)))
-    return walk
+def started(episodes, settings=SETTINGS, start=None):
+    return shared.started("random_walk", "compiled", episodes, settings, start)
 
 
-def test_is_a_scalar_kalman_filter_per_segment_and_quantity():
-    episodes = simulate("paper", n_steps=60)
+def speed_of(value, sigma, density):
+    """What a flow and its deviation say of the speed at a density [veh/km]."""
+    density = max(density, 3.33)
+    return REFERENCE_SPEED + value / density, sigma / density
+
+
+@pytest.mark.parametrize("release", RELEASES)
+def test_is_a_scalar_kalman_filter_per_segment_and_quantity(release):
+    episodes = simulate("paper", n_steps=60, release=release)
     walk, segment = started(episodes), 14
-    scale = np.array([333.0, 102.0])
-    mean = np.array([walk.estimate().density[0, segment], walk.estimate().speed[0, segment]])
-    variance = 2e-3 * scale**2
+    estimate = walk.estimate()
+    mean = np.array([estimate.density[0, segment], estimate.speed[0, segment]])
+    variance = 2e-3 * BOTH**2
     for k in range(60):
-        walk.predict(episodes.everyone, episodes.inputs[k])
-        walk.update(episodes.everyone, episodes.observed[k], episodes.values[k], SIGMA)
-        variance = variance + (np.array([0.03, 0.02]) * scale) ** 2
-        total = variance + SIGMA**2
-        residual = episodes.values[k, 0, segment] - mean
-        np.testing.assert_allclose(walk.innovations[0, segment], residual / np.sqrt(total))
-        mean = np.clip(mean + variance / total * residual, 0.0, [333.0, 112.2])
-        variance = variance * SIGMA**2 / total
+        run(walk, episodes, [k])
+        variance = variance + (np.array([0.03, 0.02]) * BOTH) ** 2
+        for i in range(2):
+            value, sigma = episodes.values[k, 0, segment, i], episodes.sigma[i]
+            if (release, i) == ("flow", 1):
+                value, sigma = speed_of(value, sigma, mean[0])
+            total = variance[i] + sigma**2
+            residual = value - mean[i]
+            np.testing.assert_allclose(walk.innovations[0, segment, i], residual / np.sqrt(total))
+            mean[i] = np.clip(mean[i] + variance[i] / total * residual, 0.0, LARGEST[i])
+            variance[i] *= sigma**2 / total
         estimate = walk.estimate()
         np.testing.assert_allclose(estimate.density[0, segment], mean[0])
         np.testing.assert_allclose(estimate.speed[0, segment], mean[1])
@@ -35,67 +47,71 @@ def test_is_a_scalar_kalman_filter_per_segment_and_quantity():
         np.testing.assert_allclose(estimate.speed_std[0, segment], np.sqrt(variance[1]))
 
 
-def test_unobserved_segments_keep_their_mean_and_lose_certainty():
+def test_unobserved_segments_lose_certainty():
     episodes = simulate(n_steps=1)
     walk = started(episodes)
     before = walk.estimate()
     walk.predict(episodes.everyone, episodes.inputs[0])
-    nothing = np.zeros((1, 19), bool)
-    walk.update(episodes.everyone, nothing, np.full((1, 19, 2), np.nan), SIGMA)
     after = walk.estimate()
-    np.testing.assert_array_equal(after.density, before.density)
     assert (after.density_std > before.density_std).all()
-    np.testing.assert_array_equal(walk.innovations, 0.0)
+    assert (after.speed_std > before.speed_std).all()
 
 
-def test_only_the_episodes_named_are_touched_and_a_batch_equals_a_loop():
-    episodes = simulate(n=3, n_steps=20)
-    batch, parts = started(episodes), started(episodes)
-    for k in range(20):
-        batch.predict(episodes.everyone, episodes.inputs[k])
-        batch.update(episodes.everyone, episodes.observed[k], episodes.values[k], SIGMA)
-        for i in range(3):
-            one = np.array([i])
-            parts.predict(one, episodes.inputs[k, one])
-            parts.update(one, episodes.observed[k, one], episodes.values[k, one], SIGMA)
-    np.testing.assert_array_equal(batch.means, parts.means)
-    np.testing.assert_array_equal(batch.variances, parts.variances)
-    np.testing.assert_array_equal(batch.innovations, parts.innovations)
+def test_a_flow_of_a_segment_found_empty_is_read_at_the_least_density():
+    """Its noise over a density of zero would be infinite, and the flow itself over it, too."""
+    episodes = simulate("paper", n_steps=1, release="flow")
+    empty = episodes.model.states(np.zeros((1, 19)), np.full((1, 19), 60.0))
+    walk = started(episodes, EstimatorSettings(), empty)
+    prior = walk.estimate()
+    assert (prior.density == 0.0).all()
+    values = np.tile([-500.0, 20.0], (1, 19, 1))  # the density stays at zero
+    walk.update(episodes.everyone, np.ones((1, 19), bool), values, episodes.sigma)
+    estimate = walk.estimate()
+    np.testing.assert_array_equal(estimate.density, 0.0)
+    floor = 0.01 * episodes.model.jam_density
+    variance, noise = 1e-3 * 102.0**2, (episodes.sigma[1] / floor) ** 2
+    said = REFERENCE_SPEED + 20.0 / floor
+    expected = prior.speed[0] + variance / (variance + noise) * (said - prior.speed[0])
+    np.testing.assert_allclose(estimate.speed[0], expected)
+    np.testing.assert_allclose(estimate.speed_std[0] ** 2, variance * noise / (variance + noise))
+    # An empty segment's flow tells next to nothing of a speed.
+    assert (estimate.speed_std > 0.9 * prior.speed_std).all()
 
 
-def test_noise_of_ten_times_the_size_stays_within_bounds():
-    episodes = simulate("paper", n=2, n_steps=200, noise=10.0)
-    walk = started(episodes)
-    for k in range(200):
-        walk.predict(episodes.everyone, episodes.inputs[k])
-        walk.update(episodes.everyone, episodes.observed[k], episodes.values[k], SIGMA)
-        estimate = walk.estimate()
-        assert (estimate.density >= 0.0).all()
-        assert (estimate.density <= episodes.model.jam_density).all()
-        assert ((estimate.speed >= 0.0) & (estimate.speed <= 1.1 * 102.0 + 1e-9)).all()
-
-
-def test_noiseless_measurements_of_a_certain_state_are_no_division_by_zero():
-    episodes = simulate(n_steps=1)
+@pytest.mark.parametrize("release", RELEASES)
+def test_noiseless_measurements_of_a_certain_state_are_no_division_by_zero(release):
+    episodes = simulate(n_steps=1, release=release)
     still = EstimatorSettings(walk_noise=(0.0, 0.0))
-    walk = make_estimator("random_walk", "reference", episodes.model, 1, still)
-    walk.reset(episodes.everyone, episodes.start, random_streams(1))
+    walk = started(episodes, still)
     everywhere = np.ones((1, 19), bool)
     for _ in range(2):
         walk.predict(episodes.everyone, episodes.inputs[0])
         walk.update(episodes.everyone, everywhere, np.full((1, 19, 2), 20.0), np.zeros(2))
     np.testing.assert_allclose(walk.estimate().density, 20.0)
+    speed = 20.0 if release == "speed" else REFERENCE_SPEED + 20.0 / 20.0
+    np.testing.assert_allclose(walk.estimate().speed, speed)
     assert not walk.diverged.any()
 
 
-def test_divergence_is_flagged_and_ends_at_the_prior():
-    episodes = simulate(n=2, n_steps=2)
-    walk = started(episodes)
-    prior = walk.estimate()
-    values = episodes.values[0].copy()
-    values[1, 14, 1] = np.nan
-    walk.predict(episodes.everyone, episodes.inputs[0])
-    walk.update(episodes.everyone, episodes.observed[0], values, SIGMA)
-    assert walk.diverged.tolist() == [False, True]
-    np.testing.assert_array_equal(walk.estimate().speed[1], prior.speed[1])
-    np.testing.assert_array_equal(walk.innovations[1], 0.0)
+@pytest.mark.parametrize("release", RELEASES)
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("which", [0, 1])
+def test_no_infinity_is_clipped_into_bounds(release, bad, which):
+    """Neither by a walk that knows its state for certain, whose gain is zero."""
+    episodes = simulate(n=2, n_steps=2, release=release)
+    still = EstimatorSettings(walk_noise=(0.0, 0.0))
+    for settings, exact in ((SETTINGS, False), (still, True)):
+        walk = started(episodes, settings)
+        prior = walk.estimate()
+        seen = np.ones((2, 19), bool)
+        if exact:
+            values = np.full((2, 19, 2), 20.0)
+            walk.update(episodes.everyone, seen, values, np.zeros(2))
+        values = episodes.values[1].copy()
+        values[1, 14, which] = bad
+        walk.update(episodes.everyone, seen, values, episodes.sigma)
+        assert walk.diverged.tolist() == [False, True]
+        estimate = walk.estimate()
+        for field in ("density", "speed", "density_std", "speed_std"):
+            np.testing.assert_array_equal(getattr(estimate, field)[1], getattr(prior, field)[1])
+        np.testing.assert_array_equal(walk.innovations[1], 0.0)

@@ -32,6 +32,19 @@ def test_every_name_and_backend_follows_the_protocol(name, backend):
         assert (a >= 0.0).all()
 
 
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("name", ESTIMATORS)
+@pytest.mark.parametrize("reference_speed", [None, 40.0])
+def test_every_estimator_measures_what_its_model_was_told_to(name, backend, reference_speed):
+    model = ARZModel(PAPER_HIGHWAY, load_parameters("paper"), 0.5, reference_speed)
+    own = make_estimator(name, backend, model, 1).model
+    assert own.reference_speed == reference_speed
+    assert own.time_step == 0.5
+    states = MODEL.states(np.full((1, 19), 30.0), np.full((1, 19), 80.0))
+    second = 80.0 if reference_speed is None else 30.0 * (80.0 - 40.0)
+    np.testing.assert_allclose(own.measure(states)[..., 1], second)
+
+
 def test_unknown_names_say_what_is_allowed():
     with pytest.raises(
         ValueError,

@@ -10,6 +10,7 @@ from dptse_env.estimators.compiled.swarm import (
     flock_of,
     measured_speeds,
     project_swarm,
+    released_swarm,
 )
 from dptse_env.model import ARZModel, load_parameters
 from dptse_env.model.road import road_of
@@ -117,6 +118,23 @@ def test_measures_as_the_model_does(corridor, parameters):
         jam, v_f, gamma = model.jam_density[s], parameters.free_flow_speed, parameters.gamma
         measured_speeds(rho, psi, jam, v_f, gamma, out)
         np.testing.assert_allclose(out, expected[:, s], atol=1e-9 * v_f)
+
+
+@everywhere
+@pytest.mark.parametrize("reference_speed", [None, 0.0, 51.0])
+def test_releases_what_the_model_measures(corridor, parameters, reference_speed):
+    """States with negative components among them, as those of members ahead of a projection."""
+    model = ARZModel(corridor, parameters, reference_speed=reference_speed)
+    road, rng = road_of(model), np.random.default_rng(0)
+    states = random_states(model, rng)
+    states += 0.02 * unit(model) * rng.normal(size=states.shape)
+    expected = model.measure(states)[..., 1]
+    out = np.empty(WIDTH)
+    for s in range(model.n_segments):
+        rho, psi = (np.ascontiguousarray(states[:, 2 * s + i]) for i in range(2))
+        released_swarm(road, s, rho, psi, out)
+        np.testing.assert_allclose(out, expected[:, s], rtol=0.0, atol=1e-9 * road.second_scale)
+    assert (states[:, 0::2] < 0.0).any()
 
 
 @everywhere

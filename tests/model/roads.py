@@ -59,5 +59,10 @@ def random_inputs(model: ARZModel, n: int, rng: np.random.Generator) -> FloatArr
     return model.boundary_inputs(density, speed)
 
 
-def model_of(road: Road, parameters: ARZParameters = PAPER, time_step: float = 1.0) -> ARZModel:
-    return ARZModel(road, parameters, time_step)
+def model_of(
+    road: Road,
+    parameters: ARZParameters = PAPER,
+    time_step: float = 1.0,
+    reference_speed: float | None = None,
+) -> ARZModel:
+    return ARZModel(road, parameters, time_step, reference_speed)

@@ -53,6 +53,52 @@ def test_measurement_of_nearly_empty_segments_is_tame():
 
 
 @both_sets
+@pytest.mark.parametrize("reference_speed", [0.0, 51.0])
+def test_with_a_reference_speed_the_centred_flow_is_measured(parameters, reference_speed):
+    model, plain = (
+        model_of(HIGHWAY, parameters, reference_speed=v) for v in (reference_speed, None)
+    )
+    rng = np.random.default_rng(5)
+    density = rng.uniform(0.0, 1.0, (5, 19)) ** 2 * model.jam_density
+    density[0] = 0.0
+    states = model.states(density, rng.uniform(0.0, 100.0, (5, 19)))
+    flow = density * (model.speed(states) - reference_speed)
+    measured = model.measure(states)
+    np.testing.assert_array_equal(measured[..., 0], density)
+    np.testing.assert_allclose(measured[..., 1], flow, rtol=1e-12, atol=1e-9)
+    # Density and speed stay what they are, for those who ask for these.
+    np.testing.assert_array_equal(model.traffic(states), plain.measure(states))
+    np.testing.assert_array_equal(
+        model.traffic_jacobian(states), plain.measurement_jacobian(states)
+    )
+    jam, v_f = model.density_scale, parameters.free_flow_speed
+    np.testing.assert_array_equal(model.measurement_scale, [jam, jam * v_f])
+    np.testing.assert_array_equal(plain.measurement_scale, [jam, v_f])
+
+
+@both_sets
+def test_the_flows_jacobian_is_that_of_central_differences(parameters):
+    model = model_of(HIGHWAY, parameters, reference_speed=51.0)
+    rng = np.random.default_rng(6)
+    density = rng.uniform(0.001, 1.0, (50, 19)) ** 3 * model.jam_density
+    states = model.states(density, rng.uniform(0.0, 100.0, (50, 19)))
+    states[0, 0::2] = -1.0  # a vacuum has no pressure
+    jacobian = model.measurement_jacobian(states)
+    # A small step: below 1 veh/km the pressure of a gamma below 1 bends without bound.
+    for column, h in ((0, 1e-6), (1, 1e-3)):
+        shift = np.zeros(38)
+        shift[column::2] = h
+        numeric = (model.measure(states + shift) - model.measure(states - shift)) / (2 * h)
+        np.testing.assert_allclose(jacobian[..., column], numeric, rtol=1e-5, atol=1e-3)
+
+
+@pytest.mark.parametrize("bad", [-1.0, np.nan, np.inf, "fast"])
+def test_a_reference_speed_that_is_none_is_refused(bad):
+    with pytest.raises(ValueError, match=r"model\.reference_speed must be .*, got "):
+        model_of(HIGHWAY, reference_speed=bad)
+
+
+@both_sets
 def test_cone_holds_speed_and_w(parameters):
     model = model_of(HIGHWAY, parameters)
     rng = np.random.default_rng(2)

@@ -99,7 +99,7 @@ def segment_update(
     shift: FloatArray,
     work: tuple[FloatArray, ...],
 ) -> bool:
-    """Two scalar measurements of one segment, its density and its speed, in Joseph form.
+    """Two scalar measurements of one segment, its density and its speed or flow, in Joseph form.
 
     With c = P h, s = h' c + r and K = c / s, `(I - K h') P (I - K h')' + K r K'` is
     `P - K c' - (c - s K) K'`; the last factor is the rounding that Joseph's form makes good. The
@@ -109,8 +109,8 @@ def segment_update(
     Args:
         covariance: `(n, padded)`, its lower half replaced.
         segment: Index of the segment.
-        row: Residuals of density and speed at the point of linearisation, then the derivatives
-            of the speed by the segment's two components.
+        row: Residuals of both at the point of linearisation, then the derivatives of the
+            second by the segment's two components.
         noise: `(2,)` variances of the measurements.
         shift: `(padded,)` what earlier measurements moved the mean by; moved on.
         work: Six scratch vectors `(padded,)`, their padding zero.

@@ -198,7 +198,7 @@ def update(
     road, filters, horizons = Road(*road_), Filters(*filters_), Horizons(*horizons_)
     n_segments, capacity, width = road.jam.size, *horizons.solution.shape[1:]
     space, held = space_for(capacity, n_segments, width), held_for(capacity, width)
-    scale, v_f = filters.density_scale, road.free_flow_speed
+    units = np.array([filters.density_scale, road.second_scale])
     for k in range(episodes.size):
         e = episodes[k]
         length = horizons.length[e]
@@ -207,11 +207,11 @@ def update(
         sound = bool(np.isfinite(filters.means[e]).all())
         for s in range(n_segments):
             for j in range(2):
-                value = values[k, s, j] / (scale if j == 0 else v_f) if observed[k, s] else 0.0
+                value = values[k, s, j] / units[j] if observed[k, s] else 0.0
                 horizons.values[e, last, s, j] = value
                 sound = sound and bool(np.isfinite(value))
-        horizons.noise[e, last, 0] = (sigma[0] / scale) ** 2
-        horizons.noise[e, last, 1] = (sigma[1] / v_f) ** 2
+        for j in range(2):
+            horizons.noise[e, last, j] = (sigma[j] / units[j]) ** 2
         if horizons.along:
             for t in range(length):
                 point = horizons.solution[e, t]

@@ -267,7 +267,7 @@ def measured_speeds(
 def released_swarm(
     road: Road, s: int, rho_row: FloatArray, psi_row: FloatArray, out: FloatArray
 ) -> None:
-    """Write the speeds [km/h] or centred flows [veh/h] that a segment releases."""
+    """Write the speeds [km/h] or centred flows [veh/h] that a sensor sees; as `measure` does."""
     jam, v_f, v_0 = road.jam[s], road.free_flow_speed, road.reference_speed
     if np.isnan(v_0):
         measured_speeds(rho_row, psi_row, jam, v_f, road.gamma, out)
@@ -275,4 +275,5 @@ def released_swarm(
     by_jam = 1.0 / jam
     for j in range(rho_row.size):
         rho = rho_row[j]
-        out[j] = psi_row[j] - rho * (v_f * power(rho * by_jam, road.gamma) + v_0)
+        held = 0.0 if rho < 0.0 else rho
+        out[j] = psi_row[j] - rho * (v_f * power(held * by_jam, road.gamma) + v_0)

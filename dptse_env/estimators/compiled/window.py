@@ -34,9 +34,10 @@ class Chain(NamedTuple):
         blocks: `(>= L - 1, S, K, 4)` of the transitions.
         offsets: `(>= L - 1, 2 S)`.
         observed: `(>= L, S)`.
-        rows: `(>= L, S, 2)` derivatives of the speed by the segment's rho and psi.
-        constants: `(>= L, S)` what the linearised speed is at a state of zero.
-        values: `(>= L, S, 2)` density and speed.
+        rows: `(>= L, S, 2)` derivatives of the second release, speed or flow, by the
+            segment's rho and psi.
+        constants: `(>= L, S)` what that is, linearised, at a state of zero.
+        values: `(>= L, S, 2)` density, and speed or flow.
         noise: `(>= L, 2)` variances.
     """
 
@@ -128,10 +129,10 @@ def _inform(road: Road, chain: Chain, n_stages: int, space: Space) -> None:
         for s in range(road.jam.size):
             by_rho, by_psi = chain.rows[t, s, 0], chain.rows[t, s, 1]
             seen = 1.0 if chain.observed[t, s] else 0.0
-            w_density, w_speed = seen / chain.noise[t, 0], seen / chain.noise[t, 1]
-            space.information[t, s, 0] = w_density + w_speed * by_rho * by_rho
-            space.information[t, s, 1] = w_speed * by_rho * by_psi
-            space.information[t, s, 2] = w_speed * by_psi * by_psi
+            w_density, w_second = seen / chain.noise[t, 0], seen / chain.noise[t, 1]
+            space.information[t, s, 0] = w_density + w_second * by_rho * by_rho
+            space.information[t, s, 1] = w_second * by_rho * by_psi
+            space.information[t, s, 2] = w_second * by_psi * by_psi
             for i in range(2):
                 before = w[i] if t > 0 else 1.0 / chain.arrival_variance[i]
                 diagonal[2 * s + i] = before + space.information[t, s, 2 * i]
