@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 
 export OMP_NUM_THREADS = 1
 
-.PHONY: help setup demo test test-slow lint format benchmark wheel-test clean clean-kernels
+.PHONY: help setup demo audit test test-slow lint format benchmark wheel-test clean clean-kernels
 
 help:  ## Show this list.
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -23,6 +23,12 @@ $(READY): pyproject.toml constraints.txt
 
 demo: setup  ## Evaluate the query schedules on held-out traffic; results/demo.
 	$(BIN)/python scripts/evaluate.py --output results/demo
+
+audit: setup  ## Attack the privacy presets, 5,000 runs in each of two worlds; results/audit.
+	$(BIN)/python scripts/audit.py --env dptse_env:dptse/PaperHighway-v0 --target replaced
+	$(BIN)/python scripts/audit.py --env dptse_env:dptse/PaperHighway-v0 --privacy corrected --target replaced
+	$(BIN)/python scripts/audit.py --noise-factor 0.709
+	$(BIN)/python scripts/audit.py
 
 test: setup  ## Run the tests, without the slow ones.
 	$(BIN)/python -m pytest -m 'not slow' -n 2

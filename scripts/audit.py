@@ -1,0 +1,148 @@
+"""Attack the privacy of an environment, and bound from below what its releases reveal.
+
+python scripts/audit.py --env dptse_env:dptse/PrivateHighway-v0 --runs 5000
+python scripts/audit.py --env dptse_env:dptse/PaperHighway-v0 --target replaced
+python scripts/audit.py --env dptse_env:dptse/PrivateHighway-v0 --noise-factor 0.709
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+
+from agents.audit.attack import attack
+from agents.audit.policies import POLICIES, make_policy
+from agents.audit.report import Finding
+from agents.audit.targets import TARGETS, choose_target
+from dptse_env.config import EnvConfig
+from dptse_env.privacy import PrivacyReport, mu_of
+from dptse_env.privacy.audit import Claim, audit
+from dptse_env.traffic import RecordLibrary
+from dptse_env.validation import inside, integer, positive, require
+from scripts.cli import run
+
+
+@dataclass(frozen=True)
+class Args:
+    """Audit the privacy of an environment."""
+
+    env: str = "dptse_env:dptse/PrivateHighway-v0"
+    """Environment id."""
+    target: str = "worst-case"
+    """Who differs: 'worst-case', an added vehicle; 'replaced' or 'deleted', one of the record."""
+    policy: str = "hunter"
+    """Who asks: 'hunter', 'adaptive', or a public schedule: 'paper', 'static', 'round-robin'."""
+    runs: int = 5000
+    """Runs in each of the two worlds."""
+    noise_factor: float = 1.0
+    """Multiplies the declared noise; below 1 shows that the audit can reject."""
+    traffic_seed: int = 0
+    """Traffic seed of the record."""
+    privacy: str | None = None
+    """Privacy preset; the environment's own if not given, as all below."""
+    epsilon: float | None = None
+    """Privacy parameter epsilon."""
+    delta: float | None = None
+    """Privacy parameter delta."""
+    unit: str | None = None
+    """Protected unit: 'trip', 'horizon' or 'event'."""
+    cap: int | None = None
+    """Queried steps in which a vehicle counts."""
+    adjacency: str | None = None
+    """'replace' or 'add_remove'."""
+    boundary_inputs: str | None = None
+    """'true', 'nominal' or 'private'."""
+    bandwidth: int | None = None
+    """Most segments to query a second."""
+    confidence: float = 0.95
+    """With which the lower bounds hold."""
+    seed: int = 0
+    """Seeds the noise."""
+    records: Path | None = None
+    """Folder of the record cache; the user's cache if not given."""
+    output: Path = Path("results/audit")
+    """Folder for the result, a JSON file."""
+
+
+def make_config(args: Args) -> EnvConfig:
+    """Return the configuration of the environment under attack."""
+    names = ("epsilon", "delta", "unit", "cap", "adjacency", "boundary_inputs")
+    privacy = {name: getattr(args, name) for name in names} | {"preset": args.privacy}
+    keywords: dict[str, Any] = {
+        "privacy": {name: value for name, value in privacy.items() if value is not None}
+    }
+    if args.bandwidth is not None:
+        keywords["bandwidth"] = args.bandwidth
+    config: EnvConfig = gym.make(args.env, **keywords).unwrapped.config  # type: ignore[attr-defined]
+    return config
+
+
+def claim_of(report: PrivacyReport) -> Claim:
+    """Return what a user was told: the account where it is a guarantee, else what was asked for."""
+    epsilon, delta = report.claimed_epsilon, report.claimed_delta
+    mu = mu_of(epsilon, delta) if report.guarantee == "none" else report.mu
+    return Claim(mu, epsilon, delta)
+
+
+def check(args: Args) -> None:
+    """Name bad input before anything is recorded.
+
+    Raises:
+        ValueError: An argument is out of range.
+    """
+    require(args.target in TARGETS, "target", f"one of {list(TARGETS)}", args.target)
+    require(args.policy in POLICIES, "policy", f"one of {list(POLICIES)}", args.policy)
+    integer("runs", args.runs, 2)
+    integer("traffic_seed", args.traffic_seed, 0)
+    integer("seed", args.seed, 0)
+    positive("noise_factor", args.noise_factor)
+    inside("confidence", args.confidence, 0.0, 1.0)
+
+
+def find(args: Args) -> Finding:
+    """Choose two worlds, play them, and test the claim."""
+    check(args)
+    config = make_config(args)
+    library = RecordLibrary(args.records)
+    library.ensure(config.corridor, [args.traffic_seed], progress=True)
+    record = library.get(config.corridor, args.traffic_seed)
+    target = choose_target(config, record, args.target, args.policy)
+    policy = make_policy(config, args.policy, target.worlds)
+    start = time.perf_counter()
+    runs = attack(
+        config, target.worlds, policy, args.runs, noise_factor=args.noise_factor, seed=args.seed
+    )
+    seconds = time.perf_counter() - start
+    privacy, report = config.privacy, config.accountant().report
+    promise = f"({privacy.epsilon:g}, {privacy.delta:g})"
+    return Finding(
+        title=f"{args.env.rpartition('/')[2]}, preset {privacy.preset} at {promise}",
+        target=target.description,
+        policy=args.policy,
+        n_runs=args.runs,
+        noise_factor=args.noise_factor,
+        distance=float(runs.distances.max()),
+        result=audit(*runs.scores, claim_of(report), args.confidence),
+        privacy=report,
+        seconds=seconds,
+    )
+
+
+def main(args: Args) -> None:
+    """Attack, and leave table and file."""
+    finding = find(args)
+    finding.print()
+    noise = "" if args.noise_factor == 1.0 else f"-noise-{args.noise_factor:g}"
+    preset = finding.privacy.preset
+    path = args.output / f"{preset}-{args.target}-{args.policy}{noise}.json"
+    finding.write(path, dataclasses.asdict(args))
+    print(f"the result is in {path}")
+
+
+if __name__ == "__main__":
+    run(main, Args, __doc__)

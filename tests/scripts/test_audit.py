@@ -1,0 +1,107 @@
+import json
+from pathlib import Path
+
+import pytest
+
+from dptse_env.privacy import mu_of
+from scripts.audit import Args, main, make_config
+
+SHORT = "dptse_env:dptse/ShortHighway-v0"
+
+
+def run(folder, **changes):
+    """Return the only file that an audit leaves, and its content."""
+    arguments = {"env": SHORT, "privacy": "guaranteed", "epsilon": 5.0, "cap": 16, "runs": 150}
+    main(Args(**{**arguments, "output": Path(folder) / "out", **changes}))
+    (path,) = (Path(folder) / "out").iterdir()
+    return path.name, json.loads(path.read_text())
+
+
+def test_a_guarantee_is_not_rejected(tmp_path, capsys):
+    name, found = run(tmp_path)
+    assert name == "guaranteed-worst-case-hunter.json"
+    mu = mu_of(5.0, 0.05)
+    assert found["verdict"] == "not rejected"
+    assert found["distance"] == pytest.approx(mu)
+    assert found["result"]["claim"] == {"mu": pytest.approx(mu), "epsilon": 5.0, "delta": 0.05}
+    assert 0.0 < found["result"]["mu"]["value"] <= mu
+    assert found["privacy"]["void_reasons"] == []
+    printed = capsys.readouterr().out
+    for words in ("Verdict: not rejected, at confidence 95%", "Power:", "epsilon", "150 runs"):
+        assert words in printed
+    assert "verified" not in printed
+    assert "boundary" not in printed
+
+
+def test_too_little_noise_is_rejected(tmp_path, capsys):
+    name, found = run(tmp_path, noise_factor=0.4)
+    assert name == "guaranteed-worst-case-hunter-noise-0.4.json"
+    assert found["verdict"] == "rejected"
+    assert found["distance"] == pytest.approx(2.5 * mu_of(5.0, 0.05))
+    assert found["result"]["mu"]["value"] > mu_of(5.0, 0.05)
+    assert "Verdict: rejected" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("preset", ["paper", "corrected"])
+def test_what_the_paper_promises_is_rejected_with_vehicles_of_the_record(preset, tmp_path, capsys):
+    _, found = run(
+        tmp_path,
+        privacy=preset,
+        epsilon=1.0,
+        target="replaced",
+        runs=700 if preset == "corrected" else 100,
+    )
+    assert found["verdict"] == "rejected"
+    # What a user was told, and not what the account makes of it.
+    assert found["result"]["claim"]["mu"] == pytest.approx(mu_of(1.0, 0.05))
+    assert "the true traffic at the boundary" in capsys.readouterr().out
+
+
+def test_every_argument_arrives(tmp_path):
+    name, found = run(
+        tmp_path, runs=10, adjacency="add_remove", unit="event", target="deleted",
+        policy="adaptive", delta=0.01, boundary_inputs="private", bandwidth=1, confidence=0.9,
+        traffic_seed=3, seed=5, cap=9,
+    )  # fmt: skip
+    assert name == "guaranteed-deleted-adaptive.json"
+    privacy = found["privacy"]
+    assert "one second of one vehicle's trip, added or removed" in privacy["protects"]
+    assert privacy["boundary_inputs"] == "private"
+    assert found["result"]["claim"]["delta"] == 0.01
+    assert found["result"]["confidence"] == 0.9
+    assert found["n_runs"] == 10
+    # 10 runs prove nothing, and that is said.
+    assert found["detectable_mu"] is None
+    assert found["arguments"]["traffic_seed"] == "3"
+
+
+def test_the_bandwidth_arrives():
+    assert make_config(Args(env=SHORT, bandwidth=1)).bandwidth == 1
+    assert make_config(Args(env=SHORT)).bandwidth == 2
+
+
+def test_two_audits_agree(tmp_path):
+    one, two = (run(tmp_path / name, runs=20, seed=1)[1]["result"] for name in ("one", "two"))
+    other = run(tmp_path / "three", runs=20, seed=2)[1]["result"]
+    assert one == two != other
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"target": "everyone"}, "target must be one of"),
+        ({"policy": "random"}, "policy must be one of"),
+        ({"runs": 1}, "runs must be an integer >= 2, got 1"),
+        ({"noise_factor": 0.0}, "noise_factor must be > 0"),
+        ({"confidence": 1.0}, r"confidence must be in \(0, 1\)"),
+        ({"traffic_seed": -1}, "traffic_seed must be an integer >= 0"),
+        ({"seed": -1}, "seed must be an integer >= 0"),
+        ({"privacy": "none"}, r"privacy\.preset must be one of"),
+        ({"epsilon": -1.0}, r"privacy\.epsilon must be > 0"),
+        ({"target": "replaced", "adjacency": "add_remove"}, "target must be 'deleted'"),
+    ],
+)
+def test_bad_arguments_are_named_and_nothing_is_written(changes, message, tmp_path):
+    with pytest.raises(ValueError, match=message):
+        run(tmp_path, **changes)
+    assert not (tmp_path / "out").exists()
