@@ -5,6 +5,7 @@ Everything is reachable from plain JSON, so the keywords of ``gym.make`` survive
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -15,6 +16,8 @@ from dptse_env.estimators.tuning import available_settings, load_settings, setti
 from dptse_env.mapping import from_mapping
 from dptse_env.model import ARZModel, ARZParameters, load_parameters
 from dptse_env.privacy import (
+    VOID_REASONS,
+    Accountant,
     PrivacySettings,
     Sensitivity,
     contribution_sensitivity,
@@ -52,7 +55,7 @@ class EnvConfig:
             set ``<estimator>-<ARZ parameters>-<privacy preset>`` if one ships, else the defaults.
         bandwidth: Most mainline segments to query a step.
         action: Name of the action encoding: ``mask``, ``scores``, ``slots`` or ``sequential``.
-        privacy: Preset, epsilon and delta of the mechanism.
+        privacy: Preset of the mechanism, epsilon and delta, and what they protect.
         reward: Term of the reward: ``joint``, ``density`` or ``speed``.
         horizon: Length of an episode [s]; None for the whole record.
         random_start: Whether an episode starts at a random second of the record.
@@ -140,14 +143,36 @@ class EnvConfig:
                 protects=privacy.protected(),
                 mean_speed_slope=slope if privacy.speed == "mean" else None,
             )
+        n_always = len(corridor.fixed_sensors)
+        if privacy.boundary == "private":
+            n_always += corridor.n_boundaries
         return paper_sensitivity(
-            n_sensors=self.bandwidth + len(corridor.fixed_sensors),
+            n_sensors=self.bandwidth + n_always,
             average_dwell=corridor.average_dwell,
             segment_length=corridor.segment_length,
             # Constants of the corridor, so that the noise does not depend on the estimator.
             free_flow_speed=corridor.speed_scale,
             jam_density=corridor.density_scale,
         )
+
+    def accountant(self) -> Accountant:
+        """Return the account of what an episode releases."""
+        return Accountant(self.privacy, self.sensitivity())
+
+    def warn_where_void(self) -> None:
+        """Warn where the preset that guarantees privacy was asked for, and other fields void it.
+
+        The warning names the line that called the caller, the constructor of an environment.
+        """
+        if not self.privacy.is_bounded:
+            return
+        reasons = self.accountant().report.void_reasons
+        if reasons:
+            listed = "; ".join(f"{reason}: {VOID_REASONS[reason]}" for reason in reasons)
+            asked = f"privacy.preset is {self.privacy.preset!r}"
+            warnings.warn(
+                f"{asked}, yet no privacy is guaranteed. {listed}", UserWarning, stacklevel=3
+            )
 
 
 PRESETS = {

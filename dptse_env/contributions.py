@@ -26,7 +26,8 @@ class Contributions:
 
     Attributes:
         cap: C, steps in which a vehicle counts; None if in all.
-        exposures: Shape (n_episodes, n_vehicles), steps in which each vehicle has counted.
+        exposures: Shape (n_episodes, n_vehicles), steps in which each vehicle has counted; as wide
+            as the largest record loaded.
     """
 
     def __init__(
@@ -44,6 +45,7 @@ class Contributions:
         self.cap, self.largest_speed = cap, largest_speed
         self._limit = n_steps if cap is None else cap
         self._start = np.zeros((n_slots, n_steps + 1), dtype=np.int64)
+        self._n_vehicles = np.zeros(n_slots, dtype=np.int64)
         self._rows = 0
         self._vehicle: NDArray[np.int32] = np.empty(0, dtype=np.int32)
         self._segment: NDArray[np.int16] = np.empty(0, dtype=np.int16)
@@ -66,11 +68,19 @@ class Contributions:
         self._segment[self._rows : end] = record.segment
         self._speed[self._rows : end] = np.clip(record.speed, 0.0, self.largest_speed)
         self._start[slot] = self._rows + record.offsets
+        self._n_vehicles[slot] = record.n_vehicles
         self._rows = end
 
     def reset(self, episodes: IntArray) -> None:
         """Begin new episodes, shape (k,): nobody has counted yet."""
         self.exposures[episodes] = 0
+
+    def of_episode(self, episode: int, slot: int) -> NDArray[np.int32]:
+        """Return how often each vehicle of a slot's record has counted, shape (its vehicles,).
+
+        It depends on the records of other episodes neither in value nor in length.
+        """
+        return self.exposures[episode, : self._n_vehicles[slot]].copy()
 
     def collect(
         self, episodes: IntArray, slots: IntArray, times: IntArray, observed: BoolArray

@@ -41,7 +41,8 @@ class SensorQueryEnv(gym.Env[Observation, Any]):
     **Info**: the same keys at reset and at every step: ``rmse_density`` [veh/km], ``rmse_speed``
     [km/h], ``n_occupied``, ``n_dropped``, ``diverged``, ``mu``, ``epsilon`` (floats) and
     ``queried`` (flags, shape (n,)); with ``truth_in_info`` also ``truth``. At reset ``privacy``
-    names the guarantee and what voids it. ``rmse_*``, ``n_occupied`` and ``truth`` come from the
+    names the guarantee, or what voids it, and the account behind it. ``mu`` and ``epsilon`` are
+    what a vehicle has spent at most so far. ``rmse_*``, ``n_occupied`` and ``truth`` come from the
     true traffic: use them to train and evaluate, never to act.
 
     **Reset options**: ``traffic_seed`` (one of ``traffic_seeds``) and ``start`` (first second).
@@ -68,6 +69,9 @@ class SensorQueryEnv(gym.Env[Observation, Any]):
 
         Raises:
             ValueError: A key is unknown or a value out of range; the message names it.
+
+        Warns:
+            UserWarning: Privacy preset ``guaranteed`` was asked for, and other keywords void it.
         """
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(
@@ -76,6 +80,7 @@ class SensorQueryEnv(gym.Env[Observation, Any]):
             )
         self.render_mode = render_mode
         self.config = resolve(preset, overrides)
+        self.config.warn_where_void()
         self.interface = QueryInterface.of(self.config)
         self.action_space = self.interface.actions.space
         self.observation_space = self.interface.observations.space

@@ -6,7 +6,12 @@ import numpy as np
 
 from dptse_env.arrays import FloatArray
 from dptse_env.model import ARZModel
-from dptse_env.traffic import Corridor, DemandDistribution
+from dptse_env.traffic import Corridor, Demand, DemandDistribution
+
+
+def _published(corridor: Corridor) -> Demand:
+    demand = corridor.demand
+    return demand.base if isinstance(demand, DemandDistribution) else demand
 
 
 def nominal_flows(corridor: Corridor, time: float) -> FloatArray:
@@ -16,9 +21,7 @@ def nominal_flows(corridor: Corridor, time: float) -> FloatArray:
         corridor: The road; a demand distribution counts with its base.
         time: Second of the record [s].
     """
-    demand = corridor.demand
-    if isinstance(demand, DemandDistribution):
-        demand = demand.base
+    demand = _published(corridor)
     flow = next(rate for start, rate in reversed(demand.mainline) if start <= time)
     on = dict(zip(corridor.on_ramps, demand.on_ramps, strict=True))
     off = dict(zip(corridor.off_ramps, corridor.exit_shares, strict=True))
@@ -57,16 +60,10 @@ def nominal_inputs(corridor: Corridor, model: ARZModel) -> FloatArray:
     """
     layout, v_f = model.layout, model.parameters.free_flow_speed
     n, n_on = corridor.n_mainline, len(corridor.on_ramps)
+    demand = _published(corridor)
     flows = np.array([nominal_flows(corridor, time) for time in range(corridor.duration + 1)])
-    demand = corridor.demand
-    if isinstance(demand, DemandDistribution):
-        demand = demand.base
     inputs = np.empty((len(flows), model.n_inputs))
-    mainline = [
-        next(rate for start, rate in reversed(demand.mainline) if start <= time)
-        for time in range(corridor.duration + 1)
-    ]
-    inputs[:, layout.entry_inputs[0]] = mainline
+    inputs[:, layout.entry_inputs[0]] = flows[:, 0]  # no ramp lies ahead of the first segment
     inputs[:, layout.entry_inputs[1:]] = demand.on_ramps
     inputs[:, layout.entry_inputs + 1] = v_f
     leaving = flows[:, [n - 1, *range(n + n_on, corridor.n_segments)]]

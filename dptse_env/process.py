@@ -16,7 +16,7 @@ from dptse_env.interface import QueryInterface
 from dptse_env.observations import AGE_CAP, Knowledge
 from dptse_env.options import ResetOptions
 from dptse_env.prior import nominal_state
-from dptse_env.privacy import Accountant, GaussianMechanism, Mechanism, noise_std
+from dptse_env.privacy import GaussianMechanism, Mechanism, noise_std
 from dptse_env.rewards import EstimationError, estimation_error
 from dptse_env.sensing import Sensing, make_answers
 from dptse_env.traffic import RecordLibrary
@@ -79,13 +79,12 @@ class QueryProcess:
         self.config, self.interface, self.n_episodes = config, interface, n
         self.model = config.model()
         self.sensing = Sensing(corridor, config.traffic_seeds, library or RecordLibrary())
-        sensitivity = config.sensitivity()
-        self.accountant = Accountant(config.privacy, sensitivity)
+        self.accountant = config.accountant()
         self.boundary = make_boundary(config.privacy.boundary, self.sensing, self.model, n)
         columns = s + self.boundary.n_released
         self.answers = make_answers(config.privacy, self.sensing, columns, n)
         self.mechanism: Mechanism = GaussianMechanism(
-            noise_std(config.privacy, sensitivity), n_episodes=n, n_segments=columns
+            noise_std(config.privacy, config.sensitivity()), n_episodes=n, n_segments=columns
         )
         self.estimator = make_estimator(
             config.estimator, config.backend, self.model, n, config.settings()
@@ -260,9 +259,11 @@ class QueryProcess:
                 "time": int(self.time[episode]),
             }
             if self.answers.contributions is not None:
-                exposures = self.answers.contributions.exposures[episode].copy()
-                info["truth"]["exposures"] = exposures
+                exposures = self.answers.contributions.of_episode(episode, self.slot[episode])
                 # A vehicle that has counted k times has spent what one of cap k has in all.
                 _, individual = self.accountant.spent(exposures)
-                info["truth"]["individual_epsilon"] = individual
+                # Lists, since records differ in their number of vehicles and Gymnasium stacks
+                # arrays of equal shape only.
+                info["truth"]["exposures"] = exposures.tolist()
+                info["truth"]["individual_epsilon"] = individual.tolist()
         return info

@@ -156,9 +156,10 @@ class BoundedAnswers:
         """Return density and flow, or mean speed, of the vehicles that count."""
         counts, speeds = self._counted.collect(episodes, slots, times, observed)
         answers = np.empty((*counts.shape, 2))
-        answers[..., 0] = counts / self._length
+        np.divide(counts, self._length, out=answers[..., 0])
         if self._speed_release == "flow":
-            answers[..., 1] = (speeds - 0.5 * self._limit * counts) / self._length
+            speeds -= 0.5 * self._limit * counts
+            np.divide(speeds, self._length, out=answers[..., 1])
         else:
             empty = counts == 0.0
             answers[..., 1] = np.where(empty, self._limit, speeds / np.where(empty, 1.0, counts))

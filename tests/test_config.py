@@ -15,6 +15,7 @@ from dptse_env.config import (
 )
 from dptse_env.estimators import EstimatorSettings, HorizonSettings
 from dptse_env.estimators.tuning import available_settings, load_settings
+from dptse_env.privacy import PrivacySettings
 from dptse_env.traffic import PAPER_HIGHWAY, SHORT_HIGHWAY, DemandDistribution, IncidentDistribution
 
 
@@ -142,3 +143,137 @@ def test_seed_ranges(text, seeds):
 def test_bad_seed_ranges_are_refused(text):
     with pytest.raises(ValueError, match=r"^seeds must "):
         parse_seeds(text)
+
+
+# --- privacy --------------------------------------------------------------------------------------
+
+
+def test_the_private_preset_is_as_announced():
+    config = PRESETS["private-highway"]
+    privacy = config.privacy
+    assert (privacy.preset, privacy.epsilon, privacy.delta, privacy.cap, privacy.unit) == (
+        "guaranteed", 5.0, 0.05, 64, "trip",
+    )  # fmt: skip
+    assert (privacy.speed, privacy.boundary) == ("flow", "nominal")
+    assert config.parameters == "w99-3lane"
+    assert isinstance(config.corridor.incident, IncidentDistribution)
+    assert isinstance(config.corridor.demand, DemandDistribution)
+
+
+def test_a_preset_by_name_keeps_the_other_fields_of_privacy():
+    config = resolve("private-highway", {"privacy": "corrected"})
+    assert config.privacy == PrivacySettings("corrected", epsilon=5.0, cap=64)
+    assert config.privacy.speed == "mean"
+    config = resolve("paper-highway", {"privacy": "guaranteed", "epsilon": 2})
+    assert config.privacy == PrivacySettings("guaranteed", epsilon=2.0)
+    assert config.privacy.boundary == "nominal"
+
+
+EVERY_PRIVACY_KEYWORD = {
+    "preset": "guaranteed",
+    "epsilon": 2,
+    "delta": 0.01,
+    "unit": "horizon",
+    "cap": 8,
+    "adjacency": "add_remove",
+    "share": 0.25,
+    "speed_release": "flow",
+    "boundary_inputs": "private",
+}
+
+
+def test_every_privacy_keyword_is_reachable_from_json():
+    assert set(EVERY_PRIVACY_KEYWORD) == {
+        field.name for field in dataclasses.fields(PrivacySettings)
+    }
+    plain = json.loads(json.dumps(EVERY_PRIVACY_KEYWORD))
+    config = resolve("paper-highway", {"privacy": plain})
+    assert config.privacy == PrivacySettings(**EVERY_PRIVACY_KEYWORD)
+    again = json.loads(json.dumps(dataclasses.asdict(config)))
+    assert resolve("short-highway", again) == config
+    nothing = {"speed_release": None, "boundary_inputs": None}
+    assert resolve("private-highway", {"privacy": nothing}) == PRESETS["private-highway"]
+
+
+@pytest.mark.parametrize(
+    ("privacy", "message"),
+    [
+        ({"cap": 0}, r"^privacy\.cap must be an integer >= 1, got 0$"),
+        ({"cap": 2.5}, r"^privacy\.cap must be of type int, got 2\.5$"),
+        ({"share": 1.0}, r"^privacy\.share must be in \(0, 1\), got 1\.0$"),
+        ({"epsilon": 0}, r"^privacy\.epsilon must be > 0, got 0"),
+        ({"delta": 0.5}, r"^privacy\.delta must be in \(0, 0\.5\), got 0\.5$"),
+        (
+            {"unit": "week"},
+            r"^privacy\.unit must be one of 'trip', 'horizon', 'event', got 'week'$",
+        ),
+        ({"adjacency": "swap"}, r"^privacy\.adjacency must be one of 'replace', 'add_remove', got"),
+        (
+            {"speed_release": "sum"},
+            r"privacy\.speed_release must be one of 'mean', 'flow', got 'sum'",
+        ),
+        ({"boundary_inputs": "no"}, r"privacy\.boundary_inputs must be one of 'true', 'nominal', "),
+        (
+            {"speed_release": "mean", "adjacency": "add_remove"},
+            r"^privacy\.adjacency must be 'replace' where mean speeds are released",
+        ),
+        (
+            {"preset": "paper", "speed_release": "flow"},
+            r"^privacy\.speed_release must be 'mean' with preset 'paper'",
+        ),
+    ],
+)
+def test_bad_privacy_is_named_with_its_path(privacy, message):
+    with pytest.raises(ValueError, match=message):
+        resolve("private-highway", {"privacy": privacy})
+
+
+@pytest.mark.parametrize(
+    ("unit", "horizon", "contributions"),
+    [("trip", 700, 64), ("trip", 50, 50), ("horizon", 50, 50), ("event", 700, 1)],
+)
+def test_a_sensitivity_counts_what_the_unit_can_contribute(unit, horizon, contributions):
+    config = resolve("private-highway", {"privacy": {"unit": unit}, "horizon": horizon})
+    sensitivity = config.sensitivity()
+    assert sensitivity.contributions == contributions
+    assert sensitivity.releases[0].bound == pytest.approx(10 * (2 * contributions) ** 0.5)
+    assert sensitivity.releases[1].bound == pytest.approx(2 * 510 * contributions**0.5)
+
+
+def test_neither_bandwidth_nor_sensors_enter_an_honest_bound():
+    first = resolve("private-highway", {}).sensitivity()
+    more = {"bandwidth": 15, "corridor": {"fixed_sensors": [0, 7, 14]}}
+    assert resolve("private-highway", more).sensitivity() == first
+    private = {"privacy": {"boundary_inputs": "private"}}
+    assert resolve("private-highway", private).sensitivity() == first
+
+
+def test_the_papers_sensitivity_counts_released_boundary_segments():
+    keywords = {"privacy": {"boundary_inputs": "private"}}
+    fewer, more = (resolve("paper-highway", k).sensitivity() for k in ({}, keywords))
+    assert dict(fewer.assumptions)["n_sensors"] == 8
+    assert dict(more.assumptions)["n_sensors"] == 8 + PAPER_HIGHWAY.n_boundaries
+
+
+VOID = {
+    "boundary_inputs": {"boundary_inputs": "true"},
+    "speed_sensitivity": {"speed_release": "mean"},
+}
+
+
+@pytest.mark.parametrize(("reason", "privacy"), VOID.items(), ids=VOID)
+def test_a_void_guarantee_is_warned_of_with_its_reason(reason, privacy):
+    config = resolve("private-highway", {"privacy": privacy})
+    with pytest.warns(UserWarning, match=f"no privacy is guaranteed. {reason}: ") as caught:
+        config.warn_where_void()
+    assert len(caught) == 1
+    assert config.accountant().report.guarantee == "none"
+
+
+@pytest.mark.parametrize(
+    "privacy",
+    ["paper", "corrected", "guaranteed", {"boundary_inputs": "private", "unit": "horizon"}],
+)
+def test_nothing_is_warned_of_where_no_guarantee_is_asked_for_or_it_holds(privacy):
+    # Warnings are errors in these tests.
+    resolve("private-highway", {"privacy": privacy}).warn_where_void()

@@ -1,8 +1,9 @@
 """Nothing of the true traffic may reach a policy except through the mechanism.
 
-With a mechanism that answers constants, two episodes over different traffic must look the same.
-The presets of this release feed the estimator true boundary inputs. That is their declared
-exception, so the tests replace them by constants, and one test shows that it is one.
+With a mechanism that answers the same whatever the traffic, two episodes over different traffic
+must look the same, bit by bit. The presets `paper` and `corrected` feed the estimator true boundary
+inputs. That is their declared exception, so their test replaces them, and one test shows that it is
+one. Each way for the truth to slip through is kept as a mutation that the comparison must catch.
 """
 
 import gymnasium as gym
@@ -10,101 +11,144 @@ import numpy as np
 import pytest
 
 from dptse_env.actions import ACTION_ENCODINGS
+from dptse_env.boundary import NominalBoundary
 from dptse_env.estimators import ESTIMATORS
 from dptse_env.process import TRUTH_INFO
 from dptse_env.schedules import SCHEDULES, make_schedule
 
 SEEDS = (0, 1)
+START, STEPS = 250, 30
+BLIND_SCHEDULES = sorted(set(SCHEDULES) - {"all"})
 
 
 class ConstantMechanism:
-    """Releases the same values whatever the traffic."""
+    """Releases the same values whatever the traffic: others for every second and segment."""
 
-    sigma = np.array([20.0, 10.0])
+    def __init__(self, mechanism, releases_flow):
+        self.sigma, self._scale = mechanism.sigma, 2000.0 if releases_flow else 80.0
+        self._step = 0
 
     def reset(self, episodes, generators):
-        pass
+        self._step = 0
 
     def release(self, episodes, values):
-        answer = np.empty_like(values)
-        answer[..., 0] = 40.0 + np.arange(values.shape[1])
-        answer[..., 1] = 80.0
-        return answer
+        self._step += 1
+        answer = np.random.default_rng(self._step).uniform(-0.2, 1.0, values.shape)
+        return answer * [60.0, self._scale]
 
 
-def transcript(env, traffic_seed, schedule=None, n_steps=60):
-    """Return all that a policy may see of an episode."""
-    observation, info = env.reset(seed=7, options={"traffic_seed": traffic_seed})
+def transcript(env, traffic_seed, schedule=None):
+    """Return all that a policy may see of an episode, and what the estimator makes of it."""
+    start = min(START, env.unwrapped.config.last_start)
+    options = {"traffic_seed": traffic_seed, "start": start}
+    observation, info = env.reset(seed=7, options=options)
     env.action_space.seed(7)
     policy = make_schedule(schedule, env, seed=7) if schedule else None
-    state, seen = None, [(observation, public(info))]
-    for _ in range(n_steps):
+    state, seen = None, [{"observation": observation, **public(env, info)}]
+    truncated = False
+    while not truncated:
         if policy is None:
             action = env.action_space.sample()
         else:
             action, state = policy.predict(observation, state, np.array([state is None]))
         observation, _, terminated, truncated, info = env.step(action)
-        seen.append((observation, (terminated, truncated), public(info)))
+        flags = {"observation": observation, "terminated": terminated, "truncated": truncated}
+        seen.append(flags | public(env, info))
     return seen
 
 
-def public(info):
-    return {
-        key: value.tolist() if isinstance(value, np.ndarray) else value
-        for key, value in info.items()
-        if key not in TRUTH_INFO
-    }
-
-
-def blind(env, boundary=True):
-    """Cut every path from the traffic to the policy, the declared exception included."""
+def public(env, info):
     process = env.unwrapped.process
-    for seed in SEEDS:
-        env.reset(seed=0, options={"traffic_seed": seed})
-    process.mechanism = ConstantMechanism()
-    if boundary:
-        process.boundary_inputs[:] = process.boundary_inputs[0, 100]
-    return env
+    estimate = {name: getattr(process.estimate, name).copy() for name in vars(process.estimate)}
+    masks = {"released": process.released.copy(), "age": process.age.copy()}
+    shown = {key: value for key, value in info.items() if key not in TRUTH_INFO}
+    return shown | estimate | masks
 
 
 def same(first, second):
     return all(
-        np.array_equal(a[0], b[0]) and a[1:] == b[1:] for a, b in zip(first, second, strict=True)
+        one.keys() == other.keys() and all(np.array_equal(one[key], other[key]) for key in one)
+        for one, other in zip(first, second, strict=True)
     )
 
 
-def make(**keywords):
-    return gym.make("dptse_env:dptse/ShortHighway-v0", traffic_seeds=SEEDS, **keywords)
+def blind(env):
+    """Cut the path through the mechanism; load both traffics first."""
+    for seed in SEEDS:
+        env.reset(seed=0, options={"traffic_seed": seed})
+    process = env.unwrapped.process
+    flow = process.config.privacy.speed == "flow"
+    process.mechanism = ConstantMechanism(process.mechanism, flow)
+    return env
+
+
+def make_private(**keywords):
+    keywords = {"horizon": STEPS, "random_start": True, **keywords}
+    return gym.make("dptse_env:dptse/PrivateHighway-v0", traffic_seeds=SEEDS, **keywords)
+
+
+def make_paper(**keywords):
+    return gym.make("dptse_env:dptse/ShortHighway-v0", traffic_seeds=SEEDS, horizon=60, **keywords)
+
+
+def with_nominal_boundary(env):
+    """Take the declared exception of the paper's presets away."""
+    process = env.unwrapped.process
+    process.boundary = NominalBoundary(process.sensing, process.model)
+    return env
+
+
+def unlike(env):
+    return not same(transcript(env, 0), transcript(env, 1))
+
+
+# --- the guaranteed preset, as it is ------------------------------------------------------------
 
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 @pytest.mark.parametrize("action", ACTION_ENCODINGS)
 def test_traffic_does_not_show(estimator, action):
-    env = blind(make(estimator=estimator, action=action))
-    assert same(transcript(env, 0), transcript(env, 1))
+    env = blind(make_private(estimator=estimator, action=action))
+    first, second = transcript(env, 0), transcript(env, 1)
+    assert same(first, second)
+    assert not np.array_equal(first[1]["observation"], first[-1]["observation"])
 
 
-@pytest.mark.parametrize("schedule", sorted(set(SCHEDULES) - {"all"}))
-def test_traffic_does_not_show_through_a_schedule(schedule):
-    env = blind(make())
+@pytest.mark.parametrize("boundary", ["nominal", "private"])
+@pytest.mark.parametrize("schedule", BLIND_SCHEDULES)
+def test_traffic_does_not_show_through_a_schedule(schedule, boundary):
+    env = blind(make_private(privacy={"boundary_inputs": boundary}))
     assert same(transcript(env, 0, schedule), transcript(env, 1, schedule))
 
 
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+@pytest.mark.parametrize("unit", ["trip", "horizon", "event"])
+def test_traffic_does_not_show_where_boundaries_are_released(estimator, unit):
+    privacy = {"boundary_inputs": "private", "unit": unit, "cap": 3}
+    env = blind(make_private(estimator=estimator, privacy=privacy))
+    assert same(transcript(env, 0), transcript(env, 1))
+
+
 def test_the_traffics_do_differ():
-    env = make(truth_in_info=True)
-    truths = [env.reset(seed=0, options={"traffic_seed": s, "start": 0}) for s in SEEDS]
-    assert len(truths) == 2
-    env = make()
-    assert not same(transcript(env, 0), transcript(env, 1))
+    env = make_private(truth_in_info=True)
+    first, second = transcript(env, 0), transcript(env, 1)
+    assert not same(first, second)
+    process = env.unwrapped.process
+    truths = [process.sensing.aggregates(np.array([s]), np.array([START])) for s in (0, 1)]
+    assert not np.array_equal(*truths)
 
 
-def test_true_boundary_inputs_show():
-    env = blind(make(), boundary=False)
-    assert not same(transcript(env, 0), transcript(env, 1))
+# --- mutations that must be caught --------------------------------------------------------------
+
+
+def test_true_boundary_inputs_would_show():
+    with pytest.warns(UserWarning, match="boundary_inputs"):
+        env = make_private(privacy={"boundary_inputs": "true"})
+    assert unlike(blind(env))
 
 
 def test_an_emptiness_mask_would_show(monkeypatch):
-    env = blind(make())
+    env = blind(make_private())
     process = env.unwrapped.process
     update = process.estimator.update
 
@@ -113,17 +157,63 @@ def test_an_emptiness_mask_would_show(monkeypatch):
         update(episodes, observed & (truth[..., 0] > 0), values, sigma)
 
     monkeypatch.setattr(process.estimator, "update", update_occupied)
-    assert not same(transcript(env, 0), transcript(env, 1))
+    assert unlike(env)
+
+
+def test_a_marker_for_empty_segments_would_show(monkeypatch):
+    env = blind(make_private())
+    mechanism = env.unwrapped.process.mechanism
+    release = mechanism.release
+
+    def release_marked(episodes, values):
+        return np.where(values[..., :1] > 0, release(episodes, values), 0.0)
+
+    monkeypatch.setattr(mechanism, "release", release_marked)
+    assert unlike(env)
 
 
 def test_an_initial_state_from_the_truth_would_show(monkeypatch):
-    env = blind(make(horizon=100))
+    env = blind(make_private())
     process = env.unwrapped.process
     reset = process.estimator.reset
 
     def reset_to_truth(episodes, states, generators):
-        truth = process.sensing.aggregates(process.slot[episodes], np.full(1, 100))
+        truth = process.truth(episodes)
         reset(episodes, process.model.states(truth[..., 0] + 1.0, truth[..., 1]), generators)
 
     monkeypatch.setattr(process.estimator, "reset", reset_to_truth)
-    assert not same(transcript(env, 0), transcript(env, 1))
+    assert unlike(env)
+
+
+def test_realised_exposures_in_info_would_show(monkeypatch):
+    """An account of what vehicles really spent is no public number."""
+    env = blind(make_private())
+    process = env.unwrapped.process
+    info = process.info
+
+    def telling(episode):
+        exposures = process.answers.contributions.of_episode(episode, process.slot[episode])
+        return info(episode) | {"mu": float(exposures.max(initial=0))}
+
+    monkeypatch.setattr(process, "info", telling)
+    assert unlike(env)
+
+
+# --- the presets of the paper, but for their declared exception ---------------------------------
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+@pytest.mark.parametrize("action", ACTION_ENCODINGS)
+def test_the_papers_presets_show_traffic_through_their_boundary_only(estimator, action):
+    env = with_nominal_boundary(blind(make_paper(estimator=estimator, action=action)))
+    assert same(transcript(env, 0), transcript(env, 1))
+
+
+@pytest.mark.parametrize("schedule", BLIND_SCHEDULES)
+def test_the_papers_presets_show_nothing_through_a_schedule(schedule):
+    env = with_nominal_boundary(blind(make_paper()))
+    assert same(transcript(env, 0, schedule), transcript(env, 1, schedule))
+
+
+def test_the_papers_boundary_inputs_show():
+    assert unlike(blind(make_paper()))

@@ -1,3 +1,5 @@
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -67,3 +69,18 @@ def test_observations_stay_inside_the_space(fill):
 def test_an_unknown_block_is_named():
     with pytest.raises(ValueError, match="unknown observation block 'clock'; known: density"):
         encoding().block(np.zeros(1, dtype=np.float32), "clock")
+
+
+def test_a_released_flow_has_its_own_name_and_scale():
+    encoder = ObservationEncoding(
+        N, S, FIXED, density_scale=100.0, speed_scale=50.0, bandwidth=2, epsilon=5.0,
+        with_picked=False, releases_flow=True,
+    )  # fmt: skip
+    assert "released_speed" not in encoder.slices
+    assert list(encoder.slices).index("released_flow") == 5
+    shown = dataclasses.replace(
+        knowledge(), released=np.dstack([np.full((2, S), 20.0), np.full((2, S), -2500.0)])
+    )
+    observation = encoder.encode(shown)
+    np.testing.assert_allclose(encoder.block(observation, "released_flow"), [[-0.5] * N] * 2)
+    np.testing.assert_allclose(encoder.block(observation, "epsilon"), np.log10(5.0), rtol=1e-6)

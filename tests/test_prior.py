@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from dptse_env.model import ARZModel, load_parameters
-from dptse_env.prior import free_flow_density, nominal_flows, nominal_state
-from dptse_env.traffic import PAPER_HIGHWAY, DemandDistribution
+from dptse_env.prior import free_flow_density, nominal_flows, nominal_inputs, nominal_state
+from dptse_env.traffic import PAPER_HIGHWAY, DemandDistribution, randomised
 
 
 @pytest.fixture(params=["paper", "w99-3lane"])
@@ -58,3 +58,37 @@ def test_the_nominal_state_hardly_moves_under_its_own_demand(model):
         after = model.step(after, inputs)
     # Ramps merge with a w of v_f as well, so only the drop of speed behind a merge is left.
     np.testing.assert_allclose(model.density(after), model.density(state), rtol=0.02, atol=0.1)
+
+
+# --- inputs at the published demand ---------------------------------------------------------------
+
+
+def test_nominal_inputs_are_the_published_demand_at_every_second(model):
+    inputs, layout = nominal_inputs(PAPER_HIGHWAY, model), model.layout
+    v_f = model.parameters.free_flow_speed
+    assert inputs.shape == (701, model.n_inputs)
+    for time in range(701):
+        rate = 6050.0 if 200 <= time < 400 else 2050.0
+        np.testing.assert_allclose(inputs[time, layout.entry_inputs], [rate, 320.0, 300.0])
+    np.testing.assert_array_equal(inputs[:, layout.entry_inputs + 1], v_f)
+
+
+def test_behind_the_exits_the_flow_that_reaches_them_is_carried_freely(model):
+    inputs, layout = nominal_inputs(PAPER_HIGHWAY, model), model.layout
+    v_f, gamma, jam = (
+        model.parameters.free_flow_speed, model.parameters.gamma, model.exit_jam_density,
+    )  # fmt: skip
+    for time in (0, 150, 450):
+        flows = nominal_flows(PAPER_HIGHWAY, time)
+        density = inputs[time, layout.exit_inputs]
+        carried = density * v_f * (1.0 - (density / jam) ** gamma)
+        np.testing.assert_allclose(carried, flows[[14, 17, 18]], rtol=1e-3)
+
+
+def test_nominal_inputs_know_neither_incident_nor_draws():
+    model = ARZModel(PAPER_HIGHWAY, load_parameters("w99-3lane"))
+    drawn = randomised(PAPER_HIGHWAY)
+    assert drawn != PAPER_HIGHWAY
+    np.testing.assert_array_equal(
+        nominal_inputs(drawn, model), nominal_inputs(PAPER_HIGHWAY, model)
+    )

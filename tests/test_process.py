@@ -16,9 +16,9 @@ SEEDS = (11, 12, 13)
 ALL = np.arange(3)
 
 
-def make(n_episodes, **keywords):
+def make(n_episodes, preset="short-highway", **keywords):
     keywords = {"traffic_seeds": "0:3", "horizon": 60, "random_start": True, **keywords}
-    config = resolve("short-highway", keywords)
+    config = resolve(preset, keywords)
     return QueryProcess(config, QueryInterface.of(config), n_episodes)
 
 
@@ -33,11 +33,18 @@ def sampled(process, n_steps):
     return [np.array([space.sample() for _ in SEEDS]) for _ in range(n_steps)]
 
 
-@pytest.mark.parametrize("estimator", ESTIMATORS)
-@pytest.mark.parametrize("action", ACTION_ENCODINGS)
-def test_a_batch_is_so_many_single_episodes(estimator, action):
-    batch = make(3, estimator=estimator, action=action)
-    singles = [make(1, estimator=estimator, action=action) for _ in SEEDS]
+COUNTED = {"preset": "guaranteed", "cap": 5, "boundary_inputs": "private"}
+
+
+@pytest.mark.parametrize(
+    ("estimator", "action", "privacy"),
+    [(e, a, "paper") for e in ESTIMATORS for a in ACTION_ENCODINGS]
+    + [(e, "mask", COUNTED) for e in ESTIMATORS],
+)
+def test_a_batch_is_so_many_single_episodes(estimator, action, privacy):
+    keywords = {"estimator": estimator, "action": action, "privacy": privacy}
+    batch = make(3, truth_in_info=True, **keywords)
+    singles = [make(1, truth_in_info=True, **keywords) for _ in SEEDS]
     together = [batch.reset(ALL, generators(SEEDS))]
     apart = [
         [one.reset(ALL[:1], generators([seed])) for one, seed in zip(singles, SEEDS, strict=True)]
@@ -73,9 +80,22 @@ def test_episodes_step_and_reset_on_their_own():
         assert (outcome.observation[2] != expected[k].observation[2]).any()
 
 
-def test_residuals_are_the_noise_that_is_declared():
+@pytest.mark.parametrize(
+    "keywords",
+    [
+        {"preset": "short-highway", "horizon": 240},
+        {"preset": "private-highway", "horizon": 240},
+        {
+            "preset": "private-highway",
+            "horizon": 120,
+            "privacy": {"boundary_inputs": "private", "share": 0.3},
+        },
+    ],
+    ids=["paper", "guaranteed", "guaranteed and private boundary"],
+)
+def test_residuals_are_the_noise_that_is_declared(keywords):
     """Released minus true over sigma: unit variance, uncorrelated over time and quantities."""
-    process = make(1, estimator="random_walk", random_start=False, horizon=240)
+    process = make(1, estimator="random_walk", random_start=False, **keywords)
     residuals = []
     release = process.mechanism.release
 
@@ -87,16 +107,19 @@ def test_residuals_are_the_noise_that_is_declared():
     process.mechanism.release = spy
     for seed in range(4):
         process.reset(ALL[:1], generators([seed]))
-        for action in sampled(process, 240):
+        for action in sampled(process, process.config.horizon_steps):
             process.step(ALL[:1], action[:1])
     r = np.array(residuals)  # seconds, segments, quantities
     n = r.size
     assert n > 10_000
-    low, high = stats.chi2.interval(1 - 1e-4, n) / np.array(n)
-    assert low < np.mean(r**2) < high
+    for part in (r, r[..., 0], r[..., 1]):
+        low, high = stats.chi2.interval(1 - 1e-4, part.size) / np.array(part.size)
+        assert low < np.mean(part**2) < high
     bound = 4.0 / np.sqrt(n / 2)
-    assert abs(np.mean(r[1:, :, :] * r[:-1, :, :])) < bound
+    for lag in (1, 2, 5):
+        assert abs(np.mean(r[lag:] * r[:-lag])) < bound
     assert abs(np.mean(r[..., 0] * r[..., 1])) < bound
+    assert abs(np.mean(r[:, 1:] * r[:, :-1])) < bound
 
 
 def test_what_is_asked_does_not_change_the_noise():
@@ -140,7 +163,8 @@ def test_a_step_from_t_predicts_with_t_and_measures_at_t_plus_one():
     for t in range(100):
         process.step(ALL[:1], np.zeros((1, 6), dtype=np.int8))
         record = process.sensing.library.get(process.config.corridor, 1)
-        np.testing.assert_array_equal(seen["inputs"][0], process.boundary_inputs[1, t])
+        expected = process.boundary.inputs(ALL[:1], np.array([1]), np.array([t]))
+        np.testing.assert_array_equal(seen["inputs"], expected)
         np.testing.assert_allclose(seen["values"][0, :, 0], record.counts[t + 1, :8] / 0.1)
 
 

@@ -1,8 +1,11 @@
 import numpy as np
 import pytest
 
-from dptse_env.sensing import Sensing
+from dptse_env.privacy import PrivacySettings
+from dptse_env.sensing import AggregateAnswers, BoundedAnswers, Sensing, make_answers
 from dptse_env.traffic import SHORT_HIGHWAY, RecordLibrary
+
+from .worlds import AWAY, Worlds, record
 
 
 @pytest.fixture(scope="module")
@@ -47,3 +50,82 @@ def test_boundary_segments_come_last(sensing):
     assert traffic.shape == (241, SHORT_HIGHWAY.n_segments + SHORT_HIGHWAY.n_boundaries, 2)
     segments = sensing.aggregates(np.zeros(241, dtype=np.int64), np.arange(241))
     np.testing.assert_array_equal(traffic[:, : SHORT_HIGHWAY.n_segments], segments)
+
+
+# --- answers with bounded contributions -----------------------------------------------------------
+
+
+def bounded(speed, cap=None):
+    places = np.array([[AWAY, 1, 1], [AWAY, 1, 2], [AWAY, AWAY, 5]])
+    speeds = np.array([[0, 20, 150], [0, 60, 40], [0, 0, 102]])
+    unit = "horizon" if cap is None else "trip"
+    settings = PrivacySettings("guaranteed", unit=unit, cap=cap or 64, speed_release=speed)
+    return Worlds(record(places, speeds, 12)).answers(settings)
+
+
+def answered(answers, time, *asked):
+    observed = np.zeros((1, 12), dtype=bool)
+    observed[0, list(asked)] = True
+    one = np.zeros(1, dtype=np.int64)
+    return answers.collect(one, one, np.array([time]), observed)[0]
+
+
+def test_a_flow_is_a_sum_of_centred_and_clipped_speeds():
+    answers = bounded("flow")
+    np.testing.assert_allclose(answered(answers, 1, 1)[1], [20.0, ((20 - 51) + (60 - 51)) / 0.1])
+    now = answered(answers, 2, 1, 2, 3)
+    np.testing.assert_allclose(now[1], [10.0, 510.0])  # 150 km/h is clipped to 102
+    np.testing.assert_allclose(now[2], [10.0, (40 - 51) / 0.1])
+    np.testing.assert_array_equal(now[3], [0.0, 0.0])  # nobody there
+    np.testing.assert_array_equal(now[5], [0.0, 0.0])  # not asked
+
+
+def test_a_mean_is_over_those_that_count():
+    answers = bounded("mean", cap=1)
+    np.testing.assert_allclose(answered(answers, 1, 1)[1], [20.0, 40.0])
+    now = answered(answers, 2, 1, 2, 5)
+    np.testing.assert_allclose(now[[1, 2]], [[0.0, 102.0]] * 2)  # both have counted before
+    np.testing.assert_allclose(now[5], [10.0, 102.0])
+
+
+@pytest.mark.parametrize(
+    ("privacy", "kind"),
+    [
+        ({"preset": "paper"}, AggregateAnswers),
+        ({"preset": "corrected"}, AggregateAnswers),
+        ({"preset": "guaranteed"}, BoundedAnswers),
+        ({"preset": "guaranteed", "speed_release": "mean"}, BoundedAnswers),
+    ],
+)
+def test_a_preset_that_bounds_contributions_counts_them(sensing, privacy, kind):
+    answers = make_answers(PrivacySettings(**privacy), sensing, 8, 1)
+    assert type(answers) is kind
+    assert (answers.contributions is None) == (kind is AggregateAnswers)
+
+
+@pytest.mark.parametrize(("unit", "cap"), [("trip", 64), ("horizon", None), ("event", None)])
+def test_the_cap_belongs_to_trips(sensing, unit, cap):
+    answers = make_answers(PrivacySettings("guaranteed", unit=unit), sensing, 8, 1)
+    assert answers.contributions.cap == cap
+
+
+def test_without_a_cap_the_answers_are_the_aggregates(sensing):
+    """Density of all vehicles, and the flow that follows from it and the mean speed."""
+    settings = PrivacySettings("guaranteed", unit="horizon")
+    bounded, plain = make_answers(settings, sensing, 8, 1), AggregateAnswers(sensing, 8)
+    bounded.load(0)
+    one, everyone = np.zeros(1, dtype=np.int64), np.ones((1, 8), dtype=bool)
+    occupied = 0
+    for t in range(1, 241):
+        density, flow = bounded.collect(one, one, np.array([t]), everyone)[0].T
+        true_density, mean = plain.collect(one, one, np.array([t]), everyone)[0].T
+        np.testing.assert_allclose(density, true_density)
+        limit = SHORT_HIGHWAY.speed_limit
+        # Some drivers are faster than the limit, and are clipped.
+        assert (flow <= true_density * (mean - 0.5 * limit) + 1e-3).all()
+        slow = mean < 0.6 * limit
+        np.testing.assert_allclose(
+            flow[slow], (true_density * (mean - 0.5 * limit))[slow], atol=1e-2, rtol=0.05
+        )
+        occupied += slow.sum()
+    assert occupied > 10

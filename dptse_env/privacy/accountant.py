@@ -1,15 +1,23 @@
 """What the releases of an episode cost, and which guarantee may be claimed for them."""
 
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from dptse_env.privacy.calibration import PRESETS, BoundaryInputs, PrivacySettings, noise_std
+from dptse_env.privacy.calibration import (
+    PRESETS,
+    BoundaryInputs,
+    PrivacySettings,
+    SpeedRelease,
+    Unit,
+    noise_std,
+)
 from dptse_env.privacy.gaussian import epsilon_of
 from dptse_env.privacy.reasons import VOID_REASONS, VoidReason
-from dptse_env.privacy.sensitivity import Sensitivity
+from dptse_env.privacy.sensitivity import Adjacency, Sensitivity
 
 __all__ = ["STRICT_DELTA", "Accountant", "PrivacyReport", "ReleaseReport"]
 
@@ -52,9 +60,14 @@ class PrivacyReport:
         guarantee: what may be claimed, or "none".
         void_reasons: why not; empty if and only if something may be claimed.
         protects: whose data is protected, and what counts as a change of it.
+        unit: what is protected; None where a preset bounds no contributions.
+        cap: queried steps in which a vehicle counts; None if in all of them.
+        adjacency: how two records differ.
+        share: part of the budget mu^2 that density gets; None where nothing is shared out.
         claimed_epsilon: the epsilon asked for.
         claimed_delta: the delta asked for.
         assumptions: the public numbers the sensitivities were computed from, by name with unit.
+        speed_release: how speeds are released.
         boundary_inputs: where the estimator's inputs at the boundary come from.
         releases: one for each released quantity.
         mu: of all releases together.
@@ -67,9 +80,14 @@ class PrivacyReport:
     guarantee: str
     void_reasons: tuple[VoidReason, ...]
     protects: str
+    unit: Unit | None
+    cap: int | None
+    adjacency: Adjacency
+    share: float | None
     claimed_epsilon: float
     claimed_delta: float
     assumptions: tuple[tuple[str, int | float], ...]
+    speed_release: SpeedRelease
     boundary_inputs: BoundaryInputs
     releases: tuple[ReleaseReport, ...]
     mu: float
@@ -97,12 +115,15 @@ class Accountant:
             sensitivity: of the released quantities.
         """
         self.report = _report(settings, sensitivity)
-        n = sensitivity.contributions
-        charged = self.report.mu * np.sqrt(np.arange(n + 1) / n) if n else [self.report.mu]
-        self._mu = np.asarray(charged, dtype=np.float64)
-        self._epsilon = np.array(
-            [epsilon_of(mu, settings.delta) if mu > 0.0 else 0.0 for mu in self._mu]
-        )
+        self._contributions = sensitivity.contributions
+
+    @cached_property
+    def _charged(self) -> tuple[FloatArray, FloatArray]:
+        """Values of mu and epsilon after 0..C steps; made when first asked for."""
+        n, delta = self._contributions, self.report.claimed_delta
+        mu = self.report.mu * np.sqrt(np.arange(n + 1) / n) if n else np.array([self.report.mu])
+        epsilon = np.array([epsilon_of(one, delta) if one > 0.0 else 0.0 for one in mu])
+        return mu, epsilon
 
     def spent(self, steps: IntArray) -> tuple[FloatArray, FloatArray]:
         """What episodes have revealed of a vehicle at most, if the sensitivities hold.
@@ -117,8 +138,9 @@ class Accountant:
         Returns:
             mu (k,) and epsilon at the delta asked for (k,), of all releases together.
         """
-        charged = np.minimum(steps, len(self._mu) - 1)
-        return self._mu[charged], self._epsilon[charged]
+        mu, epsilon = self._charged
+        charged = np.minimum(steps, len(mu) - 1)
+        return mu[charged], epsilon[charged]
 
 
 def _report(settings: PrivacySettings, sensitivity: Sensitivity) -> PrivacyReport:
@@ -142,9 +164,14 @@ def _report(settings: PrivacySettings, sensitivity: Sensitivity) -> PrivacyRepor
         guarantee="none" if found else _guarantee(settings, sensitivity),
         void_reasons=tuple(reason for reason in VOID_REASONS if reason in found),
         protects=sensitivity.protects,
+        unit=settings.unit if settings.is_bounded else None,
+        cap=settings.contribution_cap,
+        adjacency=settings.adjacency,
+        share=settings.share if settings.is_bounded else None,
         claimed_epsilon=settings.epsilon,
         claimed_delta=settings.delta,
         assumptions=sensitivity.assumptions,
+        speed_release=settings.speed,
         boundary_inputs=settings.boundary,
         releases=releases,
         mu=mu,

@@ -176,7 +176,11 @@ def contribution_sensitivity(
     return Sensitivity(
         releases=(ReleaseSensitivity("density", "veh/km", density), second),
         protects=protects,
-        assumptions=(("contributions", contributions), ("largest_speed_km_h", largest_speed)),
+        assumptions=(
+            ("contributions", contributions),
+            ("segment_length_km", segment_length),
+            ("largest_speed_km_h", largest_speed),
+        ),
         void_reasons=void_reasons,
         extremes=extremes,
         contributions=contributions,

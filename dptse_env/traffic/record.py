@@ -38,7 +38,7 @@ class InvalidRecordError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """The vehicle table of one simulated scenario, one row per vehicle and step.
+    """The vehicle table of one simulated scenario, at most one row per vehicle and step.
 
     Step k is the state of the road k seconds after the start, so step 0 is the empty road. Within a
     step, a recording lists the vehicles segment by segment.
@@ -52,7 +52,8 @@ class Record:
         n_columns: number of record columns, S + R.
 
     Raises:
-        ValueError: if the columns differ in length, are not ordered by step, or leave their range.
+        ValueError: if the columns differ in length, are not ordered by step, leave their range, or
+            have a vehicle twice in one step.
     """
 
     step: NDArray[np.int32]
@@ -90,6 +91,15 @@ class Record:
         require(int(self.vehicle.min()) >= 0, "record.vehicle", ">= 0", int(self.vehicle.min()))
         valid = bool(np.isfinite(self.speed).all() and self.speed.min() >= 0.0)
         require(valid, "record.speed", "finite and >= 0", self.speed.min())
+        # Privacy rests on it: a vehicle is on one segment at a step and counts there once.
+        places = np.sort(self.step.astype(np.int64) * self.n_vehicles + self.vehicle)
+        twice = np.flatnonzero(places[1:] == places[:-1])
+        if len(twice):
+            step, vehicle = divmod(int(places[twice[0]]), self.n_vehicles)
+            raise ValueError(
+                f"record.vehicle must be at most once in a step, got vehicle {vehicle} twice in "
+                f"step {step}"
+            )
 
     @property
     def n_rows(self) -> int:

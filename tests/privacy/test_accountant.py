@@ -8,8 +8,8 @@ from dp_accounting import get_epsilon_gaussian
 
 from dptse_env.privacy.accountant import STRICT_DELTA, Accountant
 from dptse_env.privacy.calibration import PrivacySettings
-from dptse_env.privacy.gaussian import epsilon_of
-from dptse_env.privacy.sensitivity import paper_sensitivity
+from dptse_env.privacy.gaussian import epsilon_of, mu_of
+from dptse_env.privacy.sensitivity import contribution_sensitivity, paper_sensitivity
 
 SENSITIVITY_REASONS = ("average_dwell", "adaptive_queries", "speed_sensitivity")
 
@@ -147,3 +147,96 @@ def test_the_dict_is_its_own_json_and_fresh_each_time(preset):
     first["assumptions"].clear()
     assert found.to_dict() != first
     assert found.to_dict()["assumptions"] == {"n_sensors": 8, "average_dwell_steps": 8.0}
+
+
+# --- the guaranteed preset ------------------------------------------------------------------------
+
+
+def guaranteed(cap=16, horizon=100, **wishes):
+    settings = PrivacySettings("guaranteed", 5.0, 0.05, cap=cap, **wishes)
+    slope = 0.3 if settings.speed == "mean" else None
+    sensitivity = contribution_sensitivity(
+        contributions=settings.contributions(horizon),
+        adjacency=settings.adjacency,
+        segment_length=0.1,
+        largest_speed=102.0,
+        protects=settings.protected(),
+        mean_speed_slope=slope,
+    )
+    return Accountant(settings, sensitivity)
+
+
+@pytest.mark.parametrize("share", [0.2, 0.5, 0.7])
+@pytest.mark.parametrize("adjacency", ["replace", "add_remove"])
+@pytest.mark.parametrize("unit", ["trip", "horizon", "event"])
+@pytest.mark.parametrize("boundary_inputs", [None, "nominal", "private"])
+def test_a_guarantee_is_claimed_for_its_unit(unit, adjacency, share, boundary_inputs):
+    found = guaranteed(
+        unit=unit, adjacency=adjacency, share=share, boundary_inputs=boundary_inputs
+    ).report
+    assert found.void_reasons == ()
+    assert found.guarantee == (
+        f"(5, 0.05)-differential privacy of density and flow together, for {found.protects}"
+    )
+    assert (found.unit, found.adjacency, found.share) == (unit, adjacency, share)
+    assert found.cap == (16 if unit == "trip" else None)
+    assert found.speed_release == "flow"
+    assert found.boundary_inputs == (boundary_inputs or "nominal")
+    assert found.mu == pytest.approx(mu_of(5.0, 0.05), rel=1e-12)
+    assert found.epsilon == pytest.approx(5.0, rel=1e-9)
+    assert found.epsilon_strict > 9.0
+
+
+@pytest.mark.parametrize(
+    ("wishes", "reasons"),
+    [
+        ({"boundary_inputs": "true"}, ("boundary_inputs",)),
+        ({"speed_release": "mean"}, ("speed_sensitivity",)),
+        (
+            {"speed_release": "mean", "boundary_inputs": "true"},
+            ("speed_sensitivity", "boundary_inputs"),
+        ),
+    ],
+)
+def test_what_voids_a_guarantee_is_listed(wishes, reasons):
+    found = guaranteed(**wishes).report
+    assert found.guarantee == "none"
+    assert found.void_reasons == reasons
+
+
+@pytest.mark.parametrize(("unit", "whole"), [("trip", 16), ("horizon", 100), ("event", 1)])
+def test_an_episode_is_charged_step_by_step_until_the_cap(unit, whole):
+    accountant = guaranteed(unit=unit)
+    mu, epsilon = accountant.spent(np.arange(101))
+    counted = np.minimum(np.arange(101), whole)
+    np.testing.assert_allclose(mu, accountant.report.mu * np.sqrt(counted / whole), rtol=1e-14)
+    assert (mu[0], epsilon[0]) == (0.0, 0.0)
+    assert epsilon[-1] == pytest.approx(5.0, rel=1e-9)
+    assert (np.diff(epsilon[: whole + 1]) >= 0.0).all()
+    expected = [epsilon_of(one, 0.05) for one in mu[1:]]
+    np.testing.assert_array_equal(epsilon[1:], expected)
+
+
+def test_making_an_account_takes_no_root_for_every_step(monkeypatch):
+    calls = []
+    monkeypatch.setattr(
+        "dptse_env.privacy.accountant.epsilon_of", lambda *given: calls.append(given) or 1.0
+    )
+    accountant = guaranteed(unit="horizon", horizon=700)
+    assert len(calls) == 2
+    for _ in range(3):
+        accountant.spent(np.array([5]))
+    assert len(calls) == 702
+
+
+def test_the_account_of_a_guarantee_is_plain_json():
+    for wishes in ({}, {"unit": "event"}, {"speed_release": "mean"}):
+        found = guaranteed(**wishes).report.to_dict()
+        assert json.loads(json.dumps(found, allow_nan=False)) == found
+
+
+@pytest.mark.parametrize("preset", ["paper", "corrected"])
+def test_presets_that_bound_nothing_name_no_unit(preset):
+    found = report(preset)
+    assert (found.unit, found.cap, found.share) == (None, None, None)
+    assert (found.adjacency, found.speed_release) == ("replace", "mean")

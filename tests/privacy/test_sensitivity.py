@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dptse_env.privacy.sensitivity import paper_sensitivity
+from dptse_env.privacy.sensitivity import contribution_sensitivity, paper_sensitivity
 
 NOMINAL = {
     "n_sensors": 8,
@@ -65,3 +65,52 @@ def test_bad_arguments_are_named(name, value):
 def test_a_fraction_of_a_sensor_is_refused():
     with pytest.raises(ValueError, match=r"^n_sensors must be an integer >= 1, got 7\.5$"):
         bounds(n_sensors=7.5)
+
+
+# --- bounded contributions ------------------------------------------------------------------------
+
+
+def bounded(contributions=4, adjacency="replace", **changes):
+    numbers = {"segment_length": 0.1, "largest_speed": 102.0, "protects": "a trip", **changes}
+    return contribution_sensitivity(contributions=contributions, adjacency=adjacency, **numbers)
+
+
+def test_one_vehicle_more_adds_one_term_a_step():
+    sensitivity = bounded(adjacency="add_remove")
+    assert [r.bound for r in sensitivity.releases] == pytest.approx([2 * 10.0, 2 * 510.0])
+    assert [r.unit for r in sensitivity.releases] == ["veh/km", "veh/h"]
+    assert sensitivity.joint_mu((20.0, 1020.0)) == pytest.approx(math.sqrt(2.0))
+    assert sensitivity.contributions == 4
+    assert sensitivity.void_reasons == ()
+
+
+def test_one_vehicle_replaced_is_on_two_segments_or_on_one_at_opposite_speeds():
+    sensitivity = bounded()
+    density, flow = sensitivity.releases
+    assert density.bound == pytest.approx(math.sqrt(8.0) * 10.0)
+    assert flow.bound == pytest.approx(2.0 * 1020.0)
+    # Not both at once: with little noise on one quantity, that one counts alone.
+    apart = math.hypot(density.bound / 100.0, math.sqrt(8.0) * 510.0 / 5100.0)
+    assert sensitivity.joint_mu((100.0, 5100.0)) == pytest.approx(apart)
+    assert sensitivity.joint_mu((1e9, 5100.0)) == pytest.approx(flow.bound / 5100.0)
+
+
+def test_mean_speeds_keep_the_papers_relation_and_say_that_it_fails():
+    sensitivity = bounded(mean_speed_slope=0.3)
+    density, speed = sensitivity.releases
+    assert (speed.quantity, speed.unit) == ("speed", "km/h")
+    assert speed.bound == pytest.approx(0.3 * density.bound)
+    assert sensitivity.void_reasons == ("speed_sensitivity",)
+
+
+def test_the_numbers_behind_a_bound_are_public():
+    assert dict(bounded().assumptions) == {
+        "contributions": 4, "segment_length_km": 0.1, "largest_speed_km_h": 102.0,
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["contributions", "segment_length", "largest_speed"])
+@pytest.mark.parametrize("value", [0, -1.0, math.nan])
+def test_bad_numbers_of_a_bound_are_named(name, value):
+    with pytest.raises(ValueError, match=rf"^{name} must be .*, got {value!r}$"):
+        bounded(**{name: value})

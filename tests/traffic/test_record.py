@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dptse_env.traffic import InvalidRecordError, Record, mean_dwell
-from dptse_env.traffic.record import COLUMNS
+from dptse_env.traffic.record import COLUMNS, _checksum
 
 SOURCE = {"corridor": "abc", "seed": 3, "sumo": "1.28.0"}
 
@@ -43,7 +43,12 @@ def test_counts_and_speed_sums_by_hand():
     assert record.n_vehicles == 5
 
 
-@given(st.lists(st.tuples(st.integers(0, 5), st.integers(0, 9), st.integers(0, 3)), max_size=40))
+def once_a_step():
+    entry = st.tuples(st.integers(0, 5), st.integers(0, 9), st.integers(0, 3))
+    return st.lists(entry, max_size=40, unique_by=lambda one: one[:2])
+
+
+@given(once_a_step())
 def test_rows_and_grids_agree_with_a_loop(entries):
     entries.sort()
     step, vehicle, segment = zip(*entries, strict=True) if entries else ((), (), ())
@@ -92,6 +97,10 @@ def test_a_record_does_not_follow_the_arrays_it_was_made_from():
         ({"speed": [1, 1, 1, -1, 1, 1]}, r"record\.speed must be finite and >= 0"),
         ({"n_steps": 0}, r"record\.n_steps must be an integer >= 1, got 0"),
         ({"speed": np.ones((6, 1))}, r"record\.speed must be one-dimensional"),
+        (
+            {"vehicle": [0, 1, 4, 1, 4, 4]},
+            r"record\.vehicle must be at most once in a step, got vehicle 4 twice in step 1",
+        ),
     ],
 )
 def test_impossible_tables_are_refused(fields, message):
@@ -180,6 +189,16 @@ def flip_a_byte(path):
     (path / "speed.npy").write_bytes(content)
 
 
+def double_a_vehicle(path):
+    """Write a record that no recording makes, with a checksum that is right."""
+    vehicle = np.load(path / "vehicle.npy")
+    vehicle[:] = 0
+    np.save(path / "vehicle.npy", vehicle)
+    manifest = json.loads((path / "manifest.json").read_text())
+    del manifest["sha256"]
+    edit_manifest(path, sha256=_checksum(path, manifest))
+
+
 def edit_manifest(path, **changes):
     manifest = json.loads((path / "manifest.json").read_text())
     (path / "manifest.json").write_text(json.dumps(manifest | changes))
@@ -187,6 +206,7 @@ def edit_manifest(path, **changes):
 
 DAMAGE = {
     "flipped bit": flip_a_byte,
+    "vehicle in two places": double_a_vehicle,
     "truncated column": lambda path: os.truncate(path / "step.npy", 130),
     "empty column": lambda path: os.truncate(path / "step.npy", 0),
     "missing column": lambda path: (path / "vehicle.npy").unlink(),

@@ -1,0 +1,112 @@
+"""The environment under the preset that guarantees privacy: account, warnings, truth."""
+
+import json
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from .test_env import assert_same, play, short
+
+
+def guaranteed(**keywords):
+    return short(**{"privacy": {"preset": "guaranteed", "cap": 5}, **keywords})
+
+
+def test_the_account_of_a_guarantee_is_in_info():
+    env = guaranteed(horizon=20)
+    (_, at_reset), *steps = play(env, 20)
+    account = at_reset["privacy"]
+    assert json.loads(json.dumps(account, allow_nan=False)) == account
+    assert account["guarantee"].startswith("(1, 0.05)-differential privacy of density and flow")
+    assert account["void_reasons"] == []
+    assert (account["unit"], account["cap"], account["adjacency"]) == ("trip", 5, "replace")
+    assert account["assumptions"]["contributions"] == 5
+    mus = [at_reset["mu"], *(step[4]["mu"] for step in steps)]
+    counted = np.minimum(np.arange(21), 5)
+    np.testing.assert_allclose(mus, account["mu"] * np.sqrt(counted / 5), rtol=1e-12)
+    assert steps[-1][4]["epsilon"] == pytest.approx(account["epsilon"])
+    assert account["epsilon"] == pytest.approx(1.0)
+
+
+def test_a_void_guarantee_is_warned_of_when_the_environment_is_made():
+    with pytest.warns(UserWarning, match=r"boundary_inputs: .*without noise") as caught:
+        env = guaranteed(privacy={"preset": "guaranteed", "boundary_inputs": "true"})
+    assert len(caught) == 1
+    account = env.reset(seed=0)[1]["privacy"]
+    assert (account["guarantee"], account["void_reasons"]) == ("none", ["boundary_inputs"])
+    with pytest.warns(UserWarning, match="speed_sensitivity"):
+        env = guaranteed(privacy={"preset": "guaranteed", "speed_release": "mean"})
+    account = env.reset(seed=0)[1]["privacy"]
+    assert (account["guarantee"], account["void_reasons"]) == ("none", ["speed_sensitivity"])
+
+
+def test_making_an_environment_loads_nothing_and_opens_no_account():
+    env = gym.make("dptse_env:dptse/PrivateHighway-v0").unwrapped
+    assert env._process is None
+
+
+def test_who_was_counted_is_told_only_with_the_truth():
+    _, _, _, _, hidden = play(guaranteed(), 30)[-1]
+    assert not {"exposures", "individual_epsilon", "truth"} & set(hidden)
+    env = guaranteed(truth_in_info=True)
+    env.reset(seed=0, options={"traffic_seed": 0})
+    for _ in range(100):
+        *_, info = env.step(env.action_space.sample())
+    exposures = np.array(info["truth"]["exposures"])
+    epsilons = np.array(info["truth"]["individual_epsilon"])
+    assert exposures.max() == 5
+    assert epsilons.max() == pytest.approx(info["epsilon"])
+    np.testing.assert_array_equal(epsilons == 0.0, exposures == 0)
+    assert (exposures == 0).any()
+    record = env.unwrapped.process.sensing.record(0)
+    assert len(exposures) == len(epsilons) == record.n_vehicles
+    _, again = env.reset(options={"traffic_seed": 0})
+    assert not any(again["truth"]["exposures"])
+    assert not any(again["truth"]["individual_epsilon"])
+
+
+def test_what_is_told_of_vehicles_does_not_depend_on_other_episodes():
+    alone, after = guaranteed(truth_in_info=True), guaranteed(truth_in_info=True)
+    after.reset(seed=9, options={"traffic_seed": 1})
+    after.reset(seed=9, options={"traffic_seed": 2})
+    lengths = {after.unwrapped.process.sensing.record(slot).n_vehicles for slot in range(3)}
+    assert len(lengths) > 1
+    for env in (alone, after):
+        env.action_space.seed(0)
+    options = {"traffic_seed": min(range(3), key=lambda s: _n_vehicles(after, s))}
+    assert_same(alone.reset(seed=0, options=options), after.reset(seed=0, options=options))
+    for _ in range(60):
+        chosen = alone.action_space.sample()
+        assert_same(alone.step(chosen), after.step(chosen))
+
+
+def _n_vehicles(env, slot):
+    return env.unwrapped.process.sensing.record(slot).n_vehicles
+
+
+def test_vector_environments_of_gymnasium_take_the_truth():
+    """Records differ in their number of vehicles, and Gymnasium stacks what environments tell."""
+    made = [lambda s=s: guaranteed(truth_in_info=True, traffic_seeds=[s]) for s in range(3)]
+    env = gym.vector.SyncVectorEnv(made)
+    env.reset(seed=0)
+    for _ in range(3):
+        *_, info = env.step(env.action_space.sample())
+    told = info["truth"]["exposures"]
+    assert len({len(one) for one in told}) > 1
+    env.close()
+
+
+def test_a_spec_with_every_privacy_keyword_survives_json():
+    env = gym.make(
+        "dptse_env:dptse/PrivateHighway-v0",
+        privacy={
+            "epsilon": 2.0, "delta": 0.01, "unit": "horizon", "cap": 8, "adjacency": "add_remove",
+            "share": 0.25, "speed_release": "flow", "boundary_inputs": "private",
+        },
+        traffic_seeds="0:2",
+        horizon=20,
+    )  # fmt: skip
+    again = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
+    assert again.unwrapped.config == env.unwrapped.config
+    assert_same(play(env, 5), play(again, 5))
