@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from dptse_env.model.arz import ARZModel
@@ -20,6 +20,7 @@ ROADS = {
 
 @pytest.mark.parametrize("parameters", [PAPER, W99, NO_RELAXATION], ids=lambda p: p.name)
 @pytest.mark.parametrize("road", ROADS.values(), ids=ROADS.keys())
+@example(seed=405074828)  # a gap w - v of one rounding, whose power has a steep derivative
 @given(seed=st.integers(0, 2**32 - 1))
 def test_equals_numpy(road, parameters, seed):
     plain, compiled = ARZModel(road, parameters), CompiledARZModel(road, parameters)
@@ -34,7 +35,11 @@ def test_equals_numpy(road, parameters, seed):
     by_scale = scale[None, :] / scale[:, None]
     expected = plain.jacobian(states, inputs) * by_scale
     got = compiled.jacobian(states, inputs) * by_scale
-    np.testing.assert_allclose(got, expected, rtol=1e-12, atol=1e-12)
+    # Where a rounding of the state alone changes a derivative, it may do so between the two.
+    rounded = [plain.jacobian(states * (1.0 + e), inputs) * by_scale for e in (4e-16, -4e-16)]
+    slack = np.max([np.abs(one - expected) for one in rounded], axis=0)
+    error = np.abs(got - expected)
+    np.testing.assert_array_less(error, 1e-12 * (1.0 + np.abs(expected)) + 10.0 * slack)
 
 
 def test_stays_equal_over_an_episode():
