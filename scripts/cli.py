@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 import sys
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import tyro
 
@@ -27,3 +28,21 @@ def run(main: Callable[[ArgsT], None], arguments: type[ArgsT], description: str 
     except (OSError, ValueError, NetworkError, RecordingError, SumoVersionError) as problem:
         print(f"error: {problem}", file=sys.stderr)
         raise SystemExit(2) from problem
+
+
+def command(script: str, args: Any) -> str:
+    """Return the command that makes the same results, whatever the machine and the folder.
+
+    Args:
+        script: Name of the script.
+        args: Its arguments, a dataclass; those that are not at their default are named.
+    """
+    words = [f"python scripts/{script}.py"]
+    for field in dataclasses.fields(args):
+        value = getattr(args, field.name)
+        if value == field.default or field.name in ("workers", "records", "output"):
+            continue
+        words.append("--" + field.name.replace("_", "-"))
+        if value is not True:
+            words += map(str, value) if isinstance(value, tuple) else [str(value)]
+    return " ".join(words)

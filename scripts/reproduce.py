@@ -13,23 +13,22 @@ import os
 # Read when numpy loads, here and in the workers: one thread each.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-import dataclasses
 import sys
 from dataclasses import dataclass
 from pathlib import Path
 
 from agents.evaluation import EpisodeScore
-from agents.reproduction.ledger import Ledger
+from agents.ledger import Ledger
+from agents.provenance import provenance, take_folder
 from agents.reproduction.measured import Measured
-from agents.reproduction.plan import ESTIMATORS, Design, quick
-from agents.reproduction.provenance import provenance, take_folder
+from agents.reproduction.plan import ESTIMATORS, Cell, Design, quick
 from agents.reproduction.report import draw, write_report
-from agents.reproduction.runner import make_env, missing, run_all
 from agents.reproduction.timing import StepTime, time_all
+from agents.runner import make_env, missing, run_all
 from dptse_env.config import parse_seeds
 from dptse_env.traffic import RecordLibrary
 from dptse_env.validation import integer
-from scripts.cli import run
+from scripts.cli import command, run
 
 FULL, QUICK = Path("results/paper"), Path("results/paper-quick")
 
@@ -87,8 +86,8 @@ def main(args: Args) -> None:
     records = None if args.records is None else str(args.records)
     # This makes every environment: bad input shows before anything is run.
     origin = take_folder(output, provenance(design))
-    episodes = Ledger(output / "episodes.csv", EpisodeScore)
-    times = Ledger(output / "run_time.csv", StepTime)
+    episodes = Ledger(output / "episodes.csv", Cell, EpisodeScore)
+    times = Ledger(output / "run_time.csv", Cell, StepTime)
     try:
         record(design, args)
         run_all(missing(design, episodes, records), episodes, args.workers)
@@ -99,7 +98,7 @@ def main(args: Args) -> None:
     episodes.sort()
     measured = Measured(design, episodes.rows, times.rows)
     draw(output, measured, records)
-    write_report(output / "REPORT.md", measured, origin, command(args))
+    write_report(output / "REPORT.md", measured, origin, command("reproduce", args))
     print(f"report, figures and scores are in {output}/")
 
 
@@ -108,19 +107,6 @@ def record(design: Design, args: Args) -> None:
     env = make_env(design.env, design.cells()[0], design.seeds, None)
     corridor = env.unwrapped.config.corridor  # type: ignore[attr-defined]
     RecordLibrary(args.records).ensure(corridor, design.seeds, args.workers, progress=True)
-
-
-def command(args: Args) -> str:
-    """Return the command that makes these results, whatever the machine and the folder."""
-    words = ["python scripts/reproduce.py"]
-    for field in dataclasses.fields(args):
-        value = getattr(args, field.name)
-        if value == field.default or field.name in ("workers", "records", "output"):
-            continue
-        words.append("--" + field.name.replace("_", "-"))
-        if value is not True:
-            words += map(str, value) if isinstance(value, tuple) else [str(value)]
-    return " ".join(words)
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 from dptse_env.config import TEST_SEEDS
 from dptse_env.estimators import check_estimator
@@ -14,6 +14,8 @@ ESTIMATORS = ("ekf", "ukf", "enkf", "mhe")
 """The paper's estimators, in its order."""
 BASELINES = ("random_walk", "open_loop")
 """No traffic model, and no measurements: run beside the others in every result."""
+SCHEDULE = "paper"
+"""Query schedule of every episode."""
 EPSILON, DELTA = 1.0, 0.05
 """The paper's privacy parameters wherever they are not swept."""
 
@@ -62,9 +64,9 @@ class Cell:
     bandwidth: int
 
     @property
-    def settings_name(self) -> str:
-        """Names the estimator's settings, which depend on nothing else."""
-        return f"{self.estimator}-{self.parameters}-{self.privacy}"
+    def keywords(self) -> dict[str, Any]:
+        """Keywords of ``gym.make`` that make it."""
+        return dataclasses.asdict(self)
 
 
 @dataclass(frozen=True)
@@ -115,6 +117,7 @@ class Design:
     n_timed: int = 10
     estimators: tuple[str, ...] = ESTIMATORS
     env: str = "dptse_env:dptse/PaperHighway-v0"
+    schedule: ClassVar[str] = SCHEDULE
 
     def __post_init__(self) -> None:
         """Check what no environment checks."""

@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 from agents.evaluation import WARM_UP, watch_episode
 from agents.reproduction.figures import save
 from agents.reproduction.measures import LABELS
-from agents.reproduction.plan import SETTINGS, Design, Setting
-from agents.reproduction.runner import SCHEDULE, make_env
+from agents.reproduction.plan import SCHEDULE, SETTINGS, Design, Setting
+from agents.runner import make_env
 from dptse_env.rendering import DENSITY_MAP, History
 from dptse_env.schedules import make_schedule
 

@@ -10,9 +10,9 @@ from typing import Any
 from tqdm import tqdm
 
 from agents.evaluation import run_episode
-from agents.reproduction.ledger import Ledger
-from agents.reproduction.plan import Cell, Design
-from agents.reproduction.runner import SCHEDULE, make_env
+from agents.ledger import Ledger
+from agents.reproduction.plan import SCHEDULE, Cell, Design
+from agents.runner import make_env
 from dptse_env.schedules import make_schedule
 
 PAPER_SECONDS = {"ekf": 0.06, "ukf": 0.026, "enkf": 0.040, "mhe": 0.045}
@@ -69,7 +69,7 @@ def step_time(env: Any, seed: int) -> StepTime:
 
 
 def time_all(
-    design: Design, ledger: Ledger[StepTime], records: str | None, progress: bool = True
+    design: Design, ledger: Ledger[Cell, StepTime], records: str | None, progress: bool = True
 ) -> None:
     """Time what the ledger lacks, one episode after the other in this process."""
     todo = [pair for pair in design.timed() if pair not in ledger.rows]

@@ -4,9 +4,10 @@ import json
 import pytest
 from PIL import Image
 
-from agents.reproduction import runner
+from agents import runner
 from scripts import reproduce
-from scripts.reproduce import Args, command, design_of, main
+from scripts.cli import command
+from scripts.reproduce import Args, design_of, main
 
 SMALL = {
     "env": "dptse_env:dptse/ShortHighway-v0",
@@ -103,9 +104,9 @@ def test_bad_arguments_are_named_and_nothing_is_written(changes, message, tmp_pa
 
 
 def test_the_command_says_what_matters_to_the_results(tmp_path):
-    assert command(Args()) == "python scripts/reproduce.py"
+    assert command("reproduce", Args()) == "python scripts/reproduce.py"
     args = Args(quick=True, epsilons=(0.5, 2.0), workers=7, output=tmp_path, records=tmp_path)
-    assert command(args) == "python scripts/reproduce.py --quick --epsilons 0.5 2.0"
+    assert command("reproduce", args) == "python scripts/reproduce.py --quick --epsilons 0.5 2.0"
 
 
 def test_quick_asks_for_less():

@@ -9,8 +9,8 @@ from agents.evaluation import run_episode
 from agents.reproduction import figures
 from agents.reproduction.figures import LOOKS, save_sweeps, save_times
 from agents.reproduction.plan import SETTINGS, Design
-from agents.reproduction.runner import make_env
 from agents.reproduction.space_time import save_space_time, watch
+from agents.runner import make_env
 from agents.statistics import Interval
 from dptse_env.config import resolve
 from dptse_env.schedules import make_schedule

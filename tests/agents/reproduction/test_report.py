@@ -3,9 +3,9 @@ import dataclasses
 
 import pytest
 
+from agents.provenance import provenance
 from agents.reproduction.paper_claims import CLAIMS, TARGETS
 from agents.reproduction.plan import SETTINGS
-from agents.reproduction.provenance import provenance
 from agents.reproduction.report import write_report
 from agents.reproduction.tables import (
     base_table,

@@ -3,8 +3,8 @@ import time
 import pytest
 
 from agents.reproduction.plan import Cell
-from agents.reproduction.runner import make_env
 from agents.reproduction.timing import PAPER_SECONDS, Stopwatch, step_time
+from agents.runner import make_env
 from dptse_env.config import resolve
 from dptse_env.traffic import RecordLibrary
 

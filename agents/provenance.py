@@ -13,15 +13,16 @@ from typing import Any
 
 import dptse_env
 from agents.evaluation import WARM_UP
-from agents.reproduction.plan import SETTINGS, Cell, Design
-from agents.reproduction.runner import SCHEDULE, make_env
-from dptse_env.estimators.tuning import available_settings
+from agents.ledger import Cell, CellT
+from agents.runner import Design, make_env
+from dptse_env.config import EnvConfig
+from dptse_env.estimators.tuning import available_settings, settings_name
 from dptse_env.model import load_parameters
 
 FILE = "run.json"
 
 
-def provenance(design: Design) -> dict[str, Any]:
+def provenance(design: Design[CellT]) -> dict[str, Any]:
     """Return everything beside the cells and seeds that the results depend on, as plain JSON.
 
     ``made_with`` must agree for results to stand in one folder. ``tuned`` names the settings that
@@ -31,21 +32,19 @@ def provenance(design: Design) -> dict[str, Any]:
     Raises:
         ValueError: A cell of the design is out of range; the message names the value.
     """
-    cells = design.cells()
-    corridor = _config(design, cells[0]).corridor
+    configs = [_config(design, cell) for cell in design.cells()]
     made_with: dict[str, Any] = {
         "versions": {name: version(name) for name in ("dptse-env", "libsumo")},
         "env": design.env,
-        "corridor": corridor.digest,
-        "schedule": SCHEDULE,
+        "corridor": configs[0].corridor.digest,
+        "schedule": design.schedule,
         "warm_up": WARM_UP,
         "parameters": {
             name: dataclasses.asdict(load_parameters(name))
-            for name in dict.fromkeys(setting.parameters for setting in SETTINGS)
+            for name in dict.fromkeys(str(config.parameters) for config in configs)
         },
         "settings": {
-            cell.settings_name: dataclasses.asdict(_config(design, cell).settings())
-            for cell in cells
+            _settings_name(config): dataclasses.asdict(config.settings()) for config in configs
         },
     }
     machine = {
@@ -53,7 +52,7 @@ def provenance(design: Design) -> dict[str, Any]:
         "platform": platform.platform(),
         **{name: version(name) for name in ("gymnasium", "numba", "numpy", "scipy")},
     }
-    tuned = [name for name in made_with["settings"] if name in available_settings()]
+    tuned = sorted(made_with["settings"].keys() & available_settings())
     whole = {
         "made_with": made_with,
         "tuned": tuned,
@@ -73,8 +72,14 @@ def _source() -> str:
     return digest.hexdigest()[:12]
 
 
-def _config(design: Design, cell: Cell) -> Any:
-    return make_env(design.env, cell, design.seeds, None).unwrapped.config  # type: ignore[attr-defined]
+def _config(design: Design[Any], cell: Cell) -> EnvConfig:
+    env = make_env(design.env, cell, design.seeds, None)
+    config: EnvConfig = env.unwrapped.config  # type: ignore[attr-defined]
+    return config
+
+
+def _settings_name(config: EnvConfig) -> str:
+    return settings_name(config.estimator, str(config.parameters), config.privacy.preset)
 
 
 def take_folder(folder: Path, own: Mapping[str, Any]) -> dict[str, Any]:

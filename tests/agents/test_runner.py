@@ -6,11 +6,11 @@ from typing import ClassVar
 
 import pytest
 
+from agents import runner
 from agents.evaluation import EpisodeScore, run_episode
-from agents.reproduction import runner
-from agents.reproduction.ledger import Ledger
-from agents.reproduction.plan import SETTINGS, Cell, Design
-from agents.reproduction.runner import Task, make_env, missing, run_all, run_task
+from agents.ledger import Ledger
+from agents.reproduction.plan import SCHEDULE, SETTINGS, Cell, Design
+from agents.runner import Task, make_env, missing, run_all, run_task
 from dptse_env.config import resolve
 from dptse_env.schedules import make_schedule
 from dptse_env.traffic import RecordLibrary
@@ -19,7 +19,7 @@ SHORT = "dptse_env:dptse/ShortHighway-v0"
 SEEDS = (2000, 2001)
 EKF = Cell("ekf", "w99-3lane", "paper", 1.0, 0.05, 2)
 WALK = dataclasses.replace(EKF, estimator="random_walk")
-TASKS = [Task(SHORT, cell, SEEDS, None) for cell in (EKF, WALK)]
+TASKS = [Task(SHORT, SCHEDULE, cell, SEEDS, None) for cell in (EKF, WALK)]
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -29,7 +29,7 @@ def _records():
 
 @pytest.fixture
 def ledger(tmp_path):
-    return Ledger(tmp_path / "episodes.csv", EpisodeScore)
+    return Ledger(tmp_path / "episodes.csv", Cell, EpisodeScore)
 
 
 def test_a_task_is_a_cell_on_its_seeds():
@@ -58,11 +58,11 @@ def test_the_open_loop_hears_nothing_that_its_canonical_cell_leaves_out():
 
 def test_workers_find_what_this_process_finds(ledger, tmp_path):
     run_all(TASKS, ledger, workers=2, progress=False)
-    alone = Ledger(tmp_path / "alone.csv", EpisodeScore)
+    alone = Ledger(tmp_path / "alone.csv", Cell, EpisodeScore)
     run_all(TASKS, alone, workers=1, progress=False)
     assert ledger.rows == alone.rows
     assert set(ledger.rows) == {(cell, seed) for cell in (EKF, WALK) for seed in SEEDS}
-    assert Ledger(ledger.path, EpisodeScore).rows == ledger.rows
+    assert Ledger(ledger.path, Cell, EpisodeScore).rows == ledger.rows
 
 
 def test_a_failure_in_a_worker_is_raised_and_leaves_no_process(ledger):
@@ -99,7 +99,7 @@ def test_an_interrupt_keeps_what_is_done_and_leaves_no_process(ledger, monkeypat
     assert multiprocessing.active_children() == []
     # Not waited for: what they were at is run again.
     assert {process.exitcode for process in Pool.processes} == {-signal.SIGTERM}
-    assert set(Ledger(ledger.path, EpisodeScore).rows) == {(done[0], seed) for seed in SEEDS}
+    assert set(Ledger(ledger.path, Cell, EpisodeScore).rows) == {(done[0], seed) for seed in SEEDS}
 
 
 def test_only_what_is_missing_is_run(ledger):

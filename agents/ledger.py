@@ -7,11 +7,19 @@ import dataclasses
 import io
 import os
 import typing
-from collections.abc import Iterable, Iterator
+from collections.abc import Hashable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
-from agents.reproduction.plan import Cell
+
+class Cell(Hashable, Protocol):
+    """A frozen dataclass of plain values: one configuration, run on every traffic seed."""
+
+    __dataclass_fields__: typing.ClassVar[dict[str, Any]]
+
+    @property
+    def keywords(self) -> dict[str, Any]:
+        """Keywords of ``gym.make`` that make it."""
 
 
 class Scored(Protocol):
@@ -24,10 +32,11 @@ class Scored(Protocol):
         """The traffic of the episode."""
 
 
+CellT = TypeVar("CellT", bound=Cell)
 ScoredT = TypeVar("ScoredT", bound=Scored)
 
 
-class Ledger(Generic[ScoredT]):
+class Ledger(Generic[CellT, ScoredT]):
     """One record for each (cell, traffic seed), on disk as soon as it is added.
 
     A process that dies while it writes leaves a last line without its end. Such a line is
@@ -38,17 +47,22 @@ class Ledger(Generic[ScoredT]):
         rows: Records by cell and traffic seed.
     """
 
-    def __init__(self, path: Path, record_type: type[ScoredT]) -> None:
+    def __init__(self, path: Path, cell_type: type[CellT], record_type: type[ScoredT]) -> None:
         """Read what is there.
+
+        Args:
+            path: The CSV file.
+            cell_type: Its fields are the first columns.
+            record_type: Its fields are the others.
 
         Raises:
             ValueError: A line but a torn last one is not as this class writes it.
         """
-        self.path, self._type = path, record_type
-        self._cell_fields = _parsers(Cell)
+        self.path, self._cell_type, self._type = path, cell_type, record_type
+        self._cell_fields = _parsers(cell_type)
         self._record_fields = _parsers(record_type)
         self.columns = (*self._cell_fields, *self._record_fields)
-        self.rows: dict[tuple[Cell, int], ScoredT] = {}
+        self.rows: dict[tuple[CellT, int], ScoredT] = {}
         if path.exists():
             self._read()
 
@@ -73,17 +87,19 @@ class Ledger(Generic[ScoredT]):
                 raise ValueError(f"{self.path}, line {number}: {problem}") from problem
             self.rows[key] = record
 
-    def _parse(self, line: list[str]) -> tuple[tuple[Cell, int], ScoredT]:
+    def _parse(self, line: list[str]) -> tuple[tuple[CellT, int], ScoredT]:
         if len(line) != len(self.columns):
             raise ValueError(f"must have {len(self.columns)} values, has {len(line)}")
         values = iter(line)
-        cell = Cell(**{name: parse(next(values)) for name, parse in self._cell_fields.items()})
+        cell = self._cell_type(
+            **{name: parse(next(values)) for name, parse in self._cell_fields.items()}
+        )
         record = self._type(
             **{name: parse(next(values)) for name, parse in self._record_fields.items()}
         )
         return (cell, record.traffic_seed), record
 
-    def append(self, cell: Cell, records: Iterable[ScoredT]) -> None:
+    def append(self, cell: CellT, records: Iterable[ScoredT]) -> None:
         """Add what one task found, and put it on disk before returning."""
         records = list(records)
         new = not self.path.exists() or self.path.stat().st_size == 0
@@ -106,7 +122,7 @@ class Ledger(Generic[ScoredT]):
         aside.replace(self.path)
 
     def _sorted(self) -> Iterator[list[Any]]:
-        def order(item: tuple[tuple[Cell, int], ScoredT]) -> tuple[Any, ...]:
+        def order(item: tuple[tuple[CellT, int], ScoredT]) -> tuple[Any, ...]:
             (cell, seed), _ = item
             return (*dataclasses.astuple(cell), seed)
 
@@ -114,7 +130,7 @@ class Ledger(Generic[ScoredT]):
             yield self._line(cell, record)
 
     @staticmethod
-    def _line(cell: Cell, record: Any) -> list[Any]:
+    def _line(cell: Any, record: Any) -> list[Any]:
         return [*dataclasses.astuple(cell), *dataclasses.astuple(record)]
 
 

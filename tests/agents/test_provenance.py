@@ -4,8 +4,8 @@ import json
 
 import pytest
 
+from agents.provenance import FILE, provenance, take_folder
 from agents.reproduction.plan import Design
-from agents.reproduction.provenance import FILE, provenance, take_folder
 
 DESIGN = Design(estimators=("ekf",), seeds=(2000, 2001))
 

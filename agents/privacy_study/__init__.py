@@ -1,0 +1,1 @@
+"""What a guarantee of privacy costs, and what noise as printed gives: planned, run, reported."""
