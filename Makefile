@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 
 export OMP_NUM_THREADS = 1
 
-.PHONY: help setup demo audit test test-slow lint format benchmark wheel-test clean clean-kernels
+.PHONY: help setup demo audit test test-slow lint format benchmark wheel-test clean clean-kernels reproduce privacy-study
 
 help:  ## Show this list.
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -23,6 +23,12 @@ $(READY): pyproject.toml constraints.txt
 
 demo: setup  ## Evaluate the query schedules on held-out traffic; results/demo.
 	$(BIN)/python scripts/evaluate.py --output results/demo
+
+reproduce: setup  ## Repeat the paper's results and judge its claims; results/paper.
+	$(BIN)/python scripts/reproduce.py
+
+privacy-study: setup  ## Measure what the guarantee costs; results/privacy.
+	$(BIN)/python scripts/privacy_study.py
 
 audit: setup  ## Attack the privacy presets, 5,000 runs in each of two worlds; results/audit.
 	$(BIN)/python scripts/audit.py --env dptse_env:dptse/PaperHighway-v0 --target replaced
