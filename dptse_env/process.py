@@ -12,6 +12,7 @@ from dptse_env.arrays import Action, BoolArray, FloatArray, IntArray, Observatio
 from dptse_env.boundary import make_boundary
 from dptse_env.config import EnvConfig
 from dptse_env.estimators import make_estimator
+from dptse_env.infos import Rows, as_objects, row_of
 from dptse_env.interface import QueryInterface
 from dptse_env.observations import AGE_CAP, Knowledge
 from dptse_env.options import ResetOptions
@@ -233,37 +234,46 @@ class QueryProcess:
         return Outcome(observation, reward, self.over[episodes])
 
     def info(self, episode: int) -> dict[str, Any]:
-        """Return what is said about one episode beside its observation.
+        """Return what is said about one episode beside its observation, in plain numbers."""
+        return row_of(self.infos(np.array([episode])), 0)
+
+    def infos(self, episodes: IntArray) -> Rows:
+        """Return what is said about ``episodes``, shape (k,): fresh arrays of k rows each.
 
         The keys in `TRUTH_INFO` come from the true traffic. They are training and evaluation
         signals like the reward, never a release.
         """
-        mu, epsilon = self.accountant.spent(self.elapsed[[episode]])
-        info: dict[str, Any] = {
-            "rmse_density": float(self.error.density[episode]),
-            "rmse_speed": float(self.error.speed[episode]),
-            "n_occupied": float(self.error.n_occupied[episode]),
-            "n_dropped": float(self.n_dropped[episode]),
-            "diverged": float(self.estimator.diverged[episode]),
-            "fallback": float(self.estimator.fallback[episode]),
-            "mu": float(mu[0]),
-            "epsilon": float(epsilon[0]),
-            "queried": self.queried[episode].copy(),
+        mu, epsilon = self.accountant.spent(self.elapsed[episodes])
+        infos: Rows = {
+            "rmse_density": self.error.density[episodes],
+            "rmse_speed": self.error.speed[episodes],
+            "n_occupied": self.error.n_occupied[episodes].astype(np.float64),
+            "n_dropped": self.n_dropped[episodes].astype(np.float64),
+            "diverged": self.estimator.diverged[episodes].astype(np.float64),
+            "fallback": self.estimator.fallback[episodes].astype(np.float64),
+            "mu": mu,
+            "epsilon": epsilon,
+            "queried": self.queried[episodes],
         }
         if self.config.truth_in_info:
-            truth = self.truth(np.array([episode]))[0]
-            info["truth"] = {
-                "density": truth[:, 0].copy(),
-                "speed": truth[:, 1].copy(),
-                "traffic_seed": self.config.traffic_seeds[self.slot[episode]],
-                "time": int(self.time[episode]),
-            }
-            if self.answers.contributions is not None:
-                exposures = self.answers.contributions.of_episode(episode, self.slot[episode])
-                # A vehicle that has counted k times has spent what one of cap k has in all.
-                _, individual = self.accountant.spent(exposures)
-                # Lists, since records differ in their number of vehicles and Gymnasium stacks
-                # arrays of equal shape only.
-                info["truth"]["exposures"] = exposures.tolist()
-                info["truth"]["individual_epsilon"] = individual.tolist()
-        return info
+            infos["truth"] = self._truth_infos(episodes)
+        return infos
+
+    def _truth_infos(self, episodes: IntArray) -> Rows:
+        truth, slots = self.truth(episodes), self.slot[episodes]
+        infos: Rows = {
+            "density": truth[:, :, 0].copy(),
+            "speed": truth[:, :, 1].copy(),
+            "traffic_seed": np.array(self.config.traffic_seeds)[slots],
+            "time": self.time[episodes],
+        }
+        counted = self.answers.contributions
+        if counted is not None:
+            exposures = [counted.of_episode(e, s) for e, s in zip(episodes, slots, strict=True)]
+            # A vehicle that has counted k times has spent what one of cap k has in all.
+            individual = [self.accountant.spent(steps)[1].tolist() for steps in exposures]
+            # Lists, since records differ in their number of vehicles and Gymnasium stacks arrays
+            # of equal shape only.
+            infos["exposures"] = as_objects([steps.tolist() for steps in exposures])
+            infos["individual_epsilon"] = as_objects(individual)
+        return infos

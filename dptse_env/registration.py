@@ -17,5 +17,6 @@ def register_environments() -> None:
             register(
                 id=env_id,
                 entry_point="dptse_env.env:SensorQueryEnv",
+                vector_entry_point="dptse_env.vector_env:SensorQueryVectorEnv",
                 kwargs={"preset": preset},
             )
