@@ -27,10 +27,10 @@ from dptse_env.traffic.sumo import simulate
 PARAMETERS, STEPS = "w99-3lane", 600
 
 
-def env_step(estimator: str, repeats: int) -> tuple[float, float]:
+def env_step(env_id: str, estimator: str, repeats: int) -> tuple[float, float]:
     """Return the time of an unwrapped step, and of its estimator alone [us]."""
     env = gym.make(
-        "dptse_env:dptse/PaperHighway-v0",
+        f"dptse_env:dptse/{env_id}",
         estimator=estimator,
         parameters=PARAMETERS,
         traffic_seeds="0:1",
@@ -60,11 +60,13 @@ def main() -> None:
     env = gym.make("dptse_env:dptse/PaperHighway-v0").unwrapped
     corridor = env.config.corridor  # type: ignore[attr-defined]
     live = per_call(lambda: simulate(corridor, 0), corridor.duration, max(repeats // 2, 1))
-    print(f"{'':14}{'step [us]':>10}{'estimator':>11}{'beside it':>11}{'SUMO / step':>13}")
-    for estimator in ESTIMATORS:
-        total, own = env_step(estimator, repeats)
-        print(f"{estimator:14}{total:10.1f}{own:11.1f}{total - own:11.1f}{live / total:13.1f}")
-    print(f"{'live SUMO':14}{live:10.1f}   per simulated second, recorded")
+    print(f"{'':20}{'step [us]':>10}{'estimator':>11}{'beside it':>11}{'SUMO / step':>13}")
+    rows = [("PaperHighway-v0", estimator) for estimator in ESTIMATORS]
+    for env_id, estimator in [*rows, ("PrivateHighway-v0", "ekf")]:
+        total, own = env_step(env_id, estimator, repeats)
+        name = estimator if env_id.startswith("Paper") else f"{estimator}, guaranteed"
+        print(f"{name:20}{total:10.1f}{own:11.1f}{total - own:11.1f}{live / total:13.1f}")
+    print(f"{'live SUMO':20}{live:10.1f}   per simulated second, recorded")
 
 
 if __name__ == "__main__":
