@@ -130,9 +130,10 @@ def _head(design: Design, command: str) -> str:
 
 def _bounds() -> str:
     return (
-        "Where the paper gives no number, the bound is ours, fixed in the code before the full run, "
-        f"after a look at three traffic seeds: errors are *close* or *comparable* within {CLOSE:g} %, a variation is *small* "
-        f"below {SMALL:g} %, curves are *similar* if they correlate by more than "
+        "Where the paper gives no number, the bound is ours, fixed in the code before the full "
+        "run, after a look at three traffic seeds: errors are *close* or *comparable* within "
+        f"{CLOSE:g} %, a variation is *small* below {SMALL:g} %, curves are *similar* if they "
+        "correlate by more than "
         f"{SIMILAR:g} along the grid."
     )
 
