@@ -8,13 +8,14 @@ whatever is asked.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
 import gymnasium as gym
 import numpy as np
 
+from dptse_env.config import TEST_SEEDS
 from dptse_env.rendering import History
 
 WARM_UP = 60
@@ -32,6 +33,22 @@ class Policy(Protocol):
         deterministic: bool = False,
     ) -> tuple[Any, Any]:
         """Return an action and the policy's next state."""
+
+
+def check_held_out(seeds: Sequence[int]) -> None:
+    """Refuse traffic seeds that a report must not rest on.
+
+    Raises:
+        ValueError: There are fewer than two, one stands twice, or one is not in `TEST_SEEDS`.
+    """
+    if len(set(seeds)) < 2 or len(set(seeds)) < len(seeds):
+        raise ValueError(f"seeds must be 2 or more and distinct, got {seeds}")
+    strangers = [seed for seed in seeds if seed not in TEST_SEEDS]
+    if strangers:
+        raise ValueError(
+            f"seeds must be held out, in {TEST_SEEDS[0]}..{TEST_SEEDS[-1]}: those below serve "
+            f"training and validation; got {strangers[0]}"
+        )
 
 
 @dataclass(frozen=True)

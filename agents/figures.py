@@ -55,7 +55,7 @@ def save_ladder(
         handles, labels, loc="outside lower right", ncols=len(labels), frameon=False, fontsize=8
     )
     figure.suptitle(title, x=0.01, ha="left", fontsize=10)
-    _save(figure, path)
+    save(figure, path)
 
 
 def _dot(axis: Any, interval: Interval, place: float, colour: str, label: str | None) -> None:
@@ -112,9 +112,10 @@ def save_space_time(path: Path, histories: Mapping[str, History], title: str) ->
     bar = figure.colorbar(density, ax=axes.tolist(), fraction=0.025, pad=0.02, extend="max")
     bar.set_label("density [veh/km]", fontsize=8)
     figure.suptitle(title, x=0.01, ha="left", fontsize=10)
-    _save(figure, path)
+    save(figure, path)
 
 
-def _save(figure: Figure, path: Path) -> None:
+def save(figure: Figure, path: Path) -> None:
+    """Save a figure as PNG, without pyplot and its global state."""
     path.parent.mkdir(parents=True, exist_ok=True)
     FigureCanvasAgg(figure).print_png(str(path))

@@ -135,10 +135,7 @@ def _done(
         return
     # Threads of the linear algebra would fight over the cores; children read this as they start.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    # Spawned, not forked: this process may hold threads and a loaded simulation.
-    pool = ProcessPoolExecutor(
-        workers, mp_context=multiprocessing.get_context("spawn"), initializer=_begin_worker
-    )
+    pool = make_pool(workers)
     try:
         running = {pool.submit(run_task, task): task for task in tasks}
         for future in as_completed(running):
@@ -150,6 +147,13 @@ def _done(
         raise
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+def make_pool(workers: int) -> ProcessPoolExecutor:
+    """Return processes that leave interrupts to this one and end with it, however it ends."""
+    # Spawned, not forked: this process may hold threads and a loaded simulation.
+    context = multiprocessing.get_context("spawn")
+    return ProcessPoolExecutor(workers, mp_context=context, initializer=_begin_worker)
 
 
 def _begin_worker() -> None:

@@ -12,10 +12,6 @@ where it stopped, and with more --trials it searches on; other arguments need an
 from __future__ import annotations
 
 import itertools
-import multiprocessing
-import os
-import signal
-import threading
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +22,7 @@ from rich.console import Console
 from rich.table import Table
 from tqdm import tqdm
 
+from agents.runner import make_pool
 from agents.search_space import SPACE
 from agents.tuning import TuningStudy, scores_of
 from agents.tuning_task import NOISE_SEED, TuningTask
@@ -110,26 +107,6 @@ def make_tasks(args: Args) -> list[TuningTask]:
     if not tasks:
         raise ValueError("estimators, parameters and privacy must not be empty")
     return list(tasks.values())
-
-
-def make_pool(n_workers: int) -> ProcessPoolExecutor:
-    """Return processes that end with this one, however it ends."""
-    context = multiprocessing.get_context("spawn")
-    return ProcessPoolExecutor(n_workers, context, initializer=_start_worker)
-
-
-def _start_worker() -> None:
-    # Ctrl-C reaches the whole process group; the parent decides what becomes of the workers.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    parent = multiprocessing.parent_process()
-    if parent is None:
-        raise RuntimeError("a worker needs a parent process")
-
-    def follow() -> None:
-        parent.join()
-        os._exit(1)  # the parent was killed, and nobody waits for a result
-
-    threading.Thread(target=follow, daemon=True).start()
 
 
 def tune(study: TuningStudy, args: Args, pool: ProcessPoolExecutor) -> None:

@@ -10,10 +10,10 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
+from agents.figures import save
 from agents.privacy_study.account import Account
 from agents.privacy_study.measured import DENSITY, METRICS, SPEED, Measured
 from agents.privacy_study.plan import BOUNDARY_MODES, OPEN_LOOP, Cell, Protection
-from agents.reproduction.figures import save
 from agents.reproduction.measures import LABELS
 from agents.statistics import Interval
 

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter, NullLocator
 
+from agents.figures import save
 from agents.reproduction.measured import Measured
 from agents.reproduction.measures import DENSITY, LABELS, SPEED, UNITS
 from agents.reproduction.plan import ESTIMATORS, SETTINGS, Setting
@@ -230,8 +230,3 @@ def _times(axis: Any, measured: Measured, places: Any, relative: bool) -> None:
         color="#000000",
         label="the paper",
     )
-
-
-def save(figure: Figure, path: Path) -> None:
-    """Save a figure as PNG, without pyplot and its global state."""
-    FigureCanvasAgg(figure).print_png(str(path))

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
+from agents.evaluation import check_held_out
 from dptse_env.config import TEST_SEEDS
 from dptse_env.estimators import check_estimator
 
@@ -121,14 +122,7 @@ class Design:
 
     def __post_init__(self) -> None:
         """Check what no environment checks."""
-        if len(set(self.seeds)) < 2 or len(set(self.seeds)) < len(self.seeds):
-            raise ValueError(f"seeds must be 2 or more and distinct, got {self.seeds}")
-        strangers = [seed for seed in self.seeds if seed not in TEST_SEEDS]
-        if strangers:
-            raise ValueError(
-                f"seeds must be held out, in {TEST_SEEDS[0]}..{TEST_SEEDS[-1]}: those below serve "
-                f"training and validation; got {strangers[0]}"
-            )
+        check_held_out(self.seeds)
         if self.n_timed < 2:
             raise ValueError(f"n_timed must be >= 2, got {self.n_timed}")
         for name in self.estimators:

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from agents.evaluation import WARM_UP, watch_episode
-from agents.reproduction.figures import save
+from agents.figures import save
 from agents.reproduction.measures import LABELS
 from agents.reproduction.plan import SCHEDULE, SETTINGS, Design, Setting
 from agents.runner import make_env
