@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 
 from dptse_env.arrays import FloatArray
 from dptse_env.model import ARZModel
@@ -14,29 +15,31 @@ def _published(corridor: Corridor) -> Demand:
     return demand.base if isinstance(demand, DemandDistribution) else demand
 
 
-def nominal_flows(corridor: Corridor, time: float) -> FloatArray:
-    """Return the flow through each segment at the published demand [veh/h], shape (S,).
+def nominal_flows(corridor: Corridor, times: npt.ArrayLike) -> FloatArray:
+    """Return the flow through each segment at the published demand [veh/h], shape (..., S).
 
     Args:
         corridor: The road; a demand distribution counts with its base.
-        time: Second of the record [s].
+        times: Seconds of the record [s], shape (...).
     """
     demand = _published(corridor)
-    flow = next(rate for start, rate in reversed(demand.mainline) if start <= time)
+    starts, rates = np.array(demand.mainline).T
+    flow = rates[np.searchsorted(starts, times, side="right") - 1]
     on = dict(zip(corridor.on_ramps, demand.on_ramps, strict=True))
     off = dict(zip(corridor.off_ramps, corridor.exit_shares, strict=True))
+    entries = [np.full_like(flow, rate) for rate in demand.on_ramps]
     mainline, exits = [], []
     for segment in range(corridor.n_mainline):
         if segment in off:
             exits.append(off[segment] * flow)
-            flow -= exits[-1]
-        flow += on.get(segment, 0.0)
+            flow = flow - exits[-1]
+        flow = flow + on.get(segment, 0.0)
         mainline.append(flow)
-    return np.array([*mainline, *demand.on_ramps, *exits])
+    return np.stack([*mainline, *entries, *exits], axis=-1)
 
 
 def free_flow_density(model: ARZModel, flow: FloatArray) -> FloatArray:
-    """Return the density [veh/km] at which each segment carries ``flow`` freely, both (S,).
+    """Return the density [veh/km] at which each segment carries ``flow`` freely, both (..., S).
 
     The smaller root of q = rho (v_f - p(rho)); a flow above the capacity gives the critical
     density.
@@ -61,7 +64,7 @@ def nominal_inputs(corridor: Corridor, model: ARZModel) -> FloatArray:
     layout, v_f = model.layout, model.parameters.free_flow_speed
     n, n_on = corridor.n_mainline, len(corridor.on_ramps)
     demand = _published(corridor)
-    flows = np.array([nominal_flows(corridor, time) for time in range(corridor.duration + 1)])
+    flows = nominal_flows(corridor, np.arange(corridor.duration + 1))
     inputs = np.empty((len(flows), model.n_inputs))
     inputs[:, layout.entry_inputs[0]] = flows[:, 0]  # no ramp lies ahead of the first segment
     inputs[:, layout.entry_inputs[1:]] = demand.on_ramps
@@ -71,12 +74,17 @@ def nominal_inputs(corridor: Corridor, model: ARZModel) -> FloatArray:
     return inputs
 
 
-def nominal_state(corridor: Corridor, model: ARZModel, time: float) -> FloatArray:
-    """Return the free-flow equilibrium of the published demand, shape (n_x,).
+def nominal_state(corridor: Corridor, model: ARZModel, times: npt.ArrayLike) -> FloatArray:
+    """Return the free-flow equilibrium of the published demand, shape (..., n_x).
 
     It is public: it depends on the corridor's description and the clock, never on a record.
+
+    Args:
+        corridor: The road.
+        model: Its traffic model.
+        times: Seconds of the record [s], shape (...).
     """
-    density = free_flow_density(model, nominal_flows(corridor, time))
+    density = free_flow_density(model, nominal_flows(corridor, times))
     v_f, gamma = model.parameters.free_flow_speed, model.parameters.gamma
     speed = v_f * (1.0 - (density / model.jam_density) ** gamma)
     return model.states(density, speed)
