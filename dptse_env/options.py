@@ -2,68 +2,91 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from dptse_env.arrays import IntArray
 from dptse_env.config import EnvConfig
+
+NAMES = ("traffic_seed", "start")
 
 
 @dataclass(frozen=True)
 class ResetOptions:
-    """Checked reset options; None where the episode draws for itself.
+    """Checked reset options of k episodes; None where an episode draws for itself.
 
     Attributes:
         config: The configuration they were checked against.
-        slot: Index into ``config.traffic_seeds``.
-        start: First second of the record.
+        slots: Indices into ``config.traffic_seeds``, k of them.
+        starts: First seconds of the record, k of them.
     """
 
     config: EnvConfig
-    slot: int | None = None
-    start: int | None = None
+    slots: list[int | None]
+    starts: list[int | None]
 
     @classmethod
-    def of(cls, options: Mapping[str, Any] | None, config: EnvConfig) -> ResetOptions:
-        """Check ``options``.
+    def of(
+        cls, options: Mapping[str, Any] | None, config: EnvConfig, n_episodes: int = 1
+    ) -> ResetOptions:
+        """Check ``options``: each one value for all episodes, or one for each.
 
         Raises:
-            ValueError: A key is unknown or a value out of range.
+            ValueError: A key is unknown, a value out of range, or there are too many or too few.
         """
         options = options or {}
-        allowed = ("traffic_seed", "start")
         for key in options:
-            if key not in allowed:
-                raise ValueError(f"options.{key} is unknown; allowed: {', '.join(allowed)}")
-        slot, start = options.get("traffic_seed"), options.get("start")
-        if slot is not None:
-            if slot not in config.traffic_seeds:
+            if key not in NAMES:
+                raise ValueError(f"options.{key} is unknown; allowed: {', '.join(NAMES)}")
+        seeds, starts = (per_episode(key, options.get(key), n_episodes) for key in NAMES)
+        known, last = config.traffic_seeds, config.last_start
+        for seed in seeds:
+            if seed is not None and seed not in known:
                 raise ValueError(
                     f"options.traffic_seed must be one of the environment's "
-                    f"{len(config.traffic_seeds)} traffic_seeds, got {slot!r}"
+                    f"{len(known)} traffic_seeds, got {seed!r}"
                 )
-            slot = config.traffic_seeds.index(slot)
-        last = config.last_start
-        if start is not None and not (
-            isinstance(start, int | np.integer)
-            and not isinstance(start, bool)
-            and 0 <= start <= last
-        ):
-            raise ValueError(f"options.start must be an integer in 0..{last}, got {start!r}")
-        return cls(config, slot, None if start is None else int(start))
+        for start in starts:
+            if start is not None and (type(start) is not int or not 0 <= start <= last):
+                raise ValueError(f"options.start must be an integer in 0..{last}, got {start!r}")
+        slots = [None if seed is None else known.index(seed) for seed in seeds]
+        return cls(config, slots, starts)
 
-    def draw(self, generator: np.random.Generator) -> tuple[int, int]:
-        """Return (slot, start) for one episode; what is not fixed is drawn.
+    def draw(self, generators: Sequence[np.random.Generator]) -> tuple[IntArray, IntArray]:
+        """Return the slots and first seconds of the episodes; what is not fixed is drawn.
 
         Both are drawn whether needed or not, so that fixing one leaves the other as it was.
         """
-        slot = int(generator.integers(len(self.config.traffic_seeds)))
-        start = int(generator.integers(self.config.last_start + 1))
-        if not self.config.random_start:
-            start = 0
-        return (
-            slot if self.slot is None else self.slot,
-            start if self.start is None else self.start,
+        slots = np.empty(len(generators), dtype=np.int64)
+        starts = np.empty(len(generators), dtype=np.int64)
+        for k, generator in enumerate(generators):
+            slot = int(generator.integers(len(self.config.traffic_seeds)))
+            start = int(generator.integers(self.config.last_start + 1))
+            fixed_slot, fixed_start = self.slots[k], self.starts[k]
+            slots[k] = slot if fixed_slot is None else fixed_slot
+            if fixed_start is None:
+                fixed_start = start if self.config.random_start else 0
+            starts[k] = fixed_start
+        return slots, starts
+
+
+def per_episode(name: str, value: Any, n_episodes: int) -> list[Any]:
+    """Return the values of option ``name``, one per episode, given one for all or one for each.
+
+    numpy's integers come back as Python's.
+
+    Raises:
+        ValueError: There are too many or too few.
+    """
+    if not isinstance(value, list | tuple | np.ndarray) or np.ndim(value) == 0:
+        values = [value] * n_episodes
+    elif len(value) != n_episodes:
+        raise ValueError(
+            f"options.{name} must be one value or {n_episodes}, one per episode, got {len(value)}"
         )
+    else:
+        values = list(value)
+    return [one.item() if isinstance(one, np.integer) else one for one in values]

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from dptse_env.arrays import Action, BoolArray, FloatArray, IntArray, Observation
+from dptse_env.blocks import Blocks
 from dptse_env.boundary import make_boundary
 from dptse_env.config import EnvConfig
 from dptse_env.estimators import make_estimator
@@ -66,6 +67,7 @@ class QueryProcess:
         interface: QueryInterface,
         n_episodes: int,
         library: RecordLibrary | None = None,
+        threads: int | None = 1,
     ) -> None:
         """Assemble the rooms; nothing is recorded or loaded before `reset`.
 
@@ -74,6 +76,7 @@ class QueryProcess:
             interface: The interface made of the same configuration.
             n_episodes: Size of the batch n.
             library: Where records come from; the user's cache if None.
+            threads: Threads that the estimators of a large batch may use; None for one per core.
         """
         corridor = config.corridor
         n, s = n_episodes, corridor.n_segments
@@ -90,6 +93,7 @@ class QueryProcess:
         self.estimator = make_estimator(
             config.estimator, config.backend, self.model, n, config.settings()
         )
+        self._blocks = Blocks(threads)
         interface.actions.start(n)
         self._observed_always = np.zeros(columns, dtype=bool)
         self._observed_always[[*corridor.fixed_sensors, *range(s, columns)]] = True
@@ -116,28 +120,27 @@ class QueryProcess:
             generators: One generator per episode; each gives a seed for the traffic, the noise and
                 the estimator, whatever else is configured.
             options: ``traffic_seed`` fixes the traffic (one of ``config.traffic_seeds``) and
-                ``start`` the first second of the record.
+                ``start`` the first second of the record; each one value, or k of them.
 
         Raises:
             ValueError: An option is unknown or out of range.
             RecordingError: SUMO could not make a record.
         """
-        choice = ResetOptions.of(options, self.config)
+        choice = ResetOptions.of(options, self.config, len(episodes))
         streams = [
             [np.random.default_rng(seed) for seed in generator.integers(2**63, size=3)]
             for generator in generators
         ]
-        for episode, (traffic, _, _) in zip(episodes, streams, strict=True):
-            slot, start = choice.draw(traffic)
-            self._load(slot)
-            self.slot[episode], self.time[episode] = slot, start
-            self.end[episode] = start + self.config.horizon_steps
+        slots, starts = choice.draw([traffic for traffic, _, _ in streams])
+        self._load(slots)
+        self.slot[episodes], self.time[episodes] = slots, starts
+        self.end[episodes] = starts + self.config.horizon_steps
         self.interface.actions.reset(episodes)
         self.mechanism.reset(episodes, [noise for _, noise, _ in streams])
         self.answers.reset(episodes)
         self.boundary.reset(episodes)
-        prior = [nominal_state(self.config.corridor, self.model, t) for t in self.time[episodes]]
-        self.estimator.reset(episodes, np.array(prior), [own for _, _, own in streams])
+        prior = nominal_state(self.config.corridor, self.model, self.time[episodes])
+        self.estimator.reset(episodes, prior, [own for _, _, own in streams])
         self.queried[episodes] = False
         self.n_dropped[episodes] = 0
         self.age[episodes] = AGE_CAP
@@ -184,10 +187,21 @@ class QueryProcess:
         released = self.mechanism.release(episodes, answers)
         self.boundary.take_in(episodes, released[:, n_segments:])
         observed, released = observed[:, :n_segments], released[:, :n_segments]
-        self.estimator.predict(episodes, inputs)
-        self.estimator.update(episodes, observed, released, self.mechanism.sigma)
+        self._estimate(episodes, inputs, observed, released)
         self._remember(episodes, queried, observed, released)
         return self._score(episodes, self.truth(episodes))
+
+    def _estimate(
+        self, episodes: IntArray, inputs: FloatArray, observed: BoolArray, released: FloatArray
+    ) -> None:
+        """Let the estimators predict and update, several blocks of episodes at once."""
+
+        def work(rows: slice) -> None:
+            block = episodes[rows]
+            self.estimator.predict(block, inputs[rows])
+            self.estimator.update(block, observed[rows], released[rows], self.mechanism.sigma)
+
+        self._blocks.run(len(episodes), work)
 
     def _remember(
         self, episodes: IntArray, queried: BoolArray, observed: BoolArray, released: FloatArray
@@ -215,9 +229,9 @@ class QueryProcess:
         """Return the present true (density [veh/km], speed [km/h]) of ``episodes``, (k, S, 2)."""
         return self.sensing.aggregates(self.slot[episodes], self.time[episodes])
 
-    def _load(self, slot: int) -> None:
-        """Make sure that the traffic of ``slot`` is in memory, in every form that is needed."""
-        if self.sensing.load(slot):
+    def _load(self, slots: IntArray) -> None:
+        """Make sure that the traffic of ``slots`` is in memory, in every form that is needed."""
+        for slot in self.sensing.load(slots):
             self.answers.load(slot)
             self.boundary.load(slot)
 

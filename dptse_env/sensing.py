@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Protocol
 
 import numpy as np
+import numpy.typing as npt
 
 from dptse_env.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.contributions import Contributions
@@ -30,17 +31,22 @@ class Sensing:
         self._table = np.empty((len(traffic_seeds), corridor.duration + 1, columns, 2))
         self._loaded = np.zeros(len(traffic_seeds), dtype=bool)
 
-    def load(self, slot: int) -> bool:
-        """Read or make the record of ``traffic_seeds[slot]``; return whether it was new."""
-        if self._loaded[slot]:
-            return False
-        record = self.record(slot)
-        counts = record.counts
-        self._table[slot, ..., 0] = counts / self.corridor.segment_length
-        mean = record.speed_sums / np.maximum(counts, 1)
-        self._table[slot, ..., 1] = np.where(counts > 0, mean, self.corridor.speed_limit)
-        self._loaded[slot] = True
-        return True
+    def load(self, slots: npt.ArrayLike) -> list[int]:
+        """Read or make the records of one or more slots; return those not yet in memory.
+
+        Several that are missing on disk are recorded at once, on all cores.
+        """
+        new = [slot for slot in np.unique(slots).tolist() if not self._loaded[slot]]
+        if len(new) > 1:
+            self.library.ensure(self.corridor, [self.traffic_seeds[slot] for slot in new])
+        for slot in new:
+            record = self.record(slot)
+            counts = record.counts
+            self._table[slot, ..., 0] = counts / self.corridor.segment_length
+            mean = record.speed_sums / np.maximum(counts, 1)
+            self._table[slot, ..., 1] = np.where(counts > 0, mean, self.corridor.speed_limit)
+            self._loaded[slot] = True
+        return new
 
     def record(self, slot: int) -> Record:
         """Return the record of ``traffic_seeds[slot]``, made now if there is none."""

@@ -17,8 +17,10 @@ from dptse_env.arrays import Action, BoolArray, FloatArray, IntArray, Observatio
 from dptse_env.config import resolve
 from dptse_env.infos import Rows, as_objects, in_vector_form, repeated
 from dptse_env.interface import QueryInterface
+from dptse_env.options import per_episode
 from dptse_env.process import QueryProcess
 from dptse_env.traffic import RecordLibrary
+from dptse_env.validation import integer
 
 _MODES = {mode.value: mode for mode in AutoresetMode}
 
@@ -70,9 +72,9 @@ class SensorQueryVectorEnv(VectorEnv[Observation, Action, Any]):
     - ``SameStep``: the same step begins it again; ``infos`` holds ``final_obs`` and ``final_info``.
     - ``Disabled``: the caller resets it with ``reset_mask`` before the next step.
 
-    **Reset options**: ``traffic_seed`` and ``start`` as in the scalar environment, and
-    ``reset_mask``, flags of shape (n,): only these episodes are begun, and ``infos`` speaks of no
-    others. Options do not outlive the call.
+    **Reset options**: ``traffic_seed`` and ``start`` as in the scalar environment, each one value
+    or one per episode, n of them, and ``reset_mask``, flags of shape (n,): only these episodes are
+    begun, and ``infos`` speaks of no others. Options do not outlive the call.
 
     The episodes of a batch end together unless ``reset_mask`` staggers them. ``random_start``
     spreads them over the records, so that a batch does not see one time of day.
@@ -86,6 +88,7 @@ class SensorQueryVectorEnv(VectorEnv[Observation, Action, Any]):
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         render_mode: str | None = None,
         records: str | None = None,
+        threads: int | None = None,
         **overrides: Any,
     ) -> None:
         """Describe the environment; nothing is recorded or compiled before `reset`.
@@ -96,6 +99,8 @@ class SensorQueryVectorEnv(VectorEnv[Observation, Action, Any]):
             autoreset_mode: When an episode that has ended begins again: a mode or its value.
             render_mode: None; a batch is not drawn.
             records: Folder of the record cache; None for the user's cache.
+            threads: Threads that estimate, each for a block of episodes; None for one per core.
+                Their number changes the time only.
             **overrides: As in `dptse_env.env.SensorQueryEnv`.
 
         Raises:
@@ -122,6 +127,7 @@ class SensorQueryVectorEnv(VectorEnv[Observation, Action, Any]):
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self._records = records
+        self._threads = None if threads is None else integer("threads", threads, 1)
         self._process: QueryProcess | None = None
         self._generators: list[tuple[np.random.Generator, int] | None] = [None] * self.num_envs
         self._begun = np.zeros(self.num_envs, dtype=bool)
@@ -133,8 +139,13 @@ class SensorQueryVectorEnv(VectorEnv[Observation, Action, Any]):
     def process(self) -> QueryProcess:
         """The process behind the environment, assembled at the first use."""
         if self._process is None:
-            library = RecordLibrary(self._records)
-            self._process = QueryProcess(self.config, self.interface, self.num_envs, library)
+            self._process = QueryProcess(
+                self.config,
+                self.interface,
+                self.num_envs,
+                RecordLibrary(self._records),
+                self._threads,
+            )
         return self._process
 
     @property  # type: ignore[misc]
@@ -158,7 +169,8 @@ class SensorQueryVectorEnv(VectorEnv[Observation, Action, Any]):
         Args:
             seed: s starts the generator of episode i anew with s + i; a sequence of n gives each
                 its own, None lets it go on.
-            options: ``traffic_seed``, ``start`` and ``reset_mask``, all optional.
+            options: ``traffic_seed`` and ``start``, each one or n of them, and ``reset_mask``, all
+                optional.
 
         Returns:
             Observations, shape (n, size), the last ones for episodes that go on; infos.
@@ -170,6 +182,9 @@ class SensorQueryVectorEnv(VectorEnv[Observation, Action, Any]):
         episodes = self._all
         if "reset_mask" in others:
             episodes = np.flatnonzero(self._checked_mask(others.pop("reset_mask")))
+            for key, value in others.items():
+                values = per_episode(key, value, self.num_envs)
+                others[key] = [values[episode] for episode in episodes]
         self._seed(episodes, seed)
         self._begin(episodes, others)
         return self._observation.copy(), self._infos(episodes, episodes)

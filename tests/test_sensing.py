@@ -39,10 +39,22 @@ def test_an_empty_segment_answers_with_the_speed_limit(sensing):
 
 
 def test_a_slot_is_loaded_once(sensing):
-    assert not sensing.load(0)
+    assert sensing.load(0) == []
     fresh = Sensing(SHORT_HIGHWAY, (4,), sensing.library)
-    assert fresh.load(0)
-    assert not fresh.load(0)
+    assert fresh.load(np.array([0, 0])) == [0]
+    assert fresh.load(0) == []
+
+
+def test_missing_records_are_made_together(tmp_path, monkeypatch):
+    library = RecordLibrary(tmp_path)
+    asked = []
+    monkeypatch.setattr(library, "ensure", lambda corridor, seeds: asked.append(list(seeds)))
+    sensing = Sensing(SHORT_HIGHWAY, (4, 7, 9), RecordLibrary())
+    sensing.load(0)
+    monkeypatch.setattr(library, "get", sensing.library.get)
+    sensing.library = library
+    assert sensing.load(np.array([2, 0, 1, 2])) == [1, 2]
+    assert asked == [[7, 9]]
 
 
 def test_boundary_segments_come_last(sensing):

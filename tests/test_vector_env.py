@@ -8,88 +8,9 @@ import pytest
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
 
-from dptse_env.actions import ACTION_ENCODINGS
-from dptse_env.estimators import ESTIMATORS
-from dptse_env.registration import ENVIRONMENTS
 from dptse_env.vector_env import SensorQueryVectorEnv
 
-SHORT = "dptse_env:dptse/ShortHighway-v0"
-MODES = [mode.value for mode in AutoresetMode]
-COUNTED = {"preset": "guaranteed", "cap": 5, "boundary_inputs": "private"}
-
-
-EPISODES = {"traffic_seeds": "0:3", "horizon": 6, "random_start": True}
-
-
-def short(num_envs=3, **keywords):
-    return gym.make_vec(SHORT, num_envs=num_envs, **{**EPISODES, **keywords})
-
-
-def assert_same(first, second, tolerance=1e-10):
-    """Compare everything that came back, dtypes and the keys of dicts too."""
-    if isinstance(first, dict):
-        assert first.keys() == second.keys()
-        for key in first:
-            assert_same(first[key], second[key], tolerance)
-    elif isinstance(first, tuple | list):
-        assert len(first) == len(second)
-        for one, other in zip(first, second, strict=True):
-            assert_same(one, other, tolerance)
-    elif isinstance(first, np.ndarray):
-        assert (first.dtype, first.shape) == (second.dtype, second.shape)
-        if first.dtype == object:
-            assert_same(first.tolist(), second.tolist(), tolerance)
-        elif first.dtype.kind == "f":
-            np.testing.assert_allclose(first, second, rtol=0, atol=tolerance)
-        else:
-            np.testing.assert_array_equal(first, second)
-    else:
-        assert type(first) is type(second)
-        assert first == (pytest.approx(second, abs=tolerance) if type(first) is float else second)
-
-
-def lock_step(keywords, n_steps, env_id=SHORT, **more):
-    """Hold n scalar environments of seeds s + i, wherever they are, against the batch."""
-    keywords = {**EPISODES, **keywords}
-    batch = gym.make_vec(env_id, num_envs=3, **more, **keywords)
-    vectorise = {"autoreset_mode": more["autoreset_mode"]} if more else None
-    singles = gym.make_vec(
-        env_id, num_envs=3, vectorization_mode="sync", vector_kwargs=vectorise, **keywords
-    )
-    assert batch.action_space == singles.action_space
-    assert batch.observation_space == singles.observation_space
-    assert_same(batch.reset(seed=7), singles.reset(seed=7))
-    batch.action_space.seed(1)
-    for _ in range(n_steps):
-        actions = batch.action_space.sample()
-        came_back = batch.step(actions)
-        assert came_back[0] in batch.observation_space
-        assert_same(came_back, singles.step(actions))
-    assert_same(batch.np_random_seed, singles.np_random_seed)
-    draws = [[g.integers(2**63) for g in env.np_random] for env in (batch, singles)]
-    assert draws[0] == draws[1]
-
-
-@pytest.mark.parametrize(
-    ("estimator", "action", "privacy"),
-    [(e, a, "paper") for e in ESTIMATORS for a in ACTION_ENCODINGS]
-    + [(e, "mask", COUNTED) for e in ESTIMATORS],
-)
-def test_a_batch_is_so_many_scalar_environments(estimator, action, privacy):
-    keywords = {"estimator": estimator, "action": action, "privacy": privacy}
-    lock_step({**keywords, "truth_in_info": True}, n_steps=17)
-
-
-@pytest.mark.parametrize("env_id", ENVIRONMENTS)
-def test_every_id_is_so_many_scalar_environments(env_id):
-    lock_step({"traffic_seeds": "0:2"}, n_steps=8, env_id=f"dptse_env:{env_id}")
-
-
-@pytest.mark.parametrize("truth_in_info", [False, True])
-@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
-def test_autoreset_is_that_of_gymnasium(mode, truth_in_info):
-    keywords = {"truth_in_info": truth_in_info, "privacy": COUNTED}
-    lock_step(keywords, n_steps=20, autoreset_mode=mode)
+from .vectors import COUNTED, EPISODES, SHORT, assert_same, short, staggered
 
 
 @pytest.mark.parametrize("mode", AutoresetMode)
@@ -111,17 +32,6 @@ def test_next_step_ignores_the_action_of_an_episode_that_begins_again():
     assert came_back[1].tolist() == [0.0] * 3
     assert came_back[4]["_privacy"].all()
     assert_same(came_back, other.step(actions + 5))
-
-
-def staggered(**keywords):
-    """Return an environment whose episodes 0 and 2 are two steps behind episode 1."""
-    env = short(**keywords)
-    actions = np.zeros((3, 6), dtype=np.int8)
-    env.reset(seed=3)
-    env.step(actions)
-    env.step(actions)
-    env.reset(options={"reset_mask": np.array([True, False, True])})
-    return env, actions
 
 
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
@@ -284,89 +194,3 @@ def test_a_void_guarantee_is_warned_of_at_the_caller():
     with pytest.warns(UserWarning, match="no privacy is guaranteed") as caught:
         SensorQueryVectorEnv(2, "private-highway", privacy={"boundary_inputs": "true"})
     assert [warning.filename for warning in caught] == [__file__]
-
-
-@pytest.mark.parametrize(
-    ("keywords", "message"),
-    [
-        ({"num_envs": 0}, r"^num_envs must be an integer >= 1, got 0"),
-        ({"num_envs": -2}, r"^num_envs must be an integer >= 1, got -2"),
-        ({"num_envs": 1.5}, r"^num_envs must be an integer >= 1, got 1\.5"),
-        ({"num_envs": True}, r"^num_envs must be an integer >= 1, got True"),
-        (
-            {"autoreset_mode": "next"},
-            r"^autoreset_mode must be one of NextStep, SameStep, Disabled, got 'next'",
-        ),
-        ({"autoreset_mode": None}, r"^autoreset_mode must be one of .*, got None"),
-        ({"render_mode": "rgb_array"}, r"^render_mode must be None, got 'rgb_array': a batch"),
-        ({"bandwith": 2}, r"^bandwith is unknown; allowed: corridor, estimator"),
-        ({"epsilon": -1}, r"^privacy\.epsilon must be > 0, got -1"),
-    ],
-)
-def test_bad_keywords_name_themselves(keywords, message):
-    with pytest.raises(ValueError, match=message):
-        SensorQueryVectorEnv(**{"num_envs": 2, "preset": "short-highway", **keywords})
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"options": {"reset_mask": [True] * 3}}, r"reset_mask must be a bool array .*, got list"),
-        ({"options": {"reset_mask": None}}, r"reset_mask must be a bool array .*, got NoneType"),
-        (
-            {"options": {"reset_mask": np.ones(2, bool)}},
-            r"reset_mask must be a bool array of shape \(3,\), got bool of shape \(2,\)",
-        ),
-        ({"options": {"reset_mask": np.ones(3)}}, r"got float64 of shape \(3,\)"),
-        (
-            {"options": {"reset_mask": np.zeros(3, bool)}},
-            r"reset_mask must name at least one episode",
-        ),
-        ({"options": {"seed": 1}}, r"options\.seed is unknown"),
-        ({"options": {"start": 999}}, r"options\.start must be an integer in 0\.\.234, got 999"),
-        ({"seed": [1, 2]}, r"seed must be one or a list of 3, got 2"),
-    ],
-)
-def test_bad_resets_are_refused_and_the_episodes_go_on(arguments, message):
-    (env, actions), (undisturbed, _) = staggered(), staggered()
-    with pytest.raises(ValueError, match=message):
-        env.reset(**arguments)
-    for _ in range(5):
-        assert_same(env.step(actions), undisturbed.step(actions), tolerance=0)
-
-
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize(
-    ("bad", "message"),
-    [
-        (np.zeros((2, 6), np.int8), r"actions must have shape \(3, 6\), got \(2, 6\)"),
-        (np.zeros((4, 6), np.int8), r"actions must have shape \(3, 6\), got \(4, 6\)"),
-        (np.zeros((3, 5), np.int8), r"action must have shape \(6,\)"),
-        (np.full((3, 6), 2), r"action must hold 0 and 1 only"),
-    ],
-)
-def test_bad_actions_are_refused_and_the_episodes_go_on(mode, bad, message):
-    (env, actions), (undisturbed, _) = (staggered(autoreset_mode=mode) for _ in range(2))
-    for _ in range(4):
-        assert_same(env.step(actions), undisturbed.step(actions), tolerance=0)
-    # Episode 1 is over now, or has just been begun again.
-    if mode == "Disabled":
-        for one in (env, undisturbed):
-            one.reset(options={"reset_mask": np.array([False, True, False])})
-    with pytest.raises(ValueError, match=message):
-        env.step(bad)
-    for _ in range(3 if mode == "Disabled" else 5):
-        came_back = env.step(actions)
-        assert_same(came_back, undisturbed.step(actions), tolerance=0)
-        if mode == "Disabled" and came_back[3].any():
-            break
-
-
-def test_a_step_before_the_first_reset_is_refused():
-    env = short()
-    actions = np.zeros((3, 6), dtype=np.int8)
-    with pytest.raises(gym.error.ResetNeeded, match="3 of 3 episodes were never begun"):
-        env.step(actions)
-    env.reset(options={"reset_mask": np.array([True, False, False])})
-    with pytest.raises(gym.error.ResetNeeded, match="2 of 3 episodes were never begun"):
-        env.step(actions)

@@ -170,5 +170,6 @@ class SB3VecEnv(VecEnv):
     def _note_resets(self, episodes: Sequence[int] | NDArray[np.int64] | range) -> None:
         """Keep the infos of resets where stable-baselines3 looks for them."""
         rows = self.env.process.infos(np.asarray(episodes))
+        privacy = self.env.privacy()
         for k, episode in enumerate(episodes):
-            self.reset_infos[episode] = {**row_of(rows, k), "privacy": self.env.privacy()}
+            self.reset_infos[episode] = {**row_of(rows, k), "privacy": privacy}

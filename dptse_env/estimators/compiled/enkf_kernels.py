@@ -91,7 +91,7 @@ def _disturb(swarm: FloatArray, n: int, deviation: FloatArray, draws: Draws) -> 
         row[n:] = row[0]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", nogil=True)
 def predict(road_: Packed, ensembles_: Packed, episodes: IntArray, inputs: FloatArray) -> None:
     """Move the members one step ahead under inputs `(k, n_u)`, disturb each and project it."""
     road, ensembles = Road(*road_), Ensembles(*ensembles_)
@@ -135,7 +135,7 @@ def _inflate(swarm: FloatArray, n: int, factor: float) -> None:
             row[j] = mean + factor * (row[j] - mean)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", nogil=True)
 def update(
     road_: Packed,
     ensembles_: Packed,
@@ -274,7 +274,7 @@ def _taper(tapers: FloatArray, segments: IntArray, joint: FloatArray, gain: Floa
             gain[i, j] *= weights[j // 2]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", nogil=True)
 def summarise(road_: Packed, swarms: FloatArray, n: int, out: FloatArray) -> None:
     """Write density and speed of the mean and the members' deviations to `out` `(4, E, S)`."""
     road = Road(*road_)

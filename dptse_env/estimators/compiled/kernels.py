@@ -55,7 +55,7 @@ class Filters(NamedTuple):
     is_box: bool
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", nogil=True)
 def predict(road_: Packed, filters_: Packed, episodes: IntArray, inputs: FloatArray) -> None:
     """Move episodes one step ahead under inputs `(k, n_u)`: x = f(x, u), P = F P F' + Q."""
     road, filters = Road(*road_), Filters(*filters_)
@@ -73,7 +73,7 @@ def predict(road_: Packed, filters_: Packed, episodes: IntArray, inputs: FloatAr
         propagate(road, blocks, filters.process_variance, covariance, product, transposed)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", nogil=True)
 def update(
     road_: Packed,
     filters_: Packed,
@@ -213,7 +213,7 @@ def _innovate(
             innovations[s, 1] = rows[s, 1] / np.sqrt(speed_variance + noise[1])
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", nogil=True)
 def summarise(road_: Packed, filters_: Packed, out: FloatArray) -> None:
     """Write density, speed and their standard deviations to `out` `(4, n, S)`, physical units."""
     road, filters = Road(*road_), Filters(*filters_)

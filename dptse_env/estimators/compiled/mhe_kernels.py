@@ -87,7 +87,7 @@ def _enter(road: Road, filters: Filters, horizons: Horizons, e: int, t: int) -> 
     horizons.noise[e, t] = 1.0
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", nogil=True)
 def predict(
     road_: Packed, filters_: Packed, horizons_: Packed, episodes: IntArray, inputs: FloatArray
 ) -> None:
@@ -184,7 +184,7 @@ def _linearise_measurement(
         horizons.constants[e, t, s] = (second - by_rho * rho - by_psi * psi) / unit
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", nogil=True)
 def update(
     road_: Packed,
     filters_: Packed,

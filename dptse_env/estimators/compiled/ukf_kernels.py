@@ -32,7 +32,7 @@ from dptse_env.model.network import BoolArray, FloatArray, IntArray
 from dptse_env.model.road import Road
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", nogil=True)
 def predict(
     road_: Packed, filters_: Packed, points_: Packed, episodes: IntArray, inputs: FloatArray
 ) -> None:
@@ -80,7 +80,7 @@ class Outputs(NamedTuple):
     joint: FloatArray
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", nogil=True)
 def update(
     road_: Packed,
     filters_: Packed,
