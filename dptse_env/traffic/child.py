@@ -3,6 +3,7 @@
 import json
 import os
 import pickle
+import signal
 import sys
 
 from dptse_env.traffic.sumo import RecordingError, simulate
@@ -10,6 +11,8 @@ from dptse_env.traffic.sumo import RecordingError, simulate
 
 def main() -> None:
     """Serve pickled tasks (corridor, seed, path, source) until stdin ends, one JSON line each."""
+    # Ctrl-C reaches the whole process group. What it ends is the parent's choice, told by stdin.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     # Whatever SUMO prints goes to stderr; the answers keep the original stdout to themselves.
     with os.fdopen(os.dup(1), "w", encoding="utf-8") as answers:
         os.dup2(2, 1)

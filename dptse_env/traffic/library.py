@@ -2,29 +2,47 @@
 
 A record is found by the corridor's digest, the traffic seed, SUMO's version and the record format;
 when any of them changes, another record is made. Several processes may use a library at once.
+
+A record appears under its name when it is complete, so a writer that is killed leaves a hidden
+folder at most. Nobody can tell by it whether its writer lives, perhaps on another machine, so such
+a folder is removed by its age.
 """
 
+import contextlib
 import logging
 import os
 import shutil
+import tempfile
 import threading
+import time
 import uuid
 from collections import OrderedDict
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 
 import platformdirs
 from tqdm import tqdm
 
+from dptse_env.blocks import n_cores
 from dptse_env.traffic.corridor import Corridor
+from dptse_env.traffic.network import NetworkError
 from dptse_env.traffic.record import VERSION, InvalidRecordError, Record
-from dptse_env.traffic.sumo import RecordingError, simulate, simulation_is_loaded, sumo_version
+from dptse_env.traffic.sumo import (
+    RecordingError,
+    SumoVersionError,
+    simulate,
+    simulation_is_loaded,
+    sumo_version,
+)
 from dptse_env.traffic.worker import WorkerPool
 from dptse_env.validation import integer
 
 CACHE_VARIABLE = "DPTSE_CACHE"
 """Environment variable that overrides where records are kept."""
+
+LEFTOVER_AGE = 6 * 3600.0
+"""Age [s] from which on a hidden folder is taken for a dead writer's. Writing takes a second."""
 
 logger = logging.getLogger(__name__)
 
@@ -68,21 +86,35 @@ class RecordLibrary:
 
         Raises:
             ValueError: if the seed is negative or no integer.
-            RecordingError: if the record cannot be made; the message names the seed.
+            RecordingError: if the record cannot be made; the message names the library and the
+                seed.
             NetworkError: if the corridor has to be compiled and cannot be.
-            SumoVersionError: if libsumo is missing or of another release series.
+            SumoVersionError: if libsumo is missing, broken or of another release series.
         """
         seed = integer("traffic seed", seed, 0)
         key = corridor.digest, seed
         with self._lock:
             record = self._open.get(key)
             if record is None:
-                record = self._open[key] = self._load_or_record(corridor, seed)
+                with self._naming_what_it_holds(corridor, [seed]):
+                    record = self._open[key] = self._load_or_record(corridor, seed)
                 if len(self._open) > self.n_open:
                     self._open.popitem(last=False)
             else:
                 self._open.move_to_end(key)
             return record
+
+    def missing(self, corridor: Corridor, seeds: Iterable[int]) -> list[int]:
+        """Return which of `seeds` have no record yet, each once and in the order given.
+
+        Nothing is opened: a damaged record counts as one, and `get` makes it again.
+
+        Raises:
+            ValueError: if a seed is negative or no integer.
+            SumoVersionError: if libsumo is missing or of another release series.
+        """
+        wanted = dict.fromkeys(integer("traffic seed", seed, 0) for seed in seeds)
+        return [seed for seed in wanted if not self.record_path(corridor, seed).is_dir()]
 
     def ensure(
         self,
@@ -93,6 +125,10 @@ class RecordLibrary:
     ) -> None:
         """Record whichever of `seeds` are missing, several at once.
 
+        A single one, and all of them with one worker, are made in this process unless libsumo
+        holds another simulation here. A worker that dies is replaced and its record tried again
+        (see `WorkerPool.record`).
+
         Args:
             corridor: the corridor.
             seeds: traffic seeds.
@@ -101,38 +137,18 @@ class RecordLibrary:
 
         Raises:
             ValueError: if a seed or the number of workers is out of range.
-            RecordingError: if one of them fails; the message names the seed. The others that were
-                already running are finished and kept, the rest is not begun.
+            RecordingError: if one of them fails; the message says how many of the records the
+                library holds and names the seed. The others that were already running are
+                finished and kept, the rest is not begun.
+            NetworkError: if the corridor has to be compiled and cannot be.
+            SumoVersionError: if libsumo is missing, broken or of another release series.
         """
-        n_workers = _n_cores() if workers is None else integer("workers", workers, 1)
-        wanted = dict.fromkeys(integer("traffic seed", seed, 0) for seed in seeds)
-        missing = [seed for seed in wanted if not self.record_path(corridor, seed).is_dir()]
-        if not missing:
-            return
-        with (
-            tqdm(
-                total=len(missing), desc=corridor.name, unit="record", disable=not progress
-            ) as bar,
-            WorkerPool() as pool,
-            ThreadPoolExecutor(min(n_workers, len(missing))) as threads,
-        ):
-            futures = [
-                threads.submit(
-                    pool.record,
-                    corridor,
-                    seed,
-                    self.record_path(corridor, seed),
-                    _source(corridor, seed),
-                )
-                for seed in missing
-            ]
-            try:
-                for future in as_completed(futures):
-                    future.result()
-                    bar.update()
-            except BaseException:
-                threads.shutdown(cancel_futures=True)
-                raise
+        n_workers = n_cores() if workers is None else integer("workers", workers, 1)
+        wanted = list(dict.fromkeys(integer("traffic seed", seed, 0) for seed in seeds))
+        with self._naming_what_it_holds(corridor, wanted):
+            missing = self.missing(corridor, wanted)
+            if missing:
+                self._record(corridor, missing, min(n_workers, len(missing)), progress)
 
     def record_path(self, corridor: Corridor, seed: int) -> Path:
         """Return the directory that holds a record, or will."""
@@ -148,15 +164,81 @@ class RecordLibrary:
         except InvalidRecordError as error:
             logger.warning("record is made again: %s", error)
             _discard(path)
+        self._record(corridor, [seed])
         try:
-            if simulation_is_loaded():
-                with WorkerPool() as pool:
-                    pool.record(corridor, seed, path, source)
-            else:
-                simulate(corridor, seed).save(path, source)
             return Record.load(path, source)
         except (OSError, InvalidRecordError) as error:
             raise RecordingError.of(corridor, seed, str(error)) from error
+
+    def _record(
+        self, corridor: Corridor, seeds: list[int], n_workers: int = 1, progress: bool = False
+    ) -> None:
+        """Make the records of `seeds`, at least one, here or in `n_workers` processes."""
+        folder = self.record_path(corridor, seeds[0]).parent
+        try:
+            _prepare(folder)
+        except OSError as error:
+            raise RecordingError.of(corridor, seeds[0], str(error)) from error
+        in_children = n_workers > 1 or simulation_is_loaded()
+        logger.info(
+            "%s: recording %d traffic seed(s) in %s into %s",
+            corridor.name,
+            len(seeds),
+            f"{n_workers} child process(es)" if in_children else "this process",
+            self.path,
+        )
+        with tqdm(total=len(seeds), desc=corridor.name, unit="record", disable=not progress) as bar:
+            if in_children:
+                self._record_in_children(corridor, seeds, n_workers, bar)
+                return
+            for seed in seeds:
+                try:
+                    simulate(corridor, seed).save(
+                        self.record_path(corridor, seed), _source(corridor, seed)
+                    )
+                except OSError as error:
+                    raise RecordingError.of(corridor, seed, str(error)) from error
+                bar.update()
+
+    def _record_in_children(
+        self, corridor: Corridor, seeds: list[int], n_workers: int, bar: tqdm
+    ) -> None:
+        with WorkerPool() as pool, ThreadPoolExecutor(n_workers) as threads:
+            futures = [
+                threads.submit(
+                    pool.record,
+                    corridor,
+                    seed,
+                    self.record_path(corridor, seed),
+                    _source(corridor, seed),
+                )
+                for seed in seeds
+            ]
+            try:
+                for future in as_completed(futures):
+                    future.result()
+                    bar.update()
+            except BaseException:
+                threads.shutdown(cancel_futures=True)
+                raise
+
+    @contextlib.contextmanager
+    def _naming_what_it_holds(self, corridor: Corridor, seeds: list[int]) -> Iterator[None]:
+        """Add to an error in the body where the library is and how many of `seeds` it holds."""
+        asked = f"the {len(seeds)} record(s) of {corridor.name} asked for"
+        try:
+            yield
+        except (RecordingError, NetworkError, SumoVersionError) as error:
+            try:
+                n_held = len(seeds) - len(self.missing(corridor, seeds))
+            except SumoVersionError:  # its release is part of every record's path
+                said = f"the library at {self.path} can neither find nor make {asked}: {error}"
+            else:
+                said = (
+                    f"the library at {self.path} holds {n_held} of {asked}, and the rest cannot be "
+                    f"made: {error}"
+                )
+            raise type(error)(said) from error
 
 
 def _source(corridor: Corridor, seed: int) -> dict[str, object]:
@@ -164,7 +246,7 @@ def _source(corridor: Corridor, seed: int) -> dict[str, object]:
 
 
 def _discard(path: Path) -> None:
-    """Remove a record by moving it aside first, so that nobody finds half of it."""
+    """Remove a record by moving it aside first, so that nobody finds or finishes half of it."""
     aside = path.parent / f".{path.name}-{uuid.uuid4().hex}"
     try:
         path.rename(aside)
@@ -173,7 +255,17 @@ def _discard(path: Path) -> None:
     shutil.rmtree(aside, ignore_errors=True)
 
 
-def _n_cores() -> int:
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+def _prepare(folder: Path) -> None:
+    """Create the folder, see that it can be written to, and remove what dead writers left in it.
+
+    Raises:
+        OSError: if it cannot be created or written to.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=".probe-", dir=folder):
+        pass
+    for leftover in folder.glob(".*-*/"):
+        # Either its writer finished just now, or it is another user's to remove.
+        with contextlib.suppress(FileNotFoundError, PermissionError):
+            if time.time() - leftover.stat().st_mtime > LEFTOVER_AGE:
+                _discard(leftover)

@@ -20,6 +20,7 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
+from typing import Self
 from xml.etree import ElementTree
 
 import numpy as np
@@ -68,7 +69,7 @@ class RecordingError(RuntimeError):
     """A scenario could not be recorded; the message names corridor, seed and cause."""
 
     @classmethod
-    def of(cls, corridor: Corridor, seed: int, cause: str) -> "RecordingError":
+    def of(cls, corridor: Corridor, seed: int, cause: str) -> Self:
         """Name what was being recorded and why it failed."""
         return cls(f"recording {corridor.name} with traffic seed {seed} failed: {cause}")
 
@@ -108,35 +109,76 @@ def simulate(corridor: Corridor, seed: int) -> Record:
         RecordingError: if SUMO fails, with its own words; or if libsumo already holds a
             simulation here, which is left alone (see `dptse_env.traffic.worker`).
         NetworkError: if the corridor has to be compiled and cannot be.
-        SumoVersionError: if libsumo is missing or of another release series.
+        SumoVersionError: if libsumo is missing, broken or of another release series.
+    """
+    scenario = corridor.draw(seed)
+    with running(corridor, scenario) as libsumo:
+        return _observe(libsumo, corridor, scenario)
+
+
+@contextlib.contextmanager
+def running(corridor: Corridor, scenario: Scenario) -> Iterator[ModuleType]:
+    """Hold SUMO loaded with a scenario, at second 0, and close it afterwards.
+
+    Yields:
+        The module libsumo; `seconds` moves its simulation on.
+
+    Raises:
+        RecordingError: if SUMO fails, now or in the body; or if libsumo already holds a simulation.
+        NetworkError: as `simulate`.
+        SumoVersionError: as `simulate`.
     """
     network = network_xml(corridor)
-    scenario = corridor.draw(seed)
     with _one_at_a_time, tempfile.TemporaryDirectory(prefix="dptse-sumo-") as directory:
         if simulation_is_loaded():
             cause = "libsumo holds another simulation in this process"
-            raise RecordingError.of(corridor, seed, cause)
+            raise RecordingError.of(corridor, scenario.seed, cause)
         libsumo = _import_libsumo()
         folder = Path(directory)
         messages = folder / "messages.txt"
         try:
             with _stderr_to(messages):
                 libsumo.start(_command(folder, network, corridor, scenario))
-            return _drive(libsumo, corridor, scenario)
+            yield libsumo
         except Exception as error:
             said = messages.read_text(encoding="utf-8", errors="replace").strip()
             cause = f"{type(error).__name__}: {error}" + (f"\n{said}" if said else "")
-            raise RecordingError.of(corridor, seed, cause) from error
+            raise RecordingError.of(corridor, scenario.seed, cause) from error
         finally:
             if libsumo.isLoaded():
                 libsumo.close()
 
 
+def seconds(libsumo: ModuleType, corridor: Corridor, scenario: Scenario) -> Iterator[int]:
+    """Move a loaded simulation on by a second at a time, with the scenario's incident.
+
+    Yields:
+        0, 1, ..., `corridor.duration`: the second [s] whose state libsumo holds.
+    """
+    changes: list[tuple[float, float]] = []
+    blocked_edge = ""
+    if scenario.incident is not None:
+        changes = scenario.incident.limit_changes(corridor.speed_limit)
+        blocked_edge = f"main_{scenario.incident.segment}"
+    yield 0
+    for second in range(corridor.duration):
+        for substep in range(SUBSTEPS):
+            while changes and changes[0][0] <= second + substep * STEP_LENGTH:
+                _, limit = changes.pop(0)
+                libsumo.edge.setMaxSpeed(blocked_edge, limit / KMH)
+            libsumo.simulationStep()
+        yield second + 1
+
+
 def _import_libsumo() -> ModuleType:
     """Import libsumo and check what is really there: libtraci's wheel overwrites it with 1.18."""
     expected = sumo_version()
-    import libsumo  # noqa: PLC0415  (heavy, and only a recording needs it)
-
+    try:
+        import libsumo  # noqa: PLC0415  (heavy, and only a recording needs it)
+    except ImportError as error:
+        raise SumoVersionError(
+            f"libsumo {expected} is installed but cannot be imported ({error}): reinstall libsumo"
+        ) from error
     version = str(libsumo.getVersion()[1]).removeprefix("SUMO ")
     _check_series(version)
     if version != expected:
@@ -217,39 +259,27 @@ def _routes(corridor: Corridor, scenario: Scenario) -> ElementTree.Element:
     return root
 
 
-def _drive(libsumo: ModuleType, corridor: Corridor, scenario: Scenario) -> Record:
+def _observe(libsumo: ModuleType, corridor: Corridor, scenario: Scenario) -> Record:
     """Run the loaded simulation to its end and collect the vehicle table."""
     edges = edge_ids(corridor)
     vehicles_on, speed_of = libsumo.edge.getLastStepVehicleIDs, libsumo.vehicle.getSpeed
-    changes: list[tuple[float, float]] = []
-    blocked_edge = ""
-    if scenario.incident is not None:
-        changes = scenario.incident.limit_changes(corridor.speed_limit)
-        blocked_edge = f"main_{scenario.incident.segment}"
-    n_rows: list[int] = []
-    vehicle: list[int] = []
-    segment: list[int] = []
+    n_on: list[int] = []
+    names: list[str] = []
     speed: list[float] = []
-    for step in range(corridor.duration + 1):
-        n_before = len(vehicle)
-        for column, edge in enumerate(edges):
-            ids = vehicles_on(edge)
-            vehicle += map(int, ids)
-            segment += [column] * len(ids)
-            speed += map(speed_of, ids)
-        n_rows.append(len(vehicle) - n_before)
-        if step == corridor.duration:
-            break
-        for substep in range(SUBSTEPS):
-            while changes and changes[0][0] <= step + substep * STEP_LENGTH:
-                _, limit = changes.pop(0)
-                libsumo.edge.setMaxSpeed(blocked_edge, limit / KMH)
-            libsumo.simulationStep()
+    for _ in seconds(libsumo, corridor, scenario):
+        for edge in edges:
+            here = vehicles_on(edge)
+            n_on.append(len(here))
+            names += here
+            speed += map(speed_of, here)
+    # Whatever a row needs beside SUMO's own answers is made once at the end: this loop is all that
+    # recording adds to a bare simulation.
+    cells = np.repeat(np.arange(len(n_on)), n_on)
     return Record(
-        step=np.repeat(np.arange(corridor.duration + 1, dtype=np.int32), n_rows),
-        vehicle=np.array(vehicle, dtype=np.int32),
-        segment=np.array(segment, dtype=np.int16),
+        step=(cells // len(edges)).astype(np.int32),
+        vehicle=np.fromstring(" ".join(names), dtype=np.int32, sep=" "),
+        segment=(cells % len(edges)).astype(np.int16),
         speed=(KMH * np.array(speed, dtype=np.float64)).astype(np.float32),
         n_steps=corridor.duration + 1,
-        n_columns=corridor.n_segments + corridor.n_boundaries,
+        n_columns=len(edges),
     )

@@ -18,6 +18,7 @@ from dptse_env.traffic import (
 )
 from dptse_env.traffic.network import packaged_network
 from dptse_env.traffic.record import COLUMNS
+from dptse_env.traffic.sumo import running, seconds
 
 N = PAPER_HIGHWAY.n_mainline
 INCIDENT = PAPER_HIGHWAY.incident.segment
@@ -141,6 +142,34 @@ def test_the_same_seed_gives_the_same_record_and_another_seed_another(short_reco
     assert_same(simulate(SHORT_HIGHWAY, 0), short_record)
     other = simulate(SHORT_HIGHWAY, 1)
     assert not np.array_equal(other.counts, short_record.counts)
+
+
+def test_a_bare_run_is_the_run_that_is_recorded(short_record):
+    scenario = SHORT_HIGHWAY.draw(0)
+    with running(SHORT_HIGHWAY, scenario) as libsumo:
+        counts = [libsumo.vehicle.getIDCount() for _ in seconds(libsumo, SHORT_HIGHWAY, scenario)]
+        assert libsumo.simulation.getTime() == SHORT_HIGHWAY.duration
+    np.testing.assert_array_equal(counts, short_record.counts.sum(axis=1))
+
+
+def test_a_run_is_closed_however_it_ends():
+    import libsumo
+
+    scenario = SHORT_HIGHWAY.draw(3)
+
+    def interrupted():
+        assert libsumo.isLoaded()
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt), running(SHORT_HIGHWAY, scenario):
+        interrupted()
+    assert not libsumo.isLoaded()
+    with (
+        pytest.raises(RecordingError, match=r"traffic seed 3 failed: .*nowhere"),
+        running(SHORT_HIGHWAY, scenario),
+    ):
+        libsumo.edge.getLastStepVehicleIDs("nowhere")
+    assert not libsumo.isLoaded()
 
 
 def test_sumo_writes_nothing_to_stdout_or_stderr(capfd):

@@ -9,7 +9,7 @@ import pytest
 
 from dptse_env.traffic import SHORT_HIGHWAY, Record, RecordingError, simulate, simulate_in_child
 from dptse_env.traffic.record import COLUMNS
-from dptse_env.traffic.worker import Worker, WorkerPool
+from dptse_env.traffic.worker import Worker, WorkerDiedError, WorkerPool
 
 SCRIPT = """
 from dptse_env.traffic import SHORT_HIGHWAY, simulate_in_child
@@ -83,7 +83,7 @@ def test_one_worker_serves_many_tasks_and_survives_a_failing_one(worker, tmp_pat
 
 def test_a_killed_worker_is_one_clear_error(worker, tmp_path):
     os.kill(worker.pid, signal.SIGKILL)
-    with pytest.raises(RecordingError, match=r"traffic seed 5 failed: .* ended with code -9"):
+    with pytest.raises(WorkerDiedError, match=r"traffic seed 5 failed: .* ended with code -9"):
         worker.record(SHORT_HIGHWAY, 5, tmp_path / "5", {})
     assert not worker.alive
 
@@ -102,6 +102,18 @@ def test_a_pool_replaces_a_dead_worker(tmp_path, monkeypatch):
         monkeypatch.setattr(Worker, "record", healthy)
         pool.record(SHORT_HIGHWAY, 0, tmp_path / "0", {})
     assert Record.load(tmp_path / "0", {}).n_rows > 0
+
+
+def test_half_an_answer_is_the_death_of_the_worker(tmp_path, monkeypatch):
+    script = tmp_path / "dies"
+    script.write_text("#!/bin/sh\nhead -c 1 > /dev/null\nprintf '{\"fail'\nexit 3\n")
+    script.chmod(0o700)
+    with monkeypatch.context() as patch:
+        patch.setattr(sys, "executable", str(script))
+        worker = Worker()
+    with pytest.raises(WorkerDiedError, match=r"traffic seed 4 failed: .* ended with code 3"):
+        worker.record(SHORT_HIGHWAY, 4, tmp_path / "4", {})
+    worker.close()
 
 
 class WritesToStdout:
