@@ -3,8 +3,12 @@ import numpy as np
 import pytest
 
 pytest.importorskip("stable_baselines3")
+pytest.importorskip("sb3_contrib")
 
+from sb3_contrib import MaskablePPO
+from sb3_contrib.common.maskable.evaluation import evaluate_policy as evaluate_masked
 from stable_baselines3 import PPO, SAC
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
@@ -208,3 +212,27 @@ def test_sac_learns_from_terminal_observations():
     np.testing.assert_array_equal(kept.timeouts[:30], kept.dones[:30])
     assert (kept.next_observations[:29][ends[:29]] != kept.observations[1:30][ends[:29]]).any()
     assert (kept.next_observations[:29][~ends[:29]] == kept.observations[1:30][~ends[:29]]).all()
+
+
+class DroppedPicks(BaseCallback):
+    """Counts the picks that had been made before, in every decision of the training."""
+
+    n_dropped = 0
+
+    def _on_step(self):
+        (process,) = self.training_env.get_attr("process", 0)
+        self.n_dropped += process.n_dropped.sum()
+        self.n_dropped += sum(info.get("n_dropped", 0.0) for info in self.locals["infos"])
+        return True
+
+
+@pytest.mark.parametrize(("algorithm", "masked"), [(MaskablePPO, True), (PPO, False)])
+def test_maskable_ppo_never_picks_twice(algorithm, masked):
+    env = VecMonitor(make(4, action="sequential", bandwidth=4))
+    model = algorithm("MlpPolicy", env, n_steps=32, batch_size=32, n_epochs=2, seed=0, device="cpu")
+    counter = DroppedPicks()
+    model.learn(256, callback=counter)
+    assert (counter.n_dropped == 0) == masked
+    if masked:
+        _, lengths = evaluate_masked(model, env, 8, return_episode_rewards=True)
+        assert lengths == [24] * 8

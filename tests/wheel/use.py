@@ -44,6 +44,9 @@ def main() -> None:
         env.reset(seed=0)
         env.step(env.action_space.sample())
         env.close()
+    envs = gym.make_vec("dptse_env:dptse/ShortHighway-v0", num_envs=3, traffic_seeds="0:1")
+    envs.reset(seed=0)
+    assert np.isfinite(envs.step(envs.action_space.sample())[1]).all()
     print(f"the wheel works with gymnasium {gym.__version__}")
 
 

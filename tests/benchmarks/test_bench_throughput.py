@@ -1,0 +1,169 @@
+"""Whether the throughput table says what was measured, and what was not; never how fast it is."""
+
+import csv
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.throughput import tables
+from benchmarks.throughput.children import RowError, measure, measure_all
+from benchmarks.throughput.environments import Driver, Kernel, batch
+from benchmarks.throughput.measure import Measured, Samples, queries, resident, take_turns
+from benchmarks.throughput.results import Result, best
+from benchmarks.throughput.rows import QUICK, Row, Sizes, catalogue, chosen
+from benchmarks.throughput.targets import targets
+
+ROOT = Path(__file__).parents[2]
+
+
+def result(name, peak=None, libraries=None, notes=None, **arms):
+    arms = {arm.replace("_", " "): Samples(rates) for arm, rates in arms.items()}
+    return Result(Row(name, "m:f"), [Measured(arms, peak, libraries, notes or {})])
+
+
+def results(*found):
+    return {one.row.name: one for one in found}
+
+
+def test_rates_are_medians_over_all_turns_of_all_repeats():
+    one = result("a", environment=[1.0, 2.0, 30.0])
+    one.repeats += result("a", environment=[4.0, 5.0]).repeats
+    assert one.rate("environment") == 4.0
+    assert one.rate("kernel") is None
+    low, high = np.percentile([1.0, 2.0, 4.0, 5.0, 30.0], [10, 90])
+    assert one.spread("environment") == pytest.approx((high - low) / 8.0)
+
+
+def test_a_share_pairs_the_turns_of_one_round():
+    # The machine slows down by ten in the second round: the share stays.
+    one = result("a", one_thread=[50.0, 5.0, 60.0], kernel=[100.0, 10.0, 60.0])
+    assert one.share("one thread", "kernel") == pytest.approx(0.5)
+
+
+def test_turns_alternate_and_set_up_is_off_the_clock():
+    log = []
+    work = {"a": lambda: log.append("a") or 1, "b": lambda: log.append("b") or 2}
+
+    def prepare():
+        log.append("-")
+        time.sleep(0.05)
+
+    arms = take_turns(work, 0.0, prepare)
+    assert log == ["-", "a", "b"] * 3
+    assert len(arms["a"].rates) == 3
+    assert min(arms["a"].rates) > 1 / 0.05
+
+
+def test_targets_are_judged_by_the_measured_ratios():
+    found = results(
+        result("vector-ekf-5-1024", one_thread=[30_000.0], kernel=[40_000.0]),
+        result("vector-ukf-5-1024", one_thread=[9_999.0]),
+        result("libsumo", bare=[1_000.0], recording=[850.0]),
+        result("async-2", environment=[2_000.0]),
+        result("async-8", environment=[4_000.0]),
+        result("memory-paper", peak=1_500.0, libraries=400.0,
+               notes={"early": 900.0, "late": 901.0, "records": 256.0}),
+    )  # fmt: skip
+    verdicts = [(round(t.measured, 3), t.verdict) for t in targets(found) if t.measured is not None]
+    assert verdicts == [
+        (0.75, "met"), (30_000.0, "met"), (30.0, "met"), (7.5, "missed"), (9_999.0, "missed"),
+        (0.85, "met"), (1_100.0, "missed"), (1.0, "met"),
+    ]  # fmt: skip
+    assert [t.verdict for t in targets({})] == ["not measured"] * 14
+    assert best(found, "async-") == ("async-8", 4_000.0)
+
+
+def test_tables_name_what_is_missing():
+    found = results(
+        result("libsumo", bare=[1_000.0, 1_200.0, 1_100.0], recording=[900.0]),
+        result("sumo-rl", environment=[220.0], notes={"simulated_seconds": 5.0}),
+        result("async-4", peak=300.0, libraries=200.0, environment=[4_400.0]),
+        Result(Row("scalar-ekf", "m:f"), problem="failed: no road"),
+        Result(Row("sync-8", "m:f"), problem="failed: no lane"),
+    )
+    lines = tables.summary(found).splitlines()
+    assert "| libsumo alone, simulated seconds | 1,100 ± 7% | – | 1 | – |" in lines
+    assert "| sumo-rl, single intersection, 5 s a step | 220 ± 0% | – | 1 | – |" in lines
+    assert "| one episode, EKF | failed: no road | – | – | – |" in lines
+    assert "| AsyncVectorEnv of 4, EKF | – | 4,400 ± 0% | 2 | 300 (200) |" in lines
+    assert "| SyncVectorEnv of 8, EKF | failed: no lane | – | – | – |" in lines
+    assert not any("UKF" in line for line in lines)
+    assert tables.problems(found) == ("- scalar-ekf: failed: no road\n- sync-8: failed: no lane\n")
+
+
+def test_a_module_that_is_absent_is_reported_and_keeps_nobody():
+    absent = Row("peer", "m:f", needs=("no_such_module",))
+    broken = Row("broken", "rows:best")
+    found = measure_all([absent, broken], 0.0, 1, lambda line: None)
+    assert found["peer"].problem == (
+        "no_such_module not installed: pip install 'dptse-env[benchmark]'"
+    )
+    assert "AttributeError" in found["broken"].problem
+
+
+def test_a_row_that_hangs_is_ended():
+    with pytest.raises(RowError, match="took longer than 0 s"):
+        measure(Row("slow", "environments:scalar"), 60.0, limit=0.1)
+
+
+def test_rows_are_chosen_by_pattern():
+    rows = list(catalogue(Sizes()))
+    assert len({row.name for row in rows}) == len(rows)
+    assert len(chosen(rows, ["vector-ekf-*"])) == 6
+    assert chosen(rows, []) == rows
+    assert len(list(catalogue(QUICK))) < len(rows)
+    with pytest.raises(ValueError, match=r"rows must be among libsumo, .*; got 'sumo'"):
+        chosen(rows, ["sumo"])
+
+
+def test_queries_are_masks_of_the_asked_size():
+    masks = queries(4, 3, 15, 5)
+    assert masks.shape == (4, 3, 15)
+    assert (masks.sum(axis=-1) == 5).all()
+    assert not (masks[0] == masks[1]).all()
+
+
+@pytest.mark.parametrize("estimator", ["ekf", "enkf"])
+def test_the_bare_estimator_does_the_work_of_the_environments(estimator):
+    env = batch("ShortHighway", 2, 1, estimator=estimator, traffic_seeds="0:1", horizon=200)
+    driver = Driver(env, 2, queries(4, 2, 6, 2))
+    kernel = Kernel(env)
+    driver.restart(0)
+    kernel.reset()
+    assert driver.step(6) == kernel.follow() == 12
+    kernel.check()
+    driver.restart()
+    kernel.reset()
+    driver.step(1)
+    with pytest.raises(AssertionError):
+        kernel.check()
+    kernel.follow()
+    kernel.check()
+
+
+def test_memory_is_read():
+    assert 10.0 < resident() <= resident("VmHWM")
+
+
+@pytest.mark.slow
+def test_the_command_writes_its_tables(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-m", "benchmarks.bench_throughput", "--quick", "--rows", "sync-8",
+         "plain-ekf", "--output", tmp_path],
+        cwd=ROOT, check=True, capture_output=True, text=True,
+    )  # fmt: skip
+    assert (tmp_path / "REPORT.md").read_text() == done.stdout.removesuffix("\n")
+    with (tmp_path / "throughput.csv").open() as file:
+        assert {line["row"] for line in csv.DictReader(file)} == {"sync-8", "plain-ekf"}
+    assert len(json.loads((tmp_path / "throughput.json").read_text())) == 2
+    refused = subprocess.run(
+        [sys.executable, "-m", "benchmarks.bench_throughput", "--rows", "nothing"],
+        cwd=ROOT, check=False, capture_output=True, text=True,
+    )  # fmt: skip
+    assert refused.returncode == 2
+    assert refused.stderr.startswith("error: rows must be among")
