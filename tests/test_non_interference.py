@@ -14,11 +14,11 @@ from dptse_env.actions import ACTION_ENCODINGS
 from dptse_env.boundary import NominalBoundary
 from dptse_env.estimators import ESTIMATORS
 from dptse_env.process import TRUTH_INFO
-from dptse_env.schedules import SCHEDULES, make_schedule
+from dptse_env.schedules import INFORMED, ORACLES, SCHEDULES, make_schedule
 
 SEEDS = (0, 1)
 START, STEPS = 250, 30
-BLIND_SCHEDULES = sorted(set(SCHEDULES) - {"all"})
+BLIND_SCHEDULES = sorted({*SCHEDULES, *INFORMED} - {"all"})
 
 
 class ConstantMechanism:
@@ -197,6 +197,12 @@ def test_realised_exposures_in_info_would_show(monkeypatch):
 
     monkeypatch.setattr(process, "info", telling)
     assert unlike(env)
+
+
+@pytest.mark.parametrize("oracle", sorted(set(ORACLES) - {"oracle-brute-force"}))
+def test_an_oracle_shows(oracle):
+    env = blind(make_private())
+    assert not same(transcript(env, 0, oracle), transcript(env, 1, oracle))
 
 
 # --- the presets of the paper, but for their declared exception ---------------------------------

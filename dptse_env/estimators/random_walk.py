@@ -38,6 +38,27 @@ class RandomWalk(BatchEstimator):
         self.variances = np.broadcast_to(self._initial_variance, shape).copy()
         self._prior = self.means.copy()
 
+    @property
+    def states(self) -> FloatArray:
+        """Means `(n, 2 S)` [veh/km, veh/h]."""
+        return self.model.states(self.means[..., 0], self.means[..., 1])
+
+    @property
+    def covariances(self) -> FloatArray:
+        """Covariances `(n, 2 S, 2 S)`, rho normalised by rho_m and psi by rho_m v_f.
+
+        To first order: `traffic_jacobian` turns them into the variances of density and speed.
+        """
+        rho_m, v_f = self.model.density_scale, self.model.speed_scale
+        inverse = np.linalg.inv(self.model.traffic_jacobian(self.states))
+        inverse /= np.array([[rho_m], [rho_m * v_f]])
+        blocks = inverse * self.variances[..., None, :] @ inverse.swapaxes(-1, -2)
+        n_episodes, n_segments = self.means.shape[:2]
+        whole = np.zeros((n_episodes, n_segments, 2, n_segments, 2))
+        every = np.arange(n_segments)
+        whole[:, every, :, every] = blocks.swapaxes(0, 1)
+        return whole.reshape(n_episodes, 2 * n_segments, 2 * n_segments)
+
     def _reset(
         self, episodes: IntArray, states: FloatArray, generators: Sequence[np.random.Generator]
     ) -> None:

@@ -1,0 +1,170 @@
+"""What every schedule is: `predict` around a choice of segments."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+
+from dptse_env.arrays import Action, BoolArray, FloatArray, IntArray, Observation
+from dptse_env.interface import QueryInterface
+from dptse_env.process import QueryProcess
+
+
+class ScheduleState(NamedTuple):
+    """What a schedule carries from one step to the next.
+
+    Attributes:
+        step: Decisions completed in the episode, shape (k,).
+        wanted: The segments of the decision in progress, shape (k, n_mainline).
+    """
+
+    step: IntArray
+    wanted: BoolArray
+
+
+class Schedule(ABC):
+    """A query policy; subclasses say which segments to ask in `select`.
+
+    Attributes:
+        uses_truth: Whether the choice rests on the true traffic. Such a schedule is a bound on
+            what policies can reach, and no policy.
+    """
+
+    uses_truth: ClassVar[bool] = False
+
+    def __init__(self, interface: QueryInterface, seed: int | None = None) -> None:
+        """Bind the schedule to an environment's ``interface``.
+
+        Args:
+            interface: What the environment shows and takes (``env.unwrapped.interface``).
+            seed: Seed of the schedule's own choices, for those that draw any.
+        """
+        self.interface = interface
+        self.n_mainline = interface.n_mainline
+        self.bandwidth = interface.bandwidth
+        self.generator = np.random.default_rng(seed)
+
+    @abstractmethod
+    def select(self, step: IntArray, observation: Observation) -> BoolArray:
+        """Return the segments to query, shape (k, n_mainline).
+
+        Args:
+            step: Decisions completed so far in each episode, shape (k,).
+            observation: Observations, shape (k, size).
+        """
+
+    def predict(
+        self,
+        observation: Observation,
+        state: tuple[Any, ...] | None = None,
+        episode_start: Any = None,
+        deterministic: bool = False,
+    ) -> tuple[Action, tuple[Any, ...]]:
+        """Return the actions for one observation or a batch of them, and the new state.
+
+        Args:
+            observation: Shape (size,) or (k, size).
+            state: The state returned by the last call, None at the first.
+            episode_start: Which episodes have just begun, shape (k,) or a single flag.
+            deterministic: Accepted for the sake of the common signature. A schedule does the
+                same either way; the random one draws in both cases.
+        """
+        del deterministic
+        batch = np.atleast_2d(observation)
+        k = len(batch)
+        step, wanted = self._resume(k, state, episode_start)
+        picked = self._picked(batch)
+        fresh = np.flatnonzero(~picked.any(axis=1))
+        if fresh.size:
+            wanted[fresh] = self._choose(fresh, step[fresh], batch[fresh])
+        action = self.interface.actions.encode(wanted, picked)
+        last_pick = picked.sum(axis=1) + 1 == self.interface.actions.actions_per_step
+        new_state = ScheduleState(step + last_pick, wanted)
+        return (action[0] if np.ndim(observation) == 1 else action), new_state
+
+    def _choose(self, rows: IntArray, step: IntArray, observation: Observation) -> BoolArray:
+        """Return what `select` says of some ``rows`` of the batch, all arrays of these alone."""
+        del rows
+        return self.select(step, observation)
+
+    def _resume(
+        self, k: int, state: tuple[Any, ...] | None, episode_start: Any
+    ) -> tuple[IntArray, BoolArray]:
+        if state is None:
+            step = np.zeros(k, dtype=np.int64)
+            wanted = np.zeros((k, self.n_mainline), dtype=bool)
+        else:
+            step, wanted = np.array(state[0]), np.array(state[1])
+        if episode_start is not None:
+            step[np.broadcast_to(episode_start, (k,)).astype(bool)] = 0
+        return step, wanted
+
+    def _picked(self, batch: Observation) -> BoolArray:
+        if "picked" not in self.interface.observations.slices:
+            return np.zeros((len(batch), self.n_mainline), dtype=bool)
+        return self.interface.observations.block(batch, "picked") > 0
+
+    def _block(self, observation: Observation, name: str) -> Observation:
+        return self.interface.observations.block(observation, name)
+
+    def _mask(self, chosen: IntArray) -> BoolArray:
+        """Return the mask of the chosen indices, (k, anything) to (k, n_mainline)."""
+        mask = np.zeros((len(chosen), self.n_mainline), dtype=bool)
+        np.put_along_axis(mask, chosen, True, axis=1)
+        return mask
+
+    def _highest(self, value: FloatArray | Observation, step: IntArray) -> BoolArray:
+        """Return the ``bandwidth`` segments of the highest value (k, n_mainline).
+
+        Ties go round the road with the step: breaking them from one end would ask the segments
+        there half as often again. A mainline segment with a fixed sensor is observed without being
+        asked, so it comes last, whatever its value.
+        """
+        fixed = self.interface.observations.fixed_sensors
+        score = np.array(value, dtype=np.float64)
+        score[:, fixed[fixed < self.n_mainline]] = -np.inf
+        turn = (np.arange(self.n_mainline) - step[:, None]) % self.n_mainline
+        return self._mask(np.lexsort((turn, -score), axis=1)[:, : self.bandwidth])
+
+
+class BoundSchedule(Schedule):
+    """A schedule that reads what its environment's process holds beside the observation.
+
+    Its batch is that process's episodes, all of them and in order.
+    """
+
+    name: ClassVar[str]
+
+    def __init__(self, process: QueryProcess, seed: int | None = None) -> None:
+        """Bind the schedule to a ``process`` (``env.unwrapped.process``)."""
+        super().__init__(process.interface, seed)
+        self.process = process
+
+    def predict(
+        self,
+        observation: Observation,
+        state: tuple[Any, ...] | None = None,
+        episode_start: Any = None,
+        deterministic: bool = False,
+    ) -> tuple[Action, tuple[Any, ...]]:
+        """See `Schedule.predict`.
+
+        Raises:
+            ValueError: The batch is not of the process's size.
+        """
+        k, n = len(np.atleast_2d(observation)), self.process.n_episodes
+        if k != n:
+            raise ValueError(
+                f"schedule {self.name!r} follows the {n} episodes of its environment, all of them "
+                f"and in order; got a batch of {k}"
+            )
+        return super().predict(observation, state, episode_start, deterministic)
+
+    def select(self, step: IntArray, observation: Observation) -> BoolArray:
+        """See `Schedule.select`; for all episodes."""
+        return self._choose(np.arange(self.process.n_episodes), step, observation)
+
+    @abstractmethod
+    def _choose(self, rows: IntArray, step: IntArray, observation: Observation) -> BoolArray: ...

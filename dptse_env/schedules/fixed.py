@@ -1,0 +1,150 @@
+"""Schedules that need nothing but a clock, and those that look at ages and variances."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import numpy as np
+
+from dptse_env.arrays import BoolArray, IntArray, Observation
+from dptse_env.interface import QueryInterface
+from dptse_env.observations import AGE_CAP
+from dptse_env.schedules.base import Schedule
+
+
+class Shifting(Schedule):
+    """An evenly spread set that moves one segment downstream every ``period`` steps.
+
+    The set starts at floor(n i / B) for i = 0 .. B-1; what leaves the road downstream comes back
+    upstream. ``period=4`` is the schedule of Vishnoi et al. (section IV-A), ``period=1`` a round
+    robin, ``period=None`` a static set.
+    """
+
+    def __init__(
+        self, interface: QueryInterface, seed: int | None = None, *, period: int | None = 4
+    ) -> None:
+        """Bind the schedule; ``period`` [steps] must be None or at least 1."""
+        super().__init__(interface, seed)
+        if period is not None and period < 1:
+            raise ValueError(f"schedule.period must be None or >= 1, got {period}")
+        self.period = period
+        self._start = np.arange(self.bandwidth) * self.n_mainline // self.bandwidth
+
+    def select(self, step: IntArray, observation: Observation) -> BoolArray:
+        """See `Schedule.select`."""
+        shift = np.zeros_like(step) if self.period is None else step // self.period
+        return self._mask((self._start + shift[:, None]) % self.n_mainline)
+
+
+class Random(Schedule):
+    """``bandwidth`` different segments, drawn anew at every step."""
+
+    def select(self, step: IntArray, observation: Observation) -> BoolArray:
+        """See `Schedule.select`."""
+        keys = self.generator.random((len(step), self.n_mainline))
+        return self._mask(np.argsort(keys, axis=1)[:, : self.bandwidth])
+
+
+class OldestFirst(Schedule):
+    """The segments that have not been observed for longest; ties go round the road.
+
+    A segment with a fixed sensor is observed at every step and so is never asked, unless there
+    is bandwidth to spare.
+    """
+
+    def select(self, step: IntArray, observation: Observation) -> BoolArray:
+        """See `Schedule.select`."""
+        return self._highest(self._block(observation, "age"), step)
+
+
+class LargestVariance(Schedule):
+    """The segments of the largest posterior variance in the reward's metric.
+
+    With the standard deviations s_rho and s_v of the observation, which are in the reward's units
+    already, that is s_rho^2 + s_v^2; for a reward, or a ``term``, of one of them, that one alone.
+    The blocks are clipped at exp(-10) and exp(5); what lies beyond is a tie. It costs a sort.
+    """
+
+    def __init__(
+        self, interface: QueryInterface, seed: int | None = None, *, term: str | None = None
+    ) -> None:
+        """Bind the schedule; ``term`` is one of the reward's, its own if None."""
+        super().__init__(interface, seed)
+        term = interface.reward.term if term is None else term
+        if term not in _BLOCKS:
+            raise ValueError(f"schedule.term must be one of {', '.join(_BLOCKS)}, got {term!r}")
+        self._names = _BLOCKS[term]
+
+    def select(self, step: IntArray, observation: Observation) -> BoolArray:
+        """See `Schedule.select`."""
+        n = self.n_mainline
+        logs = np.stack([self._block(observation, name)[:, :n] for name in self._names])
+        return self._highest(np.exp(2.0 * logs.astype(np.float64)).sum(axis=0), step)
+
+
+_BLOCKS = {
+    "joint": ("density_log_std", "speed_log_std"),
+    "density": ("density_log_std",),
+    "speed": ("speed_log_std",),
+}
+
+
+class StaleVariance(Schedule):
+    """The segments of the largest variance, grown with the square of the time since the last look.
+
+    Scores are ``(age + 1)^2 (s_rho^2 + min(s_v, 0.1)^2)`` with the age in seconds and deviations in
+    the reward's units; a reward of one term takes that term. The age makes up for an estimator that
+    is too sure of what it has not seen for long, the cap of a tenth of the free speed for one that
+    is not sure enough of speeds on nearly empty segments. Both were chosen on validation traffic.
+    It costs a sort.
+    """
+
+    age_power: ClassVar[float] = 2.0
+    speed_cap: ClassVar[float] = 0.1
+
+    def select(self, step: IntArray, observation: Observation) -> BoolArray:
+        """See `Schedule.select`."""
+        n, term = self.n_mainline, self.interface.reward.term
+        age, density_log, speed_log = (
+            self._block(observation, name)[:, :n].astype(np.float64)
+            for name in ("age", "density_log_std", "speed_log_std")
+        )
+        variance = np.zeros_like(age)
+        if term != "speed":
+            variance += np.exp(2.0 * density_log)
+        if term != "density":
+            variance += np.minimum(np.exp(speed_log), self.speed_cap) ** 2
+        return self._highest((AGE_CAP * age + 1.0) ** self.age_power * variance, step)
+
+
+class Nothing(Schedule):
+    """No query at all: the fixed sensors alone. A lower mark (mask actions only)."""
+
+    def select(self, step: IntArray, observation: Observation) -> BoolArray:
+        """See `Schedule.select`."""
+        return np.zeros((len(step), self.n_mainline), dtype=bool)
+
+
+class Everything(Schedule):
+    """Every segment at every step. An upper mark: it needs ``bandwidth`` equal to the road.
+
+    With the paper's mechanism more sensors mean more noise on each, so this is the upper mark of
+    coverage, not of accuracy.
+    """
+
+    def __init__(self, interface: QueryInterface, seed: int | None = None) -> None:
+        """Bind the schedule.
+
+        Raises:
+            ValueError: The bandwidth does not cover the road.
+        """
+        super().__init__(interface, seed)
+        if self.bandwidth < self.n_mainline:
+            raise ValueError(
+                f"schedule 'all' needs bandwidth {self.n_mainline}, the environment has "
+                f"{self.bandwidth}"
+            )
+
+    def select(self, step: IntArray, observation: Observation) -> BoolArray:
+        """See `Schedule.select`."""
+        return np.ones((len(step), self.n_mainline), dtype=bool)

@@ -1,0 +1,46 @@
+"""A rollout over single swaps of a greedy set."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from dptse_env.arrays import BoolArray, FloatArray
+from dptse_env.process import QueryProcess
+from dptse_env.schedules import kernels
+from dptse_env.schedules.informed import WARY, Caution, Informed
+from dptse_env.validation import integer
+
+
+class Rollout(Informed):
+    """The set of `WaryTrace`, or one that differs by a single swap, whichever promises most.
+
+    Each of the B (n - F - B) swaps, F fixed sensors on the mainline, is asked for in thought. From
+    then on the largest weighted variance is asked for at each step, and covariances go on as
+    ``P = F P F' + Q`` and by the Kalman update, with F, H and weights as they are now. The set with
+    the least sum of weighted traces over the horizon is taken; greedy's where none is less. It
+    looks further than greedy, and trusts the model further.
+
+    A set costs about an EKF's step per second of the horizon. At n = 15, B = 5 there are 46 sets:
+    some 230 EKF steps at a horizon of 5.
+    """
+
+    name: ClassVar[str] = "rollout"
+
+    def __init__(
+        self,
+        process: QueryProcess,
+        seed: int | None = None,
+        *,
+        caution: Caution = WARY,
+        horizon: int = 5,
+    ) -> None:
+        """Bind the schedule; see `Informed`. The ``horizon`` [s] includes the coming second."""
+        super().__init__(process, seed, caution=caution)
+        self.horizon = integer("schedule.horizon", horizon, 1)
+
+    def _select(
+        self, means: FloatArray, covariances: FloatArray, inputs: FloatArray, queried: BoolArray
+    ) -> None:
+        kernels.choose_by_swaps(
+            self._road, self._problem, self.horizon, means, covariances, inputs, queried
+        )
