@@ -8,15 +8,18 @@ whatever is asked.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.vector import AutoresetMode
 
+from dptse_env.arrays import FloatArray
 from dptse_env.config import TEST_SEEDS
 from dptse_env.rendering import History
+from dptse_env.vector_env import SensorQueryVectorEnv
 
 WARM_UP = 60
 """Seconds at the start of an episode that do not count: the road fills, the estimator settles."""
@@ -106,7 +109,7 @@ def run_episode(
     start = process.time[0]
     state: Any = None
     episode_start = np.ones(1, dtype=bool)
-    rewards, infos = [], []
+    seconds: list[dict[str, float]] = []
     truncated = False
     while not truncated:
         action, state = policy.predict(observation, state, episode_start, deterministic)
@@ -114,34 +117,102 @@ def run_episode(
         before = process.time[0]
         observation, reward, _, truncated, info = env.step(action)
         if process.time[0] > before:  # a sequential action may leave the traffic where it is
-            rewards.append(float(reward))
-            infos.append(info)
+            seconds.append({"reward": float(reward), **{key: info[key] for key in _SERIES}})
             if on_second is not None:
                 on_second()
-    counted = slice(max(warm_up - int(start), 0), None)
-    return _score(traffic_seed, rewards[counted], infos[counted], warm_up)
+    counted = seconds[max(warm_up - int(start), 0) :]
+    series = {
+        key: np.array([second[key] for second in counted], dtype=np.float64)
+        for key in ("reward", *_SERIES)
+    }
+    return _score(traffic_seed, series, warm_up)
 
 
-def _score(
-    traffic_seed: int, rewards: list[float], infos: list[dict[str, Any]], warm_up: int
-) -> EpisodeScore:
-    if not infos:
+def run_episodes(
+    env: SensorQueryVectorEnv,
+    policy: Policy,
+    *,
+    traffic_seeds: Sequence[int],
+    seeds: Sequence[int],
+    warm_up: int = WARM_UP,
+    deterministic: bool = True,
+    on_second: Callable[[], None] | None = None,
+) -> list[EpisodeScore]:
+    """Run a batch of episodes at once and pool the errors of each.
+
+    The scores are those of `run_episode` for each pair of seeds, but for policies that draw: those
+    draw for the whole batch at once, so they draw other numbers of the same law.
+
+    Args:
+        env: A bare vector environment, made with ``autoreset_mode="Disabled"``. Its episodes are
+            in the order of the seeds.
+        policy: Who picks the queries.
+        traffic_seeds: Traffic of each episode, n of the environment's traffic seeds.
+        seeds: Seed of the noise and the estimator of each episode, n of them.
+        warm_up: Seconds that do not count.
+        deterministic: Handed to the policy.
+        on_second: Called after the reset and after every second.
+
+    Raises:
+        ValueError: Seeds are too many or too few, the environment is made otherwise, or episodes
+            are not longer than the warm-up.
+    """
+    if not len(traffic_seeds) == len(seeds) == env.num_envs:
+        raise ValueError(
+            f"traffic_seeds and seeds must be {env.num_envs} each, one for each episode, got "
+            f"{len(traffic_seeds)} and {len(seeds)}"
+        )
+    if env.autoreset_mode is not AutoresetMode.DISABLED:
+        raise ValueError(
+            f"env must be made with autoreset_mode='Disabled', got {env.autoreset_mode.value!r}"
+        )
+    process, episodes = env.process, np.arange(env.num_envs)
+    observation, _ = env.reset(seed=list(seeds), options={"traffic_seed": list(traffic_seeds)})
+    if on_second is not None:
+        on_second()
+    state: Any = None
+    episode_start = np.ones(env.num_envs, dtype=bool)
+    seconds: list[dict[str, Any]] = []
+    while not process.over.all():
+        actions, state = policy.predict(observation, state, episode_start, deterministic)
+        episode_start = np.zeros(env.num_envs, dtype=bool)
+        before = process.time.copy()
+        transition = env.advance(actions)
+        observation = transition.observation
+        # A decision takes as many actions in every episode: time passes in all of them or in none.
+        if (process.time > before).all():
+            said = process.infos(episodes)
+            second = {"reward": transition.reward, **{key: said[key] for key in _SERIES}}
+            seconds.append({**second, "counts": process.time > warm_up})
+            if on_second is not None:
+                on_second()
+    tables = {key: np.array([second[key] for second in seconds]) for key in seconds[0]}
+    counts = tables.pop("counts")
+    return [
+        _score(seed, {key: own[counts[:, k], k] for key, own in tables.items()}, warm_up)
+        for k, seed in enumerate(traffic_seeds)
+    ]
+
+
+_SERIES = ("rmse_density", "rmse_speed", "n_occupied", "n_dropped", "diverged", "fallback")
+"""What ``info`` says of a second that a score is made of."""
+
+
+def _score(traffic_seed: int, series: Mapping[str, FloatArray], warm_up: int) -> EpisodeScore:
+    """Pool the seconds that count, arrays (T,) by their names in ``info`` and ``reward``."""
+    if not len(series["reward"]):
         raise ValueError(f"the episode must be longer than the warm-up of {warm_up} s")
-
-    def series(key: str) -> Any:
-        return np.array([info[key] for info in infos])
-
-    n_occupied = series("n_occupied")
+    n_occupied = series["n_occupied"]
     return EpisodeScore(
         traffic_seed=traffic_seed,
-        rmse_density=math.sqrt(np.mean(series("rmse_density") ** 2)),
+        rmse_density=math.sqrt(np.mean(series["rmse_density"] ** 2)),
         rmse_speed=math.sqrt(
-            np.sum(n_occupied * series("rmse_speed") ** 2) / max(n_occupied.sum(), 1.0)
+            np.sum(n_occupied * series["rmse_speed"] ** 2) / max(n_occupied.sum(), 1.0)
         ),
-        reward=float(np.mean(rewards)),
-        n_dropped=float(series("n_dropped").sum()),
-        n_diverged=float(series("diverged").sum()),
-        n_fallback=float(series("fallback").sum()),
+        reward=float(np.mean(series["reward"])),
+        n_dropped=float(series["n_dropped"].sum()),
+        n_diverged=float(series["diverged"].sum()),
+        n_fallback=float(series["fallback"].sum()),
     )
 
 

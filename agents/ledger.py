@@ -12,10 +12,14 @@ from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
 
-class Cell(Hashable, Protocol):
-    """A frozen dataclass of plain values: one configuration, run on every traffic seed."""
+class Key(Hashable, Protocol):
+    """A frozen dataclass of plain values: what is run on every traffic seed."""
 
     __dataclass_fields__: typing.ClassVar[dict[str, Any]]
+
+
+class Cell(Key, Protocol):
+    """A key that is one configuration of an environment."""
 
     @property
     def keywords(self) -> dict[str, Any]:
@@ -32,11 +36,12 @@ class Scored(Protocol):
         """The traffic of the episode."""
 
 
+KeyT = TypeVar("KeyT", bound=Key)
 CellT = TypeVar("CellT", bound=Cell)
 ScoredT = TypeVar("ScoredT", bound=Scored)
 
 
-class Ledger(Generic[CellT, ScoredT]):
+class Ledger(Generic[KeyT, ScoredT]):
     """One record for each (cell, traffic seed), on disk as soon as it is added.
 
     A process that dies while it writes leaves a last line without its end. Such a line is
@@ -47,7 +52,7 @@ class Ledger(Generic[CellT, ScoredT]):
         rows: Records by cell and traffic seed.
     """
 
-    def __init__(self, path: Path, cell_type: type[CellT], record_type: type[ScoredT]) -> None:
+    def __init__(self, path: Path, cell_type: type[KeyT], record_type: type[ScoredT]) -> None:
         """Read what is there.
 
         Args:
@@ -62,7 +67,7 @@ class Ledger(Generic[CellT, ScoredT]):
         self._cell_fields = _parsers(cell_type)
         self._record_fields = _parsers(record_type)
         self.columns = (*self._cell_fields, *self._record_fields)
-        self.rows: dict[tuple[CellT, int], ScoredT] = {}
+        self.rows: dict[tuple[KeyT, int], ScoredT] = {}
         if path.exists():
             self._read()
 
@@ -87,7 +92,7 @@ class Ledger(Generic[CellT, ScoredT]):
                 raise ValueError(f"{self.path}, line {number}: {problem}") from problem
             self.rows[key] = record
 
-    def _parse(self, line: list[str]) -> tuple[tuple[CellT, int], ScoredT]:
+    def _parse(self, line: list[str]) -> tuple[tuple[KeyT, int], ScoredT]:
         if len(line) != len(self.columns):
             raise ValueError(f"must have {len(self.columns)} values, has {len(line)}")
         values = iter(line)
@@ -99,7 +104,7 @@ class Ledger(Generic[CellT, ScoredT]):
         )
         return (cell, record.traffic_seed), record
 
-    def append(self, cell: CellT, records: Iterable[ScoredT]) -> None:
+    def append(self, cell: KeyT, records: Iterable[ScoredT]) -> None:
         """Add what one task found, and put it on disk before returning."""
         records = list(records)
         new = not self.path.exists() or self.path.stat().st_size == 0
@@ -122,7 +127,7 @@ class Ledger(Generic[CellT, ScoredT]):
         aside.replace(self.path)
 
     def _sorted(self) -> Iterator[list[Any]]:
-        def order(item: tuple[tuple[CellT, int], ScoredT]) -> tuple[Any, ...]:
+        def order(item: tuple[tuple[KeyT, int], ScoredT]) -> tuple[Any, ...]:
             (cell, seed), _ = item
             return (*dataclasses.astuple(cell), seed)
 

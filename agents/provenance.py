@@ -56,14 +56,14 @@ def provenance(design: Design[CellT]) -> dict[str, Any]:
     whole = {
         "made_with": made_with,
         "tuned": tuned,
-        "sources": [_source()],
+        "sources": [source_digest()],
         "machine": machine,
     }
     plain: dict[str, Any] = json.loads(json.dumps(whole))
     return plain
 
 
-def _source() -> str:
+def source_digest() -> str:
     """Return a digest of the package's code, which changes more often than its version."""
     digest = hashlib.sha256()
     root = Path(dptse_env.__file__).parent

@@ -91,7 +91,7 @@ class Report:
 
     def _table(self, estimator: str) -> Table:
         table = Table(box=box.SIMPLE_HEAD, title=f"estimator {estimator}", title_justify="left")
-        table.add_column("schedule", no_wrap=True)
+        table.add_column("policy", no_wrap=True)
         for metric in ("density RMSE\n[veh/km]", "speed RMSE\n[km/h]"):
             table.add_column(metric, justify="right", no_wrap=True)
             table.add_column(f"against\n{self.reference}", justify="right", no_wrap=True)

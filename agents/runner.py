@@ -8,7 +8,7 @@ import os
 import signal
 import threading
 import warnings
-from collections.abc import Generator, Iterable, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from multiprocessing.connection import wait
@@ -103,6 +103,7 @@ def run_all(
     ledger: Ledger[CellT, EpisodeScore],
     workers: int,
     progress: bool = True,
+    work: Callable[[Any], list[Any]] | None = None,
 ) -> None:
     """Run tasks and add what they find to the ledger as they end.
 
@@ -111,6 +112,7 @@ def run_all(
         ledger: Where scores go.
         workers: Processes; 1 runs in this one.
         progress: Whether to show a progress bar.
+        work: Runs a task and returns a record for each of its seeds; `run_task` if None.
 
     Raises:
         ValueError: ``workers`` is below 1.
@@ -119,25 +121,25 @@ def run_all(
     total = sum(len(task.seeds) for task in tasks)
     bar = tqdm(total=total, desc="episodes", unit="episode", mininterval=0.5, disable=not progress)
     # Closed at once: an interrupt between two results must end the workers, too.
-    with bar, contextlib.closing(_done(tasks, workers)) as done:
+    with bar, contextlib.closing(_done(tasks, workers, work or run_task)) as done:
         for task, scores in done:
             ledger.append(task.cell, scores)
             bar.update(len(scores))
 
 
 def _done(
-    tasks: Iterable[Task[CellT]], workers: int
+    tasks: Iterable[Task[CellT]], workers: int, work: Callable[[Any], list[Any]]
 ) -> Generator[tuple[Task[CellT], list[EpisodeScore]], None, None]:
     """Yield tasks with their scores, in whatever order they end."""
     if workers == 1:
         for task in tasks:
-            yield task, run_task(task)
+            yield task, work(task)
         return
     # Threads of the linear algebra would fight over the cores; children read this as they start.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     pool = make_pool(workers)
     try:
-        running = {pool.submit(run_task, task): task for task in tasks}
+        running = {pool.submit(work, task): task for task in tasks}
         for future in as_completed(running):
             yield running.pop(future), future.result()
     except BaseException:
