@@ -93,7 +93,7 @@ class QueryProcess:
         self.estimator = make_estimator(
             config.estimator, config.backend, self.model, n, config.settings()
         )
-        self._blocks = Blocks(threads)
+        self._blocks = Blocks(threads if self.estimator.is_compiled else 1)
         interface.actions.start(n)
         self._observed_always = np.zeros(columns, dtype=bool)
         self._observed_always[[*corridor.fixed_sensors, *range(s, columns)]] = True

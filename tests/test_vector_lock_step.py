@@ -47,9 +47,14 @@ def test_threads_change_nothing(estimator):
         assert_same(one.step(actions), two.step(actions), tolerance=0)
 
 
-@pytest.mark.parametrize(("threads_given", "n_names"), [(1, 1), (2, 2)])
-def test_the_estimator_works_on_so_many_threads(threads_given, n_names, monkeypatch):
-    env = short(2 * SMALLEST, threads=threads_given)
+@pytest.mark.parametrize(
+    ("estimator", "threads_given", "n_names"),
+    [("ekf", 1, 1), ("ekf", 2, 2), ("enkf", 2, 2), ("random_walk", 2, 1)],
+)
+def test_compiled_estimators_work_on_so_many_threads(
+    estimator, threads_given, n_names, monkeypatch
+):
+    env = short(2 * SMALLEST, estimator=estimator, threads=threads_given)
     env.reset(seed=0)
     names, predict = set(), env.process.estimator.predict
 

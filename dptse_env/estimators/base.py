@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import ClassVar, Literal, Protocol
 
 import numpy as np
 
@@ -48,6 +48,8 @@ class Estimator(Protocol):
     """Estimates the traffic state of a batch of episodes, S segments each.
 
     Attributes:
+        is_compiled: Whether `predict` and `update` give Python's lock away, so that blocks of
+            episodes gain by threads.
         n_episodes: Episodes n in the batch.
         innovations: `(n, S, 2)` residuals of both releases before the last update, over their
             predicted standard deviations; 0 where nothing was observed.
@@ -57,6 +59,7 @@ class Estimator(Protocol):
             the prediction.
     """
 
+    is_compiled: ClassVar[bool]
     n_episodes: int
     innovations: FloatArray
     diverged: BoolArray

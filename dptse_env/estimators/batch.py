@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -76,6 +76,8 @@ class BatchEstimator(ABC):
     `Estimator` documents the public methods. A subclass writes `innovations` and `diverged` of
     the episodes that it updates, and `fallback` where its update can fail.
     """
+
+    is_compiled: ClassVar[bool] = False
 
     def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
         """See `make_estimator`."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import ClassVar
 
 import numpy as np
 
@@ -32,6 +33,8 @@ class CompiledEnKF(BatchEstimator):
     S that holds covariances which the gain leaves out would make the measurements count for less
     than they are worth; it costs nothing to speak of.
     """
+
+    is_compiled: ClassVar[bool] = True
 
     def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
         """See `make_estimator`."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import ClassVar
 
 import numpy as np
 
@@ -18,6 +19,8 @@ from dptse_env.model.road import road_of
 
 class CompiledFilter(BatchEstimator):
     """Mean and covariance of each episode, kept where kernels can reach them."""
+
+    is_compiled: ClassVar[bool] = True
 
     def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
         """See `make_estimator`."""
