@@ -1,0 +1,1 @@
+"""Learning to query: recipes, episodes, validation, and runs that may be interrupted."""

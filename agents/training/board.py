@@ -1,0 +1,50 @@
+"""`Board`: the learning curve for TensorBoard, where that is installed."""
+
+from __future__ import annotations
+
+import importlib.util
+import logging
+from pathlib import Path
+from typing import Any
+
+from agents.training.folder import Row
+
+logger = logging.getLogger(__name__)
+
+
+class Board:
+    """Writes rows of the learning curve for TensorBoard."""
+
+    def __init__(self, folder: Path) -> None:
+        """Prepare a writer; nothing is written before the first row.
+
+        Raises:
+            ImportError: TensorBoard is not installed.
+        """
+        self._folder = folder
+        self._writer: Any = None
+
+    @classmethod
+    def open(cls, folder: Path) -> Board | None:
+        """Return a board, or say that TensorBoard is missing and return None."""
+        if importlib.util.find_spec("tensorboard") is None:
+            logger.info("TensorBoard is not installed; the learning curve is in progress.csv only")
+            return None
+        return cls(folder)
+
+    def __call__(self, row: Row) -> None:
+        """Write one row."""
+        if self._writer is None:
+            from torch.utils.tensorboard import SummaryWriter  # noqa: PLC0415  not always there
+
+            # What an interrupted training wrote beyond its last checkpoint does not count.
+            step = int(row["steps"])
+            self._writer = SummaryWriter(str(self._folder), purge_step=step)
+        for name, value in row.items():
+            if name not in ("update", "steps"):
+                self._writer.add_scalar(name, value, int(row["steps"]))
+
+    def close(self) -> None:
+        """Write what is not yet on disk."""
+        if self._writer is not None:
+            self._writer.close()

@@ -1,0 +1,125 @@
+"""`RoadChannels`: a flat observation as channels along the road."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from dptse_env.config import EnvConfig
+from dptse_env.interface import QueryInterface
+
+CENTRES = {
+    "density": (0.15, 0.15),
+    "speed": (0.6, 0.3),
+    "density_log_std": (-3.0, 1.0),
+    "speed_log_std": (-3.0, 1.0),
+    "released_density": (0.15, 0.3),
+    "released_speed": (0.6, 0.5),
+    "released_flow": (0.0, 0.1),
+    "density_innovation": (0.0, 1.5),
+    "speed_innovation": (0.0, 1.5),
+    "age": (0.1, 0.1),
+    "queried": (0.0, 1.0),
+    "fixed_density_innovation": (0.0, 1.5),
+    "fixed_speed_innovation": (0.0, 1.5),
+}
+"""What a block's values are centred on and divided by, so that channels are of order one.
+
+Constants rather than running statistics: nothing can be lost between training and use."""
+
+MAINLINE = (
+    "density", "speed", "density_log_std", "speed_log_std", "density_innovation",
+    "speed_innovation", "age", "queried",
+)  # fmt: skip
+RAMP = ("density", "speed", "density_log_std", "speed_log_std")
+FIXED = ("fixed_density_innovation", "fixed_speed_innovation")
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One value for each mainline segment.
+
+    Attributes:
+        name: What it is, for people.
+        source: Place in the observation for each segment, n of them; None where there is nothing,
+            and the channel is 0.
+        centre: Subtracted from the values.
+        scale: Then divides them.
+    """
+
+    name: str
+    source: tuple[int | None, ...]
+    centre: float
+    scale: float
+
+
+@dataclass(frozen=True)
+class RoadChannels:
+    """How an observation is laid out along the road; plain data, so that it travels with a policy.
+
+    A ramp's values stand at the segment that it joins or leaves: an on-ramp at face j at segment
+    j, downstream of the face, an off-ramp at segment j - 1. The bandwidth and epsilon are left
+    out: they do not change in a training, and a weight on them that was never tried would spoil
+    a policy elsewhere. What they do shows in the deviations and ages.
+
+    Attributes:
+        n_mainline: Segments n along the road.
+        size: Length of an observation.
+        channels: The values that change.
+        marks: For each mark 0 or 1 per segment: on-ramp, off-ramp, fixed sensor.
+    """
+
+    n_mainline: int
+    size: int
+    channels: tuple[Channel, ...]
+    marks: tuple[tuple[float, ...], ...]
+
+    @classmethod
+    def of(cls, config: EnvConfig) -> RoadChannels:
+        """Lay out the observations of an environment of ``config``."""
+        corridor, n = config.corridor, config.corridor.n_mainline
+        encoding = QueryInterface.of(config).observations
+        starts = {name: place.start for name, place in encoding.slices.items()}
+        released = [name for name in starts if name.startswith("released_")]
+        joins = {n + k: face for k, face in enumerate(corridor.on_ramps)}
+        first = n + len(corridor.on_ramps)
+        leaves = {first + k: face - 1 for k, face in enumerate(corridor.off_ramps)}
+        channels = [
+            _channel(name, starts, {i: i for i in range(n)}, n, "mainline")
+            for name in (*MAINLINE, *released)
+        ]
+        fixed = {s: k for k, s in enumerate(corridor.fixed_sensors)}
+        for kind, ramps in (("on-ramp", joins), ("off-ramp", leaves)):
+            channels += [
+                _channel(name, starts, {at: s for s, at in ramps.items()}, n, kind) for name in RAMP
+            ]
+            watched = {at: fixed[s] for s, at in ramps.items() if s in fixed}
+            if watched:
+                channels += [_channel(name, starts, watched, n, kind) for name in FIXED]
+        marks = [joins.values(), leaves.values(), [s for s in fixed if s < n]]
+        return cls(
+            n_mainline=n,
+            size=int(encoding.space.shape[0]),
+            channels=tuple(channels),
+            marks=tuple(tuple(float(i in places) for i in range(n)) for places in marks),
+        )
+
+    @property
+    def n_channels(self) -> int:
+        """Channels per segment, marks included."""
+        return len(self.channels) + len(self.marks)
+
+    def index(self, name: str) -> int:
+        """Return the number of the mainline channel of block ``name``."""
+        return next(
+            k for k, channel in enumerate(self.channels) if channel.name == f"mainline {name}"
+        )
+
+
+def _channel(
+    block: str, starts: Mapping[str, int], places: Mapping[int, int], n: int, kind: str
+) -> Channel:
+    """Make a channel; ``places`` says which item of the block stands at which segment."""
+    centre, scale = CENTRES[block]
+    source = tuple(starts[block] + places[i] if i in places else None for i in range(n))
+    return Channel(f"{kind} {block}", source, centre, scale)

@@ -1,0 +1,182 @@
+"""Train a query policy, with one training seed, in a folder of its own.
+
+python scripts/train.py --steps 2000000 --seed 0 --output results/training/pl-0
+python scripts/train.py --output results/training/maskable-0 recipe:maskable --recipe.gamma 0.97
+
+The folder gets run.json (what was trained), progress.csv (the learning curve), checkpoint.pt,
+best.zip and policy.zip (the policy best in validation, and the last). After an interruption, or a
+kill, the same command goes on where the last checkpoint was, to the same numbers; other arguments
+need another folder.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import torch
+import tyro
+from tqdm import tqdm
+
+from agents.training.board import Board
+from agents.training.folder import Row
+from agents.training.plan import TrainingPlan
+from agents.training.recipes import (
+    MaskablePPORecipe,
+    MaskRecipe,
+    PlackettLuceRecipe,
+    ScoresRecipe,
+)
+from agents.training.training import BEST, POLICY, Training
+from dptse_env.config import parse_seeds
+from dptse_env.traffic import RecordLibrary
+from dptse_env.validation import integer
+from scripts.cli import run
+
+AnyRecipe = (
+    Annotated[PlackettLuceRecipe, tyro.conf.subcommand("plackett-luce")]
+    | Annotated[MaskablePPORecipe, tyro.conf.subcommand("maskable")]
+    | Annotated[ScoresRecipe, tyro.conf.subcommand("scores")]
+    | Annotated[MaskRecipe, tyro.conf.subcommand("mask")]
+)
+
+
+@dataclass(frozen=True)
+class Args:
+    """Train a query policy."""
+
+    env: str = "dptse_env:dptse/PrivateHighway-v0"
+    """Environment id."""
+    keywords: str = "{}"
+    """Keywords of the environment as JSON, such as '{"estimator": "ukf", "bandwidth": 3}'."""
+    seed: int = 0
+    """Training seed."""
+    steps: int = 2_000_000
+    """Seconds of traffic to train for, all episodes together, each with one decision."""
+    traffic: str = "0:256"
+    """Traffic seeds to train on, first:stop; training seeds only."""
+    validation: str = "1000:1024"
+    """Traffic seeds to validate on, first:stop; validation seeds only."""
+    validate_every: int = 25
+    """Updates between two validations."""
+    checkpoint_every: int = 10
+    """Updates between two checkpoints."""
+    threads: int = 1
+    """Threads of torch; numbers depend on it in the last digits."""
+    tensorboard: bool = True
+    """Whether to write the learning curve for TensorBoard, too, where that is installed."""
+    workers: int | None = None
+    """Processes that record missing traffic; all cores if not given."""
+    records: Path | None = None
+    """Folder of the record cache; the user's cache if not given."""
+    output: Path = Path("results/training")
+    """Folder of this training."""
+    recipe: AnyRecipe = field(default_factory=PlackettLuceRecipe)
+    """How it is trained."""
+
+
+def make_plan(args: Args) -> TrainingPlan:
+    """Return the plan that the arguments describe.
+
+    Raises:
+        ValueError: An argument is out of range, or ``keywords`` is no JSON object.
+    """
+    try:
+        keywords = json.loads(args.keywords)
+    except json.JSONDecodeError as problem:
+        raise ValueError(f"keywords must be a JSON object, got {args.keywords!r}") from problem
+    if not isinstance(keywords, dict):
+        raise ValueError(f"keywords must be a JSON object, got {args.keywords!r}")
+    return TrainingPlan(
+        env=args.env,
+        recipe=args.recipe,
+        seed=args.seed,
+        steps=args.steps,
+        traffic_seeds=parse_seeds(args.traffic, "traffic"),
+        validation_seeds=parse_seeds(args.validation, "validation"),
+        keywords=keywords,
+        validate_every=args.validate_every,
+        checkpoint_every=args.checkpoint_every,
+    )
+
+
+def commit() -> str | None:
+    """Return the git commit of the sources, with "+" after it where files differ; None if none."""
+    here = Path(__file__).parent
+    try:
+        head = subprocess.run(
+            ["git", "describe", "--always", "--abbrev=40", "--exclude=*", "--dirty=+"],
+            cwd=here, capture_output=True, text=True, check=False,
+        )  # fmt: skip
+    except FileNotFoundError:
+        return None
+    return head.stdout.strip() or None
+
+
+class Bar:
+    """A progress bar over decisions, with the latest errors beside it."""
+
+    def __init__(self, total: int) -> None:
+        """Show an empty bar."""
+        self._bar = tqdm(total=total, unit="step", unit_scale=True, desc="training")
+        self._shown: dict[str, Any] = {}
+
+    def __call__(self, row: Row) -> None:
+        """Move the bar to a row."""
+        for name in ("error", "validation"):
+            if name in row:
+                self._shown[name] = f"{row[name]:.4f}"
+        self._bar.set_postfix(self._shown, refresh=False)
+        self._bar.update(int(row["steps"]) - self._bar.n)
+
+    def pretraining(self, share: float) -> None:
+        """Show how much of the pretraining is done; the bar stands still meanwhile."""
+        self._bar.set_postfix_str(f"pretraining {share:.0%}")
+
+    def close(self) -> None:
+        """Leave the bar as it is."""
+        self._bar.close()
+
+
+def main(args: Args) -> None:
+    """Record what is missing, train, and leave the policy."""
+    plan = make_plan(args)
+    torch.set_num_threads(integer("threads", args.threads, 1))
+    library = RecordLibrary(args.records)
+    seeds = (*plan.traffic_seeds, *plan.validation_seeds)
+    library.ensure(plan.config().corridor, seeds, workers=args.workers, progress=True)
+    records = None if args.records is None else str(args.records)
+    by_ppo = plan.n_updates * plan.recipe.steps_per_update // plan.actions_per_step
+    bar = Bar(plan.recipe.pretraining_steps + by_ppo)
+    board = Board.open(args.output / "tensorboard") if args.tensorboard else None
+    watchers = (bar,) if board is None else (bar, board)
+    try:
+        training = Training(
+            plan,
+            args.output,
+            records=records,
+            commit=commit(),
+            watchers=watchers,
+            on_pretraining=bar.pretraining,
+        )
+        training.run()
+    finally:
+        bar.close()
+        if board is not None:
+            board.close()
+    last = training.rows[-1]
+    print(
+        f"error in validation {last['validation']:.4f} deterministic, "
+        f"{last['validation_drawn']:.4f} drawn; {args.output}/{POLICY} and {BEST}"
+    )
+
+
+if __name__ == "__main__":
+    try:
+        run(main, Args, __doc__)
+    except KeyboardInterrupt:
+        print("\nstopped; the same command goes on from the last checkpoint")
+        raise SystemExit(130) from None

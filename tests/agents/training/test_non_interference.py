@@ -1,0 +1,73 @@
+"""A trained policy sees nothing of the true traffic; see `tests.test_non_interference`."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("sb3_contrib")
+
+import torch
+
+from agents.training.plan import TrainingPlan
+from agents.training.recipes import RECIPES
+from agents.training.training import POLICY, Training
+from dptse_env.sb3 import load_policy
+from tests.test_non_interference import START, blind, make_private, public, same
+
+SMALL = {"n_envs": 4, "twins": 2, "n_steps": 10, "batch_size": 20, "n_epochs": 1}
+PRETRAINING = {"pretraining_rounds": 1, "pretraining_seconds": 5, "pretraining_batches": 2}
+
+
+@pytest.fixture(scope="module", params=RECIPES)
+def trained(request, tmp_path_factory):
+    """A policy of every learner, trained a little with the truth at hand."""
+    learner = request.param
+    extra = {**PRETRAINING, "width": 8} if learner == "plackett-luce" else {"hidden": (8,)}
+    plan = TrainingPlan(
+        env="dptse_env:dptse/PrivateHighway-v0",
+        recipe=RECIPES[learner](**{**SMALL, **extra}),
+        seed=0,
+        steps=80,
+        traffic_seeds=(0, 1),
+        validation_seeds=(1000,),
+        keywords={"horizon": 70},
+    )
+    folder = tmp_path_factory.mktemp(learner)
+    Training(plan, folder).run()
+    return plan.recipe.action, folder / POLICY
+
+
+def transcript(env, traffic_seed, policy, deterministic):
+    options = {"traffic_seed": traffic_seed, "start": START}
+    observation, info = env.reset(seed=7, options=options)
+    torch.manual_seed(7)
+    seen, truncated = [{"observation": observation, **public(env, info)}], False
+    while not truncated:
+        action, _ = policy.predict(observation, deterministic=deterministic)
+        observation, _, _, truncated, info = env.step(action)
+        seen.append({"observation": observation, "action": action, **public(env, info)})
+    return seen
+
+
+@pytest.mark.parametrize("deterministic", [True, False])
+def test_traffic_does_not_show_through_a_trained_policy(trained, deterministic):
+    action, path = trained
+    env = blind(make_private(action=action))
+    policy = load_policy(path, env)
+    first, second = (transcript(env, seed, policy, deterministic) for seed in (0, 1))
+    assert same(first, second)
+    assert not np.array_equal(first[1]["observation"], first[-1]["observation"])
+
+
+def test_a_policy_that_sees_the_truth_would_show(trained):
+    action, path = trained
+    env = blind(make_private(action=action))
+    policy = load_policy(path, env)
+    interface = env.unwrapped.interface
+
+    def knowing(observation, deterministic):
+        density = env.unwrapped.process.truth(np.array([0]))[:, :15, 0]
+        crowded = density.argsort(axis=1).argsort(axis=1) >= 15 - interface.bandwidth
+        return interface.actions.encode(crowded, interface.actions.picked)[0], None
+
+    policy.predict = knowing
+    assert not same(transcript(env, 0, policy, False), transcript(env, 1, policy, False))

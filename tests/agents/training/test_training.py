@@ -1,0 +1,267 @@
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+pytest.importorskip("sb3_contrib")
+
+import torch
+
+from agents.training import folder as folder_module
+from agents.training.folder import CHECKPOINT, PROGRESS, read_progress
+from agents.training.plan import TrainingPlan
+from agents.training.recipes import RECIPES, PlackettLuceRecipe
+from agents.training.training import BEST, POLICY, Training
+from dptse_env.sb3 import load_policy
+
+SMALL = {"n_envs": 4, "twins": 2, "n_steps": 10, "batch_size": 20, "n_epochs": 2}
+PRETRAINING = {"pretraining_rounds": 1, "pretraining_seconds": 9, "pretraining_batches": 3}
+
+
+def make_plan(learner="plackett-luce", steps=240, **changes):
+    extra = {**PRETRAINING, "width": 8} if learner == "plackett-luce" else {"hidden": (8,)}
+    values = {
+        "env": "dptse_env:dptse/ShortHighway-v0",
+        "recipe": RECIPES[learner](**{**SMALL, **extra}),
+        "seed": 1,
+        "steps": steps,
+        "traffic_seeds": (0, 1, 2),
+        "validation_seeds": (1000, 1001),
+        "keywords": {"horizon": 80, "privacy": "guaranteed"},
+        "validate_every": 3,
+        "checkpoint_every": 2,
+    }
+    return TrainingPlan(**{**values, **changes})
+
+
+def without_time(rows):
+    return [{k: v for k, v in row.items() if k != "seconds"} for row in rows]
+
+
+class StopError(Exception):
+    pass
+
+
+def stop_at(update):
+    def watcher(row):
+        if row["update"] == update:
+            raise StopError
+
+    return watcher
+
+
+@pytest.mark.parametrize("learner", RECIPES)
+def test_a_killed_training_goes_on_to_the_same_curve(learner, tmp_path):
+    plan = make_plan(learner)
+    whole = Training(plan, tmp_path / "whole")
+    whole.run()
+    assert whole.is_finished
+    # Updates 0, 2, 4 are kept: the fifth is lost and done again. At the fourth, after 40 s, the
+    # second group of episodes is just begun anew.
+    broken = Training(plan, tmp_path / "broken", watchers=(stop_at(5),))
+    with pytest.raises(StopError):
+        broken.run()
+    torch.manual_seed(99)
+    np.random.seed(99)  # noqa: NPY002  the generator that stable-baselines3 draws from
+    seen = []
+    again = Training(plan, tmp_path / "broken", watchers=(seen.append,))
+    assert [row["update"] for row in again.rows] == [0, 1, 2, 3, 4]
+    again.run()
+    assert without_time(again.rows) == without_time(whole.rows)
+    assert without_time(seen) == without_time(whole.rows)
+    for name in (POLICY, BEST):
+        same = [(tmp_path / run / name).read_bytes() for run in ("whole", "broken")]
+        assert same[0] == same[1]
+    for name, value in whole.model.policy.state_dict().items():
+        assert torch.equal(again.model.policy.state_dict()[name], value), name
+
+
+def test_the_curve_says_what_it_should(tmp_path):
+    training = Training(make_plan(), tmp_path)
+    training.run()
+    rows = read_progress(tmp_path)
+    assert [row["update"] for row in rows] == list(range(7))
+    # Four episodes are watched for nine seconds ahead of PPO.
+    assert [row["steps"] for row in rows] == [36 + 40 * u for u in range(7)]
+    assert [row["update"] for row in rows if "validation" in row] == [0, 3, 6]
+    assert all(0.01 < row["error"] < 1 for row in rows[1:])
+    assert all(0.01 < row["validation_drawn"] < 1 for row in rows[::3])
+    rates = [row["learning_rate"] for row in rows[1:]]
+    assert rates == sorted(rates, reverse=True)
+    assert rates[-1] == pytest.approx(training.plan.recipe.final_learning_rate)
+
+
+def test_steps_are_decisions_whatever_the_encoding(tmp_path):
+    plan = make_plan("maskable")
+    training = Training(plan, tmp_path)
+    training.run()
+    assert plan.actions_per_step == 2
+    assert training.rows[-1]["steps"] == 240
+    assert training.model.num_timesteps == 480
+
+
+def test_every_update_compares_twins(tmp_path, monkeypatch):
+    training = Training(make_plan(), tmp_path)
+    given = []
+    monkeypatch.setattr(training._episodes, "recentre", given.append)
+    training.run()
+    assert len(given) == training.plan.n_updates
+    # Steps by episodes, not yet shuffled for the minibatches.
+    assert {advantages.shape for advantages in given} == {(10, 4)}
+
+
+def test_a_finished_training_is_left_alone(tmp_path):
+    Training(make_plan(), tmp_path).run()
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    again = Training(make_plan(), tmp_path)
+    again.run()
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_the_folder_says_what_was_trained(tmp_path):
+    Training(make_plan(), tmp_path, commit="abc").run()
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "run.json", PROGRESS, CHECKPOINT, POLICY, BEST,
+    }  # fmt: skip
+    said = json.loads((tmp_path / "run.json").read_text())
+    assert said["commit"] == "abc"
+    made_with = said["made_with"]
+    assert made_with["seed"] == 1
+    assert made_with["traffic_seeds"] == [0, 1, 2]
+    assert made_with["recipe"]["n_envs"] == 4
+    assert made_with["learner"] == "plackett-luce"
+    assert set(said["machine"]) >= {"torch", "stable-baselines3", "numpy", "python"}
+    policy = load_policy(tmp_path / POLICY, _env())
+    assert policy.card["training"]["steps"] == 36 + 240
+    assert policy.card["training"]["traffic seeds"] == "0..2"
+
+
+def _env():
+    import gymnasium as gym
+
+    return gym.make(
+        "dptse_env:dptse/ShortHighway-v0", action="slots", privacy="guaranteed", horizon=80
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"seed": 2}, "seed is 1 there and 2 now"),
+        ({"steps": 480}, "steps is 240 there and 480 now"),
+        ({"keywords": {"horizon": 81, "privacy": "guaranteed"}}, "keywords.horizon is 80 there"),
+        ({"traffic_seeds": (0, 1)}, r"traffic_seeds is \[0, 1, 2\] there and \[0, 1\] now"),
+        ({"validation_seeds": (1000,)}, "validation_seeds is"),
+    ],
+)
+def test_another_plan_is_refused(tmp_path, changes, message):
+    Training(make_plan(), tmp_path)
+    with pytest.raises(ValueError, match=message):
+        Training(make_plan(**changes), tmp_path)
+
+
+def test_another_recipe_or_learner_is_refused(tmp_path):
+    Training(make_plan(), tmp_path)
+    recipe = dataclasses.replace(make_plan().recipe, gamma=0.9)
+    with pytest.raises(ValueError, match=r"recipe\.gamma is 0\.95 there and 0\.9 now"):
+        Training(make_plan(recipe=recipe), tmp_path)
+    with pytest.raises(ValueError, match="learner is 'plackett-luce' there and 'mask' now"):
+        Training(make_plan("mask"), tmp_path)
+
+
+def test_a_missing_or_damaged_checkpoint_is_said(tmp_path):
+    Training(make_plan(), tmp_path).run()
+    path = tmp_path / CHECKPOINT
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(ValueError, match=r"checkpoint\.pt is damaged"):
+        Training(make_plan(), tmp_path)
+    path.unlink()
+    with pytest.raises(ValueError, match=r"checkpoint\.pt is missing, although progress\.csv"):
+        Training(make_plan(), tmp_path)
+
+
+def test_a_folder_with_other_things_is_refused(tmp_path):
+    (tmp_path / "thesis.tex").write_text("")
+    with pytest.raises(ValueError, match=r"is not empty and has no run\.json"):
+        Training(make_plan(), tmp_path)
+
+
+@pytest.mark.parametrize("name", [PROGRESS, CHECKPOINT])
+def test_a_full_disk_leaves_a_folder_to_go_on_in(tmp_path, monkeypatch, name):
+    plan = make_plan()
+    Training(plan, tmp_path / "whole").run()
+    training = Training(plan, tmp_path / "full")
+    write, calls = folder_module.write_whole, []
+
+    def full(path, content):
+        calls.append(path.name)
+        if path.name == name and calls.count(name) == 3:
+            raise OSError(28, "No space left on device")
+        write(path, content)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(folder_module, "write_whole", full)
+        with pytest.raises(OSError, match="No space left"):
+            training.run()
+    again = Training(plan, tmp_path / "full")
+    assert again.update == 2
+    again.run()
+    whole, resumed = (read_progress(tmp_path / run) for run in ("whole", "full"))
+    assert without_time(whole) == without_time(resumed)
+
+
+def test_nothing_half_written_stays(tmp_path, monkeypatch):
+    (tmp_path / "file").write_bytes(b"old")
+
+    def full(descriptor):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        folder_module.write_whole(tmp_path / "file", b"new")
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == {"file": b"old"}
+
+
+def test_pretraining_moves_the_scorer_and_counts_as_no_update(tmp_path):
+    plan = make_plan(steps=40)
+    first = Training(plan, tmp_path / "one")
+    before = first.model.policy.scorer.state_dict()
+    before = {name: value.clone() for name, value in before.items()}
+    first.run()
+    recipe = dataclasses.replace(plan.recipe, pretraining_rounds=0)
+    second = Training(make_plan(steps=40, recipe=recipe), tmp_path / "two")
+    second.run()
+    rows = [training.rows[0] for training in (first, second)]
+    assert [row["steps"] for row in rows] == [36, 0]
+    assert [row["update"] for row in rows] == [0, 0]
+    assert rows[0]["validation_drawn"] != rows[1]["validation_drawn"]
+    after = first.model.policy.scorer.state_dict()
+    assert all((after[name] != before[name]).any() for name in before)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"traffic_seeds": (0, 2000)}, r"traffic must hold seeds in 0\.\.999, got 2000"),
+        ({"validation_seeds": (2000,)}, r"validation must hold seeds in 1000\.\.1999, got 2000"),
+        ({"seed": -1}, r"seed must be an integer in 0\.\.999"),
+        ({"steps": 0}, "steps must be an integer >= 1"),
+        ({"keywords": {"action": "mask"}}, r"keywords\.action is chosen by the training"),
+    ],
+)
+def test_plans_that_are_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        make_plan(**changes)
+
+
+def test_a_bad_keyword_is_refused_before_anything_is_written(tmp_path):
+    with pytest.raises(ValueError, match="estimatr is unknown"):
+        Training(make_plan(keywords={"estimatr": "ukf"}), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_pretraining_needs_the_errors():
+    with pytest.raises(ValueError, match=r"recipe\.shows_errors must be True for a pretraining"):
+        PlackettLuceRecipe(shows_errors=False)
+    PlackettLuceRecipe(shows_errors=False, pretraining_rounds=0)

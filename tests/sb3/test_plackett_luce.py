@@ -1,0 +1,145 @@
+import itertools
+import math
+
+import numpy as np
+import pytest
+
+pytest.importorskip("torch")
+pytest.importorskip("stable_baselines3")
+
+import torch
+
+from dptse_env.sb3 import PlackettLuce
+
+SCORES = torch.tensor([[0.3, -1.2, 2.0, 0.1], [5.0, 5.0, -5.0, 0.0]], dtype=torch.float64)
+
+
+def by_formula(scores, chosen):
+    """The product of softmax probabilities over those left, in plain Python."""
+    left, probability = list(range(len(scores))), 1.0
+    for item in chosen:
+        probability *= math.exp(scores[item]) / sum(math.exp(scores[i]) for i in left)
+        left.remove(item)
+    return probability
+
+
+def all_sets(n, size):
+    return torch.tensor(list(itertools.permutations(range(n), size)))
+
+
+def over_all(scores, size):
+    """A distribution repeated for each ordered set, and these."""
+    sets = all_sets(len(scores), size)
+    return PlackettLuce(scores.expand(len(sets), -1), size), sets
+
+
+@pytest.mark.parametrize("row", [0, 1])
+@pytest.mark.parametrize("size", [1, 2, 3, 4])
+def test_probabilities_are_the_formula_and_sum_to_one(row, size):
+    distribution, sets = over_all(SCORES[row], size)
+    probabilities = distribution.log_prob(sets).exp().tolist()
+    expected = [by_formula(SCORES[row].tolist(), chosen.tolist()) for chosen in sets]
+    assert probabilities == pytest.approx(expected, rel=1e-12)
+    assert sum(probabilities) == pytest.approx(1.0, rel=1e-12)
+
+
+def test_draws_follow_the_probabilities():
+    distribution, sets = over_all(SCORES[0], 2)
+    torch.manual_seed(0)
+    n = 200_000
+    drawn = PlackettLuce(SCORES[:1].expand(n, -1), 2).sample()
+    counts = (drawn[:, None, :] == sets).all(dim=2).sum(dim=0).numpy()
+    assert counts.sum() == n
+    probabilities = distribution.log_prob(sets).exp().numpy()
+    chi_squared = ((counts - n * probabilities) ** 2 / (n * probabilities)).sum()
+    assert chi_squared < 31.3  # 99.9 % of a chi-squared variable of 11 degrees
+
+
+def test_entropies_along_average_to_the_entropy():
+    distribution, sets = over_all(SCORES[0], 3)
+    logs, entropies = distribution.evaluate(sets)
+    exact = -(logs.exp() * logs).sum()
+    assert (logs.exp() * entropies).sum().item() == pytest.approx(exact.item(), rel=1e-12)
+    assert not torch.allclose(entropies, exact.expand_as(entropies))
+
+
+def test_uniform_scores_have_the_entropy_of_a_permutation():
+    distribution = PlackettLuce(torch.zeros(1, 6), 3)
+    sets = torch.tensor([[4, 0, 2]])
+    assert distribution.entropy_along(sets).item() == pytest.approx(math.log(6 * 5 * 4), rel=1e-6)
+    assert distribution.log_prob(sets).item() == pytest.approx(-math.log(6 * 5 * 4), rel=1e-6)
+
+
+def test_the_mode_is_the_highest_scores_and_ties_go_upstream():
+    assert PlackettLuce(SCORES, 3).mode().tolist() == [[2, 0, 3], [0, 1, 3]]
+    assert PlackettLuce(torch.zeros(1, 70), 40).mode().tolist() == [list(range(40))]
+    distribution, sets = over_all(SCORES[0], 3)
+    assert sets[distribution.log_prob(sets).argmax()].tolist() == [2, 0, 3]
+
+
+def test_only_differences_of_scores_count():
+    sets = torch.tensor([[1, 3], [0, 2]])
+    shifted = PlackettLuce(SCORES + 700.0, 2).log_prob(sets)
+    torch.testing.assert_close(shifted, PlackettLuce(SCORES, 2).log_prob(sets))
+
+
+@pytest.mark.parametrize("spread", [0.0, 1.0, 1e3, 1e15, 3e38])
+def test_extreme_scores_stay_finite_in_single_precision(spread):
+    scores = (spread * torch.tensor([[1.0, -1.0, 0.5, 0.0, 1.0, -1.0]])).repeat(64, 1)
+    scores.requires_grad_()
+    distribution = PlackettLuce(scores, 4)
+    torch.manual_seed(1)
+    for sets in (distribution.sample(), torch.tensor([[5, 1, 3, 2]]).repeat(64, 1)):
+        assert (sets.sort(dim=1).values.diff(dim=1) > 0).all()
+        logs, entropies = distribution.evaluate(sets)
+        assert logs.dtype == torch.float32
+        assert torch.isfinite(logs).all()
+        assert torch.isfinite(entropies).all()
+        (gradient,) = torch.autograd.grad(logs.sum() + entropies.sum(), scores, retain_graph=True)
+        assert torch.isfinite(gradient).all()
+
+
+def test_gradients_are_those_of_finite_differences():
+    scores = SCORES.clone().requires_grad_()
+    sets = torch.tensor([[1, 3], [0, 2]])
+    assert torch.autograd.gradcheck(lambda s: PlackettLuce(s, 2).evaluate(sets), scores)
+
+
+def test_sampling_leaves_no_graph_behind():
+    scores = SCORES.clone().requires_grad_()
+    assert not PlackettLuce(scores, 2).sample().requires_grad
+    assert PlackettLuce(scores, 2).log_prob(torch.tensor([[1, 3], [0, 2]])).requires_grad
+
+
+def test_single_draws_equal_a_categorical_variable():
+    logs = PlackettLuce(SCORES, 1).log_prob(torch.tensor([[2], [0]]))
+    expected = torch.distributions.Categorical(logits=SCORES).log_prob(torch.tensor([2, 0]))
+    np.testing.assert_allclose(logs.numpy(), expected.numpy(), rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("scores", "size", "message"),
+    [
+        (torch.zeros(1, 3), 0, r"size must be in 1\.\.3, got 0"),
+        (torch.zeros(1, 3), 4, r"size must be in 1\.\.3, got 4"),
+        (torch.tensor([[0.0, torch.nan]]), 1, "scores must be finite"),
+        (torch.tensor([[0.0, torch.inf]]), 1, "scores must be finite"),
+    ],
+)
+def test_bad_distributions(scores, size, message):
+    with pytest.raises(ValueError, match=message):
+        PlackettLuce(scores, size)
+
+
+@pytest.mark.parametrize(
+    ("chosen", "message"),
+    [
+        ([[1, 1], [0, 2]], "distinct"),
+        ([[1, 4], [0, 2]], r"in \[0, 3\]"),
+        ([[-1, 2], [0, 2]], r"in \[0, 3\]"),
+        ([[1, 2, 3], [0, 1, 2]], r"shape \(2, 2\), got \(2, 3\)"),
+    ],
+)
+def test_bad_sets(chosen, message):
+    with pytest.raises(ValueError, match=message):
+        PlackettLuce(SCORES, 2).log_prob(torch.tensor(chosen))

@@ -1,0 +1,135 @@
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("sb3_contrib")
+pytest.importorskip("tyro")
+
+import tyro
+
+from agents.training import board
+from agents.training.board import Board
+from agents.training.folder import read_progress
+from agents.training.recipes import RECIPES, MaskablePPORecipe
+from scripts import train
+from scripts.train import Args, make_plan
+
+ROOT = Path(__file__).parents[2]
+SMALL = [
+    "--env", "dptse_env:dptse/ShortHighway-v0", "--traffic", "0:2", "--validation", "1000:1002",
+    "--keywords", '{"horizon": 64}', "--steps", "240", "--validate-every", "3",
+    "--checkpoint-every", "2", "--no-tensorboard", "recipe:plackett-luce",
+    "--recipe.n-envs", "4", "--recipe.twins", "2", "--recipe.n-steps", "10",
+    "--recipe.batch-size", "20", "--recipe.width", "8", "--recipe.pretraining-rounds", "1",
+    "--recipe.pretraining-seconds", "6", "--recipe.pretraining-batches", "2",
+]  # fmt: skip
+
+
+def arguments(output, *more):
+    return tyro.cli(Args, args=["--output", str(output), *more, *SMALL])
+
+
+def test_it_trains_and_goes_on(tmp_path, capsys):
+    train.main(arguments(tmp_path))
+    assert "error in validation 0." in capsys.readouterr().out
+    assert read_progress(tmp_path)[-1]["steps"] == 24 + 240
+    before = (tmp_path / "policy.zip").read_bytes()
+    train.main(arguments(tmp_path))
+    assert (tmp_path / "policy.zip").read_bytes() == before
+    with pytest.raises(ValueError, match="seed is 0 there and 1 now"):
+        train.main(arguments(tmp_path, "--seed", "1"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
+def test_a_killed_program_goes_on_to_the_same_curve(tmp_path, how):
+    def start(output):
+        return subprocess.Popen(
+            [sys.executable, "scripts/train.py", "--output", str(output), *SMALL],
+            cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE, text=True,
+        )  # fmt: skip
+
+    process = start(tmp_path / "killed")
+    deadline = time.monotonic() + 120
+    while not (tmp_path / "killed" / "checkpoint.pt").exists():
+        assert time.monotonic() < deadline, process.communicate(timeout=5)
+        time.sleep(0.01)
+    process.send_signal(how)
+    out, _ = process.communicate(timeout=120)
+    assert process.returncode == (130 if how == signal.SIGINT else -how)
+    assert how == signal.SIGKILL or "the same command goes on" in out
+    for run in ("killed", "whole"):
+        process = start(tmp_path / run)
+        process.communicate(timeout=300)
+        assert process.returncode == 0
+    curves = [
+        [{k: v for k, v in row.items() if k != "seconds"} for row in read_progress(tmp_path / run)]
+        for run in ("killed", "whole")
+    ]
+    assert curves[0] == curves[1]
+    assert len(curves[0]) == 7
+
+
+def test_every_recipe_is_on_the_command_line():
+    for name, recipe in RECIPES.items():
+        args = tyro.cli(Args, args=[f"recipe:{name}", "--recipe.gamma", "0.9"])
+        assert isinstance(args.recipe, recipe)
+        assert args.recipe.gamma == 0.9
+    assert tyro.cli(Args, args=[]).recipe == RECIPES["plackett-luce"]()
+
+
+def test_arguments_become_the_plan():
+    args = Args(seed=3, traffic="4:6", validation="1000", keywords='{"bandwidth": 3}')
+    plan = make_plan(args)
+    assert (plan.seed, plan.traffic_seeds, plan.validation_seeds) == (3, (4, 5), (1000,))
+    assert plan.config().bandwidth == 3
+    assert plan.config().action == "slots"
+    sequential = make_plan(Args(recipe=MaskablePPORecipe()))
+    assert sequential.n_updates == 313  # 2 million decisions of five picks, 32,000 an update
+
+
+@pytest.mark.parametrize("text", ["{", "[1]", "3"])
+def test_keywords_must_be_an_object(text):
+    with pytest.raises(ValueError, match="keywords must be a JSON object, got"):
+        make_plan(Args(keywords=text))
+
+
+def test_tensorboard_is_optional_and_its_absence_is_said(tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr(board.importlib.util, "find_spec", lambda name: None)
+    with caplog.at_level("INFO"):
+        assert Board.open(tmp_path) is None
+    assert "TensorBoard is not installed" in caplog.text
+
+
+def test_rows_reach_tensorboard(tmp_path):
+    pytest.importorskip("tensorboard")
+    written = Board.open(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+    written({"update": 1, "steps": 40, "error": 0.5})
+    written.close()
+    assert list(tmp_path.glob("events*"))
+
+
+def test_the_commit_is_known_or_none(monkeypatch):
+    found = train.commit()
+    assert found is None or len(found.rstrip("+")) == 40
+
+    def missing(*args, **keywords):
+        raise FileNotFoundError
+
+    monkeypatch.setattr(train.subprocess, "run", missing)
+    assert train.commit() is None
+
+
+def test_the_folder_says_what_was_trained(tmp_path):
+    train.main(arguments(tmp_path))
+    said = json.loads((tmp_path / "run.json").read_text())
+    assert said["commit"] == train.commit()
+    assert said["made_with"]["keywords"] == {"horizon": 64}
