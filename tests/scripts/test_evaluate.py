@@ -1,13 +1,17 @@
 import csv
+import dataclasses
 import json
 from pathlib import Path
 
+import gymnasium as gym
 import pytest
 from PIL import Image
 
-from scripts.evaluate import Args, main
-
-SHORT = "dptse_env:dptse/ShortHighway-v0"
+from agents.evaluation import run_episode
+from dptse_env.sb3 import load_policy
+from dptse_env.schedules import make_schedule
+from scripts.evaluate import Args, config_of, main
+from tests.agents.policies import SHORT, save
 
 
 def test_it_leaves_table_scores_and_figures(tmp_path, capsys):
@@ -63,4 +67,63 @@ def test_two_runs_agree(tmp_path):
 def test_bad_arguments_are_named_and_nothing_is_written(changes, message, tmp_path):
     with pytest.raises(ValueError, match=message):
         main(Args(**{"env": SHORT, "output": Path(tmp_path / "out"), **changes}))
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_saved_policy_stands_beside_schedules(tmp_path, capsys):
+    paths = [save(tmp_path / f"run-{seed}" / "best.zip", seed=seed) for seed in range(2)]
+    main(
+        Args(
+            env=SHORT, schedules=("round-robin",), policies=tuple(map(str, paths)),
+            estimators=("random_walk",), seeds="2000:2002", output=tmp_path / "out", workers=1,
+        )
+    )  # fmt: skip
+    assert "run-1/best" in capsys.readouterr().out
+    with (tmp_path / "out" / "episodes.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if row["schedule"] == "run-0/best"]
+    env = gym.make(
+        SHORT, action="slots", estimator="random_walk", traffic_seeds="2000:2002",
+        parameters="w99-3lane",
+    )  # fmt: skip
+    for row in rows:
+        seed = int(row["traffic_seed"])
+        own = run_episode(env, load_policy(paths[0], env), traffic_seed=seed, seed=seed)
+        assert float(row["rmse_density"]) == pytest.approx(own.rmse_density, abs=1e-9)
+    assert len(rows) == 2
+
+
+def test_scores_are_those_of_one_episode_after_another(tmp_path):
+    main(
+        Args(
+            env=SHORT, schedules=("oldest-first",), estimators=("ekf",), seeds="2000:2003",
+            noise_seed=5, output=tmp_path / "out", workers=1,
+        )
+    )  # fmt: skip
+    with (tmp_path / "out" / "episodes.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if row["schedule"] == "oldest-first"]
+    env = gym.make(SHORT, traffic_seeds="2000:2003", parameters="w99-3lane")
+    schedule = make_schedule("oldest-first", env)
+    for seed, row in zip(range(2000, 2003), rows, strict=True):
+        own = run_episode(env, schedule, traffic_seed=seed, seed=5 + seed)
+        for key, value in dataclasses.asdict(own).items():
+            assert float(row[key]) == pytest.approx(value, abs=1e-9)
+
+
+def test_privacy_is_the_environments_own_unless_given():
+    private = Args(env="dptse_env:dptse/PrivateHighway-v0")
+    privacy = config_of(private).privacy
+    assert (privacy.preset, privacy.epsilon) == ("guaranteed", 5.0)
+    given = config_of(dataclasses.replace(private, epsilon=2.0)).privacy
+    assert (given.preset, given.epsilon) == ("guaranteed", 2.0)
+
+
+def test_policies_that_do_not_fit_or_share_a_name_are_refused(tmp_path):
+    path = str(save(tmp_path / "run" / "best.zip", bandwidth=3))
+    arguments = Args(env=SHORT, policies=(path,), seeds="2000:2002", output=tmp_path / "out")
+    with pytest.raises(ValueError, match="bandwidth is 3 of the policy and 2 of the environment"):
+        main(arguments)
+    with pytest.raises(ValueError, match="'run/best' is there twice"):
+        main(dataclasses.replace(arguments, policies=(path, path)))
+    with pytest.raises(FileNotFoundError, match="no saved policy 'nobody'"):
+        main(dataclasses.replace(arguments, policies=("nobody",)))
     assert not (tmp_path / "out").exists()

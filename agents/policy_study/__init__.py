@@ -1,0 +1,1 @@
+"""Learned query policies against every baseline: frozen beforehand, run on test traffic, judged."""
