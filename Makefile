@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 
 export OMP_NUM_THREADS = 1
 
-.PHONY: help setup demo audit test test-slow lint format benchmark wheel-test clean clean-kernels reproduce privacy-study
+.PHONY: help setup demo policy-study audit test test-slow lint format benchmark wheel-test clean clean-kernels reproduce privacy-study
 
 help:  ## Show this list.
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -21,14 +21,21 @@ $(READY): pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
 	touch $@
 
-demo: setup  ## Evaluate the query schedules on held-out traffic; results/demo.
-	$(BIN)/python scripts/evaluate.py --output results/demo
+demo: setup  ## Train a small query policy and evaluate it beside the schedules on held-out traffic; results/demo.
+	$(BIN)/python scripts/train.py --env dptse_env:dptse/PaperHighway-v0 --keywords '{"parameters": "w99-3lane"}' \
+		--traffic 0:32 --validation 1000:1008 --steps 6400 --validate-every 1 --no-tensorboard --output results/demo/training \
+		recipe:plackett-luce --recipe.pretraining-rounds 2 --recipe.pretraining-batches 600
+	$(BIN)/python scripts/evaluate.py --policies results/demo/training/policy.zip --output results/demo
 
 reproduce: setup  ## Repeat the paper's results and judge its claims; results/paper.
 	$(BIN)/python scripts/reproduce.py
 
 privacy-study: setup  ## Measure what the guarantee costs; results/privacy.
 	$(BIN)/python scripts/privacy_study.py
+
+policy-study: setup  ## Hold the trained policies of results/training against every baseline; results/policies.
+	$(BIN)/python scripts/policy_study.py freeze --policies primary=results/training/primary paper=results/training/paper
+	$(BIN)/python scripts/policy_study.py run
 
 audit: setup  ## Attack the privacy presets, 5,000 runs in each of two worlds; results/audit.
 	$(BIN)/python scripts/audit.py --env dptse_env:dptse/PaperHighway-v0 --target replaced

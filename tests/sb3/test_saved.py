@@ -1,6 +1,7 @@
 import io
 import json
 import zipfile
+from importlib.resources import files
 
 import gymnasium as gym
 import numpy as np
@@ -234,3 +235,28 @@ def test_shipped_policies_are_loaded_by_name(stored, tmp_path, monkeypatch):
     assert load_policy("short", make_env()).card["training"]["seed"] == 3
     with pytest.raises(FileNotFoundError, match=r"that come with the package \(short\)"):
         load_policy("long", make_env())
+
+
+@pytest.mark.parametrize("name", shipped_policies())
+def test_shipped_policies_act_where_they_were_trained(name):
+    card = json.loads(
+        zipfile.ZipFile(files("dptse_env") / "policies" / f"{name}.zip").read("card.json")
+    )
+    env = gym.make_vec(
+        card["env"],
+        num_envs=2,
+        action=card["fits"]["action"],
+        traffic_seeds="0:1",
+        **card["keywords"],
+    )
+    policy = load_policy(name, env)
+    observation, _ = env.reset(seed=0)
+    for _ in range(3):
+        actions, _ = policy.predict(observation, deterministic=True)
+        observation, *_, infos = env.step(actions)
+        assert (infos["queried"].sum(axis=1) == env.config.bandwidth).all()
+        assert not infos["n_dropped"].any()
+
+
+def test_a_policy_comes_with_the_package():
+    assert "private-highway" in shipped_policies()

@@ -47,6 +47,8 @@ def main() -> None:
     envs = gym.make_vec("dptse_env:dptse/ShortHighway-v0", num_envs=3, traffic_seeds="0:1")
     envs.reset(seed=0)
     assert np.isfinite(envs.step(envs.action_space.sample())[1]).all()
+    policies = Path(dptse_env.__file__).parent / "policies"
+    assert (policies / "private-highway.zip").is_file(), "a trained policy must come with it"
     print(f"the wheel works with gymnasium {gym.__version__}")
 
 
