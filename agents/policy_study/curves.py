@@ -31,17 +31,17 @@ class Curve:
 
 
 def read_curves(checkpoints: Iterable[Checkpoint], cell: str) -> list[Curve]:
-    """Return the curves of a cell's policies whose run folder has one.
+    """Return the curves of a cell's policies whose run folder has one, each run's once.
 
     Raises:
         ValueError: A curve is not as ``scripts/train.py`` writes it.
     """
-    curves = []
+    curves: dict[Path, Curve] = {}
     for own in checkpoints:
         path = Path(own.path).parent / PROGRESS
-        if own.cell == cell and path.is_file():
-            curves.append(_read(path, own))
-    return curves
+        if own.cell == cell and path not in curves and path.is_file():
+            curves[path] = _read(path, own)
+    return list(curves.values())
 
 
 def _read(path: Path, checkpoint: Checkpoint) -> Curve:

@@ -37,8 +37,8 @@ LIMITS = """\
   primary result, takes their number into account.
 - Oracles see the truth. They are bounds on what asking can reach with this estimator, no policies,
   and greedy ones are not the least upper bound.
-- Baselines were not tuned beyond what the table of settings says, recipes no further than their
-  own report says."""
+- Baselines were not tuned beyond what the table of settings says. What was tried of recipes, on
+  validation traffic, and what each idea gave stands in `docs/learning.md`."""
 
 
 def draw(folder: Path, measured: Measured) -> None:
