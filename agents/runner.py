@@ -8,7 +8,7 @@ import os
 import signal
 import threading
 import warnings
-from collections.abc import Callable, Generator, Iterable, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from multiprocessing.connection import wait
@@ -61,15 +61,21 @@ class Task(Generic[CellT]):
     records: str | None
 
 
+@contextlib.contextmanager
+def void_on_purpose() -> Iterator[None]:
+    """Keep quiet about a guarantee that a study's keywords void; its account of privacy says it."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=r"privacy\.preset is .* yet no privacy")
+        yield
+
+
 def make_env(env: str, cell: Cell, seeds: Sequence[int], records: str | None) -> gym.Env[Any, Any]:
     """Make the environment of a cell.
 
     Raises:
         ValueError: A value of the cell is out of range.
     """
-    with warnings.catch_warnings():
-        # A cell that voids a guarantee does so on purpose; the account of privacy says it.
-        warnings.filterwarnings("ignore", message=r"privacy\.preset is .* yet no privacy")
+    with void_on_purpose():
         return gym.make(
             env,
             disable_env_checker=True,

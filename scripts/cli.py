@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import logging
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, TypeVar
 
 import tyro
@@ -28,6 +29,16 @@ def run(main: Callable[[ArgsT], None], arguments: type[ArgsT], description: str 
     except (OSError, ValueError, NetworkError, RecordingError, SumoVersionError) as problem:
         print(f"error: {problem}", file=sys.stderr)
         raise SystemExit(2) from problem
+
+
+@contextlib.contextmanager
+def resumable() -> Iterator[None]:
+    """On Ctrl-C in the body end with status 130, and say that the program can be gone on with."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        print("interrupted: the same command goes on from here", file=sys.stderr)
+        raise SystemExit(130) from None
 
 
 def command(script: str, args: Any) -> str:

@@ -15,7 +15,6 @@ import os
 # Read when numpy loads, here and in the workers: one thread each.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -62,7 +61,7 @@ from agents.runner import run_all
 from dptse_env.config import parse_seeds
 from dptse_env.traffic import RecordLibrary
 from dptse_env.validation import integer
-from scripts.cli import command, run
+from scripts.cli import command, resumable, run
 
 FOLDER = Path("results/policies")
 
@@ -127,11 +126,8 @@ def design_from(args: Freeze) -> Design:
 def main(args: Freeze | Run) -> None:
     """Freeze or run."""
     integer("workers", args.workers, 1)
-    try:
+    with resumable():
         freeze(args) if isinstance(args, Freeze) else test(args)
-    except KeyboardInterrupt:
-        print("interrupted: the same command goes on from here", file=sys.stderr)
-        raise SystemExit(130) from None
 
 
 def freeze(args: Freeze) -> None:

@@ -13,7 +13,6 @@ import os
 # Read when numpy loads, here and in the workers: one thread each.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,7 +27,7 @@ from agents.runner import make_env, missing, run_all
 from dptse_env.config import EnvConfig, parse_seeds
 from dptse_env.traffic import RecordLibrary
 from dptse_env.validation import integer
-from scripts.cli import command, run
+from scripts.cli import command, resumable, run
 
 FULL, QUICK = Path("results/privacy"), Path("results/privacy-quick")
 
@@ -97,14 +96,11 @@ def main(args: Args) -> None:
     origin = take_folder(output, provenance(design))
     config = make_env(design.env, design.cells()[0], design.seeds, None).unwrapped.config  # type: ignore[attr-defined]
     episodes = Ledger(output / "episodes.csv", Cell, EpisodeScore)
-    try:
+    with resumable():
         RecordLibrary(args.records).ensure(
             config.corridor, design.seeds, args.workers, progress=True
         )
         run_all(missing(design, episodes, records), episodes, args.workers)
-    except KeyboardInterrupt:
-        print("interrupted: the same command goes on from here", file=sys.stderr)
-        raise SystemExit(130) from None
     episodes.sort()
     measured = measure(design, episodes, config, records)
     draw(output, measured)

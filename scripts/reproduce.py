@@ -13,7 +13,6 @@ import os
 # Read when numpy loads, here and in the workers: one thread each.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,7 +27,7 @@ from agents.runner import make_env, missing, run_all
 from dptse_env.config import parse_seeds
 from dptse_env.traffic import RecordLibrary
 from dptse_env.validation import integer
-from scripts.cli import command, run
+from scripts.cli import command, resumable, run
 
 FULL, QUICK = Path("results/paper"), Path("results/paper-quick")
 
@@ -88,13 +87,10 @@ def main(args: Args) -> None:
     origin = take_folder(output, provenance(design))
     episodes = Ledger(output / "episodes.csv", Cell, EpisodeScore)
     times = Ledger(output / "run_time.csv", Cell, StepTime)
-    try:
+    with resumable():
         record(design, args)
         run_all(missing(design, episodes, records), episodes, args.workers)
         time_all(design, times, records)
-    except KeyboardInterrupt:
-        print("interrupted: the same command goes on from here", file=sys.stderr)
-        raise SystemExit(130) from None
     episodes.sort()
     measured = Measured(design, episodes.rows, times.rows)
     draw(output, measured, records)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -16,6 +15,7 @@ from agents.ledger import Ledger
 from agents.policy_study.asked import Asked, Watch
 from agents.policy_study.manifest import Manifest
 from agents.policy_study.plan import DETERMINISTIC, Cell, Design, Entry
+from agents.runner import void_on_purpose
 from dptse_env.config import EnvConfig
 from dptse_env.schedules import make_schedule
 from dptse_env.vector_env import SensorQueryVectorEnv
@@ -76,9 +76,7 @@ def make_batch(
     Raises:
         ValueError: A keyword is unknown or out of range.
     """
-    with warnings.catch_warnings():
-        # A cell that voids a guarantee does so on purpose; the privacy study prices it.
-        warnings.filterwarnings("ignore", message=r"privacy\.preset is .* yet no privacy")
+    with void_on_purpose():
         made = gym.make_vec(
             env,
             num_envs=len(seeds),

@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 import torch
 
-from agents.evaluation import WARM_UP, Policy
+from agents.evaluation import Policy, run_episodes
 from dptse_env.arrays import FloatArray
 from dptse_env.config import VALIDATION_SEEDS
 from dptse_env.vector_env import SensorQueryVectorEnv
@@ -50,26 +50,11 @@ class Validation:
         """
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(NOISE_SEED)
-            return self._run(policy, deterministic)
-
-    def _run(self, policy: Policy, deterministic: bool) -> FloatArray:
-        noise = [NOISE_SEED + seed for seed in self.seeds]
-        observation, _ = self.env.reset(seed=noise, options={"traffic_seed": self.seeds})
-        process, n = self.env.process, len(self.seeds)
-        state: Any = None
-        start = np.ones(n, dtype=bool)
-        total, n_seconds = np.zeros(n), 0
-        while not process.over.any():
-            actions, state = policy.predict(observation, state, start, deterministic)
-            start = np.zeros(n, dtype=bool)
-            before = process.time.copy()
-            transition = self.env.advance(actions)
-            observation = transition.observation
-            # A sequential action may leave the traffic where it is.
-            if (process.time > before).all() and process.time[0] > WARM_UP:
-                total -= transition.reward
-                n_seconds += 1
-        if not n_seconds:
-            raise ValueError(f"an episode must be longer than the warm-up of {WARM_UP} s")
-        errors: FloatArray = total / n_seconds
-        return errors
+            scores = run_episodes(
+                self.env,
+                policy,
+                traffic_seeds=self.seeds,
+                seeds=[NOISE_SEED + seed for seed in self.seeds],
+                deterministic=deterministic,
+            )
+        return np.array([-score.reward for score in scores])

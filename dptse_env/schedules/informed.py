@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar, Protocol, cast
 
@@ -113,11 +114,11 @@ class Informed(BoundSchedule):
             self._after[rows] = covariances
         return queried
 
+    @abstractmethod
     def _select(
         self, means: FloatArray, covariances: FloatArray, inputs: FloatArray, queried: BoolArray
     ) -> None:
         """Write the sets to ``queried`` (k, n_mainline), what is left to ``covariances``."""
-        raise NotImplementedError
 
     def _present(self, rows: IntArray) -> FloatArray:
         """Return present covariances, shape (k, 2 S, 2 S): the estimator's, or its own."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from abc import abstractmethod
 from dataclasses import dataclass
 from itertools import combinations
 from math import comb
@@ -71,9 +72,9 @@ class _Realised(BoundSchedule):
             chosen[live] = self._best(self._look(rows[live]))
         return chosen
 
+    @abstractmethod
     def _best(self, coming: _Next) -> BoolArray:
         """Return the sets of segments, shape (k, n_mainline)."""
-        raise NotImplementedError
 
     def _look(self, episodes: IntArray) -> _Next:
         process = self.process

@@ -36,7 +36,8 @@ def assert_same(first, second):
 
 
 def everything_in(path):
-    return sorted(entry for entry in Path(path).rglob("*") if entry.is_file())
+    # Not Path.rglob, which stumbles over folders that a process renames meanwhile.
+    return sorted(Path(folder, name) for folder, _, names in os.walk(path) for name in names)
 
 
 def start_ensure(path, n_seeds):
