@@ -18,9 +18,14 @@ class Boundary(Protocol):
 
     Attributes:
         n_released: Boundary segments that the mechanism releases at every step.
+        tables: What depends on traffic alone; a fork of the process shares it.
     """
 
     n_released: int
+
+    @property
+    def tables(self) -> tuple[FloatArray, ...]:
+        """See above."""
 
     def load(self, slot: int) -> None:
         """Prepare for the traffic of a slot, which `Sensing` has loaded."""
@@ -47,6 +52,11 @@ class TrueBoundary:
         # np.empty takes address space, not memory, until traffic is loaded into its slot.
         self._table = np.empty(shape)
 
+    @property
+    def tables(self) -> tuple[FloatArray, ...]:
+        """The inputs of all traffic."""
+        return (self._table,)
+
     def load(self, slot: int) -> None:
         """Work out the inputs of a slot's whole record."""
         traffic = self._sensing.traffic(slot)[:, self._model.n_segments :]
@@ -72,6 +82,11 @@ class NominalBoundary:
     def __init__(self, sensing: Sensing, model: ARZModel) -> None:
         """Work out the inputs of every second."""
         self._table = nominal_inputs(sensing.corridor, model)
+
+    @property
+    def tables(self) -> tuple[FloatArray, ...]:
+        """The inputs of every second."""
+        return (self._table,)
 
     def load(self, slot: int) -> None:
         """No traffic is needed."""

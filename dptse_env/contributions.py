@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from dptse_env.arrays import BoolArray, FloatArray, IntArray
+from dptse_env.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from dptse_env.traffic import Record
 
 NumberT = TypeVar("NumberT", bound=np.generic)
@@ -51,6 +51,11 @@ class Contributions:
         self._segment: NDArray[np.int16] = np.empty(0, dtype=np.int16)
         self._speed: NDArray[np.float32] = np.empty(0, dtype=np.float32)
         self.exposures: NDArray[np.int32] = np.zeros((n_episodes, 0), dtype=np.int32)
+
+    @property
+    def tables(self) -> tuple[AnyArray, ...]:
+        """The vehicle tables of all records, which no episode changes."""
+        return self._start, self._n_vehicles, self._vehicle, self._segment, self._speed
 
     def load(self, slot: int, record: Record) -> None:
         """Take in the vehicle table of one record."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -106,6 +107,24 @@ class QueryProcess:
         self.released = np.zeros((n, s, 2))
         self.estimate = self.estimator.estimate()
         self.error = EstimationError(np.zeros(n), np.zeros(n), np.zeros(n, dtype=np.int64))
+        self._is_fork = False
+
+    def fork(self) -> QueryProcess:
+        """Return a process in the same state that goes its own way, streams of noise included.
+
+        For looking ahead: a fork that is stepped like its origin gives the same bits, and the
+        origin never notices. It shares traffic and model, begins no episodes, and takes some 40 us
+        an episode to make.
+        """
+        interface = self.interface
+        shared = (
+            self.config, self.model, self.sensing, self.accountant, self._blocks,
+            interface.observations, interface.reward, interface.actions.space,
+            *self.boundary.tables, *self.answers.tables,
+        )  # fmt: skip
+        fork = copy.deepcopy(self, {id(one): one for one in shared})
+        fork._is_fork = True
+        return fork
 
     def reset(
         self,
@@ -125,7 +144,10 @@ class QueryProcess:
         Raises:
             ValueError: An option is unknown or out of range.
             RecordingError: SUMO could not make a record.
+            RuntimeError: This is a fork.
         """
+        if self._is_fork:
+            raise RuntimeError("a fork only goes on: reset the process that it was made of")
         choice = ResetOptions.of(options, self.config, len(episodes))
         streams = [
             [np.random.default_rng(seed) for seed in generator.integers(2**63, size=3)]

@@ -7,7 +7,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from dptse_env.arrays import BoolArray, FloatArray, IntArray
+from dptse_env.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from dptse_env.contributions import Contributions
 from dptse_env.privacy import PrivacySettings, SpeedRelease
 from dptse_env.traffic import Corridor, Record, RecordLibrary
@@ -79,9 +79,14 @@ class Answers(Protocol):
 
     Attributes:
         contributions: Who counted how often; None where vehicles count without bound.
+        tables: What depends on traffic alone; a fork of the process shares it.
     """
 
     contributions: Contributions | None
+
+    @property
+    def tables(self) -> tuple[AnyArray, ...]:
+        """See above."""
 
     def load(self, slot: int) -> None:
         """Prepare for the traffic of a slot, which `Sensing` has loaded."""
@@ -109,6 +114,11 @@ class AggregateAnswers:
         """Answer for the first `n_columns` record columns."""
         self.contributions: Contributions | None = None
         self._sensing, self._n_columns = sensing, n_columns
+
+    @property
+    def tables(self) -> tuple[AnyArray, ...]:
+        """Nothing: `Sensing` holds the aggregates."""
+        return ()
 
     def load(self, slot: int) -> None:
         """Nothing to prepare: `Sensing` holds the aggregates."""
@@ -147,6 +157,11 @@ class BoundedAnswers:
             len(sensing.traffic_seeds), seconds, n_episodes, corridor.speed_limit, cap
         )
         self.contributions: Contributions | None = self._counted
+
+    @property
+    def tables(self) -> tuple[AnyArray, ...]:
+        """The vehicle tables of all traffic."""
+        return self._counted.tables
 
     def load(self, slot: int) -> None:
         """Take in the vehicle table of a slot."""

@@ -1,7 +1,7 @@
 """Train a query policy, with one training seed, in a folder of its own.
 
-python scripts/train.py --steps 2000000 --seed 0 --output results/training/pl-0
-python scripts/train.py --output results/training/maskable-0 recipe:maskable --recipe.gamma 0.97
+python scripts/train.py --seed 0 --output results/training/pl-0
+python scripts/train.py --steps 2000000 --output results/training/maskable-0 recipe:maskable
 
 The folder gets run.json (what was trained), progress.csv (the learning curve), checkpoint.pt,
 best.zip and policy.zip (the policy best in validation, and the last). After an interruption, or a
@@ -54,8 +54,9 @@ class Args:
     """Keywords of the environment as JSON, such as '{"estimator": "ukf", "bandwidth": 3}'."""
     seed: int = 0
     """Training seed."""
-    steps: int = 2_000_000
-    """Seconds of traffic to train for, all episodes together, each with one decision."""
+    steps: int | None = None
+    """Seconds of traffic to train for by PPO, all episodes together, each with one decision; as
+    the recipe has it if not given: 2,000,000, and 0 for plackett-luce."""
     traffic: str = "0:256"
     """Traffic seeds to train on, first:stop; training seeds only."""
     validation: str = "1000:1024"
@@ -94,7 +95,7 @@ def make_plan(args: Args) -> TrainingPlan:
         env=args.env,
         recipe=args.recipe,
         seed=args.seed,
-        steps=args.steps,
+        steps=args.recipe.default_steps if args.steps is None else args.steps,
         traffic_seeds=parse_seeds(args.traffic, "traffic"),
         validation_seeds=parse_seeds(args.validation, "validation"),
         keywords=keywords,
@@ -132,9 +133,9 @@ class Bar:
         self._bar.set_postfix(self._shown, refresh=False)
         self._bar.update(int(row["steps"]) - self._bar.n)
 
-    def pretraining(self, share: float) -> None:
-        """Show how much of the pretraining is done; the bar stands still meanwhile."""
-        self._bar.set_postfix_str(f"pretraining {share:.0%}")
+    def show(self, what: str, share: float) -> None:
+        """Show how much of what is being done is done; the bar stands still meanwhile."""
+        self._bar.set_postfix({what: f"{share:.0%}", **self._shown})
 
     def close(self) -> None:
         """Leave the bar as it is."""
@@ -149,8 +150,7 @@ def main(args: Args) -> None:
     seeds = (*plan.traffic_seeds, *plan.validation_seeds)
     library.ensure(plan.config().corridor, seeds, workers=args.workers, progress=True)
     records = None if args.records is None else str(args.records)
-    by_ppo = plan.n_updates * plan.recipe.steps_per_update // plan.actions_per_step
-    bar = Bar(plan.recipe.pretraining_steps + by_ppo)
+    bar = Bar(plan.steps_at(plan.n_updates))
     board = Board.open(args.output / "tensorboard") if args.tensorboard else None
     watchers = (bar,) if board is None else (bar, board)
     try:
@@ -160,7 +160,7 @@ def main(args: Args) -> None:
             records=records,
             commit=commit(),
             watchers=watchers,
-            on_pretraining=bar.pretraining,
+            on_share=bar.show,
         )
         training.run()
     finally:

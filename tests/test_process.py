@@ -60,6 +60,45 @@ def test_a_batch_is_so_many_single_episodes(estimator, action, privacy):
         np.testing.assert_equal(batch.info(e), one.info(0))
 
 
+@pytest.mark.parametrize("backend", ["compiled", "reference"])
+@pytest.mark.parametrize("privacy", ["paper", COUNTED])
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+def test_a_fork_goes_on_as_its_origin_would_have(estimator, privacy, backend):
+    keywords = {"estimator": estimator, "privacy": privacy, "backend": backend}
+    origin = make(3, action="sequential", truth_in_info=True, **keywords)
+    origin.reset(ALL, generators(SEEDS))
+    actions = sampled(origin, 30)  # past the noise that is drawn at a time
+    for action in actions[:5]:
+        origin.step(ALL, action)
+    first, second = origin.fork(), origin.fork()
+    others = [origin.interface.actions.space.n - 1 - action for action in actions]
+    for action in others[5:]:
+        first.step(ALL, action)
+    ahead = second.fork()
+    for action in actions[5:]:
+        here, there, further = (p.step(ALL, action) for p in (origin, second, ahead))
+        for field in ("observation", "reward", "truncated"):
+            np.testing.assert_array_equal(getattr(here, field), getattr(there, field))
+            np.testing.assert_array_equal(getattr(here, field), getattr(further, field))
+    np.testing.assert_equal(origin.infos(ALL), second.infos(ALL))
+    assert not np.array_equal(first.released, origin.released)
+
+
+def test_forks_share_traffic_and_begin_no_episodes():
+    process = make(3, privacy=COUNTED)
+    process.reset(ALL, generators(SEEDS))
+    fork = process.fork()
+    assert fork.sensing is process.sensing
+    tables, shared = ([*p.answers.tables, *p.boundary.tables] for p in (process, fork))
+    assert all(a is b for a, b in zip(tables, shared, strict=True))
+    assert len(tables) == 6
+    assert fork.answers.contributions.exposures is not process.answers.contributions.exposures
+    for one in (fork, fork.fork()):
+        with pytest.raises(RuntimeError, match="reset the process that it was made of"):
+            one.reset(ALL, generators(SEEDS))
+    process.reset(ALL, generators(SEEDS))
+
+
 def test_episodes_step_and_reset_on_their_own():
     mixed, whole = make(3), make(3)
     mixed.reset(ALL, generators(SEEDS))

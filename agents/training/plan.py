@@ -31,12 +31,12 @@ class TrainingPlan:
         recipe: How it is trained.
         seed: Seeds first weights, draws of actions, noise and the choice of traffic.
         steps: Seconds of traffic to train for by PPO, all episodes together, each with one
-            decision; rounded up to whole updates. A pretraining of the recipe comes ahead of them.
+            decision; rounded up to whole updates. What else the recipe holds comes ahead of them.
         traffic_seeds: Traffic to train on.
         validation_seeds: Traffic to validate on.
         keywords: Of the environment, plain JSON; the recipe chooses the action encoding.
-        validate_every: Updates between two validations.
-        checkpoint_every: Updates between two checkpoints.
+        validate_every: Updates of PPO between two validations; rounds of swaps are all validated.
+        checkpoint_every: Updates of PPO between two checkpoints; every round leaves one.
 
     Raises:
         ValueError: A value is out of range, or a seed is not of its kind.
@@ -55,8 +55,12 @@ class TrainingPlan:
     def __post_init__(self) -> None:
         """Check values that need no environment."""
         integer("seed", self.seed, 0, 999)
-        for name in ("steps", "validate_every", "checkpoint_every"):
+        integer("steps", self.steps, 0)
+        for name in ("validate_every", "checkpoint_every"):
             integer(name, getattr(self, name), 1)
+        recipe = self.recipe
+        if not (self.steps or recipe.rounds.rounds or recipe.pretraining_steps):
+            raise ValueError("steps must be an integer >= 1 where a recipe holds nothing but PPO")
         for path, seeds, allowed in (
             ("traffic", self.traffic_seeds, TRAINING_SEEDS),
             ("validation", self.validation_seeds, VALIDATION_SEEDS),
@@ -72,8 +76,16 @@ class TrainingPlan:
 
     @property
     def n_updates(self) -> int:
-        """Updates in all."""
-        return -(-self.steps * self.actions_per_step // self.recipe.steps_per_update)
+        """Updates in all: rounds of swaps, then those of PPO."""
+        by_ppo = -(-self.steps * self.actions_per_step // self.recipe.steps_per_update)
+        return self.recipe.rounds.rounds + by_ppo
+
+    def steps_at(self, update: int) -> int:
+        """Seconds of traffic simulated by the end of an update, what came ahead of it included."""
+        recipe, rounds = self.recipe, self.recipe.rounds
+        by_swaps = min(update, rounds.rounds) * rounds.steps(self.config().horizon_steps)
+        by_ppo = max(update - rounds.rounds, 0) * recipe.steps_per_update // self.actions_per_step
+        return recipe.pretraining_steps + by_swaps + by_ppo
 
     @cached_property
     def actions_per_step(self) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -21,10 +22,12 @@ from agents.training.folder import (
     write_checkpoint,
     write_progress,
 )
-from agents.training.learners import acting, make_episodes, make_model
+from agents.training.improvement import improve
+from agents.training.learners import acting, make_episodes, make_model, make_swap_env, swap_seeds
 from agents.training.plan import TrainingPlan
 from agents.training.pretraining import pretrain
 from agents.training.recipes import PlackettLuceRecipe
+from agents.training.swaps import Swaps, try_swaps
 from agents.training.validation import Validation
 from dptse_env.sb3 import PlackettLucePolicy
 from dptse_env.sb3.saved import save_policy
@@ -48,13 +51,17 @@ class Watcher(Protocol):
         """Take a row."""
 
 
-class Training:
-    """A plan in a folder.
+def _silent(_what: str, _share: float) -> None:
+    """Tell nobody."""
 
-    After every update the whole state is at hand: weights, optimiser, generators, and of the
-    episodes their seeds and actions so far (`agents.training.episodes`). A checkpoint holds it,
-    so that a training that was killed goes on to the same numbers as one that was not, on the
-    same machine with the same number of torch's threads.
+
+class Training:
+    """A plan in a folder: a pretraining, rounds of swaps, updates of PPO, whichever it has.
+
+    After every round and update the whole state is at hand: weights, optimiser, generators, and of
+    PPO's episodes their seeds and actions so far (`agents.training.episodes`); rounds begin
+    episodes of their own. A checkpoint holds it, so that a training that was killed goes on to the
+    same numbers as one that was not, on the same machine with the same number of torch's threads.
     """
 
     def __init__(
@@ -65,7 +72,7 @@ class Training:
         records: str | None = None,
         commit: str | None = None,
         watchers: tuple[Watcher, ...] = (),
-        on_pretraining: Callable[[float], None] | None = None,
+        on_share: Callable[[str, float], None] = _silent,
     ) -> None:
         """Take the folder and pick up what is in it.
 
@@ -75,34 +82,33 @@ class Training:
             records: Folder of the record cache; None for the user's cache.
             commit: State of the sources, for the record.
             watchers: Told of every row, of those read back first.
-            on_pretraining: Told of the share of the pretraining that is done.
+            on_share: Told what is being done between two rows, and the share of it that is done.
 
         Raises:
             ValueError: The folder belongs to another plan, or its checkpoint is damaged.
             OSError: The folder cannot be written.
         """
         self.plan, self.folder, self._watchers = plan, folder, watchers
-        self._on_pretraining = on_pretraining
+        self._on_share = on_share
         self.config = plan.config()
         take_folder(folder, plan.provenance(commit))
         keywords = {**plan.keywords, "records": records}
         recipe = plan.recipe
-        traffic = list(plan.traffic_seeds)
-        self._episodes = make_episodes(
-            plan.env, {**keywords, "traffic_seeds": traffic}, recipe, plan.seed
-        )
+        training = {**keywords, "traffic_seeds": list(plan.traffic_seeds)}
+        self._episodes = make_episodes(plan.env, training, recipe, plan.seed)
+        self._swap_env = make_swap_env(plan.env, training, recipe)
         self._validation = Validation(
             plan.env, {**keywords, "action": recipe.action}, plan.validation_seeds
         )
         self.model: OnPolicyAlgorithm = make_model(recipe, self._episodes, plan.seed)
         self.rows: list[Row] = []
-        self._seconds, self._best = 0.0, float("inf")
+        self._rounds, self._seconds, self._best = 0, 0.0, float("inf")
         self._resume()
 
     @property
     def update(self) -> int:
-        """Updates done."""
-        return self.model.num_timesteps // self.plan.recipe.steps_per_update
+        """Rounds and updates done."""
+        return self._rounds + self.model.num_timesteps // self.plan.recipe.steps_per_update
 
     @property
     def is_finished(self) -> bool:
@@ -115,47 +121,77 @@ class Training:
         Raises:
             OSError: The disk is full or cannot be written; the last checkpoint stays.
         """
-        recipe = self.plan.recipe
-        if not self.rows and isinstance(recipe, PlackettLuceRecipe) and recipe.pretraining_rounds:
+        if not self.rows:
+            self._at_boundary(self._pretrain())
+        while self._rounds < self.plan.recipe.rounds.rounds:
             began = time.perf_counter()
-            assert isinstance(self.model.policy, PlackettLucePolicy)
-            pretrain(self.model.policy, self._episodes, recipe, self._on_pretraining)
-            self._seconds += time.perf_counter() - began
+            error = self._round()
+            self._rounds += 1
+            self._at_boundary(time.perf_counter() - began, error)
         left = self.plan.n_updates - self.update
         if left > 0:
             callback = _Boundary(self._at_boundary, self._episodes)
-            steps = left * recipe.steps_per_update
+            steps = left * self.plan.recipe.steps_per_update
             self.model.learn(steps, callback=callback, log_interval=None, reset_num_timesteps=False)
         self._save(POLICY)
 
-    def _at_boundary(self, seconds: float) -> None:
-        """Note an update that is done; called before the first one, too."""
+    def _pretrain(self) -> float:
+        """Do what the recipe holds ahead of everything else; return the seconds it took."""
+        recipe, began = self.plan.recipe, time.perf_counter()
+        if isinstance(recipe, PlackettLuceRecipe) and recipe.pretraining_rounds:
+            pretrain(self._policy, self._episodes, recipe, partial(self._on_share, "regression"))
+        return time.perf_counter() - began
+
+    def _round(self) -> float:
+        """Do a round of swaps; return the mean error of a second of the policy before it."""
+        plan, settings, env = self.plan, self.plan.recipe.rounds, self._swap_env
+        assert env is not None
+        n_states, parts = env.config.horizon_steps // settings.seconds, []
+        for part in try_swaps(
+            env,
+            acting(self.model, self._episodes),
+            swap_seeds(plan.recipe, plan.seed, self._rounds),
+            np.random.default_rng([plan.seed, self._rounds]),
+            seconds=settings.seconds,
+            trials=settings.trials,
+        ):
+            parts.append(part)
+            self._on_share("swaps", len(parts) / n_states)
+        swaps = Swaps.joined(parts)
+        improve(self._policy, swaps, settings, partial(self._on_share, "fit"))
+        return float(swaps.error.mean())
+
+    @property
+    def _policy(self) -> PlackettLucePolicy:
+        policy = self.model.policy
+        assert isinstance(policy, PlackettLucePolicy)
+        return policy
+
+    def _at_boundary(self, seconds: float, error: float | None = None) -> None:
+        """Note a round or an update that is done; PPO calls it before its first one, too."""
         update, plan = self.update, self.plan
         if self.rows and self.rows[-1]["update"] == update:
-            return  # where a training was picked up
+            return  # where a training was picked up, or PPO begins
         self._seconds += seconds
-        row = self._row(update)
-        last = update == plan.n_updates
-        if update % plan.validate_every == 0 or last:
+        row: Row = {
+            "update": update,
+            "steps": plan.steps_at(update),
+            "seconds": round(self._seconds, 1),
+        }
+        by_ppo, last = update - plan.recipe.rounds.rounds, update == plan.n_updates
+        if by_ppo > 0:
+            values = self.model.logger.name_to_value
+            row["error"] = -self._episodes.take_mean_reward()
+            row |= {name: float(values[key]) for name, key in _LOGGED.items()}
+        elif error is not None:
+            row["error"] = error
+        if by_ppo <= 0 or by_ppo % plan.validate_every == 0 or last:
             self._validate(row)
         self.rows.append(row)
         for watcher in self._watchers:
             watcher(row)
-        if update % plan.checkpoint_every == 0 or last:
+        if by_ppo <= 0 or by_ppo % plan.checkpoint_every == 0 or last:
             self._keep()
-
-    def _row(self, update: int) -> Row:
-        recipe, by_ppo = self.plan.recipe, self.model.num_timesteps // self.plan.actions_per_step
-        row: Row = {
-            "update": update,
-            "steps": recipe.pretraining_steps + by_ppo,
-            "seconds": round(self._seconds, 1),
-        }
-        if update:
-            values = self.model.logger.name_to_value
-            row["error"] = -self._episodes.take_mean_reward()
-            row |= {name: float(values[key]) for name, key in _LOGGED.items()}
-        return row
 
     def _validate(self, row: Row) -> None:
         policy = acting(self.model, self._episodes)
@@ -192,9 +228,11 @@ class Training:
         model = self.model
         name, keys, *position = np.random.get_state()  # noqa: NPY002  stable-baselines3 draws there
         assert isinstance(name, str)
-        episodes = {key: torch.from_numpy(v) for key, v in self._episodes.state().items()}
+        # Ahead of PPO, which begins them, there is nothing to keep of its episodes.
+        state = self._episodes.state() if model.num_timesteps else {}
         content = {
             "update": self.update,
+            "rounds": self._rounds,
             "steps": model.num_timesteps,
             "n_updates": model._n_updates,
             "policy": model.policy.state_dict(),
@@ -202,7 +240,7 @@ class Training:
             "torch": torch.get_rng_state(),
             "numpy": [torch.from_numpy(np.asarray(keys).astype(np.int64)), *position],
             "starts": torch.from_numpy(self._last_starts()),
-            "episodes": episodes,
+            "episodes": {key: torch.from_numpy(value) for key, value in state.items()},
             "best": self._best,
         }
         write_checkpoint(self.folder, content)
@@ -220,13 +258,15 @@ class Training:
             return
         self.rows = [row for row in read_progress(self.folder) if row["update"] <= kept["update"]]
         self._best, self._seconds = kept["best"], self.rows[-1]["seconds"]
+        self._rounds = kept["rounds"]
         model = self.model
         model.policy.load_state_dict(kept["policy"])
         model.policy.optimizer.load_state_dict(kept["optimizer"])
         model.num_timesteps, model._n_updates = kept["steps"], kept["n_updates"]
-        state = {key: value.numpy() for key, value in kept["episodes"].items()}
-        model._last_obs = self._episodes.restore(state)
-        model._last_episode_starts = kept["starts"].numpy()
+        if kept["steps"]:
+            state = {key: value.numpy() for key, value in kept["episodes"].items()}
+            model._last_obs = self._episodes.restore(state)
+            model._last_episode_starts = kept["starts"].numpy()
         torch.set_rng_state(kept["torch"])
         keys, *position = kept["numpy"]
         np.random.set_state(("MT19937", keys.numpy().astype(np.uint32), *position))  # noqa: NPY002

@@ -77,21 +77,15 @@ class _Realised(BoundSchedule):
         """Return the sets of segments, shape (k, n_mainline)."""
 
     def _look(self, episodes: IntArray) -> _Next:
-        process = self.process
-        slots, times = process.slot[episodes], process.time[episodes]
-        estimator = _copied(process.estimator)
-        estimator.predict(episodes, process.boundary.inputs(episodes, slots, times))
-        columns = process.config.corridor.n_segments + process.boundary.n_released
-        everywhere = np.ones((len(episodes), columns), dtype=bool)
-        counted = process.answers.contributions
-        before = None if counted is None else counted.exposures.copy()
-        answers = process.answers.collect(episodes, slots, times + 1, everywhere)
-        if counted is not None and before is not None:
-            counted.exposures[:] = before  # who would have counted has not
-        released = copy.deepcopy(process.mechanism).release(episodes, answers)
-        truth = process.sensing.aggregates(slots, times + 1)
-        n = process.config.corridor.n_segments
-        return _Next(episodes, truth, released[:, :n], estimator)
+        ahead = self.process.fork()
+        slots, times = ahead.slot[episodes], ahead.time[episodes]
+        n = ahead.config.corridor.n_segments
+        ahead.estimator.predict(episodes, ahead.boundary.inputs(episodes, slots, times))
+        everywhere = np.ones((len(episodes), n + ahead.boundary.n_released), dtype=bool)
+        answers = ahead.answers.collect(episodes, slots, times + 1, everywhere)
+        released = ahead.mechanism.release(episodes, answers)
+        truth = ahead.sensing.aggregates(slots, times + 1)
+        return _Next(episodes, truth, released[:, :n], ahead.estimator)
 
     def _reward(self, coming: _Next, queried: BoolArray) -> FloatArray:
         """Return the rewards (k,) of asking ``queried`` (k, n_mainline)."""

@@ -8,20 +8,25 @@ pytest.importorskip("sb3_contrib")
 import torch
 
 from agents.training.plan import TrainingPlan
-from agents.training.recipes import RECIPES
+from agents.training.recipes import RECIPES, SwapRounds
 from agents.training.training import POLICY, Training
 from dptse_env.sb3 import load_policy
 from tests.test_non_interference import START, blind, make_private, public, same
 
 SMALL = {"n_envs": 4, "twins": 2, "n_steps": 10, "batch_size": 20, "n_epochs": 1}
 PRETRAINING = {"pretraining_rounds": 1, "pretraining_seconds": 5, "pretraining_batches": 2}
+SWAPS = SwapRounds(rounds=1, episodes=2, seconds=5, trials=1, batches=2, batch_size=8)
 
 
 @pytest.fixture(scope="module", params=RECIPES)
 def trained(request, tmp_path_factory):
     """A policy of every learner, trained a little with the truth at hand."""
     learner = request.param
-    extra = {**PRETRAINING, "width": 8} if learner == "plackett-luce" else {"hidden": (8,)}
+    extra = (
+        {**PRETRAINING, "swaps": SWAPS, "width": 8}
+        if learner == "plackett-luce"
+        else {"hidden": (8,)}
+    )
     plan = TrainingPlan(
         env="dptse_env:dptse/PrivateHighway-v0",
         recipe=RECIPES[learner](**{**SMALL, **extra}),
