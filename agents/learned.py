@@ -12,15 +12,11 @@ import json
 import zipfile
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 from agents.evaluation import Policy
-
-TRANSFERABLE = ("corridor", "bandwidth")
-"""What may differ on purpose between a policy's environment and the one that it acts in."""
-_CARD = "card.json"
+from dptse_env.policies import CARD, read_policy
 
 
 @dataclass(frozen=True)
@@ -45,10 +41,10 @@ class Saved:
             FileNotFoundError: There is no such file, nor such a name.
             ValueError: The file is no saved policy.
         """
-        content = _content(str(source))
+        content = read_policy(source)
         try:
             with zipfile.ZipFile(io.BytesIO(content)) as archive:
-                card = json.loads(archive.read(_CARD))
+                card = json.loads(archive.read(CARD))
             # What is relied on further below must be there.
             saved = cls(str(source), hashlib.sha256(content).hexdigest(), card)
             _ = saved.action, saved.recipe, saved.training_seed
@@ -79,18 +75,8 @@ class Saved:
         """
         from dptse_env.sb3 import load_policy  # noqa: PLC0415
 
-        now = hashlib.sha256(_content(self.source)).hexdigest()
+        now = hashlib.sha256(read_policy(self.source)).hexdigest()
         if now != self.sha256:
             raise ValueError(f"{self.source!r} has changed: sha256 {now}, it was {self.sha256}")
         policy: Policy = load_policy(self.source, env, allow=allow)
         return policy
-
-
-def _content(source: str) -> bytes:
-    shipped = files("dptse_env").joinpath("policies", f"{source}.zip")
-    # A bare name only: the path of a file is never looked up in the package.
-    if Path(source).name == source and shipped.is_file():
-        return shipped.read_bytes()
-    if not Path(source).is_file():
-        raise FileNotFoundError(f"there is no saved policy {source!r}")
-    return Path(source).read_bytes()

@@ -17,10 +17,11 @@ from tqdm import tqdm
 
 from agents.evaluation import EpisodeScore, Policy, run_episodes, watch_episode
 from agents.figures import save_space_time
-from agents.learned import TRANSFERABLE, Saved
+from agents.learned import Saved
 from agents.report import Report
 from dptse_env.config import EnvConfig, parse_seeds
 from dptse_env.model.parameters import read_parameters
+from dptse_env.policies import TRANSFERABLE
 from dptse_env.schedules import SCHEDULES, make_schedule
 from dptse_env.traffic import RecordLibrary
 from scripts.cli import run

@@ -10,13 +10,14 @@ import gymnasium as gym
 import numpy as np
 
 from agents.evaluation import EpisodeScore, Policy, run_episodes
-from agents.learned import TRANSFERABLE, Saved
+from agents.learned import Saved
 from agents.ledger import Ledger
 from agents.policy_study.asked import Asked, Watch
 from agents.policy_study.manifest import Manifest
 from agents.policy_study.plan import DETERMINISTIC, Cell, Design, Entry
 from agents.runner import void_on_purpose
 from dptse_env.config import EnvConfig
+from dptse_env.policies import TRANSFERABLE
 from dptse_env.schedules import make_schedule
 from dptse_env.vector_env import SensorQueryVectorEnv
 

@@ -1,9 +1,10 @@
 """What stable-baselines3 needs to learn on many episodes at once. Needs the extra ``train``."""
 
+from dptse_env.policies import shipped_policies
 from dptse_env.sb3.channels import RoadChannels
 from dptse_env.sb3.plackett_luce import PlackettLuce
 from dptse_env.sb3.policy import PlackettLucePolicy
-from dptse_env.sb3.saved import SavedPolicy, load_policy, save_policy, shipped_policies
+from dptse_env.sb3.saved import SavedPolicy, load_policy, save_policy
 from dptse_env.sb3.vec_env import SB3VecEnv
 
 __all__ = [

@@ -10,7 +10,6 @@ import zipfile
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from importlib.metadata import version
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +20,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from dptse_env.arrays import Action, Observation
 from dptse_env.config import EnvConfig
 from dptse_env.interface import QueryInterface
+from dptse_env.policies import CARD, TRANSFERABLE, read_policy
 from dptse_env.sb3.channels import RoadChannels
 from dptse_env.sb3.policy import PlackettLucePolicy
 
@@ -28,12 +28,11 @@ FORMAT = "dptse-policy"
 VERSION = 1
 """Raise it whenever saved weights would no longer mean the same."""
 
-CARD, TEXT, WEIGHTS = "card.json", "CARD.md", "weights.pt"
+TEXT, WEIGHTS = "CARD.md", "weights.pt"
 
 MUST_FIT = ("format", "observation", "action", "corridor", "bandwidth")
-"""What a policy must have in common with the environment that it is to act in."""
-TRANSFERABLE = ("corridor", "bandwidth")
-"""Of these, what a caller may allow to differ; anything else would not fit the weights."""
+"""What a policy must have in common with the environment that it is to act in, but for what of
+`dptse_env.policies.TRANSFERABLE` a caller allows: with anything else its weights would not fit."""
 
 
 class ActingPolicy:
@@ -220,14 +219,6 @@ def save_policy(
         aside.unlink(missing_ok=True)
 
 
-def shipped_policies() -> list[str]:
-    """Return the names of the policies that come with the package."""
-    folder = files("dptse_env").joinpath("policies")
-    if not folder.is_dir():
-        return []
-    return sorted(entry.name[:-4] for entry in folder.iterdir() if entry.name.endswith(".zip"))
-
-
 def load_policy(
     source: str | os.PathLike[str], env: Any, *, allow: Collection[str] = ()
 ) -> SavedPolicy:
@@ -235,7 +226,7 @@ def load_policy(
 
     Args:
         source: A file, or the name of a policy that comes with the package
-            (`shipped_policies`).
+            (`dptse_env.policies`).
         env: The environment in which it is to act: of this package, scalar or vector, wrapped or
             not, or as an `SB3VecEnv`.
         allow: What may differ on purpose, of `TRANSFERABLE`. Estimator, privacy and traffic model
@@ -249,7 +240,7 @@ def load_policy(
     strangers = [name for name in allow if name not in TRANSFERABLE]
     if strangers:
         raise ValueError(f"allow must be of {', '.join(TRANSFERABLE)}, got {strangers[0]!r}")
-    content, config = _read(source), _config_of(env)
+    content, config = read_policy(source), _config_of(env)
     card, weights = _unpack(content, str(source))
     there, here = card["fits"], fit_of(config)
     differing = [
@@ -274,20 +265,6 @@ def load_policy(
 def _hint(allow: Collection[str]) -> str:
     left = [name for name in TRANSFERABLE if name not in allow]
     return f". Transfer on purpose: allow={tuple(left)!r} or some of it" if left else ""
-
-
-def _read(source: str | os.PathLike[str]) -> bytes:
-    name = os.fspath(source)
-    if name in shipped_policies():
-        return files("dptse_env").joinpath("policies", f"{name}.zip").read_bytes()
-    path = Path(source)
-    if not path.is_file():
-        known = ", ".join(shipped_policies()) or "none"
-        raise FileNotFoundError(
-            f"there is no saved policy {name!r}: neither a file, nor of those that come with the "
-            f"package ({known})"
-        )
-    return path.read_bytes()
 
 
 def _unpack(content: bytes, source: str) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:

@@ -8,8 +8,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from agents.learned import TRANSFERABLE, Saved
+from agents.learned import Saved
 from dptse_env import sb3
+from dptse_env.policies import TRANSFERABLE
 from tests.agents.policies import SHORT, save
 
 
@@ -62,7 +63,7 @@ def test_what_is_no_policy_is_refused(tmp_path):
 def test_a_name_is_looked_up_in_the_package(tmp_path, monkeypatch):
     (tmp_path / "policies").mkdir()
     save(tmp_path / "policies" / "shipped.zip", seed=4)
-    monkeypatch.setattr("agents.learned.files", lambda _: tmp_path)
+    monkeypatch.setattr("dptse_env.policies.files", lambda _: tmp_path)
     assert Saved.of("shipped").training_seed == 4
 
 

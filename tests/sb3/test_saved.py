@@ -13,6 +13,7 @@ pytest.importorskip("stable_baselines3")
 import torch
 from stable_baselines3.common.policies import ActorCriticPolicy
 
+from dptse_env import policies
 from dptse_env.config import resolve
 from dptse_env.interface import QueryInterface
 from dptse_env.sb3 import (
@@ -230,7 +231,7 @@ def test_shipped_policies_are_loaded_by_name(stored, tmp_path, monkeypatch):
     folder = tmp_path / "policies"
     folder.mkdir()
     (folder / "short.zip").write_bytes(stored.read_bytes())
-    monkeypatch.setattr(saved, "files", lambda package: tmp_path)
+    monkeypatch.setattr(policies, "files", lambda package: tmp_path)
     assert shipped_policies() == ["short"]
     assert load_policy("short", make_env()).card["training"]["seed"] == 3
     with pytest.raises(FileNotFoundError, match=r"that come with the package \(short\)"):
