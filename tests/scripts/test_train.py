@@ -28,6 +28,8 @@ SMALL = [
     "--recipe.n-envs", "4", "--recipe.twins", "2", "--recipe.n-steps", "10",
     "--recipe.batch-size", "20", "--recipe.width", "8", "--recipe.pretraining-rounds", "1",
     "--recipe.pretraining-seconds", "6", "--recipe.pretraining-batches", "2",
+    "--recipe.swaps.rounds", "1", "--recipe.swaps.episodes", "2", "--recipe.swaps.seconds", "8",
+    "--recipe.swaps.trials", "1", "--recipe.swaps.batches", "2",
 ]  # fmt: skip
 
 
@@ -38,7 +40,7 @@ def arguments(output, *more):
 def test_it_trains_and_goes_on(tmp_path, capsys):
     train.main(arguments(tmp_path))
     assert "error in validation 0." in capsys.readouterr().out
-    assert read_progress(tmp_path)[-1]["steps"] == 24 + 240
+    assert read_progress(tmp_path)[-1]["steps"] == 24 + 2 * 64 * 5 + 240
     before = (tmp_path / "policy.zip").read_bytes()
     train.main(arguments(tmp_path))
     assert (tmp_path / "policy.zip").read_bytes() == before
@@ -74,7 +76,7 @@ def test_a_killed_program_goes_on_to_the_same_curve(tmp_path, how):
         for run in ("killed", "whole")
     ]
     assert curves[0] == curves[1]
-    assert len(curves[0]) == 7
+    assert len(curves[0]) == 8
 
 
 def test_every_recipe_is_on_the_command_line():
@@ -91,6 +93,7 @@ def test_arguments_become_the_plan():
     assert (plan.seed, plan.traffic_seeds, plan.validation_seeds) == (3, (4, 5), (1000,))
     assert plan.config().bandwidth == 3
     assert plan.config().action == "slots"
+    assert (plan.steps, plan.n_updates) == (0, 10)  # rounds of swaps alone
     sequential = make_plan(Args(recipe=MaskablePPORecipe()))
     assert sequential.n_updates == 313  # 2 million decisions of five picks, 32,000 an update
 
