@@ -29,9 +29,10 @@ def improve(
     policy: PlackettLucePolicy,
     swaps: Swaps,
     settings: SwapRounds,
+    step: float,
     progress: Callable[[float], None] | None = None,
 ) -> None:
-    """Move the scores of ``policy`` by ``settings.step`` times the expected gain of asking.
+    """Move the scores of ``policy`` by ``step`` times the expected gain of asking.
 
     Gains are in units of the policy's mean error of a second, so that settings carry over to
     other environments. From each the price of the exposures is taken: vehicles that have counted
@@ -41,7 +42,8 @@ def improve(
     Args:
         policy: Changed in place.
         swaps: Tried under this policy.
-        settings: Step, price, minibatches and learning rate.
+        settings: Price, minibatches and learning rate.
+        step: By how much a score rises for an expected gain of a second's error.
         progress: Called with the share that is done, every so often.
     """
     second = swaps.error.mean()
@@ -57,7 +59,7 @@ def improve(
         rows = torch.randint(len(worth), (settings.batch_size,))
         shown, row = torch.unique(state[rows], return_inverse=True)
         moved = _scores(policy, seen[shown]) - before[shown]
-        expected = (moved[row, added[rows]] - moved[row, dropped[rows]]) / settings.step
+        expected = (moved[row, added[rows]] - moved[row, dropped[rows]]) / step
         loss = torch.square(expected - worth[rows]).mean()
         optimizer.zero_grad()
         loss.backward()

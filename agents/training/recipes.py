@@ -18,7 +18,7 @@ class SwapRounds:
         ValueError: A value is out of range; the message names it.
     """
 
-    rounds: int = 10
+    rounds: int = 8
     """How many; 0 for none."""
     episodes: int = 480
     """Episodes of a round, all at once."""
@@ -26,8 +26,10 @@ class SwapRounds:
     """For how long twins are followed, and between two states of an episode."""
     trials: int = 3
     """Swaps tried in each state."""
-    step: float = 20.0
-    """By how much a score rises for an expected gain of one second's error."""
+    step: float = 25.0
+    """By how much a score rises, in the first round, for an expected gain of a second's error."""
+    final_step: float = 5.0
+    """The same in the last round; it falls linearly, so that what rounds err by averages out."""
     price: float = 0.002
     """Of one vehicle's counting once, in seconds' errors."""
     batches: int = 600
@@ -44,8 +46,14 @@ class SwapRounds:
         for name in ("seconds", "trials", "batches", "batch_size"):
             integer(f"recipe.swaps.{name}", getattr(self, name), 1)
         positive("recipe.swaps.step", self.step)
+        positive("recipe.swaps.final_step", self.final_step)
         positive("recipe.swaps.rate", self.rate)
         non_negative("recipe.swaps.price", self.price)
+
+    def step_of(self, turn: int) -> float:
+        """Return the step of a round, counted from 0."""
+        share = turn / max(self.rounds - 1, 1)
+        return self.step + (self.final_step - self.step) * share
 
     def steps(self, horizon: int) -> int:
         """Seconds that a round simulates, all episodes and their twins together."""

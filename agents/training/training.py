@@ -158,7 +158,8 @@ class Training:
             parts.append(part)
             self._on_share("swaps", len(parts) / n_states)
         swaps = Swaps.joined(parts)
-        improve(self._policy, swaps, settings, partial(self._on_share, "fit"))
+        step = settings.step_of(self._rounds)
+        improve(self._policy, swaps, settings, step, partial(self._on_share, "fit"))
         return float(swaps.error.mean())
 
     @property

@@ -93,7 +93,7 @@ def test_arguments_become_the_plan():
     assert (plan.seed, plan.traffic_seeds, plan.validation_seeds) == (3, (4, 5), (1000,))
     assert plan.config().bandwidth == 3
     assert plan.config().action == "slots"
-    assert (plan.steps, plan.n_updates) == (0, 10)  # rounds of swaps alone
+    assert (plan.steps, plan.n_updates) == (0, 8)  # rounds of swaps alone
     sequential = make_plan(Args(recipe=MaskablePPORecipe()))
     assert sequential.n_updates == 313  # 2 million decisions of five picks, 32,000 an update
 

@@ -13,7 +13,8 @@ from dptse_env.config import resolve
 from dptse_env.sb3 import PlackettLucePolicy, RoadChannels
 
 N = 6
-SETTINGS = SwapRounds(step=3.0, price=0.01, batches=400, batch_size=256, rate=1e-2)
+STEP = 3.0
+SETTINGS = SwapRounds(price=0.01, batches=400, batch_size=256, rate=1e-2)
 
 
 @pytest.fixture
@@ -61,7 +62,7 @@ def moved(policy, swaps, settings=SETTINGS):
             return policy.scorer(policy.channels(seen)).numpy()
 
     before = scores()
-    improve(policy, swaps, settings)
+    improve(policy, swaps, settings, STEP)
     change = scores() - before
     return change - change.mean(axis=1, keepdims=True)
 
@@ -76,7 +77,7 @@ def test_scores_move_by_a_step_of_the_expected_gain(policy):
 
     swaps = planted(policy, gain)
     expected = centred(gain(policy.channels(torch.from_numpy(swaps.observations)).numpy()))
-    change = moved(policy, swaps) / SETTINGS.step
+    change = moved(policy, swaps) / STEP
     assert expected.std() > 0.04
     assert (change - expected).std() < 0.2 * expected.std()
 
@@ -86,7 +87,7 @@ def test_exposures_have_their_price(policy):
         return 8.0 * (channels[:, 0] > 0.0)
 
     swaps = planted(policy, None, exposures)
-    change = moved(policy, swaps) / SETTINGS.step
+    change = moved(policy, swaps) / STEP
     expected = -0.01 * centred(
         exposures(policy.channels(torch.from_numpy(swaps.observations)).numpy())
     )
@@ -97,18 +98,18 @@ def test_a_few_huge_gains_do_not_rule(policy):
     swaps = planted(policy, None)
     swaps.gain[:] = 0.0
     swaps.gain[(swaps.added == 2) & (swaps.state % 20 == 0)] = 1e6
-    change = moved(policy, swaps) / SETTINGS.step
+    change = moved(policy, swaps) / STEP
     assert 0.0 < change[:, 2].mean() < LARGEST
 
 
 def test_no_gain_moves_nothing_but_noise(policy):
     swaps = planted(policy, None)
-    assert np.abs(moved(policy, swaps) / SETTINGS.step).mean() < 0.01
+    assert np.abs(moved(policy, swaps) / STEP).mean() < 0.01
 
 
 def test_it_reports_its_progress_and_leaves_no_gradients(policy):
     shares = []
     few = SwapRounds(batches=100, batch_size=8)
-    improve(policy, planted(policy, None, n_states=10), few, shares.append)
+    improve(policy, planted(policy, None, n_states=10), few, STEP, shares.append)
     assert shares == [0.0, 0.5]
     assert all(p.grad is None for p in policy.scorer.parameters())

@@ -129,6 +129,18 @@ def test_rounds_of_swaps_come_first_on_the_curve(tmp_path):
     assert training.model.num_timesteps == 240
 
 
+def test_steps_fall_from_round_to_round(tmp_path, monkeypatch):
+    steps = []
+    training = Training(with_swaps(0), tmp_path)
+    monkeypatch.setattr(
+        "agents.training.training.improve", lambda _p, _s, _t, step, *_: steps.append(step)
+    )
+    training.run()
+    assert steps == [FEW_SWAPS.step, FEW_SWAPS.final_step]
+    assert SwapRounds(rounds=5, step=9.0, final_step=1.0).step_of(1) == pytest.approx(7.0)
+    assert SwapRounds(rounds=1).step_of(0) == SwapRounds().step
+
+
 def test_every_round_tries_other_swaps_in_other_episodes(tmp_path, monkeypatch):
     began, given = [], []
     training = Training(with_swaps(0), tmp_path)
