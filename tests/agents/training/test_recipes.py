@@ -7,7 +7,7 @@ pytest.importorskip("yaml")
 
 import yaml
 
-from agents.training.recipes import RECIPES, PlackettLuceRecipe
+from agents.training.recipes import RECIPES, PlackettLuceRecipe, SwapRounds
 from agents.training.yaml import ENV, FOLDER, to_yaml
 from dptse_env.actions import ACTION_ENCODINGS
 from dptse_env.config import PRESETS
@@ -59,3 +59,25 @@ def test_the_learning_rate_falls_to_its_end():
 def test_bad_values_are_named(name, value, message):
     with pytest.raises(ValueError, match=message):
         dataclasses.replace(PlackettLuceRecipe(), **{name: value})
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("rounds", -1, r"recipe\.swaps\.rounds must be an integer in 0\.\.99, got -1"),
+        ("episodes", 10_000, r"recipe\.swaps\.episodes must be an integer in 1\.\.9999"),
+        ("trials", 0, r"recipe\.swaps\.trials must be an integer >= 1"),
+        ("step", 0.0, r"recipe\.swaps\.step must be > 0"),
+        ("final_step", -1.0, r"recipe\.swaps\.final_step must be > 0"),
+        ("price", -0.1, r"recipe\.swaps\.price must be >= 0"),
+    ],
+)
+def test_bad_values_of_swap_rounds_are_named(name, value, message):
+    with pytest.raises(ValueError, match=message):
+        SwapRounds(**{name: value})
+
+
+def test_a_rounds_seconds_are_those_of_all_twins():
+    # The episodes themselves, and one unswapped and three swapped twins under either noise.
+    assert SwapRounds(episodes=10, trials=3).steps(700) == 10 * 700 * 9
+    assert RECIPES["mask"]().rounds.rounds == 0
