@@ -9,20 +9,70 @@ are measured anew, under the policy of then.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from agents.evaluation import Policy
+from agents.training.learners import SEED_STRIDE
+from agents.training.plan import TrainingPlan
 from agents.training.recipes import SwapRounds
-from agents.training.swaps import Swaps
+from agents.training.swaps import Swaps, try_swaps
 from dptse_env.sb3 import PlackettLucePolicy
+from dptse_env.vector_env import SensorQueryVectorEnv
 
 LARGEST = 0.6
 """Gains are clipped to this many seconds' error: few are larger, and they would rule the fit."""
 
 PART = 4096
 """Observations scored at a time."""
+
+SWAP_STRIDE = 10_000
+"""Between the seeds of two rounds; the first begins one stride after those of PPO's episodes."""
+
+
+def swap_round(
+    plan: TrainingPlan,
+    turn: int,
+    env: SensorQueryVectorEnv,
+    policy: PlackettLucePolicy,
+    actor: Policy,
+    on_share: Callable[[str, float], None],
+) -> float:
+    """Try swaps under a policy, and improve it by them.
+
+    Args:
+        plan: Of the training; its recipe has the settings of rounds.
+        turn: Which round, counted from 0. Its draws depend on it and on the plan's seed alone,
+            but for those of torch.
+        env: Where swaps are tried, `agents.training.learners.make_swap_env`.
+        policy: Changed in place.
+        actor: What acts as ``policy`` did before, by plain observations.
+        on_share: Told what is being done and the share of it that is done.
+
+    Returns:
+        The mean error of a second under the policy before.
+
+    Raises:
+        ValueError: There is nothing to swap, or the horizon is too short (`try_swaps`).
+    """
+    settings, parts = plan.recipe.rounds, []
+    first = SEED_STRIDE * (10 + plan.seed) + SWAP_STRIDE * (turn + 1)
+    for part in try_swaps(
+        env,
+        actor,
+        list(range(first, first + settings.episodes)),
+        np.random.default_rng([plan.seed, turn]),
+        seconds=settings.seconds,
+        trials=settings.trials,
+    ):
+        parts.append(part)
+        on_share("swaps", len(parts) * settings.seconds / env.config.horizon_steps)
+    swaps = Swaps.joined(parts)
+    improve(policy, swaps, settings, settings.step_of(turn), partial(on_share, "fit"))
+    return float(swaps.error.mean())
 
 
 def improve(

@@ -22,9 +22,6 @@ from dptse_env.vector_env import SensorQueryVectorEnv
 SEED_STRIDE = 1_000_000
 """Episode i of training seed s draws from (s + 10) strides + i: no other draw starts there."""
 
-SWAP_STRIDE = 10_000
-"""From one round of swaps to the next; the first begins one stride after those episodes."""
-
 
 def make_episodes(
     env: str, keywords: Mapping[str, Any], recipe: Recipe, seed: int
@@ -53,27 +50,16 @@ def make_episodes(
     )
 
 
-def make_swap_env(
-    env: str, keywords: Mapping[str, Any], recipe: Recipe
-) -> SensorQueryVectorEnv | None:
-    """Make the episodes in which a recipe tries swaps; None if it tries none.
+def make_swap_env(env: str, keywords: Mapping[str, Any], recipe: Recipe) -> SensorQueryVectorEnv:
+    """Make the episodes in which a recipe tries swaps; nothing is loaded before they begin.
 
     Raises:
         ValueError: A keyword is unknown or out of range.
     """
-    if not recipe.rounds.rounds:
-        return None
-    episodes = recipe.rounds.episodes
     keywords = {**keywords, "autoreset_mode": "Disabled", "action": recipe.action}
-    made = gym.make_vec(env, num_envs=episodes, **keywords)
+    made = gym.make_vec(env, num_envs=recipe.rounds.episodes, **keywords)
     assert isinstance(made, SensorQueryVectorEnv)
     return made
-
-
-def swap_seeds(recipe: Recipe, seed: int, turn: int) -> list[int]:
-    """Return the seeds of the episodes of a round of swaps."""
-    first = SEED_STRIDE * (10 + seed) + SWAP_STRIDE * (turn + 1)
-    return list(range(first, first + recipe.rounds.episodes))
 
 
 def make_model(recipe: Recipe, episodes: TrainingEpisodes, seed: int) -> OnPolicyAlgorithm:

@@ -22,12 +22,11 @@ from agents.training.folder import (
     write_checkpoint,
     write_progress,
 )
-from agents.training.improvement import improve
-from agents.training.learners import acting, make_episodes, make_model, make_swap_env, swap_seeds
+from agents.training.improvement import swap_round
+from agents.training.learners import acting, make_episodes, make_model, make_swap_env
 from agents.training.plan import TrainingPlan
 from agents.training.pretraining import pretrain
 from agents.training.recipes import PlackettLuceRecipe
-from agents.training.swaps import Swaps, try_swaps
 from agents.training.validation import Validation
 from dptse_env.sb3 import PlackettLucePolicy
 from dptse_env.sb3.saved import save_policy
@@ -125,7 +124,14 @@ class Training:
             self._at_boundary(self._pretrain())
         while self._rounds < self.plan.recipe.rounds.rounds:
             began = time.perf_counter()
-            error = self._round()
+            error = swap_round(
+                self.plan,
+                self._rounds,
+                self._swap_env,
+                self._policy,
+                acting(self.model, self._episodes),
+                self._on_share,
+            )
             self._rounds += 1
             self._at_boundary(time.perf_counter() - began, error)
         left = self.plan.n_updates - self.update
@@ -141,26 +147,6 @@ class Training:
         if isinstance(recipe, PlackettLuceRecipe) and recipe.pretraining_rounds:
             pretrain(self._policy, self._episodes, recipe, partial(self._on_share, "regression"))
         return time.perf_counter() - began
-
-    def _round(self) -> float:
-        """Do a round of swaps; return the mean error of a second of the policy before it."""
-        plan, settings, env = self.plan, self.plan.recipe.rounds, self._swap_env
-        assert env is not None
-        n_states, parts = env.config.horizon_steps // settings.seconds, []
-        for part in try_swaps(
-            env,
-            acting(self.model, self._episodes),
-            swap_seeds(plan.recipe, plan.seed, self._rounds),
-            np.random.default_rng([plan.seed, self._rounds]),
-            seconds=settings.seconds,
-            trials=settings.trials,
-        ):
-            parts.append(part)
-            self._on_share("swaps", len(parts) / n_states)
-        swaps = Swaps.joined(parts)
-        step = settings.step_of(self._rounds)
-        improve(self._policy, swaps, settings, step, partial(self._on_share, "fit"))
-        return float(swaps.error.mean())
 
     @property
     def _policy(self) -> PlackettLucePolicy:
