@@ -148,7 +148,7 @@ def main(args: Args) -> None:
     torch.set_num_threads(integer("threads", args.threads, 1))
     library = RecordLibrary(args.records)
     seeds = (*plan.traffic_seeds, *plan.validation_seeds)
-    library.ensure(plan.config().corridor, seeds, workers=args.workers, progress=True)
+    library.ensure(plan.config.corridor, seeds, workers=args.workers, progress=True)
     records = None if args.records is None else str(args.records)
     bar = Bar(plan.steps_at(plan.n_updates))
     board = Board.open(args.output / "tensorboard") if args.tensorboard else None

@@ -83,17 +83,18 @@ class TrainingPlan:
     def steps_at(self, update: int) -> int:
         """Seconds of traffic simulated by the end of an update, what came ahead of it included."""
         recipe, rounds = self.recipe, self.recipe.rounds
-        by_swaps = min(update, rounds.rounds) * rounds.steps(self.config().horizon_steps)
+        by_swaps = min(update, rounds.rounds) * rounds.steps(self.config.horizon_steps)
         by_ppo = max(update - rounds.rounds, 0) * recipe.steps_per_update // self.actions_per_step
         return recipe.pretraining_steps + by_swaps + by_ppo
 
     @cached_property
     def actions_per_step(self) -> int:
         """Actions that make one decision."""
-        return QueryInterface.of(self.config()).actions.actions_per_step
+        return QueryInterface.of(self.config).actions.actions_per_step
 
+    @cached_property
     def config(self) -> EnvConfig:
-        """Return the configuration of the environment.
+        """The configuration of the environment.
 
         Raises:
             ValueError: A keyword is unknown or out of range.
@@ -110,7 +111,7 @@ class TrainingPlan:
 
     def provenance(self, commit: str | None) -> dict[str, Any]:
         """Return what `agents.provenance.take_folder` compares and keeps, as plain JSON."""
-        config = self.config()
+        config = self.config
         libraries = ("gymnasium", "numba", "numpy", "stable-baselines3", "torch")
         whole = {
             "made_with": {

@@ -89,7 +89,7 @@ class Training:
         """
         self.plan, self.folder, self._watchers = plan, folder, watchers
         self._on_share = on_share
-        self.config = plan.config()
+        self.config = plan.config
         take_folder(folder, plan.provenance(commit))
         keywords = {**plan.keywords, "records": records}
         recipe = plan.recipe

@@ -91,8 +91,8 @@ def test_arguments_become_the_plan():
     args = Args(seed=3, traffic="4:6", validation="1000", keywords='{"bandwidth": 3}')
     plan = make_plan(args)
     assert (plan.seed, plan.traffic_seeds, plan.validation_seeds) == (3, (4, 5), (1000,))
-    assert plan.config().bandwidth == 3
-    assert plan.config().action == "slots"
+    assert plan.config.bandwidth == 3
+    assert plan.config.action == "slots"
     assert (plan.steps, plan.n_updates) == (0, 8)  # rounds of swaps alone
     sequential = make_plan(Args(recipe=MaskablePPORecipe()))
     assert sequential.n_updates == 313  # 2 million decisions of five picks, 32,000 an update
