@@ -20,7 +20,7 @@ class Curve:
     Attributes:
         recipe: Its recipe.
         training_seed: Its seed.
-        steps: Actions trained on so far.
+        steps: Seconds of traffic simulated so far.
         errors: Normalised RMSE × 1000 with deterministic actions, one for each.
     """
 

@@ -18,7 +18,12 @@ from agents.policy_study.tables import ladder
 from agents.statistics import FloatArray, Interval, mean
 
 COLOURS = {"baseline": "#5f6b7a", "bound": "#b9770e", "learned": "#1b4f72"}
-CURVES = ("#1b4f72", "#c1272d", "#5d8233", "#7d5ba6", "#b9770e", "#009e73", "#cc79a7")
+CURVES = (
+    "#1b4f72", "#c1272d", "#5d8233", "#7d5ba6", "#b9770e", "#009e73", "#cc79a7", "#333333",
+    "#56b4e9",
+)  # fmt: skip
+FEW = 1e5
+"""Seconds of training up to which learning curves are drawn to a linear scale."""
 SINCE = range(-240, 361, BIN)
 """Edges of the stretches of time from the start of the incident that are drawn [s]."""
 
@@ -77,7 +82,8 @@ def save_curves(path: Path, measured: Measured, title: str) -> None:
     choice = measured.choice(PRIMARY)
     for name, line in ((choice.baseline, "--"), (REFERENCE, ":")):
         axis.axhline(1000.0 * choice.errors[name], color="#333333", linestyle=line, label=name)
-    axis.set_xlabel("actions trained on")
+    axis.set_xscale("symlog", linthresh=FEW)  # some recipes simulate ten times what others do
+    axis.set_xlabel("seconds simulated in training")
     axis.set_ylabel("error on validation traffic × 1000")
     _finish(figure, [axis], title, path)
 
