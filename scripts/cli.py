@@ -33,7 +33,7 @@ def run(main: Callable[[ArgsT], None], arguments: type[ArgsT], description: str 
 
 @contextlib.contextmanager
 def resumable() -> Iterator[None]:
-    """On Ctrl-C in the body end with status 130, and say that the program can be gone on with."""
+    """End with status 130 on Ctrl-C in the body, and say that the program can be gone on with."""
     try:
         yield
     except KeyboardInterrupt:

@@ -19,7 +19,7 @@ from agents.offline import PlanSearch, PlanTask, held_out
 from dptse_env.schedules.plans import Plan, read_plan, write_plan
 from dptse_env.traffic import RecordLibrary
 from dptse_env.validation import integer
-from scripts.cli import run
+from scripts.cli import resumable, run
 
 
 @dataclass(frozen=True)
@@ -102,6 +102,7 @@ def save(path: Path, plan: Plan) -> None:
     aside.replace(path)
 
 
+@resumable()
 def main(args: Args) -> None:
     """Record what is missing, search, and leave the plan."""
     task = make_task(args)
@@ -129,8 +130,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        run(main, Args, __doc__)
-    except KeyboardInterrupt:
-        print("\nstopped; the same command goes on from here")
-        raise SystemExit(130) from None
+    run(main, Args, __doc__)

@@ -34,7 +34,7 @@ from agents.training.training import BEST, POLICY, Training
 from dptse_env.config import parse_seeds
 from dptse_env.traffic import RecordLibrary
 from dptse_env.validation import integer
-from scripts.cli import run
+from scripts.cli import resumable, run
 
 AnyRecipe = (
     Annotated[PlackettLuceRecipe, tyro.conf.subcommand("plackett-luce")]
@@ -142,6 +142,7 @@ class Bar:
         self._bar.close()
 
 
+@resumable()
 def main(args: Args) -> None:
     """Record what is missing, train, and leave the policy."""
     plan = make_plan(args)
@@ -175,8 +176,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        run(main, Args, __doc__)
-    except KeyboardInterrupt:
-        print("\nstopped; the same command goes on from the last checkpoint")
-        raise SystemExit(130) from None
+    run(main, Args, __doc__)

@@ -30,7 +30,7 @@ from dptse_env.model import ARZParameters
 from dptse_env.model.parameters import read_parameters
 from dptse_env.traffic import RecordLibrary
 from dptse_env.validation import integer
-from scripts.cli import run
+from scripts.cli import resumable, run
 
 
 @dataclass(frozen=True)
@@ -141,6 +141,7 @@ def add_rows(table: Table, study: TuningStudy) -> None:
     table.add_section()
 
 
+@resumable()
 def main(args: Args) -> None:
     """Record what is missing, tune every configuration, and leave the sets."""
     tasks = make_tasks(args)
@@ -163,8 +164,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        run(main, Args, __doc__)
-    except KeyboardInterrupt:
-        print("\nstopped; the same command goes on from here")
-        raise SystemExit(130) from None
+    run(main, Args, __doc__)

@@ -48,6 +48,21 @@ def test_it_trains_and_goes_on(tmp_path, capsys):
         train.main(arguments(tmp_path, "--seed", "1"))
 
 
+def test_ctrl_c_says_that_one_can_go_on(tmp_path, monkeypatch, capsys):
+    def interrupted(*_args, **_keywords):
+        raise KeyboardInterrupt
+
+    own = arguments(tmp_path)
+    monkeypatch.setattr("agents.training.training.swap_round", interrupted)
+    with pytest.raises(SystemExit) as ended:
+        train.main(own)
+    assert ended.value.code == 130
+    assert "the same command goes on" in capsys.readouterr().err
+    monkeypatch.undo()
+    train.main(own)
+    assert read_progress(tmp_path)[-1]["steps"] == 24 + 2 * 64 * 5 + 240
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
 def test_a_killed_program_goes_on_to_the_same_curve(tmp_path, how):
