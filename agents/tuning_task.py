@@ -8,13 +8,15 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 
-from agents.evaluation import WARM_UP, EpisodeScore, run_episode
+from agents.evaluation import WARM_UP, EpisodeScore, Policy, run_episode
+from agents.learned import Saved
 from agents.search_space import Knob, search_space
 from dptse_env.config import TEST_SEEDS, TRAINING_SEEDS, EnvConfig, parse_seeds
 from dptse_env.estimators import EstimatorSettings
@@ -39,13 +41,15 @@ class TuningTask:
         delta: Privacy parameter delta.
         bandwidth: Most segments to query a second; the environment's own if None.
         seeds: Traffic seeds, ``"first:stop"``, within `TRAINING_SEEDS`.
-        schedule: Query schedule.
+        schedule: Query schedule, or the ``.zip`` file of a saved policy.
         noise_seed: Noise and estimators are seeded with this plus the traffic seed.
         records: Folder of the record cache; the user's cache if None.
         with_noise_scale: Whether to search the scale of the measurements' noise, too.
 
     Raises:
-        ValueError: The estimator has nothing to tune, or seeds are not for training.
+        FileNotFoundError: There is no such saved policy.
+        ValueError: The estimator has nothing to tune, seeds are not for training, or the file is no
+            saved policy.
     """
 
     env: str
@@ -63,7 +67,7 @@ class TuningTask:
 
     def __post_init__(self) -> None:
         """Check what needs no environment."""
-        _ = self.space
+        _ = self.space, self.saved
         if not set(self.traffic_seeds) <= set(TRAINING_SEEDS):
             raise ValueError(
                 f"seeds must be training seeds, in {TRAINING_SEEDS.start}:{TRAINING_SEEDS.stop}, "
@@ -76,6 +80,11 @@ class TuningTask:
             )
         if Path(self.name).name != self.name:
             raise ValueError(f"the ARZ parameters' name must be part of a file name: {self.name!r}")
+
+    @cached_property
+    def saved(self) -> Saved | None:
+        """The saved policy that queries; None for a schedule."""
+        return Saved.of(self.schedule) if self.schedule.endswith(".zip") else None
 
     @property
     def space(self) -> dict[str, Knob]:
@@ -113,9 +122,21 @@ class TuningTask:
         }
         if self.bandwidth is not None:
             keywords["bandwidth"] = self.bandwidth
+        if self.saved is not None:
+            keywords["action"] = self.saved.action
         if settings is not None:
             keywords["estimator_settings"] = dataclasses.asdict(settings)
         return gym.make(self.env, **keywords)
+
+    def policy(self, env: gym.Env[Any, Any]) -> Policy:
+        """Bind the schedule or the saved policy to an environment.
+
+        Raises:
+            ValueError: There is no such schedule, or it does not suit the environment.
+        """
+        if self.saved is None:
+            return make_schedule(self.schedule, env)
+        return self.saved.load(env)
 
     def config(self) -> EnvConfig:
         """Return the configuration of the environment, with its present settings.
@@ -124,7 +145,7 @@ class TuningTask:
             ValueError: A value is out of range.
         """
         env = self.make()
-        make_schedule(self.schedule, env)
+        self.policy(env)
         config: EnvConfig = env.unwrapped.config  # type: ignore[attr-defined]
         return config
 
@@ -138,7 +159,7 @@ class TuningTask:
             "parameters": dataclasses.asdict(config.model().parameters),
             "privacy": dataclasses.asdict(config.privacy),
             "bandwidth": config.bandwidth,
-            "schedule": self.schedule,
+            "schedule": self.schedule if self.saved is None else self.saved.sha256,
             "seeds": self.seeds,
             "noise_seed": self.noise_seed,
             "warm_up": WARM_UP,
@@ -150,6 +171,5 @@ class TuningTask:
 def score_episode(task: TuningTask, settings: EstimatorSettings, traffic_seed: int) -> EpisodeScore:
     """Run one episode of a task with given settings."""
     env = task.make(settings)
-    schedule = make_schedule(task.schedule, env)
     noise = task.noise_seed + traffic_seed
-    return run_episode(env, schedule, traffic_seed=traffic_seed, seed=noise)
+    return run_episode(env, task.policy(env), traffic_seed=traffic_seed, seed=noise)

@@ -52,7 +52,7 @@ class Args:
     workers: int = 1
     """Processes, each with a trial of its own; results depend on the number."""
     schedule: str = "paper"
-    """Query schedule."""
+    """Query schedule, or the .zip file of a saved policy."""
     bandwidth: int | None = None
     """Most segments to query a second; the environment's own if not given."""
     epsilon: float = 1.0

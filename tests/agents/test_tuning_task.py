@@ -7,6 +7,7 @@ from agents.tuning_task import TuningTask, score_episode
 from dptse_env.estimators import EstimatorSettings
 from dptse_env.model import ARZParameters
 from dptse_env.schedules import make_schedule
+from tests.agents.policies import save
 
 TASK = TuningTask(
     env="dptse_env:dptse/ShortHighway-v0",
@@ -53,3 +54,21 @@ def test_a_task_takes_parameters_of_its_own():
     assert task.identity()["bandwidth"] == 2
     with pytest.raises(ValueError, match="unknown schedule 'best'"):
         dataclasses.replace(TASK, schedule="best").config()
+
+
+def test_settings_can_be_tuned_for_a_saved_policy(tmp_path):
+    pytest.importorskip("torch")
+    path = save(tmp_path / "policy.zip", seed=1)
+    task = dataclasses.replace(TASK, schedule=str(path))
+    settings = EstimatorSettings(process_noise=(0.02, 0.03))
+    env = task.make(settings)
+    assert env.unwrapped.config.action == "slots"
+    expected = run_episode(env, task.saved.load(env), traffic_seed=1, seed=1_000_001)
+    assert score_episode(task, settings, 1) == expected
+    assert score_episode(TASK, settings, 1) != expected
+    other = dataclasses.replace(TASK, schedule=str(save(tmp_path / "other.zip", seed=2)))
+    assert task.identity()["schedule"] != other.identity()["schedule"]  # by content, not by name
+    with pytest.raises(ValueError, match="bandwidth is 2 of the policy and 3 of the environment"):
+        dataclasses.replace(task, bandwidth=3).config()
+    with pytest.raises(FileNotFoundError, match=r"none\.zip"):
+        dataclasses.replace(task, schedule="none.zip")
