@@ -35,7 +35,9 @@ privacy-study: setup  ## Measure what the guarantee costs; results/privacy.
 	$(BIN)/python scripts/privacy_study.py
 
 policy-study: setup  ## Hold the trained policies of results/training against every baseline; results/policies.
-	$(BIN)/python scripts/policy_study.py freeze --policies primary=results/training/primary paper=results/training/paper
+	$(BIN)/python scripts/policy_study.py freeze --test-seeds 2064:2128 --policies \
+		primary=results/training/primary primary:regression=results/training/regression \
+		$(foreach cell,paper bandwidth-3 bandwidth-7 epsilon-1 epsilon-10,$(cell)=results/training/$(cell))
 	$(BIN)/python scripts/policy_study.py run
 
 audit: setup  ## Attack the privacy presets, 5,000 runs in each of two worlds; results/audit.
