@@ -78,7 +78,9 @@ def save_curves(path: Path, measured: Measured, title: str) -> None:
         means = [
             np.mean([curve.errors[curve.steps.index(step)] for curve in own]) for step in common
         ]
-        axis.plot(common, means, color=colour, linewidth=2.0, label=f"{recipe}, mean of {len(own)}")
+        label = f"{recipe}, mean of {len(own)}" if len(own) > 1 else recipe
+        # A regression alone is one point.
+        axis.plot(common, means, "o-", ms=3.5, color=colour, linewidth=2.0, label=label)
     choice = measured.choice(PRIMARY)
     for name, line in ((choice.baseline, "--"), (REFERENCE, ":")):
         axis.axhline(1000.0 * choice.errors[name], color="#333333", linestyle=line, label=name)
@@ -102,7 +104,7 @@ def save_asked(path: Path, measured: Measured, title: str) -> None:
     axes[0, 0].set_xlabel("segment")
     axes[0, 0].set_ylabel("share of seconds in which it is asked")
     axes[0, 1].set_xlabel("time since the start of the incident [s]")
-    axes[0, 1].set_ylabel(f"share of queries within {NEAR} segments of it")
+    axes[0, 1].set_ylabel(f"share of queries\nwithin {NEAR} segments of it")
     for axis, phase in zip(axes[1], PHASES, strict=True):
         axis.set_xlabel(f"segments downstream of the incident, {phase} it")
         axis.axvline(0.0, color="#333333", linewidth=0.8)
