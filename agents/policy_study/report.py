@@ -181,7 +181,7 @@ def _about(measured: Measured, learner: Learner) -> Iterator[str]:
 
 
 def _percent(interval: Interval) -> str:
-    return f"{interval.mean:.1f} % [{interval.low:.1f}, {interval.high:.1f}]"
+    return f"{interval.mean:z.1f} % [{interval.low:z.1f}, {interval.high:z.1f}]"
 
 
 def _unsuited(measured: Measured) -> Iterator[str]:
