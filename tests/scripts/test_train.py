@@ -79,9 +79,9 @@ def test_a_killed_program_goes_on_to_the_same_curve(tmp_path, how):
         assert time.monotonic() < deadline, process.communicate(timeout=5)
         time.sleep(0.01)
     process.send_signal(how)
-    out, _ = process.communicate(timeout=120)
+    _, err = process.communicate(timeout=120)
     assert process.returncode == (130 if how == signal.SIGINT else -how)
-    assert how == signal.SIGKILL or "the same command goes on" in out
+    assert how == signal.SIGKILL or "the same command goes on" in err
     for run in ("killed", "whole"):
         process = start(tmp_path / run)
         process.communicate(timeout=300)
