@@ -128,6 +128,24 @@ def run_episode(
     return _score(traffic_seed, series, warm_up)
 
 
+def make_vector(env: str, n_episodes: int, keywords: Mapping[str, Any]) -> SensorQueryVectorEnv:
+    """Make a vector environment of whole episodes, as `run_episodes` takes it.
+
+    Args:
+        env: Environment id.
+        n_episodes: Episodes at once.
+        keywords: Of ``gym.make_vec``, but for ``autoreset_mode``.
+
+    Raises:
+        ValueError: A keyword is unknown or out of range.
+    """
+    made = gym.make_vec(
+        env, num_envs=n_episodes, **{**keywords, "autoreset_mode": AutoresetMode.DISABLED}
+    )
+    assert isinstance(made, SensorQueryVectorEnv)
+    return made
+
+
 def run_episodes(
     env: SensorQueryVectorEnv,
     policy: Policy,
@@ -144,8 +162,8 @@ def run_episodes(
     draw for the whole batch at once, so they draw other numbers of the same law.
 
     Args:
-        env: A bare vector environment, made with ``autoreset_mode="Disabled"``. Its episodes are
-            in the order of the seeds.
+        env: A bare vector environment, made with ``autoreset_mode="Disabled"`` (`make_vector`). Its
+            episodes are in the order of the seeds.
         policy: Who picks the queries.
         traffic_seeds: Traffic of each episode, n of the environment's traffic seeds.
         seeds: Seed of the noise and the estimator of each episode, n of them.

@@ -15,15 +15,15 @@ from datetime import date
 from importlib.metadata import version
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 
-from agents.evaluation import WARM_UP
+from agents.evaluation import WARM_UP, make_vector
 from dptse_env.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.config import TRAINING_SEEDS, VALIDATION_SEEDS, parse_seeds
 from dptse_env.schedules import PLANS, Shifting
 from dptse_env.schedules.plans import Place, Plan
 from dptse_env.validation import integer
+from dptse_env.vector_env import SensorQueryVectorEnv
 
 NOISE_SEED = 3_000_000
 """Noise and estimators of the search are seeded from here on; evaluations begin at 0."""
@@ -90,16 +90,14 @@ class PlanTask:
         """Episodes that run at once."""
         return FEW * (self.neighbours + 1)
 
-    def make(self, n_episodes: int, seeds: tuple[int, ...]) -> gym.vector.VectorEnv[Any, Any, Any]:
+    def make(self, n_episodes: int, seeds: tuple[int, ...]) -> SensorQueryVectorEnv:
         """Make the environment for a number of episodes on some traffic seeds."""
         keywords: dict[str, Any] = {"estimator": self.estimator, "records": self.records}
         for name in ("parameters", "bandwidth"):
             if getattr(self, name) is not None:
                 keywords[name] = getattr(self, name)
-        return gym.make_vec(
-            self.env, num_envs=n_episodes, traffic_seeds=seeds, action="mask",
-            autoreset_mode="Disabled", threads=1, **keywords,
-        )  # fmt: skip
+        more = {"traffic_seeds": seeds, "action": "mask", "threads": 1}
+        return make_vector(self.env, n_episodes, {**keywords, **more})
 
 
 class Arena:

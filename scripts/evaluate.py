@@ -15,7 +15,7 @@ from typing import Any
 import gymnasium as gym
 from tqdm import tqdm
 
-from agents.evaluation import EpisodeScore, Policy, run_episodes, watch_episode
+from agents.evaluation import EpisodeScore, Policy, make_vector, run_episodes, watch_episode
 from agents.figures import save_space_time
 from agents.learned import Saved
 from agents.report import Report
@@ -130,7 +130,7 @@ def evaluate(args: Args, saved: Mapping[str, Saved]) -> dict[tuple[str, str], li
     for estimator in args.estimators:
         for name in (*args.schedules, *saved):
             keywords = keywords_of(args, estimator, name, saved)
-            env = gym.make_vec(args.env, num_envs=len(seeds), **keywords, autoreset_mode="Disabled")
+            env = make_vector(args.env, len(seeds), keywords)
             cells[estimator, name] = env, make_policy(args, name, saved, env)
     corridor = config_of(args).corridor
     library = RecordLibrary(args.records)
@@ -142,7 +142,7 @@ def evaluate(args: Args, saved: Mapping[str, Saved]) -> dict[tuple[str, str], li
         for key in list(cells):
             env, policy = cells.pop(key)  # what it has loaded may go once it has run
             scores[key] = run_episodes(
-                env,  # type: ignore[arg-type]
+                env,
                 policy,
                 traffic_seeds=seeds,
                 seeds=[args.noise_seed + seed for seed in seeds],

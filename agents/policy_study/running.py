@@ -6,10 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 
-from agents.evaluation import EpisodeScore, Policy, run_episodes
+from agents.evaluation import EpisodeScore, Policy, make_vector, run_episodes
 from agents.learned import Saved
 from agents.ledger import Ledger
 from agents.policy_study.asked import Asked, Watch
@@ -78,19 +77,8 @@ def make_batch(
         ValueError: A keyword is unknown or out of range.
     """
     with void_on_purpose():
-        made = gym.make_vec(
-            env,
-            num_envs=len(seeds),
-            **{
-                **keywords,
-                "autoreset_mode": "Disabled",
-                "traffic_seeds": list(seeds),
-                "records": records,
-                "threads": threads,
-            },
-        )
-    assert isinstance(made, SensorQueryVectorEnv)
-    return made
+        more = {"traffic_seeds": list(seeds), "records": records, "threads": threads}
+        return make_vector(env, len(seeds), {**keywords, **more})
 
 
 def config_of(cell: Cell, seeds: Sequence[int]) -> EnvConfig:

@@ -47,7 +47,7 @@ def swap_round(
         plan: Of the training; its recipe has the settings of rounds.
         turn: Which round, counted from 0. Its draws depend on it and on the plan's seed alone,
             but for those of torch.
-        env: Where swaps are tried, `agents.training.learners.make_swap_env`.
+        env: Where swaps are tried, as `try_swaps` takes it.
         policy: Changed in place.
         actor: What acts as ``policy`` did before, by plain observations.
         on_share: Told what is being done and the share of it that is done.

@@ -17,7 +17,6 @@ from agents.training.episodes import TrainingEpisodes
 from agents.training.recipes import MaskablePPORecipe, PlackettLuceRecipe, Recipe
 from dptse_env.sb3 import PlackettLucePolicy, RoadChannels, SB3VecEnv
 from dptse_env.sb3.saved import ActingPolicy
-from dptse_env.vector_env import SensorQueryVectorEnv
 
 SEED_STRIDE = 1_000_000
 """Episode i of training seed s draws from (s + 10) strides + i: no other draw starts there."""
@@ -48,18 +47,6 @@ def make_episodes(
         reward_scale=recipe.reward_scale,
         shows_errors=recipe.shows_errors,
     )
-
-
-def make_swap_env(env: str, keywords: Mapping[str, Any], recipe: Recipe) -> SensorQueryVectorEnv:
-    """Make the episodes in which a recipe tries swaps; nothing is loaded before they begin.
-
-    Raises:
-        ValueError: A keyword is unknown or out of range.
-    """
-    keywords = {**keywords, "autoreset_mode": "Disabled", "action": recipe.action}
-    made = gym.make_vec(env, num_envs=recipe.rounds.episodes, **keywords)
-    assert isinstance(made, SensorQueryVectorEnv)
-    return made
 
 
 def make_model(recipe: Recipe, episodes: TrainingEpisodes, seed: int) -> OnPolicyAlgorithm:

@@ -13,6 +13,7 @@ import torch
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
+from agents.evaluation import make_vector
 from agents.provenance import take_folder
 from agents.training.episodes import TrainingEpisodes
 from agents.training.folder import (
@@ -23,7 +24,7 @@ from agents.training.folder import (
     write_progress,
 )
 from agents.training.improvement import swap_round
-from agents.training.learners import acting, make_episodes, make_model, make_swap_env
+from agents.training.learners import acting, make_episodes, make_model
 from agents.training.plan import TrainingPlan
 from agents.training.pretraining import pretrain
 from agents.training.recipes import PlackettLuceRecipe
@@ -93,9 +94,8 @@ class Training:
         take_folder(folder, plan.provenance(commit))
         keywords = {**plan.keywords, "records": records}
         recipe = plan.recipe
-        training = {**keywords, "traffic_seeds": list(plan.traffic_seeds)}
-        self._episodes = make_episodes(plan.env, training, recipe, plan.seed)
-        self._swap_env = make_swap_env(plan.env, training, recipe)
+        self._keywords = {**keywords, "traffic_seeds": list(plan.traffic_seeds)}
+        self._episodes = make_episodes(plan.env, self._keywords, recipe, plan.seed)
         self._validation = Validation(
             plan.env, {**keywords, "action": recipe.action}, plan.validation_seeds
         )
@@ -122,18 +122,8 @@ class Training:
         """
         if not self.rows:
             self._at_boundary(self._pretrain())
-        while self._rounds < self.plan.recipe.rounds.rounds:
-            began = time.perf_counter()
-            error = swap_round(
-                self.plan,
-                self._rounds,
-                self._swap_env,
-                self._policy,
-                acting(self.model, self._episodes),
-                self._on_share,
-            )
-            self._rounds += 1
-            self._at_boundary(time.perf_counter() - began, error)
+        if self._rounds < self.plan.recipe.rounds.rounds:
+            self._swap()
         left = self.plan.n_updates - self.update
         if left > 0:
             callback = _Boundary(self._at_boundary, self._episodes)
@@ -147,6 +137,18 @@ class Training:
         if isinstance(recipe, PlackettLuceRecipe) and recipe.pretraining_rounds:
             pretrain(self._policy, self._episodes, recipe, partial(self._on_share, "regression"))
         return time.perf_counter() - began
+
+    def _swap(self) -> None:
+        """Do the rounds of swaps that are left, in episodes that go when they are done."""
+        plan, rounds = self.plan, self.plan.recipe.rounds
+        keywords = {**self._keywords, "action": plan.recipe.action}
+        env = make_vector(plan.env, rounds.episodes, keywords)
+        actor = acting(self.model, self._episodes)
+        while self._rounds < rounds.rounds:
+            began = time.perf_counter()
+            error = swap_round(plan, self._rounds, env, self._policy, actor, self._on_share)
+            self._rounds += 1
+            self._at_boundary(time.perf_counter() - began, error)
 
     @property
     def _policy(self) -> PlackettLucePolicy:

@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import torch
 
-from agents.evaluation import Policy, run_episodes
+from agents.evaluation import Policy, make_vector, run_episodes
 from dptse_env.arrays import FloatArray
 from dptse_env.config import VALIDATION_SEEDS
-from dptse_env.vector_env import SensorQueryVectorEnv
 
 NOISE_SEED = 5_000_000
 """Noise and estimators of validation are seeded with this plus the traffic seed."""
@@ -34,13 +32,8 @@ class Validation:
                 f"{VALIDATION_SEEDS[-1]}, got {strangers[:1] or 'none'}"
             )
         self.seeds = list(seeds)
-        made = gym.make_vec(
-            env,
-            num_envs=len(self.seeds),
-            **{**keywords, "autoreset_mode": "Disabled", "traffic_seeds": self.seeds},
-        )
-        assert isinstance(made, SensorQueryVectorEnv)
-        self.env = made
+        keywords = {**keywords, "traffic_seeds": self.seeds}
+        self.env = make_vector(env, len(self.seeds), keywords)
 
     def errors(self, policy: Policy, *, deterministic: bool) -> FloatArray:
         """Return the mean error of each episode after the warm-up, shape (n seeds,).
