@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from agents.evaluation import WARM_UP, make_vector
+from agents.seeds import PLAN_SEARCH
 from dptse_env.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.config import TRAINING_SEEDS, VALIDATION_SEEDS, parse_seeds
 from dptse_env.schedules import PLANS, Shifting
@@ -25,8 +26,6 @@ from dptse_env.schedules.plans import Place, Plan
 from dptse_env.validation import integer
 from dptse_env.vector_env import SensorQueryVectorEnv
 
-NOISE_SEED = 3_000_000
-"""Noise and estimators of the search are seeded from here on; evaluations begin at 0."""
 SURE = 1.0
 """Standard errors by which a neighbour must gain to take the best plan's place."""
 NOISE_STEP = 10_000
@@ -172,7 +171,7 @@ class PlanSearch:
         plans = np.stack([self.best, *(self._random(generator) for _ in range(n_random))])
         n_seeds = 2
         while len(plans) > 1:
-            scores = self._arena.scores(plans, self._seeds(generator, n_seeds), NOISE_SEED)
+            scores = self._arena.scores(plans, self._seeds(generator, n_seeds), PLAN_SEARCH.start)
             plans = plans[np.argsort(-scores.mean(axis=1))[: len(plans) // 2]]
             n_seeds *= 2
         self.best = plans[0]
@@ -198,7 +197,7 @@ class PlanSearch:
         provenance = {
             "task": task, "rounds": self.n_rounds, "adopted": self.n_adopted,
             "privacy": dataclasses.asdict(config.privacy), "warm_up": WARM_UP,
-            "noise_seed": NOISE_SEED, "date": date.today().isoformat(),
+            "noise_seed": PLAN_SEARCH.start, "date": date.today().isoformat(),
             "versions": {name: version(name) for name in ("dptse-env", "libsumo", "numpy")},
         }  # fmt: skip
         sets = tuple(tuple(np.flatnonzero(one).tolist()) for one in self.best)
@@ -206,7 +205,7 @@ class PlanSearch:
 
     def _round(self) -> None:
         generator = np.random.default_rng([self.task.seed, 1 + self.n_rounds])
-        noise = NOISE_SEED + NOISE_STEP * (1 + self.n_rounds)
+        noise = PLAN_SEARCH.start + NOISE_STEP * (1 + self.n_rounds)
         n_plans, n_seeds = self.task.neighbours, FEW
         plans = np.stack([self._neighbour(generator) for _ in range(n_plans)])
         while True:

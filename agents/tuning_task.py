@@ -18,14 +18,13 @@ import gymnasium as gym
 from agents.evaluation import WARM_UP, EpisodeScore, Policy, run_episode
 from agents.learned import Saved
 from agents.search_space import Knob, search_space
-from dptse_env.config import TEST_SEEDS, TRAINING_SEEDS, EnvConfig, parse_seeds
+from agents.seeds import TUNING
+from dptse_env.config import TRAINING_SEEDS, EnvConfig, parse_seeds
 from dptse_env.estimators import EstimatorSettings
 from dptse_env.estimators.tuning import settings_name
 from dptse_env.model import ARZParameters
 from dptse_env.schedules import make_schedule
-
-NOISE_SEED = 1_000_000
-"""Least noise seed of a tuning run; evaluations count theirs from the traffic seed."""
+from dptse_env.validation import integer
 
 
 @dataclass(frozen=True)
@@ -61,7 +60,7 @@ class TuningTask:
     bandwidth: int | None
     seeds: str
     schedule: str = "paper"
-    noise_seed: int = NOISE_SEED
+    noise_seed: int = TUNING.start
     records: str | None = None
     with_noise_scale: bool = False
 
@@ -73,11 +72,8 @@ class TuningTask:
                 f"seeds must be training seeds, in {TRAINING_SEEDS.start}:{TRAINING_SEEDS.stop}, "
                 f"got {self.seeds!r}"
             )
-        if self.noise_seed < TEST_SEEDS.stop:
-            raise ValueError(
-                f"noise_seed must be >= {TEST_SEEDS.stop}, apart from the noise of evaluations, "
-                f"got {self.noise_seed}"
-            )
+        first, last = TUNING.start, TUNING.stop - TRAINING_SEEDS.stop
+        integer("noise_seed", self.noise_seed, first, last)
         if Path(self.name).name != self.name:
             raise ValueError(f"the ARZ parameters' name must be part of a file name: {self.name!r}")
 

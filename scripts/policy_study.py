@@ -42,8 +42,6 @@ from agents.policy_study.plan import (
     CELLS,
     DETERMINISTIC,
     PRIMARY,
-    TEST_NOISE,
-    VALIDATION_NOISE,
     Design,
     Entry,
     quick,
@@ -58,6 +56,7 @@ from agents.policy_study.running import (
 )
 from agents.provenance import take_folder
 from agents.runner import run_all
+from agents.seeds import STUDY_TEST, STUDY_VALIDATION
 from dptse_env.config import parse_seeds
 from dptse_env.traffic import RecordLibrary
 from dptse_env.validation import integer
@@ -189,7 +188,7 @@ def _run(
     seeds: tuple[int, ...],
 ) -> None:
     """Run what a ledger lacks, on validation or test traffic."""
-    noise = VALIDATION_NOISE if seeds == design.validation_seeds else TEST_NOISE
+    noise = STUDY_VALIDATION.start if seeds == design.validation_seeds else STUDY_TEST.start
     missing = lacking(entries, seeds, ledger)
     library = RecordLibrary(args.records)
     for name in dict.fromkeys(entry.cell for entry in missing):

@@ -24,8 +24,9 @@ from tqdm import tqdm
 
 from agents.runner import make_pool
 from agents.search_space import SPACE
+from agents.seeds import TUNING
 from agents.tuning import TuningStudy, scores_of
-from agents.tuning_task import NOISE_SEED, TuningTask
+from agents.tuning_task import TuningTask
 from dptse_env.model import ARZParameters
 from dptse_env.model.parameters import read_parameters
 from dptse_env.traffic import RecordLibrary
@@ -59,7 +60,7 @@ class Args:
     """Privacy parameter epsilon."""
     delta: float = 0.05
     """Privacy parameter delta."""
-    noise_seed: int = NOISE_SEED
+    noise_seed: int = TUNING.start
     """Noise and estimators are seeded with this plus the traffic seed."""
     noise_scale: bool = False
     """Whether to search the scale of R, too, which the mechanism's noise makes known."""

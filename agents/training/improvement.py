@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from agents.evaluation import Policy
-from agents.training.learners import SEED_STRIDE
+from agents.seeds import training_seed
 from agents.training.plan import TrainingPlan
 from agents.training.recipes import SwapRounds
 from agents.training.swaps import Swaps, try_swaps
@@ -59,7 +59,7 @@ def swap_round(
         ValueError: There is nothing to swap, or the horizon is too short (`try_swaps`).
     """
     settings, parts = plan.recipe.rounds, []
-    first = SEED_STRIDE * (10 + plan.seed) + SWAP_STRIDE * (turn + 1)
+    first = training_seed(plan.seed) + SWAP_STRIDE * (turn + 1)
     for part in try_swaps(
         env,
         actor,

@@ -13,13 +13,11 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
+from agents.seeds import training_seed
 from agents.training.episodes import TrainingEpisodes
 from agents.training.recipes import MaskablePPORecipe, PlackettLuceRecipe, Recipe
 from dptse_env.sb3 import PlackettLucePolicy, RoadChannels, SB3VecEnv
 from dptse_env.sb3.saved import ActingPolicy
-
-SEED_STRIDE = 1_000_000
-"""Episode i of training seed s draws from (s + 10) strides + i: no other draw starts there."""
 
 
 def make_episodes(
@@ -42,7 +40,7 @@ def make_episodes(
     )
     return TrainingEpisodes(
         SB3VecEnv(made),
-        SEED_STRIDE * (10 + seed),
+        training_seed(seed),
         twins=recipe.twins,
         reward_scale=recipe.reward_scale,
         shows_errors=recipe.shows_errors,

@@ -15,8 +15,8 @@ import gymnasium as gym
 
 from agents.evaluation import WARM_UP
 from agents.provenance import source_digest
+from agents.seeds import TRAINING_VALIDATION, TRAININGS
 from agents.training.recipes import Recipe
-from agents.training.validation import NOISE_SEED
 from dptse_env.config import TRAINING_SEEDS, VALIDATION_SEEDS, EnvConfig
 from dptse_env.interface import QueryInterface
 from dptse_env.validation import integer
@@ -54,7 +54,7 @@ class TrainingPlan:
 
     def __post_init__(self) -> None:
         """Check values that need no environment."""
-        integer("seed", self.seed, 0, 999)
+        integer("seed", self.seed, 0, TRAININGS - 1)
         integer("steps", self.steps, 0)
         for name in ("validate_every", "checkpoint_every"):
             integer(name, getattr(self, name), 1)
@@ -125,7 +125,7 @@ class TrainingPlan:
                 "steps": self.steps,
                 "traffic_seeds": self.traffic_seeds,
                 "validation_seeds": self.validation_seeds,
-                "validation_noise": NOISE_SEED,
+                "validation_noise": TRAINING_VALIDATION.start,
                 "validate_every": self.validate_every,
                 "warm_up": WARM_UP,
                 "settings": {config.estimator: dataclasses.asdict(config.settings())},

@@ -9,11 +9,9 @@ import numpy as np
 import torch
 
 from agents.evaluation import Policy, make_vector, run_episodes
+from agents.seeds import TRAINING_VALIDATION
 from dptse_env.arrays import FloatArray
 from dptse_env.config import VALIDATION_SEEDS
-
-NOISE_SEED = 5_000_000
-"""Noise and estimators of validation are seeded with this plus the traffic seed."""
 
 
 class Validation:
@@ -42,12 +40,12 @@ class Validation:
         density and speed together. Draws of torch are seeded, and its generator is left as found.
         """
         with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(NOISE_SEED)
+            torch.manual_seed(TRAINING_VALIDATION.start)
             scores = run_episodes(
                 self.env,
                 policy,
                 traffic_seeds=self.seeds,
-                seeds=[NOISE_SEED + seed for seed in self.seeds],
+                seeds=[TRAINING_VALIDATION.start + seed for seed in self.seeds],
                 deterministic=deterministic,
             )
         return np.array([-score.reward for score in scores])

@@ -5,7 +5,8 @@ import shutil
 
 import pytest
 
-from agents.policy_study.plan import TEST_NOISE, VALIDATION_NOISE, Cell
+from agents.policy_study.plan import Cell
+from agents.seeds import STUDY_TEST, STUDY_VALIDATION
 from scripts import policy_study
 from scripts.policy_study import Freeze, Run, main
 from tests.agents.policies import SHORT, save
@@ -150,7 +151,7 @@ def test_what_is_missing_is_run_and_nothing_else(done, frozen, counted, monkeypa
     path.write_bytes(whole[: whole.rindex(b"\n", 0, len(whole) - 200) - 9])
     main(Run(workers=1, output=frozen / "out"))
     assert 1 <= len(counted) <= 2
-    assert {task.noise for task in counted} == {TEST_NOISE}
+    assert {task.noise for task in counted} == {STUDY_TEST.start}
     assert path.read_bytes() == whole
     assert (frozen / "out" / "asked.csv").read_bytes() == (done / "out" / "asked.csv").read_bytes()
 
@@ -172,7 +173,7 @@ def test_an_interrupted_freeze_goes_on(done, tmp_path, monkeypatch, capsys):
     assert ended.value.code == 130
     assert "the same command goes on" in capsys.readouterr().err
     assert len(rows(tmp_path / "out" / "validation.csv")) == 6
-    assert {task.noise for task in n_run} == {VALIDATION_NOISE}
+    assert {task.noise for task in n_run} == {STUDY_VALIDATION.start}
     with pytest.raises(ValueError, match="not frozen yet"):
         main(Run(workers=1, output=tmp_path / "out"))
     monkeypatch.setattr(policy_study, "run_entry", run_entry)

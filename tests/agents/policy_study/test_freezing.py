@@ -12,10 +12,10 @@ from agents.policy_study.manifest import (
     read_tuned,
 )
 from agents.policy_study.plan import (
-    TEST_NOISE,
     Entry,
 )
 from agents.policy_study.running import make_task
+from agents.seeds import STUDY_TEST
 from dptse_env.estimators.tuning import write_settings
 from tests.agents.policies import save
 from tests.agents.policy_study.worlds import SMALL, checkpoints, score
@@ -151,7 +151,7 @@ def test_tuned_settings_reach_their_policy_alone(runs, tmp_path):
     manifest = draft(SMALL, checkpoints(runs), tuned, "command")
     entries = {own.policy: own for own in manifest.entries(SMALL, bounds=False)}
     tasks = {
-        name: make_task(entry, SMALL, manifest, seeds=(2000, 2001), noise=TEST_NOISE)
+        name: make_task(entry, SMALL, manifest, seeds=(2000, 2001), noise=STUDY_TEST.start)
         for name, entry in entries.items()
     }
     assert tasks["plackett-luce"].make()[0].config.settings().walk_noise == (0.5, 0.5)

@@ -1,7 +1,6 @@
 import dataclasses
 import json
 
-import numpy as np
 import pytest
 
 from agents.policy_study.freezing import design_of, plain
@@ -10,16 +9,13 @@ from agents.policy_study.plan import (
     CELLS,
     PAPER,
     PRIVATE,
-    TEST_NOISE,
-    VALIDATION_NOISE,
     Design,
     quick,
 )
 from agents.policy_study.running import config_of
-from agents.training.learners import SEED_STRIDE
-from agents.training.validation import NOISE_SEED
-from agents.tuning_task import NOISE_SEED as TUNING_NOISE
+from dptse_env.config import parse_seeds
 from dptse_env.schedules import ORACLES
+from scripts.train import Args
 from tests.agents.policy_study.worlds import SMALL
 
 
@@ -52,11 +48,9 @@ def test_the_full_design_is_that_of_the_study():
     assert {"paper", "round-robin", "largest-variance", "greedy-trace"} <= set(BASELINES)
 
 
-def test_no_two_streams_of_noise_meet():
-    # Of tuning, validation, tests and training, each plus a traffic seed or an episode's number.
-    starts = [TUNING_NOISE, VALIDATION_NOISE, TEST_NOISE, 10 * SEED_STRIDE]
-    assert NOISE_SEED == VALIDATION_NOISE
-    assert (np.diff(starts) >= 3000).all()
+def test_recipes_are_not_chosen_where_trainings_chose_their_best_policy():
+    kept_by = parse_seeds(Args().validation)
+    assert not set(kept_by) & set(Design().validation_seeds)
 
 
 def test_quick_is_a_part_of_the_full_design():

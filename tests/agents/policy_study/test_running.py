@@ -7,11 +7,11 @@ from agents.evaluation import run_episodes
 from agents.policy_study.asked import BIN, PHASES, Watch
 from agents.policy_study.freezing import draft
 from agents.policy_study.plan import (
-    TEST_NOISE,
     Entry,
     Learner,
 )
 from agents.policy_study.running import make_batch, make_task, run_entry, suited
+from agents.seeds import STUDY_TEST
 from dptse_env.schedules import make_schedule
 from dptse_env.traffic.scenario import draw_scenario
 from tests.agents.policies import SHORT
@@ -22,7 +22,7 @@ def test_a_task_runs_the_episodes_of_its_seeds(runs):
     manifest = draft(SMALL, checkpoints(runs), (), "command")
     learner = Learner("moved", "plackett-luce", "primary", "deterministic")
     for entry in (Entry("moved", "baseline", "oldest-first"), learner.entry(1)):
-        task = make_task(entry, SMALL, manifest, seeds=(2000, 2001), noise=TEST_NOISE)
+        task = make_task(entry, SMALL, manifest, seeds=(2000, 2001), noise=STUDY_TEST.start)
         scores = run_entry(task)
         assert [own.traffic_seed for own in scores] == [2000, 2001]
         keywords = {**SMALL.cell("moved").keywords, "action": "slots"}
@@ -41,7 +41,7 @@ def test_drawn_actions_are_seeded_and_differ_from_the_likeliest(runs):
     scores = {}
     for mode in ("deterministic", "stochastic"):
         entry = Learner("primary", "plackett-luce", "primary", mode).entry(0)
-        task = make_task(entry, SMALL, manifest, seeds=(2000, 2001), noise=TEST_NOISE)
+        task = make_task(entry, SMALL, manifest, seeds=(2000, 2001), noise=STUDY_TEST.start)
         scores[mode] = run_entry(task)
         assert scores[mode] == run_entry(task)
     assert scores["deterministic"] != scores["stochastic"]

@@ -6,8 +6,8 @@ pytest.importorskip("sb3_contrib")
 
 import torch
 
+from agents.seeds import training_seed
 from agents.training.folder import read_progress
-from agents.training.learners import SEED_STRIDE
 from agents.training.recipes import PlackettLuceRecipe, SwapRounds
 from agents.training.swaps import try_swaps
 from agents.training.training import BEST, POLICY, Training
@@ -94,8 +94,8 @@ def test_every_round_tries_other_swaps_in_other_episodes(tmp_path, monkeypatch):
     seeds = [set(seeds) for seeds, _ in began]
     assert [len(one) for one in seeds] == [3, 3]
     assert not seeds[0] & seeds[1]
-    assert min(seeds[0] | seeds[1]) > SEED_STRIDE * 11 + SMALL["n_envs"]
-    assert max(seeds[0] | seeds[1]) < SEED_STRIDE * 12
+    assert min(seeds[0] | seeds[1]) > training_seed(1) + SMALL["n_envs"]
+    assert max(seeds[0] | seeds[1]) < training_seed(2)
     assert began[0][1] != began[1][1]
     # 80 s less the first of 20 to 24 leave eleven or twelve states of three episodes.
     assert {len(one.observations) for one in given} <= {33, 36}

@@ -7,7 +7,8 @@ pytest.importorskip("torch")
 import torch
 
 from agents.evaluation import run_episode
-from agents.training.validation import NOISE_SEED, Validation
+from agents.seeds import TRAINING_VALIDATION
+from agents.training.validation import Validation
 from dptse_env.actions import ACTION_ENCODINGS
 from dptse_env.schedules import make_schedule
 
@@ -36,7 +37,10 @@ def test_errors_are_those_of_single_episodes(action):
     env = gym.make(SHORT, traffic_seeds=list(SEEDS), **keywords)
     expected = [
         -run_episode(
-            env, make_schedule("round-robin", env), traffic_seed=seed, seed=NOISE_SEED + seed
+            env,
+            make_schedule("round-robin", env),
+            traffic_seed=seed,
+            seed=TRAINING_VALIDATION.start + seed,
         ).reward
         for seed in SEEDS
     ]
