@@ -16,9 +16,9 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from dptse_env.arrays import FloatArray
 from dptse_env.config import TEST_SEEDS
 from dptse_env.rendering import History
+from dptse_env.utils.arrays import FloatArray
 from dptse_env.vector_env import SensorQueryVectorEnv
 
 WARM_UP = 60

@@ -19,11 +19,11 @@ import numpy as np
 
 from agents.evaluation import WARM_UP, make_vector
 from agents.seeds import PLAN_SEARCH
-from dptse_env.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.config import TRAINING_SEEDS, VALIDATION_SEEDS, parse_seeds
 from dptse_env.schedules import PLANS, Shifting
 from dptse_env.schedules.plans import Place, Plan
-from dptse_env.validation import integer
+from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+from dptse_env.utils.validation import integer
 from dptse_env.vector_env import SensorQueryVectorEnv
 
 SURE = 1.0

@@ -16,7 +16,7 @@ from agents.evaluation import WARM_UP
 from agents.ledger import Cell, CellT
 from agents.runner import Design, make_env
 from dptse_env.config import EnvConfig
-from dptse_env.estimators.tuning import available_settings, settings_name
+from dptse_env.estimators.tuned_settings import available_settings, settings_name
 from dptse_env.model import load_parameters
 
 FILE = "run.json"

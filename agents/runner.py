@@ -20,7 +20,7 @@ from tqdm import tqdm
 from agents.evaluation import EpisodeScore, run_episode
 from agents.ledger import Cell, CellT, Ledger
 from dptse_env.schedules import make_schedule
-from dptse_env.validation import integer
+from dptse_env.utils.validation import integer
 
 
 class Design(Protocol[CellT]):

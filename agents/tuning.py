@@ -27,8 +27,8 @@ from agents.evaluation import WARM_UP, EpisodeScore
 from agents.search_space import nested, values_of
 from agents.tuning_task import TuningTask, score_episode
 from dptse_env.estimators import EstimatorSettings
-from dptse_env.estimators.tuning import write_settings
-from dptse_env.mapping import from_mapping
+from dptse_env.estimators.tuned_settings import write_settings
+from dptse_env.utils.fields import from_mapping
 
 _FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
 _COUNTED = (*_FINISHED, TrialState.RUNNING)

@@ -21,10 +21,10 @@ from agents.search_space import Knob, search_space
 from agents.seeds import TUNING
 from dptse_env.config import TRAINING_SEEDS, EnvConfig, parse_seeds
 from dptse_env.estimators import EstimatorSettings
-from dptse_env.estimators.tuning import settings_name
+from dptse_env.estimators.tuned_settings import settings_name
 from dptse_env.model import ARZParameters
 from dptse_env.schedules import make_schedule
-from dptse_env.validation import integer
+from dptse_env.utils.validation import integer
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,7 @@ class TuningTask:
             "env": self.env,
             "corridor": config.corridor.digest,
             "estimator": self.estimator,
-            "parameters": dataclasses.asdict(config.model().parameters),
+            "parameters": dataclasses.asdict(config.arz_parameters),
             "privacy": dataclasses.asdict(config.privacy),
             "bandwidth": config.bandwidth,
             "schedule": self.schedule if self.saved is None else self.saved.sha256,

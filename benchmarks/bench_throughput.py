@@ -21,9 +21,9 @@ from benchmarks.throughput.children import measure_all, to_plain
 from benchmarks.throughput.results import Results
 from benchmarks.throughput.rows import HORIZON, QUICK, Row, Sizes, catalogue, chosen
 from benchmarks.throughput.targets import targets
-from dptse_env.blocks import n_cores
 from dptse_env.config import PRESETS, parse_seeds
 from dptse_env.traffic import RecordLibrary
+from dptse_env.utils.threads import n_cores
 from scripts.cli import run
 
 METHOD = """\

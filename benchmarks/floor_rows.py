@@ -13,10 +13,10 @@ from benchmarks import floors
 from benchmarks.peers import Plain, ekf_states, programs_of
 from benchmarks.replay import Replay
 from benchmarks.timing import Row
-from dptse_env.arrays import FloatArray, IntArray
 from dptse_env.estimators.compiled.algebra import padded
 from dptse_env.estimators.compiled.normals import bits_for, stream_of
-from dptse_env.model.road import road_of
+from dptse_env.model.road_arrays import road_of
+from dptse_env.utils.arrays import FloatArray, IntArray
 
 REPEATS = 25  # steps in one call, which hides the call
 

@@ -19,12 +19,12 @@ from numba import njit
 from scipy.linalg.lapack import dpbtrf, dpbtrs
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from dptse_env.arrays import FloatArray, IntArray
 from dptse_env.estimators.compiled.dense import eliminate, products
 from dptse_env.estimators.compiled.normals import fill
 from dptse_env.estimators.compiled.swarm import advance_swarm, flock_of, measured_speeds
 from dptse_env.model.kernels import advance, scratch_of
-from dptse_env.model.road import Road
+from dptse_env.model.road_arrays import Road
+from dptse_env.utils.arrays import FloatArray, IntArray
 
 _compiled = njit(error_model="numpy", fastmath={"contract"})
 

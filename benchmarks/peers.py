@@ -25,10 +25,10 @@ from filterpy.kalman import (
 
 from benchmarks.replay import Replay
 from benchmarks.timing import Row
-from dptse_env.arrays import BoolArray, FloatArray
 from dptse_env.estimators import make_estimator
 from dptse_env.estimators.horizon import assemble, normalised_bounds
 from dptse_env.model.compiled import CompiledARZModel
+from dptse_env.utils.arrays import BoolArray, FloatArray
 
 SAMPLE = 3  # steps taken in each block
 

@@ -6,14 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dptse_env.arrays import BoolArray, FloatArray
 from dptse_env.config import resolve
 from dptse_env.estimators import EstimatorSettings
 from dptse_env.model import ARZModel
-from dptse_env.prior import nominal_state
-from dptse_env.privacy import GaussianMechanism, noise_std
-from dptse_env.sensing import Sensing
-from dptse_env.traffic import RecordLibrary
+from dptse_env.parts import make_model, make_release
+from dptse_env.release import ReleaseRequest
+from dptse_env.release.nominal import nominal_state
+from dptse_env.utils.arrays import BoolArray, FloatArray
 
 PERIOD = 4  # [s] after which the paper's schedule moves on
 
@@ -81,23 +80,23 @@ def recorded(
         "paper-highway",
         {"parameters": parameters, "bandwidth": n_queried, "traffic_seeds": seeds},
     )
-    corridor, model, n = config.corridor, config.model(), n_episodes
+    corridor, model, n = config.corridor, make_model(config), n_episodes
     if not 1 <= n_steps <= corridor.duration:
         raise ValueError(f"steps must be in 1..{corridor.duration}, got {n_steps}")
     s = corridor.n_segments
-    sensing = Sensing(corridor, seeds, RecordLibrary())
-    for slot in range(len(seeds)):
-        sensing.load(slot)
-    slots = np.arange(n) % len(seeds)
-    boundary = [sensing.traffic(slot)[:n_steps, s:] for slot in range(len(seeds))]
-    inputs = [model.boundary_inputs(one[..., 0], one[..., 1]) for one in boundary]
-    mechanism = GaussianMechanism(
-        noise_std(config.privacy, config.sensitivity()), n_episodes=n, n_segments=s
-    )
-    everyone = np.arange(n)
-    mechanism.reset(everyone, [np.random.default_rng([0, i]) for i in range(n)])
+    release = make_release(config, n)
+    traffic = release.setup.traffic
+    traffic.load(np.arange(len(seeds)))
+    indices = np.arange(n) % len(seeds)
+    boundary = [traffic.whole(index)[:n_steps, s:] for index in range(len(seeds))]
+    inputs = [model.boundary_inputs(ends[..., 0], ends[..., 1]) for ends in boundary]
+    every = np.arange(n)
+    release.reset(every, [np.random.default_rng([0, i]) for i in range(n)])
+    queried = np.zeros((n, corridor.n_mainline), dtype=bool)
     values = [
-        mechanism.release(everyone, sensing.aggregates(slots, np.full(n, k + 1)))
+        release.release(
+            ReleaseRequest(every, indices, np.full(n, k + 1), release.setup.observed(queried))
+        ).values
         for k in range(n_steps)
     ]
     roaming = np.setdiff1d(np.arange(corridor.n_mainline), corridor.fixed_sensors)
@@ -110,8 +109,8 @@ def recorded(
         model=model,
         settings=EstimatorSettings(process_noise=config.settings().process_noise),
         start=np.tile(nominal_state(corridor, model, 0), (n, 1)),
-        inputs=np.stack([inputs[slot] for slot in slots], axis=1),
+        inputs=np.stack([inputs[index] for index in indices], axis=1),
         observed=observed,
         values=np.stack(values),
-        sigma=np.array(mechanism.sigma),
+        sigma=np.array(release.sigma),
     )

@@ -8,12 +8,13 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from dptse_env.arrays import Observation
 from dptse_env.config import resolve
-from dptse_env.interface import QueryInterface
+from dptse_env.parts import make_interface, make_parts, warn_where_void
 from dptse_env.process import QueryProcess
 from dptse_env.rendering import History, render_rgb
 from dptse_env.traffic import RecordLibrary
+from dptse_env.utils.arrays import Observation
+from dptse_env.utils.validation import path_or_none
 
 _ONLY = np.zeros(1, dtype=np.int64)
 
@@ -27,9 +28,9 @@ class SensorQueryEnv(gym.Env[Observation, Any]):
     replays a SUMO record, made once per traffic seed and cached on disk.
 
     **Observation**: a flat float32 ``Box``; its named blocks are listed at
-    `dptse_env.observations.ObservationEncoding`.
+    `dptse_env.spaces.observations.ObservationEncoding`.
 
-    **Action**: set by ``action``, see `dptse_env.actions`. ``mask`` is ``MultiBinary(n)``
+    **Action**: set by ``action``, see `dptse_env.spaces.actions`. ``mask`` is ``MultiBinary(n)``
     (default), ``scores`` a ``Box``, ``slots`` a ``MultiDiscrete``, ``sequential`` a ``Discrete``
     with `action_masks`. A sampled action never raises.
 
@@ -80,11 +81,11 @@ class SensorQueryEnv(gym.Env[Observation, Any]):
             )
         self.render_mode = render_mode
         self.config = resolve(preset, overrides)
-        self.config.warn_where_void()
-        self.interface = QueryInterface.of(self.config)
+        warn_where_void(self.config)
+        self.interface = make_interface(self.config)
         self.action_space = self.interface.actions.space
         self.observation_space = self.interface.observations.space
-        self._records = records
+        self._records = path_or_none("records", records)
         self._process: QueryProcess | None = None
         self.history: History | None = None
 
@@ -93,7 +94,8 @@ class SensorQueryEnv(gym.Env[Observation, Any]):
         """The process behind the environment, assembled at the first use."""
         if self._process is None:
             library = RecordLibrary(self._records)
-            self._process = QueryProcess(self.config, self.interface, 1, library)
+            parts = make_parts(self.config, 1, library, interface=self.interface)
+            self._process = QueryProcess(parts)
         return self._process
 
     def reset(
@@ -113,7 +115,7 @@ class SensorQueryEnv(gym.Env[Observation, Any]):
         if self.render_mode is not None:
             self.history = History.begin(self.process)
         info = self.process.info(0)
-        info["privacy"] = self.process.accountant.report.to_dict()
+        info |= self.process.reset_info()
         return outcome.observation[0], info
 
     def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
@@ -150,7 +152,7 @@ class SensorQueryEnv(gym.Env[Observation, Any]):
             )
         if self.process.over[0]:
             raise gym.error.ResetNeeded("no episode is running: call reset() first")
-        free: NDArray[np.bool_] = ~self.interface.actions.picked[0]
+        free: NDArray[np.bool_] = ~self.process.pending.picked[0]
         return free
 
     def render(self) -> NDArray[np.uint8] | None:

@@ -9,28 +9,26 @@ from typing import Any
 
 import numpy as np
 
-from dptse_env.arrays import Action, BoolArray, FloatArray, IntArray, Observation
-from dptse_env.blocks import Blocks
-from dptse_env.boundary import make_boundary
-from dptse_env.config import EnvConfig
-from dptse_env.estimators import make_estimator
-from dptse_env.infos import Rows, as_objects, row_of
-from dptse_env.interface import QueryInterface
-from dptse_env.observations import AGE_CAP, Knowledge
-from dptse_env.options import ResetOptions
-from dptse_env.prior import nominal_state
-from dptse_env.privacy import GaussianMechanism, Mechanism, noise_std
-from dptse_env.rewards import EstimationError, estimation_error
-from dptse_env.sensing import Sensing, make_answers
-from dptse_env.traffic import RecordLibrary
+from dptse_env.estimators import Estimate, check_estimate
+from dptse_env.parts import Parts, complete_report
+from dptse_env.release import ReleaseRequest, check_released
+from dptse_env.release.nominal import nominal_state
+from dptse_env.reset_options import ResetOptions
+from dptse_env.spaces.actions import PendingPicks
+from dptse_env.spaces.observations import AGE_CAP, PublicState
+from dptse_env.spaces.rewards import EstimationError, ScoredSecond, estimation_error
+from dptse_env.utils.arrays import Action, BoolArray, FloatArray, IntArray, Observation
+from dptse_env.utils.registry import is_foreign
+from dptse_env.utils.threads import EpisodeThreads
+from dptse_env.utils.vector_info import Rows, row_of
 
 TRUTH_INFO = ("rmse_density", "rmse_speed", "n_occupied", "truth")
-"""Keys of ``info`` that come from the true traffic."""
+"""Keys of ``info`` that come from the true traffic; the others are public."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a step or a reset gives back for k episodes.
+    """Result of a step or a reset of k episodes.
 
     Attributes:
         observation: Shape (k, size).
@@ -44,67 +42,51 @@ class Outcome:
 
 
 class QueryProcess:
-    """The decision process: traffic moves by itself, a policy picks whom to ask.
+    """The decision process: traffic moves by itself, a policy chooses the segments to query.
 
     Queries never change the traffic, so an episode replays a record of SUMO. Every array has a
     leading axis over the episodes; ``episodes`` names the k of them that a call concerns.
 
     Attributes:
         config: The configuration.
-        interface: Encodings of actions, observations and reward.
+        interface: Action encoding, observation and reward.
+        traffic: The true traffic.
+        release: What leaves the road.
+        boundary: The model's inputs at the road's ends and ramps.
+        model: The traffic model.
+        estimator: The estimator.
         n_episodes: Size of the batch.
         time: Second of the record that each episode stands at, shape (n,).
-        slot: Index into ``config.traffic_seeds`` of each episode's traffic, shape (n,).
+        traffic_index: Index into ``config.traffic_seeds`` of each episode's traffic, shape (n,).
         queried: The last query of each episode, shape (n, n_mainline).
-        boundary: What the estimator is told of the road's surroundings.
-        answers: What the observed segments answer before noise is added.
+        pending: State of the action encoding between actions.
         estimate: The present estimates, arrays of shape (n, S).
         error: Their error, arrays of shape (n,).
     """
 
-    def __init__(
-        self,
-        config: EnvConfig,
-        interface: QueryInterface,
-        n_episodes: int,
-        library: RecordLibrary | None = None,
-        threads: int | None = 1,
-    ) -> None:
-        """Assemble the rooms; nothing is recorded or loaded before `reset`.
+    def __init__(self, parts: Parts, threads: int | None = 1) -> None:
+        """Assemble the parts; nothing is recorded or loaded before `reset`.
 
         Args:
-            config: The configuration.
-            interface: The interface made of the same configuration.
-            n_episodes: Size of the batch n.
-            library: Where records come from; the user's cache if None.
+            parts: Made by `dptse_env.parts.make_parts`.
             threads: Threads that the estimators of a large batch may use; None for one per core.
         """
-        corridor = config.corridor
-        n, s = n_episodes, corridor.n_segments
-        self.config, self.interface, self.n_episodes = config, interface, n
-        self.model = config.model()
-        self.sensing = Sensing(corridor, config.traffic_seeds, library or RecordLibrary())
-        self.accountant = config.accountant()
-        self.boundary = make_boundary(config.privacy.boundary, self.sensing, self.model, n)
-        columns = s + self.boundary.n_released
-        self.answers = make_answers(config.privacy, self.sensing, columns, n)
-        self.mechanism: Mechanism = GaussianMechanism(
-            noise_std(config.privacy, config.sensitivity()), n_episodes=n, n_segments=columns
-        )
-        self.estimator = make_estimator(
-            config.estimator, config.backend, self.model, n, config.settings()
-        )
-        self._blocks = Blocks(threads if self.estimator.is_compiled else 1)
-        interface.actions.start(n)
-        self._observed_always = np.zeros(columns, dtype=bool)
-        self._observed_always[[*corridor.fixed_sensors, *range(s, columns)]] = True
-        self.slot = np.zeros(n, dtype=np.int64)
+        self.config, self.interface = parts.config, parts.interface
+        self.traffic, self.release, self.boundary = parts.traffic, parts.release, parts.boundary
+        self.model, self.estimator = parts.model, parts.estimator
+        self._threads = EpisodeThreads(threads if self.estimator.is_compiled else 1)
+        self._checks_estimates = is_foreign(self.estimator)
+        self._checks_releases = is_foreign(self.release)
+        corridor = self.config.corridor
+        self.n_episodes = n = parts.n_episodes
+        self.pending = PendingPicks(n, corridor.n_mainline)
+        self.traffic_index = np.zeros(n, dtype=np.int64)
         self.time = np.zeros(n, dtype=np.int64)
         self.end = np.zeros(n, dtype=np.int64)
         self.queried = np.zeros((n, corridor.n_mainline), dtype=bool)
         self.n_dropped = np.zeros(n, dtype=np.int64)
         self.age = np.zeros((n, corridor.n_mainline), dtype=np.int64)
-        self.released = np.zeros((n, s, 2))
+        self.released = np.zeros((n, corridor.n_segments, 2))
         self.estimate = self.estimator.estimate()
         self.error = EstimationError(np.zeros(n), np.zeros(n), np.zeros(n, dtype=np.int64))
         self._is_fork = False
@@ -116,13 +98,11 @@ class QueryProcess:
         origin never notices. It shares traffic and model, begins no episodes, and takes some 40 us
         an episode to make.
         """
-        interface = self.interface
         shared = (
-            self.config, self.model, self.sensing, self.accountant, self._blocks,
-            interface.observations, interface.reward, interface.actions.space,
-            *self.boundary.tables, *self.answers.tables,
+            self.config, self.interface, self.model, self.traffic, self._threads,
+            *self.boundary.shared, *self.release.shared,
         )  # fmt: skip
-        fork = copy.deepcopy(self, {id(one): one for one in shared})
+        fork = copy.deepcopy(self, {id(item): item for item in shared})
         fork._is_fork = True
         return fork
 
@@ -135,7 +115,7 @@ class QueryProcess:
         """Begin new episodes.
 
         Args:
-            episodes: Which episodes, shape (k,).
+            episodes: Shape (k,).
             generators: One generator per episode; each gives a seed for the traffic, the noise and
                 the estimator, whatever else is configured.
             options: ``traffic_seed`` fixes the traffic (one of ``config.traffic_seeds``) and
@@ -148,45 +128,51 @@ class QueryProcess:
         """
         if self._is_fork:
             raise RuntimeError("a fork only goes on: reset the process that it was made of")
-        choice = ResetOptions.of(options, self.config, len(episodes))
+        choice = ResetOptions.from_mapping(options, self.config, len(episodes))
         streams = [
             [np.random.default_rng(seed) for seed in generator.integers(2**63, size=3)]
             for generator in generators
         ]
-        slots, starts = choice.draw([traffic for traffic, _, _ in streams])
-        self._load(slots)
-        self.slot[episodes], self.time[episodes] = slots, starts
+        traffic, starts = choice.draw([stream for stream, _, _ in streams])
+        for index, record in self.traffic.load(traffic):
+            self.release.load(index, record)
+            self.boundary.load(index)
+        self.traffic_index[episodes], self.time[episodes] = traffic, starts
         self.end[episodes] = starts + self.config.horizon_steps
-        self.interface.actions.reset(episodes)
-        self.mechanism.reset(episodes, [noise for _, noise, _ in streams])
-        self.answers.reset(episodes)
+        self.pending.reset(episodes)
+        self.release.reset(episodes, [noise for _, noise, _ in streams])
         self.boundary.reset(episodes)
         prior = nominal_state(self.config.corridor, self.model, self.time[episodes])
-        self.estimator.reset(episodes, prior, [own for _, _, own in streams])
+        self.estimator.reset(episodes, prior, [draws for _, _, draws in streams])
         self.queried[episodes] = False
         self.n_dropped[episodes] = 0
         self.age[episodes] = AGE_CAP
         self.released[episodes] = 0.0
-        self._score(episodes, self.truth(episodes))
-        return self._outcome(episodes, np.zeros(len(episodes)))
+        estimate = self._estimated(episodes)
+        self._score(episodes, estimate)
+        return self._outcome(episodes, estimate, np.zeros(len(episodes)))
 
     def step(self, episodes: IntArray, actions: Action) -> Outcome:
         """Carry out one action in each of ``episodes``.
 
         Args:
-            episodes: Which episodes, shape (k,).
+            episodes: Shape (k,).
             actions: Their actions, shape (k, *action space).
 
         Raises:
             ValueError: An action has a wrong shape, dtype or value.
         """
-        decision = self.interface.actions.decode(episodes, actions)
+        decision = self.interface.actions.decode(episodes, actions, self.pending)
         ready = decision.complete
         self.n_dropped[episodes] = decision.n_dropped
         reward = np.zeros(len(episodes))
-        if ready.any():
-            reward[ready] = self._advance(episodes[ready], decision.queried[ready])
-        return self._outcome(episodes, reward)
+        if not ready.any():
+            return self._outcome(episodes, self.estimate.at(episodes), reward)
+        self._advance(episodes[ready], decision.queried[ready])
+        estimate = self._estimated(episodes)
+        acted = estimate if ready.all() else self.estimate.at(episodes[ready])
+        reward[ready] = self._score(episodes[ready], acted)
+        return self._outcome(episodes, estimate, reward)
 
     @property
     def elapsed(self) -> IntArray:
@@ -198,88 +184,109 @@ class QueryProcess:
         """Whether each episode is at its end, or was never begun, shape (n,)."""
         return self.time >= self.end
 
-    def _advance(self, episodes: IntArray, queried: BoolArray) -> FloatArray:
-        """Let one second pass: sense, release, estimate, score."""
-        observed = np.tile(self._observed_always, (len(episodes), 1))
-        observed[:, : queried.shape[1]] |= queried
-        slots, n_segments = self.slot[episodes], self.config.corridor.n_segments
-        inputs = self.boundary.inputs(episodes, slots, self.time[episodes])
+    def _advance(self, episodes: IntArray, queried: BoolArray) -> None:
+        """Let one second pass: predict, release, update, and remember the query."""
+        traffic, n_segments = self.traffic_index[episodes], self.model.n_segments
+        inputs = self.boundary.inputs(episodes, traffic, self.time[episodes])
+        self._in_threads(episodes, self.estimator.predict, inputs)
         self.time[episodes] += 1
-        answers = self.answers.collect(episodes, slots, self.time[episodes], observed)
-        released = self.mechanism.release(episodes, answers)
-        self.boundary.take_in(episodes, released[:, n_segments:])
-        observed, released = observed[:, :n_segments], released[:, :n_segments]
-        self._estimate(episodes, inputs, observed, released)
-        self._remember(episodes, queried, observed, released)
-        return self._score(episodes, self.truth(episodes))
-
-    def _estimate(
-        self, episodes: IntArray, inputs: FloatArray, observed: BoolArray, released: FloatArray
-    ) -> None:
-        """Let the estimators predict and update, several blocks of episodes at once."""
-
-        def work(rows: slice) -> None:
-            block = episodes[rows]
-            self.estimator.predict(block, inputs[rows])
-            self.estimator.update(block, observed[rows], released[rows], self.mechanism.sigma)
-
-        self._blocks.run(len(episodes), work)
-
-    def _remember(
-        self, episodes: IntArray, queried: BoolArray, observed: BoolArray, released: FloatArray
-    ) -> None:
+        observed = self.release.setup.observed(queried)
+        request = ReleaseRequest(
+            episodes, traffic, self.time[episodes], observed, lambda: self._predicted(episodes)
+        )
+        values, sigma = released = self.release.release(request)
+        if self._checks_releases:
+            check_released(self.release, released, request)
+        self.boundary.update(episodes, values[:, n_segments:])
+        observed, values = observed[:, :n_segments], values[:, :n_segments]
+        self._in_threads(episodes, self.estimator.update, observed, values, shared=(sigma,))
         self.queried[episodes] = queried
-        self.released[episodes] = np.where(observed[:, :, None], released, self.released[episodes])
+        self.released[episodes] = np.where(observed[:, :, None], values, self.released[episodes])
         self.age[episodes] = np.where(observed[:, : queried.shape[1]], 0, self.age[episodes] + 1)
 
-    def _score(self, episodes: IntArray, truth: FloatArray) -> FloatArray:
-        """Compare the present estimates with the truth (k, S, 2); return the rewards."""
-        n = self.interface.n_mainline
+    def _in_threads(
+        self, episodes: IntArray, work: Any, *rows: Any, shared: tuple[Any, ...] = ()
+    ) -> None:
+        """Call ``work`` on blocks of episodes and of rows that belong to them, several at once."""
+        self._threads.run(
+            len(episodes),
+            lambda block: work(episodes[block], *(array[block] for array in rows), *shared),
+        )
+
+    def _predicted(self, episodes: IntArray) -> Estimate:
+        """Return the estimator's output before it reads the release of this second."""
+        return self.estimator.estimate().at(episodes)
+
+    def _estimated(self, episodes: IntArray) -> Estimate:
+        """Take the estimator's present output; return the rows of ``episodes``."""
         self.estimate = self.estimator.estimate()
+        if self._checks_estimates:
+            check_estimate(self.estimator, self.estimate, self.model.n_segments)
+        return self.estimate.at(episodes)
+
+    def _score(self, episodes: IntArray, estimate: Estimate) -> FloatArray:
+        """Compare estimates of ``episodes`` with the truth; return the rewards, shape (k,)."""
+        n, truth = self.interface.n_mainline, self.truth(episodes)
+        true_density, true_speed = truth[:, :n, 0], truth[:, :n, 1]
         error = estimation_error(
-            truth[:, :n, 0],
-            truth[:, :n, 1],
-            self.estimate.density[episodes, :n],
-            self.estimate.speed[episodes, :n],
+            true_density, true_speed, estimate.density[:, :n], estimate.speed[:, :n]
         )
         self.error.density[episodes] = error.density
         self.error.speed[episodes] = error.speed
         self.error.n_occupied[episodes] = error.n_occupied
-        return self.interface.reward.value(error)
+        rewards: FloatArray = self.interface.reward(
+            ScoredSecond(
+                error, true_density, true_speed, estimate, self.queried[episodes],
+                self.config.corridor,
+            )
+        )  # fmt: skip
+        return rewards
 
     def truth(self, episodes: IntArray) -> FloatArray:
         """Return the present true (density [veh/km], speed [km/h]) of ``episodes``, (k, S, 2)."""
-        return self.sensing.aggregates(self.slot[episodes], self.time[episodes])
+        return self.traffic.aggregates(self.traffic_index[episodes], self.time[episodes])
 
-    def _load(self, slots: IntArray) -> None:
-        """Make sure that the traffic of ``slots`` is in memory, in every form that is needed."""
-        for slot in self.sensing.load(slots):
-            self.answers.load(slot)
-            self.boundary.load(slot)
+    def observe(self, episodes: IntArray) -> Observation:
+        """Return the present observations of ``episodes``, shape (k, size)."""
+        return self._encoded(episodes, self.estimate.at(episodes))
 
-    def _outcome(self, episodes: IntArray, reward: FloatArray) -> Outcome:
-        knowledge = Knowledge(
-            estimate=self.estimate.at(episodes),
+    def _outcome(self, episodes: IntArray, estimate: Estimate, reward: FloatArray) -> Outcome:
+        return Outcome(self._encoded(episodes, estimate), reward, self.over[episodes])
+
+    def _encoded(self, episodes: IntArray, estimate: Estimate) -> Observation:
+        state = PublicState(
+            estimate=estimate,
             released=self.released[episodes],
             innovations=self.estimator.innovations[episodes],
             age=self.age[episodes],
             queried=self.queried[episodes],
-            picked=self.interface.actions.picked[episodes],
+            picked=self.pending.picked[episodes],
         )
-        observation = self.interface.observations.encode(knowledge)
-        return Outcome(observation, reward, self.over[episodes])
+        return self.interface.observations.encode(state)
+
+    def privacy(self) -> dict[str, Any]:
+        """Return the privacy report of the parts in force, as plain JSON."""
+        return complete_report(self.config, self.release, self.boundary).to_dict()
+
+    def reset_info(self) -> dict[str, Any]:
+        """Return what ``info`` has at a reset beside `infos`, the same for all episodes.
+
+        ``privacy`` is the privacy report, ``inherited`` the keywords whose values were measured or
+        tuned on another road.
+        """
+        return {"privacy": self.privacy(), "inherited": list(self.config.inherited)}
 
     def info(self, episode: int) -> dict[str, Any]:
-        """Return what is said about one episode beside its observation, in plain numbers."""
+        """Return the info of one episode, in plain numbers."""
         return row_of(self.infos(np.array([episode])), 0)
 
     def infos(self, episodes: IntArray) -> Rows:
-        """Return what is said about ``episodes``, shape (k,): fresh arrays of k rows each.
+        """Return the infos of ``episodes``, shape (k,): fresh arrays of k rows each.
 
         The keys in `TRUTH_INFO` come from the true traffic. They are training and evaluation
         signals like the reward, never a release.
         """
-        mu, epsilon = self.accountant.spent(self.elapsed[episodes])
+        mu, epsilon = self.release.spent(self.elapsed[episodes])
         infos: Rows = {
             "rmse_density": self.error.density[episodes],
             "rmse_speed": self.error.speed[episodes],
@@ -296,20 +303,11 @@ class QueryProcess:
         return infos
 
     def _truth_infos(self, episodes: IntArray) -> Rows:
-        truth, slots = self.truth(episodes), self.slot[episodes]
-        infos: Rows = {
+        truth, traffic = self.truth(episodes), self.traffic_index[episodes]
+        return {
             "density": truth[:, :, 0].copy(),
             "speed": truth[:, :, 1].copy(),
-            "traffic_seed": np.array(self.config.traffic_seeds)[slots],
+            "traffic_seed": np.array(self.config.traffic_seeds)[traffic],
             "time": self.time[episodes],
+            **self.release.private_info(episodes, traffic),
         }
-        counted = self.answers.contributions
-        if counted is not None:
-            exposures = [counted.of_episode(e, s) for e, s in zip(episodes, slots, strict=True)]
-            # A vehicle that has counted k times has spent what one of cap k has in all.
-            individual = [self.accountant.spent(steps)[1].tolist() for steps in exposures]
-            # Lists, since records differ in their number of vehicles and Gymnasium stacks arrays
-            # of equal shape only.
-            infos["exposures"] = as_objects([steps.tolist() for steps in exposures])
-            infos["individual_epsilon"] = as_objects(individual)
-        return infos

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dptse_env.arrays import BoolArray, FloatArray
+from dptse_env.utils.arrays import BoolArray, FloatArray
 
 if TYPE_CHECKING:
     from dptse_env.process import QueryProcess

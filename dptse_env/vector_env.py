@@ -13,14 +13,14 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from dptse_env.arrays import Action, BoolArray, FloatArray, IntArray, Observation
 from dptse_env.config import resolve
-from dptse_env.infos import Rows, as_objects, in_vector_form, repeated
-from dptse_env.interface import QueryInterface
-from dptse_env.options import per_episode
+from dptse_env.parts import make_interface, make_parts, warn_where_void
 from dptse_env.process import QueryProcess
+from dptse_env.reset_options import per_episode
 from dptse_env.traffic import RecordLibrary
-from dptse_env.validation import integer
+from dptse_env.utils.arrays import Action, BoolArray, FloatArray, IntArray, Observation
+from dptse_env.utils.validation import integer, path_or_none
+from dptse_env.utils.vector_info import Rows, as_objects, in_vector_form, repeated
 
 _MODES = {mode.value: mode for mode in AutoresetMode}
 
@@ -32,7 +32,7 @@ class Ended:
     Attributes:
         episodes: Which they are, shape (k,).
         observation: Their last observations, shape (k, size).
-        infos: What was said of them at the end, rows as in `dptse_env.infos`.
+        infos: What was said of them at the end, rows as in `dptse_env.utils.vector_info`.
     """
 
     episodes: IntArray
@@ -109,25 +109,23 @@ class SensorQueryVectorEnv(VectorEnv[Observation, Action, Any]):
         Warns:
             UserWarning: Privacy preset ``guaranteed`` was asked for, and other keywords void it.
         """
-        if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer) or num_envs < 1:
-            raise ValueError(f"num_envs must be an integer >= 1, got {num_envs!r}")
         if render_mode is not None:
             raise ValueError(
                 f"render_mode must be None, got {render_mode!r}: a batch of episodes is not drawn; "
                 "make one with gymnasium.make to see it"
             )
-        self.num_envs = int(num_envs)
+        self.num_envs = integer("num_envs", num_envs, 1, 1_000_000)
         self.autoreset_mode = _mode(autoreset_mode)
         self.metadata = {"render_modes": [], "autoreset_mode": self.autoreset_mode}
         self.config = resolve(preset, overrides)
-        self.config.warn_where_void()
-        self.interface = QueryInterface.of(self.config)
+        warn_where_void(self.config)
+        self.interface = make_interface(self.config)
         self.single_action_space = self.interface.actions.space
         self.single_observation_space = self.interface.observations.space
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
-        self._records = records
-        self._threads = None if threads is None else integer("threads", threads, 1)
+        self._records = path_or_none("records", records)
+        self._threads = None if threads is None else integer("threads", threads, 1, 1024)
         self._process: QueryProcess | None = None
         self._generators: list[tuple[np.random.Generator, int] | None] = [None] * self.num_envs
         self._begun = np.zeros(self.num_envs, dtype=bool)
@@ -139,13 +137,9 @@ class SensorQueryVectorEnv(VectorEnv[Observation, Action, Any]):
     def process(self) -> QueryProcess:
         """The process behind the environment, assembled at the first use."""
         if self._process is None:
-            self._process = QueryProcess(
-                self.config,
-                self.interface,
-                self.num_envs,
-                RecordLibrary(self._records),
-                self._threads,
-            )
+            library = RecordLibrary(self._records)
+            parts = make_parts(self.config, self.num_envs, library, interface=self.interface)
+            self._process = QueryProcess(parts, self._threads)
         return self._process
 
     @property  # type: ignore[misc]
@@ -253,12 +247,12 @@ class SensorQueryVectorEnv(VectorEnv[Observation, Action, Any]):
                 f"action_masks() needs action='sequential', this is {self.config.action!r}"
             )
         self._require_begun()
-        free: BoolArray = ~self.interface.actions.picked
+        free: BoolArray = ~self.process.pending.picked
         return free
 
     def privacy(self) -> dict[str, Any]:
         """Return the guarantee of an episode, or what voids it, and the account behind it."""
-        return self.process.accountant.report.to_dict()
+        return self.process.privacy()
 
     def _begin(self, episodes: IntArray, options: Mapping[str, Any] | None = None) -> None:
         generators = [self._generator(e)[0] for e in episodes]
@@ -269,8 +263,8 @@ class SensorQueryVectorEnv(VectorEnv[Observation, Action, Any]):
         """Return the infos of ``episodes``, with what is said of those just ``begun``."""
         infos = in_vector_form(self.process.infos(episodes), episodes, self.num_envs)
         if begun.size:
-            privacy = {"privacy": repeated(self.privacy(), len(begun))}
-            infos |= in_vector_form(privacy, begun, self.num_envs)
+            said = repeated(self.process.reset_info(), len(begun))
+            infos |= in_vector_form(said, begun, self.num_envs)
         return infos
 
     def _generator(self, episode: int) -> tuple[np.random.Generator, int]:

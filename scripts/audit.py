@@ -20,10 +20,12 @@ from agents.audit.policies import POLICIES, make_policy
 from agents.audit.report import Finding
 from agents.audit.targets import TARGETS, choose_target
 from dptse_env.config import EnvConfig
-from dptse_env.privacy import PrivacyReport, mu_of
-from dptse_env.privacy.audit import Claim, audit
+from dptse_env.parts import privacy_report
+from dptse_env.privacy import mu_of
+from dptse_env.privacy.audit_statistics import Claim, audit
+from dptse_env.release import PrivacyReport
 from dptse_env.traffic import RecordLibrary
-from dptse_env.validation import inside, integer, positive, require
+from dptse_env.utils.validation import inside, integer, positive, require
 from scripts.cli import run
 
 
@@ -118,7 +120,7 @@ def find(args: Args) -> Finding:
         config, target.worlds, policy, args.runs, noise_factor=args.noise_factor, seed=args.seed
     )
     seconds = time.perf_counter() - start
-    privacy, report = config.privacy, config.accountant().report
+    privacy, report = config.privacy, privacy_report(config)
     promise = f"({privacy.epsilon:g}, {privacy.delta:g})"
     return Finding(
         title=f"{args.env.rpartition('/')[2]}, preset {privacy.preset} at {promise}",

@@ -22,7 +22,7 @@ from dptse_env.model.calibration import (
 )
 from dptse_env.model.compiled import CompiledARZModel
 from dptse_env.model.parameters import write_parameters
-from dptse_env.sensing import Sensing
+from dptse_env.release.traffic_table import Sensing
 from dptse_env.traffic import CORRIDORS, Corridor, RecordLibrary, mean_dwell
 from scripts.cli import run
 

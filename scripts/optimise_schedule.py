@@ -18,7 +18,7 @@ from tqdm import tqdm
 from agents.offline import PlanSearch, PlanTask, held_out
 from dptse_env.schedules.plans import Plan, read_plan, write_plan
 from dptse_env.traffic import RecordLibrary
-from dptse_env.validation import integer
+from dptse_env.utils.validation import integer
 from scripts.cli import resumable, run
 
 

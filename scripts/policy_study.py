@@ -59,7 +59,7 @@ from agents.runner import run_all
 from agents.seeds import STUDY_TEST, STUDY_VALIDATION
 from dptse_env.config import parse_seeds
 from dptse_env.traffic import RecordLibrary
-from dptse_env.validation import integer
+from dptse_env.utils.validation import integer
 from scripts.cli import command, resumable, run
 
 FOLDER = Path("results/policies")

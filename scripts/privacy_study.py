@@ -26,7 +26,7 @@ from agents.provenance import provenance, take_folder
 from agents.runner import make_env, missing, run_all
 from dptse_env.config import EnvConfig, parse_seeds
 from dptse_env.traffic import RecordLibrary
-from dptse_env.validation import integer
+from dptse_env.utils.validation import integer
 from scripts.cli import command, resumable, run
 
 FULL, QUICK = Path("results/privacy"), Path("results/privacy-quick")

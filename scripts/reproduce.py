@@ -26,7 +26,7 @@ from agents.reproduction.timing import StepTime, time_all
 from agents.runner import make_env, missing, run_all
 from dptse_env.config import parse_seeds
 from dptse_env.traffic import RecordLibrary
-from dptse_env.validation import integer
+from dptse_env.utils.validation import integer
 from scripts.cli import command, resumable, run
 
 FULL, QUICK = Path("results/paper"), Path("results/paper-quick")

@@ -33,7 +33,7 @@ from agents.training.recipes import (
 from agents.training.training import BEST, POLICY, Training
 from dptse_env.config import parse_seeds
 from dptse_env.traffic import RecordLibrary
-from dptse_env.validation import integer
+from dptse_env.utils.validation import integer
 from scripts.cli import resumable, run
 
 AnyRecipe = (

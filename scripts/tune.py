@@ -30,7 +30,7 @@ from agents.tuning_task import TuningTask
 from dptse_env.model import ARZParameters
 from dptse_env.model.parameters import read_parameters
 from dptse_env.traffic import RecordLibrary
-from dptse_env.validation import integer
+from dptse_env.utils.validation import integer
 from scripts.cli import resumable, run
 
 

@@ -98,6 +98,8 @@ def rollout(env: Any, actions: list[Any]) -> dict[str, str]:
 
     def take(observation: Any, info: dict[str, Any]) -> None:
         digests["observation"].add(observation)
+        for key in ("inherited", "_inherited"):
+            info.pop(key, None)
         privacy = {key: info.pop(key) for key in ("privacy", "_privacy") if key in info}
         digests["privacy"].add(privacy.get("privacy", {}))
         digests["info"].add(info)

@@ -14,8 +14,9 @@ from dptse_env.config import (
     resolve,
 )
 from dptse_env.estimators import EstimatorSettings, HorizonSettings
-from dptse_env.estimators.tuning import available_settings, load_settings
-from dptse_env.privacy import PrivacySettings
+from dptse_env.estimators.tuned_settings import available_settings, load_settings
+from dptse_env.parts import flow_centre, make_release, privacy_report, warn_where_void
+from dptse_env.release import CappedSettings, PrivacySettings
 from dptse_env.traffic import PAPER_HIGHWAY, SHORT_HIGHWAY, DemandDistribution, IncidentDistribution
 
 
@@ -34,14 +35,14 @@ def test_presets_are_as_in_the_paper():
         "paper", 1.0, 0.05,
     )  # fmt: skip
     assert config.horizon_steps == 700
-    assert config.sensitivity().releases[0].bound == pytest.approx(
+    assert make_release(config).sensitivity.releases[0].bound == pytest.approx(
         10 * (2 * 8 * PAPER_HIGHWAY.average_dwell) ** 0.5
     )
 
 
 def test_the_noise_does_not_depend_on_the_model():
     first, second = (
-        resolve("paper-highway", {"parameters": name}).sensitivity()
+        make_release(resolve("paper-highway", {"parameters": name})).sensitivity
         for name in ("paper", "w99-3lane")
     )
     assert first == second
@@ -115,7 +116,7 @@ def test_a_mapping_of_settings_keeps_what_would_have_been_chosen():
     assert resolve("paper-highway", keywords).settings() is given
     for bad, message in (
         ({"noise": 1.0}, r"^estimator_settings\.noise is unknown; allowed: "),
-        ({"mhe": {"horizon": 0}}, r"^estimator_settings\.mhe\.horizon must be an integer >= 1"),
+        ({"mhe": {"horizon": 0}}, r"^estimator_settings\.mhe\.horizon must be an integer in 1"),
         (3, r"^estimator_settings must be "),
     ):
         with pytest.raises(ValueError, match=message):
@@ -152,9 +153,9 @@ def test_the_private_preset_is_as_announced():
     config = PRESETS["private-highway"]
     privacy = config.privacy
     assert (privacy.preset, privacy.epsilon, privacy.delta, privacy.cap, privacy.unit) == (
-        "guaranteed", 5.0, 0.05, 64, "trip",
+        "capped", 5.0, 0.05, 64, "trip",
     )  # fmt: skip
-    assert (privacy.speed, privacy.boundary) == ("flow", "nominal")
+    assert (privacy.speed_release, privacy.boundary) == ("flow", "nominal")
     assert config.parameters == "w99-3lane"
     assert isinstance(config.corridor.incident, IncidentDistribution)
     assert isinstance(config.corridor.demand, DemandDistribution)
@@ -162,15 +163,15 @@ def test_the_private_preset_is_as_announced():
 
 def test_a_preset_by_name_keeps_the_other_fields_of_privacy():
     config = resolve("private-highway", {"privacy": "corrected"})
-    assert config.privacy == PrivacySettings("corrected", epsilon=5.0, cap=64)
-    assert config.privacy.speed == "mean"
-    config = resolve("paper-highway", {"privacy": "guaranteed", "epsilon": 2})
-    assert config.privacy == PrivacySettings("guaranteed", epsilon=2.0)
+    assert config.privacy == PrivacySettings("corrected", epsilon=5.0)
+    assert flow_centre(config) is None
+    config = resolve("paper-highway", {"privacy": "capped", "epsilon": 2})
+    assert config.privacy == CappedSettings(epsilon=2.0)
     assert config.privacy.boundary == "nominal"
 
 
 EVERY_PRIVACY_KEYWORD = {
-    "preset": "guaranteed",
+    "preset": "capped",
     "epsilon": 2,
     "delta": 0.01,
     "unit": "horizon",
@@ -184,25 +185,25 @@ EVERY_PRIVACY_KEYWORD = {
 
 def test_every_privacy_keyword_is_reachable_from_json():
     assert set(EVERY_PRIVACY_KEYWORD) == {
-        field.name for field in dataclasses.fields(PrivacySettings)
+        field.name for field in dataclasses.fields(CappedSettings)
     }
     plain = json.loads(json.dumps(EVERY_PRIVACY_KEYWORD))
     config = resolve("paper-highway", {"privacy": plain})
-    assert config.privacy == PrivacySettings(**EVERY_PRIVACY_KEYWORD)
+    assert config.privacy == CappedSettings(**EVERY_PRIVACY_KEYWORD)
     again = json.loads(json.dumps(dataclasses.asdict(config)))
     assert resolve("short-highway", again) == config
-    nothing = {"speed_release": None, "boundary_inputs": None}
+    nothing = {"boundary_inputs": None}
     assert resolve("private-highway", {"privacy": nothing}) == PRESETS["private-highway"]
 
 
 @pytest.mark.parametrize(
     ("privacy", "message"),
     [
-        ({"cap": 0}, r"^privacy\.cap must be an integer >= 1, got 0$"),
-        ({"cap": 2.5}, r"^privacy\.cap must be of type int, got 2\.5$"),
-        ({"share": 1.0}, r"^privacy\.share must be in \(0, 1\), got 1\.0$"),
-        ({"epsilon": 0}, r"^privacy\.epsilon must be > 0, got 0"),
-        ({"delta": 0.5}, r"^privacy\.delta must be in \(0, 0\.5\), got 0\.5$"),
+        ({"cap": 0}, r"^privacy\.cap must be an integer in 1\.\.1000000, got 0$"),
+        ({"cap": 2.5}, r"^privacy\.cap must be an integer in 1\.\.1000000, got 2\.5$"),
+        ({"share": 1.0}, r"^privacy\.share must be a number in \[0\.001, 0\.999\], got 1\.0$"),
+        ({"epsilon": 0}, r"^privacy\.epsilon must be a number in .*, got 0$"),
+        ({"delta": 0.5}, r"^privacy\.delta must be a number in \[1e-12, 0\.5\), got 0\.5$"),
         (
             {"unit": "week"},
             r"^privacy\.unit must be one of 'trip', 'horizon', 'event', got 'week'$",
@@ -219,7 +220,7 @@ def test_every_privacy_keyword_is_reachable_from_json():
         ),
         (
             {"preset": "paper", "speed_release": "flow"},
-            r"^privacy\.speed_release must be 'mean' with preset 'paper'",
+            r"^privacy\.speed_release is unknown; allowed: preset, epsilon, delta, bound",
         ),
     ],
 )
@@ -234,23 +235,23 @@ def test_bad_privacy_is_named_with_its_path(privacy, message):
 )
 def test_a_sensitivity_counts_what_the_unit_can_contribute(unit, horizon, contributions):
     config = resolve("private-highway", {"privacy": {"unit": unit}, "horizon": horizon})
-    sensitivity = config.sensitivity()
+    sensitivity = make_release(config).sensitivity
     assert sensitivity.contributions == contributions
     assert sensitivity.releases[0].bound == pytest.approx(10 * (2 * contributions) ** 0.5)
     assert sensitivity.releases[1].bound == pytest.approx(2 * 510 * contributions**0.5)
 
 
 def test_neither_bandwidth_nor_sensors_enter_an_honest_bound():
-    first = resolve("private-highway", {}).sensitivity()
+    first = make_release(resolve("private-highway", {})).sensitivity
     more = {"bandwidth": 15, "corridor": {"fixed_sensors": [0, 7, 14]}}
-    assert resolve("private-highway", more).sensitivity() == first
+    assert make_release(resolve("private-highway", more)).sensitivity == first
     private = {"privacy": {"boundary_inputs": "private"}}
-    assert resolve("private-highway", private).sensitivity() == first
+    assert make_release(resolve("private-highway", private)).sensitivity == first
 
 
 def test_the_papers_sensitivity_counts_released_boundary_segments():
     keywords = {"privacy": {"boundary_inputs": "private"}}
-    fewer, more = (resolve("paper-highway", k).sensitivity() for k in ({}, keywords))
+    fewer, more = (make_release(resolve("paper-highway", k)).sensitivity for k in ({}, keywords))
     assert dict(fewer.assumptions)["n_sensors"] == 8
     assert dict(more.assumptions)["n_sensors"] == 8 + PAPER_HIGHWAY.n_boundaries
 
@@ -265,15 +266,15 @@ VOID = {
 def test_a_void_guarantee_is_warned_of_with_its_reason(reason, privacy):
     config = resolve("private-highway", {"privacy": privacy})
     with pytest.warns(UserWarning, match=f"no privacy is guaranteed. {reason}: ") as caught:
-        config.warn_where_void()
+        warn_where_void(config)
     assert len(caught) == 1
-    assert config.accountant().report.guarantee == "none"
+    assert privacy_report(config).guarantee == "none"
 
 
 @pytest.mark.parametrize(
     "privacy",
-    ["paper", "corrected", "guaranteed", {"boundary_inputs": "private", "unit": "horizon"}],
+    ["paper", "corrected", "capped", {"boundary_inputs": "private", "unit": "horizon"}],
 )
 def test_nothing_is_warned_of_where_no_guarantee_is_asked_for_or_it_holds(privacy):
     # Warnings are errors in these tests.
-    resolve("private-highway", {"privacy": privacy}).warn_where_void()
+    warn_where_void(resolve("private-highway", {"privacy": privacy}))

@@ -10,9 +10,9 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
-from dptse_env.actions import ACTION_ENCODINGS
 from dptse_env.process import TRUTH_INFO
 from dptse_env.registration import ENVIRONMENTS, register_environments
+from dptse_env.spaces.actions import ACTION_ENCODINGS
 
 SHORT = "dptse_env:dptse/ShortHighway-v0"
 IDS = [f"dptse_env:{env_id}" for env_id in ENVIRONMENTS]
@@ -128,6 +128,7 @@ def test_info_has_the_same_finite_numbers_at_every_step():
     env = short()
     (_, at_reset), *steps = play(env, 30)
     assert at_reset.pop("privacy")["guarantee"] == "none"
+    assert at_reset.pop("inherited") == []
     for info in [at_reset, *(step[4] for step in steps)]:
         assert info.keys() == at_reset.keys()
         flags = info.pop("queried")
@@ -281,32 +282,66 @@ def test_a_sequential_episode_renders_one_column_a_second():
     [
         ({"bandwith": 2}, r"^bandwith is unknown; allowed: corridor, estimator"),
         ({"bandwidth": 7}, r"^bandwidth must be in 1\.\.6, got 7"),
-        ({"bandwidth": 0}, r"^bandwidth must be in 1\.\.6, got 0"),
-        ({"bandwidth": 2.5}, r"^bandwidth must be of type int, got 2\.5"),
+        ({"bandwidth": 0}, r"^bandwidth must be an integer in 1\.\.1000, got 0"),
+        ({"bandwidth": 2.5}, r"^bandwidth must be an integer in 1\.\.1000, got 2\.5"),
         ({"estimator": "kf"}, r"^estimator must be one of ekf, .*, got 'kf'"),
         ({"backend": "gpu"}, r"^backend must be one of compiled, reference, got 'gpu'"),
-        ({"action": "flags"}, r"^action must be one of mask, scores, slots, sequential, got"),
-        ({"reward": "rmse"}, r"^reward must be one of joint, density, speed, got 'rmse'"),
+        ({"action": "flags"}, r"^action must be one of mask, scores, slots, sequential, or 'pack"),
+        ({"reward": "rmse"}, r"^reward must be one of joint, .*, or .*, got 'rmse'"),
         ({"privacy": "none"}, r"^privacy\.preset must be one of"),
         ({"privacy": {"sigma": 1.0}}, r"^privacy\.sigma is unknown; allowed: preset, epsilon"),
-        ({"epsilon": -1}, r"^privacy\.epsilon must be > 0, got -1"),
-        ({"privacy": {"cap": 0}}, r"^privacy\.cap must be an integer >= 1, got 0"),
-        ({"privacy": {"share": 1.5}}, r"^privacy\.share must be in \(0, 1\), got 1\.5"),
-        ({"delta": 0.7}, r"^privacy\.delta must be in \(0, 0\.5\), got 0\.7"),
-        ({"corridor": "long"}, r"^corridor must be one of paper-highway, short-highway, got 'long"),
+        ({"epsilon": -1}, r"^privacy\.epsilon must be a number in \[.*\], got -1"),
+        ({"epsilon": 1e-320}, r"^privacy\.epsilon must be .*, got 1e-320"),
+        ({"epsilon": 1e308}, r"^privacy\.epsilon must be .*, got 1e\+308"),
+        ({"epsilon": np.ones(2)}, r"^privacy\.epsilon must be a number .*, got array"),
+        ({"privacy": {"preset": "capped", "cap": 0}}, r"^privacy\.cap must be an integer in 1"),
+        ({"privacy": {"preset": "capped", "cap": 2**63}}, r"^privacy\.cap must be .*, got 92"),
+        ({"privacy": {"preset": "capped", "share": 1.5}}, r"^privacy\.share must be .*, got 1\.5"),
+        (
+            {"privacy": {"preset": "capped", "unit": np.zeros(3)}},
+            r"^privacy\.unit must be one of 'trip', .*, got array",
+        ),
+        ({"privacy": {"cap": 3}}, r"^privacy\.cap is unknown; allowed: preset, epsilon, delta, b"),
+        ({"privacy": 3}, r"^privacy must be the name of a release model, a class or a mapping, g"),
+        ({"privacy": {"preset": [1]}}, r"^privacy\.preset must be a name or a class, got \[1\]"),
+        ({"delta": 0.7}, r"^privacy\.delta must be a number in \[1e-12, 0\.5\), got 0\.7"),
+        ({"corridor": {"density_scale": 1e-300}}, r"^corridor\.density_scale must be .*, got 1e-"),
+        ({"corridor": {"lanes": 10**9}}, r"^corridor\.lanes must be an integer in 1\.\.16, got 10"),
+        ({"corridor": {"n_mainline": 2**63}}, r"^corridor\.n_mainline must be .* in 2\.\.1000, go"),
+        ({"corridor": 3}, r"^corridor must be a Corridor, or return one, got 3"),
+        ({"records": 1}, r"^records must be a path or None, got 1"),
+        ({"observation": 3}, r"^observation must be a sequence, got 3"),
+        ({"estimator": 3}, r"^estimator must be a class, or callable with .*, got 3"),
+        ({"reward": 3}, r"^reward must be callable with a ScoredSecond, got 3"),
+        ({"action": 3}, r"^action must be a class, made of \(n_mainline, bandwidth\), got 3"),
+        (
+            {"estimator": "mhe", "estimator_settings": {"initial_variance": 1e12}},
+            r"^estimator_settings\.initial_variance must be a number in .*, got 10",
+        ),
+        ({"estimator_settings": 3}, r"^estimator_settings must be a mapping, the name of a set, or"),
+        ({"traffic_seeds": [-1]}, r"^traffic_seeds\[0\] must be an integer .*, got"),
+        ({"traffic_seeds": "0:99999999999999"}, r"^traffic_seeds must be at most 10000 seeds"),
+        ({"truth_in_info": 1}, r"^truth_in_info must be of type bool, got 1"),
+        ({"corridor": "long"}, r"^corridor must be one of paper-highway, .*, got 'long"),
         ({"corridor": {"on_ramps": [9]}}, r"^corridor\.on_ramps\[0\] must be an integer in 1\.\.5"),
         ({"incident": "fog"}, r"^incident must be one of preset, random, none, got 'fog'"),
         ({"incident": {"segment": 9, "phases": [[1, 2, 3]]}}, r"ident\.segment must be .*0\.\.5"),
         ({"horizon": 241}, r"^horizon must be in 1\.\.240, got 241"),
         ({"random_start": True}, r"^random_start needs a horizon below the record's 240 s"),
-        ({"traffic_seeds": []}, r"^traffic_seeds must not be empty"),
+        ({"traffic_seeds": []}, r"^traffic_seeds must be 1 to 10000 seeds, got 0"),
         ({"traffic_seeds": "3:1"}, r"^traffic_seeds must not be empty, got '3:1'"),
-        ({"traffic_seeds": [1, 1]}, r"^traffic_seeds must be >= 0 and distinct"),
+        ({"traffic_seeds": [1, 1]}, r"^traffic_seeds must be distinct, got \(1, 1\)"),
+        ({"parameters": 3}, r"^parameters must be of type str, got 3; or parameters must be a mapp"),
         ({"parameters": "fast"}, r"^parameters must be one of .*w99-3lane.*, got 'fast'"),
         (
             {"parameters": {"name": "f", "free_flow_speed": 400.0, "jam_density": 300.0,
                             "gamma": 1.0, "relaxation_time": 50.0}},
             r"^model\.time_step must be > 0 and at most 0\.\d+ s \(CFL",
+        ),
+        (
+            {"parameters": {"name": "f", "free_flow_speed": 100.0, "jam_density": 5e-324,
+                            "gamma": 1.0, "relaxation_time": 50.0}},
+            r"^parameters\.jam_density must be a number in \[.*\], got 5e-324",
         ),
         ({"preset": "none"}, r"^preset must be one of paper-highway, .*, got 'none'"),
         ({"render_mode": "human"}, r"HumanRendering"),

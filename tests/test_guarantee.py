@@ -10,7 +10,7 @@ from .test_env import assert_same, play, short
 
 
 def guaranteed(**keywords):
-    return short(**{"privacy": {"preset": "guaranteed", "cap": 5}, **keywords})
+    return short(**{"privacy": {"preset": "capped", "cap": 5}, **keywords})
 
 
 def test_the_account_of_a_guarantee_is_in_info():
@@ -31,12 +31,12 @@ def test_the_account_of_a_guarantee_is_in_info():
 
 def test_a_void_guarantee_is_warned_of_when_the_environment_is_made():
     with pytest.warns(UserWarning, match=r"boundary_inputs: .*without noise") as caught:
-        env = guaranteed(privacy={"preset": "guaranteed", "boundary_inputs": "true"})
+        env = guaranteed(privacy={"preset": "capped", "boundary_inputs": "true"})
     assert len(caught) == 1
     account = env.reset(seed=0)[1]["privacy"]
     assert (account["guarantee"], account["void_reasons"]) == ("none", ["boundary_inputs"])
     with pytest.warns(UserWarning, match="speed_sensitivity"):
-        env = guaranteed(privacy={"preset": "guaranteed", "speed_release": "mean"})
+        env = guaranteed(privacy={"preset": "capped", "speed_release": "mean"})
     account = env.reset(seed=0)[1]["privacy"]
     assert (account["guarantee"], account["void_reasons"]) == ("none", ["speed_sensitivity"])
 
@@ -59,7 +59,7 @@ def test_who_was_counted_is_told_only_with_the_truth():
     assert epsilons.max() == pytest.approx(info["epsilon"])
     np.testing.assert_array_equal(epsilons == 0.0, exposures == 0)
     assert (exposures == 0).any()
-    record = env.unwrapped.process.sensing.record(0)
+    record = env.unwrapped.process.traffic.record(0)
     assert len(exposures) == len(epsilons) == record.n_vehicles
     _, again = env.reset(options={"traffic_seed": 0})
     assert not any(again["truth"]["exposures"])
@@ -70,7 +70,7 @@ def test_what_is_told_of_vehicles_does_not_depend_on_other_episodes():
     alone, after = guaranteed(truth_in_info=True), guaranteed(truth_in_info=True)
     after.reset(seed=9, options={"traffic_seed": 1})
     after.reset(seed=9, options={"traffic_seed": 2})
-    lengths = {after.unwrapped.process.sensing.record(slot).n_vehicles for slot in range(3)}
+    lengths = {after.unwrapped.process.traffic.record(index).n_vehicles for index in range(3)}
     assert len(lengths) > 1
     for env in (alone, after):
         env.action_space.seed(0)
@@ -82,7 +82,7 @@ def test_what_is_told_of_vehicles_does_not_depend_on_other_episodes():
 
 
 def _n_vehicles(env, slot):
-    return env.unwrapped.process.sensing.record(slot).n_vehicles
+    return env.unwrapped.process.traffic.record(slot).n_vehicles
 
 
 def test_vector_environments_of_gymnasium_take_the_truth():

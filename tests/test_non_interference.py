@@ -10,11 +10,12 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from dptse_env.actions import ACTION_ENCODINGS
-from dptse_env.boundary import NominalBoundary
 from dptse_env.estimators import ESTIMATORS
+from dptse_env.parts import flow_centre
 from dptse_env.process import TRUTH_INFO
+from dptse_env.release.boundary import NominalBoundary
 from dptse_env.schedules import INFORMED, ORACLES, SCHEDULES, make_schedule
+from dptse_env.spaces.actions import ACTION_ENCODINGS
 
 SEEDS = (0, 1)
 START, STEPS = 250, 30
@@ -77,8 +78,9 @@ def blind(env):
     for seed in SEEDS:
         env.reset(seed=0, options={"traffic_seed": seed})
     process = env.unwrapped.process
-    flow = process.config.privacy.speed == "flow"
-    process.mechanism = ConstantMechanism(process.mechanism, flow)
+    release = process.release
+    flow = flow_centre(process.config) is not None
+    release.mechanism = ConstantMechanism(release.mechanism, flow)
     return env
 
 
@@ -94,7 +96,7 @@ def make_paper(**keywords):
 def with_nominal_boundary(env):
     """Take the declared exception of the paper's presets away."""
     process = env.unwrapped.process
-    process.boundary = NominalBoundary(process.sensing, process.model)
+    process.boundary = NominalBoundary(process.traffic, process.model, 1)
     return env
 
 
@@ -134,7 +136,7 @@ def test_the_traffics_do_differ():
     first, second = transcript(env, 0), transcript(env, 1)
     assert not same(first, second)
     process = env.unwrapped.process
-    truths = [process.sensing.aggregates(np.array([s]), np.array([START])) for s in (0, 1)]
+    truths = [process.traffic.aggregates(np.array([s]), np.array([START])) for s in (0, 1)]
     assert not np.array_equal(*truths)
 
 
@@ -162,7 +164,7 @@ def test_an_emptiness_mask_would_show(monkeypatch):
 
 def test_a_marker_for_empty_segments_would_show(monkeypatch):
     env = blind(make_private())
-    mechanism = env.unwrapped.process.mechanism
+    mechanism = env.unwrapped.process.release.mechanism
     release = mechanism.release
 
     def release_marked(episodes, values):
@@ -192,7 +194,9 @@ def test_realised_exposures_in_info_would_show(monkeypatch):
     info = process.info
 
     def telling(episode):
-        exposures = process.answers.contributions.of_episode(episode, process.slot[episode])
+        exposures = process.release.contributions.of_episode(
+            episode, process.traffic_index[episode]
+        )
         return info(episode) | {"mu": float(exposures.max(initial=0))}
 
     monkeypatch.setattr(process, "info", telling)

@@ -3,12 +3,12 @@ import pytest
 import qpsolvers
 from scipy import stats
 
-from dptse_env.actions import ACTION_ENCODINGS
 from dptse_env.config import resolve
 from dptse_env.estimators import ESTIMATORS
 from dptse_env.estimators.compiled import mhe_kernels
-from dptse_env.interface import QueryInterface
+from dptse_env.parts import make_parts
 from dptse_env.process import QueryProcess
+from dptse_env.spaces.actions import ACTION_ENCODINGS
 
 from .estimators.solvers import lying, missing, silent, unsolved
 
@@ -19,7 +19,7 @@ ALL = np.arange(3)
 def make(n_episodes, preset="short-highway", **keywords):
     keywords = {"traffic_seeds": "0:3", "horizon": 60, "random_start": True, **keywords}
     config = resolve(preset, keywords)
-    return QueryProcess(config, QueryInterface.of(config), n_episodes)
+    return QueryProcess(make_parts(config, n_episodes))
 
 
 def generators(seeds):
@@ -33,7 +33,7 @@ def sampled(process, n_steps):
     return [np.array([space.sample() for _ in SEEDS]) for _ in range(n_steps)]
 
 
-COUNTED = {"preset": "guaranteed", "cap": 5, "boundary_inputs": "private"}
+COUNTED = {"preset": "capped", "cap": 5, "boundary_inputs": "private"}
 
 
 @pytest.mark.parametrize(
@@ -88,14 +88,14 @@ def test_forks_share_traffic_and_begin_no_episodes():
     process = make(3, privacy=COUNTED)
     process.reset(ALL, generators(SEEDS))
     fork = process.fork()
-    assert fork.sensing is process.sensing
-    tables, shared = ([*p.answers.tables, *p.boundary.tables] for p in (process, fork))
+    assert fork.traffic is process.traffic
+    tables, shared = ([*p.release.shared, *p.boundary.shared] for p in (process, fork))
     assert all(a is b for a, b in zip(tables, shared, strict=True))
-    assert len(tables) == 6
-    assert fork.answers.contributions.exposures is not process.answers.contributions.exposures
-    for one in (fork, fork.fork()):
+    exposures = process.release.contributions.exposures
+    assert not np.shares_memory(fork.release.contributions.exposures, exposures)
+    for forked in (fork, fork.fork()):
         with pytest.raises(RuntimeError, match="reset the process that it was made of"):
-            one.reset(ALL, generators(SEEDS))
+            forked.reset(ALL, generators(SEEDS))
     process.reset(ALL, generators(SEEDS))
 
 
@@ -130,20 +130,20 @@ def test_episodes_step_and_reset_on_their_own():
             "privacy": {"boundary_inputs": "private", "share": 0.3},
         },
     ],
-    ids=["paper", "guaranteed", "guaranteed and private boundary"],
+    ids=["paper", "capped", "guaranteed and private boundary"],
 )
 def test_residuals_are_the_noise_that_is_declared(keywords):
     """Released minus true over sigma: unit variance, uncorrelated over time and quantities."""
     process = make(1, estimator="random_walk", random_start=False, **keywords)
     residuals = []
-    release = process.mechanism.release
+    release = process.release.mechanism.release
 
     def spy(episodes, values):
         released = release(episodes, values)
-        residuals.append((released - values)[0] / process.mechanism.sigma)
+        residuals.append((released - values)[0] / process.release.sigma)
         return released
 
-    process.mechanism.release = spy
+    process.release.mechanism.release = spy
     for seed in range(4):
         process.reset(ALL[:1], generators([seed]))
         for action in sampled(process, process.config.horizon_steps):
@@ -198,10 +198,10 @@ def test_a_step_from_t_predicts_with_t_and_measures_at_t_plus_one():
         return values
 
     process.estimator.predict = predict
-    process.mechanism.release = release
+    process.release.mechanism.release = release
     for t in range(100):
         process.step(ALL[:1], np.zeros((1, 6), dtype=np.int8))
-        record = process.sensing.library.get(process.config.corridor, 1)
+        record = process.traffic.library.get(process.config.corridor, 1)
         expected = process.boundary.inputs(ALL[:1], np.array([1]), np.array([t]))
         np.testing.assert_array_equal(seen["inputs"], expected)
         np.testing.assert_allclose(seen["values"][0, :, 0], record.counts[t + 1, :8] / 0.1)
@@ -210,12 +210,12 @@ def test_a_step_from_t_predicts_with_t_and_measures_at_t_plus_one():
 def test_a_diverging_filter_is_flagged_and_the_episode_goes_on():
     process = make(1)
     process.reset(ALL[:1], generators([4]))
-    release = process.mechanism.release
-    process.mechanism.release = lambda episodes, values: np.full_like(values, np.nan)
+    release = process.release.mechanism.release
+    process.release.mechanism.release = lambda episodes, values: np.full_like(values, np.nan)
     outcome = process.step(ALL[:1], np.ones((1, 6), dtype=np.int8))
     assert process.info(0)["diverged"] == 1.0
     assert np.isfinite(process.estimate.density).all()
-    process.mechanism.release = release
+    process.release.mechanism.release = release
     outcome = process.step(ALL[:1], np.ones((1, 6), dtype=np.int8))
     assert process.info(0)["diverged"] == 0.0
     assert np.isfinite(outcome.reward).all()

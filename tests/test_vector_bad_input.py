@@ -10,19 +10,21 @@ from .vectors import MODES, assert_same, short, staggered
 @pytest.mark.parametrize(
     ("keywords", "message"),
     [
-        ({"num_envs": 0}, r"^num_envs must be an integer >= 1, got 0"),
-        ({"num_envs": -2}, r"^num_envs must be an integer >= 1, got -2"),
-        ({"num_envs": 1.5}, r"^num_envs must be an integer >= 1, got 1\.5"),
-        ({"num_envs": True}, r"^num_envs must be an integer >= 1, got True"),
+        ({"num_envs": 0}, r"^num_envs must be an integer in 1\.\.1000000, got 0"),
+        ({"num_envs": -2}, r"^num_envs must be an integer in 1\.\.1000000, got -2"),
+        ({"num_envs": 1.5}, r"^num_envs must be an integer in 1\.\.1000000, got 1\.5"),
+        ({"num_envs": True}, r"^num_envs must be an integer in 1\.\.1000000, got True"),
+        ({"num_envs": 10**12}, r"^num_envs must be an integer in 1\.\.1000000, got 1000000000000"),
         (
             {"autoreset_mode": "next"},
             r"^autoreset_mode must be one of NextStep, SameStep, Disabled, got 'next'",
         ),
         ({"autoreset_mode": None}, r"^autoreset_mode must be one of .*, got None"),
         ({"render_mode": "rgb_array"}, r"^render_mode must be None, got 'rgb_array': a batch"),
-        ({"threads": 0}, r"^threads must be an integer >= 1, got 0"),
+        ({"threads": 0}, r"^threads must be an integer in 1\.\.1024, got 0"),
         ({"bandwith": 2}, r"^bandwith is unknown; allowed: corridor, estimator"),
-        ({"epsilon": -1}, r"^privacy\.epsilon must be > 0, got -1"),
+        ({"epsilon": -1}, r"^privacy\.epsilon must be a number in \[.*\], got -1"),
+        ({"records": 1}, r"^records must be a path or None, got 1"),
     ],
 )
 def test_bad_keywords_name_themselves(keywords, message):

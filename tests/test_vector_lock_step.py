@@ -6,10 +6,10 @@ import time
 import numpy as np
 import pytest
 
-from dptse_env.actions import ACTION_ENCODINGS
-from dptse_env.blocks import SMALLEST
 from dptse_env.estimators import ESTIMATORS
 from dptse_env.registration import ENVIRONMENTS
+from dptse_env.spaces.actions import ACTION_ENCODINGS
+from dptse_env.utils.threads import SMALLEST
 
 from .vectors import COUNTED, assert_same, lock_step, short
 

@@ -7,7 +7,7 @@ from gymnasium.vector import AutoresetMode
 
 SHORT = "dptse_env:dptse/ShortHighway-v0"
 MODES = [mode.value for mode in AutoresetMode]
-COUNTED = {"preset": "guaranteed", "cap": 5, "boundary_inputs": "private"}
+COUNTED = {"preset": "capped", "cap": 5, "boundary_inputs": "private"}
 EPISODES = {"traffic_seeds": "0:3", "horizon": 6, "random_start": True}
 
 

@@ -9,14 +9,19 @@ from dataclasses import dataclass
 import numpy as np
 from tqdm import tqdm
 
-from agents.audit.policies import Policy, always_observed
+from agents.audit.policies import Policy
 from agents.audit.worlds import TwoWorlds
-from dptse_env.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.config import EnvConfig
-from dptse_env.interface import QueryInterface
-from dptse_env.privacy import GaussianMechanism, Mechanism
+from dptse_env.parts import make_parts, make_release
 from dptse_env.process import QueryProcess
-from dptse_env.sensing import Sensing, make_answers
+from dptse_env.release import (
+    GaussianMechanism,
+    GaussianRelease,
+    Mechanism,
+    ReleaseRequest,
+    TrafficTable,
+)
+from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 
 BATCH = 250
 """Runs per world to play at once."""
@@ -75,22 +80,20 @@ class Adversary:
         self, config: EnvConfig, worlds: TwoWorlds, n_runs: int, sigma: FloatArray
     ) -> None:
         """Prepare for so many runs at once, under noise of standard deviation `sigma`, (2,)."""
-        corridor, always = config.corridor, always_observed(config)
-        columns = max([corridor.n_segments, *(column + 1 for column in always)])
-        sensing = Sensing(corridor, (0, 1), worlds)
+        traffic = TrafficTable(config.corridor, (0, 1), worlds)
         # Both worlds' answers to every run, whichever world it is in.
-        self._answers = make_answers(config.privacy, sensing, columns, 2 * n_runs)
-        for world in (0, 1):
-            sensing.load(world)
-            self._answers.load(world)
+        release = make_release(config, 2 * n_runs, traffic)
+        assert isinstance(release, GaussianRelease)
+        self._release = release
+        for world, record in traffic.load([0, 1]):
+            release.load(world, record)
         self._sigma = sigma
-        self._always = np.zeros(columns, dtype=bool)
-        self._always[always] = True
 
     def reset(self, n_runs: int) -> None:
         """Begin new runs."""
         self._episodes, self._worlds = np.arange(2 * n_runs), np.repeat([0, 1], n_runs)
-        self._answers.reset(self._episodes)
+        nothing = np.random.default_rng(0)
+        self._release.reset(self._episodes, [nothing] * len(self._episodes))
         self.score, self.square = np.zeros(n_runs), np.zeros(n_runs)
 
     def expect(self, time: int, queried: BoolArray) -> tuple[FloatArray, FloatArray]:
@@ -98,11 +101,10 @@ class Adversary:
 
         Both are in units of the noise; the difference is zero where nobody asked.
         """
-        observed = np.tile(self._always, (len(queried), 1))
-        observed[:, : queried.shape[1]] |= queried
+        observed = self._release.setup.observed(queried)
         times = np.full(len(self._episodes), time)
-        answers = self._answers.collect(
-            self._episodes, self._worlds, times, np.tile(observed, (2, 1))
+        answers = self._release.true_values(
+            ReleaseRequest(self._episodes, self._worlds, times, np.tile(observed, (2, 1)))
         )
         zero, one = np.split(answers / self._sigma, 2)
         difference = np.where(observed[:, :, None], one - zero, 0.0)
@@ -162,11 +164,12 @@ def attack(
         estimator="open_loop", backend="compiled", estimator_settings=None,
     )  # fmt: skip
     size = min(BATCH, n_runs)
-    process = QueryProcess(config, QueryInterface.of(config), 2 * size, worlds)
-    sigma = noise_factor * process.mechanism.sigma
-    columns = config.corridor.n_segments + process.boundary.n_released
+    process = QueryProcess(make_parts(config, 2 * size, worlds))
+    release = process.release
+    assert isinstance(release, GaussianRelease)
+    sigma, columns = noise_factor * release.sigma, release.setup.n_columns
     tap = Wiretap(GaussianMechanism(sigma, n_episodes=2 * size, n_segments=columns))
-    process.mechanism = tap
+    release.mechanism = tap
     adversary = Adversary(config, worlds, 2 * size, sigma)
     parts = []
     with tqdm(

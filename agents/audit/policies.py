@@ -6,12 +6,12 @@ from typing import Protocol
 
 import numpy as np
 
-from agents.audit.ruler import Ruler, best_spending
+from agents.audit.ruler import Ruler, best_spending, contribution_cap
 from agents.audit.worlds import TwoWorlds
-from dptse_env.arrays import BoolArray, FloatArray
 from dptse_env.config import EnvConfig
-from dptse_env.interface import QueryInterface
+from dptse_env.parts import make_interface, make_release
 from dptse_env.schedules import SCHEDULES
+from dptse_env.utils.arrays import BoolArray, FloatArray
 
 FENCE = 3.0
 """Log-likelihood ratio at which the adaptive hunter has made up its mind: odds of 20 to 1."""
@@ -61,7 +61,7 @@ class Adaptive(Planned):
 
 def public_plan(config: EnvConfig, name: str) -> BoolArray:
     """Return the queries of a public schedule, shape (horizon, n_mainline)."""
-    interface = QueryInterface.of(config)
+    interface = make_interface(config)
     steps = np.arange(config.horizon_steps)
     size = interface.observations.space.shape[0]
     schedule = SCHEDULES[name](interface)
@@ -70,11 +70,7 @@ def public_plan(config: EnvConfig, name: str) -> BoolArray:
 
 def always_observed(config: EnvConfig) -> list[int]:
     """Return the record columns that are observed at every step without being asked."""
-    corridor = config.corridor
-    columns = list(corridor.fixed_sensors)
-    if config.privacy.boundary == "private":
-        columns += range(corridor.n_segments, corridor.n_segments + corridor.n_boundaries)
-    return columns
+    return list(make_release(config).setup.always_observed)
 
 
 def hunting_plan(config: EnvConfig, worlds: TwoWorlds) -> BoolArray:
@@ -110,7 +106,7 @@ def _worth_asking(
         unasked[seen],
         path.only(seen),
     )
-    cap = config.privacy.contribution_cap or horizon
+    cap = contribution_cap(config) or horizon
     spending = best_spending(gains, unasked, cap)
     ask = ~unasked & (np.arange(len(gains)) < spending.stop)
     columns = (-gains[ask], path.step[ask] - 1, path.segment[ask])

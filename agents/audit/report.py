@@ -15,8 +15,9 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from dptse_env.privacy import PrivacyReport, epsilon_of
-from dptse_env.privacy.audit import AuditResult, detectable_mu, rejection_probability
+from dptse_env.privacy import epsilon_of
+from dptse_env.privacy.audit_statistics import AuditResult, detectable_mu, rejection_probability
+from dptse_env.release import PrivacyReport
 
 VIOLATION = math.sqrt(2.0)
 """How far beyond the claim the reported power looks: noise divided by 1.41."""

@@ -8,10 +8,11 @@ from typing import NamedTuple
 import numpy as np
 
 from agents.audit.worlds import Path
-from dptse_env.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.config import EnvConfig
-from dptse_env.privacy import SpeedRelease, noise_std
+from dptse_env.parts import flow_centre, make_release
+from dptse_env.release import CappedSettings, SpeedRelease
 from dptse_env.traffic import Record
+from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True)
@@ -34,8 +35,9 @@ class Ruler:
     def of(cls, config: EnvConfig) -> Ruler:
         """Return the ruler of a configuration, at the noise that it declares."""
         corridor = config.corridor
-        sigma = noise_std(config.privacy, config.sensitivity())
-        return cls(corridor.segment_length, corridor.speed_limit, config.privacy.speed, sigma)
+        speed: SpeedRelease = "mean" if flow_centre(config) is None else "flow"
+        sigma = make_release(config).sigma
+        return cls(corridor.segment_length, corridor.speed_limit, speed, sigma)
 
     def of_path(self, rest: Record, path: Path) -> FloatArray:
         """Return the distance of every second of a path that is added to a record, shape (m,)."""
@@ -79,6 +81,18 @@ class Ruler:
         first = 1.0 / (self.length * self.sigma[0])
         squares: FloatArray = first**2 + (second / self.sigma[1]) ** 2
         return squares
+
+
+def replaces(config: EnvConfig) -> bool:
+    """Return whether adjacent records differ in a vehicle replaced by another, or in one more."""
+    privacy = config.privacy
+    return not isinstance(privacy, CappedSettings) or privacy.adjacency == "replace"
+
+
+def contribution_cap(config: EnvConfig) -> int | None:
+    """Return the queried steps in which a vehicle counts; None if in all of them."""
+    privacy = config.privacy
+    return privacy.contribution_cap if isinstance(privacy, CappedSettings) else None
 
 
 class Spending(NamedTuple):

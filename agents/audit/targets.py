@@ -14,12 +14,13 @@ from agents.audit.policies import (
     make_policy,
     public_plan,
 )
-from agents.audit.ruler import Ruler, best_spending
+from agents.audit.ruler import Ruler, best_spending, contribution_cap, replaces
 from agents.audit.worlds import Path, TwoWorlds
-from dptse_env.arrays import BoolArray, IntArray
 from dptse_env.config import EnvConfig
+from dptse_env.release import CappedSettings
 from dptse_env.traffic import Record
-from dptse_env.validation import require
+from dptse_env.utils.arrays import BoolArray, IntArray
+from dptse_env.utils.validation import require
 
 TARGETS = ("worst-case", "replaced", "deleted")
 """Kinds of targets; the last two are vehicles of the record."""
@@ -55,7 +56,7 @@ def choose_target(config: EnvConfig, record: Record, kind: str, policy: str) -> 
     require(kind in TARGETS, "target", f"one of {list(TARGETS)}", kind)
     if kind == "worst-case":
         return _worst_case(config, record, policy)
-    replace = config.privacy.adjacency == "replace"
+    replace = replaces(config)
     require(
         replace or kind == "deleted", "target", "'deleted' or 'worst-case' with add_remove", kind
     )
@@ -100,10 +101,10 @@ def _by_reach(config: EnvConfig, record: Record, seen: BoolArray, policy: str) -
     reach = np.zeros(len(vehicles))
     for i, (start, stop) in enumerate(pairwise([*starts.tolist(), len(rows)])):
         own = slice(start, stop)
-        if config.privacy.is_bounded and config.privacy.unit == "event":
+        if isinstance(config.privacy, CappedSettings) and config.privacy.unit == "event":
             reach[i] = gains[own].max()
         else:
-            cap = config.privacy.contribution_cap or config.horizon_steps
+            cap = contribution_cap(config) or config.horizon_steps
             reach[i] = best_spending(gains[own], unasked[own], cap).reach
     best: IntArray = vehicles[np.argsort(-reach, kind="stable")]
     return best
@@ -123,7 +124,7 @@ def _worst_case(config: EnvConfig, record: Record, policy: str) -> Target:
     here, there = (int(segment) for segment in np.lexsort((load, fixed))[:2])
     stands = Path.constant(seconds, here, 0.0)
     others = {"nobody in its place": Path.nowhere()}
-    if config.privacy.adjacency == "replace":
+    if replaces(config):
         limit = corridor.speed_limit
         others = {
             f"on segment {there} instead": Path.constant(seconds, there, 0.0),
@@ -142,7 +143,7 @@ def _protected(
     config: EnvConfig, rest: Record, seen: BoolArray, paths: tuple[Path, Path]
 ) -> tuple[Path, Path]:
     """Cut two paths down to what may differ: the one second that tells most for unit `event`."""
-    if not (config.privacy.is_bounded and config.privacy.unit == "event"):
+    if not (isinstance(config.privacy, CappedSettings) and config.privacy.unit == "event"):
         return paths
     ruler, total = Ruler.of(config), np.zeros(rest.n_steps)
     for path in paths:

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dptse_env.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.traffic import Corridor, Record, RecordLibrary
+from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True, eq=False)

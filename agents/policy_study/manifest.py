@@ -12,7 +12,7 @@ from typing import Any
 
 from agents.learned import Saved
 from agents.policy_study.plan import MODES, Cell, Design, Entry, Learner
-from dptse_env.estimators.tuning import read_settings
+from dptse_env.estimators.tuned_settings import read_settings
 
 FILE = "manifest.json"
 

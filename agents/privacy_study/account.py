@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 from agents.privacy_study.plan import Cell
 from agents.runner import make_env
 from dptse_env.config import EnvConfig
+from dptse_env.parts import privacy_report
 from dptse_env.privacy import contribution_sensitivity, epsilon_of
+from dptse_env.release import CappedSettings
 from dptse_env.traffic import Corridor, RecordLibrary
 
 
@@ -58,7 +60,6 @@ def mu_met(config: EnvConfig, density_std: float, contributions: int) -> float:
         adjacency="replace",
         segment_length=config.corridor.segment_length,
         largest_speed=config.corridor.speed_limit,
-        protects="one vehicle's trip, replaced by another",
     )
     return sensitivity.releases[0].bound / density_std
 
@@ -85,11 +86,14 @@ def account_of(env: str, cell: Cell, seeds: Sequence[int], contributions: Sequen
         contributions: Steps in which a vehicle may be met.
     """
     config: EnvConfig = make_env(env, cell, seeds, None).unwrapped.config  # type: ignore[attr-defined]
-    report = config.accountant().report
+    report = privacy_report(config)
     density_std, second_std = (release.noise_std for release in report.releases)
     # Where contributions are bounded, no vehicle counts more often, and the bound is met exactly.
-    bounded = config.privacy.is_bounded
-    most = config.privacy.contributions(config.horizon_steps) if bounded else config.horizon_steps
+    privacy = config.privacy
+    bounded = isinstance(privacy, CappedSettings)
+    most = config.horizon_steps
+    if isinstance(privacy, CappedSettings):
+        most = privacy.contributions(most)
     counted = {n: min(n, most) for n in contributions}
 
     def epsilon(mu: float) -> float:

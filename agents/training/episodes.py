@@ -10,8 +10,8 @@ from stable_baselines3.common.vec_env import VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from agents.training.truth import TrueErrors
-from dptse_env.arrays import Action, BoolArray, Observation
 from dptse_env.sb3 import SB3VecEnv
+from dptse_env.utils.arrays import Action, BoolArray, Observation
 
 State = dict[str, np.ndarray[Any, Any]]
 
@@ -23,7 +23,7 @@ class TrainingEpisodes(VecEnvWrapper):
     first round, episode i of n is begun again after i/n of its length, so that from then on an
     update sees every second of the records. All later episodes run their whole length, from the
     first second on: one begun in the middle of a record would meet vehicles none of which has
-    counted yet (`dptse_env.contributions`), which no evaluated episode does.
+    counted yet (`dptse_env.release.contributions`), which no evaluated episode does.
 
     **Kept.** Traffic is replayed and every draw is seeded, so an episode is given by its seed and
     the actions since it began. `state` is those; `restore` repeats them, which takes as long as

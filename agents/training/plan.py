@@ -18,8 +18,8 @@ from agents.provenance import source_digest
 from agents.seeds import TRAINING_VALIDATION, TRAININGS
 from agents.training.recipes import Recipe
 from dptse_env.config import TRAINING_SEEDS, VALIDATION_SEEDS, EnvConfig
-from dptse_env.interface import QueryInterface
-from dptse_env.validation import integer
+from dptse_env.parts import make_interface
+from dptse_env.utils.validation import integer
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ class TrainingPlan:
     @cached_property
     def actions_per_step(self) -> int:
         """Actions that make one decision."""
-        return QueryInterface.of(self.config).actions.actions_per_step
+        return make_interface(self.config).actions.actions_per_step
 
     @cached_property
     def config(self) -> EnvConfig:

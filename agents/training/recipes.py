@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 from dptse_env.sb3.policy import RULE
-from dptse_env.validation import inside, integer, non_negative, positive, require
+from dptse_env.utils.validation import inside, integer, non_negative, positive, require
 
 
 @dataclass(frozen=True)

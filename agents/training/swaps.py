@@ -19,9 +19,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from agents.evaluation import WARM_UP, Policy
-from dptse_env.arrays import Action, AnyArray, FloatArray, IntArray, Observation
-from dptse_env.privacy import Mechanism
 from dptse_env.process import QueryProcess
+from dptse_env.release import Capped, GaussianRelease, Mechanism
+from dptse_env.utils.arrays import Action, AnyArray, FloatArray, IntArray, Observation
 from dptse_env.vector_env import SensorQueryVectorEnv
 
 
@@ -150,8 +150,8 @@ def _tried(
 ) -> Swaps:
     """Try swaps in the first of ``actions``, in every episode of ``before``."""
     n, every = len(shown), np.arange(len(shown))
-    columns = before.config.corridor.n_segments + before.boundary.n_released
-    noise = generator.choice([-1.0, 1.0], size=(n, columns, 2)) * before.mechanism.sigma
+    columns = before.release.setup.n_columns
+    noise = generator.choice([-1.0, 1.0], size=(n, columns, 2)) * before.release.sigma
     reward, exposures = _followed(before, actions, noise)
     asked = np.zeros((n, before.interface.n_mainline), dtype=bool)
     np.put_along_axis(asked, actions[0], True, axis=1)
@@ -180,10 +180,11 @@ def _followed(
     reward, exposures = np.zeros((2, before.n_episodes))
     for sign in (1.0, -1.0):
         fork = before.fork()
-        fork.mechanism = FirstNoise(fork.mechanism, sign * noise)
+        release = fork.release
+        assert isinstance(release, GaussianRelease)
+        release.mechanism = FirstNoise(release.mechanism, sign * noise)
         for action in actions:
             reward += 0.5 * fork.step(every, action).reward
-        counted = fork.answers.contributions
-        if counted is not None:
-            exposures += 0.5 * counted.exposures.sum(axis=1)
+        if isinstance(release, Capped):
+            exposures += 0.5 * release.contributions.exposures.sum(axis=1)
     return reward, exposures

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from gymnasium import spaces
 
-from dptse_env.arrays import FloatArray, Observation
 from dptse_env.config import EnvConfig
-from dptse_env.interface import QueryInterface
+from dptse_env.parts import QueryInterface
+from dptse_env.utils.arrays import FloatArray, Observation
 
 SCALES = (0.1, 0.2)
 """What errors of density and of speed, in units of the corridor's scales, are divided by."""

@@ -10,8 +10,8 @@ import torch
 
 from agents.evaluation import Policy, make_vector, run_episodes
 from agents.seeds import TRAINING_VALIDATION
-from dptse_env.arrays import FloatArray
 from dptse_env.config import VALIDATION_SEEDS
+from dptse_env.utils.arrays import FloatArray
 
 
 class Validation:

@@ -13,8 +13,8 @@ import numpy as np
 
 from benchmarks.throughput.measure import Measured, queries, resident, take_turns, together
 from benchmarks.throughput.rows import HORIZON
-from dptse_env.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.estimators import make_estimator
+from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.vector_env import SensorQueryVectorEnv
 
 TURN = 0.2  # [s] that a turn should take

@@ -1,7 +1,14 @@
 """Traffic state estimators behind one protocol."""
 
 from dptse_env.estimators.base import Estimate, Estimator
-from dptse_env.estimators.registry import BACKENDS, ESTIMATORS, check_estimator, make_estimator
+from dptse_env.estimators.registry import (
+    BACKENDS,
+    ESTIMATORS,
+    check_estimate,
+    check_estimator,
+    make_estimator,
+    settings_type,
+)
 from dptse_env.estimators.settings import (
     EnsembleSettings,
     EstimatorSettings,
@@ -18,6 +25,8 @@ __all__ = [
     "EstimatorSettings",
     "HorizonSettings",
     "SigmaPointSettings",
+    "check_estimate",
     "check_estimator",
     "make_estimator",
+    "settings_type",
 ]

@@ -12,7 +12,7 @@ import numpy as np
 from dptse_env.estimators.base import Estimate
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
-from dptse_env.model.network import BoolArray, FloatArray, IntArray
+from dptse_env.model.layout import BoolArray, FloatArray, IntArray
 
 
 class Measurements(NamedTuple):

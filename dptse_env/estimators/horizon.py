@@ -17,9 +17,10 @@ from scipy.sparse.linalg import splu
 
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel, Bounds
-from dptse_env.model.arz import LARGEST_W, LEAST_DENSITY, LEAST_W
-from dptse_env.model.network import BoolArray, FloatArray
-from dptse_env.validation import positive
+from dptse_env.model.arz import LEAST_DENSITY, LEAST_W
+from dptse_env.model.layout import BoolArray, FloatArray
+from dptse_env.model.parameters import LARGEST_W
+from dptse_env.utils.validation import positive
 
 # Largest natural residual of an optimum, in normalised states.
 RESIDUAL = 1e-8
@@ -171,9 +172,12 @@ def solve(
     if not natural_residual(H, q, lower, upper, z) <= ROUGH:  # a NaN is no optimum either
         return None
     for _ in range(POLISHES):
-        z = _polish(P, q, lower, upper, z)
+        try:
+            z = _polish(P, q, lower, upper, z)
+        except RuntimeError:  # of splu: singular; the best answer so far is judged as it is
+            break
         pair = best, np.clip(z, lower, upper)
-        best = min(pair, key=lambda one: natural_residual(H, q, lower, upper, one))
+        best = min(pair, key=lambda answer: natural_residual(H, q, lower, upper, answer))
     best = np.where(best < lower + AT_BOUND, lower, np.where(best > upper - AT_BOUND, upper, best))
     return best if natural_residual(H, q, lower, upper, best) <= RESIDUAL else None
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dptse_env.model.network import FloatArray, RoadNetwork
+from dptse_env.model.layout import FloatArray, RoadNetwork
 
 
 def positions(network: RoadNetwork) -> FloatArray:

@@ -3,85 +3,160 @@
 from __future__ import annotations
 
 import importlib
-from typing import get_args
+from typing import Any, NamedTuple, get_args
 
-from dptse_env.estimators.base import Backend, Estimator
+import numpy as np
+
+from dptse_env.estimators.base import Backend, Estimate, Estimator
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
+from dptse_env.utils.registry import Registry, is_foreign, missing_methods, name_of_class
 
-# Each backend brings its own library, which the other must not need: modules load when asked for.
-_MODELS = {
-    "compiled": "dptse_env.model.compiled:CompiledARZModel",
-    "reference": "dptse_env.model.arz:ARZModel",
-}
-_CLASSES = {
-    "ekf": {
-        "compiled": "dptse_env.estimators.compiled.ekf:CompiledEKF",
-        "reference": "dptse_env.estimators.reference.ekf:ReferenceEKF",
-    },
-    "ukf": {
-        "compiled": "dptse_env.estimators.compiled.ukf:CompiledUKF",
-        "reference": "dptse_env.estimators.reference.ukf:ReferenceUKF",
-    },
-    "enkf": {
-        "compiled": "dptse_env.estimators.compiled.enkf:CompiledEnKF",
-        "reference": "dptse_env.estimators.reference.enkf:ReferenceEnKF",
-    },
-    "mhe": {
-        "compiled": "dptse_env.estimators.compiled.mhe:CompiledMHE",
-        "reference": "dptse_env.estimators.reference.mhe:ReferenceMHE",
-    },
-    "random_walk": dict.fromkeys(_MODELS, "dptse_env.estimators.random_walk:RandomWalk"),
-    "open_loop": dict.fromkeys(_MODELS, "dptse_env.estimators.open_loop:OpenLoop"),
-}
 
-ESTIMATORS = tuple(_CLASSES)
+class Backends(NamedTuple):
+    """The classes of an estimator that ships with the package, as ``"module:Class"``.
+
+    Modules are imported when they are needed: neither backend needs the other's libraries.
+    """
+
+    compiled: str
+    reference: str
+
+
+_MODELS = Backends("dptse_env.model.compiled:CompiledARZModel", "dptse_env.model.arz:ARZModel")
+
+
+def _filter(name: str, cls: str) -> Backends:
+    package = "dptse_env.estimators"
+    return Backends(
+        f"{package}.compiled.{name}:Compiled{cls}", f"{package}.reference.{name}:Reference{cls}"
+    )
+
+
+def _expected(part: Any) -> str | None:
+    if isinstance(part, type):
+        return missing_methods(part, ("reset", "predict", "update", "estimate"))
+    return None if callable(part) else "be a class, or callable with (model, n_episodes, settings)"
+
+
+_WALK = "dptse_env.estimators.random_walk:RandomWalk"
+_OPEN = "dptse_env.estimators.open_loop:OpenLoop"
+ESTIMATORS = Registry(
+    "estimator",
+    {
+        "ekf": _filter("ekf", "EKF"),
+        "ukf": _filter("ukf", "UKF"),
+        "enkf": _filter("enkf", "EnKF"),
+        "mhe": _filter("mhe", "MHE"),
+        "random_walk": Backends(_WALK, _WALK),
+        "open_loop": Backends(_OPEN, _OPEN),
+    },
+    check=_expected,
+)
+"""Estimators by name. One of another package is a class, or a function, of (model, n_episodes,
+settings); its attribute ``settings_type`` may name a dataclass of its own settings."""
 BACKENDS = get_args(Backend)
 
 
 def make_estimator(
-    name: str,
+    estimator: Any,
     backend: str,
     model: ARZModel,
     n_episodes: int,
-    settings: EstimatorSettings | None = None,
+    settings: Any = None,
 ) -> Estimator:
     """Build an estimator for a batch of episodes.
 
     Args:
-        name: `ekf`, `ukf`, `enkf`, `mhe`, `random_walk` (no traffic model) or `open_loop` (no
-            measurements).
+        estimator: `ekf`, `ukf`, `enkf`, `mhe`, `random_walk` (no traffic model), `open_loop` (no
+            measurements), a registered name, ``"package.module:Class"`` or a class.
         backend: `compiled` (numba) or `reference` (numpy, filterpy, qpsolvers); the random walk
-            is plain numpy under both.
+            is plain numpy under both. For a class of another package it chooses the model alone.
         model: The traffic model.
         n_episodes: Episodes to follow, >= 1.
         settings: Tuning; defaults if left out.
 
     Raises:
-        ValueError: for an unknown name or backend, or no episodes; says what is allowed.
+        ValueError: for an unknown name or backend, no episodes, or an estimator that lacks a method
+            or an attribute; says what is allowed.
     """
     if n_episodes < 1:
         raise ValueError(f"n_episodes must be >= 1, got {n_episodes}")
-    check_estimator(name, backend)
-    own = _load(_MODELS[backend])(
+    check_estimator(estimator, backend)
+    part = ESTIMATORS.find(estimator)
+    model_of_backend = _load(getattr(_MODELS, backend))(
         model.network, model.parameters, model.time_step, model.reference_speed
     )
-    estimator: Estimator = _load(_CLASSES[name][backend])(
-        own, n_episodes, settings or EstimatorSettings()
-    )
-    return estimator
+    factory = _load(getattr(part, backend)) if isinstance(part, Backends) else part
+    settings = settings_type(estimator)() if settings is None else settings
+    made: Estimator = factory(model_of_backend, n_episodes, settings)
+    if is_foreign(made):
+        _check_attributes(made, model, n_episodes)
+    return made
 
 
-def check_estimator(name: str, backend: str) -> None:
-    """Check that there is such an estimator, without loading it.
+def settings_type(estimator: Any) -> type:
+    """Return the dataclass of an estimator's settings."""
+    cls: type = getattr(ESTIMATORS.find(estimator), "settings_type", EstimatorSettings)
+    return cls
+
+
+def check_estimator(estimator: Any, backend: str) -> None:
+    """Refuse an estimator or a backend that there is not; nothing that ships is imported.
 
     Raises:
-        ValueError: for an unknown name or backend.
+        ValueError: for an unknown estimator or backend, or an estimator that lacks a method.
     """
-    if name not in ESTIMATORS:
-        raise ValueError(f"estimator must be one of {', '.join(ESTIMATORS)}, got {name!r}")
+    ESTIMATORS.find(estimator)
     if backend not in BACKENDS:
         raise ValueError(f"backend must be one of {', '.join(BACKENDS)}, got {backend!r}")
+
+
+def check_estimate(estimator: Estimator, estimate: Estimate, n_segments: int) -> None:
+    """Refuse an estimate that is not finite or not of shape (n, S).
+
+    Estimators of the package restart where they diverge; this holds those of others to it.
+
+    Raises:
+        ValueError: naming the class, what is wrong and what is expected.
+    """
+    shape = estimator.n_episodes, n_segments
+    for name in ("density", "speed", "density_std", "speed_std"):
+        values = np.asarray(getattr(estimate, name, None))
+        if values.shape != shape or values.dtype.kind != "f" or not np.isfinite(values).all():
+            raise ValueError(
+                f"estimator {name_of_class(estimator)}.estimate() must return finite floats "
+                f"{name!r} of shape {shape}, got {values.dtype} of shape {values.shape}"
+            )
+
+
+def _check_attributes(estimator: Estimator, model: ARZModel, n_episodes: int) -> None:
+    """Refuse an estimator whose class, methods or arrays are not those of the protocol."""
+    name = name_of_class(estimator)
+    missing = missing_methods(estimator, ("reset", "predict", "update", "estimate"))
+    if missing is not None:
+        raise ValueError(f"estimator {name} must {missing}")
+    shapes = {
+        "innovations": (n_episodes, model.n_segments, 2),
+        "diverged": (n_episodes,),
+        "fallback": (n_episodes,),
+    }
+    for attribute, shape in shapes.items():
+        found = getattr(estimator, attribute, None)
+        if not isinstance(found, np.ndarray) or found.shape != shape:
+            got = "none" if found is None else f"shape {np.shape(found)}"
+            raise ValueError(
+                f"estimator {name} must have an array {attribute!r} of shape {shape}, got {got}"
+            )
+    for attribute, expected in (("n_episodes", n_episodes), ("is_compiled", None)):
+        found = getattr(estimator, attribute, None)
+        if found is None or (expected is not None and found != expected):
+            raise ValueError(
+                f"estimator {name} must have {attribute!r}"
+                + (f" equal to {expected}" if expected is not None else "")
+                + f", got {found!r}"
+            )
+    check_estimate(estimator, estimator.estimate(), model.n_segments)
 
 
 def _load(path: str) -> type:

@@ -1,13 +1,12 @@
-"""How the estimators are tuned: frozen dataclasses, reachable from plain JSON."""
+"""Settings of the estimators: frozen dataclasses, reachable from plain JSON."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, TypeVar, get_args
+from typing import Annotated, Literal
 
 from dptse_env.model import Bounds
-from dptse_env.validation import finite, integer, non_negative, positive, require, sequence
+from dptse_env.utils.fields import Interval, checked_fields
 
 Linearisation = Literal["paper", "trajectory"]
 
@@ -15,47 +14,43 @@ Linearisation = Literal["paper", "trajectory"]
 REFUSED_SOLVERS = ("highs",)
 
 _PATH = "estimator_settings"
-_T = TypeVar("_T")
 
-
-def _name(path: str, value: object, allowed: tuple[str, ...]) -> None:
-    names = " or ".join(map(repr, allowed))
-    require(value in allowed, path, names, value)
+Deviation = Annotated[float, Interval(0, 10)]
+"""A standard deviation in units of rho_m or v_f."""
+ArrivalDeviation = Annotated[float, Interval(1e-6, 10)]
+"""The same, more than none."""
 
 
 @dataclass(frozen=True)
 class SigmaPointSettings:
-    """Where the unscented Kalman filter puts its points (van der Merwe, 2004), the paper's values.
+    """Sigma points of the unscented Kalman filter (van der Merwe, 2004), with the paper's values.
 
     Attributes:
-        alpha: Spread of the points, in (0, 1].
-        beta: Weight of the first point in covariances, >= 0; 2 suits normal distributions.
+        alpha: Spread of the points.
+        beta: Weight of the first point in covariances; 2 suits normal distributions.
         kappa: Secondary spread; above minus the number of states.
 
     Raises:
         ValueError: naming the field, its value and what is allowed.
     """
 
-    alpha: float = 0.1
-    beta: float = 2.0
-    kappa: float = -4.0
+    alpha: Annotated[float, Interval(1e-3, 1)] = 0.1
+    beta: Annotated[float, Interval(0, 100)] = 2.0
+    kappa: Annotated[float, Interval(-10_000, 10_000)] = -4.0
 
     def __post_init__(self) -> None:
         """Check values."""
-        alpha = positive(f"{_PATH}.ukf.alpha", self.alpha)
-        require(alpha <= 1.0, f"{_PATH}.ukf.alpha", "in (0, 1]", alpha)
-        non_negative(f"{_PATH}.ukf.beta", self.beta)
-        finite(f"{_PATH}.ukf.kappa", self.kappa)
+        checked_fields(self, f"{_PATH}.ukf")
 
 
 @dataclass(frozen=True)
 class EnsembleSettings:
-    """What the ensemble Kalman filter needs beside `EstimatorSettings`.
+    """Settings of the ensemble Kalman filter beside `EstimatorSettings`.
 
     Attributes:
-        n_members: Members of an ensemble, >= 2.
+        n_members: Members of an ensemble.
         inflation: Factor on the members' distances from their mean ahead of every update
-            (Anderson and Anderson, 1999), >= 1; 1 leaves them as they are.
+            (Anderson and Anderson, 1999); 1 leaves them as they are.
         taper: Distance along the road [km] from which a measurement no longer acts on a state
             (Gaspari and Cohn, 1999); None for no limit.
 
@@ -63,22 +58,18 @@ class EnsembleSettings:
         ValueError: naming the field, its value and what is allowed.
     """
 
-    n_members: int = 100
-    inflation: float = 1.0
-    taper: float | None = None
+    n_members: Annotated[int, Interval(2, 10_000)] = 100
+    inflation: Annotated[float, Interval(1, 10)] = 1.0
+    taper: Annotated[float, Interval(0, 1e6, open_low=True)] | None = None
 
     def __post_init__(self) -> None:
         """Check values."""
-        integer(f"{_PATH}.enkf.n_members", self.n_members, 2)
-        inflation = positive(f"{_PATH}.enkf.inflation", self.inflation)
-        require(inflation >= 1.0, f"{_PATH}.enkf.inflation", ">= 1", inflation)
-        if self.taper is not None:
-            positive(f"{_PATH}.enkf.taper", self.taper)
+        checked_fields(self, f"{_PATH}.enkf")
 
 
 @dataclass(frozen=True)
 class HorizonSettings:
-    """What a moving horizon estimator needs beside `EstimatorSettings`.
+    """Settings of the moving horizon estimator beside `EstimatorSettings`.
 
     The weights of the paper's objective (eq. 14) are inverse variances, so that H is the inverse
     covariance of the window: mu of `arrival_noise`, w_1 of the measurements' known noise and w_2
@@ -86,37 +77,31 @@ class HorizonSettings:
     `EstimatorSettings.initial_variance`.
 
     Attributes:
-        horizon: N, steps that the window reaches back, >= 1.
+        horizon: N, steps that the window reaches back.
         arrival_noise: Standard deviations of the predicted state at the window's start, of rho
             over rho_m and psi over rho_m v_f.
         linearisation: `paper`: each stage once, where it enters the window, at the mean of the
             solution before; `trajectory`: all stages anew at every step along that solution.
         bounds: `box`, the paper's, or `cone`: the program is held to the smallest box around the
             cone of physical states, and its last state is projected into the cone.
-        solver: Solver that qpsolvers is asked for.
+        solver: Name of a solver of qpsolvers.
 
     Raises:
         ValueError: naming the field, its value and what is allowed.
     """
 
-    horizon: int = 10
-    arrival_noise: tuple[float, float] = (0.03, 0.03)
+    horizon: Annotated[int, Interval(1, 1000)] = 10
+    arrival_noise: tuple[ArrivalDeviation, ArrivalDeviation] = (0.03, 0.03)
     linearisation: Linearisation = "paper"
     bounds: Bounds = "box"
     solver: str = "piqp"
 
     def __post_init__(self) -> None:
         """Check values; lists, as JSON has them, become tuples."""
-        path = f"{_PATH}.mhe"
-        object.__setattr__(self, "horizon", integer(f"{path}.horizon", self.horizon, 1))
-        pair = sequence(f"{path}.arrival_noise", self.arrival_noise, length=2)
-        noise = tuple(positive(f"{path}.arrival_noise[{i}]", v) for i, v in enumerate(pair))
-        object.__setattr__(self, "arrival_noise", noise)
-        _name(f"{path}.linearisation", self.linearisation, get_args(Linearisation))
-        _name(f"{path}.bounds", self.bounds, get_args(Bounds))
+        checked_fields(self, f"{_PATH}.mhe")
         if self.solver in REFUSED_SOLVERS:
             raise ValueError(
-                f"{path}.solver must not be {self.solver!r}, which reports false optima of "
+                f"{_PATH}.mhe.solver must not be {self.solver!r}, which reports false optima of "
                 "these programs as found; use 'piqp'"
             )
 
@@ -126,25 +111,25 @@ class EstimatorSettings:
     """Tuning of the estimators, in units of the jam density rho_m and of v_f.
 
     Attributes:
-        process_noise: Standard deviations of what the model misses in one step: of rho over
-            rho_m, of psi over rho_m v_f.
+        process_noise: Standard deviations of the process noise of one step: of rho over rho_m, of
+            psi over rho_m v_f.
         walk_noise: The same of the random walk: of rho over rho_m, of v over v_f.
         noise_scale: Factor on the known standard deviations of the measurements' noise, for an R
             that also covers what a count of vehicles says of a density; 1 is the mechanism's own.
         initial_variance: Variance of each normalised component of the prior.
-        bounds: Where means are held: the `cone` of physical states or the paper's `box`.
-        ukf: What the unscented Kalman filter needs beside these.
-        enkf: What the ensemble Kalman filter needs beside these.
-        mhe: What the moving horizon estimator needs beside these; its bounds are its own.
+        bounds: Set to which means are held: the `cone` of physical states or the paper's `box`.
+        ukf: Further settings of the unscented Kalman filter.
+        enkf: Further settings of the ensemble Kalman filter.
+        mhe: Further settings of the moving horizon estimator, which has bounds of its own.
 
     Raises:
         ValueError: naming the field, its value and what is allowed.
     """
 
-    process_noise: tuple[float, float] = (0.01, 0.01)
-    walk_noise: tuple[float, float] = (0.025, 0.025)
-    noise_scale: float = 1.0
-    initial_variance: float = 1e-3
+    process_noise: tuple[Deviation, Deviation] = (0.01, 0.01)
+    walk_noise: tuple[Deviation, Deviation] = (0.025, 0.025)
+    noise_scale: Annotated[float, Interval(1e-6, 1000)] = 1.0
+    initial_variance: Annotated[float, Interval(0, 100, open_low=True)] = 1e-3
     bounds: Bounds = "cone"
     ukf: SigmaPointSettings = field(default_factory=SigmaPointSettings)
     enkf: EnsembleSettings = field(default_factory=EnsembleSettings)
@@ -152,22 +137,4 @@ class EstimatorSettings:
 
     def __post_init__(self) -> None:
         """Check values; lists, as JSON has them, become tuples."""
-        for name in ("process_noise", "walk_noise"):
-            path = f"{_PATH}.{name}"
-            pair = sequence(path, getattr(self, name), length=2)
-            noise = tuple(non_negative(f"{path}[{i}]", value) for i, value in enumerate(pair))
-            object.__setattr__(self, name, noise)
-        for name in ("noise_scale", "initial_variance"):
-            object.__setattr__(self, name, positive(f"{_PATH}.{name}", getattr(self, name)))
-        _name(f"{_PATH}.bounds", self.bounds, get_args(Bounds))
-        for name, own in (
-            ("ukf", SigmaPointSettings),
-            ("enkf", EnsembleSettings),
-            ("mhe", HorizonSettings),
-        ):
-            object.__setattr__(self, name, _built(own, getattr(self, name)))
-
-
-def _built(cls: type[_T], value: Any) -> _T:
-    """A nested dataclass, also from its dict."""
-    return cls(**value) if isinstance(value, Mapping) else value
+        checked_fields(self, _PATH)

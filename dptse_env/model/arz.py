@@ -8,26 +8,23 @@ demand [veh/h, km/h] and how full they are [veh/km]. Every array has a leading b
 
 from __future__ import annotations
 
-import math
 from typing import Literal, NamedTuple
 
 import numpy as np
 
 from dptse_env.model.jacobian import step_jacobian
-from dptse_env.model.network import FloatArray, Layout, RoadNetwork, layout_of
-from dptse_env.model.parameters import ARZParameters
+from dptse_env.model.layout import FloatArray, Layout, RoadNetwork, layout_of
+from dptse_env.model.parameters import LARGEST_W, SECONDS_PER_HOUR, ARZParameters
 from dptse_env.model.relations import VACUUM, Relations
-from dptse_env.validation import non_negative
+from dptse_env.utils.validation import non_negative
 
 Bounds = Literal["cone", "box"]
 
-SECONDS_PER_HOUR = 3600.0
 # The cone of physical states: 1 veh/km <= rho <= rho_m, v >= 0 and 0.4 v_f <= w <= 1.1 v_f. The
 # lower bound on w keeps a nearly empty cell from standing still: there the supply changes with the
 # state as w / rho, and a filter that believes it diverges.
 LEAST_DENSITY = 1.0
 LEAST_W = 0.4
-LARGEST_W = 1.1
 # Share of the jam density below which a measurement takes the density for constant: dv/drho
 # grows as psi / rho^2, and a filter that believes it diverges.
 MEASUREMENT_FLOOR = 0.01
@@ -104,27 +101,14 @@ class ARZModel:
             second = self.density_scale
         self.measurement_scale = np.array([self.density_scale, second * self.speed_scale])
         self.largest_speed = LARGEST_W * parameters.free_flow_speed
-        if not 0.0 < time_step <= self.largest_time_step:
-            # Rounded down, so that the number named is itself admissible.
-            largest = math.floor(100.0 * self.largest_time_step) / 100.0
-            raise ValueError(
-                f"model.time_step must be > 0 and at most {largest:.2f} s (CFL condition of "
-                f"parameters {parameters.name!r}), got {time_step}"
-            )
+        parameters.require_time_step(time_step, network.segment_length)
         self.step_ratio = time_step / SECONDS_PER_HOUR / network.segment_length  # T / l [h/km]
         self.relaxation = time_step / parameters.relaxation_time  # T / tau
 
     @property
     def largest_time_step(self) -> float:
-        """Largest T [s] of the CFL condition.
-
-        Forwards, no cell sends more than it holds: (T/l) w <= 1 - T/tau up to w = 1.1 v_f.
-        Backwards, no wave crosses more than a cell; the fastest, gamma v_f, runs out of a jam.
-        """
-        p = self.parameters
-        crossing = SECONDS_PER_HOUR * self.network.segment_length / p.free_flow_speed
-        forwards = 1.0 / (LARGEST_W / crossing + 1.0 / p.relaxation_time)
-        return min(forwards, crossing / p.gamma)
+        """Largest T [s] of the CFL condition, see `ARZParameters.largest_time_step`."""
+        return self.parameters.largest_time_step(self.network.segment_length)
 
     # States -------------------------------------------------------------------------------------
 

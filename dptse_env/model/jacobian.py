@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from dptse_env.model.network import BoolArray, FloatArray
+from dptse_env.model.layout import BoolArray, FloatArray
 from dptse_env.model.relations import STANDING, VACUUM
 
 if TYPE_CHECKING:

@@ -5,14 +5,20 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
+from functools import cache
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from dptse_env.validation import integer, positive
+from dptse_env.utils.fields import Interval, checked_fields, from_mapping
+from dptse_env.utils.json_object import parse_object
 
 _SETS = resources.files("dptse_env.model") / "sets"
+
+SECONDS_PER_HOUR = 3600.0
+LARGEST_W = 1.1
+"""Largest w of a physical state, in units of v_f."""
 
 
 @dataclass(frozen=True)
@@ -20,10 +26,10 @@ class ARZParameters:
     """Parameters of the pressure `p(rho) = v_f (rho / rho_m)^gamma` and of the relaxation.
 
     Attributes:
-        name: What the set is called in tables and messages.
+        name: Name of the set in tables and messages.
         free_flow_speed: v_f [km/h]; also the w that drivers relax towards.
         jam_density: rho_m [veh/km] of a road of `lanes` lanes; other cells scale with their lanes.
-        gamma: Exponent of the pressure [-]; any positive value, fits of real traffic reach 0.4.
+        gamma: Exponent of the pressure [-]; fits of real traffic reach down to 0.4.
         relaxation_time: tau [s]; infinite for no relaxation.
         lanes: Lanes of the road that `jam_density` is for.
 
@@ -32,42 +38,55 @@ class ARZParameters:
     """
 
     name: str
-    free_flow_speed: float
-    jam_density: float
-    gamma: float
-    relaxation_time: float
-    lanes: int = 3
+    free_flow_speed: Annotated[float, Interval(0.1, 1000)]
+    jam_density: Annotated[float, Interval(0.01, 100_000)]
+    gamma: Annotated[float, Interval(0.01, 100)]
+    relaxation_time: Annotated[float, Interval(0, math.inf, open_low=True)]
+    lanes: Annotated[int, Interval(1, 16)] = 3
 
     def __post_init__(self) -> None:
         """Refuse values without physical meaning."""
-        for field in ("free_flow_speed", "jam_density", "gamma", "relaxation_time"):
-            value = getattr(self, field)
-            if field == "relaxation_time" and value == math.inf:
-                continue
-            object.__setattr__(self, field, positive(f"parameters.{field}", value))
-        object.__setattr__(self, "lanes", integer("parameters.lanes", self.lanes, 1))
+        checked_fields(self, "parameters")
 
     @classmethod
     def from_mapping(cls, mapping: Mapping[str, Any]) -> ARZParameters:
         """Build from a mapping of field names; unknown and missing keys are refused by name."""
-        known = {field.name for field in fields(cls)}
-        for key in mapping:
-            if key not in known:
-                raise ValueError(
-                    f"parameters.{key} is unknown, allowed are {', '.join(sorted(known))}"
-                )
-        for key in sorted(known - {"lanes"}):
-            if key not in mapping:
-                raise ValueError(f"parameters.{key} is missing")
-        return cls(**mapping)
+        return from_mapping(cls, mapping, "parameters")
+
+    def largest_time_step(self, segment_length: float) -> float:
+        """Return the largest time step T [s] of the CFL condition for segments of a length [km].
+
+        Forwards, no cell sends more than it holds: (T/l) w <= 1 - T/tau up to w = 1.1 v_f.
+        Backwards, no wave crosses more than a cell; the fastest, gamma v_f, runs out of a jam.
+        """
+        crossing = SECONDS_PER_HOUR * segment_length / self.free_flow_speed
+        forwards = 1.0 / (LARGEST_W / crossing + 1.0 / self.relaxation_time)
+        return min(forwards, crossing / self.gamma)
+
+    def require_time_step(self, time_step: float, segment_length: float) -> None:
+        """Refuse a time step [s] that violates the CFL condition.
+
+        Raises:
+            ValueError: It does; the message names the largest one that does not.
+        """
+        largest = self.largest_time_step(segment_length)
+        if not 0.0 < time_step <= largest:
+            # Rounded down, so that the number named is itself admissible.
+            named = math.floor(100.0 * largest) / 100.0
+            raise ValueError(
+                f"model.time_step must be > 0 and at most {named:.2f} s (CFL condition of "
+                f"parameters {self.name!r}), got {time_step}"
+            )
 
 
+@cache
 def available_parameters() -> tuple[str, ...]:
     """Names of the sets that ship with the package, sorted."""
     names = (entry.name for entry in _SETS.iterdir())
     return tuple(sorted(name.removesuffix(".json") for name in names if name.endswith(".json")))
 
 
+@cache
 def load_parameters(name: str) -> ARZParameters:
     """Load a set that ships with the package.
 
@@ -78,12 +97,18 @@ def load_parameters(name: str) -> ARZParameters:
         raise ValueError(
             f"parameters must be one of {', '.join(available_parameters())}, got {name!r}"
         )
-    return _parse(_SETS.joinpath(f"{name}.json").read_text(encoding="utf-8"))
+    entry = _SETS.joinpath(f"{name}.json")
+    return _parse(entry.read_text(encoding="utf-8"), str(entry))
 
 
 def read_parameters(path: str | Path) -> ARZParameters:
-    """Read a set from a JSON file of the shape that `write_parameters` leaves."""
-    return _parse(Path(path).read_text(encoding="utf-8"))
+    """Read a set from a JSON file of the shape that `write_parameters` leaves.
+
+    Raises:
+        ValueError: The file has another shape or a value is out of range; the message starts with
+            the path of the file.
+    """
+    return _parse(Path(path).read_text(encoding="utf-8"), str(path))
 
 
 def write_parameters(
@@ -94,8 +119,9 @@ def write_parameters(
     Path(path).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 
-def _parse(text: str) -> ARZParameters:
-    content = json.loads(text)
-    if not isinstance(content, dict) or not isinstance(content.get("parameters"), dict):
-        raise ValueError("a parameter file must be a JSON object with the key 'parameters'")
-    return ARZParameters.from_mapping(content["parameters"])
+def _parse(text: str, path: str) -> ARZParameters:
+    content = parse_object(text, path, {"parameters": dict, "provenance": dict})
+    try:
+        return ARZParameters.from_mapping(content["parameters"])
+    except ValueError as problem:
+        raise ValueError(f"{path}: {problem}") from problem

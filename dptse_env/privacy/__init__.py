@@ -1,14 +1,6 @@
-"""Differential privacy: mechanisms, sensitivity, accounting."""
+"""Differential privacy, mathematics only: Gaussian relations, sensitivities, noise, accounts."""
 
-from dptse_env.privacy.accountant import Accountant, PrivacyReport, ReleaseReport
-from dptse_env.privacy.calibration import (
-    PRESETS,
-    BoundaryInputs,
-    PrivacySettings,
-    SpeedRelease,
-    Unit,
-    noise_std,
-)
+from dptse_env.privacy.account import ReleaseAccount
 from dptse_env.privacy.gaussian import (
     analytic_multiplier,
     compose,
@@ -17,8 +9,7 @@ from dptse_env.privacy.gaussian import (
     le_ny_kappa,
     mu_of,
 )
-from dptse_env.privacy.mechanism import GaussianMechanism, Mechanism
-from dptse_env.privacy.reasons import VOID_REASONS, VoidReason
+from dptse_env.privacy.noise_std import joint_noise_std, printed_noise_std, single_noise_std
 from dptse_env.privacy.sensitivity import (
     Adjacency,
     ReleaseSensitivity,
@@ -28,28 +19,19 @@ from dptse_env.privacy.sensitivity import (
 )
 
 __all__ = [
-    "PRESETS",
-    "VOID_REASONS",
-    "Accountant",
     "Adjacency",
-    "BoundaryInputs",
-    "GaussianMechanism",
-    "Mechanism",
-    "PrivacyReport",
-    "PrivacySettings",
-    "ReleaseReport",
+    "ReleaseAccount",
     "ReleaseSensitivity",
     "Sensitivity",
-    "SpeedRelease",
-    "Unit",
-    "VoidReason",
     "analytic_multiplier",
     "compose",
     "contribution_sensitivity",
     "delta_of",
     "epsilon_of",
+    "joint_noise_std",
     "le_ny_kappa",
     "mu_of",
-    "noise_std",
     "paper_sensitivity",
+    "printed_noise_std",
+    "single_noise_std",
 ]

@@ -22,7 +22,7 @@ from collections.abc import Iterable
 from scipy.optimize import brentq
 from scipy.special import erfcx, log_ndtr, ndtri
 
-from dptse_env.validation import inside, positive
+from dptse_env.utils.validation import inside, positive
 
 __all__ = ["analytic_multiplier", "compose", "delta_of", "epsilon_of", "le_ny_kappa", "mu_of"]
 

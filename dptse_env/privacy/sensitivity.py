@@ -10,8 +10,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
-from dptse_env.privacy.reasons import VoidReason
-from dptse_env.validation import integer, positive
+from dptse_env.utils.validation import integer, positive
 
 __all__ = [
     "Adjacency",
@@ -46,18 +45,14 @@ class Sensitivity:
 
     Attributes:
         releases: one for each released quantity, in the order of the last axis of a release.
-        protects: whose data the two adjacent records differ in, and how.
         assumptions: the public numbers the bounds were computed from, by name with unit.
-        void_reasons: why the bounds fail to hold, in the environment's own setting.
         extremes: the bounds that can be met together, each with one number for each release in its
             unit; left out, all bounds can be met at once.
         contributions: C, released steps that a vehicle's data can enter; None if not bounded.
     """
 
     releases: tuple[ReleaseSensitivity, ...]
-    protects: str
     assumptions: tuple[tuple[str, int | float], ...]
-    void_reasons: tuple[VoidReason, ...] = ()
     extremes: tuple[tuple[float, ...], ...] = ()
     contributions: int | None = None
 
@@ -91,7 +86,7 @@ def paper_sensitivity(
     The differing vehicle passes each of `n_sensors` static sensors once in either record, at
     different times, and stays for `average_dwell` steps. While it does, the density there differs
     by one vehicle over the segment's length, and the speed by the slope of the equilibrium
-    relation (with exponent 1) times that. The void reasons say what this overlooks.
+    relation (with exponent 1) times that. ``docs/privacy.md`` says what this overlooks.
 
     Args:
         n_sensors: observed segments at a step: queried segments plus fixed sensors.
@@ -121,9 +116,7 @@ def paper_sensitivity(
             ReleaseSensitivity("density", "veh/km", density),
             ReleaseSensitivity("speed", "km/h", speed),
         ),
-        protects="one vehicle's trip, replaced by another",
         assumptions=(("n_sensors", n_sensors), ("average_dwell_steps", average_dwell)),
-        void_reasons=("average_dwell", "adaptive_queries", "speed_sensitivity"),
     )
 
 
@@ -133,7 +126,6 @@ def contribution_sensitivity(
     adjacency: Adjacency,
     segment_length: float,
     largest_speed: float,
-    protects: str,
     mean_speed_slope: float | None = None,
 ) -> Sensitivity:
     """Sensitivities of density and centred flow where a vehicle counts in so many steps at most.
@@ -152,7 +144,6 @@ def contribution_sensitivity(
         adjacency: how two records differ.
         segment_length: l [km].
         largest_speed: v_max [km/h], a public constant that recorded speeds are clipped to.
-        protects: whose data the two adjacent records differ in, and how.
         mean_speed_slope: where mean speeds are released in place of flows, the paper's relation
             Delta_v / Delta_rho [km/h per veh/km], which does not hold.
 
@@ -169,19 +160,16 @@ def contribution_sensitivity(
         density, flow = math.sqrt(2.0) * density, math.sqrt(2.0) * flow
     extremes: tuple[tuple[float, ...], ...] = ((density, flow), (0.0, same_segment))
     second = ReleaseSensitivity("flow", "veh/h", max(flow, same_segment))
-    void_reasons: tuple[VoidReason, ...] = ()
     if mean_speed_slope is not None:
         second = ReleaseSensitivity("speed", "km/h", mean_speed_slope * density)
-        extremes, void_reasons = (), ("speed_sensitivity",)
+        extremes = ()
     return Sensitivity(
         releases=(ReleaseSensitivity("density", "veh/km", density), second),
-        protects=protects,
         assumptions=(
             ("contributions", contributions),
             ("segment_length_km", segment_length),
             ("largest_speed_km_h", largest_speed),
         ),
-        void_reasons=void_reasons,
         extremes=extremes,
         contributions=contributions,
     )

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from dptse_env.config import EnvConfig
-from dptse_env.interface import QueryInterface
+from dptse_env.parts import make_interface
 
 CENTRES = {
     "density": (0.15, 0.15),
@@ -78,7 +78,7 @@ class RoadChannels:
     def of(cls, config: EnvConfig) -> RoadChannels:
         """Lay out the observations of an environment of ``config``."""
         corridor, n = config.corridor, config.corridor.n_mainline
-        encoding = QueryInterface.of(config).observations
+        encoding = make_interface(config).observations
         starts = {name: place.start for name, place in encoding.slices.items()}
         released = [name for name in starts if name.startswith("released_")]
         joins = {n + k: face for k, face in enumerate(corridor.on_ramps)}

@@ -17,12 +17,12 @@ import numpy as np
 import torch
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 
-from dptse_env.arrays import Action, Observation
 from dptse_env.config import EnvConfig
-from dptse_env.interface import QueryInterface
+from dptse_env.parts import QueryInterface, make_interface
 from dptse_env.policies import CARD, TRANSFERABLE, read_policy
 from dptse_env.sb3.channels import RoadChannels
 from dptse_env.sb3.policy import PlackettLucePolicy
+from dptse_env.utils.arrays import Action, Observation
 
 FORMAT = "dptse-policy"
 VERSION = 1
@@ -140,7 +140,7 @@ _KINDS = {
 
 def fit_of(config: EnvConfig) -> dict[str, Any]:
     """Return what a policy for ``config`` must fit, as plain JSON; keys as in `MUST_FIT`."""
-    encoding = QueryInterface.of(config).observations
+    encoding = make_interface(config).observations
     sizes = [f"{name}:{place.stop - place.start}" for name, place in encoding.slices.items()]
     return {
         "format": f"{FORMAT}-{VERSION}",
@@ -252,7 +252,7 @@ def load_policy(
         raise ValueError(
             f"policy {str(source)!r} does not fit: {'; '.join(differing)}{_hint(allow)}"
         )
-    interface = QueryInterface.of(config)
+    interface = make_interface(config)
     made = card["policy"]
     policy = _KINDS[made["class"]].make(config, interface, made["arguments"])
     absent = policy.load_state_dict(weights, strict=False).missing_keys

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
-from dptse_env.arrays import Action, Observation
-from dptse_env.infos import row_of
+from dptse_env.utils.arrays import Action, Observation
+from dptse_env.utils.vector_info import row_of
 from dptse_env.vector_env import SensorQueryVectorEnv
 
 _MASKS = "action_masks"

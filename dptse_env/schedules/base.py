@@ -7,9 +7,9 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from dptse_env.arrays import Action, BoolArray, FloatArray, IntArray, Observation
-from dptse_env.interface import QueryInterface
+from dptse_env.parts import QueryInterface
 from dptse_env.process import QueryProcess
+from dptse_env.utils.arrays import Action, BoolArray, FloatArray, IntArray, Observation
 
 
 class ScheduleState(NamedTuple):

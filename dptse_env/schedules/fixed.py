@@ -6,10 +6,10 @@ from typing import ClassVar
 
 import numpy as np
 
-from dptse_env.arrays import BoolArray, IntArray, Observation
-from dptse_env.interface import QueryInterface
-from dptse_env.observations import AGE_CAP
+from dptse_env.parts import QueryInterface
 from dptse_env.schedules.base import Schedule
+from dptse_env.spaces.observations import AGE_CAP
+from dptse_env.utils.arrays import BoolArray, IntArray, Observation
 
 
 class Shifting(Schedule):

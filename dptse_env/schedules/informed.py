@@ -8,13 +8,13 @@ from typing import ClassVar, Protocol, cast
 
 import numpy as np
 
-from dptse_env.arrays import BoolArray, FloatArray, IntArray, Observation
-from dptse_env.model.road import road_of
+from dptse_env.model.road_arrays import road_of
 from dptse_env.process import QueryProcess
-from dptse_env.schedules import kernels
+from dptse_env.schedules import greedy_kernels as kernels
 from dptse_env.schedules.base import BoundSchedule
-from dptse_env.schedules.outlook import Problem
-from dptse_env.validation import non_negative, positive, sequence
+from dptse_env.schedules.covariance_kernels import Problem
+from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray, Observation
+from dptse_env.utils.validation import non_negative, positive, sequence
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ class Informed(BoundSchedule):
 
     def _choose(self, rows: IntArray, step: IntArray, observation: Observation) -> BoolArray:
         process = self.process
-        inputs = process.boundary.inputs(rows, process.slot[rows], process.time[rows])
+        inputs = process.boundary.inputs(rows, process.traffic_index[rows], process.time[rows])
         means, covariances = self._estimator.states[rows], self._present(rows)
         queried = np.empty((len(rows), self.n_mainline), dtype=bool)
         self._select(means, covariances, np.ascontiguousarray(inputs), queried)
@@ -201,7 +201,7 @@ def _problem(process: QueryProcess, caution: Caution) -> Problem:
     config, model = process.config, process.model
     corridor, settings, term = config.corridor, config.settings(), process.interface.reward.term
     n, rho_m, v_f = corridor.n_mainline, model.density_scale, model.speed_scale
-    sigma = settings.noise_scale * process.mechanism.sigma / model.measurement_scale
+    sigma = settings.noise_scale * process.release.sigma / model.measurement_scale
     is_walk = config.estimator == "random_walk"
     noise = settings.walk_noise if is_walk else settings.process_noise
     always = np.array(sorted(corridor.fixed_sensors), dtype=np.int64)

@@ -11,11 +11,12 @@ from typing import ClassVar
 
 import numpy as np
 
-from dptse_env.arrays import BoolArray, FloatArray, IntArray, Observation
 from dptse_env.estimators import Estimator
 from dptse_env.process import QueryProcess
-from dptse_env.rewards import estimation_error
+from dptse_env.release import ReleaseRequest
 from dptse_env.schedules.base import BoundSchedule
+from dptse_env.spaces.rewards import ScoredSecond, estimation_error
+from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray, Observation
 
 MOST_SETS = 1_000
 """Sets of segments that the brute force tries at most in a step."""
@@ -78,13 +79,19 @@ class _Realised(BoundSchedule):
 
     def _look(self, episodes: IntArray) -> _Next:
         ahead = self.process.fork()
-        slots, times = ahead.slot[episodes], ahead.time[episodes]
+        traffic, times = ahead.traffic_index[episodes], ahead.time[episodes]
         n = ahead.config.corridor.n_segments
-        ahead.estimator.predict(episodes, ahead.boundary.inputs(episodes, slots, times))
-        everywhere = np.ones((len(episodes), n + ahead.boundary.n_released), dtype=bool)
-        answers = ahead.answers.collect(episodes, slots, times + 1, everywhere)
-        released = ahead.mechanism.release(episodes, answers)
-        truth = ahead.sensing.aggregates(slots, times + 1)
+        ahead.estimator.predict(episodes, ahead.boundary.inputs(episodes, traffic, times))
+        everywhere = np.ones((len(episodes), ahead.release.setup.n_columns), dtype=bool)
+        request = ReleaseRequest(
+            episodes,
+            traffic,
+            times + 1,
+            everywhere,
+            lambda: ahead.estimator.estimate().at(episodes),
+        )
+        released = ahead.release.release(request).values
+        truth = ahead.traffic.aggregates(traffic, times + 1)
         return _Next(episodes, truth, released[:, :n], ahead.estimator)
 
     def _reward(self, coming: _Next, queried: BoolArray) -> FloatArray:
@@ -94,13 +101,14 @@ class _Realised(BoundSchedule):
         observed[:, [*process.config.corridor.fixed_sensors]] = True
         observed[:, :n] |= queried
         estimator = _copied(coming.estimator)
-        estimator.update(episodes, observed, coming.released, process.mechanism.sigma)
+        estimator.update(episodes, observed, coming.released, process.release.sigma)
         estimate, truth = estimator.estimate().at(episodes), coming.truth[:, :n]
-        return self.interface.reward.value(
-            estimation_error(
-                truth[..., 0], truth[..., 1], estimate.density[:, :n], estimate.speed[:, :n]
-            )
+        density, speed = truth[..., 0], truth[..., 1]
+        error = estimation_error(density, speed, estimate.density[:, :n], estimate.speed[:, :n])
+        rewards: FloatArray = self.interface.reward(
+            ScoredSecond(error, density, speed, estimate, queried, process.config.corridor)
         )
+        return rewards
 
 
 class OracleGreedy(_Realised):

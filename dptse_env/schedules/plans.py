@@ -12,10 +12,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from dptse_env.arrays import BoolArray, IntArray, Observation
 from dptse_env.config import EnvConfig
 from dptse_env.process import QueryProcess
 from dptse_env.schedules.base import Schedule
+from dptse_env.utils.arrays import BoolArray, IntArray, Observation
+from dptse_env.utils.json_object import parse_object
 
 PLANS = ("best-static", "offline")
 """Kinds of plans: one set for all time, a period of sets."""
@@ -177,16 +178,7 @@ def _holds(plan: Plan, segment: int) -> int:
 
 
 def _parse(text: str, path: str) -> Plan:
-    try:
-        content = json.loads(text)
-    except json.JSONDecodeError as problem:
-        raise ValueError(f"{path} must be JSON: {problem}") from problem
-    if not isinstance(content, dict) or set(content) != set(_KEYS):
-        got = sorted(content) if isinstance(content, dict) else content
-        raise ValueError(f"{path} must be a mapping with the keys {', '.join(_KEYS)}, got {got!r}")
-    for key, kind in _KEYS.items():
-        if not isinstance(content[key], kind) or isinstance(content[key], bool):
-            raise ValueError(f"{path}: {key} must be of type {kind.__name__}, got {content[key]!r}")
+    content = parse_object(text, path, _KEYS)
     if content["kind"] not in PLANS:
         raise ValueError(f"{path}: kind must be one of {', '.join(PLANS)}, got {content['kind']!r}")
     place = Place(*(content[name] for name in ("corridor", "digest", "estimator", "bandwidth")))

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from dptse_env.arrays import BoolArray, FloatArray
 from dptse_env.process import QueryProcess
-from dptse_env.schedules import kernels
+from dptse_env.schedules import greedy_kernels as kernels
 from dptse_env.schedules.informed import WARY, Caution, Informed
-from dptse_env.validation import integer
+from dptse_env.utils.arrays import BoolArray, FloatArray
+from dptse_env.utils.validation import integer
 
 
 class Rollout(Informed):

@@ -1,17 +1,23 @@
 """Traffic: corridors, SUMO recordings and the library of records.
 
-Importing this room does not import libsumo; only making a record does.
+Importing this package does not import libsumo; only making a record does.
 """
 
 from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.demand import Demand, DemandDistribution
 from dptse_env.traffic.incident import Incident, IncidentDistribution
 from dptse_env.traffic.library import RecordLibrary
-from dptse_env.traffic.network import NetworkError
-from dptse_env.traffic.presets import CORRIDORS, PAPER_HIGHWAY, SHORT_HIGHWAY, randomised
+from dptse_env.traffic.presets import (
+    CORRIDORS,
+    PAPER_HIGHWAY,
+    SHORT_HIGHWAY,
+    find_corridor,
+    randomised,
+)
 from dptse_env.traffic.record import InvalidRecordError, Record, mean_dwell
 from dptse_env.traffic.scenario import MAINLINE, Scenario
 from dptse_env.traffic.sumo import RecordingError, SumoVersionError, simulate
+from dptse_env.traffic.sumo_network import NetworkError
 from dptse_env.traffic.worker import simulate_in_child
 
 __all__ = [
@@ -31,6 +37,7 @@ __all__ = [
     "RecordingError",
     "Scenario",
     "SumoVersionError",
+    "find_corridor",
     "mean_dwell",
     "randomised",
     "simulate",

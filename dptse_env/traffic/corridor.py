@@ -1,4 +1,4 @@
-"""The road: its geometry, who wants to use it, what goes wrong on it, and two presets.
+"""The road: its geometry, its demand and its incident.
 
 Segments are numbered from 0: the mainline first, then the on-ramps, then the off-ramps. A ramp at
 face j sits between the mainline segments j-1 and j. Around these S segments lie boundary segments
@@ -12,14 +12,23 @@ import json
 import re
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Annotated
 
 from dptse_env.traffic.demand import Demand, DemandDistribution
 from dptse_env.traffic.incident import Incident, IncidentDistribution
 from dptse_env.traffic.scenario import Scenario, draw_scenario
-from dptse_env.validation import integer, positive, require, sequence
+from dptse_env.utils.fields import Interval, checked_fields
+from dptse_env.utils.validation import integer, require
 
 NOT_TRAFFIC = ("name", "fixed_sensors", "density_scale", "speed_scale", "average_dwell")
 """Fields that describe how the traffic is observed and leave the traffic itself alone."""
+
+Face = Annotated[int, Interval(1, 999)]
+"""Number of a face between two mainline segments."""
+Share = Annotated[float, Interval(0, 1, open_low=True, open_high=True)]
+"""Share of the vehicles that pass an off-ramp."""
+Lanes = Annotated[int, Interval(1, 16)]
+"""Number of lanes."""
 
 
 @dataclass(frozen=True)
@@ -50,21 +59,22 @@ class Corridor:
     """
 
     name: str
-    n_mainline: int
-    on_ramps: tuple[int, ...]
-    off_ramps: tuple[int, ...]
-    exit_shares: tuple[float, ...]
+    n_mainline: Annotated[int, Interval(2, 1000)]
+    on_ramps: tuple[Face, ...]
+    off_ramps: tuple[Face, ...]
+    exit_shares: tuple[Share, ...]
     demand: Demand | DemandDistribution
     incident: Incident | IncidentDistribution | None
-    fixed_sensors: tuple[int, ...]
-    duration: int
-    lanes: int = 3
-    ramp_lanes: int = 1
-    segment_length: float = 0.1
-    speed_limit: float = 102.0
-    density_scale: float = 333.0
-    speed_scale: float = 102.0
-    average_dwell: float = 8.0
+    fixed_sensors: tuple[Annotated[int, Interval(0, 2997)], ...]
+    duration: Annotated[int, Interval(1, 100_000)]
+    lanes: Lanes = 3
+    ramp_lanes: Lanes = 1
+    # SUMO cannot drive an edge shorter than about a vehicle and its gap.
+    segment_length: Annotated[float, Interval(0.04, 10)] = 0.1
+    speed_limit: Annotated[float, Interval(1, 1000)] = 102.0
+    density_scale: Annotated[float, Interval(1, 100_000)] = 333.0
+    speed_scale: Annotated[float, Interval(1, 1000)] = 102.0
+    average_dwell: Annotated[float, Interval(0.01, 1e6)] = 8.0
 
     def __post_init__(self) -> None:
         """Check the fields and bring them to their declared types."""
@@ -74,66 +84,41 @@ class Corridor:
             "lower-case letters, digits and hyphens",
             self.name,
         )
-        for field, low in (("n_mainline", 2), ("duration", 1), ("lanes", 1)):
-            self._set(field, integer(f"corridor.{field}", getattr(self, field), low))
-        ramp_lanes = integer("corridor.ramp_lanes", self.ramp_lanes, 1, self.lanes)
-        self._set("ramp_lanes", ramp_lanes)
-        for field in (
-            "segment_length",
-            "speed_limit",
-            "density_scale",
-            "speed_scale",
-            "average_dwell",
-        ):
-            self._set(field, positive(f"corridor.{field}", getattr(self, field)))
-        # SUMO cannot drive an edge shorter than about a vehicle and its gap.
+        checked_fields(self, "corridor")
         require(
-            self.segment_length >= 0.04,
-            "corridor.segment_length",
-            "at least 0.04 km",
-            self.segment_length,
+            self.ramp_lanes <= self.lanes,
+            "corridor.ramp_lanes",
+            f"<= {self.lanes} lanes",
+            self.ramp_lanes,
         )
         self._check_ramps()
-        self._check_sensors()
+        sensors = self.fixed_sensors
+        for i, sensor in enumerate(sensors):
+            integer(f"corridor.fixed_sensors[{i}]", sensor, 0, self.n_segments - 1)
+        unique = len(set(sensors)) == len(sensors)
+        require(unique, "corridor.fixed_sensors", "free of duplicates", sensors)
         self._check_demand()
         self._check_incident()
 
-    def _set(self, field: str, value: object) -> None:
-        object.__setattr__(self, field, value)
-
     def _check_ramps(self) -> None:
-        last_face = self.n_mainline - 1
         for field in ("on_ramps", "off_ramps"):
-            path = f"corridor.{field}"
-            faces = tuple(
-                integer(f"{path}[{i}]", face, 1, last_face)
-                for i, face in enumerate(sequence(path, getattr(self, field)))
-            )
-            require(list(faces) == sorted(set(faces)), path, "increasing", faces)
-            self._set(field, faces)
+            faces = getattr(self, field)
+            for i, face in enumerate(faces):
+                integer(f"corridor.{field}[{i}]", face, 1, self.n_mainline - 1)
+            increasing = list(faces) == sorted(set(faces))
+            require(increasing, f"corridor.{field}", "increasing", faces)
         require(
             not set(self.on_ramps) & set(self.off_ramps),
             "corridor.off_ramps",
             f"at other faces than the on-ramps {self.on_ramps}",
             self.off_ramps,
         )
-        path = "corridor.exit_shares"
-        shares = tuple(
-            positive(f"{path}[{i}]", share)
-            for i, share in enumerate(sequence(path, self.exit_shares, len(self.off_ramps)))
+        require(
+            len(self.exit_shares) == len(self.off_ramps),
+            "corridor.exit_shares",
+            f"one share for each of the {len(self.off_ramps)} off-ramps",
+            self.exit_shares,
         )
-        for i, share in enumerate(shares):
-            require(share < 1.0, f"{path}[{i}]", "in (0, 1)", share)
-        self._set("exit_shares", shares)
-
-    def _check_sensors(self) -> None:
-        path = "corridor.fixed_sensors"
-        sensors = tuple(
-            integer(f"{path}[{i}]", sensor, 0, self.n_segments - 1)
-            for i, sensor in enumerate(sequence(path, self.fixed_sensors))
-        )
-        require(len(set(sensors)) == len(sensors), path, "free of duplicates", sensors)
-        self._set("fixed_sensors", sensors)
 
     def _check_demand(self) -> None:
         demand = self.demand.base if isinstance(self.demand, DemandDistribution) else self.demand

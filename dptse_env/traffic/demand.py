@@ -1,10 +1,19 @@
-"""How many vehicles want to enter: a fixed demand, or a range from which each seed draws one."""
+"""Demand: arrival rates of vehicles, fixed or drawn for every traffic seed."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
-from dptse_env.validation import interval, non_negative, require, sequence
+from dptse_env.utils.fields import Interval, checked_fields
+from dptse_env.utils.validation import require
+
+Rate = Annotated[float, Interval(0, 100_000)]
+"""Vehicles an hour."""
+Second = Annotated[float, Interval(0, 1e6)]
+"""Seconds of simulated time."""
+Factor = Annotated[float, Interval(0, 100, open_low=True)]
+"""Factor on every rate."""
 
 
 @dataclass(frozen=True)
@@ -20,33 +29,19 @@ class Demand:
         ValueError: if a rate is negative or the times do not start at 0 and increase.
     """
 
-    mainline: tuple[tuple[float, float], ...]
-    on_ramps: tuple[float, ...] = ()
+    mainline: tuple[tuple[Second, Rate], ...]
+    on_ramps: tuple[Rate, ...] = ()
 
     def __post_init__(self) -> None:
         """Check the fields and bring them to their declared types."""
-        steps = []
-        for i, step in enumerate(sequence("demand.mainline", self.mainline)):
-            time, rate = sequence(f"demand.mainline[{i}]", step, length=2)
-            steps.append(
-                (
-                    non_negative(f"demand.mainline[{i}] time", time),
-                    non_negative(f"demand.mainline[{i}] rate", rate),
-                )
-            )
-        times = np.array([time for time, _ in steps])
+        checked_fields(self, "demand")
+        times = np.array([time for time, _ in self.mainline])
         require(
             len(times) > 0 and times[0] == 0.0 and bool(np.all(np.diff(times) > 0)),
             "demand.mainline",
             "steps (time, rate) whose times start at 0 and increase",
             self.mainline,
         )
-        ramps = tuple(
-            non_negative(f"demand.on_ramps[{i}]", rate)
-            for i, rate in enumerate(sequence("demand.on_ramps", self.on_ramps))
-        )
-        object.__setattr__(self, "mainline", tuple(steps))
-        object.__setattr__(self, "on_ramps", ramps)
 
     def scaled(self, factor: float) -> "Demand":
         """Return this demand with every rate multiplied by `factor` [-]."""
@@ -69,11 +64,12 @@ class DemandDistribution:
     """
 
     base: Demand
-    scale: tuple[float, float] = (0.8, 1.2)
+    scale: tuple[Factor, Factor] = (0.8, 1.2)
 
     def __post_init__(self) -> None:
         """Check the fields and bring them to their declared types."""
-        object.__setattr__(self, "scale", interval("demand.scale", self.scale))
+        checked_fields(self, "demand")
+        require(self.scale[0] <= self.scale[1], "demand.scale", "(low, high)", self.scale)
 
     def draw(self, generator: np.random.Generator) -> Demand:
         """Draw one demand."""

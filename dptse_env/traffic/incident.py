@@ -1,17 +1,20 @@
-"""What slows the traffic down: a fixed incident, or ranges from which each seed draws one."""
+"""Incidents: temporary speed limits, fixed or drawn for every traffic seed."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
-from dptse_env.validation import (
-    integer,
-    interval,
-    non_negative,
-    positive,
-    require,
-    sequence,
-)
+from dptse_env.traffic.demand import Second
+from dptse_env.utils.fields import Interval, checked_fields
+from dptse_env.utils.validation import require
+
+Segment = Annotated[int, Interval(0, 999)]
+"""Index of a mainline segment."""
+Limit = Annotated[float, Interval(0, 1000, open_low=True)]
+"""Speed limit [km/h]."""
+Duration = Annotated[float, Interval(0, 1e6, open_low=True)]
+"""Seconds, more than none."""
 
 
 @dataclass(frozen=True)
@@ -27,24 +30,19 @@ class Incident:
         ValueError: if a phase is empty, out of order, or has a limit that is not positive.
     """
 
-    segment: int
-    phases: tuple[tuple[float, float, float], ...]
+    segment: Segment
+    phases: tuple[tuple[Second, Duration, Limit], ...]
 
     def __post_init__(self) -> None:
         """Check the fields and bring them to their declared types."""
-        object.__setattr__(self, "segment", integer("incident.segment", self.segment, 0))
-        phases, last_end = [], 0.0
-        for i, phase in enumerate(sequence("incident.phases", self.phases)):
-            path = f"incident.phases[{i}]"
-            values = sequence(path, phase, length=3)
-            start = non_negative(f"{path} start", values[0])
-            end = positive(f"{path} end", values[1])
-            limit = positive(f"{path} speed limit", values[2])
-            require(last_end <= start < end, path, f"after {last_end} s with start < end", phase)
-            phases.append((start, end, limit))
+        checked_fields(self, "incident")
+        require(bool(self.phases), "incident.phases", "at least one phase", self.phases)
+        last_end = 0.0
+        for i, phase in enumerate(self.phases):
+            start, end, _ = phase
+            allowed = f"after {last_end} s with start < end"
+            require(last_end <= start < end, f"incident.phases[{i}]", allowed, phase)
             last_end = end
-        require(bool(phases), "incident.phases", "at least one phase", self.phases)
-        object.__setattr__(self, "phases", tuple(phases))
 
     @property
     def start(self) -> float:
@@ -86,24 +84,28 @@ class IncidentDistribution:
         ValueError: if there is no candidate segment, or a range is not positive and ordered.
     """
 
-    segments: tuple[int, ...]
-    start: tuple[float, float] = (60.0, 300.0)
-    duration: tuple[float, float] = (60.0, 240.0)
-    speed_limit: tuple[float, float] = (5.0, 30.0)
-    recovery_duration: tuple[float, float] = (30.0, 120.0)
-    recovery_speed_limit: tuple[float, float] = (40.0, 70.0)
+    segments: tuple[Segment, ...]
+    start: tuple[Second, Second] = (60.0, 300.0)
+    duration: tuple[Duration, Duration] = (60.0, 240.0)
+    speed_limit: tuple[Limit, Limit] = (5.0, 30.0)
+    recovery_duration: tuple[Duration, Duration] = (30.0, 120.0)
+    recovery_speed_limit: tuple[Limit, Limit] = (40.0, 70.0)
 
     def __post_init__(self) -> None:
         """Check the fields and bring them to their declared types."""
-        segments = tuple(
-            integer(f"incident.segments[{i}]", segment, 0)
-            for i, segment in enumerate(sequence("incident.segments", self.segments))
-        )
-        require(bool(segments), "incident.segments", "at least one segment", self.segments)
-        object.__setattr__(self, "segments", segments)
-        object.__setattr__(self, "start", interval("incident.start", self.start, allow_zero=True))
-        for name in ("duration", "speed_limit", "recovery_duration", "recovery_speed_limit"):
-            object.__setattr__(self, name, interval(f"incident.{name}", getattr(self, name)))
+        checked_fields(self, "incident")
+        require(bool(self.segments), "incident.segments", "at least one segment", self.segments)
+        for name in (
+            "start",
+            "duration",
+            "speed_limit",
+            "recovery_duration",
+            "recovery_speed_limit",
+        ):
+            low, high = getattr(self, name)
+            require(
+                low <= high, f"incident.{name}", "a pair (low, high) with low <= high", (low, high)
+            )
 
     def draw(self, generator: np.random.Generator) -> Incident:
         """Draw one incident."""

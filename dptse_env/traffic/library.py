@@ -24,9 +24,7 @@ from pathlib import Path
 import platformdirs
 from tqdm import tqdm
 
-from dptse_env.blocks import n_cores
 from dptse_env.traffic.corridor import Corridor
-from dptse_env.traffic.network import NetworkError
 from dptse_env.traffic.record import VERSION, InvalidRecordError, Record
 from dptse_env.traffic.sumo import (
     RecordingError,
@@ -35,8 +33,10 @@ from dptse_env.traffic.sumo import (
     simulation_is_loaded,
     sumo_version,
 )
+from dptse_env.traffic.sumo_network import NetworkError
 from dptse_env.traffic.worker import WorkerPool
-from dptse_env.validation import integer
+from dptse_env.utils.threads import n_cores
+from dptse_env.utils.validation import integer
 
 CACHE_VARIABLE = "DPTSE_CACHE"
 """Environment variable that overrides where records are kept."""

@@ -5,10 +5,12 @@ Their `average_dwell` is measured on the training seeds 0..15, by
 """
 
 import dataclasses
+from typing import Any
 
 from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.demand import Demand, DemandDistribution
 from dptse_env.traffic.incident import Incident, IncidentDistribution
+from dptse_env.utils.registry import Registry
 
 PAPER_HIGHWAY = Corridor(
     name="paper-highway",
@@ -45,10 +47,31 @@ SHORT_HIGHWAY = Corridor(
 )
 """A 0.6 km stretch with one ramp of each kind and a jam of its own, for tests and first trials."""
 
-CORRIDORS: dict[str, Corridor] = {
-    corridor.name: corridor for corridor in (PAPER_HIGHWAY, SHORT_HIGHWAY)
-}
-"""The presets by name."""
+CORRIDORS = Registry(
+    "corridor",
+    {corridor.name: corridor for corridor in (PAPER_HIGHWAY, SHORT_HIGHWAY)},
+    check=lambda part: (
+        None if isinstance(part, Corridor) or callable(part) else "be a Corridor, or return one"
+    ),
+)
+"""Corridors by name."""
+
+
+def find_corridor(value: Any) -> Corridor:
+    """Return the corridor that a keyword's value stands for.
+
+    Args:
+        value: A name, ``"package.module:NAME"``, a `Corridor`, or a function that returns one.
+
+    Raises:
+        ValueError: There is none, or it is no `Corridor`.
+    """
+    corridor = CORRIDORS.find(value)
+    if not isinstance(corridor, Corridor) and callable(corridor):
+        corridor = corridor()
+    if not isinstance(corridor, Corridor):
+        raise ValueError(f"corridor {value!r} must be a Corridor, or return one, got {corridor!r}")
+    return corridor
 
 
 def randomised(corridor: Corridor) -> Corridor:

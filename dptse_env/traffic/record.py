@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dptse_env.validation import integer, require
+from dptse_env.utils.validation import integer, require
 
 FORMAT = "dptse-record"
 VERSION = 1
@@ -226,7 +226,14 @@ class Record:
             return cls(**columns, n_steps=manifest["n_steps"], n_columns=manifest["n_columns"])
         except InvalidRecordError:
             raise
-        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        except (
+            OSError,
+            ValueError,
+            KeyError,
+            TypeError,
+            AttributeError,
+            RecursionError,
+        ) as error:
             raise InvalidRecordError(f"{path}: {error!r}") from error
 
 

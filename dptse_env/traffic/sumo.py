@@ -26,9 +26,9 @@ from xml.etree import ElementTree
 import numpy as np
 
 from dptse_env.traffic.corridor import Corridor
-from dptse_env.traffic.network import edge_ids, network_xml
 from dptse_env.traffic.record import Record
 from dptse_env.traffic.scenario import MAINLINE, Scenario
+from dptse_env.traffic.sumo_network import edge_ids, network_xml
 
 SUPPORTED_SUMO = "1.28"
 """Release series that records are made with: another one drives the same scenario differently."""

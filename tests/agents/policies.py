@@ -1,7 +1,7 @@
 """Untrained policies for the short road, saved as trained ones are."""
 
 from dptse_env.config import resolve
-from dptse_env.interface import QueryInterface
+from dptse_env.parts import make_interface
 
 SHORT = "dptse_env:dptse/ShortHighway-v0"
 
@@ -14,7 +14,7 @@ def save(path, seed=0, **keywords):
 
     keywords = {"bandwidth": 2, **keywords}
     config = resolve("short-highway", {**keywords, "action": "slots"})
-    interface = QueryInterface.of(config)
+    interface = make_interface(config)
     torch.manual_seed(seed)
     policy = PlackettLucePolicy(
         interface.observations.space, interface.actions.space, lambda _: 0.0,

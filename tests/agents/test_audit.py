@@ -10,8 +10,10 @@ from agents.audit.ruler import Ruler, best_spending
 from agents.audit.targets import choose_target
 from agents.audit.worlds import Path, TwoWorlds
 from dptse_env.config import EnvConfig
-from dptse_env.privacy import PrivacySettings, epsilon_of
-from dptse_env.privacy.audit import Claim, audit
+from dptse_env.parts import privacy_report
+from dptse_env.privacy import epsilon_of
+from dptse_env.release import RELEASE_MODELS, CappedSettings
+from dptse_env.privacy.audit_statistics import Claim, audit
 from dptse_env.traffic import SHORT_HIGHWAY, Demand, Record
 
 HORIZON = 40
@@ -22,7 +24,12 @@ N_COLUMNS = ROAD.n_segments + ROAD.n_boundaries
 
 
 def config(bandwidth=2, horizon=None, **privacy):
-    settings = PrivacySettings(**{"preset": "guaranteed", "cap": 6, **privacy})
+    privacy = {
+        "preset": "capped",
+        **({} if privacy.get("preset", "capped") != "capped" else {"cap": 6}),
+        **privacy,
+    }
+    settings = RELEASE_MODELS[privacy["preset"]].settings_type(**privacy)
     return EnvConfig(ROAD, privacy=settings, bandwidth=bandwidth, horizon=horizon)
 
 
@@ -76,7 +83,7 @@ def test_worlds_differ_in_one_vehicle(record):
     assert len(path.step) > 3
 
 
-@pytest.mark.parametrize("preset", ["paper", "corrected", "guaranteed"])
+@pytest.mark.parametrize("preset", ["paper", "corrected", "capped"])
 def test_the_closed_form_is_the_distance_of_a_second(preset, record):
     setting = config(preset=preset)
     ruler = Ruler.of(setting)
@@ -97,7 +104,7 @@ def test_the_closed_form_is_the_distance_of_a_second(preset, record):
         assert distance**2 == pytest.approx(ruler.of_path(rest, moved)[0], rel=1e-9)
 
 
-@pytest.mark.parametrize("preset", ["paper", "guaranteed"])
+@pytest.mark.parametrize("preset", ["paper", "capped"])
 def test_where_paths_meet_speeds_alone_tell(preset, record):
     setting = config(preset=preset)
     ruler = Ruler.of(setting)
@@ -116,7 +123,7 @@ def test_where_paths_meet_speeds_alone_tell(preset, record):
 def test_the_worst_case_is_the_whole_of_mu(privacy, policy, record):
     setting = config(**privacy)
     worlds = choose_target(setting, record, "worst-case", policy).worlds
-    mu = setting.accountant().report.mu
+    mu = privacy_report(setting).mu
     distance = reached(setting, worlds, policy)
     assert distance <= mu * (1.0 + 1e-9)
     if policy == "hunter":
@@ -135,7 +142,7 @@ def test_no_vehicle_of_the_record_exceeds_mu(privacy, kind, policy, record):
     setting = config(**privacy)
     worlds = choose_target(setting, record, kind, policy).worlds
     distance = reached(setting, worlds, policy)
-    assert 0.0 < distance <= setting.accountant().report.mu * (1.0 + 1e-9)
+    assert 0.0 < distance <= privacy_report(setting).mu * (1.0 + 1e-9)
 
 
 @pytest.mark.parametrize("policy", ["hunter", "paper", "static", "round-robin"])
@@ -152,7 +159,7 @@ def test_the_vehicle_that_is_deleted_tells_most(privacy, policy, record):
 
 
 def test_a_replaced_vehicle_tells_more_than_a_deleted_one(record):
-    for preset in ("corrected", "guaranteed"):
+    for preset in ("corrected", "capped"):
         setting = config(preset=preset)
         replaced, deleted = (
             reached(setting, choose_target(setting, record, kind, "hunter").worlds)
@@ -177,7 +184,7 @@ def test_the_hunter_keeps_to_bandwidth_and_cap(bandwidth, record):
     plan = hunting_plan(setting, worlds)
     assert plan.sum(axis=1).max() <= bandwidth
     assert plan.sum() == 14  # seven for each of the two paths
-    assert reached(setting, worlds) == pytest.approx(setting.accountant().report.mu)
+    assert reached(setting, worlds) == pytest.approx(privacy_report(setting).mu)
 
 
 def test_the_hunter_asks_in_the_seconds_that_tell_most(record):
@@ -240,7 +247,7 @@ def test_the_adaptive_hunter_rests_where_it_has_made_up_its_mind():
     assert Planned(plan).queries(0, belief).all()
 
 
-@pytest.mark.parametrize("preset", ["paper", "guaranteed"])
+@pytest.mark.parametrize("preset", ["paper", "capped"])
 def test_the_score_is_the_log_likelihood_ratio_of_the_transcript(preset, record):
     setting = config(preset=preset)
     worlds = choose_target(setting, record, "worst-case", "hunter").worlds
@@ -279,7 +286,7 @@ def test_scores_have_the_law_of_their_distance(record):
     worlds = choose_target(setting, record, "worst-case", "hunter").worlds
     policy = make_policy(setting, "hunter", worlds)
     runs = attack(setting, worlds, policy, 400, progress=False)
-    mu = setting.accountant().report.mu
+    mu = privacy_report(setting).mu
     np.testing.assert_allclose(runs.distances, mu)
     normal = (runs.scores - np.array([[-0.5], [0.5]]) * mu**2) / mu
     assert np.abs(normal.mean(axis=1)).max() < 4.0 / np.sqrt(400)
@@ -294,7 +301,7 @@ def test_less_noise_puts_the_worlds_further_apart(record):
     worlds = choose_target(setting, record, "worst-case", "hunter").worlds
     policy = make_policy(setting, "hunter", worlds)
     runs = attack(setting, worlds, policy, 3, noise_factor=0.5, progress=False)
-    np.testing.assert_allclose(runs.distances, 2.0 * setting.accountant().report.mu)
+    np.testing.assert_allclose(runs.distances, 2.0 * privacy_report(setting).mu)
 
 
 @pytest.mark.parametrize("privacy", [{}, {"preset": "paper"}, {"boundary_inputs": "private"}])
@@ -315,7 +322,7 @@ def test_adapting_stays_below_mu_and_stops_early(record):
     setting = config(epsilon=10.0)
     worlds = choose_target(setting, record, "worst-case", "hunter").worlds
     runs = attack(setting, worlds, make_policy(setting, "adaptive", worlds), 100, progress=False)
-    mu = setting.accountant().report.mu
+    mu = privacy_report(setting).mu
     assert runs.distances.max() <= mu * (1.0 + 1e-9)
     assert runs.distances.min() < 0.9 * mu
 
@@ -323,25 +330,25 @@ def test_adapting_stays_below_mu_and_stops_early(record):
 def test_a_road_needs_no_fixed_sensor(record):
     setting = dataclasses.replace(config(), corridor=dataclasses.replace(ROAD, fixed_sensors=()))
     worlds = choose_target(setting, record, "worst-case", "hunter").worlds
-    assert reached(setting, worlds) == pytest.approx(setting.accountant().report.mu)
+    assert reached(setting, worlds) == pytest.approx(privacy_report(setting).mu)
 
 
 def test_a_short_horizon_is_kept(record):
     setting = config(horizon=10, unit="horizon")
     worlds = choose_target(setting, record, "worst-case", "hunter").worlds
     runs = attack(setting, worlds, make_policy(setting, "hunter", worlds), 2, progress=False)
-    np.testing.assert_allclose(runs.distances, setting.accountant().report.mu)
+    np.testing.assert_allclose(runs.distances, privacy_report(setting).mu)
 
 
 def test_an_audit_sees_a_cap_that_is_not_held(record, monkeypatch):
     setting = config(epsilon=5.0, cap=6)
-    report = setting.accountant().report
+    report = privacy_report(setting)
     claim = Claim(report.mu, epsilon_of(report.mu, 0.05), 0.05)
     worlds = choose_target(setting, record, "worst-case", "static").worlds
     policy = make_policy(setting, "static", worlds)
     held = attack(setting, worlds, policy, 400, progress=False)
     assert audit(*held.scores, claim).verdict == "not rejected"
-    monkeypatch.setattr(PrivacySettings, "contribution_cap", None)
+    monkeypatch.setattr(CappedSettings, "contribution_cap", None)
     broken = attack(setting, worlds, policy, 400, progress=False)
     assert audit(*broken.scores, claim).verdict == "rejected"
 

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from agents.evaluation import run_episode, run_episodes, watch_episode
-from dptse_env.actions import ACTION_ENCODINGS
 from dptse_env.schedules import INFORMED, ORACLES, SCHEDULES, make_schedule
+from dptse_env.spaces.actions import ACTION_ENCODINGS
 
 
 def make(**keywords):
@@ -40,8 +40,8 @@ def test_policies_meet_the_same_traffic_and_the_same_noise():
     for name in ("static", "random"):
         env = make()
         process = env.unwrapped.process
-        release, values = process.mechanism.release, []
-        process.mechanism.release = lambda episodes, truth, f=release, v=values: (
+        release, values = process.release.mechanism.release, []
+        process.release.mechanism.release = lambda episodes, truth, f=release, v=values: (
             v.append(f(episodes, truth)) or v[-1]
         )
         run_episode(env, make_schedule(name, env, seed=0), traffic_seed=0, seed=1)
@@ -146,7 +146,7 @@ def test_a_batch_scores_every_schedule_as_one_by_one(name):
 @pytest.mark.parametrize("deterministic", [True, False])
 @pytest.mark.parametrize("action", list(ACTION_ENCODINGS))
 def test_a_batch_scores_a_learned_policy_as_one_by_one(action, deterministic):
-    keywords = {"action": action, "estimator": "random_walk", "privacy": "guaranteed"}
+    keywords = {"action": action, "estimator": "random_walk", "privacy": "capped"}
     env = make_batch(**keywords)
     batch = run_episodes(env, Learned(env), deterministic=deterministic, **PAIRS)
     assert_same_scores(batch, one_by_one(Learned, deterministic=deterministic, **keywords))

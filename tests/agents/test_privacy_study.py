@@ -16,6 +16,7 @@ from agents.provenance import provenance
 from agents.runner import Task, make_env, run_task
 from agents.statistics import Interval
 from dptse_env.config import resolve
+from dptse_env.parts import privacy_report
 from dptse_env.privacy import epsilon_of
 from dptse_env.traffic import Corridor, RecordLibrary
 from dptse_env.traffic.record import Record
@@ -46,16 +47,16 @@ def test_the_full_design_holds_what_the_study_is_about():
     for name in ("ekf", "random_walk"):
         for epsilon in (0.5, 1.0, 2.0, 5.0, 10.0, 20.0):
             for cap in (4, 16, 64):
-                own = Cell(name, "guaranteed", "trip", cap, "nominal", epsilon, 0.05, 5)
+                own = Cell(name, "capped", "trip", cap, "nominal", epsilon, 0.05, 5)
                 assert own in cells
             for unit in ("horizon", "event"):
-                assert Cell(name, "guaranteed", unit, 0, "nominal", epsilon, 0.05, 5) in cells
+                assert Cell(name, "capped", unit, 0, "nominal", epsilon, 0.05, 5) in cells
             for preset in ("paper", "corrected"):
                 assert Cell(name, preset, "none", 0, "true", epsilon, 0.05, 5) in cells
         for mode in ("true", "nominal", "private"):
-            assert Cell(name, "guaranteed", "trip", 64, mode, 5.0, 0.05, 5) in cells
+            assert Cell(name, "capped", "trip", 64, mode, 5.0, 0.05, 5) in cells
         for bandwidth in (3, 5, 8, 15):
-            own = Cell(name, "guaranteed", "trip", 64, "nominal", 5.0, 0.05, bandwidth)
+            own = Cell(name, "capped", "trip", 64, "nominal", 5.0, 0.05, bandwidth)
             assert own in cells
 
 
@@ -75,7 +76,7 @@ def test_the_environment_is_what_the_cell_says(cell):
     assert (privacy.preset, privacy.boundary) == (cell.preset, cell.boundary_inputs)
     assert (privacy.epsilon, privacy.delta) == (cell.epsilon, cell.delta)
     assert (privacy.contribution_cap or 0) == cell.cap
-    if cell.preset == "guaranteed":
+    if cell.preset == "capped":
         assert privacy.unit == cell.unit
 
 
@@ -83,7 +84,7 @@ def test_the_open_loop_hears_nothing_that_its_shared_cell_leaves_out():
     RecordLibrary().ensure(resolve("short-highway", {}).corridor, (2000,))
     for other in (
         Cell("open_loop", "paper", "none", 0, "true", 0.5, 0.05, 1),
-        Cell("open_loop", "guaranteed", "event", 0, "nominal", 20.0, 0.05, 3),
+        Cell("open_loop", "capped", "event", 0, "nominal", 20.0, 0.05, 3),
     ):
         shared = DESIGN.cell("open_loop", boundary_inputs=other.boundary_inputs)
         assert shared in DESIGN.cells()
@@ -131,11 +132,9 @@ def test_bad_designs_are_named(changes, message):
 
 def test_a_vehicle_met_as_often_as_the_cap_has_the_guarantee_s_own_share_of_mu():
     config = config_of(BASE)
-    (density, _) = (own.noise_std for own in config.accountant().report.releases)
+    (density, _) = (own.noise_std for own in privacy_report(config).releases)
     # Half of mu^2 goes to density.
-    assert mu_met(config, density, 64) == pytest.approx(
-        config.accountant().report.mu * math.sqrt(0.5)
-    )
+    assert mu_met(config, density, 64) == pytest.approx(privacy_report(config).mu * math.sqrt(0.5))
     assert mu_met(config, density, 16) == pytest.approx(mu_met(config, density, 64) / 2.0)
 
 

@@ -9,8 +9,8 @@ from dptse_env.estimators import (
     HorizonSettings,
     SigmaPointSettings,
 )
-from dptse_env.estimators.tuning import available_settings, load_settings
-from dptse_env.mapping import from_mapping
+from dptse_env.estimators.tuned_settings import available_settings, load_settings
+from dptse_env.utils.fields import from_mapping
 
 
 def test_every_estimator_but_the_open_loop_can_be_tuned():

@@ -13,7 +13,7 @@ from agents.evaluation import EpisodeScore
 from agents.tuning import TuningStudy, scores_of
 from agents.tuning_task import TuningTask, score_episode
 from dptse_env.estimators import EstimatorSettings
-from dptse_env.estimators.tuning import load_settings, read_settings
+from dptse_env.estimators.tuned_settings import load_settings, read_settings
 
 TASK = TuningTask(
     env="dptse_env:dptse/ShortHighway-v0",

@@ -3,7 +3,7 @@
 import numpy as np
 import qpsolvers
 
-from dptse_env.estimators.compiled.kernels import Filters
+from dptse_env.estimators.compiled.ekf_kernels import Filters
 from dptse_env.estimators.compiled.mhe_kernels import Horizons, update
 
 

@@ -105,3 +105,10 @@ def test_the_residual_tells_an_optimum_from_a_corner():
     assert natural_residual(H, q, lower, upper, np.array([1.0, 0.0])) == 0.0
     assert natural_residual(H, q, lower, upper, np.array([0.0, 0.0])) == 1.0
     assert np.isnan(natural_residual(H, q, lower, upper, np.array([np.nan, 0.0])))
+
+
+def test_a_program_without_a_single_optimum_is_solved_or_refused_and_never_raises():
+    H, q = np.ones((2, 2)), np.array([-2.0, -2.0])  # z_0 + z_1 = 1 is optimal everywhere
+    lower, upper = np.full(2, -10.0), np.full(2, 10.0)
+    z = solve(H, q, lower, upper, "piqp")
+    assert z is None or natural_residual(H, q, lower, upper, z) < 1e-8

@@ -15,28 +15,32 @@ from dptse_env.estimators.settings import (
 @pytest.mark.parametrize(
     ("field", "value", "message"),
     [
-        ("process_noise", (-1.0, 0.0), r"process_noise\[0\] must be >= 0, got -1"),
-        ("process_noise", (0.1,), r"process_noise must be a sequence of 2, got \(0\.1,\)"),
-        ("process_noise", 0.1, r"process_noise must be a sequence of 2, got 0\.1"),
-        ("walk_noise", (0.0, "a"), r"walk_noise\[1\] must be a number, got 'a'"),
-        ("walk_noise", (float("nan"), 0.0), r"walk_noise\[0\] must be finite, got nan"),
-        ("noise_scale", 0.0, r"noise_scale must be > 0, got 0\.0"),
-        ("noise_scale", float("inf"), r"noise_scale must be finite, got inf"),
-        ("initial_variance", 0.0, r"initial_variance must be > 0, got 0\.0"),
+        ("process_noise", (-1.0, 0.0), r"process_noise\[0\] must be .*, got -1\.0"),
+        ("process_noise", (0.1,), r"process_noise must have 2 items, got 1: \(0\.1,\)"),
+        ("process_noise", 0.1, r"process_noise must be a sequence, got 0\.1"),
+        ("walk_noise", (0.0, "a"), r"walk_noise\[1\] must be a number in \[0, 10\], got 'a'"),
+        ("walk_noise", (float("nan"), 0.0), r"walk_noise\[0\] must be .*, got nan"),
+        ("noise_scale", 0.0, r"noise_scale must be a number in \[1e-06, 1000\], got 0\.0"),
+        ("noise_scale", float("inf"), r"noise_scale must be a number in \[1e-06, 1000\], got inf"),
+        ("initial_variance", 0.0, r"initial_variance must be a number in \(0, 100\], got 0\.0"),
         ("initial_variance", True, r"initial_variance must be a number"),
-        ("bounds", "ball", r"bounds must be 'cone' or 'box', got 'ball'"),
-        ("ukf", {"alpha": 2.0}, r"ukf\.alpha must be in \(0, 1\], got 2\.0"),
-        ("ukf", {"alpha": 0.0}, r"ukf\.alpha must be > 0, got 0\.0"),
-        ("ukf", {"beta": -1.0}, r"ukf\.beta must be >= 0, got -1"),
-        ("ukf", {"kappa": "a"}, r"ukf\.kappa must be a number, got 'a'"),
-        ("enkf", {"n_members": 1}, r"enkf\.n_members must be an integer >= 2, got 1"),
-        ("enkf", {"inflation": 0.9}, r"enkf\.inflation must be >= 1, got 0\.9"),
-        ("enkf", {"taper": 0.0}, r"enkf\.taper must be > 0, got 0\.0"),
-        ("mhe", {"horizon": 0}, r"mhe\.horizon must be an integer >= 1, got 0"),
-        ("mhe", {"horizon": 2.5}, r"mhe\.horizon must be an integer >= 1, got 2\.5"),
-        ("mhe", {"arrival_noise": [0.1, 0.0]}, r"mhe\.arrival_noise\[1\] must be > 0"),
-        ("mhe", {"linearisation": "none"}, r"mhe\.linearisation must be 'paper' or 'trajectory'"),
-        ("mhe", {"bounds": "ball"}, r"mhe\.bounds must be 'cone' or 'box', got 'ball'"),
+        ("bounds", "ball", r"bounds must be one of 'cone', 'box', got 'ball'"),
+        ("ukf", {"alpha": 2.0}, r"ukf\.alpha must be a number in \[0\.001, 1\], got 2\.0"),
+        ("ukf", {"alpha": 0.0}, r"ukf\.alpha must be a number in \[0\.001, 1\], got 0\.0"),
+        ("ukf", {"beta": -1.0}, r"ukf\.beta must be a number in \[0, 100\], got -1\.0"),
+        ("ukf", {"kappa": "a"}, r"ukf\.kappa must be a number in \[-10000, 10000\], got 'a'"),
+        ("enkf", {"n_members": 1}, r"enkf\.n_members must be an integer in 2\.\.10000, got 1"),
+        ("enkf", {"inflation": 0.9}, r"enkf\.inflation must be a number in \[1, 10\], got 0\.9"),
+        ("enkf", {"taper": 0.0}, r"enkf\.taper must be .*, got 0\.0"),
+        ("mhe", {"horizon": 0}, r"mhe\.horizon must be an integer in 1\.\.1000, got 0"),
+        ("mhe", {"horizon": 2.5}, r"mhe\.horizon must be an integer in 1\.\.1000, got 2\.5"),
+        ("mhe", {"arrival_noise": [0.1, 0.0]}, r"mhe\.arrival_noise\[1\] must be .*, got 0\.0"),
+        (
+            "mhe",
+            {"linearisation": "none"},
+            r"mhe\.linearisation must be one of 'paper', 'trajectory', got 'none'",
+        ),
+        ("mhe", {"bounds": "ball"}, r"mhe\.bounds must be one of 'cone', 'box', got 'ball'"),
         *[("mhe", {"solver": s}, rf"mhe\.solver must not be '{s}'") for s in REFUSED_SOLVERS],
     ],
 )
@@ -56,7 +60,7 @@ def test_nested_settings_may_be_given_as_dicts():
     assert settings.ukf == SigmaPointSettings(kappa=1.0)
     assert settings.enkf == EnsembleSettings(n_members=50, taper=2.0)
     assert settings.mhe == HorizonSettings(arrival_noise=(0.1, 0.2))
-    with pytest.raises(TypeError, match="n_member"):
+    with pytest.raises(ValueError, match=r"enkf\.n_member is unknown; allowed: n_members"):
         EstimatorSettings(enkf={"n_member": 50})
 
 

@@ -13,7 +13,7 @@ from dptse_env.estimators.compiled.swarm import (
     released_swarm,
 )
 from dptse_env.model import ARZModel, load_parameters
-from dptse_env.model.road import road_of
+from dptse_env.model.road_arrays import road_of
 from dptse_env.traffic import PAPER_HIGHWAY, SHORT_HIGHWAY
 
 WIDTH = 104

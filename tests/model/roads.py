@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dptse_env.model.arz import ARZModel
-from dptse_env.model.network import FloatArray
+from dptse_env.model.layout import FloatArray
 from dptse_env.model.parameters import ARZParameters, load_parameters
 
 PAPER = load_parameters("paper")

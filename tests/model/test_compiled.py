@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from dptse_env.model.arz import ARZModel
 from dptse_env.model.compiled import CompiledARZModel
 from dptse_env.model.kernels import advance, scratch_of
-from dptse_env.model.road import road_of
+from dptse_env.model.road_arrays import road_of
 
 from .roads import HIGHWAY, NO_RELAXATION, PAPER, STRAIGHT, W99, Road, random_inputs, random_states
 

@@ -34,13 +34,13 @@ def test_unknown_set_names_those_there_are():
 @pytest.mark.parametrize(
     ("field", "value", "message"),
     [
-        ("free_flow_speed", 0.0, r"parameters.free_flow_speed must be > 0, got 0.0"),
-        ("jam_density", float("nan"), r"parameters.jam_density must be finite, got nan"),
-        ("jam_density", float("inf"), r"parameters.jam_density must be finite, got inf"),
-        ("gamma", -2.0, r"parameters.gamma must be > 0, got -2.0"),
-        ("relaxation_time", "60", r"parameters.relaxation_time must be a number, got '60'"),
-        ("lanes", 0, r"parameters.lanes must be an integer >= 1, got 0"),
-        ("lanes", 1.5, r"parameters.lanes must be an integer >= 1, got 1.5"),
+        ("free_flow_speed", 0.0, r"parameters\.free_flow_speed must be .*, got 0\.0"),
+        ("jam_density", float("nan"), r"parameters\.jam_density must be .*, got nan"),
+        ("jam_density", float("inf"), r"parameters\.jam_density must be .*, got inf"),
+        ("gamma", -2.0, r"parameters\.gamma must be a number in \[0\.01, 100\], got -2\.0"),
+        ("relaxation_time", "60", r"parameters\.relaxation_time must be .*, got '60'"),
+        ("lanes", 0, r"parameters\.lanes must be an integer in 1\.\.16, got 0"),
+        ("lanes", 1.5, r"parameters\.lanes must be an integer in 1\.\.16, got 1\.5"),
     ],
 )
 def test_bad_value_is_named(field, value, message):
@@ -53,7 +53,9 @@ def test_gamma_is_not_confined_to_one_and_two():
 
 
 def test_mapping_refuses_unknown_and_missing_keys():
-    with pytest.raises(ValueError, match=r"parameters\.v_f is unknown, allowed are .*gamma"):
+    with pytest.raises(
+        ValueError, match=r"parameters\.v_f is unknown; allowed: name, free_flow_speed"
+    ):
         ARZParameters.from_mapping({**GOOD, "v_f": 1.0})
     with pytest.raises(ValueError, match=r"parameters\.gamma is missing"):
         ARZParameters.from_mapping({k: v for k, v in GOOD.items() if k != "gamma"})
@@ -71,5 +73,7 @@ def test_written_set_reads_back_with_its_provenance(tmp_path):
 def test_file_without_parameters_is_refused(tmp_path):
     path = tmp_path / "x.json"
     path.write_text("[]")
-    with pytest.raises(ValueError, match="with the key 'parameters'"):
+    with pytest.raises(
+        ValueError, match=rf"^{path} must be a mapping with the keys parameters, provenance, got"
+    ):
         read_parameters(path)

@@ -8,7 +8,7 @@ pytest.importorskip("stable_baselines3")
 import torch
 
 from dptse_env.config import PRESETS, resolve
-from dptse_env.interface import QueryInterface
+from dptse_env.parts import make_interface
 from dptse_env.sb3 import RoadChannels
 from dptse_env.sb3.channels import CENTRES
 from dptse_env.sb3.networks import Road
@@ -16,7 +16,7 @@ from dptse_env.sb3.networks import Road
 
 def numbered(config):
     """An observation in which every number is its place, and where its blocks begin."""
-    encoding = QueryInterface.of(config).observations
+    encoding = make_interface(config).observations
     starts = {name: place.start for name, place in encoding.slices.items()}
     return torch.arange(encoding.space.shape[0], dtype=torch.float32)[None], starts
 
@@ -83,7 +83,7 @@ def test_a_layout_is_plain_and_says_nothing_of_what_may_change():
 
 def test_channels_of_real_observations_are_of_order_one():
     keywords = {"traffic_seeds": "0:2", "action": "slots"}
-    env = gym.make("dptse_env:dptse/ShortHighway-v0", privacy="guaranteed", **keywords)
+    env = gym.make("dptse_env:dptse/ShortHighway-v0", privacy="capped", **keywords)
     road = Road(RoadChannels.of(env.unwrapped.config))
     env.reset(seed=0)
     env.action_space.seed(0)
@@ -95,5 +95,5 @@ def test_channels_of_real_observations_are_of_order_one():
 
 def test_every_block_of_a_road_has_a_scale():
     for preset in PRESETS.values():
-        slices = QueryInterface.of(preset).observations.slices
+        slices = make_interface(preset).observations.slices
         assert set(slices) - {"bandwidth", "epsilon"} <= set(CENTRES)

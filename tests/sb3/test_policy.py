@@ -10,7 +10,7 @@ import torch
 from stable_baselines3 import PPO
 
 from dptse_env.config import PRESETS, resolve
-from dptse_env.interface import QueryInterface
+from dptse_env.parts import make_interface
 from dptse_env.sb3 import PlackettLucePolicy, RoadChannels, SB3VecEnv
 
 SHORT = "dptse_env:dptse/ShortHighway-v0"
@@ -18,7 +18,7 @@ SHORT = "dptse_env:dptse/ShortHighway-v0"
 
 def make_policy(preset="private-highway", extra=0, **keywords):
     config = resolve(preset, {"action": "slots", **keywords})
-    interface = QueryInterface.of(config)
+    interface = make_interface(config)
     space = interface.observations.space
     if extra:
         space = spaces.Box(-np.inf, np.inf, (space.shape[0] + extra,), np.float32)
@@ -169,7 +169,7 @@ def test_ppo_learns_with_it_and_it_can_be_saved(tmp_path):
 
 def test_spaces_that_do_not_fit_are_refused():
     config = resolve("short-highway", {"action": "slots"})
-    interface, road = QueryInterface.of(config), RoadChannels.of(config)
+    interface, road = make_interface(config), RoadChannels.of(config)
     seen, taken = interface.observations.space, interface.actions.space
     for wrong in (spaces.Box(0, 1, (road.size + 1,)), spaces.Box(0, 1, (3, 3)), taken):
         with pytest.raises(ValueError, match="observation_space must have shape"):

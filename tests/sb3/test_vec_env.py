@@ -13,8 +13,8 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
-from dptse_env.actions import ACTION_ENCODINGS
 from dptse_env.sb3 import SB3VecEnv
+from dptse_env.spaces.actions import ACTION_ENCODINGS
 
 SHORT = "dptse_env:dptse/ShortHighway-v0"
 EPISODES = {"traffic_seeds": "0:3", "horizon": 6, "random_start": True}
@@ -45,7 +45,7 @@ def assert_same_info(first, second):
 @pytest.mark.parametrize("truth_in_info", [False, True])
 @pytest.mark.parametrize("action", ACTION_ENCODINGS)
 def test_it_is_a_dummy_vec_env_of_scalar_environments(action, truth_in_info):
-    keywords = {"action": action, "truth_in_info": truth_in_info, "privacy": "guaranteed"}
+    keywords = {"action": action, "truth_in_info": truth_in_info, "privacy": "capped"}
     env, other = make(**keywords), dummy(**keywords)
     space = env.action_space
     assert (space, env.observation_space) == (other.action_space, other.observation_space)

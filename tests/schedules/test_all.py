@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from dptse_env.actions import ACTION_ENCODINGS
 from dptse_env.schedules import INFORMED, ORACLES, PLANS, SCHEDULES, BoundSchedule, make_schedule
+from dptse_env.spaces.actions import ACTION_ENCODINGS
 
 from .playing import begin, make_batch, make_single, play
 

@@ -3,10 +3,10 @@ import numpy as np
 import pytest
 from stable_baselines3.common.evaluation import evaluate_policy
 
-from dptse_env.actions import ACTION_ENCODINGS
 from dptse_env.config import resolve
-from dptse_env.interface import QueryInterface
+from dptse_env.parts import make_interface
 from dptse_env.schedules import SCHEDULES, Shifting, make_schedule
+from dptse_env.spaces.actions import ACTION_ENCODINGS
 
 
 class Bare:
@@ -14,7 +14,7 @@ class Bare:
 
     def __init__(self, preset="paper-highway", **keywords):
         self.unwrapped = self
-        self.interface = QueryInterface.of(resolve(preset, keywords))
+        self.interface = make_interface(resolve(preset, keywords))
 
     def observation(self, k=1, **blocks):
         observations = self.interface.observations

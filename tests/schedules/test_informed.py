@@ -38,7 +38,7 @@ class Plain:
         mean = estimator.states[[episode]]
         P = estimator.covariances[episode] if covariance is None else covariance
         one = np.array([episode])
-        inputs = process.boundary.inputs(one, process.slot[one], process.time[one])
+        inputs = process.boundary.inputs(one, process.traffic_index[one], process.time[one])
         settings = config.settings()
         if config.estimator == "random_walk":
             self.F = np.eye(len(P))
@@ -52,7 +52,7 @@ class Plain:
             self.Q = np.diag(np.tile(np.square(q), model.n_segments))
             self.mean = model.project(model.step(mean, inputs), settings.bounds)
         self.H = self.whole(model.measurement_jacobian(self.mean)[0], model.measurement_scale)
-        sigma = settings.noise_scale * process.mechanism.sigma / model.measurement_scale
+        sigma = settings.noise_scale * process.release.sigma / model.measurement_scale
         self.R = np.tile(sigma**2, model.n_segments)
         units = [config.corridor.density_scale, config.corridor.speed_scale]
         self.T = self.whole(model.traffic_jacobian(self.mean)[0], units)[: 2 * self.n]
@@ -139,10 +139,10 @@ def test_greedy_trace_is_that_of_explicit_updates(caution, reward):
 
 
 @pytest.mark.parametrize("keywords", [
-    {"privacy": {"preset": "guaranteed"}, "estimator": "ekf"},
+    {"privacy": {"preset": "capped"}, "estimator": "ekf"},
     {"estimator": "ukf"}, {"estimator": "enkf"}, {"estimator": "mhe"},
     {"estimator": "random_walk"}, {"estimator": "ekf", "backend": "reference"},
-    {"estimator": "random_walk", "privacy": {"preset": "guaranteed"}},
+    {"estimator": "random_walk", "privacy": {"preset": "capped"}},
 ], ids=str)  # fmt: skip
 def test_greedy_works_on_every_covariance(keywords):
     env = make_batch(bandwidth=3, **keywords)
@@ -191,7 +191,7 @@ def test_a_covariance_of_its_own_begins_anew_after_seconds_without_it():
     played, _ = play(env, "round-robin", 3, observations[-1])
     assert len(played) == 3
     fresh = WaryTrace(env.unwrapped.process)
-    last = env.unwrapped.process._outcome(np.arange(3), np.zeros(3)).observation
+    last = env.unwrapped.process.observe(np.arange(3))
     schedule.predict(last)
     fresh.predict(last)
     np.testing.assert_array_equal(schedule._after, fresh._after)

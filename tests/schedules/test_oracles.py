@@ -10,7 +10,7 @@ from dptse_env.schedules.oracles import _Realised
 
 from .playing import begin, make_batch, make_single, play
 
-BOUNDED = {"preset": "guaranteed", "epsilon": 5.0, "cap": 3}
+BOUNDED = {"preset": "capped", "epsilon": 5.0, "cap": 3}
 
 
 @pytest.mark.parametrize("reward", ["joint", "density", "speed"])
@@ -92,7 +92,7 @@ def test_an_oracle_leaves_the_process_as_it_is(name, keywords):
     for query, reward in zip(queries, rewards, strict=True):
         observation, own, *_ = other.step(query.astype(np.int8))
         np.testing.assert_array_equal(own, reward)
-    last = env.unwrapped.process._outcome(np.arange(3), np.zeros(3)).observation
+    last = env.unwrapped.process.observe(np.arange(3))
     np.testing.assert_array_equal(observation, last)
 
 

@@ -11,7 +11,7 @@ SHORT = "dptse_env:dptse/ShortHighway-v0"
 
 def run(folder, **changes):
     """Return the only file that an audit leaves, and its content."""
-    arguments = {"env": SHORT, "privacy": "guaranteed", "epsilon": 5.0, "cap": 16, "runs": 150}
+    arguments = {"env": SHORT, "privacy": "capped", "epsilon": 5.0, "cap": 16, "runs": 150}
     main(Args(**{**arguments, "output": Path(folder) / "out", **changes}))
     (path,) = (Path(folder) / "out").iterdir()
     return path.name, json.loads(path.read_text())

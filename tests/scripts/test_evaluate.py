@@ -112,9 +112,9 @@ def test_scores_are_those_of_one_episode_after_another(tmp_path):
 def test_privacy_is_the_environments_own_unless_given():
     private = Args(env="dptse_env:dptse/PrivateHighway-v0")
     privacy = config_of(private).privacy
-    assert (privacy.preset, privacy.epsilon) == ("guaranteed", 5.0)
+    assert (privacy.preset, privacy.epsilon) == ("capped", 5.0)
     given = config_of(dataclasses.replace(private, epsilon=2.0)).privacy
-    assert (given.preset, given.epsilon) == ("guaranteed", 2.0)
+    assert (given.preset, given.epsilon) == ("capped", 2.0)
 
 
 def test_policies_that_do_not_fit_or_share_a_name_are_refused(tmp_path):

@@ -64,7 +64,7 @@ def test_more_noise_of_a_longer_unit_costs(output):
         error = {
             row["unit"]: float(row["rmse_density_veh_km"])
             for row in csv.DictReader(file)
-            if row["preset"] == "guaranteed" and row["epsilon"] == "1.0"
+            if row["preset"] == "capped" and row["epsilon"] == "1.0"
             and row["cap"] in ("0", "64") and row["bandwidth"] == "2"
         }  # fmt: skip
     assert error["event"] < error["trip"] < error["horizon"]

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from dptse_env.estimators.tuning import read_settings
+from dptse_env.estimators.tuned_settings import read_settings
 from scripts.tune import Args, main
 
 SHORT = "dptse_env:dptse/ShortHighway-v0"

@@ -10,9 +10,13 @@ from dptse_env.traffic import Demand, DemandDistribution
         ((), (), r"demand\.mainline must be steps"),
         (((10, 1.0),), (), r"demand\.mainline must be steps .* start at 0"),
         (((0, 1.0), (5, 2.0), (5, 3.0)), (), r"demand\.mainline must be steps .* increase"),
-        (((0, -1.0),), (), r"demand\.mainline\[0\] rate must be >= 0, got -1\.0"),
-        (((0, 1.0, 2.0),), (), r"demand\.mainline\[0\] must be a sequence of 2"),
-        (((0, 1.0),), (float("inf"),), r"demand\.on_ramps\[0\] must be finite"),
+        (((0, -1.0),), (), r"demand\.mainline\[0\]\[1\] must be .*, got -1\.0"),
+        (
+            ((0, 1.0, 2.0),),
+            (),
+            r"demand\.mainline\[0\] must have 2 items, got 3: \(0, 1\.0, 2\.0\)",
+        ),
+        (((0, 1.0),), (float("inf"),), r"demand\.on_ramps\[0\] must be .*, got inf"),
         ("2000", (), r"demand\.mainline must be a sequence"),
     ],
 )

@@ -212,6 +212,9 @@ DAMAGE = {
     "missing column": lambda path: (path / "vehicle.npy").unlink(),
     "missing manifest": lambda path: (path / "manifest.json").unlink(),
     "manifest that is no JSON": lambda path: (path / "manifest.json").write_text("{"),
+    "manifest that is nested without end": lambda path: (path / "manifest.json").write_text(
+        "[" * 100_000
+    ),
     "manifest that is a list": lambda path: (path / "manifest.json").write_text("[]"),
     "manifest with another number of steps": lambda path: edit_manifest(path, n_steps=5),
     "manifest of another version": lambda path: edit_manifest(path, version=0),

@@ -62,7 +62,7 @@ def test_each_diverge_loses_its_share_of_those_who_pass_it():
 
 
 def test_a_profile_longer_than_the_record_is_cut():
-    demand = Demand(((0, 3600.0), (50, 7200.0), (100, 9e9)), (0.0, 0.0))
+    demand = Demand(((0, 3600.0), (50, 7200.0), (100, 9e4)), (0.0, 0.0))
     corridor = dataclasses.replace(PAPER_HIGHWAY, demand=demand, incident=None, duration=80)
     scenario = corridor.draw(0)
     assert scenario.departures.max() <= 80

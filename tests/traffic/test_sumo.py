@@ -16,9 +16,9 @@ from dptse_env.traffic import (
     simulate,
     sumo,
 )
-from dptse_env.traffic.network import packaged_network
 from dptse_env.traffic.record import COLUMNS
 from dptse_env.traffic.sumo import running, seconds
+from dptse_env.traffic.sumo_network import packaged_network
 
 N = PAPER_HIGHWAY.n_mainline
 INCIDENT = PAPER_HIGHWAY.incident.segment

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dptse_env.estimators.batch import Measurements
-from dptse_env.estimators.compiled import kernels
+from dptse_env.estimators.compiled import ekf_kernels as kernels
 from dptse_env.estimators.compiled.kalman import CompiledFilter
-from dptse_env.model.network import FloatArray, IntArray
+from dptse_env.model.layout import FloatArray, IntArray
 
 
 class CompiledEKF(CompiledFilter):

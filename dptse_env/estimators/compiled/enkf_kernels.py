@@ -15,7 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from dptse_env.estimators.compiled.cholesky import solve
-from dptse_env.estimators.compiled.kernels import Packed
+from dptse_env.estimators.compiled.ekf_kernels import Packed
 from dptse_env.estimators.compiled.normals import Bits, Draws, bits_for, fill
 from dptse_env.estimators.compiled.swarm import (
     advance_swarm,
@@ -24,9 +24,9 @@ from dptse_env.estimators.compiled.swarm import (
     project_swarm,
     released_swarm,
 )
-from dptse_env.model.arz import LARGEST_W
-from dptse_env.model.network import BoolArray, FloatArray, IntArray
-from dptse_env.model.road import Road
+from dptse_env.model.layout import BoolArray, FloatArray, IntArray
+from dptse_env.model.parameters import LARGEST_W
+from dptse_env.model.road_arrays import Road
 
 
 class Ensembles(NamedTuple):

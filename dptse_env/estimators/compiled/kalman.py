@@ -9,12 +9,12 @@ import numpy as np
 
 from dptse_env.estimators.base import Estimate
 from dptse_env.estimators.batch import BatchEstimator
-from dptse_env.estimators.compiled import kernels
+from dptse_env.estimators.compiled import ekf_kernels as kernels
 from dptse_env.estimators.compiled.algebra import padded
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
-from dptse_env.model.network import FloatArray, IntArray
-from dptse_env.model.road import road_of
+from dptse_env.model.layout import FloatArray, IntArray
+from dptse_env.model.road_arrays import road_of
 
 
 class CompiledFilter(BatchEstimator):

@@ -7,13 +7,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import njit
 
-from dptse_env.estimators.compiled import kernels
+from dptse_env.estimators.compiled import ekf_kernels as kernels
 from dptse_env.estimators.compiled.active_set import held_for, minimise
-from dptse_env.estimators.compiled.kernels import Filters, project, released
+from dptse_env.estimators.compiled.ekf_kernels import Filters, project, released
 from dptse_env.estimators.compiled.window import Chain, factorise, space_for
 from dptse_env.model.kernels import advance, scratch_of
-from dptse_env.model.network import BoolArray, FloatArray, IntArray
-from dptse_env.model.road import Road
+from dptse_env.model.layout import BoolArray, FloatArray, IntArray
+from dptse_env.model.road_arrays import Road
 
 Packed = tuple[Any, ...]
 

@@ -11,8 +11,8 @@ from dptse_env.estimators.compiled.kalman import CompiledFilter
 from dptse_env.estimators.compiled.sigma_points import Points
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
-from dptse_env.model.network import FloatArray, IntArray
-from dptse_env.validation import require
+from dptse_env.model.layout import FloatArray, IntArray
+from dptse_env.utils.validation import require
 
 
 class CompiledUKF(CompiledFilter):

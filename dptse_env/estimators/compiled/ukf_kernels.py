@@ -15,7 +15,7 @@ from numba import njit
 
 from dptse_env.estimators.compiled.algebra import is_covariance, mirror
 from dptse_env.estimators.compiled.dense import eliminate, factor, products
-from dptse_env.estimators.compiled.kernels import Filters, Packed, project, restart
+from dptse_env.estimators.compiled.ekf_kernels import Filters, Packed, project, restart
 from dptse_env.estimators.compiled.sigma_points import (
     Points,
     distances_from_first,
@@ -28,8 +28,8 @@ from dptse_env.estimators.compiled.swarm import (
     project_swarm,
     released_swarm,
 )
-from dptse_env.model.network import BoolArray, FloatArray, IntArray
-from dptse_env.model.road import Road
+from dptse_env.model.layout import BoolArray, FloatArray, IntArray
+from dptse_env.model.road_arrays import Road
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

@@ -16,7 +16,7 @@ from agents.policy_study.plan import (
 )
 from agents.policy_study.running import make_task
 from agents.seeds import STUDY_TEST
-from dptse_env.estimators.tuning import write_settings
+from dptse_env.estimators.tuned_settings import write_settings
 from tests.agents.policies import save
 from tests.agents.policy_study.worlds import SMALL, checkpoints, score
 

@@ -28,7 +28,7 @@ def test_the_full_design_is_that_of_the_study():
     primary = configs["primary"]
     assert (cells["primary"].env, cells["paper"].env) == (PRIVATE, PAPER)
     assert (primary.estimator, primary.bandwidth) == ("ekf", 5)
-    assert (primary.privacy.preset, primary.privacy.epsilon) == ("guaranteed", 5.0)
+    assert (primary.privacy.preset, primary.privacy.epsilon) == ("capped", 5.0)
     changes = {
         "bandwidth-3": {"bandwidth": 3},
         "bandwidth-7": {"bandwidth": 7},

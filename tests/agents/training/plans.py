@@ -21,7 +21,7 @@ def make_plan(learner="plackett-luce", steps=240, **changes):
         "steps": steps,
         "traffic_seeds": (0, 1, 2),
         "validation_seeds": (1000, 1001),
-        "keywords": {"horizon": 80, "privacy": "guaranteed"},
+        "keywords": {"horizon": 80, "privacy": "capped"},
         "validate_every": 3,
         "checkpoint_every": 2,
     }

@@ -5,8 +5,8 @@ import pytest
 pytest.importorskip("sb3_contrib")
 
 from agents.training.episodes import TrainingEpisodes
-from dptse_env.actions import ACTION_ENCODINGS
 from dptse_env.sb3 import SB3VecEnv
+from dptse_env.spaces.actions import ACTION_ENCODINGS
 
 HORIZON = 20
 
@@ -17,7 +17,7 @@ def make(num_envs=4, seed=3, twins=1, reward_scale=1.0, shows_errors=False, **ke
         "dptse_env:dptse/ShortHighway-v0",
         num_envs=num_envs,
         autoreset_mode="SameStep",
-        privacy="guaranteed",
+        privacy="capped",
         truth_in_info=shows_errors,
         **keywords,
     )

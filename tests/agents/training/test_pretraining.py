@@ -11,7 +11,7 @@ from agents.training.pretraining import pretrain
 from agents.training.recipes import PlackettLuceRecipe
 from agents.training.truth import SCALES, TrueErrors
 from dptse_env.config import resolve
-from dptse_env.interface import QueryInterface
+from dptse_env.parts import make_interface
 
 SHORT = "dptse_env:dptse/ShortHighway-v0"
 
@@ -31,7 +31,7 @@ def make(**changes):
         **changes,
     }
     recipe = PlackettLuceRecipe(**values)
-    episodes = make_episodes(SHORT, {"traffic_seeds": "0:3", "privacy": "guaranteed"}, recipe, 0)
+    episodes = make_episodes(SHORT, {"traffic_seeds": "0:3", "privacy": "capped"}, recipe, 0)
     return recipe, episodes, make_model(recipe, episodes, 0)
 
 
@@ -100,7 +100,7 @@ def test_it_reports_its_progress_and_leaves_no_gradients():
 
 def test_errors_are_split_from_what_was_shown():
     config = resolve("short-highway", {})
-    interface = QueryInterface.of(config)
+    interface = make_interface(config)
     errors = TrueErrors(config, interface)
     env = gym.make(SHORT, traffic_seeds="0:2", truth_in_info=True)
     observation, _ = env.reset(seed=0)

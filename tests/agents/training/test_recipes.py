@@ -9,8 +9,8 @@ import yaml
 
 from agents.training.recipes import RECIPES, PlackettLuceRecipe, SwapRounds
 from agents.training.yaml import ENV, FOLDER, to_yaml
-from dptse_env.actions import ACTION_ENCODINGS
 from dptse_env.config import PRESETS
+from dptse_env.spaces.actions import ACTION_ENCODINGS
 
 
 @pytest.mark.parametrize("name", RECIPES)

@@ -9,7 +9,7 @@ from dptse_env.privacy import GaussianMechanism
 
 SHORT = "dptse_env:dptse/ShortHighway-v0"
 SEEDS = [5, 6, 7]
-COUNTED = {"preset": "guaranteed", "cap": 20, "boundary_inputs": "private"}
+COUNTED = {"preset": "capped", "cap": 20, "boundary_inputs": "private"}
 SECONDS, TRIALS, HORIZON = 6, 2, 40
 
 
@@ -77,7 +77,7 @@ def noises(env):
     generator = np.random.default_rng(0)
     generator.integers(SECONDS)
     columns = env.config.corridor.n_segments + env.process.boundary.n_released
-    return generator.choice([-1.0, 1.0], size=(3, columns, 2)) * env.process.mechanism.sigma
+    return generator.choice([-1.0, 1.0], size=(3, columns, 2)) * env.process.release.sigma
 
 
 def test_gains_are_those_of_episodes_run_apart(pass_of_swaps):
@@ -98,7 +98,7 @@ def test_gains_are_those_of_episodes_run_apart(pass_of_swaps):
         total = np.zeros(3)
         for action in [query, *policy.asked[first + 1 : first + SECONDS]]:
             total += env.step(action)[1]
-        return np.array([total, env.process.answers.contributions.exposures.sum(axis=1)])
+        return np.array([total, env.process.release.contributions.exposures.sum(axis=1)])
 
     def mean(swapped):
         return (run(swapped, 1.0) + run(swapped, -1.0)) / 2.0

@@ -110,9 +110,7 @@ def test_the_folder_says_what_was_trained(tmp_path):
 def _env():
     import gymnasium as gym
 
-    return gym.make(
-        "dptse_env:dptse/ShortHighway-v0", action="slots", privacy="guaranteed", horizon=80
-    )
+    return gym.make("dptse_env:dptse/ShortHighway-v0", action="slots", privacy="capped", horizon=80)
 
 
 @pytest.mark.parametrize(
@@ -120,7 +118,7 @@ def _env():
     [
         ({"seed": 2}, "seed is 1 there and 2 now"),
         ({"steps": 480}, "steps is 240 there and 480 now"),
-        ({"keywords": {"horizon": 81, "privacy": "guaranteed"}}, "keywords.horizon is 80 there"),
+        ({"keywords": {"horizon": 81, "privacy": "capped"}}, "keywords.horizon is 80 there"),
         ({"traffic_seeds": (0, 1)}, r"traffic_seeds is \[0, 1, 2\] there and \[0, 1\] now"),
         ({"validation_seeds": (1000,)}, "validation_seeds is"),
     ],

@@ -9,8 +9,8 @@ import torch
 from agents.evaluation import run_episode
 from agents.seeds import TRAINING_VALIDATION
 from agents.training.validation import Validation
-from dptse_env.actions import ACTION_ENCODINGS
 from dptse_env.schedules import make_schedule
+from dptse_env.spaces.actions import ACTION_ENCODINGS
 
 SHORT = "dptse_env:dptse/ShortHighway-v0"
 SEEDS = (1000, 1003)
@@ -30,7 +30,7 @@ class Drawn:
 
 @pytest.mark.parametrize("action", ACTION_ENCODINGS)
 def test_errors_are_those_of_single_episodes(action):
-    keywords = {"action": action, "privacy": "guaranteed", "horizon": 90}
+    keywords = {"action": action, "privacy": "capped", "horizon": 90}
     validation = Validation(SHORT, keywords, SEEDS)
     policy = make_schedule("round-robin", validation.env)
     errors = validation.errors(policy, deterministic=True)

@@ -1,0 +1,129 @@
+"""Tuned estimator settings: the named sets that ship with the package, and files of that shape.
+
+A set holds what was tuned for one estimator with one ARZ parameter set under one privacy preset;
+what it leaves out keeps the defaults of `EstimatorSettings`. ``scripts/tune.py`` makes them.
+"""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections.abc import Mapping
+from functools import cache
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from dptse_env.estimators.settings import EstimatorSettings
+from dptse_env.utils.fields import from_mapping
+from dptse_env.utils.json_object import parse_object
+
+_SETS = resources.files("dptse_env.estimators") / "tuned"
+_PATH = "estimator_settings"
+_KEYS = {
+    "name": str,
+    "estimator": str,
+    "parameters": str,
+    "privacy": str,
+    "settings": dict,
+    "provenance": dict,
+}
+
+
+def settings_name(estimator: str, parameters: str, privacy: str) -> str:
+    """Return the name of the set for an estimator, an ARZ parameter set and a privacy preset."""
+    return f"{estimator}-{parameters}-{privacy}"
+
+
+@cache
+def available_settings() -> tuple[str, ...]:
+    """Names of the sets that ship with the package, sorted."""
+    names = (entry.name for entry in _SETS.iterdir())
+    return tuple(sorted(name.removesuffix(".json") for name in names if name.endswith(".json")))
+
+
+def load_settings(name: str) -> EstimatorSettings:
+    """Load a set that ships with the package.
+
+    Raises:
+        ValueError: if there is no such set; the message lists those there are.
+    """
+    return _load(known_settings(name))
+
+
+def known_settings(name: str) -> str:
+    """Return the name of a set that ships with the package, given its present or former name.
+
+    Raises:
+        ValueError: if there is no such set; the message lists those there are.
+    """
+    if name in available_settings():
+        return name
+    present = name.removesuffix("-guaranteed") + "-capped"
+    if name.endswith("-guaranteed") and present in available_settings():
+        message = f"{_PATH}: {name!r} is now called {present!r}"
+        warnings.warn(message, DeprecationWarning, stacklevel=2)
+        return present
+    raise ValueError(f"{_PATH} must be one of {', '.join(available_settings())}, got {name!r}")
+
+
+@cache
+def _load(name: str) -> EstimatorSettings:
+    entry = _SETS.joinpath(f"{name}.json")
+    return _parse(entry.read_text(encoding="utf-8"), str(entry))
+
+
+def read_settings(path: str | Path) -> EstimatorSettings:
+    """Read a set from a JSON file of the shape that `write_settings` leaves.
+
+    Raises:
+        ValueError: if the file has another shape or a setting is out of range; the message starts
+            with the path of the file.
+    """
+    return _parse(Path(path).read_text(encoding="utf-8"), str(path))
+
+
+def write_settings(
+    path: str | Path,
+    *,
+    estimator: str,
+    parameters: str,
+    privacy: str,
+    settings: Mapping[str, Any],
+    provenance: Mapping[str, Any],
+) -> None:
+    """Write a set and where it comes from as JSON.
+
+    Args:
+        path: The file.
+        estimator: Name of the estimator.
+        parameters: Name of the ARZ parameter set of its model.
+        privacy: Privacy preset whose noise it met.
+        settings: The tuned fields of `EstimatorSettings`, nested ones as mappings.
+        provenance: Traffic, noise, scores, date and versions.
+
+    Raises:
+        ValueError: if a setting is unknown or out of range; nothing is written then.
+    """
+    content = {
+        "name": settings_name(estimator, parameters, privacy),
+        "estimator": estimator,
+        "parameters": parameters,
+        "privacy": privacy,
+        "settings": dict(settings),
+        "provenance": dict(provenance),
+    }
+    text = json.dumps(content, indent=2) + "\n"
+    _parse(text, str(path))
+    Path(path).write_text(text, encoding="utf-8")
+
+
+def _parse(text: str, path: str) -> EstimatorSettings:
+    content = parse_object(text, path, _KEYS)
+    name = settings_name(content["estimator"], content["parameters"], content["privacy"])
+    if content["name"] != name:
+        raise ValueError(f"{path}: name must be {name!r}, got {content['name']!r}")
+    try:
+        return from_mapping(EstimatorSettings, content["settings"], _PATH)
+    except ValueError as problem:
+        raise ValueError(f"{path}: {problem}") from problem

@@ -1,0 +1,137 @@
+"""A model as plain arrays and numbers, the form in which compiled code takes it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from dptse_env.model.arz import ARZModel
+from dptse_env.model.layout import FloatArray, IntArray
+
+LINK, MERGE, DIVERGE, EXIT = 0, 1, 2, 3
+
+
+class Road(NamedTuple):
+    """A model as arrays and numbers, in a form that compiled code takes (S segments).
+
+    Attributes:
+        free_flow_speed: v_f [km/h].
+        gamma: Exponent of the pressure.
+        step_ratio: T / l [h/km].
+        relaxation: T / tau.
+        jam: `(S,)` jam densities [veh/km].
+        outside_jam: `(S,)` jam density behind an exit [veh/km]; unused elsewhere.
+        kind: `(S,)` LINK, MERGE, DIVERGE or EXIT: the face a cell flows out through.
+        parties: `(S, 3)` the cell, the cell it flows into, and the third one at a junction
+            (the other branch of a merge, the off-ramp of a diverge), -1 where there is none.
+        share: `(S,)` exit share of a diverge.
+        entry: `(S,)` input column of the demand from outside, -1 for an inner cell.
+        exit: `(S,)` input column of the density outside, -1 for an inner cell.
+        edges: `(E, 2)` cells (from, to) between which vehicles pass.
+        edge_share: `(E,)` share of the outflow that passes.
+        neighbours: `(S, K)` cells that a cell's next state depends on, itself first, -1 padded.
+        degree: `(S,)` how many neighbours there are.
+        terms: `(M, 4)` (row cell, slot of its neighbour, outflow's cell, its party).
+        term_weight: `(M,)` weight of the outflow's gradient in the Jacobian [h/km].
+        reference_speed: v_0 [km/h] of the centred flow that sensors release; NaN where they
+            release the speed.
+        second_scale: unit of the second number that sensors release [km/h or veh/h].
+    """
+
+    free_flow_speed: float
+    gamma: float
+    step_ratio: float
+    relaxation: float
+    jam: FloatArray
+    outside_jam: FloatArray
+    kind: IntArray
+    parties: IntArray
+    share: FloatArray
+    entry: IntArray
+    exit: IntArray
+    edges: IntArray
+    edge_share: FloatArray
+    neighbours: IntArray
+    degree: IntArray
+    terms: IntArray
+    term_weight: FloatArray
+    reference_speed: float
+    second_scale: float
+
+
+def road_of(model: ARZModel) -> Road:
+    """Put a model into the form that compiled code takes."""
+    layout, n = model.layout, model.n_segments
+    kind = np.full(n, EXIT, dtype=np.int64)
+    parties = np.full((n, 3), -1, dtype=np.int64)
+    parties[:, 0] = np.arange(n)
+    share = np.zeros(n)
+    for up, down in layout.links.T:
+        kind[up], parties[up, 1] = LINK, down
+    for main, ramp, down in layout.merges.T:
+        kind[[main, ramp]] = MERGE
+        parties[main, 1:] = down, ramp
+        parties[ramp, 1:] = down, main
+    for (up, main, off), exit_share in zip(layout.diverges.T, layout.exit_shares, strict=True):
+        kind[up], share[up] = DIVERGE, exit_share
+        parties[up, 1:] = main, off
+
+    entry, leave = np.full((2, n), -1, dtype=np.int64)
+    entry[layout.entries] = layout.entry_inputs
+    leave[layout.exits] = layout.exit_inputs
+    outside_jam = np.zeros(n)
+    outside_jam[layout.exits] = model.exit_jam_density
+
+    ends, starts = np.nonzero(layout.routing)
+    edges = np.stack([starts, ends], axis=1).astype(np.int64)
+    edge_share = layout.routing[ends, starts]
+    neighbours, degree = _neighbours(model)
+    terms, weights = _terms(parties, edges, edge_share, neighbours)
+    return Road(
+        free_flow_speed=float(model.parameters.free_flow_speed),
+        gamma=float(model.parameters.gamma),
+        step_ratio=float(model.step_ratio),
+        relaxation=float(model.relaxation),
+        jam=model.jam_density,
+        outside_jam=outside_jam,
+        kind=kind,
+        parties=parties,
+        share=share,
+        entry=entry,
+        exit=leave,
+        edges=edges,
+        edge_share=edge_share,
+        neighbours=neighbours,
+        degree=degree,
+        terms=terms,
+        term_weight=model.step_ratio * weights,
+        reference_speed=np.nan if model.reference_speed is None else model.reference_speed,
+        second_scale=float(model.measurement_scale[1]),
+    )
+
+
+def _neighbours(model: ARZModel) -> tuple[IntArray, IntArray]:
+    sparsity = model.layout.sparsity()
+    degree = sparsity.sum(axis=1).astype(np.int64)
+    neighbours = np.full((model.n_segments, int(degree.max())), -1, dtype=np.int64)
+    for cell, row in enumerate(sparsity):
+        others = np.flatnonzero(row)
+        neighbours[cell, : degree[cell]] = [cell, *others[others != cell]]
+    return neighbours, degree
+
+
+def _terms(
+    parties: IntArray, edges: IntArray, edge_share: FloatArray, neighbours: IntArray
+) -> tuple[IntArray, FloatArray]:
+    """Where each outflow's gradient enters the Jacobian: in its own row and where it flows to."""
+    flows = [(cell, cell, -1.0) for cell in range(len(parties))]
+    flows += [(start, end, part) for (start, end), part in zip(edges, edge_share, strict=True)]
+    terms, weights = [], []
+    for start, row, weight in flows:
+        for party, cell in enumerate(parties[start]):
+            if cell >= 0:
+                slot = int(np.flatnonzero(neighbours[row] == cell)[0])
+                terms.append((row, slot, start, party))
+                weights.append(weight)
+    return np.array(terms, dtype=np.int64), np.array(weights)

@@ -1,0 +1,258 @@
+r"""The statistics of an audit: from the scores of two worlds to a lower bound on what leaks.
+
+An adversary meets a mechanism many times in each of two adjacent worlds and gives every run a
+score, the higher the more the run looks like world 1. A threshold on the score is a test with two
+error rates, and privacy bounds both from below together:
+
+$$\mu \ge -\Phi^{-1}(\alpha) - \Phi^{-1}(\beta), \qquad
+\varepsilon \ge \log \frac{1 - \delta - \beta}{\alpha}, \quad
+\varepsilon \ge \log \frac{1 - \delta - \alpha}{\beta}$$
+
+with $\alpha$ the rate of false positives and $\beta$ that of false negatives (Dong, Roth and Su
+2022, section 2). One half of the runs chooses the thresholds. The other half counts the errors,
+and exact upper bounds on their rates (Clopper and Pearson 1934) turn into lower bounds here.
+
+An audit can refute a claim and never prove one. Nothing here knows of traffic.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import brentq
+from scipy.special import ndtr, ndtri
+from scipy.stats import beta, binom
+
+from dptse_env.utils.validation import inside, integer, positive, require
+
+__all__ = [
+    "AuditResult",
+    "Claim",
+    "LowerBound",
+    "audit",
+    "detectable_mu",
+    "error_bound",
+    "rejection_probability",
+]
+
+FloatArray = npt.NDArray[np.float64]
+
+_N_RATES = 4  # two thresholds, one for mu and one for epsilon, with two error rates each
+
+# Thresholds are chosen by bounds of this risk. For Gaussian releases every threshold would show
+# the same mu, were the rates known: wide bounds keep the choice where rates are known best, and
+# not where they came out by luck.
+_RISK_OF_CHOICE = 1e-5
+
+
+@dataclass(frozen=True)
+class Claim:
+    """What is put to the test.
+
+    Attributes:
+        mu: of Gaussian differential privacy, > 0.
+        epsilon: > 0.
+        delta: in (0, 0.5).
+
+    Raises:
+        ValueError: if a number is out of range.
+    """
+
+    mu: float
+    epsilon: float
+    delta: float
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        positive("claim.mu", self.mu)
+        positive("claim.epsilon", self.epsilon)
+        inside("claim.delta", self.delta, 0.0, 0.5)
+
+
+@dataclass(frozen=True)
+class LowerBound:
+    """A lower bound on a privacy parameter, and the test behind it.
+
+    Attributes:
+        value: the bound, >= 0.
+        threshold: scores above it are taken for world 1.
+        false_positives: upper bound on the rate of runs in world 0 that score above it.
+        false_negatives: upper bound on the rate of runs in world 1 that do not.
+    """
+
+    value: float
+    threshold: float
+    false_positives: float
+    false_negatives: float
+
+
+@dataclass(frozen=True)
+class AuditResult:
+    """What the scores say about a claim.
+
+    Attributes:
+        claim: what was tested.
+        mu: lower bound on mu.
+        epsilon: lower bound on epsilon at the claim's delta, whatever the mechanism is. It takes
+            rare errors to see a large epsilon, so that it lies well below the truth.
+        confidence: with which both bounds hold together.
+    """
+
+    claim: Claim
+    mu: LowerBound
+    epsilon: LowerBound
+    confidence: float
+
+    @property
+    def verdict(self) -> Literal["rejected", "not rejected"]:
+        """Whether a bound lies above the claim."""
+        exceeds = self.mu.value > self.claim.mu or self.epsilon.value > self.claim.epsilon
+        return "rejected" if exceeds else "not rejected"
+
+
+def audit(
+    scores_0: npt.ArrayLike, scores_1: npt.ArrayLike, claim: Claim, confidence: float = 0.95
+) -> AuditResult:
+    """Test a claim on the scores of independent runs.
+
+    Args:
+        scores_0: (n,) scores of the runs in world 0, n >= 2.
+        scores_1: (n,) scores of the runs in world 1.
+        claim: what to test; true claims are rejected with probability 1 - confidence at most.
+        confidence: in (0, 1).
+
+    Raises:
+        ValueError: if there are too few scores, they differ in number, or one is not finite.
+    """
+    worlds = np.asarray(scores_0, dtype=np.float64), np.asarray(scores_1, dtype=np.float64)
+    for name, scores in zip(("scores_0", "scores_1"), worlds, strict=True):
+        require(scores.ndim == 1 and len(scores) >= 2, name, "two or more numbers", scores.shape)
+        require(bool(np.isfinite(scores).all()), name, "finite", scores)
+    require(len(worlds[0]) == len(worlds[1]), "scores_1", "as many as scores_0", len(worlds[1]))
+    risk = (1.0 - inside("confidence", confidence, 0.0, 1.0)) / _N_RATES
+
+    half = len(worlds[0]) // 2
+    chosen = [np.sort(scores[:half]) for scores in worlds]
+    held_out = [np.sort(scores[half:]) for scores in worlds]
+    candidates = _between(np.unique(np.concatenate(chosen)))
+    rates = _error_bounds(chosen, candidates, _RISK_OF_CHOICE)
+
+    def bound(values: FloatArray, parameter: Literal["mu", "epsilon"]) -> LowerBound:
+        best = np.flatnonzero(values == values.max())
+        threshold = candidates[best[[len(best) // 2]]]
+        bounds = _error_bounds(held_out, threshold, risk)
+        value = _mu(*bounds) if parameter == "mu" else _epsilon(*bounds, claim.delta)
+        false_positives, false_negatives = (float(rate[0]) for rate in bounds)
+        return LowerBound(float(value[0]), float(threshold[0]), false_positives, false_negatives)
+
+    return AuditResult(
+        claim=claim,
+        mu=bound(_mu(*rates), "mu"),
+        epsilon=bound(_epsilon(*rates, claim.delta), "epsilon"),
+        confidence=confidence,
+    )
+
+
+def error_bound(errors: npt.ArrayLike, trials: int, risk: float) -> FloatArray:
+    """Exact upper confidence bound on an error rate (Clopper and Pearson 1934).
+
+    Args:
+        errors: errors counted among the trials, any shape, in 0..trials.
+        trials: >= 1.
+        risk: probability that the true rate may lie above the bound, in (0, 1).
+
+    Returns:
+        The rates at which so few errors or fewer have probability `risk`; 1 where all are errors.
+    """
+    counts = np.asarray(errors, dtype=np.float64)
+    # Where all trials are errors the distribution has no second parameter above zero.
+    some_right = np.minimum(counts, trials - 1.0)
+    rates = beta.ppf(1.0 - risk, some_right + 1.0, trials - some_right)
+    bounds: FloatArray = np.where(counts >= trials, 1.0, rates)
+    return bounds
+
+
+def rejection_probability(mu: float, claimed_mu: float, n: int, confidence: float = 0.95) -> float:
+    """Power: how likely the bound on mu rejects a claim, if the truth is `mu`.
+
+    The truth is a Gaussian release that the adversary scores by its likelihood ratio, and the
+    threshold is the best one, midway. Both error counts are then binomial, and the sum over them
+    is exact. `audit` has to find its threshold first, which costs a few hundredths where the power
+    is neither near 0 nor near 1.
+
+    Args:
+        mu: true parameter, > 0.
+        claimed_mu: the claim, > 0.
+        n: runs per world, of which `audit` counts the errors in the second half.
+        confidence: of the audit.
+
+    Returns:
+        A probability; at `mu` = `claimed_mu` that of a false alarm by this bound.
+    """
+    mu, claimed_mu = positive("mu", mu), positive("claimed_mu", claimed_mu)
+    n = integer("n", n, 2)
+    trials = n - n // 2
+    risk = (1.0 - inside("confidence", confidence, 0.0, 1.0)) / _N_RATES
+    counts = np.arange(trials + 1)
+    # Falls as the errors grow in number; the two worlds' values add to the bound on mu.
+    evidence = -ndtri(error_bound(counts, trials, risk))
+    most = np.searchsorted(-evidence, evidence - claimed_mu) - 1
+    rate = float(ndtr(-0.5 * mu))
+    return float(np.sum(binom.pmf(counts, trials, rate) * binom.cdf(most, trials, rate)))
+
+
+def detectable_mu(
+    claimed_mu: float, n: int, confidence: float = 0.95, probability: float = 0.95
+) -> float:
+    """Smallest true mu at which a claim is rejected with the given probability.
+
+    Args:
+        claimed_mu: the claim, > 0.
+        n: runs per world.
+        confidence: of the audit.
+        probability: in (0, 1).
+
+    Returns:
+        mu, or infinity where so few runs cannot reject the claim however much leaks.
+    """
+    probability = inside("probability", probability, 0.0, 1.0)
+
+    def excess(mu: float) -> float:
+        return rejection_probability(mu, claimed_mu, n, confidence) - probability
+
+    low = high = claimed_mu
+    while excess(high) < 0.0:
+        if high > claimed_mu + 50.0:  # no error is ever made there
+            return math.inf
+        low, high = high, high + 1.0
+    return high if low == high else float(brentq(excess, low, high, xtol=1e-6))
+
+
+def _between(scores: FloatArray) -> FloatArray:
+    """Midpoints of increasing scores: where worlds do not overlap, a threshold keeps off both."""
+    return 0.5 * (scores[1:] + scores[:-1]) if len(scores) > 1 else scores
+
+
+def _error_bounds(
+    scores: list[FloatArray], thresholds: FloatArray, risk: float
+) -> tuple[FloatArray, FloatArray]:
+    """Upper bounds on both error rates of each threshold; `scores` are sorted."""
+    below_0, below_1 = (np.searchsorted(own, thresholds, side="right") for own in scores)
+    trials = len(scores[0])
+    return error_bound(trials - below_0, trials, risk), error_bound(below_1, trials, risk)
+
+
+def _mu(false_positives: FloatArray, false_negatives: FloatArray) -> FloatArray:
+    bound: FloatArray = np.maximum(-ndtri(false_positives) - ndtri(false_negatives), 0.0)
+    return bound
+
+
+def _epsilon(false_positives: FloatArray, false_negatives: FloatArray, delta: float) -> FloatArray:
+    """The larger of the two bounds; zero where neither says anything."""
+    ratios = np.maximum(
+        (1.0 - delta - false_negatives) / false_positives,
+        (1.0 - delta - false_positives) / false_negatives,
+    )
+    return np.log(np.maximum(ratios, 1.0))

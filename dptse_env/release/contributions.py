@@ -1,0 +1,143 @@
+"""What vehicles contribute to the answers of queried segments, each a bounded number of times.
+
+A vehicle counts in the first C steps in which the segment it is on was asked, and in no later one.
+Whether it counts depends on its own trajectory and on the queries, which are public, and never on
+other vehicles: taking one vehicle out of a record leaves what all others contribute as it was.
+"""
+
+from __future__ import annotations
+
+from typing import TypeVar
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from dptse_env.traffic import Record
+from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray, IntArray
+
+NumberT = TypeVar("NumberT", bound=np.generic)
+
+GROWTH = 1.5  # of the tables, when one more record no longer fits
+
+
+class Contributions:
+    """Vehicle tables of a set of records, and how often each vehicle counted in each episode.
+
+    Attributes:
+        cap: C, steps in which a vehicle counts; None if in all.
+        exposures: Shape (n_episodes, n_vehicles), steps in which each vehicle has counted; as wide
+            as the largest record loaded.
+    """
+
+    def __init__(
+        self, n_slots: int, n_steps: int, n_episodes: int, largest_speed: float, cap: int | None
+    ) -> None:
+        """Prepare for records of `n_steps` steps; none is loaded yet.
+
+        Args:
+            n_slots: Records to hold at most.
+            n_steps: Steps of each.
+            n_episodes: Size of the batch.
+            largest_speed: Speeds are clipped to [0, `largest_speed`] [km/h].
+            cap: C, or None.
+        """
+        self.cap, self.largest_speed = cap, largest_speed
+        self._limit = n_steps if cap is None else cap
+        self._start = np.zeros((n_slots, n_steps + 1), dtype=np.int64)
+        self._n_vehicles = np.zeros(n_slots, dtype=np.int64)
+        self._rows = 0
+        self._vehicle: NDArray[np.int32] = np.empty(0, dtype=np.int32)
+        self._segment: NDArray[np.int16] = np.empty(0, dtype=np.int16)
+        self._speed: NDArray[np.float32] = np.empty(0, dtype=np.float32)
+        self.exposures: NDArray[np.int32] = np.zeros((n_episodes, 0), dtype=np.int32)
+
+    @property
+    def tables(self) -> tuple[AnyArray, ...]:
+        """The vehicle tables of all records, which no episode changes."""
+        return self._start, self._n_vehicles, self._vehicle, self._segment, self._speed
+
+    def load(self, slot: int, record: Record) -> None:
+        """Take in the vehicle table of one record."""
+        end = self._rows + record.n_rows
+        if end > len(self._vehicle):
+            size = max(end, int(GROWTH * len(self._vehicle)))
+            self._vehicle = _grown(self._vehicle, size)
+            self._segment = _grown(self._segment, size)
+            self._speed = _grown(self._speed, size)
+        if record.n_vehicles > self.exposures.shape[1]:
+            wider = np.zeros((len(self.exposures), record.n_vehicles), dtype=np.int32)
+            wider[:, : self.exposures.shape[1]] = self.exposures
+            self.exposures = wider
+        self._vehicle[self._rows : end] = record.vehicle
+        self._segment[self._rows : end] = record.segment
+        self._speed[self._rows : end] = np.clip(record.speed, 0.0, self.largest_speed)
+        self._start[slot] = self._rows + record.offsets
+        self._n_vehicles[slot] = record.n_vehicles
+        self._rows = end
+
+    def reset(self, episodes: IntArray) -> None:
+        """Begin new episodes, shape (k,): nobody has counted yet."""
+        self.exposures[episodes] = 0
+
+    def of_episode(self, episode: int, slot: int) -> NDArray[np.int32]:
+        """Return how often each vehicle of a slot's record has counted, shape (its vehicles,).
+
+        It depends on the records of other episodes neither in value nor in length.
+        """
+        return self.exposures[episode, : self._n_vehicles[slot]].copy()
+
+    def collect(
+        self, episodes: IntArray, slots: IntArray, times: IntArray, observed: BoolArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Count the vehicles of one step on the observed segments, and charge them.
+
+        Args:
+            episodes: Which episodes, shape (k,).
+            slots: Which record each replays, shape (k,).
+            times: Which second of it, shape (k,).
+            observed: Which record columns were asked, shape (k, n_columns).
+
+        Returns:
+            Vehicles that count, and the sum of their clipped speeds [km/h], both (k, n_columns);
+            zero where nobody asked.
+        """
+        counts, speeds = np.zeros((2, *observed.shape))
+        _collect(
+            self._start, self._vehicle, self._segment, self._speed, episodes, slots, times,
+            observed, self._limit, self.exposures, counts, speeds,
+        )  # fmt: skip
+        return counts, speeds
+
+
+def _grown(column: NDArray[NumberT], size: int) -> NDArray[NumberT]:
+    """A longer copy of a column; what lies beyond its end is not yet written."""
+    longer = np.empty(size, dtype=column.dtype)
+    longer[: len(column)] = column
+    return longer
+
+
+@njit(cache=True, error_model="numpy")
+def _collect(
+    start: IntArray,
+    vehicle: NDArray[np.int32],
+    segment: NDArray[np.int16],
+    speed: NDArray[np.float32],
+    episodes: IntArray,
+    slots: IntArray,
+    times: IntArray,
+    observed: BoolArray,
+    limit: int,
+    exposures: NDArray[np.int32],
+    counts: FloatArray,
+    speeds: FloatArray,
+) -> None:
+    n_columns = observed.shape[1]
+    for k in range(episodes.size):
+        spent = exposures[episodes[k]]
+        for row in range(start[slots[k], times[k]], start[slots[k], times[k] + 1]):
+            s, v = segment[row], vehicle[row]
+            if s < n_columns and observed[k, s] and spent[v] < limit:
+                spent[v] += 1
+                counts[k, s] += 1.0
+                speeds[k, s] += speed[row]

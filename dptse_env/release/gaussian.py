@@ -1,0 +1,289 @@
+"""Release models with Gaussian noise: `Paper`, `Corrected` and `Capped`."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+
+from dptse_env.privacy import (
+    ReleaseAccount,
+    Sensitivity,
+    contribution_sensitivity,
+    epsilon_of,
+    joint_noise_std,
+    paper_sensitivity,
+    printed_noise_std,
+    single_noise_std,
+)
+from dptse_env.release.base import Released, ReleaseModel, ReleaseRequest, ReleaseSetup
+from dptse_env.release.contributions import Contributions
+from dptse_env.release.mechanism import GaussianMechanism, Mechanism
+from dptse_env.release.report import STRICT_DELTA, PrivacyReport, QuantityReport, in_order
+from dptse_env.release.settings import CappedSettings, PrivacySettings
+from dptse_env.traffic import Corridor, Record
+from dptse_env.utils.arrays import AnyArray, FloatArray, IntArray
+from dptse_env.utils.vector_info import Rows, as_objects
+
+
+class GaussianRelease(ReleaseModel):
+    """A release of true values plus Gaussian noise; a subclass has the values and the sensitivity.
+
+    Attributes:
+        sensitivity: L2 sensitivities of both released quantities over an episode.
+    """
+
+    def __init__(self, setup: ReleaseSetup) -> None:
+        """Work out sensitivity and noise; nothing is loaded."""
+        super().__init__(setup)
+        self.sensitivity = self._sensitivity()
+        self.mechanism = GaussianMechanism(
+            self._noise_std(), n_episodes=setup.n_episodes, n_segments=setup.n_columns
+        )
+
+    @property
+    def mechanism(self) -> Mechanism:
+        """The mechanism that adds the noise; account and report follow the one in force."""
+        return self._mechanism
+
+    @mechanism.setter
+    def mechanism(self, mechanism: Mechanism) -> None:
+        self._mechanism = mechanism
+        mu = self.sensitivity.joint_mu(mechanism.sigma.tolist())
+        contributions = self.sensitivity.contributions
+        self._account = ReleaseAccount(mu, self.setup.settings.delta, contributions)
+
+    @abstractmethod
+    def _sensitivity(self) -> Sensitivity:
+        """Return the sensitivities of both released quantities."""
+
+    @abstractmethod
+    def _noise_std(self) -> tuple[float, ...]:
+        """Return the standard deviations of the noise that `sensitivity` needs."""
+
+    @abstractmethod
+    def _void_reasons(self) -> tuple[str, ...]:
+        """Return the reasons for which the sensitivity or the noise gives no guarantee."""
+
+    @abstractmethod
+    def true_values(self, request: ReleaseRequest) -> FloatArray:
+        """Return what is released before noise is added, shape (k, n_columns, 2).
+
+        Where contributions are bounded, those of the observed columns are charged.
+        """
+
+    @property
+    def protects(self) -> str:
+        """Whose data is protected, and what counts as a change of it."""
+        return "one vehicle's trip, replaced by another"
+
+    @property
+    def sigma(self) -> FloatArray:
+        """See `ReleaseModel.sigma`."""
+        return self.mechanism.sigma
+
+    def reset(self, episodes: IntArray, generators: Sequence[np.random.Generator]) -> None:
+        """See `ReleaseModel.reset`."""
+        self.mechanism.reset(episodes, generators)
+
+    def release(self, request: ReleaseRequest) -> Released:
+        """See `ReleaseModel.release`."""
+        values = self.mechanism.release(request.episodes, self.true_values(request))
+        return Released(values, self.sigma)
+
+    def spent(self, steps: IntArray) -> tuple[FloatArray, FloatArray]:
+        """See `ReleaseModel.spent`."""
+        return self._account.spent(steps)
+
+    def report(self) -> PrivacyReport:
+        """See `ReleaseModel.report`; it describes the noise in force."""
+        settings, sensitivity = self.setup.settings, self.sensitivity
+        stds, mu = self.sigma.tolist(), self._account.mu
+        epsilon = epsilon_of(mu, settings.delta)
+        found = list(self._void_reasons())
+        # Le Ny's kappa is loose enough at times that even two releases stay below epsilon together.
+        if epsilon > settings.epsilon * (1.0 + 1e-9):
+            found.append("releases_not_composed")
+        flow = self.flow_centre(self.setup.corridor, settings) is not None
+        return PrivacyReport(
+            preset=self.setup.name,
+            guarantee="none" if found else self._guarantee(),
+            void_reasons=in_order(found),
+            protects=self.protects,
+            claimed_epsilon=settings.epsilon,
+            claimed_delta=settings.delta,
+            speed_release="flow" if flow else "mean",
+            boundary_inputs=settings.boundary,
+            mu=mu,
+            epsilon=epsilon,
+            epsilon_strict=epsilon_of(mu, STRICT_DELTA),
+            releases=tuple(
+                QuantityReport(one.quantity, one.unit, one.bound, std, one.bound / std)
+                for one, std in zip(sensitivity.releases, stds, strict=True)
+            ),
+            assumptions=dict(sensitivity.assumptions),
+            details=self._details(),
+        )
+
+    def _details(self) -> Mapping[str, Any]:
+        """Return the settings of this model alone, for the report."""
+        return {"unit": None, "cap": None, "adjacency": "replace", "share": None}
+
+    def _guarantee(self) -> str:
+        settings = self.setup.settings
+        quantities = " and ".join(release.quantity for release in self.sensitivity.releases)
+        return (
+            f"({settings.epsilon:g}, {settings.delta:g})-differential privacy of {quantities} "
+            f"together, for {self.protects}"
+        )
+
+
+class Paper(GaussianRelease):
+    """True density and mean speed of all vehicles, with the noise as printed in the paper."""
+
+    def _sensitivity(self) -> Sensitivity:
+        setup, corridor = self.setup, self.setup.corridor
+        return paper_sensitivity(
+            n_sensors=setup.bandwidth + len(setup.always_observed),
+            average_dwell=corridor.average_dwell,
+            segment_length=corridor.segment_length,
+            # Constants of the corridor, so that the noise does not depend on the estimator.
+            free_flow_speed=corridor.speed_scale,
+            jam_density=corridor.density_scale,
+        )
+
+    def _noise_std(self) -> tuple[float, ...]:
+        settings = self.setup.settings
+        return printed_noise_std(self.sensitivity, settings.epsilon, settings.delta)
+
+    def _void_reasons(self) -> tuple[str, ...]:
+        return ("literal_variance", "average_dwell", "adaptive_queries", "speed_sensitivity")
+
+    def true_values(self, request: ReleaseRequest) -> FloatArray:
+        """See `GaussianRelease.true_values`."""
+        setup = self.setup
+        return setup.traffic.aggregates(request.traffic, request.times, setup.n_columns)
+
+
+class Corrected(Paper):
+    """The same as `Paper`, with the noise that the theorem cited there needs, per release."""
+
+    def _noise_std(self) -> tuple[float, ...]:
+        settings = self.setup.settings
+        return single_noise_std(self.sensitivity, settings.epsilon, settings.delta)
+
+    def _void_reasons(self) -> tuple[str, ...]:
+        return super()._void_reasons()[1:]
+
+
+class Capped(GaussianRelease):
+    """Density and centred flow of vehicles that count a bounded number of times.
+
+    The guarantee holds for any query policy. The centred flow [veh/h] is the sum of v - v_0 over
+    the vehicles that count, per length, with v clipped to [0, 2 v_0]: it changes by at most v_0 / l
+    when a vehicle comes or goes. ``docs/privacy.md`` has the proof.
+    """
+
+    settings_type: ClassVar[type[PrivacySettings]] = CappedSettings
+    claims_guarantee: ClassVar[bool] = True
+
+    @classmethod
+    def flow_centre(cls, corridor: Corridor, settings: CappedSettings) -> float | None:
+        """Return half of the speed limit, the centre of the speeds that are clipped to it."""
+        return 0.5 * corridor.speed_limit if settings.speed_release == "flow" else None
+
+    def __init__(self, setup: ReleaseSetup) -> None:
+        """See `GaussianRelease`; contributions of vehicles are counted from `load` on."""
+        assert isinstance(setup.settings, CappedSettings)
+        self._settings = setup.settings
+        super().__init__(setup)
+        corridor, traffic = setup.corridor, setup.traffic
+        self.contributions = Contributions(
+            len(traffic.traffic_seeds),
+            corridor.duration + 1,
+            setup.n_episodes,
+            corridor.speed_limit,
+            setup.settings.contribution_cap,
+        )
+
+    def _sensitivity(self) -> Sensitivity:
+        corridor, settings = self.setup.corridor, self._settings
+        slope = corridor.speed_scale / corridor.density_scale
+        return contribution_sensitivity(
+            contributions=settings.contributions(self.setup.horizon),
+            adjacency=settings.adjacency,
+            segment_length=corridor.segment_length,
+            largest_speed=corridor.speed_limit,
+            mean_speed_slope=slope if settings.speed_release == "mean" else None,
+        )
+
+    def _noise_std(self) -> tuple[float, ...]:
+        settings = self._settings
+        return joint_noise_std(self.sensitivity, settings.epsilon, settings.delta, settings.share)
+
+    def _void_reasons(self) -> tuple[str, ...]:
+        return ("speed_sensitivity",) if self._settings.speed_release == "mean" else ()
+
+    @property
+    def protects(self) -> str:
+        """See `GaussianRelease.protects`."""
+        return self._settings.protected
+
+    def _details(self) -> Mapping[str, Any]:
+        settings = self._settings
+        return {
+            "unit": settings.unit,
+            "cap": settings.contribution_cap,
+            "adjacency": settings.adjacency,
+            "share": settings.share,
+        }
+
+    @property
+    def shared(self) -> tuple[AnyArray, ...]:
+        """The vehicle tables of all traffic."""
+        return self.contributions.tables
+
+    def load(self, index: int, record: Record) -> None:
+        """Read the vehicle table of a record."""
+        self.contributions.load(index, record)
+
+    def reset(self, episodes: IntArray, generators: Sequence[np.random.Generator]) -> None:
+        """See `ReleaseModel.reset`; no vehicle has counted yet."""
+        super().reset(episodes, generators)
+        self.contributions.reset(episodes)
+
+    def true_values(self, request: ReleaseRequest) -> FloatArray:
+        """See `GaussianRelease.true_values`; unobserved columns hold zeros."""
+        corridor = self.setup.corridor
+        length, limit = corridor.segment_length, corridor.speed_limit
+        counts, speeds = self.contributions.collect(
+            request.episodes, request.traffic, request.times, request.observed
+        )
+        values = np.empty((*counts.shape, 2))
+        np.divide(counts, length, out=values[..., 0])
+        if self._settings.speed_release == "flow":
+            speeds -= 0.5 * limit * counts
+            np.divide(speeds, length, out=values[..., 1])
+        else:
+            empty = counts == 0.0
+            values[..., 1] = np.where(empty, limit, speeds / np.where(empty, 1.0, counts))
+        return values
+
+    def private_info(self, episodes: IntArray, traffic: IntArray) -> Rows:
+        """Return each vehicle's contributions and the epsilon that it has spent.
+
+        Lists, since records differ in their number of vehicles and Gymnasium stacks arrays of equal
+        shape only.
+        """
+        counted = [
+            self.contributions.of_episode(episode, index)
+            for episode, index in zip(episodes, traffic, strict=True)
+        ]
+        # A vehicle that has counted k times has spent what one of cap k has in all.
+        spent = [self.spent(steps.astype(np.int64))[1].tolist() for steps in counted]
+        return {
+            "exposures": as_objects([steps.tolist() for steps in counted]),
+            "individual_epsilon": as_objects(spent),
+        }

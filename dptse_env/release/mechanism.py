@@ -1,0 +1,175 @@
+"""The mechanism: true aggregates in, released values out."""
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from dptse_env.utils.validation import integer
+
+__all__ = ["GaussianMechanism", "Mechanism"]
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.integer]
+
+GRID_SHARE = 2.0**-10
+"""Spacing of the released grid over the noise's standard deviation, at most."""
+
+
+class Mechanism(Protocol):
+    """What the decision process needs of a mechanism, for a batch of n episodes of S segments."""
+
+    @property
+    def sigma(self) -> FloatArray:
+        """Noise standard deviation of the two released quantities, (2,) [veh/km, km/h]."""
+
+    def reset(self, episodes: IntArray, generators: Sequence[np.random.Generator]) -> None:
+        """Begin new episodes.
+
+        Args:
+            episodes: (k,) distinct rows of the batch.
+            generators: k noise streams, one for each; the mechanism is their only user from now.
+        """
+
+    def release(self, episodes: IntArray, values: FloatArray) -> FloatArray:
+        """Release one step of some episodes.
+
+        Args:
+            episodes: (k,) distinct rows of the batch.
+            values: (k, S, 2) true density [veh/km] and speed [km/h] of all segments; those of
+                segments that nobody asked for may be anything, and their release is to be dropped.
+
+        Returns:
+            (k, S, 2) a fresh array of released values, in the same units.
+        """
+
+
+class GaussianMechanism:
+    """Adds independent Gaussian noise to every value and rounds the sum to a public grid.
+
+    The low bits of a sum in double precision tell which true value went into it: released as they
+    are, they would prove that a segment is empty (Mironov, 2012). Rounding to a grid of spacing
+    `grid`, a power of two between sigma / 2048 and sigma / 1024, removes them. It depends on sigma
+    alone and raises the variance by less than a millionth.
+
+    Noise is drawn for all segments at every step, whatever was asked: two policies that are run on
+    the same streams meet the same noise, and an episode's noise depends neither on the batch it is
+    in nor on how the other episodes go. It is drawn ahead in blocks of steps, since one large draw
+    costs far less than many small ones; the size of the blocks does not change the noise.
+    """
+
+    def __init__(
+        self, sigma: npt.ArrayLike, *, n_episodes: int, n_segments: int, block: int = 32
+    ) -> None:
+        """Make a mechanism for a batch of episodes; each needs a `reset` before its first release.
+
+        Args:
+            sigma: (2,) noise standard deviation of density [veh/km] and speed [km/h].
+            n_episodes: size n of the batch.
+            n_segments: number S of segments.
+            block: steps of noise to draw at a time.
+
+        Raises:
+            ValueError: if `sigma` is not two finite numbers above zero, or a size is below one.
+        """
+        std = np.array(sigma, dtype=np.float64)
+        if std.shape != (2,) or not (np.isfinite(std).all() and (std > 0.0).all()):
+            raise ValueError(f"sigma must be two finite numbers > 0, got {sigma!r}")
+        n_episodes = integer("n_episodes", n_episodes, 1)
+        n_segments = integer("n_segments", n_segments, 1)
+        block = integer("block", block, 1)
+        std.flags.writeable = False
+        self._sigma = std
+        # Powers of two: scaling by them is exact, so that a release is a multiple of the grid.
+        self._grid = 2.0 ** np.floor(np.log2(std * GRID_SHARE))
+        self._grid.flags.writeable = False
+        self._per_grid = 1.0 / self._grid
+        self._block = block
+        self._generators: list[np.random.Generator | None] = [None] * n_episodes
+        self._noise = np.empty((n_episodes, block, n_segments, 2))
+        # Next unused step of each block. An episode that was never reset has a spent block, so
+        # that it cannot be released without noise.
+        self._next = np.full(n_episodes, block)
+        # Releases that are sure to find noise in every block: spares a look at `_next` each step.
+        self._sure = 0
+
+    @property
+    def sigma(self) -> FloatArray:
+        """Noise standard deviation of the two released quantities, (2,) [veh/km, km/h]."""
+        return self._sigma
+
+    @property
+    def grid(self) -> FloatArray:
+        """Spacing of the grid that releases are rounded to, (2,), in the units of `sigma`."""
+        return self._grid
+
+    @property
+    def n_episodes(self) -> int:
+        """Size n of the batch."""
+        return len(self._generators)
+
+    def reset(self, episodes: IntArray, generators: Sequence[np.random.Generator]) -> None:
+        """Begin new episodes, each with a noise stream of its own.
+
+        Args:
+            episodes: (k,) distinct rows of the batch.
+            generators: k noise streams; the mechanism is their only user from now on.
+
+        Raises:
+            ValueError: if there is not exactly one stream for each episode.
+        """
+        rows = episodes.tolist()
+        if len(generators) != len(rows):
+            raise ValueError(
+                f"generators must be one for each of {len(rows)} episodes, got {len(generators)}"
+            )
+        for row, generator in zip(rows, generators, strict=True):
+            self._generators[row] = generator
+            self._draw(row, generator)
+        self._sure = self._block - int(self._next.max())
+
+    def release(self, episodes: IntArray, values: FloatArray) -> FloatArray:
+        """Release one step of some episodes, and move their noise streams on by one step.
+
+        Args:
+            episodes: (k,) distinct rows of the batch.
+            values: (k, S, 2) true density [veh/km] and speed [km/h] of all segments. Finite values
+                are not required of a segment that nobody asked for.
+
+        Returns:
+            (k, S, 2) a fresh array: values plus noise of standard deviation `sigma`, rounded to
+            multiples of `grid`.
+
+        Raises:
+            RuntimeError: if an episode was never reset.
+            ValueError: if `values` has another shape.
+        """
+        if self._sure <= 0:
+            self._refill(episodes)
+        step = self._next[episodes]
+        released: FloatArray = self._noise[episodes, step]  # a copy, as for any index array
+        if values.shape != released.shape:
+            raise ValueError(f"values must have shape {released.shape}, got {values.shape}")
+        released += values
+        released *= self._per_grid
+        np.rint(released, out=released)
+        released *= self._grid
+        step += 1
+        self._next[episodes] = step
+        self._sure -= 1
+        return released
+
+    def _refill(self, episodes: IntArray) -> None:
+        """Draw a new block for those of `episodes` whose block is spent."""
+        for row in episodes[self._next[episodes] == self._block].tolist():
+            generator = self._generators[row]
+            if generator is None:
+                raise RuntimeError(f"episode {row} was released before its first reset")
+            self._draw(row, generator)
+        self._sure = self._block - int(self._next.max())
+
+    def _draw(self, row: int, generator: np.random.Generator) -> None:
+        generator.standard_normal(out=self._noise[row])
+        self._noise[row] *= self._sigma
+        self._next[row] = 0

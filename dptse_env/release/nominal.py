@@ -1,0 +1,90 @@
+"""Nominal flows, inputs and states: what the published demand alone says about the road."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from dptse_env.model import ARZModel
+from dptse_env.traffic import Corridor, Demand, DemandDistribution
+from dptse_env.utils.arrays import FloatArray
+
+
+def _published(corridor: Corridor) -> Demand:
+    demand = corridor.demand
+    return demand.base if isinstance(demand, DemandDistribution) else demand
+
+
+def nominal_flows(corridor: Corridor, times: npt.ArrayLike) -> FloatArray:
+    """Return the flow through each segment at the published demand [veh/h], shape (..., S).
+
+    Args:
+        corridor: The road; a demand distribution counts with its base.
+        times: Seconds of the record [s], shape (...).
+    """
+    demand = _published(corridor)
+    starts, rates = np.array(demand.mainline).T
+    flow = rates[np.searchsorted(starts, times, side="right") - 1]
+    on = dict(zip(corridor.on_ramps, demand.on_ramps, strict=True))
+    off = dict(zip(corridor.off_ramps, corridor.exit_shares, strict=True))
+    entries = [np.full_like(flow, rate) for rate in demand.on_ramps]
+    mainline, exits = [], []
+    for segment in range(corridor.n_mainline):
+        if segment in off:
+            exits.append(off[segment] * flow)
+            flow = flow - exits[-1]
+        flow = flow + on.get(segment, 0.0)
+        mainline.append(flow)
+    return np.stack([*mainline, *entries, *exits], axis=-1)
+
+
+def free_flow_density(model: ARZModel, flow: FloatArray) -> FloatArray:
+    """Return the density [veh/km] at which each segment carries ``flow`` freely, both (..., S).
+
+    The smaller root of q = rho (v_f - p(rho)); a flow above the capacity gives the critical
+    density.
+    """
+    return _free_density(model, flow, model.jam_density)
+
+
+def _free_density(model: ARZModel, flow: FloatArray, jam: FloatArray) -> FloatArray:
+    v_f, gamma = model.parameters.free_flow_speed, model.parameters.gamma
+    filling = np.linspace(0.0, (1.0 + gamma) ** (-1.0 / gamma), 4096)
+    scaled_flow = filling * (1.0 - filling**gamma)
+    density: FloatArray = jam * np.interp(flow / (jam * v_f), scaled_flow, filling)
+    return density
+
+
+def nominal_inputs(corridor: Corridor, model: ARZModel) -> FloatArray:
+    """Return the model's inputs at the published demand for every second, shape (T + 1, n_u).
+
+    What enters does so at free speed; behind the exits traffic flows freely, at the density of
+    the flow that reaches them. No incident is known.
+    """
+    layout, v_f = model.layout, model.parameters.free_flow_speed
+    n, n_on = corridor.n_mainline, len(corridor.on_ramps)
+    demand = _published(corridor)
+    flows = nominal_flows(corridor, np.arange(corridor.duration + 1))
+    inputs = np.empty((len(flows), model.n_inputs))
+    inputs[:, layout.entry_inputs[0]] = flows[:, 0]  # no ramp lies ahead of the first segment
+    inputs[:, layout.entry_inputs[1:]] = demand.on_ramps
+    inputs[:, layout.entry_inputs + 1] = v_f
+    leaving = flows[:, [n - 1, *range(n + n_on, corridor.n_segments)]]
+    inputs[:, layout.exit_inputs] = _free_density(model, leaving, model.exit_jam_density)
+    return inputs
+
+
+def nominal_state(corridor: Corridor, model: ARZModel, times: npt.ArrayLike) -> FloatArray:
+    """Return the free-flow equilibrium of the published demand, shape (..., n_x).
+
+    It is public: it depends on the corridor's description and the clock, never on a record.
+
+    Args:
+        corridor: The road.
+        model: Its traffic model.
+        times: Seconds of the record [s], shape (...).
+    """
+    density = free_flow_density(model, nominal_flows(corridor, times))
+    v_f, gamma = model.parameters.free_flow_speed, model.parameters.gamma
+    speed = v_f * (1.0 - (density / model.jam_density) ** gamma)
+    return model.states(density, speed)

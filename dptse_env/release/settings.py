@@ -1,0 +1,107 @@
+"""What a user asks of a release model: the keyword ``privacy`` of an environment."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Literal
+
+from dptse_env.privacy import Adjacency
+from dptse_env.utils.fields import Interval, checked_fields
+
+Unit = Literal["trip", "horizon", "event"]
+"""What is protected: a trip of capped contributions, of any length, or one second of it."""
+
+SpeedRelease = Literal["mean", "flow"]
+"""How speeds are released: their mean over a segment's vehicles, or a sum, the centred flow."""
+
+BoundaryInputs = Literal["true", "nominal", "private"]
+"""Where the estimator's inputs at the boundary come from: measured traffic, public demand, or the
+boundary segments' releases."""
+
+
+@dataclass(frozen=True)
+class PrivacySettings:
+    """What every release model is asked for; one that needs more has a class of its own.
+
+    Attributes:
+        preset: The release model: ``paper``, ``corrected``, ``capped``, a registered name,
+            ``"package.module:Class"``, or a class.
+        epsilon: Privacy parameter epsilon.
+        delta: Privacy parameter delta.
+        boundary_inputs: Where the estimator's inputs at the boundary come from: ``true``,
+            ``nominal`` or ``private``; None for the model's default.
+
+    Raises:
+        ValueError: A field is out of range; the message names its path below ``privacy``.
+    """
+
+    default_boundary: ClassVar[BoundaryInputs] = "true"
+
+    preset: Any = "paper"
+    epsilon: Annotated[float, Interval(1e-4, 1e4)] = 1.0
+    delta: Annotated[float, Interval(1e-12, 0.5, open_high=True)] = 0.05
+    boundary_inputs: BoundaryInputs | None = None
+
+    def __post_init__(self) -> None:
+        """Check each field, and keep the numbers as plain floats."""
+        checked_fields(self, "privacy")
+
+    @property
+    def boundary(self) -> BoundaryInputs:
+        """Where the estimator's inputs at the boundary come from."""
+        return self.boundary_inputs or self.default_boundary
+
+
+@dataclass(frozen=True)
+class CappedSettings(PrivacySettings):
+    """What `dptse_env.release.Capped` is asked for beside `PrivacySettings`.
+
+    Attributes:
+        unit: What is protected: ``trip``, a vehicle's trip, which counts in its first ``cap``
+            queried steps; ``horizon``, a trip without a cap, charged for every step of an episode;
+            ``event``, one second of a trip.
+        cap: Of unit ``trip``, queried steps in which a vehicle counts.
+        adjacency: How two adjacent records differ: ``replace`` or ``add_remove``.
+        share: Part of the budget mu^2 that density gets.
+        speed_release: ``flow``, or ``mean`` for mean speeds, which void the guarantee.
+
+    Raises:
+        ValueError: A field is out of range; the message names its path below ``privacy``.
+    """
+
+    default_boundary: ClassVar[BoundaryInputs] = "nominal"
+
+    preset: Any = "capped"
+    unit: Unit = "trip"
+    cap: Annotated[int, Interval(1, 1_000_000)] = 64
+    adjacency: Adjacency = "replace"
+    share: Annotated[float, Interval(0.001, 0.999)] = 0.5
+    speed_release: SpeedRelease = "flow"
+
+    def __post_init__(self) -> None:
+        """Check each field, and that they go together."""
+        super().__post_init__()
+        if self.speed_release == "mean" and self.adjacency == "add_remove":
+            raise ValueError(
+                "privacy.adjacency must be 'replace' where mean speeds are released, got "
+                "'add_remove': without its one vehicle a segment has no mean"
+            )
+
+    @property
+    def contribution_cap(self) -> int | None:
+        """Queried steps in which a vehicle counts; None if in all of them."""
+        return self.cap if self.unit == "trip" else None
+
+    def contributions(self, horizon: int) -> int:
+        """Return in how many of an episode's ``horizon`` steps the protected unit can count."""
+        return {"trip": min(self.cap, horizon), "horizon": horizon, "event": 1}[self.unit]
+
+    @property
+    def protected(self) -> str:
+        """Description of what the guarantee protects."""
+        change = "replaced by another" if self.adjacency == "replace" else "added or removed"
+        return {
+            "trip": f"one vehicle's trip, {change}, which counts in {self.cap} queried steps",
+            "horizon": f"one vehicle's whole trip, {change}",
+            "event": f"one second of one vehicle's trip, {change}",
+        }[self.unit]

@@ -1,0 +1,238 @@
+"""Compiled kernels of the schedules that reckon with the estimator's covariance.
+
+One episode after the other, as in `dptse_env.estimators.compiled`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from dptse_env.model.kernels import scratch_of
+from dptse_env.model.road_arrays import Road
+from dptse_env.schedules.covariance_kernels import (
+    Problem,
+    Work,
+    downdate,
+    hold_speeds,
+    look_ahead,
+    step,
+    take_in,
+    to_traffic,
+    work_of,
+)
+from dptse_env.utils.arrays import BoolArray, FloatArray
+
+Packed = tuple[Any, ...]
+
+TRACE, LOGDET = 0, 1
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def choose_greedily(
+    road_: Packed,
+    problem_: Packed,
+    criterion: int,
+    keeps: bool,
+    means: FloatArray,
+    covariances: FloatArray,
+    inputs: FloatArray,
+    queried: BoolArray,
+) -> None:
+    """Pick segments one after the other, for k episodes.
+
+    Args:
+        road_: The `Road`.
+        problem_: The `Problem`.
+        criterion: TRACE or LOGDET.
+        keeps: Whether `covariances` gets what the coming step leaves of them.
+        means: Present states, shape (k, 2 S) [veh/km, veh/h].
+        covariances: Theirs, normalised, shape (k, 2 S, 2 S).
+        inputs: The model's inputs of the coming step, shape (k, n_u).
+        queried: Where the sets go, shape (k, n_mainline).
+    """
+    road, problem = Road(*road_), Problem(*problem_)
+    work = work_of(road, problem)
+    scratch = scratch_of(road)
+    for k in range(means.shape[0]):
+        look_ahead(road, problem, means[k], covariances[k], inputs[k], work, scratch)
+        take_in(problem, problem.always, work.covariance, work)
+        to_traffic(problem, work.covariance, work)
+        hold_speeds(problem, work)
+        pick(problem, criterion, work, queried[k])
+        if keeps:
+            take_in(problem, np.flatnonzero(queried[k]), work.covariance, work)
+            covariances[k] = work.covariance
+
+
+@njit(cache=True, error_model="numpy")
+def pick(problem: Problem, criterion: int, work: Work, queried: BoolArray) -> None:
+    """Pick B segments, each the one of the largest gain given those before."""
+    n, bandwidth, askable, noise = (
+        problem.n_mainline, problem.bandwidth, problem.askable, problem.noise,
+    )  # fmt: skip
+    traffic, rows, weights, vectors = (
+        work.traffic, work.traffic_rows, work.weights, work.vectors,
+    )  # fmt: skip
+    queried[:] = False
+    for i in range(bandwidth):
+        if i >= askable.size:
+            _fill_up(bandwidth - i, queried)
+            return
+        best, largest = -1, -np.inf
+        for j in range(askable.size):
+            s = askable[j]
+            if not queried[s]:
+                gain = _gain(n, criterion, s, traffic, rows, weights, noise)
+                if gain > largest or best < 0:
+                    best, largest = s, gain
+        queried[best] = True
+        if i + 1 < bandwidth:
+            by_both = (rows[best, 1], rows[best, 2])
+            downdate(traffic, best, n + best, rows[best, 0], by_both, noise, vectors)
+
+
+@njit(cache=True, error_model="numpy")
+def _fill_up(n_left: int, queried: BoolArray) -> None:
+    """Spend the bandwidth to spare on segments with a fixed sensor, where it gains nothing."""
+    for s in range(queried.size):
+        if n_left > 0 and not queried[s]:
+            queried[s] = True
+            n_left -= 1
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
+def _products(
+    n: int, s: int, traffic: FloatArray, weights: FloatArray
+) -> tuple[float, float, float]:
+    """Return weighted sums of squares and of products of a segment's two rows of C."""
+    xx = xy = yy = 0.0
+    for j in range(2 * n):
+        x, y = traffic[s, j], traffic[n + s, j]
+        w = weights[j] * x
+        xx += w * x
+        xy += w * y
+        yy += weights[j] * y * y
+    return xx, xy, yy
+
+
+@njit(cache=True, error_model="numpy")
+def _gain(
+    n: int,
+    criterion: int,
+    s: int,
+    traffic: FloatArray,
+    rows: FloatArray,
+    weights: FloatArray,
+    noise: FloatArray,
+) -> float:
+    """What asking a segment takes from the weighted trace, or from the log determinant.
+
+    It takes its arrays one by one: a tuple of twenty costs more in reference counts than the
+    arithmetic does.
+    """
+    f, a, b = rows[s, 0], rows[s, 1], rows[s, 2]
+    x, y, z = traffic[s, s], traffic[s, n + s], traffic[n + s, n + s]
+    s11 = f * f * x + noise[0]
+    s12 = f * (a * x + b * y)
+    s22 = a * a * x + 2.0 * a * b * y + b * b * z + noise[1]
+    left = s22 - s12 * s12 / s11
+    if criterion == LOGDET:
+        return float(np.log(s11 * left / (noise[0] * noise[1])))
+    xx, xy, yy = _products(n, s, traffic, weights)
+    g11, g12 = f * f * xx, f * (a * xx + b * xy)
+    g22 = a * a * xx + 2.0 * a * b * xy + b * b * yy
+    ratio = s12 / s11
+    return float(g11 / s11 + (g22 - 2.0 * ratio * g12 + ratio * ratio * g11) / left)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def choose_by_swaps(
+    road_: Packed,
+    problem_: Packed,
+    horizon: int,
+    means: FloatArray,
+    covariances: FloatArray,
+    inputs: FloatArray,
+    queried: BoolArray,
+) -> None:
+    """Pick greedily by the trace, then take the best of all single swaps over a horizon.
+
+    Arguments are those of `choose_greedily`, and the steps to reckon with, the coming one included.
+    `covariances` always gets what the coming step leaves of them.
+    """
+    road, problem = Road(*road_), Problem(*problem_)
+    work, after = work_of(road, problem), np.empty(covariances.shape[1:])
+    scratch, ahead, best = scratch_of(road), np.empty_like(after), np.empty_like(after)
+    for k in range(means.shape[0]):
+        look_ahead(road, problem, means[k], covariances[k], inputs[k], work, scratch)
+        take_in(problem, problem.always, work.covariance, work)
+        ahead[:] = work.covariance
+        to_traffic(problem, ahead, work)
+        hold_speeds(problem, work)
+        pick(problem, TRACE, work, queried[k])
+        base = queried[k].copy()
+        least = _roll_out(road, problem, horizon, base, ahead, after, best, work)
+        for out in np.flatnonzero(base):
+            for s in problem.askable:
+                if base[s]:
+                    continue
+                tried = base.copy()
+                tried[out], tried[s] = False, True
+                value = _roll_out(
+                    road, problem, horizon, tried, ahead, after, work.covariance, work
+                )
+                if value < least:
+                    least = value
+                    queried[k] = tried
+                    best[:] = work.covariance
+        covariances[k] = best
+
+
+@njit(cache=True, error_model="numpy")
+def _roll_out(
+    road: Road,
+    problem: Problem,
+    horizon: int,
+    asked: BoolArray,
+    ahead: FloatArray,
+    after: FloatArray,
+    first: FloatArray,
+    work: Work,
+) -> float:
+    """Return the sum of weighted traces over the horizon; `first` gets the coming step's P."""
+    after[:] = ahead
+    take_in(problem, np.flatnonzero(asked), after, work)
+    first[:] = after
+    total = _spread(problem, after, work)
+    for _ in range(horizon - 1):
+        step(road, problem, after, work)
+        take_in(problem, problem.always, after, work)
+        _spread(problem, after, work)
+        # The rule from then on: the largest weighted variance.
+        for _ in range(min(problem.bandwidth, problem.askable.size)):
+            best, largest = -1, -np.inf
+            for s in problem.askable:
+                if work.sums[0, s] > largest:
+                    best, largest = s, work.sums[0, s]
+            work.sums[0, best] = -np.inf
+            work.sums[1, best] = 1.0
+        take_in(problem, np.flatnonzero(work.sums[1]), after, work)
+        total += _spread(problem, after, work)
+    return total
+
+
+@njit(cache=True, error_model="numpy")
+def _spread(problem: Problem, covariance: FloatArray, work: Work) -> float:
+    """Return the weighted trace; `work.sums` gets each segment's share of it, then zeros."""
+    n, d, total = problem.n_mainline, 1.0 / problem.units[0], 0.0
+    for s in range(n):
+        p, q = work.to_speed[s, 0], work.to_speed[s, 1]
+        x, y = covariance[2 * s, 2 * s], covariance[2 * s, 2 * s + 1]
+        speed = p * p * x + 2.0 * p * q * y + q * q * covariance[2 * s + 1, 2 * s + 1]
+        work.sums[0, s] = work.weights[s] * d * d * x + work.weights[n + s] * speed
+        work.sums[1, s] = 0.0
+        total += work.sums[0, s]
+    return total

@@ -1,0 +1,287 @@
+"""Action encodings: from a policy's action to the segments to query.
+
+Every encoding turns a batch of actions into at most ``bandwidth`` queried mainline segments per
+episode, and turns a set of segments back into an action. An encoding holds its Gymnasium space,
+so the two cannot drift apart, and no state: what is pending between actions lives in the process
+(`PendingPicks`). Requests are cut or filled in by a rotating pointer that knows nothing of the
+traffic.
+
+Any action that the space can sample is valid. A wrong shape, a wrong dtype, a NaN or an index
+outside the road raises ``ValueError``.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from dptse_env.utils.arrays import Action, BoolArray, IntArray
+from dptse_env.utils.registry import Registry, missing_methods
+
+
+class PendingPicks:
+    """State of n episodes between actions.
+
+    Attributes:
+        picked: Segments picked so far for a decision in progress, shape (n, n_mainline); always
+            empty but for the sequential encoding.
+        pointer: Segment from which requests are cut or filled in next, shape (n,).
+        n_replaced: Picks of the decision in progress that were replaced, shape (n,).
+    """
+
+    def __init__(self, n_episodes: int, n_mainline: int) -> None:
+        """Begin n episodes without any pick."""
+        self.picked = np.zeros((n_episodes, n_mainline), dtype=bool)
+        self.pointer = np.zeros(n_episodes, dtype=np.int64)
+        self.n_replaced = np.zeros(n_episodes, dtype=np.int64)
+
+    def reset(self, episodes: IntArray) -> None:
+        """Forget what earlier actions of ``episodes`` left behind."""
+        self.picked[episodes] = False
+        self.pointer[episodes] = 0
+        self.n_replaced[episodes] = 0
+
+    def in_turn(self, episodes: IntArray, wanted: BoolArray, limit: IntArray) -> BoolArray:
+        """Keep the first ``limit`` wanted segments from the pointer on, and move it past them.
+
+        Args:
+            episodes: Shape (k,).
+            wanted: Shape (k, n_mainline).
+            limit: Segments to keep of each episode, shape (k,).
+        """
+        n = wanted.shape[1]
+        order = (self.pointer[episodes, None] + np.arange(n)) % n
+        turned = np.take_along_axis(wanted, order, axis=1)
+        turned &= np.cumsum(turned, axis=1) <= limit[:, None]
+        last = n - 1 - np.argmax(turned[:, ::-1], axis=1)
+        moved = (order[np.arange(len(episodes)), last] + 1) % n
+        self.pointer[episodes] = np.where(turned.any(axis=1), moved, self.pointer[episodes])
+        kept = np.zeros_like(wanted)
+        np.put_along_axis(kept, order, turned, axis=1)
+        return kept
+
+
+@dataclass(frozen=True)
+class Decision:
+    """The queries that a batch of actions decides on.
+
+    Attributes:
+        queried: Segments to query, shape (k, n_mainline).
+        n_dropped: Requests that were cut, repeated or replaced, shape (k,).
+        complete: Whether the decision is ready to be carried out, shape (k,). Only the sequential
+            encoding needs several actions for one decision.
+    """
+
+    queried: BoolArray
+    n_dropped: IntArray
+    complete: BoolArray
+
+
+class ActionEncoding(ABC):
+    """Base class of the encodings, made of (n_mainline, bandwidth).
+
+    Attributes:
+        space: The Gymnasium space of one action.
+        n_mainline: Segments that can be queried, n.
+        bandwidth: Most queries a step, B.
+        actions_per_step: Actions that make one decision.
+    """
+
+    actions_per_step = 1
+
+    def __init__(self, space: spaces.Space[Any], n_mainline: int, bandwidth: int) -> None:
+        """Keep the space and the sizes."""
+        self.space = space
+        self.n_mainline, self.bandwidth = n_mainline, bandwidth
+
+    @abstractmethod
+    def decode(self, episodes: IntArray, actions: Action, pending: PendingPicks) -> Decision:
+        """Turn actions into segments to query.
+
+        Args:
+            episodes: The k episodes that act, rows of ``pending``.
+            actions: Shape (k, *space.shape).
+            pending: State of all episodes; that of ``episodes`` is moved on.
+
+        Raises:
+            ValueError: A wrong shape, dtype or value; nothing is changed then.
+        """
+
+    @abstractmethod
+    def encode(self, queried: BoolArray, picked: BoolArray) -> Action:
+        """Turn wanted segments, shape (k, n_mainline), into actions of this encoding.
+
+        Args:
+            queried: Wanted segments, shape (k, n_mainline).
+            picked: Those already chosen for this decision, shape (k, n_mainline).
+
+        Raises:
+            ValueError: The encoding cannot express that set of segments.
+        """
+
+    def _checked(self, episodes: IntArray, actions: Action) -> Action:
+        """Return ``actions`` as an array of the right shape, or say what was wrong."""
+        array = np.asarray(actions)
+        expected = (len(episodes), *(self.space.shape or ()))
+        if array.shape != expected:
+            raise ValueError(
+                f"action must have shape {expected[1:]} of {self.space}, got {array.shape[1:]}"
+            )
+        if array.dtype.kind not in "biuf":
+            raise ValueError(f"action must be numeric for {self.space}, got {array.dtype}")
+        return array
+
+    def _checked_indices(self, episodes: IntArray, actions: Action) -> IntArray:
+        array, last = self._checked(episodes, actions), self.n_mainline - 1
+        if array.dtype.kind not in "iu":
+            raise ValueError(f"action must hold integers for {self.space}, got {array.dtype}")
+        if array.size and (array.min() < 0 or array.max() > last):
+            raise ValueError(f"action must lie in [0, {last}], got {array.tolist()}")
+        return array.astype(np.int64)
+
+    def _require_full(self, queried: BoolArray) -> None:
+        counts = queried.sum(axis=1)
+        if (counts != self.bandwidth).any():
+            raise ValueError(
+                f"{self.space} always queries {self.bandwidth} segments, got sets of "
+                f"{counts.tolist()}; use action='mask' to query fewer"
+            )
+
+
+def _all_complete(queried: BoolArray, n_dropped: IntArray) -> Decision:
+    return Decision(queried, n_dropped, np.ones(len(queried), dtype=bool))
+
+
+class MaskAction(ActionEncoding):
+    """``MultiBinary(n)``: one flag per segment.
+
+    More than ``bandwidth`` requests are cut by a rotating pointer. Arrays of any real dtype are
+    taken as long as they hold exactly 0 and 1, since learning libraries send flags as floats.
+    """
+
+    def __init__(self, n_mainline: int, bandwidth: int) -> None:
+        """Make the encoding for ``n_mainline`` segments and ``bandwidth`` queries a step."""
+        super().__init__(spaces.MultiBinary(n_mainline), n_mainline, bandwidth)
+
+    def decode(self, episodes: IntArray, actions: Action, pending: PendingPicks) -> Decision:
+        """See `ActionEncoding.decode`."""
+        array = self._checked(episodes, actions)
+        wanted = array != 0
+        if array.dtype.kind != "b" and not np.array_equal(array, wanted):
+            raise ValueError(f"action must hold 0 and 1 only, got {array.tolist()}")
+        n_dropped = np.maximum(wanted.sum(axis=1) - self.bandwidth, 0)
+        cut = n_dropped > 0
+        if cut.any():
+            limit = np.full(int(cut.sum()), self.bandwidth)
+            wanted[cut] = pending.in_turn(episodes[cut], wanted[cut], limit)
+        return _all_complete(wanted, n_dropped)
+
+    def encode(self, queried: BoolArray, picked: BoolArray) -> Action:
+        """See `ActionEncoding.encode`."""
+        return queried.astype(np.int8)
+
+
+class ScoresAction(ActionEncoding):
+    """``Box(-1, 1, (n,))``: the ``bandwidth`` segments of highest score; ties go upstream."""
+
+    def __init__(self, n_mainline: int, bandwidth: int) -> None:
+        """Make the encoding for ``n_mainline`` segments and ``bandwidth`` queries a step."""
+        super().__init__(spaces.Box(-1.0, 1.0, (n_mainline,), np.float32), n_mainline, bandwidth)
+
+    def decode(self, episodes: IntArray, actions: Action, pending: PendingPicks) -> Decision:
+        """See `ActionEncoding.decode`."""
+        array = self._checked(episodes, actions)
+        if array.dtype.kind != "f" or not np.isfinite(array).all():
+            raise ValueError(f"action must hold finite floats, got {array.tolist()}")
+        best = np.argsort(-array, axis=1, kind="stable")[:, : self.bandwidth]
+        queried = np.zeros(array.shape, dtype=bool)
+        np.put_along_axis(queried, best, True, axis=1)
+        return _all_complete(queried, np.zeros(len(episodes), dtype=np.int64))
+
+    def encode(self, queried: BoolArray, picked: BoolArray) -> Action:
+        """See `ActionEncoding.encode`."""
+        self._require_full(queried)
+        return (2.0 * queried - 1.0).astype(np.float32)
+
+
+class SlotsAction(ActionEncoding):
+    """``MultiDiscrete([n] * bandwidth)``: a segment per slot; repeats are refilled in rotation."""
+
+    def __init__(self, n_mainline: int, bandwidth: int) -> None:
+        """Make the encoding for ``n_mainline`` segments and ``bandwidth`` queries a step."""
+        super().__init__(spaces.MultiDiscrete([n_mainline] * bandwidth), n_mainline, bandwidth)
+
+    def decode(self, episodes: IntArray, actions: Action, pending: PendingPicks) -> Decision:
+        """See `ActionEncoding.decode`."""
+        slots = self._checked_indices(episodes, actions)
+        queried = np.zeros((len(episodes), self.n_mainline), dtype=bool)
+        np.put_along_axis(queried, slots, True, axis=1)
+        repeats = self.bandwidth - queried.sum(axis=1)
+        short = repeats > 0
+        if short.any():
+            queried[short] |= pending.in_turn(episodes[short], ~queried[short], repeats[short])
+        return _all_complete(queried, repeats)
+
+    def encode(self, queried: BoolArray, picked: BoolArray) -> Action:
+        """See `ActionEncoding.encode`."""
+        self._require_full(queried)
+        return np.nonzero(queried)[1].reshape(len(queried), self.bandwidth)
+
+
+class SequentialAction(ActionEncoding):
+    """``Discrete(n)``: one segment per action, ``bandwidth`` actions a step.
+
+    The traffic stands still until the last pick. Segments that are not picked yet may be picked
+    next, for policies that mask invalid actions; a pick of a taken segment is replaced in rotation.
+    """
+
+    def __init__(self, n_mainline: int, bandwidth: int) -> None:
+        """Make the encoding for ``n_mainline`` segments and ``bandwidth`` queries a step."""
+        super().__init__(spaces.Discrete(n_mainline), n_mainline, bandwidth)
+        self.actions_per_step = bandwidth
+
+    def decode(self, episodes: IntArray, actions: Action, pending: PendingPicks) -> Decision:
+        """See `ActionEncoding.decode`."""
+        picks = self._checked_indices(episodes, actions)
+        taken = pending.picked[episodes, picks]
+        pending.picked[episodes, picks] = True
+        if taken.any():
+            again = episodes[taken]
+            one = np.ones(len(again), dtype=np.int64)
+            pending.picked[again] |= pending.in_turn(again, ~pending.picked[again], one)
+            pending.n_replaced[again] += 1
+        queried = pending.picked[episodes]
+        complete = queried.sum(axis=1) == self.bandwidth
+        n_dropped = np.where(complete, pending.n_replaced[episodes], 0)
+        pending.picked[episodes[complete]] = False
+        pending.n_replaced[episodes[complete]] = 0
+        return Decision(queried, n_dropped, complete)
+
+    def encode(self, queried: BoolArray, picked: BoolArray) -> Action:
+        """See `ActionEncoding.encode`."""
+        self._require_full(queried)
+        choice: Action = np.argmax(queried & ~picked, axis=1)
+        return choice
+
+
+def _expected(part: Any) -> str | None:
+    if not isinstance(part, type):
+        return "be a class, made of (n_mainline, bandwidth)"
+    return missing_methods(part, ("decode", "encode"))
+
+
+ACTION_ENCODINGS = Registry(
+    "action",
+    {
+        "mask": MaskAction,
+        "scores": ScoresAction,
+        "slots": SlotsAction,
+        "sequential": SequentialAction,
+    },
+    check=_expected,
+)
+"""Action encodings by name, each a class made of (n_mainline, bandwidth)."""

@@ -1,0 +1,332 @@
+"""The observation: what the operator knows, as one flat float32 vector.
+
+It is made of named blocks, each with fixed bounds and scaled by physical constants of the
+corridor, so there are no running statistics that could be lost between training and use. It holds
+released values, the estimator's output, the query history and public settings. It never holds the
+truth, a clock, or anything that tells an empty segment from an occupied one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Protocol
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from dptse_env.estimators import Estimate
+from dptse_env.traffic import Corridor
+from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray, IntArray, Observation
+from dptse_env.utils.registry import Registry, is_foreign, missing_methods, name_of_class
+
+AGE_CAP = 60
+"""Age [s] beyond which a segment counts as not seen for long."""
+
+DEFAULT = "default"
+"""Stands for all default blocks where blocks are named."""
+
+
+@dataclass(frozen=True)
+class PublicState:
+    """The operator's knowledge about k episodes, in physical units; nothing of it is the truth.
+
+    Attributes:
+        estimate: Densities [veh/km], speeds [km/h] and their standard deviations, each (k, S).
+        released: Last released (density [veh/km], speed [km/h] or flow [veh/h]) per segment,
+            shape (k, S, 2); zero before the first release.
+        innovations: Normalised innovations of the last update, shape (k, S, 2); zero where
+            nothing was observed.
+        age: Steps since each mainline segment was last observed, shape (k, n_mainline).
+        queried: The last query, shape (k, n_mainline).
+        picked: Segments picked so far for the next query, shape (k, n_mainline).
+    """
+
+    estimate: Estimate
+    released: FloatArray
+    innovations: FloatArray
+    age: IntArray
+    queried: BoolArray
+    picked: BoolArray
+
+
+@dataclass(frozen=True)
+class ObservationSetup:
+    """The public configuration behind an observation.
+
+    Attributes:
+        corridor: The road.
+        bandwidth: Queries a step.
+        epsilon: Privacy parameter epsilon.
+        releases_flow: Whether centred flows are released in place of mean speeds.
+        picks_one_by_one: Whether a decision takes several actions.
+    """
+
+    corridor: Corridor
+    bandwidth: int
+    epsilon: float
+    releases_flow: bool = False
+    picks_one_by_one: bool = False
+
+    @cached_property
+    def fixed_sensors(self) -> IntArray:
+        """Segments with a fixed sensor, shape (F,)."""
+        return np.array(self.corridor.fixed_sensors, dtype=np.int64)
+
+
+class ObservationBlock(Protocol):
+    """A named part of the observation; a class of them is made without arguments.
+
+    Attributes:
+        name: Its name, other than those of the blocks that ship with the package.
+        low: Lower bound; values below are clipped.
+        high: Upper bound; values above are clipped.
+    """
+
+    name: str
+    low: float
+    high: float
+
+    def size(self, setup: ObservationSetup) -> int:
+        """Return the number of values."""
+
+    def values(self, state: PublicState, setup: ObservationSetup) -> AnyArray | float:
+        """Return the values of k episodes, shape (k, size), or one number for all of them."""
+
+
+@dataclass(frozen=True)
+class Block:
+    """A block that ships with the package, see `ObservationBlock`."""
+
+    name: str
+    length: Callable[[ObservationSetup], int]
+    low: float
+    high: float
+    value: Callable[[PublicState, ObservationSetup], NDArray[Any] | float]
+
+    def size(self, setup: ObservationSetup) -> int:
+        """See `ObservationBlock.size`."""
+        return self.length(setup)
+
+    def values(self, state: PublicState, setup: ObservationSetup) -> NDArray[Any] | float:
+        """See `ObservationBlock.values`."""
+        return self.value(state, setup)
+
+    def __reduce__(self) -> tuple[Callable[[str], Block], tuple[str]]:
+        """Travel as the name: functions without one cannot be pickled."""
+        return _shipped_block, (self.name,)
+
+
+def _log(deviation: FloatArray) -> FloatArray:
+    # A zero has no logarithm; the smallest number ends at the lower bound just as well.
+    return np.log(np.maximum(deviation, np.finfo(np.float64).tiny))
+
+
+def _segments(setup: ObservationSetup) -> int:
+    return setup.corridor.n_segments
+
+
+def _mainline(setup: ObservationSetup) -> int:
+    return setup.corridor.n_mainline
+
+
+def _fixed(setup: ObservationSetup) -> int:
+    return len(setup.corridor.fixed_sensors)
+
+
+def _released(component: int, scale: Callable[[Corridor], float]) -> Any:
+    def value(state: PublicState, setup: ObservationSetup) -> FloatArray:
+        n = setup.corridor.n_mainline
+        values: FloatArray = state.released[:, :n, component] / scale(setup.corridor)
+        return values
+
+    return value
+
+
+def _innovation(component: int) -> Any:
+    return lambda state, setup: state.innovations[:, : setup.corridor.n_mainline, component]
+
+
+def _fixed_innovation(component: int) -> Any:
+    return lambda state, setup: state.innovations[:, setup.fixed_sensors, component]
+
+
+_BLOCKS = (
+    Block("density", _segments, 0, 4,
+          lambda state, setup: state.estimate.density / setup.corridor.density_scale),
+    Block("speed", _segments, 0, 4,
+          lambda state, setup: state.estimate.speed / setup.corridor.speed_scale),
+    Block("density_log_std", _segments, -10, 5,
+          lambda state, setup: _log(state.estimate.density_std / setup.corridor.density_scale)),
+    Block("speed_log_std", _segments, -10, 5,
+          lambda state, setup: _log(state.estimate.speed_std / setup.corridor.speed_scale)),
+    Block("released_density", _mainline, -5, 5, _released(0, lambda road: road.density_scale)),
+    Block("released_speed", _mainline, -5, 5, _released(1, lambda road: road.speed_scale)),
+    Block("released_flow", _mainline, -5, 5,
+          _released(1, lambda road: road.density_scale * road.speed_scale)),
+    Block("density_innovation", _mainline, -10, 10, _innovation(0)),
+    Block("speed_innovation", _mainline, -10, 10, _innovation(1)),
+    Block("age", _mainline, 0, 1, lambda state, setup: state.age / AGE_CAP),
+    Block("queried", _mainline, 0, 1, lambda state, setup: state.queried),
+    Block("fixed_density_innovation", _fixed, -10, 10, _fixed_innovation(0)),
+    Block("fixed_speed_innovation", _fixed, -10, 10, _fixed_innovation(1)),
+    Block("bandwidth", lambda setup: 1, 0, 1,
+          lambda state, setup: setup.bandwidth / setup.corridor.n_mainline),
+    Block("epsilon", lambda setup: 1, -6, 6, lambda state, setup: float(np.log10(setup.epsilon))),
+    Block("picked", _mainline, 0, 1, lambda state, setup: state.picked),
+)  # fmt: skip
+
+
+def _shipped_block(name: str) -> Block:
+    return next(block for block in _BLOCKS if block.name == name)
+
+
+def _expected(part: Any) -> str | None:
+    missing = missing_methods(part, ("size", "values"))
+    if missing is None and not isinstance(getattr(part, "name", None), str):
+        return "have a name"
+    return missing
+
+
+BLOCKS = Registry("observation", {block.name: block for block in _BLOCKS}, check=_expected)
+"""Observation blocks by name."""
+
+
+def default_blocks(setup: ObservationSetup) -> list[str]:
+    """Return the names of the blocks that an observation has unless others are asked for."""
+    left_out = {"released_speed" if setup.releases_flow else "released_flow"}
+    if not setup.picks_one_by_one:
+        left_out.add("picked")
+    return [block.name for block in _BLOCKS if block.name not in left_out]
+
+
+class ObservationEncoding:
+    """Lays knowledge out in a vector; holds the space and the place of every block.
+
+    Default blocks, in order, with S segments (mainline, on-ramps, off-ramps), n mainline segments
+    and F fixed sensors:
+
+    ========================= ==== ============================================ =========
+    block                     size value                                        bounds
+    ========================= ==== ============================================ =========
+    density                   S    estimated density / density scale            [0, 4]
+    speed                     S    estimated speed / speed scale                [0, 4]
+    density_log_std           S    log of (standard deviation / scale)          [-10, 5]
+    speed_log_std             S    the same for speed                           [-10, 5]
+    released_density          n    last released density / scale                [-5, 5]
+    released_speed            n    last released speed / scale, or, under its   [-5, 5]
+                                   name, ``released_flow``
+    density_innovation        n    normalised innovation, 0 if not observed     [-10, 10]
+    speed_innovation          n    the same for speed                           [-10, 10]
+    age                       n    steps since last observed / 60, at most 1    [0, 1]
+    queried                   n    the last query                               {0, 1}
+    fixed_density_innovation  F    normalised innovation of the fixed sensors   [-10, 10]
+    fixed_speed_innovation    F    the same for speed                           [-10, 10]
+    bandwidth                 1    queries a step / n                           [0, 1]
+    epsilon                   1    log10 of the privacy parameter               [-6, 6]
+    picked                    n    picks so far (sequential actions only)       {0, 1}
+    ========================= ==== ============================================ =========
+
+    Values beyond the bounds are clipped.
+
+    Attributes:
+        setup: The public configuration.
+        space: The Gymnasium space, a float32 ``Box``.
+        slices: The place of each block, by name.
+    """
+
+    def __init__(self, setup: ObservationSetup, blocks: Sequence[Any] = (DEFAULT,)) -> None:
+        """Lay out blocks.
+
+        Args:
+            setup: The public configuration.
+            blocks: Names, ``"package.module:Class"``, objects or classes; ``"default"`` stands for
+                all default ones.
+
+        Raises:
+            ValueError: There is no such block, it lacks a method, or two have the same name.
+        """
+        self.setup = setup
+        self.n_mainline = setup.corridor.n_mainline
+        self.fixed_sensors = setup.fixed_sensors
+        names = [name for value in blocks for name in _expanded(value, setup)]
+        self.blocks: tuple[ObservationBlock, ...] = tuple(map(_made, names))
+        self._checked = tuple(map(is_foreign, self.blocks))
+        sizes = [_checked_size(block, setup) for block in self.blocks]
+        ends = np.cumsum(sizes).tolist()
+        self.slices: dict[str, slice] = {}
+        for block, size, end in zip(self.blocks, sizes, ends, strict=True):
+            if block.name in self.slices:
+                raise ValueError(f"observation has two blocks named {block.name!r}")
+            self.slices[block.name] = slice(end - size, end)
+        low = np.repeat([block.low for block in self.blocks], sizes).astype(np.float32)
+        high = np.repeat([block.high for block in self.blocks], sizes).astype(np.float32)
+        self.space = spaces.Box(low, high, dtype=np.float32)
+
+    def encode(self, state: PublicState) -> Observation:
+        """Return the observations of k episodes, shape (k, size), always inside the space."""
+        k = len(state.released)
+        flat = np.empty((k, self.space.shape[0]), dtype=np.float32)
+        places = zip(self.blocks, self.slices.values(), self._checked, strict=True)
+        for block, place, checked in places:
+            values = block.values(state, self.setup)
+            if checked:
+                _check_values(block, values, (k, place.stop - place.start))
+            flat[:, place] = values
+        np.maximum(flat, self.space.low, out=flat)
+        return np.minimum(flat, self.space.high, out=flat)
+
+    def block(self, observation: Observation, name: str) -> Observation:
+        """Return the block ``name`` of observations of shape (..., size).
+
+        Raises:
+            ValueError: There is no such block.
+        """
+        if name not in self.slices:
+            raise ValueError(f"unknown observation block {name!r}; known: {', '.join(self.slices)}")
+        return observation[..., self.slices[name]]
+
+
+def _expanded(value: Any, setup: ObservationSetup) -> list[Any]:
+    return default_blocks(setup) if isinstance(value, str) and value == DEFAULT else [value]
+
+
+def _made(value: Any) -> ObservationBlock:
+    """Return a block; one of another package must have a name of its own and sound bounds."""
+    block = BLOCKS.find(value)
+    block = block() if isinstance(block, type) else block
+    if is_foreign(block):
+        name = name_of_class(block)
+        if block.name in {own.name for own in _BLOCKS}:
+            raise ValueError(
+                f"observation {name} must not be named {block.name!r}, which is a block of "
+                "dptse_env"
+            )
+        low, high = getattr(block, "low", None), getattr(block, "high", None)
+        numbers = isinstance(low, int | float) and isinstance(high, int | float)
+        if not numbers or not block.low < block.high:
+            raise ValueError(f"observation {name} must have bounds low < high, got {low}, {high}")
+    made: ObservationBlock = block
+    return made
+
+
+def _checked_size(block: ObservationBlock, setup: ObservationSetup) -> int:
+    size = block.size(setup)
+    if type(size) is not int or size < 0:
+        raise ValueError(
+            f"observation {name_of_class(block)}.size() must return an integer >= 0, got {size!r}"
+        )
+    return size
+
+
+def _check_values(block: ObservationBlock, values: Any, shape: tuple[int, int]) -> None:
+    array = np.asarray(values)
+    if array.shape not in ((), shape) or array.dtype.kind not in "biuf":
+        raise ValueError(
+            f"observation {name_of_class(block)}.values() must return numbers of shape {shape}, "
+            f"got {array.dtype} of shape {array.shape}"
+        )
+    if not np.isfinite(array).all():
+        raise ValueError(f"observation {name_of_class(block)}.values() must return finite numbers")

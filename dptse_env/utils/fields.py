@@ -1,0 +1,252 @@
+"""Fields of configuration dataclasses: types, ranges, and values from plain JSON.
+
+Keyword values of ``gym.make`` travel as JSON, so every configuration must be reachable from
+dictionaries, lists, strings and numbers. A field says what it takes by its annotation,
+``Annotated[float, Interval(0, 1)]``; `checked_fields` holds values to it, and the documentation of
+all keywords is made from it. An error is one line: ``<path> must be <allowed>, got <value>``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import types
+import typing
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from numbers import Integral, Real
+from typing import Any, TypeVar
+
+import numpy as np
+
+T = TypeVar("T")
+
+LONGEST_SEQUENCE = 100_000
+"""Items of a sequence at most; checking more would take minutes."""
+
+
+@dataclass(frozen=True)
+class Interval:
+    """Range of a number; an end is part of it unless it is open or infinite.
+
+    Attributes:
+        low: Lower end.
+        high: Upper end.
+        open_low: Whether the lower end is left out.
+        open_high: Whether the upper end is left out.
+    """
+
+    low: float
+    high: float
+    open_low: bool = False
+    open_high: bool = False
+
+    def __contains__(self, value: float) -> bool:
+        """Return whether a number lies in the range; NaN does not."""
+        above = value > self.low if self.open_low else value >= self.low
+        return above and (value < self.high if self.open_high else value <= self.high)
+
+    def __str__(self) -> str:
+        """Return the range in mathematical notation."""
+        left, right = "(" if self.open_low else "[", ")" if self.open_high else "]"
+        return f"in {left}{self.low:g}, {self.high:g}{right}"
+
+
+def from_mapping(cls: type[T], values: Any, path: str, base: T | None = None) -> T:
+    """Build the dataclass ``cls`` from ``values``.
+
+    Args:
+        cls: A frozen dataclass. Nested dataclasses, unions of them and tuples are followed.
+        values: A mapping of field names; an instance of ``cls`` is returned as it is.
+        path: Where the values stand, for error messages; empty at the top.
+        base: Supplies the fields that ``values`` leaves out.
+
+    Raises:
+        ValueError: A key is unknown or missing, or a value has the wrong type or range; the
+            message starts with the path of the value.
+    """
+    if isinstance(values, cls):
+        return values
+    if not isinstance(values, Mapping):
+        raise ValueError(f"{path} must be a mapping or {cls.__name__}, got {_shown(values)}")
+    prefix = f"{path}." if path else ""
+    hints = field_hints(cls)
+    for key in values:
+        if key not in hints:
+            raise ValueError(f"{prefix}{key} is unknown; allowed: {', '.join(hints)}")
+    built = {
+        name: convert(hints[name], value, f"{prefix}{name}", getattr(base, name, None))
+        for name, value in values.items()
+    }
+    if base is not None:
+        return dataclasses.replace(base, **built)  # type: ignore[type-var]
+    hashable: Any = cls
+    for name in _required(hashable):
+        if name not in built:
+            raise ValueError(f"{prefix}{name} is missing")
+    return cls(**built)
+
+
+def checked_fields(instance: Any, path: str) -> None:
+    """Hold the fields of a frozen dataclass to their annotations; for ``__post_init__``.
+
+    Numbers become plain ints and floats and sequences tuples.
+
+    Raises:
+        ValueError: A value has the wrong type or range; the message starts with its path.
+    """
+    prefix = f"{path}." if path else ""
+    for name, hint in field_hints(type(instance)).items():
+        value = getattr(instance, name)
+        converted = convert(hint, value, f"{prefix}{name}", value)
+        if converted is not value:
+            object.__setattr__(instance, name, converted)
+
+
+def field_hints(cls: type) -> Mapping[str, Any]:
+    """Return the annotations of a dataclass's fields by name, in order."""
+    hashable: Any = cls
+    return _field_hints(hashable)
+
+
+@cache
+def _field_hints(cls: Any) -> Mapping[str, Any]:
+    hints = typing.get_type_hints(cls, include_extras=True)
+    return {field.name: hints[field.name] for field in dataclasses.fields(cls) if field.init}
+
+
+@cache
+def _required(cls: Any) -> tuple[str, ...]:
+    missing = dataclasses.MISSING
+    return tuple(
+        field.name
+        for field in dataclasses.fields(cls)
+        if field.default is missing and field.default_factory is missing
+    )
+
+
+def convert(hint: Any, value: Any, path: str, base: Any = None) -> Any:
+    """Return ``value`` as the annotated type ``hint``.
+
+    Args:
+        hint: An annotation.
+        value: The value, or plain JSON for it.
+        path: Where it stands.
+        base: For a dataclass, supplies the fields that a mapping leaves out.
+
+    Raises:
+        ValueError: The value has the wrong type or range; the message starts with ``path``.
+    """
+    if isinstance(value, np.generic):
+        value = value.item()
+    if hint is Any:
+        return value
+    interval = None
+    if typing.get_origin(hint) is typing.Annotated:
+        hint, *extras = typing.get_args(hint)
+        interval = next((extra for extra in extras if isinstance(extra, Interval)), None)
+    if hint is int or hint is float:
+        return _number(hint, value, path, interval)
+    origin = typing.get_origin(hint)
+    if origin in (typing.Union, types.UnionType):
+        return _convert_union(typing.get_args(hint), value, path, base)
+    if dataclasses.is_dataclass(hint):
+        keep = base if isinstance(base, typing.cast(type, hint)) else None
+        return from_mapping(typing.cast(type, hint), value, path, keep)
+    if origin is typing.Literal:
+        return _choice(typing.get_args(hint), value, path)
+    if origin is tuple:
+        return _convert_tuple(typing.get_args(hint), value, path)
+    if (isinstance(value, bool) and hint is not bool) or not isinstance(value, hint):
+        name = "None" if hint is type(None) else hint.__name__
+        raise ValueError(f"{path} must be of type {name}, got {_shown(value)}")
+    return value
+
+
+def _number(kind: type, value: Any, path: str, interval: Interval | None) -> int | float:
+    """Return an int or float, held to its range; a bool is no number here."""
+    whole = kind is int
+    allowed = allowed_numbers(kind, interval)
+    right = Integral if whole else Real
+    if isinstance(value, bool) or not isinstance(value, right):
+        raise ValueError(f"{path} must be {allowed}, got {_shown(value)}")
+    try:
+        number = int(value) if isinstance(value, Integral) and whole else float(value)
+    except OverflowError:
+        raise ValueError(f"{path} must be {allowed}, got {_shown(value)}") from None
+    inside = number in interval if interval is not None else math.isfinite(number)
+    if not inside:
+        raise ValueError(f"{path} must be {allowed}, got {_shown(value)}")
+    return number
+
+
+def allowed_numbers(kind: type, interval: Interval | None) -> str:
+    """Return in words which numbers are allowed."""
+    if interval is None:
+        return "an integer" if kind is int else "a finite number"
+    if kind is int:
+        return f"an integer in {interval.low:.0f}..{interval.high:.0f}"
+    return f"a number {interval}"
+
+
+def _choice(allowed: tuple[Any, ...], value: Any, path: str) -> Any:
+    # Membership by type first: an array compares element by element.
+    if not isinstance(value, str | int | float | None) or value not in allowed:
+        names = ", ".join(map(repr, allowed))
+        raise ValueError(f"{path} must be one of {names}, got {_shown(value)}")
+    return value
+
+
+def _convert_tuple(items: tuple[Any, ...], value: Any, path: str) -> tuple[Any, ...]:
+    if isinstance(value, str | bytes) or not isinstance(value, Sequence):
+        raise ValueError(f"{path} must be a sequence, got {_shown(value)}")
+    if len(value) > LONGEST_SEQUENCE:
+        raise ValueError(f"{path} must have at most {LONGEST_SEQUENCE} items, got {len(value)}")
+    if len(items) == 2 and items[1] is Ellipsis:
+        items = (items[0],) * len(value)
+    if len(items) != len(value):
+        raise ValueError(f"{path} must have {len(items)} items, got {len(value)}: {_shown(value)}")
+    return tuple(
+        convert(item, element, f"{path}[{i}]")
+        for i, (item, element) in enumerate(zip(items, value, strict=True))
+    )
+
+
+def _convert_union(options: tuple[Any, ...], value: Any, path: str, base: Any) -> Any:
+    """Take the option that fits; among dataclasses, the one that knows all the keys."""
+    if isinstance(value, Mapping):
+        classes: list[Any] = [option for option in options if dataclasses.is_dataclass(option)]
+        fits = [cls for cls in classes if set(value) <= set(_field_hints(cls))]
+        if classes:
+            return convert((fits or classes)[0], value, path, base)
+    if value is not None and types.NoneType in options:
+        options = tuple(option for option in options if option is not types.NoneType)
+        suffix = " or None"
+    else:
+        suffix = ""
+    if len(options) == 1:
+        try:
+            return convert(options[0], value, path, base)
+        except ValueError as problem:
+            head = f"{path} must be "
+            if not str(problem).startswith(head):  # of something inside the value
+                raise
+            raise ValueError(str(problem).replace(", got ", f"{suffix}, got ", 1)) from None
+    if all(dataclasses.is_dataclass(option) for option in options):
+        names = " or ".join(option.__name__ for option in options)
+        if not isinstance(value, options):
+            raise ValueError(f"{path} must be a mapping or {names}{suffix}, got {_shown(value)}")
+    problems = []
+    for option in options:
+        try:
+            return convert(option, value, path, base)
+        except ValueError as problem:
+            problems.append(str(problem))
+    raise ValueError("; or ".join(problems))
+
+
+def _shown(value: Any) -> str:
+    """Return a value for a message, cut where it is long."""
+    text = repr(value)
+    return text if len(text) <= 200 else f"{text[:200]}..."

@@ -1,0 +1,32 @@
+"""JSON objects with known keys, as the package's files hold them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+
+def parse_object(text: str, path: str, keys: Mapping[str, type]) -> dict[str, Any]:
+    """Parse a JSON object that has exactly some keys.
+
+    Args:
+        text: The JSON.
+        path: Where it stands, for error messages.
+        keys: Type of each value by its key.
+
+    Raises:
+        ValueError: It is no JSON, no object, or has other keys or types; the message starts with
+            ``path``.
+    """
+    try:
+        content = json.loads(text)
+    except (json.JSONDecodeError, RecursionError) as problem:
+        raise ValueError(f"{path} must be JSON: {problem}") from problem
+    if not isinstance(content, dict) or set(content) != set(keys):
+        got = str(sorted(content) if isinstance(content, dict) else content)[:200]
+        raise ValueError(f"{path} must be a mapping with the keys {', '.join(keys)}, got {got}")
+    for key, kind in keys.items():
+        if not isinstance(content[key], kind) or isinstance(content[key], bool):
+            raise ValueError(f"{path}: {key} must be of type {kind.__name__}, got {content[key]!r}")
+    return content

@@ -1,0 +1,185 @@
+"""Parts by name: what ships with the package, what others register, and what stands in a module."""
+
+from __future__ import annotations
+
+import importlib
+import re
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from importlib.metadata import entry_points
+from typing import Any
+
+PLUGINS = "dptse_env.plugins"
+"""Group of entry points of other packages. Each names a function that registers their parts; it is
+called once, when a name is looked up that is not known yet."""
+
+_PACKAGE = __name__.partition(".")[0]
+_plugins_loaded = False
+
+
+class Registry(Mapping[str, Any]):
+    """The parts of one kind.
+
+    A part is given as its name, as ``"package.module:Name"``, or as the part itself. Strings travel
+    in JSON; a registered name is known in every process that imports the package which registers
+    it, ``"package.module:Name"`` everywhere.
+
+    Attributes:
+        keyword: Path of the configuration's keyword, for messages.
+    """
+
+    def __init__(
+        self,
+        keyword: str,
+        shipped: Mapping[str, Any],
+        check: Callable[[Any], str | None],
+        aliases: Mapping[str, str] | None = None,
+    ) -> None:
+        """Hold the parts that ship with the package.
+
+        Args:
+            keyword: Path of the keyword.
+            shipped: Parts by name; a string ``"module:Name"`` is imported when it is looked up.
+            check: Returns what a part of another package should be where it is not, else None.
+            aliases: Former names by which parts can still be had, with a warning.
+        """
+        self.keyword, self._check = keyword, check
+        self._parts = dict(shipped)
+        self._shipped = frozenset(shipped)
+        self._aliases = dict(aliases or {})
+
+    def __getitem__(self, name: str) -> Any:
+        """Return the part of a name."""
+        return self._parts[name]
+
+    def __iter__(self) -> Iterator[str]:
+        """Return the names."""
+        return iter(self._parts)
+
+    def __len__(self) -> int:
+        """Return how many parts there are."""
+        return len(self._parts)
+
+    def register(self, name: str, part: Any) -> None:
+        """Give a part a name.
+
+        Args:
+            name: Lower-case letters, digits, hyphens and underscores; none that is taken.
+            part: The part, or ``"package.module:Name"``.
+
+        Raises:
+            ValueError: The name is malformed or taken, or the part is not what is expected.
+        """
+        if not isinstance(name, str) or not re.fullmatch(r"[a-z0-9][a-z0-9_-]*", name):
+            raise ValueError(
+                f"{self.keyword}: a name must be lower-case letters, digits, '-' and '_', got "
+                f"{name!r}"
+            )
+        if name in self._shipped or name in self._aliases:
+            raise ValueError(f"{self.keyword}: {name!r} ships with {_PACKAGE}, choose another name")
+        if self._parts.get(name, part) != part:
+            raise ValueError(f"{self.keyword}: {name!r} is registered already, for another part")
+        if not isinstance(part, str):
+            self._require(part, name)
+        self._parts[name] = part
+
+    def find(self, value: Any) -> Any:
+        """Return the part that a keyword's value stands for.
+
+        Args:
+            value: A name, ``"package.module:Name"``, or a part, which is returned as it is.
+
+        Raises:
+            ValueError: There is no such name, it cannot be imported, or what is found is not what
+                is expected.
+        """
+        part = value
+        if isinstance(value, str):
+            name = self.name_of(value)
+            part = self._parts.get(name, name)
+            if isinstance(part, str):
+                part = self._imported(part)
+        if is_foreign(part):
+            self._require(part, value)
+        return part
+
+    def name_of(self, value: Any) -> str:
+        """Return the name by which reports call a part: its own, or ``"package.module:Name"``.
+
+        Raises:
+            ValueError: A string is neither a name nor of that form.
+        """
+        if not isinstance(value, str):
+            return next((n for n, part in self._parts.items() if part is value), None) or (
+                name_of_class(value)
+            )
+        if value in self._aliases:
+            name = self._aliases[value]
+            warnings.warn(
+                f"{self.keyword}: {value!r} is now called {name!r}",
+                DeprecationWarning,
+                stacklevel=2,
+            )
+            return name
+        if value not in self._parts and ":" not in value:
+            load_plugins()
+        if value not in self._parts and ":" not in value:
+            raise ValueError(
+                f"{self.keyword} must be one of {', '.join(self._parts)}, or "
+                f"'package.module:Name', got {value!r}"
+            )
+        return value
+
+    def _imported(self, path: str) -> Any:
+        module, _, name = path.partition(":")
+        try:
+            found = importlib.import_module(module)
+        except Exception as problem:
+            raise ValueError(
+                f"{self.keyword} {path!r} cannot be imported: {type(problem).__name__}: {problem}"
+            ) from problem
+        try:
+            for attribute in name.split("."):
+                found = getattr(found, attribute)
+        except AttributeError as problem:
+            raise ValueError(
+                f"{self.keyword} {path!r} cannot be imported: {module} has no {name!r}"
+            ) from problem
+        return found
+
+    def _require(self, part: Any, value: Any) -> None:
+        expected = self._check(part)
+        if expected is None:
+            return
+        if isinstance(part, type) or hasattr(part, "__qualname__") or isinstance(value, str):
+            raise ValueError(f"{self.keyword} {name_of_class(part)} must {expected}")
+        raise ValueError(f"{self.keyword} must {expected}, got {value!r}")
+
+
+def name_of_class(part: Any) -> str:
+    """Return ``"package.module:Name"`` of a class or function, or of the class of an object."""
+    if isinstance(part, str):
+        return repr(part)
+    named = part if hasattr(part, "__qualname__") else type(part)
+    return f"{named.__module__}:{named.__qualname__}"
+
+
+def is_foreign(part: Any) -> bool:
+    """Return whether a class, function or object comes from outside this package."""
+    return name_of_class(part).split(":")[0].partition(".")[0] != _PACKAGE
+
+
+def missing_methods(part: Any, methods: tuple[str, ...]) -> str | None:
+    """Return what a class or object must have where it lacks one of ``methods``, else None."""
+    lacking = [name for name in methods if not callable(getattr(part, name, None))]
+    return f"have {', '.join(f'{name}()' for name in lacking)}" if lacking else None
+
+
+def load_plugins() -> None:
+    """Call the functions by which installed packages register their parts, once a process."""
+    global _plugins_loaded  # noqa: PLW0603 (a process imports its plugins once)
+    if _plugins_loaded:
+        return
+    _plugins_loaded = True
+    for entry in entry_points(group=PLUGINS):
+        entry.load()()

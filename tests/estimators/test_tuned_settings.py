@@ -1,0 +1,94 @@
+import json
+
+import pytest
+
+from dptse_env.estimators import ESTIMATORS, EstimatorSettings, HorizonSettings
+from dptse_env.estimators import tuned_settings as module
+from dptse_env.estimators.tuned_settings import (
+    available_settings,
+    load_settings,
+    read_settings,
+    settings_name,
+    write_settings,
+)
+from dptse_env.model import available_parameters
+from dptse_env.release import RELEASE_MODELS
+
+GOOD = {
+    "estimator": "mhe",
+    "parameters": "paper",
+    "privacy": "corrected",
+    "settings": {"process_noise": [0.01, 0.02], "mhe": {"arrival_noise": [0.1, 0.2]}},
+    "provenance": {"source": "a test"},
+}
+
+
+def test_shipped_sets_are_named_after_what_they_are_for():
+    assert "ekf-w99-3lane-paper" in available_settings()
+    for name in available_settings():
+        content = json.loads(module._SETS.joinpath(f"{name}.json").read_text())
+        assert content["name"] == name
+        assert content["estimator"] in ESTIMATORS
+        assert content["parameters"] in available_parameters()
+        assert content["privacy"] in RELEASE_MODELS
+        assert content["provenance"]["method"]
+        assert load_settings(name) != EstimatorSettings()
+
+
+def test_an_unknown_set_names_those_there_are():
+    with pytest.raises(
+        ValueError, match=r"^estimator_settings must be one of .*ekf-paper-paper.*, got 'ekf'$"
+    ):
+        load_settings("ekf")
+
+
+def test_a_written_set_reads_back_over_the_defaults(tmp_path):
+    path = tmp_path / "x.json"
+    write_settings(path, **GOOD)
+    assert read_settings(path) == EstimatorSettings(
+        process_noise=(0.01, 0.02), mhe=HorizonSettings(arrival_noise=(0.1, 0.2))
+    )
+    content = json.loads(path.read_text())
+    assert content == {"name": "mhe-paper-corrected", **GOOD}
+    assert content["name"] == settings_name("mhe", "paper", "corrected")
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (
+            {"process_noise": [-1.0, 0.1]},
+            r"estimator_settings\.process_noise\[0\] must be a number in ",
+        ),
+        ({"mhe": {"horizons": 3}}, r"estimator_settings\.mhe\.horizons is unknown; allowed: "),
+    ],
+)
+def test_bad_settings_are_neither_written_nor_read(settings, message, tmp_path):
+    path = tmp_path / "x.json"
+    with pytest.raises(ValueError, match=rf"^{path}: {message}"):
+        write_settings(path, **{**GOOD, "settings": settings})
+    assert not path.exists()
+    path.write_text(json.dumps({"name": "mhe-paper-corrected", **GOOD, "settings": settings}))
+    with pytest.raises(ValueError, match=rf"^{path}: {message}"):
+        read_settings(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", " must be JSON: "),
+        ("[" * 100_000, " must be JSON: "),
+        ("[]", r" must be a mapping with the keys name, .*, provenance, got \[\]"),
+        (json.dumps(GOOD), r" must be a mapping with the keys name, .*, got \['estimator', "),
+        (
+            json.dumps({"name": "x", **GOOD, "settings": 1}),
+            ": settings must be of type dict, got 1",
+        ),
+        (json.dumps({"name": "x", **GOOD}), ": name must be 'mhe-paper-corrected', got 'x'"),
+    ],
+)
+def test_a_file_of_another_shape_is_refused_by_its_path(text, message, tmp_path):
+    path = tmp_path / "x.json"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=rf"^{path}{message}"):
+        read_settings(path)

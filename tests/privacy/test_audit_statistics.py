@@ -1,0 +1,173 @@
+import math
+
+import numpy as np
+import pytest
+from scipy.stats import binom, binomtest, norm
+
+from dptse_env.privacy import epsilon_of, mu_of
+from dptse_env.privacy.audit_statistics import (
+    Claim,
+    audit,
+    detectable_mu,
+    error_bound,
+    rejection_probability,
+)
+
+
+def gaussian_scores(mu, n, seed):
+    """Log-likelihood ratios of N(mu, 1) against N(0, 1) under either: N(-+mu^2/2, mu^2)."""
+    z = np.random.default_rng(seed).standard_normal((2, n))
+    return mu * z + np.array([[-0.5], [0.5]]) * mu**2
+
+
+def claim_at(mu, delta=0.05):
+    return Claim(mu, epsilon_of(mu, delta), delta)
+
+
+def test_the_error_bound_is_scipys_and_has_its_coverage():
+    trials, risk = 200, 0.0125
+    errors = np.arange(trials + 1)
+    bounds = error_bound(errors, trials, risk)
+    for count in (0, 1, 17, 100, 199, 200):
+        # The two-sided interval puts half of its risk above.
+        interval = binomtest(count, trials).proportion_ci(1.0 - 2.0 * risk, method="exact")
+        assert bounds[count] == pytest.approx(interval.high, rel=1e-12)
+    for rate in (0.01, 0.3, 0.9):
+        assert binom.pmf(errors[bounds < rate], trials, rate).sum() <= risk
+
+
+@pytest.mark.parametrize("mu", [0.5, 2.118])
+def test_a_true_claim_is_rarely_rejected(mu):
+    results = [audit(*gaussian_scores(mu, 1_000, seed), claim_at(mu)) for seed in range(200)]
+    rejected = sum(result.verdict == "rejected" for result in results)
+    # At most 5 % in truth: more than 18 of 200 then have probability 0.6 %.
+    assert rejected <= 18
+    # The bound lies close below the truth, by the width of its own confidence interval.
+    assert np.median([result.mu.value for result in results]) > mu - 0.4
+
+
+def test_the_bounds_rest_on_held_out_runs():
+    # A threshold fitted to noise finds a difference in the half that it was fitted to.
+    found = [
+        audit(*np.random.default_rng(seed).standard_normal((2, 2_000)), Claim(0.01, 0.01, 0.01))
+        for seed in range(100)
+    ]
+    assert sum(result.verdict == "rejected" for result in found) <= 11
+
+
+@pytest.mark.parametrize("mu", [mu_of(1.0, 0.05), mu_of(5.0, 0.05)])
+def test_a_claim_that_is_too_small_by_root_two_is_rejected(mu):
+    for seed in range(10):
+        result = audit(*gaussian_scores(math.sqrt(2.0) * mu, 5_000, seed), claim_at(mu))
+        assert result.verdict == "rejected"
+        assert mu < result.mu.value < math.sqrt(2.0) * mu * 1.02
+
+
+def test_both_bounds_follow_from_their_error_rates():
+    result = audit(*gaussian_scores(1.5, 2_000, 1), claim_at(1.5))
+    scores = gaussian_scores(1.5, 2_000, 1)[:, 1_000:]
+    for bound in (result.mu, result.epsilon):
+        false_positives = int((scores[0] > bound.threshold).sum())
+        false_negatives = int((scores[1] <= bound.threshold).sum())
+        assert bound.false_positives == error_bound(false_positives, 1_000, 0.0125)
+        assert bound.false_negatives == error_bound(false_negatives, 1_000, 0.0125)
+    a, b = result.mu.false_positives, result.mu.false_negatives
+    # The trade-off curve of a Gaussian release of that mu passes through the two rates.
+    assert norm.cdf(norm.isf(a) - result.mu.value) == pytest.approx(b)
+    a, b = result.epsilon.false_positives, result.epsilon.false_negatives
+    e = math.exp(result.epsilon.value)
+    assert max(1.0 - b - 0.05 - e * a, 1.0 - a - 0.05 - e * b) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_epsilon_alone_can_reject():
+    # Randomised response reveals its bit once in ten and else nothing: a large epsilon at small
+    # error rates, but next to nothing at the rates that a bound on mu is best at.
+    generator = np.random.default_rng(3)
+    scores = generator.standard_normal((2, 5_000))
+    scores[1, generator.random(5_000) < 0.3] += 100.0
+    claim = Claim(mu=50.0, epsilon=1.0, delta=0.05)
+    result = audit(*scores, claim)
+    assert result.mu.value < claim.mu
+    assert result.epsilon.value > 3.0
+    assert result.verdict == "rejected"
+    mirrored = audit(-scores[1], -scores[0], claim)
+    assert mirrored.epsilon.value > 3.0
+
+
+def test_scores_that_say_nothing_bound_nothing():
+    result = audit(np.zeros(100), np.zeros(100), claim_at(0.5))
+    assert result.mu.value == result.epsilon.value == 0.0
+    assert result.verdict == "not rejected"
+
+
+def test_worlds_far_apart_are_separated_midway():
+    result = audit(*gaussian_scores(24.0, 5_000, 0), claim_at(0.75))
+    assert abs(result.mu.threshold) < 100.0  # the scores lie at -288 and 288, with deviation 24
+    assert result.mu.false_positives == result.mu.false_negatives == error_bound(0, 2_500, 0.0125)
+    # No error in 2,500 runs still leaves a rate of 0.00175 possible.
+    assert result.mu.value == pytest.approx(2.0 * norm.isf(0.00175), abs=1e-2)
+
+
+def test_power_is_that_of_the_audit():
+    claimed, n = 1.0, 1_000
+    for mu in (1.2, 1.4):
+        rejected = [
+            audit(*gaussian_scores(mu, n, seed), Claim(claimed, 99.0, 0.05)).verdict == "rejected"
+            for seed in range(300)
+        ]
+        power = rejection_probability(mu, claimed, n)
+        # The audit has to find its threshold first. The deviation of 300 trials is 0.03.
+        assert power - 0.12 < np.mean(rejected) < power + 0.08
+    assert (
+        0.1 < rejection_probability(1.2, claimed, n) < 0.5 < rejection_probability(1.4, claimed, n)
+    )
+
+
+def test_power_is_the_sum_over_both_counts():
+    mu, claimed, n = 2.0, 0.8, 60
+    counts, rate = np.arange(31), 0.5 * math.erfc(0.5 * mu / math.sqrt(2.0))
+    bounds = error_bound(counts, 30, 0.0125)
+    rejects = norm.isf(bounds)[:, None] + norm.isf(bounds) > claimed
+    weights = binom.pmf(counts, 30, rate)
+    assert 0.1 < weights @ rejects @ weights < 0.9
+    assert rejection_probability(mu, claimed, n) == pytest.approx(weights @ rejects @ weights)
+
+
+def test_false_alarms_are_rare_and_root_two_is_seen_at_5000_runs():
+    for mu in (mu_of(1.0, 0.05), mu_of(5.0, 0.05)):
+        assert rejection_probability(mu, mu, 5_000) < 0.01
+        assert rejection_probability(math.sqrt(2.0) * mu, mu, 5_000) > 0.999
+
+
+def test_detectable_mu_is_where_power_reaches_its_mark():
+    mu = detectable_mu(1.0, 2_000, probability=0.8)
+    assert 1.0 < mu < 1.3
+    assert rejection_probability(mu, 1.0, 2_000) == pytest.approx(0.8, abs=1e-3)
+    # Not a single error in 10 runs leaves an error rate of 35 % possible.
+    assert detectable_mu(5.0, 20) == math.inf
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((np.zeros(1), np.zeros(1)), "scores_0 must be two or more numbers"),
+        ((np.zeros(3), np.zeros(4)), "scores_1 must be as many as scores_0, got 4"),
+        ((np.zeros(2), np.array([0.0, np.nan])), "scores_1 must be finite"),
+    ],
+)
+def test_bad_scores_are_named(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        audit(*arguments, claim_at(1.0))
+
+
+@pytest.mark.parametrize(
+    ("field", "value"), [("mu", 0.0), ("epsilon", math.inf), ("delta", 0.5), ("delta", 0.0)]
+)
+def test_bad_claims_are_named(field, value):
+    with pytest.raises(ValueError, match=rf"claim\.{field} must be"):
+        Claim(**{"mu": 1.0, "epsilon": 1.0, "delta": 0.05, field: value})
+
+
+def test_bad_confidence_is_named():
+    with pytest.raises(ValueError, match="confidence must be in"):
+        audit(np.zeros(2), np.zeros(2), claim_at(1.0), 1.0)

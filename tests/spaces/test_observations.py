@@ -1,0 +1,120 @@
+import dataclasses
+import pickle
+
+import numpy as np
+import pytest
+
+from dptse_env.estimators import Estimate
+from dptse_env.spaces.observations import (
+    AGE_CAP,
+    ObservationEncoding,
+    ObservationSetup,
+    PublicState,
+)
+from dptse_env.traffic import Corridor, Demand
+
+N, S = 4, 6
+ROAD = Corridor(
+    name="road",
+    n_mainline=N,
+    on_ramps=(1,),
+    off_ramps=(2,),
+    exit_shares=(0.1,),
+    demand=Demand(((0.0, 1000.0),), (100.0,)),
+    incident=None,
+    fixed_sensors=(3, 5),
+    duration=100,
+    density_scale=100.0,
+    speed_scale=50.0,
+)
+
+
+def encoding(blocks=("default",), epsilon=0.1, **changes):
+    return ObservationEncoding(ObservationSetup(ROAD, 2, epsilon, **changes), blocks)
+
+
+def state(k=2, fill=1.0):
+    def full(*shape):
+        return np.full((k, *shape), fill)
+
+    return PublicState(
+        estimate=Estimate(50 * full(S), 25 * full(S), 10 * full(S), 5 * full(S)),
+        released=np.dstack([20 * full(S), 10 * full(S)]),
+        innovations=np.dstack([np.arange(S) * full(S), -np.arange(S) * full(S)]),
+        age=np.array([[0, 3, AGE_CAP, 10 * AGE_CAP]] * k),
+        queried=np.array([[True, False, True, False]] * k),
+        picked=np.array([[False, True, False, False]] * k),
+    )
+
+
+def test_blocks_hold_what_their_names_say():
+    encoder = encoding(picks_one_by_one=True)
+    observation = encoder.encode(state())
+    expected = {
+        "density": [0.5] * S,
+        "speed": [0.5] * S,
+        "density_log_std": [np.log(0.1)] * S,
+        "speed_log_std": [np.log(0.1)] * S,
+        "released_density": [0.2] * N,
+        "released_speed": [0.2] * N,
+        "density_innovation": [0, 1, 2, 3],
+        "speed_innovation": [0, -1, -2, -3],
+        "age": [0, 0.05, 1, 1],
+        "queried": [1, 0, 1, 0],
+        "fixed_density_innovation": [3, 5],
+        "fixed_speed_innovation": [-3, -5],
+        "bandwidth": [0.5],
+        "epsilon": [-1],
+        "picked": [0, 1, 0, 0],
+    }
+    assert list(encoder.slices) == list(expected)
+    for name, values in expected.items():
+        block = encoder.block(observation, name)
+        np.testing.assert_allclose(block, [values, values], rtol=1e-6, err_msg=name)
+    assert sum(map(len, expected.values())) == observation.shape[1]
+
+
+@pytest.mark.parametrize("fill", [0.0, 1.0, -1e9, 1e9])
+def test_observations_stay_inside_the_space(fill):
+    encoder = encoding()
+    with np.errstate(invalid="ignore"):
+        observation = encoder.encode(state(1, abs(fill)))
+    assert observation.dtype == np.float32
+    assert encoder.space.contains(observation[0])
+
+
+def test_an_unknown_block_is_named():
+    with pytest.raises(ValueError, match="unknown observation block 'clock'; known: density"):
+        encoding().block(np.zeros(1, dtype=np.float32), "clock")
+
+
+def test_a_released_flow_has_its_own_name_and_scale():
+    encoder = encoding(epsilon=5.0, releases_flow=True)
+    assert "released_speed" not in encoder.slices
+    assert list(encoder.slices).index("released_flow") == 5
+    shown = dataclasses.replace(
+        state(), released=np.dstack([np.full((2, S), 20.0), np.full((2, S), -2500.0)])
+    )
+    observation = encoder.encode(shown)
+    np.testing.assert_allclose(encoder.block(observation, "released_flow"), [[-0.5] * N] * 2)
+    np.testing.assert_allclose(encoder.block(observation, "epsilon"), np.log10(5.0), rtol=1e-6)
+
+
+def test_blocks_can_be_chosen_and_come_in_the_order_asked_for():
+    encoder = encoding(("age", "speed"))
+    assert list(encoder.slices) == ["age", "speed"]
+    observation = encoder.encode(state())
+    assert observation.shape == (2, N + S)
+    np.testing.assert_allclose(encoder.block(observation, "age"), [[0, 0.05, 1, 1]] * 2)
+    assert encoder.space.contains(observation[0])
+
+
+@pytest.mark.parametrize("blocks", [("age", "age"), ("default", "age")])
+def test_a_block_stands_once(blocks):
+    with pytest.raises(ValueError, match="observation has two blocks named 'age'"):
+        encoding(blocks)
+
+
+def test_an_encoding_travels_by_pickle():
+    copy = pickle.loads(pickle.dumps(encoding()))
+    np.testing.assert_array_equal(copy.encode(state()), encoding().encode(state()))

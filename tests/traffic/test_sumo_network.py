@@ -1,0 +1,94 @@
+import dataclasses
+import importlib.util
+import re
+
+import pytest
+
+from dptse_env.traffic import CORRIDORS, PAPER_HIGHWAY, SHORT_HIGHWAY, NetworkError, simulate
+from dptse_env.traffic.sumo_network import (
+    Geometry,
+    compile_network,
+    edge_ids,
+    network_xml,
+    packaged_network,
+)
+
+needs_netconvert = pytest.mark.skipif(
+    importlib.util.find_spec("sumo") is None, reason="eclipse-sumo (extra corridors) is missing"
+)
+
+
+@pytest.mark.parametrize("name", CORRIDORS)
+def test_packaged_networks_have_one_edge_per_column_of_nominal_length(name):
+    corridor = CORRIDORS[name]
+    network = packaged_network(name)
+    edges = re.findall(r'<edge id="([^":]+)"', network)
+    assert sorted(edges) == sorted(edge_ids(corridor))
+    assert len(edges) == corridor.n_segments + corridor.n_boundaries
+    lanes = re.findall(r'<lane id="[^":]+".*? speed="([\d.]+)" length="([\d.]+)"', network)
+    assert {float(length) for _, length in lanes} == {1000 * corridor.segment_length}
+    assert {float(speed) for speed, _ in lanes} == {round(corridor.speed_limit / 3.6, 2)}
+
+
+@pytest.mark.parametrize("name", CORRIDORS)
+def test_packaged_networks_carry_no_path_and_no_time(name):
+    network = packaged_network(name)
+    assert "<!--" not in network
+    assert "/tmp" not in network
+    assert "generated" not in network
+
+
+@pytest.mark.parametrize("name", CORRIDORS)
+def test_merges_are_zippers(name):
+    corridor = CORRIDORS[name]
+    zippers = re.findall(r'<junction id="(\w+)" type="zipper"', packaged_network(name))
+    assert sorted(zippers) == sorted(f"face_{face}" for face in corridor.on_ramps)
+
+
+@needs_netconvert
+@pytest.mark.parametrize("name", CORRIDORS)
+def test_packaged_networks_are_what_netconvert_makes_of_the_presets(name):
+    assert compile_network(Geometry.of(CORRIDORS[name])) == packaged_network(name)
+
+
+def test_a_preset_is_not_compiled(monkeypatch):
+    monkeypatch.setattr("dptse_env.traffic.sumo_network.compile_network", None)
+    changed = dataclasses.replace(PAPER_HIGHWAY, name="mine", incident=None, duration=60)
+    assert network_xml(changed) == packaged_network("paper-highway")
+
+
+@needs_netconvert
+def test_a_geometry_of_ones_own_is_compiled_and_drives():
+    corridor = dataclasses.replace(
+        SHORT_HIGHWAY,
+        n_mainline=4,
+        on_ramps=(1,),
+        off_ramps=(2,),
+        lanes=3,
+        ramp_lanes=2,
+        segment_length=0.15,
+        speed_limit=90.0,
+        incident=None,
+        duration=60,
+        fixed_sensors=(),
+    )
+    record = simulate(corridor, 0)
+    assert record.counts[:, : corridor.n_segments].any(axis=0).all()
+
+
+@needs_netconvert
+def test_netconverts_own_words_are_in_the_error():
+    geometry = Geometry.of(PAPER_HIGHWAY)._replace(ramp_lanes=0)
+    with pytest.raises(NetworkError, match=r"netconvert refused.*\n.*Error"):
+        compile_network(geometry)
+
+
+def test_a_missing_netconvert_names_the_extra(monkeypatch):
+    found = importlib.util.find_spec
+
+    def without_sumo(name, *rest):
+        return None if name == "sumo" else found(name, *rest)
+
+    monkeypatch.setattr(importlib.util, "find_spec", without_sumo)
+    with pytest.raises(NetworkError, match=r"pip install 'dptse-env\[corridors\]'"):
+        compile_network(Geometry.of(PAPER_HIGHWAY)._replace(n_mainline=21))

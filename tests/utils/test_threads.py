@@ -1,0 +1,63 @@
+import pickle
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from dptse_env.utils.threads import SMALLEST, EpisodeThreads
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3])
+@pytest.mark.parametrize("n_rows", [0, 1, SMALLEST - 1, 2 * SMALLEST, 1000])
+def test_every_row_is_worked_on_once(threads, n_rows):
+    seen = np.zeros(n_rows, dtype=int)
+
+    def work(rows):
+        seen[rows] += 1
+
+    EpisodeThreads(threads).run(n_rows, work)
+    assert (seen == 1).all()
+
+
+def test_large_batches_use_the_threads_and_small_ones_do_not():
+    names = set()
+
+    def work(rows):
+        names.add(threading.current_thread().name)
+        time.sleep(0.01)
+
+    blocks = EpisodeThreads(2)
+    blocks.run(2 * SMALLEST - 1, work)
+    assert names == {threading.current_thread().name}
+    blocks.run(2 * SMALLEST, work)
+    assert len(names) == 2
+
+
+@pytest.mark.parametrize("own", [True, False])
+def test_an_exception_is_raised_once_nobody_works_any_more(own):
+    running = []
+    here = threading.current_thread()
+
+    def work(rows):
+        running.append(rows)
+        fails = own == (threading.current_thread() is here)
+        time.sleep(0.01 if fails else 0.03)
+        running.remove(rows)
+        if fails:
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        EpisodeThreads(2).run(2 * SMALLEST, work)
+    assert not running
+
+
+def test_the_threads_stay_behind_when_it_travels():
+    blocks = EpisodeThreads(2)
+    blocks.run(2 * SMALLEST, lambda rows: None)
+    assert pickle.loads(pickle.dumps(blocks)).threads == 2
+
+
+def test_at_least_one_thread():
+    with pytest.raises(ValueError, match="threads must be an integer >= 1, got 0"):
+        EpisodeThreads(0)

@@ -1,0 +1,51 @@
+import numpy as np
+
+from dptse_env.utils.vector_info import as_objects, in_vector_form, repeated, row_of
+
+ROWS = {
+    "error": np.array([1.5, 2.5]),
+    "queried": np.array([[True, False], [False, True]]),
+    "truth": {"time": np.array([3, 4]), "lists": as_objects([[1], [2, 3]])},
+}
+
+
+def test_a_row_is_plain_python():
+    row = row_of(ROWS, 1)
+    assert row.pop("queried").tolist() == [False, True]
+    assert row == {"error": 2.5, "truth": {"time": 4, "lists": [2, 3]}}
+    assert type(row["error"]) is float
+    assert type(row["truth"]["time"]) is int
+
+
+def test_a_row_is_a_copy():
+    row = row_of(ROWS, 0)
+    row["queried"][:] = False
+    assert ROWS["queried"][0, 0]
+
+
+def test_objects_are_kept_as_they_are():
+    arrays = [np.zeros(2), np.ones(2)]
+    objects = as_objects(arrays)
+    assert objects.shape == (2,)
+    assert objects[1] is arrays[1]
+
+
+def test_vector_form_marks_of_whom_something_is_said():
+    infos = in_vector_form(ROWS, np.array([3, 1]), 4)
+    assert infos.keys() == {"error", "_error", "queried", "_queried", "truth", "_truth"}
+    assert infos["error"].tolist() == [0.0, 2.5, 0.0, 1.5]
+    assert infos["queried"].tolist() == [[False] * 2, [False, True], [False] * 2, [True, False]]
+    assert infos["truth"]["time"].dtype == np.int64
+    assert infos["truth"]["lists"].tolist() == [None, [2, 3], None, [1]]
+    for flags in (infos["_error"], infos["_truth"], infos["truth"]["_lists"]):
+        assert flags.dtype == bool
+        assert flags.tolist() == [False, True, False, True]
+    assert infos["_error"] is not infos["_queried"]
+
+
+def test_the_same_said_of_several():
+    info = {"mu": 0.5, "cap": None, "preset": "paper", "reasons": ["a"], "more": {"n": 3}}
+    rows = repeated(info, 2)
+    assert rows["mu"].tolist() == [0.5, 0.5]
+    assert rows["more"]["n"].dtype == np.int64
+    assert row_of(rows, 0) == row_of(rows, 1) == info
