@@ -124,9 +124,9 @@ class Arena:
         """Return mean rewards of plans (m, period, n) on traffic seeds (r,), shape (m, r)."""
         each = self.n_episodes // len(seeds)
         blocks = [plans[i : i + each] for i in range(0, len(plans), each)]
-        return np.concatenate([self._block(block, seeds, noise) for block in blocks])
+        return np.concatenate([self.block(block, seeds, noise) for block in blocks])
 
-    def _block(self, plans: BoolArray, seeds: IntArray, noise: int) -> FloatArray:
+    def block(self, plans: BoolArray, seeds: IntArray, noise: int) -> FloatArray:
         m, r = len(plans), len(seeds)
         n_used = m * r
         traffic = np.resize(np.tile(seeds, m), self.n_episodes).tolist()

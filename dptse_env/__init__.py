@@ -9,9 +9,9 @@ Importing the package registers its environments with Gymnasium::
 The module prefix makes the id known in subprocesses too.
 """
 
-from dptse_env.registration import register_environments
+from dptse_env.registration import register_environments, register_part
 
-__all__ = ["register_environments"]
+__all__ = ["register_environments", "register_part"]
 __version__ = "0.1.0"
 
 register_environments()

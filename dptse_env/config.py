@@ -287,21 +287,17 @@ def _corridor(base: Corridor, values: dict[str, Any]) -> Corridor:
         base = from_mapping(Corridor, _with_scales(base, corridor), "corridor", base)
     else:
         base = find_corridor(corridor)
-    named: dict[str, dict[str, Any]] = {
-        "demand": {"preset": base.demand, "random": randomised(base).demand},
-        "incident": {
-            "preset": base.incident,
-            "random": randomised(base).incident,
-            "none": None,
-        },
-    }
-    for key, known in named.items():
+    for key, names in (
+        ("demand", ("preset", "random")),
+        ("incident", ("preset", "random", "none")),
+    ):
         if key not in values:
             continue
         value = values.pop(key)
         if isinstance(value, str):
-            _require_name(key, value, known)
-            value = known[value]
+            _require_name(key, value, names)
+            source = randomised(base) if value == "random" else base
+            value = None if value == "none" else getattr(source, key)
         base = from_mapping(Corridor, {key: value}, "corridor", base)
     return base
 

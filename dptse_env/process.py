@@ -14,7 +14,7 @@ from dptse_env.parts import Parts, complete_report
 from dptse_env.release import ReleaseRequest, check_released
 from dptse_env.release.nominal import nominal_state
 from dptse_env.reset_options import ResetOptions
-from dptse_env.spaces.actions import PendingPicks
+from dptse_env.spaces.actions import PendingPicks, check_decision
 from dptse_env.spaces.observations import AGE_CAP, PublicState
 from dptse_env.spaces.rewards import EstimationError, ScoredSecond, estimation_error
 from dptse_env.utils.arrays import Action, BoolArray, FloatArray, IntArray, Observation
@@ -77,6 +77,7 @@ class QueryProcess:
         self._threads = EpisodeThreads(threads if self.estimator.is_compiled else 1)
         self._checks_estimates = is_foreign(self.estimator)
         self._checks_releases = is_foreign(self.release)
+        self._checks_decisions = is_foreign(self.interface.actions)
         corridor = self.config.corridor
         self.n_episodes = n = parts.n_episodes
         self.pending = PendingPicks(n, corridor.n_mainline)
@@ -162,7 +163,10 @@ class QueryProcess:
         Raises:
             ValueError: An action has a wrong shape, dtype or value.
         """
-        decision = self.interface.actions.decode(episodes, actions, self.pending)
+        encoding = self.interface.actions
+        decision = encoding.decode(episodes, actions, self.pending)
+        if self._checks_decisions:
+            check_decision(encoding, decision, len(episodes))
         ready = decision.complete
         self.n_dropped[episodes] = decision.n_dropped
         reward = np.zeros(len(episodes))

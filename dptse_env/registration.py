@@ -1,4 +1,10 @@
-"""The environment ids. Entry points are strings, so registering imports nothing heavy."""
+"""Registration: environment ids with Gymnasium, and names for the parts of other packages.
+
+Entry points and registries are named by strings, so registering imports nothing heavy.
+"""
+
+from importlib import import_module
+from typing import Any
 
 from gymnasium.envs.registration import register, registry
 
@@ -8,6 +14,17 @@ ENVIRONMENTS = {
     "dptse/ShortHighway-v0": "short-highway",
 }
 """Environment ids and the preset behind each."""
+
+REGISTRIES = {
+    "action": "dptse_env.spaces.actions:ACTION_ENCODINGS",
+    "corridor": "dptse_env.traffic:CORRIDORS",
+    "estimator": "dptse_env.estimators:ESTIMATORS",
+    "observation": "dptse_env.spaces.observations:BLOCKS",
+    "privacy": "dptse_env.release:RELEASE_MODELS",
+    "reward": "dptse_env.spaces.rewards:REWARDS",
+    "schedule": "dptse_env.schedules:SCHEDULES",
+}
+"""Registries by the keyword that takes their names."""
 
 
 def register_environments() -> None:
@@ -20,3 +37,25 @@ def register_environments() -> None:
                 vector_entry_point="dptse_env.vector_env:SensorQueryVectorEnv",
                 kwargs={"preset": preset},
             )
+
+
+def register_part(keyword: str, name: str, part: Any) -> None:
+    """Give a part of another package a name that a keyword takes; twice changes nothing.
+
+    Names are known in the processes that call this. A package whose names are to be known
+    everywhere calls it from a function that its entry point in the group ``dptse_env.plugins``
+    names; ``"package.module:Name"`` needs no registration.
+
+    Args:
+        keyword: One of `REGISTRIES`.
+        name: Lower-case letters, digits, hyphens and underscores; none that is taken.
+        part: The part, or ``"package.module:Name"``, which is imported when it is used.
+
+    Raises:
+        ValueError: The keyword is unknown, the name malformed or taken, or the part is not what the
+            keyword takes.
+    """
+    if keyword not in REGISTRIES:
+        raise ValueError(f"keyword must be one of {', '.join(REGISTRIES)}, got {keyword!r}")
+    module, _, attribute = REGISTRIES[keyword].partition(":")
+    getattr(import_module(module), attribute).register(name, part)

@@ -1,16 +1,15 @@
-"""What the estimators share: the batch, its flags, and the checks of what they are given."""
+"""The base of estimators: the batch, its flags, and checks of arguments."""
 
 from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from dptse_env.estimators.base import Estimate
-from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
 from dptse_env.model.layout import BoolArray, FloatArray, IntArray
 
@@ -79,11 +78,12 @@ class BatchEstimator(ABC):
 
     is_compiled: ClassVar[bool] = False
 
-    def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
+    def __init__(self, model: ARZModel, n_episodes: int, settings: Any) -> None:
         """See `make_estimator`."""
         self.model = model
         self.n_episodes = n_episodes
         self.settings = settings
+        self._noise_scale: float = getattr(settings, "noise_scale", 1.0)
         self.innovations = np.zeros((n_episodes, model.n_segments, 2))
         self.diverged = np.zeros(n_episodes, dtype=np.bool_)
         self.fallback = np.zeros(n_episodes, dtype=np.bool_)
@@ -111,7 +111,7 @@ class BatchEstimator(ABC):
         n_segments = self.model.n_segments
         given = checked_measurements(self.n_episodes, n_segments, episodes, observed, values, sigma)
         self.fallback[given.episodes] = False
-        self._update(given._replace(sigma=self.settings.noise_scale * given.sigma))
+        self._update(given._replace(sigma=self._noise_scale * given.sigma))
 
     @abstractmethod
     def estimate(self) -> Estimate:

@@ -1,29 +1,36 @@
-"""Query policies that need no training, from a clock to a rollout, and oracles above them.
+"""Query schedules: policies that need no training, from a clock to a rollout, and oracles.
 
-Every schedule has the ``predict`` of a stable-baselines3 policy, so one loop serves fixed and
-learned policies alike. What it must remember between steps travels in ``state``, so one schedule
-serves any number of episodes at once.
+Every schedule has the ``predict`` of a stable-baselines3 policy, so one loop serves schedules and
+learned policies alike. Its memory between steps travels in ``state``, so one schedule serves any
+number of episodes at once.
 
-======================== ========== ======================================================
-schedules                sees       extra cost of a step
-======================== ========== ======================================================
-`SCHEDULES`              the        a sort at most
+======================== ============ ====================================================
+schedules                use          extra cost of a step
+======================== ============ ====================================================
+`OBSERVATION_SCHEDULES`  the          a sort at most
                          observation
-`INFORMED`               the        an EKF's step or two; ``rollout`` some hundred of them
+`COVARIANCE_SCHEDULES`   the          an EKF's step or two; ``rollout`` some hundred of them
                          estimator's
                          covariance
-`PLANS`                  the clock  none; optimised beforehand on training traffic
-`ORACLES`                the truth  bounds, no policies: ``uses_truth`` is True
-======================== ========== ======================================================
+`PLANS`                  a clock      none; optimised beforehand on training traffic
+`ORACLES`                the truth    they are bounds, no policies: ``uses_truth`` is True
+======================== ============ ====================================================
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from dptse_env.schedules.base import BoundSchedule, Schedule, ScheduleState
+from dptse_env.schedules.base import ProcessSchedule, Schedule, ScheduleState
+from dptse_env.schedules.covariance import (
+    CovarianceInflation,
+    CovarianceSchedule,
+    Greedy,
+    GreedyLogdet,
+    GreedyTrace,
+    InflatedTrace,
+)
 from dptse_env.schedules.fixed import (
     Everything,
     LargestVariance,
@@ -33,30 +40,32 @@ from dptse_env.schedules.fixed import (
     Shifting,
     StaleVariance,
 )
-from dptse_env.schedules.informed import (
-    Caution,
-    Greedy,
-    GreedyLogdet,
-    GreedyTrace,
-    Informed,
-    WaryTrace,
-)
 from dptse_env.schedules.oracles import OracleBruteForce, OracleError, OracleGreedy
-from dptse_env.schedules.plans import PLANS, Place, Plan, Planned, find_plan, read_plan
+from dptse_env.schedules.plans import (
+    PLAN_ALIASES,
+    PLANS,
+    Plan,
+    PlanContext,
+    Planned,
+    find_plan,
+    read_plan,
+)
 from dptse_env.schedules.rollout import Rollout
+from dptse_env.utils.registry import Registry, name_of_class
 
 __all__ = [
-    "INFORMED",
+    "COVARIANCE_SCHEDULES",
+    "OBSERVATION_SCHEDULES",
     "ORACLES",
     "PLANS",
     "SCHEDULES",
-    "BoundSchedule",
-    "Caution",
+    "CovarianceInflation",
+    "CovarianceSchedule",
     "Everything",
     "Greedy",
     "GreedyLogdet",
     "GreedyTrace",
-    "Informed",
+    "InflatedTrace",
     "LargestVariance",
     "Nothing",
     "OldestFirst",
@@ -64,18 +73,19 @@ __all__ = [
     "OracleError",
     "OracleGreedy",
     "Plan",
+    "PlanContext",
     "Planned",
+    "ProcessSchedule",
     "Random",
     "Rollout",
     "Schedule",
     "ScheduleState",
     "Shifting",
     "StaleVariance",
-    "WaryTrace",
     "make_schedule",
 ]
 
-SCHEDULES: dict[str, Callable[..., Schedule]] = {
+OBSERVATION_SCHEDULES: dict[str, Any] = {
     "none": Nothing,
     "static": partial(Shifting, period=None),
     "paper": partial(Shifting, period=4),
@@ -87,17 +97,17 @@ SCHEDULES: dict[str, Callable[..., Schedule]] = {
     "stale-variance": StaleVariance,
     "all": Everything,
 }
-"""Schedules that see nothing but the observation, each made of (interface, seed)."""
+"""Schedules that use nothing but the observation, each made of (interface, seed)."""
 
-INFORMED: dict[str, Callable[..., BoundSchedule]] = {
+COVARIANCE_SCHEDULES: dict[str, type[ProcessSchedule]] = {
     "greedy-trace": GreedyTrace,
     "greedy-logdet": GreedyLogdet,
-    "wary-trace": WaryTrace,
+    "inflated-trace": InflatedTrace,
     "rollout": Rollout,
 }
-"""Schedules that know the estimator's covariance, each made of (process, seed)."""
+"""Schedules that use the estimator's covariance, each made of (process, seed)."""
 
-ORACLES: dict[str, Callable[..., BoundSchedule]] = {
+ORACLES: dict[str, type[ProcessSchedule]] = {
     "oracle-error": OracleError,
     "oracle-greedy": OracleGreedy,
     "oracle-brute-force": OracleBruteForce,
@@ -105,12 +115,30 @@ ORACLES: dict[str, Callable[..., BoundSchedule]] = {
 """Bounds that see the truth, each made of (process, seed). They are no policies."""
 
 
-def make_schedule(name: str, env: Any, seed: int | None = None) -> Schedule:
-    """Return the schedule ``name`` for an environment.
+def _expected(part: Any) -> str | None:
+    if isinstance(part, type) and not issubclass(part, Schedule):
+        return "be a subclass of dptse_env.schedules.Schedule"
+    if not callable(part) and not callable(getattr(part, "predict", None)):
+        return "be a subclass of dptse_env.schedules.Schedule, or have predict()"
+    return None
+
+
+SCHEDULES = Registry(
+    "schedule",
+    {**OBSERVATION_SCHEDULES, **COVARIANCE_SCHEDULES, **dict.fromkeys(PLANS), **ORACLES},
+    check=_expected,
+    aliases={"wary-trace": "inflated-trace", **PLAN_ALIASES},
+)
+"""All schedules by name."""
+
+
+def make_schedule(schedule: Any, env: Any, seed: int | None = None) -> Any:
+    """Return a schedule for an environment.
 
     Args:
-        name: A name in `SCHEDULES`, `INFORMED`, `PLANS` or `ORACLES`, or the path of a plan, a
-            file whose name ends in ``.json``.
+        schedule: A name in `SCHEDULES`, the path of a plan, a file whose name ends in ``.json``,
+            ``"package.module:Class"``, a subclass of `Schedule`, or an object with ``predict``,
+            which is returned as it is.
         env: An environment of this package, scalar or vector, wrapped or not.
         seed: Seed of the schedule's own choices.
 
@@ -118,15 +146,16 @@ def make_schedule(name: str, env: Any, seed: int | None = None) -> Schedule:
         ValueError: The name is unknown or the schedule does not suit the environment.
     """
     env = env.unwrapped
-    if name in SCHEDULES:
-        return SCHEDULES[name](env.interface, seed)
-    if name.endswith(".json"):
-        return Planned(env.process, read_plan(name), seed)
+    if isinstance(schedule, str) and schedule.endswith(".json"):
+        return Planned(env.process, read_plan(schedule), seed)
+    name = SCHEDULES.name_of(schedule)
     if name in PLANS:
-        return Planned(env.process, find_plan(name, Place.of(env.config)), seed)
-    if name in INFORMED:
-        return INFORMED[name](env.process, seed)
-    if name in ORACLES:
-        return ORACLES[name](env.process, seed)
-    known = (*SCHEDULES, *INFORMED, *PLANS, *ORACLES)
-    raise ValueError(f"unknown schedule {name!r}; known: {', '.join(known)}")
+        return Planned(env.process, find_plan(name, PlanContext.from_config(env.config)), seed)
+    part = SCHEDULES.find(schedule)
+    if not isinstance(part, type | partial):
+        return part
+    cls: Any = part.func if isinstance(part, partial) else part
+    made = part(env.process if issubclass(cls, ProcessSchedule) else env.interface, seed)
+    if not callable(getattr(made, "predict", None)):
+        raise ValueError(f"schedule {name_of_class(cls)} must have predict()")
+    return made

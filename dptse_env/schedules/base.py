@@ -1,4 +1,4 @@
-"""What every schedule is: `predict` around a choice of segments."""
+"""The base of schedules: `predict` around a choice of segments."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from dptse_env.utils.arrays import Action, BoolArray, FloatArray, IntArray, Obse
 
 
 class ScheduleState(NamedTuple):
-    """What a schedule carries from one step to the next.
+    """State of a schedule between steps.
 
     Attributes:
         step: Decisions completed in the episode, shape (k,).
@@ -25,11 +25,11 @@ class ScheduleState(NamedTuple):
 
 
 class Schedule(ABC):
-    """A query policy; subclasses say which segments to ask in `select`.
+    """A query policy that needs no training; subclasses choose segments in `select`.
 
     Attributes:
-        uses_truth: Whether the choice rests on the true traffic. Such a schedule is a bound on
-            what policies can reach, and no policy.
+        uses_truth: Whether the choice depends on the true traffic. Such a schedule is a bound on
+            policies, and no policy.
     """
 
     uses_truth: ClassVar[bool] = False
@@ -38,7 +38,7 @@ class Schedule(ABC):
         """Bind the schedule to an environment's ``interface``.
 
         Args:
-            interface: What the environment shows and takes (``env.unwrapped.interface``).
+            interface: Interface of the environment (``env.unwrapped.interface``).
             seed: Seed of the schedule's own choices, for those that draw any.
         """
         self.interface = interface
@@ -85,7 +85,7 @@ class Schedule(ABC):
         return (action[0] if np.ndim(observation) == 1 else action), new_state
 
     def _choose(self, rows: IntArray, step: IntArray, observation: Observation) -> BoolArray:
-        """Return what `select` says of some ``rows`` of the batch, all arrays of these alone."""
+        """Return `select` of some ``rows`` of the batch; all arrays are of these alone."""
         del rows
         return self.select(step, observation)
 
@@ -106,31 +106,32 @@ class Schedule(ABC):
             return np.zeros((len(batch), self.n_mainline), dtype=bool)
         return self.interface.observations.block(batch, "picked") > 0
 
-    def _block(self, observation: Observation, name: str) -> Observation:
+    def block(self, observation: Observation, name: str) -> Observation:
+        """Return a block of observations (k, size), shape (k, size of the block)."""
         return self.interface.observations.block(observation, name)
 
-    def _mask(self, chosen: IntArray) -> BoolArray:
+    def mask(self, chosen: IntArray) -> BoolArray:
         """Return the mask of the chosen indices, (k, anything) to (k, n_mainline)."""
         mask = np.zeros((len(chosen), self.n_mainline), dtype=bool)
         np.put_along_axis(mask, chosen, True, axis=1)
         return mask
 
-    def _highest(self, value: FloatArray | Observation, step: IntArray) -> BoolArray:
+    def highest(self, value: FloatArray | Observation, step: IntArray) -> BoolArray:
         """Return the ``bandwidth`` segments of the highest value (k, n_mainline).
 
-        Ties go round the road with the step: breaking them from one end would ask the segments
-        there half as often again. A mainline segment with a fixed sensor is observed without being
-        asked, so it comes last, whatever its value.
+        Ties rotate along the road with the step: breaking them from one end would query the
+        segments there half as often again. A mainline segment with a fixed sensor is observed
+        without a query, so it comes last, whatever its value.
         """
         fixed = self.interface.observations.fixed_sensors
         score = np.array(value, dtype=np.float64)
         score[:, fixed[fixed < self.n_mainline]] = -np.inf
         turn = (np.arange(self.n_mainline) - step[:, None]) % self.n_mainline
-        return self._mask(np.lexsort((turn, -score), axis=1)[:, : self.bandwidth])
+        return self.mask(np.lexsort((turn, -score), axis=1)[:, : self.bandwidth])
 
 
-class BoundSchedule(Schedule):
-    """A schedule that reads what its environment's process holds beside the observation.
+class ProcessSchedule(Schedule):
+    """A schedule that reads the state of its environment's process beside the observation.
 
     Its batch is that process's episodes, all of them and in order.
     """

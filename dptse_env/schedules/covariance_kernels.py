@@ -1,4 +1,4 @@
-"""Compiled: the coming second, as the estimator's covariance has it.
+"""Compiled kernels that propagate and update the estimator's covariance over the coming second.
 
 One episode after the other, as in `dptse_env.estimators.compiled`. States are normalised: rho by
 rho_m, psi by rho_m v_f. Over the mainline, traffic is in the reward's units: all densities, then
@@ -21,13 +21,13 @@ from dptse_env.utils.arrays import FloatArray, IntArray
 
 
 class Problem(NamedTuple):
-    """What does not change from step to step, in a form that compiled code takes.
+    """Constants of a road and an estimator, in a form that compiled code takes.
 
     Attributes:
         n_mainline: n.
         bandwidth: B.
         always: Segments with a fixed sensor, shape (F,).
-        askable: Mainline segments without one, shape (A,).
+        can_query: Mainline segments without one, shape (A,).
         noise: Variances of both releases, normalised, shape (2,).
         process_variance: What a step adds, shape (2,): to rho and psi, normalised, or in a random
             walk to rho over rho_m and v over v_f.
@@ -44,7 +44,7 @@ class Problem(NamedTuple):
     n_mainline: int
     bandwidth: int
     always: IntArray
-    askable: IntArray
+    can_query: IntArray
     noise: FloatArray
     process_variance: FloatArray
     is_walk: bool
@@ -72,7 +72,7 @@ class Work(NamedTuple):
         traffic_rows: Derivatives of both releases by density and speed in the reward's units: the
             first by density, the second by either, shape (n, 3).
         vectors: Shape (2, 2 S).
-        sums: Each segment's share of a trace, then whether it is asked, shape (2, n).
+        sums: Each segment's share of a trace, then whether it is queried, shape (2, n).
     """
 
     mean: FloatArray
@@ -183,7 +183,7 @@ def downdate(
     noise: FloatArray,
     vectors: FloatArray,
 ) -> None:
-    """Take in both releases of a segment: P - P H' (H P H' + R)^-1 H P, of rank two.
+    """Update by both releases of a segment: P - P H' (H P H' + R)^-1 H P, of rank two.
 
     With L L' = H P H' + R, the rows of L^-1 H P are written to `vectors` and their products
     taken from P.
@@ -220,8 +220,8 @@ def downdate(
 
 
 @njit(cache=True, error_model="numpy")
-def take_in(problem: Problem, segments: IntArray, covariance: FloatArray, work: Work) -> None:
-    """Let a covariance of states take in what segments release."""
+def condition(problem: Problem, segments: IntArray, covariance: FloatArray, work: Work) -> None:
+    """Update a covariance of states by the releases of segments."""
     for s in segments:
         rows = (work.rows[s, 0], work.rows[s, 1])
         downdate(covariance, 2 * s, 2 * s + 1, 1.0, rows, problem.noise, work.vectors)

@@ -1,4 +1,4 @@
-"""Schedules that need nothing but a clock, and those that look at ages and variances."""
+"""Schedules that use a clock, or the ages and variances in the observation."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Shifting(Schedule):
     def select(self, step: IntArray, observation: Observation) -> BoolArray:
         """See `Schedule.select`."""
         shift = np.zeros_like(step) if self.period is None else step // self.period
-        return self._mask((self._start + shift[:, None]) % self.n_mainline)
+        return self.mask((self._start + shift[:, None]) % self.n_mainline)
 
 
 class Random(Schedule):
@@ -42,19 +42,19 @@ class Random(Schedule):
     def select(self, step: IntArray, observation: Observation) -> BoolArray:
         """See `Schedule.select`."""
         keys = self.generator.random((len(step), self.n_mainline))
-        return self._mask(np.argsort(keys, axis=1)[:, : self.bandwidth])
+        return self.mask(np.argsort(keys, axis=1)[:, : self.bandwidth])
 
 
 class OldestFirst(Schedule):
     """The segments that have not been observed for longest; ties go round the road.
 
-    A segment with a fixed sensor is observed at every step and so is never asked, unless there
+    A segment with a fixed sensor is observed at every step and so is never queried, unless there
     is bandwidth to spare.
     """
 
     def select(self, step: IntArray, observation: Observation) -> BoolArray:
         """See `Schedule.select`."""
-        return self._highest(self._block(observation, "age"), step)
+        return self.highest(self.block(observation, "age"), step)
 
 
 class LargestVariance(Schedule):
@@ -78,8 +78,8 @@ class LargestVariance(Schedule):
     def select(self, step: IntArray, observation: Observation) -> BoolArray:
         """See `Schedule.select`."""
         n = self.n_mainline
-        logs = np.stack([self._block(observation, name)[:, :n] for name in self._names])
-        return self._highest(np.exp(2.0 * logs.astype(np.float64)).sum(axis=0), step)
+        logs = np.stack([self.block(observation, name)[:, :n] for name in self._names])
+        return self.highest(np.exp(2.0 * logs.astype(np.float64)).sum(axis=0), step)
 
 
 _BLOCKS = {
@@ -94,9 +94,9 @@ class StaleVariance(Schedule):
 
     Scores are ``(age + 1)^2 (s_rho^2 + min(s_v, 0.1)^2)`` with the age in seconds and deviations in
     the reward's units; a reward of one term takes that term. The age makes up for an estimator that
-    is too sure of what it has not seen for long, the cap of a tenth of the free speed for one that
-    is not sure enough of speeds on nearly empty segments. Both were chosen on validation traffic.
-    It costs a sort.
+    is overconfident about segments it has not seen for long, the cap of a tenth of the free speed
+    for one that is underconfident about speeds on nearly empty segments. Both were chosen on
+    validation traffic. It costs a sort.
     """
 
     age_power: ClassVar[float] = 2.0
@@ -106,7 +106,7 @@ class StaleVariance(Schedule):
         """See `Schedule.select`."""
         n, term = self.n_mainline, self.interface.reward.term
         age, density_log, speed_log = (
-            self._block(observation, name)[:, :n].astype(np.float64)
+            self.block(observation, name)[:, :n].astype(np.float64)
             for name in ("age", "density_log_std", "speed_log_std")
         )
         variance = np.zeros_like(age)
@@ -114,7 +114,7 @@ class StaleVariance(Schedule):
             variance += np.exp(2.0 * density_log)
         if term != "density":
             variance += np.minimum(np.exp(speed_log), self.speed_cap) ** 2
-        return self._highest((AGE_CAP * age + 1.0) ** self.age_power * variance, step)
+        return self.highest((AGE_CAP * age + 1.0) ** self.age_power * variance, step)
 
 
 class Nothing(Schedule):

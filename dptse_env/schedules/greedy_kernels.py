@@ -1,4 +1,4 @@
-"""Compiled kernels of the schedules that reckon with the estimator's covariance.
+"""Compiled kernels of the schedules that use the estimator's covariance.
 
 One episode after the other, as in `dptse_env.estimators.compiled`.
 """
@@ -15,11 +15,11 @@ from dptse_env.model.road_arrays import Road
 from dptse_env.schedules.covariance_kernels import (
     Problem,
     Work,
+    condition,
     downdate,
     hold_speeds,
     look_ahead,
     step,
-    take_in,
     to_traffic,
     work_of,
 )
@@ -58,32 +58,32 @@ def choose_greedily(
     scratch = scratch_of(road)
     for k in range(means.shape[0]):
         look_ahead(road, problem, means[k], covariances[k], inputs[k], work, scratch)
-        take_in(problem, problem.always, work.covariance, work)
+        condition(problem, problem.always, work.covariance, work)
         to_traffic(problem, work.covariance, work)
         hold_speeds(problem, work)
         pick(problem, criterion, work, queried[k])
         if keeps:
-            take_in(problem, np.flatnonzero(queried[k]), work.covariance, work)
+            condition(problem, np.flatnonzero(queried[k]), work.covariance, work)
             covariances[k] = work.covariance
 
 
 @njit(cache=True, error_model="numpy")
 def pick(problem: Problem, criterion: int, work: Work, queried: BoolArray) -> None:
     """Pick B segments, each the one of the largest gain given those before."""
-    n, bandwidth, askable, noise = (
-        problem.n_mainline, problem.bandwidth, problem.askable, problem.noise,
+    n, bandwidth, can_query, noise = (
+        problem.n_mainline, problem.bandwidth, problem.can_query, problem.noise,
     )  # fmt: skip
     traffic, rows, weights, vectors = (
         work.traffic, work.traffic_rows, work.weights, work.vectors,
     )  # fmt: skip
     queried[:] = False
     for i in range(bandwidth):
-        if i >= askable.size:
+        if i >= can_query.size:
             _fill_up(bandwidth - i, queried)
             return
         best, largest = -1, -np.inf
-        for j in range(askable.size):
-            s = askable[j]
+        for j in range(can_query.size):
+            s = can_query[j]
             if not queried[s]:
                 gain = _gain(n, criterion, s, traffic, rows, weights, noise)
                 if gain > largest or best < 0:
@@ -128,7 +128,7 @@ def _gain(
     weights: FloatArray,
     noise: FloatArray,
 ) -> float:
-    """What asking a segment takes from the weighted trace, or from the log determinant.
+    """Reduction of the weighted trace, or of the log determinant, by querying a segment.
 
     It takes its arrays one by one: a tuple of twenty costs more in reference counts than the
     arithmetic does.
@@ -168,7 +168,7 @@ def choose_by_swaps(
     scratch, ahead, best = scratch_of(road), np.empty_like(after), np.empty_like(after)
     for k in range(means.shape[0]):
         look_ahead(road, problem, means[k], covariances[k], inputs[k], work, scratch)
-        take_in(problem, problem.always, work.covariance, work)
+        condition(problem, problem.always, work.covariance, work)
         ahead[:] = work.covariance
         to_traffic(problem, ahead, work)
         hold_speeds(problem, work)
@@ -176,7 +176,7 @@ def choose_by_swaps(
         base = queried[k].copy()
         least = _roll_out(road, problem, horizon, base, ahead, after, best, work)
         for out in np.flatnonzero(base):
-            for s in problem.askable:
+            for s in problem.can_query:
                 if base[s]:
                     continue
                 tried = base.copy()
@@ -196,7 +196,7 @@ def _roll_out(
     road: Road,
     problem: Problem,
     horizon: int,
-    asked: BoolArray,
+    queried: BoolArray,
     ahead: FloatArray,
     after: FloatArray,
     first: FloatArray,
@@ -204,22 +204,22 @@ def _roll_out(
 ) -> float:
     """Return the sum of weighted traces over the horizon; `first` gets the coming step's P."""
     after[:] = ahead
-    take_in(problem, np.flatnonzero(asked), after, work)
+    condition(problem, np.flatnonzero(queried), after, work)
     first[:] = after
     total = _spread(problem, after, work)
     for _ in range(horizon - 1):
         step(road, problem, after, work)
-        take_in(problem, problem.always, after, work)
+        condition(problem, problem.always, after, work)
         _spread(problem, after, work)
         # The rule from then on: the largest weighted variance.
-        for _ in range(min(problem.bandwidth, problem.askable.size)):
+        for _ in range(min(problem.bandwidth, problem.can_query.size)):
             best, largest = -1, -np.inf
-            for s in problem.askable:
+            for s in problem.can_query:
                 if work.sums[0, s] > largest:
                     best, largest = s, work.sums[0, s]
             work.sums[0, best] = -np.inf
             work.sums[1, best] = 1.0
-        take_in(problem, np.flatnonzero(work.sums[1]), after, work)
+        condition(problem, np.flatnonzero(work.sums[1]), after, work)
         total += _spread(problem, after, work)
     return total
 

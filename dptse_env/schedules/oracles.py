@@ -1,4 +1,4 @@
-"""Oracles: schedules that see the true traffic. Bounds on what policies can reach, no policies."""
+"""Oracles: schedules that see the true traffic. They are bounds on policies, and no policies."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import numpy as np
 from dptse_env.estimators import Estimator
 from dptse_env.process import QueryProcess
 from dptse_env.release import ReleaseRequest
-from dptse_env.schedules.base import BoundSchedule
+from dptse_env.schedules.base import ProcessSchedule
 from dptse_env.spaces.rewards import ScoredSecond, estimation_error
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray, Observation
 
@@ -22,7 +22,7 @@ MOST_SETS = 1_000
 """Sets of segments that the brute force tries at most in a step."""
 
 
-class OracleError(BoundSchedule):
+class OracleError(ProcessSchedule):
     """The segments where the present estimate is worst, in the reward's metric.
 
     The squared error is ``((rho_est - rho) / rho_0)^2 + m ((v_est - v) / v_0)^2`` with the
@@ -43,12 +43,12 @@ class OracleError(BoundSchedule):
         if term != "density":
             speed = ((estimate.speed[:, :n] - truth[..., 1]) / corridor.speed_scale) ** 2
             error += np.where(truth[..., 0] > 0.0, speed, 0.0)
-        return self._highest(error, step)
+        return self.highest(error, step)
 
 
 @dataclass(frozen=True)
-class _Next:
-    """The second that is coming, k episodes: all that an update needs but the set of segments."""
+class _NextSecond:
+    """The coming second of k episodes: everything that an update needs but the set of segments."""
 
     episodes: IntArray
     truth: FloatArray
@@ -56,8 +56,8 @@ class _Next:
     estimator: Estimator
 
 
-class _Realised(BoundSchedule):
-    """Tries updates of the coming second with the answers and the noise that will come.
+class _Realised(ProcessSchedule):
+    """Tries updates of the coming second with the true values and the noise that will come.
 
     Everything is tried on copies: noise, contributions and estimator of the process stay as they
     are, so an episode under an oracle meets the noise that it would have met anyway.
@@ -74,10 +74,10 @@ class _Realised(BoundSchedule):
         return chosen
 
     @abstractmethod
-    def _best(self, coming: _Next) -> BoolArray:
+    def _best(self, coming: _NextSecond) -> BoolArray:
         """Return the sets of segments, shape (k, n_mainline)."""
 
-    def _look(self, episodes: IntArray) -> _Next:
+    def _look(self, episodes: IntArray) -> _NextSecond:
         ahead = self.process.fork()
         traffic, times = ahead.traffic_index[episodes], ahead.time[episodes]
         n = ahead.config.corridor.n_segments
@@ -92,10 +92,10 @@ class _Realised(BoundSchedule):
         )
         released = ahead.release.release(request).values
         truth = ahead.traffic.aggregates(traffic, times + 1)
-        return _Next(episodes, truth, released[:, :n], ahead.estimator)
+        return _NextSecond(episodes, truth, released[:, :n], ahead.estimator)
 
-    def _reward(self, coming: _Next, queried: BoolArray) -> FloatArray:
-        """Return the rewards (k,) of asking ``queried`` (k, n_mainline)."""
+    def _reward(self, coming: _NextSecond, queried: BoolArray) -> FloatArray:
+        """Return the rewards (k,) of querying ``queried`` (k, n_mainline)."""
         process, n, episodes = self.process, self.n_mainline, coming.episodes
         observed = np.zeros(coming.truth.shape[:2], dtype=bool)
         observed[:, [*process.config.corridor.fixed_sensors]] = True
@@ -112,7 +112,7 @@ class _Realised(BoundSchedule):
 
 
 class OracleGreedy(_Realised):
-    """Adds segments one after the other, each the one that the realised reward gains most by.
+    """Segments one after the other, each the one that raises the realised reward most.
 
     The reward is that of the coming second after an update by the set so far: it sees truth and
     noise. Segments are added until there are B, even where one does harm. About B n updates of the
@@ -121,7 +121,7 @@ class OracleGreedy(_Realised):
 
     name: ClassVar[str] = "oracle-greedy"
 
-    def _best(self, coming: _Next) -> BoolArray:
+    def _best(self, coming: _NextSecond) -> BoolArray:
         k = len(coming.episodes)
         queried = np.zeros((k, self.n_mainline), dtype=bool)
         every = np.arange(k)
@@ -159,11 +159,11 @@ class OracleBruteForce(_Realised):
                 f"{OracleGreedy.name!r}"
             )
 
-    def _best(self, coming: _Next) -> BoolArray:
+    def _best(self, coming: _NextSecond) -> BoolArray:
         k = len(coming.episodes)
         best, queried = np.full(k, -np.inf), np.zeros((k, self.n_mainline), dtype=bool)
         for chosen in combinations(range(self.n_mainline), self.bandwidth):
-            tried = self._mask(np.tile(chosen, (k, 1)))
+            tried = self.mask(np.tile(chosen, (k, 1)))
             reward = self._reward(coming, tried)
             better = reward > best
             best[better], queried[better] = reward[better], tried[better]
@@ -171,6 +171,6 @@ class OracleBruteForce(_Realised):
 
 
 def _copied(estimator: Estimator) -> Estimator:
-    """Return an estimator of its own state and streams that shares the model."""
+    """Return a copy of an estimator with its own state and streams, sharing the model."""
     model = getattr(estimator, "model", None)
     return copy.deepcopy(estimator, {id(model): model})

@@ -1,4 +1,4 @@
-"""Open-loop schedules that were optimised on training traffic, and the files that they come in."""
+"""Open-loop schedules that were optimised on training traffic, and their files."""
 
 from __future__ import annotations
 
@@ -13,18 +13,22 @@ from typing import Any, ClassVar
 import numpy as np
 
 from dptse_env.config import EnvConfig
+from dptse_env.estimators import ESTIMATORS
 from dptse_env.process import QueryProcess
 from dptse_env.schedules.base import Schedule
 from dptse_env.utils.arrays import BoolArray, IntArray, Observation
 from dptse_env.utils.json_object import parse_object
 
-PLANS = ("best-static", "offline")
+PLANS = ("best-static", "optimised-plan")
 """Kinds of plans: one set for all time, a period of sets."""
+
+PLAN_ALIASES = {"offline": "optimised-plan"}
+"""Former names of kinds."""
 
 
 @dataclass(frozen=True)
-class Place:
-    """What a plan was made for.
+class PlanContext:
+    """The road, traffic, estimator and bandwidth that a plan was optimised for.
 
     Attributes:
         corridor: Name of the road.
@@ -39,13 +43,13 @@ class Place:
     bandwidth: int
 
     @classmethod
-    def of(cls, config: EnvConfig) -> Place:
-        """Return what a configuration asks for."""
-        corridor = config.corridor
-        return cls(corridor.name, corridor.digest, config.estimator, config.bandwidth)
+    def from_config(cls, config: EnvConfig) -> PlanContext:
+        """Return the context of a configuration."""
+        corridor, estimator = config.corridor, ESTIMATORS.name_of(config.estimator)
+        return cls(corridor.name, corridor.digest, estimator, config.bandwidth)
 
     def __str__(self) -> str:
-        """Name it in one line."""
+        """Return it in one line."""
         return (
             f"{self.corridor} (traffic {self.digest[:8]}), {self.estimator}, "
             f"bandwidth {self.bandwidth}"
@@ -58,23 +62,21 @@ class Plan:
 
     Attributes:
         kind: One of `PLANS`.
-        place: What it was made for.
+        context: The configuration that it was optimised for.
         sets: The segments of each step of the period.
         provenance: Traffic, noise, scores, date and versions.
     """
 
     kind: str
-    place: Place
+    context: PlanContext
     sets: tuple[tuple[int, ...], ...]
     provenance: Mapping[str, Any]
 
     @property
     def name(self) -> str:
         """Name of the file it ships in, without the suffix."""
-        place = self.place
-        return "-".join(
-            (self.kind, place.corridor, place.digest[:8], place.estimator, f"b{place.bandwidth}")
-        )
+        to = self.context
+        return "-".join((self.kind, to.corridor, to.digest[:8], to.estimator, f"b{to.bandwidth}"))
 
 
 def available_plans() -> dict[str, Plan]:
@@ -82,20 +84,20 @@ def available_plans() -> dict[str, Plan]:
     return dict(_shipped())
 
 
-def find_plan(kind: str, place: Place) -> Plan:
-    """Return the shipped plan of a kind for a place.
+def find_plan(kind: str, context: PlanContext) -> Plan:
+    """Return the shipped plan of a kind for a context.
 
     Raises:
         ValueError: There is none; the message names those that there are.
     """
     of_kind = [plan for plan in _shipped().values() if plan.kind == kind]
     for plan in of_kind:
-        if plan.place == place:
+        if plan.context == context:
             return plan
-    known = "; ".join(str(plan.place) for plan in of_kind) or "none at all"
+    known = "; ".join(str(plan.context) for plan in of_kind) or "none at all"
     raise ValueError(
-        f"no plan {kind!r} ships for {place}; there is one for: {known}. "
-        "scripts/optimise_schedule.py makes one; pass its file as the schedule"
+        f"no plan {kind!r} ships for {context}; there is one for: {known}. "
+        "scripts/search_plan.py makes one; pass its file as the schedule"
     )
 
 
@@ -114,18 +116,18 @@ def write_plan(path: str | Path, plan: Plan) -> None:
     Raises:
         ValueError: The plan is not one that can be read back; nothing is written then.
     """
-    head = {"kind": plan.kind, **vars(plan.place), "provenance": dict(plan.provenance)}
-    rows = ",\n".join(f"    {json.dumps(list(one))}" for one in plan.sets)
+    head = {"kind": plan.kind, **vars(plan.context), "provenance": dict(plan.provenance)}
+    rows = ",\n".join(f"    {json.dumps(list(segments))}" for segments in plan.sets)
     text = json.dumps(head, indent=2)[:-2] + f',\n  "sets": [\n{rows}\n  ]\n}}\n'
     _parse(text, str(path))
     Path(path).write_text(text, encoding="utf-8")
 
 
 class Planned(Schedule):
-    """Asks what a plan says, period after period: an open-loop schedule.
+    """Queries the sets of a plan, period after period: an open-loop schedule.
 
-    The plan was optimised on training traffic for the mean reward, under one estimator; another
-    estimator may follow it, another road, traffic or bandwidth may not. It costs an index.
+    The plan was optimised on training traffic for the mean reward, under one estimator. Another
+    estimator may follow it; another road, traffic or bandwidth may not. It costs an index.
     """
 
     name: ClassVar[str] = "plan"
@@ -137,17 +139,19 @@ class Planned(Schedule):
             ValueError: The plan was made for another corridor or bandwidth.
         """
         super().__init__(process.interface, seed)
-        own, place = plan.place, Place.of(process.config)
-        if (own.digest, own.bandwidth) != (place.digest, place.bandwidth):
-            raise ValueError(f"plan {plan.name} was made for {own}; the environment is {place}")
-        last = max(max(one) for one in plan.sets)
+        made_for, context = plan.context, PlanContext.from_config(process.config)
+        if (made_for.digest, made_for.bandwidth) != (context.digest, context.bandwidth):
+            raise ValueError(
+                f"plan {plan.name} was made for {made_for}; the environment is {context}"
+            )
+        last = max(map(max, plan.sets))
         if last >= self.n_mainline:
             raise ValueError(
-                f"plan {plan.name}: sets[{_holds(plan, last)}] asks segment {last}, the road has "
-                f"{self.n_mainline}"
+                f"plan {plan.name}: sets[{_first_with(plan, last)}] has segment {last}, the road "
+                f"has {self.n_mainline} segments"
             )
         self.plan = plan
-        self._sets = self._mask(np.array(plan.sets, dtype=np.int64))
+        self._sets = self.mask(np.array(plan.sets, dtype=np.int64))
 
     def select(self, step: IntArray, observation: Observation) -> BoolArray:
         """See `Schedule.select`."""
@@ -172,28 +176,30 @@ def _shipped() -> dict[str, Plan]:
     return {plan.name: plan for plan in plans}
 
 
-def _holds(plan: Plan, segment: int) -> int:
-    """Return the first step that asks a segment."""
-    return next(i for i, one in enumerate(plan.sets) if segment in one)
+def _first_with(plan: Plan, segment: int) -> int:
+    """Return the first step that queries a segment."""
+    return next(i for i, segments in enumerate(plan.sets) if segment in segments)
 
 
 def _parse(text: str, path: str) -> Plan:
     content = parse_object(text, path, _KEYS)
-    if content["kind"] not in PLANS:
-        raise ValueError(f"{path}: kind must be one of {', '.join(PLANS)}, got {content['kind']!r}")
-    place = Place(*(content[name] for name in ("corridor", "digest", "estimator", "bandwidth")))
+    kind = PLAN_ALIASES.get(content["kind"], content["kind"])
+    if kind not in PLANS:
+        raise ValueError(f"{path}: kind must be one of {', '.join(PLANS)}, got {kind!r}")
+    keys = ("corridor", "digest", "estimator", "bandwidth")
+    context = PlanContext(*(content[key] for key in keys))
     sets = tuple(
-        _checked_set(one, place.bandwidth, f"{path}: sets[{i}]")
-        for i, one in enumerate(content["sets"])
+        _checked_set(segments, context.bandwidth, f"{path}: sets[{i}]")
+        for i, segments in enumerate(content["sets"])
     )
-    if not sets or (content["kind"] == "best-static" and len(sets) != 1):
+    if not sets or (kind == "best-static" and len(sets) != 1):
         raise ValueError(f"{path}: sets must hold a period, got {len(sets)} sets")
-    return Plan(content["kind"], place, sets, content["provenance"])
+    return Plan(kind, context, sets, content["provenance"])
 
 
-def _checked_set(one: Any, bandwidth: int, path: str) -> tuple[int, ...]:
-    """Return one set of segments, refused if it is none of ``bandwidth`` distinct indices."""
-    is_set = isinstance(one, list) and all(type(s) is int and s >= 0 for s in one)
-    if not is_set or len(set(one)) != len(one) or len(one) != bandwidth:
-        raise ValueError(f"{path} must be {bandwidth} distinct segments, got {one!r}")
-    return tuple(sorted(one))
+def _checked_set(segments: Any, bandwidth: int, path: str) -> tuple[int, ...]:
+    """Return a set of segments, refused unless it is ``bandwidth`` distinct indices."""
+    is_set = isinstance(segments, list) and all(type(s) is int and s >= 0 for s in segments)
+    if not is_set or len(set(segments)) != len(segments) or len(segments) != bandwidth:
+        raise ValueError(f"{path} must be {bandwidth} distinct segments, got {segments!r}")
+    return tuple(sorted(segments))

@@ -6,19 +6,19 @@ from typing import ClassVar
 
 from dptse_env.process import QueryProcess
 from dptse_env.schedules import greedy_kernels as kernels
-from dptse_env.schedules.informed import WARY, Caution, Informed
+from dptse_env.schedules.covariance import INFLATED, CovarianceInflation, CovarianceSchedule
 from dptse_env.utils.arrays import BoolArray, FloatArray
 from dptse_env.utils.validation import integer
 
 
-class Rollout(Informed):
-    """The set of `WaryTrace`, or one that differs by a single swap, whichever promises most.
+class Rollout(CovarianceSchedule):
+    """The set of `InflatedTrace`, or one that differs by a single swap, whichever promises most.
 
-    Each of the B (n - F - B) swaps, F fixed sensors on the mainline, is asked for in thought. From
-    then on the largest weighted variance is asked for at each step, and covariances go on as
-    ``P = F P F' + Q`` and by the Kalman update, with F, H and weights as they are now. The set with
-    the least sum of weighted traces over the horizon is taken; greedy's where none is less. It
-    looks further than greedy, and trusts the model further.
+    Each of the B (n - F - B) swaps, F fixed sensors on the mainline, is evaluated in simulation:
+    from then on the segments of largest weighted variance are queried at each step, and covariances
+    evolve by ``P = F P F' + Q`` and the Kalman update, with F, H and weights as they are now. The
+    set with the least sum of weighted traces over the horizon is taken, the greedy one in a tie. It
+    looks further ahead than the greedy design and relies more on the model.
 
     A set costs about an EKF's step per second of the horizon. At n = 15, B = 5 there are 46 sets:
     some 230 EKF steps at a horizon of 5.
@@ -31,11 +31,11 @@ class Rollout(Informed):
         process: QueryProcess,
         seed: int | None = None,
         *,
-        caution: Caution = WARY,
+        inflation: CovarianceInflation = INFLATED,
         horizon: int = 5,
     ) -> None:
-        """Bind the schedule; see `Informed`. The ``horizon`` [s] includes the coming second."""
-        super().__init__(process, seed, caution=caution)
+        """Bind the schedule with a ``horizon`` [s], which includes the coming second."""
+        super().__init__(process, seed, inflation=inflation)
         self.horizon = integer("schedule.horizon", horizon, 1)
 
     def _select(

@@ -20,7 +20,7 @@ import numpy as np
 from gymnasium import spaces
 
 from dptse_env.utils.arrays import Action, BoolArray, IntArray
-from dptse_env.utils.registry import Registry, missing_methods
+from dptse_env.utils.registry import Registry, missing_methods, name_of_class
 
 
 class PendingPicks:
@@ -266,6 +266,36 @@ class SequentialAction(ActionEncoding):
         self._require_full(queried)
         choice: Action = np.argmax(queried & ~picked, axis=1)
         return choice
+
+
+def check_decision(encoding: ActionEncoding, decision: Any, n_actions: int) -> None:
+    """Refuse a decision of another package that is malformed or exceeds the bandwidth.
+
+    Raises:
+        ValueError: naming the class, what is wrong and what is expected.
+    """
+    name, shape = name_of_class(encoding), (n_actions, encoding.n_mainline)
+    queried, complete = np.asarray(decision.queried), np.asarray(decision.complete)
+    if queried.shape != shape or queried.dtype != np.bool_:
+        raise ValueError(
+            f"action {name}.decode() must return flags of shape {shape} as queried, got "
+            f"{queried.dtype} of shape {queried.shape}"
+        )
+    if complete.shape != shape[:1] or complete.dtype != np.bool_:
+        raise ValueError(
+            f"action {name}.decode() must return flags of shape {shape[:1]} as complete, got "
+            f"{complete.dtype} of shape {complete.shape}"
+        )
+    if np.shape(decision.n_dropped) != shape[:1]:
+        raise ValueError(
+            f"action {name}.decode() must return n_dropped of shape {shape[:1]}, got "
+            f"{np.shape(decision.n_dropped)}"
+        )
+    most = int(queried[complete].sum(axis=1).max(initial=0))
+    if most > encoding.bandwidth:
+        raise ValueError(
+            f"action {name}.decode() must query at most {encoding.bandwidth} segments, got {most}"
+        )
 
 
 def _expected(part: Any) -> str | None:

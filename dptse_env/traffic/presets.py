@@ -47,9 +47,12 @@ SHORT_HIGHWAY = Corridor(
 )
 """A 0.6 km stretch with one ramp of each kind and a jam of its own, for tests and first trials."""
 
+SHIPPED_CORRIDORS = (PAPER_HIGHWAY, SHORT_HIGHWAY)
+"""The corridors whose networks come compiled with the package."""
+
 CORRIDORS = Registry(
     "corridor",
-    {corridor.name: corridor for corridor in (PAPER_HIGHWAY, SHORT_HIGHWAY)},
+    {corridor.name: corridor for corridor in SHIPPED_CORRIDORS},
     check=lambda part: (
         None if isinstance(part, Corridor) or callable(part) else "be a Corridor, or return one"
     ),

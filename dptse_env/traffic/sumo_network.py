@@ -21,7 +21,7 @@ from typing import NamedTuple
 from xml.etree import ElementTree
 
 from dptse_env.traffic.corridor import Corridor
-from dptse_env.traffic.presets import CORRIDORS
+from dptse_env.traffic.presets import SHIPPED_CORRIDORS
 
 LANE_WIDTH_M = 3.2
 RAMP_ANGLE = math.radians(45.0)  # a flat ramp would stretch the junction over half a segment
@@ -77,7 +77,7 @@ def network_xml(corridor: Corridor) -> str:
         NetworkError: if the geometry is no preset's and netconvert is missing or fails.
     """
     geometry = Geometry.of(corridor)
-    for preset in CORRIDORS.values():
+    for preset in SHIPPED_CORRIDORS:
         if Geometry.of(preset) == geometry:
             return packaged_network(preset.name)
     return compile_network(geometry)

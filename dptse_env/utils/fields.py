@@ -79,6 +79,8 @@ def from_mapping(cls: type[T], values: Any, path: str, base: T | None = None) ->
         name: convert(hints[name], value, f"{prefix}{name}", getattr(base, name, None))
         for name, value in values.items()
     }
+    if base is not None and not built:
+        return base
     if base is not None:
         return dataclasses.replace(base, **built)  # type: ignore[type-var]
     hashable: Any = cls
@@ -140,45 +142,48 @@ def convert(hint: Any, value: Any, path: str, base: Any = None) -> Any:
     """
     if isinstance(value, np.generic):
         value = value.item()
-    if hint is Any:
+    kind, interval, origin, items = _parsed(hint)
+    if kind is Any:
         return value
-    interval = None
-    if typing.get_origin(hint) is typing.Annotated:
-        hint, *extras = typing.get_args(hint)
-        interval = next((extra for extra in extras if isinstance(extra, Interval)), None)
-    if hint is int or hint is float:
-        return _number(hint, value, path, interval)
-    origin = typing.get_origin(hint)
+    if kind is int or kind is float:
+        return _number(kind, value, path, interval)
     if origin in (typing.Union, types.UnionType):
-        return _convert_union(typing.get_args(hint), value, path, base)
-    if dataclasses.is_dataclass(hint):
-        keep = base if isinstance(base, typing.cast(type, hint)) else None
-        return from_mapping(typing.cast(type, hint), value, path, keep)
+        return _convert_union(items, value, path, base)
+    if dataclasses.is_dataclass(kind):
+        keep = base if isinstance(base, typing.cast(type, kind)) else None
+        return from_mapping(typing.cast(type, kind), value, path, keep)
     if origin is typing.Literal:
-        return _choice(typing.get_args(hint), value, path)
+        return _choice(items, value, path)
     if origin is tuple:
-        return _convert_tuple(typing.get_args(hint), value, path)
-    if (isinstance(value, bool) and hint is not bool) or not isinstance(value, hint):
-        name = "None" if hint is type(None) else hint.__name__
+        return _convert_tuple(items, value, path)
+    if (isinstance(value, bool) and kind is not bool) or not isinstance(value, kind):
+        name = "None" if kind is type(None) else kind.__name__
         raise ValueError(f"{path} must be of type {name}, got {_shown(value)}")
     return value
 
 
+@cache
+def _parsed(hint: Any) -> tuple[Any, Interval | None, Any, tuple[Any, ...]]:
+    """Return the type behind an annotation, its range, and what the type is made of."""
+    interval = None
+    if typing.get_origin(hint) is typing.Annotated:
+        hint, *extras = typing.get_args(hint)
+        interval = next((extra for extra in extras if isinstance(extra, Interval)), None)
+    return hint, interval, typing.get_origin(hint), typing.get_args(hint)
+
+
 def _number(kind: type, value: Any, path: str, interval: Interval | None) -> int | float:
     """Return an int or float, held to its range; a bool is no number here."""
-    whole = kind is int
-    allowed = allowed_numbers(kind, interval)
-    right = Integral if whole else Real
-    if isinstance(value, bool) or not isinstance(value, right):
-        raise ValueError(f"{path} must be {allowed}, got {_shown(value)}")
-    try:
-        number = int(value) if isinstance(value, Integral) and whole else float(value)
-    except OverflowError:
-        raise ValueError(f"{path} must be {allowed}, got {_shown(value)}") from None
-    inside = number in interval if interval is not None else math.isfinite(number)
-    if not inside:
-        raise ValueError(f"{path} must be {allowed}, got {_shown(value)}")
-    return number
+    number: Any = value
+    if type(value) is not kind:
+        is_number = isinstance(value, Integral if kind is int else Real)
+        try:
+            number = kind(value) if is_number and not isinstance(value, bool) else math.nan
+        except OverflowError:
+            number = math.nan
+    if number in interval if interval is not None else math.isfinite(number):
+        return typing.cast("int | float", number)
+    raise ValueError(f"{path} must be {allowed_numbers(kind, interval)}, got {_shown(value)}")
 
 
 def allowed_numbers(kind: type, interval: Interval | None) -> str:

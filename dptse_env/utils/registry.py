@@ -80,7 +80,7 @@ class Registry(Mapping[str, Any]):
         if self._parts.get(name, part) != part:
             raise ValueError(f"{self.keyword}: {name!r} is registered already, for another part")
         if not isinstance(part, str):
-            self._require(part, name)
+            self._require(part)
         self._parts[name] = part
 
     def find(self, value: Any) -> Any:
@@ -100,7 +100,7 @@ class Registry(Mapping[str, Any]):
             if isinstance(part, str):
                 part = self._imported(part)
         if is_foreign(part):
-            self._require(part, value)
+            self._require(part)
         return part
 
     def name_of(self, value: Any) -> str:
@@ -147,13 +147,13 @@ class Registry(Mapping[str, Any]):
             ) from problem
         return found
 
-    def _require(self, part: Any, value: Any) -> None:
+    def _require(self, part: Any) -> None:
         expected = self._check(part)
         if expected is None:
             return
-        if isinstance(part, type) or hasattr(part, "__qualname__") or isinstance(value, str):
-            raise ValueError(f"{self.keyword} {name_of_class(part)} must {expected}")
-        raise ValueError(f"{self.keyword} must {expected}, got {value!r}")
+        if type(part).__module__ == "builtins" and not hasattr(part, "__qualname__"):
+            raise ValueError(f"{self.keyword} must {expected}, got {part!r}")
+        raise ValueError(f"{self.keyword} {name_of_class(part)} must {expected}")
 
 
 def name_of_class(part: Any) -> str:

@@ -3,13 +3,20 @@
 import numpy as np
 import pytest
 
-from dptse_env.schedules import INFORMED, ORACLES, PLANS, SCHEDULES, BoundSchedule, make_schedule
+from dptse_env.schedules import (
+    COVARIANCE_SCHEDULES,
+    OBSERVATION_SCHEDULES,
+    ORACLES,
+    PLANS,
+    ProcessSchedule,
+    make_schedule,
+)
 from dptse_env.spaces.actions import ACTION_ENCODINGS
 
 from .playing import begin, make_batch, make_single, play
 
-NAMES = [*sorted(set(SCHEDULES) - {"none", "all"}), *INFORMED, *ORACLES]
-BOUND = [*INFORMED, *ORACLES]
+NAMES = [*sorted(set(OBSERVATION_SCHEDULES) - {"none", "all"}), *COVARIANCE_SCHEDULES, *ORACLES]
+BOUND = [*COVARIANCE_SCHEDULES, *ORACLES]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -54,7 +61,7 @@ def test_a_schedule_begins_anew_with_the_episode(name):
 
 
 @pytest.mark.parametrize("name", sorted(set(NAMES) - {"random"}))
-def test_asking_twice_changes_nothing(name):
+def test_choosing_twice_changes_nothing(name):
     env, other = make_batch(), make_batch()
     expected, rewards = play(other, name, 8)
     schedule, observation, state = make_schedule(name, env), begin(env), None
@@ -71,15 +78,16 @@ def test_asking_twice_changes_nothing(name):
 def test_a_bound_schedule_refuses_another_batch(name):
     env = make_batch()
     schedule, observation = make_schedule(name, env), begin(env)
-    assert isinstance(schedule, BoundSchedule)
+    assert isinstance(schedule, ProcessSchedule)
     with pytest.raises(ValueError, match=rf"'{name}' follows the 3 episodes .* a batch of 2"):
         schedule.predict(observation[:2])
 
 
 @pytest.mark.parametrize(
-    "name", ["oldest-first", "largest-variance", "stale-variance", "oracle-error", *INFORMED]
+    "name",
+    ["oldest-first", "largest-variance", "stale-variance", "oracle-error", *COVARIANCE_SCHEDULES],
 )
-def test_a_segment_with_a_fixed_sensor_is_asked_last(name):
+def test_a_segment_with_a_fixed_sensor_is_queried_last(name):
     queries, _ = play(make_batch(bandwidth=5), name, 6)
     assert not queries[..., 5].any()  # the fixed one of six
     assert play(make_batch(bandwidth=6), name, 2)[0].all()
@@ -87,12 +95,14 @@ def test_a_segment_with_a_fixed_sensor_is_asked_last(name):
 
 def test_only_oracles_use_the_truth():
     env = make_batch()
-    names = [*sorted(set(SCHEDULES) - {"all"}), *INFORMED]
+    names = [*sorted(set(OBSERVATION_SCHEDULES) - {"all"}), *COVARIANCE_SCHEDULES]
     assert not any(make_schedule(name, env).uses_truth for name in names)
     assert all(make_schedule(name, env).uses_truth for name in ORACLES)
-    assert not set(ORACLES) & {*SCHEDULES, *INFORMED, *PLANS}
+    assert not set(ORACLES) & {*OBSERVATION_SCHEDULES, *COVARIANCE_SCHEDULES, *PLANS}
 
 
 def test_unknown_names_are_told_all_names():
-    with pytest.raises(ValueError, match=r"unknown schedule 'best'; known: none, .*oracle-error"):
+    with pytest.raises(
+        ValueError, match=r"schedule must be one of none, .*oracle-error.*, got 'best'"
+    ):
         make_schedule("best", make_batch())

@@ -5,7 +5,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 
 from dptse_env.config import resolve
 from dptse_env.parts import make_interface
-from dptse_env.schedules import SCHEDULES, Shifting, make_schedule
+from dptse_env.schedules import OBSERVATION_SCHEDULES, Shifting, make_schedule
 from dptse_env.spaces.actions import ACTION_ENCODINGS
 
 
@@ -24,7 +24,7 @@ class Bare:
         return flat
 
 
-def asked(name, n_steps, **keywords):
+def queried(name, n_steps, **keywords):
     """Return the segments that a schedule asks for over some steps."""
     env = Bare(**keywords)
     schedule, state, sets = make_schedule(name, env, seed=0), None, []
@@ -35,7 +35,7 @@ def asked(name, n_steps, **keywords):
 
 
 def test_the_paper_shifts_one_segment_every_four_steps():
-    sets = asked("paper", 61)
+    sets = queried("paper", 61)
     assert sets[:4] == [[0, 3, 6, 9, 12]] * 4
     assert sets[4:8] == [[1, 4, 7, 10, 13]] * 4
     assert sets[8] == [2, 5, 8, 11, 14]
@@ -44,37 +44,37 @@ def test_the_paper_shifts_one_segment_every_four_steps():
 
 
 def test_the_last_segment_wraps_to_the_first():
-    sets = asked("paper", 9, bandwidth=2)
+    sets = queried("paper", 9, bandwidth=2)
     assert sets[0] == [0, 7]
-    wide = asked("round-robin", 9, bandwidth=2)
+    wide = queried("round-robin", 9, bandwidth=2)
     assert wide[8] == [0, 8]
 
 
 def test_sets_start_as_far_apart_as_possible():
     for bandwidth in (5, 7, 11):
-        (start,) = asked("static", 1, bandwidth=bandwidth)
+        (start,) = queried("static", 1, bandwidth=bandwidth)
         assert start == [15 * i // bandwidth for i in range(bandwidth)]
 
 
 def test_round_robin_shifts_every_step_and_static_never():
-    assert asked("round-robin", 3) == [[0, 3, 6, 9, 12], [1, 4, 7, 10, 13], [2, 5, 8, 11, 14]]
-    assert asked("static", 9) == [[0, 3, 6, 9, 12]] * 9
+    assert queried("round-robin", 3) == [[0, 3, 6, 9, 12], [1, 4, 7, 10, 13], [2, 5, 8, 11, 14]]
+    assert queried("static", 9) == [[0, 3, 6, 9, 12]] * 9
 
 
 def test_random_draws_different_sets_of_full_size():
-    sets = asked("random", 200)
+    sets = queried("random", 200)
     assert all(len(chosen) == 5 for chosen in sets)
     assert len({tuple(chosen) for chosen in sets}) > 150
     counts = np.bincount(np.concatenate(sets), minlength=15)
     assert counts.min() > 40
-    assert asked("random", 5) == asked("random", 5)
+    assert queried("random", 5) == queried("random", 5)
 
 
 def test_none_and_all():
-    assert asked("none", 1) == [[]]
-    assert asked("all", 1, bandwidth=15) == [list(range(15))]
+    assert queried("none", 1) == [[]]
+    assert queried("all", 1, bandwidth=15) == [list(range(15))]
     with pytest.raises(ValueError, match="'all' needs bandwidth 15, the environment has 5"):
-        asked("all", 1)
+        queried("all", 1)
 
 
 def test_oldest_first_asks_the_oldest():
@@ -137,7 +137,7 @@ def test_a_schedule_asks_the_same_in_every_encoding(name, action):
     assert queried(action) == expected
 
 
-@pytest.mark.parametrize("name", sorted(set(SCHEDULES) - {"all"}))
+@pytest.mark.parametrize("name", sorted(set(OBSERVATION_SCHEDULES) - {"all"}))
 def test_stable_baselines3_evaluates_a_schedule(name):
     env = gym.make("dptse_env:dptse/ShortHighway-v0", horizon=20, traffic_seeds="0:1")
     schedule = make_schedule(name, env, seed=0)
@@ -146,7 +146,7 @@ def test_stable_baselines3_evaluates_a_schedule(name):
 
 
 def test_bad_schedules_are_named():
-    with pytest.raises(ValueError, match="unknown schedule 'best'; known: none, static, paper"):
+    with pytest.raises(ValueError, match="schedule must be one of none, static, paper"):
         make_schedule("best", Bare())
     with pytest.raises(ValueError, match=r"schedule\.period must be None or >= 1, got 0"):
         Shifting(Bare().interface, period=0)

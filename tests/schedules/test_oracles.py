@@ -36,12 +36,12 @@ def test_oracle_error_asks_where_the_estimate_is_worst(reward):
 
 
 def realised(policy, sets_before, keywords):
-    """Return the reward of asking a set after some others, from an episode begun anew."""
+    """Return the reward of querying a set after some others, from an episode begun anew."""
     env = make_single(**keywords)
     begin(env)
-    for asked in [*sets_before, policy]:
+    for queried in [*sets_before, policy]:
         mask = np.zeros(6, dtype=np.int8)
-        mask[list(asked)] = 1
+        mask[list(queried)] = 1
         _, reward, *_ = env.step(mask)
     return reward
 
@@ -59,12 +59,12 @@ def test_the_brute_force_is_that_of_episodes_begun_anew(keywords):
     before = []
     for query, reward in zip(queries[:, 0], rewards[:, 0], strict=True):
         tried = {
-            asked: realised(asked, before, keywords)
-            for asked in itertools.combinations(range(6), 2)
+            queried: realised(queried, before, keywords)
+            for queried in itertools.combinations(range(6), 2)
         }
-        asked = tuple(np.flatnonzero(query).tolist())
-        assert tried[asked] == max(tried.values()) == reward
-        before.append(asked)
+        queried = tuple(np.flatnonzero(query).tolist())
+        assert tried[queried] == max(tried.values()) == reward
+        before.append(queried)
 
 
 def test_the_greedy_oracle_adds_the_best_segment_each_time():
@@ -72,19 +72,19 @@ def test_the_greedy_oracle_adds_the_best_segment_each_time():
     queries, rewards = play(make_single(**keywords), "oracle-greedy", 4)
     before = []
     for query, reward in zip(queries[:, 0], rewards[:, 0], strict=True):
-        asked = []
+        queried = []
         for _ in range(3):
-            left = [s for s in range(6) if s not in asked]
-            asked.append(max(left, key=lambda s: realised([*asked, s], before, keywords)))
-        assert np.flatnonzero(query).tolist() == sorted(asked)
-        assert reward == realised(asked, before, keywords)
-        before.append(asked)
+            left = [s for s in range(6) if s not in queried]
+            queried.append(max(left, key=lambda s: realised([*queried, s], before, keywords)))
+        assert np.flatnonzero(query).tolist() == sorted(queried)
+        assert reward == realised(queried, before, keywords)
+        before.append(queried)
 
 
 @pytest.mark.parametrize("name", ["oracle-error", "oracle-greedy", "oracle-brute-force"])
 @pytest.mark.parametrize("keywords", [{"privacy": BOUNDED}, {"estimator": "enkf"}], ids=str)
 def test_an_oracle_leaves_the_process_as_it_is(name, keywords):
-    """Whoever follows an oracle's queries without asking it meets the same numbers."""
+    """Whoever follows an oracle's queries without calling it meets the same numbers."""
     env = make_batch(**keywords)
     queries, rewards = play(env, name, 40)  # more than a block of noise
     other = make_batch(**keywords)

@@ -5,8 +5,8 @@ import pytest
 
 from dptse_env.schedules import PLANS, make_schedule
 from dptse_env.schedules.plans import (
-    Place,
     Plan,
+    PlanContext,
     available_plans,
     find_plan,
     read_plan,
@@ -18,14 +18,14 @@ from .playing import make_batch, make_single, play
 SETS = ((0, 3), (1, 2), (2, 4))
 
 
-def plan_for(env, sets=SETS, kind="offline"):
-    return Plan(kind, Place.of(env.unwrapped.config), sets, {"rounds": 1})
+def plan_for(env, sets=SETS, kind="optimised-plan"):
+    return Plan(kind, PlanContext.from_config(env.unwrapped.config), sets, {"rounds": 1})
 
 
 def test_a_plan_is_followed_period_after_period(tmp_path):
     env = make_batch()
-    write_plan(tmp_path / "own.json", plan_for(env))
-    queries, _ = play(env, str(tmp_path / "own.json"), 7)
+    write_plan(tmp_path / "plan.json", plan_for(env))
+    queries, _ = play(env, str(tmp_path / "plan.json"), 7)
     for step, query in enumerate(queries):
         expected = np.isin(np.arange(6), SETS[step % 3])
         np.testing.assert_array_equal(query, np.tile(expected, (3, 1)))
@@ -34,16 +34,16 @@ def test_a_plan_is_followed_period_after_period(tmp_path):
 @pytest.mark.parametrize("action", ["scores", "slots", "sequential"])
 def test_in_every_encoding(tmp_path, action):
     env = make_batch(action=action)
-    write_plan(tmp_path / "own.json", plan_for(env))
-    queries, _ = play(env, str(tmp_path / "own.json"), 4)
+    write_plan(tmp_path / "plan.json", plan_for(env))
+    queries, _ = play(env, str(tmp_path / "plan.json"), 4)
     assert [np.flatnonzero(q[0]).tolist() for q in queries] == [[0, 3], [1, 2], [2, 4], [0, 3]]
 
 
 def test_a_plan_is_read_back_as_written(tmp_path):
     plan = plan_for(make_batch())
-    write_plan(tmp_path / "own.json", plan)
-    assert read_plan(tmp_path / "own.json") == plan
-    assert plan.name.startswith("offline-short-highway-")
+    write_plan(tmp_path / "plan.json", plan)
+    assert read_plan(tmp_path / "plan.json") == plan
+    assert plan.name.startswith("optimised-plan-short-highway-")
     assert plan.name.endswith("-ekf-b2")
 
 
@@ -51,16 +51,16 @@ def test_a_plan_is_read_back_as_written(tmp_path):
 def test_a_plan_for_another_environment_is_refused_with_both_named(tmp_path, keywords):
     env, other = make_single(), make_single(**keywords)
     plan = plan_for(env)
-    write_plan(tmp_path / "own.json", plan)
+    write_plan(tmp_path / "plan.json", plan)
     with pytest.raises(ValueError, match="was made for") as caught:
-        make_schedule(str(tmp_path / "own.json"), other)
-    for place in (plan.place, Place.of(other.unwrapped.config)):
+        make_schedule(str(tmp_path / "plan.json"), other)
+    for place in (plan.context, PlanContext.from_config(other.unwrapped.config)):
         assert str(place) in str(caught.value)
 
 
 def test_another_estimator_may_follow_a_plan(tmp_path):
-    write_plan(tmp_path / "own.json", plan_for(make_single()))
-    make_schedule(str(tmp_path / "own.json"), make_single(estimator="ukf"))
+    write_plan(tmp_path / "plan.json", plan_for(make_single()))
+    make_schedule(str(tmp_path / "plan.json"), make_single(estimator="ukf"))
 
 
 @pytest.mark.parametrize("kind", PLANS)
@@ -73,39 +73,39 @@ def test_a_plan_that_does_not_ship_is_refused(kind):
 def test_shipped_plans_are_found_under_their_own_name():
     for name, plan in available_plans().items():
         assert plan.name == name
-        assert find_plan(plan.kind, plan.place) is plan
+        assert find_plan(plan.kind, plan.context) is plan
         assert "validation" in plan.provenance
 
 
 @pytest.mark.parametrize(("changes", "message"), [
-    ({"kind": "best"}, "kind must be one of best-static, offline, got 'best'"),
+    ({"kind": "best"}, "kind must be one of best-static, optimised-plan, got 'best'"),
     ({"kind": "best-static"}, "sets must hold a period, got 3 sets"),
     ({"sets": []}, "sets must hold a period, got 0 sets"),
     ({"sets": [[0, 0]]}, r"sets\[0\] must be 2 distinct segments, got \[0, 0\]"),
     ({"sets": [[0, 1], [0, 1, 2]]}, r"sets\[1\] must be 2 distinct segments"),
-    ({"sets": [[0, 9]]}, r"sets\[0\] asks segment 9, the road has 6"),
+    ({"sets": [[0, 9]]}, r"sets\[0\] has segment 9, the road has 6"),
     ({"bandwidth": "2"}, "bandwidth must be of type int, got '2'"),
     ({"more": 1}, "must be a mapping with the keys"),
 ], ids=str)  # fmt: skip
 def test_a_bad_file_is_named(tmp_path, changes, message):
-    path, env = tmp_path / "own.json", make_single()
+    path, env = tmp_path / "plan.json", make_single()
     write_plan(path, plan_for(env))
     path.write_text(json.dumps(json.loads(path.read_text()) | changes))
     with pytest.raises(ValueError, match=message) as caught:
         make_schedule(str(path), env)
-    assert str(path) in str(caught.value) or "asks segment" in message
+    assert str(path) in str(caught.value) or "has segment" in message
 
 
 def test_a_file_that_is_not_json_or_missing_is_named(tmp_path):
-    path = tmp_path / "own.json"
-    with pytest.raises(FileNotFoundError, match=r"own\.json"):
+    path = tmp_path / "plan.json"
+    with pytest.raises(FileNotFoundError, match=r"plan\.json"):
         make_schedule(str(path), make_single())
     path.write_text("{")
-    with pytest.raises(ValueError, match=r"own\.json must be JSON"):
+    with pytest.raises(ValueError, match=r"plan\.json must be JSON"):
         make_schedule(str(path), make_single())
 
 
 def test_a_bad_plan_is_not_written(tmp_path):
     with pytest.raises(ValueError, match="distinct"):
-        write_plan(tmp_path / "own.json", plan_for(make_batch(), ((0, 0),)))
+        write_plan(tmp_path / "plan.json", plan_for(make_batch(), ((0, 0),)))
     assert not list(tmp_path.iterdir())

@@ -68,7 +68,7 @@ def test_a_base_supplies_what_is_left_out():
         ({"name": "a", "wheels": [], "drive": {"torque": 1}}, r"^bike\.drive\.torque is unknown"),
         (
             {"name": "a", "wheels": [], "drive": 3},
-            r"^bike\.drive must be a mapping or a Engine or None, got 3",
+            r"^bike\.drive must be a mapping or Engine or None, got 3",
         ),
         (3, r"^bike must be a mapping"),
     ],

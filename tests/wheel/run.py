@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -32,6 +33,9 @@ def main() -> None:
         python = folder / "venv" / "bin" / "python"
         pins = ROOT / "constraints.txt"
         call(python, "-m", "pip", "install", "--quiet", "-c", pins, wheel, cwd=folder)
+        # Another project's parts: copied, so that the build leaves nothing in the checkout.
+        shutil.copytree(ROOT / "tests" / "plugin", folder / "plugin")
+        call(python, "-m", "pip", "install", "--quiet", "-c", pins, folder / "plugin", cwd=folder)
         (folder / "use.py").write_text(USE.read_text())
         call(python, "-W", "error", "use.py", cwd=folder, DPTSE_CACHE=str(folder / "cache"))
         # The lowest Gymnasium that is allowed must serve as well as the pinned one.

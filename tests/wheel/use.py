@@ -47,9 +47,30 @@ def main() -> None:
     envs = gym.make_vec("dptse_env:dptse/ShortHighway-v0", num_envs=3, traffic_seeds="0:1")
     envs.reset(seed=0)
     assert np.isfinite(envs.step(envs.action_space.sample())[1]).all()
+    use_parts_of_another_package()
     policies = Path(dptse_env.__file__).parent / "policies"
     assert (policies / "private-highway.zip").is_file(), "a trained policy must come with it"
     print(f"the wheel works with gymnasium {gym.__version__}")
+
+
+def use_parts_of_another_package() -> None:
+    """Run with a part of every kind, by names that the entry point of their package registers."""
+    kinds = ("action", "corridor", "estimator", "privacy", "reward")
+    keywords = {kind: f"plugin-{kind}" for kind in kinds}
+    keywords["observation"] = ["default", "plugin-observation"]
+    env = gym.make("dptse_env:dptse/ShortHighway-v0", **keywords)
+    assert env.reset(seed=0)[1]["privacy"]["preset"] == "plugin-privacy"
+    assert np.isfinite(env.step(env.action_space.sample())[1])
+    envs = gym.make_vec(
+        "dptse_env:dptse/ShortHighway-v0",
+        num_envs=2,
+        vectorization_mode="async",
+        vector_kwargs={"context": "spawn"},
+        **keywords,
+    )
+    envs.reset(seed=0)
+    assert np.isfinite(envs.step(envs.action_space.sample())[1]).all()
+    envs.close()
 
 
 if __name__ == "__main__":

@@ -5,31 +5,31 @@ import itertools
 import numpy as np
 import pytest
 
-from dptse_env.schedules import INFORMED, make_schedule
-from dptse_env.schedules.informed import (
-    TRUSTING,
-    Caution,
+from dptse_env.schedules import COVARIANCE_SCHEDULES, make_schedule
+from dptse_env.schedules.covariance import (
+    NO_INFLATION,
+    CovarianceInflation,
+    CovarianceSchedule,
     GreedyLogdet,
     GreedyTrace,
-    Informed,
-    WaryTrace,
+    InflatedTrace,
 )
 from dptse_env.schedules.rollout import Rollout
 
 from .playing import begin, make_batch, play
 
-CAUTIONS = {
-    "trusting": TRUSTING,
-    "occupied": Caution(occupied=True),
-    "capped": Caution(speed_cap=0.05),
-    "noisy": Caution(process_noise=(0.05, 0.02), occupied=True, speed_cap=0.1),
+INFLATIONS = {
+    "trusting": NO_INFLATION,
+    "occupied": CovarianceInflation(occupied=True),
+    "capped": CovarianceInflation(speed_cap=0.05),
+    "noisy": CovarianceInflation(process_noise=(0.05, 0.02), occupied=True, speed_cap=0.1),
 }
 
 
 class Plain:
     """The coming second of one episode, with the estimator's covariance or another, in numpy."""
 
-    def __init__(self, env, episode, caution, covariance=None):
+    def __init__(self, env, episode, inflation, covariance=None):
         self.process = process = env.unwrapped.process
         config, model, estimator = process.config, process.model, process.estimator
         self.model, self.n = model, config.corridor.n_mainline
@@ -43,12 +43,12 @@ class Plain:
         if config.estimator == "random_walk":
             self.F = np.eye(len(P))
             back = np.linalg.inv(self.whole(model.traffic_jacobian(mean)[0], [rho_m, v_f]))
-            q = caution.process_noise or settings.walk_noise
+            q = inflation.process_noise or settings.walk_noise
             self.Q = back @ np.diag(np.tile(np.square(q), model.n_segments)) @ back.T
             self.mean = mean
         else:
             self.F = model.jacobian(mean, inputs)[0] * self.scale / self.scale[:, None]
-            q = caution.process_noise or settings.process_noise
+            q = inflation.process_noise or settings.process_noise
             self.Q = np.diag(np.tile(np.square(q), model.n_segments))
             self.mean = model.project(model.step(mean, inputs), settings.bounds)
         self.H = self.whole(model.measurement_jacobian(self.mean)[0], model.measurement_scale)
@@ -58,7 +58,7 @@ class Plain:
         self.T = self.whole(model.traffic_jacobian(self.mean)[0], units)[: 2 * self.n]
         self.P = self.F @ P @ self.F.T + self.Q
         self.fixed = list(config.corridor.fixed_sensors)
-        self.weights = self.weigh(caution, config.reward)
+        self.weights = self.weigh(inflation, config.reward)
 
     def whole(self, blocks, units):
         matrix = np.zeros((2 * self.model.n_segments, 2 * self.model.n_segments))
@@ -66,20 +66,20 @@ class Plain:
             matrix[2 * s : 2 * s + 2, 2 * s : 2 * s + 2] = block
         return matrix * self.scale / np.tile(units, self.model.n_segments)[:, None]
 
-    def weigh(self, caution, term):
+    def weigh(self, inflation, term):
         weights = np.ones((self.n, 2)) * [term != "speed", term != "density"]
-        if caution.occupied:
+        if inflation.occupied:
             length = self.process.config.corridor.segment_length
             weights[:, 1] *= 1.0 - np.exp(-length * self.mean[0, : 2 * self.n : 2])
-        if caution.speed_cap is not None:
+        if inflation.speed_cap is not None:
             variance = np.diag(self.T @ self.after([]) @ self.T.T)[1::2]
-            weights[:, 1] *= np.minimum(1.0, caution.speed_cap**2 / variance)
+            weights[:, 1] *= np.minimum(1.0, inflation.speed_cap**2 / variance)
         return weights
 
-    def after(self, asked, P=None):
-        """Return the covariance after the fixed sensors and the asked segments."""
+    def after(self, queried, P=None):
+        """Return the covariance after the fixed sensors and the queried segments."""
         P = self.P if P is None else P
-        rows = np.concatenate([[2 * s, 2 * s + 1] for s in sorted({*self.fixed, *asked})])
+        rows = np.concatenate([[2 * s, 2 * s + 1] for s in sorted({*self.fixed, *queried})])
         H, R = self.H[rows], np.diag(self.R[rows])
         return P - P @ H.T @ np.linalg.solve(H @ P @ H.T + R, H @ P)
 
@@ -87,27 +87,27 @@ class Plain:
         variances = np.diag(self.T @ P @ self.T.T).reshape(-1, 2)
         return np.sum(self.weights * variances, axis=1)
 
-    def trace(self, asked):
-        return self.shares(self.after(asked)).sum()
+    def trace(self, queried):
+        return self.shares(self.after(queried)).sum()
 
-    def logdet(self, asked):
-        return np.linalg.slogdet(self.after(asked))[1]
+    def logdet(self, queried):
+        return np.linalg.slogdet(self.after(queried))[1]
 
     def greedy(self, bandwidth, cost):
-        asked = []
+        queried = []
         for _ in range(bandwidth):
-            left = [s for s in range(self.n) if s not in {*asked, *self.fixed}]
-            asked.append(min(left, key=lambda s: cost([*asked, s])))
-        return sorted(asked)
+            left = [s for s in range(self.n) if s not in {*queried, *self.fixed}]
+            queried.append(min(left, key=lambda s: cost([*queried, s])))
+        return sorted(queried)
 
-    def rolled_out(self, asked, horizon):
-        P = self.after(asked)
+    def rolled_out(self, queried, horizon):
+        P = self.after(queried)
         total = self.shares(P).sum()
         for _ in range(horizon - 1):
             P = self.F @ P @ self.F.T + self.Q
             value = self.shares(self.after([], P))
             value[[s for s in self.fixed if s < self.n]] = -np.inf
-            P = self.after(np.argsort(-value)[: len(asked)].tolist(), P)
+            P = self.after(np.argsort(-value)[: len(queried)].tolist(), P)
             total += self.shares(P).sum()
         return total
 
@@ -127,15 +127,17 @@ def chosen(schedule, observation):
 
 
 @pytest.mark.parametrize("reward", ["joint", "density", "speed"])
-@pytest.mark.parametrize("caution", CAUTIONS)
-def test_greedy_trace_is_that_of_explicit_updates(caution, reward):
+@pytest.mark.parametrize("inflation", INFLATIONS)
+def test_greedy_trace_is_that_of_explicit_updates(inflation, reward):
     env = make_batch(bandwidth=3, reward=reward)
-    own = CAUTIONS[caution]
+    own = INFLATIONS[inflation]
     for observation in states(env):
-        schedule = GreedyTrace(env.unwrapped.process, caution=own)  # begins with the estimator's P
-        for episode, asked in enumerate(chosen(schedule, observation)):
+        schedule = GreedyTrace(
+            env.unwrapped.process, inflation=own
+        )  # begins with the estimator's P
+        for episode, queried in enumerate(chosen(schedule, observation)):
             plain = Plain(env, episode, own)
-            assert asked == plain.greedy(3, plain.trace)
+            assert queried == plain.greedy(3, plain.trace)
 
 
 @pytest.mark.parametrize("keywords", [
@@ -148,11 +150,11 @@ def test_greedy_works_on_every_covariance(keywords):
     env = make_batch(bandwidth=3, **keywords)
     for observation in states(env, 5):
         for kind in (GreedyTrace, GreedyLogdet):
-            for episode, asked in enumerate(chosen(kind(env.unwrapped.process), observation)):
-                plain = Plain(env, episode, TRUSTING)
+            for episode, queried in enumerate(chosen(kind(env.unwrapped.process), observation)):
+                plain = Plain(env, episode, NO_INFLATION)
                 cost = plain.trace if kind is GreedyTrace else plain.logdet
                 # The segments of a walk can tie: sets may differ, what they cost may not.
-                assert cost(asked) == pytest.approx(cost(plain.greedy(3, cost)), rel=1e-9)
+                assert cost(queried) == pytest.approx(cost(plain.greedy(3, cost)), rel=1e-9)
 
 
 @pytest.mark.parametrize("reward", ["joint", "density"])
@@ -160,24 +162,24 @@ def test_greedy_logdet_is_that_of_explicit_updates(reward):
     env = make_batch(bandwidth=3, reward=reward)
     schedule = GreedyLogdet(env.unwrapped.process)
     for observation in states(env):
-        for episode, asked in enumerate(chosen(schedule, observation)):
-            plain = Plain(env, episode, TRUSTING)
-            assert asked == plain.greedy(3, plain.logdet)
+        for episode, queried in enumerate(chosen(schedule, observation)):
+            plain = Plain(env, episode, NO_INFLATION)
+            assert queried == plain.greedy(3, plain.logdet)
 
 
 def test_what_is_left_is_the_explicit_posterior():
     """A covariance of its own follows its own queries through several seconds."""
     env = make_batch(bandwidth=2)
-    caution = Caution(process_noise=(0.05, 0.02), occupied=True, speed_cap=0.1)
-    schedule, observation = WaryTrace(env.unwrapped.process, caution=caution), begin(env)
+    inflation = CovarianceInflation(process_noise=(0.05, 0.02), occupied=True, speed_cap=0.1)
+    schedule, observation = InflatedTrace(env.unwrapped.process, inflation=inflation), begin(env)
     state, own = None, [None] * 3
     for _ in range(6):
-        plains = [Plain(env, episode, caution, own[episode]) for episode in range(3)]
+        plains = [Plain(env, episode, inflation, own[episode]) for episode in range(3)]
         action, state = schedule.predict(observation, state)
         for episode, plain in enumerate(plains):
-            asked = np.flatnonzero(action[episode]).tolist()
-            assert asked == plain.greedy(2, plain.trace)
-            own[episode] = plain.after(asked)
+            queried = np.flatnonzero(action[episode]).tolist()
+            assert queried == plain.greedy(2, plain.trace)
+            own[episode] = plain.after(queried)
             found = schedule._after[episode]
             np.testing.assert_allclose(found, own[episode], atol=1e-9 * np.abs(own[episode]).max())
         observation = env.step(action)[0]
@@ -185,12 +187,12 @@ def test_what_is_left_is_the_explicit_posterior():
 
 def test_a_covariance_of_its_own_begins_anew_after_seconds_without_it():
     env = make_batch()
-    schedule = WaryTrace(env.unwrapped.process)
+    schedule = InflatedTrace(env.unwrapped.process)
     observations = list(itertools.islice(states(env, 4), 3))
     schedule.predict(observations[-1])
     played, _ = play(env, "round-robin", 3, observations[-1])
     assert len(played) == 3
-    fresh = WaryTrace(env.unwrapped.process)
+    fresh = InflatedTrace(env.unwrapped.process)
     last = env.unwrapped.process.observe(np.arange(3))
     schedule.predict(last)
     fresh.predict(last)
@@ -200,11 +202,11 @@ def test_a_covariance_of_its_own_begins_anew_after_seconds_without_it():
 @pytest.mark.parametrize("horizon", [1, 4])
 def test_rollout_takes_the_best_single_swap(horizon):
     env = make_batch()
-    caution, improved = CAUTIONS["noisy"], 0
+    inflation, improved = INFLATIONS["noisy"], 0
     for observation in states(env):
-        schedule = Rollout(env.unwrapped.process, caution=caution, horizon=horizon)
-        for episode, asked in enumerate(chosen(schedule, observation)):
-            plain = Plain(env, episode, caution)
+        schedule = Rollout(env.unwrapped.process, inflation=inflation, horizon=horizon)
+        for episode, queried in enumerate(chosen(schedule, observation)):
+            plain = Plain(env, episode, inflation)
             base = plain.greedy(2, plain.trace)
             swaps = [
                 sorted({*base} - {out} | {into})
@@ -213,26 +215,26 @@ def test_rollout_takes_the_best_single_swap(horizon):
                 if into not in {*base, *plain.fixed}
             ]
             best = min([base, *swaps], key=lambda one: plain.rolled_out(one, horizon))
-            assert asked == best
-            improved += asked != base
+            assert queried == best
+            improved += queried != base
     assert improved > 0 or horizon == 1
 
 
-@pytest.mark.parametrize("name", INFORMED)
+@pytest.mark.parametrize("name", COVARIANCE_SCHEDULES)
 def test_an_estimator_without_a_covariance_is_refused(name):
     env = make_batch(estimator="open_loop")
     with pytest.raises(ValueError, match=rf"'{name}' needs .* covariance, 'open_loop' has none"):
         make_schedule(name, env)
 
 
-def test_bad_cautions_are_named():
-    with pytest.raises(ValueError, match=r"caution\.speed_cap must be"):
-        Caution(speed_cap=0.0)
-    with pytest.raises(ValueError, match=r"caution\.process_noise\[1\] must be"):
-        Caution(process_noise=(0.1, -0.1))
+def test_bad_inflations_are_named():
+    with pytest.raises(ValueError, match=r"inflation\.speed_cap must be"):
+        CovarianceInflation(speed_cap=0.0)
+    with pytest.raises(ValueError, match=r"inflation\.process_noise\[1\] must be"):
+        CovarianceInflation(process_noise=(0.1, -0.1))
     with pytest.raises(ValueError, match=r"schedule\.horizon must be"):
         Rollout(make_batch().unwrapped.process, horizon=0)
-    assert issubclass(WaryTrace, Informed)
+    assert issubclass(InflatedTrace, CovarianceSchedule)
 
 
 def test_a_random_walks_covariance_gives_its_own_variances():
@@ -241,7 +243,7 @@ def test_a_random_walks_covariance_gives_its_own_variances():
         pass
     estimate = env.unwrapped.process.estimate
     for episode in range(3):
-        plain = Plain(env, episode, TRUSTING)
+        plain = Plain(env, episode, NO_INFLATION)
         plain.P = env.unwrapped.process.estimator.covariances[episode]
         own = np.diag(plain.T @ plain.P @ plain.T.T).reshape(-1, 2)
         expected = np.stack([estimate.density_std, estimate.speed_std], -1)[episode, : plain.n]

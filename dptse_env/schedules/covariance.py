@@ -1,4 +1,4 @@
-"""Schedules that know the estimator's covariance: the operator's own knowledge, not the truth."""
+"""Schedules that use the estimator's covariance: the operator's own knowledge, not the truth."""
 
 from __future__ import annotations
 
@@ -11,23 +11,24 @@ import numpy as np
 from dptse_env.model.road_arrays import road_of
 from dptse_env.process import QueryProcess
 from dptse_env.schedules import greedy_kernels as kernels
-from dptse_env.schedules.base import BoundSchedule
+from dptse_env.schedules.base import ProcessSchedule
 from dptse_env.schedules.covariance_kernels import Problem
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray, Observation
 from dptse_env.utils.validation import non_negative, positive, sequence
 
 
 @dataclass(frozen=True)
-class Caution:
-    """How far a schedule trusts the estimator's covariance.
+class CovarianceInflation:
+    """Inflation of the covariance by which a schedule chooses, and weights of its variances.
 
     Attributes:
-        process_noise: Standard deviations of what the model misses in a step, of rho over rho_m and
-            of psi over rho_m v_f. With them the schedule keeps a covariance of its own, begun with
-            the estimator's prior. None takes the estimator's present covariance and settings.
-        occupied: Whether the variance of a speed weighs as probably as the segment has a vehicle,
-            1 - exp(-rho l); a segment without one has no speed to be wrong about.
-        speed_cap: Deviation of a speed, in the reward's scale, beyond which it does not count.
+        process_noise: Standard deviations of the process noise of a step, of rho over rho_m and of
+            psi over rho_m v_f. With them the schedule propagates a covariance of its own, starting
+            from the estimator's prior. None takes the estimator's present covariance and settings.
+        occupied: Whether the variance of a speed is weighted by the probability that the segment
+            has a vehicle, 1 - exp(-rho l); an empty segment has no speed to be wrong about.
+        speed_cap: Standard deviation of a speed, in the reward's scale, beyond which it does not
+            count.
 
     Raises:
         ValueError: A value is out of range.
@@ -40,22 +41,22 @@ class Caution:
     def __post_init__(self) -> None:
         """Check values."""
         if self.process_noise is not None:
-            pair = sequence("caution.process_noise", self.process_noise, length=2)
+            pair = sequence("inflation.process_noise", self.process_noise, length=2)
             for i, value in enumerate(pair):
-                non_negative(f"caution.process_noise[{i}]", value)
+                non_negative(f"inflation.process_noise[{i}]", value)
         if self.speed_cap is not None:
-            positive("caution.speed_cap", self.speed_cap)
+            positive("inflation.speed_cap", self.speed_cap)
 
 
-TRUSTING = Caution()
+NO_INFLATION = CovarianceInflation()
 """The estimator's covariance as it is."""
 
-WARY = Caution(process_noise=(0.1, 0.03), occupied=True, speed_cap=0.1)
-"""Chosen on validation traffic among those that differ from it by factors of three."""
+INFLATED = CovarianceInflation(process_noise=(0.1, 0.03), occupied=True, speed_cap=0.1)
+"""Chosen on validation traffic among inflations that differ from it by factors of three."""
 
 
-class WithCovariance(Protocol):
-    """What the schedules need of an estimator."""
+class HasCovariance(Protocol):
+    """An estimator with a covariance."""
 
     @property
     def states(self) -> FloatArray:
@@ -66,26 +67,30 @@ class WithCovariance(Protocol):
         """Shape (n, 2 S, 2 S), rho normalised by rho_m and psi by rho_m v_f."""
 
 
-class Informed(BoundSchedule):
+class CovarianceSchedule(ProcessSchedule):
     """A schedule that predicts a covariance one step ahead.
 
-    The prediction is x = f(x, u), P = F P F' + Q at the present estimate, with the inputs that the
-    estimator will be given: the EKF's own. For other estimators with a model it is a
-    linearisation of theirs; a random walk adds its own variance and leaves segments as they are.
-    Releases and traffic are linearised at the predicted mean.
+    The prediction is that of the EKF, x = f(x, u), P = F P F' + Q at the present estimate, with the
+    inputs that the estimator will be given. For other estimators with a model it is a linearisation
+    of theirs; a random walk adds its own variance and leaves segments as they are. Releases and
+    traffic are linearised at the predicted mean.
     """
 
     name: ClassVar[str]
 
     def __init__(
-        self, process: QueryProcess, seed: int | None = None, *, caution: Caution = TRUSTING
+        self,
+        process: QueryProcess,
+        seed: int | None = None,
+        *,
+        inflation: CovarianceInflation = NO_INFLATION,
     ) -> None:
         """Bind the schedule.
 
         Args:
             process: The process (``env.unwrapped.process``).
             seed: Unused; nothing is drawn.
-            caution: How far the covariance is trusted.
+            inflation: Inflation of the covariance.
 
         Raises:
             ValueError: The estimator has no covariance.
@@ -96,10 +101,10 @@ class Informed(BoundSchedule):
                 f"schedule {self.name!r} needs an estimator with a covariance, "
                 f"{process.config.estimator!r} has none"
             )
-        self.caution = caution
-        self._estimator = cast(WithCovariance, process.estimator)
+        self.inflation = inflation
+        self._estimator = cast(HasCovariance, process.estimator)
         self._road = tuple(road_of(process.model))
-        self._problem = tuple(_problem(process, caution))
+        self._problem = tuple(_problem(process, inflation))
         self._covariances: FloatArray = self._estimator.covariances
         self._after = self._covariances.copy()
         self._second = np.full(process.n_episodes, -1)
@@ -110,7 +115,7 @@ class Informed(BoundSchedule):
         means, covariances = self._estimator.states[rows], self._present(rows)
         queried = np.empty((len(rows), self.n_mainline), dtype=bool)
         self._select(means, covariances, np.ascontiguousarray(inputs), queried)
-        if self.caution.process_noise is not None:
+        if self.inflation.process_noise is not None:
             self._after[rows] = covariances
         return queried
 
@@ -118,15 +123,15 @@ class Informed(BoundSchedule):
     def _select(
         self, means: FloatArray, covariances: FloatArray, inputs: FloatArray, queried: BoolArray
     ) -> None:
-        """Write the sets to ``queried`` (k, n_mainline), what is left to ``covariances``."""
+        """Write the sets to ``queried`` (k, n_mainline), posterior ones to ``covariances``."""
 
     def _present(self, rows: IntArray) -> FloatArray:
-        """Return present covariances, shape (k, 2 S, 2 S): the estimator's, or its own."""
-        if self.caution.process_noise is None:
-            theirs: FloatArray = self._estimator.covariances
-            return theirs if len(rows) == len(theirs) else theirs[rows]
-        # Asked again in the same second, it begins where it began before; after a second without
-        # being asked, as after a reset, it begins anew with the estimator's.
+        """Return present covariances, shape (k, 2 S, 2 S): the estimator's, or inflated ones."""
+        if self.inflation.process_noise is None:
+            covariances: FloatArray = self._estimator.covariances
+            return covariances if len(rows) == len(covariances) else covariances[rows]
+        # Called again in the same second, it starts where it started before; after a second without
+        # a call, as after a reset, it starts anew from the estimator's.
         second = self.process.elapsed[rows]
         missed = (second == 0) | (second > self._second[rows] + 1) | (second < self._second[rows])
         moved = second == self._second[rows] + 1
@@ -134,25 +139,25 @@ class Informed(BoundSchedule):
         if missed.any():
             self._covariances[rows[missed]] = self._estimator.covariances[rows[missed]]
         self._second[rows] = second
-        own: FloatArray = self._covariances[rows]
-        return own
+        inflated: FloatArray = self._covariances[rows]
+        return inflated
 
 
-class Greedy(Informed):
-    """Segments one after the other, each the one whose release tells most given those before.
+class Greedy(CovarianceSchedule):
+    """Greedy design: segments one after the other, each the most informative given those before.
 
-    C is the covariance of density and speed over the mainline, in the reward's units, that the
-    fixed sensors leave of the prediction. Asking segment s, H_s its two rows and R the noise, takes
-    ``C H_s' (H_s C H_s' + R)^-1 H_s C`` from C. Criteria:
+    C is the predicted covariance of density and speed over the mainline, in the reward's units,
+    after an update by the fixed sensors. A query of segment s, with its two rows H_s and the noise
+    R, reduces C by ``C H_s' (H_s C H_s' + R)^-1 H_s C``. Criteria:
 
-    - ``trace`` (A-optimal): the trace of that, weighted as `Caution` says. The full trace is the
-      squared error that the estimator expects in the reward's metric.
-    - ``logdet`` (D-optimal): ``log det(H_s C H_s' + R) - log det R``, what the log determinant of
-      the whole state's covariance loses. It is the same in all units, so it knows nothing of the
-      reward. The gain is submodular: greedy reaches 63 % of the best set's.
+    - ``trace`` (A-optimal): the trace of that reduction, weighted as in `CovarianceInflation`. The
+      full trace is the squared error that the estimator expects in the reward's metric.
+    - ``logdet`` (D-optimal): ``log det(H_s C H_s' + R) - log det R``, the reduction of the log
+      determinant of the whole state's covariance. It is the same in all units, so it does not
+      depend on the reward. The gain is submodular: greedy reaches 63 % of the best set's.
 
     One rank-2 downdate of C a pick, O(B n^2), after a prediction of the cost of the EKF's own.
-    About 1.2 EKF steps in all at n = 15, B = 5, with a covariance of its own about 1.5.
+    About 1.2 EKF steps in all at n = 15, B = 5, with an inflated covariance about 1.5.
     """
 
     criterion: ClassVar[int]
@@ -160,7 +165,7 @@ class Greedy(Informed):
     def _select(
         self, means: FloatArray, covariances: FloatArray, inputs: FloatArray, queried: BoolArray
     ) -> None:
-        keeps = self.caution.process_noise is not None
+        keeps = self.inflation.process_noise is not None
         kernels.choose_greedily(
             self._road, self._problem, self.criterion, keeps, means, covariances, inputs, queried
         )
@@ -180,24 +185,28 @@ class GreedyLogdet(Greedy):
     criterion: ClassVar[int] = kernels.LOGDET
 
 
-class WaryTrace(GreedyTrace):
-    """`GreedyTrace` that trusts no covariance: `WARY`, unless told otherwise.
+class InflatedTrace(GreedyTrace):
+    """`GreedyTrace` with an inflated covariance, `INFLATED` by default.
 
-    An estimator that is sure of what it has not seen for long leaves its errors there. The larger
-    process noise lets variances grow back within seconds, the cap keeps the speeds of nearly empty
-    segments from outweighing all else.
+    An estimator that is overconfident about segments it has not seen for long keeps its errors
+    there. The larger process noise lets variances grow back within seconds; the cap keeps the
+    speeds of nearly empty segments from outweighing everything else.
     """
 
-    name: ClassVar[str] = "wary-trace"
+    name: ClassVar[str] = "inflated-trace"
 
     def __init__(
-        self, process: QueryProcess, seed: int | None = None, *, caution: Caution = WARY
+        self,
+        process: QueryProcess,
+        seed: int | None = None,
+        *,
+        inflation: CovarianceInflation = INFLATED,
     ) -> None:
-        """See `Informed`."""
-        super().__init__(process, seed, caution=caution)
+        """See `CovarianceSchedule`."""
+        super().__init__(process, seed, inflation=inflation)
 
 
-def _problem(process: QueryProcess, caution: Caution) -> Problem:
+def _problem(process: QueryProcess, inflation: CovarianceInflation) -> Problem:
     config, model = process.config, process.model
     corridor, settings, term = config.corridor, config.settings(), process.interface.reward.term
     n, rho_m, v_f = corridor.n_mainline, model.density_scale, model.speed_scale
@@ -209,14 +218,14 @@ def _problem(process: QueryProcess, caution: Caution) -> Problem:
         n_mainline=n,
         bandwidth=config.bandwidth,
         always=always,
-        askable=np.setdiff1d(np.arange(n), always),
+        can_query=np.setdiff1d(np.arange(n), always),
         noise=sigma**2,
-        process_variance=np.square(caution.process_noise or noise, dtype=np.float64),
+        process_variance=np.square(inflation.process_noise or noise, dtype=np.float64),
         is_walk=is_walk,
         is_box=settings.bounds == "box",
         density_scale=float(rho_m),
         units=np.array([corridor.density_scale / rho_m, corridor.speed_scale / v_f]),
         term_weights=np.array([term != "speed", term != "density"], dtype=np.float64),
-        length=corridor.segment_length if caution.occupied else 0.0,
-        speed_cap=np.inf if caution.speed_cap is None else caution.speed_cap,
+        length=corridor.segment_length if inflation.occupied else 0.0,
+        speed_cap=np.inf if inflation.speed_cap is None else inflation.speed_cap,
     )

@@ -1,0 +1,314 @@
+"""Parts of another package: by name, by module and as objects, and bad ones."""
+
+import json
+import pickle
+import sys
+import warnings
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from dptse_env import register_part
+from dptse_env.estimators import Estimate
+from dptse_env.release import Released
+from dptse_env.schedules import make_schedule
+
+SHORT = "dptse_env:dptse/ShortHighway-v0"
+SOURCE = str(Path(__file__).parent / "plugin")
+sys.path.insert(0, SOURCE)
+
+import dptse_plugin  # noqa: E402
+from dptse_plugin import parts  # noqa: E402
+
+KEYWORDS = [keyword for keyword in dptse_plugin.PARTS if keyword != "schedule"]
+
+
+def by_module(keyword):
+    return f"dptse_plugin.parts:{dptse_plugin.PARTS[keyword]}"
+
+
+def as_object(keyword):
+    return getattr(parts, dptse_plugin.PARTS[keyword])
+
+
+def by_name(keyword):
+    dptse_plugin.register()
+    return f"plugin-{keyword}"
+
+
+def keywords(form):
+    values = {keyword: form(keyword) for keyword in KEYWORDS}
+    return {
+        **values,
+        "observation": ["default", values["observation"]],
+        "estimator_settings": {"weight": 0.5},
+        "privacy": {"preset": values["privacy"], "scale": 5.0},
+        "traffic_seeds": [0],
+    }
+
+
+def rollout(env, n_steps=20):
+    env.action_space.seed(3)
+    observation, info = env.reset(seed=2)
+    seen = [(observation, info)]
+    for _ in range(n_steps):
+        observation, reward, *_, info = env.step(env.action_space.sample())
+        seen.append((observation, reward, info))
+    return seen
+
+
+def same(first, second):
+    for one, other in zip(first, second, strict=True):
+        for a, b in zip(one[:-1], other[:-1], strict=True):
+            np.testing.assert_array_equal(a, b)
+    return True
+
+
+@pytest.mark.parametrize("form", [by_name, by_module, as_object])
+def test_every_part_serves_in_every_form(form):
+    env = gym.make(SHORT, **keywords(form))
+    seen, expected = rollout(env), rollout(gym.make(SHORT, **keywords(by_module)))
+    assert same(seen, expected)
+    assert env.action_space == gym.spaces.Discrete(5)
+    assert env.unwrapped.config.corridor.name == "plugin-road"
+    assert "mean_density" in env.unwrapped.interface.observations.slices
+    privacy = seen[0][1]["privacy"]
+    name = form(keyword="privacy") if form is by_name else "dptse_plugin.parts:LaplaceRelease"
+    assert privacy["preset"] == name
+    # What it claims is shown, and voided by the boundary inputs, as for every model.
+    assert (privacy["guarantee"], privacy["void_reasons"]) == ("none", ["boundary_inputs"])
+
+
+def test_a_claim_is_shown_as_it_is_made():
+    values = keywords(by_module)
+    values["privacy"]["boundary_inputs"] = "nominal"
+    privacy = gym.make(SHORT, **values).reset(seed=0)[1]["privacy"]
+    assert (privacy["guarantee"], privacy["void_reasons"]) == ("a claim", [])
+
+
+@pytest.mark.parametrize("form", [by_name, by_module])
+def test_strings_survive_the_spec(form):
+    env = gym.make(SHORT, **keywords(form))
+    spec = gym.envs.registration.EnvSpec.from_json(env.spec.to_json())
+    assert json.loads(env.spec.to_json())["kwargs"]["estimator"] == form("estimator")
+    assert same(rollout(gym.make(spec)), rollout(gym.make(SHORT, **keywords(form))))
+    copy = pickle.loads(pickle.dumps(env.unwrapped.config))
+    assert copy == env.unwrapped.config
+
+
+@pytest.mark.parametrize("form", [by_module, as_object])
+def test_a_batch_is_so_many_single_episodes(form):
+    batch = gym.make_vec(SHORT, num_envs=2, **keywords(form))
+    actions = np.array([1, 3])
+    observation, _ = batch.reset(seed=4)
+    for episode in range(2):
+        env = gym.make(SHORT, **keywords(form))
+        np.testing.assert_array_equal(env.reset(seed=4 + episode)[0], observation[episode])
+    after = [batch.step(actions)[0] for _ in range(5)][-1]
+    for episode in range(2):
+        env = gym.make(SHORT, **keywords(form))
+        env.reset(seed=4 + episode)
+        alone = [env.step(actions[episode])[0] for _ in range(5)][-1]
+        np.testing.assert_array_equal(alone, after[episode])
+
+
+def test_spawned_workers_know_modules(monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", SOURCE)
+    envs = gym.make_vec(
+        SHORT,
+        num_envs=2,
+        vectorization_mode="async",
+        vector_kwargs={"context": "spawn"},
+        **keywords(by_module),
+    )
+    try:
+        envs.reset(seed=0)
+        assert np.isfinite(envs.step(envs.action_space.sample())[1]).all()
+    finally:
+        envs.close()
+
+
+@pytest.mark.parametrize("form", [by_name, by_module, as_object])
+def test_a_schedule_of_another_package(form):
+    env = gym.make(SHORT, traffic_seeds=[0])
+    schedule = make_schedule(form("schedule"), env)
+    observation, _ = env.reset(seed=0)
+    action, _ = schedule.predict(observation)
+    assert action.sum() == 2
+    assert make_schedule(schedule, env) is schedule
+
+
+# --- names ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("estimator", "ekf", parts.Smoothed), "estimator: 'ekf' ships with dptse_env"),
+        (("privacy", "guaranteed", parts.LaplaceRelease), "'guaranteed' ships with dptse_env"),
+        (("observation", "age", parts.MeanDensity), "observation: 'age' ships with dptse_env"),
+        (("estimator", "My Filter", parts.Smoothed), "a name must be lower-case letters"),
+        (("estimator", "mine", 3), "estimator must be a class, or callable .*, got 3"),
+        (("estimators", "mine", parts.Smoothed), "keyword must be one of action, corridor, est"),
+    ],
+)
+def test_names_that_cannot_be_registered(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        register_part(*arguments)
+
+
+def test_a_name_stands_for_one_part():
+    register_part("reward", "cheap", parts.cheap_queries)
+    register_part("reward", "cheap", parts.cheap_queries)
+    with pytest.raises(ValueError, match="reward: 'cheap' is registered already, for another part"):
+        register_part("reward", "cheap", lambda second: second.error.density)
+
+
+def test_former_names_serve_with_a_warning():
+    with pytest.warns(DeprecationWarning, match="'guaranteed' is now called 'capped'"):
+        env = gym.make(SHORT, privacy="guaranteed")
+    assert env.unwrapped.config.privacy.preset == "capped"
+    with pytest.warns(DeprecationWarning, match="'wary-trace' is now called 'inflated-trace'"):
+        make_schedule("wary-trace", env)
+    with pytest.warns(DeprecationWarning, match="now called 'ekf-w99-3lane-capped'"):
+        gym.make(SHORT, estimator_settings="ekf-w99-3lane-guaranteed")
+
+
+# --- bad parts --------------------------------------------------------------------------------
+
+
+class NoUpdate:
+    def reset(self): ...
+    def predict(self): ...
+    def estimate(self): ...
+
+
+class NoInnovations(NoUpdate):
+    is_compiled = False
+
+    def __init__(self, model, n_episodes, settings):
+        self.n_episodes = n_episodes
+
+    def update(self): ...
+
+
+class Nan(parts.Smoothed):
+    def estimate(self):
+        return Estimate(*[np.full_like(self.traffic[..., 0], np.nan)] * 4)
+
+
+class Late(parts.Smoothed):
+    """Sound until its first update."""
+
+    def _update(self, given):
+        self.traffic[given.episodes] = np.inf
+
+
+class WrongShape(parts.LaplaceRelease):
+    def release(self, request):
+        return Released(np.zeros((1, 2)), self.sigma)
+
+
+class NanRelease(parts.LaplaceRelease):
+    def release(self, request):
+        values, sigma = super().release(request)
+        return Released(values * np.nan, sigma)
+
+
+class NoSize:
+    name, low, high = "no_size", 0.0, 1.0
+
+    def values(self, state, setup): ...
+
+
+class Clash(parts.MeanDensity):
+    name = "age"
+
+
+class Unbounded(parts.MeanDensity):
+    name, low, high = "unbounded", 1.0, 1.0
+
+
+class BlockOfNan(parts.MeanDensity):
+    def values(self, state, setup):
+        return super().values(state, setup) * np.nan
+
+
+class BlockOfWrongShape(parts.MeanDensity):
+    def values(self, state, setup):
+        return state.estimate.density
+
+
+class TooMany(parts.Neighbours):
+    def decode(self, episodes, actions, pending):
+        decision = super().decode(episodes, actions, pending)
+        decision.queried[:] = True
+        return decision
+
+
+def scalar_reward(second):
+    return -1.0
+
+
+def nan_reward(second):
+    return np.full(len(second.queried), np.nan)
+
+
+HERE = "tests.test_plugin"
+WHEN_MADE = {
+    "no module": ({"estimator": "no_such_module:Filter"}, r"^estimator 'no_such_module:Filter' cannot be imported: ModuleNotFoundError"),
+    "no class": ({"estimator": f"{HERE}:Missing"}, rf"^estimator '{HERE}:Missing' cannot be imported: {HERE} has no 'Missing'"),
+    "no update()": ({"estimator": NoUpdate}, rf"^estimator {HERE}:NoUpdate must have update\(\)"),
+    "no release model": ({"privacy": NoUpdate}, rf"^privacy\.preset {HERE}:NoUpdate must be a subclass of dptse_env.release.ReleaseModel"),
+    "no size()": ({"observation": ["default", NoSize]}, rf"^observation {HERE}:NoSize must have size\(\)"),
+    "a block's name": ({"observation": ["default", Clash]}, rf"^observation {HERE}:Clash must not be named 'age', which is a block of dptse_env"),
+    "a block's bounds": ({"observation": [Unbounded]}, rf"^observation {HERE}:Unbounded must have bounds low < high, got 1.0, 1.0"),
+    "no decode()": ({"action": NoUpdate}, rf"^action {HERE}:NoUpdate must have decode\(\), encode\(\)"),
+    "no corridor": ({"corridor": NoUpdate}, r"must be a Corridor, or return one, got <"),
+    "no reward": ({"reward": NoUpdate}, rf"^reward {HERE}:NoUpdate must be callable with a ScoredSecond"),
+    "unknown settings": ({"estimator": parts.Smoothed, "estimator_settings": {"gain": 1}}, r"^estimator_settings\.gain is unknown; allowed: weight"),
+    "bad settings": ({"privacy": {"preset": parts.LaplaceRelease, "scale": -1}}, r"^privacy\.scale must be a number in \[0, 100\], got -1"),
+}  # fmt: skip
+AT_RESET = {
+    "no innovations": ({"estimator": NoInnovations}, rf"^estimator {HERE}:NoInnovations must have an array 'innovations' of shape \(1, 8, 2\), got none"),
+    "estimates of NaN": ({"estimator": Nan}, rf"^estimator {HERE}:Nan.estimate\(\) must return finite floats 'density' of shape \(1, 8\)"),
+    "a block of NaN": ({"observation": [BlockOfNan]}, rf"^observation {HERE}:BlockOfNan.values\(\) must return finite numbers"),
+    "a block of wrong shape": ({"observation": [BlockOfWrongShape]}, rf"^observation {HERE}:BlockOfWrongShape.values\(\) must return numbers of shape \(1, 1\), got float64 of shape \(1, 8\)"),
+    "a scalar reward": ({"reward": scalar_reward}, rf"^reward {HERE}:scalar_reward must return finite numbers of shape \(1,\), got float64 of shape \(\)"),
+    "a reward of NaN": ({"reward": nan_reward}, rf"^reward {HERE}:nan_reward must return finite numbers"),
+}  # fmt: skip
+AT_STEP = {
+    "estimates that become infinite": ({"estimator": Late}, rf"^estimator {HERE}:Late.estimate\(\) must return finite floats"),
+    "a release of wrong shape": ({"privacy": WrongShape}, rf"^privacy\.preset {HERE}:WrongShape.release\(\) must return floats of shape \(1, 8, 2\), got float64 of shape \(1, 2\)"),
+    "a release of NaN": ({"privacy": NanRelease}, rf"^privacy\.preset {HERE}:NanRelease.release\(\) must return finite values of observed segments"),
+    "too many queries": ({"action": TooMany}, rf"^action {HERE}:TooMany.decode\(\) must query at most 2 segments, got 6"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("values", "message"), WHEN_MADE.values(), ids=WHEN_MADE)
+def test_bad_parts_are_refused_when_the_environment_is_made(values, message):
+    with pytest.raises(ValueError, match=message):
+        gym.make(SHORT, traffic_seeds=[0], **values)
+
+
+@pytest.mark.parametrize(("values", "message"), AT_RESET.values(), ids=AT_RESET)
+def test_bad_parts_are_refused_at_the_first_reset(values, message):
+    env = gym.make(SHORT, traffic_seeds=[0], **values)
+    with pytest.raises(ValueError, match=message):
+        env.reset(seed=0)
+
+
+@pytest.mark.parametrize(("values", "message"), AT_STEP.values(), ids=AT_STEP)
+def test_bad_parts_are_refused_in_the_step_in_which_they_fail(values, message):
+    env = gym.make(SHORT, traffic_seeds=[0], disable_env_checker=True, **values)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=message):
+        env.step(env.action_space.sample())
+
+
+def test_shipped_parts_are_not_warned_of():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        gym.make(SHORT, corridor="short-highway")
