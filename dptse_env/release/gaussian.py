@@ -128,8 +128,8 @@ class GaussianRelease(ReleaseModel):
         )
 
     def _details(self) -> Mapping[str, Any]:
-        """Return the settings of this model alone, for the report."""
-        return {"unit": None, "cap": None, "adjacency": "replace", "share": None}
+        """Return the settings of this model alone, for the report; none of them is None."""
+        return {"adjacency": "replace"}
 
     def _guarantee(self) -> str:
         settings = self.setup.settings
@@ -233,12 +233,9 @@ class Capped(GaussianRelease):
 
     def _details(self) -> Mapping[str, Any]:
         settings = self._settings
-        return {
-            "unit": settings.unit,
-            "cap": settings.contribution_cap,
-            "adjacency": settings.adjacency,
-            "share": settings.share,
-        }
+        cap = {"cap": settings.cap} if settings.unit == "trip" else {}
+        shared = {"adjacency": settings.adjacency, "share": settings.share}
+        return {"unit": settings.unit, **cap, **shared}
 
     @property
     def shared(self) -> tuple[AnyArray, ...]:
