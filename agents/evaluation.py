@@ -245,7 +245,7 @@ def watch_episode(
         if history:
             history[0].append(process)
         else:
-            history.append(History.begin(process))
+            history.append(History.from_process(process))
 
     score = run_episode(env, policy, traffic_seed=traffic_seed, seed=seed, on_second=on_second)
     return score, history[0]

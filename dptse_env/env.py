@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from dptse_env.config import resolve
 from dptse_env.parts import make_interface, make_parts, warn_where_void
 from dptse_env.process import QueryProcess
-from dptse_env.rendering import History, render_rgb
+from dptse_env.rendering import History, Picture
 from dptse_env.traffic import RecordLibrary
 from dptse_env.utils.arrays import Observation
-from dptse_env.utils.validation import path_or_none
+from dptse_env.utils.validation import integer, path_or_none
 
 _ONLY = np.zeros(1, dtype=np.int64)
 
@@ -22,31 +22,83 @@ _ONLY = np.zeros(1, dtype=np.int64)
 class SensorQueryEnv(gym.Env[Observation, Any]):
     """Choose which segments' connected vehicles to query, second by second.
 
-    One step is one second of traffic. A policy picks at most ``bandwidth`` mainline segments, a
-    private mechanism answers for them and for the fixed sensors, an estimator updates, and the
-    reward is minus the error of its estimate. Queries never change the traffic: an episode
-    replays a SUMO record, made once per traffic seed and cached on disk.
+    One step is one second of traffic. A policy picks at most ``bandwidth`` of the n mainline
+    segments, a private mechanism answers for them and for the fixed sensors, an estimator updates
+    its estimate of all S segments (mainline, on-ramps, off-ramps), and the reward is minus the
+    error of that estimate. Queries never change the traffic: an episode replays a record of SUMO,
+    made once for each traffic seed and cached on disk.
 
-    **Observation**: a flat float32 ``Box``; its named blocks are listed at
-    `dptse_env.spaces.observations.ObservationEncoding`.
+    **Observation**: a flat float32 ``Box`` of named blocks, in this order; ``interface.observations
+    .slices`` has the place of each. F is the number of fixed sensors, and the density and speed
+    scales are constants of the corridor.
 
-    **Action**: set by ``action``, see `dptse_env.spaces.actions`. ``mask`` is ``MultiBinary(n)``
-    (default), ``scores`` a ``Box``, ``slots`` a ``MultiDiscrete``, ``sequential`` a ``Discrete``
-    with `action_masks`. A sampled action never raises.
+    ========================= ==== ============================================ =========
+    block                     size value                                        bounds
+    ========================= ==== ============================================ =========
+    density                   S    estimated density / density scale            [0, 4]
+    speed                     S    estimated speed / speed scale                [0, 4]
+    density_log_std           S    log of (standard deviation / scale)          [-10, 5]
+    speed_log_std             S    the same for the speed                       [-10, 5]
+    released_density          n    last released density / scale                [-5, 5]
+    released_speed            n    last released speed / scale; where flows are [-5, 5]
+                                   released, ``released_flow`` takes its place
+    density_innovation        n    normalised innovation, 0 if not observed     [-10, 10]
+    speed_innovation          n    the same for the second released quantity    [-10, 10]
+    age                       n    seconds since last observed / 60, at most 1  [0, 1]
+    queried                   n    the last query                               {0, 1}
+    fixed_density_innovation  F    normalised innovation of the fixed sensors   [-10, 10]
+    fixed_speed_innovation    F    the same for the second released quantity    [-10, 10]
+    bandwidth                 1    queries a step / n                           [0, 1]
+    epsilon                   1    log10 of the privacy parameter               [-6, 6]
+    picked                    n    picks so far (``action="sequential"`` only)  {0, 1}
+    ========================= ==== ============================================ =========
+
+    Values beyond the bounds are clipped. ``observation`` chooses other blocks.
+
+    **Action**: ``action`` chooses the encoding; a sampled action never raises.
+
+    ============== ============================ ============================================
+    ``action``     space                        meaning
+    ============== ============================ ============================================
+    ``mask``       ``MultiBinary(n)``           one flag per segment (default)
+    ``scores``     ``Box(-1, 1, (n,))``         the ``bandwidth`` segments of highest score
+    ``slots``      ``MultiDiscrete([n] * B)``   one segment for each of the B queries
+    ``sequential`` ``Discrete(n)``              one segment per action, B actions a second;
+                                                `action_masks` has the segments still free
+    ============== ============================ ============================================
 
     **Reward**: minus the root mean squared error over the mainline, density and speed each in
-    units of its scale (``reward`` picks one of them).
+    units of its scale; ``reward`` chooses one of the two or another reward.
 
-    **Episode**: ends by ``truncated`` after ``horizon`` seconds; it never terminates.
+    **Episode**: is truncated after ``horizon`` seconds and never terminates.
 
-    **Info**: the same keys at reset and at every step: ``rmse_density`` [veh/km], ``rmse_speed``
-    [km/h], ``n_occupied``, ``n_dropped``, ``diverged``, ``mu``, ``epsilon`` (floats) and
-    ``queried`` (flags, shape (n,)); with ``truth_in_info`` also ``truth``. At reset ``privacy``
-    names the guarantee, or what voids it, and the account behind it. ``mu`` and ``epsilon`` are
-    what a vehicle has spent at most so far. ``rmse_*``, ``n_occupied`` and ``truth`` come from the
-    true traffic: use them to train and evaluate, never to act.
+    **Info**: numbers are floats and have the same keys at the reset and at every step.
 
-    **Reset options**: ``traffic_seed`` (one of ``traffic_seeds``) and ``start`` (first second).
+    ================= =====================================================================
+    key               value
+    ================= =====================================================================
+    ``rmse_density``  error of the estimated mainline densities [veh/km]; true traffic
+    ``rmse_speed``    error of the speeds of occupied segments [km/h]; true traffic
+    ``n_occupied``    mainline segments with a vehicle; true traffic
+    ``n_dropped``     requested segments that were cut, repeated or replaced
+    ``queried``       the segments that were queried, flags of shape (n,)
+    ``diverged``      1 if the estimator diverged in this second and was started anew
+    ``fallback``      1 if its update had no solution in this second, so that it only predicted
+    ``mu``            privacy loss of a vehicle so far, at most: Gaussian DP parameter
+    ``epsilon``       the same as epsilon at the configured delta
+    ``truth``         true traffic, with ``truth_in_info=True`` only
+    ``privacy``       at the reset only: the guarantee and its account (`privacy`)
+    ``inherited``     at the reset only: keywords whose values belong to another road
+    ================= =====================================================================
+
+    Values marked "true traffic" serve training and evaluation, as the reward does. They are not
+    covered by the guarantee, and no policy may act on them. The others are public.
+
+    **Reset options**: ``traffic_seed`` (one of ``traffic_seeds``) and ``start`` (first second of
+    the record).
+
+    **Rendering**: ``render_mode="rgb_array"`` draws true density, estimate, queries and error over
+    space and time. The picture shows true traffic.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 (Gymnasium's own)
@@ -56,6 +108,7 @@ class SensorQueryEnv(gym.Env[Observation, Any]):
         preset: str = "paper-highway",
         *,
         render_mode: str | None = None,
+        render_every: int = 1,
         records: str | None = None,
         **overrides: Any,
     ) -> None:
@@ -64,15 +117,18 @@ class SensorQueryEnv(gym.Env[Observation, Any]):
         Args:
             preset: Name of a preset in `dptse_env.config.PRESETS`.
             render_mode: None or ``"rgb_array"``.
+            render_every: Simulated time between two drawings [s]; in between, `render` returns the
+                last one.
             records: Folder of the record cache; None for the user's cache.
-            **overrides: Fields of `dptse_env.config.EnvConfig`, or the shortcuts ``incident``,
-                ``epsilon`` and ``delta``. Values may be plain JSON.
+            **overrides: Fields of `dptse_env.config.EnvConfig`, or the shortcuts ``epsilon``,
+                ``delta``, ``incident`` and ``demand``. Values may be plain JSON.
 
         Raises:
             ValueError: A key is unknown or a value out of range; the message names it.
 
         Warns:
-            UserWarning: Privacy preset ``guaranteed`` was asked for, and other keywords void it.
+            UserWarning: A release model with a guarantee is configured, and other keywords void
+                it, or values of another road are used on this one.
         """
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(
@@ -80,6 +136,7 @@ class SensorQueryEnv(gym.Env[Observation, Any]):
                 "environment in gymnasium.wrappers.HumanRendering to see it in a window"
             )
         self.render_mode = render_mode
+        self.render_every = integer("render_every", render_every, 1)
         self.config = resolve(preset, overrides)
         warn_where_void(self.config)
         self.interface = make_interface(self.config)
@@ -88,6 +145,8 @@ class SensorQueryEnv(gym.Env[Observation, Any]):
         self._records = path_or_none("records", records)
         self._process: QueryProcess | None = None
         self.history: History | None = None
+        self._picture: Picture | None = None
+        self._frame: tuple[int, NDArray[np.uint8]] | None = None
 
     @property
     def process(self) -> QueryProcess:
@@ -113,7 +172,7 @@ class SensorQueryEnv(gym.Env[Observation, Any]):
         super().reset(seed=seed)
         outcome = self.process.reset(_ONLY, [self.np_random], options)
         if self.render_mode is not None:
-            self.history = History.begin(self.process)
+            self.history, self._frame = History.from_process(self.process), None
         info = self.process.info(0)
         info |= self.process.reset_info()
         return outcome.observation[0], info
@@ -123,7 +182,7 @@ class SensorQueryEnv(gym.Env[Observation, Any]):
 
         Raises:
             ValueError: The action has a wrong shape, dtype or value.
-            gymnasium.error.ResetNeeded: The episode is over or was never begun.
+            gymnasium.error.ResetNeeded: The episode is over, or none was begun.
         """
         process = self.process
         if process.over[0]:
@@ -143,20 +202,21 @@ class SensorQueryEnv(gym.Env[Observation, Any]):
         """Return which segments may be picked next, shape (n,), for ``action="sequential"``.
 
         Raises:
-            ValueError: The actions are not sequential.
+            ValueError: A step takes one action only.
             gymnasium.error.ResetNeeded: No episode is running.
         """
-        if self.config.action != "sequential":
-            raise ValueError(
-                f"action_masks() needs action='sequential', this is {self.config.action!r}"
-            )
+        self.interface.require_sequential()
         if self.process.over[0]:
             raise gym.error.ResetNeeded("no episode is running: call reset() first")
         free: NDArray[np.bool_] = ~self.process.pending.picked[0]
         return free
 
+    def privacy(self) -> dict[str, Any]:
+        """Return the guarantee of an episode, or what voids it, and the account behind it."""
+        return self.process.privacy()
+
     def render(self) -> NDArray[np.uint8] | None:
-        """Return the episode so far as a picture over space and time, shape (h, w, 3).
+        """Return the episode so far as a picture over space and time, shape (height, width, 3).
 
         Raises:
             gymnasium.error.ResetNeeded: No episode has begun.
@@ -168,4 +228,13 @@ class SensorQueryEnv(gym.Env[Observation, Any]):
             return None
         if self.history is None:
             raise gym.error.ResetNeeded("nothing to render: call reset() first")
-        return render_rgb(self.history)
+        second = int(self.process.elapsed[0])
+        if self._frame is None or self._is_due(second - self._frame[0]):
+            if self._picture is None:
+                self._picture = Picture(self.history)
+            self._frame = second, self._picture.draw(self.history)
+        return self._frame[1].copy()
+
+    def _is_due(self, since: int) -> bool:
+        """Return whether a picture that is ``since`` seconds old is to be drawn again."""
+        return since >= self.render_every or (since > 0 and bool(self.process.over[0]))

@@ -47,6 +47,14 @@ class QueryInterface:
     observations: ObservationEncoding
     reward: Any
 
+    def require_sequential(self) -> None:
+        """Raise ``ValueError`` unless an action picks one segment, as for ``"sequential"``."""
+        if not self.actions.picks_one_by_one:
+            raise ValueError(
+                "action_masks() needs action='sequential' or another encoding that picks one "
+                f"segment per action, got {name_of_class(self.actions)}"
+            )
+
 
 @dataclass(frozen=True)
 class Parts:

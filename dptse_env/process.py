@@ -1,4 +1,4 @@
-"""One step of the decision process, for a batch of episodes. The only place where it is written."""
+"""The step of the decision process, written in this place alone, for a batch of episodes."""
 
 from __future__ import annotations
 
@@ -42,10 +42,11 @@ class Outcome:
 
 
 class QueryProcess:
-    """The decision process: traffic moves by itself, a policy chooses the segments to query.
+    """The decision process: traffic evolves by itself, and a policy chooses segments to query.
 
     Queries never change the traffic, so an episode replays a record of SUMO. Every array has a
-    leading axis over the episodes; ``episodes`` names the k of them that a call concerns.
+    leading axis over the n episodes; the argument ``episodes`` has the indices of the k of them
+    that a call concerns.
 
     Attributes:
         config: The configuration.
@@ -93,11 +94,10 @@ class QueryProcess:
         self._is_fork = False
 
     def fork(self) -> QueryProcess:
-        """Return a process in the same state that goes its own way, streams of noise included.
+        """Return a copy for looking ahead, streams of noise included.
 
-        For looking ahead: a fork that is stepped like its origin gives the same bits, and the
-        origin never notices. It shares traffic and model, begins no episodes, and takes some 40 us
-        an episode to make.
+        A fork that is stepped like its origin gives the same bits, and the origin is not affected.
+        It shares traffic and model, cannot be reset, and takes some 40 us an episode to make.
         """
         shared = (
             self.config, self.interface, self.model, self.traffic, self._threads,
@@ -118,7 +118,7 @@ class QueryProcess:
         Args:
             episodes: Shape (k,).
             generators: One generator per episode; each gives a seed for the traffic, the noise and
-                the estimator, whatever else is configured.
+                the estimator, whatever the configuration.
             options: ``traffic_seed`` fixes the traffic (one of ``config.traffic_seeds``) and
                 ``start`` the first second of the record; each one value, or k of them.
 
@@ -128,7 +128,7 @@ class QueryProcess:
             RuntimeError: This is a fork.
         """
         if self._is_fork:
-            raise RuntimeError("a fork only goes on: reset the process that it was made of")
+            raise RuntimeError("a fork cannot be reset: reset the process that it was made from")
         choice = ResetOptions.from_mapping(options, self.config, len(episodes))
         streams = [
             [np.random.default_rng(seed) for seed in generator.integers(2**63, size=3)]
@@ -185,11 +185,11 @@ class QueryProcess:
 
     @property
     def over(self) -> BoolArray:
-        """Whether each episode is at its end, or was never begun, shape (n,)."""
+        """Flags of episodes that are at their end or were never reset, shape (n,)."""
         return self.time >= self.end
 
     def _advance(self, episodes: IntArray, queried: BoolArray) -> None:
-        """Let one second pass: predict, release, update, and remember the query."""
+        """Advance one second: predict, release, update, and store the query."""
         traffic, n_segments = self.traffic_index[episodes], self.model.n_segments
         inputs = self.boundary.inputs(episodes, traffic, self.time[episodes])
         self._in_threads(episodes, self.estimator.predict, inputs)
@@ -211,7 +211,7 @@ class QueryProcess:
     def _in_threads(
         self, episodes: IntArray, work: Any, *rows: Any, shared: tuple[Any, ...] = ()
     ) -> None:
-        """Call ``work`` on blocks of episodes and of rows that belong to them, several at once."""
+        """Call ``work`` on blocks of episodes and of their rows, in several threads."""
         self._threads.run(
             len(episodes),
             lambda block: work(episodes[block], *(array[block] for array in rows), *shared),
@@ -222,7 +222,7 @@ class QueryProcess:
         return self.estimator.estimate().at(episodes)
 
     def _estimated(self, episodes: IntArray) -> Estimate:
-        """Take the estimator's present output; return the rows of ``episodes``."""
+        """Store the estimator's present output; return the rows of ``episodes``."""
         self.estimate = self.estimator.estimate()
         if self._checks_estimates:
             check_estimate(self.estimator, self.estimate, self.model.n_segments)
@@ -273,7 +273,7 @@ class QueryProcess:
         return complete_report(self.config, self.release, self.boundary).to_dict()
 
     def reset_info(self) -> dict[str, Any]:
-        """Return what ``info`` has at a reset beside `infos`, the same for all episodes.
+        """Return the part of ``info`` that is added at a reset, the same for all episodes.
 
         ``privacy`` is the privacy report, ``inherited`` the keywords whose values were measured or
         tuned on another road.
@@ -287,8 +287,8 @@ class QueryProcess:
     def infos(self, episodes: IntArray) -> Rows:
         """Return the infos of ``episodes``, shape (k,): fresh arrays of k rows each.
 
-        The keys in `TRUTH_INFO` come from the true traffic. They are training and evaluation
-        signals like the reward, never a release.
+        The keys in `TRUTH_INFO` come from the true traffic. They serve training and evaluation, as
+        the reward does, and are not covered by the guarantee. The others are public.
         """
         mu, epsilon = self.release.spent(self.elapsed[episodes])
         infos: Rows = {

@@ -40,11 +40,12 @@ def register_environments() -> None:
 
 
 def register_part(keyword: str, name: str, part: Any) -> None:
-    """Give a part of another package a name that a keyword takes; twice changes nothing.
+    """Register a part of another package under a name that a keyword accepts.
 
-    Names are known in the processes that call this. A package whose names are to be known
-    everywhere calls it from a function that its entry point in the group ``dptse_env.plugins``
-    names; ``"package.module:Name"`` needs no registration.
+    The name is known in processes that make this call. For a name that is known everywhere, a
+    package makes it in a function that it declares as an entry point of the group
+    ``dptse_env.plugins``. ``"package.module:Name"`` needs no registration. Registering a part twice
+    changes nothing.
 
     Args:
         keyword: One of `REGISTRIES`.
@@ -52,8 +53,8 @@ def register_part(keyword: str, name: str, part: Any) -> None:
         part: The part, or ``"package.module:Name"``, which is imported when it is used.
 
     Raises:
-        ValueError: The keyword is unknown, the name malformed or taken, or the part is not what the
-            keyword takes.
+        ValueError: The keyword is unknown, the name malformed or taken, or the part does not fit
+            the keyword.
     """
     if keyword not in REGISTRIES:
         raise ValueError(f"keyword must be one of {', '.join(REGISTRIES)}, got {keyword!r}")

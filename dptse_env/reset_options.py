@@ -16,10 +16,10 @@ NAMES = ("traffic_seed", "start")
 
 @dataclass(frozen=True)
 class ResetOptions:
-    """Checked reset options of k episodes; None where an episode draws for itself.
+    """Checked reset options of k episodes; None where an episode draws a random value.
 
     Attributes:
-        config: The configuration they were checked against.
+        config: The configuration of the environment.
         traffic: Indices into ``config.traffic_seeds``, k of them.
         starts: First seconds of the record, k of them.
     """
@@ -56,9 +56,9 @@ class ResetOptions:
         return cls(config, traffic, starts)
 
     def draw(self, generators: Sequence[np.random.Generator]) -> tuple[IntArray, IntArray]:
-        """Return traffic indices and first seconds of the episodes; what is not fixed is drawn.
+        """Return traffic indices and first seconds of the episodes, drawn where they are not fixed.
 
-        Both are drawn whether needed or not, so that fixing one leaves the other as it was.
+        Both are always drawn, so that fixing one does not change the other.
         """
         traffic = np.empty(len(generators), dtype=np.int64)
         starts = np.empty(len(generators), dtype=np.int64)

@@ -20,19 +20,19 @@ from dptse_env.reset_options import per_episode
 from dptse_env.traffic import RecordLibrary
 from dptse_env.utils.arrays import Action, BoolArray, FloatArray, IntArray, Observation
 from dptse_env.utils.validation import integer, path_or_none
-from dptse_env.utils.vector_info import Rows, as_objects, in_vector_form, repeated
+from dptse_env.utils.vector_info import Rows, in_vector_form, object_array, repeated_rows
 
 _MODES = {mode.value: mode for mode in AutoresetMode}
 
 
 @dataclass(frozen=True)
-class Ended:
-    """How k episodes ended that have been begun again since.
+class FinalStates:
+    """Final observations and infos of k episodes that were reset in the same step.
 
     Attributes:
-        episodes: Which they are, shape (k,).
+        episodes: Their indices, shape (k,).
         observation: Their last observations, shape (k, size).
-        infos: What was said of them at the end, rows as in `dptse_env.utils.vector_info`.
+        infos: Their last infos, as rows of `dptse_env.utils.vector_info`.
     """
 
     episodes: IntArray
@@ -42,42 +42,43 @@ class Ended:
 
 @dataclass(frozen=True)
 class Transition:
-    """What a step gives back for all n episodes, ahead of its infos.
+    """Result of a step of all n episodes, but for the infos.
 
     Attributes:
         observation: Shape (n, size).
-        reward: Shape (n,); zero where an episode was begun instead of stepped.
+        reward: Shape (n,); zero where an episode was reset instead of stepped.
         truncated: Whether the horizon is reached, shape (n,).
-        begun: Which episodes were begun again, shape (n,).
-        ended: How they ended, in same-step mode; None where none did.
+        was_reset: Whether an episode was reset, shape (n,).
+        final: In same-step mode, the final states of the episodes that ended; None if none did.
     """
 
     observation: Observation
     reward: FloatArray
     truncated: BoolArray
-    begun: BoolArray
-    ended: Ended | None
+    was_reset: BoolArray
+    final: FinalStates | None
 
 
 class SensorQueryVectorEnv(VectorEnv[Observation, Action, Any]):
-    """Choose whom to query in n episodes at once; see `dptse_env.env.SensorQueryEnv` for what.
+    """A batch of n episodes in one process, sharing the records in memory.
 
-    All episodes live in one process and share the records in memory. Episode i gives the numbers
-    of the scalar environment of seed s + i. Every array leads with an axis over the n episodes;
-    ``infos`` has Gymnasium's vector form, with the keys of the scalar environment.
+    Spaces, keywords, rewards and infos are those of `dptse_env.env.SensorQueryEnv`. Every array has
+    a leading axis over the n episodes, and ``infos`` has Gymnasium's vector form. After
+    ``reset(seed=s)``, episode i gives the numbers of the scalar environment after
+    ``reset(seed=s + i)``.
 
-    **Autoreset** (``metadata["autoreset_mode"]``), for an episode that has ended:
+    **Autoreset** (``metadata["autoreset_mode"]``) of an episode that has ended:
 
-    - ``NextStep`` (default): the next step begins it again; its action is ignored, its reward is 0.
-    - ``SameStep``: the same step begins it again; ``infos`` holds ``final_obs`` and ``final_info``.
+    - ``NextStep`` (default): the next step resets it, ignores its action and gives a reward of 0.
+    - ``SameStep``: the same step resets it; ``infos`` has ``final_obs`` and ``final_info``.
     - ``Disabled``: the caller resets it with ``reset_mask`` before the next step.
 
     **Reset options**: ``traffic_seed`` and ``start`` as in the scalar environment, each one value
-    or one per episode, n of them, and ``reset_mask``, flags of shape (n,): only these episodes are
-    begun, and ``infos`` speaks of no others. Options do not outlive the call.
+    for all episodes or a list of n. ``reset_mask``, flags of shape (n,), resets the flagged
+    episodes only, and ``infos`` has values for those alone. Options do not outlive the call.
 
     The episodes of a batch end together unless ``reset_mask`` staggers them. ``random_start``
-    spreads them over the records, so that a batch does not see one time of day.
+    spreads them over the records, so that the episodes of a batch differ in their time of day.
     """
 
     def __init__(
@@ -94,12 +95,12 @@ class SensorQueryVectorEnv(VectorEnv[Observation, Action, Any]):
         """Describe the environment; nothing is recorded or compiled before `reset`.
 
         Args:
-            num_envs: How many episodes run at once, n.
+            num_envs: Number n of episodes.
             preset: Name of a preset in `dptse_env.config.PRESETS`.
-            autoreset_mode: When an episode that has ended begins again: a mode or its value.
+            autoreset_mode: A mode or its value, see above.
             render_mode: None; a batch is not drawn.
             records: Folder of the record cache; None for the user's cache.
-            threads: Threads that estimate, each for a block of episodes; None for one per core.
+            threads: Threads of the estimator, each for a block of episodes; None for one per core.
                 Their number changes the time only.
             **overrides: As in `dptse_env.env.SensorQueryEnv`.
 
@@ -107,7 +108,8 @@ class SensorQueryVectorEnv(VectorEnv[Observation, Action, Any]):
             ValueError: A key is unknown or a value out of range; the message names it.
 
         Warns:
-            UserWarning: Privacy preset ``guaranteed`` was asked for, and other keywords void it.
+            UserWarning: A release model with a guarantee is configured, and other keywords void
+                it, or values of another road are used on this one.
         """
         if render_mode is not None:
             raise ValueError(
@@ -128,7 +130,7 @@ class SensorQueryVectorEnv(VectorEnv[Observation, Action, Any]):
         self._threads = None if threads is None else integer("threads", threads, 1, 1024)
         self._process: QueryProcess | None = None
         self._generators: list[tuple[np.random.Generator, int] | None] = [None] * self.num_envs
-        self._begun = np.zeros(self.num_envs, dtype=bool)
+        self._was_reset = np.zeros(self.num_envs, dtype=bool)
         self._all = np.arange(self.num_envs)
         size = self.single_observation_space.shape
         self._observation = np.zeros((self.num_envs, *size), dtype=np.float32)
@@ -158,29 +160,28 @@ class SensorQueryVectorEnv(VectorEnv[Observation, Action, Any]):
         seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[Observation, dict[str, Any]]:
-        """Begin all episodes, or those of ``options["reset_mask"]``.
+        """Reset all episodes, or those of ``options["reset_mask"]``.
 
         Args:
-            seed: s starts the generator of episode i anew with s + i; a sequence of n gives each
-                its own, None lets it go on.
-            options: ``traffic_seed`` and ``start``, each one or n of them, and ``reset_mask``, all
-                optional.
+            seed: A seed s stands for s + i in episode i; a sequence has a seed for each episode,
+                or None for one whose generator continues.
+            options: ``traffic_seed``, ``start`` and ``reset_mask``, all optional.
 
         Returns:
-            Observations, shape (n, size), the last ones for episodes that go on; infos.
+            Observations, shape (n, size), unchanged for episodes that are not reset; and infos.
 
         Raises:
             ValueError: A seed or an option is unknown, out of range or of a wrong shape.
         """
-        others = dict(options or {})
+        choices = dict(options or {})
         episodes = self._all
-        if "reset_mask" in others:
-            episodes = np.flatnonzero(self._checked_mask(others.pop("reset_mask")))
-            for key, value in others.items():
+        if "reset_mask" in choices:
+            episodes = np.flatnonzero(self._checked_mask(choices.pop("reset_mask")))
+            for key, value in choices.items():
                 values = per_episode(key, value, self.num_envs)
-                others[key] = [values[episode] for episode in episodes]
+                choices[key] = [values[episode] for episode in episodes]
         self._seed(episodes, seed)
-        self._begin(episodes, others)
+        self._reset(episodes, choices)
         return self._observation.copy(), self._infos(episodes, episodes)
 
     def step(
@@ -190,16 +191,16 @@ class SensorQueryVectorEnv(VectorEnv[Observation, Action, Any]):
 
         Raises:
             ValueError: The actions have a wrong shape, dtype or value; nothing is changed then.
-            gymnasium.error.ResetNeeded: An episode was never begun, or is over and autoreset is
+            gymnasium.error.ResetNeeded: An episode was never reset, or is over and autoreset is
                 disabled.
         """
         transition = self.advance(actions)
-        infos = self._infos(self._all, np.flatnonzero(transition.begun))
-        ended = transition.ended
-        if ended is not None:
-            final: Rows = {"final_obs": as_objects(list(ended.observation))}
-            final["final_info"] = ended.infos
-            infos |= in_vector_form(final, ended.episodes, self.num_envs)
+        infos = self._infos(self._all, np.flatnonzero(transition.was_reset))
+        final = transition.final
+        if final is not None:
+            rows: Rows = {"final_obs": object_array(list(final.observation))}
+            rows["final_info"] = final.infos
+            infos |= in_vector_form(rows, final.episodes, self.num_envs)
         return (
             transition.observation,
             transition.reward,
@@ -209,7 +210,7 @@ class SensorQueryVectorEnv(VectorEnv[Observation, Action, Any]):
         )
 
     def advance(self, actions: Action) -> Transition:
-        """Do what `step` does, without collecting infos of episodes that go on.
+        """Step as `step` does, without collecting the infos of episodes that continue.
 
         Raises:
             ValueError: As in `step`.
@@ -227,26 +228,23 @@ class SensorQueryVectorEnv(VectorEnv[Observation, Action, Any]):
             outcome = self.process.step(live, actions[live])
             self._observation[live] = outcome.observation
             reward[live], truncated[live] = outcome.reward, outcome.truncated
-        begun, ended = over, None
+        to_reset, final = over, None
         if self.autoreset_mode is AutoresetMode.SAME_STEP and truncated.any():
-            begun, done = truncated, np.flatnonzero(truncated)
-            ended = Ended(done, self._observation[done], self.process.infos(done))
-        if begun.any():
-            self._begin(np.flatnonzero(begun))
-        return Transition(self._observation.copy(), reward, truncated, begun, ended)
+            to_reset, done = truncated, np.flatnonzero(truncated)
+            final = FinalStates(done, self._observation[done], self.process.infos(done))
+        if to_reset.any():
+            self._reset(np.flatnonzero(to_reset))
+        return Transition(self._observation.copy(), reward, truncated, to_reset, final)
 
     def action_masks(self) -> BoolArray:
         """Return which segments may be picked next, shape (n, n_mainline), for ``sequential``.
 
         Raises:
-            ValueError: The actions are not sequential.
-            gymnasium.error.ResetNeeded: An episode was never begun.
+            ValueError: An action is not the pick of one segment.
+            gymnasium.error.ResetNeeded: An episode was never reset.
         """
-        if self.config.action != "sequential":
-            raise ValueError(
-                f"action_masks() needs action='sequential', this is {self.config.action!r}"
-            )
-        self._require_begun()
+        self.interface.require_sequential()
+        self._require_reset()
         free: BoolArray = ~self.process.pending.picked
         return free
 
@@ -254,21 +252,21 @@ class SensorQueryVectorEnv(VectorEnv[Observation, Action, Any]):
         """Return the guarantee of an episode, or what voids it, and the account behind it."""
         return self.process.privacy()
 
-    def _begin(self, episodes: IntArray, options: Mapping[str, Any] | None = None) -> None:
+    def _reset(self, episodes: IntArray, options: Mapping[str, Any] | None = None) -> None:
         generators = [self._generator(e)[0] for e in episodes]
         self._observation[episodes] = self.process.reset(episodes, generators, options).observation
-        self._begun[episodes] = True
+        self._was_reset[episodes] = True
 
-    def _infos(self, episodes: IntArray, begun: IntArray) -> dict[str, Any]:
-        """Return the infos of ``episodes``, with what is said of those just ``begun``."""
+    def _infos(self, episodes: IntArray, reset: IntArray) -> dict[str, Any]:
+        """Return the infos of ``episodes``, and the reset infos of those in ``reset``."""
         infos = in_vector_form(self.process.infos(episodes), episodes, self.num_envs)
-        if begun.size:
-            said = repeated(self.process.reset_info(), len(begun))
-            infos |= in_vector_form(said, begun, self.num_envs)
+        if reset.size:
+            rows = repeated_rows(self.process.reset_info(), len(reset))
+            infos |= in_vector_form(rows, reset, self.num_envs)
         return infos
 
     def _generator(self, episode: int) -> tuple[np.random.Generator, int]:
-        """Return the generator of an episode and its seed; without a seed it draws its own."""
+        """Return the generator of an episode and its seed, drawn by the system if none is set."""
         known = self._generators[episode]
         if known is None:
             known = self._generators[episode] = seeding.np_random()
@@ -280,9 +278,11 @@ class SensorQueryVectorEnv(VectorEnv[Observation, Action, Any]):
         if isinstance(seed, int | np.integer):
             seeds: list[int | None] = [int(seed) + e for e in range(self.num_envs)]
         else:
-            seeds = [None if one is None else index(one) for one in seed]
+            seeds = [None if value is None else index(value) for value in seed]
         if len(seeds) != self.num_envs:
-            raise ValueError(f"seed must be one or a list of {self.num_envs}, got {len(seeds)}")
+            raise ValueError(
+                f"seed must be an integer or a list of {self.num_envs}, got {len(seeds)}"
+            )
         fresh = {e: seeding.np_random(s) for e in episodes if (s := seeds[e]) is not None}
         for episode, generator in fresh.items():
             self._generators[episode] = generator
@@ -297,16 +297,16 @@ class SensorQueryVectorEnv(VectorEnv[Observation, Action, Any]):
             raise ValueError("options.reset_mask must name at least one episode, all are False")
         return mask
 
-    def _require_begun(self) -> None:
-        if not self._begun.all():
+    def _require_reset(self) -> None:
+        if not self._was_reset.all():
             raise gym.error.ResetNeeded(
-                f"{(~self._begun).sum()} of {self.num_envs} episodes were never begun: "
+                f"{(~self._was_reset).sum()} of {self.num_envs} episodes were never reset: "
                 "call reset() first"
             )
 
     def _checked_over(self) -> BoolArray:
-        """Return which episodes are to be begun instead of stepped, shape (n,)."""
-        self._require_begun()
+        """Return the flags of episodes to reset instead of to step, shape (n,)."""
+        self._require_reset()
         over = self.process.over
         if self.autoreset_mode is AutoresetMode.DISABLED and over.any():
             raise gym.error.ResetNeeded(

@@ -120,7 +120,7 @@ def test_sequential_actions_move_the_traffic_on_their_last_pick():
 
 
 def test_action_masks_are_for_sequential_actions():
-    with pytest.raises(ValueError, match="needs action='sequential', this is 'mask'"):
+    with pytest.raises(ValueError, match="needs action='sequential' or .*, got .*:MaskAction"):
         short().unwrapped.action_masks()
 
 
@@ -268,6 +268,35 @@ def test_rendering():
     assert (picture != empty).mean() > 0.05
 
 
+def test_a_reused_picture_is_the_picture_of_a_fresh_one():
+    env = short(render_mode="rgb_array")
+    for seed in (0, 1):
+        play(env, 50, seed)
+        env.render()
+    fresh = short(render_mode="rgb_array")
+    play(fresh, 50, 1)
+    assert (env.render() == fresh.render()).all()
+
+
+def test_render_every_redraws_every_kth_second_and_at_the_end():
+    env = short(render_mode="rgb_array", render_every=4, horizon=10)
+    env.reset(seed=0)
+    pictures = [env.render()]
+    for _ in range(10):
+        env.step(env.action_space.sample())
+        pictures.append(env.render())
+    drawn = [k for k in range(1, 11) if (pictures[k] != pictures[k - 1]).any()]
+    assert drawn == [4, 8, 10]
+
+
+def test_a_caller_may_write_into_a_picture():
+    env = short(render_mode="rgb_array")
+    env.reset(seed=0)
+    before = env.render()
+    env.render()[:] = 0
+    assert (env.render() == before).all()
+
+
 def test_a_sequential_episode_renders_one_column_a_second():
     env = short(action="sequential", bandwidth=3, render_mode="rgb_array")
     play(env, 30)
@@ -309,6 +338,7 @@ def test_a_sequential_episode_renders_one_column_a_second():
         ({"corridor": {"lanes": 10**9}}, r"^corridor\.lanes must be an integer in 1\.\.16, got 10"),
         ({"corridor": {"n_mainline": 2**63}}, r"^corridor\.n_mainline must be .* in 2\.\.1000, go"),
         ({"corridor": 3}, r"^corridor must be a Corridor, or return one, got 3"),
+        ({"render_every": 0}, r"^render_every must be an integer >= 1, got 0"),
         ({"records": 1}, r"^records must be a path or None, got 1"),
         ({"observation": 3}, r"^observation must be a sequence, got 3"),
         ({"estimator": 3}, r"^estimator must be a class, or callable with .*, got 3"),

@@ -14,7 +14,7 @@ from dptse_env.estimators import ESTIMATORS
 from dptse_env.parts import flow_centre
 from dptse_env.process import TRUTH_INFO
 from dptse_env.release.boundary import NominalBoundary
-from dptse_env.schedules import COVARIANCE_SCHEDULES, ORACLES, OBSERVATION_SCHEDULES, make_schedule
+from dptse_env.schedules import COVARIANCE_SCHEDULES, OBSERVATION_SCHEDULES, ORACLES, make_schedule
 from dptse_env.spaces.actions import ACTION_ENCODINGS
 
 SEEDS = (0, 1)

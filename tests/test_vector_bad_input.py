@@ -53,7 +53,7 @@ def test_bad_keywords_name_themselves(keywords, message):
             r"options\.start must be one value or 3, one per episode, got 2",
         ),
         ({"options": {"traffic_seed": [0, 1, 7]}}, r"options\.traffic_seed must be .*, got 7"),
-        ({"seed": [1, 2]}, r"seed must be one or a list of 3, got 2"),
+        ({"seed": [1, 2]}, r"seed must be an integer or a list of 3, got 2"),
     ],
 )
 def test_bad_resets_are_refused_and_the_episodes_go_on(arguments, message):
@@ -94,8 +94,8 @@ def test_bad_actions_are_refused_and_the_episodes_go_on(mode, bad, message):
 def test_a_step_before_the_first_reset_is_refused():
     env = short()
     actions = np.zeros((3, 6), dtype=np.int8)
-    with pytest.raises(gym.error.ResetNeeded, match="3 of 3 episodes were never begun"):
+    with pytest.raises(gym.error.ResetNeeded, match="3 of 3 episodes were never reset"):
         env.step(actions)
     env.reset(options={"reset_mask": np.array([True, False, False])})
-    with pytest.raises(gym.error.ResetNeeded, match="2 of 3 episodes were never begun"):
+    with pytest.raises(gym.error.ResetNeeded, match="2 of 3 episodes were never reset"):
         env.step(actions)

@@ -13,7 +13,7 @@ from typing import ClassVar, Literal, Protocol
 
 import numpy as np
 
-from dptse_env.model.layout import BoolArray, FloatArray, IntArray
+from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 
 Backend = Literal["compiled", "reference"]
 

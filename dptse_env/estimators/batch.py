@@ -11,7 +11,7 @@ import numpy as np
 
 from dptse_env.estimators.base import Estimate
 from dptse_env.model import ARZModel
-from dptse_env.model.layout import BoolArray, FloatArray, IntArray
+from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 
 
 class Measurements(NamedTuple):

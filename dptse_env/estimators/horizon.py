@@ -18,8 +18,8 @@ from scipy.sparse.linalg import splu
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel, Bounds
 from dptse_env.model.arz import LEAST_DENSITY, LEAST_W
-from dptse_env.model.layout import BoolArray, FloatArray
 from dptse_env.model.parameters import LARGEST_W
+from dptse_env.utils.arrays import BoolArray, FloatArray
 from dptse_env.utils.validation import positive
 
 # Largest natural residual of an optimum, in normalised states.

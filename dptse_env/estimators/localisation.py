@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from dptse_env.model.layout import FloatArray, RoadNetwork
+from dptse_env.model.layout import RoadNetwork
+from dptse_env.utils.arrays import FloatArray
 
 
 def positions(network: RoadNetwork) -> FloatArray:

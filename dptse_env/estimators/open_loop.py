@@ -10,7 +10,7 @@ from dptse_env.estimators.base import Estimate
 from dptse_env.estimators.batch import BatchEstimator, Measurements
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
-from dptse_env.model.layout import FloatArray, IntArray
+from dptse_env.utils.arrays import FloatArray, IntArray
 
 
 class OpenLoop(BatchEstimator):

@@ -13,9 +13,10 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from dptse_env.model.jacobian import step_jacobian
-from dptse_env.model.layout import FloatArray, Layout, RoadNetwork, layout_of
+from dptse_env.model.layout import Layout, RoadNetwork, layout_of
 from dptse_env.model.parameters import LARGEST_W, SECONDS_PER_HOUR, ARZParameters
 from dptse_env.model.relations import VACUUM, Relations
+from dptse_env.utils.arrays import FloatArray
 from dptse_env.utils.validation import non_negative
 
 Bounds = Literal["cone", "box"]

@@ -14,7 +14,7 @@ import numpy as np
 from scipy import optimize
 
 from dptse_env.model.compiled import CompiledARZModel
-from dptse_env.model.layout import FloatArray, RoadNetwork
+from dptse_env.model.layout import RoadNetwork
 from dptse_env.model.parameters import ARZParameters
 from dptse_env.model.prediction import (
     HORIZONS,
@@ -23,6 +23,7 @@ from dptse_env.model.prediction import (
     persistence_error,
     prediction_error,
 )
+from dptse_env.utils.arrays import FloatArray
 
 __all__ = [
     "HORIZONS",

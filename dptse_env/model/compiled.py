@@ -7,9 +7,10 @@ from numba import njit
 
 from dptse_env.model.arz import ARZModel
 from dptse_env.model.kernels import advance, scratch_of
-from dptse_env.model.layout import FloatArray, RoadNetwork
+from dptse_env.model.layout import RoadNetwork
 from dptse_env.model.parameters import ARZParameters
 from dptse_env.model.road_arrays import Road, road_of
+from dptse_env.utils.arrays import FloatArray
 
 
 class CompiledARZModel(ARZModel):

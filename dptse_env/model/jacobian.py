@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from dptse_env.model.layout import BoolArray, FloatArray
 from dptse_env.model.relations import STANDING, VACUUM
+from dptse_env.utils.arrays import BoolArray, FloatArray
 
 if TYPE_CHECKING:
     from dptse_env.model.arz import ARZModel, Cells

@@ -18,9 +18,9 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from dptse_env.model.layout import FloatArray
 from dptse_env.model.relations import STANDING, VACUUM
 from dptse_env.model.road_arrays import EXIT, LINK, MERGE, Road
+from dptse_env.utils.arrays import FloatArray
 
 # Columns of the table of cells: values, then partial derivatives by the cell's own rho and psi.
 _W, _V, _D, _W_RHO, _W_PSI, _V_RHO, _V_PSI, _D_RHO, _D_PSI = range(9)

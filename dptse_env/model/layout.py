@@ -1,4 +1,4 @@
-"""The road as the model sees it: who flows into whom, and how many lanes each cell has."""
+"""The road as the model sees it: which cells flow into which, and the lanes of each cell."""
 
 from __future__ import annotations
 
@@ -7,15 +7,12 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
+from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 
 
 class RoadNetwork(Protocol):
-    """What the model needs to know of a corridor.
+    """The properties of a corridor that the model needs.
 
     Segments are ordered: mainline 0..N-1, then on-ramps, then off-ramps (S in all). On-ramp
     `on_ramps[i] = j` joins at the face between mainline segments j-1 and j; off-ramp

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dptse_env.model.layout import FloatArray
+from dptse_env.utils.arrays import FloatArray
 
 # Below this share of its jam density a cell is a vacuum: it sends nothing, and w is v_f there.
 VACUUM = 1e-12

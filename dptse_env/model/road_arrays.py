@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dptse_env.model.arz import ARZModel
-from dptse_env.model.layout import FloatArray, IntArray
+from dptse_env.utils.arrays import FloatArray, IntArray
 
 LINK, MERGE, DIVERGE, EXIT = 0, 1, 2, 3
 

@@ -3,14 +3,11 @@
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 
 from dptse_env.privacy.gaussian import epsilon_of
+from dptse_env.utils.arrays import FloatArray, IntArray
 
 __all__ = ["ReleaseAccount"]
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.integer]
 
 
 class ReleaseAccount:

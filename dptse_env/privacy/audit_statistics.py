@@ -25,6 +25,7 @@ from scipy.optimize import brentq
 from scipy.special import ndtr, ndtri
 from scipy.stats import beta, binom
 
+from dptse_env.utils.arrays import FloatArray
 from dptse_env.utils.validation import inside, integer, positive, require
 
 __all__ = [
@@ -36,8 +37,6 @@ __all__ = [
     "error_bound",
     "rejection_probability",
 ]
-
-FloatArray = npt.NDArray[np.float64]
 
 _N_RATES = 4  # two thresholds, one for mu and one for epsilon, with two error rates each
 

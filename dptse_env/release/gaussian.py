@@ -25,7 +25,7 @@ from dptse_env.release.report import STRICT_DELTA, PrivacyReport, QuantityReport
 from dptse_env.release.settings import CappedSettings, PrivacySettings
 from dptse_env.traffic import Corridor, Record
 from dptse_env.utils.arrays import AnyArray, FloatArray, IntArray
-from dptse_env.utils.vector_info import Rows, as_objects
+from dptse_env.utils.vector_info import Rows, object_array
 
 
 class GaussianRelease(ReleaseModel):
@@ -281,6 +281,6 @@ class Capped(GaussianRelease):
         # A vehicle that has counted k times has spent what one of cap k has in all.
         spent = [self.spent(steps.astype(np.int64))[1].tolist() for steps in counted]
         return {
-            "exposures": as_objects([steps.tolist() for steps in counted]),
-            "individual_epsilon": as_objects(spent),
+            "exposures": object_array([steps.tolist() for steps in counted]),
+            "individual_epsilon": object_array(spent),
         }

@@ -6,12 +6,10 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
+from dptse_env.utils.arrays import FloatArray, IntArray
 from dptse_env.utils.validation import integer
 
 __all__ = ["GaussianMechanism", "Mechanism"]
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.integer]
 
 GRID_SHARE = 2.0**-10
 """Spacing of the released grid over the noise's standard deviation, at most."""

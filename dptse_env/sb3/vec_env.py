@@ -94,7 +94,7 @@ class SB3VecEnv(VecEnv):
         self._actions = None
         # One dict each: wrappers and callbacks write into them.
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        ended = transition.ended
+        ended = transition.final
         if ended is not None:
             for k, episode in enumerate(ended.episodes):
                 infos[episode].update(row_of(ended.infos, k))

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from gymnasium import spaces
@@ -89,9 +89,12 @@ class ActionEncoding(ABC):
         n_mainline: Segments that can be queried, n.
         bandwidth: Most queries a step, B.
         actions_per_step: Actions that make one decision.
+        picks_one_by_one: Whether an action picks one segment, so that segments already picked can
+            be masked.
     """
 
     actions_per_step = 1
+    picks_one_by_one: ClassVar[bool] = False
 
     def __init__(self, space: spaces.Space[Any], n_mainline: int, bandwidth: int) -> None:
         """Keep the space and the sizes."""
@@ -238,6 +241,8 @@ class SequentialAction(ActionEncoding):
     The traffic stands still until the last pick. Segments that are not picked yet may be picked
     next, for policies that mask invalid actions; a pick of a taken segment is replaced in rotation.
     """
+
+    picks_one_by_one: ClassVar[bool] = True
 
     def __init__(self, n_mainline: int, bandwidth: int) -> None:
         """Make the encoding for ``n_mainline`` segments and ``bandwidth`` queries a step."""

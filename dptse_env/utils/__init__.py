@@ -1,1 +1,1 @@
-"""Helpers that every package uses and that know nothing of traffic, privacy or queries."""
+"""Helpers for all packages, independent of traffic, privacy and queries."""

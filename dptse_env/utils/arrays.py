@@ -1,4 +1,4 @@
-"""Array type aliases shared by the rooms above the ground floor."""
+"""Type aliases of arrays."""
 
 from typing import Any, TypeAlias
 

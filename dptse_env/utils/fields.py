@@ -1,9 +1,9 @@
 """Fields of configuration dataclasses: types, ranges, and values from plain JSON.
 
 Keyword values of ``gym.make`` travel as JSON, so every configuration must be reachable from
-dictionaries, lists, strings and numbers. A field says what it takes by its annotation,
-``Annotated[float, Interval(0, 1)]``; `checked_fields` holds values to it, and the documentation of
-all keywords is made from it. An error is one line: ``<path> must be <allowed>, got <value>``.
+dictionaries, lists, strings and numbers. The annotation of a field declares its type and range,
+``Annotated[float, Interval(0, 1)]``: `checked_fields` enforces it, and ``docs/configuration.md`` is
+generated from it. An error is one line: ``<path> must be <allowed>, got <value>``.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def from_mapping(cls: type[T], values: Any, path: str, base: T | None = None) ->
     Args:
         cls: A frozen dataclass. Nested dataclasses, unions of them and tuples are followed.
         values: A mapping of field names; an instance of ``cls`` is returned as it is.
-        path: Where the values stand, for error messages; empty at the top.
+        path: Path of the values, for error messages; empty at the top.
         base: Supplies the fields that ``values`` leaves out.
 
     Raises:
@@ -91,7 +91,7 @@ def from_mapping(cls: type[T], values: Any, path: str, base: T | None = None) ->
 
 
 def checked_fields(instance: Any, path: str) -> None:
-    """Hold the fields of a frozen dataclass to their annotations; for ``__post_init__``.
+    """Check the fields of a frozen dataclass against their annotations, in ``__post_init__``.
 
     Numbers become plain ints and floats and sequences tuples.
 
@@ -134,7 +134,7 @@ def convert(hint: Any, value: Any, path: str, base: Any = None) -> Any:
     Args:
         hint: An annotation.
         value: The value, or plain JSON for it.
-        path: Where it stands.
+        path: Its path, for error messages.
         base: For a dataclass, supplies the fields that a mapping leaves out.
 
     Raises:

@@ -1,4 +1,4 @@
-"""JSON objects with known keys, as the package's files hold them."""
+"""Parsing of JSON objects with known keys, the format of the package's files."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ def parse_object(text: str, path: str, keys: Mapping[str, type]) -> dict[str, An
 
     Args:
         text: The JSON.
-        path: Where it stands, for error messages.
+        path: Its path, for error messages.
         keys: Type of each value by its key.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Parts by name: what ships with the package, what others register, and what stands in a module."""
+"""Registries: parts by name, shipped with the package or registered by others, or by module path."""
 
 from __future__ import annotations
 
@@ -40,8 +40,9 @@ class Registry(Mapping[str, Any]):
         Args:
             keyword: Path of the keyword.
             shipped: Parts by name; a string ``"module:Name"`` is imported when it is looked up.
-            check: Returns what a part of another package should be where it is not, else None.
-            aliases: Former names by which parts can still be had, with a warning.
+            check: Returns the requirement that a part of another package misses, worded to follow
+                "must", or None.
+            aliases: Former names, which still work with a ``DeprecationWarning``.
         """
         self.keyword, self._check = keyword, check
         self._parts = dict(shipped)
@@ -68,7 +69,7 @@ class Registry(Mapping[str, Any]):
             part: The part, or ``"package.module:Name"``.
 
         Raises:
-            ValueError: The name is malformed or taken, or the part is not what is expected.
+            ValueError: The name is malformed or taken, or the part lacks something.
         """
         if not isinstance(name, str) or not re.fullmatch(r"[a-z0-9][a-z0-9_-]*", name):
             raise ValueError(
@@ -90,8 +91,7 @@ class Registry(Mapping[str, Any]):
             value: A name, ``"package.module:Name"``, or a part, which is returned as it is.
 
         Raises:
-            ValueError: There is no such name, it cannot be imported, or what is found is not what
-                is expected.
+            ValueError: There is no such name, it cannot be imported, or the part lacks something.
         """
         part = value
         if isinstance(value, str):
@@ -104,7 +104,7 @@ class Registry(Mapping[str, Any]):
         return part
 
     def name_of(self, value: Any) -> str:
-        """Return the name by which reports call a part: its own, or ``"package.module:Name"``.
+        """Return the name of a part in reports: as registered, or ``"package.module:Name"``.
 
         Raises:
             ValueError: A string is neither a name nor of that form.
@@ -170,7 +170,7 @@ def is_foreign(part: Any) -> bool:
 
 
 def missing_methods(part: Any, methods: tuple[str, ...]) -> str | None:
-    """Return what a class or object must have where it lacks one of ``methods``, else None."""
+    """Return "have f(), g()" for the ``methods`` that a class or object lacks, or None."""
     lacking = [name for name in methods if not callable(getattr(part, name, None))]
     return f"have {', '.join(f'{name}()' for name in lacking)}" if lacking else None
 

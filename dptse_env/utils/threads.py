@@ -1,7 +1,7 @@
 """Threads that work on blocks of a batch of episodes.
 
-Compiled code that gives Python's lock away runs on several cores at once; what numpy and Python
-do around it does not.
+Compiled code that releases the global interpreter lock runs on several cores at once; the numpy
+and Python code around it does not.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from itertools import pairwise
 from dptse_env.utils.validation import integer
 
 SMALLEST = 16
-"""Episodes below which a block is not worth a thread: handing it over takes some 50 us."""
+"""Smallest block of episodes that is worth a thread: handing one over takes some 50 us."""
 
 BLOCKS_PER_THREAD = 4
 
@@ -40,13 +40,13 @@ class EpisodeThreads:
         self._owner = 0
 
     def __reduce__(self) -> tuple[type[EpisodeThreads], tuple[int]]:
-        """Travel without the threads."""
+        """Pickle without the threads."""
         return type(self), (self.threads,)
 
     def run(self, n_rows: int, work: Callable[[slice], None]) -> None:
         """Call ``work`` on slices that cover ``n_rows`` rows; return when all are done.
 
-        An exception of any of them is raised here, once none is running any more.
+        An exception in any of them is raised here, once all have stopped.
         """
         n_threads = max(min(self.threads, n_rows // SMALLEST), 1)
         if n_threads == 1:

@@ -15,7 +15,7 @@ def require(condition: bool, path: str, allowed: str, value: object) -> None:
 def integer(path: str, value: object, low: int, high: int | None = None) -> int:
     """Return `value` as an ``int`` within [low, high], both inclusive, or raise ``ValueError``."""
     allowed = f"an integer >= {low}" if high is None else f"an integer in {low}..{high}"
-    # A bool is an int to Python; nobody means one here.
+    # A bool is an int to Python.
     if isinstance(value, bool) or not isinstance(value, Integral):
         raise ValueError(f"{path} must be {allowed}, got {value!r}")
     number = int(value)

@@ -1,8 +1,8 @@
-"""What is said beside observations, for many episodes at once and for one.
+"""Conversion of per-episode info between batch rows, scalar dicts and Gymnasium's vector form.
 
-Inside, the infos of k episodes are *rows*: a dict of arrays with a leading axis of length k, or of
-such dicts. Gymnasium's vector form spreads them over all n episodes and marks, under the key with
-an underscore before it, which of them a value was said of.
+*Rows* of k episodes are a dict of arrays with a leading axis of length k, or of such dicts.
+Gymnasium's vector form has arrays over all n episodes and, under the same key with a leading
+underscore, the flags of the episodes that have a value.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ Rows = dict[str, Any]
 
 
 def row_of(rows: Mapping[str, Any], k: int) -> dict[str, Any]:
-    """Return row k as plain Python numbers, and as fresh arrays where a value has a shape."""
+    """Return row k, as plain Python numbers and as fresh arrays where a value has a shape."""
     return {
         key: row_of(value, k)
         if isinstance(value, Mapping)
@@ -28,24 +28,24 @@ def row_of(rows: Mapping[str, Any], k: int) -> dict[str, Any]:
     }
 
 
-def as_objects(values: list[Any]) -> NDArray[np.object_]:
-    """Return an array that holds the k values as they are, arrays and lists too."""
+def object_array(values: list[Any]) -> NDArray[np.object_]:
+    """Return an array of k objects, which may be arrays and lists themselves."""
     objects = np.empty(len(values), dtype=object)
     for k, value in enumerate(values):
         objects[k] = value
     return objects
 
 
-def repeated(info: Mapping[str, Any], k: int) -> Rows:
-    """Return the rows of k episodes of which the same is said; lists and dicts are shared."""
+def repeated_rows(info: Mapping[str, Any], k: int) -> Rows:
+    """Return the rows of k episodes that have the same info; lists and dicts are shared."""
     rows: Rows = {}
     for key, value in info.items():
         if isinstance(value, Mapping):
-            rows[key] = repeated(value, k)
+            rows[key] = repeated_rows(value, k)
         elif isinstance(value, bool | int | float):
             rows[key] = np.full(k, value)
         else:
-            rows[key] = as_objects([value] * k)
+            rows[key] = object_array([value] * k)
     return rows
 
 
@@ -53,16 +53,16 @@ def in_vector_form(rows: Mapping[str, Any], episodes: IntArray, n_episodes: int)
     """Spread rows over all episodes, in the form of `gymnasium.vector.VectorEnv`.
 
     Args:
-        rows: What is said of ``episodes``.
-        episodes: Which they are, shape (k,).
+        rows: Infos of ``episodes``.
+        episodes: Indices, shape (k,).
         n_episodes: Size of the batch n.
 
     Returns:
-        Under each key an array of shape (n, ...), zero or None where nothing is said, and under
-        ``_key`` whether something is, shape (n,).
+        Under each key an array of shape (n, ...), zero or None where an episode has no value, and
+        under ``_key`` the flags of those that have one, shape (n,).
     """
-    said = np.zeros(n_episodes, dtype=bool)
-    said[episodes] = True
+    present = np.zeros(n_episodes, dtype=bool)
+    present[episodes] = True
     infos: dict[str, Any] = {}
     for key, value in rows.items():
         if isinstance(value, Mapping):
@@ -71,5 +71,5 @@ def in_vector_form(rows: Mapping[str, Any], episodes: IntArray, n_episodes: int)
             blank = None if value.dtype == object else 0
             infos[key] = np.full((n_episodes, *value.shape[1:]), blank, dtype=value.dtype)
             infos[key][episodes] = value
-        infos[f"_{key}"] = said.copy()
+        infos[f"_{key}"] = present.copy()
     return infos

@@ -12,8 +12,8 @@ from agents.audit.worlds import Path, TwoWorlds
 from dptse_env.config import EnvConfig
 from dptse_env.parts import privacy_report
 from dptse_env.privacy import epsilon_of
-from dptse_env.release import RELEASE_MODELS, CappedSettings
 from dptse_env.privacy.audit_statistics import Claim, audit
+from dptse_env.release import RELEASE_MODELS, CappedSettings
 from dptse_env.traffic import SHORT_HIGHWAY, Demand, Record
 
 HORIZON = 40

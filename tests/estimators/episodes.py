@@ -12,10 +12,10 @@ from dptse_env.estimators import EstimatorSettings, make_estimator
 from dptse_env.estimators.base import Estimator
 from dptse_env.model.arz import ARZModel
 from dptse_env.model.compiled import CompiledARZModel
-from dptse_env.model.layout import BoolArray, FloatArray
 from dptse_env.model.parameters import load_parameters
 from dptse_env.traffic import PAPER_HIGHWAY
 from dptse_env.traffic.record import Record
+from dptse_env.utils.arrays import BoolArray, FloatArray
 
 SIGMA = np.array([15.0, 6.0])  # [veh/km, km/h]
 # What sensors release beside the density: the mean speed, or the flow rho (v - v_0), whose noise is

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dptse_env.model.arz import ARZModel
-from dptse_env.model.layout import FloatArray
 from dptse_env.model.parameters import ARZParameters, load_parameters
+from dptse_env.utils.arrays import FloatArray
 
 PAPER = load_parameters("paper")
 W99 = load_parameters("w99-3lane")

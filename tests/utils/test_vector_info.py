@@ -1,11 +1,11 @@
 import numpy as np
 
-from dptse_env.utils.vector_info import as_objects, in_vector_form, repeated, row_of
+from dptse_env.utils.vector_info import in_vector_form, object_array, repeated_rows, row_of
 
 ROWS = {
     "error": np.array([1.5, 2.5]),
     "queried": np.array([[True, False], [False, True]]),
-    "truth": {"time": np.array([3, 4]), "lists": as_objects([[1], [2, 3]])},
+    "truth": {"time": np.array([3, 4]), "lists": object_array([[1], [2, 3]])},
 }
 
 
@@ -25,7 +25,7 @@ def test_a_row_is_a_copy():
 
 def test_objects_are_kept_as_they_are():
     arrays = [np.zeros(2), np.ones(2)]
-    objects = as_objects(arrays)
+    objects = object_array(arrays)
     assert objects.shape == (2,)
     assert objects[1] is arrays[1]
 
@@ -45,7 +45,7 @@ def test_vector_form_marks_of_whom_something_is_said():
 
 def test_the_same_said_of_several():
     info = {"mu": 0.5, "cap": None, "preset": "paper", "reasons": ["a"], "more": {"n": 3}}
-    rows = repeated(info, 2)
+    rows = repeated_rows(info, 2)
     assert rows["mu"].tolist() == [0.5, 0.5]
     assert rows["more"]["n"].dtype == np.int64
     assert row_of(rows, 0) == row_of(rows, 1) == info

@@ -16,8 +16,8 @@ from numba import njit
 
 from dptse_env.estimators.compiled.window import Chain, Space, gradient, solve
 from dptse_env.estimators.horizon import AT_BOUND
-from dptse_env.model.layout import FloatArray, IntArray
 from dptse_env.model.road_arrays import Road
+from dptse_env.utils.arrays import FloatArray, IntArray
 
 LARGEST_SET = 96
 # Rounds that change all at once, which is quick and may cycle, and rounds in all; the later ones

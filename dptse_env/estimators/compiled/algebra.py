@@ -10,8 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from dptse_env.model.layout import FloatArray
 from dptse_env.model.road_arrays import Road
+from dptse_env.utils.arrays import FloatArray
 
 LANE = 8
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from dptse_env.model.layout import FloatArray
+from dptse_env.utils.arrays import FloatArray
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dptse_env.estimators.batch import Measurements
 from dptse_env.estimators.compiled import ekf_kernels as kernels
 from dptse_env.estimators.compiled.kalman import CompiledFilter
-from dptse_env.model.layout import FloatArray, IntArray
+from dptse_env.utils.arrays import FloatArray, IntArray
 
 
 class CompiledEKF(CompiledFilter):

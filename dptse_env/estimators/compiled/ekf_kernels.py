@@ -20,10 +20,10 @@ from dptse_env.estimators.compiled.algebra import (
 )
 from dptse_env.model.arz import LEAST_DENSITY, LEAST_W, MEASUREMENT_FLOOR
 from dptse_env.model.kernels import advance, pressure, scratch_of
-from dptse_env.model.layout import BoolArray, FloatArray, IntArray
 from dptse_env.model.parameters import LARGEST_W
 from dptse_env.model.relations import VACUUM
 from dptse_env.model.road_arrays import Road
+from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 
 # A `Road` or `Filters` as a plain tuple: calling compiled code from Python with a named one costs
 # 2 us more, a tenth of a whole step. Functions that Python calls take these.

@@ -15,8 +15,8 @@ from dptse_env.estimators.compiled.normals import LANES, stream_of
 from dptse_env.estimators.localisation import tapers
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
-from dptse_env.model.layout import FloatArray, IntArray
 from dptse_env.model.road_arrays import road_of
+from dptse_env.utils.arrays import FloatArray, IntArray
 
 
 class CompiledEnKF(BatchEstimator):

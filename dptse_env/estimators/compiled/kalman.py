@@ -13,8 +13,8 @@ from dptse_env.estimators.compiled import ekf_kernels as kernels
 from dptse_env.estimators.compiled.algebra import padded
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
-from dptse_env.model.layout import FloatArray, IntArray
 from dptse_env.model.road_arrays import road_of
+from dptse_env.utils.arrays import FloatArray, IntArray
 
 
 class CompiledFilter(BatchEstimator):

@@ -20,8 +20,8 @@ from dptse_env.estimators.horizon import (
 )
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
-from dptse_env.model.layout import FloatArray, IntArray
 from dptse_env.model.road_arrays import Road, road_of
+from dptse_env.utils.arrays import FloatArray, IntArray
 
 
 class CompiledMHE(CompiledFilter):

@@ -12,8 +12,8 @@ from dptse_env.estimators.compiled.active_set import held_for, minimise
 from dptse_env.estimators.compiled.ekf_kernels import Filters, project, released
 from dptse_env.estimators.compiled.window import Chain, factorise, space_for
 from dptse_env.model.kernels import advance, scratch_of
-from dptse_env.model.layout import BoolArray, FloatArray, IntArray
 from dptse_env.model.road_arrays import Road
+from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 
 Packed = tuple[Any, ...]
 

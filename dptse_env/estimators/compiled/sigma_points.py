@@ -14,7 +14,7 @@ from numba import njit
 
 from dptse_env.estimators.compiled.algebra import mirror
 from dptse_env.estimators.compiled.dense import products
-from dptse_env.model.layout import BoolArray, FloatArray
+from dptse_env.utils.arrays import BoolArray, FloatArray
 
 
 class Points(NamedTuple):

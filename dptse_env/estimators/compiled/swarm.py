@@ -15,10 +15,10 @@ from numba import njit
 
 from dptse_env.estimators.compiled.power import power
 from dptse_env.model.arz import LEAST_DENSITY, LEAST_W, MEASUREMENT_FLOOR
-from dptse_env.model.layout import FloatArray
 from dptse_env.model.parameters import LARGEST_W
 from dptse_env.model.relations import VACUUM
 from dptse_env.model.road_arrays import EXIT, LINK, MERGE, Road
+from dptse_env.utils.arrays import FloatArray
 
 
 class Flock(NamedTuple):

@@ -11,7 +11,7 @@ from dptse_env.estimators.compiled.kalman import CompiledFilter
 from dptse_env.estimators.compiled.sigma_points import Points
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
-from dptse_env.model.layout import FloatArray, IntArray
+from dptse_env.utils.arrays import FloatArray, IntArray
 from dptse_env.utils.validation import require
 
 

@@ -28,8 +28,8 @@ from dptse_env.estimators.compiled.swarm import (
     project_swarm,
     released_swarm,
 )
-from dptse_env.model.layout import BoolArray, FloatArray, IntArray
 from dptse_env.model.road_arrays import Road
+from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

@@ -20,8 +20,8 @@ from dptse_env.estimators.compiled.algebra import (
     scratch_vectors,
     segment_update,
 )
-from dptse_env.model.layout import BoolArray, FloatArray
 from dptse_env.model.road_arrays import Road
+from dptse_env.utils.arrays import BoolArray, FloatArray
 
 
 class Chain(NamedTuple):

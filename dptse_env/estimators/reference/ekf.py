@@ -8,7 +8,7 @@ from filterpy.kalman import ExtendedKalmanFilter
 from dptse_env.estimators.reference.kalman import EpisodeFilter, ReferenceFilter, linearise
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
-from dptse_env.model.layout import BoolArray, FloatArray
+from dptse_env.utils.arrays import BoolArray, FloatArray
 
 
 class _Filter(ExtendedKalmanFilter):  # type: ignore[misc]

@@ -17,7 +17,7 @@ from dptse_env.estimators.batch import BatchEstimator, Measurements
 from dptse_env.estimators.localisation import tapers
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
-from dptse_env.model.layout import BoolArray, FloatArray, IntArray
+from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 
 
 class _Streams(NamedTuple):

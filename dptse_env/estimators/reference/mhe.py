@@ -20,7 +20,7 @@ from dptse_env.estimators.horizon import (
 from dptse_env.estimators.reference.kalman import EpisodeFilter, ReferenceFilter
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
-from dptse_env.model.layout import BoolArray, FloatArray
+from dptse_env.utils.arrays import BoolArray, FloatArray
 
 
 @dataclass
