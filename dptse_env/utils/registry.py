@@ -1,4 +1,4 @@
-"""Registries: parts by name, shipped with the package or registered by others, or by module path."""
+"""Registries: parts by name, or by ``"package.module:Name"``."""
 
 from __future__ import annotations
 
