@@ -131,16 +131,6 @@ class TrainingEpisodes(VecEnvWrapper):
             others = groups.sum(axis=2, keepdims=True) - groups
             groups -= others / (self.twins - 1)
 
-    def split(self, observation: Observation) -> tuple[Observation, Observation]:
-        """Return what `TrueErrors.split` does of observations with errors behind them.
-
-        Raises:
-            ValueError: Errors are not shown.
-        """
-        if self._errors is None:
-            raise ValueError("episodes must be made with shows_errors")
-        return self._errors.split(observation)
-
     def state(self) -> State:
         """Return what `restore` needs: which episode each is at, and its actions so far."""
         longest = int(self._position.max())

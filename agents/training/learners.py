@@ -70,6 +70,8 @@ def make_model(recipe: Recipe, episodes: TrainingEpisodes, seed: int) -> OnPolic
     if isinstance(recipe, PlackettLuceRecipe):
         keywords["policy_kwargs"]["road"] = RoadChannels.of(episodes.env.config)
         model = PPO(PlackettLucePolicy, episodes, **keywords)
+        # Draws of the training must not depend on how many weights were drawn before them.
+        torch.manual_seed(training_seed(seed))
     elif isinstance(recipe, MaskablePPORecipe):
         model = MaskablePPO("MlpPolicy", episodes, **keywords)
     else:

@@ -16,6 +16,9 @@ from torch import Tensor
 
 from agents.training.episodes import TrainingEpisodes
 from agents.training.recipes import PlackettLuceRecipe
+from agents.training.truth import squared_errors
+from dptse_env.arrays import Observation
+from dptse_env.process import QueryProcess
 from dptse_env.sb3 import PlackettLucePolicy
 
 FLOOR = 1e-4
@@ -39,6 +42,7 @@ def pretrain(
     episodes: TrainingEpisodes,
     recipe: PlackettLuceRecipe,
     progress: Callable[[float], None] | None = None,
+    squared: Callable[[QueryProcess], Observation] = squared_errors,
 ) -> None:
     """Let ``policy`` act, and fit its scores to the squared errors that follow from it.
 
@@ -49,9 +53,10 @@ def pretrain(
 
     Args:
         policy: Changed in place.
-        episodes: With ``shows_errors``; they are begun anew, and left where they are.
+        episodes: They are begun anew, and left where they are.
         recipe: Rounds, seconds, minibatches and sharpness.
         progress: Called with the share that is done, every so often.
+        squared: Returns the squared errors of all episodes, shape (n, n_mainline).
     """
     level = torch.tensor([LEVEL], requires_grad=True)
     optimizer = torch.optim.Adam([*policy.scorer.parameters(), level], lr=recipe.pretraining_rate)
@@ -62,9 +67,8 @@ def pretrain(
     for turn in range(recipe.pretraining_rounds):
         for second in range(recipe.pretraining_seconds):
             if second % recipe.pretraining_every == 0:
-                plain, squared = episodes.split(observation)
-                seen.append(torch.from_numpy(plain))
-                errors.append(torch.from_numpy(squared))
+                seen.append(torch.from_numpy(observation[:, : policy.road.size].copy()))
+                errors.append(torch.from_numpy(squared(episodes.env.process)))
             actions, _ = policy.predict(observation, deterministic=False)
             observation, *_ = episodes.step(actions)
         if turn:

@@ -8,6 +8,7 @@ from gymnasium import spaces
 from dptse_env.arrays import FloatArray, Observation
 from dptse_env.config import EnvConfig
 from dptse_env.interface import QueryInterface
+from dptse_env.process import QueryProcess
 
 SCALES = (0.1, 0.2)
 """What errors of density and of speed, in units of the corridor's scales, are divided by."""
@@ -49,12 +50,16 @@ class TrueErrors:
         )
         return np.concatenate([observation, *errors], axis=1).astype(np.float32)
 
-    def split(self, shown: Observation) -> tuple[Observation, Observation]:
-        """Return plain observations (k, size) and squared errors (k, n) of what `append` made.
 
-        A squared error is that of the density and of the speed together, in units of the scales.
-        """
-        size = self._encoding.space.shape[0]
-        density, speed = np.split(shown[:, size:], 2, axis=1)
-        squared = (SCALES[0] * density) ** 2 + (SCALES[1] * speed) ** 2
-        return shown[:, :size].copy(), squared
+def squared_errors(process: QueryProcess) -> Observation:
+    """Return the squared error of the estimate in every mainline segment, shape (n, n_mainline).
+
+    Density and speed count together, in units of the corridor's scales. The speed of an empty
+    segment does not count.
+    """
+    corridor, n = process.config.corridor, process.interface.n_mainline
+    truth, estimate = process.truth(np.arange(process.n_episodes))[:, :n], process.estimate
+    density = (estimate.density[:, :n] - truth[..., 0]) / corridor.density_scale
+    speed = (estimate.speed[:, :n] - truth[..., 1]) / corridor.speed_scale
+    squared = density**2 + np.where(truth[..., 0] > 0, speed, 0.0) ** 2
+    return squared.astype(np.float32)

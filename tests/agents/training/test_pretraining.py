@@ -9,9 +9,7 @@ import torch
 from agents.training.learners import make_episodes, make_model
 from agents.training.pretraining import pretrain
 from agents.training.recipes import PlackettLuceRecipe
-from agents.training.truth import SCALES, TrueErrors
-from dptse_env.config import resolve
-from dptse_env.interface import QueryInterface
+from agents.training.truth import squared_errors
 
 SHORT = "dptse_env:dptse/ShortHighway-v0"
 
@@ -35,19 +33,11 @@ def make(**changes):
     return recipe, episodes, make_model(recipe, episodes, 0)
 
 
-def planted(episodes, monkeypatch, variance):
-    """Let the squared errors scatter around a mean that the observation tells."""
-    generator = np.random.default_rng(0)
-
-    def split(observation):
-        plain = observation[:, : episodes.env.single_observation_space.shape[0]]
-        squared = variance(plain) * generator.exponential(size=(len(plain), 6))
-        return plain.copy(), squared.astype(np.float32)
-
-    monkeypatch.setattr(episodes, "split", split)
+def queried_variance(process):
+    return 0.01 * np.exp(2.0 * process.queried)
 
 
-def test_scores_become_the_logarithms_of_expected_squared_errors(monkeypatch):
+def test_scores_become_the_logarithms_of_expected_squared_errors():
     recipe, episodes, model = make(
         age_bonus=0.0,
         pretraining_seconds=239,
@@ -55,26 +45,27 @@ def test_scores_become_the_logarithms_of_expected_squared_errors(monkeypatch):
         pretraining_batches=1000,
         pretraining_rate=1e-2,
     )
-    block = episodes.env.interface.observations.block
+    generator = np.random.default_rng(0)
 
-    def variance(plain):
-        return 0.01 * np.exp(2.0 * block(plain, "queried"))
+    def planted(process):
+        variance = queried_variance(process)
+        return (variance * generator.exponential(size=variance.shape)).astype(np.float32)
 
-    planted(episodes, monkeypatch, variance)
-    pretrain(model.policy, episodes, recipe)
+    pretrain(model.policy, episodes, recipe, squared=planted)
     seen = episodes.reset()
     for _ in range(60):
         seen = episodes.step(model.policy.predict(seen)[0])[0]
     policy = model.policy
     scores = policy.scorer(policy.channels(torch.tensor(seen))).detach().numpy()
-    difference = scores / recipe.sharpness - np.log(variance(seen[:, :-12]))
+    expected = np.log(queried_variance(episodes.env.process))
+    difference = scores / recipe.sharpness - expected
     # But for a constant, which no choice depends on.
     difference -= difference.mean()
-    assert np.log(variance(seen[:, :-12])).std() > 0.9
+    assert expected.std() > 0.9
     assert difference.std() < 0.4
 
 
-def test_the_bonus_for_age_is_added_once_after_any_number_of_rounds(monkeypatch):
+def test_the_bonus_for_age_is_added_once_after_any_number_of_rounds():
     weights = []
     for rounds, bonus in ((3, 0.5), (3, 0.0)):
         recipe, episodes, model = make(
@@ -98,30 +89,18 @@ def test_it_reports_its_progress_and_leaves_no_gradients():
     assert np.isnan(episodes.take_mean_reward())
 
 
-def test_errors_are_split_from_what_was_shown():
-    config = resolve("short-highway", {})
-    interface = QueryInterface.of(config)
-    errors = TrueErrors(config, interface)
+def test_squared_errors_are_those_of_density_and_speed_in_units_of_their_scales():
     env = gym.make(SHORT, traffic_seeds="0:2", truth_in_info=True)
     observation, _ = env.reset(seed=0)
     for _ in range(50):
         observation, *_, info = env.step(np.eye(2, 6, dtype=np.int8).sum(axis=0))
-    density, speed = (info["truth"][name][None] for name in ("density", "speed"))
-    plain, squared = errors.split(errors.append(observation[None], density, speed))
-    np.testing.assert_array_equal(plain[0], observation)
-    estimated = [
-        interface.observations.block(observation, name)[:6] for name in ("density", "speed")
-    ]
-    expected = (estimated[0] - density[0, :6] / config.corridor.density_scale) ** 2
-    occupied = density[0, :6] > 0
+    density, speed = (info["truth"][name][:6] for name in ("density", "speed"))
+    squared = squared_errors(env.unwrapped.process)
+    block = env.unwrapped.interface.observations.block
+    estimated = [block(observation, name)[:6] for name in ("density", "speed")]
+    corridor, occupied = env.unwrapped.config.corridor, density > 0
+    expected = (estimated[0] - density / corridor.density_scale) ** 2
     assert occupied.any()
-    expected += occupied * (estimated[1] - speed[0, :6] / config.corridor.speed_scale) ** 2
+    expected += occupied * (estimated[1] - speed / corridor.speed_scale) ** 2
     np.testing.assert_allclose(squared[0], expected, rtol=1e-4, atol=1e-8)
-    assert errors.space().shape == (len(observation) + 12,)
-    assert len(SCALES) == 2
-
-
-def test_it_needs_the_errors():
-    _, episodes, _ = make(shows_errors=False, pretraining_rounds=0)
-    with pytest.raises(ValueError, match="must be made with shows_errors"):
-        episodes.split(episodes.reset())
+    assert squared.shape == (1, 6)
