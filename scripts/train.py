@@ -21,8 +21,6 @@ import torch
 import tyro
 from tqdm import tqdm
 
-from agents.training.board import Board
-from agents.training.folder import Row
 from agents.training.plan import TrainingPlan
 from agents.training.recipes import (
     MaskablePPORecipe,
@@ -30,6 +28,8 @@ from agents.training.recipes import (
     PlackettLuceRecipe,
     ScoresRecipe,
 )
+from agents.training.run_files import Row
+from agents.training.tensorboard_writer import Board
 from agents.training.training import BEST, POLICY, Training
 from dptse_env.config import parse_seeds
 from dptse_env.traffic import RecordLibrary

@@ -12,7 +12,7 @@ from dptse_env.validation import inside, integer, non_negative, positive, requir
 
 @dataclass(frozen=True)
 class SwapRounds:
-    """Rounds of policy improvement by measured swaps (`agents.training.improvement`).
+    """Rounds of policy improvement by measured swaps (`agents.training.policy_iteration`).
 
     Raises:
         ValueError: A value is out of range; the message names it.
@@ -174,7 +174,7 @@ class PlackettLuceRecipe(Recipe):
     rule: dict[str, float] = field(default_factory=lambda: dict(RULE))
     """First weights of observation blocks in the scores."""
     pretraining_rounds: int = 3
-    """Rounds of `agents.training.pretraining` ahead of PPO; 0 for none."""
+    """Rounds of `agents.training.regression` ahead of PPO; 0 for none."""
     pretraining_seconds: int = 700
     """Seconds that every episode is watched in a round."""
     pretraining_every: int = 2

@@ -16,18 +16,18 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from agents.evaluation import make_vector
 from agents.provenance import take_folder
 from agents.training.episodes import TrainingEpisodes
-from agents.training.folder import (
+from agents.training.plan import TrainingPlan
+from agents.training.policy_iteration import swap_round
+from agents.training.ppo import acting, make_episodes, make_model
+from agents.training.recipes import PlackettLuceRecipe
+from agents.training.regression import pretrain
+from agents.training.run_files import (
     Row,
     read_checkpoint,
     read_progress,
     write_checkpoint,
     write_progress,
 )
-from agents.training.improvement import swap_round
-from agents.training.learners import acting, make_episodes, make_model
-from agents.training.plan import TrainingPlan
-from agents.training.pretraining import pretrain
-from agents.training.recipes import PlackettLuceRecipe
 from agents.training.validation import Validation
 from dptse_env.sb3 import PlackettLucePolicy
 from dptse_env.sb3.saved import save_policy

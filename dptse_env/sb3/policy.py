@@ -13,8 +13,8 @@ from torch import Tensor
 
 from dptse_env.config import resolve
 from dptse_env.sb3.channels import RoadChannels
-from dptse_env.sb3.networks import Critic, RatedAdam, Road, Scorer
 from dptse_env.sb3.plackett_luce import PlackettLuce
+from dptse_env.sb3.torch_modules import Critic, RatedAdam, Road, Scorer
 
 RULE = {"density_log_std": 2.8, "speed_log_std": 1.2, "age": 7.2}
 """First weights of the scores; untrained, the policy asks what is uncertain or long not seen."""
@@ -25,7 +25,7 @@ class PlackettLucePolicy(ActorCriticPolicy):
 
     Actions are those of the encoding ``slots``. Random ones follow the Plackett-Luce distribution
     over the scores, deterministic ones are the B highest scores, ties upstream. The network
-    (`dptse_env.sb3.networks.Scorer`) starts as a rule and learns a correction to it. The value
+    (`dptse_env.sb3.torch_modules.Scorer`) starts as a rule and learns a correction to it. The value
     has a network of its own: with a shared one, the value's loss spoils the scores.
 
     One set of weights serves any B, any estimator, any privacy and any encoding of the same

@@ -11,7 +11,7 @@ from dptse_env.config import PRESETS, resolve
 from dptse_env.interface import QueryInterface
 from dptse_env.sb3 import RoadChannels
 from dptse_env.sb3.channels import CENTRES
-from dptse_env.sb3.networks import Road
+from dptse_env.sb3.torch_modules import Road
 
 
 def numbered(config):

@@ -13,10 +13,10 @@ pytest.importorskip("tyro")
 
 import tyro
 
-from agents.training import board
-from agents.training.board import Board
-from agents.training.folder import read_progress
+from agents.training import tensorboard_writer as board
 from agents.training.recipes import RECIPES, MaskablePPORecipe
+from agents.training.run_files import read_progress
+from agents.training.tensorboard_writer import Board
 from scripts import train
 from scripts.train import Args, make_plan
 

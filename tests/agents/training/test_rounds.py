@@ -7,8 +7,8 @@ pytest.importorskip("sb3_contrib")
 import torch
 
 from agents.seeds import training_seed
-from agents.training.folder import read_progress
 from agents.training.recipes import PlackettLuceRecipe, SwapRounds
+from agents.training.run_files import read_progress
 from agents.training.swaps import try_swaps
 from agents.training.training import BEST, POLICY, Training
 from tests.agents.training.plans import (
@@ -70,7 +70,7 @@ def test_steps_fall_from_round_to_round(tmp_path, monkeypatch):
     steps = []
     training = Training(with_swaps(0), tmp_path)
     monkeypatch.setattr(
-        "agents.training.improvement.improve", lambda _p, _s, _t, step, *_: steps.append(step)
+        "agents.training.policy_iteration.improve", lambda _p, _s, _t, step, *_: steps.append(step)
     )
     training.run()
     assert steps == [FEW_SWAPS.step, FEW_SWAPS.final_step]
@@ -86,9 +86,9 @@ def test_every_round_tries_other_swaps_in_other_episodes(tmp_path, monkeypatch):
         began.append((seeds, copy.deepcopy(generator).random()))
         return try_swaps(env, policy, seeds, generator, **keywords)
 
-    monkeypatch.setattr("agents.training.improvement.try_swaps", recorded)
+    monkeypatch.setattr("agents.training.policy_iteration.try_swaps", recorded)
     monkeypatch.setattr(
-        "agents.training.improvement.improve", lambda policy, swaps, *_: given.append(swaps)
+        "agents.training.policy_iteration.improve", lambda policy, swaps, *_: given.append(swaps)
     )
     training.run()
     seeds = [set(seeds) for seeds, _ in began]

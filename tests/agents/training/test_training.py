@@ -8,9 +8,9 @@ pytest.importorskip("sb3_contrib")
 
 import torch
 
-from agents.training import folder as folder_module
-from agents.training.folder import CHECKPOINT, PROGRESS, read_progress
+from agents.training import run_files as folder_module
 from agents.training.recipes import RECIPES, PlackettLuceRecipe
+from agents.training.run_files import CHECKPOINT, PROGRESS, read_progress
 from agents.training.training import BEST, POLICY, Training
 from dptse_env.sb3 import load_policy
 from tests.agents.training.plans import (

@@ -6,9 +6,9 @@ pytest.importorskip("sb3_contrib")
 
 import torch
 
-from agents.training.learners import make_episodes, make_model
-from agents.training.pretraining import pretrain
+from agents.training.ppo import make_episodes, make_model
 from agents.training.recipes import PlackettLuceRecipe
+from agents.training.regression import pretrain
 from agents.training.truth import squared_errors
 
 SHORT = "dptse_env:dptse/ShortHighway-v0"

@@ -6,7 +6,7 @@ pytest.importorskip("sb3_contrib")
 
 import torch
 
-from agents.training.improvement import LARGEST, improve
+from agents.training.policy_iteration import LARGEST, improve
 from agents.training.recipes import SwapRounds
 from agents.training.swaps import Swaps
 from dptse_env.config import resolve

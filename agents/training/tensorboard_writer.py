@@ -7,7 +7,7 @@ import logging
 from pathlib import Path
 from typing import Any
 
-from agents.training.folder import Row
+from agents.training.run_files import Row
 
 logger = logging.getLogger(__name__)
 
