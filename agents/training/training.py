@@ -143,9 +143,9 @@ class Training:
         plan, rounds = self.plan, self.plan.recipe.rounds
         keywords = {**self._keywords, "action": plan.recipe.action}
         env = make_vector(plan.env, rounds.episodes, keywords)
-        actor = acting(self.model, self._episodes)
         while self._rounds < rounds.rounds:
             began = time.perf_counter()
+            actor = acting(self.model, self._episodes)
             error = swap_round(plan, self._rounds, env, self._policy, actor, self._on_share)
             self._rounds += 1
             self._at_boundary(time.perf_counter() - began, error)

@@ -20,7 +20,10 @@ from tests.agents.training.plans import (
     without_time,
 )
 
-FEW_SWAPS = SwapRounds(rounds=2, episodes=3, seconds=5, trials=2, batches=4, batch_size=16)
+# Steps and rates are large, so that every round acts otherwise than the one before.
+FEW_SWAPS = SwapRounds(
+    rounds=2, episodes=3, seconds=5, trials=2, batches=20, batch_size=16, rate=0.05
+)
 
 
 def with_swaps(steps):
