@@ -104,7 +104,7 @@ def _make_plackett_luce(
     config: EnvConfig, interface: QueryInterface, arguments: Mapping[str, Any]
 ) -> BasePolicy:
     space = interface.observations.space, interface.actions.space
-    return PlackettLucePolicy(*space, _never, road=RoadChannels.of(config), **arguments)
+    return PlackettLucePolicy(*space, road=RoadChannels.from_config(config), **arguments)
 
 
 def _make_perceptron(
@@ -161,7 +161,7 @@ def save_policy(
     training: Mapping[str, Any],
     figures: Mapping[str, Any],
 ) -> None:
-    """Write what acting needs of a policy: weights without the critic, and a card.
+    """Write what acting needs of a policy: its weights and a card.
 
     The file is put in place when it is whole; one that stood there stays until then.
 
@@ -197,11 +197,8 @@ def save_policy(
         "training": dict(training),
         "figures": dict(figures),
     }
-    weights = {
-        key: value for key, value in policy.state_dict().items() if not key.startswith("critic.")
-    }
     kept = io.BytesIO()
-    torch.save(weights, kept)
+    torch.save(dict(policy.state_dict()), kept)
     whole = io.BytesIO()
     with zipfile.ZipFile(whole, "w", zipfile.ZIP_DEFLATED) as archive:
         for entry, content in (
@@ -256,7 +253,7 @@ def load_policy(
     made = card["policy"]
     policy = _KINDS[made["class"]].make(config, interface, made["arguments"])
     absent = policy.load_state_dict(weights, strict=False).missing_keys
-    if any(not key.startswith("critic.") for key in absent):
+    if absent:
         raise ValueError(f"policy {str(source)!r} lacks weights: {', '.join(absent)}")
     policy.set_training_mode(False)
     return SavedPolicy(policy, card, interface)

@@ -6,31 +6,27 @@ pytest.importorskip("sb3_contrib")
 
 import torch
 
-from agents.training.ppo import make_episodes, make_model
-from agents.training.recipes import PlackettLuceRecipe
-from agents.training.regression import pretrain
-from agents.training.truth import squared_errors
+from agents.training.episodes import make_episodes
+from agents.training.recipes import PlackettLuceRecipe, RegressionRounds
+from agents.training.regression import regress, squared_errors
+from dptse_env.sb3 import PlackettLucePolicy, RoadChannels
 
 SHORT = "dptse_env:dptse/ShortHighway-v0"
+SETTINGS = {"rounds": 1, "seconds": 100, "batches": 200, "batch_size": 64, "rate": 3e-3}
 
 
 def make(**changes):
-    values = {
-        "n_envs": 8,
-        "twins": 1,
-        "n_steps": 10,
-        "batch_size": 40,
-        "width": 8,
-        "pretraining_rounds": 1,
-        "pretraining_seconds": 100,
-        "pretraining_batches": 200,
-        "pretraining_batch_size": 64,
-        "pretraining_rate": 3e-3,
-        **changes,
-    }
-    recipe = PlackettLuceRecipe(**values)
+    settings = RegressionRounds(**{**SETTINGS, **changes})
+    recipe = PlackettLuceRecipe(n_envs=8, replicas=1, regression=settings)
     episodes = make_episodes(SHORT, {"traffic_seeds": "0:3", "privacy": "guaranteed"}, recipe, 0)
-    return recipe, episodes, make_model(recipe, episodes, 0)
+    torch.manual_seed(0)
+    policy = PlackettLucePolicy(
+        episodes.observation_space,
+        episodes.action_space,
+        road=RoadChannels.from_config(episodes.env.config),
+        width=8,
+    )
+    return settings, episodes, policy
 
 
 def queried_variance(process):
@@ -38,12 +34,8 @@ def queried_variance(process):
 
 
 def test_scores_become_the_logarithms_of_expected_squared_errors():
-    recipe, episodes, model = make(
-        age_bonus=0.0,
-        pretraining_seconds=239,
-        pretraining_every=1,
-        pretraining_batches=1000,
-        pretraining_rate=1e-2,
+    settings, episodes, policy = make(
+        age_bonus=0.0, seconds=239, interval=1, batches=1000, rate=1e-2
     )
     generator = np.random.default_rng(0)
 
@@ -51,14 +43,13 @@ def test_scores_become_the_logarithms_of_expected_squared_errors():
         variance = queried_variance(process)
         return (variance * generator.exponential(size=variance.shape)).astype(np.float32)
 
-    pretrain(model.policy, episodes, recipe, squared=planted)
+    regress(policy, episodes, settings, targets=planted)
     seen = episodes.reset()
     for _ in range(60):
-        seen = episodes.step(model.policy.predict(seen)[0])[0]
-    policy = model.policy
-    scores = policy.scorer(policy.channels(torch.tensor(seen))).detach().numpy()
+        seen = episodes.step(policy.predict(seen)[0])[0]
+    scores = policy.scores(torch.tensor(seen)).detach().numpy()
     expected = np.log(queried_variance(episodes.env.process))
-    difference = scores / recipe.sharpness - expected
+    difference = scores / settings.sharpness - expected
     # But for a constant, which no choice depends on.
     difference -= difference.mean()
     assert expected.std() > 0.9
@@ -68,25 +59,21 @@ def test_scores_become_the_logarithms_of_expected_squared_errors():
 def test_the_bonus_for_age_is_added_once_after_any_number_of_rounds():
     weights = []
     for rounds, bonus in ((3, 0.5), (3, 0.0)):
-        recipe, episodes, model = make(
-            pretraining_rounds=rounds, age_bonus=bonus, pretraining_seconds=2,
-            pretraining_batches=1, pretraining_rate=1e-9,
-        )  # fmt: skip
-        pretrain(model.policy, episodes, recipe)
-        weights.append(dict(zip(model.policy.rule, model.policy.scorer.rule.tolist(), strict=True)))
+        settings, episodes, policy = make(
+            rounds=rounds, age_bonus=bonus, seconds=2, batches=1, rate=1e-9
+        )
+        regress(policy, episodes, settings)
+        weights.append(dict(zip(policy.rule, policy.scorer.rule.tolist(), strict=True)))
     assert weights[0]["age"] - weights[1]["age"] == pytest.approx(0.5 * 4.0, rel=1e-4)
     assert weights[0]["speed_log_std"] == pytest.approx(0.5 * 4.0, rel=1e-4)
 
 
 def test_it_reports_its_progress_and_leaves_no_gradients():
-    shares = []
-    recipe, episodes, model = make(
-        pretraining_rounds=2, pretraining_seconds=3, pretraining_batches=100
-    )
-    pretrain(model.policy, episodes, recipe, shares.append)
-    assert shares == [0.0, 0.25, 0.5, 0.75]
-    assert all(p.grad is None for p in model.policy.scorer.parameters())
-    assert np.isnan(episodes.take_mean_reward())
+    fractions = []
+    settings, episodes, policy = make(rounds=2, seconds=3, batches=100)
+    regress(policy, episodes, settings, fractions.append)
+    assert fractions == [0.0, 0.25, 0.5, 0.75]
+    assert all(p.grad is None for p in policy.scorer.parameters())
 
 
 def test_squared_errors_are_those_of_density_and_speed_in_units_of_their_scales():
