@@ -1,7 +1,8 @@
-"""What stable-baselines3 needs to learn on many episodes at once. Needs the extra ``train``."""
+"""Learning with stable-baselines3 on many episodes at once; needs the extra ``train``."""
 
 from dptse_env.policies import shipped_policies
 from dptse_env.sb3.channels import RoadChannels
+from dptse_env.sb3.fit import TrainedOn
 from dptse_env.sb3.plackett_luce import PlackettLuce
 from dptse_env.sb3.policy import PlackettLucePolicy
 from dptse_env.sb3.saved import SavedPolicy, load_policy, save_policy
@@ -13,6 +14,7 @@ __all__ = [
     "RoadChannels",
     "SB3VecEnv",
     "SavedPolicy",
+    "TrainedOn",
     "load_policy",
     "save_policy",
     "shipped_policies",

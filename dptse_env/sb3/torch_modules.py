@@ -87,7 +87,7 @@ class Scorer(nn.Module):
         super().__init__()
         indices = torch.tensor([road.index(name) for name in rule])
         self.register_buffer("rule_channels", indices, persistent=False)
-        self.rule = nn.Parameter(torch.tensor(list(rule.values())))
+        self.rule = nn.Parameter(torch.tensor(list(rule.values()), dtype=torch.float32))
         self.trunk = Trunk(road.n_channels, width)
         self.correction = nn.Conv1d(width, 1, 1, bias=False)
         # Small rather than zero: behind a zero the trunk would not learn at first.

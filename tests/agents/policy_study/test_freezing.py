@@ -66,7 +66,7 @@ def test_a_draft_says_who_suits_and_tries_every_policy(runs):
     assert "no plan 'offline' ships for" in manifest.unsuited["primary"]["offline"]
     assert manifest.bounds == {"primary": ("oracle-error",), "other": (), "moved": ()}
     stranger = find_checkpoints((f"primary={runs}/other",), SMALL)
-    with pytest.raises(ValueError, match="bandwidth is 3 of the policy and 2"):
+    with pytest.raises(ValueError, match="bandwidth is 3 for the policy and 2"):
         draft(SMALL, stranger, (), "command")
 
 
