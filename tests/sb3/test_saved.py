@@ -1,5 +1,7 @@
 import io
 import json
+import subprocess
+import sys
 import zipfile
 from importlib.resources import files
 
@@ -417,3 +419,26 @@ def test_shipped_policies_act_where_they_were_trained(name):
 
 def test_a_policy_comes_with_the_package():
     assert "private-highway" in shipped_policies()
+
+
+WITHOUT = """
+import sys
+
+class Missing:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] == {missing!r}:
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+
+sys.meta_path.insert(0, Missing())
+try:
+    import dptse_env.sb3
+except ImportError as problem:
+    print(problem)
+"""
+
+
+@pytest.mark.parametrize("missing", ["torch", "stable_baselines3"])
+def test_the_extra_is_named_where_it_is_missing(missing):
+    code = WITHOUT.format(missing=missing)
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert f"{missing} is not installed: pip install 'dptse-env[train]'" in run.stdout
