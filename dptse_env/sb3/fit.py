@@ -126,11 +126,12 @@ def check_fit(
             f"{TrainedOn.from_card(card)}, traffic {there['corridor']:.8}",
             f"{TrainedOn.from_corridor(config.corridor)}, traffic {here['corridor']:.8}",
         )
-    refused = [text for key, text in problems.items() if key not in allow]
+    refused = {key: text for key, text in problems.items() if key not in allow}
     if refused:
-        missing = [key for key in TRANSFERABLE if key in problems and key not in allow]
-        hint = f"; to transfer it on purpose, allow {' and '.join(missing)}" if missing else ""
-        raise ValueError("; ".join(refused) + hint)
+        hint = ""
+        if all(key in TRANSFERABLE for key in refused):
+            hint = f"; to transfer it on purpose, allow {' and '.join(sorted(refused))}"
+        raise ValueError("; ".join(refused.values()) + hint)
 
 
 def _difference(key: str, there: object, here: object) -> str:

@@ -112,7 +112,8 @@ def save_policy(
 
     Raises:
         ValueError: The policy could not be loaded again: it is of another class, has parts of its
-            own, is too large, or has weights that are not finite. Or the path ends otherwise.
+            its own, is too large, or has weights that are not finite. Or the path does not end
+            in ``.zip``.
         OSError: The file cannot be written.
     """
     target = Path(path)
@@ -154,8 +155,8 @@ def load_policy(
 ) -> SavedPolicy:
     """Load a policy for an environment.
 
-    No code of the file is run, and its size, the size of the network that it asks for and its
-    values are checked before anything is built (`dptse_env.policies.reading`).
+    No code in the file is run. Its size, its values and the shapes of its network are checked
+    before anything is built (`dptse_env.policies.reading`).
 
     Args:
         source: A file, or the name of a policy that comes with the package

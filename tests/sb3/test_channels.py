@@ -22,7 +22,7 @@ def numbered(config):
 
 
 def raw(road, name, observation):
-    """What a channel shows before it is scaled; NaN where there is nothing."""
+    """The values of a channel before it is scaled; None where there are none."""
     (k,) = (k for k, channel in enumerate(road.channels) if channel.name == name)
     channel = road.channels[k]
     shown = RoadFeatures(road)(observation)[0, k].numpy() * channel.scale + channel.centre

@@ -53,7 +53,7 @@ def planted(policy, gain, contributions=None, n_states=300, trials=20):
 
 
 def moved(policy, swaps, settings=SETTINGS):
-    """How the scores move, but for a constant of each state, which no choice depends on."""
+    """The moves of the scores, but for a constant of each state, which no choice depends on."""
     seen = torch.from_numpy(swaps.observations)
 
     def scores():
