@@ -24,7 +24,7 @@ $(READY): pyproject.toml constraints.txt
 demo: setup  ## Train a small query policy and evaluate it beside the schedules on held-out traffic; results/demo.
 	$(BIN)/python scripts/train.py --env dptse_env:dptse/PaperHighway-v0 --keywords '{"parameters": "w99-3lane"}' \
 		--traffic 0:32 --validation 1000:1008 --no-tensorboard --output results/demo/training \
-		recipe:plackett-luce --recipe.pretraining-rounds 2 --recipe.pretraining-batches 600 \
+		recipe:plackett-luce --recipe.regression.rounds 2 --recipe.regression.batches 600 \
 		--recipe.swaps.rounds 1 --recipe.swaps.episodes 96 --recipe.swaps.batches 300
 	$(BIN)/python scripts/evaluate.py --policies results/demo/training/policy.zip --output results/demo
 

@@ -6,17 +6,13 @@ neither.
 
 from __future__ import annotations
 
-import hashlib
-import io
-import json
-import zipfile
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from agents.evaluation import Policy
-from dptse_env.policies import CARD, read_policy
+from dptse_env.policies import read_policy
 
 
 @dataclass(frozen=True)
@@ -41,15 +37,13 @@ class Saved:
             FileNotFoundError: There is no such file, nor such a name.
             ValueError: The file is no saved policy.
         """
-        content = read_policy(source)
+        file = read_policy(source)
+        saved = cls(file.source, file.sha256, file.card)
         try:
-            with zipfile.ZipFile(io.BytesIO(content)) as archive:
-                card = json.loads(archive.read(CARD))
             # What is relied on further below must be there.
-            saved = cls(str(source), hashlib.sha256(content).hexdigest(), card)
-            _ = saved.action, saved.recipe, saved.training_seed
-        except (zipfile.BadZipFile, KeyError, TypeError, ValueError) as problem:
-            raise ValueError(f"{str(source)!r} is no saved policy: {problem!r}") from problem
+            _ = saved.recipe, saved.training_seed
+        except (KeyError, TypeError, ValueError) as problem:
+            raise ValueError(f"{file.source!r} is not a saved policy: {problem!r}") from problem
         return saved
 
     @property
@@ -75,7 +69,7 @@ class Saved:
         """
         from dptse_env.sb3 import load_policy  # noqa: PLC0415
 
-        now = hashlib.sha256(read_policy(self.source)).hexdigest()
+        now = read_policy(self.source).sha256
         if now != self.sha256:
             raise ValueError(f"{self.source!r} has changed: sha256 {now}, it was {self.sha256}")
         policy: Policy = load_policy(self.source, env, allow=allow)

@@ -28,7 +28,7 @@ class Args:
 
     env: str = "dptse_env:dptse/PrivateHighway-v0"
     """Environment id."""
-    kind: str = "offline"
+    kind: str = "optimised-plan"
     """What to search: 'offline', a period of sets, or 'best-static', one set."""
     period: int = 12
     """Sets in the period; a static set has one."""

@@ -1,11 +1,11 @@
-"""Train a query policy, with one training seed, in a folder of its own.
+"""Train a query policy in a folder.
 
 python scripts/train.py --seed 0 --output results/training/pl-0
 python scripts/train.py --steps 2000000 --output results/training/maskable-0 recipe:maskable
 
-The folder gets run.json (what was trained), progress.csv (the learning curve), checkpoint.pt,
+The folder gets run.json (the settings), progress.csv (the learning curve), checkpoint.pt,
 best.zip and policy.zip (the policy best in validation, and the last). After an interruption, or a
-kill, the same command goes on where the last checkpoint was, to the same numbers; other arguments
+kill, the same command continues from the last checkpoint to the same numbers; other arguments
 need another folder.
 """
 
@@ -21,8 +21,6 @@ import torch
 import tyro
 from tqdm import tqdm
 
-from agents.training.board import Board
-from agents.training.folder import Row
 from agents.training.plan import TrainingPlan
 from agents.training.recipes import (
     MaskablePPORecipe,
@@ -30,6 +28,8 @@ from agents.training.recipes import (
     PlackettLuceRecipe,
     ScoresRecipe,
 )
+from agents.training.run_files import Row
+from agents.training.tensorboard_writer import make_tensorboard_writer
 from agents.training.training import BEST, POLICY, Training
 from dptse_env.config import parse_seeds
 from dptse_env.traffic import RecordLibrary
@@ -55,28 +55,28 @@ class Args:
     seed: int = 0
     """Training seed."""
     steps: int | None = None
-    """Seconds of traffic to train for by PPO, all episodes together, each with one decision; as
-    the recipe has it if not given: 2,000,000, and 0 for plackett-luce."""
+    """Seconds of traffic to train for by PPO, all episodes together, each with one decision;
+    2,000,000 if not given. The recipe plackett-luce is trained in rounds and takes none."""
     traffic: str = "0:256"
     """Traffic seeds to train on, first:stop; training seeds only."""
     validation: str = "1000:1024"
     """Traffic seeds to validate on, first:stop; validation seeds only."""
     validate_every: int = 25
-    """Updates between two validations."""
+    """Updates of PPO between two validations."""
     checkpoint_every: int = 10
-    """Updates between two checkpoints."""
+    """Updates of PPO between two checkpoints."""
     threads: int = 1
     """Threads of torch; numbers depend on it in the last digits."""
     tensorboard: bool = True
-    """Whether to write the learning curve for TensorBoard, too, where that is installed."""
+    """Whether to also write the learning curve for TensorBoard, where that is installed."""
     workers: int | None = None
     """Processes that record missing traffic; all cores if not given."""
     records: Path | None = None
     """Folder of the record cache; the user's cache if not given."""
     output: Path = Path("results/training")
-    """Folder of this training."""
+    """Folder of the training."""
     recipe: AnyRecipe = field(default_factory=PlackettLuceRecipe)
-    """How it is trained."""
+    """Recipe of the training."""
 
 
 def make_plan(args: Args) -> TrainingPlan:
@@ -105,12 +105,12 @@ def make_plan(args: Args) -> TrainingPlan:
 
 
 def commit() -> str | None:
-    """Return the git commit of the sources, with "+" after it where files differ; None if none."""
-    here = Path(__file__).parent
+    """Return the git commit of the sources, with "+" appended where files differ; None if none."""
+    sources = Path(__file__).parent
     try:
         head = subprocess.run(
             ["git", "describe", "--always", "--abbrev=40", "--exclude=*", "--dirty=+"],
-            cwd=here, capture_output=True, text=True, check=False,
+            cwd=sources, capture_output=True, text=True, check=False,
         )  # fmt: skip
     except FileNotFoundError:
         return None
@@ -126,16 +126,16 @@ class Bar:
         self._shown: dict[str, Any] = {}
 
     def __call__(self, row: Row) -> None:
-        """Move the bar to a row."""
+        """Advance the bar to a row."""
         for name in ("error", "validation"):
             if name in row:
                 self._shown[name] = f"{row[name]:.4f}"
         self._bar.set_postfix(self._shown, refresh=False)
         self._bar.update(int(row["steps"]) - self._bar.n)
 
-    def show(self, what: str, share: float) -> None:
-        """Show how much of what is being done is done; the bar stands still meanwhile."""
-        self._bar.set_postfix({what: f"{share:.0%}", **self._shown})
+    def show(self, stage: str, fraction: float) -> None:
+        """Show the fraction of a stage that is done; the bar stands still meanwhile."""
+        self._bar.set_postfix({stage: f"{fraction:.0%}", **self._shown})
 
     def close(self) -> None:
         """Leave the bar as it is."""
@@ -144,7 +144,7 @@ class Bar:
 
 @resumable()
 def main(args: Args) -> None:
-    """Record what is missing, train, and leave the policy."""
+    """Record missing traffic, train, and leave the policy."""
     plan = make_plan(args)
     torch.set_num_threads(integer("threads", args.threads, 1))
     library = RecordLibrary(args.records)
@@ -152,8 +152,8 @@ def main(args: Args) -> None:
     library.ensure(plan.config.corridor, seeds, workers=args.workers, progress=True)
     records = None if args.records is None else str(args.records)
     bar = Bar(plan.steps_at(plan.n_updates))
-    board = Board.open(args.output / "tensorboard") if args.tensorboard else None
-    watchers = (bar,) if board is None else (bar, board)
+    writer = make_tensorboard_writer(args.output / "tensorboard") if args.tensorboard else None
+    watchers = (bar,) if writer is None else (bar, writer)
     try:
         training = Training(
             plan,
@@ -161,13 +161,13 @@ def main(args: Args) -> None:
             records=records,
             commit=commit(),
             watchers=watchers,
-            on_share=bar.show,
+            progress=bar.show,
         )
         training.run()
     finally:
         bar.close()
-        if board is not None:
-            board.close()
+        if writer is not None:
+            writer.close()
     last = training.rows[-1]
     print(
         f"error in validation {last['validation']:.4f} deterministic, "

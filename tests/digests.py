@@ -47,15 +47,15 @@ VARIANTS: dict[str, dict[str, Any]] = {
 SCHEDULES = (
     "static", "paper", "round-robin", "random", "oldest-first", "largest-variance",
     "largest-density-variance", "stale-variance", "none", "greedy-trace", "greedy-logdet",
-    "wary-trace", "rollout", "oracle-error", "oracle-greedy", "oracle-brute-force",
+    "inflated-trace", "rollout", "oracle-error", "oracle-greedy", "oracle-brute-force",
 )  # fmt: skip
 SECONDS = 60
 EPISODES = 3
 TRAININGS = {
     "plackett-luce": [
         "recipe:plackett-luce", "--recipe.n-envs", "8", "--recipe.width", "8",
-        "--recipe.pretraining-rounds", "1", "--recipe.pretraining-seconds", "60",
-        "--recipe.pretraining-batches", "20", "--recipe.swaps.rounds", "1",
+        "--recipe.regression.rounds", "1", "--recipe.regression.seconds", "60",
+        "--recipe.regression.batches", "20", "--recipe.swaps.rounds", "1",
         "--recipe.swaps.episodes", "4", "--recipe.swaps.batches", "10",
     ],
     "scores": [

@@ -120,7 +120,7 @@ def test_sequential_actions_move_the_traffic_on_their_last_pick():
 
 
 def test_action_masks_are_for_sequential_actions():
-    with pytest.raises(ValueError, match="needs action='sequential' or .*, got .*:MaskAction"):
+    with pytest.raises(ValueError, match=r"needs action='sequential' or .*, got .*:MaskAction"):
         short().unwrapped.action_masks()
 
 
@@ -348,7 +348,7 @@ def test_a_sequential_episode_renders_one_column_a_second():
             {"estimator": "mhe", "estimator_settings": {"initial_variance": 1e12}},
             r"^estimator_settings\.initial_variance must be a number in .*, got 10",
         ),
-        ({"estimator_settings": 3}, r"^estimator_settings must be a mapping, the name of a set, or"),
+        ({"estimator_settings": 3}, r"^estimator_settings must be a mapping, the name of a set"),
         ({"traffic_seeds": [-1]}, r"^traffic_seeds\[0\] must be an integer .*, got"),
         ({"traffic_seeds": "0:99999999999999"}, r"^traffic_seeds must be at most 10000 seeds"),
         ({"truth_in_info": 1}, r"^truth_in_info must be of type bool, got 1"),
@@ -361,7 +361,7 @@ def test_a_sequential_episode_renders_one_column_a_second():
         ({"traffic_seeds": []}, r"^traffic_seeds must be 1 to 10000 seeds, got 0"),
         ({"traffic_seeds": "3:1"}, r"^traffic_seeds must not be empty, got '3:1'"),
         ({"traffic_seeds": [1, 1]}, r"^traffic_seeds must be distinct, got \(1, 1\)"),
-        ({"parameters": 3}, r"^parameters must be of type str, got 3; or parameters must be a mapp"),
+        ({"parameters": 3}, r"^parameters must be of type str, got 3; or .* must be a mapping"),
         ({"parameters": "fast"}, r"^parameters must be one of .*w99-3lane.*, got 'fast'"),
         (
             {"parameters": {"name": "f", "free_flow_speed": 400.0, "jam_density": 300.0,

@@ -8,12 +8,8 @@ import numpy as np
 import pytest
 
 PAGE = Path(__file__).parents[1] / "docs" / "extending.md"
-EXAMPLES = {
-    heading: code
-    for heading, code in re.findall(
-        r"^## ([^\n]*)\n(?:(?!^## ).)*?```python\n(.*?)```", PAGE.read_text(), re.DOTALL | re.MULTILINE
-    )
-}  # fmt: skip
+SECTION = re.compile(r"^## ([^\n]*)\n(?:(?!^## ).)*?```python\n(.*?)```", re.DOTALL | re.MULTILINE)
+EXAMPLES = dict(SECTION.findall(PAGE.read_text(encoding="utf-8")))
 POINTS = [
     "Estimator", "Release model", "Reward", "Observation block", "Action encoding", "Corridor",
     "Schedule", "Names", "Parts of a process",

@@ -258,33 +258,106 @@ def nan_reward(second):
 
 HERE = "tests.test_plugin"
 WHEN_MADE = {
-    "no module": ({"estimator": "no_such_module:Filter"}, r"^estimator 'no_such_module:Filter' cannot be imported: ModuleNotFoundError"),
-    "no class": ({"estimator": f"{HERE}:Missing"}, rf"^estimator '{HERE}:Missing' cannot be imported: {HERE} has no 'Missing'"),
-    "no update()": ({"estimator": NoUpdate}, rf"^estimator {HERE}:NoUpdate must have update\(\)"),
-    "no release model": ({"privacy": NoUpdate}, rf"^privacy\.preset {HERE}:NoUpdate must be a subclass of dptse_env.release.ReleaseModel"),
-    "no size()": ({"observation": ["default", NoSize]}, rf"^observation {HERE}:NoSize must have size\(\)"),
-    "a block's name": ({"observation": ["default", Clash]}, rf"^observation {HERE}:Clash must not be named 'age', which is a block of dptse_env"),
-    "a block's bounds": ({"observation": [Unbounded]}, rf"^observation {HERE}:Unbounded must have bounds low < high, got 1.0, 1.0"),
-    "no decode()": ({"action": NoUpdate}, rf"^action {HERE}:NoUpdate must have decode\(\), encode\(\)"),
-    "no corridor": ({"corridor": NoUpdate}, r"must be a Corridor, or return one, got <"),
-    "no reward": ({"reward": NoUpdate}, rf"^reward {HERE}:NoUpdate must be callable with a ScoredSecond"),
-    "unknown settings": ({"estimator": parts.Smoothed, "estimator_settings": {"gain": 1}}, r"^estimator_settings\.gain is unknown; allowed: weight"),
-    "bad settings": ({"privacy": {"preset": parts.LaplaceRelease, "scale": -1}}, r"^privacy\.scale must be a number in \[0, 100\], got -1"),
-}  # fmt: skip
+    "no module": (
+        {"estimator": "no_such_module:Filter"},
+        r"^estimator 'no_such_module:Filter' cannot be imported: ModuleNotFoundError",
+    ),
+    "no class": (
+        {"estimator": f"{HERE}:Missing"},
+        rf"^estimator '{HERE}:Missing' cannot be imported: {HERE} has no 'Missing'",
+    ),
+    "no update()": (
+        {"estimator": NoUpdate},
+        rf"^estimator {HERE}:NoUpdate must have update\(\)",
+    ),
+    "no release model": (
+        {"privacy": NoUpdate},
+        rf"^privacy\.preset {HERE}:NoUpdate must be a subclass of "
+        r"dptse_env.release.ReleaseModel",
+    ),
+    "no size()": (
+        {"observation": ["default", NoSize]},
+        rf"^observation {HERE}:NoSize must have size\(\)",
+    ),
+    "a block's name": (
+        {"observation": ["default", Clash]},
+        rf"^observation {HERE}:Clash must not be named 'age', which is a block of dptse_env",
+    ),
+    "a block's bounds": (
+        {"observation": [Unbounded]},
+        rf"^observation {HERE}:Unbounded must have bounds low < high, got 1.0, 1.0",
+    ),
+    "no decode()": (
+        {"action": NoUpdate},
+        rf"^action {HERE}:NoUpdate must have decode\(\), encode\(\)",
+    ),
+    "no corridor": (
+        {"corridor": NoUpdate},
+        r"must be a Corridor, or return one, got <",
+    ),
+    "no reward": (
+        {"reward": NoUpdate},
+        rf"^reward {HERE}:NoUpdate must be callable with a ScoredSecond",
+    ),
+    "unknown settings": (
+        {"estimator": parts.Smoothed, "estimator_settings": {"gain": 1}},
+        r"^estimator_settings\.gain is unknown; allowed: weight",
+    ),
+    "bad settings": (
+        {"privacy": {"preset": parts.LaplaceRelease, "scale": -1}},
+        r"^privacy\.scale must be a number in \[0, 100\], got -1",
+    ),
+}
 AT_RESET = {
-    "no innovations": ({"estimator": NoInnovations}, rf"^estimator {HERE}:NoInnovations must have an array 'innovations' of shape \(1, 8, 2\), got none"),
-    "estimates of NaN": ({"estimator": Nan}, rf"^estimator {HERE}:Nan.estimate\(\) must return finite floats 'density' of shape \(1, 8\)"),
-    "a block of NaN": ({"observation": [BlockOfNan]}, rf"^observation {HERE}:BlockOfNan.values\(\) must return finite numbers"),
-    "a block of wrong shape": ({"observation": [BlockOfWrongShape]}, rf"^observation {HERE}:BlockOfWrongShape.values\(\) must return numbers of shape \(1, 1\), got float64 of shape \(1, 8\)"),
-    "a scalar reward": ({"reward": scalar_reward}, rf"^reward {HERE}:scalar_reward must return finite numbers of shape \(1,\), got float64 of shape \(\)"),
-    "a reward of NaN": ({"reward": nan_reward}, rf"^reward {HERE}:nan_reward must return finite numbers"),
-}  # fmt: skip
+    "no innovations": (
+        {"estimator": NoInnovations},
+        rf"^estimator {HERE}:NoInnovations must have an array 'innovations' of shape \(1, "
+        r"8, 2\), got none",
+    ),
+    "estimates of NaN": (
+        {"estimator": Nan},
+        rf"^estimator {HERE}:Nan.estimate\(\) must return finite floats 'density' of shape "
+        r"\(1, 8\)",
+    ),
+    "a block of NaN": (
+        {"observation": [BlockOfNan]},
+        rf"^observation {HERE}:BlockOfNan.values\(\) must return finite numbers",
+    ),
+    "a block of wrong shape": (
+        {"observation": [BlockOfWrongShape]},
+        rf"^observation {HERE}:BlockOfWrongShape.values\(\) must return numbers of shape "
+        r"\(1, 1\), got float64 of shape \(1, 8\)",
+    ),
+    "a scalar reward": (
+        {"reward": scalar_reward},
+        rf"^reward {HERE}:scalar_reward must return finite numbers of shape \(1,\), got "
+        r"float64 of shape \(\)",
+    ),
+    "a reward of NaN": (
+        {"reward": nan_reward},
+        rf"^reward {HERE}:nan_reward must return finite numbers",
+    ),
+}
 AT_STEP = {
-    "estimates that become infinite": ({"estimator": Late}, rf"^estimator {HERE}:Late.estimate\(\) must return finite floats"),
-    "a release of wrong shape": ({"privacy": WrongShape}, rf"^privacy\.preset {HERE}:WrongShape.release\(\) must return floats of shape \(1, 8, 2\), got float64 of shape \(1, 2\)"),
-    "a release of NaN": ({"privacy": NanRelease}, rf"^privacy\.preset {HERE}:NanRelease.release\(\) must return finite values of observed segments"),
-    "too many queries": ({"action": TooMany}, rf"^action {HERE}:TooMany.decode\(\) must query at most 2 segments, got 6"),
-}  # fmt: skip
+    "estimates that become infinite": (
+        {"estimator": Late},
+        rf"^estimator {HERE}:Late.estimate\(\) must return finite floats",
+    ),
+    "a release of wrong shape": (
+        {"privacy": WrongShape},
+        rf"^privacy\.preset {HERE}:WrongShape.release\(\) must return floats of shape \(1, "
+        r"8, 2\), got float64 of shape \(1, 2\)",
+    ),
+    "a release of NaN": (
+        {"privacy": NanRelease},
+        rf"^privacy\.preset {HERE}:NanRelease.release\(\) must return finite values of "
+        r"observed segments",
+    ),
+    "too many queries": (
+        {"action": TooMany},
+        rf"^action {HERE}:TooMany.decode\(\) must query at most 2 segments, got 6",
+    ),
+}
 
 
 @pytest.mark.parametrize(("values", "message"), WHEN_MADE.values(), ids=WHEN_MADE)

@@ -152,7 +152,7 @@ def test_action_masks():
     masks = env.action_masks()
     assert masks.shape == (3, 6)
     assert np.argwhere(~masks).tolist() == [[0, 0], [1, 4], [2, 5]]
-    with pytest.raises(ValueError, match="needs action='sequential' or .*, got .*:MaskAction"):
+    with pytest.raises(ValueError, match=r"needs action='sequential' or .*, got .*:MaskAction"):
         short().action_masks()
 
 

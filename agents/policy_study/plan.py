@@ -9,7 +9,7 @@ from typing import Any
 
 from agents.evaluation import check_held_out
 from dptse_env.config import TEST_SEEDS, VALIDATION_SEEDS
-from dptse_env.schedules import INFORMED, ORACLES, PLANS, SCHEDULES
+from dptse_env.schedules import COVARIANCE_SCHEDULES, ORACLES, PLANS, SCHEDULES
 from dptse_env.traffic import CORRIDORS
 
 PRIVATE = "dptse_env:dptse/PrivateHighway-v0"
@@ -76,7 +76,11 @@ CELLS = (
     ),
 )
 """The primary cell, then the secondary ones."""
-BASELINES = (*(name for name in SCHEDULES if name not in ("none", "all")), *INFORMED, *PLANS)
+BASELINES = (
+    *(name for name in SCHEDULES if name not in ("none", "all")),
+    *COVARIANCE_SCHEDULES,
+    *PLANS,
+)
 """Policies that need no training: the ladder that a learned one must climb."""
 
 

@@ -1,1 +1,1 @@
-"""Learning to query: recipes, episodes, validation, and runs that may be interrupted."""
+"""Training of query policies: recipes, episodes, validation, and resumable runs."""

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
-from agents.training.truth import TrueErrors
+from agents.seeds import training_seed
+from agents.training.recipes import Recipe
 from dptse_env.sb3 import SB3VecEnv
 from dptse_env.utils.arrays import Action, BoolArray, Observation
 
@@ -19,59 +22,45 @@ State = dict[str, np.ndarray[Any, Any]]
 class TrainingEpisodes(VecEnvWrapper):
     """An `SB3VecEnv` for training.
 
-    **Spread.** Episodes of equal length that begin together would all see the same hour. In their
-    first round, episode i of n is begun again after i/n of its length, so that from then on an
-    update sees every second of the records. All later episodes run their whole length, from the
-    first second on: one begun in the middle of a record would meet vehicles none of which has
-    counted yet (`dptse_env.release.contributions`), which no evaluated episode does.
+    **Spread over time.** Episodes of equal length that begin together would always be in the same
+    phase. In their first round, episode i of n is therefore restarted after i/n of its length, so
+    that from then on an update sees every second of the records. All later episodes run to their
+    end, from the first second on: an episode that began in the middle of a record would meet
+    vehicles without any previous contribution (`dptse_env.release.contributions`), as no
+    evaluated episode does.
 
-    **Kept.** Traffic is replayed and every draw is seeded, so an episode is given by its seed and
-    the actions since it began. `state` is those; `restore` repeats them, which takes as long as
+    **Resumable.** Traffic is replayed and every draw is seeded, so an episode is given by its seed
+    and its actions so far. `state` returns those; `restore` repeats them, which takes as long as
     the longest episode has lasted and gives the same bits.
 
-    **Twins.** Each group of ``twins`` episodes has the same traffic and the same noise at every
-    second, whatever it asks. What happens to a twin does not depend on the actions of the others,
-    so the mean advantage of the others is a baseline that leaves the policy gradient unbiased
-    and takes away what traffic and noise do to all of them (`recentre`).
-
-    **Truth for the critic.** With ``shows_errors``, observations are followed by the true errors of
-    every mainline segment. `dptse_env.sb3.PlackettLucePolicy` gives them to its critic alone,
-    which is left behind when the training ends.
+    **Replicas.** Each group of ``replicas`` episodes has the same traffic and the same noise at
+    every second, whatever it queries (common random numbers). The outcome of a replica does not
+    depend on the actions of the others in its group, so their mean advantage is a baseline that
+    leaves the policy gradient unbiased and removes the common effect of traffic and noise
+    (`recentre`).
 
     **Scaled.** Rewards are multiplied by a constant.
     """
 
     def __init__(
-        self,
-        venv: SB3VecEnv,
-        first_seed: int,
-        *,
-        twins: int = 1,
-        reward_scale: float = 1.0,
-        shows_errors: bool = False,
+        self, venv: SB3VecEnv, first_seed: int, *, replicas: int = 1, reward_scale: float = 1.0
     ) -> None:
         """Wrap ``venv``; group k of episodes draws from ``first_seed`` + k.
 
         Raises:
-            ValueError: The number of episodes is no multiple of ``twins``, or errors are to be
-                shown and the environment does not have ``truth_in_info``.
+            ValueError: The number of episodes is no multiple of ``replicas``.
         """
         super().__init__(venv)
-        if shows_errors and not venv.env.config.truth_in_info:
-            raise ValueError("shows_errors needs an environment with truth_in_info=True")
-        self._errors = TrueErrors(venv.env.config, venv.env.interface) if shows_errors else None
-        if self._errors is not None:
-            self.observation_space = self._errors.space()
-        if venv.num_envs % twins:
+        if venv.num_envs % replicas:
             raise ValueError(
-                f"episodes must be a multiple of twins {twins}, got {venv.num_envs} episodes"
+                f"episodes must be a multiple of replicas {replicas}, got {venv.num_envs}"
             )
-        self.env, self.twins, self.reward_scale = venv.env, twins, reward_scale
-        group = np.arange(venv.num_envs) // twins
-        self._seeds_of_all = (first_seed + group).tolist()
+        self.env, self.replicas, self.reward_scale = venv.env, replicas, reward_scale
+        group = np.arange(venv.num_envs) // replicas
+        self._episode_seeds = (first_seed + group).tolist()
         self._length = self.env.config.horizon_steps * self.env.interface.actions.actions_per_step
         n = self.num_envs
-        self._breaks = group * twins * self._length // n
+        self._breaks = group * replicas * self._length // n
         shape = self.action_space.shape or ()
         self._kept = np.zeros((self._length, n, *shape), dtype=self.action_space.dtype)
         self._count = np.zeros(n, dtype=np.int64)
@@ -81,10 +70,10 @@ class TrainingEpisodes(VecEnvWrapper):
 
     def reset(self) -> Observation:
         """Begin all episodes anew from the first seed."""
-        observation, _ = self.env.reset(seed=self._seeds_of_all)
+        observation, _ = self.env.reset(seed=self._episode_seeds)
         self._clock = 0
         self._count[:], self._position[:] = 1, 0
-        return self._shown(observation)
+        return observation
 
     def step_async(self, actions: Action) -> None:
         """Keep the actions and pass them on."""
@@ -98,25 +87,18 @@ class TrainingEpisodes(VecEnvWrapper):
         self._clock += 1
         self._position += 1
         self._total += float(rewards.sum())
-        # An unfinished sequential decision is paid nothing; an error is never exactly zero.
+        # An unfinished sequential decision has no reward; an error is never exactly zero.
         self._n_seconds += int(np.count_nonzero(rewards))
-        if self._errors is not None:
-            for episode in np.flatnonzero(dones):
-                info = infos[episode]
-                truth = (info["truth"][name][None] for name in ("density", "speed"))
-                last = info["terminal_observation"][None]
-                info["terminal_observation"] = self._errors.append(last, *truth)[0]
         due = (self._breaks == self._clock) & ~dones
         if due.any():
-            before = self._shown(observation)
             for episode in np.flatnonzero(due):
-                infos[episode]["terminal_observation"] = before[episode]
+                infos[episode]["terminal_observation"] = observation[episode]
                 infos[episode]["TimeLimit.truncated"] = True
             observation, _ = self.env.reset(options={"reset_mask": due})
             dones = dones | due
         self._count[dones] += 1
         self._position[dones] = 0
-        return self._shown(observation), rewards * np.float32(self.reward_scale), dones, infos
+        return observation, rewards * np.float32(self.reward_scale), dones, infos
 
     def take_mean_reward(self) -> float:
         """Return the mean unscaled reward of a second since the last call; NaN if none passed."""
@@ -125,24 +107,14 @@ class TrainingEpisodes(VecEnvWrapper):
         return mean
 
     def recentre(self, advantages: NDArray[np.float32]) -> None:
-        """Subtract from advantages (steps, n), in place, the mean of each one's twins."""
-        if self.twins > 1:
-            groups = advantages.reshape(len(advantages), -1, self.twins)
-            others = groups.sum(axis=2, keepdims=True) - groups
-            groups -= others / (self.twins - 1)
-
-    def split(self, observation: Observation) -> tuple[Observation, Observation]:
-        """Return what `TrueErrors.split` does of observations with errors behind them.
-
-        Raises:
-            ValueError: Errors are not shown.
-        """
-        if self._errors is None:
-            raise ValueError("episodes must be made with shows_errors")
-        return self._errors.split(observation)
+        """Subtract from each of the advantages (steps, n), in place, the mean of its replicas'."""
+        if self.replicas > 1:
+            groups = advantages.reshape(len(advantages), -1, self.replicas)
+            rest = groups.sum(axis=2, keepdims=True) - groups
+            groups -= rest / (self.replicas - 1)
 
     def state(self) -> State:
-        """Return what `restore` needs: which episode each is at, and its actions so far."""
+        """Return what `restore` needs: the number of each episode and its actions so far."""
         longest = int(self._position.max())
         return {
             "count": self._count.copy(),
@@ -155,12 +127,12 @@ class TrainingEpisodes(VecEnvWrapper):
         """Repeat the actions of ``state``; return the observations at its end, (n, size)."""
         count, position, actions = state["count"], state["position"], state["actions"]
         longest, again = len(actions), count > 1
-        observation, _ = self.env.reset(seed=self._seeds_of_all)
-        # Earlier episodes only move the generators on: each takes the same few draws.
+        observation, _ = self.env.reset(seed=self._episode_seeds)
+        # Earlier episodes only advance the generators: each takes the same few draws.
         for earlier in range(2, int(count.max())):
             observation = self._begin(count > earlier, observation)
         for k in range(longest):
-            # Whoever begins later idles until then, so that all end together.
+            # Episodes with fewer actions idle at first, so that all end together.
             start = longest - position
             observation = self._begin(again & (start == k), observation)
             rows = np.maximum(k - start, 0)
@@ -169,17 +141,32 @@ class TrainingEpisodes(VecEnvWrapper):
         self._count, self._position = count.copy(), position.copy()
         self._clock = int(state["clock"])
         self._kept[:longest] = actions
-        return self._shown(observation)
-
-    def _shown(self, observation: Observation) -> Observation:
-        """Return observations as the model is to see them."""
-        if self._errors is None:
-            return observation
-        truth = self.env.process.truth(np.arange(self.num_envs))
-        return self._errors.append(observation, truth[:, :, 0], truth[:, :, 1])
+        return observation
 
     def _begin(self, mask: BoolArray, observation: Observation) -> Observation:
         """Begin the episodes of ``mask``, if any; return all observations."""
         if not mask.any():
             return observation
         return self.env.reset(options={"reset_mask": mask})[0]
+
+
+def make_episodes(
+    env: str, keywords: Mapping[str, Any], recipe: Recipe, seed: int, *, reward_scale: float = 1.0
+) -> TrainingEpisodes:
+    """Make the episodes that a recipe trains on.
+
+    Args:
+        env: Environment id.
+        keywords: Of the environment.
+        recipe: Number of episodes, replicas and action encoding.
+        seed: Training seed.
+        reward_scale: Factor on rewards.
+
+    Raises:
+        ValueError: A keyword is unknown or out of range.
+    """
+    chosen = {"autoreset_mode": "SameStep", "action": recipe.action}
+    made = gym.make_vec(env, num_envs=recipe.n_envs, **{**keywords, **chosen})
+    return TrainingEpisodes(
+        SB3VecEnv(made), training_seed(seed), replicas=recipe.replicas, reward_scale=reward_scale
+    )

@@ -1,4 +1,4 @@
-"""`TrainingPlan`: everything that one training depends on."""
+"""`TrainingPlan`: everything that a training depends on."""
 
 from __future__ import annotations
 
@@ -18,24 +18,25 @@ from agents.provenance import source_digest
 from agents.seeds import TRAINING_VALIDATION, TRAININGS
 from agents.training.recipes import Recipe
 from dptse_env.config import TRAINING_SEEDS, VALIDATION_SEEDS, EnvConfig
+from dptse_env.env import SensorQueryEnv
 from dptse_env.parts import make_interface
 from dptse_env.utils.validation import integer
 
 
 @dataclass(frozen=True)
 class TrainingPlan:
-    """One learner on one environment with one training seed.
+    """A recipe on an environment with a training seed.
 
     Attributes:
         env: Environment id.
         recipe: How it is trained.
-        seed: Seeds first weights, draws of actions, noise and the choice of traffic.
+        seed: Seeds the initial weights, draws of actions, noise and the choice of traffic.
         steps: Seconds of traffic to train for by PPO, all episodes together, each with one
-            decision; rounded up to whole updates. What else the recipe holds comes ahead of them.
+            decision; rounded up to complete updates. 0 for a recipe that is trained in rounds.
         traffic_seeds: Traffic to train on.
         validation_seeds: Traffic to validate on.
         keywords: Of the environment, plain JSON; the recipe chooses the action encoding.
-        validate_every: Updates of PPO between two validations; rounds of swaps are all validated.
+        validate_every: Updates of PPO between two validations; all rounds of swaps are validated.
         checkpoint_every: Updates of PPO between two checkpoints; every round leaves one.
 
     Raises:
@@ -56,19 +57,17 @@ class TrainingPlan:
         """Check values that need no environment."""
         integer("seed", self.seed, 0, TRAININGS - 1)
         integer("steps", self.steps, 0)
+        self.recipe.check_steps(self.steps)
         for name in ("validate_every", "checkpoint_every"):
             integer(name, getattr(self, name), 1)
-        recipe = self.recipe
-        if not (self.steps or recipe.rounds.rounds or recipe.pretraining_steps):
-            raise ValueError("steps must be an integer >= 1 where a recipe holds nothing but PPO")
         for path, seeds, allowed in (
             ("traffic", self.traffic_seeds, TRAINING_SEEDS),
             ("validation", self.validation_seeds, VALIDATION_SEEDS),
         ):
-            strangers = [seed for seed in seeds if seed not in allowed]
-            if strangers:
+            outside = [seed for seed in seeds if seed not in allowed]
+            if outside:
                 raise ValueError(
-                    f"{path} must hold seeds in {allowed[0]}..{allowed[-1]}, got {strangers[0]}"
+                    f"{path} must hold seeds in {allowed[0]}..{allowed[-1]}, got {outside[0]}"
                 )
         for key in ("action", "traffic_seeds", "autoreset_mode"):
             if key in self.keywords:
@@ -76,16 +75,17 @@ class TrainingPlan:
 
     @property
     def n_updates(self) -> int:
-        """Updates in all: rounds of swaps, then those of PPO."""
-        by_ppo = -(-self.steps * self.actions_per_step // self.recipe.steps_per_update)
-        return self.recipe.rounds.rounds + by_ppo
+        """Updates of PPO, or rounds of swaps."""
+        return self.recipe.n_updates(self.steps, self.actions_per_step)
 
     def steps_at(self, update: int) -> int:
-        """Seconds of traffic simulated by the end of an update, what came ahead of it included."""
-        recipe, rounds = self.recipe, self.recipe.rounds
-        by_swaps = min(update, rounds.rounds) * rounds.steps(self.config.horizon_steps)
-        by_ppo = max(update - rounds.rounds, 0) * recipe.steps_per_update // self.actions_per_step
-        return recipe.pretraining_steps + by_swaps + by_ppo
+        """Return the seconds of traffic simulated by the end of an update, all of them counted."""
+        return self.recipe.steps_at(update, self.config.horizon_steps, self.actions_per_step)
+
+    def is_due(self, update: int, every: int) -> bool:
+        """Return whether a task that is due ``every`` so many updates is due after this one."""
+        is_last = update == self.n_updates
+        return self.recipe.has_long_updates or update % every == 0 or is_last
 
     @cached_property
     def actions_per_step(self) -> int:
@@ -106,14 +106,14 @@ class TrainingPlan:
             traffic_seeds=list(self.traffic_seeds),
             **self.keywords,
         )
-        config: EnvConfig = made.unwrapped.config  # type: ignore[attr-defined]
-        return config
+        assert isinstance(made.unwrapped, SensorQueryEnv)
+        return made.unwrapped.config
 
     def provenance(self, commit: str | None) -> dict[str, Any]:
         """Return what `agents.provenance.take_folder` compares and keeps, as plain JSON."""
         config = self.config
         libraries = ("gymnasium", "numba", "numpy", "stable-baselines3", "torch")
-        whole = {
+        content = {
             "made_with": {
                 "versions": {name: version(name) for name in ("dptse-env", "libsumo")},
                 "env": self.env,
@@ -139,5 +139,5 @@ class TrainingPlan:
                 **{name: version(name) for name in libraries},
             },
         }
-        plain: dict[str, Any] = json.loads(json.dumps(whole))
+        plain: dict[str, Any] = json.loads(json.dumps(content))
         return plain

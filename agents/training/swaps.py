@@ -1,14 +1,15 @@
-"""What a swap of one queried segment for another gains, measured on twins of an episode.
+"""Gains of swaps: how much an episode's error falls when a queried segment is swapped for another.
 
-Two twins begin in the same second with the same estimator and the same traffic. They ask the same
-but for one segment of their first query, and the same from then on, so what their errors differ by
-in the coming seconds comes from that swap alone. The policy is not asked again after a swap: near
-an optimum, what it would do differently then is worth little.
+Each gain is measured on paired forks of an episode: they start in the same second with the same
+estimator and the same traffic, and make the same queries, except that a segment of the first query
+is swapped in one of them. The difference of their errors over the next seconds therefore comes from
+that swap alone. The policy does not react to a swap: near an optimum, its reaction is worth little.
 
-Noise would drown the difference. In the first query it is therefore plus or minus sigma, which has
-the moments of the Gaussian up to the third, and every trial is run with either sign, which takes
-away all that is odd in it; in later seconds it is the noise that comes. A swap's gain scatters by a
-third of what it does with Gaussian noise of one sign.
+Noise would drown the difference. In the first query it is therefore plus or minus sigma, which
+matches the moments of the Gaussian up to the third, and every fork is run with either sign
+(antithetic noise), which cancels all that is odd in it; in later seconds the noise is that of the
+episode. The standard deviation of a measured gain is a third of that with Gaussian noise of one
+sign.
 """
 
 from __future__ import annotations
@@ -22,22 +23,23 @@ from agents.evaluation import WARM_UP, Policy
 from dptse_env.process import QueryProcess
 from dptse_env.release import Capped, GaussianRelease, Mechanism
 from dptse_env.utils.arrays import Action, AnyArray, FloatArray, IntArray, Observation
+from dptse_env.utils.registry import name_of_class
 from dptse_env.vector_env import SensorQueryVectorEnv
 
 
 @dataclass(frozen=True)
 class Swaps:
-    """Swaps that were tried, k of them in m states.
+    """Gains of k swaps that were tried in m states.
 
     Attributes:
         observations: Of the states, shape (m, size).
-        error: Mean error of a second in the seconds that follow a state, minus the reward, (m,).
-        state: In which state each swap was tried, shape (k,).
-        added: Segment that was asked, shape (k,).
-        dropped: Segment that was not asked in its place, shape (k,).
-        gain: By how much less the estimate erred in these seconds, summed, shape (k,).
-        exposures: By how much more often vehicles counted in them, shape (k,); zero where
-            vehicles count without bound.
+        error: Mean one-second error, minus the reward, over the seconds after a state, shape (m,).
+        state: Index of the state in which each swap was tried, shape (k,).
+        added: Segment that was queried, shape (k,).
+        dropped: Segment that was queried without the swap, shape (k,).
+        gain: Decrease of the summed error over these seconds due to the swap, shape (k,).
+        contributions: Increase of the number of vehicles' contributions in them, shape (k,); zero
+            where contributions are not bounded.
     """
 
     observations: Observation
@@ -46,26 +48,26 @@ class Swaps:
     added: IntArray
     dropped: IntArray
     gain: FloatArray
-    exposures: FloatArray
+    contributions: FloatArray
 
     @classmethod
-    def joined(cls, parts: Sequence[Swaps]) -> Swaps:
+    def from_parts(cls, parts: Sequence[Swaps]) -> Swaps:
         """Return the swaps of all parts."""
 
-        def all_of(name: str) -> AnyArray:
+        def joined(name: str) -> AnyArray:
             return np.concatenate([getattr(part, name) for part in parts])
 
         first = np.cumsum([0] + [len(part.observations) for part in parts[:-1]])
         return cls(
-            all_of("observations"),
-            all_of("error"),
+            joined("observations"),
+            joined("error"),
             np.concatenate([n + part.state for n, part in zip(first, parts, strict=True)]),
-            *(all_of(name) for name in ("added", "dropped", "gain", "exposures")),
+            *(joined(name) for name in ("added", "dropped", "gain", "contributions")),
         )
 
 
-class FirstNoise:
-    """A mechanism whose next release has a given noise; later ones are those of another."""
+class AntitheticNoise:
+    """A mechanism whose next release has given noise; later ones have that of another mechanism."""
 
     def __init__(self, mechanism: Mechanism, noise: FloatArray) -> None:
         """Take over from ``mechanism``; ``noise`` has the shape of a release."""
@@ -78,13 +80,13 @@ class FirstNoise:
         return self._mechanism.sigma
 
     def reset(self, episodes: IntArray, generators: Sequence[np.random.Generator]) -> None:
-        """See `Mechanism`; episodes begin with noise of their own."""
+        """See `Mechanism`; new episodes have the noise of the other mechanism only."""
         self._is_first = False
         self._mechanism.reset(episodes, generators)
 
     def release(self, episodes: IntArray, values: FloatArray) -> FloatArray:
         """See `Mechanism`."""
-        released = self._mechanism.release(episodes, values)  # its streams move on in any case
+        released = self._mechanism.release(episodes, values)  # advances its streams in any case
         if not self._is_first:
             return released
         self._is_first = False
@@ -100,31 +102,31 @@ def try_swaps(
     seconds: int,
     trials: int,
 ) -> Iterator[Swaps]:
-    """Run an episode of ``policy`` for each seed, and try swaps all along.
+    """Run an episode of ``policy`` for each seed, and try swaps in states along the way.
 
     Args:
         env: One episode for each seed, actions ``slots``, autoreset disabled.
         policy: Acts by drawing.
         seeds: Of the episodes, n of them.
-        generator: Draws the swaps, one of the queried for one of the other segments, and signs.
-        seconds: For how many seconds twins are followed, and how many lie between two states.
+        generator: Draws the swaps, a queried segment for one of the rest, and the signs of noise.
+        seconds: Seconds over which a gain is measured, and between two states.
         trials: Swaps in each state.
 
     Yields:
-        The swaps of n states, of one second of all episodes.
+        The swaps of n states, of the same second in all episodes.
 
     Raises:
         ValueError: All segments are queried, so that there is nothing to swap, or episodes end
-            before a twin could be followed.
+            before a gain could be measured.
     """
     horizon, n = env.config.horizon_steps, env.interface.n_mainline
     if env.config.bandwidth >= n:
         raise ValueError(f"swaps need a bandwidth below {n} segments, got {env.config.bandwidth}")
-    # States fall on other seconds in every pass.
+    # The states of every round are at other seconds.
     first = min(WARM_UP, horizon // 4) + int(generator.integers(seconds))
     if first + seconds > horizon:
         raise ValueError(
-            f"swaps need a horizon that leaves {seconds} s to follow twins, got {horizon} s"
+            f"swaps need a horizon that leaves {seconds} s to measure a gain, got {horizon} s"
         )
     observation, _ = env.reset(seed=seeds)
     for _ in range(first):
@@ -138,7 +140,8 @@ def try_swaps(
 
 
 def _drawn(policy: Policy, observation: Observation) -> Action:
-    return policy.predict(observation, deterministic=False)[0]
+    action: Action = policy.predict(observation, deterministic=False)[0]
+    return action
 
 
 def _tried(
@@ -152,39 +155,43 @@ def _tried(
     n, every = len(shown), np.arange(len(shown))
     columns = before.release.setup.n_columns
     noise = generator.choice([-1.0, 1.0], size=(n, columns, 2)) * before.release.sigma
-    reward, exposures = _followed(before, actions, noise)
-    asked = np.zeros((n, before.interface.n_mainline), dtype=bool)
-    np.put_along_axis(asked, actions[0], True, axis=1)
+    reward, contributions = _replayed(before, actions, noise)
+    queried = np.zeros((n, before.interface.n_mainline), dtype=bool)
+    np.put_along_axis(queried, actions[0], True, axis=1)
     parts = []
     for _ in range(trials):
-        added = np.where(asked, -1.0, generator.random(asked.shape)).argmax(axis=1)
+        added = np.where(queried, -1.0, generator.random(queried.shape)).argmax(axis=1)
         place = generator.integers(actions[0].shape[1], size=n)
         query = actions[0].copy()
         query[every, place] = added
-        swapped_reward, swapped_exposures = _followed(before, [query, *actions[1:]], noise)
+        swapped_reward, swapped_contributions = _replayed(before, [query, *actions[1:]], noise)
         dropped = actions[0][every, place]
-        gain, more = swapped_reward - reward, swapped_exposures - exposures
-        parts.append((every, added, dropped, gain, more))
-    state, *rest = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return Swaps(shown, -reward / len(actions), state, *rest)
+        gain, increase = swapped_reward - reward, swapped_contributions - contributions
+        parts.append((every, added, dropped, gain, increase))
+    state, *columns_of_swaps = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return Swaps(shown, -reward / len(actions), state, *columns_of_swaps)
 
 
-def _followed(
+def _replayed(
     before: QueryProcess, actions: Sequence[Action], noise: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the summed reward of each episode and how often its vehicles have counted by then.
+    """Return the summed reward of each episode and its vehicles' number of contributions by then.
 
     Both are means over the noise and its opposite, shape (n,).
     """
     every = np.arange(before.n_episodes)
-    reward, exposures = np.zeros((2, before.n_episodes))
+    reward, contributions = np.zeros((2, before.n_episodes))
     for sign in (1.0, -1.0):
         fork = before.fork()
         release = fork.release
-        assert isinstance(release, GaussianRelease)
-        release.mechanism = FirstNoise(release.mechanism, sign * noise)
+        if not isinstance(release, GaussianRelease):
+            raise ValueError(
+                "swaps need a release model with Gaussian noise, got "
+                f"{name_of_class(type(release))}"
+            )
+        release.mechanism = AntitheticNoise(release.mechanism, sign * noise)
         for action in actions:
             reward += 0.5 * fork.step(every, action).reward
         if isinstance(release, Capped):
-            exposures += 0.5 * release.contributions.exposures.sum(axis=1)
-    return reward, exposures
+            contributions += 0.5 * release.contributions.exposures.sum(axis=1)
+    return reward, contributions

@@ -1,4 +1,4 @@
-"""`Validation`: what a policy reaches on validation traffic, all episodes at once."""
+"""`Validation`: errors of policies on validation traffic, all episodes at once."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ class Validation:
         Raises:
             ValueError: A seed is not in `VALIDATION_SEEDS`, or a keyword is out of range.
         """
-        strangers = [seed for seed in seeds if seed not in VALIDATION_SEEDS]
-        if strangers or not seeds:
+        outside = [seed for seed in seeds if seed not in VALIDATION_SEEDS]
+        if outside or not seeds:
             raise ValueError(
                 f"validation must be traffic seeds in {VALIDATION_SEEDS[0]}.."
-                f"{VALIDATION_SEEDS[-1]}, got {strangers[:1] or 'none'}"
+                f"{VALIDATION_SEEDS[-1]}, got {outside[0] if outside else 'none'}"
             )
         self.seeds = list(seeds)
         keywords = {**keywords, "traffic_seeds": self.seeds}

@@ -1,4 +1,4 @@
-"""Saved policies as files, as far as one gets without torch; those that come with the package."""
+"""Saved policies: reading their files without torch, and those that come with the package."""
 
 from __future__ import annotations
 
@@ -6,11 +6,20 @@ import os
 from importlib.resources import files
 from pathlib import Path
 
-CARD = "card.json"
-"""The card in a saved policy: plain JSON that says what it is and what it fits."""
+from dptse_env.policies.reading import CARD, LARGEST_FILE, WEIGHTS, PolicyFile, parse_policy
+
+__all__ = [
+    "CARD",
+    "TRANSFERABLE",
+    "WEIGHTS",
+    "PolicyFile",
+    "parse_policy",
+    "read_policy",
+    "shipped_policies",
+]
 
 TRANSFERABLE = ("corridor", "bandwidth")
-"""What a caller may allow to differ between a policy and the environment that it acts in."""
+"""Properties that a caller may allow to differ between a policy and its environment."""
 
 
 def shipped_policies() -> list[str]:
@@ -19,8 +28,8 @@ def shipped_policies() -> list[str]:
     return sorted(entry.name[:-4] for entry in entries if entry.name.endswith(".zip"))
 
 
-def read_policy(source: str | os.PathLike[str]) -> bytes:
-    """Return the content of a saved policy.
+def read_policy(source: str | os.PathLike[str]) -> PolicyFile:
+    """Read a saved policy.
 
     Args:
         source: A file, or the name of a policy that comes with the package; such a name comes
@@ -28,15 +37,18 @@ def read_policy(source: str | os.PathLike[str]) -> bytes:
 
     Raises:
         FileNotFoundError: There is no such file, nor such a name.
+        ValueError: The file is not a saved policy, is damaged, or exceeds a limit of
+            `dptse_env.policies.reading`.
     """
     name = os.fspath(source)
     if name in shipped_policies():
-        return files("dptse_env").joinpath("policies", f"{name}.zip").read_bytes()
-    path = Path(source)
-    if not path.is_file():
+        path = files("dptse_env").joinpath("policies", f"{name}.zip")
+        return parse_policy(path.read_bytes(), name)
+    if not Path(source).is_file():
         known = ", ".join(shipped_policies()) or "none"
         raise FileNotFoundError(
-            f"there is no saved policy {name!r}: neither a file, nor of those that come with the "
-            f"package ({known})"
+            f"there is no saved policy {name!r}: neither a file, nor one of those that come with "
+            f"the package ({known})"
         )
-    return path.read_bytes()
+    with Path(source).open("rb") as file:
+        return parse_policy(file.read(LARGEST_FILE + 1), name)

@@ -23,7 +23,7 @@ CENTRES = {
     "fixed_density_innovation": (0.0, 1.5),
     "fixed_speed_innovation": (0.0, 1.5),
 }
-"""What a block's values are centred on and divided by, so that channels are of order one.
+"""Centre and scale of each block's values, chosen so that channels are of order one.
 
 Constants rather than running statistics: nothing can be lost between training and use."""
 
@@ -40,11 +40,11 @@ class Channel:
     """One value for each mainline segment.
 
     Attributes:
-        name: What it is, for people.
-        source: Place in the observation for each segment, n of them; None where there is nothing,
-            and the channel is 0.
+        name: Kind of segment and observation block, such as ``"off-ramp density"``.
+        source: Index into the observation for each of the n segments; None where there is no
+            value, and the channel is 0.
         centre: Subtracted from the values.
-        scale: Then divides them.
+        scale: Divides the centred values.
     """
 
     name: str
@@ -55,18 +55,18 @@ class Channel:
 
 @dataclass(frozen=True)
 class RoadChannels:
-    """How an observation is laid out along the road; plain data, so that it travels with a policy.
+    """Layout of an observation along the road, as plain data that travels with a policy.
 
-    A ramp's values stand at the segment that it joins or leaves: an on-ramp at face j at segment
-    j, downstream of the face, an off-ramp at segment j - 1. The bandwidth and epsilon are left
-    out: they do not change in a training, and a weight on them that was never tried would spoil
-    a policy elsewhere. What they do shows in the deviations and ages.
+    A ramp's values are assigned to the segment that it joins or leaves: an on-ramp at face j to
+    segment j, downstream of the face, an off-ramp to segment j - 1. The bandwidth and epsilon are
+    left out: they are constant during a training, so their weights would remain untrained and
+    would spoil the policy elsewhere. Their effect shows in the deviations and ages.
 
     Attributes:
         n_mainline: Segments n along the road.
         size: Length of an observation.
-        channels: The values that change.
-        marks: For each mark 0 or 1 per segment: on-ramp, off-ramp, fixed sensor.
+        channels: The channels with values from the observation.
+        marks: Constant channels of 0 or 1 per segment: on-ramp, off-ramp, fixed sensor.
     """
 
     n_mainline: int
@@ -75,8 +75,8 @@ class RoadChannels:
     marks: tuple[tuple[float, ...], ...]
 
     @classmethod
-    def of(cls, config: EnvConfig) -> RoadChannels:
-        """Lay out the observations of an environment of ``config``."""
+    def from_config(cls, config: EnvConfig) -> RoadChannels:
+        """Return the layout of the observations of an environment of ``config``."""
         corridor, n = config.corridor, config.corridor.n_mainline
         encoding = make_interface(config).observations
         starts = {name: place.start for name, place in encoding.slices.items()}
@@ -109,17 +109,23 @@ class RoadChannels:
         """Channels per segment, marks included."""
         return len(self.channels) + len(self.marks)
 
-    def index(self, name: str) -> int:
-        """Return the number of the mainline channel of block ``name``."""
-        return next(
-            k for k, channel in enumerate(self.channels) if channel.name == f"mainline {name}"
-        )
+    def index(self, block: str) -> int:
+        """Return the index of the mainline channel of an observation block.
+
+        Raises:
+            ValueError: The block has no mainline channel.
+        """
+        names = [channel.name for channel in self.channels]
+        if f"mainline {block}" not in names:
+            known = ", ".join(name[9:] for name in names if name.startswith("mainline "))
+            raise ValueError(f"observation block must be one of {known}, got {block!r}")
+        return names.index(f"mainline {block}")
 
 
 def _channel(
-    block: str, starts: Mapping[str, int], places: Mapping[int, int], n: int, kind: str
+    block: str, starts: Mapping[str, int], offsets: Mapping[int, int], n: int, kind: str
 ) -> Channel:
-    """Make a channel; ``places`` says which item of the block stands at which segment."""
+    """Make a channel; ``offsets`` maps a segment to the position of its value in the block."""
     centre, scale = CENTRES[block]
-    source = tuple(starts[block] + places[i] if i in places else None for i in range(n))
+    source = tuple(starts[block] + offsets[i] if i in offsets else None for i in range(n))
     return Channel(f"{kind} {block}", source, centre, scale)

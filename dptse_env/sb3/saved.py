@@ -1,38 +1,37 @@
-"""Trained policies as small files: written once, and refused where they do not fit."""
+"""Trained policies as small files, checked when they are read and refused where they do not fit."""
 
 from __future__ import annotations
 
 import io
 import json
 import os
-import pickle
 import zipfile
-from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+from stable_baselines3.common.policies import BasePolicy
 
 from dptse_env.config import EnvConfig
+from dptse_env.estimators import ESTIMATORS
 from dptse_env.parts import QueryInterface, make_interface
-from dptse_env.policies import CARD, TRANSFERABLE, read_policy
-from dptse_env.sb3.channels import RoadChannels
-from dptse_env.sb3.policy import PlackettLucePolicy
+from dptse_env.policies import (
+    CARD,
+    TRANSFERABLE,
+    WEIGHTS,
+    PolicyFile,
+    parse_policy,
+    read_policy,
+)
+from dptse_env.sb3.fit import TrainedOn, check_fit, make_fit
+from dptse_env.sb3.kinds import KINDS, Shapes
 from dptse_env.utils.arrays import Action, Observation
 
-FORMAT = "dptse-policy"
-VERSION = 1
-"""Raise it whenever saved weights would no longer mean the same."""
-
-TEXT, WEIGHTS = "CARD.md", "weights.pt"
-
-MUST_FIT = ("format", "observation", "action", "corridor", "bandwidth")
-"""What a policy must have in common with the environment that it is to act in, but for what of
-`dptse_env.policies.TRANSFERABLE` a caller allows: with anything else its weights would not fit."""
+TEXT = "CARD.md"
+"""Entry of a policy file with the card for people."""
 
 
 class ActingPolicy:
@@ -45,7 +44,7 @@ class ActingPolicy:
     def __init__(self, policy: BasePolicy, interface: QueryInterface) -> None:
         """Bind a policy to an environment's interface."""
         self._policy, self.interface = policy, interface
-        # A maskable policy wants masks beside the observation, which holds them, too.
+        # A maskable policy expects masks beside the observation, which holds them, too.
         self._takes_masks = type(policy).__name__ == "MaskableActorCriticPolicy"
 
     def predict(
@@ -58,8 +57,8 @@ class ActingPolicy:
         """Return actions for one observation (size,) or a batch (k, size).
 
         Args:
-            observation: What the environment shows.
-            state: Not needed; given back as it is.
+            observation: From the environment.
+            state: Not needed; returned as it is.
             episode_start: Not needed.
             deterministic: The most probable action instead of a random one. Random ones are drawn
                 by torch's generator.
@@ -76,7 +75,8 @@ class SavedPolicy(ActingPolicy):
     """A trained policy with the ``predict`` of stable-baselines3.
 
     Attributes:
-        card: What it is, how it was trained, and what it fits.
+        card: Description of the policy, its training, and what it fits.
+        trained_on: The road that it was trained on.
         interface: Of the environment that it acts in.
     """
 
@@ -85,70 +85,7 @@ class SavedPolicy(ActingPolicy):
     ) -> None:
         """Bind a policy to its card and to an environment's interface."""
         super().__init__(policy, interface)
-        self.card = dict(card)
-
-
-@dataclass(frozen=True)
-class _Kind:
-    """How a class of policies is made for an environment from the arguments on its card."""
-
-    make: Callable[[EnvConfig, QueryInterface, Mapping[str, Any]], BasePolicy]
-    arguments: Callable[[Any], dict[str, Any]]
-
-
-def _never(_: float) -> float:
-    return 0.0
-
-
-def _make_plackett_luce(
-    config: EnvConfig, interface: QueryInterface, arguments: Mapping[str, Any]
-) -> BasePolicy:
-    space = interface.observations.space, interface.actions.space
-    return PlackettLucePolicy(*space, _never, road=RoadChannels.of(config), **arguments)
-
-
-def _make_perceptron(
-    _: EnvConfig, interface: QueryInterface, arguments: Mapping[str, Any]
-) -> BasePolicy:
-    space = interface.observations.space, interface.actions.space
-    return ActorCriticPolicy(*space, _never, **arguments)
-
-
-def _make_maskable(
-    _: EnvConfig, interface: QueryInterface, arguments: Mapping[str, Any]
-) -> BasePolicy:
-    # Only such a policy needs sb3-contrib.
-    from sb3_contrib.common.maskable.policies import (  # noqa: PLC0415
-        MaskableActorCriticPolicy,
-    )
-
-    space = interface.observations.space, interface.actions.space
-    policy: BasePolicy = MaskableActorCriticPolicy(*space, _never, **arguments)
-    return policy
-
-
-_KINDS = {
-    "PlackettLucePolicy": _Kind(
-        _make_plackett_luce, lambda policy: {"width": policy.width, "rule": policy.rule}
-    ),
-    "ActorCriticPolicy": _Kind(_make_perceptron, lambda policy: {"net_arch": policy.net_arch}),
-    "MaskableActorCriticPolicy": _Kind(
-        _make_maskable, lambda policy: {"net_arch": policy.net_arch}
-    ),
-}
-
-
-def fit_of(config: EnvConfig) -> dict[str, Any]:
-    """Return what a policy for ``config`` must fit, as plain JSON; keys as in `MUST_FIT`."""
-    encoding = make_interface(config).observations
-    sizes = [f"{name}:{place.stop - place.start}" for name, place in encoding.slices.items()]
-    return {
-        "format": f"{FORMAT}-{VERSION}",
-        "observation": " ".join(sizes),
-        "action": config.action,
-        "corridor": config.corridor.digest,
-        "bandwidth": config.bandwidth,
-    }
+        self.card, self.trained_on = dict(card), TrainedOn.from_card(card)
 
 
 def save_policy(
@@ -161,62 +98,57 @@ def save_policy(
     training: Mapping[str, Any],
     figures: Mapping[str, Any],
 ) -> None:
-    """Write what acting needs of a policy: weights without the critic, and a card.
+    """Write what acting needs of a policy: its weights and a card.
 
-    The file is put in place when it is whole; one that stood there stays until then.
+    The file is put in place when it is complete; an older one stays until then.
 
     Args:
         path: A file that ends in ``.zip``.
         policy: One of `PlackettLucePolicy`, ``ActorCriticPolicy``, ``MaskableActorCriticPolicy``.
-        config: What it was trained on.
-        env: Environment id.
+        config: Of the environment that it was trained on.
+        env: Id of that environment.
         keywords: Those of the environment, plain JSON.
         training: Recipe, seeds, steps; plain JSON.
-        figures: What it reaches, by name; plain JSON.
+        figures: Results, by name; plain JSON.
 
     Raises:
-        ValueError: Another class of policy, or another ending.
+        ValueError: The policy could not be loaded again: it is of another class, has parts of
+            its own, is too large, or has weights that are not finite. Or the path does not end
+            in ``.zip``.
         OSError: The file cannot be written.
     """
     target = Path(path)
     name = type(policy).__name__
-    if name not in _KINDS:
-        raise ValueError(f"policy must be one of {', '.join(_KINDS)}, got {name}")
+    if name not in KINDS:
+        raise ValueError(f"policy must be one of {', '.join(KINDS)}, got {name}")
     if target.suffix != ".zip":
         raise ValueError(f"path must end in .zip, got {str(path)!r}")
-    corridor = config.corridor
+    kind = KINDS[name]
+    arguments = kind.describe(policy)
     card = {
-        "fits": fit_of(config),
-        "policy": {"class": name, "arguments": _KINDS[name].arguments(policy)},
+        "fits": make_fit(config, kind),
+        "policy": {"class": name, "arguments": arguments},
         "env": env,
         "keywords": dict(keywords),
-        "corridor": corridor.name,
-        "estimator": config.estimator,
+        "corridor": config.corridor.name,
+        "trained_on": TrainedOn.from_corridor(config.corridor).to_dict(),
+        "estimator": ESTIMATORS.name_of(config.estimator),
         "epsilon": config.privacy.epsilon,
         "versions": {name: version(name) for name in ("dptse-env", "stable-baselines3", "torch")},
         "training": dict(training),
         "figures": dict(figures),
     }
-    weights = {
-        key: value for key, value in policy.state_dict().items() if not key.startswith("critic.")
-    }
-    kept = io.BytesIO()
-    torch.save(weights, kept)
-    whole = io.BytesIO()
-    with zipfile.ZipFile(whole, "w", zipfile.ZIP_DEFLATED) as archive:
-        for entry, content in (
-            (CARD, json.dumps(card, indent=2) + "\n"),
-            (TEXT, _text(card)),
-            (WEIGHTS, kept.getvalue()),
-        ):
-            # A fixed date: the same policy gives the same file.
-            archive.writestr(zipfile.ZipInfo(entry), content, zipfile.ZIP_DEFLATED)
-    aside = target.with_suffix(".tmp")
+    content = _packed(card, policy)
     try:
-        aside.write_bytes(whole.getvalue())
-        aside.replace(target)
+        _check_weights(parse_policy(content, str(path)), kind.shapes(config, arguments))
+    except ValueError as problem:
+        raise ValueError(f"policy cannot be saved: {problem}") from problem
+    temporary = target.with_suffix(".tmp")
+    try:
+        temporary.write_bytes(content)
+        temporary.replace(target)
     finally:
-        aside.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
 
 
 def load_policy(
@@ -224,63 +156,82 @@ def load_policy(
 ) -> SavedPolicy:
     """Load a policy for an environment.
 
+    No code in the file is run. Its size, its values and the shapes of its network are checked
+    before anything is built (`dptse_env.policies.reading`).
+
     Args:
         source: A file, or the name of a policy that comes with the package
             (`dptse_env.policies`).
         env: The environment in which it is to act: of this package, scalar or vector, wrapped or
             not, or as an `SB3VecEnv`.
-        allow: What may differ on purpose, of `TRANSFERABLE`. Estimator, privacy and traffic model
-            may always differ.
+        allow: Properties that may differ on purpose, of `TRANSFERABLE`. Estimator, privacy and
+            traffic model may always differ. With ``"corridor"`` a `PlackettLucePolicy` acts on
+            roads of any size whose observations have the same channels (`RoadChannels`); a
+            perceptron's observations must have the same size.
 
     Raises:
         FileNotFoundError: There is no such file, nor such a name.
-        ValueError: The file is no saved policy, or the policy does not fit the environment: the
-            message names what each of them has.
+        ValueError: The file is not a saved policy, or the policy does not fit the environment: the
+            message names the values of both.
     """
-    strangers = [name for name in allow if name not in TRANSFERABLE]
-    if strangers:
-        raise ValueError(f"allow must be of {', '.join(TRANSFERABLE)}, got {strangers[0]!r}")
-    content, config = read_policy(source), _config_of(env)
-    card, weights = _unpack(content, str(source))
-    there, here = card["fits"], fit_of(config)
-    differing = [
-        f"{key} is {there.get(key)!r} of the policy and {here[key]!r} of the environment"
-        for key in MUST_FIT
-        if there.get(key) != here[key] and key not in allow
-    ]
-    if differing:
-        raise ValueError(
-            f"policy {str(source)!r} does not fit: {'; '.join(differing)}{_hint(allow)}"
-        )
-    interface = make_interface(config)
-    made = card["policy"]
-    policy = _KINDS[made["class"]].make(config, interface, made["arguments"])
-    absent = policy.load_state_dict(weights, strict=False).missing_keys
-    if any(not key.startswith("critic.") for key in absent):
-        raise ValueError(f"policy {str(source)!r} lacks weights: {', '.join(absent)}")
-    policy.set_training_mode(False)
-    return SavedPolicy(policy, card, interface)
-
-
-def _hint(allow: Collection[str]) -> str:
-    left = [name for name in TRANSFERABLE if name not in allow]
-    return f". Transfer on purpose: allow={tuple(left)!r} or some of it" if left else ""
-
-
-def _unpack(content: bytes, source: str) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
-    """Return card and weights of a file's content."""
+    unknown = [name for name in allow if name not in TRANSFERABLE]
+    if unknown:
+        raise ValueError(f"allow must be of {', '.join(TRANSFERABLE)}, got {unknown[0]!r}")
+    config = _config_of(env)
+    file = read_policy(source)
     try:
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            card: dict[str, Any] = json.loads(archive.read(CARD))
-            weights = torch.load(io.BytesIO(archive.read(WEIGHTS)), weights_only=True)
-        known = card["policy"]["class"] in _KINDS and isinstance(card["fits"], dict)
-    except pickle.UnpicklingError as problem:
-        raise ValueError(f"{source!r} holds more than weights and is not loaded") from problem
-    except (zipfile.BadZipFile, KeyError, ValueError, RuntimeError, EOFError) as problem:
-        raise ValueError(f"{source!r} is no saved policy, or damaged: {problem}") from problem
-    if not known:
-        raise ValueError(f"{source!r} holds a policy of an unknown class")
-    return card, weights
+        return _bind(file, config, allow)
+    except ValueError as problem:
+        raise ValueError(f"policy {file.source!r} cannot be loaded: {problem!s:.1000}") from problem
+
+
+def _bind(file: PolicyFile, config: EnvConfig, allow: Collection[str]) -> SavedPolicy:
+    """Make the policy of a file for an environment of ``config``.
+
+    Raises:
+        ValueError: It does not fit, or its card and its weights do not agree.
+    """
+    name, arguments = (file.card["policy"][key] for key in ("class", "arguments"))
+    if name not in KINDS:
+        raise ValueError(f"its class must be one of {', '.join(KINDS)}, got {name!r}")
+    kind = KINDS[name]
+    check_fit(file.card, kind, config, allow)
+    _check_weights(file, kind.shapes(config, arguments))
+    with torch.random.fork_rng(devices=[]):  # initial weights, which are replaced, take no draws
+        policy = kind.make(config, arguments)
+    weights = {name: torch.from_numpy(array) for name, array in file.weights.items()}
+    policy.load_state_dict(weights)
+    policy.set_training_mode(False)
+    return SavedPolicy(policy, file.card, make_interface(config))
+
+
+def _check_weights(file: PolicyFile, shapes: Shapes) -> None:
+    """Refuse weights that are not exactly those of the network that a card describes."""
+    found = {name: array.shape for name, array in file.weights.items()}
+    missing = [name for name in shapes if name not in found]
+    unknown = [name for name in found if name not in shapes]
+    for problem, names in (("lacks weights", missing), ("has unknown weights", unknown)):
+        if names:
+            raise ValueError(f"it {problem} {', '.join(map(repr, names[:5]))}")
+    for name, shape in shapes.items():
+        if found[name] != shape:
+            raise ValueError(f"weight {name!r} must have shape {shape}, got {found[name]}")
+
+
+def _packed(card: Mapping[str, Any], policy: BasePolicy) -> bytes:
+    """Return the content of a policy file."""
+    weights = io.BytesIO()
+    torch.save({k: v.detach().cpu().contiguous() for k, v in policy.state_dict().items()}, weights)
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, entry in (
+            (CARD, json.dumps(card, indent=2) + "\n"),
+            (TEXT, _text(card)),
+            (WEIGHTS, weights.getvalue()),
+        ):
+            # A fixed date: the same policy gives the same file.
+            archive.writestr(zipfile.ZipInfo(name), entry, zipfile.ZIP_DEFLATED)
+    return content.getvalue()
 
 
 def _config_of(env: Any) -> EnvConfig:
@@ -297,13 +248,13 @@ def _text(card: Mapping[str, Any]) -> str:
     lines = [
         f"# {card['policy']['class']} for {card['env'].rpartition(':')[2]}",
         "",
-        f"Chooses {fits['bandwidth']} segments a second on corridor {card['corridor']} "
+        f"Chooses {fits['bandwidth']} segments a second on corridor {TrainedOn.from_card(card)} "
         f"(action encoding `{fits['action']}`), trained with estimator {card['estimator']} at "
         f"epsilon {card['epsilon']:g}.",
         "",
-        "It sees released values, the estimator's output and the query history, and no truth; an "
-        "episode's guarantee of privacy is that of the environment's mechanism, whatever it asks. "
-        "It was trained on simulated traffic and has not been tried on a real road.",
+        "It observes released values, the estimator's output and the query history, and no truth; "
+        "an episode's guarantee of privacy is that of the environment's mechanism, whatever the "
+        "policy queries. It was trained on simulated traffic and has not been tried on real roads.",
         "",
         "| | |",
         "|---|---|",

@@ -20,14 +20,15 @@ _MASKS = "action_masks"
 
 
 class SB3VecEnv(VecEnv):
-    """A `SensorQueryVectorEnv` as stable-baselines3 wants it.
+    """A `SensorQueryVectorEnv` with the interface of stable-baselines3.
 
-    An episode that ends is begun again in place: the observation is the first of the next one, and
-    ``infos[i]`` has ``terminal_observation``, ``TimeLimit.truncated`` and what the scalar
-    environment says at the end. For episodes that go on, ``infos[i]`` is empty. Numbers, seeds and
-    options are those of ``DummyVecEnv`` over as many scalar environments.
+    An episode that ends is replaced by a new one in the same step: the observation is the first of
+    the new episode, and ``infos[i]`` has ``terminal_observation``, ``TimeLimit.truncated`` and the
+    info of the scalar environment at the end. For episodes that continue, ``infos[i]`` is empty.
+    Numbers, seeds and options are those of ``DummyVecEnv`` over as many scalar environments.
 
-    ``env_method("action_masks")`` gives the masks of sequential actions, as MaskablePPO asks.
+    ``env_method("action_masks")`` returns the masks of sequential actions, as MaskablePPO needs
+    them.
 
     Example::
 
@@ -45,7 +46,7 @@ class SB3VecEnv(VecEnv):
                 ``autoreset_mode="SameStep"``.
 
         Raises:
-            ValueError: Another class or another autoreset mode.
+            ValueError: The environment is of another class, or has another autoreset mode.
         """
         if not isinstance(env, SensorQueryVectorEnv):
             raise ValueError(
@@ -55,7 +56,7 @@ class SB3VecEnv(VecEnv):
         if env.autoreset_mode is not AutoresetMode.SAME_STEP:
             raise ValueError(
                 f"env must be made with autoreset_mode='{AutoresetMode.SAME_STEP.value}', since "
-                "stable-baselines3 expects an episode that ends to begin again in the same step; "
+                "stable-baselines3 expects a new episode in the step in which one ends; "
                 f"got '{env.autoreset_mode.value}'"
             )
         self.env = env
@@ -63,7 +64,7 @@ class SB3VecEnv(VecEnv):
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
 
     def reset(self) -> Observation:
-        """Begin all episodes, with what `seed` and `set_options` left; shape (n, size).
+        """Begin all episodes, with the seeds and options that were set; return (n, size).
 
         Raises:
             ValueError: An option is unknown or out of range.
@@ -83,7 +84,7 @@ class SB3VecEnv(VecEnv):
         return observation
 
     def step_async(self, actions: Action) -> None:
-        """Take the actions, shape (n, *action space); `step_wait` carries them out."""
+        """Store the actions, shape (n, *action space), until `step_wait` executes them."""
         self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
@@ -94,32 +95,32 @@ class SB3VecEnv(VecEnv):
         self._actions = None
         # One dict each: wrappers and callbacks write into them.
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        ended = transition.final
-        if ended is not None:
-            for k, episode in enumerate(ended.episodes):
-                infos[episode].update(row_of(ended.infos, k))
-                infos[episode]["terminal_observation"] = ended.observation[k].copy()
+        final = transition.final
+        if final is not None:
+            for k, episode in enumerate(final.episodes):
+                infos[episode].update(row_of(final.infos, k))
+                infos[episode]["terminal_observation"] = final.observation[k].copy()
                 infos[episode]["TimeLimit.truncated"] = True
-            self._note_resets(ended.episodes)
+            self._note_resets(final.episodes)
         reward = transition.reward.astype(np.float32)
         return transition.observation, reward, transition.truncated, infos
 
     def close(self) -> None:
-        """Close the environment; twice is fine."""
+        """Close the environment; closing it again does nothing."""
         self.env.close()
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """Return an attribute as each of the scalar environments would have it.
+        """Return an attribute as each of the scalar environments would return it.
 
         Raises:
-            AttributeError: There is none; `action_masks` is there for sequential actions only.
+            AttributeError: There is none; `action_masks` exists for sequential actions only.
         """
         episodes = list(self._get_indices(indices))
         if attr_name == _MASKS:
-            if self.env.config.action != "sequential":
-                raise AttributeError(
-                    f"action_masks needs action='sequential', this is {self.env.config.action!r}"
-                )
+            try:
+                self.env.interface.require_sequential()
+            except ValueError as problem:
+                raise AttributeError(str(problem)) from problem
             return [lambda e=e: self._masks()[e] for e in episodes]
         if attr_name in ("action_space", "observation_space"):
             return [getattr(self, attr_name)] * len(episodes)
@@ -147,7 +148,7 @@ class SB3VecEnv(VecEnv):
         """Return the masks of sequential actions, each of shape (n_mainline,), for `action_masks`.
 
         Raises:
-            AttributeError: Another method, or the actions are not sequential.
+            AttributeError: The method is another one, or the actions are not sequential.
         """
         if method_name != _MASKS:
             raise AttributeError(
@@ -168,8 +169,8 @@ class SB3VecEnv(VecEnv):
         return self.env.action_masks()
 
     def _note_resets(self, episodes: Sequence[int] | NDArray[np.int64] | range) -> None:
-        """Keep the infos of resets where stable-baselines3 looks for them."""
+        """Store the infos of resets where stable-baselines3 looks for them."""
         rows = self.env.process.infos(np.asarray(episodes))
-        privacy = self.env.privacy()
+        at_reset = self.env.process.reset_info()
         for k, episode in enumerate(episodes):
-            self.reset_infos[episode] = {**row_of(rows, k), "privacy": privacy}
+            self.reset_infos[episode] = {**row_of(rows, k), **at_reset}

@@ -17,8 +17,8 @@ def save(path, seed=0, **keywords):
     interface = make_interface(config)
     torch.manual_seed(seed)
     policy = PlackettLucePolicy(
-        interface.observations.space, interface.actions.space, lambda _: 0.0,
-        road=RoadChannels.of(config), width=8,
+        interface.observations.space, interface.actions.space,
+        road=RoadChannels.from_config(config), width=8,
     )  # fmt: skip
     with torch.no_grad():
         for weights in policy.parameters():  # fresh ones leave the rule as it is

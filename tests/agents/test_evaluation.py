@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from agents.evaluation import run_episode, run_episodes, watch_episode
-from dptse_env.schedules import INFORMED, ORACLES, SCHEDULES, make_schedule
+from dptse_env.schedules import COVARIANCE_SCHEDULES, ORACLES, SCHEDULES, make_schedule
 from dptse_env.spaces.actions import ACTION_ENCODINGS
 
 
@@ -132,7 +132,9 @@ class Learned:
         return (action[0] if np.ndim(observation) == 1 else action), state
 
 
-LADDER = [name for name in (*SCHEDULES, *INFORMED, *ORACLES) if name not in ("random", "all")]
+LADDER = [
+    name for name in (*SCHEDULES, *COVARIANCE_SCHEDULES, *ORACLES) if name not in ("random", "all")
+]
 
 
 @pytest.mark.parametrize("name", LADDER)

@@ -33,7 +33,7 @@ def test_it_acts_as_the_policy_that_was_saved(tmp_path):
 def test_another_bandwidth_is_refused_unless_it_is_meant(tmp_path):
     saved = Saved.of(save(tmp_path / "policy.zip"))
     env = gym.make(SHORT, action="slots", bandwidth=3)
-    with pytest.raises(ValueError, match="bandwidth is 2 of the policy and 3 of the environment"):
+    with pytest.raises(ValueError, match="bandwidth is 2 for the policy and 3 for the environment"):
         saved.load(env)
     saved.load(env, allow=TRANSFERABLE)
 
@@ -51,13 +51,26 @@ def test_what_is_no_policy_is_refused(tmp_path):
         Saved.of("nobody")
     text = tmp_path / "text.zip"
     text.write_text("no archive")
-    with pytest.raises(ValueError, match="no saved policy: BadZipFile"):
+    with pytest.raises(ValueError, match="not a saved policy, or damaged: File is not a zip file"):
         Saved.of(text)
     for card in ({"fits": {}}, {"fits": {"action": "mask"}, "training": {"seed": 1}}, []):
         with zipfile.ZipFile(text, "w") as archive:
             archive.writestr("card.json", json.dumps(card))
-        with pytest.raises(ValueError, match="no saved policy"):
+        with pytest.raises(ValueError, match="not a saved policy"):
             Saved.of(text)
+
+
+@pytest.mark.parametrize("training", [{"seed": 1}, {"learner": "mask", "seed": "first"}])
+def test_a_card_without_recipe_or_training_seed_is_refused(tmp_path, training):
+    path = save(tmp_path / "policy.zip")
+    with zipfile.ZipFile(path) as archive:
+        entries = {name: archive.read(name) for name in archive.namelist()}
+    card = {**json.loads(entries["card.json"]), "training": training}
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in {**entries, "card.json": json.dumps(card)}.items():
+            archive.writestr(name, content)
+    with pytest.raises(ValueError, match="not a saved policy"):
+        Saved.of(path)
 
 
 def test_a_name_is_looked_up_in_the_package(tmp_path, monkeypatch):

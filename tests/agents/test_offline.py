@@ -9,7 +9,7 @@ from dptse_env.schedules.plans import Place
 
 SHORT = "dptse_env:dptse/ShortHighway-v0"
 TASK = PlanTask(
-    SHORT, "offline", 3, estimator="random_walk", seeds="0:4", neighbours=7, bandwidth=2
+    SHORT, "optimised-plan", 3, estimator="random_walk", seeds="0:4", neighbours=7, bandwidth=2
 )
 
 

@@ -68,7 +68,7 @@ def test_settings_can_be_tuned_for_a_saved_policy(tmp_path):
     assert score_episode(TASK, settings, 1) != expected
     other = dataclasses.replace(TASK, schedule=str(save(tmp_path / "other.zip", seed=2)))
     assert task.identity()["schedule"] != other.identity()["schedule"]  # by content, not by name
-    with pytest.raises(ValueError, match="bandwidth is 2 of the policy and 3 of the environment"):
+    with pytest.raises(ValueError, match="bandwidth is 2 for the policy and 3 for the environment"):
         dataclasses.replace(task, bandwidth=3).config()
     with pytest.raises(FileNotFoundError, match=r"none\.zip"):
         dataclasses.replace(task, schedule="none.zip")

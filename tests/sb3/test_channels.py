@@ -11,7 +11,7 @@ from dptse_env.config import PRESETS, resolve
 from dptse_env.parts import make_interface
 from dptse_env.sb3 import RoadChannels
 from dptse_env.sb3.channels import CENTRES
-from dptse_env.sb3.networks import Road
+from dptse_env.sb3.torch_modules import RoadFeatures
 
 
 def numbered(config):
@@ -22,28 +22,28 @@ def numbered(config):
 
 
 def raw(road, name, observation):
-    """What a channel shows before it is scaled; NaN where there is nothing."""
+    """The values of a channel before it is scaled; None where there are none."""
     (k,) = (k for k, channel in enumerate(road.channels) if channel.name == name)
     channel = road.channels[k]
-    shown = Road(road)(observation)[0, k].numpy() * channel.scale + channel.centre
+    shown = RoadFeatures(road)(observation)[0, k].numpy() * channel.scale + channel.centre
     return [x if at is not None else None for x, at in zip(shown, channel.source, strict=True)]
 
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_mainline_blocks_stand_at_their_segments(preset):
     config = PRESETS[preset]
-    road, n = RoadChannels.of(config), config.corridor.n_mainline
+    road, n = RoadChannels.from_config(config), config.corridor.n_mainline
     observation, starts = numbered(config)
-    released = "released_flow" if config.privacy.speed == "flow" else "released_speed"
+    released = "released_flow" if preset == "private-highway" else "released_speed"
     for name in ("density", "speed_log_std", "released_density", released, "age", "queried"):
         expected = starts[name] + np.arange(n)
         np.testing.assert_allclose(raw(road, f"mainline {name}", observation), expected, rtol=1e-5)
-    assert Road(road)(observation).shape == (1, road.n_channels, n)
+    assert RoadFeatures(road)(observation).shape == (1, road.n_channels, n)
 
 
 def test_ramps_stand_where_they_join_and_fixed_sensors_with_them():
     config = PRESETS["paper-highway"]  # on-ramps at faces 3 and 9, off-ramps at 6 and 12
-    road = RoadChannels.of(config)
+    road = RoadChannels.from_config(config)
     observation, starts = numbered(config)
     on, off = (raw(road, f"{kind}-ramp density", observation) for kind in ("on", "off"))
     assert {i: round(x) - starts["density"] for i, x in enumerate(on) if x is not None} == {
@@ -59,32 +59,31 @@ def test_ramps_stand_where_they_join_and_fixed_sensors_with_them():
 
 
 def test_where_there_is_nothing_a_channel_is_zero():
-    road = RoadChannels.of(PRESETS["paper-highway"])
+    road = RoadChannels.from_config(PRESETS["paper-highway"])
     observation, _ = numbered(PRESETS["paper-highway"])
-    shown = Road(road)(observation)[0].numpy()
+    shown = RoadFeatures(road)(observation)[0].numpy()
     for k, channel in enumerate(road.channels):
         empty = np.array([at is None for at in channel.source])
         assert (shown[k, empty] == 0).all(), channel.name
 
 
-def test_what_follows_an_observation_is_not_read():
-    road = RoadChannels.of(PRESETS["paper-highway"])
-    observation, _ = numbered(PRESETS["paper-highway"])
-    longer = torch.cat([observation, torch.full((1, 30), torch.inf)], dim=1)
-    assert torch.equal(Road(road)(longer), Road(road)(observation))
+def test_an_unknown_block_has_no_channel():
+    road = RoadChannels.from_config(PRESETS["paper-highway"])
+    with pytest.raises(ValueError, match=r"observation block must be one of density, .*'colour'"):
+        road.index("colour")
 
 
-def test_a_layout_is_plain_and_says_nothing_of_what_may_change():
-    road = RoadChannels.of(PRESETS["private-highway"])
-    others = {"estimator": "ukf", "bandwidth": 3, "epsilon": 1.0, "action": "slots"}
-    assert RoadChannels.of(resolve("private-highway", others)) == road
-    assert hash(road) == hash(RoadChannels.of(PRESETS["private-highway"]))
+def test_a_layout_is_plain_and_independent_of_what_may_change():
+    road = RoadChannels.from_config(PRESETS["private-highway"])
+    changes = {"estimator": "ukf", "bandwidth": 3, "epsilon": 1.0, "action": "slots"}
+    assert RoadChannels.from_config(resolve("private-highway", changes)) == road
+    assert hash(road) == hash(RoadChannels.from_config(PRESETS["private-highway"]))
 
 
 def test_channels_of_real_observations_are_of_order_one():
     keywords = {"traffic_seeds": "0:2", "action": "slots"}
     env = gym.make("dptse_env:dptse/ShortHighway-v0", privacy="capped", **keywords)
-    road = Road(RoadChannels.of(env.unwrapped.config))
+    road = RoadFeatures(RoadChannels.from_config(env.unwrapped.config))
     env.reset(seed=0)
     env.action_space.seed(0)
     seen = [env.step(env.action_space.sample())[0] for _ in range(240)]

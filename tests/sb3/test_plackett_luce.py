@@ -55,18 +55,9 @@ def test_draws_follow_the_probabilities():
     assert chi_squared < 31.3  # 99.9 % of a chi-squared variable of 11 degrees
 
 
-def test_entropies_along_average_to_the_entropy():
-    distribution, sets = over_all(SCORES[0], 3)
-    logs, entropies = distribution.evaluate(sets)
-    exact = -(logs.exp() * logs).sum()
-    assert (logs.exp() * entropies).sum().item() == pytest.approx(exact.item(), rel=1e-12)
-    assert not torch.allclose(entropies, exact.expand_as(entropies))
-
-
-def test_uniform_scores_have_the_entropy_of_a_permutation():
+def test_uniform_scores_make_all_ordered_sets_equally_probable():
     distribution = PlackettLuce(torch.zeros(1, 6), 3)
     sets = torch.tensor([[4, 0, 2]])
-    assert distribution.entropy_along(sets).item() == pytest.approx(math.log(6 * 5 * 4), rel=1e-6)
     assert distribution.log_prob(sets).item() == pytest.approx(-math.log(6 * 5 * 4), rel=1e-6)
 
 
@@ -91,18 +82,17 @@ def test_extreme_scores_stay_finite_in_single_precision(spread):
     torch.manual_seed(1)
     for sets in (distribution.sample(), torch.tensor([[5, 1, 3, 2]]).repeat(64, 1)):
         assert (sets.sort(dim=1).values.diff(dim=1) > 0).all()
-        logs, entropies = distribution.evaluate(sets)
+        logs = distribution.log_prob(sets)
         assert logs.dtype == torch.float32
         assert torch.isfinite(logs).all()
-        assert torch.isfinite(entropies).all()
-        (gradient,) = torch.autograd.grad(logs.sum() + entropies.sum(), scores, retain_graph=True)
+        (gradient,) = torch.autograd.grad(logs.sum(), scores, retain_graph=True)
         assert torch.isfinite(gradient).all()
 
 
 def test_gradients_are_those_of_finite_differences():
     scores = SCORES.clone().requires_grad_()
     sets = torch.tensor([[1, 3], [0, 2]])
-    assert torch.autograd.gradcheck(lambda s: PlackettLuce(s, 2).evaluate(sets), scores)
+    assert torch.autograd.gradcheck(lambda s: PlackettLuce(s, 2).log_prob(sets), scores)
 
 
 def test_sampling_leaves_no_graph_behind():

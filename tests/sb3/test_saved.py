@@ -1,5 +1,7 @@
 import io
 import json
+import subprocess
+import sys
 import zipfile
 from importlib.resources import files
 
@@ -8,46 +10,22 @@ import numpy as np
 import pytest
 
 pytest.importorskip("torch")
-pytest.importorskip("stable_baselines3")
+pytest.importorskip("sb3_contrib")
 
 import torch
 from stable_baselines3.common.policies import ActorCriticPolicy
 
-from dptse_env import policies
 from dptse_env.config import resolve
 from dptse_env.parts import make_interface
 from dptse_env.sb3 import (
-    PlackettLucePolicy,
-    RoadChannels,
     SB3VecEnv,
+    TrainedOn,
     load_policy,
     save_policy,
-    saved,
     shipped_policies,
 )
-
-SHORT = "dptse_env:dptse/ShortHighway-v0"
-ABOUT = {
-    "env": SHORT,
-    "keywords": {"estimator": "ekf"},
-    "training": {"learner": "plackett-luce", "seed": 3, "steps": 100},
-    "figures": {"error": 0.1234567890123},
-}
-
-
-def make_policy(action="slots", **keywords):
-    config = resolve("short-highway", {"action": action, **keywords})
-    interface = make_interface(config)
-    spaces = interface.observations.space, interface.actions.space
-    torch.manual_seed(0)
-    if action == "slots":
-        policy = PlackettLucePolicy(*spaces, lambda _: 1.0, road=RoadChannels.of(config), width=8)
-    elif action == "sequential":
-        maskable = pytest.importorskip("sb3_contrib.common.maskable.policies")
-        policy = maskable.MaskableActorCriticPolicy(*spaces, lambda _: 1.0, net_arch=[16])
-    else:
-        policy = ActorCriticPolicy(*spaces, lambda _: 1.0, net_arch=[16])
-    return policy, config
+from dptse_env.traffic import PAPER_HIGHWAY, SHORT_HIGHWAY
+from tests.sb3.saved_files import ABOUT, SHORT, edit_card, edit_weights, make_policy
 
 
 @pytest.fixture
@@ -79,16 +57,16 @@ def test_a_loaded_policy_acts_as_the_saved_one(tmp_path, action):
     batch = np.stack([seen, seen])
     extra = {}
     if action == "sequential":
-        extra["action_masks"] = ~env.unwrapped.interface.actions.picked
+        extra["action_masks"] = ~env.unwrapped.process.pending.picked
     expected, _ = policy.predict(seen, deterministic=True, **extra)
     np.testing.assert_array_equal(loaded.predict(seen, deterministic=True)[0], expected)
     both, state = loaded.predict(batch, None, np.ones(2, bool), True)
     np.testing.assert_allclose(both, [expected, expected], atol=1e-6)
     assert state is None
     draws = []
-    for one in (policy, loaded):
+    for acting in (policy, loaded):
         torch.manual_seed(5)
-        draws.append(one.predict(seen, **(extra if one is policy else {}))[0])
+        draws.append(acting.predict(seen, **(extra if acting is policy else {}))[0])
     np.testing.assert_array_equal(*draws)
     env.step(expected)
 
@@ -116,7 +94,15 @@ def test_it_is_loaded_for_any_form_of_the_environment(stored):
         load_policy(stored, gym.make("CartPole-v1"))
 
 
-def test_the_file_is_small_and_says_what_it_is(stored):
+def test_loading_takes_no_draws(stored):
+    torch.manual_seed(0)
+    expected = torch.rand(1)
+    torch.manual_seed(0)
+    load_policy(stored, make_env())
+    assert torch.equal(torch.rand(1), expected)
+
+
+def test_the_file_is_small_and_describes_the_policy(stored):
     policy, config = make_policy()
     assert stored.stat().st_size < 100_000
     with zipfile.ZipFile(stored) as archive:
@@ -128,11 +114,14 @@ def test_the_file_is_small_and_says_what_it_is(stored):
     assert card["fits"]["corridor"] == config.corridor.digest
     assert card["fits"]["bandwidth"] == 2
     assert card["keywords"] == {"estimator": "ekf"}
+    assert card["trained_on"] == {
+        "corridor": "short-highway", "n_mainline": 6, "lanes": 2, "segment_length": 0.1,
+    }  # fmt: skip
     assert set(card["versions"]) == {"dptse-env", "stable-baselines3", "torch"}
     assert "ShortHighway-v0" in text
+    assert "short-highway (6 mainline segments of 0.1 km, 2 lanes)" in text
     assert "| error | 0.123457 |" in text
-    assert not [name for name in weights if name.startswith("critic.")]
-    assert weights.keys() == {n for n in policy.state_dict() if not n.startswith("critic.")}
+    assert weights.keys() == policy.state_dict().keys()
 
 
 def test_the_same_policy_gives_the_same_file(stored, tmp_path):
@@ -144,11 +133,19 @@ def test_the_same_policy_gives_the_same_file(stored, tmp_path):
 @pytest.mark.parametrize(
     ("keywords", "message"),
     [
-        ({"bandwidth": 3}, r"bandwidth is 2 of the policy and 3 of the environment"),
-        ({"action": "mask"}, r"action is 'slots' of the policy and 'mask' of the environment"),
-        ({"incident": "none"}, r"corridor is '\w{64}' of the policy and '\w{64}' of the env"),
-        ({"privacy": "capped"}, r"observation is '.*released_speed:6.*released_flow:6"),
-        ({"corridor": {"fixed_sensors": [5]}}, "observation is '.*fixed_speed_innovation:2"),
+        ({"bandwidth": 3}, r"bandwidth is 2 for the policy and 3 for the environment"),
+        ({"action": "mask"}, r"action is 'slots' for the policy and 'mask' for the environment"),
+        (
+            {"incident": "none"},
+            r"corridor is 'short-highway \(6 .*\), traffic (\w{8})' for the policy and "
+            r"'short-highway \(6 .*\), traffic (?!\1)\w{8}' for the environment",
+        ),
+        (
+            {"privacy": "capped"},
+            r"\['mainline released_speed'\] are of .*\['mainline released_flow'\] of the env",
+        ),
+        ({"corridor": {"fixed_sensors": [5]}}, "'off-ramp fixed_density_innovation', .* policy"),
+        ({"corridor": {"fixed_sensors": [7]}}, "observation is '.*fixed_speed_innovation:1"),
     ],
 )
 @pytest.mark.filterwarnings("ignore:privacy.preset")
@@ -159,7 +156,7 @@ def test_a_policy_that_does_not_fit_is_refused(stored, keywords, message):
 
 def test_transfer_on_purpose(stored):
     env = make_env(bandwidth=3, incident="none", estimator="random_walk", epsilon=0.3)
-    with pytest.raises(ValueError, match=r"corridor is .*allow=\('corridor',\)"):
+    with pytest.raises(ValueError, match=r"corridor is .*to transfer it on purpose, allow corr"):
         load_policy(stored, env, allow=("bandwidth",))
     policy = load_policy(stored, env, allow=("bandwidth", "corridor"))
     action, _ = policy.predict(observe(env), deterministic=True)
@@ -168,9 +165,71 @@ def test_transfer_on_purpose(stored):
         load_policy(stored, env, allow=("action",))
 
 
-def test_another_format_is_refused(stored, monkeypatch):
-    monkeypatch.setattr(saved, "VERSION", saved.VERSION + 1)
-    with pytest.raises(ValueError, match="format is 'dptse-policy-1' of the policy and 'dptse-pol"):
+def test_a_shared_network_moves_to_a_road_of_another_size(tmp_path):
+    policy, config = make_policy(preset="paper-highway")
+    path = tmp_path / "paper.zip"
+    save_policy(path, policy, config, **ABOUT)
+    env = make_env(bandwidth=5)
+    both = r"'paper-highway \(15 mainline .* and 'short-highway \(6 mainline .*allow corridor$"
+    with pytest.raises(ValueError, match=both):
+        load_policy(path, env)
+    loaded = load_policy(path, env, allow=("corridor",))
+    assert loaded.trained_on == TrainedOn.from_corridor(PAPER_HIGHWAY)
+    assert loaded.trained_on != TrainedOn.from_corridor(SHORT_HIGHWAY)
+    # The same weights, made for the short road.
+    direct, _ = make_policy(bandwidth=5)
+    direct.load_state_dict(policy.state_dict())
+    observation = observe(env)
+    np.testing.assert_array_equal(
+        loaded.predict(observation, deterministic=True)[0],
+        direct.predict(observation, deterministic=True)[0],
+    )
+    truncated = False
+    while not truncated:
+        action, _ = loaded.predict(observation)
+        observation, _, _, truncated, info = env.step(action)
+        assert info["n_dropped"] == 0
+
+
+def test_a_perceptron_stays_on_its_road(tmp_path):
+    policy, config = make_policy("scores", preset="paper-highway", bandwidth=2)
+    save_policy(tmp_path / "paper.zip", policy, config, **ABOUT)
+    env = make_env(action="scores")
+    for allow in ((), ("corridor",), ("corridor", "bandwidth")):
+        with pytest.raises(ValueError, match=r"is tied to the observation it") as refused:
+            load_policy(tmp_path / "paper.zip", env, allow=allow)
+        assert "on purpose" not in str(refused.value)  # there is no way to do it
+
+
+def test_the_shipped_policy_moves_to_the_short_road():
+    env = make_env(privacy={"preset": "capped", "cap": 64})
+    with pytest.raises(ValueError, match="allow bandwidth and corridor"):
+        load_policy("private-highway", env)
+    policy = load_policy("private-highway", env, allow=("corridor", "bandwidth"))
+    assert str(policy.trained_on) == "paper-highway (15 mainline segments of 0.1 km, 3 lanes)"
+    observation, _ = env.reset(seed=0)
+    for _ in range(30):
+        action, _ = policy.predict(observation, deterministic=True)
+        observation, _, _, _, info = env.step(action)
+        assert info["queried"].sum() == 2
+    with pytest.raises(ValueError, match=r"\['released_flow'\] are of .*\['released_speed'\]"):
+        load_policy("private-highway", make_env(), allow=("corridor", "bandwidth"))
+
+
+def test_cards_of_version_0_1_name_the_road_as_far_as_they_can(stored):
+    def former(card):
+        del card["trained_on"], card["fits"]["channels"]
+        card["fits"]["corridor"] = "0" * 64
+
+    edit_card(stored, former)
+    loaded = load_policy(stored, make_env(), allow=("corridor",))
+    assert loaded.trained_on == TrainedOn("short-highway", 6, None, None)
+    assert str(loaded.trained_on) == "short-highway (6 mainline segments)"
+
+
+def test_another_format_is_refused(stored):
+    edit_card(stored, lambda card: card["fits"].update(format="dptse-policy-2"))
+    with pytest.raises(ValueError, match="format is 'dptse-policy-2' for the policy and 'dptse-p"):
         load_policy(stored, make_env())
 
 
@@ -180,28 +239,109 @@ def test_files_that_are_not_there_or_damaged(stored, tmp_path):
     content = stored.read_bytes()
     for damaged in (b"", b"text", content[: len(content) // 2]):
         stored.write_bytes(damaged)
-        with pytest.raises(ValueError, match="is no saved policy, or damaged"):
+        with pytest.raises(ValueError, match="is not a saved policy, or damaged"):
             load_policy(stored, make_env())
 
 
-def rewritten(path, **entries):
-    with zipfile.ZipFile(path) as archive:
-        kept = {name: archive.read(name) for name in archive.namelist()}
-    with zipfile.ZipFile(path, "w") as archive:
-        for name, content in {**kept, **entries}.items():
-            archive.writestr(name, content)
+@pytest.mark.parametrize(
+    ("action", "change", "message"),
+    [
+        ("slots", lambda w: w.update({"scorer.rule": print}), "more than .*tensors .*print"),
+        ("slots", lambda w: w.clear(), r"must have 1\.\.256 tensors of weights, got 0"),
+        ("slots", lambda w: w.pop("scorer.rule"), r"lacks weights 'scorer\.rule'"),
+        ("slots", lambda w: w.update(extra=torch.zeros(2)), "unknown weights 'extra'"),
+        ("slots", lambda w: w.update({"critic.share.0.bias": torch.zeros(2)}), "unknown weights"),
+        ("slots", lambda w: w["scorer.rule"].fill_(torch.nan), "'scorer.rule' must be finite"),
+        ("mask", lambda w: w["action_net.bias"].fill_(torch.inf), "must be finite"),
+        ("slots", lambda w: w.update({"scorer.rule": w["scorer.rule"].double()}), "DoubleStorage"),
+        ("slots", lambda w: w.update({"scorer.rule": torch.zeros(4)}), r"shape \(3,\), got \(4,\)"),
+        (
+            "slots",
+            lambda w: w.update({"scorer.trunk.whole.weight": torch.zeros(8, 8).t()}),
+            "must be contiguous",
+        ),
+        (
+            "scores",
+            lambda w: w.update({"action_net.weight": torch.zeros(1, 1).expand(6, 16)}),
+            "must be contiguous",
+        ),
+        ("sequential", lambda w: w.pop("value_net.bias"), "lacks weights 'value_net.bias'"),
+        ("mask", lambda w: w.update(log_std=torch.zeros(6)), "unknown weights 'log_std'"),
+    ],
+)  # fmt: skip
+def test_weights_other_than_those_of_the_network_are_refused(tmp_path, action, change, message):
+    policy, config = make_policy(action)
+    path = tmp_path / "one.zip"
+    save_policy(path, policy, config, **ABOUT)
+    edit_weights(path, change)
+    with pytest.raises(ValueError, match=message) as refused:
+        load_policy(path, make_env(action=action))
+    assert "one.zip" in str(refused.value)
+    assert "\n" not in str(refused.value)
 
 
-def test_weights_that_run_code_or_are_missing(stored):
-    evil, empty = io.BytesIO(), io.BytesIO()
-    torch.save({"scorer.rule": print}, evil)
-    torch.save({}, empty)
-    rewritten(stored, **{"weights.pt": evil.getvalue()})
-    with pytest.raises(ValueError, match="holds more than weights and is not loaded"):
-        load_policy(stored, make_env())
-    rewritten(stored, **{"weights.pt": empty.getvalue()})
-    with pytest.raises(ValueError, match=r"lacks weights: .*scorer\.rule"):
-        load_policy(stored, make_env())
+@pytest.mark.parametrize(
+    ("action", "change", "message"),
+    [
+        ("slots", lambda c: c.pop("fits"), "field 'fits' of type dict"),
+        ("slots", lambda c: c["fits"].update(bandwidth="2"), r"'fits\.bandwidth' of type int"),
+        ("slots", lambda c: c["fits"].update(bandwidth=True), r"'fits\.bandwidth' of type int"),
+        ("slots", lambda c: c["fits"].update(action="x" * 3000), "more than 2000 characters"),
+        ("slots", lambda c: c["fits"].update(channels=7), "'fits.channels' .* a list of names"),
+        ("slots", lambda c: c["fits"]["channels"].append("colour"), r"\['colour'\] are of"),
+        ("slots", lambda c: c["policy"].update({"class": "Oracle"}), "must be one of .*'Oracle'"),
+        ("slots", lambda c: c["policy"].update({"class": "ActorCriticPolicy"}), "must be net_arch"),
+        ("slots", lambda c: _arguments(c).update(width=12_000), r"\(12000, 23, 5\), got \(8, 23"),
+        ("slots", lambda c: _arguments(c).update(width=10**30), r"width must be .* in 1\.\.100000"),
+        ("slots", lambda c: _arguments(c).update(width=-1), r"width must be an integer in 1\.\."),
+        ("slots", lambda c: _arguments(c).update(width=8.0), r"width must be an integer in 1\.\."),
+        ("slots", lambda c: _arguments(c).update(depth=3), "arguments must be rule, width"),
+        ("slots", lambda c: _arguments(c).update(rule=[1]), "rule must be a mapping"),
+        ("slots", lambda c: _arguments(c).update(rule={"colour": 1}), "must be one of .*'colour'"),
+        ("slots", lambda c: _arguments(c).update(rule={"age": 10**400}), "must be a number up to"),
+        ("slots", lambda c: _arguments(c).update(rule={"age": "7"}), "must be a number up to"),
+        ("slots", lambda c: c.update(trained_on={"corridor": 3}), "does not describe the road"),
+        ("mask", lambda c: _arguments(c).update(net_arch=[12_000] * 3), "lacks weights"),
+        ("mask", lambda c: _arguments(c).update(net_arch=[12_000]), r"\(12000, \d+\), got \(16, "),
+        ("mask", lambda c: _arguments(c).update(net_arch=[0]), r"an integer in 1\.\.100000, got 0"),
+        ("mask", lambda c: _arguments(c).update(net_arch="deep"), "net_arch must have lists"),
+        ("mask", lambda c: _arguments(c).update(net_arch={"qf": [1]}), "net_arch must have pi and"),
+        (
+            "mask",
+            lambda c: c["policy"].update({"class": "MaskableActorCriticPolicy"}),
+            "acts by action encoding 'sequential', got 'mask'",
+        ),
+    ],
+)  # fmt: skip
+def test_damaged_cards_are_refused(tmp_path, action, change, message):
+    policy, config = make_policy(action)
+    path = tmp_path / "one.zip"
+    save_policy(path, policy, config, **ABOUT)
+    edit_card(path, change)
+    with pytest.raises(ValueError, match=message) as refused:
+        load_policy(path, make_env(action=action))
+    assert "one.zip" in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def _arguments(card):
+    return card["policy"]["arguments"]
+
+
+@pytest.mark.parametrize("net_arch", [[], [8, 4], {"pi": [8], "vf": [4, 4]}, {"pi": [3]}])
+@pytest.mark.parametrize("action", ["scores", "mask"])
+def test_perceptrons_of_all_shapes_are_loaded(tmp_path, action, net_arch):
+    config = resolve("short-highway", {"action": action})
+    interface = make_interface(config)
+    spaces = interface.observations.space, interface.actions.space
+    policy = ActorCriticPolicy(*spaces, lambda _: 1.0, net_arch=net_arch)
+    save_policy(tmp_path / "one.zip", policy, config, **ABOUT)
+    env = make_env(action=action)
+    seen = observe(env)
+    np.testing.assert_array_equal(
+        load_policy(tmp_path / "one.zip", env).predict(seen, deterministic=True)[0],
+        policy.predict(seen, deterministic=True)[0],
+    )
 
 
 def test_a_full_disk_leaves_the_old_file(stored, monkeypatch):
@@ -225,16 +365,34 @@ def test_what_cannot_be_saved(tmp_path):
         save_policy(tmp_path / "one.pt", policy, config, **ABOUT)
     with pytest.raises(ValueError, match="policy must be one of PlackettLucePolicy"):
         save_policy(tmp_path / "one.zip", torch.nn.Linear(1, 1), config, **ABOUT)
+    with torch.no_grad():
+        policy.scorer.rule[0] = torch.nan
+    with pytest.raises(ValueError, match=r"cannot be saved: .*'scorer.rule' must be finite"):
+        save_policy(tmp_path / "one.zip", policy, config, **ABOUT)
+    long = {**ABOUT, "figures": {"notes": "x" * 70_000}}
+    with pytest.raises(ValueError, match=r"cannot be saved: .* more than 65536 bytes"):
+        save_policy(tmp_path / "one.zip", make_policy()[0], config, **long)
+    assert not list(tmp_path.iterdir())
 
 
-def test_shipped_policies_are_loaded_by_name(stored, tmp_path, monkeypatch):
-    folder = tmp_path / "policies"
-    folder.mkdir()
-    (folder / "short.zip").write_bytes(stored.read_bytes())
-    monkeypatch.setattr(policies, "files", lambda package: tmp_path)
-    assert shipped_policies() == ["short"]
-    assert load_policy("short", make_env()).card["training"]["seed"] == 3
-    with pytest.raises(FileNotFoundError, match=r"that come with the package \(short\)"):
+def test_perceptrons_with_parts_that_a_card_cannot_describe_are_not_saved(tmp_path):
+    config = resolve("short-highway", {"action": "scores"})
+    interface = make_interface(config)
+    spaces = interface.observations.space, interface.actions.space
+    policy = ActorCriticPolicy(*spaces, lambda _: 1.0, activation_fn=torch.nn.ReLU)
+    with pytest.raises(ValueError, match="must have Tanh units, got ReLU"):
+        save_policy(tmp_path / "one.zip", policy, config, **ABOUT)
+    policy = ActorCriticPolicy(*spaces, lambda _: 1.0, use_sde=True, net_arch=[8])
+    with pytest.raises(ValueError, match="cannot be saved: weight 'log_std' must have shape"):
+        save_policy(tmp_path / "one.zip", policy, config, **ABOUT)
+
+
+def test_shipped_policies_are_loaded_by_name_whatever_files_there_are(stored, monkeypatch):
+    stored.rename(stored.parent / "private-highway")
+    monkeypatch.chdir(stored.parent)
+    env = gym.make("dptse_env:dptse/PrivateHighway-v0", action="slots")
+    assert load_policy("private-highway", env).card["env"] == "dptse_env:dptse/PrivateHighway-v0"
+    with pytest.raises(FileNotFoundError, match=r"come with the package \(private-highway"):
         load_policy("long", make_env())
 
 
@@ -261,3 +419,26 @@ def test_shipped_policies_act_where_they_were_trained(name):
 
 def test_a_policy_comes_with_the_package():
     assert "private-highway" in shipped_policies()
+
+
+WITHOUT = """
+import sys
+
+class Missing:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] == {missing!r}:
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+
+sys.meta_path.insert(0, Missing())
+try:
+    import dptse_env.sb3
+except ImportError as problem:
+    print(problem)
+"""
+
+
+@pytest.mark.parametrize("missing", ["torch", "stable_baselines3"])
+def test_the_extra_is_named_where_it_is_missing(missing):
+    code = WITHOUT.format(missing=missing)
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert f"{missing} is not installed: pip install 'dptse-env[train]'" in run.stdout

@@ -120,7 +120,7 @@ def test_privacy_is_the_environments_own_unless_given():
 def test_policies_that_do_not_fit_or_share_a_name_are_refused(tmp_path):
     path = str(save(tmp_path / "run" / "best.zip", bandwidth=3))
     arguments = Args(env=SHORT, policies=(path,), seeds="2000:2002", output=tmp_path / "out")
-    with pytest.raises(ValueError, match="bandwidth is 3 of the policy and 2 of the environment"):
+    with pytest.raises(ValueError, match="bandwidth is 3 for the policy and 2 for the environment"):
         main(arguments)
     with pytest.raises(ValueError, match="'run/best' is there twice"):
         main(dataclasses.replace(arguments, policies=(path, path)))

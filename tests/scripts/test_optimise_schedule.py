@@ -9,7 +9,7 @@ SHORT = "dptse_env:dptse/ShortHighway-v0"
 
 
 def arguments(folder, **changes):
-    keywords = {"kind": "offline", "period": 2, "rounds": 2, "neighbours": 3, **changes}
+    keywords = {"kind": "optimised-plan", "period": 2, "rounds": 2, "neighbours": 3, **changes}
     return Args(env=SHORT, estimator="random_walk", seeds="0:4", output=folder, **keywords)
 
 

@@ -28,7 +28,7 @@ def arguments(folder, **changes):
         **{
             "policies": (f"primary={folder}/runs",),
             "cells": ("primary", "moved"),
-            "baselines": ("paper", "oldest-first", "offline"),
+            "baselines": ("paper", "oldest-first", "optimised-plan"),
             "validation_seeds": "1000:1002",
             "test_seeds": "2000:2002",
             "workers": 1,

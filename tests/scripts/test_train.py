@@ -13,34 +13,41 @@ pytest.importorskip("tyro")
 
 import tyro
 
-from agents.training import board
-from agents.training.board import Board
-from agents.training.folder import read_progress
 from agents.training.recipes import RECIPES, MaskablePPORecipe
+from agents.training.run_files import read_progress
+from agents.training.tensorboard_writer import make_tensorboard_writer
 from scripts import train
 from scripts.train import Args, make_plan
 
 ROOT = Path(__file__).parents[2]
 SMALL = [
     "--env", "dptse_env:dptse/ShortHighway-v0", "--traffic", "0:2", "--validation", "1000:1002",
-    "--keywords", '{"horizon": 64}', "--steps", "240", "--validate-every", "3",
-    "--checkpoint-every", "2", "--no-tensorboard", "recipe:plackett-luce",
-    "--recipe.n-envs", "4", "--recipe.twins", "2", "--recipe.n-steps", "10",
-    "--recipe.batch-size", "20", "--recipe.width", "8", "--recipe.pretraining-rounds", "1",
-    "--recipe.pretraining-seconds", "6", "--recipe.pretraining-batches", "2",
-    "--recipe.swaps.rounds", "1", "--recipe.swaps.episodes", "2", "--recipe.swaps.seconds", "8",
+    "--keywords", '{"horizon": 64}', "--no-tensorboard",
+]  # fmt: skip
+ROUNDS = [
+    "recipe:plackett-luce", "--recipe.n-envs", "4", "--recipe.replicas", "2", "--recipe.width", "8",
+    "--recipe.regression.rounds", "1", "--recipe.regression.seconds", "6",
+    "--recipe.regression.batches", "2", "--recipe.swaps.rounds", "2",
+    "--recipe.swaps.episodes", "2", "--recipe.swaps.seconds", "8",
     "--recipe.swaps.trials", "1", "--recipe.swaps.batches", "2",
 ]  # fmt: skip
+PPO = [
+    "--steps", "240", "--validate-every", "3", "--checkpoint-every", "2", "recipe:scores",
+    "--recipe.n-envs", "4", "--recipe.replicas", "2", "--recipe.n-steps", "10",
+    "--recipe.batch-size", "20", "--recipe.hidden", "8",
+]  # fmt: skip
+STEPS = 24 + 2 * (2 * 64 * 5)
+"""Of the regression and of two rounds of swaps."""
 
 
 def arguments(output, *more):
-    return tyro.cli(Args, args=["--output", str(output), *more, *SMALL])
+    return tyro.cli(Args, args=["--output", str(output), *more, *SMALL, *ROUNDS])
 
 
-def test_it_trains_and_goes_on(tmp_path, capsys):
+def test_it_trains_and_continues(tmp_path, capsys):
     train.main(arguments(tmp_path))
     assert "error in validation 0." in capsys.readouterr().out
-    assert read_progress(tmp_path)[-1]["steps"] == 24 + 2 * 64 * 5 + 240
+    assert read_progress(tmp_path)[-1]["steps"] == STEPS
     before = (tmp_path / "policy.zip").read_bytes()
     train.main(arguments(tmp_path))
     assert (tmp_path / "policy.zip").read_bytes() == before
@@ -48,27 +55,33 @@ def test_it_trains_and_goes_on(tmp_path, capsys):
         train.main(arguments(tmp_path, "--seed", "1"))
 
 
-def test_ctrl_c_says_that_one_can_go_on(tmp_path, monkeypatch, capsys):
-    def interrupted(*_args, **_keywords):
-        raise KeyboardInterrupt
+def test_ctrl_c_leaves_a_training_to_continue(tmp_path, monkeypatch, capsys):
+    replace, written = Path.replace, []
 
-    own = arguments(tmp_path)
-    monkeypatch.setattr("agents.training.training.swap_round", interrupted)
-    with pytest.raises(SystemExit) as ended:
-        train.main(own)
+    def interrupted(path, target):
+        written.append(target.name)
+        if written.count("checkpoint.pt") == 2:
+            raise KeyboardInterrupt
+        return replace(path, target)
+
+    args = arguments(tmp_path)
+    with monkeypatch.context() as patch:
+        patch.setattr("pathlib.Path.replace", interrupted)
+        with pytest.raises(SystemExit) as ended:
+            train.main(args)
     assert ended.value.code == 130
     assert "the same command goes on" in capsys.readouterr().err
-    monkeypatch.undo()
-    train.main(own)
-    assert read_progress(tmp_path)[-1]["steps"] == 24 + 2 * 64 * 5 + 240
+    train.main(args)
+    assert read_progress(tmp_path)[-1]["steps"] == STEPS
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
-def test_a_killed_program_goes_on_to_the_same_curve(tmp_path, how):
+@pytest.mark.parametrize(("recipe", "n_rows"), [(ROUNDS, 3), (PPO, 7)])
+def test_a_killed_program_continues_to_the_same_curve(tmp_path, how, recipe, n_rows):
     def start(output):
         return subprocess.Popen(
-            [sys.executable, "scripts/train.py", "--output", str(output), *SMALL],
+            [sys.executable, "scripts/train.py", "--output", str(output), *SMALL, *recipe],
             cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, stdout=subprocess.PIPE,
             stderr=subprocess.PIPE, text=True,
         )  # fmt: skip
@@ -91,15 +104,22 @@ def test_a_killed_program_goes_on_to_the_same_curve(tmp_path, how):
         for run in ("killed", "whole")
     ]
     assert curves[0] == curves[1]
-    assert len(curves[0]) == 8
+    assert len(curves[0]) == n_rows
 
 
 def test_every_recipe_is_on_the_command_line():
     for name, recipe in RECIPES.items():
-        args = tyro.cli(Args, args=[f"recipe:{name}", "--recipe.gamma", "0.9"])
+        args = tyro.cli(Args, args=[f"recipe:{name}", "--recipe.n-envs", "8"])
         assert isinstance(args.recipe, recipe)
-        assert args.recipe.gamma == 0.9
+        assert args.recipe.n_envs == 8
     assert tyro.cli(Args, args=[]).recipe == RECIPES["plackett-luce"]()
+
+
+def test_former_names_of_options_are_kept():
+    former = ["--recipe.twins", "2", "--recipe.pretraining-rounds", "1", "--recipe.sharpness", "3"]
+    recipe = tyro.cli(Args, args=["recipe:plackett-luce", *former]).recipe
+    assert (recipe.replicas, recipe.regression.rounds, recipe.regression.sharpness) == (2, 1, 3.0)
+    assert tyro.cli(Args, args=["recipe:mask", "--recipe.twins", "8"]).recipe.replicas == 8
 
 
 def test_arguments_become_the_plan():
@@ -119,19 +139,19 @@ def test_keywords_must_be_an_object(text):
         make_plan(Args(keywords=text))
 
 
-def test_tensorboard_is_optional_and_its_absence_is_said(tmp_path, monkeypatch, caplog):
-    monkeypatch.setattr(board.importlib.util, "find_spec", lambda name: None)
+def test_tensorboard_is_optional_and_its_absence_is_logged(tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with caplog.at_level("INFO"):
-        assert Board.open(tmp_path) is None
+        assert make_tensorboard_writer(tmp_path) is None
     assert "TensorBoard is not installed" in caplog.text
 
 
 def test_rows_reach_tensorboard(tmp_path):
     pytest.importorskip("tensorboard")
-    written = Board.open(tmp_path)
+    writer = make_tensorboard_writer(tmp_path)
     assert list(tmp_path.iterdir()) == []
-    written({"update": 1, "steps": 40, "error": 0.5})
-    written.close()
+    writer({"update": 1, "steps": 40, "error": 0.5})
+    writer.close()
     assert list(tmp_path.glob("events*"))
 
 
@@ -142,12 +162,12 @@ def test_the_commit_is_known_or_none(monkeypatch):
     def missing(*args, **keywords):
         raise FileNotFoundError
 
-    monkeypatch.setattr(train.subprocess, "run", missing)
+    monkeypatch.setattr("subprocess.run", missing)
     assert train.commit() is None
 
 
-def test_the_folder_says_what_was_trained(tmp_path):
+def test_the_folder_describes_the_training(tmp_path):
     train.main(arguments(tmp_path))
-    said = json.loads((tmp_path / "run.json").read_text())
-    assert said["commit"] == train.commit()
-    assert said["made_with"]["keywords"] == {"horizon": 64}
+    record = json.loads((tmp_path / "run.json").read_text())
+    assert record["commit"] == train.commit()
+    assert record["made_with"]["keywords"] == {"horizon": 64}

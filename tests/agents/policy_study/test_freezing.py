@@ -63,10 +63,10 @@ def test_a_policy_that_was_changed_after_freezing_is_refused(tmp_path):
 def test_a_draft_says_who_suits_and_tries_every_policy(runs):
     manifest = draft(SMALL, checkpoints(runs), (), "command")
     assert manifest.ladder["primary"] == ("paper", "oldest-first")
-    assert "no plan 'offline' ships for" in manifest.unsuited["primary"]["offline"]
+    assert "no plan 'offline' ships for" in manifest.unsuited["primary"]["optimised-plan"]
     assert manifest.bounds == {"primary": ("oracle-error",), "other": (), "moved": ()}
     stranger = find_checkpoints((f"primary={runs}/other",), SMALL)
-    with pytest.raises(ValueError, match="bandwidth is 3 of the policy and 2"):
+    with pytest.raises(ValueError, match="bandwidth is 3 for the policy and 2"):
         draft(SMALL, stranger, (), "command")
 
 

@@ -27,7 +27,7 @@ SMALL = Design(
         Cell("other", "three a second", SHORT, {**WALK, "bandwidth": 3}, bounds=()),
         Cell("moved", "no incident", SHORT, {**WALK, "incident": "none"}, ("primary",), ()),
     ),
-    baselines=("paper", "oldest-first", "offline"),
+    baselines=("paper", "oldest-first", "optimised-plan"),
     validation_seeds=(1000, 1001),
     test_seeds=(2000, 2001),
 )
@@ -71,7 +71,7 @@ def made_up(runs_below=(10.0,) * 5, n_seeds=64, *, spread=0.0, elsewhere=12.0, a
         plain(design), "python scripts/policy_study.py freeze", tuple(files),
         (Tuned("paper", "ekf", "paper", "paper", {}),), ladder,
         {"primary": ("oracle-error",), "other": (), "moved": ()},
-        {"primary": {"offline": "no plan"}},
+        {"primary": {"optimised-plan": "no plan"}},
         {
             "primary": Choice("oldest-first", {"primary": chosen}, errors),
             "other": Choice("oldest-first", {"other": chosen}, errors),

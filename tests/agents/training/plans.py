@@ -1,24 +1,29 @@
-"""Trainings of a few seconds, and what stops them."""
+"""Trainings of a few seconds, and a watcher that stops them."""
 
 from agents.training.plan import TrainingPlan
-from agents.training.recipes import RECIPES, SwapRounds
+from agents.training.recipes import RECIPES, PlackettLuceRecipe, RegressionRounds, SwapRounds
 
-SMALL = {"n_envs": 4, "twins": 2, "n_steps": 10, "batch_size": 20, "n_epochs": 2}
-PRETRAINING = {"pretraining_rounds": 1, "pretraining_seconds": 9, "pretraining_batches": 3}
-NO_SWAPS = SwapRounds(rounds=0)
+SMALL = {"n_envs": 4, "replicas": 2}
+SMALL_PPO = {**SMALL, "n_steps": 10, "batch_size": 20, "n_epochs": 2, "hidden": (8,)}
+REGRESSION = RegressionRounds(rounds=1, seconds=9, batches=3)
+# Steps and rates are large, so that every round acts otherwise than the one before.
+FEW_SWAPS = SwapRounds(
+    rounds=2, episodes=3, seconds=5, trials=2, batches=20, batch_size=16, rate=0.05
+)
 
 
-def make_plan(learner="plackett-luce", steps=240, **changes):
-    extra = (
-        {**PRETRAINING, "swaps": NO_SWAPS, "width": 8}
-        if learner == "plackett-luce"
-        else {"hidden": (8,)}
-    )
+def make_recipe(learner):
+    if learner == "plackett-luce":
+        return PlackettLuceRecipe(**SMALL, regression=REGRESSION, swaps=FEW_SWAPS, width=8)
+    return RECIPES[learner](**SMALL_PPO)
+
+
+def make_plan(learner="plackett-luce", **changes):
     values = {
         "env": "dptse_env:dptse/ShortHighway-v0",
-        "recipe": RECIPES[learner](**{**SMALL, **extra}),
+        "recipe": make_recipe(learner),
         "seed": 1,
-        "steps": steps,
+        "steps": 0 if learner == "plackett-luce" else 240,
         "traffic_seeds": (0, 1, 2),
         "validation_seeds": (1000, 1001),
         "keywords": {"horizon": 80, "privacy": "capped"},

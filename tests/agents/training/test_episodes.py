@@ -11,19 +11,16 @@ from dptse_env.spaces.actions import ACTION_ENCODINGS
 HORIZON = 20
 
 
-def make(num_envs=4, seed=3, twins=1, reward_scale=1.0, shows_errors=False, **keywords):
+def make(num_envs=4, seed=3, replicas=1, reward_scale=1.0, **keywords):
     keywords = {"traffic_seeds": "0:3", "horizon": HORIZON, "random_start": True, **keywords}
     env = gym.make_vec(
         "dptse_env:dptse/ShortHighway-v0",
         num_envs=num_envs,
         autoreset_mode="SameStep",
         privacy="capped",
-        truth_in_info=shows_errors,
         **keywords,
     )
-    return TrainingEpisodes(
-        SB3VecEnv(env), seed, twins=twins, reward_scale=reward_scale, shows_errors=shows_errors
-    )
+    return TrainingEpisodes(SB3VecEnv(env), seed, replicas=replicas, reward_scale=reward_scale)
 
 
 def play(episodes, steps, generator):
@@ -45,7 +42,7 @@ def assert_same(first, second):
                 )
 
 
-def test_episodes_are_spread_over_time_and_then_whole():
+def test_episodes_are_spread_over_time_and_then_complete():
     episodes = make()
     episodes.reset()
     transitions = play(episodes, 3 * HORIZON, np.random.default_rng(0))
@@ -64,13 +61,12 @@ def test_episodes_are_spread_over_time_and_then_whole():
 
 @pytest.mark.parametrize("steps", [0, 1, 7, 20, 33, 60, 65])
 @pytest.mark.parametrize("action", ACTION_ENCODINGS)
-def test_a_kept_state_is_gone_on_from_to_the_same_bits(action, steps):
-    keywords = {"action": action, "shows_errors": steps == 33}
-    episodes = make(**keywords)
+def test_a_kept_state_is_continued_to_the_same_bits(action, steps):
+    episodes = make(action=action)
     episodes.reset()
     seen = play(episodes, steps, np.random.default_rng(0))
     state = {key: value.copy() for key, value in episodes.state().items()}
-    other = make(**keywords)
+    other = make(action=action)
     observation = other.restore(state)
     if seen:
         np.testing.assert_array_equal(observation, seen[-1][0])
@@ -91,8 +87,8 @@ def make_reset(seed, **keywords):
     return episodes
 
 
-def test_twins_meet_the_same_traffic_and_noise():
-    episodes = make(num_envs=6, twins=3, action="slots")
+def test_replicas_meet_the_same_traffic_and_noise():
+    episodes = make(num_envs=6, replicas=3, action="slots")
     episodes.reset()
     same = np.tile([[0, 3]], (6, 1))
     for _ in range(2 * HORIZON + 3):
@@ -107,8 +103,8 @@ def test_twins_meet_the_same_traffic_and_noise():
     assert rewards[0] == rewards[2] != rewards[1]
 
 
-def test_recentred_advantages_are_compared_with_the_twins():
-    episodes = make(num_envs=4, twins=2)
+def test_recentred_advantages_are_compared_with_the_replicas():
+    episodes = make(num_envs=4, replicas=2)
     advantages = np.arange(8, dtype=np.float32).reshape(2, 4) ** 2
     episodes.recentre(advantages)
     assert advantages.tolist() == [[-1, 1, -5, 5], [-9, 9, -13, 13]]
@@ -136,50 +132,6 @@ def test_the_mean_is_that_of_a_second_where_a_decision_takes_several_actions():
     assert episodes.take_mean_reward() == pytest.approx(rewards[2::3].mean(), rel=1e-5)
 
 
-def test_errors_are_shown_behind_the_observation():
-    episodes = make(shows_errors=True, action="slots")
-    plain = make(action="slots")
-    first, second = episodes.reset(), plain.reset()
-    size = second.shape[1]
-    assert episodes.observation_space.shape == (size + 12,)
-    np.testing.assert_array_equal(first[:, :size], second)
-    process = episodes.env.process
-    generators = np.random.default_rng(0), np.random.default_rng(0)
-    for one, other in zip(
-        play(episodes, HORIZON - 6, generators[0]), play(plain, HORIZON - 6, generators[1]),
-        strict=True,
-    ):  # fmt: skip
-        np.testing.assert_array_equal(one[0][:, :size], other[0])
-        assert np.isfinite(one[0]).all()
-    truth, config = process.truth(np.arange(4)), episodes.env.config
-    density = (process.estimate.density - truth[..., 0])[:, :6] / config.corridor.density_scale
-    np.testing.assert_allclose(one[0][:, size : size + 6], density / 0.1, atol=1e-4)
-    empty = truth[:, :6, 0] == 0
-    assert (one[0][:, size + 6 :][empty] == 0).all()
-    assert (one[0][:, size + 6 :][~empty] != 0).all()
-
-
-def test_the_end_of_an_episode_is_shown_with_the_errors_of_then():
-    episodes = make(shows_errors=True, action="slots", num_envs=2)
-    episodes.reset()
-    actions = np.zeros((2, 2), dtype=np.int64)
-    for k in range(HORIZON):
-        *_, dones, infos = episodes.step(actions)
-        for episode in np.flatnonzero(dones):
-            ended = infos[episode]["terminal_observation"]
-            assert ended.shape == episodes.observation_space.shape
-            if k == HORIZON - 1:
-                truth = infos[episode]["truth"]
-                scale = episodes.env.config.corridor.density_scale
-                errors = ended[:6] - truth["density"][:6] / scale
-                size = len(ended) - 12
-                np.testing.assert_allclose(ended[size : size + 6], errors / 0.1, atol=1e-5)
-    assert dones[0]
-
-
-def test_what_is_refused():
-    with pytest.raises(ValueError, match="multiple of twins 3, got 4 episodes"):
-        make(twins=3)
-    plain = make().venv
-    with pytest.raises(ValueError, match=r"shows_errors needs .* truth_in_info=True"):
-        TrainingEpisodes(plain, 0, shows_errors=True)
+def test_a_number_of_episodes_that_replicas_do_not_divide_is_refused():
+    with pytest.raises(ValueError, match="multiple of replicas 3, got 4"):
+        make(replicas=3)

@@ -1,5 +1,7 @@
 """A trained policy sees nothing of the true traffic; see `tests.test_non_interference`."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -11,10 +13,9 @@ from agents.training.plan import TrainingPlan
 from agents.training.recipes import RECIPES, SwapRounds
 from agents.training.training import POLICY, Training
 from dptse_env.sb3 import load_policy
+from tests.agents.training.plans import make_recipe
 from tests.test_non_interference import START, blind, make_private, public, same
 
-SMALL = {"n_envs": 4, "twins": 2, "n_steps": 10, "batch_size": 20, "n_epochs": 1}
-PRETRAINING = {"pretraining_rounds": 1, "pretraining_seconds": 5, "pretraining_batches": 2}
 SWAPS = SwapRounds(rounds=1, episodes=2, seconds=5, trials=1, batches=2, batch_size=8)
 
 
@@ -22,16 +23,14 @@ SWAPS = SwapRounds(rounds=1, episodes=2, seconds=5, trials=1, batches=2, batch_s
 def trained(request, tmp_path_factory):
     """A policy of every learner, trained a little with the truth at hand."""
     learner = request.param
-    extra = (
-        {**PRETRAINING, "swaps": SWAPS, "width": 8}
-        if learner == "plackett-luce"
-        else {"hidden": (8,)}
-    )
+    recipe = make_recipe(learner)
+    if learner == "plackett-luce":
+        recipe = dataclasses.replace(recipe, swaps=SWAPS)
     plan = TrainingPlan(
         env="dptse_env:dptse/PrivateHighway-v0",
-        recipe=RECIPES[learner](**{**SMALL, **extra}),
+        recipe=recipe,
         seed=0,
-        steps=80,
+        steps=0 if learner == "plackett-luce" else 80,
         traffic_seeds=(0, 1),
         validation_seeds=(1000,),
         keywords={"horizon": 70},
@@ -72,7 +71,7 @@ def test_a_policy_that_sees_the_truth_would_show(trained):
     def knowing(observation, deterministic):
         density = env.unwrapped.process.truth(np.array([0]))[:, :15, 0]
         crowded = density.argsort(axis=1).argsort(axis=1) >= 15 - interface.bandwidth
-        return interface.actions.encode(crowded, interface.actions.picked)[0], None
+        return interface.actions.encode(crowded, env.unwrapped.process.pending.picked)[0], None
 
     policy.predict = knowing
     assert not same(transcript(env, 0, policy, False), transcript(env, 1, policy, False))

@@ -3,45 +3,33 @@ import dataclasses
 import pytest
 
 pytest.importorskip("sb3_contrib")
-pytest.importorskip("yaml")
+pytest.importorskip("tyro")
 
-import yaml
-
-from agents.training.recipes import RECIPES, PlackettLuceRecipe, SwapRounds
-from agents.training.yaml import ENV, FOLDER, to_yaml
-from dptse_env.config import PRESETS
+from agents.training.recipes import (
+    RECIPES,
+    PlackettLuceRecipe,
+    RegressionRounds,
+    ScoresRecipe,
+    SwapRounds,
+)
 from dptse_env.spaces.actions import ACTION_ENCODINGS
-
-
-@pytest.mark.parametrize("name", RECIPES)
-def test_the_yaml_beside_is_the_recipe(name):
-    recipe = RECIPES[name]()
-    text = (FOLDER / f"{name}.yml").read_text()
-    assert text == to_yaml(recipe), "run python -m agents.training.yaml"
-    values = yaml.safe_load(text)[ENV]
-    for key in ("n_envs", "n_steps", "batch_size", "n_epochs", "target_kl", "clip_range"):
-        assert values[key] == getattr(recipe, key)
-    assert values["gamma"] ** recipe.picks == pytest.approx(recipe.gamma, abs=1e-5)
-    keywords = eval(values["policy_kwargs"])
-    assert keywords.pop("road", "private-highway") == "private-highway"
-    assert keywords == recipe.policy_keywords()
-
-
-def test_there_is_no_other_yaml():
-    assert {path.stem for path in FOLDER.glob("*.yml")} == set(RECIPES)
 
 
 @pytest.mark.parametrize("recipe", RECIPES.values())
 def test_recipes_are_sound(recipe):
     assert recipe.action in ACTION_ENCODINGS
-    assert recipe().n_envs % recipe().twins == 0
-    assert recipe().steps_per_update % recipe().batch_size == 0
-    encoding = ACTION_ENCODINGS[recipe.action](15, PRESETS["private-highway"].bandwidth)
-    assert recipe.picks == encoding.actions_per_step
+    assert recipe().n_envs % recipe().replicas == 0
+    recipe().check_steps(recipe.default_steps)
+
+
+@pytest.mark.parametrize("name", ["maskable", "scores", "mask"])
+def test_minibatches_divide_an_update(name):
+    recipe = RECIPES[name]()
+    assert recipe.steps_per_update % recipe.batch_size == 0
 
 
 def test_the_learning_rate_falls_to_its_end():
-    schedule = PlackettLuceRecipe(learning_rate=3e-3, final_learning_rate=1e-3).schedule()
+    schedule = ScoresRecipe(learning_rate=3e-3, final_learning_rate=1e-3).schedule()
     assert [schedule(left) for left in (1.0, 0.5, 0.0)] == pytest.approx([3e-3, 2e-3, 1e-3])
 
 
@@ -53,12 +41,12 @@ def test_the_learning_rate_falls_to_its_end():
         ("gamma", 1.0, r"recipe\.gamma must be in \(0, 1\), got 1\.0"),
         ("learning_rate", 0.0, r"recipe\.learning_rate must be > 0"),
         ("ent_coef", -0.1, r"recipe\.ent_coef must be >= 0"),
-        ("twins", 3, r"recipe\.n_envs must be a multiple of twins 3, got 128"),
+        ("replicas", 3, r"recipe\.n_envs must be a multiple of replicas 3, got 128"),
     ],
 )
 def test_bad_values_are_named(name, value, message):
     with pytest.raises(ValueError, match=message):
-        dataclasses.replace(PlackettLuceRecipe(), **{name: value})
+        dataclasses.replace(ScoresRecipe(), **{name: value})
 
 
 @pytest.mark.parametrize(
@@ -77,7 +65,25 @@ def test_bad_values_of_swap_rounds_are_named(name, value, message):
         SwapRounds(**{name: value})
 
 
-def test_a_rounds_seconds_are_those_of_all_twins():
-    # The episodes themselves, and one unswapped and three swapped twins under either noise.
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("rounds", -1, r"recipe\.regression\.rounds must be an integer >= 0, got -1"),
+        ("interval", 0, r"recipe\.regression\.interval must be an integer >= 1"),
+        ("rate", 0.0, r"recipe\.regression\.rate must be > 0"),
+        ("age_bonus", -0.1, r"recipe\.regression\.age_bonus must be >= 0"),
+    ],
+)
+def test_bad_values_of_regression_rounds_are_named(name, value, message):
+    with pytest.raises(ValueError, match=message):
+        RegressionRounds(**{name: value})
+
+
+def test_a_recipe_without_any_round_is_refused():
+    with pytest.raises(ValueError, match=r"recipe\.swaps\.rounds must be an integer in 1\.\.99"):
+        PlackettLuceRecipe(regression=RegressionRounds(rounds=0), swaps=SwapRounds(rounds=0))
+
+
+def test_seconds_of_a_round_include_those_of_its_forks():
+    # The episodes themselves, and one unswapped and three swapped forks under either noise.
     assert SwapRounds(episodes=10, trials=3).steps(700) == 10 * 700 * 9
-    assert RECIPES["mask"]().rounds.rounds == 0

@@ -1,36 +1,36 @@
-import copy
+import dataclasses
 
 import pytest
 
 pytest.importorskip("sb3_contrib")
 
+import gymnasium as gym
+import numpy as np
 import torch
 
+from agents.evaluation import make_vector
 from agents.seeds import training_seed
-from agents.training.folder import read_progress
-from agents.training.recipes import PlackettLuceRecipe, SwapRounds
-from agents.training.swaps import try_swaps
+from agents.training.policy_iteration import collect_swaps, swap_round
+from agents.training.recipes import SwapRounds
+from agents.training.run_files import read_progress
 from agents.training.training import BEST, POLICY, Training
+from dptse_env.config import resolve
+from dptse_env.sb3 import PlackettLucePolicy, RoadChannels
 from tests.agents.training.plans import (
-    PRETRAINING,
-    SMALL,
+    FEW_SWAPS,
     StopError,
     make_plan,
     stop_at,
     without_time,
 )
 
-FEW_SWAPS = SwapRounds(rounds=2, episodes=3, seconds=5, trials=2, batches=4, batch_size=16)
+SEED = 1
+KEYWORDS = {"horizon": 80, "privacy": "capped", "action": "slots", "traffic_seeds": "0:3"}
 
 
-def with_swaps(steps):
-    recipe = PlackettLuceRecipe(**{**SMALL, **PRETRAINING, "swaps": FEW_SWAPS, "width": 8})
-    return make_plan(recipe=recipe, steps=steps)
-
-
-@pytest.mark.parametrize(("stopped", "steps"), [(0, 240), (1, 240), (2, 240), (2, 0), (5, 240)])
-def test_a_training_killed_between_rounds_of_swaps_goes_on_alike(stopped, steps, tmp_path):
-    plan = with_swaps(steps)
+@pytest.mark.parametrize("stopped", [0, 1, 2])
+def test_a_training_killed_between_rounds_continues_alike(stopped, tmp_path):
+    plan = make_plan()
     whole = Training(plan, tmp_path / "whole")
     whole.run()
     broken = Training(plan, tmp_path / "broken", watchers=(stop_at(stopped),))
@@ -47,56 +47,85 @@ def test_a_training_killed_between_rounds_of_swaps_goes_on_alike(stopped, steps,
         assert same[0] == same[1]
 
 
-def test_rounds_of_swaps_come_first_on_the_curve(tmp_path):
-    told = []
-    training = Training(with_swaps(240), tmp_path, on_share=lambda *one: told.append(one))
+def test_the_curve_of_rounds(tmp_path):
+    reports = []
+    training = Training(make_plan(), tmp_path, progress=lambda *report: reports.append(report))
     training.run()
     rows = read_progress(tmp_path)
-    assert [row["update"] for row in rows] == list(range(9))
-    # Three episodes of 80 s in a round, each with (1 + 2) twins, under noise and its opposite.
-    ahead = 36 + 2 * 3 * 80 * 7
-    assert [row["steps"] for row in rows[:3]] == [36, 36 + 1680, ahead]
-    assert [row["steps"] for row in rows[2:]] == [ahead + 40 * u for u in range(7)]
-    assert [row["update"] for row in rows if "validation" in row] == [0, 1, 2, 5, 8]
+    assert [row["update"] for row in rows] == [0, 1, 2]
+    # Four episodes are simulated for nine seconds ahead of the rounds; in a round three of 80 s,
+    # each with 1 + 2 forks under noise and its opposite.
+    assert [row["steps"] for row in rows] == [36, 36 + 1680, 36 + 2 * 1680]
+    assert all(0.01 < row["validation"] < 1 for row in rows)
+    assert all(0.01 < row["validation_drawn"] < 1 for row in rows)
     assert all(0.01 < row["error"] < 1 for row in rows[1:])
-    assert [row["update"] for row in rows if "kl" in row] == [3, 4, 5, 6, 7, 8]
-    kinds = [what for what, _ in told]
-    assert list(dict.fromkeys(kinds)) == ["regression", "swaps", "fit"]
-    assert all(0.0 <= share <= 1.0 for _, share in told)
-    assert training.model.num_timesteps == 240
+    stages = [stage for stage, _ in reports]
+    assert list(dict.fromkeys(stages)) == ["regression", "swaps", "fit"]
+    assert all(0.0 <= fraction <= 1.0 for _, fraction in reports)
 
 
-def test_steps_fall_from_round_to_round(tmp_path, monkeypatch):
-    steps = []
-    training = Training(with_swaps(0), tmp_path)
-    monkeypatch.setattr(
-        "agents.training.improvement.improve", lambda _p, _s, _t, step, *_: steps.append(step)
-    )
-    training.run()
-    assert steps == [FEW_SWAPS.step, FEW_SWAPS.final_step]
+def make_policy():
+    env = gym.make("dptse_env:dptse/ShortHighway-v0", **KEYWORDS)
+    road = RoadChannels.from_config(resolve("short-highway", {"privacy": "capped"}))
+    torch.manual_seed(0)
+    return PlackettLucePolicy(env.observation_space, env.action_space, road=road, width=8)
+
+
+def make_batch():
+    return make_vector("dptse_env:dptse/ShortHighway-v0", FEW_SWAPS.episodes, KEYWORDS)
+
+
+def ignore(stage, fraction):
+    pass
+
+
+def weights_after(settings, index):
+    policy = make_policy()
+    swap_round(policy, make_batch(), settings, index, SEED, ignore)
+    return torch.nn.utils.parameters_to_vector(policy.parameters()).detach().numpy()
+
+
+def test_steps_fall_from_round_to_round():
+    settings = dataclasses.replace(FEW_SWAPS, step=9.0, final_step=1.0)
+    first, last = (weights_after(settings, index) for index in (0, 1))
+    other_end = dataclasses.replace(settings, final_step=2.0)
+    other_start = dataclasses.replace(settings, step=8.0)
+    np.testing.assert_array_equal(weights_after(other_end, 0), first)
+    np.testing.assert_array_equal(weights_after(other_start, 1), last)
+    assert (weights_after(other_start, 0) != first).any()
+    assert (weights_after(other_end, 1) != last).any()
     assert SwapRounds(rounds=5, step=9.0, final_step=1.0).step_of(1) == pytest.approx(7.0)
     assert SwapRounds(rounds=1).step_of(0) == SwapRounds().step
 
 
-def test_every_round_tries_other_swaps_in_other_episodes(tmp_path, monkeypatch):
-    began, given = [], []
-    training = Training(with_swaps(0), tmp_path)
+class Seeds:
+    """An environment that remembers the seeds of its episodes."""
 
-    def recorded(env, policy, seeds, generator, **keywords):
-        began.append((seeds, copy.deepcopy(generator).random()))
-        return try_swaps(env, policy, seeds, generator, **keywords)
+    def __init__(self, env):
+        self.env, self.seeds = env, set()
 
-    monkeypatch.setattr("agents.training.improvement.try_swaps", recorded)
-    monkeypatch.setattr(
-        "agents.training.improvement.improve", lambda policy, swaps, *_: given.append(swaps)
-    )
-    training.run()
-    seeds = [set(seeds) for seeds, _ in began]
-    assert [len(one) for one in seeds] == [3, 3]
+    def __getattr__(self, name):
+        return getattr(self.env, name)
+
+    def reset(self, *, seed):
+        self.seeds |= set(seed)
+        return self.env.reset(seed=seed)
+
+
+def test_every_round_tries_other_swaps_in_other_episodes():
+    policy, env = make_policy(), make_batch()
+    seeds, rounds = [], []
+    for index in (0, 1):
+        episodes = Seeds(env)
+        torch.manual_seed(0)
+        rounds.append(collect_swaps(policy, episodes, FEW_SWAPS, index, SEED, ignore))
+        seeds.append(episodes.seeds)
+    assert [len(of_a_round) for of_a_round in seeds] == [3, 3]
     assert not seeds[0] & seeds[1]
-    assert min(seeds[0] | seeds[1]) > training_seed(1) + SMALL["n_envs"]
-    assert max(seeds[0] | seeds[1]) < training_seed(2)
-    assert began[0][1] != began[1][1]
+    assert min(seeds[0] | seeds[1]) > training_seed(SEED) + make_plan().recipe.n_envs
+    assert max(seeds[0] | seeds[1]) < training_seed(SEED + 1)
     # 80 s less the first of 20 to 24 leave eleven or twelve states of three episodes.
-    assert {len(one.observations) for one in given} <= {33, 36}
-    assert all(len(one.gain) == 2 * len(one.observations) for one in given)
+    assert {len(swaps.observations) for swaps in rounds} <= {33, 36}
+    assert all(len(swaps.gain) == 2 * len(swaps.observations) for swaps in rounds)
+    n = min(len(swaps.added) for swaps in rounds)
+    assert (rounds[0].added[:n] != rounds[1].added[:n]).any()

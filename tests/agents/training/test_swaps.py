@@ -4,8 +4,8 @@ import pytest
 
 pytest.importorskip("sb3_contrib")
 
-from agents.training.swaps import FirstNoise, Swaps, try_swaps
-from dptse_env.privacy import GaussianMechanism
+from agents.training.swaps import AntitheticNoise, Swaps, try_swaps
+from dptse_env.release import GaussianMechanism
 
 SHORT = "dptse_env:dptse/ShortHighway-v0"
 SEEDS = [5, 6, 7]
@@ -14,17 +14,17 @@ SECONDS, TRIALS, HORIZON = 6, 2, 40
 
 
 class Wandering:
-    """Asks at random, and remembers what it saw and asked."""
+    """Queries at random, and remembers observations and queries."""
 
     def __init__(self):
         self.generator = np.random.default_rng(3)
-        self.seen, self.asked = [], []
+        self.seen, self.queried = [], []
 
     def predict(self, observation, state=None, episode_start=None, deterministic=False):
         assert not deterministic
         self.seen.append(observation.copy())
-        self.asked.append(self.generator.permuted(np.tile(np.arange(6), (3, 1)), axis=1)[:, :2])
-        return self.asked[-1], state
+        self.queried.append(self.generator.permuted(np.tile(np.arange(6), (3, 1)), axis=1)[:, :2])
+        return self.queried[-1], state
 
 
 def make(**keywords):
@@ -54,30 +54,31 @@ def test_swaps_are_tried_all_along_and_the_episodes_go_on_as_without(pass_of_swa
         np.testing.assert_array_equal(part.observations, policy.seen[first + k * SECONDS])
     env = make()
     observation, _ = env.reset(seed=SEEDS)
-    for seen, action in zip(policy.seen, policy.asked, strict=True):
+    for seen, action in zip(policy.seen, policy.queried, strict=True):
         np.testing.assert_array_equal(seen, observation)
         observation, *_ = env.step(action)
 
 
-def test_a_swap_takes_one_that_was_asked_for_one_that_was_not(pass_of_swaps):
+def test_a_swap_replaces_a_queried_segment_by_one_that_was_not(pass_of_swaps):
     policy, parts = pass_of_swaps
     for part in parts:
         first = next(k for k, seen in enumerate(policy.seen) if (seen == part.observations).all())
-        asked = policy.asked[first]
+        queried = policy.queried[first]
         assert part.state.tolist() == [0, 1, 2] * TRIALS
         for episode, added, dropped in zip(part.state, part.added, part.dropped, strict=True):
-            assert dropped in asked[episode]
-            assert added not in asked[episode]
-    whole = Swaps.joined(parts)
-    assert set(whole.added) == set(whole.dropped) == set(range(6))
+            assert dropped in queried[episode]
+            assert added not in queried[episode]
+    joined = Swaps.from_parts(parts)
+    assert set(joined.added) == set(joined.dropped) == set(range(6))
 
 
 def noises(env):
     """Signs as the first state's, drawn like the swaps: they come after the choice of seconds."""
     generator = np.random.default_rng(0)
     generator.integers(SECONDS)
-    columns = env.config.corridor.n_segments + env.process.boundary.n_released
-    return generator.choice([-1.0, 1.0], size=(3, columns, 2)) * env.process.release.sigma
+    release = env.process.release
+    signs = generator.choice([-1.0, 1.0], size=(3, release.setup.n_columns, 2))
+    return signs * release.sigma
 
 
 def test_gains_are_those_of_episodes_run_apart(pass_of_swaps):
@@ -89,16 +90,17 @@ def test_gains_are_those_of_episodes_run_apart(pass_of_swaps):
         """Return rewards and exposures of an episode from its reset on; no forks."""
         env = make()
         env.reset(seed=SEEDS)
-        for action in policy.asked[:first]:
+        for action in policy.queried[:first]:
             env.step(action)
-        env.process.mechanism = FirstNoise(env.process.mechanism, sign * noises(env))
-        query = policy.asked[first].copy()
+        release = env.process.release
+        release.mechanism = AntitheticNoise(release.mechanism, sign * noises(env))
+        query = policy.queried[first].copy()
         for episode, added, dropped in swapped:
             query[episode][query[episode] == dropped] = added
         total = np.zeros(3)
-        for action in [query, *policy.asked[first + 1 : first + SECONDS]]:
+        for action in [query, *policy.queried[first + 1 : first + SECONDS]]:
             total += env.step(action)[1]
-        return np.array([total, env.process.release.contributions.exposures.sum(axis=1)])
+        return np.array([total, release.contributions.exposures.sum(axis=1)])
 
     def mean(swapped):
         return (run(swapped, 1.0) + run(swapped, -1.0)) / 2.0
@@ -110,31 +112,31 @@ def test_gains_are_those_of_episodes_run_apart(pass_of_swaps):
         swapped = zip(part.state[rows], part.added[rows], part.dropped[rows], strict=True)
         expected = mean(list(swapped)) - plain
         np.testing.assert_allclose(part.gain[rows], expected[0], atol=1e-12)
-        np.testing.assert_array_equal(part.exposures[rows], expected[1])
+        np.testing.assert_array_equal(part.contributions[rows], expected[1])
     assert np.abs(part.gain).min() > 1e-6
-    assert np.abs(part.exposures).max() > 0
+    assert np.abs(part.contributions).max() > 0
 
 
 def test_other_draws_try_other_swaps(pass_of_swaps):
-    again = Swaps.joined(tried(make(), Wandering()))
-    other = Swaps.joined(tried(make(), Wandering(), seed=1))
-    whole = Swaps.joined(pass_of_swaps[1])
-    np.testing.assert_array_equal(whole.gain, again.gain)
-    assert not np.array_equal(whole.added[:50], other.added[:50])
+    again = Swaps.from_parts(tried(make(), Wandering()))
+    other = Swaps.from_parts(tried(make(), Wandering(), seed=1))
+    joined = Swaps.from_parts(pass_of_swaps[1])
+    np.testing.assert_array_equal(joined.gain, again.gain)
+    assert not np.array_equal(joined.added[:50], other.added[:50])
 
 
 def test_states_of_later_parts_are_counted_on():
     part = tried(make(), Wandering())[0]
-    whole = Swaps.joined([part, part])
-    assert whole.state.tolist() == [0, 1, 2, 0, 1, 2, 3, 4, 5, 3, 4, 5]
-    assert whole.observations.shape == (6, part.observations.shape[1])
-    np.testing.assert_array_equal(whole.gain, np.tile(part.gain, 2))
+    joined = Swaps.from_parts([part, part])
+    assert joined.state.tolist() == [0, 1, 2, 0, 1, 2, 3, 4, 5, 3, 4, 5]
+    assert joined.observations.shape == (6, part.observations.shape[1])
+    np.testing.assert_array_equal(joined.gain, np.tile(part.gain, 2))
 
 
 def test_without_a_cap_nothing_is_counted():
-    whole = Swaps.joined(tried(make(privacy="paper"), Wandering()))
-    assert not whole.exposures.any()
-    assert whole.gain.any()
+    joined = Swaps.from_parts(tried(make(privacy="paper"), Wandering()))
+    assert not joined.contributions.any()
+    assert joined.gain.any()
 
 
 def test_only_the_next_release_has_the_noise_that_is_given():
@@ -144,12 +146,12 @@ def test_only_the_next_release_has_the_noise_that_is_given():
         return made
 
     episodes, values, noise = np.array([0]), np.ones((1, 4, 2)), np.full((1, 4, 2), 0.25)
-    plain, given = mechanism(), FirstNoise(mechanism(), noise)
+    plain, given = mechanism(), AntitheticNoise(mechanism(), noise)
     np.testing.assert_array_equal(given.sigma, plain.sigma)
     plain.release(episodes, values)
     np.testing.assert_array_equal(given.release(episodes, values), values + noise)
     np.testing.assert_array_equal(given.release(episodes, values), plain.release(episodes, values))
-    given = FirstNoise(mechanism(), noise)
+    given = AntitheticNoise(mechanism(), noise)
     given.reset(episodes, [np.random.default_rng(1)])
     np.testing.assert_array_equal(
         given.release(episodes, values), mechanism().release(episodes, values)
@@ -160,10 +162,10 @@ def test_only_the_next_release_has_the_noise_that_is_given():
     ("keywords", "message"),
     [
         ({"bandwidth": 6}, "bandwidth below 6 segments, got 6"),
-        ({"horizon": 6}, "leaves 6 s to follow twins, got 6 s"),
+        ({"horizon": 6}, "leaves 6 s to measure a gain, got 6 s"),
     ],
 )
-def test_nothing_to_swap_is_said(keywords, message):
+def test_environments_without_swaps_are_refused(keywords, message):
     keywords = {"traffic_seeds": "0:3", "bandwidth": 2, **keywords}
     env = gym.make_vec(SHORT, num_envs=3, action="slots", autoreset_mode="Disabled", **keywords)
     with pytest.raises(ValueError, match=message):

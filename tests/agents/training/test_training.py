@@ -1,5 +1,6 @@
 import dataclasses
 import json
+import pathlib
 
 import numpy as np
 import pytest
@@ -8,21 +9,23 @@ pytest.importorskip("sb3_contrib")
 
 import torch
 
-from agents.training import folder as folder_module
-from agents.training.folder import CHECKPOINT, PROGRESS, read_progress
-from agents.training.recipes import RECIPES, PlackettLuceRecipe
+from agents.training.recipes import RECIPES, RegressionRounds
+from agents.training.run_files import CHECKPOINT, PROGRESS, read_progress, write_atomic
 from agents.training.training import BEST, POLICY, Training
 from dptse_env.sb3 import load_policy
 from tests.agents.training.plans import (
     StopError,
     make_plan,
+    make_recipe,
     stop_at,
     without_time,
 )
 
+PPO_LEARNERS = [name for name in RECIPES if name != "plackett-luce"]
 
-@pytest.mark.parametrize("learner", RECIPES)
-def test_a_killed_training_goes_on_to_the_same_curve(learner, tmp_path):
+
+@pytest.mark.parametrize("learner", PPO_LEARNERS)
+def test_a_killed_training_continues_to_the_same_curve(learner, tmp_path):
     plan = make_plan(learner)
     whole = Training(plan, tmp_path / "whole")
     whole.run()
@@ -43,17 +46,16 @@ def test_a_killed_training_goes_on_to_the_same_curve(learner, tmp_path):
     for name in (POLICY, BEST):
         same = [(tmp_path / run / name).read_bytes() for run in ("whole", "broken")]
         assert same[0] == same[1]
-    for name, value in whole.model.policy.state_dict().items():
-        assert torch.equal(again.model.policy.state_dict()[name], value), name
+    for name, value in whole.learner.policy.state_dict().items():
+        assert torch.equal(again.learner.policy.state_dict()[name], value), name
 
 
-def test_the_curve_says_what_it_should(tmp_path):
-    training = Training(make_plan(), tmp_path)
+def test_the_curve_of_ppo(tmp_path):
+    training = Training(make_plan("scores"), tmp_path)
     training.run()
     rows = read_progress(tmp_path)
     assert [row["update"] for row in rows] == list(range(7))
-    # Four episodes are watched for nine seconds ahead of PPO.
-    assert [row["steps"] for row in rows] == [36 + 40 * u for u in range(7)]
+    assert [row["steps"] for row in rows] == [40 * u for u in range(7)]
     assert [row["update"] for row in rows if "validation" in row] == [0, 3, 6]
     assert all(0.01 < row["error"] < 1 for row in rows[1:])
     assert all(0.01 < row["validation_drawn"] < 1 for row in rows[::3])
@@ -68,17 +70,17 @@ def test_steps_are_decisions_whatever_the_encoding(tmp_path):
     training.run()
     assert plan.actions_per_step == 2
     assert training.rows[-1]["steps"] == 240
-    assert training.model.num_timesteps == 480
+    assert training.learner.model.num_timesteps == 480
 
 
-def test_every_update_compares_twins(tmp_path, monkeypatch):
-    training = Training(make_plan(), tmp_path)
-    given = []
-    monkeypatch.setattr(training._episodes, "recentre", given.append)
+def test_every_update_compares_replicas(tmp_path):
+    training = Training(make_plan("scores"), tmp_path)
     training.run()
-    assert len(given) == training.plan.n_updates
-    # Steps by episodes, not yet shuffled for the minibatches.
-    assert {advantages.shape for advantages in given} == {(10, 4)}
+    # Episode by episode, as the minibatches are drawn from. Of two replicas each is compared with
+    # the other, so that their advantages are opposite.
+    advantages = training.learner.model.rollout_buffer.advantages.reshape(2, 2, 10)
+    np.testing.assert_allclose(advantages[:, 0], -advantages[:, 1], atol=1e-6)
+    assert np.abs(advantages).max() > 0.01
 
 
 def test_a_finished_training_is_left_alone(tmp_path):
@@ -89,21 +91,21 @@ def test_a_finished_training_is_left_alone(tmp_path):
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
-def test_the_folder_says_what_was_trained(tmp_path):
+def test_the_folder_describes_the_training(tmp_path):
     Training(make_plan(), tmp_path, commit="abc").run()
     assert {path.name for path in tmp_path.iterdir()} == {
         "run.json", PROGRESS, CHECKPOINT, POLICY, BEST,
     }  # fmt: skip
-    said = json.loads((tmp_path / "run.json").read_text())
-    assert said["commit"] == "abc"
-    made_with = said["made_with"]
+    record = json.loads((tmp_path / "run.json").read_text())
+    assert record["commit"] == "abc"
+    made_with = record["made_with"]
     assert made_with["seed"] == 1
     assert made_with["traffic_seeds"] == [0, 1, 2]
     assert made_with["recipe"]["n_envs"] == 4
     assert made_with["learner"] == "plackett-luce"
-    assert set(said["machine"]) >= {"torch", "stable-baselines3", "numpy", "python"}
+    assert set(record["machine"]) >= {"torch", "stable-baselines3", "numpy", "python"}
     policy = load_policy(tmp_path / POLICY, _env())
-    assert policy.card["training"]["steps"] == 36 + 240
+    assert policy.card["training"]["steps"] == 36 + 2 * 3 * 80 * 7
     assert policy.card["training"]["traffic seeds"] == "0..2"
 
 
@@ -124,21 +126,21 @@ def _env():
     ],
 )
 def test_another_plan_is_refused(tmp_path, changes, message):
-    Training(make_plan(), tmp_path)
+    Training(make_plan("mask"), tmp_path)
     with pytest.raises(ValueError, match=message):
-        Training(make_plan(**changes), tmp_path)
+        Training(make_plan("mask", **changes), tmp_path)
 
 
 def test_another_recipe_or_learner_is_refused(tmp_path):
-    Training(make_plan(), tmp_path)
-    recipe = dataclasses.replace(make_plan().recipe, gamma=0.9)
+    Training(make_plan("scores"), tmp_path)
+    recipe = dataclasses.replace(make_recipe("scores"), gamma=0.9)
     with pytest.raises(ValueError, match=r"recipe\.gamma is 0\.95 there and 0\.9 now"):
-        Training(make_plan(recipe=recipe), tmp_path)
-    with pytest.raises(ValueError, match="learner is 'plackett-luce' there and 'mask' now"):
+        Training(make_plan("scores", recipe=recipe), tmp_path)
+    with pytest.raises(ValueError, match="learner is 'scores' there and 'mask' now"):
         Training(make_plan("mask"), tmp_path)
 
 
-def test_a_missing_or_damaged_checkpoint_is_said(tmp_path):
+def test_a_missing_or_damaged_checkpoint_is_named(tmp_path):
     Training(make_plan(), tmp_path).run()
     path = tmp_path / CHECKPOINT
     path.write_bytes(path.read_bytes()[:1000])
@@ -149,6 +151,15 @@ def test_a_missing_or_damaged_checkpoint_is_said(tmp_path):
         Training(make_plan(), tmp_path)
 
 
+def test_a_checkpoint_of_a_former_version_is_refused(tmp_path):
+    Training(make_plan("mask"), tmp_path)
+    torch.save({"update": 3, "rounds": 0}, tmp_path / CHECKPOINT)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    with pytest.raises(ValueError, match=r"checkpoint\.pt has format 1, and this version"):
+        Training(make_plan("mask", validate_every=1), tmp_path)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
 def test_a_folder_with_other_things_is_refused(tmp_path):
     (tmp_path / "thesis.tex").write_text("")
     with pytest.raises(ValueError, match=r"is not empty and has no run\.json"):
@@ -156,20 +167,20 @@ def test_a_folder_with_other_things_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize("name", [PROGRESS, CHECKPOINT])
-def test_a_full_disk_leaves_a_folder_to_go_on_in(tmp_path, monkeypatch, name):
-    plan = make_plan()
+def test_a_full_disk_leaves_a_folder_to_continue_in(tmp_path, monkeypatch, name):
+    plan = make_plan("scores")
     Training(plan, tmp_path / "whole").run()
     training = Training(plan, tmp_path / "full")
-    write, calls = folder_module.write_whole, []
+    replace, written = pathlib.Path.replace, []
 
-    def full(path, content):
-        calls.append(path.name)
-        if path.name == name and calls.count(name) == 3:
+    def full(path, target):
+        written.append(target.name)
+        if target.name == name and written.count(name) == 3:
             raise OSError(28, "No space left on device")
-        write(path, content)
+        return replace(path, target)
 
     with monkeypatch.context() as patch:
-        patch.setattr(folder_module, "write_whole", full)
+        patch.setattr("pathlib.Path.replace", full)
         with pytest.raises(OSError, match="No space left"):
             training.run()
     again = Training(plan, tmp_path / "full")
@@ -187,24 +198,23 @@ def test_nothing_half_written_stays(tmp_path, monkeypatch):
 
     monkeypatch.setattr("os.fsync", full)
     with pytest.raises(OSError, match="No space left"):
-        folder_module.write_whole(tmp_path / "file", b"new")
+        write_atomic(tmp_path / "file", b"new")
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == {"file": b"old"}
 
 
-def test_pretraining_moves_the_scorer_and_counts_as_no_update(tmp_path):
-    plan = make_plan(steps=40)
+def test_the_regression_moves_the_scorer_and_counts_as_no_update(tmp_path):
+    plan = make_plan()
     first = Training(plan, tmp_path / "one")
-    before = first.model.policy.scorer.state_dict()
-    before = {name: value.clone() for name, value in before.items()}
+    before = {name: value.clone() for name, value in first.learner.policy.state_dict().items()}
     first.run()
-    recipe = dataclasses.replace(plan.recipe, pretraining_rounds=0)
-    second = Training(make_plan(steps=40, recipe=recipe), tmp_path / "two")
+    recipe = dataclasses.replace(plan.recipe, regression=RegressionRounds(rounds=0))
+    second = Training(make_plan(recipe=recipe), tmp_path / "two")
     second.run()
     rows = [training.rows[0] for training in (first, second)]
     assert [row["steps"] for row in rows] == [36, 0]
     assert [row["update"] for row in rows] == [0, 0]
     assert rows[0]["validation_drawn"] != rows[1]["validation_drawn"]
-    after = first.model.policy.scorer.state_dict()
+    after = first.learner.policy.state_dict()
     assert all((after[name] != before[name]).any() for name in before)
 
 
@@ -215,7 +225,8 @@ def test_pretraining_moves_the_scorer_and_counts_as_no_update(tmp_path):
         ({"validation_seeds": (2000,)}, r"validation must hold seeds in 1000\.\.1999, got 2000"),
         ({"seed": -1}, r"seed must be an integer in 0\.\.999"),
         ({"steps": -1}, "steps must be an integer >= 0"),
-        ({"steps": 0, "recipe": RECIPES["mask"]()}, "steps must be an integer >= 1 where"),
+        ({"steps": 0, "recipe": RECIPES["mask"]()}, "steps must be an integer >= 1"),
+        ({"steps": 240}, "steps must be 0 for plackett-luce, which is trained in rounds, got 240"),
         ({"keywords": {"action": "mask"}}, r"keywords\.action is chosen by the training"),
     ],
 )
@@ -228,9 +239,3 @@ def test_a_bad_keyword_is_refused_before_anything_is_written(tmp_path):
     with pytest.raises(ValueError, match="estimatr is unknown"):
         Training(make_plan(keywords={"estimatr": "ukf"}), tmp_path / "run")
     assert not (tmp_path / "run").exists()
-
-
-def test_a_pretraining_needs_the_errors():
-    with pytest.raises(ValueError, match=r"recipe\.shows_errors must be True for a pretraining"):
-        PlackettLuceRecipe(shows_errors=False)
-    PlackettLuceRecipe(shows_errors=False, pretraining_rounds=0)

@@ -1,4 +1,4 @@
-"""What a training leaves on disk: each file is put in place when it is whole."""
+"""Files that a training leaves on disk: checkpoint and learning curve, each written atomically."""
 
 from __future__ import annotations
 
@@ -14,6 +14,9 @@ import torch
 
 CHECKPOINT, PROGRESS = "checkpoint.pt", "progress.csv"
 
+FORMAT = 2
+"""Of checkpoints; raise it whenever their content changes its meaning."""
+
 COLUMNS = (
     "update", "steps", "seconds", "error", "validation", "validation_drawn", "learning_rate",
     "kl", "clipped", "entropy", "explained_variance", "value_loss",
@@ -24,34 +27,34 @@ validation traffic with deterministic and with drawn actions."""
 Row = dict[str, float]
 
 
-def write_whole(path: Path, content: bytes) -> None:
-    """Write a file so that a kill or a full disk leaves the old one or the new one.
+def write_atomic(path: Path, content: bytes) -> None:
+    """Write a file so that a kill or a full disk leaves either the old content or the new.
 
     Raises:
-        OSError: It cannot be written; what stood there stays.
+        OSError: It cannot be written; the old content stays.
     """
-    aside = path.with_suffix(".tmp")
+    temporary = path.with_suffix(".tmp")
     try:
-        with aside.open("wb") as file:
+        with temporary.open("wb") as file:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
-        aside.replace(path)
+        temporary.replace(path)
     finally:
-        aside.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
 
 
 def write_progress(folder: Path, rows: Sequence[Row]) -> None:
-    """Write the learning curve; what a row lacks stays empty."""
+    """Write the learning curve; missing values stay empty."""
     text = io.StringIO()
     writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
-    write_whole(folder / PROGRESS, text.getvalue().encode())
+    write_atomic(folder / PROGRESS, text.getvalue().encode())
 
 
 def read_progress(folder: Path) -> list[Row]:
-    """Return the learning curve as written, shorter rows where values are missing."""
+    """Return the learning curve; rows lack the values that are missing in the file."""
     with (folder / PROGRESS).open(encoding="utf-8", newline="") as file:
         return [
             {name: json.loads(value) for name, value in row.items() if value}
@@ -61,23 +64,23 @@ def read_progress(folder: Path) -> list[Row]:
 
 def write_checkpoint(folder: Path, content: dict[str, Any]) -> None:
     """Write a checkpoint of tensors, numbers and strings."""
-    kept = io.BytesIO()
-    torch.save(content, kept)
-    write_whole(folder / CHECKPOINT, kept.getvalue())
+    buffer = io.BytesIO()
+    torch.save({"format": FORMAT, **content}, buffer)
+    write_atomic(folder / CHECKPOINT, buffer.getvalue())
 
 
 def read_checkpoint(folder: Path) -> dict[str, Any] | None:
     """Return the checkpoint of a folder; None where no training has begun.
 
     Raises:
-        ValueError: It is damaged, or missing although there is a learning curve.
+        ValueError: It is damaged, of another format, or missing although there is a learning curve.
     """
     path = folder / CHECKPOINT
     if not path.exists():
         if (folder / PROGRESS).exists():
             raise ValueError(
-                f"{path} is missing, although {PROGRESS} says that the training had begun: put it "
-                "back, or remove the folder to start over"
+                f"{path} is missing, although {PROGRESS} shows that the training had begun: "
+                "restore it, or remove the folder to start over"
             )
         return None
     try:
@@ -85,5 +88,11 @@ def read_checkpoint(folder: Path) -> dict[str, Any] | None:
     except Exception as problem:
         raise ValueError(f"{path} is damaged: {problem}; remove the folder to start over") from (
             problem
+        )
+    found = content.get("format", 1)
+    if found != FORMAT:
+        raise ValueError(
+            f"{path} has format {found}, and this version continues from format {FORMAT} only: "
+            "finish the training with the version that began it, or remove the folder to start over"
         )
     return content

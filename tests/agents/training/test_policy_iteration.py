@@ -6,7 +6,7 @@ pytest.importorskip("sb3_contrib")
 
 import torch
 
-from agents.training.improvement import LARGEST, improve
+from agents.training.policy_iteration import LARGEST_GAIN, raise_scores
 from agents.training.recipes import SwapRounds
 from agents.training.swaps import Swaps
 from dptse_env.config import resolve
@@ -26,13 +26,12 @@ def policy():
     return PlackettLucePolicy(
         env.observation_space,
         env.action_space,
-        lambda _: 0.0,
-        road=RoadChannels.of(resolve("short-highway", {})),
+        road=RoadChannels.from_config(resolve("short-highway", {})),
         width=16,
     )
 
 
-def planted(policy, gain, exposures=None, n_states=300, trials=20):
+def planted(policy, gain, contributions=None, n_states=300, trials=20):
     """Swaps whose gain is that of their segments, ``gain(channels)`` of shape (m, N), and noise."""
     generator = np.random.default_rng(0)
     size = policy.observation_space.shape[0]
@@ -44,25 +43,25 @@ def planted(policy, gain, exposures=None, n_states=300, trials=20):
     def difference(of):
         if of is None:
             return np.zeros(len(state))
-        values = of(policy.channels(torch.from_numpy(seen)).numpy())
+        values = of(policy.features(torch.from_numpy(seen)).numpy())
         return values[state, added] - values[state, dropped]
 
     noise = generator.normal(0.0, 0.02, len(state))
     error = np.full(n_states, 0.1)
     gains = 0.1 * (difference(gain) + noise)
-    return Swaps(seen, error, state, added, dropped, gains, difference(exposures))
+    return Swaps(seen, error, state, added, dropped, gains, difference(contributions))
 
 
 def moved(policy, swaps, settings=SETTINGS):
-    """How the scores move, but for a constant of each state, which no choice depends on."""
+    """The moves of the scores, but for a constant of each state, which no choice depends on."""
     seen = torch.from_numpy(swaps.observations)
 
     def scores():
         with torch.no_grad():
-            return policy.scorer(policy.channels(seen)).numpy()
+            return policy.scores(seen).numpy()
 
     before = scores()
-    improve(policy, swaps, settings, STEP)
+    raise_scores(policy, swaps, settings, STEP)
     change = scores() - before
     return change - change.mean(axis=1, keepdims=True)
 
@@ -76,30 +75,30 @@ def test_scores_move_by_a_step_of_the_expected_gain(policy):
         return 0.1 * np.tanh(channels[:, 0])
 
     swaps = planted(policy, gain)
-    expected = centred(gain(policy.channels(torch.from_numpy(swaps.observations)).numpy()))
+    expected = centred(gain(policy.features(torch.from_numpy(swaps.observations)).numpy()))
     change = moved(policy, swaps) / STEP
     assert expected.std() > 0.04
     assert (change - expected).std() < 0.2 * expected.std()
 
 
-def test_exposures_have_their_price(policy):
-    def exposures(channels):
+def test_contributions_have_their_price(policy):
+    def contributions(channels):
         return 8.0 * (channels[:, 0] > 0.0)
 
-    swaps = planted(policy, None, exposures)
+    swaps = planted(policy, None, contributions)
     change = moved(policy, swaps) / STEP
     expected = -0.01 * centred(
-        exposures(policy.channels(torch.from_numpy(swaps.observations)).numpy())
+        contributions(policy.features(torch.from_numpy(swaps.observations)).numpy())
     )
     assert np.corrcoef(change.ravel(), expected.ravel())[0, 1] > 0.9
 
 
-def test_a_few_huge_gains_do_not_rule(policy):
+def test_a_few_huge_gains_do_not_dominate(policy):
     swaps = planted(policy, None)
     swaps.gain[:] = 0.0
     swaps.gain[(swaps.added == 2) & (swaps.state % 20 == 0)] = 1e6
     change = moved(policy, swaps) / STEP
-    assert 0.0 < change[:, 2].mean() < LARGEST
+    assert 0.0 < change[:, 2].mean() < LARGEST_GAIN
 
 
 def test_no_gain_moves_nothing_but_noise(policy):
@@ -110,6 +109,6 @@ def test_no_gain_moves_nothing_but_noise(policy):
 def test_it_reports_its_progress_and_leaves_no_gradients(policy):
     shares = []
     few = SwapRounds(batches=100, batch_size=8)
-    improve(policy, planted(policy, None, n_states=10), few, STEP, shares.append)
+    raise_scores(policy, planted(policy, None, n_states=10), few, STEP, shares.append)
     assert shares == [0.0, 0.5]
     assert all(p.grad is None for p in policy.scorer.parameters())

@@ -1,0 +1,144 @@
+"""Policy iteration with measured advantages: scores move in proportion to the gains of swaps.
+
+The gain of swapping segment j for segment i is learned as a difference g_i - g_j of a number per
+segment, by least squares. Scores move by a small multiple of g, which is a step of mirror descent
+on the distribution over sets (its weights exp(score) are multiplied by exp(step g)); then gains
+are measured anew, under the new policy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+import torch
+
+from agents.seeds import training_seed
+from agents.training.recipes import SwapRounds
+from agents.training.swaps import Swaps, try_swaps
+from dptse_env.sb3 import PlackettLucePolicy
+from dptse_env.vector_env import SensorQueryVectorEnv
+
+LARGEST_GAIN = 0.6
+"""Clips gains [mean one-second errors]: outliers would dominate the least-squares fit."""
+
+PART = 4096
+"""Observations scored at a time."""
+
+SEED_STRIDE = 10_000
+"""Between the seeds of two rounds; the first begins a stride after those of the regression."""
+
+REPORT_INTERVAL = 50
+"""Minibatches between two reports of progress."""
+
+
+def swap_round(
+    policy: PlackettLucePolicy,
+    env: SensorQueryVectorEnv,
+    settings: SwapRounds,
+    index: int,
+    seed: int,
+    progress: Callable[[str, float], None],
+) -> float:
+    """Try swaps under a policy, and improve it by them.
+
+    Args:
+        policy: Changed in place.
+        env: As `collect_swaps` takes it.
+        settings: Of rounds.
+        index: Number of the round, counted from 0.
+        seed: Training seed.
+        progress: Called with the name of a stage and the fraction of it that is done.
+
+    Returns:
+        The mean one-second error under the policy before the round.
+
+    Raises:
+        ValueError: There is nothing to swap, or the horizon is too short (`try_swaps`).
+    """
+    swaps = collect_swaps(policy, env, settings, index, seed, progress)
+    raise_scores(policy, swaps, settings, settings.step_of(index), partial(progress, "fit"))
+    return float(swaps.error.mean())
+
+
+def collect_swaps(
+    policy: PlackettLucePolicy,
+    env: SensorQueryVectorEnv,
+    settings: SwapRounds,
+    index: int,
+    seed: int,
+    progress: Callable[[str, float], None],
+) -> Swaps:
+    """Return the swaps of a round, tried under ``policy``.
+
+    Args:
+        policy: Acts by drawing.
+        env: An environment as `try_swaps` takes it, of ``settings.episodes`` episodes.
+        settings: Of rounds.
+        index: Number of the round, counted from 0.
+        seed: Training seed. Draws depend on it and on ``index`` alone, but for those of torch.
+        progress: Called with the name of a stage and the fraction of it that is done.
+
+    Raises:
+        ValueError: There is nothing to swap, or the horizon is too short (`try_swaps`).
+    """
+    first, parts = training_seed(seed) + SEED_STRIDE * (index + 1), []
+    for part in try_swaps(
+        env,
+        policy,
+        list(range(first, first + settings.episodes)),
+        np.random.default_rng([seed, index]),
+        seconds=settings.seconds,
+        trials=settings.trials,
+    ):
+        parts.append(part)
+        progress("swaps", len(parts) * settings.seconds / env.config.horizon_steps)
+    return Swaps.from_parts(parts)
+
+
+def raise_scores(
+    policy: PlackettLucePolicy,
+    swaps: Swaps,
+    settings: SwapRounds,
+    step: float,
+    progress: Callable[[float], None] | None = None,
+) -> None:
+    """Raise the scores of ``policy`` by ``step`` times the expected gain of a query.
+
+    Gains are in units of the policy's mean one-second error, so that settings carry over to other
+    environments. The price of contributions is subtracted from each: vehicles that have reached
+    their cap are missing from the releases for the rest of an episode, long after the seconds in
+    which a gain is measured.
+
+    Args:
+        policy: Changed in place.
+        swaps: Tried under this policy.
+        settings: Price, minibatches and learning rate.
+        step: Rise of a score for an expected gain of one mean one-second error.
+        progress: Called with the fraction that is done, every so often.
+    """
+    unit = swaps.error.mean()
+    gains = np.clip(swaps.gain / unit, -LARGEST_GAIN, LARGEST_GAIN)
+    gains -= settings.price * swaps.contributions
+    seen = torch.from_numpy(swaps.observations)
+    targets = torch.from_numpy(gains.astype(np.float32))
+    state, added, dropped = map(torch.from_numpy, (swaps.state, swaps.added, swaps.dropped))
+    with torch.no_grad():
+        parts = [policy.scores(seen[i : i + PART]) for i in range(0, len(seen), PART)]
+        before = torch.cat(parts)
+    optimizer = torch.optim.Adam(policy.scorer.parameters(), lr=settings.rate)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, settings.batches)
+    for batch in range(settings.batches):
+        rows = torch.randint(len(targets), (settings.batch_size,))
+        shown, row = torch.unique(state[rows], return_inverse=True)
+        moved = policy.scores(seen[shown]) - before[shown]
+        expected = (moved[row, added[rows]] - moved[row, dropped[rows]]) / step
+        loss = torch.square(expected - targets[rows]).mean()
+        optimizer.zero_grad()
+        torch.autograd.backward(loss)
+        optimizer.step()
+        schedule.step()
+        if progress is not None and batch % REPORT_INTERVAL == 0:
+            progress(batch / settings.batches)
+    policy.scorer.zero_grad()

@@ -1,0 +1,129 @@
+"""Regression of the estimate's squared errors: a scorer learns where the estimate is wrong.
+
+The estimator's own variance is a poor predictor of its error: process noise is tuned for the
+accuracy of estimates, and a jam that has not been observed yet is in no variance. In training the
+true traffic is known, so the error that is expected given an observation can be learned by
+regression, with orders of magnitude less data than PPO needs: every segment of every second is a
+sample. Querying the segments where it is largest comes close to querying by the true error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from agents.training.episodes import TrainingEpisodes
+from agents.training.recipes import RegressionRounds
+from dptse_env.process import QueryProcess
+from dptse_env.sb3 import PlackettLucePolicy
+from dptse_env.utils.arrays import FloatArray, Observation
+
+FLOOR = 1e-4
+"""Added to squared errors: below an error of a hundredth, differences do not matter."""
+
+VARIANCE = {"density_log_std": 0.5, "speed_log_std": 0.5, "age": 0.1}
+"""Initial weights of the fit: logarithms of squared errors near the estimator's own variances."""
+
+LEVEL = -3.0
+"""Initial constant of these logarithms."""
+
+DECAY = 0.95
+"""Fraction by which the learning rate has fallen at the end."""
+
+REPORT_INTERVAL = 50
+"""Minibatches between two reports of progress."""
+
+
+def squared_errors(process: QueryProcess) -> Observation:
+    """Return the squared error of the estimate in every mainline segment, shape (n, n_mainline).
+
+    Density and speed count together, in units of the corridor's scales. The speed of an empty
+    segment does not count.
+    """
+    corridor, n = process.config.corridor, process.interface.n_mainline
+    truth, estimate = process.truth(np.arange(process.n_episodes))[:, :n], process.estimate
+    density = (estimate.density[:, :n] - truth[..., 0]) / corridor.density_scale
+    speed = (estimate.speed[:, :n] - truth[..., 1]) / corridor.speed_scale
+    squared: FloatArray = density**2 + np.where(truth[..., 0] > 0, speed, 0.0) ** 2
+    return squared.astype(np.float32)
+
+
+def regress(
+    policy: PlackettLucePolicy,
+    episodes: TrainingEpisodes,
+    settings: RegressionRounds,
+    progress: Callable[[float], None] | None = None,
+    targets: Callable[[QueryProcess], Observation] = squared_errors,
+) -> None:
+    """Let ``policy`` act, and fit its scores to the squared errors that follow from it.
+
+    With the expected squared error exp(z) of a segment, the loss y exp(-z) + z is that of normal
+    errors with this variance; it is least where exp(z) is the mean of y. Scores are ``sharpness``
+    times z plus a bonus for age, since querying segments that have not been observed for long gains
+    more, up to a constant. Each round aggregates data collected by the current policy, as in
+    DAgger.
+
+    Args:
+        policy: Changed in place.
+        episodes: Reset first, and left where they end.
+        settings: Rounds, seconds, minibatches and sharpness.
+        progress: Called with the fraction that is done, every so often.
+        targets: Returns the squared errors of all episodes, shape (n, n_mainline).
+    """
+    level = torch.tensor([LEVEL], requires_grad=True)
+    optimizer = torch.optim.Adam([*policy.scorer.parameters(), level], lr=settings.rate)
+    bonus = {"age": settings.age_bonus}
+    observation = episodes.reset()
+    seen: list[Tensor] = []
+    errors: list[Tensor] = []
+    for index in range(settings.rounds):
+        for second in range(settings.seconds):
+            if second % settings.interval == 0:
+                seen.append(torch.from_numpy(observation.copy()))
+                errors.append(torch.from_numpy(targets(episodes.env.process)))
+            actions, _ = policy.predict(observation, deterministic=False)
+            stepped, *_ = episodes.step(actions)
+            assert isinstance(stepped, np.ndarray)
+            observation = stepped
+        if index:
+            _add(policy, bonus, -settings.sharpness)
+        else:
+            _add(policy, policy.rule, -1.0)
+            _add(policy, VARIANCE, settings.sharpness)
+        samples = torch.cat(seen), torch.cat(errors)
+        for batch in range(settings.batches):
+            done = (index + batch / settings.batches) / settings.rounds
+            optimizer.param_groups[0]["lr"] = settings.rate * (1.0 - DECAY * done)
+            _fit(policy, level, optimizer, settings, *samples)
+            if progress is not None and batch % REPORT_INTERVAL == 0:
+                progress(done)
+        _add(policy, bonus, settings.sharpness)
+    policy.scorer.zero_grad()
+
+
+def _add(policy: PlackettLucePolicy, weights: Mapping[str, float], factor: float) -> None:
+    """Add multiples of ``weights`` to the weights of the rule."""
+    with torch.no_grad():
+        for k, name in enumerate(policy.rule):
+            policy.scorer.rule[k] += factor * weights.get(name, 0.0)
+
+
+def _fit(
+    policy: PlackettLucePolicy,
+    level: Tensor,
+    optimizer: torch.optim.Optimizer,
+    settings: RegressionRounds,
+    seen: Tensor,
+    errors: Tensor,
+) -> None:
+    """Take a step of the optimizer on a random minibatch."""
+    rows = torch.randint(len(seen), (settings.batch_size,))
+    logs = policy.scores(seen[rows]) / settings.sharpness + level
+    loss = ((errors[rows] + FLOOR) * torch.exp(-logs) + logs).mean()
+    optimizer.zero_grad()
+    torch.autograd.backward(loss)
+    torch.nn.utils.clip_grad_norm_(policy.scorer.parameters(), settings.max_grad_norm)
+    optimizer.step()

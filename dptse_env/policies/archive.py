@@ -1,0 +1,46 @@
+"""Zip archives of unknown origin, read with bounds."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+
+MOST_ENTRIES = 1000
+"""Entries in an archive, at most."""
+
+_DIRECTORY_SIGNATURE = b"PK\x01\x02"
+
+
+def open_archive(content: bytes) -> zipfile.ZipFile:
+    """Return an archive whose directory is not too long to be read.
+
+    Raises:
+        ValueError: It has too many entries.
+        zipfile.BadZipFile: It is no zip archive, or damaged.
+    """
+    if content.count(_DIRECTORY_SIGNATURE) > MOST_ENTRIES:
+        raise ValueError(f"it has more than {MOST_ENTRIES} entries")
+    return zipfile.ZipFile(io.BytesIO(content))
+
+
+def read_entry(archive: zipfile.ZipFile, name: str, largest: int) -> bytes:
+    """Return the content of an entry, whatever size its header declares.
+
+    Args:
+        archive: The archive.
+        name: Of the entry.
+        largest: Size of the content, at most [bytes].
+
+    Raises:
+        ValueError: The content is larger, or compressed in an unusual way.
+        KeyError: There is no such entry.
+    """
+    entry = archive.getinfo(name)
+    # Other methods are decompressed in one go, however large the content is.
+    if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise ValueError(f"entry {name!r} must be stored or deflated")
+    with archive.open(entry) as file:
+        content = file.read(largest + 1)
+    if len(content) > largest:
+        raise ValueError(f"entry {name!r} has more than {largest} bytes")
+    return content
