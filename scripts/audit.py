@@ -15,10 +15,10 @@ from typing import Any
 
 import gymnasium as gym
 
-from agents.audit.attack import attack
-from agents.audit.policies import POLICIES, make_policy
-from agents.audit.report import Finding
-from agents.audit.targets import TARGETS, choose_target
+from agents.studies.audit.attack import attack
+from agents.studies.audit.policies import POLICIES, make_policy
+from agents.studies.audit.report import Finding
+from agents.studies.audit.targets import TARGETS, choose_target
 from dptse_env.config import EnvConfig
 from dptse_env.privacy import PrivacyReport, mu_of
 from dptse_env.privacy.audit import Claim, audit

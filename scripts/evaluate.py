@@ -15,10 +15,16 @@ from typing import Any
 import gymnasium as gym
 from tqdm import tqdm
 
-from agents.evaluation import EpisodeScore, Policy, make_vector, run_episodes, watch_episode
-from agents.figures import save_space_time
-from agents.learned import Saved
-from agents.report import Report
+from agents.evaluation.episodes import (
+    EpisodeScore,
+    Policy,
+    make_vector,
+    run_episodes,
+    watch_episode,
+)
+from agents.evaluation.figures import save_space_time
+from agents.evaluation.policies import Saved
+from agents.evaluation.report import Report
 from dptse_env.config import EnvConfig, parse_seeds
 from dptse_env.model.parameters import read_parameters
 from dptse_env.policies import TRANSFERABLE

@@ -20,11 +20,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from agents.evaluation import EpisodeScore
-from agents.ledger import Ledger
-from agents.policy_study.asked import Asked
-from agents.policy_study.curves import read_curves
-from agents.policy_study.freezing import (
+from agents.evaluation.episodes import EpisodeScore
+from agents.experiments.ledger import Ledger
+from agents.experiments.provenance import take_folder
+from agents.experiments.runner import run_all
+from agents.experiments.seeds import STUDY_TEST, STUDY_VALIDATION
+from agents.studies.policies.curves import read_curves
+from agents.studies.policies.freezing import (
     ASKED,
     TEST,
     VALIDATION,
@@ -35,9 +37,8 @@ from agents.policy_study.freezing import (
     draft,
     origin_of,
 )
-from agents.policy_study.manifest import Manifest, find_checkpoints, read_tuned
-from agents.policy_study.measured import Measured
-from agents.policy_study.plan import (
+from agents.studies.policies.manifest import Manifest, find_checkpoints, read_tuned
+from agents.studies.policies.plan import (
     BASELINES,
     CELLS,
     DETERMINISTIC,
@@ -46,17 +47,16 @@ from agents.policy_study.plan import (
     Entry,
     quick,
 )
-from agents.policy_study.report import draw, write_report
-from agents.policy_study.running import (
+from agents.studies.policies.queries import Asked
+from agents.studies.policies.report import draw, write_report
+from agents.studies.policies.results import Measured
+from agents.studies.policies.running import (
     config_of,
     lacking,
     make_task,
     run_entry,
     watch_entry,
 )
-from agents.provenance import take_folder
-from agents.runner import run_all
-from agents.seeds import STUDY_TEST, STUDY_VALIDATION
 from dptse_env.config import parse_seeds
 from dptse_env.traffic import RecordLibrary
 from dptse_env.validation import integer

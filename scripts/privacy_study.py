@@ -16,14 +16,14 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 from dataclasses import dataclass
 from pathlib import Path
 
-from agents.evaluation import EpisodeScore
-from agents.ledger import Ledger
-from agents.privacy_study.account import account_of, trip_lengths
-from agents.privacy_study.measured import Measured
-from agents.privacy_study.plan import Cell, Design, quick
-from agents.privacy_study.report import draw, write_report
-from agents.provenance import provenance, take_folder
-from agents.runner import make_env, missing, run_all
+from agents.evaluation.episodes import EpisodeScore
+from agents.experiments.ledger import Ledger
+from agents.experiments.provenance import provenance, take_folder
+from agents.experiments.runner import make_env, missing, run_all
+from agents.studies.privacy.account import account_of, trip_lengths
+from agents.studies.privacy.plan import Cell, Design, quick
+from agents.studies.privacy.report import draw, write_report
+from agents.studies.privacy.results import Measured
 from dptse_env.config import EnvConfig, parse_seeds
 from dptse_env.traffic import RecordLibrary
 from dptse_env.validation import integer

@@ -16,14 +16,14 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 from dataclasses import dataclass
 from pathlib import Path
 
-from agents.evaluation import EpisodeScore
-from agents.ledger import Ledger
-from agents.provenance import provenance, take_folder
-from agents.reproduction.measured import Measured
-from agents.reproduction.plan import ESTIMATORS, Cell, Design, quick
-from agents.reproduction.report import draw, write_report
-from agents.reproduction.timing import StepTime, time_all
-from agents.runner import make_env, missing, run_all
+from agents.evaluation.episodes import EpisodeScore
+from agents.experiments.ledger import Ledger
+from agents.experiments.provenance import provenance, take_folder
+from agents.experiments.runner import make_env, missing, run_all
+from agents.studies.paper.plan import ESTIMATORS, Cell, Design, quick
+from agents.studies.paper.report import draw, write_report
+from agents.studies.paper.results import Measured
+from agents.studies.paper.timing import StepTime, time_all
 from dptse_env.config import parse_seeds
 from dptse_env.traffic import RecordLibrary
 from dptse_env.validation import integer

@@ -22,11 +22,11 @@ from rich.console import Console
 from rich.table import Table
 from tqdm import tqdm
 
-from agents.runner import make_pool
-from agents.search_space import SPACE
-from agents.seeds import TUNING
-from agents.tuning import TuningStudy, scores_of
-from agents.tuning_task import TuningTask
+from agents.experiments.runner import make_pool
+from agents.experiments.seeds import TUNING
+from agents.search.space import SPACE
+from agents.search.tuning import TuningStudy, scores_of
+from agents.search.tuning_task import TuningTask
 from dptse_env.model import ARZParameters
 from dptse_env.model.parameters import read_parameters
 from dptse_env.traffic import RecordLibrary

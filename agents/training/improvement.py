@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from agents.evaluation import Policy
-from agents.seeds import training_seed
+from agents.evaluation.episodes import Policy
+from agents.experiments.seeds import training_seed
 from agents.training.plan import TrainingPlan
 from agents.training.recipes import SwapRounds
 from agents.training.swaps import Swaps, try_swaps

@@ -13,7 +13,7 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
-from agents.seeds import training_seed
+from agents.experiments.seeds import training_seed
 from agents.training.episodes import TrainingEpisodes
 from agents.training.recipes import MaskablePPORecipe, PlackettLuceRecipe, Recipe
 from dptse_env.sb3 import PlackettLucePolicy, RoadChannels, SB3VecEnv

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from agents.evaluation import WARM_UP, Policy
+from agents.evaluation.episodes import WARM_UP, Policy
 from dptse_env.arrays import Action, AnyArray, FloatArray, IntArray, Observation
 from dptse_env.privacy import Mechanism
 from dptse_env.process import QueryProcess

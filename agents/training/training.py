@@ -13,8 +13,8 @@ import torch
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-from agents.evaluation import make_vector
-from agents.provenance import take_folder
+from agents.evaluation.episodes import make_vector
+from agents.experiments.provenance import take_folder
 from agents.training.episodes import TrainingEpisodes
 from agents.training.folder import (
     Row,

@@ -7,7 +7,7 @@ import gymnasium as gym
 import pytest
 from PIL import Image
 
-from agents.evaluation import run_episode
+from agents.evaluation.episodes import run_episode
 from dptse_env.sb3 import load_policy
 from dptse_env.schedules import make_schedule
 from scripts.evaluate import Args, config_of, main

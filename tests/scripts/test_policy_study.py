@@ -5,8 +5,8 @@ import shutil
 
 import pytest
 
-from agents.policy_study.plan import Cell
-from agents.seeds import STUDY_TEST, STUDY_VALIDATION
+from agents.experiments.seeds import STUDY_TEST, STUDY_VALIDATION
+from agents.studies.policies.plan import Cell
 from scripts import policy_study
 from scripts.policy_study import Freeze, Run, main
 from tests.agents.policies import SHORT, save

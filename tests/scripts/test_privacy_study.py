@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from agents import runner
+from agents.experiments import runner
 from scripts import privacy_study
 from scripts.cli import command
 from scripts.privacy_study import Args, design_of, main

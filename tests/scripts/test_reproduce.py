@@ -4,7 +4,7 @@ import json
 import pytest
 from PIL import Image
 
-from agents import runner
+from agents.experiments import runner
 from scripts import reproduce
 from scripts.cli import command
 from scripts.reproduce import Args, design_of, main

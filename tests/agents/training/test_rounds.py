@@ -6,7 +6,7 @@ pytest.importorskip("sb3_contrib")
 
 import torch
 
-from agents.seeds import training_seed
+from agents.experiments.seeds import training_seed
 from agents.training.folder import read_progress
 from agents.training.recipes import PlackettLuceRecipe, SwapRounds
 from agents.training.swaps import try_swaps

@@ -1,0 +1,1 @@
+"""What studies and searches share: seeds, designs, engines, ledgers, provenance, tables, plots."""

@@ -1,0 +1,285 @@
+"""Search open-loop schedules on training traffic: a static set, or a period of sets.
+
+A plan's score is the mean reward of a second after the warm-up. Queries never change the traffic
+and noise does not depend on them, so plans are compared on the same traffic and the same noise,
+many of them at once as episodes of one vector environment. Every round draws fresh traffic: a plan
+that is good by luck does not stay the best.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import date
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+
+from agents.evaluation.episodes import WARM_UP, make_vector
+from agents.experiments.seeds import PLAN_SEARCH
+from dptse_env.arrays import BoolArray, FloatArray, IntArray
+from dptse_env.config import TRAINING_SEEDS, VALIDATION_SEEDS, parse_seeds
+from dptse_env.schedules import PLANS, Shifting
+from dptse_env.schedules.plans import Place, Plan
+from dptse_env.validation import integer
+from dptse_env.vector_env import SensorQueryVectorEnv
+
+SURE = 1.0
+"""Standard errors by which a neighbour must gain to take the best plan's place."""
+NOISE_STEP = 10_000
+"""Noise seeds from one round to the next."""
+FEW = 4
+"""Traffic seeds of the first look at a neighbour."""
+
+
+@dataclass(frozen=True)
+class PlanTask:
+    """What is searched for.
+
+    Attributes:
+        env: Environment id.
+        kind: One of `dptse_env.schedules.PLANS`.
+        period: Sets in the plan; 1 for ``best-static``.
+        estimator: Name of the estimator.
+        parameters: Name of the ARZ parameters; the environment's own if None.
+        bandwidth: Queries a step; the environment's own if None.
+        seeds: Traffic seeds, ``"first:stop"``, within `TRAINING_SEEDS`.
+        neighbours: Neighbours of the best plan that a round looks at; twice as many random plans
+            begin the search.
+        seed: Seeds the search.
+        records: Folder of the record cache; the user's cache if None.
+
+    Raises:
+        ValueError: A value is out of range.
+    """
+
+    env: str
+    kind: str
+    period: int
+    estimator: str = "ekf"
+    parameters: str | None = None
+    bandwidth: int | None = None
+    seeds: str = "0:64"
+    neighbours: int = 31
+    seed: int = 0
+    records: str | None = None
+
+    def __post_init__(self) -> None:
+        """Check what needs no environment."""
+        if self.kind not in PLANS:
+            raise ValueError(f"kind must be one of {', '.join(PLANS)}, got {self.kind!r}")
+        integer("period", self.period, 1)
+        if self.kind == "best-static" and self.period != 1:
+            raise ValueError(f"period must be 1 for a static set, got {self.period}")
+        if not set(self.traffic_seeds) <= set(TRAINING_SEEDS):
+            raise ValueError(f"seeds must be training seeds, below 1000, got {self.seeds!r}")
+        integer("neighbours", self.neighbours, 3)
+        if len(self.traffic_seeds) < FEW:
+            raise ValueError(f"seeds must be {FEW} or more, got {self.seeds!r}")
+
+    @property
+    def traffic_seeds(self) -> tuple[int, ...]:
+        """The traffic seeds one by one."""
+        return parse_seeds(self.seeds)
+
+    @property
+    def batch(self) -> int:
+        """Episodes that run at once."""
+        return FEW * (self.neighbours + 1)
+
+    def make(self, n_episodes: int, seeds: tuple[int, ...]) -> SensorQueryVectorEnv:
+        """Make the environment for a number of episodes on some traffic seeds."""
+        keywords: dict[str, Any] = {"estimator": self.estimator, "records": self.records}
+        for name in ("parameters", "bandwidth"):
+            if getattr(self, name) is not None:
+                keywords[name] = getattr(self, name)
+        more = {"traffic_seeds": seeds, "action": "mask", "threads": 1}
+        return make_vector(self.env, n_episodes, {**keywords, **more})
+
+
+class Arena:
+    """Scores plans on the same traffic and noise, a batch of plans at a time.
+
+    Attributes:
+        env: The vector environment.
+        askable: Mainline segments without a fixed sensor, shape (A,).
+    """
+
+    def __init__(self, task: PlanTask, seeds: tuple[int, ...], n_episodes: int) -> None:
+        """Make the environment; nothing is recorded before `scores`."""
+        self.env: Any = task.make(n_episodes, seeds).unwrapped
+        self.n_episodes = n_episodes
+        config = self.env.config
+        self.n_mainline, self.bandwidth = config.corridor.n_mainline, config.bandwidth
+        self.askable = np.setdiff1d(np.arange(self.n_mainline), config.corridor.fixed_sensors)
+        if len(self.askable) < self.bandwidth:
+            raise ValueError(
+                f"bandwidth {self.bandwidth} leaves nothing to choose among the "
+                f"{len(self.askable)} segments without a fixed sensor"
+            )
+
+    def scores(self, plans: BoolArray, seeds: IntArray, noise: int) -> FloatArray:
+        """Return mean rewards of plans (m, period, n) on traffic seeds (r,), shape (m, r)."""
+        each = self.n_episodes // len(seeds)
+        blocks = [plans[i : i + each] for i in range(0, len(plans), each)]
+        return np.concatenate([self._block(block, seeds, noise) for block in blocks])
+
+    def _block(self, plans: BoolArray, seeds: IntArray, noise: int) -> FloatArray:
+        m, r = len(plans), len(seeds)
+        n_used = m * r
+        traffic = np.resize(np.tile(seeds, m), self.n_episodes).tolist()
+        followed = np.resize(np.repeat(np.arange(m), r), self.n_episodes)
+        used = np.arange(self.n_episodes) < n_used
+        env = self.env
+        env.reset(seed=[noise + one for one in traffic], options={"traffic_seed": traffic})
+        total, n_steps = np.zeros(self.n_episodes), env.config.horizon_steps
+        for step in range(n_steps):
+            transition = env.advance(plans[followed, step % plans.shape[1]].astype(np.int8))
+            if step >= WARM_UP:
+                total += transition.reward
+        mean: FloatArray = total[used] / (n_steps - WARM_UP)
+        return mean.reshape(m, r)
+
+
+class PlanSearch:
+    """Successive halving of random plans, then exchanges of one segment at a time.
+
+    A round looks at neighbours of the best plan so far on a few fresh seeds, at the best quarter of
+    them on four times as many, and at the best of these on as many as the batch holds. There its
+    mean gain must be `SURE` standard errors above zero for it to take the place. Rounds depend on
+    the task's seed and their number alone, so a search that is interrupted goes on to the same end.
+
+    Attributes:
+        best: The best plan so far, shape (period, n).
+        n_rounds: Rounds done.
+        n_adopted: Neighbours that took its place.
+    """
+
+    def __init__(self, task: PlanTask) -> None:
+        """Begin with an even plan; see `begin` and `go_on`."""
+        self.task = task
+        self._arena = Arena(task, task.traffic_seeds, task.batch)
+        self.best = even_plan(self._arena, task.period)
+        self.n_rounds = self.n_adopted = 0
+
+    def begin(self) -> None:
+        """Take the best of random plans by successive halving, an even plan among them."""
+        generator = np.random.default_rng([self.task.seed, 0])
+        n_random = 2 * self.task.neighbours + 1
+        plans = np.stack([self.best, *(self._random(generator) for _ in range(n_random))])
+        n_seeds = 2
+        while len(plans) > 1:
+            scores = self._arena.scores(plans, self._seeds(generator, n_seeds), PLAN_SEARCH.start)
+            plans = plans[np.argsort(-scores.mean(axis=1))[: len(plans) // 2]]
+            n_seeds *= 2
+        self.best = plans[0]
+
+    def resume(self, plan: Plan) -> None:
+        """Go on with what an interrupted search left."""
+        self.best = masks_of(plan, self._arena.n_mainline)
+        self.n_rounds = int(plan.provenance["rounds"])
+        self.n_adopted = int(plan.provenance["adopted"])
+
+    def go_on(self, n_rounds: int, on_round: Callable[[], None]) -> None:
+        """Run rounds until there are ``n_rounds``; call ``on_round`` after each."""
+        while self.n_rounds < n_rounds:
+            self._round()
+            self.n_rounds += 1
+            on_round()
+
+    def plan(self) -> Plan:
+        """Return the best plan so far, with its provenance."""
+        config = self._arena.env.config
+        task = dataclasses.asdict(self.task)
+        del task["records"]
+        provenance = {
+            "task": task, "rounds": self.n_rounds, "adopted": self.n_adopted,
+            "privacy": dataclasses.asdict(config.privacy), "warm_up": WARM_UP,
+            "noise_seed": PLAN_SEARCH.start, "date": date.today().isoformat(),
+            "versions": {name: version(name) for name in ("dptse-env", "libsumo", "numpy")},
+        }  # fmt: skip
+        sets = tuple(tuple(np.flatnonzero(one).tolist()) for one in self.best)
+        return Plan(self.task.kind, Place.of(config), sets, provenance)
+
+    def _round(self) -> None:
+        generator = np.random.default_rng([self.task.seed, 1 + self.n_rounds])
+        noise = PLAN_SEARCH.start + NOISE_STEP * (1 + self.n_rounds)
+        n_plans, n_seeds = self.task.neighbours, FEW
+        plans = np.stack([self._neighbour(generator) for _ in range(n_plans)])
+        while True:
+            seeds = self._seeds(generator, n_seeds)
+            scores = self._arena.scores(np.stack([self.best, *plans]), seeds, noise)
+            gains = scores[1:] - scores[0]
+            order = np.argsort(-gains.mean(axis=1))
+            if n_plans == 1:
+                break
+            n_plans = max((n_plans + 1) // 4 - 1, 1)
+            n_seeds = self.task.batch // (n_plans + 1)
+            plans, noise = plans[order[:n_plans]], noise + NOISE_STEP // 4
+        gain = gains[0]
+        if gain.mean() > SURE * gain.std(ddof=1) / np.sqrt(len(gain)):
+            self.best, self.n_adopted = plans[0], self.n_adopted + 1
+
+    def _seeds(self, generator: np.random.Generator, n_seeds: int) -> IntArray:
+        """Draw traffic seeds, as many as there are at most."""
+        seeds = self.task.traffic_seeds
+        return generator.choice(seeds, min(n_seeds, len(seeds), self.task.batch), replace=False)
+
+    def _random(self, generator: np.random.Generator) -> BoolArray:
+        """Return a random plan; what is longer than a set asks all segments equally often."""
+        arena, period = self._arena, self.task.period
+        plan = np.zeros((period, arena.n_mainline), dtype=bool)
+        left: list[int] = []
+        for one in plan:
+            while one.sum() < arena.bandwidth:
+                if not left:
+                    left = generator.permutation(arena.askable).tolist()
+                fresh = [s for s in left if not one[s]]
+                if not fresh:
+                    left += generator.permutation(arena.askable).tolist()
+                    continue
+                one[fresh[0]] = True
+                left.remove(fresh[0])
+        return plan
+
+    def _neighbour(self, generator: np.random.Generator) -> BoolArray:
+        """Exchange one segment of one set, or, half of the time, segments between two sets."""
+        plan, free = self.best.copy(), self._arena.askable
+        while np.array_equal(plan, self.best):
+            first = generator.integers(len(plan))
+            out = generator.choice(np.flatnonzero(plan[first]))
+            into = generator.choice([s for s in free if not plan[first, s]] or [out])
+            givers = np.flatnonzero(plan[:, into] & ~plan[:, out])
+            if givers.size and generator.random() < 0.5:
+                second = generator.choice(givers)
+                plan[second, into], plan[second, out] = False, True
+            plan[first, out], plan[first, into] = False, True
+        return plan
+
+
+def held_out(task: PlanTask, plan: Plan, n_seeds: int = 16) -> dict[str, float]:
+    """Return the mean rewards of a plan and of a round robin on validation traffic."""
+    seeds = tuple(VALIDATION_SEEDS[:n_seeds])
+    arena = Arena(task, seeds, n_seeds)
+    rival = even_plan(arena, arena.n_mainline)
+    found = {"plan": masks_of(plan, arena.n_mainline), "round-robin": rival}
+    return {
+        name: float(arena.scores(masks[None], np.array(seeds), 0).mean())
+        for name, masks in found.items()
+    }
+
+
+def masks_of(plan: Plan, n_mainline: int) -> BoolArray:
+    """Return a plan's sets as masks, shape (period, n_mainline)."""
+    masks = np.zeros((len(plan.sets), n_mainline), dtype=bool)
+    np.put_along_axis(masks, np.array(plan.sets), True, axis=1)
+    return masks
+
+
+def even_plan(arena: Arena, period: int) -> BoolArray:
+    """Return the first steps of a round robin as masks, shape (period, n_mainline)."""
+    even = Shifting(arena.env.interface, period=1)
+    size = arena.env.single_observation_space.shape
+    return even.select(np.arange(period), np.zeros((period, *size), dtype=np.float32))

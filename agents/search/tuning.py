@@ -1,0 +1,300 @@
+"""Tune an estimator's settings on training traffic with Optuna, in a journal that can be resumed.
+
+One process asks for trials and writes the journal; episodes run in the executor that it is given.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import logging
+import math
+from collections.abc import Callable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from datetime import date
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import optuna
+from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock, JournalStorage
+from optuna.trial import FrozenTrial, TrialState
+
+from agents.evaluation.episodes import WARM_UP, EpisodeScore
+from agents.search.space import nested, values_of
+from agents.search.tuning_task import TuningTask, score_episode
+from dptse_env.estimators import EstimatorSettings
+from dptse_env.estimators.tuning import write_settings
+from dptse_env.mapping import from_mapping
+
+_FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
+_COUNTED = (*_FINISHED, TrialState.RUNNING)
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass
+class _Running:
+    """A trial on its way over the traffic seeds."""
+
+    trial: optuna.Trial
+    settings: EstimatorSettings
+    scores: list[EpisodeScore] = field(default_factory=list)
+
+
+class TuningStudy:
+    """The trials of one task, kept in ``<folder>/<name>.journal``.
+
+    The first trials are the defaults and the set that the environment has been choosing itself;
+    both run to the end. The others stop early once they fall behind the median.
+
+    Attributes:
+        task: What is tuned.
+        study: Optuna's study; its values are mean rewards, to be maximised.
+    """
+
+    def __init__(self, task: TuningTask, folder: Path, seed: int = 0) -> None:
+        """Begin or go on; use `open`, which makes sure that nobody else does."""
+        self.task, self.seed = task, seed
+        self.space = task.space
+        self.path = journal_path(task, folder)
+        backend = JournalFileBackend(str(self.path), JournalFileOpenLock(str(self.path)))
+        self.study = optuna.create_study(
+            storage=JournalStorage(backend),
+            study_name=task.name,
+            direction="maximize",
+            pruner=optuna.pruners.MedianPruner(n_startup_trials=8, n_warmup_steps=1),
+            load_if_exists=True,
+        )
+        self._identify({**task.identity(), "sampler_seed": seed})
+        # Nobody else is at work here, so whatever is running belongs to a run that was killed.
+        for trial in self.study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
+            self.study.tell(trial.number, state=TrialState.FAIL)
+        self._enqueue("defaults", EstimatorSettings())
+        self._enqueue("shipped", task.config().settings())
+
+    @classmethod
+    @contextmanager
+    def open(cls, task: TuningTask, folder: Path, seed: int = 0) -> Iterator[TuningStudy]:
+        """Open a study and keep others out of it meanwhile.
+
+        Args:
+            task: What to tune.
+            folder: Where the journal is; made if missing.
+            seed: Seeds the sampler.
+
+        Raises:
+            ValueError: The journal is of a study with other arguments.
+            BlockingIOError: Another process has the study open.
+        """
+        folder.mkdir(parents=True, exist_ok=True)
+        path = journal_path(task, folder)
+        with path.open("ab") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as problem:
+                raise BlockingIOError(f"another run is writing {path}") from problem
+            _mend(path)
+            yield cls(task, folder, seed)
+
+    def _identify(self, identity: dict[str, Any]) -> None:
+        identity = json.loads(json.dumps(identity))
+        kept = self.study.user_attrs.get("identity")
+        if kept is None:
+            self.study.set_user_attr("identity", identity)
+        elif kept != identity:
+            keys = [key for key in {**kept, **identity} if kept.get(key) != identity.get(key)]
+            ours, theirs = ({key: one.get(key) for key in keys} for one in (identity, kept))
+            raise ValueError(
+                f"{self.path} belongs to a study with {theirs}, this one has {ours}; "
+                "choose another output folder"
+            )
+
+    def _enqueue(self, label: str, settings: EstimatorSettings) -> None:
+        """Queue a labelled trial unless it was run or waits, or equals one that does."""
+        values = values_of(settings, self.space)
+        states = (*_FINISHED, TrialState.WAITING)
+        for trial in self.study.get_trials(deepcopy=False, states=states):
+            if label == trial.user_attrs.get("label"):
+                return
+        if label == "shipped" and settings == EstimatorSettings():
+            return
+        if not all(knob.holds(values[path]) for path, knob in self.space.items()):
+            logger.warning("the %s settings lie outside of the search: %s", label, values)
+            return
+        self.study.enqueue_trial(values, user_attrs={"label": label})
+
+    def n_finished(self) -> int:
+        """Return the number of trials that ran to their end or were stopped early."""
+        return len(self.study.get_trials(deepcopy=False, states=_FINISHED))
+
+    def labelled(self, label: str) -> FrozenTrial | None:
+        """Return the finished trial of the ``defaults`` or of the ``shipped`` set, if any."""
+        for trial in self.study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)):
+            if trial.user_attrs.get("label") == label:
+                return trial
+        return None
+
+    def best(self) -> FrozenTrial | None:
+        """Return the best trial that ran to its end, if any."""
+        trials = self.study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+        return max(trials, key=_value, default=None)
+
+    def run(
+        self,
+        n_trials: int,
+        executor: Executor,
+        n_parallel: int = 1,
+        on_trial: Callable[[], None] | None = None,
+    ) -> None:
+        """Run trials until ``n_trials`` are finished, those of earlier runs included.
+
+        With one trial at a time, a study that was interrupted comes out as one that was not.
+
+        Args:
+            n_trials: Trials wanted in all.
+            executor: Runs the episodes.
+            n_parallel: Trials under way at once.
+            on_trial: Called after every finished trial.
+        """
+        running: dict[Future[EpisodeScore], _Running] = {}
+        try:
+            while True:
+                while len(running) < n_parallel and self._n_counted() < n_trials:
+                    self._submit(self._ask(), executor, running)
+                if not running:
+                    return
+                for future in wait(running, return_when=FIRST_COMPLETED).done:
+                    one = running[future]
+                    one.scores.append(future.result())
+                    finished = self._tell(one)
+                    del running[future]
+                    if not finished:
+                        self._submit(one, executor, running)
+                    elif on_trial is not None:
+                        on_trial()
+        except BaseException:
+            for one in running.values():
+                self.study.tell(one.trial, state=TrialState.FAIL, skip_if_finished=True)
+            raise
+
+    def _n_counted(self) -> int:
+        return len(self.study.get_trials(deepcopy=False, states=_COUNTED))
+
+    def _ask(self) -> _Running:
+        # A sampler of its own for each trial: resuming must not draw the first numbers again.
+        seed = np.random.SeedSequence([self.seed, self._n_counted()]).generate_state(1)[0]
+        self.study.sampler = optuna.samplers.TPESampler(seed=int(seed), multivariate=True)
+        trial = self.study.ask()
+        values = {path: knob.suggest(trial, path) for path, knob in self.space.items()}
+        settings = nested(values)
+        trial.set_user_attr("settings", settings)
+        return _Running(trial, from_mapping(EstimatorSettings, settings, "estimator_settings"))
+
+    def _submit(
+        self, one: _Running, executor: Executor, running: dict[Future[EpisodeScore], _Running]
+    ) -> None:
+        seed = self.task.traffic_seeds[len(one.scores)]
+        running[executor.submit(score_episode, self.task, one.settings, seed)] = one
+
+    def _tell(self, one: _Running) -> bool:
+        """Report the latest episode; return whether the trial is finished."""
+        trial, scores = one.trial, one.scores
+        reward = float(np.mean([score.reward for score in scores]))
+        if not math.isfinite(reward):
+            trial.set_user_attr("not_finite", scores[-1].traffic_seed)
+            self.study.tell(trial, state=TrialState.PRUNED)
+            return True
+        trial.report(reward, len(scores))
+        if len(scores) == len(self.task.traffic_seeds):
+            for key, value in _summary(scores).items():
+                trial.set_user_attr(key, value)
+            self.study.tell(trial, reward)
+            return True
+        if "label" not in trial.user_attrs and trial.should_prune():
+            self.study.tell(trial, state=TrialState.PRUNED)
+            return True
+        return False
+
+    def write(self, path: Path) -> None:
+        """Write the best settings and where they come from.
+
+        Raises:
+            ValueError: No trial ran to its end.
+        """
+        best, defaults = self.best(), self.labelled("defaults")
+        if best is None:
+            raise ValueError(f"{self.task.name}: no trial ran to its end with a finite score")
+        write_settings(
+            path,
+            estimator=self.task.estimator,
+            parameters=self.task.parameters_name,
+            privacy=self.task.privacy,
+            settings=best.user_attrs["settings"],
+            provenance=self._provenance(best, defaults),
+        )
+
+    def _provenance(self, best: FrozenTrial, defaults: FrozenTrial | None) -> dict[str, Any]:
+        task, config = self.task, self.task.config()
+        settings = from_mapping(EstimatorSettings, best.user_attrs["settings"], "settings")
+        values = values_of(settings, self.space)
+        trials = self.study.get_trials(deepcopy=False, states=(TrialState.PRUNED,))
+        packages = ("dptse-env", "libsumo", "numba", "numpy", "optuna")
+        return {
+            "method": "tree-structured Parzen estimator on the mean reward of a second",
+            "corridor": config.corridor.name,
+            "schedule": task.schedule,
+            "bandwidth": config.bandwidth,
+            "epsilon": config.privacy.epsilon,
+            "delta": config.privacy.delta,
+            "seeds": task.seeds,
+            "noise_seed": task.noise_seed,
+            "sampler_seed": self.seed,
+            "warm_up": WARM_UP,
+            "n_trials": self.n_finished(),
+            "n_stopped_early": len(trials),
+            **scores_of(best),
+            "defaults": None if defaults is None else scores_of(defaults),
+            "at_bounds": [path for path, knob in self.space.items() if knob.at_bound(values[path])],
+            "date": date.today().isoformat(),
+            "versions": {name: version(name) for name in packages},
+        }
+
+
+def journal_path(task: TuningTask, folder: Path) -> Path:
+    """Return where the journal of a task is kept."""
+    return folder / f"{task.name}.journal"
+
+
+def scores_of(trial: FrozenTrial) -> dict[str, float]:
+    """Return the mean reward (``score``), the errors and the mishaps of a finished trial."""
+    keys = ("rmse_density", "rmse_speed", "n_diverged")
+    return {"score": _value(trial), **{key: trial.user_attrs[key] for key in keys}}
+
+
+def _value(trial: FrozenTrial) -> float:
+    if trial.value is None:
+        raise ValueError(f"trial {trial.number} has no score")
+    return trial.value
+
+
+def _summary(scores: list[EpisodeScore]) -> dict[str, float]:
+    """Errors as means over traffic seeds, mishaps as sums."""
+    return {
+        "rmse_density": float(np.mean([score.rmse_density for score in scores])),
+        "rmse_speed": float(np.mean([score.rmse_speed for score in scores])),
+        "n_diverged": float(sum(score.n_diverged for score in scores)),
+    }
+
+
+def _mend(path: Path) -> None:
+    """Undo what a killed run left of a write: half a line and a lock, which Optuna trips over."""
+    content = path.read_bytes()
+    whole = content.rfind(b"\n") + 1
+    if whole < len(content):
+        with path.open("r+b") as file:
+            file.truncate(whole)
+    Path(f"{path}.lock").unlink(missing_ok=True)

@@ -1,0 +1,201 @@
+"""The attack: play both worlds many times, and score each public transcript."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from tqdm import tqdm
+
+from agents.studies.audit.policies import Policy, always_observed
+from agents.studies.audit.worlds import TwoWorlds
+from dptse_env.arrays import BoolArray, FloatArray, IntArray
+from dptse_env.config import EnvConfig
+from dptse_env.interface import QueryInterface
+from dptse_env.privacy import GaussianMechanism, Mechanism
+from dptse_env.process import QueryProcess
+from dptse_env.sensing import Sensing, make_answers
+
+BATCH = 250
+"""Runs per world to play at once."""
+
+
+@dataclass(frozen=True)
+class Runs:
+    """What came of the runs, world by world.
+
+    Attributes:
+        scores: Log-likelihood ratio of world 1 of each transcript, (2, n).
+        distances: Distance between the worlds' true answers under each run's queries, in units of
+            the noise, (2, n). Given a distance D for sure, the scores are N(-+D^2/2, D^2).
+    """
+
+    scores: FloatArray
+    distances: FloatArray
+
+
+class Wiretap:
+    """A mechanism whose releases are kept: the public transcript, one step at a time.
+
+    Attributes:
+        released: The last releases, shape (k, n_columns, 2).
+    """
+
+    def __init__(self, mechanism: Mechanism) -> None:
+        """Listen to a mechanism."""
+        self._mechanism = mechanism
+        self.released = np.empty((0, 0, 2))
+
+    @property
+    def sigma(self) -> FloatArray:
+        """See `Mechanism.sigma`."""
+        return self._mechanism.sigma
+
+    def reset(self, episodes: IntArray, generators: Sequence[np.random.Generator]) -> None:
+        """See `Mechanism.reset`."""
+        self._mechanism.reset(episodes, generators)
+
+    def release(self, episodes: IntArray, values: FloatArray) -> FloatArray:
+        """See `Mechanism.release`."""
+        self.released = self._mechanism.release(episodes, values)
+        return self.released
+
+
+class Adversary:
+    """Knows both worlds and the queries, and works out what either world would answer.
+
+    Attributes:
+        score: Log-likelihood ratio of world 1 of each run's transcript so far, shape (k,).
+        square: Squared distance between the worlds' answers so far, in units of the noise, (k,).
+    """
+
+    def __init__(
+        self, config: EnvConfig, worlds: TwoWorlds, n_runs: int, sigma: FloatArray
+    ) -> None:
+        """Prepare for so many runs at once, under noise of standard deviation `sigma`, (2,)."""
+        corridor, always = config.corridor, always_observed(config)
+        columns = max([corridor.n_segments, *(column + 1 for column in always)])
+        sensing = Sensing(corridor, (0, 1), worlds)
+        # Both worlds' answers to every run, whichever world it is in.
+        self._answers = make_answers(config.privacy, sensing, columns, 2 * n_runs)
+        for world in (0, 1):
+            sensing.load(world)
+            self._answers.load(world)
+        self._sigma = sigma
+        self._always = np.zeros(columns, dtype=bool)
+        self._always[always] = True
+
+    def reset(self, n_runs: int) -> None:
+        """Begin new runs."""
+        self._episodes, self._worlds = np.arange(2 * n_runs), np.repeat([0, 1], n_runs)
+        self._answers.reset(self._episodes)
+        self.score, self.square = np.zeros(n_runs), np.zeros(n_runs)
+
+    def expect(self, time: int, queried: BoolArray) -> tuple[FloatArray, FloatArray]:
+        """Return midpoint and difference of both worlds' answers, (k, n_columns, 2), and add up.
+
+        Both are in units of the noise; the difference is zero where nobody asked.
+        """
+        observed = np.tile(self._always, (len(queried), 1))
+        observed[:, : queried.shape[1]] |= queried
+        times = np.full(len(self._episodes), time)
+        answers = self._answers.collect(
+            self._episodes, self._worlds, times, np.tile(observed, (2, 1))
+        )
+        zero, one = np.split(answers / self._sigma, 2)
+        difference = np.where(observed[:, :, None], one - zero, 0.0)
+        self.square += np.sum(difference**2, axis=(1, 2))
+        return 0.5 * (zero + one), difference
+
+    def take_in(self, time: int, queried: BoolArray, released: FloatArray) -> None:
+        """Score one released step: the log-likelihood ratio of Gaussians of either mean."""
+        midpoint, difference = self.expect(time, queried)
+        self.score += np.sum((released / self._sigma - midpoint) * difference, axis=(1, 2))
+
+
+def planned_distance(
+    config: EnvConfig, worlds: TwoWorlds, plan: BoolArray, sigma: FloatArray
+) -> float:
+    """Return the distance between the worlds under fixed queries, in units of the noise.
+
+    Args:
+        config: The configuration.
+        worlds: The two worlds.
+        plan: Segments by step, shape (horizon, n_mainline).
+        sigma: Noise standard deviations, (2,).
+    """
+    adversary = Adversary(config, worlds, 1, sigma)
+    adversary.reset(1)
+    for step, queried in enumerate(plan):
+        adversary.expect(step + 1, queried[None])
+    return float(np.sqrt(adversary.square[0]))
+
+
+def attack(
+    config: EnvConfig,
+    worlds: TwoWorlds,
+    policy: Policy,
+    n_runs: int,
+    *,
+    noise_factor: float = 1.0,
+    seed: int = 0,
+    progress: bool = True,
+) -> Runs:
+    """Play both worlds and score every transcript.
+
+    Each run is an episode of the decision process from the first second of the record. What the
+    estimator makes of the releases adds nothing to them, so the one that costs least is used.
+
+    Args:
+        config: The configuration under attack.
+        worlds: The two worlds.
+        policy: Chooses the queries.
+        n_runs: Runs per world n.
+        noise_factor: Multiplies the noise that the configuration declares.
+        seed: Seeds the noise, >= 0.
+        progress: Whether to show a progress bar.
+    """
+    config = dataclasses.replace(
+        config, traffic_seeds=(0, 1), random_start=False, action="mask",
+        estimator="open_loop", backend="compiled", estimator_settings=None,
+    )  # fmt: skip
+    size = min(BATCH, n_runs)
+    process = QueryProcess(config, QueryInterface.of(config), 2 * size, worlds)
+    sigma = noise_factor * process.mechanism.sigma
+    columns = config.corridor.n_segments + process.boundary.n_released
+    tap = Wiretap(GaussianMechanism(sigma, n_episodes=2 * size, n_segments=columns))
+    process.mechanism = tap
+    adversary = Adversary(config, worlds, 2 * size, sigma)
+    parts = []
+    with tqdm(
+        total=2 * n_runs, desc="attacking", unit="run", mininterval=0.5, disable=not progress
+    ) as bar:
+        for first in range(0, n_runs, size):
+            batch = range(first, min(first + size, n_runs))
+            for world in (0, 1):
+                _begin(process, world, batch, seed)
+            _play(process, tap, adversary, policy, 2 * len(batch))
+            parts.append([adversary.score.reshape(2, -1), np.sqrt(adversary.square).reshape(2, -1)])
+            bar.update(2 * len(batch))
+    scores, distances = (np.concatenate(part, axis=1) for part in zip(*parts, strict=True))
+    return Runs(scores, distances)
+
+
+def _begin(process: QueryProcess, world: int, batch: range, seed: int) -> None:
+    """Begin some runs of a world, each with a noise stream of its own whatever the batch."""
+    episodes = np.arange(world * len(batch), (world + 1) * len(batch))
+    streams = [np.random.default_rng((seed, world, run)) for run in batch]
+    process.reset(episodes, streams, {"traffic_seed": world, "start": 0})
+
+
+def _play(
+    process: QueryProcess, tap: Wiretap, adversary: Adversary, policy: Policy, n_runs: int
+) -> None:
+    """Play runs that were begun to their end; their scores stay with the adversary."""
+    adversary.reset(n_runs)
+    for step in range(process.config.horizon_steps):
+        queries = policy.queries(step, adversary.score)
+        process.step(np.arange(n_runs), queries.astype(np.int8))
+        adversary.take_in(step + 1, process.queried[:n_runs], tap.released)

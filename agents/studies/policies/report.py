@@ -1,0 +1,247 @@
+"""The report of the study: rules, verdicts, then what they rest on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from agents.evaluation.statistics import Interval, crossed_t
+from agents.experiments.seeds import STUDY_TEST, STUDY_VALIDATION, TRAINING
+from agents.studies.paper.tables import markdown, shown
+from agents.studies.policies.figures import save_asked, save_cells, save_curves, save_ladder
+from agents.studies.policies.plan import PRIMARY, Learner
+from agents.studies.policies.results import ERROR_ORACLE, Measured
+from agents.studies.policies.rules import RULES, TARGETS, Verdict, judge
+from agents.studies.policies.tables import (
+    choice_table,
+    health_table,
+    ladder_table,
+    secondary_table,
+    seeds_table,
+    verdict_table,
+    write_summary,
+)
+
+CAPTIONS = {
+    "fig_ladder.png": "Everyone in the primary cell, least density-and-speed error first.",
+    "fig_cells.png": "How far learned policies lie below the references, in every cell.",
+    "fig_curves.png": "Learning curves: thin for each training seed, thick for their "
+    "mean, on the validation seeds of the training. Marks: schedules on those of the study.",
+    "fig_asked.png": "Where and when policies ask, on the road and seen from the incident.",
+}
+
+LIMITS = """\
+- The traffic is SUMO's, on one road. Nothing is said of other roads.
+- With few training seeds that differ by much, the percentile bootstrap is too narrow (five of them
+  cover some 84 % in the extreme case). The t interval for crossed random effects, told beside the
+  primary result, takes their number into account.
+- Oracles see the truth. They are bounds on what asking can reach with this estimator, no policies,
+  and greedy ones are not the least upper bound.
+- Baselines were not tuned beyond what the table of settings says. What was tried of recipes, on
+  validation traffic, and what each idea gave stands in `docs/learning.md`."""
+
+
+def draw(folder: Path, measured: Measured) -> None:
+    """Save the figures and the summary."""
+    seeds = f"{len(measured.design.test_seeds)} test seeds, 95 % intervals"
+    save_ladder(folder / "fig_ladder.png", measured, f"{_primary_name(measured)}; {seeds}")
+    save_cells(folder / "fig_cells.png", measured, f"Learned policies against references; {seeds}")
+    save_curves(folder / "fig_curves.png", measured, f"{_primary_name(measured)}: learning curves")
+    save_asked(folder / "fig_asked.png", measured, f"{_primary_name(measured)}: who is asked")
+    write_summary(folder / "summary.csv", measured)
+
+
+def write_report(path: Path, measured: Measured, origin: Mapping[str, Any]) -> None:
+    """Write everything as Markdown.
+
+    Args:
+        path: Where to.
+        measured: What was measured.
+        origin: What `take_folder` returned.
+    """
+    learner = measured.primary
+    verdicts = [] if learner is None else [judge(measured, learner, own) for own in TARGETS]
+    sections = [
+        _head(measured),
+        "## Rules\n\nStated before anything was run on test traffic.",
+        RULES,
+        "## Verdicts",
+        *_verdicts(measured, learner, verdicts),
+        "## In sentences",
+        "\n".join(f"- {sentence}" for sentence in sentences(measured, learner, verdicts)),
+        "## Figures\n\nBars are 95 % intervals.",
+        *(f"![{text}]({name})\n\n{text}" for name, text in CAPTIONS.items()),
+        "## What validation traffic chose",
+        choice_table(measured),
+        *_unsuited(measured),
+        "## Secondary cells",
+        _secondary(measured),
+        "## Ladders\n\nMean [95 % interval]; IQM is the interquartile mean over all training seeds "
+        "and traffic seeds. Below best baseline: against the one that validation traffic chose.",
+        *_ladders(measured),
+        f"## Limits\n\n{LIMITS}",
+        *_origin(measured, origin),
+    ]
+    path.write_text("\n\n".join(sections) + "\n", encoding="utf-8")
+
+
+def _primary_name(measured: Measured) -> str:
+    return measured.design.cell(PRIMARY).says
+
+
+def _head(measured: Measured) -> str:
+    design, manifest = measured.design, measured.manifest
+    n_entries = len(manifest.entries(design))
+    return (
+        "# Learned query policies against every baseline\n\n"
+        f"{len(design.cells)} cells, {n_entries} policies in them, each on "
+        f"{len(design.test_seeds)} test seeds ({min(design.test_seeds)} to "
+        f"{max(design.test_seeds)}); all are paired by traffic and noise. {_frozen(measured)} "
+        f"Traffic seeds of training are below 1000, of validation 1000 to 1999, of tests 2000 to "
+        f"2999. Noise is seeded with {STUDY_VALIDATION.start:,} plus the traffic seed in "
+        f"validation and {STUDY_TEST.start:,} plus the traffic seed in tests; training counts from "
+        f"{TRAINING.start:,} on. This file is generated by\n\n```\n"
+        f"{manifest.command}\npython scripts/policy_study.py run\n```"
+    )
+
+
+def _frozen(measured: Measured) -> str:
+    manifest = measured.manifest
+    n_checkpoints = len(manifest.checkpoints)
+    return (
+        f"{n_checkpoints} trained policies, the best baseline and the best recipe of every cell "
+        f"were frozen on {manifest.frozen} in `manifest.json` ({manifest.digest}), before test "
+        "traffic was touched; the program runs no other file."
+    )
+
+
+def _verdicts(
+    measured: Measured, learner: Learner | None, verdicts: Sequence[Verdict]
+) -> Iterator[str]:
+    if learner is None:
+        yield "**Missed**: no trained policy was frozen for the primary cell."
+        return
+    yield (
+        f"Learned policy: {learner.policy}, {learner.mode}, "
+        f"{len(measured.manifest.runs(learner))} training seeds, in {_primary_name(measured)}."
+    )
+    yield verdict_table(list(verdicts))
+    yield "Each training seed:"
+    yield seeds_table(measured, learner)
+
+
+def sentences(
+    measured: Measured, learner: Learner | None, verdicts: Sequence[Verdict]
+) -> Iterator[str]:
+    """Say in words what the numbers say."""
+    for own in verdicts:
+        yield (
+            f"{'Met' if own.is_met else 'Missed'}: at least {own.target.percent:g} % "
+            f"{own.target.says}. Measured {_percent(own.overall)} below `{own.reference}`, and "
+            f"{_percent(own.worst)} for the worst training seed ({own.worst_seed})."
+        )
+    if learner is not None:
+        yield from _about(measured, learner)
+    baseline, paper = measured.references
+    below = measured.below(measured.schedule(PRIMARY, baseline), measured.schedule(PRIMARY, paper))
+    if baseline != paper:
+        yield f"The best baseline, `{baseline}`, lies {_percent(below)} below the paper's schedule."
+    if ERROR_ORACLE in measured.manifest.bounds[PRIMARY]:
+        oracle = measured.schedule(PRIMARY, ERROR_ORACLE)
+        room = measured.below(oracle, measured.schedule(PRIMARY, baseline))
+        yield f"The error oracle, which sees the truth, lies {_percent(room)} below `{baseline}`."
+
+
+def _about(measured: Measured, learner: Learner) -> Iterator[str]:
+    table = measured.learned(learner)
+    hindsight = measured.best_on_test(PRIMARY)
+    if hindsight != measured.references[0]:
+        below = measured.below(table, measured.schedule(PRIMARY, hindsight))
+        yield (
+            f"The best baseline on test traffic is `{hindsight}`, known in hindsight only: the "
+            f"learned policy lies {_percent(below)} below it."
+        )
+    way = measured.of_way(learner)
+    if way is not None:
+        yield f"It goes {_percent(way)} of the way from the best baseline to the error oracle."
+    difference = measured.schedule(PRIMARY, measured.references[0]) - table
+    interval, p_value = crossed_t(difference)
+    yield (
+        f"Student's t for crossed random effects: the best baseline errs {shown(interval)} × 1000 "
+        f"more than the learned policy, p = {p_value:.2g}."
+    )
+    other = Learner(
+        learner.cell,
+        learner.policy,
+        learner.trained_in,
+        "stochastic" if learner.mode == "deterministic" else "deterministic",
+    )
+    below = measured.below(table, measured.learned(other))
+    yield f"Acting {learner.mode} it lies {_percent(below)} below itself acting {other.mode}."
+
+
+def _percent(interval: Interval) -> str:
+    return f"{interval.mean:z.1f} % [{interval.low:z.1f}, {interval.high:z.1f}]"
+
+
+def _unsuited(measured: Measured) -> Iterator[str]:
+    lines = [
+        f"- {cell}: `{name}`: {why}"
+        for cell, others in measured.manifest.unsuited.items()
+        for name, why in others.items()
+    ]
+    if lines:
+        yield "Schedules that do not suit a cell, and so do not stand on its ladder:"
+        yield "\n".join(lines)
+
+
+def _secondary(measured: Measured) -> str:
+    if not measured.comparisons:
+        return "No learned policy was frozen for a secondary cell."
+    return (
+        "Learned against the best baseline of each cell. *Below* has a bootstrap interval, the "
+        "difference and its p-value come from Student's t for crossed random effects; p-values "
+        f"are Holm's over {len(measured.comparisons)} comparisons.\n\n{secondary_table(measured)}"
+    )
+
+
+def _ladders(measured: Measured) -> Iterator[str]:
+    for cell in measured.design.cells:
+        yield f"### {cell.name}: {cell.says}"
+        yield ladder_table(measured, cell.name)
+        yield f"Seconds lost by the estimator, over all episodes: {_lost(measured, cell.name)}"
+
+
+def _lost(measured: Measured, cell: str) -> str:
+    text = health_table(measured, cell)
+    return f"\n\n{text}" if text.startswith("|") else text
+
+
+def _origin(measured: Measured, origin: Mapping[str, Any]) -> Iterator[str]:
+    manifest, machine = measured.manifest, origin["machine"]
+    yield "## Origin"
+    versions = next(iter(origin["made_with"]["cells"].values()))["versions"]
+    sources = {"source of dptse_env": ", ".join(origin["sources"])}
+    rows = [[name, str(own)] for name, own in {**versions, **sources, **machine}.items()]
+    yield markdown(["version of", ""], rows)
+    yield "Policies that were frozen:"
+    checkpoints = [
+        [f"`{own.path}`", own.cell, own.recipe, str(own.training_seed), own.sha256[:16]]
+        for own in manifest.checkpoints
+    ]
+    header = ["file", "cell", "recipe", "training seed", "sha256"]
+    yield markdown(header, checkpoints) if checkpoints else "None."
+    settings = [[own.policy, own.estimator, own.parameters, own.privacy] for own in manifest.tuned]
+    yield (
+        markdown(["settings of the estimator tuned for", "estimator", "ARZ", "preset"], settings)
+        if settings
+        else "All policies share the settings of the estimator that the environment takes by "
+        "default; none brought its own."
+    )
+    if len(origin["sources"]) > 1:
+        yield (
+            "**The code of dptse_env changed while this folder was filled**: some results may be "
+            "of an earlier state than others. Remove the folder and start over for results of one "
+            "state."
+        )

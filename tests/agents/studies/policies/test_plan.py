@@ -1,0 +1,84 @@
+import dataclasses
+import json
+
+import pytest
+
+from agents.studies.policies.freezing import design_of, plain
+from agents.studies.policies.plan import (
+    BASELINES,
+    CELLS,
+    PAPER,
+    PRIVATE,
+    Design,
+    quick,
+)
+from agents.studies.policies.running import config_of
+from dptse_env.config import parse_seeds
+from dptse_env.schedules import ORACLES
+from scripts.train import Args
+from tests.agents.studies.policies.worlds import SMALL
+
+
+def test_the_full_design_is_that_of_the_study():
+    design = Design()
+    assert (len(design.validation_seeds), len(design.test_seeds)) == (64, 64)
+    cells = {cell.name: cell for cell in design.cells}
+    assert next(iter(cells)) == "primary"
+    configs = {name: config_of(cell, (0,)) for name, cell in cells.items()}
+    primary = configs["primary"]
+    assert (cells["primary"].env, cells["paper"].env) == (PRIVATE, PAPER)
+    assert (primary.estimator, primary.bandwidth) == ("ekf", 5)
+    assert (primary.privacy.preset, primary.privacy.epsilon) == ("guaranteed", 5.0)
+    changes = {
+        "bandwidth-3": {"bandwidth": 3},
+        "bandwidth-7": {"bandwidth": 7},
+        "ukf": {"estimator": "ukf"},
+        "mhe": {"estimator": "mhe"},
+        "epsilon-1": {"privacy": dataclasses.replace(primary.privacy, epsilon=1.0)},
+        "epsilon-10": {"privacy": dataclasses.replace(primary.privacy, epsilon=10.0)},
+    }
+    for name, change in changes.items():
+        assert configs[name] == dataclasses.replace(primary, **change)
+    fixed = configs["paper-incident"].corridor
+    assert fixed.incident == configs["paper"].corridor.incident
+    assert fixed.demand == primary.corridor.demand
+    # PaperHighway releases speeds in place of flows: another observation.
+    assert {name for name, cell in cells.items() if not cell.transfers} == {"primary", "paper"}
+    assert not set(BASELINES) & set(ORACLES)
+    assert {"paper", "round-robin", "largest-variance", "greedy-trace"} <= set(BASELINES)
+
+
+def test_recipes_are_not_chosen_where_trainings_chose_their_best_policy():
+    kept_by = parse_seeds(Args().validation)
+    assert not set(kept_by) & set(Design().validation_seeds)
+
+
+def test_quick_is_a_part_of_the_full_design():
+    part = quick(Design())
+    assert [cell.name for cell in part.cells] == ["primary"]
+    assert set(part.test_seeds) < set(Design().test_seeds)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"cells": CELLS[1:]}, "begin with 'primary'"),
+        ({"cells": (CELLS[0], CELLS[0])}, "distinct"),
+        ({"test_seeds": (1000, 1001)}, "held out"),
+        ({"validation_seeds": (2000, 2001)}, r"in 1000\.\.1999"),
+        ({"validation_seeds": (1000,)}, "2 or more"),
+        ({"baselines": ("oldest-first",)}, "hold 'paper' and no oracle"),
+        ({"baselines": ("paper", "oracle-error")}, "no oracle"),
+    ],
+)
+def test_bad_designs_are_named(changes, message):
+    with pytest.raises(ValueError, match=message):
+        Design(**changes)
+
+
+def test_a_design_survives_json():
+    for design in (Design(), SMALL):
+        assert plain(design_of(json.loads(json.dumps(plain(design))))) == plain(design)
+        assert [config_of(cell, (0,)) for cell in design_of(plain(design)).cells] == [
+            config_of(cell, (0,)) for cell in design.cells
+        ]
