@@ -1,14 +1,15 @@
-"""Run query policies over held-out traffic and pool their errors.
+"""Run query policies over recorded traffic and pool their errors.
 
-Policies are compared on the same traffic and the same noise: episode i of every policy is reset
-with the same seed and the same traffic seed, and the mechanism draws noise for all segments
-whatever is asked.
+Policies are paired by common random numbers: episode i of every policy is reset with the same seed
+and the same traffic seed, and the mechanism draws noise for all segments whichever are queried.
 """
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Callable, Mapping, Sequence
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -17,7 +18,8 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 
 from dptse_env.arrays import FloatArray
-from dptse_env.config import TEST_SEEDS
+from dptse_env.config import TEST_SEEDS, TRAINING_SEEDS, VALIDATION_SEEDS, EnvConfig
+from dptse_env.env import SensorQueryEnv
 from dptse_env.rendering import History
 from dptse_env.vector_env import SensorQueryVectorEnv
 
@@ -26,7 +28,7 @@ WARM_UP = 60
 
 
 class Policy(Protocol):
-    """What an evaluation needs of a policy, a schedule or a model of stable-baselines3."""
+    """A query policy: a schedule, or a model of stable-baselines3."""
 
     def predict(
         self,
@@ -38,25 +40,65 @@ class Policy(Protocol):
         """Return an action and the policy's next state."""
 
 
-def check_held_out(seeds: Sequence[int]) -> None:
+def unwrap(env: gym.Env[Any, Any]) -> SensorQueryEnv:
+    """Return the environment of this package under its wrappers.
+
+    Raises:
+        TypeError: It is none of this package.
+    """
+    bare = env.unwrapped
+    if not isinstance(bare, SensorQueryEnv):
+        raise TypeError(f"env must be an environment of dptse_env, got {type(bare).__name__}")
+    return bare
+
+
+def make_config(env: str, keywords: Mapping[str, Any]) -> EnvConfig:
+    """Return the configuration of an environment.
+
+    Args:
+        env: Environment id.
+        keywords: Keywords of ``gym.make``.
+
+    Raises:
+        ValueError: A keyword is unknown or out of range.
+    """
+    return unwrap(gym.make(env, disable_env_checker=True, **keywords)).config
+
+
+@contextlib.contextmanager
+def without_void_warning() -> Iterator[None]:
+    """Suppress the void-guarantee warning; the study reports it itself."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=r"privacy\.preset is .* yet no privacy")
+        yield
+
+
+def check_test_seeds(seeds: Sequence[int], path: str = "seeds") -> None:
     """Refuse traffic seeds that a report must not rest on.
 
     Raises:
-        ValueError: There are fewer than two, one stands twice, or one is not in `TEST_SEEDS`.
+        ValueError: There are fewer than two, two are equal, or one is not in `TEST_SEEDS`.
     """
     if len(set(seeds)) < 2 or len(set(seeds)) < len(seeds):
-        raise ValueError(f"seeds must be 2 or more and distinct, got {seeds}")
-    strangers = [seed for seed in seeds if seed not in TEST_SEEDS]
-    if strangers:
+        raise ValueError(f"{path} must be 2 or more and distinct, got {seeds}")
+    outside = [seed for seed in seeds if seed not in TEST_SEEDS]
+    if outside:
         raise ValueError(
-            f"seeds must be held out, in {TEST_SEEDS[0]}..{TEST_SEEDS[-1]}: those below serve "
-            f"training and validation; got {strangers[0]}"
+            f"{path} must be test seeds, in {TEST_SEEDS[0]}..{TEST_SEEDS[-1]}: those below serve "
+            f"training and validation; got {outside[0]}"
         )
+
+
+def seed_kind(seeds: Sequence[int]) -> str:
+    """Return which range traffic seeds belong to: training, validation, test, or mixed."""
+    ranges = {"training": TRAINING_SEEDS, "validation": VALIDATION_SEEDS, "test": TEST_SEEDS}
+    kinds = [name for name, members in ranges.items() if set(seeds) <= set(members)]
+    return kinds[0] if kinds else "mixed"
 
 
 @dataclass(frozen=True)
 class EpisodeScore:
-    """What one episode says about a policy.
+    """The errors of one episode.
 
     Attributes:
         traffic_seed: The traffic it replayed.
@@ -92,7 +134,7 @@ def run_episode(
 
     Args:
         env: An environment of this package, wrapped or not.
-        policy: Who picks the queries.
+        policy: Picks the queries.
         traffic_seed: One of the environment's traffic seeds.
         seed: Seeds the noise and the estimator.
         warm_up: Seconds that do not count.
@@ -102,7 +144,7 @@ def run_episode(
     Raises:
         ValueError: The episode is not longer than the warm-up.
     """
-    process = env.unwrapped.process  # type: ignore[attr-defined]
+    process = unwrap(env).process
     observation, info = env.reset(seed=seed, options={"traffic_seed": traffic_seed})
     if on_second is not None:
         on_second()
@@ -158,13 +200,13 @@ def run_episodes(
 ) -> list[EpisodeScore]:
     """Run a batch of episodes at once and pool the errors of each.
 
-    The scores are those of `run_episode` for each pair of seeds, but for policies that draw: those
-    draw for the whole batch at once, so they draw other numbers of the same law.
+    The scores are those of `run_episode` for each pair of seeds, but for policies that draw at
+    random: they draw for the whole batch at once, so other numbers from the same distribution.
 
     Args:
         env: A bare vector environment, made with ``autoreset_mode="Disabled"`` (`make_vector`). Its
             episodes are in the order of the seeds.
-        policy: Who picks the queries.
+        policy: Picks the queries.
         traffic_seeds: Traffic of each episode, n of the environment's traffic seeds.
         seeds: Seed of the noise and the estimator of each episode, n of them.
         warm_up: Seconds that do not count.
@@ -199,21 +241,21 @@ def run_episodes(
         observation = transition.observation
         # A decision takes as many actions in every episode: time passes in all of them or in none.
         if (process.time > before).all():
-            said = process.infos(episodes)
-            second = {"reward": transition.reward, **{key: said[key] for key in _SERIES}}
+            info = process.infos(episodes)
+            second = {"reward": transition.reward, **{key: info[key] for key in _SERIES}}
             seconds.append({**second, "counts": process.time > warm_up})
             if on_second is not None:
                 on_second()
     tables = {key: np.array([second[key] for second in seconds]) for key in seconds[0]}
     counts = tables.pop("counts")
     return [
-        _score(seed, {key: own[counts[:, k], k] for key, own in tables.items()}, warm_up)
+        _score(seed, {key: table[counts[:, k], k] for key, table in tables.items()}, warm_up)
         for k, seed in enumerate(traffic_seeds)
     ]
 
 
 _SERIES = ("rmse_density", "rmse_speed", "n_occupied", "n_dropped", "diverged", "fallback")
-"""What ``info`` says of a second that a score is made of."""
+"""Keys of ``info`` that a score is made of."""
 
 
 def _score(traffic_seed: int, series: Mapping[str, FloatArray], warm_up: int) -> EpisodeScore:
@@ -237,8 +279,12 @@ def _score(traffic_seed: int, series: Mapping[str, FloatArray], warm_up: int) ->
 def watch_episode(
     env: gym.Env[Any, Any], policy: Policy, *, traffic_seed: int, seed: int
 ) -> tuple[EpisodeScore, History]:
-    """Run one episode and keep what a picture needs of it."""
-    process = env.unwrapped.process  # type: ignore[attr-defined]
+    """Run one episode and keep its maps of densities and queries.
+
+    Returns:
+        The score, and the history from the reset on; its first entry is the state at the reset.
+    """
+    process = unwrap(env).process
     history: list[History] = []
 
     def on_second() -> None:

@@ -1,7 +1,7 @@
-"""Saved policies: what their cards say, and how one is bound to an environment.
+"""Query policies by name: schedules, and saved policies with their cards.
 
-torch and stable-baselines3 are imported where a policy is loaded, so that schedules alone need
-neither.
+torch and stable-baselines3 are imported when a saved policy is loaded, so that schedules and cards
+need neither.
 """
 
 from __future__ import annotations
@@ -16,12 +16,42 @@ from pathlib import Path
 from typing import Any
 
 from agents.evaluation.episodes import Policy
-from dptse_env.policies import CARD, read_policy
+from dptse_env.policies import CARD, read_policy, shipped_policies
+from dptse_env.schedules import make_schedule
 
 
 @dataclass(frozen=True)
-class Saved:
-    """A saved policy, as far as its file says without torch.
+class NamedSchedule:
+    """A query schedule by its name or the file of its plan.
+
+    Attributes:
+        source: The name, or the path of a plan.
+    """
+
+    source: str
+
+    @property
+    def keywords(self) -> dict[str, Any]:
+        """Keywords that an environment needs for it: none, schedules speak every encoding."""
+        return {}
+
+    @property
+    def identity(self) -> str:
+        """The name."""
+        return self.source
+
+    def load(self, env: Any, *, allow: Collection[str] = (), seed: int | None = None) -> Policy:
+        """Bind the schedule to an environment, see `dptse_env.schedules.make_schedule`.
+
+        Raises:
+            ValueError: The name is unknown or the schedule does not suit the environment.
+        """
+        return make_schedule(self.source, env, seed)
+
+
+@dataclass(frozen=True)
+class SavedPolicy:
+    """A saved policy, as far as its file can be read without torch.
 
     Attributes:
         source: The file, or the name of a policy that comes with the package.
@@ -33,33 +63,24 @@ class Saved:
     sha256: str
     card: Mapping[str, Any]
 
-    @classmethod
-    def of(cls, source: str | Path) -> Saved:
-        """Read the card of a saved policy.
+    @property
+    def keywords(self) -> dict[str, Any]:
+        """Keywords that an environment needs for it: its action encoding."""
+        return {"action": self.action}
 
-        Raises:
-            FileNotFoundError: There is no such file, nor such a name.
-            ValueError: The file is no saved policy.
-        """
-        content = read_policy(source)
-        try:
-            with zipfile.ZipFile(io.BytesIO(content)) as archive:
-                card = json.loads(archive.read(CARD))
-            # What is relied on further below must be there.
-            saved = cls(str(source), hashlib.sha256(content).hexdigest(), card)
-            _ = saved.action, saved.recipe, saved.training_seed
-        except (zipfile.BadZipFile, KeyError, TypeError, ValueError) as problem:
-            raise ValueError(f"{str(source)!r} is no saved policy: {problem!r}") from problem
-        return saved
+    @property
+    def identity(self) -> str:
+        """Digest of the file, which tells policies apart whatever their files are called."""
+        return self.sha256
 
     @property
     def action(self) -> str:
-        """The action encoding that it speaks."""
+        """The action encoding of the policy."""
         return str(self.card["fits"]["action"])
 
     @property
     def recipe(self) -> str:
-        """Name of the recipe that it was trained by."""
+        """Name of the recipe that trained it."""
         return str(self.card["training"]["learner"])
 
     @property
@@ -67,7 +88,7 @@ class Saved:
         """Seed of its training."""
         return int(self.card["training"]["seed"])
 
-    def load(self, env: Any, *, allow: Collection[str] = ()) -> Policy:
+    def load(self, env: Any, *, allow: Collection[str] = (), seed: int | None = None) -> Policy:
         """Bind the policy to an environment, see `dptse_env.sb3.load_policy`.
 
         Raises:
@@ -75,8 +96,48 @@ class Saved:
         """
         from dptse_env.sb3 import load_policy  # noqa: PLC0415
 
-        now = hashlib.sha256(read_policy(self.source)).hexdigest()
-        if now != self.sha256:
-            raise ValueError(f"{self.source!r} has changed: sha256 {now}, it was {self.sha256}")
+        present = hashlib.sha256(read_policy(self.source)).hexdigest()
+        if present != self.sha256:
+            raise ValueError(f"{self.source!r} has changed: sha256 {present}, it was {self.sha256}")
         policy: Policy = load_policy(self.source, env, allow=allow)
         return policy
+
+
+PolicySource = NamedSchedule | SavedPolicy
+"""What a name of a policy stands for."""
+
+
+def find_policy(source: str) -> PolicySource:
+    """Return the policy that a name or a file stands for.
+
+    Args:
+        source: The ``.zip`` file of a saved policy, the name of one that comes with the package, or
+            else a schedule: its name or the ``.json`` file of a plan. Whether a schedule exists and
+            suits an environment is checked when it is loaded.
+
+    Raises:
+        FileNotFoundError: There is no such saved policy.
+        ValueError: The file is no saved policy.
+    """
+    if source.endswith(".zip") or source in shipped_policies():
+        return read_saved_policy(source)
+    return NamedSchedule(source)
+
+
+def read_saved_policy(source: str | Path) -> SavedPolicy:
+    """Read the card of a saved policy.
+
+    Raises:
+        FileNotFoundError: There is no such file, nor such a name.
+        ValueError: The file is no saved policy.
+    """
+    content = read_policy(source)
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            card = json.loads(archive.read(CARD))
+        saved = SavedPolicy(str(source), hashlib.sha256(content).hexdigest(), card)
+        # The entries of the card that the properties rely on must be there.
+        _ = saved.action, saved.recipe, saved.training_seed
+    except (zipfile.BadZipFile, KeyError, TypeError, ValueError) as problem:
+        raise ValueError(f"{str(source)!r} is no saved policy: {problem!r}") from problem
+    return saved

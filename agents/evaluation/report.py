@@ -1,4 +1,4 @@
-"""From the scores of an evaluation to its table, its files and its figures."""
+"""The report of an evaluation: a table for each estimator, files, and a figure of errors."""
 
 from __future__ import annotations
 
@@ -11,27 +11,26 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from rich import box
-from rich.console import Console
 from rich.table import Table
 
 from agents.evaluation.episodes import EpisodeScore
-from agents.evaluation.figures import save_ladder
+from agents.evaluation.figures import save_errors
 from agents.evaluation.statistics import Interval, mean_interval, paired_difference
+from agents.evaluation.terminal import make_table, print_table, print_text
 
 METRICS = ("rmse_density", "rmse_speed", "reward")
 
 
 @dataclass(frozen=True)
 class Row:
-    """One estimator with one policy.
+    """The scores of one policy with one estimator, summarised.
 
     Attributes:
         estimator: Name of the estimator.
         policy: Name of the policy.
         mean: By metric, the mean over episodes with its 95 % interval.
         difference: By metric, the mean paired difference to the reference policy.
-        n_diverged: Seconds, over all episodes, in which the estimator had to start over.
+        n_diverged: Seconds over all episodes in which the estimator had to start over.
     """
 
     estimator: str
@@ -51,8 +50,8 @@ class Report:
 
         Args:
             scores: By (estimator, policy): one score per episode, in one order for all.
-            reference: Policy that the others are compared with; one of those in ``scores``.
-            title: Says what was measured.
+            reference: Policy that the others are compared with; it is in ``scores``.
+            title: Environment, settings and episodes.
 
         Raises:
             ValueError: There are fewer than two episodes.
@@ -84,21 +83,19 @@ class Report:
 
     def print(self) -> None:
         """Print a table per estimator, best density error first."""
-        console = Console()
-        console.print(f"{self.title}; mean ± half of the 95 % interval")
+        print_text(f"{self.title}; mean ± half of the 95 % interval")
         for estimator in dict.fromkeys(row.estimator for row in self.rows):
-            console.print(self._table(estimator))
+            print_table(self._table(estimator))
 
     def _table(self, estimator: str) -> Table:
-        table = Table(box=box.SIMPLE_HEAD, title=f"estimator {estimator}", title_justify="left")
-        table.add_column("policy", no_wrap=True)
-        for metric in ("density RMSE\n[veh/km]", "speed RMSE\n[km/h]"):
-            table.add_column(metric, justify="right", no_wrap=True)
-            table.add_column(f"against\n{self.reference}", justify="right", no_wrap=True)
+        against = f"against\n{self.reference}"
+        metrics = {"rmse_density": "density RMSE\n[veh/km]", "rmse_speed": "speed RMSE\n[km/h]"}
+        columns = [column for metric in metrics.values() for column in (metric, against)]
+        table = make_table(f"estimator {estimator}", "policy", *columns)
         rows = {row.policy: row for row in self.rows if row.estimator == estimator}
         for policy in self.ranked(estimator):
             cells = []
-            for metric in ("rmse_density", "rmse_speed"):
+            for metric in metrics:
                 mean, difference = rows[policy].mean[metric], rows[policy].difference[metric]
                 cells.append(f"{mean.mean:.2f} ± {mean.half_width:.2f}")
                 compared = f"{difference.mean:+.2f} ± {difference.half_width:.2f}"
@@ -107,14 +104,14 @@ class Report:
         return table
 
     def write(self, folder: Path, arguments: Mapping[str, Any]) -> None:
-        """Write every score to ``episodes.csv``, the table and its origin to ``summary.json``."""
+        """Write all scores to ``episodes.csv``, the table and its origin to ``summary.json``."""
         folder.mkdir(parents=True, exist_ok=True)
         columns = [field.name for field in dataclasses.fields(EpisodeScore)]
         with (folder / "episodes.csv").open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
             writer.writerow(["estimator", "schedule", *columns])
-            for key, cell in self.scores.items():
-                writer.writerows([*key, *dataclasses.astuple(score)] for score in cell)
+            for key, scores in self.scores.items():
+                writer.writerows([*key, *dataclasses.astuple(score)] for score in scores)
         packages = ("dptse-env", "gymnasium", "libsumo", "numba", "numpy")
         summary = {
             "title": self.title,
@@ -126,9 +123,9 @@ class Report:
         (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
 
     def draw(self, path: Path) -> None:
-        """Draw density and speed errors of every policy as dots with intervals."""
+        """Save a figure of density and speed errors of all policies."""
         series: dict[str, dict[str, tuple[Interval, Interval]]] = {}
         for row in self.rows:
             pair = row.mean["rmse_density"], row.mean["rmse_speed"]
             series.setdefault(row.estimator, {})[row.policy] = pair
-        save_ladder(path, self.ranked(self.rows[0].estimator), series, self.title)
+        save_errors(path, self.ranked(self.rows[0].estimator), series, self.title)

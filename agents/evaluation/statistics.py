@@ -6,10 +6,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import stats
 
-FloatArray = NDArray[np.float64]
+from dptse_env.arrays import FloatArray
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,8 @@ def paired_difference(values: ArrayLike, reference: ArrayLike) -> Interval:
 
 def mean(table: FloatArray) -> FloatArray:
     """Return the mean over the last two axes."""
-    return table.mean(axis=(-2, -1))
+    means: FloatArray = table.mean(axis=(-2, -1))
+    return means
 
 
 def iqm(table: FloatArray) -> FloatArray:
@@ -128,17 +129,17 @@ def bootstrap(
     """Return a statistic of paired tables with its two-level percentile bootstrap interval.
 
     Training seeds and traffic seeds are crossed: every run meets all traffic. Each resample draws
-    traffic seeds with replacement, the same for all tables, which keeps them paired, and for each
-    table its own training seeds with replacement (the "pigeonhole bootstrap" of Owen, 2007). The
-    interval lies between the percentiles of the statistic over the resamples. Where runs differ
-    little beside what they share on each traffic seed, it covers as often as it says. Five runs
-    that differ by much more than their means over traffic are known covers some 84 % at 95 %:
-    `crossed_t` takes the few runs into account.
+    traffic seeds with replacement, the same for all tables, which keeps them paired, and training
+    seeds with replacement, separately for each table (the "pigeonhole bootstrap" of Owen, 2007).
+    The interval lies between the percentiles of the statistic over the resamples. Its coverage is
+    nominal where runs differ little on each traffic seed. With five runs that differ by much more
+    than the standard error of their means over traffic, a nominal 95 % covers some 84 %:
+    `crossed_t` accounts for the small number of runs.
 
     Args:
         statistic: Takes arrays (r, S, T), one for each table, and returns (r,).
         *tables: Values by training seed and traffic seed, shape (S, T); (T,) for a policy that
-            was not trained. T is one for all, S is each table's own.
+            was not trained. T is the same for all tables, S may differ.
         confidence: Coverage of the interval, in (0, 1).
         n_resamples: Number of resamples.
         seed: Seeds the resampling.
@@ -161,12 +162,12 @@ def bootstrap(
             drawn.append(table[rows, columns])
         parts.append(statistic(*drawn))
     values = np.concatenate(parts)
-    whole = float(statistic(*(table[None] for table in checked))[0])
-    if not (np.isfinite(values).all() and np.isfinite(whole)):
+    estimate = float(statistic(*(table[None] for table in checked))[0])
+    if not (np.isfinite(values).all() and np.isfinite(estimate)):
         raise ValueError("the statistic must be finite on every resample")
     tail = 50.0 * (1.0 - confidence)
     low, high = np.percentile(values, [tail, 100.0 - tail])
-    return Interval(whole, float(low), float(high), n_columns)
+    return Interval(estimate, float(low), float(high), n_columns)
 
 
 _CHUNK = 500
@@ -213,8 +214,8 @@ def crossed_t(table: ArrayLike, confidence: float = 0.95) -> tuple[Interval, flo
 def holm(p_values: Mapping[str, float]) -> dict[str, float]:
     """Return p-values adjusted by Holm's (1979) step-down procedure.
 
-    What stays below a level alpha may be claimed together with an error of at most alpha in all,
-    whatever the tests have to do with one another.
+    Rejecting where the adjusted value is below alpha keeps the family-wise error rate at alpha,
+    however the tests depend on one another.
 
     Raises:
         ValueError: A value is not in [0, 1].
@@ -231,7 +232,7 @@ def holm(p_values: Mapping[str, float]) -> dict[str, float]:
 
 
 def worst_row(table: ArrayLike) -> int:
-    """Return which training seed has the largest mean error over the traffic seeds.
+    """Return the index of the training seed with the largest mean error over the traffic seeds.
 
     Raises:
         ValueError: The table is too small or not finite.

@@ -1,4 +1,4 @@
-"""What is done so far: a CSV file that only grows, and survives being cut off."""
+"""Results on disk: a CSV file that only grows and survives an interrupted write."""
 
 from __future__ import annotations
 
@@ -7,27 +7,16 @@ import dataclasses
 import io
 import os
 import typing
-from collections.abc import Hashable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
-
-class Key(Hashable, Protocol):
-    """A frozen dataclass of plain values: what is run on every traffic seed."""
-
-    __dataclass_fields__: typing.ClassVar[dict[str, Any]]
-
-
-class Cell(Key, Protocol):
-    """A key that is one configuration of an environment."""
-
-    @property
-    def keywords(self) -> dict[str, Any]:
-        """Keywords of ``gym.make`` that make it."""
+from agents.experiments.cells import KeyT
+from agents.experiments.files import write_atomically
 
 
 class Scored(Protocol):
-    """A dataclass that says something about one episode."""
+    """A dataclass of what was measured in one episode."""
 
     __dataclass_fields__: typing.ClassVar[dict[str, Any]]
 
@@ -36,107 +25,104 @@ class Scored(Protocol):
         """The traffic of the episode."""
 
 
-KeyT = TypeVar("KeyT", bound=Key)
-CellT = TypeVar("CellT", bound=Cell)
 ScoredT = TypeVar("ScoredT", bound=Scored)
 
 
 class Ledger(Generic[KeyT, ScoredT]):
-    """One record for each (cell, traffic seed), on disk as soon as it is added.
+    """One record for each key and traffic seed, on disk as soon as it is added.
 
-    A process that dies while it writes leaves a last line without its end. Such a line is
-    dropped when the file is opened again; what it said is then run again.
+    A process that dies while it writes leaves a last line without its end. Such a line is dropped
+    when the file is opened again, and its episode is run again.
 
     Attributes:
         path: The CSV file.
-        rows: Records by cell and traffic seed.
+        rows: Records by key and traffic seed.
     """
 
-    def __init__(self, path: Path, cell_type: type[KeyT], record_type: type[ScoredT]) -> None:
-        """Read what is there.
+    def __init__(self, path: Path, key_type: type[KeyT], record_type: type[ScoredT]) -> None:
+        """Read the file, if there is one.
 
         Args:
             path: The CSV file.
-            cell_type: Its fields are the first columns.
-            record_type: Its fields are the others.
+            key_type: Type of the keys; its fields are the first columns.
+            record_type: Type of the records; its fields are the other columns.
 
         Raises:
-            ValueError: A line but a torn last one is not as this class writes it.
+            ValueError: A line other than a torn last one is not as this class writes it.
         """
-        self.path, self._cell_type, self._type = path, cell_type, record_type
-        self._cell_fields = _parsers(cell_type)
+        self.path, self._key_type, self._record_type = path, key_type, record_type
+        self._key_fields = _parsers(key_type)
         self._record_fields = _parsers(record_type)
-        self.columns = (*self._cell_fields, *self._record_fields)
+        self.columns = (*self._key_fields, *self._record_fields)
         self.rows: dict[tuple[KeyT, int], ScoredT] = {}
         if path.exists():
             self._read()
 
     def _read(self) -> None:
-        whole, end, torn = self.path.read_text(encoding="utf-8").rpartition("\n")
+        lines, end, torn = self.path.read_text(encoding="utf-8").rpartition("\n")
         if torn:
-            # In place: what is kept is never written twice, so it cannot be lost here.
-            os.truncate(self.path, len((whole + end).encode()))
-        if not whole:
+            # Cut in place: complete lines are never written again, so they cannot be lost here.
+            os.truncate(self.path, len((lines + end).encode()))
+        if not lines:
             return
-        lines = csv.reader(io.StringIO(whole))
-        header = tuple(next(lines))
+        reader = csv.reader(io.StringIO(lines))
+        header = tuple(next(reader))
         if header != self.columns:
             raise ValueError(
                 f"{self.path} must have the columns {', '.join(self.columns)}; it has "
                 f"{', '.join(header)}: remove it or choose another folder"
             )
-        for number, line in enumerate(lines, start=2):
+        for number, line in enumerate(reader, start=2):
             try:
                 key, record = self._parse(line)
             except ValueError as problem:
                 raise ValueError(f"{self.path}, line {number}: {problem}") from problem
-            self.rows[key] = record
+            self.rows[key, record.traffic_seed] = record
 
-    def _parse(self, line: list[str]) -> tuple[tuple[KeyT, int], ScoredT]:
+    def _parse(self, line: list[str]) -> tuple[KeyT, ScoredT]:
         if len(line) != len(self.columns):
             raise ValueError(f"must have {len(self.columns)} values, has {len(line)}")
         values = iter(line)
-        cell = self._cell_type(
-            **{name: parse(next(values)) for name, parse in self._cell_fields.items()}
-        )
-        record = self._type(
-            **{name: parse(next(values)) for name, parse in self._record_fields.items()}
-        )
-        return (cell, record.traffic_seed), record
+        key = {name: parse(next(values)) for name, parse in self._key_fields.items()}
+        record = {name: parse(next(values)) for name, parse in self._record_fields.items()}
+        return self._key_type(**key), self._record_type(**record)
 
-    def append(self, cell: KeyT, records: Iterable[ScoredT]) -> None:
-        """Add what one task found, and put it on disk before returning."""
+    def lacking(self, key: KeyT, seeds: Iterable[int]) -> tuple[int, ...]:
+        """Return the traffic seeds of which a key has no record."""
+        return tuple(seed for seed in seeds if (key, seed) not in self.rows)
+
+    def append(self, key: KeyT, records: Iterable[ScoredT]) -> None:
+        """Add the records of one task, and put them on disk before returning."""
         records = list(records)
         new = not self.path.exists() or self.path.stat().st_size == 0
         with self.path.open("a", newline="", encoding="utf-8") as file:
             writer = csv.writer(file, lineterminator="\n")
             if new:
                 writer.writerow(self.columns)
-            writer.writerows(self._line(cell, record) for record in records)
+            writer.writerows(_line(key, record) for record in records)
             file.flush()
             os.fsync(file.fileno())
-        self.rows.update({(cell, record.traffic_seed): record for record in records})
+        self.rows.update({(key, record.traffic_seed): record for record in records})
 
     def sort(self) -> None:
-        """Put the file in an order that does not depend on how the run went."""
-        aside = self.path.with_suffix(".tmp")
-        with aside.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(self.columns)
-            writer.writerows(self._sorted())
-        aside.replace(self.path)
+        """Put the file in an order that does not depend on the course of the run."""
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow(self.columns)
+        writer.writerows(self._sorted())
+        write_atomically(self.path, text.getvalue())
 
     def _sorted(self) -> Iterator[list[Any]]:
-        def order(item: tuple[tuple[KeyT, int], ScoredT]) -> tuple[Any, ...]:
-            (cell, seed), _ = item
-            return (*dataclasses.astuple(cell), seed)
+        def order(item: tuple[tuple[Any, int], ScoredT]) -> tuple[Any, ...]:
+            (key, seed), _ = item
+            return (*dataclasses.astuple(key), seed)
 
-        for (cell, _), record in sorted(self.rows.items(), key=order):
-            yield self._line(cell, record)
+        for (key, _), record in sorted(self.rows.items(), key=order):
+            yield _line(key, record)
 
-    @staticmethod
-    def _line(cell: Any, record: Any) -> list[Any]:
-        return [*dataclasses.astuple(cell), *dataclasses.astuple(record)]
+
+def _line(key: Any, record: Any) -> list[Any]:
+    return [*dataclasses.astuple(key), *dataclasses.astuple(record)]
 
 
 def _parsers(cls: type) -> dict[str, type]:

@@ -1,4 +1,4 @@
-"""What a folder of results was made with; another make is refused."""
+"""Provenance of a folder of results: what it was made with; other results are refused there."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ import dataclasses
 import hashlib
 import json
 import platform
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import dptse_env
 from agents.evaluation.episodes import WARM_UP
-from agents.experiments.ledger import Cell, CellT
-from agents.experiments.runner import Design, make_env
+from agents.experiments.cells import Design
+from agents.experiments.files import write_json
 from dptse_env.config import EnvConfig
 from dptse_env.estimators.tuning import available_settings, settings_name
 from dptse_env.model import load_parameters
@@ -22,44 +22,53 @@ from dptse_env.model import load_parameters
 FILE = "run.json"
 
 
-def provenance(design: Design[CellT]) -> dict[str, Any]:
-    """Return everything beside the cells and seeds that the results depend on, as plain JSON.
-
-    ``made_with`` must agree for results to stand in one folder. ``tuned`` names the settings that
-    come from a shipped set. ``sources`` (states of the package's code) and ``machine`` are for the
-    record.
+def design_provenance(design: Design[Any]) -> dict[str, Any]:
+    """Return the provenance of a design's results.
 
     Raises:
         ValueError: A cell of the design is out of range; the message names the value.
     """
-    configs = [_config(design, cell) for cell in design.cells()]
-    made_with: dict[str, Any] = {
+    environment = environment_provenance(design.env, design.schedule, design.configs)
+    return results_provenance(environment, design.configs)
+
+
+def environment_provenance(env: str, schedule: str, configs: Sequence[EnvConfig]) -> dict[str, Any]:
+    """Return versions, traffic and models behind results of one environment, as plain JSON."""
+    names = dict.fromkeys(str(config.parameters) for config in configs)
+    return {
         "versions": {name: version(name) for name in ("dptse-env", "libsumo")},
-        "env": design.env,
+        "env": env,
         "corridor": configs[0].corridor.digest,
-        "schedule": design.schedule,
+        "schedule": schedule,
         "warm_up": WARM_UP,
-        "parameters": {
-            name: dataclasses.asdict(load_parameters(name))
-            for name in dict.fromkeys(str(config.parameters) for config in configs)
-        },
-        "settings": {
-            _settings_name(config): dataclasses.asdict(config.settings()) for config in configs
-        },
+        "parameters": {name: dataclasses.asdict(load_parameters(name)) for name in names},
     }
-    machine = {
-        "python": platform.python_version(),
-        "platform": platform.platform(),
-        **{name: version(name) for name in ("gymnasium", "numba", "numpy", "scipy")},
-    }
-    tuned = sorted(made_with["settings"].keys() & available_settings())
-    whole = {
-        "made_with": made_with,
-        "tuned": tuned,
+
+
+def results_provenance(
+    made_with: Mapping[str, Any], configs: Sequence[EnvConfig]
+) -> dict[str, Any]:
+    """Return everything but cells and seeds that results depend on, as plain JSON.
+
+    ``made_with`` must agree for results to stand in one folder; the estimators' settings are added
+    to it. ``tuned`` names the settings that come from a shipped set. ``sources`` (states of the
+    package's code) and ``machine`` are for the record.
+    """
+    settings = {
+        settings_name(config.estimator, str(config.parameters), config.privacy.preset):
+        dataclasses.asdict(config.settings()) for config in configs
+    }  # fmt: skip
+    content = {
+        "made_with": {**made_with, "settings": settings},
+        "tuned": sorted(settings.keys() & available_settings()),
         "sources": [source_digest()],
-        "machine": machine,
+        "machine": {
+            "python": platform.python_version(),
+            "platform": platform.platform(),
+            **{name: version(name) for name in ("gymnasium", "numba", "numpy", "scipy")},
+        },
     }
-    plain: dict[str, Any] = json.loads(json.dumps(whole))
+    plain: dict[str, Any] = json.loads(json.dumps(content))
     return plain
 
 
@@ -72,58 +81,59 @@ def source_digest() -> str:
     return digest.hexdigest()[:12]
 
 
-def _config(design: Design[Any], cell: Cell) -> EnvConfig:
-    env = make_env(design.env, cell, design.seeds, None)
-    config: EnvConfig = env.unwrapped.config  # type: ignore[attr-defined]
-    return config
-
-
-def _settings_name(config: EnvConfig) -> str:
-    return settings_name(config.estimator, str(config.parameters), config.privacy.preset)
-
-
-def take_folder(folder: Path, own: Mapping[str, Any]) -> dict[str, Any]:
-    """Take a folder for a run: start it, or go on in one that was made in the same way.
-
-    Settings of estimators and states of the code that the folder has not seen yet are added.
-
-    Returns:
-        What the folder now says it was made with.
+def check_folder(folder: Path, provenance: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Return the provenance of a folder; None where there is nothing yet.
 
     Raises:
-        ValueError: The folder was made with something else, or without saying with what.
+        ValueError: The folder was made with something else, or has no provenance.
     """
     path = folder / FILE
-    if path.exists():
-        try:
-            whole = json.loads(path.read_text(encoding="utf-8"))
-            before, sources = whole["made_with"], whole["sources"]
-        except (json.JSONDecodeError, KeyError) as problem:
-            raise ValueError(f"{path} is not as this program writes it: {problem!r}") from problem
-        differences = list(_differences(before, own["made_with"]))
-        if differences:
-            raise ValueError(
-                f"{folder} was made with other settings: {'; '.join(differences[:5])}. Choose "
-                "another --output, or remove the folder to start over"
-            )
-        settings = {**before["settings"], **own["made_with"]["settings"]}
-        own = {
-            **own,
-            "made_with": {**own["made_with"], "settings": settings},
-            "tuned": sorted({*whole["tuned"], *own["tuned"]}),
-            "sources": list(dict.fromkeys([*sources, *own["sources"]])),
+    if not path.exists():
+        if folder.exists() and any(folder.iterdir()):
+            raise ValueError(f"{folder} is not empty and has no {FILE}: choose another --output")
+        return None
+    try:
+        recorded: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        made_with, _ = recorded["made_with"], recorded["sources"]
+    except (json.JSONDecodeError, KeyError) as problem:
+        raise ValueError(f"{path} is not as this program writes it: {problem!r}") from problem
+    differences = list(_differences(made_with, provenance["made_with"]))
+    if differences:
+        raise ValueError(
+            f"{folder} was made with other settings: {'; '.join(differences[:5])}. Choose "
+            "another --output, or remove the folder to start over"
+        )
+    return recorded
+
+
+def take_folder(folder: Path, provenance: Mapping[str, Any]) -> dict[str, Any]:
+    """Take a folder for new results: start it, or go on in one that was made in the same way.
+
+    Settings of estimators and states of the code that the folder does not have yet are added.
+
+    Returns:
+        The provenance of the folder.
+
+    Raises:
+        ValueError: The folder was made with something else, or has no provenance.
+    """
+    recorded = check_folder(folder, provenance)
+    content = dict(provenance)
+    if recorded is not None:
+        made_with = provenance["made_with"]
+        settings = {**recorded["made_with"]["settings"], **made_with["settings"]}
+        content |= {
+            "made_with": {**made_with, "settings": settings},
+            "tuned": sorted({*recorded["tuned"], *provenance["tuned"]}),
+            "sources": list(dict.fromkeys([*recorded["sources"], *provenance["sources"]])),
         }
-    elif folder.exists() and any(folder.iterdir()):
-        raise ValueError(f"{folder} is not empty and has no {FILE}: choose another --output")
     folder.mkdir(parents=True, exist_ok=True)
-    aside = path.with_suffix(".tmp")
-    aside.write_text(json.dumps(own, indent=2) + "\n", encoding="utf-8")
-    aside.replace(path)
-    return dict(own)
+    write_json(folder / FILE, content)
+    return content
 
 
 def _differences(before: Any, now: Any, path: str = "") -> Iterator[str]:
-    """Name each value that both have and that differs."""
+    """Yield a description of each value that both have and that differs."""
     if isinstance(before, Mapping) and isinstance(now, Mapping):
         for key in before.keys() & now.keys():
             yield from _differences(before[key], now[key], f"{path}.{key}" if path else key)

@@ -1,7 +1,7 @@
-"""The seeds of noise and estimators, by what draws from them: disjoint ranges, one table.
+"""Seeds of noise and estimators: one table of disjoint ranges, by what draws from them.
 
 An episode's generator is seeded with the first number of a range plus its traffic seed, or, in a
-training, plus the number of the episode. What is chosen on one range is reported on another.
+training, plus the number of the episode. Choices and reports never share a range.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ PLAN_SEARCH = range(3_000_000, 4_000_000)
 TRAINING_VALIDATION = range(4_000_000, 5_000_000)
 """The learning curve of a training, by which its best policy is kept."""
 STUDY_VALIDATION = range(5_000_000, 6_000_000)
-"""The choice of the best baseline and the best recipe of a study."""
+"""The choice of the best baseline and the best recipe in the study of policies."""
 STUDY_TEST = range(6_000_000, 7_000_000)
-"""What a study of policies reports."""
+"""The test results of the study of policies."""
 TRAINING = range(10_000_000, 1_010_000_000)
 """Training episodes; see `training_seed`."""
 
@@ -33,7 +33,7 @@ NOISE_SEEDS = {
 """All ranges by name."""
 
 TRAININGS = 1_000
-"""Training seeds are in 0..999; each has a stretch of `TRAINING` of its own."""
+"""Training seeds are in 0..999; each has its separate stretch of `TRAINING`."""
 
 
 def training_seed(seed: int) -> int:

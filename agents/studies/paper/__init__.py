@@ -1,1 +1,1 @@
-"""The paper's five results: planned, run, judged, drawn and reported."""
+"""Reproduction of the paper's five results, with a verdict on each of its claims."""

@@ -1,4 +1,4 @@
-"""What a claim is, and the one rule by which it holds or does not."""
+"""Claims about measurements, and the rule by which they hold or do not."""
 
 from __future__ import annotations
 
@@ -8,23 +8,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 from agents.evaluation.statistics import Interval
-from agents.studies.paper.plan import Setting
-from agents.studies.paper.results import Measured, UnmeasuredError
+from agents.experiments.cells import UnmeasuredError
+from agents.studies.paper.plan import SETTINGS, Setting
+from agents.studies.paper.results import PaperResults
 
 Verdict = Literal["holds", "does not hold", "undecided", "not measured"]
-
-RULE = """\
-Every claim is split into parts. A part is one number for each traffic seed, mostly a difference of
-two errors on the same traffic and the same noise; its mean over the seeds has a 95 % interval
-(Student's t). The claim says beforehand in which range the number should lie.
-
-- A part **holds** if its whole interval lies inside the range.
-- A part **does not hold** if its whole interval lies outside the range.
-- A part is **undecided** otherwise: the interval includes an end of the range, mostly zero.
-
-A claim **holds** if all its parts hold, and **does not hold** if at least one part does not.
-Otherwise it is **undecided**. Intervals are not widened for the number of parts: of a hundred parts
-whose true value lies at an end of the range, about five will be decided by chance."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +28,7 @@ class Range:
     high: float = math.inf
 
     def __str__(self) -> str:
-        """Say it in words."""
+        """Return the range in words."""
         if self.low == -math.inf:
             return f"below {self.high:g}"
         if self.high == math.inf:
@@ -54,34 +42,34 @@ ABOVE_ZERO = Range(low=0.0)
 
 @dataclass(frozen=True)
 class Claim:
-    """Something that measurements can support or refute.
+    """A statement that measurements can support or refute.
 
     Attributes:
         key: Short name.
-        says: The claim.
-        measured: What the numbers are.
-        unit: Their unit.
-        expected: Where they should lie.
+        statement: The claim.
+        quantity: The quantity that is measured.
+        unit: Unit of the quantity.
+        expected: Range in which the quantity should lie.
         measure: Returns the interval of each part by its name.
     """
 
     key: str
-    says: str
-    measured: str
+    statement: str
+    quantity: str
     unit: str
     expected: Range
-    measure: Callable[[Measured, Setting], Mapping[str, Interval]]
+    measure: Callable[[PaperResults, Setting], Mapping[str, Interval]]
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a claim under one setting.
+    """Measurement and verdict of a claim under one setting.
 
     Attributes:
         claim: The claim.
         setting: The setting.
         parts: Interval and verdict by the name of the part; empty if not measured.
-        verdict: That of the whole claim.
+        verdict: Verdict of the claim.
     """
 
     claim: Claim
@@ -91,7 +79,7 @@ class Outcome:
 
 
 def judge_part(interval: Interval, expected: Range) -> Verdict:
-    """Return whether an interval lies inside a range, outside of it, or across an end."""
+    """Judge a part by whether its interval lies inside a range, outside of it, or across an end."""
     if expected.low < interval.low and interval.high < expected.high:
         return "holds"
     if interval.high < expected.low or interval.low > expected.high:
@@ -100,7 +88,7 @@ def judge_part(interval: Interval, expected: Range) -> Verdict:
 
 
 def combine(verdicts: Iterable[Verdict]) -> Verdict:
-    """Return the verdict of a claim from those of its parts.
+    """Return the verdict of a claim from the verdicts of its parts.
 
     Raises:
         ValueError: There are no parts.
@@ -113,11 +101,19 @@ def combine(verdicts: Iterable[Verdict]) -> Verdict:
     return "holds" if verdicts == {"holds"} else "undecided"
 
 
-def judge(claim: Claim, measured: Measured, setting: Setting) -> Outcome:
-    """Measure a claim under a setting and judge it by `RULE`."""
+def judge(claim: Claim, results: PaperResults, setting: Setting) -> Outcome:
+    """Measure a claim under a setting and judge it by the rule of the report."""
     try:
-        intervals = claim.measure(measured, setting)
+        intervals = claim.measure(results, setting)
     except UnmeasuredError:
         return Outcome(claim, setting, {}, "not measured")
-    parts = {name: (own, judge_part(own, claim.expected)) for name, own in intervals.items()}
+    parts = {
+        name: (interval, judge_part(interval, claim.expected))
+        for name, interval in intervals.items()
+    }
     return Outcome(claim, setting, parts, combine(verdict for _, verdict in parts.values()))
+
+
+def judge_all(claims: Iterable[Claim], results: PaperResults) -> list[list[Outcome]]:
+    """Judge each claim under every setting."""
+    return [[judge(claim, results, setting) for setting in SETTINGS] for claim in claims]

@@ -1,4 +1,4 @@
-"""The numbers that the claims are about, each an interval over traffic seeds."""
+"""Quantities that the claims are about, each as an interval over traffic seeds."""
 
 from __future__ import annotations
 
@@ -13,29 +13,21 @@ from agents.evaluation.statistics import (
     mean_interval,
     paired_difference,
 )
+from agents.experiments.cells import DENSITY, METRICS, SPEED
+from agents.experiments.plots import LABELS
 from agents.studies.paper.plan import ESTIMATORS, Setting
-from agents.studies.paper.results import FloatArray, Measured, correlations, roughness, slopes
+from agents.studies.paper.results import PaperResults, correlations, roughness, slopes
+from dptse_env.arrays import FloatArray
 
-LABELS = {
-    "ekf": "EKF",
-    "ukf": "UKF",
-    "enkf": "EnKF",
-    "mhe": "MHE",
-    "random_walk": "random walk",
-    "open_loop": "open loop",
-}
-DENSITY, SPEED = "rmse_density", "rmse_speed"
-UNITS = {DENSITY: "veh/km", SPEED: "km/h"}
-
-Measure = Callable[[Measured, Setting], Mapping[str, Interval]]
+Measure = Callable[[PaperResults, Setting], Mapping[str, Interval]]
 
 
 def percent(values: FloatArray, reference: FloatArray) -> Interval:
-    """Return how much larger values are than their references [%]."""
+    """Return by how much values exceed their references [%]."""
     return mean_interval(100.0 * (values / reference - 1.0))
 
 
-def _mean(m: Measured, field: str, name: str, setting: Setting, metric: str) -> FloatArray:
+def _mean(m: PaperResults, field: str, name: str, setting: Setting, metric: str) -> FloatArray:
     """Return the mean of a curve over its points, for each seed."""
     mean: FloatArray = m.curve(field, name, setting, metric).mean(axis=0)
     return mean
@@ -44,27 +36,27 @@ def _mean(m: Measured, field: str, name: str, setting: Setting, metric: str) -> 
 def falls(metric: str) -> Measure:
     """Measure the slope of the error over the number of CV segments."""
 
-    def measure(m: Measured, setting: Setting) -> Mapping[str, Interval]:
-        places = np.array(m.design.sweeps["bandwidth"].values)
+    def measure(m: PaperResults, setting: Setting) -> Mapping[str, Interval]:
+        places = np.array(m.design.sweeps["bandwidth"])
         curves = {name: m.curve("bandwidth", name, setting, metric) for name in ESTIMATORS}
-        return {LABELS[name]: mean_interval(slopes(places, own)) for name, own in curves.items()}
+        return {LABELS[name]: mean_interval(slopes(places, y)) for name, y in curves.items()}
 
     return measure
 
 
 def against_others(name: str, metric: str, *fields: str) -> Measure:
-    """Measure how far an estimator's mean error over a sweep lies above each other one's."""
+    """Measure an estimator's mean error over a sweep minus that of each other estimator."""
 
-    def measure(m: Measured, setting: Setting) -> Mapping[str, Interval]:
+    def measure(m: PaperResults, setting: Setting) -> Mapping[str, Interval]:
         parts = {}
         for field in fields:
-            own = _mean(m, field, name, setting, metric)
+            error = _mean(m, field, name, setting, metric)
             for other in ESTIMATORS:
                 if other != name:
                     label = f"{LABELS[name]} − {LABELS[other]}"
                     label += f", over {_AXES[field]}" if len(fields) > 1 else ""
                     reference = _mean(m, field, other, setting, metric)
-                    parts[label] = paired_difference(own, reference)
+                    parts[label] = paired_difference(error, reference)
         return parts
 
     return measure
@@ -76,9 +68,9 @@ _AXES = {"bandwidth": "CV segments", "epsilon": "ε", "delta": "δ"}
 def percent_apart(*pairs: tuple[str, str, str]) -> Measure:
     """Measure differences of mean errors over CV segments, each (estimator, reference, metric)."""
 
-    def measure(m: Measured, setting: Setting) -> Mapping[str, Interval]:
+    def measure(m: PaperResults, setting: Setting) -> Mapping[str, Interval]:
         return {
-            f"{LABELS[a]} to {LABELS[b]}, {_NAMES[metric]}": percent(
+            f"{LABELS[a]} to {LABELS[b]}, {METRICS[metric][0]}": percent(
                 _mean(m, "bandwidth", a, setting, metric), _mean(m, "bandwidth", b, setting, metric)
             )
             for a, b, metric in pairs
@@ -87,21 +79,18 @@ def percent_apart(*pairs: tuple[str, str, str]) -> Measure:
     return measure
 
 
-_NAMES = {DENSITY: "density", SPEED: "speed"}
-
-
-def mhe_behind_ekf(m: Measured, setting: Setting) -> Mapping[str, Interval]:
+def mhe_behind_ekf(m: PaperResults, setting: Setting) -> Mapping[str, Interval]:
     """Measure the MHE's speed error above the EKF's."""
     mhe, ekf = (_mean(m, "bandwidth", name, setting, SPEED) for name in ("mhe", "ekf"))
     return {"MHE − EKF": paired_difference(mhe, ekf)}
 
 
-def enkf_rougher(m: Measured, setting: Setting) -> Mapping[str, Interval]:
-    """Measure how much rougher the EnKF's density curve is than each other one."""
+def enkf_rougher(m: PaperResults, setting: Setting) -> Mapping[str, Interval]:
+    """Measure the roughness of the EnKF's density curve minus that of each other estimator."""
     rough = {name: roughness(m.curve("bandwidth", name, setting, DENSITY)) for name in ESTIMATORS}
     return {
-        f"EnKF − {LABELS[name]}": paired_difference(rough["enkf"], own)
-        for name, own in rough.items()
+        f"EnKF − {LABELS[name]}": paired_difference(rough["enkf"], other)
+        for name, other in rough.items()
         if name != "enkf"
     }
 
@@ -115,8 +104,8 @@ def _correlation(a: FloatArray, b: FloatArray) -> Interval:
     return Interval(mean, low, high, z.n)
 
 
-def alike_over_epsilon(m: Measured, setting: Setting) -> Mapping[str, Interval]:
-    """Measure how two estimators' density curves over epsilon correlate."""
+def alike_over_epsilon(m: PaperResults, setting: Setting) -> Mapping[str, Interval]:
+    """Measure the correlation of two estimators' density curves over epsilon."""
     curves = {name: m.curve("epsilon", name, setting, DENSITY) for name in ESTIMATORS}
     return {
         f"{LABELS[a]}, {LABELS[b]}": _correlation(curves[a], curves[b])
@@ -124,8 +113,8 @@ def alike_over_epsilon(m: Measured, setting: Setting) -> Mapping[str, Interval]:
     }
 
 
-def speed_like_density(m: Measured, setting: Setting) -> Mapping[str, Interval]:
-    """Measure how an estimator's density and speed curves correlate."""
+def speed_like_density(m: PaperResults, setting: Setting) -> Mapping[str, Interval]:
+    """Measure the correlation of an estimator's density and speed curves."""
     return {
         f"{LABELS[name]}, over {_AXES[field]}": _correlation(
             m.curve(field, name, setting, DENSITY), m.curve(field, name, setting, SPEED)
@@ -135,7 +124,7 @@ def speed_like_density(m: Measured, setting: Setting) -> Mapping[str, Interval]:
     }
 
 
-def epsilon_matters_more(m: Measured, setting: Setting) -> Mapping[str, Interval]:
+def epsilon_matters_more(m: PaperResults, setting: Setting) -> Mapping[str, Interval]:
     """Measure the fall of the density error from end to end, over epsilon minus over delta."""
     parts = {}
     for name in ESTIMATORS:
@@ -146,7 +135,7 @@ def epsilon_matters_more(m: Measured, setting: Setting) -> Mapping[str, Interval
 
 
 def growth(field: str, low: float | None, high: float | None) -> Measure:
-    """Measure how much the density error at one value of a sweep exceeds that at a higher one [%].
+    """Measure the excess of the density error at one value of a sweep over a higher value [%].
 
     Args:
         field: The sweep.
@@ -154,8 +143,8 @@ def growth(field: str, low: float | None, high: float | None) -> Measure:
         high: The value of less privacy; None for the highest.
     """
 
-    def measure(m: Measured, setting: Setting) -> Mapping[str, Interval]:
-        values = m.design.sweeps[field].values
+    def measure(m: PaperResults, setting: Setting) -> Mapping[str, Interval]:
+        values = m.design.sweeps[field]
         ends = values[0] if low is None else low, values[-1] if high is None else high
         return {
             LABELS[name]: percent(*(m.at(field, end, name, setting, DENSITY) for end in ends))
@@ -165,8 +154,8 @@ def growth(field: str, low: float | None, high: float | None) -> Measure:
     return measure
 
 
-def time_order(m: Measured, setting: Setting) -> Mapping[str, Interval]:
-    """Measure ratios of times a step of neighbours in the paper's order."""
+def time_order(m: PaperResults, setting: Setting) -> Mapping[str, Interval]:
+    """Measure the ratios of step times of neighbours in the paper's order."""
     order = ("ukf", "enkf", "mhe", "ekf")
     return {
         f"{LABELS[a]} / {LABELS[b]}": geometric_mean_interval(
@@ -179,7 +168,7 @@ def time_order(m: Measured, setting: Setting) -> Mapping[str, Interval]:
 def below(reference: str, metric: str) -> Measure:
     """Measure every estimator's error minus a baseline's at the base point."""
 
-    def measure(m: Measured, setting: Setting) -> Mapping[str, Interval]:
+    def measure(m: PaperResults, setting: Setting) -> Mapping[str, Interval]:
         other = m.base(reference, setting, metric)
         return {
             f"{LABELS[name]} − {LABELS[reference]}": paired_difference(

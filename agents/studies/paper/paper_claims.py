@@ -6,10 +6,9 @@ before the full run, after a look at three traffic seeds.
 
 from __future__ import annotations
 
+from agents.experiments.cells import DENSITY, SPEED
 from agents.studies.paper.claims import ABOVE_ZERO, BELOW_ZERO, Claim, Range
 from agents.studies.paper.measures import (
-    DENSITY,
-    SPEED,
     against_others,
     alike_over_epsilon,
     below,
@@ -157,4 +156,4 @@ TARGETS = (
         below("open_loop", SPEED),
     ),
 )  # fmt: skip
-"""What this project asks of its estimators."""
+"""Targets of this project for its estimators."""

@@ -1,28 +1,25 @@
-"""What is run to reproduce the paper: its sweeps, and the cells that they share."""
+"""Plan of the reproduction: the paper's sweeps, and the cells that they share."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
-from agents.evaluation.episodes import check_held_out
-from dptse_env.config import TEST_SEEDS
+from agents.experiments.cells import Design
 from dptse_env.estimators import check_estimator
 
 ESTIMATORS = ("ekf", "ukf", "enkf", "mhe")
 """The paper's estimators, in its order."""
 BASELINES = ("random_walk", "open_loop")
-"""No traffic model, and no measurements: run beside the others in every result."""
-SCHEDULE = "paper"
-"""Query schedule of every episode."""
+"""Run beside them in every result: without a traffic model, and without measurements."""
 EPSILON, DELTA = 1.0, 0.05
 """The paper's privacy parameters wherever they are not swept."""
 
 
 class Setting(NamedTuple):
-    """What the paper leaves open: each result is shown under all of them.
+    """A choice that the paper leaves open; each result is shown under all of them.
 
     Attributes:
         privacy: Privacy preset.
@@ -33,7 +30,7 @@ class Setting(NamedTuple):
     parameters: str
 
     def __str__(self) -> str:
-        """Name both."""
+        """Return both names."""
         return f"{self.privacy} noise, {self.parameters} parameters"
 
 
@@ -45,7 +42,7 @@ SETTINGS = tuple(
 
 
 @dataclass(frozen=True)
-class Cell:
+class PaperCell:
     """One configuration, run on every traffic seed.
 
     Attributes:
@@ -71,45 +68,22 @@ class Cell:
 
 
 @dataclass(frozen=True)
-class Sweep:
-    """One field of a cell over its values, the others held.
+class PaperDesign(Design[PaperCell]):
+    """The cells of the paper's results.
 
     Attributes:
-        field: Field of `Cell` that varies.
-        values: Its values, ascending.
-        bandwidth: CV segments where they do not vary.
-    """
-
-    field: str
-    values: tuple[float, ...]
-    bandwidth: int
-
-    @property
-    def base(self) -> float:
-        """The value of the field where another one is swept."""
-        return {"epsilon": EPSILON, "delta": DELTA, "bandwidth": self.bandwidth}[self.field]
-
-
-@dataclass(frozen=True)
-class Design:
-    """Everything that is run.
-
-    Attributes:
-        seeds: Held-out traffic seeds, of `TEST_SEEDS`; each is the seed of the noise, too.
         cv_segments: Numbers of CV segments of result 1.
-        epsilons: Values of result 3; 1 is added.
-        deltas: Values of result 4; 0.05 is added.
+        epsilons: Values of epsilon of result 3; 1 is added.
+        deltas: Values of delta of result 4; 0.05 is added.
         picture_segments: CV segments of result 2.
         privacy_segments: CV segments of results 3, 4 and 5.
         n_timed: Most traffic seeds behind each time of result 5.
-        estimators: Those of the paper's estimators that are run; the baselines always are.
-        env: Environment id.
+        estimators: Estimators of the paper; random walk and open loop are always run.
 
     Raises:
         ValueError: A value is out of range; the message names it.
     """
 
-    seeds: tuple[int, ...] = tuple(TEST_SEEDS[:20])
     cv_segments: tuple[int, ...] = tuple(range(5, 12))
     epsilons: tuple[float, ...] = (0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 2.0, 5.0, 10.0)
     deltas: tuple[float, ...] = (0.001, 0.003, 0.01, 0.03, 0.05, 0.1, 0.2)
@@ -117,12 +91,10 @@ class Design:
     privacy_segments: int = 5
     n_timed: int = 10
     estimators: tuple[str, ...] = ESTIMATORS
-    env: str = "dptse_env:dptse/PaperHighway-v0"
-    schedule: ClassVar[str] = SCHEDULE
 
     def __post_init__(self) -> None:
         """Check what no environment checks."""
-        check_held_out(self.seeds)
+        super().__post_init__()
         if self.n_timed < 2:
             raise ValueError(f"n_timed must be >= 2, got {self.n_timed}")
         for name in self.estimators:
@@ -145,87 +117,72 @@ class Design:
         return (*(name for name in ESTIMATORS if name in self.estimators), *BASELINES)
 
     @property
-    def sweeps(self) -> dict[str, Sweep]:
-        """The sweeps of results 1, 3 and 4 by the field that varies."""
+    def sweeps(self) -> dict[str, tuple[float, ...]]:
+        """Values of the sweeps of results 1, 3 and 4, ascending, by the field that varies."""
         values: dict[str, Sequence[float]] = {
             "bandwidth": self.cv_segments,
             "epsilon": (*self.epsilons, EPSILON),
             "delta": (*self.deltas, DELTA),
         }
-        return {
-            field: Sweep(field, tuple(sorted(set(own))), self.privacy_segments)
-            for field, own in values.items()
-        }
+        return {field: tuple(sorted(set(grid))) for field, grid in values.items()}
 
-    def base(self, estimator: str, setting: Setting) -> Cell:
+    def base(self, estimator: str, setting: Setting) -> PaperCell:
         """Return the cell of the paper's privacy and the fewest CV segments."""
-        return canonical(
-            Cell(
-                estimator,
-                setting.parameters,
-                setting.privacy,
-                EPSILON,
-                DELTA,
-                self.privacy_segments,
-            )
-        )
+        privacy, parameters = setting
+        segments = self.privacy_segments
+        return canonical(PaperCell(estimator, parameters, privacy, EPSILON, DELTA, segments))
 
-    def along(self, field: str, estimator: str, setting: Setting) -> list[Cell]:
+    def along(self, field: str, estimator: str, setting: Setting) -> list[PaperCell]:
         """Return the cells of one curve, in the order of the sweep's values."""
         base = self.base(estimator, setting)
-        return [
-            canonical(dataclasses.replace(base, **{field: value}))
-            for value in self.sweeps[field].values
-        ]
+        changes: list[dict[str, Any]] = [{field: value} for value in self.sweeps[field]]
+        return [canonical(dataclasses.replace(base, **change)) for change in changes]
 
-    def picture(self, estimator: str, setting: Setting) -> Cell:
+    def picture(self, estimator: str, setting: Setting) -> PaperCell:
         """Return the cell that result 2 shows."""
         base = self.base(estimator, setting)
         return canonical(dataclasses.replace(base, bandwidth=self.picture_segments))
 
-    def cells(self) -> list[Cell]:
-        """Return every cell of results 1, 3 and 4 once."""
+    def all_cells(self) -> Iterator[PaperCell]:
+        """Yield the cells of results 1, 3 and 4."""
+        for setting in SETTINGS:
+            for estimator in self.all_estimators:
+                yield from self.cells_of(estimator, setting)
 
-        def all_of_them() -> Iterator[Cell]:
-            for setting in SETTINGS:
-                for estimator in self.all_estimators:
-                    yield self.base(estimator, setting)
-                    for field in self.sweeps:
-                        yield from self.along(field, estimator, setting)
+    def cells_of(self, estimator: str, setting: Setting) -> Iterator[PaperCell]:
+        """Yield the cells of an estimator under a setting."""
+        yield self.base(estimator, setting)
+        for field in self.sweeps:
+            yield from self.along(field, estimator, setting)
 
-        return list(dict.fromkeys(all_of_them()))
-
-    def timed(self) -> list[tuple[Cell, int]]:
+    def timed(self) -> list[tuple[PaperCell, int]]:
         """Return the episodes that are timed; estimators alternate, so that drift hits them all."""
         cells = [self.base(name, setting) for setting in SETTINGS for name in self.all_estimators]
-        return [
-            (cell, seed) for seed in self.seeds[: self.n_timed] for cell in dict.fromkeys(cells)
-        ]
+        seeds = self.traffic_seeds[: self.n_timed]
+        return [(cell, seed) for seed in seeds for cell in dict.fromkeys(cells)]
+
+    def quick(self) -> PaperDesign:
+        """Return a design of the same results with fewer points and seeds."""
+
+        def thin(values: Sequence[float], kept: float) -> tuple[float, ...]:
+            return tuple(sorted({values[0], values[-1], kept}))
+
+        middle = self.cv_segments[len(self.cv_segments) // 2]
+        return dataclasses.replace(
+            self,
+            seeds=self.first_seeds(4),
+            cv_segments=tuple(int(n) for n in thin(self.cv_segments, middle)),
+            epsilons=thin(self.epsilons, EPSILON),
+            deltas=thin(self.deltas, DELTA),
+            n_timed=4,
+        )
 
 
-def canonical(cell: Cell) -> Cell:
+def canonical(cell: PaperCell) -> PaperCell:
     """Return the cell that stands for all that give the same episodes.
 
-    The open loop takes in nothing that is released, so neither noise nor queries matter to it.
+    The open loop uses no release, so neither noise nor queries matter to it.
     """
     if cell.estimator != "open_loop":
         return cell
     return dataclasses.replace(cell, privacy="paper", epsilon=EPSILON, delta=DELTA, bandwidth=1)
-
-
-def quick(design: Design) -> Design:
-    """Return a design that shows the same results with fewer points and seeds."""
-
-    def thin(values: Sequence[float], keep: float | None = None) -> tuple[float, ...]:
-        ends = (values[0], values[-1])
-        middle = values[len(values) // 2] if keep is None else keep
-        return tuple(sorted({*ends, middle}))
-
-    return dataclasses.replace(
-        design,
-        seeds=design.seeds[:4],
-        cv_segments=tuple(int(n) for n in thin(design.cv_segments)),
-        epsilons=thin(design.epsilons, EPSILON),
-        deltas=thin(design.deltas, DELTA),
-        n_timed=4,
-    )

@@ -1,50 +1,27 @@
-"""The scores of a run as arrays, and the few numbers that claims are about."""
+"""Results of the reproduction as arrays, and the statistics of curves that claims are about."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from agents.evaluation.episodes import EpisodeScore
-from agents.studies.paper.plan import Cell, Design, Setting
+from agents.experiments.cells import Results, UnmeasuredError
+from agents.studies.paper.plan import PaperCell, PaperDesign, Setting
 from agents.studies.paper.timing import StepTime
-
-FloatArray = NDArray[np.float64]
-
-
-class UnmeasuredError(Exception):
-    """A claim is about something that was not run."""
+from dptse_env.arrays import FloatArray
 
 
-class Measured:
-    """Scores by cell, in the order of the design's seeds.
+@dataclass(frozen=True)
+class PaperResults(Results[PaperDesign, PaperCell]):
+    """Scores and times of the cells of a design.
 
     Attributes:
-        design: What was run.
-        scores: Score by cell and traffic seed.
         times: Time of a step by cell and traffic seed.
     """
 
-    def __init__(
-        self,
-        design: Design,
-        scores: Mapping[tuple[Cell, int], EpisodeScore],
-        times: Mapping[tuple[Cell, int], StepTime],
-    ) -> None:
-        """Keep what was measured."""
-        self.design, self.scores, self.times = design, scores, times
-
-    def values(self, cell: Cell, metric: str) -> FloatArray:
-        """Return a field of `EpisodeScore` for each seed, shape (n_seeds,).
-
-        Raises:
-            UnmeasuredError: The cell was not run.
-        """
-        if (cell, self.design.seeds[0]) not in self.scores:
-            raise UnmeasuredError(cell)
-        return np.array([getattr(self.scores[cell, seed], metric) for seed in self.design.seeds])
+    times: Mapping[tuple[PaperCell, int], StepTime]
 
     def curve(self, field: str, estimator: str, setting: Setting, metric: str) -> FloatArray:
         """Return a metric along a sweep, shape (n_points, n_seeds)."""
@@ -55,7 +32,7 @@ class Measured:
         self, field: str, value: float, estimator: str, setting: Setting, metric: str
     ) -> FloatArray:
         """Return one point of a sweep, shape (n_seeds,)."""
-        point = self.design.sweeps[field].values.index(value)
+        point = self.design.sweeps[field].index(value)
         return self.values(self.design.along(field, estimator, setting)[point], metric)
 
     def base(self, estimator: str, setting: Setting, metric: str) -> FloatArray:
@@ -63,9 +40,13 @@ class Measured:
         return self.values(self.design.base(estimator, setting), metric)
 
     def seconds(self, estimator: str, setting: Setting) -> FloatArray:
-        """Return the time of a step for each timed seed [s], shape (n_timed,)."""
+        """Return the time of a step for each timed seed [s], shape (n_timed,).
+
+        Raises:
+            UnmeasuredError: The estimator was not timed.
+        """
         cell = self.design.base(estimator, setting)
-        seeds = self.design.seeds[: self.design.n_timed]
+        seeds = self.design.traffic_seeds[: self.design.n_timed]
         if (cell, seeds[0]) not in self.times:
             raise UnmeasuredError(cell)
         return np.array([self.times[cell, seed].seconds for seed in seeds])
@@ -79,7 +60,7 @@ def slopes(places: FloatArray, curve: FloatArray) -> FloatArray:
 
 
 def roughness(curve: FloatArray) -> FloatArray:
-    """Return the mean size of the second differences along a curve (n_points, n), shape (n,).
+    """Return the mean absolute second difference along a curve (n_points, n), shape (n,).
 
     A straight line has none, whatever its slope.
     """

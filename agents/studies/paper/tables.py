@@ -1,43 +1,19 @@
-"""Tables of the report, in Markdown, and the summary as CSV."""
+"""Tables of the reproduction, in Markdown."""
 
 from __future__ import annotations
 
-import csv
-import dataclasses
 from collections.abc import Iterable, Sequence
-from pathlib import Path
-from typing import Any
 
-from agents.evaluation.statistics import Interval, geometric_mean_interval, mean_interval
-from agents.studies.paper.claims import Claim, Outcome, judge
-from agents.studies.paper.measures import DENSITY, LABELS, SPEED, percent
-from agents.studies.paper.plan import ESTIMATORS, SETTINGS, Cell
-from agents.studies.paper.results import Measured
+from agents.evaluation.episodes import EpisodeScore
+from agents.evaluation.statistics import geometric_mean_interval, mean_interval
+from agents.experiments import tables
+from agents.experiments.plots import LABELS
+from agents.experiments.tables import format_interval, markdown
+from agents.studies.paper.claims import Outcome
+from agents.studies.paper.measures import percent
+from agents.studies.paper.plan import ESTIMATORS, SETTINGS
+from agents.studies.paper.results import PaperResults
 from agents.studies.paper.timing import PAPER_SECONDS
-
-
-def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a Markdown table; the first column is left-aligned, the others centred."""
-    lines = [header, ["---", *[":-:"] * (len(header) - 1)], *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
-
-
-def outcomes(claims: Iterable[Claim], measured: Measured) -> dict[str, list[Outcome]]:
-    """Judge claims under every setting; by the claim's key."""
-    return {claim.key: [judge(claim, measured, own) for own in SETTINGS] for claim in claims}
-
-
-def shown(interval: Interval) -> str:
-    """Return a mean with its interval."""
-    return f"{_number(interval.mean)} [{_number(interval.low)}, {_number(interval.high)}]"
-
-
-def _number(value: float) -> str:
-    """Three significant digits or two decimals, whichever says more."""
-    if 0.0 < abs(value) < 0.1:
-        return f"{value:.2g}"
-    return f"{value:.1f}" if abs(value) >= 100 else f"{value:.2f}"
-
 
 _MARKS = {
     "holds": "**holds**",
@@ -45,10 +21,11 @@ _MARKS = {
     "undecided": "undecided",
     "not measured": "not measured",
 }
+_SIGNS = {"holds": "✓", "does not hold": "✗", "undecided": "?"}
 _HEADER = [str(setting) for setting in SETTINGS]
 
 
-def verdict_table(judged: dict[str, list[Outcome]]) -> str:
+def verdict_table(judged: Iterable[Sequence[Outcome]]) -> str:
     """Return one row for each claim, with the count of its parts that hold."""
 
     def cell(outcome: Outcome) -> str:
@@ -56,104 +33,70 @@ def verdict_table(judged: dict[str, list[Outcome]]) -> str:
         count = f" ({n_held} of {len(outcome.parts)})" if outcome.parts else ""
         return _MARKS[outcome.verdict] + count
 
-    rows = [[f"{key}. {own[0].claim.says}", *map(cell, own)] for key, own in judged.items()]
+    claims = [(outcomes[0].claim, outcomes) for outcomes in judged]
+    rows = [[f"{claim.key}. {claim.statement}", *map(cell, row)] for claim, row in claims]
     return markdown(["claim", *_HEADER], rows)
 
 
-def detail(own: Sequence[Outcome]) -> str:
-    """Return what was measured for one claim: a row for each part."""
-    claim = own[0].claim
-    signs = {"holds": "✓", "does not hold": "✗", "undecided": "?"}
-    names = list(dict.fromkeys(name for outcome in own for name in outcome.parts))
-
-    def cell(outcome: Outcome, name: str) -> str:
-        interval, verdict = outcome.parts[name]
-        return f"{shown(interval)} {signs[verdict]}"
-
-    rows = [[name, *(cell(outcome, name) for outcome in own)] for name in names]
-    rows.append(["**verdict**", *(_MARKS[outcome.verdict] for outcome in own)])
-    return (
-        f"**{claim.key}. {claim.says}**\n\n"
-        f"Measured: {claim.measured} [{claim.unit}]. Holds if {claim.expected}.\n\n"
-        + markdown(["part", *_HEADER], rows)
-    )
+def parts_table(outcomes: Sequence[Outcome]) -> str:
+    """Return the measurements for one claim: a row for each part, the verdict last."""
+    names = dict.fromkeys(name for outcome in outcomes for name in outcome.parts)
+    rows = []
+    for name in names:
+        parts = [outcome.parts[name] for outcome in outcomes]
+        rows.append([name, *(f"{format_interval(i)} {_SIGNS[verdict]}" for i, verdict in parts)])
+    rows.append(["**verdict**", *(_MARKS[outcome.verdict] for outcome in outcomes)])
+    return markdown(["part", *_HEADER], rows)
 
 
-def base_table(measured: Measured, metric: str) -> str:
+def base_table(results: PaperResults, metric: str) -> str:
     """Return errors at the base point, and by how much they exceed the random walk's [%]."""
     rows = []
-    for name in measured.design.all_estimators:
+    for name in results.design.all_estimators:
         row = [LABELS[name]]
         for setting in SETTINGS:
-            own = measured.base(name, setting, metric)
-            walk = measured.base("random_walk", setting, metric)
-            text = shown(mean_interval(own))
+            errors = results.base(name, setting, metric)
+            text = format_interval(mean_interval(errors))
             if name != "random_walk":
-                excess = percent(own, walk)
+                excess = percent(errors, results.base("random_walk", setting, metric))
                 text += f"; {excess.mean:+.1f} ± {excess.half_width:.1f} %"
             row.append(text)
         rows.append(row)
     return markdown(["estimator", *_HEADER], rows)
 
 
-def time_table(measured: Measured) -> str:
+def time_table(results: PaperResults) -> str:
     """Return times of a step beside the paper's [ms], and relative to the EKF's."""
     rows = []
-    for name in measured.design.all_estimators:
-        told = name in ESTIMATORS
-        row = [
-            LABELS[name],
-            f"{PAPER_SECONDS[name] * 1e3:g}" if told else "-",
-            f"{PAPER_SECONDS[name] / PAPER_SECONDS['ekf']:.2f}" if told else "-",
-        ]
+    for name in results.design.all_estimators:
+        row = [LABELS[name], "-", "-"]
+        if name in ESTIMATORS:
+            seconds = PAPER_SECONDS[name]
+            row[1:] = [f"{seconds * 1e3:g}", f"{seconds / PAPER_SECONDS['ekf']:.2f}"]
         for setting in SETTINGS:
-            own = measured.seconds(name, setting)
-            text = shown(geometric_mean_interval(own * 1e3))
-            if "ekf" in measured.design.estimators:
-                ratio = geometric_mean_interval(own / measured.seconds("ekf", setting))
+            times = results.seconds(name, setting)
+            text = format_interval(geometric_mean_interval(times * 1e3))
+            if "ekf" in results.design.estimators:
+                ratio = geometric_mean_interval(times / results.seconds("ekf", setting))
                 text += f"; {ratio.mean:.2f}"
             row.append(text)
         rows.append(row)
     return markdown(["estimator", "paper [ms]", "paper, / EKF", *_HEADER], rows)
 
 
-def health_table(measured: Measured) -> str:
-    """Return seconds lost by each estimator under each setting, over all its episodes."""
-    rows = []
-    for name in measured.design.all_estimators:
-        row = [LABELS[name]]
-        for setting in SETTINGS:
-            stands_for = [
-                cell
-                for field in measured.design.sweeps
-                for cell in measured.design.along(field, name, setting)
-            ]
-            cells = list(dict.fromkeys([*stands_for, measured.design.base(name, setting)]))
-            diverged, fallback = (
-                sum(float(measured.values(cell, metric).sum()) for cell in cells)
-                for metric in ("n_diverged", "n_fallback")
-            )
-            n_episodes = len(cells) * len(measured.design.seeds)
-            row.append(f"{diverged:.0f}, {fallback:.0f} (of {n_episodes} episodes)")
-        rows.append(row)
-    return markdown(["estimator", *_HEADER], rows)
+def health_table(results: PaperResults) -> str:
+    """Return the seconds that each estimator lost under each setting, over all its episodes."""
+    groups: dict[tuple[str, ...], list[EpisodeScore]] = {
+        (LABELS[name], str(setting)): results.episodes(*results.design.cells_of(name, setting))
+        for name in results.design.all_estimators
+        for setting in SETTINGS
+    }
+    return tables.health_table(["estimator", "setting"], groups)
 
 
-def write_summary(path: Path, measured: Measured) -> None:
-    """Write means with intervals as CSV, one row for each cell."""
-    metrics = {DENSITY: "veh_km", SPEED: "km_h"}
-    columns = [field.name for field in dataclasses.fields(Cell)]
-    columns += ["n_seeds"]
-    for metric, unit in metrics.items():
-        columns += [f"{metric}_{unit}", f"{metric}_low", f"{metric}_high"]
-    columns += ["reward", "reward_low", "reward_high", "n_diverged", "n_fallback"]
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(columns)
-        for cell in sorted(measured.design.cells(), key=dataclasses.astuple):
-            row: list[Any] = [*dataclasses.astuple(cell), len(measured.design.seeds)]
-            for metric in (*metrics, "reward"):
-                own = mean_interval(measured.values(cell, metric))
-                row += [f"{value:.6g}" for value in (own.mean, own.low, own.high)]
-            row += [measured.values(cell, f"n_{kind}").sum() for kind in ("diverged", "fallback")]
-            writer.writerow(row)
+def grid_table(results: PaperResults) -> str:
+    """Return the values of the sweeps."""
+    names = {"bandwidth": "number of CV segments", "epsilon": "ε", "delta": "δ"}
+    sweeps = results.design.sweeps
+    rows = [[name, ", ".join(f"{x:g}" for x in sweeps[field])] for field, name in names.items()]
+    return markdown(["grid", "values"], rows)

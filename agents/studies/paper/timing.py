@@ -1,4 +1,4 @@
-"""Wall time of the estimators, measured where they are used: in episodes."""
+"""Wall time of the estimators, measured in episodes."""
 
 from __future__ import annotations
 
@@ -7,12 +7,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import gymnasium as gym
 from tqdm import tqdm
 
-from agents.evaluation.episodes import run_episode
+from agents.evaluation.episodes import run_episode, unwrap
 from agents.experiments.ledger import Ledger
 from agents.experiments.runner import make_env
-from agents.studies.paper.plan import SCHEDULE, Cell, Design
+from agents.studies.paper.plan import PaperCell, PaperDesign
 from dptse_env.schedules import make_schedule
 
 PAPER_SECONDS = {"ekf": 0.06, "ukf": 0.026, "enkf": 0.040, "mhe": 0.045}
@@ -21,7 +22,7 @@ PAPER_SECONDS = {"ekf": 0.06, "ukf": 0.026, "enkf": 0.040, "mhe": 0.045}
 
 @dataclass(frozen=True)
 class StepTime:
-    """How long an estimator took in one episode.
+    """Time of an estimator in one episode.
 
     Attributes:
         traffic_seed: The traffic it followed.
@@ -52,32 +53,43 @@ class Stopwatch:
         return call
 
 
-def step_time(env: Any, seed: int) -> StepTime:
+def step_time(env: gym.Env[Any, Any], schedule: str, seed: int) -> StepTime:
     """Run one episode and return the mean time of an estimator's step, batch of one.
 
-    The one estimate at the reset is counted with the steps.
+    The estimate at the reset is counted with the steps.
     """
-    process = env.unwrapped.process
-    own = process.estimator
-    watch = Stopwatch(own, ("predict", "update", "estimate"))
+    process, methods = unwrap(env).process, ("predict", "update", "estimate")
+    watch = Stopwatch(process.estimator, methods)
     try:
-        run_episode(env, make_schedule(SCHEDULE, env), traffic_seed=seed, seed=seed)
+        run_episode(env, make_schedule(schedule, env), traffic_seed=seed, seed=seed)
     finally:
-        for name in ("predict", "update", "estimate"):
-            delattr(own, name)  # what hides the class's own method
+        for name in methods:
+            delattr(process.estimator, name)  # which hides the method of the class
     return StepTime(seed, watch.seconds / float(process.elapsed[0]))
 
 
+def untimed(
+    design: PaperDesign, ledger: Ledger[PaperCell, StepTime]
+) -> list[tuple[PaperCell, int]]:
+    """Return the timed episodes that a ledger lacks."""
+    return [episode for episode in design.timed() if episode not in ledger.rows]
+
+
 def time_all(
-    design: Design, ledger: Ledger[Cell, StepTime], records: str | None, progress: bool = True
+    design: PaperDesign,
+    ledger: Ledger[PaperCell, StepTime],
+    records: str | None,
+    progress: bool = True,
 ) -> None:
-    """Time what the ledger lacks, one episode after the other in this process."""
-    todo = [pair for pair in design.timed() if pair not in ledger.rows]
-    envs: dict[Cell, Any] = {}
-    for cell, seed in tqdm(
-        todo, desc="timing", unit="episode", mininterval=0.5, disable=not progress
-    ):
+    """Time the episodes that a ledger lacks, one after the other in this process."""
+    envs: dict[PaperCell, gym.Env[Any, Any]] = {}
+    bar = tqdm(
+        untimed(design, ledger), desc="timing", unit="episode", mininterval=0.5,
+        disable=not progress,
+    )  # fmt: skip
+    for cell, seed in bar:
         if cell not in envs:
-            envs[cell] = make_env(design.env, cell, design.seeds, records)
-            step_time(envs[cell], seed)  # kernels load and traffic is read before anything counts
-        ledger.append(cell, [step_time(envs[cell], seed)])
+            envs[cell] = make_env(design.env, cell, design.traffic_seeds, records)
+            # Kernels load and traffic is read before anything counts.
+            step_time(envs[cell], design.schedule, seed)
+        ledger.append(cell, [step_time(envs[cell], design.schedule, seed)])
