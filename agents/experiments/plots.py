@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.ticker import FixedLocator, NullLocator
+from numpy.typing import ArrayLike
 
 from agents.evaluation.statistics import Interval
 from dptse_env.arrays import FloatArray
@@ -45,16 +46,16 @@ ESTIMATOR_LOOKS = {
 
 def draw_curve(
     axis: Axes,
-    places: Sequence[float] | FloatArray,
+    places: ArrayLike,
     intervals: Sequence[Interval],
     look: Look,
     label: str | None = None,
 ) -> None:
     """Draw means at their places with intervals as bars."""
     means = [interval.mean for interval in intervals]
-    spread = np.array([[own.mean - own.low, own.high - own.mean] for own in intervals]).T
+    spread = np.array([[each.mean - each.low, each.high - each.mean] for each in intervals]).T
     axis.errorbar(
-        places, means, yerr=spread, color=look.colour, marker=look.marker, linestyle=look.line,
+        np.asarray(places), means, yerr=spread, color=look.colour, marker=look.marker, linestyle=look.line,
         markersize=4, linewidth=1.2, capsize=2, label=label,
     )  # fmt: skip
 

@@ -1,1 +1,1 @@
-"""What a guarantee of privacy costs, and what noise as printed gives: planned, run, reported."""
+"""The price of a privacy guarantee, and the guarantee that noise as printed gives."""

@@ -1,17 +1,16 @@
-"""What noise is worth to a vehicle: epsilon as claimed, as composed, and as really met."""
+"""Guarantees behind noise: epsilon as claimed, as composed, and as met by one vehicle."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from agents.experiments.runner import make_env
-from agents.studies.privacy.plan import Cell
+from agents.evaluation.episodes import make_config, without_void_warning
+from agents.studies.privacy.plan import PrivacyCell
+from dptse_env.arrays import IntArray
 from dptse_env.config import EnvConfig
 from dptse_env.privacy import contribution_sensitivity, epsilon_of
 from dptse_env.traffic import Corridor, RecordLibrary
@@ -19,17 +18,17 @@ from dptse_env.traffic import Corridor, RecordLibrary
 
 @dataclass(frozen=True)
 class Account:
-    """What a configuration's noise is worth.
+    """The guarantee that a configuration's noise gives.
 
     Attributes:
-        claimed: The epsilon asked for.
-        composed: Epsilon of both releases together, if the preset's own sensitivities held.
+        claimed: The epsilon of the configuration.
+        composed: Epsilon of both releases together, if the preset's sensitivities held.
         density_std: Noise of a density [veh/km].
         second_std: Noise of a mean speed [km/h] or of a flow [veh/h].
-        met: Steps in which a vehicle is met, and the epsilon of the density releases alone.
-        alone: The same with the speeds: epsilon of both releases for a vehicle that is alone on its
-            segment and stands.
-        void_reasons: Why nothing may be claimed; empty where something may.
+        met: By the number of steps in which a vehicle is met, epsilon of the density releases.
+        alone: The same with the speeds: epsilon of both releases for a vehicle that stands and is
+            alone on its segment.
+        void_reasons: Reasons why no guarantee holds; empty where one does.
     """
 
     claimed: float
@@ -42,11 +41,11 @@ class Account:
 
 
 def mu_met(config: EnvConfig, density_std: float, contributions: int) -> float:
-    """Return mu of the density releases alone for a vehicle that is met so many times.
+    """Return mu of the density releases alone for a vehicle that is met in some steps.
 
-    A lower bound on that of the whole transcript: what is released of speeds only adds to it. It
-    is reached by two records in which one vehicle's trip is replaced by another one elsewhere, each
-    met `contributions` times.
+    A lower bound on mu of the whole transcript, since releases of speeds only add to it. It is
+    reached by two records in which one vehicle's trip is replaced by a trip elsewhere, each met
+    `contributions` times.
 
     Args:
         config: Gives the segment length and the largest speed.
@@ -68,23 +67,23 @@ def mu_alone(
 ) -> float:
     """Return mu of densities and mean speeds for a vehicle that is alone where it is met.
 
-    It stands, and an empty segment answers with the speed limit, so its mean speed moves by the
-    limit. In either world `contributions` segments differ.
+    The vehicle stands, and an empty segment releases the speed limit, so the mean speed moves by
+    the limit. In either record `contributions` segments differ.
     """
     speed = math.sqrt(2.0 * contributions) * config.corridor.speed_limit / mean_speed_std
     return math.hypot(mu_met(config, density_std, contributions), speed)
 
 
-def account_of(env: str, cell: Cell, seeds: Sequence[int], contributions: Sequence[int]) -> Account:
-    """Return what the noise of a cell is worth.
+def make_account(env: str, cell: PrivacyCell, contributions: Sequence[int]) -> Account:
+    """Return the guarantee behind the noise of a cell.
 
     Args:
         env: Environment id.
         cell: The cell.
-        seeds: Traffic seeds that the environment is made with; the account depends on none.
         contributions: Steps in which a vehicle may be met.
     """
-    config: EnvConfig = make_env(env, cell, seeds, None).unwrapped.config  # type: ignore[attr-defined]
+    with without_void_warning():
+        config = make_config(env, cell.keywords)
     report = config.accountant().report
     density_std, second_std = (release.noise_std for release in report.releases)
     # Where contributions are bounded, no vehicle counts more often, and the bound is met exactly.
@@ -92,38 +91,61 @@ def account_of(env: str, cell: Cell, seeds: Sequence[int], contributions: Sequen
     most = config.privacy.contributions(config.horizon_steps) if bounded else config.horizon_steps
     counted = {n: min(n, most) for n in contributions}
 
-    def epsilon(mu: float) -> float:
-        return epsilon_of(mu, config.privacy.delta)
+    def met(n: int) -> float:
+        return epsilon_of(mu_met(config, density_std, n), config.privacy.delta)
 
     def alone(n: int) -> float:
         if bounded:
-            return epsilon(report.mu * math.sqrt(n / most))
-        return epsilon(mu_alone(config, density_std, second_std, n))
+            mu = report.mu * math.sqrt(n / most)
+        else:
+            mu = mu_alone(config, density_std, second_std, n)
+        return epsilon_of(mu, config.privacy.delta)
 
     return Account(
         claimed=cell.epsilon,
         composed=report.epsilon,
         density_std=density_std,
         second_std=second_std,
-        met={n: epsilon(mu_met(config, density_std, own)) for n, own in counted.items()},
-        alone={n: alone(own) for n, own in counted.items()},
+        met={n: met(count) for n, count in counted.items()},
+        alone={n: alone(count) for n, count in counted.items()},
         void_reasons=report.void_reasons,
     )
 
 
-def trip_lengths(
-    corridor: Corridor, seeds: Sequence[int], records: str | Path | None
-) -> NDArray[np.int64]:
-    """Return how long each vehicle of the records can be met, pooled over the seeds [s].
+@dataclass(frozen=True)
+class Traffic:
+    """The traffic of a corridor, whatever the seed.
 
-    That is the number of seconds that it is on a segment which can be queried. Vehicles that still
-    drive when a record ends count with what was recorded. Truth: for evaluation only.
+    Attributes:
+        corridor: Digest of the corridor.
     """
-    library = RecordLibrary(records)
-    lengths = []
-    for seed in seeds:
-        record = library.get(corridor, seed)
-        mainline = record.segment < corridor.n_mainline
-        seconds = np.bincount(record.vehicle[mainline], minlength=record.n_vehicles)
-        lengths.append(seconds[seconds > 0])
-    return np.concatenate(lengths).astype(np.int64)
+
+    corridor: str
+
+
+@dataclass(frozen=True)
+class Trips:
+    """The lengths of all trips of a record.
+
+    Attributes:
+        traffic_seed: The traffic.
+        seconds: Seconds that each vehicle is on a segment which can be queried, numbers with
+            spaces between them. Vehicles that still drive when the record ends count with what was
+            recorded.
+    """
+
+    traffic_seed: int
+    seconds: str
+
+    @property
+    def lengths(self) -> IntArray:
+        """The seconds as an array, shape (n_vehicles,)."""
+        return np.array(self.seconds.split(), dtype=np.int64)
+
+
+def measure_trips(corridor: Corridor, seed: int, library: RecordLibrary) -> Trips:
+    """Return the lengths of the trips of a record; truth, for evaluation only."""
+    record = library.get(corridor, seed)
+    mainline = record.segment < corridor.n_mainline
+    seconds = np.bincount(record.vehicle[mainline], minlength=record.n_vehicles)
+    return Trips(seed, " ".join(map(str, seconds[seconds > 0].tolist())))

@@ -1,93 +1,84 @@
-"""The figures of the study."""
+"""Figures of the study of privacy."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
-from agents.evaluation.figures import save
+from agents.evaluation.figures import add_frame, add_legend, make_figure
 from agents.evaluation.statistics import Interval
-from agents.studies.paper.measures import LABELS
+from agents.experiments.cells import DENSITY, METRICS, SPEED
+from agents.experiments.plots import (
+    ESTIMATOR_LOOKS,
+    GREY,
+    LABELS,
+    Look,
+    draw_curve,
+    draw_level,
+    set_log_ticks,
+    shifted,
+)
 from agents.studies.privacy.account import Account
-from agents.studies.privacy.plan import BOUNDARY_MODES, OPEN_LOOP, Cell, Protection
-from agents.studies.privacy.results import DENSITY, METRICS, SPEED, Measured
+from agents.studies.privacy.plan import BOUNDARY_MODES, OPEN_LOOP, PrivacyCell, Protection
+from agents.studies.privacy.results import PrivacyResults
 
 CAPS = ("#9ecae1", "#4292c6", "#2171b5", "#08519c", "#08306b")
-"""From the smallest cap, the least noise, to the largest."""
-OTHER = {
-    "event": ("#009e73", "s", "--"),
-    "horizon": ("#d55e00", "^", "--"),
-    "paper": ("#cc79a7", "D", "-"),
-    "corrected": ("#7d5ba6", "v", "-"),
+"""Shades from the smallest cap, the least noise, to the largest."""
+LOOKS = {
+    "event": Look("#009e73", "s", "--"),
+    "horizon": Look("#d55e00", "^", "--"),
+    "paper": Look("#cc79a7", "D"),
+    "corrected": Look("#7d5ba6", "v"),
 }
-ESTIMATORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#b9770e")
-GREY = "#333333"
+MODE_LABELS = ("nominal", "private", "true\n(no guarantee)")
 TICKS = (2, 3, 5, 7, 10, 15, 20, 30, 40, 50, 70, 100, 150, 200, 300, 500)
 EPSILON_TICKS = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1e3, 1e4, 1e5, 1e6)
 
 
-class Look(NamedTuple):
-    """How a curve looks."""
-
-    colour: str
-    marker: str
-    line: str
-
-
-def save_epsilon(path: Path, measured: Measured, title: str) -> None:
-    """Save errors against epsilon for every cap and unit, a row for each error."""
-    design = measured.design
-    figure = Figure(figsize=(4.6 * len(design.estimators) + 0.6, 7.4), dpi=140)
-    figure.set_layout_engine("constrained")
+def draw_epsilon(results: PrivacyResults) -> Figure:
+    """Draw errors against epsilon for every cap and unit, a row for each error."""
+    design = results.design
+    figure = make_figure(4.6 * len(design.estimators) + 0.6, 7.4)
     axes = figure.subplots(2, len(design.estimators), squeeze=False, sharex=True, sharey="row")
     for row, metric in zip(axes, METRICS, strict=True):
         for axis, name in zip(row, design.estimators, strict=True):
             for k, protection in enumerate(design.guaranteed):
-                cells = design.along_epsilon(name, protection)
-                places = _beside(design.epsilons, k - 2)
-                look = _look(measured, protection)
-                _curve(axis, places, _means(measured, cells, metric), look, str(protection))
-            alone = measured.mean(design.cell(OPEN_LOOP), metric)
-            _line(axis, alone, "open loop, nominal boundary")
-            _log(axis, design.epsilons)
+                means = _means(results, design.along_epsilon(name, protection), metric)
+                places = shifted(design.epsilons, 0.008 * (k - 2), log=True)
+                draw_curve(axis, places, means, _look(results, protection), str(protection))
+            alone = results.mean(design.cell(OPEN_LOOP), metric)
+            draw_level(axis, alone, label="open loop, nominal boundary")
+            _set_log(axis, design.epsilons)
             axis.set_title(LABELS[name], fontsize=9, loc="left")
         row[0].set_ylabel(_axis_label(metric))
     for axis in axes[-1]:
         axis.set_xlabel("ε")
-    _finish(figure, axes.flat, title, path)
+    return _finish(figure, axes.flat)
 
 
-def save_modes(path: Path, measured: Measured, title: str) -> None:
-    """Save errors by boundary mode and against the bandwidth, a row for each error."""
-    design = measured.design
-    figure = Figure(figsize=(9.4, 6.6), dpi=140)
-    figure.set_layout_engine("constrained")
+def draw_modes(results: PrivacyResults) -> Figure:
+    """Draw errors by boundary mode and against the bandwidth, a row for each error."""
+    design = results.design
+    figure = make_figure(9.4, 6.6)
     axes = figure.subplots(2, 2, squeeze=False)
     for row, metric in zip(axes, METRICS, strict=True):
         for k, name in enumerate(design.all_estimators):
-            colour = GREY if name == OPEN_LOOP else ESTIMATORS[k % len(ESTIMATORS)]
-            marker = "os^Dv"[k % 5]
+            look, label = ESTIMATOR_LOOKS[name], LABELS[name]
             modes = [design.cell(name, boundary_inputs=mode) for mode in BOUNDARY_MODES]
             places = np.arange(len(modes)) + 0.12 * (k - (len(design.all_estimators) - 1) / 2)
-            _curve(
-                row[0],
-                places,
-                _means(measured, modes, metric),
-                Look(colour, marker, ""),
-                LABELS[name],
-            )
+            dots = Look(look.colour, look.marker or "x", "")
+            draw_curve(row[0], places, _means(results, modes, metric), dots, label)
             if name == OPEN_LOOP:
-                _line(row[1], measured.mean(design.cell(name), metric), "open loop, nominal")
+                alone = results.mean(design.cell(name), metric)
+                draw_level(row[1], alone, label="open loop, nominal boundary")
                 continue
-            means = _means(measured, design.along_bandwidth(name), metric)
-            shifted = np.array(design.bandwidths) + 0.12 * (k - 0.5)
-            _curve(row[1], shifted, means, Look(colour, marker, "-"), LABELS[name])
-        row[0].set_xticks(range(len(BOUNDARY_MODES)), _MODES)
+            means = _means(results, design.along_bandwidth(name), metric)
+            draw_curve(row[1], np.array(design.bandwidths) + 0.12 * (k - 0.5), means, look, label)
+        row[0].set_xticks(range(len(BOUNDARY_MODES)), MODE_LABELS)
         row[0].set_xlim(-0.5, len(BOUNDARY_MODES) - 0.5)
         row[1].set_xticks(design.bandwidths)
         row[0].set_ylabel(_axis_label(metric))
@@ -95,98 +86,90 @@ def save_modes(path: Path, measured: Measured, title: str) -> None:
             axis.set_ylim(bottom=0.0)
     axes[1, 0].set_xlabel("boundary inputs of the estimator")
     axes[1, 1].set_xlabel("segments queried a second")
-    _finish(figure, axes[0], title, path)
+    return _finish(figure, axes[0])
 
 
-_MODES = ("nominal", "private", "true\n(no guarantee)")
+class Abscissa(NamedTuple):
+    """A kind of epsilon that errors are drawn over.
+
+    Attributes:
+        label: Label of the axis.
+        value: Returns it from an account.
+        is_claimed: Whether it is the epsilon that the configuration names.
+    """
+
+    label: str
+    value: Callable[[Account], float]
+    is_claimed: bool = False
 
 
-class Panel(NamedTuple):
-    """A panel of errors: which error, over which epsilon."""
-
-    metric: str
-    over: str
-
-
-PANELS = (
-    (Panel(DENSITY, "claimed"), Panel(DENSITY, "alone")),
-    (Panel(SPEED, "claimed"), Panel(SPEED, "alone")),
-)
-
-
-def save_claimed(path: Path, measured: Measured, title: str) -> None:
-    """Save epsilon claimed against true, and the first estimator's errors over either."""
-    figure = Figure(figsize=(13.6, 7.8), dpi=130)
-    figure.set_layout_engine("constrained")
+def draw_claimed(results: PrivacyResults) -> Figure:
+    """Draw epsilon claimed against true, and the first estimator's errors over both."""
+    figure = make_figure(13.6, 7.8, dpi=130)
     axes = figure.subplots(2, 3)
-    _true_epsilon(axes[0, 0], measured)
-    _errors(axes[1, 0], measured, Panel(DENSITY, "met"))
-    for row, panels in zip(axes, PANELS, strict=True):
-        for axis, panel in zip(row[1:], panels, strict=True):
-            _errors(axis, measured, panel)
-    _finish(figure, [*axes[:, 1], axes[0, 2]], title, path)
+    cap, _ = results.meetings
+    claimed = Abscissa("ε claimed", lambda account: account.claimed, is_claimed=True)
+    met = Abscissa(f"ε true of densities alone,\nmet {cap} times", lambda account: account.met[cap])
+    alone = Abscissa(
+        f"ε true of both releases,\nmet {cap} times, alone and standing",
+        lambda account: account.alone[cap],
+    )
+    _true_epsilon(axes[0, 0], results)
+    _errors(axes[1, 0], results, DENSITY, met)
+    for row, metric in zip(axes, (DENSITY, SPEED), strict=True):
+        _errors(row[1], results, metric, claimed)
+        _errors(row[2], results, metric, alone)
+    return _finish(figure, [*axes[:, 1], axes[0, 2]])
 
 
-def _errors(axis: Any, measured: Measured, panel: Panel) -> None:
+def _errors(axis: Axes, results: PrivacyResults, metric: str, over: Abscissa) -> None:
     """Draw errors under the paper's noise and under a guarantee over one kind of epsilon."""
-    design, (cap, _) = measured.design, measured.meetings
+    design = results.design
     name = design.estimators[0]
     drawn: list[float] = []
     for k, protection in enumerate((*design.printed, design.base)):
-        accounts = measured.accounts[protection]
-        places = [getattr(own, panel.over) for own in accounts]
-        if panel.over != "claimed":
-            places = [own[cap] for own in places]
+        places = [over.value(account) for account in results.accounts[protection]]
         drawn += places
-        means = _means(measured, design.along_epsilon(name, protection), panel.metric)
-        shifted = _beside(places, k - 1) if panel.over == "claimed" else places
-        _curve(axis, shifted, means, _look(measured, protection), _plain(protection))
-    for mode, style in (("nominal", ":"), ("true", "--")):
-        alone = measured.mean(design.cell(OPEN_LOOP, boundary_inputs=mode), panel.metric)
-        _line(axis, alone, f"open loop, {mode} boundary", style)
-    _log(axis, _ticks(drawn))
-    axis.set_ylabel(f"{LABELS[name]}: {_axis_label(panel.metric)}")
-    axis.set_xlabel(
-        {
-            "claimed": "ε claimed",
-            "met": f"ε true of densities alone,\nmet {cap} times",
-            "alone": f"ε true of both releases,\nmet {cap} times, alone and standing",
-        }[panel.over]
-    )
+        means = _means(results, design.along_epsilon(name, protection), metric)
+        moved = shifted(places, 0.008 * (k - 1) if over.is_claimed else 0.0, log=True)
+        label = str(protection).replace("`", "")
+        draw_curve(axis, moved, means, _look(results, protection), label)
+    for mode, line in (("nominal", ":"), ("true", "--")):
+        alone = results.mean(design.cell(OPEN_LOOP, boundary_inputs=mode), metric)
+        draw_level(axis, alone, line, f"open loop, {mode} boundary")
+    _set_log(axis, _ticks(drawn))
+    axis.set_ylabel(f"{LABELS[name]}: {_axis_label(metric)}")
+    axis.set_xlabel(over.label)
 
 
-def _plain(protection: Protection) -> str:
-    """Name a protection without the marks of Markdown."""
-    return str(protection).replace("`", "")
-
-
-def _true_epsilon(axis: Any, measured: Measured) -> None:
+def _true_epsilon(axis: Axes, results: PrivacyResults) -> None:
     """Draw epsilon as composed and as met against epsilon claimed."""
-    claimed = np.array(measured.design.epsilons)
-    cap, horizon = measured.meetings
+    claimed = np.array(results.design.epsilons)
+    cap, horizon = results.meetings
     axis.plot(claimed, claimed, color=GREY, linewidth=1.2)
-    ways: tuple[tuple[str, str, Callable[[Account], float]], ...] = (
-        ("composed, own sensitivities", ":", lambda one: one.composed),
-        (f"densities alone, met {cap} times", "-", lambda one: one.met[cap]),
-        (f"densities alone, met {horizon} times", "--", lambda one: one.met[horizon]),
-        (f"both, met {cap} times, alone and standing", "-.", lambda one: one.alone[cap]),
+    kinds: tuple[tuple[str, str, Callable[[Account], float]], ...] = (
+        ("composed, own sensitivities", ":", lambda account: account.composed),
+        (f"densities alone, met {cap} times", "-", lambda account: account.met[cap]),
+        (f"densities alone, met {horizon} times", "--", lambda account: account.met[horizon]),
+        (f"both, met {cap} times, alone and standing", "-.", lambda account: account.alone[cap]),
     )
     highest = float(claimed[-1])
-    for protection in measured.design.printed:
-        colour, marker, _ = _look(measured, protection)
-        for _, line, value in ways:
-            true = [value(one) for one in measured.accounts[protection]]
+    for protection in results.design.printed:
+        colour, marker, _ = _look(results, protection)
+        for _, line, value in kinds:
+            true = [value(account) for account in results.accounts[protection]]
             highest = max(highest, *true)
             axis.plot(claimed, true, line, color=colour, marker=marker, markersize=4, linewidth=1.2)
-    _log(axis, measured.design.epsilons)
-    axis.yaxis.set_major_locator(FixedLocator(_ticks([float(claimed[0]), highest])))
+    _set_log(axis, results.design.epsilons)
+    set_log_ticks(axis.yaxis, _ticks([float(claimed[0]), highest]))
     axis.set_xlabel("ε claimed")
     axis.set_ylabel("ε true, boundary inputs left out")
-    axis.set_ylim(top=highest * 3e3)  # room for the legend
+    axis.set_ylim(top=highest * 3e3)  # space for the legend
     # Colours are named below the panels.
-    (own,) = axis.plot([], [], color=GREY, label="as claimed, and as guaranteed")
-    handles = [axis.plot([], [], line, color="#888888", label=says)[0] for says, line, _ in ways]
-    axis.legend(handles=[own, *handles], fontsize=7, frameon=False, loc="upper left")
+    handles = axis.plot([], [], color=GREY, label="as claimed, and as guaranteed")
+    for label, line, _ in kinds:
+        handles += axis.plot([], [], line, color="#888888", label=label)
+    axis.legend(handles=handles, fontsize=7, frameon=False, loc="upper left")
 
 
 def _ticks(values: Sequence[float]) -> list[float]:
@@ -196,55 +179,24 @@ def _ticks(values: Sequence[float]) -> list[float]:
     return [tick for tick in ticks if low / 1.5 <= tick <= high * 1.5]
 
 
-def _look(measured: Measured, protection: Protection) -> Look:
+def _look(results: PrivacyResults, protection: Protection) -> Look:
     if protection.cap:
-        caps = measured.design.caps
+        caps = results.design.caps
         shade = round((len(CAPS) - 1) * (caps.index(protection.cap) + 1) / len(caps))
-        return Look(CAPS[shade], "o", "-")
-    key = protection.unit if protection.unit in OTHER else protection.preset
-    return Look(*OTHER[key])
+        return Look(CAPS[shade], "o")
+    return LOOKS[protection.unit if protection.unit in LOOKS else protection.preset]
 
 
-def _means(measured: Measured, cells: Sequence[Cell], metric: str) -> list[Interval]:
-    return [measured.mean(cell, metric) for cell in cells]
+def _means(results: PrivacyResults, cells: Sequence[PrivacyCell], metric: str) -> list[Interval]:
+    return [results.mean(cell, metric) for cell in cells]
 
 
-def _beside(places: Sequence[float], shift: float) -> Any:
-    """Move points a little aside on a logarithmic axis, so that bars do not hide one another."""
-    return np.array(places) * (places[-1] / places[0]) ** (0.008 * shift)
-
-
-def _curve(axis: Any, places: Any, intervals: Sequence[Interval], look: Look, label: str) -> None:
-    spread = [[own.mean - own.low, own.high - own.mean] for own in intervals]
-    axis.errorbar(
-        places,
-        [own.mean for own in intervals],
-        yerr=np.array(spread).T,
-        color=look.colour,
-        marker=look.marker,
-        linestyle=look.line,
-        markersize=4.5,
-        linewidth=1.3,
-        capsize=2,
-        label=label,
-    )
-
-
-def _line(axis: Any, interval: Interval, label: str, style: str = ":") -> None:
-    axis.axhline(interval.mean, color=GREY, linestyle=style, linewidth=1.3, label=label)
-    axis.axhspan(interval.low, interval.high, color=GREY, alpha=0.10, linewidth=0)
-
-
-def _log(axis: Any, ticks: Sequence[float]) -> None:
+def _set_log(axis: Axes, ticks: Sequence[float]) -> None:
     """Make both axes logarithmic, with plain numbers."""
-    for scale, own, places in (
-        (axis.set_xscale, axis.xaxis, ticks),
-        (axis.set_yscale, axis.yaxis, TICKS),
-    ):
-        scale("log")
-        own.set_major_locator(FixedLocator(list(places)))
-        own.set_minor_locator(NullLocator())
-        own.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_xscale("log")
+    set_log_ticks(axis.xaxis, ticks)
+    axis.set_yscale("log")
+    set_log_ticks(axis.yaxis, TICKS)
 
 
 def _axis_label(metric: str) -> str:
@@ -252,25 +204,10 @@ def _axis_label(metric: str) -> str:
     return f"{name} RMSE [{unit}]"
 
 
-def _finish(figure: Figure, axes: Iterable[Any], title: str, path: Path) -> None:
-    """Name every curve once below the panels, and save."""
-    axes = list(axes)
+def _finish(figure: Figure, named: Iterable[Axes]) -> Figure:
+    """Frame all panels, and name the curves of some below them."""
+    named = list(named)
     for axis in figure.axes:
-        axis.grid(color="#e3e6ea", linewidth=0.7)
-        axis.set_axisbelow(True)
-        axis.spines[["top", "right"]].set_visible(False)
-        axis.tick_params(labelsize=8)
-    named: dict[str, Any] = {}
-    for axis in axes:
-        for handle, label in zip(*axis.get_legend_handles_labels(), strict=True):
-            named.setdefault(label, handle)
-    figure.legend(
-        list(named.values()),
-        list(named),
-        loc="outside lower center",
-        ncols=min(len(named), 6),
-        frameon=False,
-        fontsize=8,
-    )
-    figure.suptitle(title, x=0.01, ha="left", fontsize=10)
-    save(figure, path)
+        add_frame(axis)
+    add_legend(figure, named, columns=6)
+    return figure

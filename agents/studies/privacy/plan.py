@@ -1,4 +1,4 @@
-"""What is run to price a guarantee of privacy: its curves, and the cells that they share."""
+"""Plan of the study of privacy: its curves, and the cells that they share."""
 
 from __future__ import annotations
 
@@ -7,21 +7,19 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from agents.evaluation.episodes import check_held_out
-from dptse_env.config import TEST_SEEDS
+from agents.experiments.cells import Design
 from dptse_env.estimators import check_estimator
-from dptse_env.schedules import SCHEDULES
 
 GUARANTEED, PRINTED = "guaranteed", ("paper", "corrected")
 OPEN_LOOP = "open_loop"
-"""The estimator that takes in no measurements: run beside the others in every figure."""
+"""The estimator without measurements: run beside the others in every figure."""
 BOUNDARY_MODES = ("nominal", "private", "true")
 UNBOUNDED = "none"
 """Protected unit of a preset that bounds no contributions."""
 
 
 class Protection(NamedTuple):
-    """A preset, and what it protects.
+    """A privacy preset with its protected unit and cap.
 
     Attributes:
         preset: Privacy preset.
@@ -34,14 +32,14 @@ class Protection(NamedTuple):
     cap: int = 0
 
     def __str__(self) -> str:
-        """Name it in a figure or a table."""
+        """Return the name in a table; names of presets are code."""
         if self.preset != GUARANTEED:
             return f"`{self.preset}` noise"
         return f"{self.unit}, C = {self.cap}" if self.cap else self.unit
 
 
 @dataclass(frozen=True)
-class Cell:
+class PrivacyCell:
     """One configuration, run on every traffic seed.
 
     Attributes:
@@ -50,8 +48,8 @@ class Cell:
         unit: Protected unit; `UNBOUNDED` where the preset bounds no contributions.
         cap: Queried steps in which a vehicle counts; 0 where none is set.
         boundary_inputs: ``true``, ``nominal`` or ``private``.
-        epsilon: Privacy parameter asked for.
-        delta: Privacy parameter asked for.
+        epsilon: Privacy parameter of the configuration.
+        delta: Privacy parameter of the configuration.
         bandwidth: Segments queried a second.
     """
 
@@ -78,27 +76,24 @@ class Cell:
 
 
 @dataclass(frozen=True)
-class Design:
-    """Everything that is run.
+class PrivacyDesign(Design[PrivacyCell]):
+    """The cells of the study; traffic, ARZ parameters and horizon are the environment's.
 
     Attributes:
-        seeds: Held-out traffic seeds, of `TEST_SEEDS`; each is the seed of the noise, too.
         estimators: Estimators beside the open loop, which is always run.
-        epsilons: Values of epsilon asked for; the base value is added.
-        caps: Caps of the unit ``trip``; the base value is added.
+        epsilons: Values of epsilon; the base value is added.
+        caps: Caps of the unit trip; the base value is added.
         bandwidths: Segments queried a second; the base value is added.
-        epsilon: Base value, at which boundary modes and bandwidths are compared.
-        delta: Of every cell.
-        cap: Base value.
-        bandwidth: Base value.
-        schedule: Query schedule of every episode.
-        env: Environment id; its traffic, ARZ parameters and horizon are used.
+        epsilon: Base value of epsilon, at which boundary modes and bandwidths are compared.
+        delta: The delta of every cell.
+        cap: Base value of the cap.
+        bandwidth: Base value of the bandwidth.
 
     Raises:
         ValueError: A value is out of range; the message names it.
     """
 
-    seeds: tuple[int, ...] = tuple(TEST_SEEDS[:20])
+    env: str = "dptse_env:dptse/PrivateHighway-v0"
     estimators: tuple[str, ...] = ("ekf", "random_walk")
     epsilons: tuple[float, ...] = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
     caps: tuple[int, ...] = (4, 16, 64)
@@ -107,22 +102,16 @@ class Design:
     delta: float = 0.05
     cap: int = 64
     bandwidth: int = 5
-    schedule: str = "paper"
-    env: str = "dptse_env:dptse/PrivateHighway-v0"
 
     def __post_init__(self) -> None:
         """Check what no environment checks, and put the values in order."""
-        check_held_out(self.seeds)
+        super().__post_init__()
         if not self.estimators or len(set(self.estimators)) < len(self.estimators):
             raise ValueError(f"estimators must be 1 or more and distinct, got {self.estimators}")
         for name in self.estimators:
             check_estimator(name, "compiled")
             if name == OPEN_LOOP:
                 raise ValueError(f"estimators must not name {OPEN_LOOP!r}: it is always run")
-        # The random one is drawn anew at every start, so an interrupted run could not go on.
-        known = sorted(SCHEDULES.keys() - {"random"})
-        if self.schedule not in known:
-            raise ValueError(f"schedule must be one of {', '.join(known)}, got {self.schedule!r}")
         self._complete("epsilons", self.epsilon)
         self._complete("caps", self.cap)
         self._complete("bandwidths", self.bandwidth)
@@ -148,11 +137,7 @@ class Design:
     def guaranteed(self) -> tuple[Protection, ...]:
         """Protections with a guarantee: by cap, then the units that need none."""
         trips = tuple(Protection(GUARANTEED, "trip", cap) for cap in self.caps)
-        return (
-            Protection(GUARANTEED, "event"),
-            *trips,
-            Protection(GUARANTEED, "horizon"),
-        )
+        return (Protection(GUARANTEED, "event"), *trips, Protection(GUARANTEED, "horizon"))
 
     @property
     def printed(self) -> tuple[Protection, ...]:
@@ -167,11 +152,11 @@ class Design:
         epsilon: float | None = None,
         boundary_inputs: str | None = None,
         bandwidth: int | None = None,
-    ) -> Cell:
-        """Return one cell; what is left out is at its base value, the boundary as in the preset."""
+    ) -> PrivacyCell:
+        """Return a cell; fields left out have base values, the boundary is as in the preset."""
         preset, unit, cap = protection or self.base
         mode = boundary_inputs or ("nominal" if preset == GUARANTEED else "true")
-        cell = Cell(
+        cell = PrivacyCell(
             estimator=estimator,
             preset=preset,
             unit=unit,
@@ -183,49 +168,45 @@ class Design:
         )
         return self._canonical(cell)
 
-    def _canonical(self, cell: Cell) -> Cell:
+    def _canonical(self, cell: PrivacyCell) -> PrivacyCell:
         """Return the cell that stands for all that give the same episodes.
 
-        The open loop takes in what it is given at the boundary and nothing else; where that is not
-        released, neither noise nor queries matter to it.
+        The open loop uses the boundary inputs and nothing else; where these are not released,
+        neither noise nor queries matter to it.
         """
         if cell.estimator != OPEN_LOOP or cell.boundary_inputs == "private":
             return cell
         mode = cell.boundary_inputs
-        return Cell(OPEN_LOOP, *self.base, mode, self.epsilon, self.delta, self.bandwidth)
+        base = self.epsilon, self.delta, self.bandwidth
+        return PrivacyCell(OPEN_LOOP, *self.base, mode, *base)
 
-    def along_epsilon(self, estimator: str, protection: Protection) -> list[Cell]:
+    def along_epsilon(self, estimator: str, protection: Protection) -> list[PrivacyCell]:
         """Return the cells of one curve over epsilon."""
         return [self.cell(estimator, protection, epsilon=value) for value in self.epsilons]
 
-    def along_bandwidth(self, estimator: str) -> list[Cell]:
+    def along_bandwidth(self, estimator: str) -> list[PrivacyCell]:
         """Return the cells of one curve over the bandwidth."""
         return [self.cell(estimator, bandwidth=value) for value in self.bandwidths]
 
-    def cells(self) -> list[Cell]:
-        """Return every cell once."""
+    def all_cells(self) -> Iterator[PrivacyCell]:
+        """Yield the cells of every curve and table."""
+        for name in self.all_estimators:
+            for protection in (*self.guaranteed, *self.printed):
+                yield from self.along_epsilon(name, protection)
+            for mode in BOUNDARY_MODES:
+                yield self.cell(name, boundary_inputs=mode)
+            yield from self.along_bandwidth(name)
 
-        def all_of_them() -> Iterator[Cell]:
-            for name in self.all_estimators:
-                for protection in (*self.guaranteed, *self.printed):
-                    yield from self.along_epsilon(name, protection)
-                for mode in BOUNDARY_MODES:
-                    yield self.cell(name, boundary_inputs=mode)
-                yield from self.along_bandwidth(name)
+    def quick(self) -> PrivacyDesign:
+        """Return a design of the same results with fewer points and seeds."""
 
-        return list(dict.fromkeys(all_of_them()))
+        def ends(values: tuple[Any, ...]) -> tuple[Any, ...]:
+            return values[0], values[-1]
 
-
-def quick(design: Design) -> Design:
-    """Return a design that shows the same with fewer points and seeds."""
-
-    def ends(values: tuple[Any, ...]) -> tuple[Any, ...]:
-        return values[0], values[-1]
-
-    return dataclasses.replace(
-        design,
-        seeds=design.seeds[:3],
-        epsilons=(*ends(design.epsilons), 1.0),
-        caps=ends(design.caps),
-        bandwidths=ends(design.bandwidths),
-    )
+        return dataclasses.replace(
+            self,
+            seeds=self.first_seeds(3),
+            epsilons=(*ends(self.epsilons), 1.0),
+            caps=ends(self.caps),
+            bandwidths=ends(self.bandwidths),
+        )

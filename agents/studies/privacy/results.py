@@ -1,4 +1,4 @@
-"""The scores of a run as intervals over traffic seeds, paired where cells are compared."""
+"""Results of the study of privacy, and the lengths of trips that they are read with."""
 
 from __future__ import annotations
 
@@ -6,49 +6,33 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from agents.evaluation.episodes import EpisodeScore
-from agents.evaluation.statistics import Interval, mean_interval, paired_difference
+from agents.experiments.cells import Results
 from agents.studies.privacy.account import Account
-from agents.studies.privacy.plan import Cell, Design, Protection
-
-DENSITY, SPEED = "rmse_density", "rmse_speed"
-METRICS = {DENSITY: ("density", "veh/km"), SPEED: ("speed", "km/h")}
-"""Name and unit of each error."""
+from agents.studies.privacy.plan import PrivacyCell, PrivacyDesign, Protection
+from dptse_env.arrays import IntArray
 
 
 @dataclass(frozen=True)
-class Measured:
-    """What was run, and what came of it.
+class PrivacyResults(Results[PrivacyDesign, PrivacyCell]):
+    """Scores of the cells of a design, with the guarantee behind their noise.
 
     Attributes:
-        design: What was run.
-        scores: Score by cell and traffic seed.
-        accounts: What noise is worth, by protection and in the order of the design's epsilons.
-        trips: Seconds that each vehicle of the traffic can be met, shape (n_vehicles,).
+        accounts: Guarantees by protection, in the order of the design's epsilons.
+        trips: Seconds in which each vehicle of the traffic can be met, shape (n_vehicles,).
         horizon: Length of an episode [s].
     """
 
-    design: Design
-    scores: Mapping[tuple[Cell, int], EpisodeScore]
     accounts: Mapping[Protection, Sequence[Account]]
-    trips: NDArray[np.int64]
+    trips: IntArray
     horizon: int
-
-    def values(self, cell: Cell, metric: str) -> NDArray[np.float64]:
-        """Return a field of `EpisodeScore` for each seed, shape (n_seeds,)."""
-        return np.array([getattr(self.scores[cell, seed], metric) for seed in self.design.seeds])
-
-    def mean(self, cell: Cell, metric: str) -> Interval:
-        """Return the mean of a field over the seeds with its interval."""
-        return mean_interval(self.values(cell, metric))
-
-    def difference(self, cell: Cell, reference: Cell, metric: str) -> Interval:
-        """Return by how much a cell exceeds another one, paired by traffic and noise."""
-        return paired_difference(self.values(cell, metric), self.values(reference, metric))
 
     @property
     def meetings(self) -> tuple[int, int]:
         """Steps in which a vehicle is met: as many as the base cap, and all of an episode."""
         return min(self.design.cap, self.horizon), self.horizon
+
+    @property
+    def longest_trip(self) -> int:
+        """Most seconds in which a vehicle can be met."""
+        return int(np.max(self.trips))

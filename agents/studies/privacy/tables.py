@@ -1,149 +1,111 @@
-"""Tables of the study, in Markdown, and the summary as CSV."""
+"""Tables of the study of privacy, in Markdown."""
 
 from __future__ import annotations
 
-import csv
-import dataclasses
-from pathlib import Path
-from typing import Any
-
-from agents.studies.paper.measures import LABELS
-from agents.studies.paper.tables import markdown, shown
-from agents.studies.privacy.plan import BOUNDARY_MODES, Cell
-from agents.studies.privacy.results import DENSITY, METRICS, SPEED, Measured
+from agents.experiments import tables
+from agents.experiments.cells import METRICS
+from agents.experiments.plots import LABELS
+from agents.experiments.tables import format_interval, format_number, markdown
+from agents.studies.privacy.plan import BOUNDARY_MODES, PrivacyCell
+from agents.studies.privacy.results import PrivacyResults
 
 
-def epsilon_table(measured: Measured, estimator: str, metric: str) -> str:
-    """Return errors by protection (rows) and epsilon asked for (columns)."""
-    design = measured.design
-    rows = [
-        [
-            str(protection),
-            *(
-                shown(measured.mean(cell, metric))
-                for cell in design.along_epsilon(estimator, protection)
-            ),
-        ]
-        for protection in (*design.guaranteed, *design.printed)
-    ]
+def epsilon_table(results: PrivacyResults, estimator: str, metric: str) -> str:
+    """Return errors by protection (rows) and epsilon (columns)."""
+    design = results.design
+    rows = []
+    for protection in (*design.guaranteed, *design.printed):
+        cells = design.along_epsilon(estimator, protection)
+        means = [format_interval(results.mean(cell, metric)) for cell in cells]
+        rows.append([str(protection), *means])
     return markdown(["protection", *(f"ε = {value:g}" for value in design.epsilons)], rows)
 
 
-def noise_table(measured: Measured) -> str:
+def noise_table(results: PrivacyResults) -> str:
     """Return the noise of a density and of a mean speed or flow behind each cell."""
-    design = measured.design
+    design = results.design
     rows = []
     for protection in (*design.guaranteed, *design.printed):
         unit = "km/h" if protection in design.printed else "veh/h"
-        accounts = measured.accounts[protection]
-        noise = [f"{own.density_std:.3g} veh/km; {own.second_std:.3g} {unit}" for own in accounts]
+        accounts = results.accounts[protection]
+        noise = [f"{a.density_std:.3g} veh/km; {a.second_std:.3g} {unit}" for a in accounts]
         rows.append([str(protection), *noise])
     return markdown(["protection", *(f"ε = {value:g}" for value in design.epsilons)], rows)
 
 
-def claimed_table(measured: Measured) -> str:
+def claimed_table(results: PrivacyResults) -> str:
     """Return epsilon claimed, composed and met of the paper's noise."""
-    cap, horizon = measured.meetings
-    longest = int(measured.trips.max())
-    met = sorted({cap, longest, horizon})
+    cap, horizon = results.meetings
+    met = sorted({cap, results.longest_trip, horizon})
     rows = []
-    for protection in measured.design.printed:
-        for own in measured.accounts[protection]:
-            values = [own.composed, *(own.met[n] for n in met), own.alone[cap]]
-            rows.append([str(protection), f"{own.claimed:g}", *map(number, values)])
+    for protection in results.design.printed:
+        for account in results.accounts[protection]:
+            values = [account.composed, *(account.met[n] for n in met), account.alone[cap]]
+            rows.append([str(protection), f"{account.claimed:g}", *map(format_number, values)])
     header = ["noise", "claimed", "composed", *(f"met {n} times, at least" for n in met)]
-    header.append(f"met {cap} times, alone and standing")
-    return markdown(header, rows)
+    return markdown([*header, f"met {cap} times, alone and standing"], rows)
 
 
-def number(value: float) -> str:
-    """Return three significant digits without an exponent."""
-    return f"{float(f'{value:.3g}'):g}" if abs(value) < 1e5 else f"{value:,.0f}"
-
-
-def cost_table(measured: Measured, estimator: str) -> str:
+def cost_table(results: PrivacyResults, estimator: str) -> str:
     """Return by how much a guarantee's errors exceed those of the paper's noise, paired."""
-    design = measured.design
+    design = results.design
     rows = []
     for value in design.epsilons:
         cell = design.cell(estimator, epsilon=value)
         row = [f"{value:g}"]
         for protection in design.printed:
             reference = design.cell(estimator, protection, epsilon=value)
-            row += [shown(measured.difference(cell, reference, metric)) for metric in METRICS]
+            row += [format_interval(results.difference(cell, reference, m)) for m in METRICS]
         rows.append(row)
-    header = ["ε asked for"]
+    header = ["ε"]
     for protection in design.printed:
         header += [f"{name} over {protection} [{unit}]" for name, unit in METRICS.values()]
     return markdown(header, rows)
 
 
-def modes_table(measured: Measured) -> str:
+def modes_table(results: PrivacyResults) -> str:
     """Return errors by boundary mode, and the paired difference to the nominal one."""
-    design = measured.design
+    design = results.design
     rows = []
     for name in design.all_estimators:
         nominal = design.cell(name, boundary_inputs=BOUNDARY_MODES[0])
         for mode in BOUNDARY_MODES:
             cell = design.cell(name, boundary_inputs=mode)
-            rows.append([LABELS[name], mode, *_compared(measured, cell, nominal)])
+            rows.append([LABELS[name], mode, *_compared(results, cell, nominal)])
     return markdown(["estimator", "boundary inputs", *_header("nominal")], rows)
 
 
-def bandwidth_table(measured: Measured) -> str:
-    """Return errors by bandwidth, and the paired difference to the base one."""
-    design = measured.design
+def bandwidth_table(results: PrivacyResults) -> str:
+    """Return errors by bandwidth, and the paired difference to the base value."""
+    design = results.design
     rows = []
     for name in design.estimators:
         base = design.cell(name)
         for cell in design.along_bandwidth(name):
-            rows.append([LABELS[name], str(cell.bandwidth), *_compared(measured, cell, base)])
+            rows.append([LABELS[name], str(cell.bandwidth), *_compared(results, cell, base)])
     return markdown(["estimator", "queried a second", *_header(str(design.bandwidth))], rows)
 
 
 def _header(reference: str) -> list[str]:
-    header = []
-    for name, unit in METRICS.values():
-        header += [f"{name} RMSE [{unit}]", f"against {reference}"]
-    return header
+    columns = [(f"{name} RMSE [{unit}]", f"against {reference}") for name, unit in METRICS.values()]
+    return [column for pair in columns for column in pair]
 
 
-def _compared(measured: Measured, cell: Cell, reference: Cell) -> list[str]:
+def _compared(results: PrivacyResults, cell: PrivacyCell, reference: PrivacyCell) -> list[str]:
     row = []
     for metric in METRICS:
-        row.append(shown(measured.mean(cell, metric)))
-        same = cell == reference
-        row.append("-" if same else shown(measured.difference(cell, reference, metric)))
-    return row
+        difference = format_interval(results.difference(cell, reference, metric))
+        row += [format_interval(results.mean(cell, metric)), difference]
+    return [row[0], "-", row[2], "-"] if cell == reference else row
 
 
-def health_table(measured: Measured) -> str:
-    """Return seconds lost by each estimator, over all its episodes."""
-    design = measured.design
-    rows = []
-    for name in design.all_estimators:
-        cells = [cell for cell in design.cells() if cell.estimator == name]
-        lost = [
-            f"{sum(float(measured.values(cell, kind).sum()) for cell in cells):.0f}"
-            for kind in ("n_diverged", "n_fallback")
-        ]
-        rows.append([LABELS[name], *lost, str(len(cells) * len(design.seeds))])
-    return markdown(["estimator", "started over [s]", "kept the prediction [s]", "episodes"], rows)
-
-
-def write_summary(path: Path, measured: Measured) -> None:
-    """Write means with intervals as CSV, one row for each cell."""
-    columns = [field.name for field in dataclasses.fields(Cell)] + ["n_seeds"]
-    for metric, unit in ((DENSITY, "veh_km"), (SPEED, "km_h")):
-        columns += [f"{metric}_{unit}", f"{metric}_low", f"{metric}_high"]
-    columns += ["reward", "reward_low", "reward_high", "n_diverged", "n_fallback"]
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(columns)
-        for cell in sorted(measured.design.cells(), key=dataclasses.astuple):
-            row: list[Any] = [*dataclasses.astuple(cell), len(measured.design.seeds)]
-            for metric in (DENSITY, SPEED, "reward"):
-                own = measured.mean(cell, metric)
-                row += [f"{value:.6g}" for value in (own.mean, own.low, own.high)]
-            row += [measured.values(cell, f"n_{kind}").sum() for kind in ("diverged", "fallback")]
-            writer.writerow(row)
+def health_table(results: PrivacyResults) -> str:
+    """Return the seconds that each estimator lost, over all its episodes."""
+    cells = results.design.cells()
+    return tables.health_table(
+        ["estimator"],
+        {
+            (LABELS[name],): results.episodes(*(cell for cell in cells if cell.estimator == name))
+            for name in results.design.all_estimators
+        },
+    )
