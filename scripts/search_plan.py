@@ -1,10 +1,10 @@
-"""Optimise an open-loop schedule on training traffic: a static set, or a period of sets.
+"""Search an open-loop query plan on training traffic: a static set, or a period of sets.
 
-python scripts/optimise_schedule.py --kind offline --period 12 --rounds 200
+python scripts/search_plan.py --kind offline --period 12 --rounds 200
 
 The plan is left in <output>/<name>.json after every round. After an interruption, or a kill, the
-same command goes on where it stopped, and with more --rounds it searches on. The schedule of
-that file is used like any other by its path. To ship one, copy it to dptse_env/schedules/plans/.
+same command goes on where it stopped, and with more --rounds it searches on. The file is used
+like any other schedule by its path. To ship it, copy it to dptse_env/schedules/plans/.
 """
 
 from __future__ import annotations
@@ -15,21 +15,22 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from agents.search.plans import PlanSearch, PlanTask, held_out
+from agents.experiments.files import replacing
+from agents.search.plans import PlanSearch, PlanTask, validation_scores
 from dptse_env.schedules.plans import Plan, read_plan, write_plan
 from dptse_env.traffic import RecordLibrary
 from dptse_env.validation import integer
-from scripts.cli import resumable, run
+from scripts.cli import records_argument, resumable, run
 
 
 @dataclass(frozen=True)
 class Args:
-    """Optimise an open-loop schedule."""
+    """Search an open-loop query plan."""
 
     env: str = "dptse_env:dptse/PrivateHighway-v0"
     """Environment id."""
     kind: str = "offline"
-    """What to search: 'offline', a period of sets, or 'best-static', one set."""
+    """Kind of plan: 'offline', a period of sets, or 'best-static', one set."""
     period: int = 12
     """Sets in the period; a static set has one."""
     estimator: str = "ekf"
@@ -43,7 +44,7 @@ class Args:
     rounds: int = 100
     """Rounds of exchanges, those of earlier runs included."""
     neighbours: int = 31
-    """Neighbours that a round looks at; four times as many episodes run at once."""
+    """Neighbours that a round tries; four times as many episodes run at once."""
     search_seed: int = 0
     """Seeds the search."""
     records: Path | None = None
@@ -53,7 +54,7 @@ class Args:
 
 
 def make_task(args: Args) -> PlanTask:
-    """Return what is searched for, checked.
+    """Return the task, checked.
 
     Raises:
         ValueError: An argument is out of range.
@@ -69,23 +70,24 @@ def make_task(args: Args) -> PlanTask:
         seeds=args.seeds,
         neighbours=args.neighbours,
         seed=args.search_seed,
-        records=None if args.records is None else str(args.records),
+        records=records_argument(args.records),
     )
 
 
 def resumed(search: PlanSearch, path: Path) -> bool:
-    """Go on with the plan in a file, if there is one.
+    """Resume the search of the plan in a file; return whether there is one.
 
     Raises:
         ValueError: The file is of another search.
     """
     if not path.exists():
         return False
-    found, own = read_plan(path), search.plan()
+    found = read_plan(path)
+    task = found.provenance.get("task", {})
     differences = [
-        f"{key} is {found.provenance.get('task', {}).get(key)!r} there and {value!r} now"
-        for key, value in own.provenance["task"].items()
-        if found.provenance.get("task", {}).get(key) != value
+        f"{key} is {task.get(key)!r} there and {value!r} now"
+        for key, value in search.plan().provenance["task"].items()
+        if task.get(key) != value
     ]
     if differences:
         raise ValueError(
@@ -96,10 +98,9 @@ def resumed(search: PlanSearch, path: Path) -> bool:
 
 
 def save(path: Path, plan: Plan) -> None:
-    """Write a plan in one piece, whatever interrupts."""
-    aside = path.with_suffix(".tmp")
-    write_plan(aside, plan)
-    aside.replace(path)
+    """Write a plan in one piece."""
+    with replacing(path) as temporary:
+        write_plan(temporary, plan)
 
 
 @resumable()
@@ -108,7 +109,7 @@ def main(args: Args) -> None:
     task = make_task(args)
     search = PlanSearch(task)
     path = args.output / f"{search.plan().name}.json"
-    corridor = task.make(1, task.traffic_seeds).unwrapped.config.corridor  # type: ignore[attr-defined]
+    corridor = task.make(1, task.traffic_seeds).config.corridor
     RecordLibrary(args.records).ensure(corridor, task.traffic_seeds, progress=True)
     args.output.mkdir(parents=True, exist_ok=True)
     if not resumed(search, path):
@@ -124,7 +125,7 @@ def main(args: Args) -> None:
 
         search.go_on(args.rounds, on_round)
     plan = search.plan()
-    scores = held_out(task, plan)
+    scores = validation_scores(task, plan)
     save(path, dataclasses.replace(plan, provenance={**plan.provenance, "validation": scores}))
     print(f"mean reward on validation traffic: {scores}\nthe plan is in {path}")
 

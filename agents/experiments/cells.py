@@ -53,17 +53,18 @@ class Design(ABC, Generic[CellT]):
         seeds: Test traffic seeds, first:stop; each is the seed of the noise, too.
         schedule: Query schedule of every episode.
         env: Environment id.
-
-    Raises:
-        ValueError: A value is out of range.
     """
 
     seeds: str = f"{TEST_SEEDS.start}:{TEST_SEEDS.start + 20}"
     schedule: str = "paper"
     env: str = "dptse_env:dptse/PaperHighway-v0"
 
-    def __post_init__(self) -> None:
-        """Check what no environment checks."""
+    def check(self) -> None:
+        """Check the values that no environment checks.
+
+        Raises:
+            ValueError: A value is out of range; the message names it.
+        """
         check_test_seeds(self.traffic_seeds)
         # Draws of the random schedule start anew after an interruption.
         known = sorted(SCHEDULES.keys() - {"random"})
@@ -90,11 +91,12 @@ class Design(ABC, Generic[CellT]):
 
     @cached_property
     def configs(self) -> list[EnvConfig]:
-        """The configurations of all cells.
+        """The configurations of all cells, after a check of the design.
 
         Raises:
-            ValueError: A value of a cell is out of range.
+            ValueError: A value of the design or of a cell is out of range.
         """
+        self.check()
         seeds = {"traffic_seeds": list(self.traffic_seeds)}
         with without_void_warning():
             return [make_config(self.env, {**cell.keywords, **seeds}) for cell in self.cells()]

@@ -41,6 +41,10 @@ ResultT = TypeVar("ResultT")
 class Engine(Protocol):
     """Runs tasks: in local processes, or wherever another implementation sends them."""
 
+    @property
+    def is_parallel(self) -> bool:
+        """Whether several tasks share a machine, so that each should use one thread."""
+
     def run(
         self, work: Callable[[TaskT], ResultT], tasks: Sequence[TaskT]
     ) -> Generator[tuple[TaskT, ResultT], None, None]:
@@ -70,6 +74,11 @@ class LocalProcesses:
     def __post_init__(self) -> None:
         """Check the number."""
         integer("workers", self.workers, 1)
+
+    @property
+    def is_parallel(self) -> bool:
+        """See `Engine.is_parallel`."""
+        return self.workers > 1
 
     def run(
         self, work: Callable[[TaskT], ResultT], tasks: Sequence[TaskT]

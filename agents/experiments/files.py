@@ -38,5 +38,12 @@ def write_atomically(path: Path, content: bytes | str) -> None:
 
 
 def write_json(path: Path, content: Any, sort_keys: bool = False) -> None:
-    """Write plain values as indented JSON in one piece."""
-    write_atomically(path, json.dumps(content, indent=2, sort_keys=sort_keys) + "\n")
+    """Write plain values as indented JSON in one piece.
+
+    Raises:
+        OSError: The file cannot be written; the old one stays.
+        ValueError: A number is not finite.
+    """
+    write_atomically(
+        path, json.dumps(content, indent=2, sort_keys=sort_keys, allow_nan=False) + "\n"
+    )

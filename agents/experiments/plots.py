@@ -55,7 +55,8 @@ def draw_curve(
     means = [interval.mean for interval in intervals]
     spread = np.array([[each.mean - each.low, each.high - each.mean] for each in intervals]).T
     axis.errorbar(
-        np.asarray(places), means, yerr=spread, color=look.colour, marker=look.marker, linestyle=look.line,
+        np.asarray(places), means, yerr=spread,
+        color=look.colour, marker=look.marker, linestyle=look.line,
         markersize=4, linewidth=1.2, capsize=2, label=label,
     )  # fmt: skip
 

@@ -1,9 +1,8 @@
-"""Search open-loop schedules on training traffic: a static set, or a period of sets.
+"""Search open-loop query plans on training traffic: a static set, or a period of sets.
 
-A plan's score is the mean reward of a second after the warm-up. Queries never change the traffic
-and noise does not depend on them, so plans are compared on the same traffic and the same noise,
-many of them at once as episodes of one vector environment. Every round draws fresh traffic: a plan
-that is good by luck does not stay the best.
+A plan's score is the mean reward of a second after the warm-up. Queries change neither traffic nor
+noise, so plans are compared by common random numbers, many at once as episodes of one vector
+environment. Every round draws fresh traffic: a plan that is good by chance does not stay the best.
 """
 
 from __future__ import annotations
@@ -26,17 +25,17 @@ from dptse_env.schedules.plans import Place, Plan
 from dptse_env.validation import integer
 from dptse_env.vector_env import SensorQueryVectorEnv
 
-SURE = 1.0
-"""Standard errors by which a neighbour must gain to take the best plan's place."""
+LEAST_GAIN = 1.0
+"""Least gain of a neighbour that replaces the best plan [standard errors]."""
 NOISE_STEP = 10_000
-"""Noise seeds from one round to the next."""
+"""Difference of noise seeds from one round to the next."""
 FEW = 4
-"""Traffic seeds of the first look at a neighbour."""
+"""Traffic seeds of the first comparison with a neighbour."""
 
 
 @dataclass(frozen=True)
 class PlanTask:
-    """What is searched for.
+    """The plan that is searched for, and the traffic it is searched on.
 
     Attributes:
         env: Environment id.
@@ -46,7 +45,7 @@ class PlanTask:
         parameters: Name of the ARZ parameters; the environment's own if None.
         bandwidth: Queries a step; the environment's own if None.
         seeds: Traffic seeds, ``"first:stop"``, within `TRAINING_SEEDS`.
-        neighbours: Neighbours of the best plan that a round looks at; twice as many random plans
+        neighbours: Neighbours of the best plan that a round tries; twice as many random plans
             begin the search.
         seed: Seeds the search.
         records: Folder of the record cache; the user's cache if None.
@@ -99,25 +98,25 @@ class PlanTask:
         return make_vector(self.env, n_episodes, {**keywords, **more})
 
 
-class Arena:
+class PlanScorer:
     """Scores plans on the same traffic and noise, a batch of plans at a time.
 
     Attributes:
         env: The vector environment.
-        askable: Mainline segments without a fixed sensor, shape (A,).
+        free: Mainline segments without a fixed sensor, shape (A,).
     """
 
     def __init__(self, task: PlanTask, seeds: tuple[int, ...], n_episodes: int) -> None:
         """Make the environment; nothing is recorded before `scores`."""
-        self.env: Any = task.make(n_episodes, seeds).unwrapped
+        self.env = task.make(n_episodes, seeds)
         self.n_episodes = n_episodes
         config = self.env.config
         self.n_mainline, self.bandwidth = config.corridor.n_mainline, config.bandwidth
-        self.askable = np.setdiff1d(np.arange(self.n_mainline), config.corridor.fixed_sensors)
-        if len(self.askable) < self.bandwidth:
+        self.free = np.setdiff1d(np.arange(self.n_mainline), config.corridor.fixed_sensors)
+        if len(self.free) < self.bandwidth:
             raise ValueError(
                 f"bandwidth {self.bandwidth} leaves nothing to choose among the "
-                f"{len(self.askable)} segments without a fixed sensor"
+                f"{len(self.free)} segments without a fixed sensor"
             )
 
     def scores(self, plans: BoolArray, seeds: IntArray, noise: int) -> FloatArray:
@@ -133,7 +132,7 @@ class Arena:
         followed = np.resize(np.repeat(np.arange(m), r), self.n_episodes)
         used = np.arange(self.n_episodes) < n_used
         env = self.env
-        env.reset(seed=[noise + one for one in traffic], options={"traffic_seed": traffic})
+        env.reset(seed=[noise + seed for seed in traffic], options={"traffic_seed": traffic})
         total, n_steps = np.zeros(self.n_episodes), env.config.horizon_steps
         for step in range(n_steps):
             transition = env.advance(plans[followed, step % plans.shape[1]].astype(np.int8))
@@ -146,22 +145,27 @@ class Arena:
 class PlanSearch:
     """Successive halving of random plans, then exchanges of one segment at a time.
 
-    A round looks at neighbours of the best plan so far on a few fresh seeds, at the best quarter of
-    them on four times as many, and at the best of these on as many as the batch holds. There its
-    mean gain must be `SURE` standard errors above zero for it to take the place. Rounds depend on
-    the task's seed and their number alone, so a search that is interrupted goes on to the same end.
+    A round tries neighbours of the best plan so far on a few fresh seeds, the best quarter of them
+    on four times as many, and the best of these on as many as the batch holds. It replaces the best
+    plan if its mean gain there is `LEAST_GAIN` standard errors above zero. Rounds depend on the
+    task's seed and their number alone, so an interrupted search resumes to the same result.
 
     Attributes:
         best: The best plan so far, shape (period, n).
-        n_rounds: Rounds done.
-        n_adopted: Neighbours that took its place.
+        n_rounds: Finished rounds.
+        n_adopted: Neighbours that replaced it.
     """
 
-    def __init__(self, task: PlanTask) -> None:
-        """Begin with an even plan; see `begin` and `go_on`."""
+    def __init__(self, task: PlanTask, scorer: PlanScorer | None = None) -> None:
+        """Start from an even plan; see `begin` and `go_on`.
+
+        Args:
+            task: The task.
+            scorer: Scores the plans; on the task's traffic if None.
+        """
         self.task = task
-        self._arena = Arena(task, task.traffic_seeds, task.batch)
-        self.best = even_plan(self._arena, task.period)
+        self._scorer = scorer or PlanScorer(task, task.traffic_seeds, task.batch)
+        self.best = even_plan(self._scorer, task.period)
         self.n_rounds = self.n_adopted = 0
 
     def begin(self) -> None:
@@ -171,14 +175,14 @@ class PlanSearch:
         plans = np.stack([self.best, *(self._random(generator) for _ in range(n_random))])
         n_seeds = 2
         while len(plans) > 1:
-            scores = self._arena.scores(plans, self._seeds(generator, n_seeds), PLAN_SEARCH.start)
+            scores = self._scorer.scores(plans, self._seeds(generator, n_seeds), PLAN_SEARCH.start)
             plans = plans[np.argsort(-scores.mean(axis=1))[: len(plans) // 2]]
             n_seeds *= 2
         self.best = plans[0]
 
     def resume(self, plan: Plan) -> None:
-        """Go on with what an interrupted search left."""
-        self.best = masks_of(plan, self._arena.n_mainline)
+        """Resume an interrupted search from its plan."""
+        self.best = plan_masks(plan, self._scorer.n_mainline)
         self.n_rounds = int(plan.provenance["rounds"])
         self.n_adopted = int(plan.provenance["adopted"])
 
@@ -191,7 +195,7 @@ class PlanSearch:
 
     def plan(self) -> Plan:
         """Return the best plan so far, with its provenance."""
-        config = self._arena.env.config
+        config = self._scorer.env.config
         task = dataclasses.asdict(self.task)
         del task["records"]
         provenance = {
@@ -200,7 +204,7 @@ class PlanSearch:
             "noise_seed": PLAN_SEARCH.start, "date": date.today().isoformat(),
             "versions": {name: version(name) for name in ("dptse-env", "libsumo", "numpy")},
         }  # fmt: skip
-        sets = tuple(tuple(np.flatnonzero(one).tolist()) for one in self.best)
+        sets = tuple(tuple(np.flatnonzero(mask).tolist()) for mask in self.best)
         return Plan(self.task.kind, Place.of(config), sets, provenance)
 
     def _round(self) -> None:
@@ -210,7 +214,7 @@ class PlanSearch:
         plans = np.stack([self._neighbour(generator) for _ in range(n_plans)])
         while True:
             seeds = self._seeds(generator, n_seeds)
-            scores = self._arena.scores(np.stack([self.best, *plans]), seeds, noise)
+            scores = self._scorer.scores(np.stack([self.best, *plans]), seeds, noise)
             gains = scores[1:] - scores[0]
             order = np.argsort(-gains.mean(axis=1))
             if n_plans == 1:
@@ -219,7 +223,7 @@ class PlanSearch:
             n_seeds = self.task.batch // (n_plans + 1)
             plans, noise = plans[order[:n_plans]], noise + NOISE_STEP // 4
         gain = gains[0]
-        if gain.mean() > SURE * gain.std(ddof=1) / np.sqrt(len(gain)):
+        if gain.mean() > LEAST_GAIN * gain.std(ddof=1) / np.sqrt(len(gain)):
             self.best, self.n_adopted = plans[0], self.n_adopted + 1
 
     def _seeds(self, generator: np.random.Generator, n_seeds: int) -> IntArray:
@@ -228,25 +232,25 @@ class PlanSearch:
         return generator.choice(seeds, min(n_seeds, len(seeds), self.task.batch), replace=False)
 
     def _random(self, generator: np.random.Generator) -> BoolArray:
-        """Return a random plan; what is longer than a set asks all segments equally often."""
-        arena, period = self._arena, self.task.period
-        plan = np.zeros((period, arena.n_mainline), dtype=bool)
+        """Return a random plan that queries all segments equally often over its period."""
+        scorer, period = self._scorer, self.task.period
+        plan = np.zeros((period, scorer.n_mainline), dtype=bool)
         left: list[int] = []
-        for one in plan:
-            while one.sum() < arena.bandwidth:
+        for mask in plan:
+            while mask.sum() < scorer.bandwidth:
                 if not left:
-                    left = generator.permutation(arena.askable).tolist()
-                fresh = [s for s in left if not one[s]]
+                    left = generator.permutation(scorer.free).tolist()
+                fresh = [s for s in left if not mask[s]]
                 if not fresh:
-                    left += generator.permutation(arena.askable).tolist()
+                    left += generator.permutation(scorer.free).tolist()
                     continue
-                one[fresh[0]] = True
+                mask[fresh[0]] = True
                 left.remove(fresh[0])
         return plan
 
     def _neighbour(self, generator: np.random.Generator) -> BoolArray:
         """Exchange one segment of one set, or, half of the time, segments between two sets."""
-        plan, free = self.best.copy(), self._arena.askable
+        plan, free = self.best.copy(), self._scorer.free
         while np.array_equal(plan, self.best):
             first = generator.integers(len(plan))
             out = generator.choice(np.flatnonzero(plan[first]))
@@ -259,27 +263,27 @@ class PlanSearch:
         return plan
 
 
-def held_out(task: PlanTask, plan: Plan, n_seeds: int = 16) -> dict[str, float]:
+def validation_scores(task: PlanTask, plan: Plan, n_seeds: int = 16) -> dict[str, float]:
     """Return the mean rewards of a plan and of a round robin on validation traffic."""
     seeds = tuple(VALIDATION_SEEDS[:n_seeds])
-    arena = Arena(task, seeds, n_seeds)
-    rival = even_plan(arena, arena.n_mainline)
-    found = {"plan": masks_of(plan, arena.n_mainline), "round-robin": rival}
+    scorer = PlanScorer(task, seeds, n_seeds)
+    round_robin = even_plan(scorer, scorer.n_mainline)
+    plans = {"plan": plan_masks(plan, scorer.n_mainline), "round-robin": round_robin}
     return {
-        name: float(arena.scores(masks[None], np.array(seeds), 0).mean())
-        for name, masks in found.items()
+        name: float(scorer.scores(masks[None], np.array(seeds), 0).mean())
+        for name, masks in plans.items()
     }
 
 
-def masks_of(plan: Plan, n_mainline: int) -> BoolArray:
+def plan_masks(plan: Plan, n_mainline: int) -> BoolArray:
     """Return a plan's sets as masks, shape (period, n_mainline)."""
     masks = np.zeros((len(plan.sets), n_mainline), dtype=bool)
     np.put_along_axis(masks, np.array(plan.sets), True, axis=1)
     return masks
 
 
-def even_plan(arena: Arena, period: int) -> BoolArray:
+def even_plan(scorer: PlanScorer, period: int) -> BoolArray:
     """Return the first steps of a round robin as masks, shape (period, n_mainline)."""
-    even = Shifting(arena.env.interface, period=1)
-    size = arena.env.single_observation_space.shape
+    even = Shifting(scorer.env.interface, period=1)
+    size = scorer.env.single_observation_space.shape or ()
     return even.select(np.arange(period), np.zeros((period, *size), dtype=np.float32))

@@ -1,4 +1,4 @@
-"""What is tuned of each estimator, and within which limits."""
+"""Search space of the settings of each estimator."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Range:
     log: bool = True
 
     def suggest(self, trial: optuna.Trial, name: str) -> float:
-        """Return a trial's value of the setting, to four digits, which is all that matters."""
+        """Return a trial's value of the setting, rounded to four digits."""
         return float(f"{trial.suggest_float(name, self.low, self.high, log=self.log):.4g}")
 
     def holds(self, value: Any) -> bool:
@@ -67,7 +67,7 @@ class Choice:
 
 Knob = Range | Choice
 
-_PROCESS_NOISE = {
+_PROCESS_NOISE: Mapping[str, Knob] = {
     "process_noise.0": Range(1e-3, 5e-2),
     "process_noise.1": Range(1e-3, 5e-2),
 }
@@ -76,7 +76,7 @@ _PROCESS_NOISE = {
 # what the factor would: R is known from the mechanism, so it stays and Q is searched.
 NOISE_SCALE = {"noise_scale": Range(0.5, 3.0)}
 
-SPACE: dict[str, dict[str, Knob]] = {
+SPACE: dict[str, Mapping[str, Knob]] = {
     "ekf": _PROCESS_NOISE,
     "ukf": {**_PROCESS_NOISE, "ukf.alpha": Range(0.1, 1.0)},
     "enkf": {
@@ -100,7 +100,7 @@ SPACE: dict[str, dict[str, Knob]] = {
 
 
 def search_space(estimator: str, with_noise_scale: bool = False) -> dict[str, Knob]:
-    """Return what is tuned of an estimator.
+    """Return the search space of an estimator.
 
     Args:
         estimator: Its name.
@@ -120,7 +120,7 @@ def search_space(estimator: str, with_noise_scale: bool = False) -> dict[str, Kn
 
 
 def nested(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return values by path as the mapping that `EstimatorSettings` is built from.
+    """Return values by path as a mapping for `EstimatorSettings`.
 
     Both items of a pair must be there: ``{"process_noise.0": 1, "process_noise.1": 2}`` becomes
     ``{"process_noise": [1, 2]}``.

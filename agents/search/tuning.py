@@ -1,6 +1,6 @@
 """Tune an estimator's settings on training traffic with Optuna, in a journal that can be resumed.
 
-One process asks for trials and writes the journal; episodes run in the executor that it is given.
+One process proposes trials and writes the journal; episodes run in an executor.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock, Jou
 from optuna.trial import FrozenTrial, TrialState
 
 from agents.evaluation.episodes import WARM_UP, EpisodeScore
+from agents.experiments.files import replacing
 from agents.search.space import nested, values_of
 from agents.search.tuning_task import TuningTask, score_episode
 from dptse_env.estimators import EstimatorSettings
@@ -35,10 +36,13 @@ _COUNTED = (*_FINISHED, TrialState.RUNNING)
 
 logger = logging.getLogger(__name__)
 
+Score = Callable[[TuningTask, EstimatorSettings, int], EpisodeScore]
+"""Scores settings on a traffic seed; a function of a module, so that workers can import it."""
+
 
 @dataclass
 class _Running:
-    """A trial on its way over the traffic seeds."""
+    """A trial under way over the traffic seeds."""
 
     trial: optuna.Trial
     settings: EstimatorSettings
@@ -48,17 +52,19 @@ class _Running:
 class TuningStudy:
     """The trials of one task, kept in ``<folder>/<name>.journal``.
 
-    The first trials are the defaults and the set that the environment has been choosing itself;
-    both run to the end. The others stop early once they fall behind the median.
+    The first trials are the defaults and the set that the environment takes by default; both run
+    to the end. Later trials stop early once they fall behind the median.
 
     Attributes:
-        task: What is tuned.
+        task: The task.
         study: Optuna's study; its values are mean rewards, to be maximised.
     """
 
-    def __init__(self, task: TuningTask, folder: Path, seed: int = 0) -> None:
-        """Begin or go on; use `open`, which makes sure that nobody else does."""
-        self.task, self.seed = task, seed
+    def __init__(
+        self, task: TuningTask, folder: Path, seed: int = 0, score: Score = score_episode
+    ) -> None:
+        """Begin or go on; use `locked_study`, which keeps other processes out."""
+        self.task, self.seed, self._score = task, seed, score
         self.space = task.space
         self.path = journal_path(task, folder)
         backend = JournalFileBackend(str(self.path), JournalFileOpenLock(str(self.path)))
@@ -70,35 +76,11 @@ class TuningStudy:
             load_if_exists=True,
         )
         self._identify({**task.identity(), "sampler_seed": seed})
-        # Nobody else is at work here, so whatever is running belongs to a run that was killed.
+        # No other process has the journal, so running trials belong to a run that was killed.
         for trial in self.study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
             self.study.tell(trial.number, state=TrialState.FAIL)
         self._enqueue("defaults", EstimatorSettings())
         self._enqueue("shipped", task.config().settings())
-
-    @classmethod
-    @contextmanager
-    def open(cls, task: TuningTask, folder: Path, seed: int = 0) -> Iterator[TuningStudy]:
-        """Open a study and keep others out of it meanwhile.
-
-        Args:
-            task: What to tune.
-            folder: Where the journal is; made if missing.
-            seed: Seeds the sampler.
-
-        Raises:
-            ValueError: The journal is of a study with other arguments.
-            BlockingIOError: Another process has the study open.
-        """
-        folder.mkdir(parents=True, exist_ok=True)
-        path = journal_path(task, folder)
-        with path.open("ab") as file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as problem:
-                raise BlockingIOError(f"another run is writing {path}") from problem
-            _mend(path)
-            yield cls(task, folder, seed)
 
     def _identify(self, identity: dict[str, Any]) -> None:
         identity = json.loads(json.dumps(identity))
@@ -107,14 +89,14 @@ class TuningStudy:
             self.study.set_user_attr("identity", identity)
         elif kept != identity:
             keys = [key for key in {**kept, **identity} if kept.get(key) != identity.get(key)]
-            ours, theirs = ({key: one.get(key) for key in keys} for one in (identity, kept))
+            ours, theirs = ({key: each.get(key) for key in keys} for each in (identity, kept))
             raise ValueError(
                 f"{self.path} belongs to a study with {theirs}, this one has {ours}; "
                 "choose another output folder"
             )
 
     def _enqueue(self, label: str, settings: EstimatorSettings) -> None:
-        """Queue a labelled trial unless it was run or waits, or equals one that does."""
+        """Queue a labelled trial, unless one with its label was run or waits."""
         values = values_of(settings, self.space)
         states = (*_FINISHED, TrialState.WAITING)
         for trial in self.study.get_trials(deepcopy=False, states=states):
@@ -155,7 +137,7 @@ class TuningStudy:
         With one trial at a time, a study that was interrupted comes out as one that was not.
 
         Args:
-            n_trials: Trials wanted in all.
+            n_trials: Total number of trials.
             executor: Runs the episodes.
             n_parallel: Trials under way at once.
             on_trial: Called after every finished trial.
@@ -164,28 +146,28 @@ class TuningStudy:
         try:
             while True:
                 while len(running) < n_parallel and self._n_counted() < n_trials:
-                    self._submit(self._ask(), executor, running)
+                    self._submit(self._propose(), executor, running)
                 if not running:
                     return
                 for future in wait(running, return_when=FIRST_COMPLETED).done:
-                    one = running[future]
-                    one.scores.append(future.result())
-                    finished = self._tell(one)
+                    trial = running[future]
+                    trial.scores.append(future.result())
+                    finished = self._tell(trial)
                     del running[future]
                     if not finished:
-                        self._submit(one, executor, running)
+                        self._submit(trial, executor, running)
                     elif on_trial is not None:
                         on_trial()
         except BaseException:
-            for one in running.values():
-                self.study.tell(one.trial, state=TrialState.FAIL, skip_if_finished=True)
+            for trial in running.values():
+                self.study.tell(trial.trial, state=TrialState.FAIL, skip_if_finished=True)
             raise
 
     def _n_counted(self) -> int:
         return len(self.study.get_trials(deepcopy=False, states=_COUNTED))
 
-    def _ask(self) -> _Running:
-        # A sampler of its own for each trial: resuming must not draw the first numbers again.
+    def _propose(self) -> _Running:
+        # A new sampler for each trial: resuming must not draw the first numbers again.
         seed = np.random.SeedSequence([self.seed, self._n_counted()]).generate_state(1)[0]
         self.study.sampler = optuna.samplers.TPESampler(seed=int(seed), multivariate=True)
         trial = self.study.ask()
@@ -195,14 +177,14 @@ class TuningStudy:
         return _Running(trial, from_mapping(EstimatorSettings, settings, "estimator_settings"))
 
     def _submit(
-        self, one: _Running, executor: Executor, running: dict[Future[EpisodeScore], _Running]
+        self, trial: _Running, executor: Executor, running: dict[Future[EpisodeScore], _Running]
     ) -> None:
-        seed = self.task.traffic_seeds[len(one.scores)]
-        running[executor.submit(score_episode, self.task, one.settings, seed)] = one
+        seed = self.task.traffic_seeds[len(trial.scores)]
+        running[executor.submit(self._score, self.task, trial.settings, seed)] = trial
 
-    def _tell(self, one: _Running) -> bool:
+    def _tell(self, running: _Running) -> bool:
         """Report the latest episode; return whether the trial is finished."""
-        trial, scores = one.trial, one.scores
+        trial, scores = running.trial, running.scores
         reward = float(np.mean([score.reward for score in scores]))
         if not math.isfinite(reward):
             trial.set_user_attr("not_finite", scores[-1].traffic_seed)
@@ -220,7 +202,7 @@ class TuningStudy:
         return False
 
     def write(self, path: Path) -> None:
-        """Write the best settings and where they come from.
+        """Write the best settings with their provenance.
 
         Raises:
             ValueError: No trial ran to its end.
@@ -228,14 +210,15 @@ class TuningStudy:
         best, defaults = self.best(), self.labelled("defaults")
         if best is None:
             raise ValueError(f"{self.task.name}: no trial ran to its end with a finite score")
-        write_settings(
-            path,
-            estimator=self.task.estimator,
-            parameters=self.task.parameters_name,
-            privacy=self.task.privacy,
-            settings=best.user_attrs["settings"],
-            provenance=self._provenance(best, defaults),
-        )
+        with replacing(path) as temporary:
+            write_settings(
+                temporary,
+                estimator=self.task.estimator,
+                parameters=self.task.parameters_name,
+                privacy=self.task.privacy,
+                settings=best.user_attrs["settings"],
+                provenance=self._provenance(best, defaults),
+            )
 
     def _provenance(self, best: FrozenTrial, defaults: FrozenTrial | None) -> dict[str, Any]:
         task, config = self.task, self.task.config()
@@ -264,13 +247,40 @@ class TuningStudy:
         }
 
 
+@contextmanager
+def locked_study(
+    task: TuningTask, folder: Path, seed: int = 0, score: Score = score_episode
+) -> Iterator[TuningStudy]:
+    """Begin a study or go on with it, and keep other processes out of it meanwhile.
+
+    Args:
+        task: The task.
+        folder: Folder of the journal; made if missing.
+        seed: Seeds the sampler.
+        score: Scores settings on a traffic seed.
+
+    Raises:
+        ValueError: The journal is of a study with other arguments.
+        BlockingIOError: Another process has the study open.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    path = journal_path(task, folder)
+    with path.open("ab") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as problem:
+            raise BlockingIOError(f"another run is writing {path}") from problem
+        _mend(path)
+        yield TuningStudy(task, folder, seed, score)
+
+
 def journal_path(task: TuningTask, folder: Path) -> Path:
-    """Return where the journal of a task is kept."""
+    """Return the path of the journal of a task."""
     return folder / f"{task.name}.journal"
 
 
 def scores_of(trial: FrozenTrial) -> dict[str, float]:
-    """Return the mean reward (``score``), the errors and the mishaps of a finished trial."""
+    """Return the mean reward (``score``), errors and divergences of a finished trial."""
     keys = ("rmse_density", "rmse_speed", "n_diverged")
     return {"score": _value(trial), **{key: trial.user_attrs[key] for key in keys}}
 
@@ -282,7 +292,7 @@ def _value(trial: FrozenTrial) -> float:
 
 
 def _summary(scores: list[EpisodeScore]) -> dict[str, float]:
-    """Errors as means over traffic seeds, mishaps as sums."""
+    """Return errors as means over traffic seeds, divergences as sums."""
     return {
         "rmse_density": float(np.mean([score.rmse_density for score in scores])),
         "rmse_speed": float(np.mean([score.rmse_speed for score in scores])),
@@ -291,10 +301,10 @@ def _summary(scores: list[EpisodeScore]) -> dict[str, float]:
 
 
 def _mend(path: Path) -> None:
-    """Undo what a killed run left of a write: half a line and a lock, which Optuna trips over."""
+    """Undo the incomplete write of a killed run, half a line and a lock that Optuna cannot read."""
     content = path.read_bytes()
-    whole = content.rfind(b"\n") + 1
-    if whole < len(content):
+    complete = content.rfind(b"\n") + 1
+    if complete < len(content):
         with path.open("r+b") as file:
-            file.truncate(whole)
+            file.truncate(complete)
     Path(f"{path}.lock").unlink(missing_ok=True)

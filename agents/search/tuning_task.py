@@ -1,13 +1,13 @@
-"""What a set of estimator settings is tuned for, and how settings are scored.
+"""Tuning tasks: the configuration that estimator settings are tuned for, and their score.
 
-Settings are paid what a user of the environment is paid: the mean reward of a second, after the
-warm-up.
+The score is the mean reward of a second after the warm-up, as the environment gives it.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
@@ -15,21 +15,20 @@ from typing import Any
 
 import gymnasium as gym
 
-from agents.evaluation.episodes import WARM_UP, EpisodeScore, Policy, run_episode
-from agents.evaluation.policies import Saved
+from agents.evaluation.episodes import WARM_UP, EpisodeScore, run_episode, unwrap
+from agents.evaluation.policies import PolicySource, find_policy
 from agents.experiments.seeds import TUNING
 from agents.search.space import Knob, search_space
 from dptse_env.config import TRAINING_SEEDS, EnvConfig, parse_seeds
 from dptse_env.estimators import EstimatorSettings
 from dptse_env.estimators.tuning import settings_name
 from dptse_env.model import ARZParameters
-from dptse_env.schedules import make_schedule
 from dptse_env.validation import integer
 
 
 @dataclass(frozen=True)
 class TuningTask:
-    """What one set is tuned for.
+    """The configuration that one set of settings is tuned for.
 
     Attributes:
         env: Environment id.
@@ -40,10 +39,12 @@ class TuningTask:
         delta: Privacy parameter delta.
         bandwidth: Most segments to query a second; the environment's own if None.
         seeds: Traffic seeds, ``"first:stop"``, within `TRAINING_SEEDS`.
-        schedule: Query schedule, or the ``.zip`` file of a saved policy.
+        schedule: Query schedule, or a saved policy: its ``.zip`` file or shipped name.
         noise_seed: Noise and estimators are seeded with this plus the traffic seed.
         records: Folder of the record cache; the user's cache if None.
         with_noise_scale: Whether to search the scale of the measurements' noise, too.
+        keywords: More keywords of the environment, none of those above; ``privacy`` may hold more
+            fields of the preset.
 
     Raises:
         FileNotFoundError: There is no such saved policy.
@@ -63,10 +64,17 @@ class TuningTask:
     noise_seed: int = TUNING.start
     records: str | None = None
     with_noise_scale: bool = False
+    keywords: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Check what needs no environment."""
-        _ = self.space, self.saved
+        _ = self.space, self.source
+        taken = self.keywords.keys() & {field.name for field in dataclasses.fields(self)}
+        nested = self.keywords.get("privacy", {})
+        if taken - {"privacy"} or not isinstance(nested, Mapping):
+            raise ValueError(
+                f"keywords must not hold {', '.join(sorted(taken))}: each is an argument"
+            )
         if not set(self.traffic_seeds) <= set(TRAINING_SEEDS):
             raise ValueError(
                 f"seeds must be training seeds, in {TRAINING_SEEDS.start}:{TRAINING_SEEDS.stop}, "
@@ -78,13 +86,13 @@ class TuningTask:
             raise ValueError(f"the ARZ parameters' name must be part of a file name: {self.name!r}")
 
     @cached_property
-    def saved(self) -> Saved | None:
-        """The saved policy that queries; None for a schedule."""
-        return Saved.of(self.schedule) if self.schedule.endswith(".zip") else None
+    def source(self) -> PolicySource:
+        """The schedule or the saved policy that queries."""
+        return find_policy(self.schedule)
 
     @property
     def space(self) -> dict[str, Knob]:
-        """What is searched, by path into the settings."""
+        """The search space, by path into the settings."""
         return search_space(self.estimator, self.with_noise_scale)
 
     @property
@@ -103,50 +111,38 @@ class TuningTask:
         return settings_name(self.estimator, self.parameters_name, self.privacy)
 
     def make(self, settings: EstimatorSettings | None = None) -> gym.Env[Any, Any]:
-        """Make the environment; with the settings that it would choose itself if None."""
+        """Make the environment; with its default settings if None."""
         parameters = self.parameters
-        if isinstance(parameters, ARZParameters):
-            parameters = dataclasses.asdict(parameters)  # type: ignore[assignment]
+        privacy = {"preset": self.privacy, "epsilon": self.epsilon, "delta": self.delta}
         keywords: dict[str, Any] = {
+            **self.keywords,
+            **self.source.keywords,
             "estimator": self.estimator,
-            "parameters": parameters,
-            "privacy": self.privacy,
-            "epsilon": self.epsilon,
-            "delta": self.delta,
+            "parameters": (
+                parameters if isinstance(parameters, str) else dataclasses.asdict(parameters)
+            ),
+            "privacy": {**self.keywords.get("privacy", {}), **privacy},
             "traffic_seeds": self.seeds,
             "records": self.records,
         }
         if self.bandwidth is not None:
             keywords["bandwidth"] = self.bandwidth
-        if self.saved is not None:
-            keywords["action"] = self.saved.action
         if settings is not None:
             keywords["estimator_settings"] = dataclasses.asdict(settings)
         return gym.make(self.env, **keywords)
 
-    def policy(self, env: gym.Env[Any, Any]) -> Policy:
-        """Bind the schedule or the saved policy to an environment.
-
-        Raises:
-            ValueError: There is no such schedule, or it does not suit the environment.
-        """
-        if self.saved is None:
-            return make_schedule(self.schedule, env)
-        return self.saved.load(env)
-
     def config(self) -> EnvConfig:
-        """Return the configuration of the environment, with its present settings.
+        """Return the configuration of the environment, with its default settings.
 
         Raises:
-            ValueError: A value is out of range.
+            ValueError: A value is out of range, or the policy does not suit the environment.
         """
         env = self.make()
-        self.policy(env)
-        config: EnvConfig = env.unwrapped.config  # type: ignore[attr-defined]
-        return config
+        self.source.load(env)
+        return unwrap(env).config
 
     def identity(self) -> dict[str, Any]:
-        """Return everything that scores of two studies must share to be compared."""
+        """Return everything that two studies must share for their scores to be comparable."""
         config = self.config()
         return {
             "env": self.env,
@@ -155,7 +151,8 @@ class TuningTask:
             "parameters": dataclasses.asdict(config.model().parameters),
             "privacy": dataclasses.asdict(config.privacy),
             "bandwidth": config.bandwidth,
-            "schedule": self.schedule if self.saved is None else self.saved.sha256,
+            **({"keywords": dict(self.keywords)} if self.keywords else {}),
+            "schedule": self.source.identity,
             "seeds": self.seeds,
             "noise_seed": self.noise_seed,
             "warm_up": WARM_UP,
@@ -167,5 +164,5 @@ class TuningTask:
 def score_episode(task: TuningTask, settings: EstimatorSettings, traffic_seed: int) -> EpisodeScore:
     """Run one episode of a task with given settings."""
     env = task.make(settings)
-    noise = task.noise_seed + traffic_seed
-    return run_episode(env, task.policy(env), traffic_seed=traffic_seed, seed=noise)
+    policy, noise = task.source.load(env), task.noise_seed + traffic_seed
+    return run_episode(env, policy, traffic_seed=traffic_seed, seed=noise)

@@ -1,1 +1,1 @@
-"""The adversary of an audit: two worlds, whom to look for, what to ask, and how to score it."""
+"""Audit of a privacy claim: two adjacent worlds, an adversary, and a statistical test."""

@@ -5,46 +5,50 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from tqdm import tqdm
 
-from agents.studies.audit.policies import Policy, always_observed
-from agents.studies.audit.worlds import TwoWorlds
-from dptse_env.arrays import BoolArray, FloatArray, IntArray
+from agents.studies.audit.policies import AdversaryPolicy, always_observed
+from agents.studies.audit.worlds import AdjacentWorlds
+from dptse_env.arrays import BoolArray, FloatArray
 from dptse_env.config import EnvConfig
 from dptse_env.interface import QueryInterface
 from dptse_env.privacy import GaussianMechanism, Mechanism
 from dptse_env.process import QueryProcess
 from dptse_env.sensing import Sensing, make_answers
 
+Indices = NDArray[np.integer[Any]]
+
 BATCH = 250
-"""Runs per world to play at once."""
+"""Default number of runs per world that are played at once."""
 
 
 @dataclass(frozen=True)
 class Runs:
-    """What came of the runs, world by world.
+    """Scores and distances of the runs, world by world.
 
     Attributes:
         scores: Log-likelihood ratio of world 1 of each transcript, (2, n).
-        distances: Distance between the worlds' true answers under each run's queries, in units of
-            the noise, (2, n). Given a distance D for sure, the scores are N(-+D^2/2, D^2).
+        distances: Distance between the worlds' true sums under each run's queries, in units of the
+            noise, (2, n). For a constant distance D the scores are N(-+D^2/2, D^2).
     """
 
     scores: FloatArray
     distances: FloatArray
 
 
-class Wiretap:
-    """A mechanism whose releases are kept: the public transcript, one step at a time.
+class RecordingMechanism:
+    """A mechanism that keeps its last releases: the public transcript, one step at a time.
 
     Attributes:
         released: The last releases, shape (k, n_columns, 2).
     """
 
     def __init__(self, mechanism: Mechanism) -> None:
-        """Listen to a mechanism."""
+        """Wrap a mechanism."""
         self._mechanism = mechanism
         self.released = np.empty((0, 0, 2))
 
@@ -53,32 +57,32 @@ class Wiretap:
         """See `Mechanism.sigma`."""
         return self._mechanism.sigma
 
-    def reset(self, episodes: IntArray, generators: Sequence[np.random.Generator]) -> None:
+    def reset(self, episodes: Indices, generators: Sequence[np.random.Generator]) -> None:
         """See `Mechanism.reset`."""
         self._mechanism.reset(episodes, generators)
 
-    def release(self, episodes: IntArray, values: FloatArray) -> FloatArray:
+    def release(self, episodes: Indices, values: FloatArray) -> FloatArray:
         """See `Mechanism.release`."""
         self.released = self._mechanism.release(episodes, values)
         return self.released
 
 
 class Adversary:
-    """Knows both worlds and the queries, and works out what either world would answer.
+    """Knows both worlds and the queries, and works out the sums of either world.
 
     Attributes:
         score: Log-likelihood ratio of world 1 of each run's transcript so far, shape (k,).
-        square: Squared distance between the worlds' answers so far, in units of the noise, (k,).
+        square: Squared distance between the worlds' sums so far, in units of the noise, (k,).
     """
 
     def __init__(
-        self, config: EnvConfig, worlds: TwoWorlds, n_runs: int, sigma: FloatArray
+        self, config: EnvConfig, worlds: AdjacentWorlds, n_runs: int, sigma: FloatArray
     ) -> None:
-        """Prepare for so many runs at once, under noise of standard deviation `sigma`, (2,)."""
+        """Prepare for n_runs at once, under noise of standard deviation `sigma`, (2,)."""
         corridor, always = config.corridor, always_observed(config)
         columns = max([corridor.n_segments, *(column + 1 for column in always)])
         sensing = Sensing(corridor, (0, 1), worlds)
-        # Both worlds' answers to every run, whichever world it is in.
+        # Sums of both worlds for every run, whichever world it is in.
         self._answers = make_answers(config.privacy, sensing, columns, 2 * n_runs)
         for world in (0, 1):
             sensing.load(world)
@@ -94,9 +98,9 @@ class Adversary:
         self.score, self.square = np.zeros(n_runs), np.zeros(n_runs)
 
     def expect(self, time: int, queried: BoolArray) -> tuple[FloatArray, FloatArray]:
-        """Return midpoint and difference of both worlds' answers, (k, n_columns, 2), and add up.
+        """Return midpoint and difference of both worlds' sums, (k, n_columns, 2), and add up.
 
-        Both are in units of the noise; the difference is zero where nobody asked.
+        Both are in units of the noise; the difference is zero where nothing is observed.
         """
         observed = np.tile(self._always, (len(queried), 1))
         observed[:, : queried.shape[1]] |= queried
@@ -104,19 +108,19 @@ class Adversary:
         answers = self._answers.collect(
             self._episodes, self._worlds, times, np.tile(observed, (2, 1))
         )
-        zero, one = np.split(answers / self._sigma, 2)
-        difference = np.where(observed[:, :, None], one - zero, 0.0)
+        zero, first = np.split(answers / self._sigma, 2)
+        difference = np.where(observed[:, :, None], first - zero, 0.0)
         self.square += np.sum(difference**2, axis=(1, 2))
-        return 0.5 * (zero + one), difference
+        return 0.5 * (zero + first), difference
 
-    def take_in(self, time: int, queried: BoolArray, released: FloatArray) -> None:
+    def update(self, time: int, queried: BoolArray, released: FloatArray) -> None:
         """Score one released step: the log-likelihood ratio of Gaussians of either mean."""
         midpoint, difference = self.expect(time, queried)
         self.score += np.sum((released / self._sigma - midpoint) * difference, axis=(1, 2))
 
 
 def planned_distance(
-    config: EnvConfig, worlds: TwoWorlds, plan: BoolArray, sigma: FloatArray
+    config: EnvConfig, worlds: AdjacentWorlds, plan: BoolArray, sigma: FloatArray
 ) -> float:
     """Return the distance between the worlds under fixed queries, in units of the noise.
 
@@ -135,18 +139,19 @@ def planned_distance(
 
 def attack(
     config: EnvConfig,
-    worlds: TwoWorlds,
-    policy: Policy,
+    worlds: AdjacentWorlds,
+    policy: AdversaryPolicy,
     n_runs: int,
     *,
     noise_factor: float = 1.0,
     seed: int = 0,
+    batch: int = BATCH,
     progress: bool = True,
 ) -> Runs:
     """Play both worlds and score every transcript.
 
-    Each run is an episode of the decision process from the first second of the record. What the
-    estimator makes of the releases adds nothing to them, so the one that costs least is used.
+    Each run is an episode of the decision process from the first second of the record. Estimates
+    reveal nothing beyond the releases, so the cheapest estimator is used.
 
     Args:
         config: The configuration under attack.
@@ -155,47 +160,54 @@ def attack(
         n_runs: Runs per world n.
         noise_factor: Multiplies the noise that the configuration declares.
         seed: Seeds the noise, >= 0.
+        batch: Runs per world that are played at once; results do not depend on it.
         progress: Whether to show a progress bar.
     """
     config = dataclasses.replace(
         config, traffic_seeds=(0, 1), random_start=False, action="mask",
         estimator="open_loop", backend="compiled", estimator_settings=None,
     )  # fmt: skip
-    size = min(BATCH, n_runs)
+    size = min(batch, n_runs)
     process = QueryProcess(config, QueryInterface.of(config), 2 * size, worlds)
     sigma = noise_factor * process.mechanism.sigma
     columns = config.corridor.n_segments + process.boundary.n_released
-    tap = Wiretap(GaussianMechanism(sigma, n_episodes=2 * size, n_segments=columns))
-    process.mechanism = tap
+    mechanism = RecordingMechanism(
+        GaussianMechanism(sigma, n_episodes=2 * size, n_segments=columns)
+    )
+    process.mechanism = mechanism
     adversary = Adversary(config, worlds, 2 * size, sigma)
     parts = []
     with tqdm(
         total=2 * n_runs, desc="attacking", unit="run", mininterval=0.5, disable=not progress
     ) as bar:
         for first in range(0, n_runs, size):
-            batch = range(first, min(first + size, n_runs))
+            runs = range(first, min(first + size, n_runs))
             for world in (0, 1):
-                _begin(process, world, batch, seed)
-            _play(process, tap, adversary, policy, 2 * len(batch))
+                _begin(process, world, runs, seed)
+            _play(process, mechanism, adversary, policy, 2 * len(runs))
             parts.append([adversary.score.reshape(2, -1), np.sqrt(adversary.square).reshape(2, -1)])
-            bar.update(2 * len(batch))
+            bar.update(2 * len(runs))
     scores, distances = (np.concatenate(part, axis=1) for part in zip(*parts, strict=True))
     return Runs(scores, distances)
 
 
-def _begin(process: QueryProcess, world: int, batch: range, seed: int) -> None:
-    """Begin some runs of a world, each with a noise stream of its own whatever the batch."""
-    episodes = np.arange(world * len(batch), (world + 1) * len(batch))
-    streams = [np.random.default_rng((seed, world, run)) for run in batch]
+def _begin(process: QueryProcess, world: int, runs: range, seed: int) -> None:
+    """Begin some runs of a world; a run's noise stream does not depend on the batch."""
+    episodes = np.arange(world * len(runs), (world + 1) * len(runs))
+    streams = [np.random.default_rng((seed, world, run)) for run in runs]
     process.reset(episodes, streams, {"traffic_seed": world, "start": 0})
 
 
 def _play(
-    process: QueryProcess, tap: Wiretap, adversary: Adversary, policy: Policy, n_runs: int
+    process: QueryProcess,
+    mechanism: RecordingMechanism,
+    adversary: Adversary,
+    policy: AdversaryPolicy,
+    n_runs: int,
 ) -> None:
-    """Play runs that were begun to their end; their scores stay with the adversary."""
+    """Play runs to their end; their scores stay with the adversary."""
     adversary.reset(n_runs)
     for step in range(process.config.horizon_steps):
         queries = policy.queries(step, adversary.score)
         process.step(np.arange(n_runs), queries.astype(np.int8))
-        adversary.take_in(step + 1, process.queried[:n_runs], tap.released)
+        adversary.update(step + 1, process.queried[:n_runs], mechanism.released)

@@ -1,4 +1,4 @@
-"""How far one second of one vehicle moves the releases, in closed form."""
+"""Distances by which one second of one vehicle moves the releases, in closed form."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agents.studies.audit.worlds import Path
+from agents.studies.audit.worlds import Trajectory
 from dptse_env.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.config import EnvConfig
 from dptse_env.privacy import SpeedRelease, noise_std
@@ -15,13 +15,13 @@ from dptse_env.traffic import Record
 
 
 @dataclass(frozen=True)
-class Ruler:
-    """Squared distances between the answers with and without a vehicle, in units of the noise.
+class ReleaseDistances:
+    """Squared distances between sums with and without a vehicle, in units of the noise.
 
     Attributes:
         length: Length of a segment [km].
-        largest_speed: The road's limit, that an empty segment answers and flows clip to [km/h].
-        speed_release: What is released of the speeds.
+        largest_speed: The speed limit, which an empty segment has and flows clip to [km/h].
+        speed_release: Kind of the release of speeds.
         sigma: Noise of density and of speed or flow, (2,).
     """
 
@@ -31,86 +31,87 @@ class Ruler:
     sigma: FloatArray
 
     @classmethod
-    def of(cls, config: EnvConfig) -> Ruler:
-        """Return the ruler of a configuration, at the noise that it declares."""
+    def from_config(cls, config: EnvConfig) -> ReleaseDistances:
+        """Return the distances under a configuration, at the noise that it declares."""
         corridor = config.corridor
         sigma = noise_std(config.privacy, config.sensitivity())
         return cls(corridor.segment_length, corridor.speed_limit, config.privacy.speed, sigma)
 
-    def of_path(self, rest: Record, path: Path) -> FloatArray:
-        """Return the distance of every second of a path that is added to a record, shape (m,)."""
-        others = rest.counts[path.step, path.segment]
-        return self._squares(others, rest.speed_sums[path.step, path.segment], path.speed)
+    def by_second(self, rest: Record, added: Trajectory) -> FloatArray:
+        """Return squares for the seconds of a trajectory that is added to a record, shape (m,)."""
+        count = rest.counts[added.step, added.segment]
+        return self._squares(count, rest.speed_sums[added.step, added.segment], added.speed)
 
-    def of_rows(self, record: Record) -> FloatArray:
-        """Return the distance of every row of a record, with and without it, shape (rows,)."""
+    def by_row(self, record: Record) -> FloatArray:
+        """Return squares for the rows of a record, with and without each, shape (rows,)."""
         speed = record.speed.astype(np.float64)
-        others = record.counts[record.step, record.segment] - 1
-        return self._squares(others, record.speed_sums[record.step, record.segment] - speed, speed)
+        count = record.counts[record.step, record.segment] - 1
+        return self._squares(count, record.speed_sums[record.step, record.segment] - speed, speed)
 
-    def of_meeting(self, rest: Record, paths: tuple[Path, Path]) -> FloatArray:
-        """Return the same where two paths meet, between one being there and the other.
+    def where_equal(self, rest: Record, pair: tuple[Trajectory, Trajectory]) -> FloatArray:
+        """Return squares between two trajectories on the same segments at the same seconds.
 
         Args:
-            rest: Everybody else.
-            paths: The same seconds on the same segments, m each.
+            rest: The other vehicles.
+            pair: The same seconds on the same segments, m each.
 
         Returns:
-            Shape (m,): the densities agree, and the speeds alone tell the two apart.
+            Shape (m,): the densities agree, and the speeds alone differ.
         """
-        step, segment = paths[0].step, paths[0].segment
-        one, other = (path.speed for path in paths)
+        step, segment = pair[0].step, pair[0].segment
+        first, second = (each.speed for each in pair)
         if self.speed_release == "flow":
-            clipped = np.clip(one, 0.0, self.largest_speed)
-            second = (clipped - np.clip(other, 0.0, self.largest_speed)) / self.length
+            clipped = np.clip(first, 0.0, self.largest_speed)
+            change = (clipped - np.clip(second, 0.0, self.largest_speed)) / self.length
         else:
-            second = (one - other) / (rest.counts[step, segment] + 1)
-        squares: FloatArray = (second / self.sigma[1]) ** 2
+            change = (first - second) / (rest.counts[step, segment] + 1)
+        squares: FloatArray = (change / self.sigma[1]) ** 2
         return squares
 
-    def _squares(self, others: IntArray, their_speeds: FloatArray, speed: FloatArray) -> FloatArray:
+    def _squares(self, count: IntArray, speed_sum: FloatArray, speed: FloatArray) -> FloatArray:
         if self.speed_release == "flow":
             clipped = np.clip(speed, 0.0, self.largest_speed)
             second = (clipped - 0.5 * self.largest_speed) / self.length
         else:
-            # Nobody answers with the limit.
-            without = np.where(others > 0, their_speeds / np.maximum(others, 1), self.largest_speed)
-            second = (their_speeds + speed) / (others + 1) - without
+            # An empty segment has the limit.
+            without = np.where(count > 0, speed_sum / np.maximum(count, 1), self.largest_speed)
+            second = (speed_sum + speed) / (count + 1) - without
         first = 1.0 / (self.length * self.sigma[0])
         squares: FloatArray = first**2 + (second / self.sigma[1]) ** 2
         return squares
 
 
-class Spending(NamedTuple):
-    """How to spend a vehicle's contributions.
+class ContributionPlan(NamedTuple):
+    """The seconds in which a vehicle's contributions reveal most.
 
     Attributes:
         reach: Sum of the squared distances of the seconds that count.
-        asked: How many of the other seconds to ask for, beside those observed anyhow.
-        stop: Ask before this one of the vehicle's seconds; after it the rest would be spent
-            unasked.
+        n_queries: Number of other seconds to query, beside those observed at every step.
+        stop: Index before which all chosen queries must lie; later seconds would be counted only
+            after contributions that were not chosen.
     """
 
     reach: float
-    asked: int
+    n_queries: int
     stop: int
 
 
-def best_spending(gains: FloatArray, unasked: BoolArray, cap: int) -> Spending:
-    """Return how a vehicle that counts in its first `cap` observed seconds tells most.
+def plan_contributions(gains: FloatArray, always: BoolArray, cap: int) -> ContributionPlan:
+    """Return the plan of a vehicle that counts in its first `cap` observed seconds.
 
     Args:
         gains: Squared distances of its seconds in order, shape (m,).
-        unasked: Which of them are observed whether asked for or not, shape (m,).
+        always: Flags of seconds that are observed without a query, shape (m,).
         cap: Most seconds that count.
     """
     if cap >= len(gains):
-        return Spending(float(gains.sum()), cap, len(gains))
-    fixed = np.flatnonzero(unasked)
+        return ContributionPlan(float(gains.sum()), cap, len(gains))
+    fixed = np.flatnonzero(always)
     options = []
-    # With the first n unasked seconds counted, all others have to come before the next of them.
+    # With the first n such seconds counted, all queries have to come before the next of them.
     for n in range(min(len(fixed), cap) + 1):
         stop = int(fixed[n]) if n < len(fixed) else len(gains)
-        free = np.sort(gains[:stop][~unasked[:stop]])[::-1][: cap - n]
-        options.append(Spending(float(gains[fixed[:n]].sum() + free.sum()), cap - n, stop))
+        free = np.sort(gains[:stop][~always[:stop]])[::-1][: cap - n]
+        reach = float(gains[fixed[:n]].sum() + free.sum())
+        options.append(ContributionPlan(reach, cap - n, stop))
     return max(options)

@@ -1,4 +1,4 @@
-"""What the adversary asks: a public schedule, a hunter of the vehicle, a hunter that adapts."""
+"""Query policies of the adversary: public schedules, the hunter of a vehicle, an adaptive one."""
 
 from __future__ import annotations
 
@@ -6,28 +6,28 @@ from typing import Protocol
 
 import numpy as np
 
-from agents.studies.audit.distances import Ruler, best_spending
-from agents.studies.audit.worlds import TwoWorlds
+from agents.studies.audit.distances import ReleaseDistances, plan_contributions
+from agents.studies.audit.worlds import AdjacentWorlds
 from dptse_env.arrays import BoolArray, FloatArray
 from dptse_env.config import EnvConfig
 from dptse_env.interface import QueryInterface
 from dptse_env.schedules import SCHEDULES
 
-FENCE = 3.0
-"""Log-likelihood ratio at which the adaptive hunter has made up its mind: odds of 20 to 1."""
+DECISION_THRESHOLD = 3.0
+"""Log-likelihood ratio at which the adaptive hunter is decided: odds of 20 to 1."""
 
 PUBLIC_SCHEDULES = ("paper", "static", "round-robin")
-"""Schedules that look at nothing: their queries are known beforehand."""
+"""Schedules that ignore observations: their queries are known beforehand."""
 
 POLICIES = ("hunter", "adaptive", *PUBLIC_SCHEDULES)
 """Names of the policies."""
 
 
-class Policy(Protocol):
-    """Chooses queries by what was released before, and by what the adversary knows."""
+class AdversaryPolicy(Protocol):
+    """Chooses queries from past releases and the adversary's knowledge."""
 
     def queries(self, step: int, belief: FloatArray) -> BoolArray:
-        """Return the segments to ask, shape (k, n_mainline).
+        """Return the segments to query, shape (k, n_mainline).
 
         Args:
             step: Steps released so far.
@@ -35,8 +35,8 @@ class Policy(Protocol):
         """
 
 
-class Planned:
-    """Asks what was planned, whatever is released.
+class FixedQueries:
+    """Queries by a plan, whatever is released.
 
     Attributes:
         plan: Segments by step, shape (horizon, n_mainline).
@@ -47,16 +47,18 @@ class Planned:
         self.plan = plan
 
     def queries(self, step: int, belief: FloatArray) -> BoolArray:
-        """See `Policy.queries`."""
+        """See `AdversaryPolicy.queries`."""
         return np.tile(self.plan[step], (len(belief), 1))
 
 
-class Adaptive(Planned):
-    """Follows its plan while it is undecided, and leaves the vehicle alone from then on."""
+class AdaptiveQueries(FixedQueries):
+    """Follows its plan while it is undecided, and stops querying from then on."""
 
     def queries(self, step: int, belief: FloatArray) -> BoolArray:
-        """See `Policy.queries`."""
-        return self.plan[step] & (np.abs(belief) < FENCE)[:, None]
+        """See `AdversaryPolicy.queries`."""
+        undecided = np.abs(belief) < DECISION_THRESHOLD
+        queries: BoolArray = self.plan[step] & undecided[:, None]
+        return queries
 
 
 def public_plan(config: EnvConfig, name: str) -> BoolArray:
@@ -69,7 +71,7 @@ def public_plan(config: EnvConfig, name: str) -> BoolArray:
 
 
 def always_observed(config: EnvConfig) -> list[int]:
-    """Return the record columns that are observed at every step without being asked."""
+    """Return the record columns that are observed at every step without a query."""
     corridor = config.corridor
     columns = list(corridor.fixed_sensors)
     if config.privacy.boundary == "private":
@@ -77,19 +79,19 @@ def always_observed(config: EnvConfig) -> list[int]:
     return columns
 
 
-def hunting_plan(config: EnvConfig, worlds: TwoWorlds) -> BoolArray:
+def hunting_plan(config: EnvConfig, worlds: AdjacentWorlds) -> BoolArray:
     """Return the queries that follow the vehicle in both worlds, shape (horizon, n_mainline).
 
-    A path is asked for in the seconds that tell most, as many as count, within the bandwidth.
+    A trajectory is queried in the seconds that reveal most, as many as count, within the bandwidth.
     """
     plan = np.zeros((config.horizon_steps, config.corridor.n_mainline), dtype=bool)
     candidates, left = [], []
     for world in (0, 1):
-        seconds, budget = _worth_asking(config, worlds, world)
+        seconds, budget = _worthwhile(config, worlds, world)
         candidates += seconds
         left.append(budget)
     for _, step, segment, world in sorted(candidates):
-        # Where both paths meet, one query serves both.
+        # Where both trajectories meet, one query serves both.
         free = plan[step, segment] or plan[step].sum() < config.bandwidth
         if left[world] and free:
             plan[step, segment] = True
@@ -97,41 +99,44 @@ def hunting_plan(config: EnvConfig, worlds: TwoWorlds) -> BoolArray:
     return plan
 
 
-def _worth_asking(
-    config: EnvConfig, worlds: TwoWorlds, world: int
+def _worthwhile(
+    config: EnvConfig, worlds: AdjacentWorlds, world: int
 ) -> tuple[list[tuple[float, int, int, int]], int]:
-    """Return (-gain, step, segment, world) of what may be asked of a path, and how many of it."""
-    path, horizon = worlds.paths[world], config.horizon_steps
-    unasked = np.isin(path.segment, always_observed(config))
-    seen = (unasked | (path.segment < config.corridor.n_mainline)) & (path.step >= 1)
-    seen &= path.step <= horizon
-    gains, unasked, path = (
-        _gains(Ruler.of(config), worlds, world)[seen],
-        unasked[seen],
-        path.only(seen),
+    """Return (-gain, step, segment, world) of possible queries, and how many of them to make."""
+    vehicle, horizon = worlds.trajectories[world], config.horizon_steps
+    always = np.isin(vehicle.segment, always_observed(config))
+    seen = (always | (vehicle.segment < config.corridor.n_mainline)) & (vehicle.step >= 1)
+    seen &= vehicle.step <= horizon
+    distances = ReleaseDistances.from_config(config)
+    gains, always, vehicle = (
+        _gains(distances, worlds, world)[seen],
+        always[seen],
+        vehicle.only(seen),
     )
-    cap = config.privacy.contribution_cap or horizon
-    spending = best_spending(gains, unasked, cap)
-    ask = ~unasked & (np.arange(len(gains)) < spending.stop)
-    columns = (-gains[ask], path.step[ask] - 1, path.segment[ask])
+    plan = plan_contributions(gains, always, config.privacy.contribution_cap or horizon)
+    chosen = ~always & (np.arange(len(gains)) < plan.stop)
+    columns = (-gains[chosen], vehicle.step[chosen] - 1, vehicle.segment[chosen])
     rows = zip(*(column.tolist() for column in columns), strict=True)
-    return [(*row, world) for row in rows], spending.asked
+    return [(*row, world) for row in rows], plan.n_queries
 
 
-def _gains(ruler: Ruler, worlds: TwoWorlds, world: int) -> FloatArray:
-    """What each second of one world's path tells, shape (m,); where both meet, half of it."""
-    own, other = worlds.paths[world], worlds.paths[1 - world]
-    gains = ruler.of_path(worlds.rest, own)
-    _, mine, its = np.intersect1d(own.step, other.step, assume_unique=True, return_indices=True)
-    meet = own.segment[mine] == other.segment[its]
-    mine, its = mine[meet], its[meet]
-    gains[mine] = 0.5 * ruler.of_meeting(worlds.rest, (own.only(mine), other.only(its)))
+def _gains(distances: ReleaseDistances, worlds: AdjacentWorlds, world: int) -> FloatArray:
+    """Return the gain of each second of a trajectory, shape (m,); half of it where both meet."""
+    vehicle, other = worlds.trajectories[world], worlds.trajectories[1 - world]
+    gains = distances.by_second(worlds.rest, vehicle)
+    _, here, there = np.intersect1d(
+        vehicle.step, other.step, assume_unique=True, return_indices=True
+    )
+    meet = vehicle.segment[here] == other.segment[there]
+    here, there = here[meet], there[meet]
+    pair = vehicle.only(here), other.only(there)
+    gains[here] = 0.5 * distances.where_equal(worlds.rest, pair)
     return gains
 
 
-def make_policy(config: EnvConfig, name: str, worlds: TwoWorlds) -> Planned:
+def make_policy(config: EnvConfig, name: str, worlds: AdjacentWorlds) -> FixedQueries:
     """Return the policy of a name in `POLICIES` for two worlds."""
     if name in PUBLIC_SCHEDULES:
-        return Planned(public_plan(config, name))
+        return FixedQueries(public_plan(config, name))
     plan = hunting_plan(config, worlds)
-    return Adaptive(plan) if name == "adaptive" else Planned(plan)
+    return AdaptiveQueries(plan) if name == "adaptive" else FixedQueries(plan)

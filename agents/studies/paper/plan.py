@@ -79,9 +79,6 @@ class PaperDesign(Design[PaperCell]):
         privacy_segments: CV segments of results 3, 4 and 5.
         n_timed: Most traffic seeds behind each time of result 5.
         estimators: Estimators of the paper; random walk and open loop are always run.
-
-    Raises:
-        ValueError: A value is out of range; the message names it.
     """
 
     cv_segments: tuple[int, ...] = tuple(range(5, 12))
@@ -92,9 +89,9 @@ class PaperDesign(Design[PaperCell]):
     n_timed: int = 10
     estimators: tuple[str, ...] = ESTIMATORS
 
-    def __post_init__(self) -> None:
-        """Check what no environment checks."""
-        super().__post_init__()
+    def check(self) -> None:
+        """See `Design.check`."""
+        super().check()
         if self.n_timed < 2:
             raise ValueError(f"n_timed must be >= 2, got {self.n_timed}")
         for name in self.estimators:

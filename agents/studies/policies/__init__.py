@@ -1,1 +1,1 @@
-"""Learned query policies against every baseline: frozen beforehand, run on test traffic, judged."""
+"""Learned query policies against every baseline: frozen, run on test traffic once, judged."""

@@ -1,112 +1,59 @@
-"""From policies to a manifest: what suits, what validation traffic says, what is chosen."""
+"""Freezing: which schedules suit a cell, and the choices that validation traffic makes."""
 
 from __future__ import annotations
 
 import dataclasses
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from agents.evaluation.episodes import EpisodeScore
 from agents.experiments.ledger import Ledger
-from agents.experiments.provenance import provenance
+from agents.experiments.provenance import environment_provenance, results_provenance
 from agents.studies.policies.manifest import Checkpoint, Choice, Manifest, Tuned
-from agents.studies.policies.plan import Cell, Design, Entry
-from agents.studies.policies.running import config_of, make_task, mean_error, suited
+from agents.studies.policies.plan import Entry, PolicyCell, PolicyDesign
+from agents.studies.policies.running import cell_config, make_task, suitable
 
-TEST, VALIDATION, ASKED = "episodes.csv", "validation.csv", "asked.csv"
-
-
-def plain(design: Design) -> dict[str, Any]:
-    """Return a design as plain JSON."""
-    content: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(design)))
-    return content
+TEST, VALIDATION, QUERIES = "episodes.csv", "validation.csv", "queries.csv"
 
 
-def design_of(content: Mapping[str, Any]) -> Design:
-    """Return the design that `plain` made JSON of.
-
-    Raises:
-        ValueError: A value is out of range.
-    """
-    cells = [
-        Cell(**{**own, **{key: tuple(own[key]) for key in ("transfers", "bounds", "without")}})
-        for own in content["cells"]
-    ]
-    others = {key: tuple(value) for key, value in content.items() if key != "cells"}
-    return Design(cells=tuple(cells), **others)
-
-
-@dataclasses.dataclass(frozen=True)
-class _OneCell:
-    """A design of one cell, as `agents.experiments.provenance.provenance` takes it."""
-
-    cell: Cell
-    seeds: tuple[int, ...]
-    schedule: str = "every baseline"
-
-    @property
-    def env(self) -> str:
-        return self.cell.env
-
-    def cells(self) -> list[Cell]:
-        return [self.cell]
-
-
-def origin_of(design: Design) -> dict[str, Any]:
-    """Return what the results depend on beside policies and seeds, for `take_folder`.
+def design_provenance(design: PolicyDesign) -> dict[str, Any]:
+    """Return the provenance of the results of a design but for policies and seeds.
 
     Raises:
         ValueError: A cell is out of range; the message names the value.
     """
-    parts = {cell.name: provenance(_OneCell(cell, design.test_seeds)) for cell in design.cells}
-    settings: dict[str, Any] = {}
-    for part in parts.values():
-        settings |= part["made_with"].pop("settings")
-    first = next(iter(parts.values()))
-    return {
-        **first,
-        "made_with": {
-            "cells": {name: part["made_with"] for name, part in parts.items()},
-            "settings": settings,
-        },
-        "tuned": sorted({name for part in parts.values() for name in part["tuned"]}),
+    configs = {cell.name: cell_config(cell, design.test_seeds) for cell in design.cells}
+    cells = {
+        cell.name: environment_provenance(cell.env, "every baseline", [configs[cell.name]])
+        for cell in design.cells
     }
+    return results_provenance({"cells": cells}, list(configs.values()))
 
 
 def draft(
-    design: Design, checkpoints: Sequence[Checkpoint], tuned: Sequence[Tuned], command: str
+    design: PolicyDesign, checkpoints: Sequence[Checkpoint], tuned: Sequence[Tuned], command: str
 ) -> Manifest:
-    """Return a manifest without choices, after trying everyone in every cell.
+    """Return a manifest without choices, after trying every policy in every cell.
 
     Raises:
-        ValueError: A policy does not fit its cell, settings fit no cell or belong to nobody, a
-            bound does not suit its cell, or a cell has no baseline.
+        ValueError: A policy does not fit its cell, settings fit no cell or no policy, a bound does
+            not suit its cell, or a cell has no baseline.
     """
-    fits = {
-        cell.name: suited(
-            cell, [name for name in (*design.baselines, *cell.bounds) if name not in cell.without]
-        )
-        for cell in design.cells
-    }
-    ladder = {
-        name: tuple(own for own in fit if own in design.baselines)
-        for name, (fit, _) in fits.items()
-    }
-    bounds = {
-        cell.name: tuple(own for own in fits[cell.name][0] if own in cell.bounds)
-        for cell in design.cells
-    }
-    unsuited = {
-        cell.name: fits[cell.name][1]
-        | {name: "left out for its cost" for name in cell.without if name in design.baselines}
-        for cell in design.cells
-    }
-    unsuited = {name: others for name, others in unsuited.items() if others}
+    ladder, bounds, unsuited = {}, {}, {}
+    for cell in design.cells:
+        tried = (*design.baselines, *cell.bounds)
+        fit, reasons = suitable(cell, [name for name in tried if name not in cell.without])
+        reasons |= {n: "left out for its cost" for n in cell.without if n in design.baselines}
+        ladder[cell.name] = tuple(name for name in fit if name in design.baselines)
+        bounds[cell.name] = tuple(name for name in fit if name in cell.bounds)
+        if reasons:
+            unsuited[cell.name] = reasons
     manifest = Manifest(
-        design=plain(design),
+        design=design.to_json(),
         command=command,
         checkpoints=tuple(checkpoints),
         tuned=tuple(tuned),
@@ -117,23 +64,22 @@ def draft(
     _check_tuned(design, manifest)
     for entry in manifest.entries(design, bounds=False):
         if entry.kind == "learned":
-            task = make_task(entry, design, manifest, seeds=(0,), noise=0)
-            task.make()
+            make_task(entry, design, manifest, seeds=(0,), noise=0).make()
     return manifest
 
 
-def _check_tuned(design: Design, manifest: Manifest) -> None:
-    """Refuse settings that nobody would use: a wrong name would otherwise go unnoticed."""
-    names = {*design.baselines, *(own.recipe for own in manifest.checkpoints)}
+def _check_tuned(design: PolicyDesign, manifest: Manifest) -> None:
+    """Refuse settings that no policy would use: a wrong name would otherwise go unnoticed."""
+    names = {*design.baselines, *(checkpoint.recipe for checkpoint in manifest.checkpoints)}
     names |= {name for cell in design.cells for name in cell.bounds}
-    for own in manifest.tuned:
-        if own.policy not in names:
-            raise ValueError(f"settings are given for {own.policy!r}, which is not run")
-        configs = [config_of(cell, (0,)) for cell in design.cells]
-        if all(manifest.settings(own.policy, config) is None for config in configs):
+    configs = [cell_config(cell, (0,)) for cell in design.cells]
+    for tuned in manifest.tuned:
+        if tuned.policy not in names:
+            raise ValueError(f"settings are given for {tuned.policy!r}, which is not run")
+        if all(manifest.settings(tuned.policy, config) is None for config in configs):
             raise ValueError(
-                f"settings of {own.policy!r} are for {own.estimator}, {own.parameters}, "
-                f"{own.privacy}: no cell is that"
+                f"settings of {tuned.policy!r} are for {tuned.estimator}, {tuned.parameters}, "
+                f"{tuned.privacy}: no cell is that"
             )
 
 
@@ -150,51 +96,57 @@ def check_untouched(folder: Path) -> None:
         )
 
 
-def begin(folder: Path, own: Manifest) -> Manifest:
-    """Put a draft into a folder, or go on with the same one there.
+def begin(folder: Path, drafted: Manifest) -> Manifest:
+    """Put a draft into a folder, or go on with the same draft there.
 
     Raises:
-        ValueError: The folder has a manifest of something else.
+        ValueError: The folder has another manifest.
     """
     try:
-        before = Manifest.read(folder)
+        recorded = Manifest.read(folder)
     except FileNotFoundError:
-        own.write(folder)
-        return own
-    kept = dataclasses.replace(before, choices={}, frozen="", command=own.command)
-    if kept.digest != own.digest:
+        drafted.write(folder)
+        return drafted
+    undecided = dataclasses.replace(recorded, choices={}, frozen="", command=drafted.command)
+    if undecided.digest != drafted.digest:
         raise ValueError(
             f"{folder} has a manifest of other policies, cells or settings: choose another "
             "--output, or remove the folder to start over"
         )
-    return before
+    return recorded
 
 
-def choose(design: Design, manifest: Manifest, ledger: Ledger[Entry, EpisodeScore]) -> Manifest:
-    """Return the manifest with what validation traffic decides, frozen.
+def choose(
+    design: PolicyDesign, manifest: Manifest, ledger: Ledger[Entry, EpisodeScore]
+) -> Manifest:
+    """Return the manifest with the choices of validation traffic, frozen.
 
     Args:
-        design: What is run.
+        design: The design.
         manifest: The draft.
         ledger: Scores on validation traffic of all its entries without bounds.
     """
     choices = {cell.name: _choice(cell, design, manifest, ledger) for cell in design.cells}
-    now = datetime.now(UTC).isoformat(timespec="seconds")
-    return dataclasses.replace(manifest, choices=choices, frozen=now)
+    time = datetime.now(UTC).isoformat(timespec="seconds")
+    return dataclasses.replace(manifest, choices=choices, frozen=time)
 
 
 def _choice(
-    cell: Cell, design: Design, manifest: Manifest, ledger: Ledger[Entry, EpisodeScore]
+    cell: PolicyCell,
+    design: PolicyDesign,
+    manifest: Manifest,
+    ledger: Ledger[Entry, EpisodeScore],
 ) -> Choice:
-    seeds = design.validation_seeds
+    def mean_error(entry: Entry) -> float:
+        scores = (ledger.rows[entry, seed] for seed in design.validation_seeds)
+        return float(np.mean([-score.reward for score in scores]))
+
     baselines = {
-        name: mean_error(ledger, Entry(cell.name, "baseline", name), seeds)
-        for name in manifest.ladder[cell.name]
+        name: mean_error(Entry(cell.name, "baseline", name)) for name in manifest.ladder[cell.name]
     }
     learners = {}
     for learner in manifest.learners(cell):
-        runs = [learner.entry(seed) for seed in manifest.runs(learner)]
-        errors = [mean_error(ledger, entry, seeds) for entry in runs]
+        errors = [mean_error(learner.entry(seed)) for seed in manifest.runs(learner)]
         learners[learner.policy, learner.mode] = sum(errors) / len(errors)
     best = {cell.name: min(learners, key=lambda pair: learners[pair])} if learners else {}
     named = {f"{policy}, {mode}": error for (policy, mode), error in learners.items()}

@@ -1,4 +1,4 @@
-"""The manifest: which policies and which choices are fixed before test traffic is touched."""
+"""The manifest: the policies and choices that are fixed before test traffic is touched."""
 
 from __future__ import annotations
 
@@ -10,8 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from agents.evaluation.policies import Saved
-from agents.studies.policies.plan import MODES, Cell, Design, Entry, Learner
+from agents.evaluation.policies import SavedPolicy, read_saved_policy
+from agents.experiments.files import write_json
+from agents.studies.policies.plan import MODES, Entry, Learner, PolicyCell, PolicyDesign
+from dptse_env.config import EnvConfig
 from dptse_env.estimators.tuning import read_settings
 
 FILE = "manifest.json"
@@ -23,9 +25,9 @@ class Checkpoint:
 
     Attributes:
         cell: Cell that it was trained for.
-        recipe: Recipe that it was trained by, or the name that it was given.
+        recipe: Recipe that trained it, or the name that it was given.
         training_seed: Seed of its training.
-        action: Action encoding that it speaks.
+        action: Its action encoding.
         path: Its file.
         sha256: Digest of that file.
     """
@@ -37,14 +39,14 @@ class Checkpoint:
     path: str
     sha256: str
 
-    def saved(self) -> Saved:
-        """Return the file behind it.
+    def saved(self) -> SavedPolicy:
+        """Return the saved policy.
 
         Raises:
             FileNotFoundError: It is gone.
             ValueError: It is not the file that was frozen.
         """
-        saved = Saved.of(self.path)
+        saved = read_saved_policy(self.path)
         if saved.sha256 != self.sha256:
             raise ValueError(
                 f"{self.path} is not the policy that was frozen: its sha256 is {saved.sha256}, the "
@@ -58,7 +60,7 @@ class Tuned:
     """Estimator settings that were tuned for one policy, as ``scripts/tune.py`` writes them.
 
     Attributes:
-        policy: Schedule or recipe that alone uses them.
+        policy: The schedule or recipe that uses them.
         estimator: Estimator that they are for.
         parameters: ARZ parameter set that they are for.
         privacy: Privacy preset that they are for.
@@ -74,7 +76,7 @@ class Tuned:
 
 @dataclass(frozen=True)
 class Choice:
-    """What validation traffic decided in a cell.
+    """The choices in a cell that validation traffic decided.
 
     Attributes:
         baseline: The schedule of least error.
@@ -92,15 +94,15 @@ class Manifest:
     """Everything that is fixed before test traffic is touched.
 
     Attributes:
-        design: What is run, as plain JSON.
+        design: The design, as plain JSON.
         command: The command that froze it.
         checkpoints: The policies.
-        tuned: Settings of the estimator that policies bring along.
+        tuned: Estimator settings that were tuned for single policies.
         ladder: By cell, the baselines that suit it.
         bounds: By cell, the oracles that suit it.
-        unsuited: By cell, why other baselines and oracles do not.
+        unsuited: By cell, the reasons why other baselines and oracles do not.
         choices: By cell; empty until validation is done.
-        frozen: When, in UTC; empty until then.
+        frozen: Time of freezing, in UTC; empty until then.
     """
 
     design: dict[str, Any]
@@ -114,11 +116,8 @@ class Manifest:
     frozen: str = ""
 
     def write(self, folder: Path) -> None:
-        """Write it to a folder, whole or not at all."""
-        aside = folder / f"{FILE}.tmp"
-        text = json.dumps(dataclasses.asdict(self), indent=2, sort_keys=True)
-        aside.write_text(text + "\n", encoding="utf-8")
-        aside.replace(folder / FILE)
+        """Write the manifest to a folder in one piece."""
+        write_json(folder / FILE, dataclasses.asdict(self), sort_keys=True)
 
     @classmethod
     def read(cls, folder: Path) -> Manifest:
@@ -131,32 +130,32 @@ class Manifest:
         path = folder / FILE
         if not path.exists():
             raise FileNotFoundError(
-                f"{path} is missing: freeze policies first, with `policy_study.py freeze`"
+                f"{path} is missing: freeze policies first, with `study.py policies freeze`"
             )
         try:
-            whole = json.loads(path.read_text(encoding="utf-8"))
+            content = json.loads(path.read_text(encoding="utf-8"))
             choices = {
-                name: Choice(
-                    own["baseline"],
-                    {key: (pair[0], pair[1]) for key, pair in own["learners"].items()},
-                    own["errors"],
+                cell: Choice(
+                    choice["baseline"],
+                    {origin: (pair[0], pair[1]) for origin, pair in choice["learners"].items()},
+                    choice["errors"],
                 )
-                for name, own in whole.pop("choices").items()
+                for cell, choice in content.pop("choices").items()
             }
             return cls(
-                checkpoints=tuple(Checkpoint(**own) for own in whole.pop("checkpoints")),
-                tuned=tuple(Tuned(**own) for own in whole.pop("tuned")),
-                ladder={name: tuple(own) for name, own in whole.pop("ladder").items()},
-                bounds={name: tuple(own) for name, own in whole.pop("bounds").items()},
+                checkpoints=tuple(Checkpoint(**fields) for fields in content.pop("checkpoints")),
+                tuned=tuple(Tuned(**fields) for fields in content.pop("tuned")),
+                ladder={cell: tuple(names) for cell, names in content.pop("ladder").items()},
+                bounds={cell: tuple(names) for cell, names in content.pop("bounds").items()},
                 choices=choices,
-                **whole,
+                **content,
             )
         except (json.JSONDecodeError, KeyError, TypeError) as problem:
             raise ValueError(f"{path} is not as this program writes it: {problem!r}") from problem
 
     @property
     def digest(self) -> str:
-        """Digest of what is fixed."""
+        """Digest of the manifest."""
         plain = json.dumps(dataclasses.asdict(self), sort_keys=True)
         return hashlib.sha256(plain.encode()).hexdigest()[:12]
 
@@ -167,26 +166,28 @@ class Manifest:
             ValueError: It was not frozen.
         """
         wanted = entry.trained_in, entry.policy, entry.training_seed
-        for own in self.checkpoints:
-            if (own.cell, own.recipe, own.training_seed) == wanted:
-                return own
+        for checkpoint in self.checkpoints:
+            if (checkpoint.cell, checkpoint.recipe, checkpoint.training_seed) == wanted:
+                return checkpoint
         raise ValueError(f"the manifest has no policy {wanted}")
 
-    def settings(self, policy: str, config: Any) -> dict[str, Any] | None:
-        """Return the settings that a policy brings along for a configuration, None if none."""
+    def settings(self, policy: str, config: EnvConfig) -> dict[str, Any] | None:
+        """Return the settings tuned for a policy in a configuration, None if none."""
         place = config.estimator, str(config.parameters), config.privacy.preset
-        for own in self.tuned:
-            if (own.policy, own.estimator, own.parameters, own.privacy) == (policy, *place):
-                return own.settings
+        for tuned in self.tuned:
+            if (tuned.policy, tuned.estimator, tuned.parameters, tuned.privacy) == (policy, *place):
+                return tuned.settings
         return None
 
-    def learners(self, cell: Cell) -> list[Learner]:
-        """Return who is run in a cell: its own recipes in both modes, and what moved there.
+    def learners(self, cell: PolicyCell) -> list[Learner]:
+        """Return the learned policies that are run in a cell.
 
-        Of a cell whose policies are moved, only the recipe and mode that its own validation chose.
+        These are the recipes trained for it, in both modes, and transfers: of each other cell the
+        recipe and mode that its validation chose.
         """
-        own = dict.fromkeys(one.recipe for one in self.checkpoints if one.cell == cell.name)
-        found = [Learner(cell.name, recipe, cell.name, mode) for recipe in own for mode in MODES]
+        trained = (each for each in self.checkpoints if each.cell == cell.name)
+        recipes = dict.fromkeys(checkpoint.recipe for checkpoint in trained)
+        found = [Learner(cell.name, name, cell.name, mode) for name in recipes for mode in MODES]
         for origin in cell.transfers:
             if origin in self.choices and origin in self.choices[origin].learners:
                 recipe, mode = self.choices[origin].learners[origin]
@@ -197,18 +198,18 @@ class Manifest:
         """Return the training seeds of a learner, ascending."""
         return tuple(
             sorted(
-                one.training_seed
-                for one in self.checkpoints
-                if (one.cell, one.recipe) == (learner.trained_in, learner.policy)
+                checkpoint.training_seed
+                for checkpoint in self.checkpoints
+                if (checkpoint.cell, checkpoint.recipe) == (learner.trained_in, learner.policy)
             )
         )
 
-    def entries(self, design: Design, bounds: bool = True) -> list[Entry]:
-        """Return everyone who is run in every cell.
+    def entries(self, design: PolicyDesign, bounds: bool = True) -> list[Entry]:
+        """Return all policies that are run, in every cell.
 
         Args:
-            design: What is run.
-            bounds: Whether the oracles are, too.
+            design: The design.
+            bounds: Whether oracles are among them.
         """
         entries = []
         for cell in design.cells:
@@ -221,14 +222,14 @@ class Manifest:
 
 
 def find_checkpoints(
-    given: Sequence[str], design: Design, which: str = "best.zip"
+    given: Sequence[str], design: PolicyDesign, which: str = "best.zip"
 ) -> tuple[Checkpoint, ...]:
     """Return the policies that were named, in order.
 
     Args:
         given: ``cell=path`` or ``cell:name=path``; a path is a saved policy, a run folder, or a
-            folder of those. A name tells apart what one recipe gave with different arguments.
-        design: Its cells may be named.
+            folder of those. A name tells policies of one recipe with other arguments apart.
+        design: The design, whose cells may be named.
         which: The file to take from a run folder.
 
     Raises:
@@ -243,7 +244,7 @@ def find_checkpoints(
         cell_name, _, name = place.partition(":")
         cell = design.cell(cell_name)
         for file in _files(Path(path), which):
-            saved = Saved.of(file)
+            saved = read_saved_policy(file)
             key = cell.name, name or saved.recipe, saved.training_seed
             if key in found:
                 raise ValueError(
@@ -264,7 +265,7 @@ def _files(path: Path, which: str) -> list[Path]:
 
 
 def read_tuned(given: Iterable[str]) -> tuple[Tuned, ...]:
-    """Return settings that policies bring along, given as ``policy=file``.
+    """Return settings tuned for single policies, given as ``policy=file``.
 
     Raises:
         ValueError: A file is not as ``scripts/tune.py`` writes it, or two are for one place.

@@ -1,16 +1,18 @@
-"""What is run: the cells, the ladder of baselines, and who stands on it."""
+"""Plan of the study of policies: its cells, baselines and learned policies."""
 
 from __future__ import annotations
 
 import dataclasses
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from agents.evaluation.episodes import check_held_out
+from agents.evaluation.episodes import check_test_seeds
 from dptse_env.config import TEST_SEEDS, VALIDATION_SEEDS
 from dptse_env.schedules import INFORMED, ORACLES, PLANS, SCHEDULES
 from dptse_env.traffic import CORRIDORS
+from dptse_env.traffic.incident import Incident
 
 PRIVATE = "dptse_env:dptse/PrivateHighway-v0"
 PAPER = "dptse_env:dptse/PaperHighway-v0"
@@ -22,21 +24,21 @@ DETERMINISTIC, STOCHASTIC = MODES = ("deterministic", "stochastic")
 
 
 @dataclass(frozen=True)
-class Cell:
-    """One environment, with all who are compared in it.
+class PolicyCell:
+    """An environment in which policies are compared.
 
     Attributes:
         name: Short name.
-        says: What it is, in words.
+        description: Description of the environment.
         env: Environment id.
         keywords: Keywords of ``gym.make`` that make it.
         transfers: Cells whose learned policies are run here, too, without training.
         bounds: Oracles that are run; they see the truth.
-        without: Schedules that would suit but take too long to be run here, too.
+        without: Schedules that suit the cell but take too long.
     """
 
     name: str
-    says: str
+    description: str
     env: str
     keywords: Mapping[str, Any]
     transfers: tuple[str, ...] = ()
@@ -44,12 +46,13 @@ class Cell:
     without: tuple[str, ...] = ("rollout",)
 
 
-def _private(name: str, says: str, **fields: Any) -> Cell:
-    own = {"estimator": "ekf", "bandwidth": 5, **fields.pop("keywords", {})}
-    return Cell(name, says, PRIVATE, own, **fields)
+def _private(name: str, description: str, **fields: Any) -> PolicyCell:
+    keywords = {"estimator": "ekf", "bandwidth": 5, **fields.pop("keywords", {})}
+    return PolicyCell(name, description, PRIVATE, keywords, **fields)
 
 
-_INCIDENT = dataclasses.asdict(CORRIDORS["paper-highway"].incident)  # type: ignore[arg-type]
+_INCIDENT = CORRIDORS["paper-highway"].incident
+assert isinstance(_INCIDENT, Incident)
 CELLS = (
     _private(
         PRIMARY,
@@ -57,10 +60,10 @@ CELLS = (
         bounds=("oracle-error", "oracle-greedy"),
         without=(),
     ),
-    Cell("paper", "PaperHighway, EKF, B = 5", PAPER, {"estimator": "ekf", "bandwidth": 5}),
+    PolicyCell("paper", "PaperHighway, EKF, B = 5", PAPER, {"estimator": "ekf", "bandwidth": 5}),
     *(
-        _private(name, says, keywords=keywords, transfers=(PRIMARY,))
-        for name, says, keywords in (
+        _private(name, description, keywords=keywords, transfers=(PRIMARY,))
+        for name, description, keywords in (
             ("bandwidth-3", "B = 3", {"bandwidth": 3}),
             ("bandwidth-7", "B = 7", {"bandwidth": 7}),
             ("ukf", "UKF", {"estimator": "ukf"}),
@@ -70,32 +73,32 @@ CELLS = (
             (
                 "paper-incident",
                 "the paper's incident in place of random ones",
-                {"incident": _INCIDENT},
+                {"incident": dataclasses.asdict(_INCIDENT)},
             ),
         )
     ),
 )
 """The primary cell, then the secondary ones."""
 BASELINES = (*(name for name in SCHEDULES if name not in ("none", "all")), *INFORMED, *PLANS)
-"""Policies that need no training: the ladder that a learned one must climb."""
+"""Policies that need no training, against which learned policies are held."""
 
 
 @dataclass(frozen=True)
-class Design:
-    """Everything that is run.
+class PolicyDesign:
+    """The cells of the study, their baselines and traffic.
 
     Attributes:
         cells: The cells, the primary one first.
         baselines: Schedules that need no training; those that do not suit a cell are left out.
         validation_seeds: Traffic on which the best baseline and the best recipe are chosen; by
-            default apart from that on which a training keeps its best policy.
-        test_seeds: Traffic of everything that is reported.
+            default disjoint from the traffic on which a training keeps its best policy.
+        test_seeds: Traffic of all reported results.
 
     Raises:
         ValueError: A value is out of range; the message names it.
     """
 
-    cells: tuple[Cell, ...] = CELLS
+    cells: tuple[PolicyCell, ...] = CELLS
     baselines: tuple[str, ...] = BASELINES
     validation_seeds: tuple[int, ...] = tuple(VALIDATION_SEEDS[100:164])
     test_seeds: tuple[int, ...] = tuple(TEST_SEEDS[:64])
@@ -105,7 +108,7 @@ class Design:
         names = [cell.name for cell in self.cells]
         if not names or names[0] != PRIMARY or len(set(names)) < len(names):
             raise ValueError(f"cells must be distinct and begin with {PRIMARY!r}, got {names}")
-        check_held_out(self.test_seeds)
+        check_test_seeds(self.test_seeds, "test_seeds")
         chosen = self.validation_seeds
         if len(set(chosen)) < max(len(chosen), 2) or set(chosen) - set(VALIDATION_SEEDS):
             raise ValueError(
@@ -118,7 +121,7 @@ class Design:
                 f"baselines must hold {REFERENCE!r} and no oracle, got {self.baselines}"
             )
 
-    def cell(self, name: str) -> Cell:
+    def cell(self, name: str) -> PolicyCell:
         """Return a cell by its name.
 
         Raises:
@@ -130,28 +133,51 @@ class Design:
         known = ", ".join(cell.name for cell in self.cells)
         raise ValueError(f"cell must be one of {known}, got {name!r}")
 
+    def quick(self) -> PolicyDesign:
+        """Return a design of the primary cell alone, on few seeds."""
+        return dataclasses.replace(
+            self,
+            cells=self.cells[:1],
+            validation_seeds=self.validation_seeds[:8],
+            test_seeds=self.test_seeds[:8],
+        )
 
-def quick(design: Design) -> Design:
-    """Return a design of the primary cell alone, on few seeds."""
-    return dataclasses.replace(
-        design,
-        cells=design.cells[:1],
-        validation_seeds=design.validation_seeds[:8],
-        test_seeds=design.test_seeds[:8],
-    )
+    def to_json(self) -> dict[str, Any]:
+        """Return the design as plain JSON."""
+        content: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(self)))
+        return content
+
+    @classmethod
+    def from_json(cls, content: Mapping[str, Any]) -> PolicyDesign:
+        """Return the design of plain JSON.
+
+        Raises:
+            ValueError: A value is out of range.
+        """
+        cells = []
+        for recorded in content["cells"]:
+            fields: dict[str, Any] = {
+                key: tuple(value) if isinstance(value, list) else value
+                for key, value in recorded.items()
+            }
+            # Manifests that were frozen with another name of this field stay readable.
+            fields.setdefault("description", fields.pop("says", ""))
+            cells.append(PolicyCell(**fields))
+        rest = {key: tuple(value) for key, value in content.items() if key != "cells"}
+        return cls(cells=tuple(cells), **rest)
 
 
 @dataclass(frozen=True)
 class Entry:
-    """A policy in a cell, run on every traffic seed: what a ledger's rows are of.
+    """A policy in a cell, run on every traffic seed: the key of the ledgers.
 
     Attributes:
         cell: Name of the cell.
         kind: ``baseline``, ``bound`` or ``learned``.
         policy: Name of the schedule or of the recipe.
-        trained_in: Cell that a learned policy was trained for; empty for others.
-        training_seed: Seed of its training; -1 for others.
-        mode: How it acts, one of `MODES`; schedules have one way only.
+        trained_in: Cell that a learned policy was trained for; empty for schedules.
+        training_seed: Seed of its training; -1 for schedules.
+        mode: One of `MODES`; schedules have one only.
     """
 
     cell: str
@@ -164,7 +190,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Learner:
-    """The runs of one recipe, by whatever training seeds there are, in one cell and one mode.
+    """The policies of one recipe, of all its training seeds, in one cell and one mode.
 
     Attributes:
         cell: Cell in which it is run.
@@ -179,11 +205,11 @@ class Learner:
     mode: str
 
     def entry(self, training_seed: int) -> Entry:
-        """Return the entry of one of its runs."""
+        """Return the entry of a training seed."""
         return Entry(self.cell, "learned", self.policy, self.trained_in, training_seed, self.mode)
 
     @property
     def label(self) -> str:
-        """Name it in figures and tables."""
+        """The name in figures and tables."""
         moved = "" if self.trained_in == self.cell else f", from {self.trained_in}"
         return self.policy + moved + (" (drawn)" if self.mode == STOCHASTIC else "")

@@ -1,8 +1,8 @@
-"""The scores of a run as statistics over training seeds and traffic seeds."""
+"""Results of the study of policies: statistics over training seeds and traffic seeds."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -10,7 +10,6 @@ import numpy as np
 
 from agents.evaluation.episodes import EpisodeScore
 from agents.evaluation.statistics import (
-    FloatArray,
     Interval,
     bootstrap,
     crossed_t,
@@ -19,17 +18,15 @@ from agents.evaluation.statistics import (
     percent_of_way,
     worst_row,
 )
+from agents.experiments import cells
 from agents.studies.policies.curves import Curve
 from agents.studies.policies.manifest import Choice, Manifest
-from agents.studies.policies.plan import PRIMARY, REFERENCE, Design, Entry, Learner
-from agents.studies.policies.queries import Asked
+from agents.studies.policies.plan import PRIMARY, REFERENCE, Entry, Learner, PolicyDesign
+from agents.studies.policies.queries import QueryCounts
+from dptse_env.arrays import FloatArray
 
-ERROR, DENSITY, SPEED = "error", "rmse_density", "rmse_speed"
-METRICS = {
-    ERROR: ("density-and-speed", "× 1000"),
-    DENSITY: ("density", "veh/km"),
-    SPEED: ("speed", "km/h"),
-}
+ERROR = "error"
+METRICS = {ERROR: ("density-and-speed", "× 1000"), **cells.METRICS}
 """Name and unit of each error."""
 ERROR_ORACLE = "oracle-error"
 
@@ -41,10 +38,10 @@ class Comparison:
     Attributes:
         learner: The policy.
         baseline: The baseline, chosen on validation traffic.
-        below: By how much its error lies below the baseline's [%], two-level bootstrap.
-        difference: Baseline's error minus its own, crossed t.
+        below: How far its error lies below the baseline's [%], two-level bootstrap.
+        difference: Error of the baseline minus that of the policy, crossed t.
         p_value: Of a zero difference, crossed t.
-        adjusted: The same after Holm over all secondary comparisons.
+        adjusted: The p-value after Holm over all secondary comparisons.
     """
 
     learner: Learner
@@ -56,29 +53,29 @@ class Comparison:
 
     @property
     def verdict(self) -> str:
-        """Whether the difference can be told from zero at 5 % in all."""
+        """The direction of a difference that is significant at 5 % over all comparisons."""
         if self.adjusted >= 0.05:
-            return "not told apart"
+            return "not significant"
         return "better" if self.difference.mean > 0.0 else "worse"
 
 
 @dataclass(frozen=True)
-class Measured:
-    """What was run, and what came of it.
+class PolicyResults:
+    """Scores, queries and learning curves of a design.
 
     Attributes:
-        design: What was run.
-        manifest: What had been fixed before.
+        design: The design.
+        manifest: The policies and choices that were frozen.
         scores: Score by entry and test seed.
-        asked: Queries by entry of the primary cell and test seed.
+        queries: Queries by entry of the primary cell and test seed.
         curves: Learning curves of the policies of the primary cell.
         n_resamples: Resamples of every bootstrap.
     """
 
-    design: Design
+    design: PolicyDesign
     manifest: Manifest
     scores: Mapping[tuple[Entry, int], EpisodeScore]
-    asked: Mapping[tuple[Entry, int], Asked]
+    queries: Mapping[tuple[Entry, int], QueryCounts]
     curves: Sequence[Curve]
     n_resamples: int = 10_000
 
@@ -105,16 +102,16 @@ class Measured:
         seeds = self.manifest.runs(learner)
         return self.table([learner.entry(seed) for seed in seeds], metric)
 
-    def interval(self, statistic: object, *tables: FloatArray) -> Interval:
+    def interval(self, statistic: Callable[..., FloatArray], *tables: FloatArray) -> Interval:
         """Return a statistic with its two-level bootstrap interval."""
-        return bootstrap(statistic, *tables, n_resamples=self.n_resamples)  # type: ignore[arg-type]
+        return bootstrap(statistic, *tables, n_resamples=self.n_resamples)
 
     def below(self, table: FloatArray, reference: FloatArray) -> Interval:
-        """Return by how much errors lie below those of a reference [%]."""
+        """Return how far errors lie below those of a reference [%]."""
         return self.interval(percent_below, table, reference)
 
     def choice(self, cell: str) -> Choice:
-        """Return what validation traffic decided in a cell."""
+        """Return the choices of validation traffic in a cell."""
         return self.manifest.choices[cell]
 
     def best_on_test(self, cell: str) -> str:
@@ -124,7 +121,7 @@ class Measured:
 
     @property
     def primary(self) -> Learner | None:
-        """The learned policy that the targets are about; None where none was frozen."""
+        """The learned policy of the targets; None if none was frozen."""
         chosen = self.choice(PRIMARY).learners.get(PRIMARY)
         return None if chosen is None else Learner(PRIMARY, chosen[0], PRIMARY, chosen[1])
 
@@ -141,8 +138,8 @@ class Measured:
         """Return the place of the training seed of largest error on test traffic."""
         return worst_row(self.learned(learner))
 
-    def of_way(self, learner: Learner) -> Interval | None:
-        """Return how far a policy came from the best baseline to the error oracle [%]."""
+    def progress(self, learner: Learner) -> Interval | None:
+        """Return how far a policy is from the best baseline to the error oracle [%]."""
         cell = learner.cell
         if ERROR_ORACLE not in self.manifest.bounds[cell]:
             return None
@@ -154,7 +151,7 @@ class Measured:
 
     @cached_property
     def comparisons(self) -> list[Comparison]:
-        """Every learned policy of the secondary cells against the best baseline there."""
+        """Comparisons of all learned policies of the secondary cells with the best baseline."""
         pairs = [
             (learner, self.choice(cell.name).baseline)
             for cell in self.design.cells[1:]
@@ -178,7 +175,7 @@ class Measured:
 
     @property
     def references(self) -> tuple[str, str]:
-        """The primary cell's best baseline, chosen on validation traffic, and the paper's."""
+        """The best baseline of the primary cell, and the paper's schedule."""
         return self.choice(PRIMARY).baseline, REFERENCE
 
 

@@ -1,52 +1,53 @@
-"""Runs entries: all traffic seeds of a policy in a cell at once."""
+"""Running entries: all traffic seeds of a policy in a cell at once."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
-from agents.evaluation.episodes import EpisodeScore, Policy, make_vector, run_episodes
-from agents.evaluation.policies import Saved
-from agents.experiments.ledger import Ledger
-from agents.experiments.runner import void_on_purpose
+from agents.evaluation.episodes import (
+    EpisodeScore,
+    Policy,
+    make_vector,
+    run_episodes,
+    without_void_warning,
+)
+from agents.evaluation.policies import NamedSchedule, PolicySource, SavedPolicy
 from agents.studies.policies.manifest import Manifest
-from agents.studies.policies.plan import DETERMINISTIC, Cell, Design, Entry
-from agents.studies.policies.queries import Asked, Watch
+from agents.studies.policies.plan import DETERMINISTIC, Entry, PolicyCell, PolicyDesign
+from agents.studies.policies.queries import QueryCounter, QueryCounts
 from dptse_env.config import EnvConfig
 from dptse_env.policies import TRANSFERABLE
-from dptse_env.schedules import make_schedule
 from dptse_env.vector_env import SensorQueryVectorEnv
 
 POLICY_SEED = 0
-"""Seeds what a schedule draws, and torch where a learned policy draws."""
+"""Seeds the draws of a schedule, and torch for the draws of a learned policy."""
 
 
 @dataclass(frozen=True)
-class Task:
+class EntryTask:
     """An entry on traffic seeds, with everything that a worker needs.
 
     Attributes:
         cell: The entry.
+        policy: Its policy.
         env: Environment id.
         keywords: Keywords of ``gym.make_vec``.
         seeds: Traffic seeds.
         noise: Noise is seeded with this plus the traffic seed.
-        saved: The learned policy; None for a schedule.
-        moved: Whether it acts in a cell that it was not trained for.
+        transferred: Whether the policy acts in a cell that it was not trained for.
         records: Folder of the record cache; None for the user's cache.
         threads: Threads that estimate; None for one per core.
     """
 
     cell: Entry
+    policy: PolicySource
     env: str
     keywords: Mapping[str, Any]
     seeds: tuple[int, ...]
     noise: int
-    saved: Saved | None
-    moved: bool
+    transferred: bool
     records: str | None
     threads: int | None
 
@@ -57,11 +58,10 @@ class Task:
             ValueError: A keyword is out of range, or the policy does not suit.
         """
         env = make_batch(self.env, self.keywords, self.seeds, self.records, self.threads)
-        if self.saved is None:
-            return env, make_schedule(self.cell.policy, env, POLICY_SEED)
-        # Another incident is another corridor to `load_policy`. What it sees and how it acts must
+        # Another incident is another corridor to a saved policy; its observations and actions must
         # be the same all the same.
-        return env, self.saved.load(env, allow=TRANSFERABLE if self.moved else ())
+        allow = TRANSFERABLE if self.transferred else ()
+        return env, self.policy.load(env, allow=allow, seed=POLICY_SEED)
 
 
 def make_batch(
@@ -76,12 +76,12 @@ def make_batch(
     Raises:
         ValueError: A keyword is unknown or out of range.
     """
-    with void_on_purpose():
-        more = {"traffic_seeds": list(seeds), "records": records, "threads": threads}
+    more = {"traffic_seeds": list(seeds), "records": records, "threads": threads}
+    with without_void_warning():
         return make_vector(env, len(seeds), {**keywords, **more})
 
 
-def config_of(cell: Cell, seeds: Sequence[int]) -> EnvConfig:
+def cell_config(cell: PolicyCell, seeds: Sequence[int]) -> EnvConfig:
     """Return the configuration of a cell.
 
     Raises:
@@ -90,24 +90,26 @@ def config_of(cell: Cell, seeds: Sequence[int]) -> EnvConfig:
     return make_batch(cell.env, cell.keywords, seeds).config
 
 
-def run_entry(task: Task) -> list[EpisodeScore]:
+def run_entry(task: EntryTask) -> list[EpisodeScore]:
     """Run an entry on all its seeds."""
-    env, policy = task.make()
-    return _run(task, env, policy)
+    return _run(task, *task.make())
 
 
-def watch_entry(task: Task) -> list[Asked]:
-    """Run an entry and return whom it asked."""
+def count_queries(task: EntryTask) -> list[QueryCounts]:
+    """Run an entry and return its queries."""
     env, policy = task.make()
-    watch = Watch(env.process, task.seeds)
-    _run(task, env, policy, watch)
-    return watch.asked()
+    counter = QueryCounter(env.process, task.seeds)
+    _run(task, env, policy, counter)
+    return counter.results()
 
 
 def _run(
-    task: Task, env: SensorQueryVectorEnv, policy: Policy, watch: Watch | None = None
+    task: EntryTask,
+    env: SensorQueryVectorEnv,
+    policy: Policy,
+    on_second: Callable[[], None] | None = None,
 ) -> list[EpisodeScore]:
-    if task.saved is not None:
+    if isinstance(task.policy, SavedPolicy):
         import torch  # noqa: PLC0415 (schedules alone do without)
 
         torch.manual_seed(POLICY_SEED)
@@ -117,65 +119,61 @@ def _run(
         traffic_seeds=task.seeds,
         seeds=[task.noise + seed for seed in task.seeds],
         deterministic=task.cell.mode == DETERMINISTIC,
-        on_second=watch,
+        on_second=on_second,
     )
 
 
 def make_task(
     entry: Entry,
-    design: Design,
+    design: PolicyDesign,
     manifest: Manifest,
     *,
     seeds: Sequence[int],
     noise: int,
     records: str | None = None,
     threads: int | None = None,
-) -> Task:
-    """Return the task of an entry, with the policy that was frozen and the settings it brings.
+) -> EntryTask:
+    """Return the task of an entry, with the frozen policy and the settings tuned for it.
 
     Raises:
         FileNotFoundError: The file of a frozen policy is gone.
         ValueError: It is not the file that was frozen.
     """
     cell = design.cell(entry.cell)
-    keywords = dict(cell.keywords)
-    settings = manifest.settings(entry.policy, config_of(cell, seeds))
+    policy: PolicySource = NamedSchedule(entry.policy)
+    if entry.kind == "learned":
+        policy = manifest.checkpoint(entry).saved()
+    keywords = {**cell.keywords, **policy.keywords}
+    settings = manifest.settings(entry.policy, cell_config(cell, seeds))
     if settings is not None:
         keywords["estimator_settings"] = settings
-    saved = None
-    if entry.kind == "learned":
-        checkpoint = manifest.checkpoint(entry)
-        saved, keywords["action"] = checkpoint.saved(), checkpoint.action
-    moved = entry.trained_in not in ("", entry.cell)
-    return Task(entry, cell.env, keywords, tuple(seeds), noise, saved, moved, records, threads)
+    return EntryTask(
+        cell=entry,
+        policy=policy,
+        env=cell.env,
+        keywords=keywords,
+        seeds=tuple(seeds),
+        noise=noise,
+        transferred=entry.trained_in not in ("", entry.cell),
+        records=records,
+        threads=threads,
+    )
 
 
-def lacking(
-    entries: Sequence[Entry], seeds: Sequence[int], ledger: Ledger[Entry, Any]
-) -> list[Entry]:
-    """Return the entries of which the ledger lacks a seed; they are run whole again."""
-    return [entry for entry in entries if any((entry, seed) not in ledger.rows for seed in seeds)]
-
-
-def suited(cell: Cell, names: Sequence[str]) -> tuple[tuple[str, ...], dict[str, str]]:
-    """Return the schedules that can be run in a cell, and why the others cannot.
+def suitable(cell: PolicyCell, names: Sequence[str]) -> tuple[tuple[str, ...], dict[str, str]]:
+    """Return the schedules that can be run in a cell, and the reasons why others cannot.
 
     Raises:
         ValueError: The cell itself is out of range.
     """
     env = make_batch(cell.env, cell.keywords, (0,))
-    env.process  # noqa: B018 (assembled here, so that what fails below is the schedule's)
-    fit, others = [], {}
+    env.process  # noqa: B018 (made here, so that an error below is the schedule's)
+    fit, reasons = [], {}
     for name in names:
         try:
-            make_schedule(name, env, POLICY_SEED)
+            NamedSchedule(name).load(env, seed=POLICY_SEED)
         except ValueError as problem:
-            others[name] = str(problem)
+            reasons[name] = str(problem)
         else:
             fit.append(name)
-    return tuple(fit), others
-
-
-def mean_error(ledger: Ledger[Entry, EpisodeScore], entry: Entry, seeds: Sequence[int]) -> float:
-    """Return the mean error of an entry over the seeds: minus the environment's reward."""
-    return float(np.mean([-ledger.rows[entry, seed].reward for seed in seeds]))
+    return tuple(fit), reasons

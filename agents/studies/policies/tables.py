@@ -1,22 +1,25 @@
-"""Tables of the study, in Markdown, and the summary as CSV."""
+"""Tables of the study of policies, in Markdown, and its summary as CSV."""
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from agents.evaluation.statistics import FloatArray, Interval, iqm, mean
-from agents.studies.paper.tables import markdown, shown
+from agents.evaluation.episodes import EpisodeScore
+from agents.evaluation.statistics import iqm, mean
+from agents.experiments import tables
+from agents.experiments.tables import format_interval, interval_columns, markdown, write_csv
 from agents.studies.policies.plan import REFERENCE, Learner
-from agents.studies.policies.results import ERROR, METRICS, Measured
+from agents.studies.policies.results import ERROR, METRICS, PolicyResults
 from agents.studies.policies.rules import Verdict
+from dptse_env.arrays import FloatArray
 
 
 @dataclass(frozen=True)
-class Rung:
-    """One policy of a cell.
+class Rank:
+    """A policy of a cell with its errors.
 
     Attributes:
         label: Its name.
@@ -31,102 +34,94 @@ class Rung:
     errors: dict[str, FloatArray]
 
 
-def ladder(measured: Measured, cell: str) -> list[Rung]:
-    """Return everyone who was run in a cell, least error first."""
-    manifest = measured.manifest
+def ranking(results: PolicyResults, cell: str) -> list[Rank]:
+    """Return all policies that were run in a cell, least error first."""
+    manifest = results.manifest
 
-    def rungs() -> Iterator[Rung]:
+    def ranks() -> Iterator[Rank]:
         for kind, names in (("baseline", manifest.ladder), ("bound", manifest.bounds)):
             for name in names[cell]:
-                errors = {metric: measured.schedule(cell, name, metric) for metric in METRICS}
-                yield Rung(name, kind, 0, errors)
-        for learner in manifest.learners(measured.design.cell(cell)):
-            errors = {metric: measured.learned(learner, metric) for metric in METRICS}
-            yield Rung(learner.label, "learned", len(errors[ERROR]), errors)
+                errors = {metric: results.schedule(cell, name, metric) for metric in METRICS}
+                yield Rank(name, kind, 0, errors)
+        for learner in manifest.learners(results.design.cell(cell)):
+            errors = {metric: results.learned(learner, metric) for metric in METRICS}
+            yield Rank(learner.label, "learned", len(errors[ERROR]), errors)
 
-    return sorted(rungs(), key=lambda rung: float(rung.errors[ERROR].mean()))
+    return sorted(ranks(), key=lambda rank: float(rank.errors[ERROR].mean()))
 
 
-def ladder_table(measured: Measured, cell: str) -> str:
-    """Return the ladder of a cell, with everyone's percentage below the best baseline."""
-    best = measured.schedule(cell, measured.choice(cell).baseline)
+def ranking_table(results: PolicyResults, cell: str) -> str:
+    """Return the ranking of a cell, with percentages below the best baseline."""
+    baseline = results.choice(cell).baseline
+    best, estimates = results.schedule(cell, baseline), list(METRICS)[1:]
     rows = []
-    for rung in ladder(measured, cell):
-        table = rung.errors[ERROR]
-        below = shown(measured.below(table, best))
-        if rung.kind == "baseline" and rung.label == measured.choice(cell).baseline:
+    for rank in ranking(results, cell):
+        below = format_interval(results.below(rank.errors[ERROR], best))
+        if (rank.kind, rank.label) == ("baseline", baseline):
             below = "best on validation"
         rows.append(
             [
-                f"**{rung.label}**" if rung.kind == "learned" else rung.label,
-                f"learned, {rung.n_runs} training seed(s)" if rung.n_runs else rung.kind,
-                shown(measured.interval(mean, table)),
-                shown(measured.interval(iqm, table)),
+                f"**{rank.label}**" if rank.kind == "learned" else rank.label,
+                f"learned, {rank.n_runs} training seed(s)" if rank.n_runs else rank.kind,
+                format_interval(results.interval(mean, rank.errors[ERROR])),
+                format_interval(results.interval(iqm, rank.errors[ERROR])),
                 below,
-                *(
-                    shown(measured.interval(mean, rung.errors[metric]))
-                    for metric in list(METRICS)[1:]
-                ),
+                *(format_interval(results.interval(mean, rank.errors[m])) for m in estimates),
             ]
         )
-    header = [
-        "policy",
-        "kind",
-        "error × 1000",
-        "IQM",
-        "below best baseline [%]",
-        *(f"{name} RMSE [{unit}]" for name, unit in list(METRICS.values())[1:]),
-    ]
-    return markdown(header, rows)
+    header = ["policy", "kind", "error × 1000", "IQM", "below best baseline [%]"]
+    units = [METRICS[metric] for metric in estimates]
+    return markdown([*header, *(f"{name} RMSE [{unit}]" for name, unit in units)], rows)
 
 
-def verdict_table(verdicts: list[Verdict]) -> str:
+def verdict_table(verdicts: Sequence[Verdict]) -> str:
     """Return one row for each target."""
     rows = [
         [
-            f"at least {own.target.percent:g} % {own.target.says} (`{own.reference}`)",
-            "**met**" if own.is_met else "**missed**",
-            shown(own.overall),
-            f"{shown(own.worst)} (seed {own.worst_seed})",
-            "; ".join(says for says, is_so in own.parts.items() if not is_so) or "-",
+            f"at least {verdict.target.percent:g} % {verdict.target.description} "
+            f"(`{verdict.reference}`)",
+            "**met**" if verdict.is_met else "**missed**",
+            format_interval(verdict.overall),
+            f"{format_interval(verdict.worst)} (seed {verdict.worst_seed})",
+            "; ".join(part for part, holds in verdict.parts.items() if not holds) or "-",
         ]
-        for own in verdicts
+        for verdict in verdicts
     ]
-    header = ["target", "verdict", "below [%]", "worst training seed [%]", "what is wanting"]
+    header = ["target", "verdict", "below [%]", "worst training seed [%]", "missing conditions"]
     return markdown(header, rows)
 
 
-def seeds_table(measured: Measured, learner: Learner) -> str:
+def seeds_table(results: PolicyResults, learner: Learner) -> str:
     """Return each training seed's error and percentages below both references."""
-    errors = measured.learned(learner)
-    references = [measured.schedule(learner.cell, name) for name in measured.references]
-    rows = [
-        [
-            str(seed),
-            shown(measured.interval(mean, own)),
-            *(shown(measured.below(own, reference)) for reference in references),
-        ]
-        for seed, own in zip(measured.manifest.runs(learner), errors, strict=True)
-    ]
+    references = [results.schedule(learner.cell, name) for name in results.references]
+    rows = []
+    seeds = results.manifest.runs(learner)
+    for seed, errors in zip(seeds, results.learned(learner), strict=True):
+        below = [format_interval(results.below(errors, reference)) for reference in references]
+        rows.append([str(seed), format_interval(results.interval(mean, errors)), *below])
     header = ["training seed", "error × 1000"]
-    return markdown([*header, *(f"below `{name}` [%]" for name in measured.references)], rows)
+    return markdown([*header, *(f"below `{name}` [%]" for name in results.references)], rows)
 
 
-def secondary_table(measured: Measured) -> str:
+def secondary_table(results: PolicyResults) -> str:
     """Return the comparisons of the secondary cells."""
+
+    def probability(value: float) -> str:
+        return "< 0.0001" if value < 1e-4 else f"{value:.4f}"
+
     rows = [
         [
-            own.learner.cell,
-            own.learner.label,
-            str(len(measured.manifest.runs(own.learner))),
-            own.baseline,
-            shown(own.below),
-            shown(own.difference),
-            _probability(own.p_value),
-            _probability(own.adjusted),
-            own.verdict,
+            comparison.learner.cell,
+            comparison.learner.label,
+            str(len(results.manifest.runs(comparison.learner))),
+            comparison.baseline,
+            format_interval(comparison.below),
+            format_interval(comparison.difference),
+            probability(comparison.p_value),
+            probability(comparison.adjusted),
+            comparison.verdict,
         ]
-        for own in measured.comparisons
+        for comparison in results.comparisons
     ]
     header = [
         "cell", "policy", "training seeds", "best baseline", "below [%]", "difference × 1000", "p",
@@ -135,25 +130,19 @@ def secondary_table(measured: Measured) -> str:
     return markdown(header, rows)
 
 
-def _probability(value: float) -> str:
-    return "< 0.0001" if value < 1e-4 else f"{value:.4f}"
-
-
-def choice_table(measured: Measured) -> str:
-    """Return what validation traffic chose in each cell, and what was best on test traffic."""
+def choice_table(results: PolicyResults) -> str:
+    """Return the choices of validation traffic in each cell, and the best on test traffic."""
     rows = []
-    for cell in measured.design.cells:
-        choice = measured.choice(cell.name)
+    for cell in results.design.cells:
+        choice, best = results.choice(cell.name), results.best_on_test(cell.name)
+        chosen, other = (results.schedule(cell.name, name) for name in (choice.baseline, best))
+        gap = f"{best} ({format_interval(results.below(other, chosen))} % below)"
         learned = choice.learners.get(cell.name)
-        best = measured.best_on_test(cell.name)
-        gap = measured.below(
-            measured.schedule(cell.name, best), measured.schedule(cell.name, choice.baseline)
-        )
         rows.append(
             [
-                f"{cell.name}: {cell.says}",
+                f"{cell.name}: {cell.description}",
                 choice.baseline,
-                "the same" if best == choice.baseline else f"{best} ({shown(gap)} % below)",
+                "the same" if best == choice.baseline else gap,
                 ", ".join(learned) if learned else "-",
             ]
         )
@@ -161,44 +150,54 @@ def choice_table(measured: Measured) -> str:
     return markdown(header, rows)
 
 
-def health_table(measured: Measured, cell: str) -> str:
-    """Return seconds lost by the estimator under each policy of a cell, over all episodes."""
-    totals: dict[str, list[float]] = {}
-    for (entry, _), score in measured.scores.items():
+def health_table(results: PolicyResults, cell: str) -> str:
+    """Return the seconds that the estimator lost under policies of a cell; empty if none."""
+    groups: dict[tuple[str, ...], list[EpisodeScore]] = {}
+    for (entry, _), score in results.scores.items():
         if entry.cell == cell:
-            own = totals.setdefault(f"{entry.policy}, {entry.mode}", [0.0, 0.0, 0.0])
-            for k, name in enumerate(("n_diverged", "n_fallback", "n_dropped")):
-                own[k] += getattr(score, name)
-    rows = [[name, *(f"{value:.0f}" for value in own)] for name, own in totals.items() if any(own)]
-    if not rows:
-        return "None, under any policy."
-    return markdown(["policy", "started over [s]", "kept the prediction [s]", "dropped"], rows)
+            groups.setdefault((f"{entry.policy}, {entry.mode}",), []).append(score)
+    lost = {
+        names: scores
+        for names, scores in groups.items()
+        if any(score.n_diverged or score.n_fallback or score.n_dropped for score in scores)
+    }
+    return tables.health_table(["policy"], lost) if lost else ""
 
 
-def write_summary(path: Path, measured: Measured) -> None:
-    """Write the ladders of all cells as CSV, one row for each policy."""
+def checkpoint_table(results: PolicyResults) -> str:
+    """Return the policies that were frozen."""
+    header = ["file", "cell", "recipe", "training seed", "sha256"]
+    rows = [
+        [f"`{own.path}`", own.cell, own.recipe, str(own.training_seed), own.sha256[:16]]
+        for own in results.manifest.checkpoints
+    ]
+    return markdown(header, rows) if rows else ""
+
+
+def tuned_table(results: PolicyResults) -> str:
+    """Return the estimator settings that were tuned for single policies; empty if none."""
+    header = ["settings of the estimator tuned for", "estimator", "ARZ", "preset"]
+    tuned = results.manifest.tuned
+    rows = [[own.policy, own.estimator, own.parameters, own.privacy] for own in tuned]
+    return markdown(header, rows) if rows else ""
+
+
+def write_summary(path: Path, results: PolicyResults) -> None:
+    """Write the rankings of all cells as CSV, one row for each policy."""
     columns = ["cell", "policy", "kind", "n_training_seeds", "n_traffic_seeds"]
-    for metric in METRICS:
-        columns += [metric, f"{metric}_low", f"{metric}_high"]
-    columns += ["iqm", "iqm_low", "iqm_high"]
-    for against in ("best", "paper"):
-        columns += [f"percent_below_{against}{end}" for end in ("", "_low", "_high")]
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(columns)
-        for cell in measured.design.cells:
-            name = cell.name
-            references = [
-                measured.schedule(name, own) for own in (measured.choice(name).baseline, REFERENCE)
-            ]
-            for rung in ladder(measured, name):
-                errors = rung.errors[ERROR]
-                intervals = [measured.interval(mean, table) for table in rung.errors.values()]
-                intervals.append(measured.interval(iqm, errors))
-                intervals += [measured.below(errors, own) for own in references]
-                row = [name, rung.label, rung.kind, rung.n_runs, errors.shape[1]]
-                writer.writerow([*row, *(text for own in intervals for text in _ends(own))])
+    for name in (*METRICS, "iqm", "percent_below_best", "percent_below_paper"):
+        columns += [name, f"{name}_low", f"{name}_high"]
 
+    def rows() -> Iterator[list[Any]]:
+        for cell in results.design.cells:
+            names = results.choice(cell.name).baseline, REFERENCE
+            references = [results.schedule(cell.name, name) for name in names]
+            for rank in ranking(results, cell.name):
+                errors = rank.errors[ERROR]
+                intervals = [results.interval(mean, table) for table in rank.errors.values()]
+                intervals.append(results.interval(iqm, errors))
+                intervals += [results.below(errors, reference) for reference in references]
+                row = [cell.name, rank.label, rank.kind, rank.n_runs, errors.shape[1]]
+                yield [*row, *(text for each in intervals for text in interval_columns(each))]
 
-def _ends(interval: Interval) -> list[str]:
-    return [f"{value:.6g}" for value in (interval.mean, interval.low, interval.high)]
+    write_csv(path, columns, rows())

@@ -88,9 +88,6 @@ class PrivacyDesign(Design[PrivacyCell]):
         delta: The delta of every cell.
         cap: Base value of the cap.
         bandwidth: Base value of the bandwidth.
-
-    Raises:
-        ValueError: A value is out of range; the message names it.
     """
 
     env: str = "dptse_env:dptse/PrivateHighway-v0"
@@ -104,24 +101,28 @@ class PrivacyDesign(Design[PrivacyCell]):
     bandwidth: int = 5
 
     def __post_init__(self) -> None:
-        """Check what no environment checks, and put the values in order."""
-        super().__post_init__()
+        """Sort the grids with their base values in them."""
+        for name, base in self._grids.items():
+            object.__setattr__(self, name, tuple(sorted({*getattr(self, name), base})))
+
+    @property
+    def _grids(self) -> dict[str, float]:
+        """Base values by the names of their grids."""
+        return {"epsilons": self.epsilon, "caps": self.cap, "bandwidths": self.bandwidth}
+
+    def check(self) -> None:
+        """See `Design.check`."""
+        super().check()
         if not self.estimators or len(set(self.estimators)) < len(self.estimators):
             raise ValueError(f"estimators must be 1 or more and distinct, got {self.estimators}")
         for name in self.estimators:
             check_estimator(name, "compiled")
             if name == OPEN_LOOP:
                 raise ValueError(f"estimators must not name {OPEN_LOOP!r}: it is always run")
-        self._complete("epsilons", self.epsilon)
-        self._complete("caps", self.cap)
-        self._complete("bandwidths", self.bandwidth)
-
-    def _complete(self, name: str, base: float) -> None:
-        """Sort a grid with its base value in it."""
-        values = tuple(sorted({*getattr(self, name), base}))
-        if len(values) < 2:
-            raise ValueError(f"{name} must hold a value beside {base:g}, got {getattr(self, name)}")
-        object.__setattr__(self, name, values)
+        for name, base in self._grids.items():
+            values = getattr(self, name)
+            if len(values) < 2:
+                raise ValueError(f"{name} must hold a value beside {base:g}, got {values}")
 
     @property
     def all_estimators(self) -> tuple[str, ...]:
