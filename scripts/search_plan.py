@@ -10,9 +10,10 @@ like any other schedule by its path. To ship it, copy it to dptse_env/schedules/
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
+import tyro
 from tqdm import tqdm
 
 from agents.experiments.files import replacing
@@ -20,58 +21,19 @@ from agents.search.plans import PlanSearch, PlanTask, validation_scores
 from dptse_env.schedules.plans import Plan, read_plan, write_plan
 from dptse_env.traffic import RecordLibrary
 from dptse_env.validation import integer
-from scripts.cli import records_argument, resumable, run
+from scripts.cli import resumable, run
 
 
 @dataclass(frozen=True)
 class Args:
     """Search an open-loop query plan."""
 
-    env: str = "dptse_env:dptse/PrivateHighway-v0"
-    """Environment id."""
-    kind: str = "offline"
-    """Kind of plan: 'offline', a period of sets, or 'best-static', one set."""
-    period: int = 12
-    """Sets in the period; a static set has one."""
-    estimator: str = "ekf"
-    """State estimator."""
-    parameters: str | None = None
-    """Name of the ARZ parameters; the environment's own if not given."""
-    bandwidth: int | None = None
-    """Segments to query a second; the environment's own if not given."""
-    seeds: str = "0:64"
-    """Traffic seeds, first:stop; training seeds only."""
+    task: tyro.conf.OmitArgPrefixes[PlanTask] = field(default_factory=PlanTask)
+    """The search."""
     rounds: int = 100
     """Rounds of exchanges, those of earlier runs included."""
-    neighbours: int = 31
-    """Neighbours that a round tries; four times as many episodes run at once."""
-    search_seed: int = 0
-    """Seeds the search."""
-    records: Path | None = None
-    """Folder of the record cache; the user's cache if not given."""
     output: Path = Path("results/schedules")
     """Folder for the plan."""
-
-
-def make_task(args: Args) -> PlanTask:
-    """Return the task, checked.
-
-    Raises:
-        ValueError: An argument is out of range.
-    """
-    integer("rounds", args.rounds, 1)
-    return PlanTask(
-        env=args.env,
-        kind=args.kind,
-        period=1 if args.kind == "best-static" else args.period,
-        estimator=args.estimator,
-        parameters=args.parameters,
-        bandwidth=args.bandwidth,
-        seeds=args.seeds,
-        neighbours=args.neighbours,
-        seed=args.search_seed,
-        records=records_argument(args.records),
-    )
 
 
 def resumed(search: PlanSearch, path: Path) -> bool:
@@ -106,11 +68,14 @@ def save(path: Path, plan: Plan) -> None:
 @resumable()
 def main(args: Args) -> None:
     """Record what is missing, search, and leave the plan."""
-    task = make_task(args)
+    integer("rounds", args.rounds, 1)
+    task = args.task
+    if task.kind == "best-static":
+        task = dataclasses.replace(task, period=1)
     search = PlanSearch(task)
     path = args.output / f"{search.plan().name}.json"
     corridor = task.make(1, task.traffic_seeds).config.corridor
-    RecordLibrary(args.records).ensure(corridor, task.traffic_seeds, progress=True)
+    RecordLibrary(task.records).ensure(corridor, task.traffic_seeds, progress=True)
     args.output.mkdir(parents=True, exist_ok=True)
     if not resumed(search, path):
         search.begin()

@@ -40,7 +40,8 @@ class Args:
     env: str = "dptse_env:dptse/PaperHighway-v0"
     """Environment id."""
     keywords: str = "{}"
-    """More keywords of the environment as JSON, such as '{"privacy": {"cap": 16}}'."""
+    """Keywords of the environment as JSON, such as '{"privacy": {"cap": 16}}'; arguments below come
+    before them."""
     estimators: tuple[str, ...] = tuple(SPACE)
     """State estimators."""
     parameters: tuple[str, ...] = ("w99-3lane", "paper")
@@ -79,7 +80,9 @@ def make_tasks(args: Args) -> list[TuningTask]:
     Raises:
         ValueError: An argument is out of range.
     """
-    keywords = parse_keywords(args.keywords)
+    keywords = {**parse_keywords(args.keywords), "epsilon": args.epsilon, "delta": args.delta}
+    if args.bandwidth is not None:
+        keywords["bandwidth"] = args.bandwidth
     integer("trials", args.trials, 1)
     integer("workers", args.workers, 1)
     tasks: dict[str, TuningTask] = {}
@@ -94,9 +97,6 @@ def make_tasks(args: Args) -> list[TuningTask]:
             estimator=estimator,
             parameters=parameters,
             privacy=privacy,
-            epsilon=args.epsilon,
-            delta=args.delta,
-            bandwidth=args.bandwidth,
             seeds=args.seeds,
             schedule=args.schedule,
             noise_seed=args.noise_seed,

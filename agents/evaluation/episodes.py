@@ -17,9 +17,9 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from dptse_env.arrays import FloatArray
 from dptse_env.config import TEST_SEEDS, TRAINING_SEEDS, VALIDATION_SEEDS, EnvConfig
 from dptse_env.env import SensorQueryEnv
+from dptse_env.process import QueryProcess
 from dptse_env.rendering import History
 from dptse_env.vector_env import SensorQueryVectorEnv
 
@@ -144,30 +144,15 @@ def run_episode(
     Raises:
         ValueError: The episode is not longer than the warm-up.
     """
+    observation, _ = env.reset(seed=seed, options={"traffic_seed": traffic_seed})
+
+    def step(action: Any) -> tuple[Any, Any]:
+        observation, reward, *_ = env.step(action)
+        return observation, reward
+
     process = unwrap(env).process
-    observation, info = env.reset(seed=seed, options={"traffic_seed": traffic_seed})
-    if on_second is not None:
-        on_second()
-    start = process.time[0]
-    state: Any = None
-    episode_start = np.ones(1, dtype=bool)
-    seconds: list[dict[str, float]] = []
-    truncated = False
-    while not truncated:
-        action, state = policy.predict(observation, state, episode_start, deterministic)
-        episode_start = np.zeros(1, dtype=bool)
-        before = process.time[0]
-        observation, reward, _, truncated, info = env.step(action)
-        if process.time[0] > before:  # a sequential action may leave the traffic where it is
-            seconds.append({"reward": float(reward), **{key: info[key] for key in _SERIES}})
-            if on_second is not None:
-                on_second()
-    counted = seconds[max(warm_up - int(start), 0) :]
-    series = {
-        key: np.array([second[key] for second in counted], dtype=np.float64)
-        for key in ("reward", *_SERIES)
-    }
-    return _score(traffic_seed, series, warm_up)
+    seconds = _play(process, policy, observation, step, deterministic, on_second)
+    return _pool(seconds, [traffic_seed], warm_up)[0]
 
 
 def make_vector(env: str, n_episodes: int, keywords: Mapping[str, Any]) -> SensorQueryVectorEnv:
@@ -226,54 +211,77 @@ def run_episodes(
         raise ValueError(
             f"env must be made with autoreset_mode='Disabled', got {env.autoreset_mode.value!r}"
         )
-    process, episodes = env.process, np.arange(env.num_envs)
     observation, _ = env.reset(seed=list(seeds), options={"traffic_seed": list(traffic_seeds)})
-    if on_second is not None:
-        on_second()
-    state: Any = None
-    episode_start = np.ones(env.num_envs, dtype=bool)
-    seconds: list[dict[str, Any]] = []
-    while not process.over.all():
-        actions, state = policy.predict(observation, state, episode_start, deterministic)
-        episode_start = np.zeros(env.num_envs, dtype=bool)
-        before = process.time.copy()
+
+    def step(actions: Any) -> tuple[Any, Any]:
         transition = env.advance(actions)
-        observation = transition.observation
-        # A decision takes as many actions in every episode: time passes in all of them or in none.
-        if (process.time > before).all():
-            info = process.infos(episodes)
-            second = {"reward": transition.reward, **{key: info[key] for key in _SERIES}}
-            seconds.append({**second, "counts": process.time > warm_up})
-            if on_second is not None:
-                on_second()
-    tables = {key: np.array([second[key] for second in seconds]) for key in seconds[0]}
-    counts = tables.pop("counts")
-    return [
-        _score(seed, {key: table[counts[:, k], k] for key, table in tables.items()}, warm_up)
-        for k, seed in enumerate(traffic_seeds)
-    ]
+        return transition.observation, transition.reward
+
+    seconds = _play(env.process, policy, observation, step, deterministic, on_second)
+    return _pool(seconds, traffic_seeds, warm_up)
 
 
 _SERIES = ("rmse_density", "rmse_speed", "n_occupied", "n_dropped", "diverged", "fallback")
 """Keys of ``info`` that a score is made of."""
 
 
-def _score(traffic_seed: int, series: Mapping[str, FloatArray], warm_up: int) -> EpisodeScore:
-    """Pool the seconds that count, arrays (T,) by their names in ``info`` and ``reward``."""
-    if not len(series["reward"]):
-        raise ValueError(f"the episode must be longer than the warm-up of {warm_up} s")
-    n_occupied = series["n_occupied"]
-    return EpisodeScore(
-        traffic_seed=traffic_seed,
-        rmse_density=math.sqrt(np.mean(series["rmse_density"] ** 2)),
-        rmse_speed=math.sqrt(
-            np.sum(n_occupied * series["rmse_speed"] ** 2) / max(n_occupied.sum(), 1.0)
-        ),
-        reward=float(np.mean(series["reward"])),
-        n_dropped=float(series["n_dropped"].sum()),
-        n_diverged=float(series["diverged"].sum()),
-        n_fallback=float(series["fallback"].sum()),
-    )
+def _play(
+    process: QueryProcess,
+    policy: Policy,
+    observation: Any,
+    step: Callable[[Any], tuple[Any, Any]],
+    deterministic: bool,
+    on_second: Callable[[], None] | None,
+) -> list[dict[str, Any]]:
+    """Play n episodes to their end; return `_SERIES`, reward and time of every second, (n,) each.
+
+    ``step`` takes actions and returns observations and rewards.
+    """
+    n = process.n_episodes
+    state: Any = None
+    episode_start = np.ones(n, dtype=bool)
+    seconds: list[dict[str, Any]] = []
+    if on_second is not None:
+        on_second()
+    while not process.over.all():
+        action, state = policy.predict(observation, state, episode_start, deterministic)
+        episode_start = np.zeros(n, dtype=bool)
+        before = process.time.copy()
+        observation, reward = step(action)
+        # Sequential actions may leave the traffic where it is, in all episodes or in none.
+        if (process.time > before).all():
+            info = process.infos(np.arange(n))
+            series = {key: info[key] for key in _SERIES}
+            seconds.append({"reward": np.ravel(reward), "time": process.time.copy(), **series})
+            if on_second is not None:
+                on_second()
+    return seconds
+
+
+def _pool(
+    seconds: Sequence[Mapping[str, Any]], traffic_seeds: Sequence[int], warm_up: int
+) -> list[EpisodeScore]:
+    """Pool the seconds of each episode that count."""
+    tables = {key: np.array([second[key] for second in seconds]) for key in seconds[0]}
+    scores = []
+    for k, traffic_seed in enumerate(traffic_seeds):
+        counts = tables["time"][:, k] > warm_up
+        if not counts.any():
+            raise ValueError(f"the episode must be longer than the warm-up of {warm_up} s")
+        series = {key: table[counts, k] for key, table in tables.items()}
+        n_occupied = series["n_occupied"]
+        squares = n_occupied * series["rmse_speed"] ** 2
+        score = EpisodeScore(
+            traffic_seed=traffic_seed,
+            rmse_density=math.sqrt(np.mean(series["rmse_density"] ** 2)),
+            rmse_speed=math.sqrt(np.sum(squares) / max(n_occupied.sum(), 1.0)),
+            reward=float(np.mean(series["reward"])),
+            n_dropped=float(series["n_dropped"].sum()),
+            n_diverged=float(series["diverged"].sum()),
+            n_fallback=float(series["fallback"].sum()),
+        )
+        scores.append(score)
+    return scores
 
 
 def watch_episode(

@@ -39,24 +39,21 @@ class PlanTask:
 
     Attributes:
         env: Environment id.
-        kind: One of `dptse_env.schedules.PLANS`.
-        period: Sets in the plan; 1 for ``best-static``.
-        estimator: Name of the estimator.
-        parameters: Name of the ARZ parameters; the environment's own if None.
-        bandwidth: Queries a step; the environment's own if None.
-        seeds: Traffic seeds, ``"first:stop"``, within `TRAINING_SEEDS`.
+        kind: Kind of plan: 'offline', a period of sets, or 'best-static', one set.
+        period: Sets in the period; 1 for a static set.
+        estimator: State estimator.
+        parameters: Name of the ARZ parameters; the environment's own if not given.
+        bandwidth: Segments to query a second; the environment's own if not given.
+        seeds: Traffic seeds, first:stop; training seeds only.
         neighbours: Neighbours of the best plan that a round tries; twice as many random plans
-            begin the search.
+            begin the search, and four times as many episodes run at once.
         seed: Seeds the search.
-        records: Folder of the record cache; the user's cache if None.
-
-    Raises:
-        ValueError: A value is out of range.
+        records: Folder of the record cache; the user's cache if not given.
     """
 
-    env: str
-    kind: str
-    period: int
+    env: str = "dptse_env:dptse/PrivateHighway-v0"
+    kind: str = "offline"
+    period: int = 12
     estimator: str = "ekf"
     parameters: str | None = None
     bandwidth: int | None = None
@@ -65,8 +62,12 @@ class PlanTask:
     seed: int = 0
     records: str | None = None
 
-    def __post_init__(self) -> None:
-        """Check what needs no environment."""
+    def check(self) -> None:
+        """Check what needs no environment.
+
+        Raises:
+            ValueError: A value is out of range.
+        """
         if self.kind not in PLANS:
             raise ValueError(f"kind must be one of {', '.join(PLANS)}, got {self.kind!r}")
         integer("period", self.period, 1)
@@ -107,7 +108,12 @@ class PlanScorer:
     """
 
     def __init__(self, task: PlanTask, seeds: tuple[int, ...], n_episodes: int) -> None:
-        """Make the environment; nothing is recorded before `scores`."""
+        """Make the environment; nothing is recorded before `scores`.
+
+        Raises:
+            ValueError: A value of the task is out of range.
+        """
+        task.check()
         self.env = task.make(n_episodes, seeds)
         self.n_episodes = n_episodes
         config = self.env.config

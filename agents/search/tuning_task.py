@@ -23,7 +23,7 @@ from dptse_env.config import TRAINING_SEEDS, EnvConfig, parse_seeds
 from dptse_env.estimators import EstimatorSettings
 from dptse_env.estimators.tuning import settings_name
 from dptse_env.model import ARZParameters
-from dptse_env.validation import integer
+from dptse_env.validation import integer, require
 
 
 @dataclass(frozen=True)
@@ -35,46 +35,37 @@ class TuningTask:
         estimator: Name of the estimator.
         parameters: ARZ parameters of its model, or the name of a set.
         privacy: Privacy preset.
-        epsilon: Privacy parameter epsilon.
-        delta: Privacy parameter delta.
-        bandwidth: Most segments to query a second; the environment's own if None.
         seeds: Traffic seeds, ``"first:stop"``, within `TRAINING_SEEDS`.
+        keywords: Other keywords of the environment; a mapping ``privacy`` goes with the preset.
         schedule: Query schedule, or a saved policy: its ``.zip`` file or shipped name.
         noise_seed: Noise and estimators are seeded with this plus the traffic seed.
         records: Folder of the record cache; the user's cache if None.
         with_noise_scale: Whether to search the scale of the measurements' noise, too.
-        keywords: More keywords of the environment, none of those above; ``privacy`` may hold more
-            fields of the preset.
 
     Raises:
         FileNotFoundError: There is no such saved policy.
-        ValueError: The estimator has nothing to tune, seeds are not for training, or the file is no
-            saved policy.
+        ValueError: The estimator has nothing to tune, seeds are not for training, keywords hold
+            another field, or the file is no saved policy.
     """
 
     env: str
     estimator: str
     parameters: str | ARZParameters
     privacy: str
-    epsilon: float
-    delta: float
-    bandwidth: int | None
     seeds: str
+    keywords: Mapping[str, Any] = field(default_factory=dict)
     schedule: str = "paper"
     noise_seed: int = TUNING.start
     records: str | None = None
     with_noise_scale: bool = False
-    keywords: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Check what needs no environment."""
         _ = self.space, self.source
-        taken = self.keywords.keys() & {field.name for field in dataclasses.fields(self)}
-        nested = self.keywords.get("privacy", {})
-        if taken - {"privacy"} or not isinstance(nested, Mapping):
-            raise ValueError(
-                f"keywords must not hold {', '.join(sorted(taken))}: each is an argument"
-            )
+        for name in ("estimator", "parameters", "traffic_seeds", "records", "action"):
+            require(name not in self.keywords, f"keywords.{name}", "left out", name)
+        privacy = self.keywords.get("privacy", {})
+        require(isinstance(privacy, Mapping), "keywords.privacy", "a JSON object", privacy)
         if not set(self.traffic_seeds) <= set(TRAINING_SEEDS):
             raise ValueError(
                 f"seeds must be training seeds, in {TRAINING_SEEDS.start}:{TRAINING_SEEDS.stop}, "
@@ -112,21 +103,17 @@ class TuningTask:
 
     def make(self, settings: EstimatorSettings | None = None) -> gym.Env[Any, Any]:
         """Make the environment; with its default settings if None."""
-        parameters = self.parameters
-        privacy = {"preset": self.privacy, "epsilon": self.epsilon, "delta": self.delta}
         keywords: dict[str, Any] = {
             **self.keywords,
             **self.source.keywords,
             "estimator": self.estimator,
-            "parameters": (
-                parameters if isinstance(parameters, str) else dataclasses.asdict(parameters)
-            ),
-            "privacy": {**self.keywords.get("privacy", {}), **privacy},
+            "parameters": self.parameters,
+            "privacy": {**self.keywords.get("privacy", {}), "preset": self.privacy},
             "traffic_seeds": self.seeds,
             "records": self.records,
         }
-        if self.bandwidth is not None:
-            keywords["bandwidth"] = self.bandwidth
+        if isinstance(self.parameters, ARZParameters):
+            keywords["parameters"] = dataclasses.asdict(self.parameters)
         if settings is not None:
             keywords["estimator_settings"] = dataclasses.asdict(settings)
         return gym.make(self.env, **keywords)
@@ -151,7 +138,7 @@ class TuningTask:
             "parameters": dataclasses.asdict(config.model().parameters),
             "privacy": dataclasses.asdict(config.privacy),
             "bandwidth": config.bandwidth,
-            **({"keywords": dict(self.keywords)} if self.keywords else {}),
+            "keywords": dict(self.keywords),
             "schedule": self.source.identity,
             "seeds": self.seeds,
             "noise_seed": self.noise_seed,

@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from agents.evaluation.policies import Saved
+from agents.evaluation.policies import read_saved_policy
 from dptse_env import sb3
 from dptse_env.policies import TRANSFERABLE
 from tests.agents.policies import SHORT, save
@@ -16,7 +16,7 @@ from tests.agents.policies import SHORT, save
 
 def test_the_card_says_what_it_is(tmp_path):
     path = save(tmp_path / "policy.zip", seed=3)
-    saved = Saved.of(path)
+    saved = read_saved_policy(path)
     assert (saved.recipe, saved.training_seed, saved.action) == ("plackett-luce", 3, "slots")
     assert saved.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
 
@@ -25,13 +25,13 @@ def test_it_acts_as_the_policy_that_was_saved(tmp_path):
     path = save(tmp_path / "policy.zip")
     env = gym.make(SHORT, action="slots")
     observation, _ = env.reset(seed=0)
-    own, _ = Saved.of(path).load(env).predict(observation, None, None, deterministic=True)
+    own, _ = read_saved_policy(path).load(env).predict(observation, None, None, deterministic=True)
     other, _ = sb3.load_policy(path, env).predict(observation, deterministic=True)
     np.testing.assert_array_equal(own, other)
 
 
 def test_another_bandwidth_is_refused_unless_it_is_meant(tmp_path):
-    saved = Saved.of(save(tmp_path / "policy.zip"))
+    saved = read_saved_policy(save(tmp_path / "policy.zip"))
     env = gym.make(SHORT, action="slots", bandwidth=3)
     with pytest.raises(ValueError, match="bandwidth is 2 of the policy and 3 of the environment"):
         saved.load(env)
@@ -40,7 +40,7 @@ def test_another_bandwidth_is_refused_unless_it_is_meant(tmp_path):
 
 def test_a_file_that_has_changed_is_refused(tmp_path):
     path = save(tmp_path / "policy.zip", seed=0)
-    saved = Saved.of(path)
+    saved = read_saved_policy(path)
     save(path, seed=1)
     with pytest.raises(ValueError, match="has changed"):
         saved.load(gym.make(SHORT, action="slots"))
@@ -48,29 +48,29 @@ def test_a_file_that_has_changed_is_refused(tmp_path):
 
 def test_what_is_no_policy_is_refused(tmp_path):
     with pytest.raises(FileNotFoundError, match="no saved policy 'nobody'"):
-        Saved.of("nobody")
+        read_saved_policy("nobody")
     text = tmp_path / "text.zip"
     text.write_text("no archive")
     with pytest.raises(ValueError, match="no saved policy: BadZipFile"):
-        Saved.of(text)
+        read_saved_policy(text)
     for card in ({"fits": {}}, {"fits": {"action": "mask"}, "training": {"seed": 1}}, []):
         with zipfile.ZipFile(text, "w") as archive:
             archive.writestr("card.json", json.dumps(card))
         with pytest.raises(ValueError, match="no saved policy"):
-            Saved.of(text)
+            read_saved_policy(text)
 
 
 def test_a_name_is_looked_up_in_the_package(tmp_path, monkeypatch):
     (tmp_path / "policies").mkdir()
     save(tmp_path / "policies" / "shipped.zip", seed=4)
     monkeypatch.setattr("dptse_env.policies.files", lambda _: tmp_path)
-    assert Saved.of("shipped").training_seed == 4
+    assert read_saved_policy("shipped").training_seed == 4
 
 
 def test_a_card_is_read_without_torch(tmp_path):
     path = save(tmp_path / "policy.zip")
     code = (
         "import sys; import scripts.evaluate; from agents.evaluation.policies import Saved; "
-        f"assert Saved.of({str(path)!r}).action == 'slots'; assert 'torch' not in sys.modules"
+        f"assert read_saved_policy({str(path)!r}).action == 'slots'; assert 'torch' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
