@@ -32,12 +32,7 @@ from agents.evaluation.figures import (
     save_figure,
     truth_map,
 )
-from agents.evaluation.policies import (
-    PolicySource,
-    SavedPolicy,
-    find_policy,
-    read_saved_policy,
-)
+from agents.evaluation.policies import PolicySource, SavedPolicy, find_policy, read_saved_policy
 from agents.evaluation.report import Report
 from dptse_env.config import EnvConfig, parse_seeds
 from dptse_env.policies import TRANSFERABLE

@@ -52,7 +52,7 @@ def draw_curve(
     label: str | None = None,
 ) -> None:
     """Draw means at their places with intervals as bars."""
-    means = [interval.mean for interval in intervals]
+    means = np.array([interval.mean for interval in intervals])
     spread = np.array([[each.mean - each.low, each.high - each.mean] for each in intervals]).T
     axis.errorbar(
         np.asarray(places), means, yerr=spread,

@@ -91,10 +91,7 @@ SPACE: dict[str, Mapping[str, Knob]] = {
         "mhe.linearisation": Choice(("paper", "trajectory")),
         "mhe.bounds": Choice(("box", "cone")),
     },
-    "random_walk": {
-        "walk_noise.0": Range(1e-3, 0.1),
-        "walk_noise.1": Range(1e-3, 0.1),
-    },
+    "random_walk": {"walk_noise.0": Range(1e-3, 0.1), "walk_noise.1": Range(1e-3, 0.1)},
 }
 """By estimator: paths into `EstimatorSettings` and where their values are searched."""
 

@@ -2,6 +2,7 @@ import json
 
 import pytest
 
+from agents.search.plans import PlanTask
 from dptse_env.schedules.plans import read_plan
 from scripts.search_plan import Args, main
 
@@ -9,8 +10,10 @@ SHORT = "dptse_env:dptse/ShortHighway-v0"
 
 
 def arguments(folder, **changes):
-    keywords = {"kind": "offline", "period": 2, "rounds": 2, "neighbours": 3, **changes}
-    return Args(env=SHORT, estimator="random_walk", seeds="0:4", output=folder, **keywords)
+    keywords = {"kind": "offline", "period": 2, "neighbours": 3, **changes}
+    rounds = keywords.pop("rounds", 2)
+    task = PlanTask(env=SHORT, estimator="random_walk", seeds="0:4", **keywords)
+    return Args(task=task, rounds=rounds, output=folder)
 
 
 def test_it_leaves_a_plan_and_goes_on(tmp_path, capsys):

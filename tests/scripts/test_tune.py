@@ -91,7 +91,7 @@ def group_lives(group):
         ({"seeds": "2000:2008"}, "seeds must be training seeds"),
         ({"trials": 0}, "trials must be an integer >= 1, got 0"),
         ({"workers": 0}, "workers must be an integer >= 1, got 0"),
-        ({"estimators": ("ekf", "ekf")}, "ekf-w99-3lane-paper must be asked for once"),
+        ({"estimators": ("ekf", "ekf")}, "ekf-w99-3lane-paper must be given once"),
         ({"estimators": ()}, "must not be empty"),
     ],
 )

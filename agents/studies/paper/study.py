@@ -30,6 +30,7 @@ from agents.studies.paper.tables import (
 )
 from agents.studies.paper.timing import StepTime, time_all, untimed
 
+TEMPLATES = Path(__file__).parent
 PICTURE = "fig2_space_time.png"
 
 
@@ -61,7 +62,7 @@ def run(design: PaperDesign, place: Workplace, command: str) -> None:
         time_all(design, times, place.records)
     results = PaperResults(design, episodes.rows, times.rows)
     draw(place, results)
-    write_report(place.folder, Path(__file__).parent, report(results, recorded, command))
+    write_report(place.folder, TEMPLATES, report(results, recorded, command))
     write_summary(place.folder / "summary.csv", results)
 
 

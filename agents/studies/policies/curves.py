@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from agents.experiments.tables import write_csv
 from agents.studies.policies.manifest import Checkpoint
 
-PROGRESS, CURVES = "progress.csv", "curves.csv"
+PROGRESS = "progress.csv"
 _ERROR = "validation"
 
 
@@ -29,34 +28,6 @@ class Curve:
     training_seed: int
     steps: tuple[float, ...]
     errors: tuple[float, ...]
-
-
-def keep_curves(folder: Path, checkpoints: Iterable[Checkpoint], cell: str) -> list[Curve]:
-    """Return the learning curves of a cell's policies, and keep them in a folder of results.
-
-    They are read from the folder, or else from the folders of the trainings, as far as these are
-    there.
-
-    Raises:
-        ValueError: A curve is not as ``scripts/train.py`` writes it.
-    """
-    path = folder / CURVES
-    if not path.exists():
-        curves = read_curves(checkpoints, cell)
-        if curves:
-            rows = [
-                (curve.recipe, curve.training_seed, step, error)
-                for curve in curves
-                for step, error in zip(curve.steps, curve.errors, strict=True)
-            ]
-            write_csv(path, ("recipe", "training_seed", "steps", "error"), rows)
-        return curves
-    points: dict[tuple[str, int], list[tuple[float, float]]] = {}
-    with path.open(encoding="utf-8", newline="") as file:
-        for row in csv.DictReader(file):
-            curve = points.setdefault((row["recipe"], int(row["training_seed"])), [])
-            curve.append((float(row["steps"]), float(row["error"])))
-    return [_curve(*key, curve) for key, curve in points.items()]
 
 
 def read_curves(checkpoints: Iterable[Checkpoint], cell: str) -> list[Curve]:
@@ -84,9 +55,5 @@ def _read(path: Path, checkpoint: Checkpoint) -> Curve:
             raise ValueError(f"{path} is no learning curve: {problem!r}") from problem
     if not points:
         raise ValueError(f"{path} is no learning curve: it has no validation")
-    return _curve(checkpoint.recipe, checkpoint.training_seed, points)
-
-
-def _curve(recipe: str, training_seed: int, points: Sequence[tuple[float, float]]) -> Curve:
     steps, errors = zip(*points, strict=True)
-    return Curve(recipe, training_seed, steps, errors)
+    return Curve(checkpoint.recipe, checkpoint.training_seed, steps, errors)

@@ -132,10 +132,7 @@ def choose(
 
 
 def _choice(
-    cell: PolicyCell,
-    design: PolicyDesign,
-    manifest: Manifest,
-    ledger: Ledger[Entry, EpisodeScore],
+    cell: PolicyCell, design: PolicyDesign, manifest: Manifest, ledger: Ledger[Entry, EpisodeScore]
 ) -> Choice:
     def mean_error(entry: Entry) -> float:
         scores = (ledger.rows[entry, seed] for seed in design.validation_seeds)

@@ -55,10 +55,7 @@ _INCIDENT = CORRIDORS["paper-highway"].incident
 assert isinstance(_INCIDENT, Incident)
 CELLS = (
     _private(
-        PRIMARY,
-        "PrivateHighway, EKF, B = 5",
-        bounds=("oracle-error", "oracle-greedy"),
-        without=(),
+        PRIMARY, "PrivateHighway, EKF, B = 5", bounds=("oracle-error", "oracle-greedy"), without=()
     ),
     PolicyCell("paper", "PaperHighway, EKF, B = 5", PAPER, {"estimator": "ekf", "bandwidth": 5}),
     *(

@@ -16,7 +16,7 @@ from agents.experiments.reports import write_report
 from agents.experiments.runner import Workplace
 from agents.experiments.seeds import STUDY_TEST, STUDY_VALIDATION, TRAINING
 from agents.experiments.tables import versions_table
-from agents.studies.policies.curves import keep_curves
+from agents.studies.policies.curves import read_curves
 from agents.studies.policies.figures import draw_cells, draw_curves, draw_queries, draw_ranking
 from agents.studies.policies.freezing import (
     QUERIES,
@@ -29,14 +29,7 @@ from agents.studies.policies.freezing import (
     draft,
 )
 from agents.studies.policies.manifest import Checkpoint, Manifest, Tuned
-from agents.studies.policies.plan import (
-    DETERMINISTIC,
-    MODES,
-    PRIMARY,
-    Entry,
-    Learner,
-    PolicyDesign,
-)
+from agents.studies.policies.plan import DETERMINISTIC, MODES, PRIMARY, Entry, Learner, PolicyDesign
 from agents.studies.policies.queries import QueryCounts
 from agents.studies.policies.results import ERROR_ORACLE, PolicyResults
 from agents.studies.policies.rules import LEAST_RUNS, LEAST_TRAFFIC, TARGETS, judge
@@ -59,6 +52,7 @@ from agents.studies.policies.tables import (
     write_summary,
 )
 
+TEMPLATES = Path(__file__).parent
 CURVES_FIGURE = "fig_curves.png"
 
 
@@ -126,10 +120,10 @@ def run(place: Workplace) -> None:
         recorded = take_folder(place.folder, provenance)
         _run(place, design, manifest, unscored, episodes, run_entry, seeds)
         _run(place, design, manifest, uncounted, queries, count_queries, seeds)
-    curves = keep_curves(place.folder, manifest.checkpoints, PRIMARY)
+    curves = read_curves(manifest.checkpoints, PRIMARY)
     results = PolicyResults(design, manifest, episodes.rows, queries.rows, curves)
     draw(place.folder, results)
-    write_report(place.folder, Path(__file__).parent, report(place.folder, results, recorded))
+    write_report(place.folder, TEMPLATES, report(place.folder, results, recorded))
     write_summary(place.folder / "summary.csv", results)
 
 
@@ -169,7 +163,7 @@ def _run(
 
 
 def draw(folder: Path, results: PolicyResults) -> None:
-    """Save the figures; learning curves that are gone leave the figure as it is."""
+    """Save the figures; that of the learning curves stays as it is where trainings are gone."""
     name = results.design.cell(PRIMARY).description
     seeds = f"{len(results.design.test_seeds)} test seeds, 95 % intervals"
     save_figure(draw_ranking(results), folder / "fig_ladder.png", f"{name}; {seeds}")

@@ -34,6 +34,8 @@ from agents.studies.privacy.tables import (
 )
 from dptse_env.traffic import RecordLibrary
 
+TEMPLATES = Path(__file__).parent
+
 
 def run(design: PrivacyDesign, place: Workplace, command: str) -> None:
     """Run the episodes that are missing, then draw and report.
@@ -57,7 +59,7 @@ def run(design: PrivacyDesign, place: Workplace, command: str) -> None:
         run_all(tasks, episodes, place.engine, run_task)
     results = read_results(design, place, episodes)
     draw(place.folder, results)
-    write_report(place.folder, Path(__file__).parent, report(results, recorded, command))
+    write_report(place.folder, TEMPLATES, report(results, recorded, command))
     write_summary(place.folder / "summary.csv", results)
 
 

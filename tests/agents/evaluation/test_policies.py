@@ -70,7 +70,7 @@ def test_a_name_is_looked_up_in_the_package(tmp_path, monkeypatch):
 def test_a_card_is_read_without_torch(tmp_path):
     path = save(tmp_path / "policy.zip")
     code = (
-        "import sys; import scripts.evaluate; from agents.evaluation.policies import Saved; "
-        f"assert read_saved_policy({str(path)!r}).action == 'slots'; assert 'torch' not in sys.modules"
+        "import sys; import scripts.evaluate; from agents.evaluation.policies import find_policy; "
+        f"assert find_policy({str(path)!r}).action == 'slots'; assert 'torch' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

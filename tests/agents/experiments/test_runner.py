@@ -1,25 +1,26 @@
 import dataclasses
 import multiprocessing
+import os
 import signal
-from concurrent.futures import ProcessPoolExecutor
-from typing import ClassVar
+import time
+from pathlib import Path
 
 import pytest
 
 from agents.evaluation.episodes import EpisodeScore, run_episode
-from agents.experiments import runner
+from agents.experiments.engine import LocalProcesses, follow_parent, run_all
 from agents.experiments.ledger import Ledger
-from agents.experiments.runner import Task, make_env, missing, run_all, run_task
-from agents.studies.paper.plan import SCHEDULE, SETTINGS, Cell, Design
+from agents.experiments.runner import EpisodeTask, make_env, missing_tasks, run_task
+from agents.studies.paper.plan import SETTINGS, PaperCell, PaperDesign
 from dptse_env.config import resolve
 from dptse_env.schedules import make_schedule
 from dptse_env.traffic import RecordLibrary
 
 SHORT = "dptse_env:dptse/ShortHighway-v0"
 SEEDS = (2000, 2001)
-EKF = Cell("ekf", "w99-3lane", "paper", 1.0, 0.05, 2)
+EKF = PaperCell("ekf", "w99-3lane", "paper", 1.0, 0.05, 2)
 WALK = dataclasses.replace(EKF, estimator="random_walk")
-TASKS = [Task(SHORT, SCHEDULE, cell, SEEDS, None) for cell in (EKF, WALK)]
+TASKS = [EpisodeTask(SHORT, "paper", cell, SEEDS, None) for cell in (EKF, WALK)]
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -29,7 +30,7 @@ def _records():
 
 @pytest.fixture
 def ledger(tmp_path):
-    return Ledger(tmp_path / "episodes.csv", Cell, EpisodeScore)
+    return Ledger(tmp_path / "episodes.csv", PaperCell, EpisodeScore)
 
 
 def test_a_task_is_a_cell_on_its_seeds():
@@ -49,78 +50,110 @@ def test_noise_alone_moves_what_differs_in_noise_alone():
         assert less.rmse_density < more.rmse_density
 
 
-def test_the_open_loop_hears_nothing_that_its_canonical_cell_leaves_out():
-    one = Cell("open_loop", "paper", "paper", 1.0, 0.05, 1)
-    two = Cell("open_loop", "paper", "corrected", 0.1, 0.01, 3)
-    first, second = (run_task(dataclasses.replace(TASKS[0], cell=cell)) for cell in (one, two))
-    assert first == second
+def test_the_open_loop_does_not_depend_on_what_its_canonical_cell_leaves_out():
+    first = PaperCell("open_loop", "paper", "paper", 1.0, 0.05, 1)
+    second = PaperCell("open_loop", "paper", "corrected", 0.1, 0.01, 3)
+    scores = [run_task(dataclasses.replace(TASKS[0], cell=cell)) for cell in (first, second)]
+    assert scores[0] == scores[1]
 
 
 def test_workers_find_what_this_process_finds(ledger, tmp_path):
-    run_all(TASKS, ledger, workers=2, progress=False)
-    alone = Ledger(tmp_path / "alone.csv", Cell, EpisodeScore)
-    run_all(TASKS, alone, workers=1, progress=False)
+    run_all(TASKS, ledger, LocalProcesses(2), run_task, progress=False)
+    alone = Ledger(tmp_path / "alone.csv", PaperCell, EpisodeScore)
+    run_all(TASKS, alone, LocalProcesses(1), run_task, progress=False)
     assert ledger.rows == alone.rows
     assert set(ledger.rows) == {(cell, seed) for cell in (EKF, WALK) for seed in SEEDS}
-    assert Ledger(ledger.path, Cell, EpisodeScore).rows == ledger.rows
+    assert ledger.path.read_bytes() == alone.path.read_bytes()
+
+
+class Reversed:
+    """An engine of another kind: it runs the last task first."""
+
+    is_parallel = False
+
+    def run(self, work, tasks):
+        for task in reversed(tasks):
+            yield task, work(task)
+
+
+def test_any_engine_fills_a_ledger(ledger, tmp_path):
+    run_all(TASKS, ledger, Reversed(), run_task, progress=False)
+    alone = Ledger(tmp_path / "alone.csv", PaperCell, EpisodeScore)
+    run_all(TASKS, alone, LocalProcesses(1), run_task, progress=False)
+    assert ledger.path.read_bytes() == alone.path.read_bytes()
 
 
 def test_a_failure_in_a_worker_is_raised_and_leaves_no_process(ledger):
     bad = dataclasses.replace(TASKS[0], cell=dataclasses.replace(EKF, bandwidth=99))
     with pytest.raises(ValueError, match="bandwidth must be in"):
-        run_all([bad, *TASKS], ledger, workers=2, progress=False)
+        run_all([bad, *TASKS], ledger, LocalProcesses(2), run_task, progress=False)
     assert multiprocessing.active_children() == []
 
 
-class Pool(ProcessPoolExecutor):
-    """A pool that can be asked how its processes ended."""
+def wait_for_ever(seconds):
+    """Take as long as it is told; leave a file that says how it ended."""
+    if seconds:
+        folder = Path(os.environ["ENDS"])
+        (folder / str(os.getpid())).write_text("begun")
+        time.sleep(seconds)
+        (folder / str(os.getpid())).write_text("ended")
+    return seconds
 
-    processes: ClassVar[list] = []
 
-    def shutdown(self, *args, **keywords):
-        self.processes[:] = (self._processes or {}).values()
-        super().shutdown(*args, **keywords)
-
-
-def test_an_interrupt_keeps_what_is_done_and_leaves_no_process(ledger, monkeypatch):
-    append, done = ledger.append, []
-
-    def interrupted(cell, scores):
-        append(cell, scores)
-        done.append(cell)
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(ledger, "append", interrupted)
-    monkeypatch.setattr(runner, "ProcessPoolExecutor", Pool)
+def test_an_interrupt_ends_what_runs_and_leaves_no_process(tmp_path, monkeypatch):
+    monkeypatch.setenv("ENDS", str(tmp_path))
+    start = time.monotonic()
+    results = LocalProcesses(2).run(wait_for_ever, [600, 0])
+    assert next(results) == (0, 0)
+    deadline = time.monotonic() + 60
+    while not list(tmp_path.iterdir()):
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
     # The traceback keeps the frames alive, so that nothing ends by being forgotten.
     with pytest.raises(KeyboardInterrupt) as caught:
-        run_all(TASKS, ledger, workers=2, progress=False)
+        results.throw(KeyboardInterrupt())
     assert caught.tb is not None
     assert multiprocessing.active_children() == []
-    # Not waited for: what they were at is run again.
-    assert {process.exitcode for process in Pool.processes} == {-signal.SIGTERM}
-    assert set(Ledger(ledger.path, Cell, EpisodeScore).rows) == {(done[0], seed) for seed in SEEDS}
+    # Not waited for: it is run again.
+    assert time.monotonic() - start < 300
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["begun"]
+
+
+def test_an_interrupt_keeps_what_is_done(ledger):
+    done = []
+
+    def interrupted(task):
+        if done:
+            raise KeyboardInterrupt
+        done.append(task)
+        return run_task(task)
+
+    with pytest.raises(KeyboardInterrupt):
+        run_all(TASKS, ledger, LocalProcesses(1), interrupted, progress=False)
+    again = Ledger(ledger.path, PaperCell, EpisodeScore)
+    assert set(again.rows) == {(done[0].cell, seed) for seed in SEEDS}
 
 
 def test_only_what_is_missing_is_run(ledger):
-    design = Design(seeds=SEEDS, estimators=("ekf",))
-    assert sum(len(task.seeds) for task in missing(design, ledger, None)) == 2 * len(design.cells())
+    design = PaperDesign(seeds="2000:2002", estimators=("ekf",))
+    tasks = missing_tasks(design, ledger, None)
+    assert sum(len(task.seeds) for task in tasks) == 2 * len(design.cells())
     cell = design.base("ekf", SETTINGS[0])
     score = EpisodeScore(2000, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0)
     ledger.append(cell, [score])
-    left = {task.cell: task.seeds for task in missing(design, ledger, None)}
+    left = {task.cell: task.seeds for task in missing_tasks(design, ledger, None)}
     assert left[cell] == (2001,)
     ledger.append(cell, [dataclasses.replace(score, traffic_seed=2001)])
-    assert cell not in {task.cell for task in missing(design, ledger, None)}
+    assert cell not in {task.cell for task in missing_tasks(design, ledger, None)}
 
 
-def test_fewer_than_one_worker_is_refused(ledger):
+def test_fewer_than_one_worker_is_refused():
     with pytest.raises(ValueError, match="workers must be an integer >= 1, got 0"):
-        run_all(TASKS, ledger, workers=0, progress=False)
+        LocalProcesses(0)
 
 
 def test_workers_end_with_their_parent():
-    """Whoever kills this program leaves nobody behind."""
+    """No process outlives a program that is killed."""
     context = multiprocessing.get_context("spawn")
     receiver, sender = context.Pipe(duplex=False)
     parent = context.Process(target=_parent, args=(sender,))
@@ -143,6 +176,7 @@ def _parent(sender):
 
 
 def _child(sender):
-    runner._begin_worker()
+    follow_parent()
+    assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
     sender.send("ready")
     multiprocessing.Event().wait(60)

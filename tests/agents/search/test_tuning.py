@@ -9,8 +9,7 @@ import pytest
 from optuna.trial import TrialState
 
 from agents.evaluation.episodes import EpisodeScore
-from agents.search import tuning
-from agents.search.tuning import TuningStudy, scores_of
+from agents.search.tuning import journal_path, locked_study, scores_of
 from agents.search.tuning_task import TuningTask, score_episode
 from dptse_env.estimators import EstimatorSettings
 from dptse_env.estimators.tuning import load_settings, read_settings
@@ -20,10 +19,8 @@ TASK = TuningTask(
     estimator="ekf",
     parameters="w99-3lane",
     privacy="paper",
-    epsilon=1.0,
-    delta=0.05,
-    bandwidth=2,
     seeds="0:3",
+    keywords={"epsilon": 1.0, "delta": 0.05, "bandwidth": 2},
 )
 
 
@@ -37,16 +34,20 @@ def made_up(task, settings, seed):
     return EpisodeScore(seed, 10 + distance, 5 + distance, -0.1 * distance - seed, 0.0, 1.0, 0.0)
 
 
-@pytest.fixture
-def fake(monkeypatch):
-    calls = []
+class Fake:
+    """Scores that are made up, and what was scored."""
 
-    def score(task, settings, seed):
-        calls.append((settings, seed))
+    def __init__(self):
+        self.calls = []
+
+    def __call__(self, task, settings, seed):
+        self.calls.append((settings, seed))
         return made_up(task, settings, seed)
 
-    monkeypatch.setattr(tuning, "score_episode", score)
-    return calls
+
+@pytest.fixture
+def fake():
+    return Fake()
 
 
 @pytest.fixture
@@ -55,8 +56,8 @@ def executor():
         yield threads
 
 
-def run(folder, executor, n_trials, task=TASK, **keywords):
-    with TuningStudy.open(task, folder) as study:
+def run(folder, executor, n_trials, task=TASK, score=score_episode, **keywords):
+    with locked_study(task, folder, score=score) as study:
         study.run(n_trials, executor, **keywords)
     return study
 
@@ -82,7 +83,7 @@ def test_it_beats_the_defaults_on_real_traffic(tmp_path, executor):
 
 
 def test_it_finds_the_best_settings(tmp_path, executor, fake):
-    study = run(tmp_path, executor, 60)
+    study = run(tmp_path, executor, 60, score=fake)
     path = tmp_path / "x.json"
     study.write(path)
     assert read_settings(path).process_noise == pytest.approx((0.02, 0.005), rel=0.5)
@@ -98,33 +99,32 @@ def test_it_finds_the_best_settings(tmp_path, executor, fake):
 
 
 def test_the_defaults_and_the_present_set_are_tried_first_and_to_the_end(tmp_path, executor, fake):
-    run(tmp_path, executor, 2)
-    shipped = load_settings("ekf-w99-3lane-paper")
-    assert fake == [(one, seed) for one in (EstimatorSettings(), shipped) for seed in range(3)]
-    run(tmp_path / "open", executor, 1, dataclasses.replace(TASK, privacy="corrected"))
-    assert fake[6:] == [(EstimatorSettings(), seed) for seed in range(3)]
+    run(tmp_path, executor, 2, score=fake)
+    first = EstimatorSettings(), load_settings("ekf-w99-3lane-paper")
+    assert fake.calls == [(settings, seed) for settings in first for seed in range(3)]
+    other = Fake()
+    run(tmp_path / "open", executor, 1, dataclasses.replace(TASK, privacy="corrected"), other)
+    assert other.calls == [(EstimatorSettings(), seed) for seed in range(3)]
 
 
-def test_bad_trials_stop_early_but_never_the_first_two(tmp_path, executor, fake, monkeypatch):
-    study = run(tmp_path, executor, 30)
+def test_bad_trials_stop_early_but_never_the_first_two(tmp_path, executor, fake):
+    study = run(tmp_path, executor, 30, score=fake)
     pruned = [t for t in study.study.get_trials() if t.state == TrialState.PRUNED]
     assert pruned
     assert all(len(t.intermediate_values) < 3 for t in pruned)
-    monkeypatch.setattr(tuning.optuna.Trial, "should_prune", lambda trial: True)
-    study = run(tmp_path / "strict", executor, 4)
-    assert [t.state.name for t in study.study.get_trials()] == ["COMPLETE"] * 2 + ["PRUNED"] * 2
+    assert not any("label" in t.user_attrs for t in pruned)
 
 
-def test_an_interrupted_study_comes_out_as_one_that_was_not(tmp_path, executor, fake, monkeypatch):
-    whole = run(tmp_path / "whole", executor, 20)
-    first = trials(run(tmp_path / "parts", executor, 13))
-    path = tuning.journal_path(TASK, tmp_path / "parts")
+def test_an_interrupted_study_comes_out_as_one_that_was_not(tmp_path, executor, fake):
+    whole = run(tmp_path / "whole", executor, 20, score=fake)
+    first = trials(run(tmp_path / "parts", executor, 13, score=fake))
+    path = journal_path(TASK, tmp_path / "parts")
     lines = path.read_bytes().splitlines(keepends=True)
     # Cut inside trial 12, as a kill in the middle of a write does, the lock still there.
     started = max(i for i, line in enumerate(lines) if json.loads(line)["op_code"] == 4)
     path.write_bytes(b"".join(lines[: started + 2]) + b'{"op_co')
     (tmp_path / "parts" / f"{path.name}.lock").touch()
-    resumed = run(tmp_path / "parts", executor, 20)
+    resumed = run(tmp_path / "parts", executor, 20, score=fake)
     kept = [trial for trial in trials(resumed) if trial[0] != TrialState.FAIL]
     assert len(trials(resumed)) == 21
     assert first[:12] == kept[:12]
@@ -133,25 +133,23 @@ def test_an_interrupted_study_comes_out_as_one_that_was_not(tmp_path, executor, 
 
 
 def test_a_finished_study_does_nothing_more(tmp_path, executor, fake):
-    run(tmp_path, executor, 5)
-    n_calls = len(fake)
-    study = run(tmp_path, executor, 5)
+    run(tmp_path, executor, 5, score=fake)
+    again = Fake()
+    study = run(tmp_path, executor, 5, score=again)
     study.write(tmp_path / "x.json")
-    assert len(fake) == n_calls
+    assert again.calls == []
     assert read_settings(tmp_path / "x.json") == EstimatorSettings(
         **study.best().user_attrs["settings"]
     )
 
 
-def test_a_stale_first_trial_is_run_again(tmp_path, executor, monkeypatch):
+def test_a_stale_first_trial_is_run_again(tmp_path, executor):
     def fail(task, settings, seed):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(tuning, "score_episode", fail)
     with pytest.raises(KeyboardInterrupt):
-        run(tmp_path, executor, 5)
-    monkeypatch.setattr(tuning, "score_episode", made_up)
-    study = run(tmp_path, executor, 5)
+        run(tmp_path, executor, 5, score=fail)
+    study = run(tmp_path, executor, 5, score=made_up)
     assert study.n_finished() == 5
     assert study.labelled("defaults").intermediate_values
     assert study.labelled("shipped").intermediate_values
@@ -161,51 +159,53 @@ def test_a_stale_first_trial_is_run_again(tmp_path, executor, monkeypatch):
 
 
 def test_several_trials_at_once_make_the_number_wanted(tmp_path, fake):
-    told = []
+    finished = []
     with ThreadPoolExecutor(3) as threads:
-        study = run(tmp_path, threads, 10, n_parallel=3, on_trial=lambda: told.append(1))
-    assert study.n_finished() == len(study.study.get_trials()) == len(told) == 10
+        study = run(
+            tmp_path, threads, 10, score=fake, n_parallel=3, on_trial=lambda: finished.append(1)
+        )
+    assert study.n_finished() == len(study.study.get_trials()) == len(finished) == 10
 
 
-def test_a_score_that_is_not_finite_is_never_the_best(tmp_path, executor, fake, monkeypatch):
+def test_a_score_that_is_not_finite_is_never_the_best(tmp_path, executor):
     def score(task, settings, seed):
-        one = made_up(task, settings, seed)
+        result = made_up(task, settings, seed)
         bad = settings.process_noise[0] > EstimatorSettings().process_noise[0]
-        return dataclasses.replace(one, reward=math.nan) if bad else one
+        return dataclasses.replace(result, reward=math.nan) if bad else result
 
-    monkeypatch.setattr(tuning, "score_episode", score)
-    study = run(tmp_path, executor, 20)
+    study = run(tmp_path, executor, 20, score=score)
     assert any("not_finite" in trial.user_attrs for trial in study.study.get_trials())
     assert study.best().params["process_noise.0"] <= 0.01
-    monkeypatch.setattr(
-        tuning,
-        "score_episode",
-        lambda *args: dataclasses.replace(made_up(*args), reward=math.nan),
-    )
-    study = run(tmp_path / "nothing", executor, 3)
+    study = run(
+        tmp_path / "nothing", executor, 3,
+        score=lambda *args: dataclasses.replace(made_up(*args), reward=math.nan),
+    )  # fmt: skip
     with pytest.raises(ValueError, match="ekf-w99-3lane-paper: no trial ran to its end"):
         study.write(tmp_path / "x.json")
 
 
 @pytest.mark.parametrize(
     ("changes", "named"),
-    [({"seeds": "0:2"}, "'seeds': '0:3'.*'seeds': '0:2'"), ({"bandwidth": 3}, "'bandwidth': 2")],
+    [
+        ({"seeds": "0:2"}, "'seeds': '0:3'.*'seeds': '0:2'"),
+        ({"keywords": {"bandwidth": 3}}, "'bandwidth': 2"),
+    ],
 )
 def test_a_study_of_other_arguments_is_refused(changes, named, tmp_path, executor, fake):
-    run(tmp_path, executor, 2)
+    run(tmp_path, executor, 2, score=fake)
     with pytest.raises(ValueError, match=f"ekf-w99-3lane-paper.journal belongs to .*{named}"):
-        run(tmp_path, executor, 2, dataclasses.replace(TASK, **changes))
+        run(tmp_path, executor, 2, dataclasses.replace(TASK, **changes), fake)
     with (
         pytest.raises(ValueError, match="sampler_seed"),
-        TuningStudy.open(TASK, tmp_path, seed=1),
+        locked_study(TASK, tmp_path, seed=1),
     ):
         pass
 
 
 def test_two_runs_do_not_write_one_journal(tmp_path):
     with (
-        TuningStudy.open(TASK, tmp_path),
+        locked_study(TASK, tmp_path),
         pytest.raises(BlockingIOError, match=r"another run is writing .*\.journal"),
-        TuningStudy.open(TASK, tmp_path),
+        locked_study(TASK, tmp_path),
     ):
         pass

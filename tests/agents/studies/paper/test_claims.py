@@ -1,9 +1,9 @@
 import pytest
 
 from agents.evaluation.statistics import Interval
+from agents.experiments.cells import UnmeasuredError
 from agents.studies.paper.claims import BELOW_ZERO, Claim, Range, combine, judge, judge_part
 from agents.studies.paper.plan import SETTINGS
-from agents.studies.paper.results import UnmeasuredError
 
 
 def interval(low, high):

@@ -8,7 +8,7 @@ import pytest
 from agents.studies.paper.claims import judge
 from agents.studies.paper.paper_claims import CLAIMS, TARGETS
 from agents.studies.paper.plan import SETTINGS
-from agents.studies.paper.results import Measured, correlations, roughness, slopes
+from agents.studies.paper.results import PaperResults, correlations, roughness, slopes
 from tests.agents.studies.paper.made_up import DESIGN, make_up
 
 BY_KEY = {claim.key: claim for claim in (*CLAIMS, *TARGETS)}
@@ -105,7 +105,7 @@ def test_seeds_that_disagree_leave_it_open():
         key: dataclasses.replace(score, rmse_density=float(generator.uniform(5.0, 50.0)))
         for key, score in noisy.scores.items()
     }
-    measured = Measured(DESIGN, scores, noisy.times)
+    measured = PaperResults(DESIGN, scores, noisy.times)
     assert verdict("P3", measured) == "undecided"
     assert verdict("P1", measured) == "undecided"
 

@@ -2,7 +2,7 @@ import dataclasses
 
 import pytest
 
-from agents.studies.paper.plan import BASELINES, ESTIMATORS, SETTINGS, Design, canonical, quick
+from agents.studies.paper.plan import BASELINES, ESTIMATORS, SETTINGS, PaperDesign, canonical
 from tests.agents.studies.paper.made_up import DESIGN
 
 
@@ -18,10 +18,10 @@ def test_cells_that_results_share_are_run_once():
 
 
 def test_the_full_design_is_the_paper_s():
-    design = Design()
-    assert design.sweeps["bandwidth"].values == (5, 6, 7, 8, 9, 10, 11)
+    design = PaperDesign()
+    assert design.sweeps["bandwidth"] == (5, 6, 7, 8, 9, 10, 11)
     assert design.picture("ukf", SETTINGS[0]).bandwidth == 7
-    assert len(design.seeds) >= 20
+    assert len(design.traffic_seeds) >= 20
     base = design.base("mhe", SETTINGS[3])
     assert (base.epsilon, base.delta, base.bandwidth) == (1.0, 0.05, 5)
     assert (base.privacy, base.parameters) == ("corrected", "w99-3lane")
@@ -33,8 +33,8 @@ def test_every_cell_runs_under_all_four_settings():
 
 
 def test_the_open_loop_runs_once_for_each_parameter_set():
-    own = [cell for cell in DESIGN.cells() if cell.estimator == "open_loop"]
-    assert [cell.parameters for cell in own] == ["paper", "w99-3lane"]
+    cells = [cell for cell in DESIGN.cells() if cell.estimator == "open_loop"]
+    assert [cell.parameters for cell in cells] == ["paper", "w99-3lane"]
     assert len(set(DESIGN.along("epsilon", "open_loop", SETTINGS[0]))) == 1
     ekf = DESIGN.base("ekf", SETTINGS[0])
     assert canonical(ekf) == ekf
@@ -42,8 +42,8 @@ def test_the_open_loop_runs_once_for_each_parameter_set():
 
 def test_sweeps_are_sorted_and_hold_the_base_value():
     design = dataclasses.replace(DESIGN, epsilons=(3.0, 0.2), deltas=(0.2,))
-    assert design.sweeps["epsilon"].values == (0.2, 1.0, 3.0)
-    assert design.sweeps["delta"].values == (0.05, 0.2)
+    assert design.sweeps["epsilon"] == (0.2, 1.0, 3.0)
+    assert design.sweeps["delta"] == (0.05, 0.2)
 
 
 def test_baselines_come_last_and_always():
@@ -59,20 +59,23 @@ def test_timed_episodes_alternate_estimators():
 
 
 def test_quick_is_a_part_of_the_full_design():
-    full, part = Design(), quick(Design())
-    assert len(part.cells()) * len(part.seeds) < len(full.cells()) * len(full.seeds) / 10
+    full, part = PaperDesign(), PaperDesign().quick()
+    n_part, n_full = (len(each.cells()) * len(each.traffic_seeds) for each in (part, full))
+    assert n_part < n_full / 10
+    assert set(part.traffic_seeds) < set(full.traffic_seeds)
     assert set(part.cells()) < set(full.cells())
-    assert part.sweeps["bandwidth"].values == (5, 8, 11)
-    assert part.sweeps["epsilon"].values == (0.1, 1.0, 10.0)
+    assert part.sweeps["bandwidth"] == (5, 8, 11)
+    assert part.sweeps["epsilon"] == (0.1, 1.0, 10.0)
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"seeds": (2000,)}, "seeds must be 2 or more"),
-        ({"seeds": (2000, 2000)}, "distinct"),
-        ({"seeds": (0, 2000)}, r"held out, in 2000\.\.2999.*got 0"),
-        ({"seeds": (1999, 2000)}, "got 1999"),
+        ({"seeds": "2000"}, "seeds must be 2 or more"),
+        ({"seeds": "all"}, "must be 'first:stop' or one seed"),
+        ({"seeds": "0:4"}, r"test seeds, in 2000\.\.2999.*got 0"),
+        ({"seeds": "1999:2001"}, "got 1999"),
+        ({"schedule": "random"}, r"schedule must be one of .*round-robin"),
         ({"n_timed": 1}, "n_timed must be >= 2"),
         ({"estimators": ("kf",)}, "estimator must be one of"),
         ({"estimators": ("random_walk",)}, "estimators must be among ekf, ukf, enkf, mhe"),
@@ -84,4 +87,4 @@ def test_quick_is_a_part_of_the_full_design():
 )
 def test_bad_designs_are_named(changes, message):
     with pytest.raises(ValueError, match=message):
-        dataclasses.replace(DESIGN, **changes)
+        dataclasses.replace(DESIGN, **changes).check()

@@ -9,7 +9,7 @@ from agents.studies.policies.plan import (
     CELLS,
     PAPER,
     PRIVATE,
-    Design,
+    PolicyDesign,
     quick,
 )
 from agents.studies.policies.running import config_of
@@ -20,7 +20,7 @@ from tests.agents.studies.policies.worlds import SMALL
 
 
 def test_the_full_design_is_that_of_the_study():
-    design = Design()
+    design = PolicyDesign()
     assert (len(design.validation_seeds), len(design.test_seeds)) == (64, 64)
     cells = {cell.name: cell for cell in design.cells}
     assert next(iter(cells)) == "primary"
@@ -50,13 +50,13 @@ def test_the_full_design_is_that_of_the_study():
 
 def test_recipes_are_not_chosen_where_trainings_chose_their_best_policy():
     kept_by = parse_seeds(Args().validation)
-    assert not set(kept_by) & set(Design().validation_seeds)
+    assert not set(kept_by) & set(PolicyDesign().validation_seeds)
 
 
 def test_quick_is_a_part_of_the_full_design():
-    part = quick(Design())
+    part = quick(PolicyDesign())
     assert [cell.name for cell in part.cells] == ["primary"]
-    assert set(part.test_seeds) < set(Design().test_seeds)
+    assert set(part.test_seeds) < set(PolicyDesign().test_seeds)
 
 
 @pytest.mark.parametrize(
@@ -73,11 +73,11 @@ def test_quick_is_a_part_of_the_full_design():
 )
 def test_bad_designs_are_named(changes, message):
     with pytest.raises(ValueError, match=message):
-        Design(**changes)
+        PolicyDesign(**changes)
 
 
 def test_a_design_survives_json():
-    for design in (Design(), SMALL):
+    for design in (PolicyDesign(), SMALL):
         assert plain(design_of(json.loads(json.dumps(plain(design))))) == plain(design)
         assert [config_of(cell, (0,)) for cell in design_of(plain(design)).cells] == [
             config_of(cell, (0,)) for cell in design.cells

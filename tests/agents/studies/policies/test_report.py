@@ -3,6 +3,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from agents.studies.policies.report import draw, write_report
 from PIL import Image
 
 from agents.studies.policies import figures, tables
@@ -10,7 +11,6 @@ from agents.studies.policies.curves import read_curves
 from agents.studies.policies.manifest import (
     find_checkpoints,
 )
-from agents.studies.policies.report import draw, write_report
 from tests.agents.policies import save
 from tests.agents.studies.policies.worlds import SMALL, asked, checkpoints, made_up
 

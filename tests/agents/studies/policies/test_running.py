@@ -10,7 +10,7 @@ from agents.studies.policies.plan import (
     Entry,
     Learner,
 )
-from agents.studies.policies.queries import BIN, PHASES, Watch
+from agents.studies.policies.queries import BIN, PHASES, QueryCounter
 from agents.studies.policies.running import make_batch, make_task, run_entry, suited
 from dptse_env.schedules import make_schedule
 from dptse_env.traffic.scenario import draw_scenario
@@ -55,7 +55,7 @@ def test_a_cell_that_is_wrong_is_not_taken_for_a_schedule_that_does_not_suit():
 
 def test_queries_are_counted_where_and_when_they_are_asked():
     env = make_batch(SHORT, {**WALK, "incident": "random"}, (2000, 2001))
-    watch, queried, times = Watch(env.process, (2000, 2001)), [], []
+    watch, queried, times = QueryCounter(env.process, (2000, 2001)), [], []
 
     def note():
         watch()
@@ -84,7 +84,7 @@ def test_queries_are_counted_where_and_when_they_are_asked():
 
 def test_without_an_incident_all_of_an_episode_is_before_it():
     env = make_batch(SHORT, {**WALK, "incident": "none"}, (2000,))
-    watch = Watch(env.process, (2000,))
+    watch = QueryCounter(env.process, (2000,))
     run_episodes(
         env, make_schedule("paper", env), traffic_seeds=(2000,), seeds=(1,), on_second=watch
     )

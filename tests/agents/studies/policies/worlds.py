@@ -13,19 +13,19 @@ from agents.studies.policies.manifest import (
     find_checkpoints,
 )
 from agents.studies.policies.plan import (
-    Cell,
-    Design,
+    PolicyCell,
+    PolicyDesign,
 )
-from agents.studies.policies.queries import Asked
-from agents.studies.policies.results import Measured
+from agents.studies.policies.queries import QueryCounts
+from agents.studies.policies.results import PolicyResults
 from tests.agents.policies import SHORT
 
 WALK = {"estimator": "random_walk", "bandwidth": 2}
-SMALL = Design(
+SMALL = PolicyDesign(
     cells=(
-        Cell("primary", "a short road", SHORT, WALK, bounds=("oracle-error",)),
-        Cell("other", "three a second", SHORT, {**WALK, "bandwidth": 3}, bounds=()),
-        Cell("moved", "no incident", SHORT, {**WALK, "incident": "none"}, ("primary",), ()),
+        PolicyCell("primary", "a short road", SHORT, WALK, bounds=("oracle-error",)),
+        PolicyCell("other", "three a second", SHORT, {**WALK, "bandwidth": 3}, bounds=()),
+        PolicyCell("moved", "no incident", SHORT, {**WALK, "incident": "none"}, ("primary",), ()),
     ),
     baselines=("paper", "oldest-first", "offline"),
     validation_seeds=(1000, 1001),
@@ -44,17 +44,17 @@ def score(seed, error, **fields):
 
 
 def asked(seed):
-    return Asked(seed, 3, 60.0, "60 100 80", "1 2 3 4 5 6", "6 5 4 3 2 1", "0 0 9 9 0 0",
+    return QueryCounts(seed, 3, 60.0, "60 100 80", "1 2 3 4 5 6", "6 5 4 3 2 1", "0 0 9 9 0 0",
                  " ".join(["7"] * 12))  # fmt: skip
 
 
 def made_up(runs_below=(10.0,) * 5, n_seeds=64, *, spread=0.0, elsewhere=12.0, asks=True):
     """Scores in which learned policies lie so many percent below the best baseline."""
-    design = Design(
+    design = PolicyDesign(
         cells=(
-            Cell("primary", "made up", SHORT, WALK, bounds=("oracle-error",)),
-            Cell("other", "made up too", SHORT, WALK, (), ()),
-            Cell("moved", "and moved", SHORT, WALK, ("primary",), ()),
+            PolicyCell("primary", "made up", SHORT, WALK, bounds=("oracle-error",)),
+            PolicyCell("other", "made up too", SHORT, WALK, (), ()),
+            PolicyCell("moved", "and moved", SHORT, WALK, ("primary",), ()),
         ),
         baselines=("paper", "oldest-first"),
         test_seeds=tuple(range(2000, 2000 + n_seeds)),
@@ -96,4 +96,4 @@ def made_up(runs_below=(10.0,) * 5, n_seeds=64, *, spread=0.0, elsewhere=12.0, a
         if asks and key[0].cell == "primary" and key[0].mode == "deterministic"
     }
     curves = [Curve("plackett-luce", seed, (0, 10), (120.0, 90.0 + seed)) for seed in range(2)]
-    return Measured(design, manifest, scores, watched, curves, n_resamples=400)
+    return PolicyResults(design, manifest, scores, watched, curves, n_resamples=400)

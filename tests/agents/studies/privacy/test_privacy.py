@@ -12,8 +12,14 @@ from agents.experiments.provenance import provenance
 from agents.experiments.runner import Task, make_env, run_task
 from agents.studies.privacy import report
 from agents.studies.privacy.account import account_of, mu_alone, mu_met, trip_lengths
-from agents.studies.privacy.plan import BOUNDARY_MODES, Cell, Design, Protection, quick
-from agents.studies.privacy.results import DENSITY, SPEED, Measured
+from agents.studies.privacy.plan import (
+    BOUNDARY_MODES,
+    PrivacyCell,
+    PrivacyDesign,
+    Protection,
+    quick,
+)
+from agents.studies.privacy.results import DENSITY, SPEED, PrivacyResults
 from agents.studies.privacy.tables import cost_table, modes_table, number, write_summary
 from dptse_env.config import resolve
 from dptse_env.privacy import epsilon_of
@@ -21,7 +27,7 @@ from dptse_env.traffic import Corridor, RecordLibrary
 from dptse_env.traffic.record import Record
 
 SHORT = "dptse_env:dptse/ShortHighway-v0"
-DESIGN = Design(
+DESIGN = PrivacyDesign(
     seeds=(2000, 2001, 2002),
     epsilons=(1.0, 20.0),
     caps=(4,),
@@ -40,27 +46,29 @@ def config_of(cell):
 
 
 def test_the_full_design_holds_what_the_study_is_about():
-    design = Design()
+    design = PrivacyDesign()
     assert len(design.seeds) >= 20
     cells = set(design.cells())
     for name in ("ekf", "random_walk"):
         for epsilon in (0.5, 1.0, 2.0, 5.0, 10.0, 20.0):
             for cap in (4, 16, 64):
-                own = Cell(name, "guaranteed", "trip", cap, "nominal", epsilon, 0.05, 5)
+                own = PrivacyCell(name, "guaranteed", "trip", cap, "nominal", epsilon, 0.05, 5)
                 assert own in cells
             for unit in ("horizon", "event"):
-                assert Cell(name, "guaranteed", unit, 0, "nominal", epsilon, 0.05, 5) in cells
+                assert (
+                    PrivacyCell(name, "guaranteed", unit, 0, "nominal", epsilon, 0.05, 5) in cells
+                )
             for preset in ("paper", "corrected"):
-                assert Cell(name, preset, "none", 0, "true", epsilon, 0.05, 5) in cells
+                assert PrivacyCell(name, preset, "none", 0, "true", epsilon, 0.05, 5) in cells
         for mode in ("true", "nominal", "private"):
-            assert Cell(name, "guaranteed", "trip", 64, mode, 5.0, 0.05, 5) in cells
+            assert PrivacyCell(name, "guaranteed", "trip", 64, mode, 5.0, 0.05, 5) in cells
         for bandwidth in (3, 5, 8, 15):
-            own = Cell(name, "guaranteed", "trip", 64, "nominal", 5.0, 0.05, bandwidth)
+            own = PrivacyCell(name, "guaranteed", "trip", 64, "nominal", 5.0, 0.05, bandwidth)
             assert own in cells
 
 
 def test_cells_that_figures_share_are_run_once():
-    cells = Design().cells()
+    cells = PrivacyDesign().cells()
     assert len(cells) == len(set(cells))
     # Five units of six epsilons, two presets of six, two modes, three bandwidths; for each of two.
     n_private_open_loops = 1
@@ -82,8 +90,8 @@ def test_the_environment_is_what_the_cell_says(cell):
 def test_the_open_loop_hears_nothing_that_its_shared_cell_leaves_out():
     RecordLibrary().ensure(resolve("short-highway", {}).corridor, (2000,))
     for other in (
-        Cell("open_loop", "paper", "none", 0, "true", 0.5, 0.05, 1),
-        Cell("open_loop", "guaranteed", "event", 0, "nominal", 20.0, 0.05, 3),
+        PrivacyCell("open_loop", "paper", "none", 0, "true", 0.5, 0.05, 1),
+        PrivacyCell("open_loop", "guaranteed", "event", 0, "nominal", 20.0, 0.05, 3),
     ):
         shared = DESIGN.cell("open_loop", boundary_inputs=other.boundary_inputs)
         assert shared in DESIGN.cells()
@@ -100,7 +108,7 @@ def test_grids_are_sorted_and_hold_the_base_values():
 
 
 def test_quick_is_a_part_of_the_full_design():
-    full, part = Design(), quick(Design())
+    full, part = PrivacyDesign(), quick(PrivacyDesign())
     assert set(part.cells()) < set(full.cells())
     assert set(part.seeds) < set(full.seeds)
     assert len(part.cells()) * len(part.seeds) < len(full.cells()) * len(full.seeds) / 8
@@ -207,7 +215,7 @@ def made_up(density=lambda cell: 10.0):
         ]
         for protection in (*DESIGN.guaranteed, *DESIGN.printed)
     }
-    return Measured(DESIGN, scores, accounts, np.array([50, 60, 70, 90]), 400)
+    return PrivacyResults(DESIGN, scores, accounts, np.array([50, 60, 70, 90]), 400)
 
 
 def priced(cell):
