@@ -4,7 +4,15 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from agents.evaluation.episodes import run_episode, run_episodes, watch_episode
+from agents.evaluation.episodes import (
+    check_test_seeds,
+    make_config,
+    run_episode,
+    run_episodes,
+    seed_kind,
+    unwrap,
+    watch_episode,
+)
 from dptse_env.actions import ACTION_ENCODINGS
 from dptse_env.schedules import INFORMED, ORACLES, SCHEDULES, make_schedule
 
@@ -71,6 +79,40 @@ def test_watching_changes_nothing():
     assert watched == run_episode(env, schedule, traffic_seed=0, seed=1)
     assert len(history.truth) == len(history.queried) == 241
     assert np.array(history.queried)[1:].sum(axis=1).tolist() == [2] * 240
+
+
+@pytest.mark.parametrize(
+    ("seeds", "message"),
+    [
+        ((2000,), "seeds must be 2 or more"),
+        ((2000, 2000), "distinct"),
+        ((0, 2000), r"test seeds, in 2000\.\.2999.*got 0"),
+        ((1999, 2000), "got 1999"),
+    ],
+)
+def test_seeds_that_are_no_test_seeds_are_refused(seeds, message):
+    with pytest.raises(ValueError, match=message):
+        check_test_seeds(seeds)
+
+
+@pytest.mark.parametrize(
+    ("seeds", "kind"),
+    [
+        (range(500, 502), "training"),
+        ((1000, 1999), "validation"),
+        ((2000, 2999), "test"),
+        ((999, 1000), "mixed"),
+        ((2999, 3000), "mixed"),
+    ],
+)
+def test_seeds_are_named_by_their_range(seeds, kind):
+    assert seed_kind(seeds) == kind
+
+
+def test_an_environment_of_another_package_is_refused():
+    with pytest.raises(TypeError, match="environment of dptse_env, got CartPoleEnv"):
+        unwrap(gym.make("CartPole-v1"))
+    assert make_config("dptse_env:dptse/ShortHighway-v0", {"bandwidth": 1}).bandwidth == 1
 
 
 # A batch at once

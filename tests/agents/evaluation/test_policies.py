@@ -8,9 +8,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from agents.evaluation.policies import read_saved_policy
+from agents.evaluation.policies import find_policy, read_saved_policy
 from dptse_env import sb3
 from dptse_env.policies import TRANSFERABLE
+from dptse_env.schedules import make_schedule
 from tests.agents.policies import SHORT, save
 
 
@@ -58,6 +59,25 @@ def test_what_is_no_policy_is_refused(tmp_path):
             archive.writestr("card.json", json.dumps(card))
         with pytest.raises(ValueError, match="no saved policy"):
             read_saved_policy(text)
+
+
+def test_a_name_is_a_saved_policy_or_a_schedule(tmp_path):
+    path = save(tmp_path / "policy.zip", seed=2)
+    saved, schedule = find_policy(str(path)), find_policy("paper")
+    assert saved == read_saved_policy(path)
+    assert saved.keywords == {"action": "slots"}
+    assert saved.identity == saved.sha256
+    assert (schedule.keywords, schedule.identity) == ({}, "paper")
+    assert find_policy("private-highway").keywords == {"action": "slots"}
+    env = gym.make(SHORT)
+    observation, _ = env.reset(seed=0)
+    own, _ = schedule.load(env).predict(observation, None, None)
+    other, _ = make_schedule("paper", env).predict(observation, None, None)
+    np.testing.assert_array_equal(own, other)
+    with pytest.raises(ValueError, match="unknown schedule 'nobody'"):
+        find_policy("nobody").load(env)
+    with pytest.raises(FileNotFoundError, match=r"none\.zip"):
+        find_policy("none.zip")
 
 
 def test_a_name_is_looked_up_in_the_package(tmp_path, monkeypatch):

@@ -3,19 +3,18 @@ import dataclasses
 import numpy as np
 import pytest
 
-from agents.studies.audit import attack as attack_module
 from agents.studies.audit.attack import Adversary, attack, planned_distance
-from agents.studies.audit.distances import Ruler, best_spending
+from agents.studies.audit.distances import ReleaseDistances, plan_contributions
 from agents.studies.audit.policies import (
-    FENCE,
-    Adaptive,
-    Planned,
+    DECISION_THRESHOLD,
+    AdaptiveQueries,
+    FixedQueries,
     hunting_plan,
     make_policy,
     public_plan,
 )
 from agents.studies.audit.targets import choose_target
-from agents.studies.audit.worlds import Path, TwoWorlds
+from agents.studies.audit.worlds import AdjacentWorlds, Trajectory
 from dptse_env.config import EnvConfig
 from dptse_env.privacy import PrivacySettings, epsilon_of
 from dptse_env.privacy.audit import Claim, audit
@@ -50,7 +49,7 @@ def record():
 
 def reached(setting, worlds, policy="hunter"):
     plan = make_policy(setting, policy, worlds).plan
-    return planned_distance(setting, worlds, plan, Ruler.of(setting).sigma)
+    return planned_distance(setting, worlds, plan, ReleaseDistances.from_config(setting).sigma)
 
 
 ALL_PRIVACY = [
@@ -68,9 +67,9 @@ ALL_PRIVACY = [
 
 
 def test_worlds_differ_in_one_vehicle(record):
-    path = Path.of(record, 3)
+    path = Trajectory.from_record(record, 3)
     rest = record.without(3)
-    worlds = TwoWorlds(rest, (path, Path.nowhere()))
+    worlds = AdjacentWorlds(rest, (path, Trajectory.absent()))
     one, other = worlds.get(ROAD, 0), worlds.get(ROAD, 1)
     np.testing.assert_array_equal(one.counts, record.counts)
     np.testing.assert_allclose(one.speed_sums, record.speed_sums)
@@ -78,7 +77,7 @@ def test_worlds_differ_in_one_vehicle(record):
     again = one.without(rest.n_vehicles)
     for name in ("step", "vehicle", "segment", "speed"):
         np.testing.assert_array_equal(getattr(again, name), getattr(rest, name))
-    added = Path.of(one, rest.n_vehicles)
+    added = Trajectory.from_record(one, rest.n_vehicles)
     np.testing.assert_array_equal(added.segment, path.segment)
     assert len(path.step) > 3
 
@@ -86,35 +85,35 @@ def test_worlds_differ_in_one_vehicle(record):
 @pytest.mark.parametrize("preset", ["paper", "corrected", "guaranteed"])
 def test_the_closed_form_is_the_distance_of_a_second(preset, record):
     setting = config(preset=preset)
-    ruler = Ruler.of(setting)
+    distances = ReleaseDistances.from_config(setting)
     rows = np.linspace(0, record.n_rows - 1, 25).astype(int)
-    squares = ruler.of_rows(record)
+    squares = distances.by_row(record)
     for row in rows:
         step, segment, vehicle = (
             int(column[row]) for column in (record.step, record.segment, record.vehicle)
         )
-        path = Path.of(record, vehicle)
+        path = Trajectory.from_record(record, vehicle)
         keep, moved = path.only(path.step != step), path.only(path.step == step)
-        rest = TwoWorlds(record.without(vehicle), (keep, keep)).get(ROAD, 0)
-        worlds = TwoWorlds(rest, (moved, Path.nowhere()))
+        rest = AdjacentWorlds(record.without(vehicle), (keep, keep)).get(ROAD, 0)
+        worlds = AdjacentWorlds(rest, (moved, Trajectory.absent()))
         plan = np.zeros((HORIZON, ROAD.n_mainline), dtype=bool)
         plan[step - 1, segment] = True
-        distance = planned_distance(setting, worlds, plan, ruler.sigma)
+        distance = planned_distance(setting, worlds, plan, distances.sigma)
         assert distance**2 == pytest.approx(squares[row], rel=1e-9)
-        assert distance**2 == pytest.approx(ruler.of_path(rest, moved)[0], rel=1e-9)
+        assert distance**2 == pytest.approx(distances.by_second(rest, moved)[0], rel=1e-9)
 
 
 @pytest.mark.parametrize("preset", ["paper", "guaranteed"])
 def test_where_paths_meet_speeds_alone_tell(preset, record):
     setting = config(preset=preset)
-    ruler = Ruler.of(setting)
-    paths = tuple(Path.constant(np.array([20]), 2, speed) for speed in (5.0, 140.0))
-    worlds = TwoWorlds(record, paths)
+    distances = ReleaseDistances.from_config(setting)
+    paths = tuple(Trajectory.constant(np.array([20]), 2, speed) for speed in (5.0, 140.0))
+    worlds = AdjacentWorlds(record, paths)
     plan = np.zeros((HORIZON, ROAD.n_mainline), dtype=bool)
     plan[19, 2] = True
-    distance = planned_distance(setting, worlds, plan, ruler.sigma)
+    distance = planned_distance(setting, worlds, plan, distances.sigma)
     assert record.counts[20, 2] > 0
-    assert distance**2 == pytest.approx(ruler.of_meeting(record, paths)[0], rel=1e-9)
+    assert distance**2 == pytest.approx(distances.where_equal(record, paths)[0], rel=1e-9)
     assert distance > 0.0
 
 
@@ -151,7 +150,13 @@ def test_the_vehicle_that_is_deleted_tells_most(privacy, policy, record):
     setting = config(**privacy)
     chosen = reached(setting, choose_target(setting, record, "deleted", policy).worlds, policy)
     everyone = [
-        reached(setting, TwoWorlds(record.without(v), (Path.of(record, v), Path.nowhere())), policy)
+        reached(
+            setting,
+            AdjacentWorlds(
+                record.without(v), (Trajectory.from_record(record, v), Trajectory.absent())
+            ),
+            policy,
+        )
         for v in range(record.n_vehicles)
     ]
     assert chosen == pytest.approx(max(everyone), rel=1e-9)
@@ -171,7 +176,7 @@ def test_a_replaced_vehicle_tells_more_than_a_deleted_one(record):
 def test_an_event_is_one_second(record):
     setting = config(unit="event")
     for kind in ("worst-case", "replaced", "deleted"):
-        paths = choose_target(setting, record, kind, "hunter").worlds.paths
+        paths = choose_target(setting, record, kind, "hunter").worlds.trajectories
         assert {len(path.step) for path in paths} <= {0, 1}
         assert len({int(step) for path in paths for step in path.step}) == 1
 
@@ -180,33 +185,35 @@ def test_an_event_is_one_second(record):
 def test_the_hunter_keeps_to_bandwidth_and_cap(bandwidth, record):
     setting = config(bandwidth, cap=7)
     seconds = np.arange(1, HORIZON + 1)
-    worlds = TwoWorlds(record, (Path.constant(seconds, 0, 0.0), Path.constant(seconds, 1, 0.0)))
+    worlds = AdjacentWorlds(
+        record, (Trajectory.constant(seconds, 0, 0.0), Trajectory.constant(seconds, 1, 0.0))
+    )
     plan = hunting_plan(setting, worlds)
     assert plan.sum(axis=1).max() <= bandwidth
     assert plan.sum() == 14  # seven for each of the two paths
     assert reached(setting, worlds) == pytest.approx(setting.accountant().report.mu)
 
 
-def test_the_hunter_asks_in_the_seconds_that_tell_most(record):
+def test_the_hunter_queries_the_seconds_that_reveal_most(record):
     setting = config(cap=3)
-    path = Path.of(record, 0)
-    worlds = TwoWorlds(record.without(0), (path, Path.nowhere()))
+    path = Trajectory.from_record(record, 0)
+    worlds = AdjacentWorlds(record.without(0), (path, Trajectory.absent()))
     # The fixed sensor at the end of the road comes after them.
-    askable = path.only(path.segment < 5)
-    best = askable.step[np.argsort(-np.abs(np.clip(askable.speed, 0, 102) - 51.0))[:3]]
+    free = path.only(path.segment < 5)
+    best = free.step[np.argsort(-np.abs(np.clip(free.speed, 0, 102) - 51.0))[:3]]
     plan = hunting_plan(setting, worlds)
     assert set(np.flatnonzero(plan.any(axis=1)) + 1) == set(best.tolist())
     assert plan.sum() == 3
 
 
-def test_the_hunter_asks_where_the_two_paths_part(record):
+def test_the_hunter_queries_where_the_two_trajectories_part(record):
     setting = config(bandwidth=2, cap=4)
     seconds = np.arange(1, 21)
     # Side by side at a standstill, then apart and a little slower to tell.
     together = np.where(seconds <= 10, 1, 2), np.where(seconds <= 10, 1, 3)
     speed = np.where(seconds <= 10, 0.0, 20.0)
-    paths = tuple(Path(seconds, segment, speed) for segment in together)
-    plan = hunting_plan(setting, TwoWorlds(record, paths))
+    paths = tuple(Trajectory(seconds, segment, speed) for segment in together)
+    plan = hunting_plan(setting, AdjacentWorlds(record, paths))
     assert plan[:10].sum() == 0
     assert plan[10:20, [2, 3]].sum() == plan.sum() == 8
 
@@ -215,17 +222,17 @@ def test_contributions_are_spent_where_they_tell_most():
     generator = np.random.default_rng(2)
     for cap in (1, 2, 3, 5, 8):
         for _ in range(20):
-            gains, unasked = generator.random(7), generator.random(7) < 0.4
-            spending = best_spending(gains, unasked, cap)
-            # Every set of seconds to ask for; the first that are observed count.
+            gains, always = generator.random(7), generator.random(7) < 0.4
+            plan = plan_contributions(gains, always, cap)
+            # Every set of seconds to query; the first that are observed count.
             options = []
-            for asked in range(2**7):
-                observed = unasked | (asked >> np.arange(7) & 1).astype(bool)
+            for queried in range(2**7):
+                observed = always | (queried >> np.arange(7) & 1).astype(bool)
                 options.append(gains[np.flatnonzero(observed)[:cap]].sum())
-            assert spending.reach == pytest.approx(max(options))
-            best = np.flatnonzero(~unasked[: spending.stop])
-            best = best[np.argsort(-gains[best])][: spending.asked]
-            observed = unasked.copy()
+            assert plan.reach == pytest.approx(max(options))
+            best = np.flatnonzero(~always[: plan.stop])
+            best = best[np.argsort(-gains[best])][: plan.n_queries]
+            observed = always.copy()
             observed[best] = True
             assert gains[np.flatnonzero(observed)[:cap]].sum() == pytest.approx(max(options))
 
@@ -239,12 +246,14 @@ def test_public_schedules_are_those_of_the_environment():
     assert plan.shape == (HORIZON, ROAD.n_mainline)
 
 
-def test_the_adaptive_hunter_rests_where_it_has_made_up_its_mind():
+def test_the_adaptive_hunter_rests_where_it_is_decided():
     plan = np.ones((2, 3), dtype=bool)
-    belief = np.array([0.0, -FENCE - 0.1, FENCE + 0.1, 0.5 * FENCE])
-    queries = Adaptive(plan).queries(0, belief)
+    belief = np.array(
+        [0.0, -DECISION_THRESHOLD - 0.1, DECISION_THRESHOLD + 0.1, 0.5 * DECISION_THRESHOLD]
+    )
+    queries = AdaptiveQueries(plan).queries(0, belief)
     assert queries.any(axis=1).tolist() == [True, False, False, True]
-    assert Planned(plan).queries(0, belief).all()
+    assert FixedQueries(plan).queries(0, belief).all()
 
 
 @pytest.mark.parametrize("preset", ["paper", "guaranteed"])
@@ -253,7 +262,7 @@ def test_the_score_is_the_log_likelihood_ratio_of_the_transcript(preset, record)
     worlds = choose_target(setting, record, "worst-case", "hunter").worlds
     # A schedule that mostly looks elsewhere: what it does not see must not count.
     plan = make_policy(setting, "paper", worlds).plan
-    sigma = Ruler.of(setting).sigma
+    sigma = ReleaseDistances.from_config(setting).sigma
     square = planned_distance(setting, worlds, plan, sigma) ** 2
     answers = Adversary(setting, worlds, 2, sigma)
     adversary = Adversary(setting, worlds, 2, sigma)
@@ -276,7 +285,7 @@ def test_the_score_is_the_log_likelihood_ratio_of_the_transcript(preset, record)
         expected += logs[1] - logs[0]
         # What nobody asked for must not matter.
         released[:, ~watched] = 1e6
-        adversary.take_in(step + 1, both, released * sigma)
+        adversary.update(step + 1, both, released * sigma)
     np.testing.assert_allclose(adversary.score, expected, rtol=1e-9)
     assert adversary.score[0] == pytest.approx(0.5 * square)
 
@@ -305,13 +314,12 @@ def test_less_noise_puts_the_worlds_further_apart(record):
 
 
 @pytest.mark.parametrize("privacy", [{}, {"preset": "paper"}, {"boundary_inputs": "private"}])
-def test_runs_do_not_depend_on_the_batch(privacy, record, monkeypatch):
+def test_runs_do_not_depend_on_the_batch(privacy, record):
     setting = config(**privacy)
     worlds = choose_target(setting, record, "replaced", "hunter").worlds
     policy = make_policy(setting, "adaptive", worlds)
     whole = attack(setting, worlds, policy, 5, seed=3, progress=False)
-    monkeypatch.setattr(attack_module, "BATCH", 2)
-    parts = attack(setting, worlds, policy, 5, seed=3, progress=False)
+    parts = attack(setting, worlds, policy, 5, seed=3, batch=2, progress=False)
     np.testing.assert_array_equal(whole.scores, parts.scores)
     np.testing.assert_array_equal(whole.distances, parts.distances)
     other = attack(setting, worlds, policy, 5, seed=4, progress=False)
