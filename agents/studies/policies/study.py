@@ -93,8 +93,12 @@ def freeze(
     return manifest, True
 
 
-def run(place: Workplace) -> None:
+def run(place: Workplace, n_resamples: int = 10_000) -> None:
     """Run the frozen policies and choices on test traffic, and report.
+
+    Args:
+        place: Where it runs and leaves its results.
+        n_resamples: Resamples of every bootstrap.
 
     Raises:
         FileNotFoundError: Nothing was frozen, or a frozen policy is gone that is still to be run.
@@ -121,7 +125,7 @@ def run(place: Workplace) -> None:
         _run(place, design, manifest, unscored, episodes, run_entry, seeds)
         _run(place, design, manifest, uncounted, queries, count_queries, seeds)
     curves = read_curves(manifest.checkpoints, PRIMARY)
-    results = PolicyResults(design, manifest, episodes.rows, queries.rows, curves)
+    results = PolicyResults(design, manifest, episodes.rows, queries.rows, curves, n_resamples)
     draw(place.folder, results)
     write_report(place.folder, TEMPLATES, report(place.folder, results, recorded))
     write_summary(place.folder / "summary.csv", results)

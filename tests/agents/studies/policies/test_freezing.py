@@ -65,9 +65,9 @@ def test_a_draft_says_who_suits_and_tries_every_policy(runs):
     assert manifest.ladder["primary"] == ("paper", "oldest-first")
     assert "no plan 'offline' ships for" in manifest.unsuited["primary"]["offline"]
     assert manifest.bounds == {"primary": ("oracle-error",), "other": (), "moved": ()}
-    stranger = find_checkpoints((f"primary={runs}/other",), SMALL)
+    other = find_checkpoints((f"primary={runs}/other",), SMALL)
     with pytest.raises(ValueError, match="bandwidth is 3 of the policy and 2"):
-        draft(SMALL, stranger, (), "command")
+        draft(SMALL, other, (), "command")
 
 
 def test_a_cell_goes_without_what_costs_too_much(runs):

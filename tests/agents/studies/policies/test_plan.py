@@ -1,18 +1,15 @@
 import dataclasses
-import json
 
 import pytest
 
-from agents.studies.policies.freezing import design_of, plain
 from agents.studies.policies.plan import (
     BASELINES,
     CELLS,
     PAPER,
     PRIVATE,
     PolicyDesign,
-    quick,
 )
-from agents.studies.policies.running import config_of
+from agents.studies.policies.running import cell_config
 from dptse_env.config import parse_seeds
 from dptse_env.schedules import ORACLES
 from scripts.train import Args
@@ -24,7 +21,7 @@ def test_the_full_design_is_that_of_the_study():
     assert (len(design.validation_seeds), len(design.test_seeds)) == (64, 64)
     cells = {cell.name: cell for cell in design.cells}
     assert next(iter(cells)) == "primary"
-    configs = {name: config_of(cell, (0,)) for name, cell in cells.items()}
+    configs = {name: cell_config(cell, (0,)) for name, cell in cells.items()}
     primary = configs["primary"]
     assert (cells["primary"].env, cells["paper"].env) == (PRIVATE, PAPER)
     assert (primary.estimator, primary.bandwidth) == ("ekf", 5)
@@ -54,7 +51,7 @@ def test_recipes_are_not_chosen_where_trainings_chose_their_best_policy():
 
 
 def test_quick_is_a_part_of_the_full_design():
-    part = quick(PolicyDesign())
+    part = PolicyDesign().quick()
     assert [cell.name for cell in part.cells] == ["primary"]
     assert set(part.test_seeds) < set(PolicyDesign().test_seeds)
 
@@ -64,7 +61,7 @@ def test_quick_is_a_part_of_the_full_design():
     [
         ({"cells": CELLS[1:]}, "begin with 'primary'"),
         ({"cells": (CELLS[0], CELLS[0])}, "distinct"),
-        ({"test_seeds": (1000, 1001)}, "held out"),
+        ({"test_seeds": (1000, 1001)}, "test_seeds must be test seeds"),
         ({"validation_seeds": (2000, 2001)}, r"in 1000\.\.1999"),
         ({"validation_seeds": (1000,)}, "2 or more"),
         ({"baselines": ("oldest-first",)}, "hold 'paper' and no oracle"),
@@ -78,7 +75,14 @@ def test_bad_designs_are_named(changes, message):
 
 def test_a_design_survives_json():
     for design in (PolicyDesign(), SMALL):
-        assert plain(design_of(json.loads(json.dumps(plain(design))))) == plain(design)
-        assert [config_of(cell, (0,)) for cell in design_of(plain(design)).cells] == [
-            config_of(cell, (0,)) for cell in design.cells
-        ]
+        again = PolicyDesign.from_json(design.to_json())
+        assert again.to_json() == design.to_json()
+        configs = [[cell_config(cell, (0,)) for cell in each.cells] for each in (design, again)]
+        assert configs[0] == configs[1]
+
+
+def test_designs_of_earlier_manifests_are_read():
+    content = SMALL.to_json()
+    for cell in content["cells"]:
+        cell["says"] = cell.pop("description")
+    assert PolicyDesign.from_json(content).to_json() == SMALL.to_json()

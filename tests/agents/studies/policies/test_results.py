@@ -2,16 +2,17 @@ import dataclasses
 
 import pytest
 
+from agents.experiments.cells import DENSITY
 from agents.studies.policies.plan import (
     Entry,
 )
-from agents.studies.policies.results import DENSITY, ERROR
+from agents.studies.policies.results import ERROR
 from agents.studies.policies.rules import TARGETS, judge
 from tests.agents.studies.policies.worlds import made_up
 
 
-def verdicts(measured):
-    return [judge(measured, measured.primary, target) for target in TARGETS]
+def verdicts(results):
+    return [judge(results, results.primary, target) for target in TARGETS]
 
 
 def test_targets_are_met_where_all_is_so():
@@ -40,7 +41,7 @@ def test_targets_are_met_where_all_is_so():
 def test_a_target_is_missed_where_one_thing_is_wanting(changes, wanting):
     best, _ = verdicts(made_up(**changes))
     assert not best.is_met
-    assert [says for says, is_so in best.parts.items() if not is_so] == wanting
+    assert [part for part, holds in best.parts.items() if not holds] == wanting
 
 
 def test_the_worst_training_seed_is_that_of_largest_error():
@@ -50,19 +51,19 @@ def test_the_worst_training_seed_is_that_of_largest_error():
 
 
 def test_the_reference_is_what_validation_chose_whatever_test_traffic_says():
-    measured = made_up()
-    worse = dataclasses.replace(measured.choice("primary"), baseline="paper")
-    choices = {**measured.manifest.choices, "primary": worse}
+    results = made_up()
+    worse = dataclasses.replace(results.choice("primary"), baseline="paper")
+    choices = {**results.manifest.choices, "primary": worse}
     other = dataclasses.replace(
-        measured, manifest=dataclasses.replace(measured.manifest, choices=choices)
+        results, manifest=dataclasses.replace(results.manifest, choices=choices)
     )
     assert verdicts(other)[0].reference == "paper"
     assert other.best_on_test("primary") == "oldest-first"
 
 
 def test_half_of_the_way_to_the_oracle():
-    measured = made_up()
-    assert measured.of_way(measured.primary).mean == pytest.approx(50.0)
+    results = made_up()
+    assert results.progress(results.primary).mean == pytest.approx(50.0)
 
 
 def test_secondary_cells_are_judged_together():
@@ -77,14 +78,14 @@ def test_secondary_cells_are_judged_together():
     assert sorted(one.adjusted for one in unsure) == pytest.approx([2 * low, max(2 * low, high)])
     assert {one.verdict for one in made_up(elsewhere=-5.0, spread=0.01).comparisons} == {"worse"}
     same = made_up(elsewhere=0.0, spread=0.1).comparisons
-    assert {one.verdict for one in same} == {"not told apart"}
+    assert {one.verdict for one in same} == {"not significant"}
 
 
 def test_errors_are_minus_rewards_and_times_a_thousand():
-    measured = made_up()
-    error = measured.schedule("primary", "paper")
+    results = made_up()
+    error = results.schedule("primary", "paper")
     assert error.shape == (1, 64)
-    first = measured.scores[Entry("primary", "baseline", "paper"), 2000]
+    first = results.scores[Entry("primary", "baseline", "paper"), 2000]
     assert error[0, 0] == -1000.0 * first.reward
-    assert measured.schedule("primary", "paper", DENSITY)[0, 0] == first.rmse_density
-    assert measured.learned(measured.primary, ERROR).shape == (5, 64)
+    assert results.schedule("primary", "paper", DENSITY)[0, 0] == first.rmse_density
+    assert results.learned(results.primary, ERROR).shape == (5, 64)

@@ -11,7 +11,13 @@ from agents.studies.policies.plan import (
     Learner,
 )
 from agents.studies.policies.queries import BIN, PHASES, QueryCounter
-from agents.studies.policies.running import make_batch, make_task, run_entry, suited
+from agents.studies.policies.running import (
+    count_queries,
+    make_batch,
+    make_task,
+    run_entry,
+    suitable,
+)
 from dptse_env.schedules import make_schedule
 from dptse_env.traffic.scenario import draw_scenario
 from tests.agents.policies import SHORT
@@ -50,45 +56,42 @@ def test_drawn_actions_are_seeded_and_differ_from_the_likeliest(runs):
 def test_a_cell_that_is_wrong_is_not_taken_for_a_schedule_that_does_not_suit():
     wrong = dataclasses.replace(SMALL.cells[0], keywords={"estimator": "kf"})
     with pytest.raises(ValueError, match="estimator must be one of"):
-        suited(wrong, ("paper",))
+        suitable(wrong, ("paper",))
 
 
-def test_queries_are_counted_where_and_when_they_are_asked():
+def test_queries_are_counted_by_segment_and_time():
     env = make_batch(SHORT, {**WALK, "incident": "random"}, (2000, 2001))
-    watch, queried, times = QueryCounter(env.process, (2000, 2001)), [], []
+    counter, queried, times = QueryCounter(env.process, (2000, 2001)), [], []
 
     def note():
-        watch()
+        counter()
         queried.append(env.process.queried.copy())
         times.append(env.process.time.copy())
 
     schedule = make_schedule("paper", env)
     run_episodes(env, schedule, traffic_seeds=(2000, 2001), seeds=(1, 2), on_second=note)
     flags, seconds = np.array(queried)[1:], np.array(times)[1:, 0]
-    for k, asked in enumerate(watch.asked()):
-        total = sum(asked.counts(phase) for phase in PHASES)
+    for k, counts in enumerate(counter.results()):
+        total = sum(counts.counts(phase) for phase in PHASES)
         np.testing.assert_array_equal(total, flags[:, k].sum(axis=0))
-        before = seconds <= asked.start
-        np.testing.assert_array_equal(asked.counts("before"), flags[before, k].sum(axis=0))
-        assert asked.counts("seconds").sum() == 240
-        assert asked.counts("seconds")[0] == before.sum()
-        incident = draw_scenario(env.config.corridor, asked.traffic_seed).incident
+        before = seconds <= counts.start
+        np.testing.assert_array_equal(counts.counts("before"), flags[before, k].sum(axis=0))
+        assert counts.counts("seconds").sum() == 240
+        assert counts.counts("seconds")[0] == before.sum()
+        incident = draw_scenario(env.config.corridor, counts.traffic_seed).incident
         after = seconds > incident.phases[-1][1]
-        np.testing.assert_array_equal(asked.counts("after"), flags[after, k].sum(axis=0))
+        np.testing.assert_array_equal(counts.counts("after"), flags[after, k].sum(axis=0))
         assert after.any()
-        near = np.abs(np.arange(6) - asked.incident) <= 2
-        stretches = flags[:, k][:, near].sum(axis=1).reshape(-1, BIN).sum(axis=1)
-        np.testing.assert_array_equal(asked.counts("near"), stretches)
-    assert {asked.incident for asked in watch.asked()} != {-1}
+        near = np.abs(np.arange(6) - counts.incident) <= 2
+        bins = flags[:, k][:, near].sum(axis=1).reshape(-1, BIN).sum(axis=1)
+        np.testing.assert_array_equal(counts.counts("near"), bins)
+    assert {counts.incident for counts in counter.results()} != {-1}
 
 
-def test_without_an_incident_all_of_an_episode_is_before_it():
-    env = make_batch(SHORT, {**WALK, "incident": "none"}, (2000,))
-    watch = QueryCounter(env.process, (2000,))
-    run_episodes(
-        env, make_schedule("paper", env), traffic_seeds=(2000,), seeds=(1,), on_second=watch
-    )
-    (asked,) = watch.asked()
-    assert asked.incident == -1
-    assert asked.counts("seconds").tolist() == [240, 0, 0]
-    assert not asked.counts("near").any()
+def test_without_an_incident_all_of_an_episode_is_before_it(runs):
+    manifest = draft(SMALL, checkpoints(runs), (), "command")
+    entry = Entry("moved", "baseline", "paper")
+    (counts,) = count_queries(make_task(entry, SMALL, manifest, seeds=(2000,), noise=0))
+    assert (counts.incident, counts.start) == (-1, 0.0)
+    assert counts.counts("seconds").tolist() == [240, 0, 0]
+    assert not counts.counts("near").any()

@@ -4,7 +4,6 @@ import numpy as np
 
 from agents.evaluation.episodes import EpisodeScore
 from agents.studies.policies.curves import Curve
-from agents.studies.policies.freezing import plain
 from agents.studies.policies.manifest import (
     Checkpoint,
     Choice,
@@ -43,12 +42,12 @@ def score(seed, error, **fields):
     return EpisodeScore(traffic_seed=seed, **{**numbers, **kept, **fields})
 
 
-def asked(seed):
+def queries(seed):
     return QueryCounts(seed, 3, 60.0, "60 100 80", "1 2 3 4 5 6", "6 5 4 3 2 1", "0 0 9 9 0 0",
                  " ".join(["7"] * 12))  # fmt: skip
 
 
-def made_up(runs_below=(10.0,) * 5, n_seeds=64, *, spread=0.0, elsewhere=12.0, asks=True):
+def made_up(runs_below=(10.0,) * 5, n_seeds=64, *, spread=0.0, elsewhere=12.0, counts_queries=True):
     """Scores in which learned policies lie so many percent below the best baseline."""
     design = PolicyDesign(
         cells=(
@@ -68,7 +67,7 @@ def made_up(runs_below=(10.0,) * 5, n_seeds=64, *, spread=0.0, elsewhere=12.0, a
     ]
     errors = {"paper": 0.12, "oldest-first": 0.1}
     manifest = Manifest(
-        plain(design), "python scripts/policy_study.py freeze", tuple(files),
+        design.to_json(), "python scripts/study.py policies freeze", tuple(files),
         (Tuned("paper", "ekf", "paper", "paper", {}),), ladder,
         {"primary": ("oracle-error",), "other": (), "moved": ()},
         {"primary": {"offline": "no plan"}},
@@ -90,10 +89,10 @@ def made_up(runs_below=(10.0,) * 5, n_seeds=64, *, spread=0.0, elsewhere=12.0, a
         noise = 1.0 + spread * generator.standard_normal(n_seeds) * (entry.kind == "learned")
         for seed, error in zip(design.test_seeds, traffic * (1 - below / 100) * noise, strict=True):
             scores[entry, seed] = score(seed, error)
-    watched = {
-        key: asked(key[1])
+    counted = {
+        key: queries(key[1])
         for key in scores
-        if asks and key[0].cell == "primary" and key[0].mode == "deterministic"
+        if counts_queries and key[0].cell == "primary" and key[0].mode == "deterministic"
     }
     curves = [Curve("plackett-luce", seed, (0, 10), (120.0, 90.0 + seed)) for seed in range(2)]
-    return PolicyResults(design, manifest, scores, watched, curves, n_resamples=400)
+    return PolicyResults(design, manifest, scores, counted, curves, n_resamples=400)

@@ -4,31 +4,27 @@ import math
 
 import numpy as np
 import pytest
-from PIL import Image
 
-from agents.evaluation.episodes import EpisodeScore
+from agents.evaluation.episodes import EpisodeScore, make_config, without_void_warning
 from agents.evaluation.statistics import Interval
-from agents.experiments.provenance import provenance
-from agents.experiments.runner import Task, make_env, run_task
-from agents.studies.privacy import report
-from agents.studies.privacy.account import account_of, mu_alone, mu_met, trip_lengths
-from agents.studies.privacy.plan import (
-    BOUNDARY_MODES,
-    PrivacyCell,
-    PrivacyDesign,
-    Protection,
-    quick,
-)
-from agents.studies.privacy.results import DENSITY, SPEED, PrivacyResults
-from agents.studies.privacy.tables import cost_table, modes_table, number, write_summary
+from agents.experiments.cells import DENSITY, SPEED
+from agents.experiments.provenance import design_provenance
+from agents.experiments.reports import fill
+from agents.experiments.runner import EpisodeTask, run_task
+from agents.experiments.tables import format_number, write_summary
+from agents.studies.privacy import study
+from agents.studies.privacy.account import make_account, measure_trips, mu_alone, mu_met
+from agents.studies.privacy.plan import BOUNDARY_MODES, PrivacyCell, PrivacyDesign, Protection
+from agents.studies.privacy.results import PrivacyResults
+from agents.studies.privacy.tables import cost_table, modes_table
 from dptse_env.config import resolve
 from dptse_env.privacy import epsilon_of
-from dptse_env.traffic import Corridor, RecordLibrary
+from dptse_env.traffic import RecordLibrary
 from dptse_env.traffic.record import Record
 
 SHORT = "dptse_env:dptse/ShortHighway-v0"
 DESIGN = PrivacyDesign(
-    seeds=(2000, 2001, 2002),
+    seeds="2000:2003",
     epsilons=(1.0, 20.0),
     caps=(4,),
     bandwidths=(1,),
@@ -39,7 +35,8 @@ BASE = DESIGN.cell("ekf")
 
 
 def config_of(cell):
-    return make_env(SHORT, cell, DESIGN.seeds, None).unwrapped.config
+    with without_void_warning():
+        return make_config(SHORT, cell.keywords)
 
 
 # What is run
@@ -47,13 +44,13 @@ def config_of(cell):
 
 def test_the_full_design_holds_what_the_study_is_about():
     design = PrivacyDesign()
-    assert len(design.seeds) >= 20
+    assert len(design.traffic_seeds) >= 20
     cells = set(design.cells())
     for name in ("ekf", "random_walk"):
         for epsilon in (0.5, 1.0, 2.0, 5.0, 10.0, 20.0):
             for cap in (4, 16, 64):
-                own = PrivacyCell(name, "guaranteed", "trip", cap, "nominal", epsilon, 0.05, 5)
-                assert own in cells
+                cell = PrivacyCell(name, "guaranteed", "trip", cap, "nominal", epsilon, 0.05, 5)
+                assert cell in cells
             for unit in ("horizon", "event"):
                 assert (
                     PrivacyCell(name, "guaranteed", unit, 0, "nominal", epsilon, 0.05, 5) in cells
@@ -63,8 +60,8 @@ def test_the_full_design_holds_what_the_study_is_about():
         for mode in ("true", "nominal", "private"):
             assert PrivacyCell(name, "guaranteed", "trip", 64, mode, 5.0, 0.05, 5) in cells
         for bandwidth in (3, 5, 8, 15):
-            own = PrivacyCell(name, "guaranteed", "trip", 64, "nominal", 5.0, 0.05, bandwidth)
-            assert own in cells
+            cell = PrivacyCell(name, "guaranteed", "trip", 64, "nominal", 5.0, 0.05, bandwidth)
+            assert cell in cells
 
 
 def test_cells_that_figures_share_are_run_once():
@@ -87,7 +84,7 @@ def test_the_environment_is_what_the_cell_says(cell):
         assert privacy.unit == cell.unit
 
 
-def test_the_open_loop_hears_nothing_that_its_shared_cell_leaves_out():
+def test_the_open_loop_does_not_depend_on_what_its_shared_cell_leaves_out():
     RecordLibrary().ensure(resolve("short-highway", {}).corridor, (2000,))
     for other in (
         PrivacyCell("open_loop", "paper", "none", 0, "true", 0.5, 0.05, 1),
@@ -95,10 +92,10 @@ def test_the_open_loop_hears_nothing_that_its_shared_cell_leaves_out():
     ):
         shared = DESIGN.cell("open_loop", boundary_inputs=other.boundary_inputs)
         assert shared in DESIGN.cells()
-        own, same = (
-            run_task(Task(SHORT, "paper", cell, (2000,), None)) for cell in (other, shared)
-        )
-        assert own == same
+        scores = [
+            run_task(EpisodeTask(SHORT, "paper", cell, (2000,), None)) for cell in (other, shared)
+        ]
+        assert scores[0] == scores[1]
 
 
 def test_grids_are_sorted_and_hold_the_base_values():
@@ -108,18 +105,18 @@ def test_grids_are_sorted_and_hold_the_base_values():
 
 
 def test_quick_is_a_part_of_the_full_design():
-    full, part = PrivacyDesign(), quick(PrivacyDesign())
+    full, part = PrivacyDesign(), PrivacyDesign().quick()
     assert set(part.cells()) < set(full.cells())
-    assert set(part.seeds) < set(full.seeds)
-    assert len(part.cells()) * len(part.seeds) < len(full.cells()) * len(full.seeds) / 8
+    assert set(part.traffic_seeds) < set(full.traffic_seeds)
+    n_part, n_full = (len(each.cells()) * len(each.traffic_seeds) for each in (part, full))
+    assert n_part < n_full / 8
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"seeds": (2000,)}, "seeds must be 2 or more"),
-        ({"seeds": (2000, 2000)}, "distinct"),
-        ({"seeds": (7, 2000)}, r"held out, in 2000\.\.2999.*got 7"),
+        ({"seeds": "2000"}, "seeds must be 2 or more"),
+        ({"seeds": "7:9"}, r"test seeds, in 2000\.\.2999.*got 7"),
         ({"estimators": ()}, "estimators must be 1 or more"),
         ({"estimators": ("kf",)}, "estimator must be one of"),
         ({"estimators": ("open_loop",)}, "it is always run"),
@@ -131,7 +128,7 @@ def test_quick_is_a_part_of_the_full_design():
 )
 def test_bad_designs_are_named(changes, message):
     with pytest.raises(ValueError, match=message):
-        dataclasses.replace(DESIGN, **changes)
+        dataclasses.replace(DESIGN, **changes).check()
 
 
 # What noise is worth
@@ -139,7 +136,7 @@ def test_bad_designs_are_named(changes, message):
 
 def test_a_vehicle_met_as_often_as_the_cap_has_the_guarantee_s_own_share_of_mu():
     config = config_of(BASE)
-    (density, _) = (own.noise_std for own in config.accountant().report.releases)
+    (density, _) = (release.noise_std for release in config.accountant().report.releases)
     # Half of mu^2 goes to density.
     assert mu_met(config, density, 64) == pytest.approx(
         config.accountant().report.mu * math.sqrt(0.5)
@@ -148,27 +145,27 @@ def test_a_vehicle_met_as_often_as_the_cap_has_the_guarantee_s_own_share_of_mu()
 
 
 def test_a_guarantee_is_worth_what_it_claims_and_no_vehicle_counts_beyond_the_cap():
-    own = account_of(SHORT, DESIGN.cell("ekf"), DESIGN.seeds, (4, 64, 500))
-    assert own.claimed == own.composed == pytest.approx(5.0)
-    assert own.alone[64] == own.alone[500] == pytest.approx(5.0)
-    assert own.alone[4] < 2.0
-    assert own.met[4] < own.met[64] == own.met[500] < 5.0
-    assert own.void_reasons == ()
+    account = make_account(SHORT, DESIGN.cell("ekf"), (4, 64, 500))
+    assert account.claimed == account.composed == pytest.approx(5.0)
+    assert account.alone[64] == account.alone[500] == pytest.approx(5.0)
+    assert account.alone[4] < 2.0
+    assert account.met[4] < account.met[64] == account.met[500] < 5.0
+    assert account.void_reasons == ()
 
 
 @pytest.mark.parametrize("preset", ["paper", "corrected"])
 def test_the_paper_s_noise_is_worth_less_the_more_often_a_vehicle_is_met(preset):
     cell = DESIGN.cell("ekf", Protection(preset), epsilon=1.0)
-    own = account_of(SHORT, cell, DESIGN.seeds, (4, 64, 300))
+    account = make_account(SHORT, cell, (4, 64, 300))
     report = config_of(cell).accountant().report
-    assert own.composed == report.epsilon
-    assert (own.density_std, own.second_std) == tuple(r.noise_std for r in report.releases)
-    assert own.met[4] < own.met[64] < own.met[300]
+    assert account.composed == report.epsilon
+    assert (account.density_std, account.second_std) == tuple(r.noise_std for r in report.releases)
+    assert account.met[4] < account.met[64] < account.met[300]
     # sqrt(2 C) vehicles on 100 m, by hand.
-    by_hand = math.sqrt(2 * 64) / 0.1 / own.density_std
-    assert own.met[64] == pytest.approx(epsilon_of(by_hand, 0.05))
-    assert own.met[64] < own.alone[64]
-    assert "adaptive_queries" in own.void_reasons
+    by_hand = math.sqrt(2 * 64) / 0.1 / account.density_std
+    assert account.met[64] == pytest.approx(epsilon_of(by_hand, 0.05))
+    assert account.met[64] < account.alone[64]
+    assert "adaptive_queries" in account.void_reasons
 
 
 def test_a_vehicle_alone_moves_a_mean_speed_by_the_limit():
@@ -180,8 +177,19 @@ def test_a_vehicle_alone_moves_a_mean_speed_by_the_limit():
     )
 
 
-def test_trips_count_seconds_where_a_vehicle_can_be_queried(monkeypatch):
-    corridor: Corridor = config_of(BASE).corridor
+class OneRecord(RecordLibrary):
+    """A library of a record that a test makes up."""
+
+    def __init__(self, record):
+        super().__init__()
+        self.record = record
+
+    def get(self, corridor, seed):
+        return self.record
+
+
+def test_trips_count_seconds_where_a_vehicle_can_be_queried():
+    corridor = config_of(BASE).corridor
     n = corridor.n_mainline
     record = Record(
         step=np.array([1, 1, 2, 2, 3]),
@@ -191,11 +199,12 @@ def test_trips_count_seconds_where_a_vehicle_can_be_queried(monkeypatch):
         n_steps=4,
         n_columns=n + 1,
     )
-    monkeypatch.setattr(RecordLibrary, "get", lambda *_: record)
-    assert sorted(trip_lengths(corridor, (2000, 2001), None)) == [1, 1, 2, 2]
+    trips = measure_trips(corridor, 2000, OneRecord(record))
+    assert trips.traffic_seed == 2000
+    assert sorted(trips.lengths) == [1, 2]
 
 
-# What is said
+# The report
 
 
 def score(seed, density, speed):
@@ -205,12 +214,12 @@ def score(seed, density, speed):
 def made_up(density=lambda cell: 10.0):
     scores = {}
     for cell in DESIGN.cells():
-        for k, seed in enumerate(DESIGN.seeds):
+        for k, seed in enumerate(DESIGN.traffic_seeds):
             # Seeds differ by much, cells on one seed by little: what pairing is for.
             scores[cell, seed] = score(seed, density(cell) + 5.0 * k + 0.01 * k**2, 4.0 + k)
     accounts = {
         protection: [
-            account_of(SHORT, cell, DESIGN.seeds, (64, 90, 400))
+            make_account(SHORT, cell, (64, 90, 400))
             for cell in DESIGN.along_epsilon("ekf", protection)
         ]
         for protection in (*DESIGN.guaranteed, *DESIGN.printed)
@@ -223,58 +232,80 @@ def priced(cell):
 
 
 @pytest.fixture(scope="module")
-def measured():
+def results():
     return made_up(priced)
 
 
-def test_differences_are_paired(measured):
+def test_differences_are_paired(results):
     paper = DESIGN.cell("ekf", Protection("paper"))
-    assert measured.mean(BASE, DENSITY).half_width > 5.0
-    difference = measured.difference(BASE, paper, DENSITY)
+    assert results.mean(BASE, DENSITY).half_width > 5.0
+    difference = results.difference(BASE, paper, DENSITY)
     assert difference.mean == pytest.approx(3.0)
     assert difference.half_width < 1e-9
-    assert measured.difference(BASE, paper, SPEED).mean == 0.0
+    assert results.difference(BASE, paper, SPEED).mean == 0.0
 
 
-def test_the_price_is_in_table_and_sentence(measured):
-    assert "3.00 [3.00, 3.00]" in cost_table(measured, "ekf")
-    assert "2.00 [2.00, 2.00]" in cost_table(measured, "ekf")
-    first = next(iter(report.sentences(measured)))
-    assert "density +3.00 [+3.00, +3.00] veh/km, speed unchanged" in first
-    assert "guarantee of ε = 5 (trip, C = 64)" in first
+def test_the_price_is_in_table_and_numbers(results):
+    assert "3.00 [3.00, 3.00]" in cost_table(results, "ekf")
+    assert "2.00 [2.00, 2.00]" in cost_table(results, "ekf")
+    numbers = study.estimator_numbers(results, "ekf")
+    (printed, change), _ = numbers["over_printed"]
+    assert printed == Protection("paper")
+    assert (change.density.mean, change.speed.mean) == (pytest.approx(3.0), 0.0)
 
 
-def test_sentences_follow_the_numbers():
+def test_the_open_loop_is_beaten_where_the_numbers_are_lower():
     def saves(cell):
         return 11.0 - (2.0 if cell.estimator == "ekf" and cell.epsilon > 4.0 else 0.0)
 
-    text = "\n".join(report.sentences(made_up(saves)))
-    assert "density at ε = 5, 20; speed at none" in text
-    assert "random walk with a guarantee (trip, C = 64) errs less" in text
-    assert "zero: density at none" in text
+    results = made_up(saves)
+    ekf, walk = (study.estimator_numbers(results, name) for name in ("ekf", "random_walk"))
+    assert (ekf["better_density"], ekf["better_speed"]) == ([5.0, 20.0], [])
+    assert (walk["better_density"], walk["better_speed"]) == ([], [])
+
+
+def test_the_report_holds_every_table_and_number(results):
+    provenance = design_provenance(DESIGN)
+    content = study.report(results, provenance, "the command")
+    text = fill(study.TEMPLATES, content)
+    for name, value in content.items():
+        if name.endswith("_table"):
+            assert value in text, name
+    for numbers in content["estimators"]:
+        assert numbers["cost_table"] in text
+        for _, _, table in numbers["error_tables"]:
+            assert table in text
+        for _, change in numbers["over_printed"]:
+            assert f"{change.density.mean:+.2f} [{change.density.low:+.2f}, " in text
+    assert "the command" in text
+    for protection in (*DESIGN.guaranteed, *DESIGN.printed):
+        assert f"| {protection} |" in text
+    assert "`ekf-paper-guaranteed`" in text
 
 
 @pytest.mark.parametrize(
-    ("interval", "text"),
-    [
-        (Interval(1.0, 0.5, 1.5, 3), "+1.00 [+0.50, +1.50] km/h"),
-        (Interval(-1.0, -2.5, 0.5, 3), "-1.00 [-2.50, +0.50] km/h (not told from 0)"),
-        (Interval(0.0, 0.0, 0.0, 3), "unchanged to the last digit [km/h]"),
-    ],
+    ("interval", "is_certain"),
+    [(Interval(1.0, 0.5, 1.5, 3), True), (Interval(-1.0, -2.5, 0.5, 3), False)],
 )
-def test_a_change_says_whether_it_can_be_told_from_zero(interval, text):
-    assert report.change(interval, "km/h") == text
+def test_a_change_is_marked_where_zero_is_in_its_interval(interval, is_certain, results):
+    provenance = design_provenance(DESIGN)
+    content = study.report(results, provenance, "the command")
+    content["estimators"][0]["cap_change"] = study.Change(interval, interval)
+    lines = fill(study.TEMPLATES, content).splitlines()
+    text = f"{interval.mean:+.2f} [{interval.low:+.2f}, {interval.high:+.2f}] km/h"
+    (line,) = (line for line in lines if text in line)
+    assert line.partition(text)[2].startswith(".") is is_certain
 
 
 @pytest.mark.parametrize(
     ("value", "text"), [(0.4512, "0.451"), (33.26, "33.3"), (2117.0, "2120"), (408595.2, "408,595")]
 )
 def test_numbers_have_three_digits_and_no_exponent(value, text):
-    assert number(value) == text
+    assert format_number(value) == text
 
 
-def test_every_mode_of_every_estimator_is_in_the_table(measured):
-    rows = modes_table(measured).splitlines()[2:]
+def test_every_mode_of_every_estimator_is_in_the_table(results):
+    rows = modes_table(results).splitlines()[2:]
     assert [row.split(" | ")[:2] for row in rows] == [
         [f"| {name}", mode]
         for name in ("EKF", "random walk", "open loop")
@@ -282,26 +313,25 @@ def test_every_mode_of_every_estimator_is_in_the_table(measured):
     ]
 
 
-def test_the_summary_has_a_row_for_each_cell(measured, tmp_path):
-    write_summary(tmp_path / "summary.csv", measured)
+def test_the_summary_has_a_row_for_each_cell(results, tmp_path):
+    write_summary(tmp_path / "summary.csv", results)
     with (tmp_path / "summary.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == len(DESIGN.cells())
-    own = next(row for row in rows if row["preset"] == "paper" and row["estimator"] == "ekf")
-    assert float(own["rmse_density_veh_km"]) == pytest.approx(8.0 + 5.0 + 0.05 / 3.0, rel=1e-5)
-    assert float(own["n_diverged"]) == 3.0
+    row = next(row for row in rows if row["preset"] == "paper" and row["estimator"] == "ekf")
+    assert float(row["rmse_density_veh_km"]) == pytest.approx(8.0 + 5.0 + 0.05 / 3.0, rel=1e-5)
+    assert float(row["n_diverged"]) == 3.0
 
 
-def test_figures_and_report_stand_by_themselves(measured, tmp_path):
-    report.draw(tmp_path, measured)
-    report.write_report(tmp_path / "REPORT.md", measured, provenance(DESIGN), "the command")
-    text = (tmp_path / "REPORT.md").read_text()
-    assert "the command" in text
-    for name in report.CAPTIONS:
-        assert f"({name})" in text
-        with Image.open(tmp_path / name) as image:
-            # Something is drawn: neither one colour nor the few of an empty frame.
-            assert len(image.convert("RGB").getcolors(maxcolors=2**20)) > 100
-    for protection in (*DESIGN.guaranteed, *DESIGN.printed):
-        assert f"| {protection} |" in text
-    assert "`ekf-paper-guaranteed`" in text
+def test_figures_show_every_cell(results):
+    epsilon, modes = study.draw_epsilon(results), study.draw_modes(results)
+    n_protections = len(DESIGN.guaranteed)
+    for axis in epsilon.axes:
+        assert len(axis.containers) == n_protections
+    means = epsilon.axes[0].containers[1].lines[0].get_ydata()
+    cells = DESIGN.along_epsilon("ekf", DESIGN.guaranteed[1])
+    np.testing.assert_allclose(means, [results.mean(cell, DENSITY).mean for cell in cells])
+    assert len(modes.axes[0].containers) == len(DESIGN.all_estimators)
+    claimed = study.draw_claimed(results)
+    for axis in claimed.axes[1:]:
+        assert len(axis.containers) == len(DESIGN.printed) + 1
