@@ -94,7 +94,7 @@ def find_plan(kind: str, place: Place) -> Plan:
     known = "; ".join(str(plan.place) for plan in of_kind) or "none at all"
     raise ValueError(
         f"no plan {kind!r} ships for {place}; there is one for: {known}. "
-        "scripts/optimise_schedule.py makes one; pass its file as the schedule"
+        "scripts/search_plan.py makes one; pass its file as the schedule"
     )
 
 
