@@ -58,7 +58,7 @@ def command(script: str, args: Any) -> str:
 
     Args:
         script: Name of the script, with its subcommands.
-        args: Its arguments, a dataclass, perhaps of dataclasses without defaults of their own.
+        args: Its arguments, a dataclass; fields may be dataclasses of more arguments.
     """
     return " ".join([f"python scripts/{script}", *_words(args)])
 

@@ -58,9 +58,9 @@ class Args:
     policies: tuple[str, ...] = ()
     """Trained policies: files, or names of those that come with the package."""
     stochastic: bool = False
-    """Whether trained policies draw their actions in place of taking the likeliest."""
+    """Let trained policies draw their actions instead of taking the likeliest."""
     transfer: bool = False
-    """Whether trained policies may act on traffic or with a bandwidth that they do not know."""
+    """Let trained policies act on traffic or with a bandwidth that they were not trained for."""
     estimators: tuple[str, ...] = ("ekf", "random_walk")
     """State estimators."""
     seeds: str = "2000:2008"

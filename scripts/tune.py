@@ -53,7 +53,7 @@ class Args:
     trials: int = 60
     """Trials per configuration, those of earlier runs included."""
     workers: int = 1
-    """Processes, each with a trial of its own; results depend on the number."""
+    """Processes, each with a separate trial; results depend on the number."""
     schedule: str = "paper"
     """Query schedule, or a saved policy: its .zip file or shipped name."""
     bandwidth: int | None = None
@@ -65,7 +65,7 @@ class Args:
     noise_seed: int = TUNING.start
     """Noise and estimators are seeded with this plus the traffic seed."""
     noise_scale: bool = False
-    """Whether to search the scale of R, too, which the mechanism's noise makes known."""
+    """Search the scale of R, too, although the mechanism's noise is known."""
     sampler_seed: int = 0
     """Seeds the search."""
     records: Path | None = None

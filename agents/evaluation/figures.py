@@ -21,6 +21,7 @@ from dptse_env.rendering import DENSITY_MAP, QUERY_COLOUR, History
 
 COLOURS = ("#1b4f72", "#c1272d", "#5d8233", "#7d5ba6", "#b9770e")
 GRID_COLOUR = "#e3e6ea"
+ERROR_TICKS = (1, 1.5, 2, 3, 5, 7, 10, 15, 20, 30, 50, 70, 100, 150, 200)
 
 
 def make_figure(width: float, height: float, dpi: int = 140) -> Figure:
@@ -99,7 +100,7 @@ def save_errors(
                 colour = COLOURS[k % len(COLOURS)]
                 draw_dot(axis, intervals[row][metric], place + shift, colour, label)
         axis.set_xscale("log")
-        axis.xaxis.set_major_locator(FixedLocator([1, 2, 5, 10, 20, 50, 100, 200]))
+        axis.xaxis.set_major_locator(FixedLocator(ERROR_TICKS))
         axis.xaxis.set_minor_locator(NullLocator())
         axis.xaxis.set_major_formatter("{x:g}")
         axis.margins(x=0.12)
@@ -126,7 +127,7 @@ class RoadMap:
 
     @property
     def is_flags(self) -> bool:
-        """Whether the panel shows queried segments."""
+        """True for a panel of queried segments."""
         return self.values.dtype == bool
 
 

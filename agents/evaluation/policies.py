@@ -104,7 +104,7 @@ class SavedPolicy:
 
 
 PolicySource = NamedSchedule | SavedPolicy
-"""What a name of a policy stands for."""
+"""A query policy before it is bound to an environment."""
 
 
 def find_policy(source: str) -> PolicySource:

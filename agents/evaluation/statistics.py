@@ -34,7 +34,7 @@ class Interval:
         return (self.high - self.low) / 2
 
     def excludes_zero(self) -> bool:
-        """Whether zero lies outside the interval."""
+        """Return true if zero lies outside the interval."""
         return self.low > 0.0 or self.high < 0.0
 
 

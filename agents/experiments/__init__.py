@@ -1,1 +1,1 @@
-"""What studies and searches share: seeds, designs, engines, ledgers, provenance, tables, plots."""
+"""Shared parts of studies and searches: seeds, designs, engines, ledgers, tables, plots."""

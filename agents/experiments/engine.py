@@ -43,7 +43,7 @@ class Engine(Protocol):
 
     @property
     def is_parallel(self) -> bool:
-        """Whether several tasks share a machine, so that each should use one thread."""
+        """True if tasks share a machine, so that each should use one thread."""
 
     def run(
         self, work: Callable[[TaskT], ResultT], tasks: Sequence[TaskT]
@@ -131,7 +131,7 @@ def run_all(
 
 
 def make_pool(workers: int) -> ProcessPoolExecutor:
-    """Return processes that leave interrupts to this one and end with it, however it ends."""
+    """Return workers that leave interrupts to the caller and end with it, however it ends."""
     # Spawned, not forked: this process may hold threads and a loaded simulation.
     context = multiprocessing.get_context("spawn")
     return ProcessPoolExecutor(workers, mp_context=context, initializer=follow_parent)
@@ -147,5 +147,5 @@ def _end_with_parent() -> None:
     parent = multiprocessing.parent_process()
     assert parent is not None
     wait([parent.sentinel])
-    # The parent was killed: nobody takes results any more, and nothing is left to clean up.
+    # The parent was killed: no process takes results any more, and nothing is left to clean up.
     os._exit(1)

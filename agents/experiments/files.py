@@ -1,4 +1,4 @@
-"""Atomic writes: whatever interrupts one, the old file or the new one is there, and complete."""
+"""Atomic writes: after an interruption either the old or the new file is there, complete."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Reports: Markdown templates, filled with tables and numbers.
 
-A template is English prose that a person can edit. A name that it uses and nobody gives is an
-error. Filters: ``interval`` (a mean with its interval), ``number`` (three significant digits),
-``plain`` (a number without trailing zeros), ``integers`` (a range of integers).
+A template is English prose that a person can edit. A name in it without a value is an error.
+Filters: ``interval`` (a mean with its interval), ``number`` (three significant digits), ``plain``
+(a number without trailing zeros), ``integers`` (a range of integers).
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ from dptse_env.traffic import Corridor, RecordLibrary
 
 @dataclass(frozen=True)
 class Workplace:
-    """Where a study runs and leaves its results.
+    """Folder and processes of a study.
 
     Attributes:
         folder: Folder of ledgers, figures and report.

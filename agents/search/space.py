@@ -32,11 +32,11 @@ class Range:
         return float(f"{trial.suggest_float(name, self.low, self.high, log=self.log):.4g}")
 
     def holds(self, value: Any) -> bool:
-        """Whether the search can reach ``value``."""
+        """Return true if the search can reach ``value``."""
         return bool(self.low <= value <= self.high)
 
     def at_bound(self, value: Any) -> bool:
-        """Whether ``value`` lies within a fiftieth of the range of one of its ends."""
+        """Return true if ``value`` lies within a fiftieth of the range of an end."""
         scale = math.log if self.log else float
         share = (scale(value) - scale(self.low)) / (scale(self.high) - scale(self.low))
         return not 0.02 < share < 0.98
@@ -57,11 +57,11 @@ class Choice:
         return trial.suggest_categorical(name, self.options)
 
     def holds(self, value: Any) -> bool:
-        """Whether the search can reach ``value``."""
+        """Return true if the search can reach ``value``."""
         return value in self.options
 
     def at_bound(self, value: Any) -> bool:
-        """Whether ``value`` lies at an end: options have none."""
+        """Return false: options have no ends."""
         return False
 
 

@@ -212,7 +212,8 @@ Watched = dict[PaperCell, tuple[EpisodeScore, History]]
 def watch_pictures(design: PaperDesign, records: str | None) -> Watched:
     """Run the episodes of result 2: the first traffic seed, every estimator and setting."""
     seed, watched = design.traffic_seeds[0], {}
-    cells = [design.picture(name, own) for own in SETTINGS for name in design.all_estimators]
+    names = design.all_estimators
+    cells = [design.picture(name, setting) for setting in SETTINGS for name in names]
     for cell in dict.fromkeys(cells):
         env = make_env(design.env, cell, design.traffic_seeds, records)
         schedule = make_schedule(design.schedule, env)

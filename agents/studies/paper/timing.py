@@ -37,7 +37,7 @@ class Stopwatch:
     """Adds up the time spent in some methods of an object."""
 
     def __init__(self, timed: Any, names: Sequence[str]) -> None:
-        """Replace the methods of this one object by timed ones."""
+        """Replace the methods of this object by timed methods."""
         self.seconds = 0.0
         for name in names:
             setattr(timed, name, self._timed(getattr(timed, name)))

@@ -20,7 +20,7 @@ PRIMARY = "primary"
 REFERENCE = "paper"
 """The paper's schedule."""
 DETERMINISTIC, STOCHASTIC = MODES = ("deterministic", "stochastic")
-"""Whether a learned policy takes its likeliest action or draws one."""
+"""Modes of a learned policy: it takes its likeliest action, or draws an action."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ CELLS = (
         )
     ),
 )
-"""The primary cell, then the secondary ones."""
+"""The primary cell, then the secondary cells."""
 BASELINES = (*(name for name in SCHEDULES if name not in ("none", "all")), *INFORMED, *PLANS)
 """Policies that need no training, against which learned policies are held."""
 

@@ -67,7 +67,7 @@ class Verdict:
 
     @property
     def is_met(self) -> bool:
-        """Whether all conditions hold."""
+        """True if all conditions hold."""
         return all(self.parts.values())
 
 

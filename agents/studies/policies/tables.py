@@ -168,8 +168,8 @@ def checkpoint_table(results: PolicyResults) -> str:
     """Return the policies that were frozen."""
     header = ["file", "cell", "recipe", "training seed", "sha256"]
     rows = [
-        [f"`{own.path}`", own.cell, own.recipe, str(own.training_seed), own.sha256[:16]]
-        for own in results.manifest.checkpoints
+        [f"`{each.path}`", each.cell, each.recipe, str(each.training_seed), each.sha256[:16]]
+        for each in results.manifest.checkpoints
     ]
     return markdown(header, rows) if rows else ""
 
@@ -178,7 +178,7 @@ def tuned_table(results: PolicyResults) -> str:
     """Return the estimator settings that were tuned for single policies; empty if none."""
     header = ["settings of the estimator tuned for", "estimator", "ARZ", "preset"]
     tuned = results.manifest.tuned
-    rows = [[own.policy, own.estimator, own.parameters, own.privacy] for own in tuned]
+    rows = [[each.policy, each.estimator, each.parameters, each.privacy] for each in tuned]
     return markdown(header, rows) if rows else ""
 
 
