@@ -15,9 +15,9 @@ from typing import Any
 
 from agents.evaluation.episodes import make_config
 from agents.studies.audit.attack import attack
-from agents.studies.audit.policies import POLICIES, make_policy
 from agents.studies.audit.report import Finding
-from agents.studies.audit.targets import TARGETS, choose_target
+from agents.studies.audit.strategies import STRATEGIES, make_policy
+from agents.studies.audit.targets import TARGET_KINDS, choose_target
 from dptse_env.config import EnvConfig
 from dptse_env.privacy import PrivacyReport, mu_of
 from dptse_env.privacy.audit import Claim, audit
@@ -93,8 +93,8 @@ def check(args: Args) -> None:
     Raises:
         ValueError: An argument is out of range.
     """
-    require(args.target in TARGETS, "target", f"one of {list(TARGETS)}", args.target)
-    require(args.policy in POLICIES, "policy", f"one of {list(POLICIES)}", args.policy)
+    require(args.target in TARGET_KINDS, "target", f"one of {list(TARGET_KINDS)}", args.target)
+    require(args.policy in STRATEGIES, "policy", f"one of {list(STRATEGIES)}", args.policy)
     integer("runs", args.runs, 2)
     integer("traffic_seed", args.traffic_seed, 0)
     integer("seed", args.seed, 0)

@@ -28,7 +28,7 @@ from agents.experiments.runner import Workplace
 from agents.studies.paper import study as paper_study
 from agents.studies.paper.plan import PaperDesign
 from agents.studies.policies import study as policy_study
-from agents.studies.policies.manifest import FILE, find_checkpoints, read_tuned
+from agents.studies.policies.manifest import MANIFEST_FILE, find_checkpoints, read_tuned
 from agents.studies.policies.plan import BASELINES, CELLS, PolicyCell, PolicyDesign
 from agents.studies.privacy import study as privacy_study
 from agents.studies.privacy.plan import PrivacyDesign
@@ -39,7 +39,7 @@ RESULTS = Path("results")
 
 
 @dataclass(frozen=True)
-class Place:
+class StudyOptions:
     """Arguments that results do not depend on."""
 
     workers: int = os.cpu_count() or 1
@@ -57,7 +57,7 @@ class Place:
 
 
 @dataclass(frozen=True)
-class Paper(Place):
+class Paper(StudyOptions):
     """Reproduce the paper's five results, and judge its claims."""
 
     quick: bool = False
@@ -67,7 +67,7 @@ class Paper(Place):
 
 
 @dataclass(frozen=True)
-class Privacy(Place):
+class Privacy(StudyOptions):
     """Price a guarantee of privacy, and account for the noise as printed."""
 
     quick: bool = False
@@ -77,7 +77,7 @@ class Privacy(Place):
 
 
 @dataclass(frozen=True)
-class Freeze(Place):
+class Freeze(StudyOptions):
     """Fix policies and choices before test traffic is touched."""
 
     policies: tuple[str, ...] = ()
@@ -100,7 +100,7 @@ class Freeze(Place):
 
 
 @dataclass(frozen=True)
-class Run(Place):
+class Run(StudyOptions):
     """Run the frozen policies and choices on test traffic, and report."""
 
 
@@ -172,13 +172,13 @@ def freeze(args: Freeze, cells: tuple[PolicyCell, ...] = CELLS) -> None:
         tuned=read_tuned(args.settings),
     )
     if not is_new:
-        print(f"frozen before, on {manifest.frozen}: {place.folder / FILE}")
+        print(f"frozen before, on {manifest.frozen}: {place.folder / MANIFEST_FILE}")
         return
     for name, choice in manifest.choices.items():
         learned = choice.learners.get(name)
         against = f"; learned: {', '.join(learned)}" if learned else ""
         print(f"{name}: best baseline {choice.baseline}{against}")
-    print(f"frozen: {place.folder / FILE}")
+    print(f"frozen: {place.folder / MANIFEST_FILE}")
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ from dptse_env.rendering import DENSITY_MAP, QUERY_COLOUR, History
 
 COLOURS = ("#1b4f72", "#c1272d", "#5d8233", "#7d5ba6", "#b9770e")
 GRID_COLOUR = "#e3e6ea"
-ERROR_TICKS = (1, 1.5, 2, 3, 5, 7, 10, 15, 20, 30, 50, 70, 100, 150, 200)
+ERROR_TICKS = (1, 1.5, 2, 3, 5, 7, 10, 15, 20, 30, 40, 50, 70, 100, 150, 200, 300, 500)
 
 
 def make_figure(width: float, height: float, dpi: int = 140) -> Figure:

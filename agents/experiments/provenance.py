@@ -19,7 +19,7 @@ from dptse_env.config import EnvConfig
 from dptse_env.estimators.tuning import available_settings, settings_name
 from dptse_env.model import load_parameters
 
-FILE = "run.json"
+PROVENANCE_FILE = "run.json"
 
 
 def design_provenance(design: Design[Any]) -> dict[str, Any]:
@@ -87,10 +87,12 @@ def check_folder(folder: Path, provenance: Mapping[str, Any]) -> dict[str, Any] 
     Raises:
         ValueError: The folder was made with something else, or has no provenance.
     """
-    path = folder / FILE
+    path = folder / PROVENANCE_FILE
     if not path.exists():
         if folder.exists() and any(folder.iterdir()):
-            raise ValueError(f"{folder} is not empty and has no {FILE}: choose another --output")
+            raise ValueError(
+                f"{folder} is not empty and has no {PROVENANCE_FILE}: choose another --output"
+            )
         return None
     try:
         recorded: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
@@ -128,7 +130,7 @@ def take_folder(folder: Path, provenance: Mapping[str, Any]) -> dict[str, Any]:
             "sources": list(dict.fromkeys([*recorded["sources"], *provenance["sources"]])),
         }
     folder.mkdir(parents=True, exist_ok=True)
-    write_json(folder / FILE, content)
+    write_json(folder / PROVENANCE_FILE, content)
     return content
 
 

@@ -29,7 +29,7 @@ LEAST_GAIN = 1.0
 """Least gain of a neighbour that replaces the best plan [standard errors]."""
 NOISE_STEP = 10_000
 """Difference of noise seeds from one round to the next."""
-FEW = 4
+FIRST_SEEDS = 4
 """Traffic seeds of the first comparison with a neighbour."""
 
 
@@ -76,8 +76,8 @@ class PlanTask:
         if not set(self.traffic_seeds) <= set(TRAINING_SEEDS):
             raise ValueError(f"seeds must be training seeds, below 1000, got {self.seeds!r}")
         integer("neighbours", self.neighbours, 3)
-        if len(self.traffic_seeds) < FEW:
-            raise ValueError(f"seeds must be {FEW} or more, got {self.seeds!r}")
+        if len(self.traffic_seeds) < FIRST_SEEDS:
+            raise ValueError(f"seeds must be {FIRST_SEEDS} or more, got {self.seeds!r}")
 
     @property
     def traffic_seeds(self) -> tuple[int, ...]:
@@ -87,7 +87,7 @@ class PlanTask:
     @property
     def batch(self) -> int:
         """Episodes that run at once."""
-        return FEW * (self.neighbours + 1)
+        return FIRST_SEEDS * (self.neighbours + 1)
 
     def make(self, n_episodes: int, seeds: tuple[int, ...]) -> SensorQueryVectorEnv:
         """Make the environment for a number of episodes on some traffic seeds."""
@@ -216,7 +216,7 @@ class PlanSearch:
     def _round(self) -> None:
         generator = np.random.default_rng([self.task.seed, 1 + self.n_rounds])
         noise = PLAN_SEARCH.start + NOISE_STEP * (1 + self.n_rounds)
-        n_plans, n_seeds = self.task.neighbours, FEW
+        n_plans, n_seeds = self.task.neighbours, FIRST_SEEDS
         plans = np.stack([self._neighbour(generator) for _ in range(n_plans)])
         while True:
             seeds = self._seeds(generator, n_seeds)

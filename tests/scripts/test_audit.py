@@ -51,7 +51,7 @@ def test_what_the_paper_promises_is_rejected_with_vehicles_of_the_record(preset,
         runs=700 if preset == "corrected" else 100,
     )
     assert found["verdict"] == "rejected"
-    # What a user was told, and not what the account makes of it.
+    # The claim to users, not the account.
     assert found["result"]["claim"]["mu"] == pytest.approx(mu_of(1.0, 0.05))
     assert "boundary_inputs" in found["privacy"]["void_reasons"]
 
@@ -80,9 +80,11 @@ def test_the_bandwidth_arrives():
 
 
 def test_two_audits_agree(tmp_path):
-    one, two = (run(tmp_path / name, runs=20, seed=1)[1]["result"] for name in ("one", "two"))
+    first, second = (
+        run(tmp_path / name, runs=20, seed=1)[1]["result"] for name in ("first", "second")
+    )
     other = run(tmp_path / "three", runs=20, seed=2)[1]["result"]
-    assert one == two != other
+    assert first == second != other
 
 
 @pytest.mark.parametrize(

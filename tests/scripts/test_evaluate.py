@@ -44,15 +44,15 @@ def test_it_leaves_table_scores_and_figures(tmp_path, capsys):
 
 
 def test_two_runs_agree(tmp_path):
-    for name in ("one", "two"):
+    for name in ("first", "second"):
         main(
             Args(
                 env=SHORT, schedules=("random",), estimators=("ekf",), seeds="2000:2002",
                 output=tmp_path / name, workers=1,
             )
         )  # fmt: skip
-    one, two = ((tmp_path / name / "episodes.csv").read_text() for name in ("one", "two"))
-    assert one == two
+    first, second = ((tmp_path / name / "episodes.csv").read_text() for name in ("first", "second"))
+    assert first == second
 
 
 @pytest.mark.parametrize(
@@ -90,8 +90,8 @@ def test_a_saved_policy_stands_beside_schedules(tmp_path, capsys):
     )  # fmt: skip
     for row in rows:
         seed = int(row["traffic_seed"])
-        own = run_episode(env, load_policy(paths[0], env), traffic_seed=seed, seed=seed)
-        assert float(row["rmse_density"]) == pytest.approx(own.rmse_density, abs=1e-9)
+        expected = run_episode(env, load_policy(paths[0], env), traffic_seed=seed, seed=seed)
+        assert float(row["rmse_density"]) == pytest.approx(expected.rmse_density, abs=1e-9)
     assert len(rows) == 2
 
 
@@ -107,8 +107,8 @@ def test_scores_are_those_of_one_episode_after_another(tmp_path):
     env = gym.make(SHORT, traffic_seeds="2000:2003", parameters="w99-3lane")
     schedule = make_schedule("oldest-first", env)
     for seed, row in zip(range(2000, 2003), rows, strict=True):
-        own = run_episode(env, schedule, traffic_seed=seed, seed=5 + seed)
-        for key, value in dataclasses.asdict(own).items():
+        expected = run_episode(env, schedule, traffic_seed=seed, seed=5 + seed)
+        for key, value in dataclasses.asdict(expected).items():
             assert float(row[key]) == pytest.approx(value, abs=1e-9)
 
 

@@ -56,8 +56,8 @@ def test_fields_of_a_corridor_and_keywords_are_recorded(tmp_path):
     main(given)
     assert RecordLibrary(tmp_path).record_path(calm, 0).is_dir()
     main(dataclasses.replace(given, corridor=None, keywords='{"incident": "none"}', seeds="1:2"))
-    whole = resolve("short-highway", {"incident": "none"}).corridor
-    assert RecordLibrary(tmp_path).record_path(whole, 1).is_dir()
+    full = resolve("short-highway", {"incident": "none"}).corridor
+    assert RecordLibrary(tmp_path).record_path(full, 1).is_dir()
 
 
 def test_mistakes_end_in_one_line_on_stderr():

@@ -71,7 +71,7 @@ def finished(journal):
     """Count trials that were completed (1) or stopped early (2)."""
     records = [line for line in journal.read_text().splitlines() if line.endswith("}")]
     states = [json.loads(line) for line in records]
-    return sum(one["op_code"] == 6 and one["state"] in (1, 2) for one in states)
+    return sum(each["op_code"] == 6 and each["state"] in (1, 2) for each in states)
 
 
 def group_lives(group):

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from agents.studies.audit.policies import AdversaryPolicy, always_observed
+from agents.studies.audit.strategies import AdversaryPolicy, always_observed
 from agents.studies.audit.worlds import AdjacentWorlds
 from dptse_env.arrays import BoolArray, FloatArray
 from dptse_env.config import EnvConfig

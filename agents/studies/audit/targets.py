@@ -9,7 +9,7 @@ import numpy as np
 
 from agents.studies.audit.attack import planned_distance
 from agents.studies.audit.distances import ReleaseDistances, plan_contributions
-from agents.studies.audit.policies import (
+from agents.studies.audit.strategies import (
     PUBLIC_SCHEDULES,
     always_observed,
     make_policy,
@@ -21,7 +21,7 @@ from dptse_env.config import EnvConfig
 from dptse_env.traffic import Record
 from dptse_env.validation import require
 
-TARGETS = ("worst-case", "replaced", "deleted")
+TARGET_KINDS = ("worst-case", "replaced", "deleted")
 """Kinds of targets; the last two are vehicles of the record."""
 
 SHORTLIST = 12
@@ -52,7 +52,7 @@ def choose_target(config: EnvConfig, record: Record, kind: str, policy: str) -> 
     Raises:
         ValueError: The kind does not go with the adjacency, or the record holds too few vehicles.
     """
-    require(kind in TARGETS, "target", f"one of {list(TARGETS)}", kind)
+    require(kind in TARGET_KINDS, "target", f"one of {list(TARGET_KINDS)}", kind)
     if kind == "worst-case":
         return _worst_case(config, record, policy)
     replace = config.privacy.adjacency == "replace"

@@ -16,7 +16,7 @@ Verdict = Literal["holds", "does not hold", "undecided", "not measured"]
 
 
 @dataclass(frozen=True)
-class Range:
+class ExpectedRange:
     """An open range of values.
 
     Attributes:
@@ -36,8 +36,8 @@ class Range:
         return f"between {self.low:g} and {self.high:g}"
 
 
-BELOW_ZERO = Range(high=0.0)
-ABOVE_ZERO = Range(low=0.0)
+BELOW_ZERO = ExpectedRange(high=0.0)
+ABOVE_ZERO = ExpectedRange(low=0.0)
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Claim:
         statement: The claim.
         quantity: The quantity that is measured.
         unit: Unit of the quantity.
-        expected: Range in which the quantity should lie.
+        expected: ExpectedRange in which the quantity should lie.
         measure: Returns the interval of each part by its name.
     """
 
@@ -57,7 +57,7 @@ class Claim:
     statement: str
     quantity: str
     unit: str
-    expected: Range
+    expected: ExpectedRange
     measure: Callable[[PaperResults, Setting], Mapping[str, Interval]]
 
 
@@ -78,7 +78,7 @@ class Outcome:
     verdict: Verdict
 
 
-def judge_part(interval: Interval, expected: Range) -> Verdict:
+def judge_part(interval: Interval, expected: ExpectedRange) -> Verdict:
     """Judge a part by whether its interval lies inside a range, outside of it, or across an end."""
     if expected.low < interval.low and interval.high < expected.high:
         return "holds"

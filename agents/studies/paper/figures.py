@@ -15,6 +15,7 @@ from matplotlib.ticker import NullFormatter
 
 from agents.evaluation.episodes import EpisodeScore, watch_episode
 from agents.evaluation.figures import (
+    ERROR_TICKS,
     add_frame,
     add_legend,
     draw_maps,
@@ -34,7 +35,7 @@ from agents.experiments.plots import (
     shifted,
 )
 from agents.experiments.runner import make_env
-from agents.studies.paper.plan import ESTIMATORS, SETTINGS, PaperCell, PaperDesign, Setting
+from agents.studies.paper.plan import PAPER_ESTIMATORS, SETTINGS, PaperCell, PaperDesign, Setting
 from agents.studies.paper.results import PaperResults
 from agents.studies.paper.timing import PAPER_SECONDS
 from dptse_env.rendering import History
@@ -43,7 +44,6 @@ from dptse_env.schedules import make_schedule
 AXES = {"bandwidth": "number of CV segments", "epsilon": "ε", "delta": "δ"}
 OFF_SCALE = 1.3
 """An open loop this many times above everything else is named at the edge instead of drawn."""
-TICKS = (10, 15, 20, 30, 40, 50, 70, 100, 150, 200, 300)
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,7 @@ def _sweep_panel(
         axis.set_xticks(places)
     if layout.log:
         axis.set_yscale("log")
-        set_log_ticks(axis.yaxis, TICKS)
+        set_log_ticks(axis.yaxis, ERROR_TICKS)
     alone = mean_interval(results.base("open_loop", setting, metric))
     draw_open_loop(axis, alone, highest, METRICS[metric][1], always=layout.log)
     add_frame(axis)
@@ -195,7 +195,7 @@ def _time_panel(axis: Axes, results: PaperResults, places: Any, relative: bool) 
                 label=f"here, {setting}" if name == names[0] else None,
             )
     scale = PAPER_SECONDS["ekf"] if relative else 1e-3
-    published = [k for k, name in enumerate(names) if name in ESTIMATORS]
+    published = [k for k, name in enumerate(names) if name in PAPER_ESTIMATORS]
     axis.plot(
         [PAPER_SECONDS[names[k]] / scale for k in published],
         [places[k] for k in published],

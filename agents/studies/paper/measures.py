@@ -15,7 +15,7 @@ from agents.evaluation.statistics import (
 )
 from agents.experiments.cells import DENSITY, METRICS, SPEED
 from agents.experiments.plots import LABELS
-from agents.studies.paper.plan import ESTIMATORS, Setting
+from agents.studies.paper.plan import PAPER_ESTIMATORS, Setting
 from agents.studies.paper.results import PaperResults, correlations, roughness, slopes
 from dptse_env.arrays import FloatArray
 
@@ -38,7 +38,7 @@ def falls(metric: str) -> Measure:
 
     def measure(m: PaperResults, setting: Setting) -> Mapping[str, Interval]:
         places = np.array(m.design.sweeps["bandwidth"])
-        curves = {name: m.curve("bandwidth", name, setting, metric) for name in ESTIMATORS}
+        curves = {name: m.curve("bandwidth", name, setting, metric) for name in PAPER_ESTIMATORS}
         return {LABELS[name]: mean_interval(slopes(places, y)) for name, y in curves.items()}
 
     return measure
@@ -51,7 +51,7 @@ def against_others(name: str, metric: str, *fields: str) -> Measure:
         parts = {}
         for field in fields:
             error = _mean(m, field, name, setting, metric)
-            for other in ESTIMATORS:
+            for other in PAPER_ESTIMATORS:
                 if other != name:
                     label = f"{LABELS[name]} − {LABELS[other]}"
                     label += f", over {_AXES[field]}" if len(fields) > 1 else ""
@@ -87,7 +87,9 @@ def mhe_behind_ekf(m: PaperResults, setting: Setting) -> Mapping[str, Interval]:
 
 def enkf_rougher(m: PaperResults, setting: Setting) -> Mapping[str, Interval]:
     """Measure the roughness of the EnKF's density curve minus that of each other estimator."""
-    rough = {name: roughness(m.curve("bandwidth", name, setting, DENSITY)) for name in ESTIMATORS}
+    rough = {
+        name: roughness(m.curve("bandwidth", name, setting, DENSITY)) for name in PAPER_ESTIMATORS
+    }
     return {
         f"EnKF − {LABELS[name]}": paired_difference(rough["enkf"], other)
         for name, other in rough.items()
@@ -106,10 +108,10 @@ def _correlation(a: FloatArray, b: FloatArray) -> Interval:
 
 def alike_over_epsilon(m: PaperResults, setting: Setting) -> Mapping[str, Interval]:
     """Measure the correlation of two estimators' density curves over epsilon."""
-    curves = {name: m.curve("epsilon", name, setting, DENSITY) for name in ESTIMATORS}
+    curves = {name: m.curve("epsilon", name, setting, DENSITY) for name in PAPER_ESTIMATORS}
     return {
         f"{LABELS[a]}, {LABELS[b]}": _correlation(curves[a], curves[b])
-        for a, b in combinations(ESTIMATORS, 2)
+        for a, b in combinations(PAPER_ESTIMATORS, 2)
     }
 
 
@@ -120,14 +122,14 @@ def speed_like_density(m: PaperResults, setting: Setting) -> Mapping[str, Interv
             m.curve(field, name, setting, DENSITY), m.curve(field, name, setting, SPEED)
         )
         for field in ("epsilon", "delta")
-        for name in ESTIMATORS
+        for name in PAPER_ESTIMATORS
     }
 
 
 def epsilon_matters_more(m: PaperResults, setting: Setting) -> Mapping[str, Interval]:
     """Measure the fall of the density error from end to end, over epsilon minus over delta."""
     parts = {}
-    for name in ESTIMATORS:
+    for name in PAPER_ESTIMATORS:
         epsilon, delta = (m.curve(field, name, setting, DENSITY) for field in ("epsilon", "delta"))
         fall = epsilon[0] - epsilon[-1], delta[0] - delta[-1]
         parts[LABELS[name]] = paired_difference(*fall)
@@ -148,7 +150,7 @@ def growth(field: str, low: float | None, high: float | None) -> Measure:
         ends = values[0] if low is None else low, values[-1] if high is None else high
         return {
             LABELS[name]: percent(*(m.at(field, end, name, setting, DENSITY) for end in ends))
-            for name in ESTIMATORS
+            for name in PAPER_ESTIMATORS
         }
 
     return measure
@@ -174,7 +176,7 @@ def below(reference: str, metric: str) -> Measure:
             f"{LABELS[name]} − {LABELS[reference]}": paired_difference(
                 m.base(name, setting, metric), other
             )
-            for name in ESTIMATORS
+            for name in PAPER_ESTIMATORS
         }
 
     return measure

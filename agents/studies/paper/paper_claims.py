@@ -7,7 +7,7 @@ before the full run, after a look at three traffic seeds.
 from __future__ import annotations
 
 from agents.experiments.cells import DENSITY, SPEED
-from agents.studies.paper.claims import ABOVE_ZERO, BELOW_ZERO, Claim, Range
+from agents.studies.paper.claims import ABOVE_ZERO, BELOW_ZERO, Claim, ExpectedRange
 from agents.studies.paper.measures import (
     against_others,
     alike_over_epsilon,
@@ -66,12 +66,12 @@ CLAIMS = (
     ),
     Claim(
         "P7", "In density, MHE and EKF follow UKF closely.",
-        _APART, "%", Range(-CLOSE, CLOSE),
+        _APART, "%", ExpectedRange(-CLOSE, CLOSE),
         percent_apart(("mhe", "ukf", DENSITY), ("ekf", "ukf", DENSITY)),
     ),
     Claim(
         "P8", "In speed, EKF follows UKF closely.",
-        _APART, "%", Range(-CLOSE, CLOSE), percent_apart(("ekf", "ukf", SPEED)),
+        _APART, "%", ExpectedRange(-CLOSE, CLOSE), percent_apart(("ekf", "ukf", SPEED)),
     ),
     Claim(
         "P9", "MHE falls behind EKF in speed.",
@@ -79,7 +79,7 @@ CLAIMS = (
     ),
     Claim(
         "P10", "EKF and MHE perform comparably.",
-        _APART, "%", Range(-CLOSE, CLOSE),
+        _APART, "%", ExpectedRange(-CLOSE, CLOSE),
         percent_apart(("mhe", "ekf", DENSITY), ("mhe", "ekf", SPEED)),
     ),
     Claim(
@@ -99,13 +99,13 @@ CLAIMS = (
     ),
     Claim(
         "P14", "All techniques vary similarly with privacy.",
-        "correlation of the density RMSE of two techniques along ε", "1", Range(low=SIMILAR),
-        alike_over_epsilon,
+        "correlation of the density RMSE of two techniques along ε", "1",
+        ExpectedRange(low=SIMILAR), alike_over_epsilon,
     ),
     Claim(
         "P15", "The speed error varies with ε and δ as the density error does.",
         "correlation of the density and the speed RMSE along ε and along δ", "1",
-        Range(low=SIMILAR), speed_like_density,
+        ExpectedRange(low=SIMILAR), speed_like_density,
     ),
     Claim(
         "P16", "ε has more influence than δ.",
@@ -115,26 +115,26 @@ CLAIMS = (
     Claim(
         "P17", "The variation is small over the full range of δ.",
         "excess of the density RMSE at the lowest δ over that at the highest", "%",
-        Range(-SMALL, SMALL), growth("delta", None, None),
+        ExpectedRange(-SMALL, SMALL), growth("delta", None, None),
     ),
     Claim(
         "P18", "The variation is small for ε above 1.",
         "excess of the density RMSE at ε = 1 over that at the highest ε", "%",
-        Range(-SMALL, SMALL), growth("epsilon", EPSILON, None),
+        ExpectedRange(-SMALL, SMALL), growth("epsilon", EPSILON, None),
     ),
     Claim(
         "P19", "The error worsens quickly as ε goes from 1 towards 0.",
         "excess of the density RMSE at the lowest ε over that at ε = 1", "%",
-        Range(low=SMALL), growth("epsilon", None, EPSILON),
+        ExpectedRange(low=SMALL), growth("epsilon", None, EPSILON),
     ),
     Claim(
         "P20", "A step takes UKF the least time, then EnKF, MHE and EKF.",
-        "ratio of the times of a step", "1", Range(high=1.0), time_order,
+        "ratio of the times of a step", "1", ExpectedRange(high=1.0), time_order,
     ),
 )  # fmt: skip
 """Claims of the paper's section on results, in its order."""
 
-TARGETS = (
+PROJECT_TARGETS = (
     Claim(
         "T1", "Every estimator beats the random walk in density.",
         "difference of density RMSE at the base point", "veh/km", BELOW_ZERO,

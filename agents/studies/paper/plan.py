@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 from agents.experiments.cells import Design
 from dptse_env.estimators import check_estimator
 
-ESTIMATORS = ("ekf", "ukf", "enkf", "mhe")
+PAPER_ESTIMATORS = ("ekf", "ukf", "enkf", "mhe")
 """The paper's estimators, in its order."""
-BASELINES = ("random_walk", "open_loop")
+BASELINE_ESTIMATORS = ("random_walk", "open_loop")
 """Run beside them in every result: without a traffic model, and without measurements."""
 EPSILON, DELTA = 1.0, 0.05
 """The paper's privacy parameters wherever they are not swept."""
@@ -87,7 +87,7 @@ class PaperDesign(Design[PaperCell]):
     picture_segments: int = 7
     privacy_segments: int = 5
     n_timed: int = 10
-    estimators: tuple[str, ...] = ESTIMATORS
+    estimators: tuple[str, ...] = PAPER_ESTIMATORS
 
     def check(self) -> None:
         """See `Design.check`."""
@@ -96,10 +96,10 @@ class PaperDesign(Design[PaperCell]):
             raise ValueError(f"n_timed must be >= 2, got {self.n_timed}")
         for name in self.estimators:
             check_estimator(name, "compiled")
-            if name not in ESTIMATORS:
+            if name not in PAPER_ESTIMATORS:
                 raise ValueError(
-                    f"estimators must be among {', '.join(ESTIMATORS)}, got {name!r}; "
-                    f"{' and '.join(BASELINES)} are always run"
+                    f"estimators must be among {', '.join(PAPER_ESTIMATORS)}, got {name!r}; "
+                    f"{' and '.join(BASELINE_ESTIMATORS)} are always run"
                 )
         if len(set(self.cv_segments)) < 3:
             raise ValueError(f"cv_segments must be 3 or more values, got {self.cv_segments}")
@@ -111,7 +111,10 @@ class PaperDesign(Design[PaperCell]):
     @property
     def all_estimators(self) -> tuple[str, ...]:
         """The paper's estimators that are run, in its order, then the baselines."""
-        return (*(name for name in ESTIMATORS if name in self.estimators), *BASELINES)
+        return (
+            *(name for name in PAPER_ESTIMATORS if name in self.estimators),
+            *BASELINE_ESTIMATORS,
+        )
 
     @property
     def sweeps(self) -> dict[str, tuple[float, ...]]:

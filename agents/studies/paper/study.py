@@ -17,7 +17,7 @@ from agents.experiments.runner import Workplace, missing_tasks, run_task
 from agents.experiments.tables import format_range, settings_table, versions_table, write_summary
 from agents.studies.paper.claims import judge_all
 from agents.studies.paper.figures import OFF_SCALE, draw_figures, draw_pictures, watch_pictures
-from agents.studies.paper.paper_claims import CLAIMS, CLOSE, SIMILAR, SMALL, TARGETS
+from agents.studies.paper.paper_claims import CLAIMS, CLOSE, PROJECT_TARGETS, SIMILAR, SMALL
 from agents.studies.paper.plan import DELTA, EPSILON, PaperCell, PaperDesign
 from agents.studies.paper.results import PaperResults
 from agents.studies.paper.tables import (
@@ -87,7 +87,7 @@ def draw(place: Workplace, results: PaperResults) -> None:
 
 def report(results: PaperResults, recorded: Mapping[str, Any], command: str) -> dict[str, Any]:
     """Return the tables and numbers of the report."""
-    claims, targets = judge_all(CLAIMS, results), judge_all(TARGETS, results)
+    claims, targets = judge_all(CLAIMS, results), judge_all(PROJECT_TARGETS, results)
     details = [(outcomes[0].claim, parts_table(outcomes)) for outcomes in (*claims, *targets)]
     return {
         "design": results.design,

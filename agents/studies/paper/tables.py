@@ -11,7 +11,7 @@ from agents.experiments.plots import LABELS
 from agents.experiments.tables import format_interval, markdown
 from agents.studies.paper.claims import Outcome
 from agents.studies.paper.measures import percent
-from agents.studies.paper.plan import ESTIMATORS, SETTINGS
+from agents.studies.paper.plan import PAPER_ESTIMATORS, SETTINGS
 from agents.studies.paper.results import PaperResults
 from agents.studies.paper.timing import PAPER_SECONDS
 
@@ -70,7 +70,7 @@ def time_table(results: PaperResults) -> str:
     rows = []
     for name in results.design.all_estimators:
         row = [LABELS[name], "-", "-"]
-        if name in ESTIMATORS:
+        if name in PAPER_ESTIMATORS:
             seconds = PAPER_SECONDS[name]
             row[1:] = [f"{seconds * 1e3:g}", f"{seconds / PAPER_SECONDS['ekf']:.2f}"]
         for setting in SETTINGS:

@@ -22,12 +22,12 @@ from agents.studies.policies.queries import (
 from agents.studies.policies.results import METRICS, PolicyResults
 from agents.studies.policies.tables import ranking
 
-COLOURS = {"baseline": "#5f6b7a", "bound": "#b9770e", "learned": "#1b4f72"}
-CURVES = (
+KIND_COLOURS = {"baseline": "#5f6b7a", "bound": "#b9770e", "learned": "#1b4f72"}
+LINE_COLOURS = (
     "#1b4f72", "#c1272d", "#5d8233", "#7d5ba6", "#b9770e", "#009e73", "#cc79a7", "#333333",
     "#56b4e9",
 )  # fmt: skip
-FEW = 1e5
+LINEAR_UP_TO = 1e5
 """Seconds of training up to which learning curves are drawn to a linear scale."""
 SINCE = range(-240, 361, BIN)
 """Edges of the bins of time from the start of the incident that are drawn [s]."""
@@ -42,7 +42,7 @@ def draw_ranking(results: PolicyResults) -> Figure:
     for axis, (metric, (name, unit)) in zip(axes, METRICS.items(), strict=True):
         for place, rank in zip(places, ranks, strict=True):
             interval = results.interval(mean, rank.errors[metric])
-            draw_dot(axis, interval, place, COLOURS[rank.kind], rank.kind)
+            draw_dot(axis, interval, place, KIND_COLOURS[rank.kind], rank.kind)
         axis.set_xlabel(f"{name} error [{unit}]")
     axes[0].set_yticks(places, [rank.label for rank in ranks])
     return _finish(figure)
@@ -63,7 +63,7 @@ def draw_cells(results: PolicyResults) -> Figure:
         labels = ("below the best baseline", "below the paper's schedule")
         for k, (name, label) in enumerate(zip(names, labels, strict=True)):
             below = results.below(results.learned(learner), results.schedule(cell, name))
-            draw_dot(axis, below, place + 0.12 - 0.24 * k, CURVES[k], label)
+            draw_dot(axis, below, place + 0.12 - 0.24 * k, LINE_COLOURS[k], label)
     axis.axvline(0.0, color="#333333", linewidth=1.0)
     axis.set_yticks(places, [label for label, _, _ in rows])
     axis.set_xlabel("error below the reference [%]")
@@ -75,7 +75,7 @@ def draw_curves(results: PolicyResults) -> Figure:
     figure = make_figure(7.6, 4.6)
     axis = figure.subplots()
     recipes = dict.fromkeys(curve.recipe for curve in results.curves)
-    for colour, recipe in zip(cycle(CURVES), recipes, strict=False):
+    for colour, recipe in zip(cycle(LINE_COLOURS), recipes, strict=False):
         curves = [curve for curve in results.curves if curve.recipe == recipe]
         for curve in curves:
             axis.plot(curve.steps, curve.errors, color=colour, linewidth=0.8, alpha=0.5)
@@ -89,7 +89,9 @@ def draw_curves(results: PolicyResults) -> Figure:
     choice = results.choice(PRIMARY)
     for name, line in ((choice.baseline, "--"), (REFERENCE, ":")):
         axis.axhline(1000.0 * choice.errors[name], color="#333333", linestyle=line, label=name)
-    axis.set_xscale("symlog", linthresh=FEW)  # some recipes simulate ten times what others do
+    axis.set_xscale(
+        "symlog", linthresh=LINEAR_UP_TO
+    )  # some recipes simulate ten times what others do
     axis.set_xlabel("seconds simulated in training")
     axis.set_ylabel("error on validation traffic × 1000")
     return _finish(figure)
@@ -99,7 +101,9 @@ def draw_queries(results: PolicyResults) -> Figure:
     """Draw where and when policies of the primary cell query."""
     figure = make_figure(11.0, 7.0)
     axes = figure.subplots(2, 3)
-    for colour, (label, episodes) in zip(cycle(CURVES), _drawn(results).items(), strict=False):
+    for colour, (label, episodes) in zip(
+        cycle(LINE_COLOURS), _drawn(results).items(), strict=False
+    ):
         shares = by_segment(episodes)
         axes[0, 0].plot(1 + np.arange(len(shares)), shares, "o-", ms=3, color=colour, label=label)
         for axis, phase in zip(axes[1], PHASES, strict=True):

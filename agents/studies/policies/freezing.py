@@ -13,7 +13,7 @@ import numpy as np
 from agents.evaluation.episodes import EpisodeScore
 from agents.experiments.ledger import Ledger
 from agents.experiments.provenance import environment_provenance, results_provenance
-from agents.studies.policies.manifest import Checkpoint, Choice, Manifest, Tuned
+from agents.studies.policies.manifest import CellChoice, Checkpoint, Manifest, Tuned
 from agents.studies.policies.plan import Entry, PolicyCell, PolicyDesign
 from agents.studies.policies.running import cell_config, make_task, suitable
 
@@ -133,7 +133,7 @@ def choose(
 
 def _choice(
     cell: PolicyCell, design: PolicyDesign, manifest: Manifest, ledger: Ledger[Entry, EpisodeScore]
-) -> Choice:
+) -> CellChoice:
     def mean_error(entry: Entry) -> float:
         scores = (ledger.rows[entry, seed] for seed in design.validation_seeds)
         return float(np.mean([-score.reward for score in scores]))
@@ -147,7 +147,7 @@ def _choice(
         learners[learner.policy, learner.mode] = sum(errors) / len(errors)
     best = {cell.name: min(learners, key=lambda pair: learners[pair])} if learners else {}
     named = {f"{policy}, {mode}": error for (policy, mode), error in learners.items()}
-    return Choice(
+    return CellChoice(
         baseline=min(baselines, key=lambda name: baselines[name]),
         learners=best,
         errors={**baselines, **named},

@@ -16,7 +16,7 @@ from agents.studies.policies.plan import MODES, Entry, Learner, PolicyCell, Poli
 from dptse_env.config import EnvConfig
 from dptse_env.estimators.tuning import read_settings
 
-FILE = "manifest.json"
+MANIFEST_FILE = "manifest.json"
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class Tuned:
 
 
 @dataclass(frozen=True)
-class Choice:
+class CellChoice:
     """The choices in a cell that validation traffic decided.
 
     Attributes:
@@ -112,12 +112,12 @@ class Manifest:
     ladder: dict[str, tuple[str, ...]]
     bounds: dict[str, tuple[str, ...]]
     unsuited: dict[str, dict[str, str]]
-    choices: dict[str, Choice] = dataclasses.field(default_factory=dict)
+    choices: dict[str, CellChoice] = dataclasses.field(default_factory=dict)
     frozen: str = ""
 
     def write(self, folder: Path) -> None:
         """Write the manifest to a folder in one piece."""
-        write_json(folder / FILE, dataclasses.asdict(self), sort_keys=True)
+        write_json(folder / MANIFEST_FILE, dataclasses.asdict(self), sort_keys=True)
 
     @classmethod
     def read(cls, folder: Path) -> Manifest:
@@ -127,7 +127,7 @@ class Manifest:
             FileNotFoundError: Nothing was frozen there.
             ValueError: It is not as this class writes it.
         """
-        path = folder / FILE
+        path = folder / MANIFEST_FILE
         if not path.exists():
             raise FileNotFoundError(
                 f"{path} is missing: freeze policies first, with `study.py policies freeze`"
@@ -135,7 +135,7 @@ class Manifest:
         try:
             content = json.loads(path.read_text(encoding="utf-8"))
             choices = {
-                cell: Choice(
+                cell: CellChoice(
                     choice["baseline"],
                     {origin: (pair[0], pair[1]) for origin, pair in choice["learners"].items()},
                     choice["errors"],

@@ -20,7 +20,7 @@ from agents.evaluation.statistics import (
 )
 from agents.experiments import cells
 from agents.studies.policies.curves import Curve
-from agents.studies.policies.manifest import Choice, Manifest
+from agents.studies.policies.manifest import CellChoice, Manifest
 from agents.studies.policies.plan import PRIMARY, REFERENCE, Entry, Learner, PolicyDesign
 from agents.studies.policies.queries import QueryCounts
 from dptse_env.arrays import FloatArray
@@ -110,7 +110,7 @@ class PolicyResults:
         """Return how far errors lie below those of a reference [%]."""
         return self.interval(percent_below, table, reference)
 
-    def choice(self, cell: str) -> Choice:
+    def choice(self, cell: str) -> CellChoice:
         """Return the choices of validation traffic in a cell."""
         return self.manifest.choices[cell]
 

@@ -13,7 +13,7 @@ LEAST_RUNS, LEAST_TRAFFIC = 5, 64
 
 
 @dataclass(frozen=True)
-class Target:
+class PolicyTarget:
     """A percentage that a policy must lie below a reference.
 
     Attributes:
@@ -27,14 +27,14 @@ class Target:
     baseline: str = ""
 
 
-TARGETS = (
-    Target("below the best baseline that needs no training", 8.0),
-    Target("below the paper's schedule", 15.0, REFERENCE),
+POLICY_TARGETS = (
+    PolicyTarget("below the best baseline that needs no training", 8.0),
+    PolicyTarget("below the paper's schedule", 15.0, REFERENCE),
 )
 
 
 @dataclass(frozen=True)
-class Verdict:
+class TargetVerdict:
     """Measurement and verdict of a target.
 
     Attributes:
@@ -46,7 +46,7 @@ class Verdict:
         enough: Whether there were enough training seeds and test seeds.
     """
 
-    target: Target
+    target: PolicyTarget
     reference: str
     overall: Interval
     worst: Interval
@@ -71,12 +71,12 @@ class Verdict:
         return all(self.parts.values())
 
 
-def judge(results: PolicyResults, learner: Learner, target: Target) -> Verdict:
+def judge(results: PolicyResults, learner: Learner, target: PolicyTarget) -> TargetVerdict:
     """Judge a learned policy of the primary cell by the rules of the report."""
     reference = target.baseline or results.choice(learner.cell).baseline
     errors, other = results.learned(learner), results.schedule(learner.cell, reference)
     place = results.worst(learner)
-    return Verdict(
+    return TargetVerdict(
         target=target,
         reference=reference,
         overall=results.below(errors, other),

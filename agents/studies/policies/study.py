@@ -32,7 +32,7 @@ from agents.studies.policies.manifest import Checkpoint, Manifest, Tuned
 from agents.studies.policies.plan import DETERMINISTIC, MODES, PRIMARY, Entry, Learner, PolicyDesign
 from agents.studies.policies.queries import QueryCounts
 from agents.studies.policies.results import ERROR_ORACLE, PolicyResults
-from agents.studies.policies.rules import LEAST_RUNS, LEAST_TRAFFIC, TARGETS, judge
+from agents.studies.policies.rules import LEAST_RUNS, LEAST_TRAFFIC, POLICY_TARGETS, judge
 from agents.studies.policies.running import (
     EntryTask,
     cell_config,
@@ -181,7 +181,7 @@ def draw(folder: Path, results: PolicyResults) -> None:
 def report(folder: Path, results: PolicyResults, recorded: Mapping[str, Any]) -> dict[str, Any]:
     """Return the tables and numbers of the report."""
     design, manifest, learner = results.design, results.manifest, results.primary
-    verdicts = [] if learner is None else [judge(results, learner, each) for each in TARGETS]
+    verdicts = [] if learner is None else [judge(results, learner, each) for each in POLICY_TARGETS]
     best, paper = (results.schedule(PRIMARY, name) for name in results.references)
     oracle = None
     if ERROR_ORACLE in manifest.bounds[PRIMARY]:

@@ -13,7 +13,7 @@ from agents.experiments import tables
 from agents.experiments.tables import format_interval, interval_columns, markdown, write_csv
 from agents.studies.policies.plan import REFERENCE, Learner
 from agents.studies.policies.results import ERROR, METRICS, PolicyResults
-from agents.studies.policies.rules import Verdict
+from agents.studies.policies.rules import TargetVerdict
 from dptse_env.arrays import FloatArray
 
 
@@ -74,7 +74,7 @@ def ranking_table(results: PolicyResults, cell: str) -> str:
     return markdown([*header, *(f"{name} RMSE [{unit}]" for name, unit in units)], rows)
 
 
-def verdict_table(verdicts: Sequence[Verdict]) -> str:
+def verdict_table(verdicts: Sequence[TargetVerdict]) -> str:
     """Return one row for each target."""
     rows = [
         [

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from agents.evaluation.figures import add_frame, add_legend, make_figure
+from agents.evaluation.figures import ERROR_TICKS, add_frame, add_legend, make_figure
 from agents.evaluation.statistics import Interval
 from agents.experiments.cells import DENSITY, METRICS, SPEED
 from agents.experiments.plots import (
@@ -28,14 +28,13 @@ from agents.studies.privacy.results import PrivacyResults
 
 CAPS = ("#9ecae1", "#4292c6", "#2171b5", "#08519c", "#08306b")
 """Shades from the smallest cap, the least noise, to the largest."""
-LOOKS = {
+PROTECTION_LOOKS = {
     "event": Look("#009e73", "s", "--"),
     "horizon": Look("#d55e00", "^", "--"),
     "paper": Look("#cc79a7", "D"),
     "corrected": Look("#7d5ba6", "v"),
 }
 MODE_LABELS = ("nominal", "private", "true\n(no guarantee)")
-TICKS = (2, 3, 5, 7, 10, 15, 20, 30, 40, 50, 70, 100, 150, 200, 300, 500)
 EPSILON_TICKS = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1e3, 1e4, 1e5, 1e6)
 
 
@@ -184,7 +183,9 @@ def _look(results: PrivacyResults, protection: Protection) -> Look:
         caps = results.design.caps
         shade = round((len(CAPS) - 1) * (caps.index(protection.cap) + 1) / len(caps))
         return Look(CAPS[shade], "o")
-    return LOOKS[protection.unit if protection.unit in LOOKS else protection.preset]
+    return PROTECTION_LOOKS[
+        protection.unit if protection.unit in PROTECTION_LOOKS else protection.preset
+    ]
 
 
 def _means(results: PrivacyResults, cells: Sequence[PrivacyCell], metric: str) -> list[Interval]:
@@ -196,7 +197,7 @@ def _set_log(axis: Axes, ticks: Sequence[float]) -> None:
     axis.set_xscale("log")
     set_log_ticks(axis.xaxis, ticks)
     axis.set_yscale("log")
-    set_log_ticks(axis.yaxis, TICKS)
+    set_log_ticks(axis.yaxis, ERROR_TICKS)
 
 
 def _axis_label(metric: str) -> str:

@@ -141,7 +141,9 @@ def one_by_one(make_policy, deterministic=True, **keywords):
 
 
 def assert_same_scores(batch, singles):
-    table = np.array([[dataclasses.astuple(score) for score in own] for own in (batch, singles)])
+    table = np.array(
+        [[dataclasses.astuple(score) for score in scores] for scores in (batch, singles)]
+    )
     np.testing.assert_allclose(table[0], table[1], rtol=0, atol=1e-9)
     assert len({score.rmse_density for score in batch}) == len(batch)
 

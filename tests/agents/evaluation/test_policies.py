@@ -26,9 +26,11 @@ def test_it_acts_as_the_policy_that_was_saved(tmp_path):
     path = save(tmp_path / "policy.zip")
     env = gym.make(SHORT, action="slots")
     observation, _ = env.reset(seed=0)
-    own, _ = read_saved_policy(path).load(env).predict(observation, None, None, deterministic=True)
-    other, _ = sb3.load_policy(path, env).predict(observation, deterministic=True)
-    np.testing.assert_array_equal(own, other)
+    action, _ = (
+        read_saved_policy(path).load(env).predict(observation, None, None, deterministic=True)
+    )
+    expected, _ = sb3.load_policy(path, env).predict(observation, deterministic=True)
+    np.testing.assert_array_equal(action, expected)
 
 
 def test_another_bandwidth_is_refused_unless_it_is_meant(tmp_path):
@@ -71,9 +73,9 @@ def test_a_name_is_a_saved_policy_or_a_schedule(tmp_path):
     assert find_policy("private-highway").keywords == {"action": "slots"}
     env = gym.make(SHORT)
     observation, _ = env.reset(seed=0)
-    own, _ = schedule.load(env).predict(observation, None, None)
-    other, _ = make_schedule("paper", env).predict(observation, None, None)
-    np.testing.assert_array_equal(own, other)
+    action, _ = schedule.load(env).predict(observation, None, None)
+    expected, _ = make_schedule("paper", env).predict(observation, None, None)
+    np.testing.assert_array_equal(action, expected)
     with pytest.raises(ValueError, match="unknown schedule 'nobody'"):
         find_policy("nobody").load(env)
     with pytest.raises(FileNotFoundError, match=r"none\.zip"):

@@ -56,11 +56,11 @@ def test_bad_values_are_refused():
 
 def test_a_geometric_interval_is_the_same_for_inverse_ratios():
     values = np.array([0.5, 1.0, 4.0, 3.0])
-    own, inverse = geometric_mean_interval(values), geometric_mean_interval(1.0 / values)
-    assert own.mean == pytest.approx(np.prod(values) ** 0.25)
-    assert 0.0 < own.low < own.mean < own.high
-    assert (inverse.low, inverse.high) == pytest.approx((1.0 / own.high, 1.0 / own.low))
-    assert own.n == 4
+    mean, inverse = geometric_mean_interval(values), geometric_mean_interval(1.0 / values)
+    assert mean.mean == pytest.approx(np.prod(values) ** 0.25)
+    assert 0.0 < mean.low < mean.mean < mean.high
+    assert (inverse.low, inverse.high) == pytest.approx((1.0 / mean.high, 1.0 / mean.low))
+    assert mean.n == 4
 
 
 @pytest.mark.parametrize("values", [[1.0, 0.0], [1.0, -1.0], [1.0, np.nan]])

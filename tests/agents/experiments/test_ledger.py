@@ -41,12 +41,12 @@ def test_other_records_keep_their_own_columns(path):
 @pytest.mark.parametrize("cut", [1, 5, 30])
 def test_a_torn_last_line_is_dropped_and_can_be_added_again(path, cut):
     filled(path)
-    whole = path.read_bytes()
-    path.write_bytes(whole[:-cut])
+    before = path.read_bytes()
+    path.write_bytes(before[:-cut])
     ledger = Ledger(path, PaperCell, EpisodeScore)
     assert set(ledger.rows) == {(CELL, 2000), (CELL, 2001)}
     ledger.append(OTHER, [score(2000, speed=1e-17)])
-    assert path.read_bytes() == whole
+    assert path.read_bytes() == before
 
 
 def test_a_torn_header_is_an_empty_file(path):

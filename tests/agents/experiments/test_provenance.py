@@ -5,7 +5,7 @@ import json
 import pytest
 
 from agents.experiments.provenance import (
-    FILE,
+    PROVENANCE_FILE,
     check_folder,
     design_provenance,
     environment_provenance,
@@ -50,7 +50,7 @@ def test_a_folder_is_started_and_gone_on_with(provenance, tmp_path):
     take_folder(folder, provenance)
     (folder / "episodes.csv").touch()
     assert take_folder(folder, provenance) == check_folder(folder, provenance) == provenance
-    assert json.loads((folder / FILE).read_text()) == provenance
+    assert json.loads((folder / PROVENANCE_FILE).read_text()) == provenance
 
 
 def test_another_state_of_the_code_is_noted_where_results_are_added(provenance, tmp_path):
@@ -70,7 +70,7 @@ def test_other_seeds_and_points_go_on_in_the_same_folder(provenance, tmp_path):
 def test_settings_of_new_estimators_are_added(provenance, tmp_path):
     take_folder(tmp_path, provenance)
     take_folder(tmp_path, design_provenance(dataclasses.replace(DESIGN, estimators=("ukf",))))
-    kept = json.loads((tmp_path / FILE).read_text())["made_with"]["settings"]
+    kept = json.loads((tmp_path / PROVENANCE_FILE).read_text())["made_with"]["settings"]
     assert {"ekf-paper-paper", "ukf-paper-paper"} <= set(kept)
 
 
@@ -95,12 +95,12 @@ def test_a_folder_made_otherwise_is_refused_with_both_named(provenance, path, va
             take(tmp_path, provenance)
         for word in (".".join(path), repr(value), repr(now)):
             assert word in str(refusal.value)
-    assert json.loads((tmp_path / FILE).read_text()) == before
+    assert json.loads((tmp_path / PROVENANCE_FILE).read_text()) == before
 
 
 @pytest.mark.parametrize("text", ["", "{}", '{"made_with": {}}'])
 def test_a_damaged_origin_is_named(provenance, text, tmp_path):
-    (tmp_path / FILE).write_text(text)
+    (tmp_path / PROVENANCE_FILE).write_text(text)
     with pytest.raises(ValueError, match=r"run\.json is not as this program writes it"):
         take_folder(tmp_path, provenance)
 

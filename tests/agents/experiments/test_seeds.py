@@ -7,8 +7,8 @@ from dptse_env.config import TEST_SEEDS
 
 
 def test_no_two_uses_share_a_seed():
-    for (one, a), (other, b) in combinations(NOISE_SEEDS.items(), 2):
-        assert a.stop <= b.start or b.stop <= a.start, (one, other)
+    for (first, a), (second, b) in combinations(NOISE_SEEDS.items(), 2):
+        assert a.stop <= b.start or b.stop <= a.start, (first, second)
 
 
 def test_every_range_holds_every_traffic_seed():

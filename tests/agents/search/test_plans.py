@@ -45,9 +45,9 @@ def test_scores_do_not_depend_on_the_blocks(scorer):
     plans = np.stack([even_plan(scorer, 3), ~even_plan(scorer, 3)])
     plans[1] = np.roll(plans[0], 1, axis=1)
     seeds = np.arange(4)
-    whole = scorer.scores(plans, seeds, 0)
+    wide = scorer.scores(plans, seeds, 0)
     narrow = PlanScorer(TASK, TASK.traffic_seeds, 4).scores(plans, seeds, 0)
-    np.testing.assert_array_equal(whole, narrow)
+    np.testing.assert_array_equal(wide, narrow)
 
 
 class Fake(PlanScorer):
@@ -122,16 +122,16 @@ def test_a_search_goes_on_to_the_same_end():
     def hits(plans, seeds, noise):
         return (plans * worth).sum(axis=(1, 2))[:, None] + luck_of(noise, seeds)
 
-    whole, first, second = make_search(), make_search(), make_search()
-    whole.go_on(3, lambda: None)
+    complete, first, second = make_search(), make_search(), make_search()
+    complete.go_on(3, lambda: None)
     first.go_on(1, lambda: None)
     second.resume(first.plan())
     second.go_on(3, lambda: None)
-    np.testing.assert_array_equal(second.best, whole.best)
-    assert whole.n_adopted > 0
-    assert second.plan() == whole.plan()
+    np.testing.assert_array_equal(second.best, complete.best)
+    assert complete.n_adopted > 0
+    assert second.plan() == complete.plan()
     config = task.make(1, task.traffic_seeds).config
-    assert whole.plan().place == Place.of(config)
+    assert complete.plan().place == Place.of(config)
 
 
 def test_held_out_scores_are_of_validation_traffic():

@@ -116,7 +116,7 @@ def test_bad_trials_stop_early_but_never_the_first_two(tmp_path, executor, fake)
 
 
 def test_an_interrupted_study_comes_out_as_one_that_was_not(tmp_path, executor, fake):
-    whole = run(tmp_path / "whole", executor, 20, score=fake)
+    complete = run(tmp_path / "complete", executor, 20, score=fake)
     first = trials(run(tmp_path / "parts", executor, 13, score=fake))
     path = journal_path(TASK, tmp_path / "parts")
     lines = path.read_bytes().splitlines(keepends=True)
@@ -128,7 +128,7 @@ def test_an_interrupted_study_comes_out_as_one_that_was_not(tmp_path, executor, 
     kept = [trial for trial in trials(resumed) if trial[0] != TrialState.FAIL]
     assert len(trials(resumed)) == 21
     assert first[:12] == kept[:12]
-    assert kept == trials(whole)
+    assert kept == trials(complete)
     assert resumed.n_finished() == 20
 
 

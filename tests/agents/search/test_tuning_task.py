@@ -59,10 +59,10 @@ def test_keywords_reach_the_environment_and_the_identity():
 
 
 def test_a_task_takes_parameters_of_its_own():
-    own = ARZParameters("own", 100.0, 300.0, 1.0, 30.0)
-    task = dataclasses.replace(TASK, parameters=own, keywords={})
-    assert task.name == "ekf-own-paper"
-    assert task.config().parameters == own
+    parameters = ARZParameters("mine", 100.0, 300.0, 1.0, 30.0)
+    task = dataclasses.replace(TASK, parameters=parameters, keywords={})
+    assert task.name == "ekf-mine-paper"
+    assert task.config().parameters == parameters
     assert task.config().settings() == EstimatorSettings()
     assert task.identity()["bandwidth"] == 2
     with pytest.raises(ValueError, match="unknown schedule 'best'"):

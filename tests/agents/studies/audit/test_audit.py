@@ -5,7 +5,7 @@ import pytest
 
 from agents.studies.audit.attack import Adversary, attack, planned_distance
 from agents.studies.audit.distances import ReleaseDistances, plan_contributions
-from agents.studies.audit.policies import (
+from agents.studies.audit.strategies import (
     DECISION_THRESHOLD,
     AdaptiveQueries,
     FixedQueries,
@@ -70,14 +70,14 @@ def test_worlds_differ_in_one_vehicle(record):
     path = Trajectory.from_record(record, 3)
     rest = record.without(3)
     worlds = AdjacentWorlds(rest, (path, Trajectory.absent()))
-    one, other = worlds.get(ROAD, 0), worlds.get(ROAD, 1)
-    np.testing.assert_array_equal(one.counts, record.counts)
-    np.testing.assert_allclose(one.speed_sums, record.speed_sums)
-    np.testing.assert_array_equal(other.counts, rest.counts)
-    again = one.without(rest.n_vehicles)
+    first, second = worlds.get(ROAD, 0), worlds.get(ROAD, 1)
+    np.testing.assert_array_equal(first.counts, record.counts)
+    np.testing.assert_allclose(first.speed_sums, record.speed_sums)
+    np.testing.assert_array_equal(second.counts, rest.counts)
+    again = first.without(rest.n_vehicles)
     for name in ("step", "vehicle", "segment", "speed"):
         np.testing.assert_array_equal(getattr(again, name), getattr(rest, name))
-    added = Trajectory.from_record(one, rest.n_vehicles)
+    added = Trajectory.from_record(first, rest.n_vehicles)
     np.testing.assert_array_equal(added.segment, path.segment)
     assert len(path.step) > 3
 
@@ -273,17 +273,17 @@ def test_the_score_is_the_log_likelihood_ratio_of_the_transcript(preset, record)
     for step, queried in enumerate(plan):
         both = np.tile(queried, (2, 1))
         midpoint, difference = answers.expect(step + 1, both)
-        zero, one = (midpoint - 0.5 * difference)[0], (midpoint + 0.5 * difference)[0]
+        zero, first = (midpoint - 0.5 * difference)[0], (midpoint + 0.5 * difference)[0]
         # The transcript of world 1 without noise, and one of world 0 with it.
-        released = np.stack([one, zero + noise[step]])
+        released = np.stack([first, zero + noise[step]])
         watched = np.zeros(ROAD.n_segments, dtype=bool)
         watched[list(ROAD.fixed_sensors)] = True
         watched[: ROAD.n_mainline] |= queried
         logs = [
-            -0.5 * np.sum((released - mean)[:, watched] ** 2, axis=(1, 2)) for mean in (zero, one)
+            -0.5 * np.sum((released - mean)[:, watched] ** 2, axis=(1, 2)) for mean in (zero, first)
         ]
         expected += logs[1] - logs[0]
-        # What nobody asked for must not matter.
+        # What is not observed must not matter.
         released[:, ~watched] = 1e6
         adversary.update(step + 1, both, released * sigma)
     np.testing.assert_allclose(adversary.score, expected, rtol=1e-9)
@@ -300,7 +300,7 @@ def test_scores_have_the_law_of_their_distance(record):
     normal = (runs.scores - np.array([[-0.5], [0.5]]) * mu**2) / mu
     assert np.abs(normal.mean(axis=1)).max() < 4.0 / np.sqrt(400)
     assert np.abs(normal.var(axis=1) - 1.0).max() < 4.0 * np.sqrt(2.0 / 400)
-    # Every run has noise of its own, in either world.
+    # Every run has separate noise, in either world.
     assert len(np.unique(runs.scores)) == runs.scores.size
     assert abs(np.corrcoef(runs.scores)[0, 1]) < 4.0 / np.sqrt(400)
 
@@ -318,12 +318,12 @@ def test_runs_do_not_depend_on_the_batch(privacy, record):
     setting = config(**privacy)
     worlds = choose_target(setting, record, "replaced", "hunter").worlds
     policy = make_policy(setting, "adaptive", worlds)
-    whole = attack(setting, worlds, policy, 5, seed=3, progress=False)
+    together = attack(setting, worlds, policy, 5, seed=3, progress=False)
     parts = attack(setting, worlds, policy, 5, seed=3, batch=2, progress=False)
-    np.testing.assert_array_equal(whole.scores, parts.scores)
-    np.testing.assert_array_equal(whole.distances, parts.distances)
+    np.testing.assert_array_equal(together.scores, parts.scores)
+    np.testing.assert_array_equal(together.distances, parts.distances)
     other = attack(setting, worlds, policy, 5, seed=4, progress=False)
-    assert not np.isin(other.scores, whole.scores).any()
+    assert not np.isin(other.scores, together.scores).any()
 
 
 def test_adapting_stays_below_mu_and_stops_early(record):

@@ -2,7 +2,7 @@ import pytest
 
 from agents.evaluation.statistics import Interval
 from agents.experiments.cells import UnmeasuredError
-from agents.studies.paper.claims import BELOW_ZERO, Claim, Range, combine, judge, judge_part
+from agents.studies.paper.claims import BELOW_ZERO, Claim, ExpectedRange, combine, judge, judge_part
 from agents.studies.paper.plan import SETTINGS
 
 
@@ -13,14 +13,14 @@ def interval(low, high):
 @pytest.mark.parametrize(
     ("expected", "held", "failed", "open_"),
     [
-        (Range(high=0.0), (-2.0, -1.0), (1.0, 2.0), (-1.0, 1.0)),
-        (Range(low=0.0), (1.0, 2.0), (-2.0, -1.0), (-1.0, 1.0)),
-        (Range(-5.0, 5.0), (-4.0, 4.0), (5.5, 9.0), (4.0, 6.0)),
-        (Range(-5.0, 5.0), (1.0, 2.0), (-9.0, -5.5), (-6.0, 6.0)),
-        (Range(low=0.9), (0.95, 0.99), (0.1, 0.5), (0.8, 0.95)),
-        (Range(high=0.0), (-2.0, -1.0), (1.0, 2.0), (-1.0, 0.0)),
-        (Range(high=0.0), (-2.0, -1.0), (1.0, 2.0), (0.0, 0.0)),
-        (Range(low=0.0), (1.0, 2.0), (-2.0, -1.0), (0.0, 1.0)),
+        (ExpectedRange(high=0.0), (-2.0, -1.0), (1.0, 2.0), (-1.0, 1.0)),
+        (ExpectedRange(low=0.0), (1.0, 2.0), (-2.0, -1.0), (-1.0, 1.0)),
+        (ExpectedRange(-5.0, 5.0), (-4.0, 4.0), (5.5, 9.0), (4.0, 6.0)),
+        (ExpectedRange(-5.0, 5.0), (1.0, 2.0), (-9.0, -5.5), (-6.0, 6.0)),
+        (ExpectedRange(low=0.9), (0.95, 0.99), (0.1, 0.5), (0.8, 0.95)),
+        (ExpectedRange(high=0.0), (-2.0, -1.0), (1.0, 2.0), (-1.0, 0.0)),
+        (ExpectedRange(high=0.0), (-2.0, -1.0), (1.0, 2.0), (0.0, 0.0)),
+        (ExpectedRange(low=0.0), (1.0, 2.0), (-2.0, -1.0), (0.0, 1.0)),
     ],
 )
 def test_a_part_is_judged_by_its_whole_interval(expected, held, failed, open_):
@@ -48,10 +48,10 @@ def test_no_part_is_no_verdict():
 
 
 def test_what_was_not_run_is_not_judged():
-    def measure(measured, setting):
+    def measure(results, setting):
         raise UnmeasuredError
 
-    claim = Claim("X", "says", "measured", "1", BELOW_ZERO, measure)
+    claim = Claim("X", "statement", "quantity", "1", BELOW_ZERO, measure)
     outcome = judge(claim, None, SETTINGS[0])
     assert outcome.verdict == "not measured"
     assert outcome.parts == {}
@@ -59,7 +59,7 @@ def test_what_was_not_run_is_not_judged():
 
 def test_an_outcome_keeps_its_parts():
     parts = {"a": interval(-2.0, -1.0), "b": interval(-1.0, 1.0)}
-    claim = Claim("X", "says", "measured", "1", BELOW_ZERO, lambda measured, setting: parts)
+    claim = Claim("X", "statement", "quantity", "1", BELOW_ZERO, lambda results, setting: parts)
     outcome = judge(claim, None, SETTINGS[0])
     assert {name: verdict for name, (_, verdict) in outcome.parts.items()} == {
         "a": "holds",
@@ -69,5 +69,5 @@ def test_an_outcome_keeps_its_parts():
 
 
 def test_a_range_says_itself():
-    texts = map(str, (BELOW_ZERO, Range(low=0.9), Range(-5.0, 5.0)))
+    texts = map(str, (BELOW_ZERO, ExpectedRange(low=0.9), ExpectedRange(-5.0, 5.0)))
     assert list(texts) == ["below 0", "above 0.9", "between -5 and 5"]

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from agents.studies.paper.claims import judge
-from agents.studies.paper.paper_claims import CLAIMS, TARGETS
+from agents.studies.paper.paper_claims import CLAIMS, PROJECT_TARGETS
 from agents.studies.paper.plan import SETTINGS
 from agents.studies.paper.results import PaperResults, correlations, roughness, slopes
 from tests.agents.studies.paper.made_up import DESIGN, make_up
 
-BY_KEY = {claim.key: claim for claim in (*CLAIMS, *TARGETS)}
+BY_KEY = {claim.key: claim for claim in (*CLAIMS, *PROJECT_TARGETS)}
 RANKS = {"ukf": 10.0, "ekf": 10.2, "mhe": 10.3, "enkf": 12.0, "random_walk": 15.0}
 
 
@@ -77,8 +77,8 @@ FALSE = {
 }
 
 
-def verdict(key, measured):
-    return judge(BY_KEY[key], measured, SETTINGS[1]).verdict
+def verdict(key, results):
+    return judge(BY_KEY[key], results, SETTINGS[1]).verdict
 
 
 # P10 asks both of density and of speed, where P9 asks the contrary of speed.
@@ -105,9 +105,9 @@ def test_seeds_that_disagree_leave_it_open():
         key: dataclasses.replace(score, rmse_density=float(generator.uniform(5.0, 50.0)))
         for key, score in noisy.scores.items()
     }
-    measured = PaperResults(DESIGN, scores, noisy.times)
-    assert verdict("P3", measured) == "undecided"
-    assert verdict("P1", measured) == "undecided"
+    results = PaperResults(DESIGN, scores, noisy.times)
+    assert verdict("P3", results) == "undecided"
+    assert verdict("P1", results) == "undecided"
 
 
 def test_claims_about_what_was_not_run_are_not_measured():

@@ -2,7 +2,13 @@ import dataclasses
 
 import pytest
 
-from agents.studies.paper.plan import BASELINES, ESTIMATORS, SETTINGS, PaperDesign, canonical
+from agents.studies.paper.plan import (
+    BASELINE_ESTIMATORS,
+    PAPER_ESTIMATORS,
+    SETTINGS,
+    PaperDesign,
+    canonical,
+)
 from tests.agents.studies.paper.made_up import DESIGN
 
 
@@ -11,7 +17,7 @@ def test_cells_that_results_share_are_run_once():
     assert len(set(cells)) == len(cells)
     # Per estimator and setting: 4 numbers of CV segments, 3 other epsilons, 2 other deltas.
     assert len(cells) == 5 * 4 * (4 + 3 + 2) + 2
-    for name in ESTIMATORS:
+    for name in PAPER_ESTIMATORS:
         for setting in SETTINGS:
             base = DESIGN.base(name, setting)
             assert all(base in DESIGN.along(field, name, setting) for field in DESIGN.sweeps)
@@ -48,7 +54,7 @@ def test_sweeps_are_sorted_and_hold_the_base_value():
 
 def test_baselines_come_last_and_always():
     design = dataclasses.replace(DESIGN, estimators=("mhe", "ekf"))
-    assert design.all_estimators == ("ekf", "mhe", *BASELINES)
+    assert design.all_estimators == ("ekf", "mhe", *BASELINE_ESTIMATORS)
 
 
 def test_timed_episodes_alternate_estimators():

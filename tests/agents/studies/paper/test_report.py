@@ -9,7 +9,7 @@ from agents.experiments.reports import fill
 from agents.experiments.tables import markdown, settings_table, write_summary
 from agents.studies.paper import study
 from agents.studies.paper.claims import judge_all
-from agents.studies.paper.paper_claims import CLAIMS, TARGETS
+from agents.studies.paper.paper_claims import CLAIMS, PROJECT_TARGETS
 from agents.studies.paper.plan import SETTINGS
 from agents.studies.paper.tables import (
     base_table,
@@ -50,7 +50,7 @@ def test_the_report_holds_every_table_and_number(provenance, tmp_path):
     for name, value in content.items():
         if name.endswith("_table"):
             assert value in text, name
-    for claim in (*CLAIMS, *TARGETS):
+    for claim in (*CLAIMS, *PROJECT_TARGETS):
         assert claim.statement in text
         assert claim.quantity in text
     for _, table in content["details"]:
@@ -74,10 +74,10 @@ def test_results_of_two_states_of_the_code_are_marked(provenance):
         fill(study.TEMPLATES, study.report(RESULTS, {**provenance, "sources": sources}, "command"))
         for sources in (["a"], ["a", "b"])
     ]
-    one, two = (set(text.splitlines()) for text in texts)
-    assert "| source of dptse_env | a, b |" in two
+    plain, marked = (set(text.splitlines()) for text in texts)
+    assert "| source of dptse_env | a, b |" in marked
     # A paragraph says so, which is not there otherwise.
-    assert len(two - one) == 2
+    assert len(marked - plain) == 2
 
 
 def test_a_verdict_table_counts_the_parts_that_hold():

@@ -7,7 +7,7 @@ from agents.experiments.ledger import Ledger
 from agents.experiments.seeds import STUDY_TEST
 from agents.studies.policies.freezing import begin, choose, draft
 from agents.studies.policies.manifest import (
-    Choice,
+    CellChoice,
     Manifest,
     find_checkpoints,
     read_tuned,
@@ -23,16 +23,16 @@ from tests.agents.studies.policies.worlds import SMALL, checkpoints, score
 
 def test_policies_are_found_and_their_digests_kept(runs):
     found = checkpoints(runs)
-    assert [(own.cell, own.recipe, own.training_seed) for own in found] == [
+    assert [(each.cell, each.recipe, each.training_seed) for each in found] == [
         ("primary", "plackett-luce", 0),
         ("primary", "plackett-luce", 1),
         ("other", "plackett-luce", 0),
     ]
-    assert len({own.sha256 for own in found}) == 3
+    assert len({each.sha256 for each in found}) == 3
     single = find_checkpoints((f"primary={runs}/primary/pl-0/best.zip",), SMALL)
     assert single == found[:1]
     given = (f"primary={runs}/primary", f"primary:longer={runs}/primary/pl-0")
-    assert [own.recipe for own in find_checkpoints(given, SMALL)] == [
+    assert [each.recipe for each in find_checkpoints(given, SMALL)] == [
         "plackett-luce", "plackett-luce", "longer",
     ]  # fmt: skip
 
@@ -82,10 +82,10 @@ def test_policies_move_to_another_bandwidth(runs):
     cell = dataclasses.replace(SMALL.cells[1], transfers=("primary",))
     design = dataclasses.replace(SMALL, cells=(SMALL.cells[0], cell))
     manifest = draft(design, checkpoints(runs), (), "command")
-    chosen = Choice("paper", {"primary": ("plackett-luce", "deterministic")}, {})
+    chosen = CellChoice("paper", {"primary": ("plackett-luce", "deterministic")}, {})
     manifest = dataclasses.replace(manifest, choices={"primary": chosen})
-    moved = [own for own in manifest.entries(design) if own.trained_in not in ("", own.cell)]
-    assert [(own.cell, own.training_seed) for own in moved] == [("other", 0), ("other", 1)]
+    moved = [each for each in manifest.entries(design) if each.trained_in not in ("", each.cell)]
+    assert [(each.cell, each.training_seed) for each in moved] == [("other", 0), ("other", 1)]
     env, policy = make_task(moved[0], design, manifest, seeds=(1000,), noise=0).make()
     observation, _ = env.reset(seed=0)
     assert policy.predict(observation)[0].shape == (1, 3)
@@ -95,14 +95,14 @@ def test_entries_are_everyone_in_every_cell(runs):
     manifest = draft(SMALL, checkpoints(runs), (), "command")
     before = manifest.entries(SMALL, bounds=False)
     assert Entry("primary", "learned", "plackett-luce", "primary", 1, "stochastic") in before
-    assert not [own for own in before if own.kind == "bound"]
+    assert not [each for each in before if each.kind == "bound"]
     # Who moves is known once validation has chosen.
-    assert not [own for own in before if own.cell == "moved" and own.kind == "learned"]
-    choices = {name: Choice("paper", {}, {}) for name in ("other", "moved")}
-    choices["primary"] = Choice("paper", {"primary": ("plackett-luce", "stochastic")}, {})
+    assert not [each for each in before if each.cell == "moved" and each.kind == "learned"]
+    choices = {name: CellChoice("paper", {}, {}) for name in ("other", "moved")}
+    choices["primary"] = CellChoice("paper", {"primary": ("plackett-luce", "stochastic")}, {})
     entries = dataclasses.replace(manifest, choices=choices).entries(SMALL)
     assert len(entries) == len(set(entries)) == 2 + 1 + 4 + 2 + 2 + 2 + 2
-    assert [own for own in entries if own.cell == "moved" and own.kind == "learned"] == [
+    assert [each for each in entries if each.cell == "moved" and each.kind == "learned"] == [
         Entry("moved", "learned", "plackett-luce", "primary", seed, "stochastic")
         for seed in range(2)
     ]
@@ -142,14 +142,14 @@ def test_a_folder_keeps_to_one_manifest(runs, tmp_path):
 
 
 def test_tuned_settings_reach_their_policy_alone(runs, tmp_path):
-    path = tmp_path / "own.json"
+    path = tmp_path / "tuned.json"
     write_settings(
         path, estimator="random_walk", parameters="paper", privacy="paper",
         settings={"walk_noise": [0.5, 0.5]}, provenance={},
     )  # fmt: skip
     tuned = read_tuned((f"plackett-luce={path}",))
     manifest = draft(SMALL, checkpoints(runs), tuned, "command")
-    entries = {own.policy: own for own in manifest.entries(SMALL, bounds=False)}
+    entries = {each.policy: each for each in manifest.entries(SMALL, bounds=False)}
     tasks = {
         name: make_task(entry, SMALL, manifest, seeds=(2000, 2001), noise=STUDY_TEST.start)
         for name, entry in entries.items()

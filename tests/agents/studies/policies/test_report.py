@@ -120,11 +120,11 @@ def test_curves_are_read_where_a_run_has_one(runs, tmp_path):
     assert curves[0].steps == (0.0, 100.0)
     assert curves[0].errors == pytest.approx((300.0, 200.0))
     assert read_curves(checkpoints(runs), "other") == []
-    # The last policy of a run, under a name of its own, has no other curve.
-    again = [dataclasses.replace(own, recipe="last") for own in checkpoints(runs)]
+    # The last policy of a run, under another name, has no other curve.
+    again = [dataclasses.replace(each, recipe="last") for each in checkpoints(runs)]
     assert read_curves([*checkpoints(runs), *again], "primary") == curves
     save(tmp_path / "best.zip")
     (tmp_path / "progress.csv").write_text("steps,loss\n1,2\n")
-    (own,) = find_checkpoints((f"primary={tmp_path}",), SMALL)
+    (checkpoint,) = find_checkpoints((f"primary={tmp_path}",), SMALL)
     with pytest.raises(ValueError, match="is no learning curve"):
-        read_curves((own,), "primary")
+        read_curves((checkpoint,), "primary")

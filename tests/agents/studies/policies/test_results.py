@@ -7,12 +7,12 @@ from agents.studies.policies.plan import (
     Entry,
 )
 from agents.studies.policies.results import ERROR
-from agents.studies.policies.rules import TARGETS, judge
+from agents.studies.policies.rules import POLICY_TARGETS, judge
 from tests.agents.studies.policies.worlds import made_up
 
 
 def verdicts(results):
-    return [judge(results, results.primary, target) for target in TARGETS]
+    return [judge(results, results.primary, target) for target in POLICY_TARGETS]
 
 
 def test_targets_are_met_where_all_is_so():
@@ -67,18 +67,18 @@ def test_half_of_the_way_to_the_oracle():
 
 
 def test_secondary_cells_are_judged_together():
-    own, moved = made_up(spread=0.05).comparisons
-    assert (own.learner.cell, moved.learner.cell) == ("other", "moved")
+    trained, moved = made_up(spread=0.05).comparisons
+    assert (trained.learner.cell, moved.learner.cell) == ("other", "moved")
     assert moved.learner.trained_in == "primary"
-    assert own.verdict == moved.verdict == "better"
-    assert own.below.mean == pytest.approx(12.0, abs=0.5)
+    assert trained.verdict == moved.verdict == "better"
+    assert trained.below.mean == pytest.approx(12.0, abs=0.5)
     unsure = made_up(elsewhere=2.0, spread=0.3).comparisons
-    low, high = sorted(one.p_value for one in unsure)
+    low, high = sorted(each.p_value for each in unsure)
     assert 0.05 < low < 0.5
-    assert sorted(one.adjusted for one in unsure) == pytest.approx([2 * low, max(2 * low, high)])
-    assert {one.verdict for one in made_up(elsewhere=-5.0, spread=0.01).comparisons} == {"worse"}
+    assert sorted(each.adjusted for each in unsure) == pytest.approx([2 * low, max(2 * low, high)])
+    assert {each.verdict for each in made_up(elsewhere=-5.0, spread=0.01).comparisons} == {"worse"}
     same = made_up(elsewhere=0.0, spread=0.1).comparisons
-    assert {one.verdict for one in same} == {"not significant"}
+    assert {each.verdict for each in same} == {"not significant"}
 
 
 def test_errors_are_minus_rewards_and_times_a_thousand():

@@ -30,7 +30,7 @@ def test_a_task_runs_the_episodes_of_its_seeds(runs):
     for entry in (Entry("moved", "baseline", "oldest-first"), learner.entry(1)):
         task = make_task(entry, SMALL, manifest, seeds=(2000, 2001), noise=STUDY_TEST.start)
         scores = run_entry(task)
-        assert [own.traffic_seed for own in scores] == [2000, 2001]
+        assert [score.traffic_seed for score in scores] == [2000, 2001]
         keywords = {**SMALL.cell("moved").keywords, "action": "slots"}
         env = make_batch(SHORT, keywords, (2000, 2001))
         policy = make_schedule("oldest-first", env)

@@ -5,8 +5,8 @@ import numpy as np
 from agents.evaluation.episodes import EpisodeScore
 from agents.studies.policies.curves import Curve
 from agents.studies.policies.manifest import (
+    CellChoice,
     Checkpoint,
-    Choice,
     Manifest,
     Tuned,
     find_checkpoints,
@@ -72,9 +72,9 @@ def made_up(runs_below=(10.0,) * 5, n_seeds=64, *, spread=0.0, elsewhere=12.0, c
         {"primary": ("oracle-error",), "other": (), "moved": ()},
         {"primary": {"offline": "no plan"}},
         {
-            "primary": Choice("oldest-first", {"primary": chosen}, errors),
-            "other": Choice("oldest-first", {"other": chosen}, errors),
-            "moved": Choice("oldest-first", {}, errors),
+            "primary": CellChoice("oldest-first", {"primary": chosen}, errors),
+            "other": CellChoice("oldest-first", {"other": chosen}, errors),
+            "moved": CellChoice("oldest-first", {}, errors),
         },
         "2026-01-01T00:00:00+00:00",
     )  # fmt: skip

@@ -19,7 +19,7 @@ DECISION_THRESHOLD = 3.0
 PUBLIC_SCHEDULES = ("paper", "static", "round-robin")
 """Schedules that ignore observations: their queries are known beforehand."""
 
-POLICIES = ("hunter", "adaptive", *PUBLIC_SCHEDULES)
+STRATEGIES = ("hunter", "adaptive", *PUBLIC_SCHEDULES)
 """Names of the policies."""
 
 
@@ -135,7 +135,7 @@ def _gains(distances: ReleaseDistances, worlds: AdjacentWorlds, world: int) -> F
 
 
 def make_policy(config: EnvConfig, name: str, worlds: AdjacentWorlds) -> FixedQueries:
-    """Return the policy of a name in `POLICIES` for two worlds."""
+    """Return the policy of a name in `STRATEGIES` for two worlds."""
     if name in PUBLIC_SCHEDULES:
         return FixedQueries(public_plan(config, name))
     plan = hunting_plan(config, worlds)
