@@ -89,9 +89,8 @@ def draw_curves(results: PolicyResults) -> Figure:
     choice = results.choice(PRIMARY)
     for name, line in ((choice.baseline, "--"), (REFERENCE, ":")):
         axis.axhline(1000.0 * choice.errors[name], color="#333333", linestyle=line, label=name)
-    axis.set_xscale(
-        "symlog", linthresh=LINEAR_UP_TO
-    )  # some recipes simulate ten times what others do
+    # Some recipes simulate ten times as long as others.
+    axis.set_xscale("symlog", linthresh=LINEAR_UP_TO)
     axis.set_xlabel("seconds simulated in training")
     axis.set_ylabel("error on validation traffic × 1000")
     return _finish(figure)
@@ -101,9 +100,8 @@ def draw_queries(results: PolicyResults) -> Figure:
     """Draw where and when policies of the primary cell query."""
     figure = make_figure(11.0, 7.0)
     axes = figure.subplots(2, 3)
-    for colour, (label, episodes) in zip(
-        cycle(LINE_COLOURS), _drawn(results).items(), strict=False
-    ):
+    drawn = _drawn(results).items()
+    for colour, (label, episodes) in zip(cycle(LINE_COLOURS), drawn, strict=False):
         shares = by_segment(episodes)
         axes[0, 0].plot(1 + np.arange(len(shares)), shares, "o-", ms=3, color=colour, label=label)
         for axis, phase in zip(axes[1], PHASES, strict=True):
