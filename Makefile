@@ -29,16 +29,16 @@ demo: setup  ## Train a small query policy and evaluate it beside the schedules 
 	$(BIN)/python scripts/evaluate.py --policies results/demo/training/policy.zip --output results/demo
 
 reproduce: setup  ## Repeat the paper's results and judge its claims; results/paper.
-	$(BIN)/python scripts/reproduce.py
+	$(BIN)/python scripts/study.py paper
 
-privacy-study: setup  ## Measure what the guarantee costs; results/privacy.
-	$(BIN)/python scripts/privacy_study.py
+privacy-study: setup  ## Measure the price of the guarantee; results/privacy.
+	$(BIN)/python scripts/study.py privacy
 
 policy-study: setup  ## Hold the trained policies of results/training against every baseline; results/policies.
-	$(BIN)/python scripts/policy_study.py freeze --test-seeds 2064:2128 --policies \
+	$(BIN)/python scripts/study.py policies freeze --test-seeds 2064:2128 --policies \
 		primary=results/training/primary primary:regression=results/training/regression \
 		$(foreach cell,paper bandwidth-3 bandwidth-7 epsilon-1 epsilon-10,$(cell)=results/training/$(cell))
-	$(BIN)/python scripts/policy_study.py run
+	$(BIN)/python scripts/study.py policies run
 
 audit: setup  ## Attack the privacy presets, 5,000 runs in each of two worlds; results/audit.
 	$(BIN)/python scripts/audit.py --env dptse_env:dptse/PaperHighway-v0 --target replaced
@@ -49,7 +49,7 @@ audit: setup  ## Attack the privacy presets, 5,000 runs in each of two worlds; r
 test: setup  ## Run the tests, without the slow ones.
 	$(BIN)/python -m pytest -m 'not slow' -n 2
 
-test-slow: setup  ## Run the slow tests.
+test-slow: setup  ## Run the slow tests: before a release, and after a change to kernels, workers or benchmarks.
 	$(BIN)/python -m pytest -m slow
 
 lint: setup  ## Check style, types and import rules.

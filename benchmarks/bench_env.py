@@ -64,7 +64,7 @@ def main() -> None:
     rows = [("PaperHighway-v0", estimator) for estimator in ESTIMATORS]
     for env_id, estimator in [*rows, ("PrivateHighway-v0", "ekf")]:
         total, own = env_step(env_id, estimator, repeats)
-        name = estimator if env_id.startswith("Paper") else f"{estimator}, guaranteed"
+        name = estimator if env_id.startswith("Paper") else f"{estimator}, capped"
         print(f"{name:20}{total:10.1f}{own:11.1f}{total - own:11.1f}{live / total:13.1f}")
     print(f"{'live SUMO':20}{live:10.1f}   per simulated second, recorded")
 

@@ -1,4 +1,4 @@
-"""Time of an estimator's step: compiled, the reference, their peers and the arithmetic floor.
+"""Time of an estimator's step: compiled, the reference, and their peers.
 
 python benchmarks/bench_estimators.py
 
@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from benchmarks.compile_time import cold_and_warm
-from benchmarks.floor_rows import floor_of
 from benchmarks.peers import SolverPeer, peers
 from benchmarks.replay import Replay, recorded
 from benchmarks.timing import Row, Steps, interleave
@@ -69,12 +68,11 @@ class Group(NamedTuple):
 
     steps: list[Steps]
     peers: list[Row]
-    floor: Row
 
     @property
     def rows(self) -> list[Row]:
         """All that run."""
-        return [*self.steps, *self.peers, self.floor]
+        return [*self.steps, *self.peers]
 
 
 def group_of(estimator: str, replay: Replay, block: int) -> Group:
@@ -86,7 +84,7 @@ def group_of(estimator: str, replay: Replay, block: int) -> Group:
     ]
     if has_reference(estimator):
         steps.append(Steps(estimator, "reference", "reference", one))
-    return Group(steps, peers(estimator, one, block), floor_of(estimator, one, block))
+    return Group(steps, peers(estimator, one, block))
 
 
 def has_reference(estimator: str) -> bool:
@@ -99,21 +97,21 @@ def has_reference(estimator: str) -> bool:
 
 
 def print_table(groups: dict[str, Group]) -> None:
-    """Print a line a row; ratios are to the quickest peer and to the floor."""
+    """Print a line a row; the ratio is to the quickest peer."""
     print(
-        f"{'':6}{'':24}{'us/step':>9}{'95 %':>9}{'peer/it':>9}{'it/floor':>9}"
+        f"{'':6}{'':24}{'us/step':>9}{'95 %':>9}{'peer/it':>9}"
         f"{'target':>8}{'':>5}{'goal':>7}{'':>5}{'estimate()':>12}"
     )
     for estimator, group in groups.items():
-        peer, floor = min(row.mean for row in group.peers), group.floor.mean
+        peer = min(row.mean for row in group.peers)
         for row in group.rows:
             line = f"{estimator:6}{row.label:24}{row.mean:9.1f}{row.percentile_95:9.1f}"
-            line += f"{peer / row.mean:9.2f}{row.mean / floor:9.2f}"
+            line += f"{peer / row.mean:9.2f}"
             if isinstance(row, Steps):
                 if row.label.startswith("compiled"):
                     for aim in AIMS[estimator]:
                         line += f"{aim:7.0f}{'met' if row.mean <= aim else 'no':>5} "
-                line = f"{line:88}{row.reading.mean:12.1f}"
+                line = f"{line:79}{row.reading.mean:12.1f}"
             print(line)
 
 

@@ -13,12 +13,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
-
-from agents.audit.attack import attack
-from agents.audit.policies import POLICIES, make_policy
-from agents.audit.report import Finding
-from agents.audit.targets import TARGETS, choose_target
+from agents.evaluation.episodes import make_config
+from agents.studies.audit.attack import attack
+from agents.studies.audit.report import Finding
+from agents.studies.audit.strategies import STRATEGIES, make_policy
+from agents.studies.audit.targets import TARGET_KINDS, choose_target
 from dptse_env.config import EnvConfig
 from dptse_env.parts import privacy_report
 from dptse_env.privacy import mu_of
@@ -36,9 +35,9 @@ class Args:
     env: str = "dptse_env:dptse/PrivateHighway-v0"
     """Environment id."""
     target: str = "worst-case"
-    """Who differs: 'worst-case', an added vehicle; 'replaced' or 'deleted', one of the record."""
+    """Vehicle that differs: 'worst-case', an added one; 'replaced' or 'deleted', of the record."""
     policy: str = "hunter"
-    """Who asks: 'hunter', 'adaptive', or a public schedule: 'paper', 'static', 'round-robin'."""
+    """Queries: 'hunter', 'adaptive', or a public schedule: 'paper', 'static', 'round-robin'."""
     runs: int = 5000
     """Runs in each of the two worlds."""
     noise_factor: float = 1.0
@@ -62,7 +61,7 @@ class Args:
     bandwidth: int | None = None
     """Most segments to query a second."""
     confidence: float = 0.95
-    """With which the lower bounds hold."""
+    """Confidence of the lower bounds."""
     seed: int = 0
     """Seeds the noise."""
     records: Path | None = None
@@ -71,7 +70,7 @@ class Args:
     """Folder for the result, a JSON file."""
 
 
-def make_config(args: Args) -> EnvConfig:
+def attacked_config(args: Args) -> EnvConfig:
     """Return the configuration of the environment under attack."""
     names = ("epsilon", "delta", "unit", "cap", "adjacency", "boundary_inputs")
     privacy = {name: getattr(args, name) for name in names} | {"preset": args.privacy}
@@ -80,25 +79,24 @@ def make_config(args: Args) -> EnvConfig:
     }
     if args.bandwidth is not None:
         keywords["bandwidth"] = args.bandwidth
-    config: EnvConfig = gym.make(args.env, **keywords).unwrapped.config  # type: ignore[attr-defined]
-    return config
+    return make_config(args.env, keywords)
 
 
-def claim_of(report: PrivacyReport) -> Claim:
-    """Return what a user was told: the account where it is a guarantee, else what was asked for."""
+def make_claim(report: PrivacyReport) -> Claim:
+    """Return the claim to users: the account of a guarantee, or else the requested parameters."""
     epsilon, delta = report.claimed_epsilon, report.claimed_delta
     mu = mu_of(epsilon, delta) if report.guarantee == "none" else report.mu
     return Claim(mu, epsilon, delta)
 
 
 def check(args: Args) -> None:
-    """Name bad input before anything is recorded.
+    """Check the arguments before anything is recorded.
 
     Raises:
         ValueError: An argument is out of range.
     """
-    require(args.target in TARGETS, "target", f"one of {list(TARGETS)}", args.target)
-    require(args.policy in POLICIES, "policy", f"one of {list(POLICIES)}", args.policy)
+    require(args.target in TARGET_KINDS, "target", f"one of {list(TARGET_KINDS)}", args.target)
+    require(args.policy in STRATEGIES, "policy", f"one of {list(STRATEGIES)}", args.policy)
     integer("runs", args.runs, 2)
     integer("traffic_seed", args.traffic_seed, 0)
     integer("seed", args.seed, 0)
@@ -106,10 +104,10 @@ def check(args: Args) -> None:
     inside("confidence", args.confidence, 0.0, 1.0)
 
 
-def find(args: Args) -> Finding:
+def run_audit(args: Args) -> Finding:
     """Choose two worlds, play them, and test the claim."""
     check(args)
-    config = make_config(args)
+    config = attacked_config(args)
     library = RecordLibrary(args.records)
     library.ensure(config.corridor, [args.traffic_seed], progress=True)
     record = library.get(config.corridor, args.traffic_seed)
@@ -121,15 +119,15 @@ def find(args: Args) -> Finding:
     )
     seconds = time.perf_counter() - start
     privacy, report = config.privacy, privacy_report(config)
-    promise = f"({privacy.epsilon:g}, {privacy.delta:g})"
+    claim = f"({privacy.epsilon:g}, {privacy.delta:g})"
     return Finding(
-        title=f"{args.env.rpartition('/')[2]}, preset {privacy.preset} at {promise}",
+        title=f"{args.env.rpartition('/')[2]}, preset {privacy.preset} at {claim}",
         target=target.description,
         policy=args.policy,
         n_runs=args.runs,
         noise_factor=args.noise_factor,
         distance=float(runs.distances.max()),
-        result=audit(*runs.scores, claim_of(report), args.confidence),
+        result=audit(runs.scores[0], runs.scores[1], make_claim(report), args.confidence),
         privacy=report,
         seconds=seconds,
     )
@@ -137,7 +135,7 @@ def find(args: Args) -> Finding:
 
 def main(args: Args) -> None:
     """Attack, and leave table and file."""
-    finding = find(args)
+    finding = run_audit(args)
     finding.print()
     noise = "" if args.noise_factor == 1.0 else f"-noise-{args.noise_factor:g}"
     preset = finding.privacy.preset

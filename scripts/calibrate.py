@@ -1,6 +1,7 @@
 """Fit the ARZ parameters to recorded traffic and compare predictions on held-out seeds.
 
 python scripts/calibrate.py --train 0:16 --held-out 1000:1008
+python scripts/calibrate.py --corridor '{"speed_limit": 90}' --name my-road
 """
 
 from __future__ import annotations
@@ -11,6 +12,10 @@ from datetime import date
 from importlib.metadata import version
 from pathlib import Path
 
+import numpy as np
+
+from agents.evaluation.terminal import make_table, print_table
+from agents.experiments.files import replacing
 from dptse_env.config import parse_seeds
 from dptse_env.model import ARZParameters, available_parameters, load_parameters
 from dptse_env.model.calibration import (
@@ -22,17 +27,23 @@ from dptse_env.model.calibration import (
 )
 from dptse_env.model.compiled import CompiledARZModel
 from dptse_env.model.parameters import write_parameters
-from dptse_env.release.traffic_table import Sensing
-from dptse_env.traffic import CORRIDORS, Corridor, RecordLibrary, mean_dwell
-from scripts.cli import run
+from dptse_env.release.traffic_table import TrafficTable
+from dptse_env.traffic import Corridor, RecordLibrary, mean_dwell
+from scripts.cli import make_corridor, parse_keywords, run
 
 
 @dataclass(frozen=True)
 class Args:
     """Fit the ARZ parameters."""
 
-    corridor: str = "paper-highway"
-    """Name of the corridor."""
+    corridor: str | None = None
+    """Corridor: the name of a shipped one, or a JSON object of fields that replace those of the
+    environment's corridor; the environment's own if not given."""
+    env: str = "dptse_env:dptse/PaperHighway-v0"
+    """Environment id."""
+    keywords: str = "{}"
+    """Keywords of the environment as JSON; those about the corridor, its demand and its incident
+    matter."""
     train: str = "0:16"
     """Traffic seeds to fit, first:stop."""
     held_out: str = "1000:1008"
@@ -53,13 +64,26 @@ def load_series(
     corridor: Corridor, seeds: tuple[int, ...], library: RecordLibrary
 ) -> list[TrafficSeries]:
     """Return the aggregates of the recorded traffic of ``seeds``."""
-    sensing, s = Sensing(corridor, seeds, library), corridor.n_segments
+    traffic, s = TrafficTable(corridor, seeds, library), corridor.n_segments
     series = []
-    for slot in range(len(seeds)):
-        sensing.load(slot)
-        density, speed = sensing.traffic(slot)[..., 0], sensing.traffic(slot)[..., 1]
+    for index in range(len(seeds)):
+        traffic.load(index)
+        density, speed = np.moveaxis(traffic.whole(index), -1, 0)
         series.append(TrafficSeries(density[:, :s], speed[:, :s], density[:, s:], speed[:, s:]))
     return series
+
+
+def shipped_parameters(corridor: Corridor) -> list[ARZParameters]:
+    """Return the shipped sets that are stable on a corridor."""
+    known = []
+    for name in available_parameters():
+        try:
+            CompiledARZModel(corridor, load_parameters(name))
+        except ValueError as problem:
+            print(f"without {name}: {problem}")
+        else:
+            known.append(load_parameters(name))
+    return known
 
 
 def compare(
@@ -75,12 +99,15 @@ def compare(
 def print_errors(errors: dict[str, PredictionError], title: str) -> None:
     """Print density and speed errors by horizon."""
     horizons = next(iter(errors.values())).horizons
-    print(f"{title}: density [veh/km] / speed [km/h] RMSE")
-    print(f"{'prediction':14}" + "".join(f"{f'{horizon} s':>14}" for horizon in horizons))
+    table = make_table(
+        f"{title}: density [veh/km] / speed [km/h] RMSE",
+        "prediction",
+        *(f"{horizon} s" for horizon in horizons),
+    )
     for name, error in errors.items():
         pairs = zip(error.density, error.speed, strict=True)
-        cells = (f"{density:.1f} / {speed:.1f}" for density, speed in pairs)
-        print(f"{name:14}" + "".join(f"{cell:>14}" for cell in cells))
+        table.add_row(name, *(f"{density:.1f} / {speed:.1f}" for density, speed in pairs))
+    print_table(table)
 
 
 def main(args: Args) -> None:
@@ -89,23 +116,21 @@ def main(args: Args) -> None:
     shared = sorted(set(train) & set(held_out))
     if shared:
         raise ValueError(f"held_out must not share seeds with train, both have {shared}")
-    if args.corridor not in CORRIDORS:
-        raise ValueError(f"corridor must be one of {', '.join(CORRIDORS)}, got {args.corridor!r}")
-    corridor, library = CORRIDORS[args.corridor], RecordLibrary(args.records)
+    corridor = make_corridor(args.corridor, args.env, parse_keywords(args.keywords))
+    library = RecordLibrary(args.records)
     library.ensure(corridor, (*train, *held_out), workers=args.workers, progress=True)
     dwell = mean_dwell((library.get(corridor, seed) for seed in train), corridor.n_mainline)
     fit = calibrate(
         corridor, load_series(corridor, train, library), args.name,
         max_evaluations=args.max_evaluations,
     )  # fmt: skip
-    known = [load_parameters(name) for name in available_parameters()]
-    errors = compare(corridor, [*known, fit.parameters], load_series(corridor, held_out, library))
+    candidates = [*shipped_parameters(corridor), fit.parameters]
+    errors = compare(corridor, candidates, load_series(corridor, held_out, library))
     print_errors(errors, f"{corridor.name}, held-out seeds {args.held_out}")
     print(f"fitted: {fit.parameters}")
     if fit.at_bounds:
         print(f"at the bounds of the search: {', '.join(fit.at_bounds)}")
     print(f"mean time on a mainline segment: {dwell:.2f} s")
-    args.output.mkdir(parents=True, exist_ok=True)
     path = args.output / f"{args.name}.json"
     provenance = {
         "corridor": corridor.name,
@@ -119,7 +144,9 @@ def main(args: Args) -> None:
         "versions": {name: version(name) for name in ("dptse-env", "libsumo", "scipy")},
         "held_out_errors": {name: dataclasses.asdict(error) for name, error in errors.items()},
     }
-    write_parameters(path, fit.parameters, provenance)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as temporary:
+        write_parameters(temporary, fit.parameters, provenance)
     print(f"written to {path}")
 
 

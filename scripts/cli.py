@@ -1,31 +1,44 @@
-"""What every script does around its job: arguments, logging, one line on bad input."""
+"""Shared parts of all scripts: arguments, logging, and one line on bad input."""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
+import json
 import logging
+import shlex
 import sys
-from collections.abc import Callable, Iterator
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
 from typing import Any, TypeVar
 
 import tyro
 
-from dptse_env.traffic import NetworkError, RecordingError, SumoVersionError
+from agents.evaluation.episodes import make_config
+from dptse_env.model.parameters import read_parameters
+from dptse_env.traffic import CORRIDORS, Corridor, NetworkError, RecordingError, SumoVersionError
 
 ArgsT = TypeVar("ArgsT")
 
+_NOT_RESULTS = ("workers", "records", "output")
+"""Arguments that results do not depend on."""
 
-def run(main: Callable[[ArgsT], None], arguments: type[ArgsT], description: str | None) -> None:
+
+def run(main: Callable[[Any], None], arguments: Any, description: str | None) -> None:
     """Parse the command line into ``arguments`` and call ``main`` with them.
 
     Bad input, a file that cannot be read or written and a failed recording end the program with
-    status 2 and their one message; anything else is a fault of the program and keeps its traceback.
+    status 2 and their message in one line; any other exception keeps its traceback.
+
+    Args:
+        main: The program.
+        arguments: A dataclass, or a union of dataclasses for subcommands.
+        description: Text for ``--help``.
     """
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(message)s")
-    args = tyro.cli(arguments, description=description)
     try:
-        main(args)
+        main(tyro.cli(arguments, description=description))
     except (OSError, ValueError, NetworkError, RecordingError, SumoVersionError) as problem:
         print(f"error: {problem}", file=sys.stderr)
         raise SystemExit(2) from problem
@@ -33,7 +46,7 @@ def run(main: Callable[[ArgsT], None], arguments: type[ArgsT], description: str 
 
 @contextlib.contextmanager
 def resumable() -> Iterator[None]:
-    """End with status 130 on Ctrl-C in the body, and say that the program can be gone on with."""
+    """End with status 130 on Ctrl-C in the body, and print how to resume the program."""
     try:
         yield
     except KeyboardInterrupt:
@@ -45,15 +58,80 @@ def command(script: str, args: Any) -> str:
     """Return the command that makes the same results, whatever the machine and the folder.
 
     Args:
-        script: Name of the script.
-        args: Its arguments, a dataclass; those that are not at their default are named.
+        script: Name of the script, with its subcommands.
+        args: Its arguments, a dataclass; fields may be dataclasses of more arguments.
     """
-    words = [f"python scripts/{script}.py"]
+    return " ".join([f"python scripts/{script}", *_words(args)])
+
+
+def _words(args: Any) -> Iterator[str]:
+    """Yield the arguments that are not at their default."""
     for field in dataclasses.fields(args):
         value = getattr(args, field.name)
-        if value == field.default or field.name in ("workers", "records", "output"):
-            continue
-        words.append("--" + field.name.replace("_", "-"))
-        if value is not True:
-            words += map(str, value) if isinstance(value, tuple) else [str(value)]
-    return " ".join(words)
+        if dataclasses.is_dataclass(value):
+            yield from _words(value)
+        elif value != field.default and field.name not in _NOT_RESULTS:
+            yield "--" + field.name.replace("_", "-")
+            if value is not True:
+                values = value if isinstance(value, tuple) else (value,)
+                yield from (shlex.quote(str(each)) for each in values)
+
+
+def parse_keywords(text: str) -> dict[str, Any]:
+    """Return keywords of an environment that are given as a JSON object.
+
+    Raises:
+        ValueError: The text is no JSON object.
+    """
+    try:
+        keywords = json.loads(text)
+    except json.JSONDecodeError as problem:
+        raise ValueError(f"keywords must be a JSON object, got {text!r}") from problem
+    if not isinstance(keywords, dict):
+        raise ValueError(f"keywords must be a JSON object, got {text!r}")
+    return keywords
+
+
+def make_corridor(corridor: str | None, env: str, keywords: Mapping[str, Any]) -> Corridor:
+    """Return the corridor of an environment.
+
+    Args:
+        corridor: Name of a shipped corridor, or a JSON object of corridor fields that replace
+            those of the environment's; None for the environment's corridor.
+        env: Environment id.
+        keywords: Keywords of the environment.
+
+    Raises:
+        ValueError: A name is unknown, or a field or keyword is unknown or out of range.
+    """
+    given: dict[str, Any] = {}
+    if corridor is not None:
+        given["corridor"] = corridor
+        if corridor not in CORRIDORS:
+            with contextlib.suppress(json.JSONDecodeError):
+                given["corridor"] = json.loads(corridor)
+            if not isinstance(given["corridor"], dict):
+                raise ValueError(
+                    f"corridor must be one of {', '.join(CORRIDORS)} or a JSON object of corridor "
+                    f"fields, got {corridor!r}"
+                )
+        # Traffic does not depend on queries, and a short road may have fewer segments.
+        given["bandwidth"] = 1
+    with warnings.catch_warnings():
+        # They are about the guarantee and the estimator; only the corridor is wanted.
+        warnings.simplefilter("ignore", UserWarning)
+        return make_config(env, {**given, **keywords}).corridor
+
+
+def parameters_argument(source: str) -> str | dict[str, Any]:
+    """Return ARZ parameters as a keyword: the name of a set, or the content of a JSON file.
+
+    Raises:
+        ValueError: The file is no set of parameters.
+    """
+    return dataclasses.asdict(read_parameters(source)) if source.endswith(".json") else source
+
+
+def records_argument(records: Path | None) -> str | None:
+    """Return the folder of the record cache as a keyword."""
+    return None if records is None else str(records)

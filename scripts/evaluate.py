@@ -1,4 +1,4 @@
-"""Evaluate query schedules and trained policies on held-out traffic, paired on traffic and noise.
+"""Evaluate query schedules and trained policies on recorded traffic, paired on traffic and noise.
 
 python scripts/evaluate.py --schedules paper round-robin --seeds 2000:2020
 python scripts/evaluate.py --policies results/training/primary/pl-0/best.zip
@@ -15,16 +15,33 @@ from typing import Any
 import gymnasium as gym
 from tqdm import tqdm
 
-from agents.evaluation import EpisodeScore, Policy, make_vector, run_episodes, watch_episode
-from agents.figures import save_space_time
-from agents.learned import Saved
-from agents.report import Report
+from agents.evaluation.episodes import (
+    EpisodeScore,
+    Policy,
+    make_config,
+    make_vector,
+    run_episodes,
+    seed_kind,
+    watch_episode,
+)
+from agents.evaluation.figures import (
+    RoadMap,
+    draw_maps,
+    estimate_map,
+    query_map,
+    save_figure,
+    truth_map,
+)
+from agents.evaluation.policies import PolicySource, SavedPolicy, find_policy, read_saved_policy
+from agents.evaluation.report import Report
 from dptse_env.config import EnvConfig, parse_seeds
-from dptse_env.model.parameters import read_parameters
 from dptse_env.policies import TRANSFERABLE
-from dptse_env.schedules import SCHEDULES, make_schedule
+from dptse_env.schedules import OBSERVATION_SCHEDULES
 from dptse_env.traffic import RecordLibrary
-from scripts.cli import run
+from scripts.cli import parameters_argument, parse_keywords, records_argument, run
+
+ALL = "all"
+"""The schedule that runs with a bandwidth that covers the road."""
 
 
 @dataclass(frozen=True)
@@ -33,14 +50,17 @@ class Args:
 
     env: str = "dptse_env:dptse/PaperHighway-v0"
     """Environment id."""
-    schedules: tuple[str, ...] = tuple(SCHEDULES)
+    keywords: str = "{}"
+    """Keywords of the environment as JSON, such as '{"reward": "speed"}'; arguments below come
+    before them."""
+    schedules: tuple[str, ...] = tuple(OBSERVATION_SCHEDULES)
     """Query schedules and oracles; 'all' runs with a bandwidth that covers the road."""
     policies: tuple[str, ...] = ()
     """Trained policies: files, or names of those that come with the package."""
     stochastic: bool = False
-    """Whether trained policies draw their actions in place of taking the likeliest."""
+    """Let trained policies draw their actions instead of taking the likeliest."""
     transfer: bool = False
-    """Whether trained policies may act on traffic or with a bandwidth that they do not know."""
+    """Let trained policies act on traffic or with a bandwidth that they were not trained for."""
     estimators: tuple[str, ...] = ("ekf", "random_walk")
     """State estimators."""
     seeds: str = "2000:2008"
@@ -67,80 +87,72 @@ class Args:
     """Folder for table, scores and figures."""
 
 
-def keywords_of(
-    args: Args, estimator: str, name: str, saved: Mapping[str, Saved]
-) -> dict[str, Any]:
-    """Return the keywords of the environment that a schedule or a policy acts in."""
-    parameters: str | dict[str, Any] = args.parameters
-    if args.parameters.endswith(".json"):
-        parameters = dataclasses.asdict(read_parameters(args.parameters))
+def make_keywords(args: Args, estimator: str, source: PolicySource) -> dict[str, Any]:
+    """Return the keywords of the environment in which a policy acts.
+
+    Raises:
+        ValueError: An argument is no JSON object or no file of parameters.
+    """
     keywords: dict[str, Any] = {
+        **parse_keywords(args.keywords),
+        **source.keywords,
         "estimator": estimator,
-        "parameters": parameters,
+        "parameters": parameters_argument(args.parameters),
         "traffic_seeds": args.seeds,
-        "records": None if args.records is None else str(args.records),
+        "records": records_argument(args.records),
     }
     for key in ("privacy", "epsilon", "delta", "bandwidth"):
         if getattr(args, key) is not None:
             keywords[key] = getattr(args, key)
-    if name in saved:
-        keywords["action"] = saved[name].action
-    if name == "all":
-        config: EnvConfig = gym.make(args.env, **keywords).unwrapped.config  # type: ignore[attr-defined]
-        keywords["bandwidth"] = config.corridor.n_mainline
+    if source.source == ALL:
+        keywords["bandwidth"] = make_config(args.env, keywords).corridor.n_mainline
     return keywords
 
 
-def config_of(args: Args) -> EnvConfig:
-    """Return the configuration of the first estimator's environment."""
-    env = gym.make(args.env, **keywords_of(args, args.estimators[0], args.reference, {}))
-    config: EnvConfig = env.unwrapped.config  # type: ignore[attr-defined]
-    return config
+def reference_config(args: Args) -> EnvConfig:
+    """Return the configuration of the reference with the first estimator."""
+    keywords = make_keywords(args, args.estimators[0], find_policy(args.reference))
+    return make_config(args.env, keywords)
 
 
-def make_policy(args: Args, name: str, saved: Mapping[str, Saved], env: Any) -> Policy:
-    """Bind a schedule or a policy to an environment, scalar or vector."""
-    if name not in saved:
-        return make_schedule(name, env, seed=args.noise_seed)
-    return saved[name].load(env, allow=TRANSFERABLE if args.transfer else ())
-
-
-def read_policies(args: Args) -> dict[str, Saved]:
-    """Return the policies by the name that tables give them.
+def find_sources(args: Args) -> dict[str, PolicySource]:
+    """Return schedules and policies by their names in tables.
 
     Raises:
+        FileNotFoundError: There is no such saved policy.
         ValueError: A file is no saved policy, or two names are the same.
     """
-    saved: dict[str, Saved] = {}
+    sources = {name: find_policy(name) for name in (*args.schedules, args.reference)}
     for source in args.policies:
         path = Path(source)
-        # Files of runs are all called the same; their folders are not.
+        # Files of runs have one name; their folders differ.
         name = f"{path.parent.name}/{path.stem}" if path.suffix == ".zip" else source
-        if name in saved or name in args.schedules:
+        if name in sources:
             raise ValueError(f"policies must have different names, {name!r} is there twice")
-        saved[name] = Saved.of(source)
-    return saved
+        sources[name] = read_saved_policy(source)
+    return sources
 
 
-def evaluate(args: Args, saved: Mapping[str, Saved]) -> dict[tuple[str, str], list[EpisodeScore]]:
+def evaluate(
+    args: Args, sources: Mapping[str, PolicySource]
+) -> dict[tuple[str, str], list[EpisodeScore]]:
     """Run every schedule and policy with every estimator, on all traffic seeds at once."""
     seeds = parse_seeds(args.seeds)
     # All cells are made before the first runs: bad input shows before anything is recorded.
     cells = {}
     for estimator in args.estimators:
-        for name in (*args.schedules, *saved):
-            keywords = keywords_of(args, estimator, name, saved)
-            env = make_vector(args.env, len(seeds), keywords)
-            cells[estimator, name] = env, make_policy(args, name, saved, env)
-    corridor = config_of(args).corridor
+        for name, source in sources.items():
+            env = make_vector(args.env, len(seeds), make_keywords(args, estimator, source))
+            cells[estimator, name] = env, load(args, source, env)
     library = RecordLibrary(args.records)
+    corridor = reference_config(args).corridor
     library.ensure(corridor, seeds, workers=args.workers, progress=True)
     scores: dict[tuple[str, str], list[EpisodeScore]] = {}
     with tqdm(
         total=len(cells) * len(seeds), desc="evaluating", unit="episode", mininterval=0.5
     ) as bar:
         for key in list(cells):
-            env, policy = cells.pop(key)  # what it has loaded may go once it has run
+            env, policy = cells.pop(key)  # frees the traffic it has loaded after the run
             scores[key] = run_episodes(
                 env,
                 policy,
@@ -152,38 +164,46 @@ def evaluate(args: Args, saved: Mapping[str, Saved]) -> dict[tuple[str, str], li
     return scores
 
 
-def draw_traffic(args: Args, report: Report, saved: Mapping[str, Saved], noise: str) -> None:
-    """Draw what the reference, the best schedule and the best policy make of the first traffic."""
+def load(args: Args, source: PolicySource, env: Any) -> Policy:
+    """Bind a schedule or a policy to an environment, scalar or vector."""
+    return source.load(env, allow=TRANSFERABLE if args.transfer else (), seed=args.noise_seed)
+
+
+def draw_traffic(
+    args: Args, report: Report, sources: Mapping[str, PolicySource], noise: str
+) -> None:
+    """Draw the first traffic with the reference, the best schedule and the best policy."""
     estimator, seed = args.estimators[0], parse_seeds(args.seeds)[0]
-    ranked = [name for name in report.ranked(estimator) if name not in (args.reference, "all")]
-    schedules = [name for name in ranked if name not in saved]
-    policies = [name for name in ranked if name in saved]
-    histories = {}
-    for name in (args.reference, *schedules[:1], *policies[:1]):
-        env = gym.make(args.env, **keywords_of(args, estimator, name, saved))
-        policy = make_policy(args, name, saved, env)
-        noise_seed = args.noise_seed + seed
-        _, histories[name] = watch_episode(env, policy, traffic_seed=seed, seed=noise_seed)
+    ranked = [name for name in report.ranked(estimator) if name not in (args.reference, ALL)]
+    learned = [name for name in ranked if isinstance(sources[name], SavedPolicy)]
+    schedules = [name for name in ranked if name not in learned]
+    maps: list[RoadMap] = []
+    for name in (args.reference, *schedules[:1], *learned[:1]):
+        env = gym.make(args.env, **make_keywords(args, estimator, sources[name]))
+        policy = load(args, sources[name], env)
+        score, history = watch_episode(env, policy, traffic_seed=seed, seed=args.noise_seed + seed)
+        maps += [
+            *([] if maps else [truth_map(history)]),
+            estimate_map(history, score, f"{name}: estimate"),
+            query_map(history, f"{name}: queried"),
+        ]
     title = f"Traffic seed {seed}, {estimator}, {noise}"
-    save_space_time(args.output / "space_time.png", histories, title)
+    save_figure(draw_maps([maps], width=8.4), args.output / "space_time.png", title)
 
 
 def main(args: Args) -> None:
     """Record what is missing, evaluate, and leave table, scores and figures."""
-    if args.reference not in args.schedules:
-        args = dataclasses.replace(args, schedules=(*args.schedules, args.reference))
-    saved = read_policies(args)
-    scores = evaluate(args, saved)
-    privacy = config_of(args).privacy
+    sources = find_sources(args)
+    scores = evaluate(args, sources)
+    seeds, privacy = parse_seeds(args.seeds), reference_config(args).privacy
     noise = f"{privacy.preset} noise at ({privacy.epsilon:g}, {privacy.delta:g})"
-    env_name = args.env.rpartition("/")[2]
-    n_episodes = len(parse_seeds(args.seeds))
-    title = f"{env_name}, {args.parameters}, {noise}, {n_episodes} held-out episodes"
+    traffic = f"{len(seeds)} episodes on {seed_kind(seeds)} traffic"
+    title = f"{args.env.rpartition('/')[2]}, {args.parameters}, {noise}, {traffic}"
     report = Report(scores, args.reference, title)
     report.print()
     report.write(args.output, dataclasses.asdict(args))
     report.draw(args.output / "schedules.png")
-    draw_traffic(args, report, saved, noise)
+    draw_traffic(args, report, sources, noise)
     print(f"scores and figures are in {args.output}/")
 
 

@@ -1,6 +1,8 @@
 """Record traffic with SUMO into the library, so that environments only replay it.
 
-Example: python scripts/record.py --corridor paper-highway --seeds 0:64
+python scripts/record.py --seeds 0:64
+python scripts/record.py --corridor short-highway --seeds 0:16
+python scripts/record.py --env dptse_env:dptse/PrivateHighway-v0 --keywords '{"incident": "none"}'
 """
 
 from __future__ import annotations
@@ -9,16 +11,22 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dptse_env.config import parse_seeds
-from dptse_env.traffic import CORRIDORS, RecordLibrary, mean_dwell, randomised
-from scripts.cli import run
+from dptse_env.traffic import RecordLibrary, mean_dwell
+from scripts.cli import make_corridor, parse_keywords, run
 
 
 @dataclass(frozen=True)
 class Args:
-    """What to record, and where to."""
+    """Record traffic."""
 
-    corridor: str = "paper-highway"
-    """Name of the corridor: paper-highway or short-highway."""
+    corridor: str | None = None
+    """Corridor: the name of a shipped one, or a JSON object of fields that replace those of the
+    environment's corridor; the environment's own if not given."""
+    env: str = "dptse_env:dptse/PaperHighway-v0"
+    """Environment id."""
+    keywords: str = "{}"
+    """Keywords of the environment as JSON; those about the corridor, its demand and its incident
+    matter."""
     seeds: str = "0:16"
     """Traffic seeds, first:stop."""
     random: bool = False
@@ -30,13 +38,11 @@ class Args:
 
 
 def main(args: Args) -> None:
-    """Record, then say what is there."""
-    if args.corridor not in CORRIDORS:
-        raise ValueError(f"corridor must be one of {sorted(CORRIDORS)}, got {args.corridor!r}")
-    corridor = CORRIDORS[args.corridor]
+    """Record, and print what the library has."""
+    keywords = parse_keywords(args.keywords)
     if args.random:
-        corridor = randomised(corridor)
-    seeds = parse_seeds(args.seeds)
+        keywords |= {"demand": "random", "incident": "random"}
+    corridor, seeds = make_corridor(args.corridor, args.env, keywords), parse_seeds(args.seeds)
     library = RecordLibrary(args.records)
     library.ensure(corridor, seeds, workers=args.workers, progress=True)
     dwell = mean_dwell((library.get(corridor, seed) for seed in seeds), corridor.n_mainline)

@@ -3,7 +3,7 @@
 python scripts/tune.py --estimators ekf ukf --privacy paper corrected --seeds 0:8 --workers 2
 
 Each set is left in <output>/<estimator>-<ARZ parameters>-<privacy preset>.json. To ship one, copy
-it to dptse_env/estimators/tuned/: environments of that configuration then choose it by themselves.
+it to dptse_env/estimators/tuned/: environments of that configuration then take it by default.
 
 Trials are kept in a journal beside it. After an interruption, or a kill, the same command goes on
 where it stopped, and with more --trials it searches on; other arguments need another folder.
@@ -17,21 +17,20 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import optuna
-from rich import box
-from rich.console import Console
 from rich.table import Table
 from tqdm import tqdm
 
-from agents.runner import make_pool
-from agents.search_space import SPACE
-from agents.seeds import TUNING
-from agents.tuning import TuningStudy, scores_of
-from agents.tuning_task import TuningTask
+from agents.evaluation.terminal import make_table, print_table
+from agents.experiments.engine import make_pool
+from agents.experiments.seeds import TUNING
+from agents.search.space import SPACE
+from agents.search.tuning import TuningStudy, locked_study, scores_of
+from agents.search.tuning_task import TuningTask
 from dptse_env.model import ARZParameters
 from dptse_env.model.parameters import read_parameters
 from dptse_env.traffic import RecordLibrary
 from dptse_env.utils.validation import integer
-from scripts.cli import resumable, run
+from scripts.cli import parse_keywords, records_argument, resumable, run
 
 
 @dataclass(frozen=True)
@@ -40,6 +39,9 @@ class Args:
 
     env: str = "dptse_env:dptse/PaperHighway-v0"
     """Environment id."""
+    keywords: str = "{}"
+    """Keywords of the environment as JSON, such as '{"privacy": {"cap": 16}}'; arguments below come
+    before them."""
     estimators: tuple[str, ...] = tuple(SPACE)
     """State estimators."""
     parameters: tuple[str, ...] = ("w99-3lane", "paper")
@@ -51,9 +53,9 @@ class Args:
     trials: int = 60
     """Trials per configuration, those of earlier runs included."""
     workers: int = 1
-    """Processes, each with a trial of its own; results depend on the number."""
+    """Processes, each with a separate trial; results depend on the number."""
     schedule: str = "paper"
-    """Query schedule, or the .zip file of a saved policy."""
+    """Query schedule, or a saved policy: its .zip file or shipped name."""
     bandwidth: int | None = None
     """Most segments to query a second; the environment's own if not given."""
     epsilon: float = 1.0
@@ -63,7 +65,7 @@ class Args:
     noise_seed: int = TUNING.start
     """Noise and estimators are seeded with this plus the traffic seed."""
     noise_scale: bool = False
-    """Whether to search the scale of R, too, which the mechanism's noise makes known."""
+    """Search the scale of R, too, although the mechanism's noise is known."""
     sampler_seed: int = 0
     """Seeds the search."""
     records: Path | None = None
@@ -78,6 +80,9 @@ def make_tasks(args: Args) -> list[TuningTask]:
     Raises:
         ValueError: An argument is out of range.
     """
+    keywords = {**parse_keywords(args.keywords), "epsilon": args.epsilon, "delta": args.delta}
+    if args.bandwidth is not None:
+        keywords["bandwidth"] = args.bandwidth
     integer("trials", args.trials, 1)
     integer("workers", args.workers, 1)
     tasks: dict[str, TuningTask] = {}
@@ -92,18 +97,16 @@ def make_tasks(args: Args) -> list[TuningTask]:
             estimator=estimator,
             parameters=parameters,
             privacy=privacy,
-            epsilon=args.epsilon,
-            delta=args.delta,
-            bandwidth=args.bandwidth,
             seeds=args.seeds,
             schedule=args.schedule,
             noise_seed=args.noise_seed,
-            records=None if args.records is None else str(args.records),
+            records=records_argument(args.records),
             with_noise_scale=args.noise_scale,
+            keywords=keywords,
         )
         task.config()
         if task.name in tasks:
-            raise ValueError(f"{task.name} must be asked for once")
+            raise ValueError(f"{task.name} must be given once")
         tasks[task.name] = task
     if not tasks:
         raise ValueError("estimators, parameters and privacy must not be empty")
@@ -128,7 +131,7 @@ def tune(study: TuningStudy, args: Args, pool: ProcessPoolExecutor) -> None:
 
 
 def add_rows(table: Table, study: TuningStudy) -> None:
-    """Add what a study began with and what it found to the table of all."""
+    """Add the scores of a study's default, shipped and tuned settings to the table."""
     best = study.best()
     if best is None:
         raise ValueError(f"{study.task.name}: no trial ran to its end with a finite score")
@@ -150,17 +153,15 @@ def main(args: Args) -> None:
     library = RecordLibrary(args.records)
     library.ensure(corridor, tasks[0].traffic_seeds, workers=args.workers, progress=True)
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    table = Table(box=box.SIMPLE_HEAD, title="on the traffic tuned on", title_justify="left")
-    table.add_column("set", no_wrap=True)
-    for header in ("settings", "reward", "density RMSE\n[veh/km]", "speed RMSE\n[km/h]"):
-        table.add_column(header, justify="left" if header == "settings" else "right")
+    errors = "density RMSE\n[veh/km]", "speed RMSE\n[km/h]"
+    table = make_table("scores on the tuning traffic", "set", "settings", "reward", *errors, left=2)
     with make_pool(args.workers) as pool:
         for task in tasks:
-            with TuningStudy.open(task, args.output, args.sampler_seed) as study:
+            with locked_study(task, args.output, args.sampler_seed) as study:
                 tune(study, args, pool)
                 study.write(args.output / f"{task.name}.json")
                 add_rows(table, study)
-    Console().print(table)
+    print_table(table)
     print(f"tuned sets are in {args.output}/; copy to dptse_env/estimators/tuned/ to ship one")
 
 

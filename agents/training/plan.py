@@ -13,9 +13,9 @@ from typing import Any
 
 import gymnasium as gym
 
-from agents.evaluation import WARM_UP
-from agents.provenance import source_digest
-from agents.seeds import TRAINING_VALIDATION, TRAININGS
+from agents.evaluation.episodes import WARM_UP
+from agents.experiments.provenance import source_digest
+from agents.experiments.seeds import TRAINING_VALIDATION, TRAININGS
 from agents.training.recipes import Recipe
 from dptse_env.config import TRAINING_SEEDS, VALIDATION_SEEDS, EnvConfig
 from dptse_env.env import SensorQueryEnv
@@ -110,7 +110,7 @@ class TrainingPlan:
         return made.unwrapped.config
 
     def provenance(self, commit: str | None) -> dict[str, Any]:
-        """Return what `agents.provenance.take_folder` compares and keeps, as plain JSON."""
+        """Return what `take_folder` compares and keeps, as plain JSON."""
         config = self.config
         libraries = ("gymnasium", "numba", "numpy", "stable-baselines3", "torch")
         content = {

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 import torch
 
-from agents.provenance import take_folder
+from agents.experiments.provenance import take_folder
 from agents.training.learner import Learner
 from agents.training.plackett_luce import PlackettLuceLearner
 from agents.training.plan import TrainingPlan

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from agents.evaluation import Policy, make_vector, run_episodes
-from agents.seeds import TRAINING_VALIDATION
+from agents.evaluation.episodes import Policy, make_vector, run_episodes
+from agents.experiments.seeds import TRAINING_VALIDATION
 from dptse_env.config import VALIDATION_SEEDS
 from dptse_env.utils.arrays import FloatArray
 

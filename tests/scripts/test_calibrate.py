@@ -24,11 +24,24 @@ def test_it_fits_on_some_seeds_and_reports_on_others(tmp_path, capsys):
     assert provenance["train"] == "0:2"
 
 
+def test_a_corridor_of_other_fields_is_calibrated(tmp_path):
+    main(
+        Args(
+            corridor='{"name": "slow-road", "speed_limit": 80.0, "duration": 120}',
+            env="dptse_env:dptse/ShortHighway-v0", train="0:1", held_out="1000:1001",
+            max_evaluations=5, workers=1, name="slow", output=tmp_path / "deep" / "out",
+        )
+    )  # fmt: skip
+    content = json.loads((tmp_path / "deep" / "out" / "slow.json").read_text())
+    assert content["provenance"]["corridor"] == "slow-road"
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"held_out": "1:3"}, r"held_out must not share seeds with train, both have \[1\]"),
-        ({"corridor": "long"}, "corridor must be one of paper-highway, short-highway, got 'long'"),
+        ({"corridor": "long"}, "corridor must be one of paper-highway, short-highway or a JSON"),
+        ({"keywords": '{"corridor": {"length": 1}}'}, r"corridor\.length"),
         ({"train": "x"}, "train must be 'first:stop' or one seed, got 'x'"),
     ],
 )

@@ -1,8 +1,10 @@
+import dataclasses
 import os
 import subprocess
 import sys
 from pathlib import Path
 
+from dptse_env.config import resolve
 from dptse_env.traffic import SHORT_HIGHWAY, RecordLibrary, randomised
 from scripts.record import Args, main
 
@@ -40,15 +42,32 @@ def test_the_command_records_into_the_library_and_reports_the_dwell(tmp_path):
 
 
 def test_random_traffic_is_recorded_on_request(tmp_path, capsys):
-    main(Args("short-highway", "0:1", random=True, workers=1, records=tmp_path))
+    main(Args("short-highway", seeds="0:1", random=True, workers=1, records=tmp_path))
     assert RecordLibrary(tmp_path).record_path(randomised(SHORT_HIGHWAY), 0).is_dir()
     assert "1 record(s)" in capsys.readouterr().out
+
+
+def test_fields_of_a_corridor_and_keywords_are_recorded(tmp_path):
+    calm = dataclasses.replace(SHORT_HIGHWAY, duration=60, incident=None)
+    given = Args(
+        corridor='{"duration": 60, "incident": null}', seeds="0:1",
+        env="dptse_env:dptse/ShortHighway-v0", workers=1, records=tmp_path,
+    )  # fmt: skip
+    main(given)
+    assert RecordLibrary(tmp_path).record_path(calm, 0).is_dir()
+    main(dataclasses.replace(given, corridor=None, keywords='{"incident": "none"}', seeds="1:2"))
+    full = resolve("short-highway", {"incident": "none"}).corridor
+    assert RecordLibrary(tmp_path).record_path(full, 1).is_dir()
 
 
 def test_mistakes_end_in_one_line_on_stderr():
     for arguments, message in (
         (["--seeds", "x"], "error: seeds must be 'first:stop'"),
         (["--corridor", "nowhere"], "error: corridor must be one of"),
+        (["--corridor", '{"length": 3}'], "error: corridor.length"),
+        (["--corridor", '{"duration": -3}'], "error: corridor.duration must be"),
+        (["--corridor", "3"], "error: corridor must be one of"),
+        (["--keywords", "3"], "error: keywords must be a JSON object"),
     ):
         result = run(*arguments)
         assert result.returncode == 2

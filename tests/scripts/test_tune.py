@@ -71,7 +71,7 @@ def finished(journal):
     """Count trials that were completed (1) or stopped early (2)."""
     records = [line for line in journal.read_text().splitlines() if line.endswith("}")]
     states = [json.loads(line) for line in records]
-    return sum(one["op_code"] == 6 and one["state"] in (1, 2) for one in states)
+    return sum(each["op_code"] == 6 and each["state"] in (1, 2) for each in states)
 
 
 def group_lives(group):
@@ -91,7 +91,7 @@ def group_lives(group):
         ({"seeds": "2000:2008"}, "seeds must be training seeds"),
         ({"trials": 0}, "trials must be an integer >= 1, got 0"),
         ({"workers": 0}, "workers must be an integer >= 1, got 0"),
-        ({"estimators": ("ekf", "ekf")}, "ekf-w99-3lane-paper must be asked for once"),
+        ({"estimators": ("ekf", "ekf")}, "ekf-w99-3lane-paper must be given once"),
         ({"estimators": ()}, "must not be empty"),
     ],
 )

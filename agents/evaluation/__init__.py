@@ -1,0 +1,1 @@
+"""Evaluation of query policies: episodes, statistics, saved policies, tables and figures."""

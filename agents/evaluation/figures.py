@@ -1,0 +1,191 @@
+"""Figures of an evaluation, and the parts that other figures share with them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+from matplotlib.ticker import FixedLocator, NullLocator
+from numpy.typing import NDArray
+
+from agents.evaluation.episodes import EpisodeScore
+from agents.evaluation.statistics import Interval
+from dptse_env.rendering import DENSITY_MAP, QUERY_COLOUR, History
+
+COLOURS = ("#1b4f72", "#c1272d", "#5d8233", "#7d5ba6", "#b9770e")
+GRID_COLOUR = "#e3e6ea"
+ERROR_TICKS = (1, 1.5, 2, 3, 5, 7, 10, 15, 20, 30, 40, 50, 70, 100, 150, 200, 300, 500)
+
+
+def make_figure(width: float, height: float, dpi: int = 140) -> Figure:
+    """Return an empty figure [inches] that lays out its axes without overlaps."""
+    return Figure(figsize=(width, height), dpi=dpi, layout="constrained")
+
+
+def save_figure(figure: Figure, path: Path, title: str) -> None:
+    """Give a figure its title and save it as PNG, without pyplot and its global state."""
+    figure.suptitle(title, x=0.01, ha="left", fontsize=10)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    FigureCanvasAgg(figure)
+    figure.savefig(path, format="png")
+
+
+def add_frame(axis: Axes, lines: Literal["both", "x", "y"] = "both") -> None:
+    """Give axes a grid behind their curves and no lines above and to the right."""
+    axis.grid(axis=lines, color=GRID_COLOUR, linewidth=0.7)
+    axis.set_axisbelow(True)
+    axis.spines[["top", "right"]].set_visible(False)
+    axis.tick_params(labelsize=8)
+
+
+def add_legend(figure: Figure, axes: Iterable[Axes], columns: int = 5) -> None:
+    """Name each label of some axes once below all panels."""
+    named: dict[str, Any] = {}
+    for axis in axes:
+        for handle, label in zip(*axis.get_legend_handles_labels(), strict=True):
+            named.setdefault(label, handle)
+    if named:
+        figure.legend(
+            list(named.values()),
+            list(named),
+            loc="outside lower center",
+            ncols=min(len(named), columns),
+            frameon=False,
+            fontsize=8,
+        )
+
+
+def draw_dot(axis: Axes, interval: Interval, place: float, colour: str, label: str | None) -> None:
+    """Draw a mean with its interval at a height, and its value beside it."""
+    spread = [[interval.mean - interval.low], [interval.high - interval.mean]]
+    axis.errorbar(
+        [interval.mean], [place], xerr=spread, color=colour, label=label,
+        fmt="o", markersize=4, capsize=2.5, linewidth=1.2,
+    )  # fmt: skip
+    axis.annotate(
+        f"{interval.mean:.1f}", (interval.high, place), color=colour,
+        xytext=(5, 0), textcoords="offset points", va="center", fontsize=7,
+    )  # fmt: skip
+
+
+def save_errors(
+    path: Path,
+    rows: Sequence[str],
+    series: Mapping[str, Mapping[str, tuple[Interval, Interval]]],
+    title: str,
+) -> None:
+    """Save the errors of every policy as dots with 95 % intervals, density beside speed.
+
+    Args:
+        path: Where to save the PNG.
+        rows: Policies, from top to bottom.
+        series: By estimator, then by policy: (density [veh/km], speed [km/h]) intervals.
+        title: Title of the figure.
+    """
+    figure = make_figure(8.4, 1.6 + 0.42 * len(rows), dpi=150)
+    axes = figure.subplots(1, 2, sharey=True)
+    places = np.arange(len(rows))[::-1]
+    for metric, axis in enumerate(axes):
+        for k, (name, intervals) in enumerate(series.items()):
+            shift = ((len(series) - 1) / 2 - k) * 0.3
+            for place, row in zip(places, rows, strict=True):
+                label = name if row == rows[0] else None
+                colour = COLOURS[k % len(COLOURS)]
+                draw_dot(axis, intervals[row][metric], place + shift, colour, label)
+        axis.set_xscale("log")
+        axis.xaxis.set_major_locator(FixedLocator(ERROR_TICKS))
+        axis.xaxis.set_minor_locator(NullLocator())
+        axis.xaxis.set_major_formatter("{x:g}")
+        axis.margins(x=0.12)
+        axis.set_xlabel(("density RMSE [veh/km]", "speed RMSE [km/h]")[metric])
+        add_frame(axis, "x")
+    axes[0].set_yticks(places, rows)
+    add_legend(figure, axes[:1])
+    save_figure(figure, path, title)
+
+
+@dataclass(frozen=True)
+class RoadMap:
+    """A panel over space and time.
+
+    Attributes:
+        title: Title of the panel.
+        values: Densities [veh/km] or flags of queried segments, shape (n_mainline, n_seconds).
+        history: The episode, for its scales.
+    """
+
+    title: str
+    values: NDArray[Any]
+    history: History
+
+    @property
+    def is_flags(self) -> bool:
+        """True for a panel of queried segments."""
+        return self.values.dtype == bool
+
+
+def truth_map(history: History, title: str = "true density") -> RoadMap:
+    """Return the panel of the true density."""
+    return RoadMap(title, np.array(history.truth).T, history)
+
+
+def estimate_map(history: History, score: EpisodeScore, title: str) -> RoadMap:
+    """Return the panel of the estimated density; its title ends with the RMSE of the score."""
+    title = f"{title}, RMSE {score.rmse_density:.1f} veh/km"
+    return RoadMap(title, np.array(history.estimate).T, history)
+
+
+def query_map(history: History, title: str) -> RoadMap:
+    """Return the panel of the queried segments."""
+    return RoadMap(title, np.array(history.queried).T, history)
+
+
+def draw_maps(columns: Sequence[Sequence[RoadMap]], width: float) -> Figure:
+    """Draw panels over space and time with one colour bar for all densities.
+
+    Args:
+        columns: Panels of each column from top to bottom; rows have one kind of panel.
+        width: Width of the figure [inches].
+    """
+    ratios = [0.75 if panel.is_flags else 1.25 for panel in columns[0]]
+    figure = make_figure(width, sum(ratios) + 1.2)
+    axes = figure.subplots(
+        len(ratios), len(columns), squeeze=False, sharex=True, sharey=True,
+        gridspec_kw={"height_ratios": ratios},
+    )  # fmt: skip
+    for k, panels in enumerate(columns):
+        for axis, panel in zip(axes[:, k], panels, strict=True):
+            image = _draw_map(axis, panel)
+            if not panel.is_flags:
+                densities = image
+        axes[-1, k].set_xlabel("time [s]", fontsize=8)
+    for axis in axes[:, 0]:
+        axis.set_ylabel("road [km]", fontsize=8)
+    bar = figure.colorbar(
+        densities, ax=axes.ravel().tolist(), fraction=0.02, pad=0.01, extend="max"
+    )
+    bar.set_label("density [veh/km]", fontsize=8)
+    bar.ax.tick_params(labelsize=8)
+    return figure
+
+
+def _draw_map(axis: Axes, panel: RoadMap) -> AxesImage:
+    n, n_seconds = panel.values.shape
+    axis.set_title(panel.title, loc="left", fontsize=9, pad=3, color=QUERY_COLOUR)
+    axis.tick_params(labelsize=8)
+    return axis.imshow(
+        panel.values,
+        origin="lower",
+        aspect="auto",
+        extent=(-0.5, n_seconds - 0.5, 0.0, n * panel.history.segment_length),
+        cmap="Greys" if panel.is_flags else DENSITY_MAP,
+        vmin=0.0,
+        vmax=1.0 if panel.is_flags else panel.history.density_scale,
+    )

@@ -1,0 +1,131 @@
+"""The report of an evaluation: a table for each estimator, files, and a figure of errors."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from rich.table import Table
+
+from agents.evaluation.episodes import EpisodeScore
+from agents.evaluation.figures import save_errors
+from agents.evaluation.statistics import Interval, mean_interval, paired_difference
+from agents.evaluation.terminal import make_table, print_table, print_text
+
+METRICS = ("rmse_density", "rmse_speed", "reward")
+
+
+@dataclass(frozen=True)
+class Row:
+    """The scores of one policy with one estimator, summarised.
+
+    Attributes:
+        estimator: Name of the estimator.
+        policy: Name of the policy.
+        mean: By metric, the mean over episodes with its 95 % interval.
+        difference: By metric, the mean paired difference to the reference policy.
+        n_diverged: Seconds over all episodes in which the estimator had to start over.
+    """
+
+    estimator: str
+    policy: str
+    mean: dict[str, Interval]
+    difference: dict[str, Interval]
+    n_diverged: float
+
+
+class Report:
+    """The scores of policies on the same episodes, summarised."""
+
+    def __init__(
+        self, scores: Mapping[tuple[str, str], list[EpisodeScore]], reference: str, title: str
+    ) -> None:
+        """Summarise scores.
+
+        Args:
+            scores: By (estimator, policy): one score per episode, in one order for all.
+            reference: Policy that the others are compared with; it is in ``scores``.
+            title: Environment, settings and episodes.
+
+        Raises:
+            ValueError: There are fewer than two episodes.
+        """
+        self.scores, self.reference, self.title = dict(scores), reference, title
+        self.rows = [self._row(*key) for key in self.scores]
+
+    def _row(self, estimator: str, policy: str) -> Row:
+        cell, reference = self.scores[estimator, policy], self.scores[estimator, self.reference]
+
+        def values(scores: list[EpisodeScore], metric: str) -> list[float]:
+            return [getattr(score, metric) for score in scores]
+
+        return Row(
+            estimator,
+            policy,
+            {name: mean_interval(values(cell, name)) for name in METRICS},
+            {
+                name: paired_difference(values(cell, name), values(reference, name))
+                for name in METRICS
+            },
+            sum(score.n_diverged for score in cell),
+        )
+
+    def ranked(self, estimator: str) -> list[str]:
+        """Return the policies by mean density error, best first."""
+        rows = [row for row in self.rows if row.estimator == estimator]
+        return [row.policy for row in sorted(rows, key=lambda row: row.mean["rmse_density"].mean)]
+
+    def print(self) -> None:
+        """Print a table per estimator, best density error first."""
+        print_text(f"{self.title}; mean ± half of the 95 % interval")
+        for estimator in dict.fromkeys(row.estimator for row in self.rows):
+            print_table(self._table(estimator))
+
+    def _table(self, estimator: str) -> Table:
+        against = f"against\n{self.reference}"
+        metrics = {"rmse_density": "density RMSE\n[veh/km]", "rmse_speed": "speed RMSE\n[km/h]"}
+        columns = [column for metric in metrics.values() for column in (metric, against)]
+        table = make_table(f"estimator {estimator}", "policy", *columns)
+        rows = {row.policy: row for row in self.rows if row.estimator == estimator}
+        for policy in self.ranked(estimator):
+            cells = []
+            for metric in metrics:
+                mean, difference = rows[policy].mean[metric], rows[policy].difference[metric]
+                cells.append(f"{mean.mean:.2f} ± {mean.half_width:.2f}")
+                compared = f"{difference.mean:+.2f} ± {difference.half_width:.2f}"
+                cells.append("-" if policy == self.reference else compared)
+            table.add_row(policy, *cells)
+        return table
+
+    def write(self, folder: Path, arguments: Mapping[str, Any]) -> None:
+        """Write all scores to ``episodes.csv``, the table and its origin to ``summary.json``."""
+        folder.mkdir(parents=True, exist_ok=True)
+        columns = [field.name for field in dataclasses.fields(EpisodeScore)]
+        with (folder / "episodes.csv").open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow(["estimator", "schedule", *columns])
+            for key, scores in self.scores.items():
+                writer.writerows([*key, *dataclasses.astuple(score)] for score in scores)
+        packages = ("dptse-env", "gymnasium", "libsumo", "numba", "numpy")
+        summary = {
+            "title": self.title,
+            "reference": self.reference,
+            "arguments": {key: str(value) for key, value in arguments.items()},
+            "versions": {name: version(name) for name in packages},
+            "rows": [dataclasses.asdict(row) for row in self.rows],
+        }
+        (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+
+    def draw(self, path: Path) -> None:
+        """Save a figure of density and speed errors of all policies."""
+        series: dict[str, dict[str, tuple[Interval, Interval]]] = {}
+        for row in self.rows:
+            pair = row.mean["rmse_density"], row.mean["rmse_speed"]
+            series.setdefault(row.estimator, {})[row.policy] = pair
+        save_errors(path, self.ranked(self.rows[0].estimator), series, self.title)

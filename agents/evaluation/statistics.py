@@ -1,0 +1,261 @@
+"""Intervals over traffic seeds, and over training seeds crossed with them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy import stats
+
+from dptse_env.utils.arrays import FloatArray
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A mean with its confidence interval.
+
+    Attributes:
+        mean: The mean.
+        low: Lower end.
+        high: Upper end.
+        n: Number of values behind it.
+    """
+
+    mean: float
+    low: float
+    high: float
+    n: int
+
+    @property
+    def half_width(self) -> float:
+        """Half of the interval's length."""
+        return (self.high - self.low) / 2
+
+    def excludes_zero(self) -> bool:
+        """Return true if zero lies outside the interval."""
+        return self.low > 0.0 or self.high < 0.0
+
+
+def mean_interval(values: ArrayLike, confidence: float = 0.95) -> Interval:
+    """Return the mean of independent values with Student's t interval.
+
+    Args:
+        values: One value per traffic seed, shape (n,), n >= 2.
+        confidence: Coverage of the interval, in (0, 1).
+
+    Raises:
+        ValueError: There are fewer than two values or one is not finite.
+    """
+    array = np.asarray(values, dtype=np.float64)
+    if array.ndim != 1 or len(array) < 2:
+        raise ValueError(f"an interval needs at least 2 values, got shape {array.shape}")
+    if not np.isfinite(array).all():
+        raise ValueError(f"values must be finite, got {array.tolist()}")
+    mean, error = float(array.mean()), float(stats.sem(array))
+    if error == 0.0:
+        return Interval(mean, mean, mean, len(array))
+    low, high = stats.t.interval(confidence, len(array) - 1, loc=mean, scale=error)
+    return Interval(mean, float(low), float(high), len(array))
+
+
+def geometric_mean_interval(values: ArrayLike) -> Interval:
+    """Return the geometric mean of positive values with its 95 % interval.
+
+    For times and ratios: the interval is that of the logarithms, so it never reaches zero, and
+    the inverse ratios give the inverse interval.
+
+    Raises:
+        ValueError: There are fewer than two values or one is not positive and finite.
+    """
+    array = np.asarray(values, dtype=np.float64)
+    if not (array > 0.0).all():
+        raise ValueError(f"values must be above zero, got {array.tolist()}")
+    logs = mean_interval(np.log(array))
+    mean, low, high = (float(np.exp(end)) for end in (logs.mean, logs.low, logs.high))
+    return Interval(mean, low, high, logs.n)
+
+
+def paired_difference(values: ArrayLike, reference: ArrayLike) -> Interval:
+    """Return the mean of ``values - reference``, paired by position, with its 95 % interval.
+
+    Raises:
+        ValueError: The two do not pair up.
+    """
+    a, b = np.asarray(values, dtype=np.float64), np.asarray(reference, dtype=np.float64)
+    if a.shape != b.shape:
+        raise ValueError(f"paired values must have one shape, got {a.shape} and {b.shape}")
+    return mean_interval(a - b)
+
+
+def mean(table: FloatArray) -> FloatArray:
+    """Return the mean over the last two axes."""
+    means: FloatArray = table.mean(axis=(-2, -1))
+    return means
+
+
+def iqm(table: FloatArray) -> FloatArray:
+    """Return the interquartile mean over the last two axes.
+
+    The mean of the middle half of all runs on all traffic seeds together, as in Agarwal et al.
+    (2021), "Deep reinforcement learning at the edge of the statistical precipice".
+    """
+    pooled = table.reshape(*table.shape[:-2], -1)
+    middle: FloatArray = stats.trim_mean(pooled, 0.25, axis=-1)
+    return middle
+
+
+def percent_below(table: FloatArray, reference: FloatArray) -> FloatArray:
+    """Return by how much the mean of ``table`` lies below that of ``reference`` [%].
+
+    A ratio of means, not a mean of ratios: traffic with large errors weighs as much as it errs.
+    """
+    return 100.0 * (1.0 - mean(table) / mean(reference))
+
+
+def percent_of_way(table: FloatArray, start: FloatArray, end: FloatArray) -> FloatArray:
+    """Return how far the mean of ``table`` has come from that of ``start`` to ``end``'s [%]."""
+    return 100.0 * (mean(start) - mean(table)) / (mean(start) - mean(end))
+
+
+def bootstrap(
+    statistic: Callable[..., FloatArray],
+    *tables: ArrayLike,
+    confidence: float = 0.95,
+    n_resamples: int = 10_000,
+    seed: int = 0,
+) -> Interval:
+    """Return a statistic of paired tables with its two-level percentile bootstrap interval.
+
+    Training seeds and traffic seeds are crossed: every run meets all traffic. Each resample draws
+    traffic seeds with replacement, the same for all tables, which keeps them paired, and training
+    seeds with replacement, separately for each table (the "pigeonhole bootstrap" of Owen, 2007).
+    The interval lies between the percentiles of the statistic over the resamples. Its coverage is
+    nominal where runs differ little on each traffic seed. With five runs that differ by much more
+    than the standard error of their means over traffic, a nominal 95 % covers some 84 %:
+    `crossed_t` accounts for the small number of runs.
+
+    Args:
+        statistic: Takes arrays (r, S, T), one for each table, and returns (r,).
+        *tables: Values by training seed and traffic seed, shape (S, T); (T,) for a policy that
+            was not trained. T is the same for all tables, S may differ.
+        confidence: Coverage of the interval, in (0, 1).
+        n_resamples: Number of resamples.
+        seed: Seeds the resampling.
+
+    Raises:
+        ValueError: Tables do not pair up, are too small or not finite, or the statistic is not.
+    """
+    checked = _paired_tables(tables)
+    if n_resamples < 100:
+        raise ValueError(f"n_resamples must be >= 100, got {n_resamples}")
+    n_columns = checked[0].shape[1]
+    generator = np.random.default_rng(seed)
+    parts = []
+    for first in range(0, n_resamples, _CHUNK):
+        size = min(_CHUNK, n_resamples - first)
+        columns = generator.integers(n_columns, size=(size, 1, n_columns))
+        drawn = []
+        for table in checked:
+            rows = generator.integers(len(table), size=(size, len(table), 1))
+            drawn.append(table[rows, columns])
+        parts.append(statistic(*drawn))
+    values = np.concatenate(parts)
+    estimate = float(statistic(*(table[None] for table in checked))[0])
+    if not (np.isfinite(values).all() and np.isfinite(estimate)):
+        raise ValueError("the statistic must be finite on every resample")
+    tail = 50.0 * (1.0 - confidence)
+    low, high = np.percentile(values, [tail, 100.0 - tail])
+    return Interval(estimate, float(low), float(high), n_columns)
+
+
+_CHUNK = 500
+"""Resamples drawn at once, which bounds the memory."""
+
+
+def crossed_t(table: ArrayLike, confidence: float = 0.95) -> tuple[Interval, float]:
+    """Return the mean of crossed values with Student's interval, and the p-value of a zero mean.
+
+    A two-way random-effects model with one value in each cell: training seed, traffic seed and
+    their interaction. The mean squares of the rows plus those of the columns minus those of the
+    residual estimate the variance of the mean, and Satterthwaite's formula its degrees of
+    freedom. With one training seed this is the paired t test over traffic seeds.
+
+    Args:
+        table: Paired differences by training seed and traffic seed, shape (S, T) or (T,).
+        confidence: Coverage of the interval, in (0, 1).
+
+    Raises:
+        ValueError: The table is too small or not finite.
+    """
+    (values,) = _paired_tables([table])
+    n_rows, n_columns = values.shape
+    centre, by_row, by_column = values.mean(), values.mean(axis=1), values.mean(axis=0)
+    variance = n_rows * by_column.var(ddof=1)
+    terms = [(variance, n_columns - 1)]
+    if n_rows > 1:
+        residual = values - by_row[:, None] - by_column + centre
+        df = (n_rows - 1) * (n_columns - 1)
+        rows, rest = n_columns * by_row.var(ddof=1), np.sum(residual**2) / df
+        # Sampling may leave the difference of mean squares below either of them.
+        variance = max(variance + rows - rest, variance, rows)
+        terms += [(rows, n_rows - 1), (rest, df)]
+    if variance == 0.0:
+        point = float(centre)
+        return Interval(point, point, point, n_columns), float(point == 0.0)
+    freedom = variance**2 / sum(square**2 / df for square, df in terms)
+    spread = np.sqrt(variance / values.size)
+    low, high = stats.t.interval(confidence, freedom, loc=centre, scale=spread)
+    p_value = 2.0 * stats.t.sf(abs(centre) / spread, freedom)
+    return Interval(float(centre), float(low), float(high), n_columns), float(p_value)
+
+
+def holm(p_values: Mapping[str, float]) -> dict[str, float]:
+    """Return p-values adjusted by Holm's (1979) step-down procedure.
+
+    Rejecting where the adjusted value is below alpha keeps the family-wise error rate at alpha,
+    however the tests depend on one another.
+
+    Raises:
+        ValueError: A value is not in [0, 1].
+    """
+    for name, value in p_values.items():
+        if not 0.0 <= value <= 1.0:
+            raise ValueError(f"p-values must be in [0, 1], got {value!r} for {name}")
+    adjusted: dict[str, float] = {}
+    largest = 0.0
+    for rank, name in enumerate(sorted(p_values, key=lambda name: p_values[name])):
+        largest = max(largest, min(1.0, (len(p_values) - rank) * p_values[name]))
+        adjusted[name] = largest
+    return {name: adjusted[name] for name in p_values}
+
+
+def worst_row(table: ArrayLike) -> int:
+    """Return the index of the training seed with the largest mean error over the traffic seeds.
+
+    Raises:
+        ValueError: The table is too small or not finite.
+    """
+    (values,) = _paired_tables([table])
+    return int(np.argmax(values.mean(axis=1)))
+
+
+def _paired_tables(tables: Sequence[ArrayLike]) -> list[FloatArray]:
+    """Return tables as arrays (S, T), checked."""
+    checked = []
+    for table in tables:
+        array = np.asarray(table, dtype=np.float64)
+        array = array[None] if array.ndim == 1 else array
+        if array.ndim != 2 or len(array) < 1 or array.shape[1] < 2:
+            raise ValueError(
+                f"a table needs a training seed and 2 traffic seeds, got shape {array.shape}"
+            )
+        if not np.isfinite(array).all():
+            raise ValueError(f"values must be finite, {np.sum(~np.isfinite(array))} are not")
+        checked.append(array)
+    if len({array.shape[1] for array in checked}) != 1:
+        raise ValueError(
+            f"tables must have the same traffic seeds, got {[a.shape for a in checked]}"
+        )
+    return checked

@@ -1,0 +1,1 @@
+"""Shared parts of studies and searches: seeds, designs, engines, ledgers, tables, plots."""

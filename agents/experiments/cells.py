@@ -1,0 +1,146 @@
+"""Cells, designs and results: the parts that every study is made of."""
+
+from __future__ import annotations
+
+import typing
+from abc import ABC, abstractmethod
+from collections.abc import Hashable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Generic, Protocol, TypeVar
+
+import numpy as np
+
+from agents.evaluation.episodes import (
+    EpisodeScore,
+    check_test_seeds,
+    make_config,
+    without_void_warning,
+)
+from agents.evaluation.statistics import Interval, mean_interval, paired_difference
+from dptse_env.config import TEST_SEEDS, EnvConfig, parse_seeds
+from dptse_env.schedules import OBSERVATION_SCHEDULES
+from dptse_env.utils.arrays import FloatArray
+
+DENSITY, SPEED = "rmse_density", "rmse_speed"
+METRICS = {DENSITY: ("density", "veh/km"), SPEED: ("speed", "km/h")}
+"""Name and unit of each error of an estimate."""
+
+
+class Key(Hashable, Protocol):
+    """A frozen dataclass of plain values that is run on every traffic seed."""
+
+    __dataclass_fields__: typing.ClassVar[dict[str, Any]]
+
+
+class Cell(Key, Protocol):
+    """A key that is a configuration of an environment."""
+
+    @property
+    def keywords(self) -> dict[str, Any]:
+        """Keywords of ``gym.make`` that make it."""
+
+
+KeyT = TypeVar("KeyT", bound=Key)
+CellT = TypeVar("CellT", bound=Cell)
+
+
+@dataclass(frozen=True)
+class Design(ABC, Generic[CellT]):
+    """The cells of a study of one environment, each run on every traffic seed.
+
+    Attributes:
+        seeds: Test traffic seeds, first:stop; each is the seed of the noise, too.
+        schedule: Query schedule of every episode.
+        env: Environment id.
+    """
+
+    seeds: str = f"{TEST_SEEDS.start}:{TEST_SEEDS.start + 20}"
+    schedule: str = "paper"
+    env: str = "dptse_env:dptse/PaperHighway-v0"
+
+    def check(self) -> None:
+        """Check the values that no environment checks.
+
+        Raises:
+            ValueError: A value is out of range; the message names it.
+        """
+        check_test_seeds(self.traffic_seeds)
+        # Draws of the random schedule start anew after an interruption.
+        known = sorted(OBSERVATION_SCHEDULES.keys() - {"random"})
+        if self.schedule not in known:
+            raise ValueError(f"schedule must be one of {', '.join(known)}, got {self.schedule!r}")
+
+    @property
+    def traffic_seeds(self) -> tuple[int, ...]:
+        """The traffic seeds."""
+        return parse_seeds(self.seeds)
+
+    def first_seeds(self, n: int) -> str:
+        """Return the first n traffic seeds, or all where there are fewer, as first:stop."""
+        seeds = self.traffic_seeds[:n]
+        return f"{seeds[0]}:{seeds[-1] + 1}"
+
+    @abstractmethod
+    def all_cells(self) -> Iterator[CellT]:
+        """Yield the cells of every curve and table; cells may repeat."""
+
+    def cells(self) -> list[CellT]:
+        """Return every cell once."""
+        return list(dict.fromkeys(self.all_cells()))
+
+    @cached_property
+    def configs(self) -> list[EnvConfig]:
+        """The configurations of all cells, after a check of the design.
+
+        Raises:
+            ValueError: A value of the design or of a cell is out of range.
+        """
+        self.check()
+        seeds = {"traffic_seeds": list(self.traffic_seeds)}
+        with without_void_warning():
+            return [make_config(self.env, {**cell.keywords, **seeds}) for cell in self.cells()]
+
+
+DesignT = TypeVar("DesignT", bound=Design[Any])
+
+
+class UnmeasuredError(Exception):
+    """The cell was not run."""
+
+
+@dataclass(frozen=True)
+class Results(Generic[DesignT, CellT]):
+    """Scores by cell, in the order of the traffic seeds of a design.
+
+    Attributes:
+        design: The design.
+        scores: Score by cell and traffic seed.
+    """
+
+    design: DesignT
+    scores: Mapping[tuple[CellT, int], EpisodeScore]
+
+    def values(self, cell: CellT, metric: str) -> FloatArray:
+        """Return a field of `EpisodeScore` for each seed, shape (n_seeds,).
+
+        Raises:
+            UnmeasuredError: The cell was not run.
+        """
+        seeds = self.design.traffic_seeds
+        if (cell, seeds[0]) not in self.scores:
+            raise UnmeasuredError(cell)
+        return np.array([getattr(self.scores[cell, seed], metric) for seed in seeds])
+
+    def mean(self, cell: CellT, metric: str) -> Interval:
+        """Return the mean of a field over the seeds with its interval."""
+        return mean_interval(self.values(cell, metric))
+
+    def difference(self, cell: CellT, reference: CellT, metric: str) -> Interval:
+        """Return by how much a cell exceeds a reference, paired by traffic and noise."""
+        return paired_difference(self.values(cell, metric), self.values(reference, metric))
+
+    def episodes(self, *cells: CellT) -> list[EpisodeScore]:
+        """Return the scores of all episodes of some cells, each cell once."""
+        seeds = self.design.traffic_seeds
+        return [self.scores[cell, seed] for cell in dict.fromkeys(cells) for seed in seeds]

@@ -1,0 +1,49 @@
+"""Atomic writes: after an interruption either the old or the new file is there, complete."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Yield a temporary path, whose file takes the place of ``path`` when the body is done.
+
+    Raises:
+        OSError: The file cannot be written; the old one stays.
+    """
+    temporary = path.with_name(f"{path.name}.tmp")
+    try:
+        yield temporary
+        with temporary.open("rb+") as file:
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_atomically(path: Path, content: bytes | str) -> None:
+    """Write a file in one piece, text as UTF-8.
+
+    Raises:
+        OSError: It cannot be written; the old one stays.
+    """
+    with replacing(path) as temporary:
+        temporary.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
+def write_json(path: Path, content: Any, sort_keys: bool = False) -> None:
+    """Write plain values as indented JSON in one piece.
+
+    Raises:
+        OSError: The file cannot be written; the old one stays.
+        ValueError: A number is not finite.
+    """
+    write_atomically(
+        path, json.dumps(content, indent=2, sort_keys=sort_keys, allow_nan=False) + "\n"
+    )

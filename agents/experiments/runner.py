@@ -1,0 +1,88 @@
+"""Run the episodes of a design that its ledger lacks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Generic
+
+import gymnasium as gym
+
+from agents.evaluation.episodes import EpisodeScore, run_episode, without_void_warning
+from agents.experiments.cells import Cell, CellT, Design
+from agents.experiments.engine import Engine
+from agents.experiments.ledger import Ledger
+from dptse_env.schedules import make_schedule
+from dptse_env.traffic import Corridor, RecordLibrary
+
+
+@dataclass(frozen=True)
+class Workplace:
+    """Folder and processes of a study.
+
+    Attributes:
+        folder: Folder of ledgers, figures and report.
+        engine: Runs the episodes.
+        records: Folder of the record cache; None for the user's cache.
+        recorders: Processes that record missing traffic; None for all cores.
+    """
+
+    folder: Path
+    engine: Engine
+    records: str | None = None
+    recorders: int | None = None
+
+    def record(self, corridor: Corridor, seeds: Sequence[int]) -> None:
+        """Record the traffic that is missing."""
+        library = RecordLibrary(self.records)
+        library.ensure(corridor, seeds, self.recorders, progress=True)
+
+
+@dataclass(frozen=True)
+class EpisodeTask(Generic[CellT]):
+    """A cell on some traffic seeds.
+
+    Attributes:
+        env: Environment id.
+        schedule: Query schedule.
+        cell: The cell.
+        seeds: Its traffic seeds.
+        records: Folder of the record cache; None for the user's cache.
+    """
+
+    env: str
+    schedule: str
+    cell: CellT
+    seeds: tuple[int, ...]
+    records: str | None
+
+
+def make_env(env: str, cell: Cell, seeds: Sequence[int], records: str | None) -> gym.Env[Any, Any]:
+    """Make the environment of a cell.
+
+    Raises:
+        ValueError: A value of the cell is out of range.
+    """
+    seeded: dict[str, Any] = {"traffic_seeds": list(seeds), "records": records}
+    with without_void_warning():
+        return gym.make(env, disable_env_checker=True, **seeded, **cell.keywords)
+
+
+def run_task(task: EpisodeTask[Any]) -> list[EpisodeScore]:
+    """Run a cell on its seeds; a seed gives the traffic and the noise, so cells are paired."""
+    env = make_env(task.env, task.cell, task.seeds, task.records)
+    schedule = make_schedule(task.schedule, env)
+    return [run_episode(env, schedule, traffic_seed=seed, seed=seed) for seed in task.seeds]
+
+
+def missing_tasks(
+    design: Design[CellT], ledger: Ledger[CellT, EpisodeScore], records: str | None
+) -> list[EpisodeTask[CellT]]:
+    """Return the episodes that a ledger lacks, one task a cell."""
+    lacking = {cell: ledger.lacking(cell, design.traffic_seeds) for cell in design.cells()}
+    return [
+        EpisodeTask(design.env, design.schedule, cell, seeds, records)
+        for cell, seeds in lacking.items()
+        if seeds
+    ]

@@ -1,0 +1,41 @@
+"""Seeds of noise and estimators: one table of disjoint ranges, by what draws from them.
+
+An episode's generator is seeded with the first number of a range plus its traffic seed, or, in a
+training, plus the number of the episode. Choices and reports never share a range.
+"""
+
+from __future__ import annotations
+
+EVALUATION = range(1_000_000)
+"""``scripts/evaluate.py``, and the studies of estimators and of privacy."""
+TUNING = range(1_000_000, 2_000_000)
+"""The search of estimator settings."""
+PLAN_SEARCH = range(3_000_000, 4_000_000)
+"""The search of open-loop plans."""
+TRAINING_VALIDATION = range(4_000_000, 5_000_000)
+"""The learning curve of a training, by which its best policy is kept."""
+STUDY_VALIDATION = range(5_000_000, 6_000_000)
+"""The choice of the best baseline and the best recipe in the study of policies."""
+STUDY_TEST = range(6_000_000, 7_000_000)
+"""The test results of the study of policies."""
+TRAINING = range(10_000_000, 1_010_000_000)
+"""Training episodes; see `training_seed`."""
+
+NOISE_SEEDS = {
+    "evaluation": EVALUATION,
+    "tuning": TUNING,
+    "plan search": PLAN_SEARCH,
+    "training validation": TRAINING_VALIDATION,
+    "study validation": STUDY_VALIDATION,
+    "study test": STUDY_TEST,
+    "training": TRAINING,
+}
+"""All ranges by name."""
+
+TRAININGS = 1_000
+"""Training seeds are in 0..999; each has its separate stretch of `TRAINING`."""
+
+
+def training_seed(seed: int) -> int:
+    """Return the seed of the first episode of a training, a million apart from the next one's."""
+    return TRAINING.start + seed * (len(TRAINING) // TRAININGS)

@@ -1,0 +1,139 @@
+"""Tables of reports in Markdown, numbers as text, and the summary of a study as CSV."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from agents.evaluation.episodes import EpisodeScore
+from agents.evaluation.statistics import Interval
+from agents.experiments.cells import METRICS, Results
+from agents.experiments.files import write_atomically
+
+
+def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a Markdown table; the first column is left-aligned, the others centred."""
+    lines = [header, ["---", *[":-:"] * (len(header) - 1)], *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def format_interval(interval: Interval) -> str:
+    """Return a mean with its interval, three significant digits or two decimals each."""
+
+    def digits(value: float) -> str:
+        if 0.0 < abs(value) < 0.1:
+            return f"{value:.2g}"
+        return f"{value:.1f}" if abs(value) >= 100 else f"{value:.2f}"
+
+    return f"{digits(interval.mean)} [{digits(interval.low)}, {digits(interval.high)}]"
+
+
+def format_number(value: float) -> str:
+    """Return three significant digits without an exponent."""
+    return f"{float(f'{value:.3g}'):g}" if abs(value) < 1e5 else f"{value:,.0f}"
+
+
+def format_range(values: Sequence[int]) -> str:
+    """Return integers briefly, as their first and last where none is left out."""
+    if list(values) == list(range(values[0], values[-1] + 1)):
+        return f"{values[0]} to {values[-1]}"
+    return ", ".join(map(str, values))
+
+
+def health_table(
+    header: Sequence[str], groups: Mapping[tuple[str, ...], Sequence[EpisodeScore]]
+) -> str:
+    """Return the seconds that the estimator lost, summed over the episodes of each group.
+
+    Args:
+        header: Headers of the groups' names.
+        groups: Episodes by the names of their group, one for each header.
+    """
+    fields = {
+        "n_diverged": "started over [s]",
+        "n_fallback": "kept the prediction [s]",
+        "n_dropped": "dropped requests",
+    }
+    rows = [
+        [
+            *names,
+            *(f"{sum(getattr(score, field) for score in scores):.0f}" for field in fields),
+            str(len(scores)),
+        ]
+        for names, scores in groups.items()
+    ]
+    return markdown([*header, *fields.values(), "episodes"], rows)
+
+
+def versions_table(versions: Mapping[str, Any], provenance: Mapping[str, Any]) -> str:
+    """Return the versions behind results: packages, states of the code, and the machine."""
+    sources = {"source of dptse_env": ", ".join(provenance["sources"])}
+    rows = {**versions, **sources, **provenance["machine"]}
+    return markdown(["version of", ""], [[name, str(value)] for name, value in rows.items()])
+
+
+_FILTER = ("process_noise", "noise_scale", "initial_variance", "bounds")
+_READ_BY = {
+    "ekf": _FILTER,
+    "ukf": (*_FILTER, "ukf"),
+    "enkf": (*_FILTER, "enkf"),
+    "mhe": ("process_noise", "noise_scale", "mhe"),
+    "random_walk": ("walk_noise", "noise_scale", "initial_variance"),
+    "open_loop": ("bounds",),
+}
+"""Fields of the settings that an estimator reads."""
+
+
+def settings_table(provenance: Mapping[str, Any]) -> str:
+    """Return the estimators' settings, as far as each estimator reads them."""
+    rows = []
+    for name, settings in provenance["made_with"]["settings"].items():
+        fields = {key: settings[key] for key in _READ_BY[name.partition("-")[0]]}
+        tuned = "yes" if name in provenance["tuned"] else "no"
+        rows.append([f"`{name}`", tuned, _one_line(fields)])
+    return markdown(["settings", "tuned", "values"], rows)
+
+
+def _one_line(settings: Mapping[str, Any]) -> str:
+    return ", ".join(
+        f"{key} ({_one_line(value)})" if isinstance(value, Mapping) else f"{key} {value}"
+        for key, value in settings.items()
+    )
+
+
+def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    """Write a CSV file in one piece."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(rows)
+    write_atomically(path, text.getvalue())
+
+
+def interval_columns(interval: Interval) -> list[str]:
+    """Return a mean and the ends of its interval as cells of a CSV file."""
+    return [f"{value:.6g}" for value in (interval.mean, interval.low, interval.high)]
+
+
+def write_summary(path: Path, results: Results[Any, Any]) -> None:
+    """Write means with intervals as CSV, one row for each cell."""
+    cells = sorted(results.design.cells(), key=dataclasses.astuple)
+    columns = [*(field.name for field in dataclasses.fields(cells[0])), "n_seeds"]
+    for metric, unit in zip(METRICS, ("veh_km", "km_h"), strict=True):
+        columns += [f"{metric}_{unit}", f"{metric}_low", f"{metric}_high"]
+    columns += ["reward", "reward_low", "reward_high", "n_diverged", "n_fallback"]
+
+    def rows() -> Iterator[list[Any]]:
+        for cell in cells:
+            row = [*dataclasses.astuple(cell), len(results.design.traffic_seeds)]
+            for metric in (*METRICS, "reward"):
+                row += interval_columns(results.mean(cell, metric))
+            yield row + [
+                results.values(cell, f"n_{kind}").sum() for kind in ("diverged", "fallback")
+            ]
+
+    write_csv(path, columns, rows())

@@ -1,1 +1,0 @@
-"""Learned query policies against every baseline: frozen beforehand, run on test traffic, judged."""

@@ -1,1 +1,0 @@
-"""The paper's five results: planned, run, judged, drawn and reported."""

@@ -1,0 +1,1 @@
+"""Search of estimator settings and of open-loop plans on training traffic."""

@@ -1,0 +1,155 @@
+"""Tuning tasks: the configuration that estimator settings are tuned for, and their score.
+
+The score is the mean reward of a second after the warm-up, as the environment gives it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+
+from agents.evaluation.episodes import WARM_UP, EpisodeScore, run_episode, unwrap
+from agents.evaluation.policies import PolicySource, find_policy
+from agents.experiments.seeds import TUNING
+from agents.search.space import Knob, search_space
+from dptse_env.config import TRAINING_SEEDS, EnvConfig, parse_seeds
+from dptse_env.estimators import EstimatorSettings
+from dptse_env.estimators.tuned_settings import settings_name
+from dptse_env.model import ARZParameters
+from dptse_env.utils.validation import integer, require
+
+
+@dataclass(frozen=True)
+class TuningTask:
+    """The configuration that one set of settings is tuned for.
+
+    Attributes:
+        env: Environment id.
+        estimator: Name of the estimator.
+        parameters: ARZ parameters of its model, or the name of a set.
+        privacy: Privacy preset.
+        seeds: Traffic seeds, ``"first:stop"``, within `TRAINING_SEEDS`.
+        keywords: Other keywords of the environment; a mapping ``privacy`` goes with the preset.
+        schedule: Query schedule, or a saved policy: its ``.zip`` file or shipped name.
+        noise_seed: Noise and estimators are seeded with this plus the traffic seed.
+        records: Folder of the record cache; the user's cache if None.
+        with_noise_scale: Whether to search the scale of the measurements' noise, too.
+
+    Raises:
+        FileNotFoundError: There is no such saved policy.
+        ValueError: The estimator has nothing to tune, seeds are not for training, keywords hold
+            another field, or the file is no saved policy.
+    """
+
+    env: str
+    estimator: str
+    parameters: str | ARZParameters
+    privacy: str
+    seeds: str
+    keywords: Mapping[str, Any] = field(default_factory=dict)
+    schedule: str = "paper"
+    noise_seed: int = TUNING.start
+    records: str | None = None
+    with_noise_scale: bool = False
+
+    def __post_init__(self) -> None:
+        """Check what needs no environment."""
+        _ = self.space, self.source
+        for name in ("estimator", "parameters", "traffic_seeds", "records", "action"):
+            require(name not in self.keywords, f"keywords.{name}", "left out", name)
+        privacy = self.keywords.get("privacy", {})
+        require(isinstance(privacy, Mapping), "keywords.privacy", "a JSON object", privacy)
+        if not set(self.traffic_seeds) <= set(TRAINING_SEEDS):
+            raise ValueError(
+                f"seeds must be training seeds, in {TRAINING_SEEDS.start}:{TRAINING_SEEDS.stop}, "
+                f"got {self.seeds!r}"
+            )
+        first, last = TUNING.start, TUNING.stop - TRAINING_SEEDS.stop
+        integer("noise_seed", self.noise_seed, first, last)
+        if Path(self.name).name != self.name:
+            raise ValueError(f"the ARZ parameters' name must be part of a file name: {self.name!r}")
+
+    @cached_property
+    def source(self) -> PolicySource:
+        """The schedule or the saved policy that queries."""
+        return find_policy(self.schedule)
+
+    @property
+    def space(self) -> dict[str, Knob]:
+        """The search space, by path into the settings."""
+        return search_space(self.estimator, self.with_noise_scale)
+
+    @property
+    def traffic_seeds(self) -> tuple[int, ...]:
+        """The traffic seeds one by one."""
+        return parse_seeds(self.seeds)
+
+    @property
+    def parameters_name(self) -> str:
+        """Name of the ARZ parameters."""
+        return self.parameters if isinstance(self.parameters, str) else self.parameters.name
+
+    @property
+    def name(self) -> str:
+        """Name of the set."""
+        return settings_name(self.estimator, self.parameters_name, self.privacy)
+
+    def make(self, settings: EstimatorSettings | None = None) -> gym.Env[Any, Any]:
+        """Make the environment; with its default settings if None."""
+        keywords: dict[str, Any] = {
+            **self.keywords,
+            **self.source.keywords,
+            "estimator": self.estimator,
+            "parameters": self.parameters,
+            "privacy": {**self.keywords.get("privacy", {}), "preset": self.privacy},
+            "traffic_seeds": self.seeds,
+            "records": self.records,
+        }
+        if isinstance(self.parameters, ARZParameters):
+            keywords["parameters"] = dataclasses.asdict(self.parameters)
+        if settings is not None:
+            keywords["estimator_settings"] = dataclasses.asdict(settings)
+        return gym.make(self.env, **keywords)
+
+    def config(self) -> EnvConfig:
+        """Return the configuration of the environment, with its default settings.
+
+        Raises:
+            ValueError: A value is out of range, or the policy does not suit the environment.
+        """
+        env = self.make()
+        self.source.load(env)
+        return unwrap(env).config
+
+    def identity(self) -> dict[str, Any]:
+        """Return everything that two studies must share for their scores to be comparable."""
+        config = self.config()
+        return {
+            "env": self.env,
+            "corridor": config.corridor.digest,
+            "estimator": self.estimator,
+            "parameters": dataclasses.asdict(config.arz_parameters),
+            "privacy": dataclasses.asdict(config.privacy),
+            "bandwidth": config.bandwidth,
+            "keywords": dict(self.keywords),
+            "schedule": self.source.identity,
+            "seeds": self.seeds,
+            "noise_seed": self.noise_seed,
+            "warm_up": WARM_UP,
+            "dptse-env": version("dptse-env"),
+            "space": {path: repr(knob) for path, knob in self.space.items()},
+        }
+
+
+def score_episode(task: TuningTask, settings: EstimatorSettings, traffic_seed: int) -> EpisodeScore:
+    """Run one episode of a task with given settings."""
+    env = task.make(settings)
+    policy, noise = task.source.load(env), task.noise_seed + traffic_seed
+    return run_episode(env, policy, traffic_seed=traffic_seed, seed=noise)

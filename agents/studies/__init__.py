@@ -1,0 +1,1 @@
+"""Studies on test traffic, each with its plan, measurements and report template."""

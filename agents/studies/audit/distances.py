@@ -1,0 +1,119 @@
+"""Distances by which one second of one vehicle moves the releases, in closed form."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from agents.studies.audit.worlds import Trajectory
+from dptse_env.config import EnvConfig
+from dptse_env.parts import flow_centre, make_release
+from dptse_env.release import SpeedRelease
+from dptse_env.traffic import Record
+from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+
+
+@dataclass(frozen=True)
+class ReleaseDistances:
+    """Squared distances between sums with and without a vehicle, in units of the noise.
+
+    Attributes:
+        length: Length of a segment [km].
+        largest_speed: The speed limit, which an empty segment has and flows clip to [km/h].
+        speed_release: Kind of the release of speeds.
+        sigma: Noise of density and of speed or flow, (2,).
+    """
+
+    length: float
+    largest_speed: float
+    speed_release: SpeedRelease
+    sigma: FloatArray
+
+    @classmethod
+    def from_config(cls, config: EnvConfig) -> ReleaseDistances:
+        """Return the distances under a configuration, at the noise that it declares."""
+        corridor = config.corridor
+        speed: SpeedRelease = "mean" if flow_centre(config) is None else "flow"
+        sigma = make_release(config).sigma
+        return cls(corridor.segment_length, corridor.speed_limit, speed, sigma)
+
+    def by_second(self, rest: Record, added: Trajectory) -> FloatArray:
+        """Return squares for the seconds of a trajectory that is added to a record, shape (m,)."""
+        count = rest.counts[added.step, added.segment]
+        return self._squares(count, rest.speed_sums[added.step, added.segment], added.speed)
+
+    def by_row(self, record: Record) -> FloatArray:
+        """Return squares for the rows of a record, with and without each, shape (rows,)."""
+        speed = record.speed.astype(np.float64)
+        count = record.counts[record.step, record.segment] - 1
+        return self._squares(count, record.speed_sums[record.step, record.segment] - speed, speed)
+
+    def where_equal(self, rest: Record, pair: tuple[Trajectory, Trajectory]) -> FloatArray:
+        """Return squares between two trajectories on the same segments at the same seconds.
+
+        Args:
+            rest: The other vehicles.
+            pair: The same seconds on the same segments, m each.
+
+        Returns:
+            Shape (m,): the densities agree, and the speeds alone differ.
+        """
+        step, segment = pair[0].step, pair[0].segment
+        first, second = (each.speed for each in pair)
+        if self.speed_release == "flow":
+            clipped = np.clip(first, 0.0, self.largest_speed)
+            change = (clipped - np.clip(second, 0.0, self.largest_speed)) / self.length
+        else:
+            change = (first - second) / (rest.counts[step, segment] + 1)
+        squares: FloatArray = (change / self.sigma[1]) ** 2
+        return squares
+
+    def _squares(self, count: IntArray, speed_sum: FloatArray, speed: FloatArray) -> FloatArray:
+        if self.speed_release == "flow":
+            clipped = np.clip(speed, 0.0, self.largest_speed)
+            second = (clipped - 0.5 * self.largest_speed) / self.length
+        else:
+            # An empty segment has the limit.
+            without = np.where(count > 0, speed_sum / np.maximum(count, 1), self.largest_speed)
+            second = (speed_sum + speed) / (count + 1) - without
+        first = 1.0 / (self.length * self.sigma[0])
+        squares: FloatArray = first**2 + (second / self.sigma[1]) ** 2
+        return squares
+
+
+class ContributionPlan(NamedTuple):
+    """The seconds in which a vehicle's contributions reveal most.
+
+    Attributes:
+        reach: Sum of the squared distances of the seconds that count.
+        n_queries: Number of other seconds to query, beside those observed at every step.
+        stop: Index before which all chosen queries must lie; later seconds would be counted only
+            after contributions that were not chosen.
+    """
+
+    reach: float
+    n_queries: int
+    stop: int
+
+
+def plan_contributions(gains: FloatArray, always: BoolArray, cap: int) -> ContributionPlan:
+    """Return the plan of a vehicle that counts in its first `cap` observed seconds.
+
+    Args:
+        gains: Squared distances of its seconds in order, shape (m,).
+        always: Flags of seconds that are observed without a query, shape (m,).
+        cap: Most seconds that count.
+    """
+    if cap >= len(gains):
+        return ContributionPlan(float(gains.sum()), cap, len(gains))
+    fixed = np.flatnonzero(always)
+    options = []
+    # With the first n such seconds counted, all queries have to come before the next of them.
+    for n in range(min(len(fixed), cap) + 1):
+        stop = int(fixed[n]) if n < len(fixed) else len(gains)
+        free = np.sort(gains[:stop][~always[:stop]])[::-1][: cap - n]
+        reach = float(gains[fixed[:n]].sum() + free.sum())
+        options.append(ContributionPlan(reach, cap - n, stop))
+    return max(options)

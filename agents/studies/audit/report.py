@@ -1,0 +1,105 @@
+"""The finding of an audit: its numbers, a table, sentences and a file."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from agents.evaluation.terminal import make_table, print_table, print_text
+from agents.experiments.files import write_json
+from agents.experiments.reports import fill
+from dptse_env.privacy import epsilon_of
+from dptse_env.privacy.audit_statistics import AuditResult, detectable_mu, rejection_probability
+from dptse_env.release import PrivacyReport
+
+VIOLATION = math.sqrt(2.0)
+"""Ratio of a true mu to the claimed one for which power is reported: noise divided by 1.41."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """The finding of one audit.
+
+    Attributes:
+        title: The environment and the claim under attack.
+        target: The difference of the two worlds in words.
+        policy: Name of the policy.
+        n_runs: Runs per world.
+        noise_factor: Factor of the declared noise.
+        distance: Largest distance between the worlds' true sums, in units of the noise: the
+            largest mu that this attack can show.
+        result: The test of the claim.
+        privacy: The configuration's privacy report.
+        seconds: Duration of the runs.
+    """
+
+    title: str
+    target: str
+    policy: str
+    n_runs: int
+    noise_factor: float
+    distance: float
+    result: AuditResult
+    privacy: PrivacyReport
+    seconds: float
+
+    @property
+    def gaussian_epsilon(self) -> float:
+        """The epsilon, at the claim's delta, of a Gaussian release with the bound on mu."""
+        mu = self.result.mu.value
+        return epsilon_of(mu, self.result.claim.delta) if mu > 0.0 else 0.0
+
+    @property
+    def power(self) -> float:
+        """Probability of rejecting a mechanism with a mu of `VIOLATION` times the claim."""
+        result, claimed = self.result, self.result.claim.mu
+        return rejection_probability(VIOLATION * claimed, claimed, self.n_runs, result.confidence)
+
+    @property
+    def detectable(self) -> float:
+        """Least mu for which a claim is rejected with probability 95 %, or infinity."""
+        return detectable_mu(self.result.claim.mu, self.n_runs, self.result.confidence)
+
+    def print(self) -> None:
+        """Print the table, and the sentences that end with the verdict."""
+        columns = "claimed", "lower\nbound", "threshold", "false +", "false -"
+        table = make_table(self.title, "", *columns)
+        claim, bounds = self.result.claim, (self.result.mu, self.result.epsilon)
+        names = "mu", f"epsilon at delta {claim.delta:g}"
+        for name, claimed, bound in zip(names, (claim.mu, claim.epsilon), bounds, strict=True):
+            rates = f"<= {bound.false_positives:.4f}", f"<= {bound.false_negatives:.4f}"
+            row = f"{claimed:.3f}", f"{bound.value:.3f}", f"{bound.threshold:.2f}", *rates
+            table.add_row(name, *row)
+        print_table(table)
+        print_text(fill(Path(__file__).parent, self._sentences(), "report.txt.j2").rstrip())
+
+    def _sentences(self) -> dict[str, Any]:
+        """Return the numbers of the sentences."""
+        return {
+            "finding": self,
+            "violation": VIOLATION,
+            "is_detectable": math.isfinite(self.detectable),
+            "reachable_factor": self.noise_factor * self.distance / self.detectable,
+            "has_true_boundary": "boundary_inputs" in self.privacy.void_reasons,
+        }
+
+    def write(self, path: Path, arguments: Mapping[str, Any]) -> None:
+        """Write the finding to a JSON file, with its origin."""
+        fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        content = fields | {
+            "verdict": self.result.verdict,
+            "result": dataclasses.asdict(self.result),
+            "gaussian_epsilon": self.gaussian_epsilon,
+            "power": self.power,
+            "detectable_mu": self.detectable if math.isfinite(self.detectable) else None,
+            "privacy": self.privacy.to_dict(),
+            "arguments": {key: str(value) for key, value in arguments.items()},
+            "versions": {name: version(name) for name in ("dptse-env", "numpy", "scipy")},
+        }
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_json(path, content)

@@ -1,0 +1,1 @@
+"""Learned query policies against every baseline: frozen, run on test traffic once, judged."""

@@ -1,0 +1,241 @@
+"""The study of policies from freezing to the report."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from agents.evaluation.episodes import EpisodeScore
+from agents.evaluation.figures import save_figure
+from agents.evaluation.statistics import crossed_t
+from agents.experiments.engine import run_all
+from agents.experiments.ledger import Ledger, ScoredT
+from agents.experiments.provenance import check_folder, take_folder
+from agents.experiments.reports import write_report
+from agents.experiments.runner import Workplace
+from agents.experiments.seeds import STUDY_TEST, STUDY_VALIDATION, TRAINING
+from agents.experiments.tables import versions_table
+from agents.studies.policies.curves import read_curves
+from agents.studies.policies.figures import draw_cells, draw_curves, draw_queries, draw_ranking
+from agents.studies.policies.freezing import (
+    QUERIES,
+    TEST,
+    VALIDATION,
+    begin,
+    check_untouched,
+    choose,
+    design_provenance,
+    draft,
+)
+from agents.studies.policies.manifest import Checkpoint, Manifest, Tuned
+from agents.studies.policies.plan import DETERMINISTIC, MODES, PRIMARY, Entry, Learner, PolicyDesign
+from agents.studies.policies.queries import QueryCounts
+from agents.studies.policies.results import ERROR_ORACLE, PolicyResults
+from agents.studies.policies.rules import LEAST_RUNS, LEAST_TRAFFIC, POLICY_TARGETS, judge
+from agents.studies.policies.running import (
+    EntryTask,
+    cell_config,
+    count_queries,
+    make_task,
+    run_entry,
+)
+from agents.studies.policies.tables import (
+    checkpoint_table,
+    choice_table,
+    health_table,
+    ranking_table,
+    secondary_table,
+    seeds_table,
+    tuned_table,
+    verdict_table,
+    write_summary,
+)
+
+TEMPLATES = Path(__file__).parent
+CURVES_FIGURE = "fig_curves.png"
+
+
+def freeze(
+    design: PolicyDesign,
+    place: Workplace,
+    command: str,
+    *,
+    checkpoints: Sequence[Checkpoint] = (),
+    tuned: Sequence[Tuned] = (),
+) -> tuple[Manifest, bool]:
+    """Fix policies and choices before test traffic is touched.
+
+    Args:
+        design: The plan.
+        place: Where it runs and leaves its results.
+        command: The command that freezes.
+        checkpoints: Learned policies.
+        tuned: Estimator settings tuned for single policies.
+
+    Returns:
+        The manifest, and whether it was frozen by this call.
+
+    Raises:
+        ValueError: Test traffic has been run, or the folder is of something else.
+    """
+    check_untouched(place.folder)
+    drafted = draft(design, checkpoints, tuned, command)
+    take_folder(place.folder, design_provenance(design))
+    manifest = begin(place.folder, drafted)
+    if manifest.frozen:
+        return manifest, False
+    ledger = Ledger(place.folder / VALIDATION, Entry, EpisodeScore)
+    lacking = _lacking(manifest.entries(design, bounds=False), design.validation_seeds, ledger)
+    _run(place, design, manifest, lacking, ledger, run_entry, design.validation_seeds)
+    manifest = choose(design, manifest, ledger)
+    manifest.write(place.folder)
+    return manifest, True
+
+
+def run(place: Workplace, n_resamples: int = 10_000) -> None:
+    """Run the frozen policies and choices on test traffic, and report.
+
+    Args:
+        place: Where it runs and leaves its results.
+        n_resamples: Resamples of every bootstrap.
+
+    Raises:
+        FileNotFoundError: Nothing was frozen, or a frozen policy is gone that is still to be run.
+        ValueError: The folder is not frozen yet, or a policy is not the one that was frozen.
+    """
+    manifest = Manifest.read(place.folder)
+    if not manifest.frozen:
+        raise ValueError(
+            f"{place.folder} is not frozen yet: run the same `freeze` to its end first"
+        )
+    design = PolicyDesign.from_json(manifest.design)
+    provenance = design_provenance(design)
+    recorded = check_folder(place.folder, provenance)
+    assert recorded is not None  # freezing has started the folder
+    episodes = Ledger(place.folder / TEST, Entry, EpisodeScore)
+    queries = Ledger(place.folder / QUERIES, Entry, QueryCounts)
+    entries, seeds = manifest.entries(design), design.test_seeds
+    primary = [each for each in entries if (each.cell, each.mode) == (PRIMARY, DETERMINISTIC)]
+    unscored, uncounted = _lacking(entries, seeds, episodes), _lacking(primary, seeds, queries)
+    if unscored or uncounted:
+        for checkpoint in manifest.checkpoints:
+            checkpoint.saved()
+        recorded = take_folder(place.folder, provenance)
+        _run(place, design, manifest, unscored, episodes, run_entry, seeds)
+        _run(place, design, manifest, uncounted, queries, count_queries, seeds)
+    curves = read_curves(manifest.checkpoints, PRIMARY)
+    results = PolicyResults(design, manifest, episodes.rows, queries.rows, curves, n_resamples)
+    draw(place.folder, results)
+    write_report(place.folder, TEMPLATES, report(place.folder, results, recorded))
+    write_summary(place.folder / "summary.csv", results)
+
+
+def _lacking(
+    entries: Sequence[Entry], seeds: Sequence[int], ledger: Ledger[Entry, ScoredT]
+) -> list[Entry]:
+    """Return the entries of which a ledger lacks a seed; they are run on all seeds again."""
+    return [entry for entry in entries if ledger.lacking(entry, seeds)]
+
+
+def _run(
+    place: Workplace,
+    design: PolicyDesign,
+    manifest: Manifest,
+    entries: Sequence[Entry],
+    ledger: Ledger[Entry, ScoredT],
+    work: Callable[[EntryTask], list[ScoredT]],
+    seeds: tuple[int, ...],
+) -> None:
+    """Run entries on validation or test traffic."""
+    noise = STUDY_VALIDATION.start if seeds == design.validation_seeds else STUDY_TEST.start
+    for name in dict.fromkeys(entry.cell for entry in entries):
+        place.record(cell_config(design.cell(name), seeds).corridor, seeds)
+    tasks = [
+        make_task(
+            entry,
+            design,
+            manifest,
+            seeds=seeds,
+            noise=noise,
+            records=place.records,
+            threads=1 if place.engine.is_parallel else None,
+        )
+        for entry in entries
+    ]
+    run_all(tasks, ledger, place.engine, work)
+
+
+def draw(folder: Path, results: PolicyResults) -> None:
+    """Save the figures; that of the learning curves stays as it is where trainings are gone."""
+    name = results.design.cell(PRIMARY).description
+    seeds = f"{len(results.design.test_seeds)} test seeds, 95 % intervals"
+    save_figure(draw_ranking(results), folder / "fig_ladder.png", f"{name}; {seeds}")
+    title = f"Learned policies against references; {seeds}"
+    save_figure(draw_cells(results), folder / "fig_cells.png", title)
+    save_figure(draw_queries(results), folder / "fig_queries.png", f"{name}: queries")
+    if results.curves:
+        save_figure(draw_curves(results), folder / CURVES_FIGURE, f"{name}: learning curves")
+
+
+def report(folder: Path, results: PolicyResults, recorded: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the tables and numbers of the report."""
+    design, manifest, learner = results.design, results.manifest, results.primary
+    verdicts = [] if learner is None else [judge(results, learner, each) for each in POLICY_TARGETS]
+    best, paper = (results.schedule(PRIMARY, name) for name in results.references)
+    oracle = None
+    if ERROR_ORACLE in manifest.bounds[PRIMARY]:
+        oracle = results.below(results.schedule(PRIMARY, ERROR_ORACLE), best)
+    versions = next(iter(recorded["made_with"]["cells"].values()))["versions"]
+    return {
+        "design": design,
+        "manifest": manifest,
+        # Manifests that an earlier script froze name it.
+        "freeze_command": manifest.command.replace("policy_study.py", "study.py policies"),
+        "n_entries": len(manifest.entries(design)),
+        "noise": {"validation": STUDY_VALIDATION, "test": STUDY_TEST, "training": TRAINING},
+        "least_runs": LEAST_RUNS,
+        "least_traffic": LEAST_TRAFFIC,
+        "primary_cell": design.cell(PRIMARY),
+        "best_baseline": results.references[0],
+        "reference": results.references[1],
+        "best_below_paper": results.below(best, paper),
+        "oracle_below_best": oracle,
+        "verdicts": verdicts,
+        "verdict_table": verdict_table(verdicts),
+        "learned": None if learner is None else _learned(results, learner),
+        "has_curves": (folder / CURVES_FIGURE).exists(),
+        "choice_table": choice_table(results),
+        "n_comparisons": len(results.comparisons),
+        "secondary_table": secondary_table(results),
+        "cells": [
+            (cell, ranking_table(results, cell.name), health_table(results, cell.name))
+            for cell in design.cells
+        ],
+        "checkpoint_table": checkpoint_table(results),
+        "tuned_table": tuned_table(results),
+        "versions_table": versions_table(versions, recorded),
+        "provenance": recorded,
+    }
+
+
+def _learned(results: PolicyResults, learner: Learner) -> dict[str, Any]:
+    """Return the numbers of the report about the learned policy of the targets."""
+    errors, hindsight = results.learned(learner), results.best_on_test(PRIMARY)
+    best = results.schedule(PRIMARY, results.references[0])
+    (other,) = (mode for mode in MODES if mode != learner.mode)
+    counterpart = Learner(learner.cell, learner.policy, learner.trained_in, other)
+    difference, p_value = crossed_t(best - errors)
+    return {
+        "policy": learner.policy,
+        "mode": learner.mode,
+        "n_runs": len(results.manifest.runs(learner)),
+        "seeds_table": seeds_table(results, learner),
+        "hindsight": hindsight,
+        "below_hindsight": results.below(errors, results.schedule(PRIMARY, hindsight)),
+        "progress": results.progress(learner),
+        "difference": difference,
+        "p_value": p_value,
+        "other_mode": other,
+        "below_other_mode": results.below(errors, results.learned(counterpart)),
+    }

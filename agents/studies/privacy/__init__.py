@@ -1,0 +1,1 @@
+"""The price of a privacy guarantee, and the guarantee that noise as printed gives."""

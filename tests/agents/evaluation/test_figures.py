@@ -1,0 +1,64 @@
+import gymnasium as gym
+import numpy as np
+import pytest
+from PIL import Image
+
+from agents.evaluation.episodes import watch_episode
+from agents.evaluation.figures import (
+    draw_maps,
+    estimate_map,
+    query_map,
+    save_errors,
+    save_figure,
+    truth_map,
+)
+from agents.evaluation.statistics import Interval
+from dptse_env.schedules import make_schedule
+
+SHORT = "dptse_env:dptse/ShortHighway-v0"
+
+
+@pytest.fixture(scope="module")
+def watched():
+    env = gym.make(SHORT, traffic_seeds="0:1", estimator="random_walk")
+    return watch_episode(env, make_schedule("paper", env), traffic_seed=0, seed=1)
+
+
+def test_a_map_names_exactly_the_error_of_the_score(watched):
+    """The seconds of the figure's error are those of the score: from 61 on, not from 60."""
+    score, history = watched
+    squares = (np.array(history.estimate) - np.array(history.truth)) ** 2
+    pooled = np.sqrt(squares[61:].mean())
+    assert score.rmse_density == pytest.approx(pooled)
+    assert estimate_map(history, score, "EKF").title == f"EKF, RMSE {pooled:.1f} veh/km"
+    # One second makes a difference where its error is large.
+    history.estimate[60] = history.estimate[60] + 1e4
+    assert estimate_map(history, score, "EKF").title == f"EKF, RMSE {pooled:.1f} veh/km"
+
+
+def test_maps_stand_in_columns_with_one_bar(watched, tmp_path):
+    score, history = watched
+    column = [
+        truth_map(history), estimate_map(history, score, "estimate"), query_map(history, "queried"),
+    ]  # fmt: skip
+    figure = draw_maps([column, column], width=8.0)
+    assert len(figure.axes) == 2 * 3 + 1
+    titles = [axis.get_title(loc="left") for axis in figure.axes[:-1]]
+    assert titles[::2] == titles[1::2] == [panel.title for panel in column]
+    image = figure.axes[0].images[0]
+    np.testing.assert_array_equal(image.get_array(), np.array(history.truth).T)
+    assert image.get_clim() == (0.0, history.density_scale)
+    assert figure.axes[4].images[0].get_clim() == (0.0, 1.0)
+    save_figure(figure, tmp_path / "deep" / "maps.png", "title")
+    with Image.open(tmp_path / "deep" / "maps.png") as saved:
+        assert saved.format == "PNG"
+
+
+def test_errors_of_every_policy_are_drawn(tmp_path):
+    pair = Interval(10.0, 9.0, 11.0, 3), Interval(5.0, 4.0, 6.0, 3)
+    rows = ["paper", "round-robin"]
+    series = {name: dict.fromkeys(rows, pair) for name in ("ekf", "ukf")}
+    save_errors(tmp_path / "errors.png", rows, series, "title")
+    with Image.open(tmp_path / "errors.png") as image:
+        # Something is drawn: neither one colour nor the few of an empty frame.
+        assert len(image.convert("RGB").getcolors(maxcolors=2**20)) > 100

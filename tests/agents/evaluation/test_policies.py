@@ -1,0 +1,111 @@
+import hashlib
+import json
+import subprocess
+import sys
+import zipfile
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from agents.evaluation.policies import find_policy, read_saved_policy
+from dptse_env import sb3
+from dptse_env.policies import TRANSFERABLE
+from dptse_env.schedules import make_schedule
+from tests.agents.policies import SHORT, save
+
+
+def test_the_card_says_what_it_is(tmp_path):
+    path = save(tmp_path / "policy.zip", seed=3)
+    saved = read_saved_policy(path)
+    assert (saved.recipe, saved.training_seed, saved.action) == ("plackett-luce", 3, "slots")
+    assert saved.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def test_it_acts_as_the_policy_that_was_saved(tmp_path):
+    path = save(tmp_path / "policy.zip")
+    env = gym.make(SHORT, action="slots")
+    observation, _ = env.reset(seed=0)
+    action, _ = (
+        read_saved_policy(path).load(env).predict(observation, None, None, deterministic=True)
+    )
+    expected, _ = sb3.load_policy(path, env).predict(observation, deterministic=True)
+    np.testing.assert_array_equal(action, expected)
+
+
+def test_another_bandwidth_is_refused_unless_it_is_meant(tmp_path):
+    saved = read_saved_policy(save(tmp_path / "policy.zip"))
+    env = gym.make(SHORT, action="slots", bandwidth=3)
+    with pytest.raises(ValueError, match="bandwidth is 2 for the policy and 3 for the environment"):
+        saved.load(env)
+    saved.load(env, allow=TRANSFERABLE)
+
+
+def test_a_file_that_has_changed_is_refused(tmp_path):
+    path = save(tmp_path / "policy.zip", seed=0)
+    saved = read_saved_policy(path)
+    save(path, seed=1)
+    with pytest.raises(ValueError, match="has changed"):
+        saved.load(gym.make(SHORT, action="slots"))
+
+
+def test_what_is_no_policy_is_refused(tmp_path):
+    with pytest.raises(FileNotFoundError, match="no saved policy 'nobody'"):
+        read_saved_policy("nobody")
+    text = tmp_path / "text.zip"
+    text.write_text("no archive")
+    with pytest.raises(ValueError, match="not a saved policy, or damaged: File is not a zip file"):
+        read_saved_policy(text)
+    for card in ({"fits": {}}, {"fits": {"action": "mask"}, "training": {"seed": 1}}, []):
+        with zipfile.ZipFile(text, "w") as archive:
+            archive.writestr("card.json", json.dumps(card))
+        with pytest.raises(ValueError, match="not a saved policy"):
+            read_saved_policy(text)
+
+
+def test_a_name_is_a_saved_policy_or_a_schedule(tmp_path):
+    path = save(tmp_path / "policy.zip", seed=2)
+    saved, schedule = find_policy(str(path)), find_policy("paper")
+    assert saved == read_saved_policy(path)
+    assert saved.keywords == {"action": "slots"}
+    assert saved.identity == saved.sha256
+    assert (schedule.keywords, schedule.identity) == ({}, "paper")
+    assert find_policy("private-highway").keywords == {"action": "slots"}
+    env = gym.make(SHORT)
+    observation, _ = env.reset(seed=0)
+    action, _ = schedule.load(env).predict(observation, None, None)
+    expected, _ = make_schedule("paper", env).predict(observation, None, None)
+    np.testing.assert_array_equal(action, expected)
+    with pytest.raises(ValueError, match=r"schedule must be one of .*, got 'nobody'"):
+        find_policy("nobody").load(env)
+    with pytest.raises(FileNotFoundError, match=r"none\.zip"):
+        find_policy("none.zip")
+
+
+@pytest.mark.parametrize("training", [{"seed": 1}, {"learner": "mask", "seed": "first"}])
+def test_a_card_without_recipe_or_training_seed_is_refused(tmp_path, training):
+    path = save(tmp_path / "policy.zip")
+    with zipfile.ZipFile(path) as archive:
+        entries = {name: archive.read(name) for name in archive.namelist()}
+    card = {**json.loads(entries["card.json"]), "training": training}
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in {**entries, "card.json": json.dumps(card)}.items():
+            archive.writestr(name, content)
+    with pytest.raises(ValueError, match="not a saved policy"):
+        read_saved_policy(path)
+
+
+def test_a_name_is_looked_up_in_the_package(tmp_path, monkeypatch):
+    (tmp_path / "policies").mkdir()
+    save(tmp_path / "policies" / "shipped.zip", seed=4)
+    monkeypatch.setattr("dptse_env.policies.files", lambda _: tmp_path)
+    assert read_saved_policy("shipped").training_seed == 4
+
+
+def test_a_card_is_read_without_torch(tmp_path):
+    path = save(tmp_path / "policy.zip")
+    code = (
+        "import sys; import scripts.evaluate; from agents.evaluation.policies import find_policy; "
+        f"assert find_policy({str(path)!r}).action == 'slots'; assert 'torch' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)

@@ -1,0 +1,208 @@
+import numpy as np
+import pytest
+from scipy import stats
+
+from agents.evaluation.statistics import (
+    Interval,
+    bootstrap,
+    crossed_t,
+    geometric_mean_interval,
+    holm,
+    iqm,
+    mean,
+    mean_interval,
+    paired_difference,
+    percent_below,
+    percent_of_way,
+    worst_row,
+)
+
+
+def test_the_interval_is_students():
+    interval = mean_interval([1.0, 2.0, 3.0, 4.0])
+    # t(0.975, 3) = 3.18245 and the standard error is 0.645497
+    assert interval.mean == pytest.approx(2.5)
+    assert interval.half_width == pytest.approx(3.18245 * 0.645497, rel=1e-5)
+    assert interval.n == 4
+
+
+def test_the_interval_covers_as_often_as_it_says():
+    draws = np.random.default_rng(0).standard_normal((2000, 8))
+    covered = [interval.low <= 0 <= interval.high for interval in map(mean_interval, draws)]
+    assert 0.93 < np.mean(covered) < 0.97
+
+
+def test_pairing_removes_what_the_two_share():
+    generator = np.random.default_rng(0)
+    shared = 100 * generator.standard_normal(20)
+    difference = paired_difference(shared + 1.0 + 0.1 * generator.standard_normal(20), shared)
+    assert difference.excludes_zero()
+    assert difference.mean == pytest.approx(1.0, abs=0.1)
+
+
+def test_equal_values_have_an_interval_of_no_length():
+    assert mean_interval([2.0, 2.0]) == Interval(2.0, 2.0, 2.0, 2)
+    assert not paired_difference([1.0, 2.0], [1.0, 2.0]).excludes_zero()
+
+
+def test_bad_values_are_refused():
+    with pytest.raises(ValueError, match="at least 2 values"):
+        mean_interval([1.0])
+    with pytest.raises(ValueError, match="finite"):
+        mean_interval([1.0, float("nan")])
+    with pytest.raises(ValueError, match=r"one shape, got \(2,\) and \(3,\)"):
+        paired_difference([1, 2], [1, 2, 3])
+
+
+def test_a_geometric_interval_is_the_same_for_inverse_ratios():
+    values = np.array([0.5, 1.0, 4.0, 3.0])
+    mean, inverse = geometric_mean_interval(values), geometric_mean_interval(1.0 / values)
+    assert mean.mean == pytest.approx(np.prod(values) ** 0.25)
+    assert 0.0 < mean.low < mean.mean < mean.high
+    assert (inverse.low, inverse.high) == pytest.approx((1.0 / mean.high, 1.0 / mean.low))
+    assert mean.n == 4
+
+
+@pytest.mark.parametrize("values", [[1.0, 0.0], [1.0, -1.0], [1.0, np.nan]])
+def test_a_geometric_mean_needs_positive_values(values):
+    with pytest.raises(ValueError, match="must be above zero"):
+        geometric_mean_interval(values)
+
+
+def crossed(generator, n_runs, n_traffic, of_runs, of_traffic, of_cells):
+    """Zero-mean values by run and traffic, of the three standard deviations given."""
+    return (
+        of_runs * generator.standard_normal((n_runs, 1))
+        + of_traffic * generator.standard_normal((1, n_traffic))
+        + of_cells * generator.standard_normal((n_runs, n_traffic))
+    )
+
+
+def coverage(make_interval, spreads, n_trials=300, n_runs=5, n_traffic=64):
+    generator = np.random.default_rng(1)
+    tables = [crossed(generator, n_runs, n_traffic, *spreads) for _ in range(n_trials)]
+    intervals = [make_interval(table) for table in tables]
+    return np.mean([interval.low <= 0.0 <= interval.high for interval in intervals])
+
+
+def two_level(table):
+    return bootstrap(mean, table, n_resamples=400)
+
+
+def test_the_bootstrap_covers_where_traffic_decides_and_says_where_it_does_not():
+    assert 0.92 < coverage(two_level, (1.0, 8.0, 2.0)) < 0.98
+    assert 0.79 < coverage(two_level, (1.0, 0.0, 0.5)) < 0.89  # as its docstring admits
+
+
+@pytest.mark.parametrize("spreads", [(1.0, 8.0, 2.0), (1.0, 1.0, 1.0), (1.0, 0.0, 0.5)])
+def test_the_crossed_t_interval_covers_whoever_decides(spreads):
+    assert 0.92 < coverage(lambda table: crossed_t(table)[0], spreads) < 0.985
+
+
+def test_resampling_one_level_alone_would_be_too_sure():
+    table = crossed(np.random.default_rng(3), 5, 64, 1.0, 6.0, 0.1)
+    width = two_level(table).half_width
+    traffic_alone, runs_alone = table.mean(axis=0), np.tile(table.mean(axis=1)[:, None], 64)
+    assert width > 1.1 * two_level(traffic_alone).half_width
+    assert width > 1.2 * two_level(runs_alone).half_width
+
+
+def test_the_bootstrap_finds_a_known_effect_that_pairing_reveals():
+    generator = np.random.default_rng(3)
+    traffic = 50.0 + 10.0 * generator.standard_normal(64)
+    reference = traffic + 0.5 * generator.standard_normal(64)
+    runs = 0.9 * traffic + 0.3 * generator.standard_normal((5, 1))
+    below = bootstrap(percent_below, runs, reference)
+    assert below.mean == pytest.approx(100 * (1 - runs.mean() / reference.mean()))
+    assert below.low < 10.0 < below.high
+    assert below.half_width < 1.0
+    assert below.n == 64
+    # Drawn apart, the same numbers would say nothing.
+    assert bootstrap(mean, runs).half_width > 2.0
+
+
+def test_rows_of_tables_are_drawn_apart_and_columns_together():
+    rows = np.tile(np.arange(5.0)[:, None], (1, 8))
+    same = bootstrap(lambda a, b: mean(a) - mean(b), rows, rows)
+    assert same.mean == 0.0
+    assert same.high > 1.0
+    columns = np.tile(np.arange(8.0), (5, 1))
+    assert bootstrap(lambda a, b: mean(a) - mean(b), columns, columns).half_width == 0.0
+
+
+def test_the_bootstrap_is_seeded():
+    table = np.random.default_rng(4).standard_normal((3, 9))
+    assert bootstrap(iqm, table, seed=5) == bootstrap(iqm, table, seed=5)
+    assert bootstrap(iqm, table, seed=5) != bootstrap(iqm, table, seed=6)
+
+
+def test_the_interquartile_mean_is_that_of_the_pooled_middle_half():
+    table = np.array([[100.0, 1.0, 2.0, 3.0], [4.0, 5.0, 6.0, -100.0]])
+    assert iqm(table) == pytest.approx(np.mean([2.0, 3.0, 4.0, 5.0]))
+    assert iqm(np.stack([table, 2.0 * table])) == pytest.approx([3.5, 7.0])
+
+
+def test_percent_of_the_way():
+    assert percent_of_way(np.full((5, 2), 9.0), np.full((1, 2), 10.0), np.full((1, 2), 6.0)) == 25.0
+
+
+def test_crossed_t_of_one_run_is_the_paired_t_test():
+    values = np.random.default_rng(5).standard_normal(12) + 0.4
+    interval, p_value = crossed_t(values)
+    assert interval == mean_interval(values)
+    assert p_value == pytest.approx(stats.ttest_1samp(values, 0.0).pvalue)
+
+
+def test_crossed_t_knows_how_few_runs_there_are():
+    runs = np.array([1.0, 2.0, 0.5, 1.5, 3.0])
+    table = runs[:, None] + 1e-9 * np.random.default_rng(6).standard_normal((5, 64))
+    interval, p_value = crossed_t(table)
+    expected = mean_interval(runs)
+    assert (interval.low, interval.high) == pytest.approx((expected.low, expected.high), rel=1e-6)
+    assert p_value == pytest.approx(stats.ttest_1samp(runs, 0.0).pvalue, rel=1e-6)
+
+
+def test_crossed_t_of_equal_values():
+    assert crossed_t(np.zeros((3, 4))) == (Interval(0.0, 0.0, 0.0, 4), 1.0)
+    assert crossed_t(np.ones((3, 4)))[1] == 0.0
+
+
+def test_holm_steps_down():
+    # Holm (1979); the values of R's p.adjust(c(0.01, 0.04, 0.03, 0.005), "holm").
+    adjusted = holm({"a": 0.01, "b": 0.04, "c": 0.03, "d": 0.005})
+    assert adjusted == pytest.approx({"a": 0.03, "b": 0.06, "c": 0.06, "d": 0.02})
+    assert list(adjusted) == ["a", "b", "c", "d"]
+    assert holm({"a": 0.6, "b": 0.7}) == {"a": 1.0, "b": 1.0}
+    assert holm({}) == {}
+
+
+@pytest.mark.parametrize("value", [-0.1, 1.5, np.nan])
+def test_holm_takes_probabilities_only(value):
+    with pytest.raises(ValueError, match=r"p-values must be in \[0, 1\], got .* for x"):
+        holm({"x": value})
+
+
+def test_the_worst_run_errs_most_on_average():
+    assert worst_row([[1.0, 9.0], [6.0, 6.0], [11.0, 0.0]]) == 1
+
+
+@pytest.mark.parametrize(
+    ("tables", "message"),
+    [
+        ([np.ones((5, 1))], r"2 traffic seeds, got shape \(5, 1\)"),
+        ([np.ones((0, 4))], "a training seed"),
+        ([np.ones((2, 3, 4))], r"got shape \(2, 3, 4\)"),
+        ([np.array([[1.0, np.nan]])], "values must be finite, 1 are not"),
+        ([np.ones((2, 4)), np.ones(5)], "same traffic seeds"),
+    ],
+)
+def test_degenerate_tables_are_refused(tables, message):
+    with pytest.raises(ValueError, match=message):
+        bootstrap(lambda *drawn: mean(drawn[0]), *tables)
+
+
+def test_a_statistic_that_breaks_down_is_refused():
+    with pytest.raises(ValueError, match="finite on every resample"), np.errstate(divide="ignore"):
+        bootstrap(percent_below, np.ones(3), np.array([-1.0, 0.0, 1.0]))
+    with pytest.raises(ValueError, match="n_resamples must be >= 100, got 9"):
+        bootstrap(mean, np.ones(3), n_resamples=9)

@@ -1,0 +1,79 @@
+import optuna
+import pytest
+
+from agents.search.space import SPACE, Choice, Range, nested, search_space, values_of
+from dptse_env.estimators import (
+    ESTIMATORS,
+    EnsembleSettings,
+    EstimatorSettings,
+    HorizonSettings,
+    SigmaPointSettings,
+)
+from dptse_env.estimators.tuned_settings import available_settings, load_settings
+from dptse_env.utils.fields import from_mapping
+
+
+def test_every_estimator_but_the_open_loop_can_be_tuned():
+    assert {*SPACE, "open_loop"} == set(ESTIMATORS)
+    with pytest.raises(ValueError, match=r"'open_loop' has nothing to tune.*tunable are ekf, ukf"):
+        search_space("open_loop")
+    with pytest.raises(ValueError, match=r"estimator must be one of ekf, .*, got 'kf'"):
+        search_space("kf")
+
+
+@pytest.mark.parametrize("estimator", SPACE)
+def test_the_search_holds_the_defaults_and_the_shipped_sets(estimator):
+    space = search_space(estimator)
+    shipped = [name for name in available_settings() if name.startswith(f"{estimator}-")]
+    for settings in (EstimatorSettings(), *map(load_settings, shipped)):
+        values = values_of(settings, space)
+        assert list(values) == list(space)
+        assert all(knob.holds(values[path]) for path, knob in space.items())
+        assert from_mapping(EstimatorSettings, nested(values), "settings") == settings
+
+
+def test_paths_become_nested_settings():
+    settings = EstimatorSettings(
+        process_noise=(0.1, 0.2),
+        walk_noise=(0.3, 0.4),
+        noise_scale=1.5,
+        ukf=SigmaPointSettings(alpha=1.0),
+        enkf=EnsembleSettings(inflation=1.02, taper=0.5),
+        mhe=HorizonSettings(arrival_noise=(0.5, 0.6), linearisation="trajectory", bounds="cone"),
+    )
+    everything = {path: knob for name in SPACE for path, knob in search_space(name, True).items()}
+    values = values_of(settings, everything)
+    assert values["process_noise.1"] == 0.2
+    assert values["mhe.arrival_noise.0"] == 0.5
+    assert nested(values) == {
+        "process_noise": [0.1, 0.2],
+        "walk_noise": [0.3, 0.4],
+        "noise_scale": 1.5,
+        "ukf": {"alpha": 1.0},
+        "enkf": {"inflation": 1.02, "taper": 0.5},
+        "mhe": {"arrival_noise": [0.5, 0.6], "linearisation": "trajectory", "bounds": "cone"},
+    }
+
+
+def test_values_are_suggested_within_their_range_to_four_digits():
+    study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
+    for _ in range(20):
+        value = Range(0.001, 0.1).suggest(study.ask(), "x")
+        assert 0.001 <= value <= 0.1
+        assert value == float(f"{value:.4g}")
+    values = [Range(0.001, 0.1).suggest(study.ask(), "y") for _ in range(200)]
+    assert 60 < sum(value < 0.01 for value in values) < 140  # even in the logarithm
+    values = [Range(0.001, 0.1, log=False).suggest(study.ask(), "z") for _ in range(200)]
+    assert sum(value < 0.01 for value in values) < 40
+    assert {Choice((1, 2)).suggest(study.ask(), "c") for _ in range(20)} == {1, 2}
+
+
+def test_bounds_of_the_search_are_seen():
+    knob = Range(1e-3, 1e-1)
+    assert [knob.at_bound(value) for value in (1e-3, 1.09e-3, 1.2e-3, 8e-2, 9.2e-2, 1e-1)] == [
+        True, True, False, False, True, True,
+    ]  # fmt: skip
+    assert [Range(1.0, 1.1, log=False).at_bound(value) for value in (1.001, 1.05)] == [True, False]
+    assert [knob.holds(value) for value in (9e-4, 1e-2, 0.2)] == [False, True, False]
+    assert [Choice((1, 2)).holds(value) for value in (1, 3)] == [True, False]
+    assert not Choice((1, 2)).at_bound(1)

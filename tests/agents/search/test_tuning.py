@@ -1,0 +1,211 @@
+import dataclasses
+import json
+import math
+import warnings
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+from optuna.trial import TrialState
+
+from agents.evaluation.episodes import EpisodeScore
+from agents.search.tuning import journal_path, locked_study, scores_of
+from agents.search.tuning_task import TuningTask, score_episode
+from dptse_env.estimators import EstimatorSettings
+from dptse_env.estimators.tuned_settings import load_settings, read_settings
+
+TASK = TuningTask(
+    env="dptse_env:dptse/ShortHighway-v0",
+    estimator="ekf",
+    parameters="w99-3lane",
+    privacy="paper",
+    seeds="0:3",
+    keywords={"epsilon": 1.0, "delta": 0.05, "bandwidth": 2},
+)
+
+
+def made_up(task, settings, seed):
+    """Best at a process noise of (0.02, 0.005) and the noise's own scale."""
+    distance = (
+        math.log(settings.process_noise[0] / 0.02) ** 2
+        + math.log(settings.process_noise[1] / 0.005) ** 2
+        + math.log(settings.noise_scale) ** 2
+    )
+    return EpisodeScore(seed, 10 + distance, 5 + distance, -0.1 * distance - seed, 0.0, 1.0, 0.0)
+
+
+class Fake:
+    """Scores that are made up, and what was scored."""
+
+    def __init__(self):
+        self.calls = []
+
+    def __call__(self, task, settings, seed):
+        self.calls.append((settings, seed))
+        return made_up(task, settings, seed)
+
+
+@pytest.fixture
+def fake():
+    return Fake()
+
+
+@pytest.fixture
+def executor():
+    with ThreadPoolExecutor(1) as threads:
+        yield threads
+
+
+def run(folder, executor, n_trials, task=TASK, score=score_episode, **keywords):
+    with locked_study(task, folder, score=score) as study:
+        study.run(n_trials, executor, **keywords)
+    return study
+
+
+def trials(study):
+    return [(t.state, t.params, t.intermediate_values) for t in study.study.get_trials()]
+
+
+def test_it_beats_the_defaults_on_real_traffic(tmp_path, executor):
+    task = dataclasses.replace(TASK, seeds="0:2")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        study = run(tmp_path, executor, 6, task)
+    best, defaults = study.best(), study.labelled("defaults")
+    assert study.n_finished() == 6
+    assert best.value >= defaults.value
+    settings = EstimatorSettings(**best.user_attrs["settings"])
+    scores = [score_episode(task, settings, seed) for seed in (0, 1)]
+    assert best.value == pytest.approx(np.mean([score.reward for score in scores]), rel=1e-12)
+    for key in ("rmse_density", "rmse_speed"):
+        expected = np.mean([getattr(score, key) for score in scores])
+        assert best.user_attrs[key] == pytest.approx(expected, rel=1e-12)
+
+
+def test_it_finds_the_best_settings(tmp_path, executor, fake):
+    study = run(tmp_path, executor, 60, score=fake)
+    path = tmp_path / "x.json"
+    study.write(path)
+    assert read_settings(path).process_noise == pytest.approx((0.02, 0.005), rel=0.5)
+    provenance = json.loads(path.read_text())["provenance"]
+    assert provenance["score"] == study.study.best_value > provenance["defaults"]["score"]
+    assert provenance["defaults"]["score"] == scores_of(study.labelled("defaults"))["score"]
+    assert provenance["n_trials"] == 60 > provenance["n_stopped_early"] > 0
+    assert (provenance["seeds"], provenance["bandwidth"]) == ("0:3", 2)
+    assert provenance["n_diverged"] == 3.0
+    assert provenance["at_bounds"] == []
+    assert len({tuple(t.params.values()) for t in study.study.get_trials()}) == 60
+    assert set(provenance["versions"]) >= {"dptse-env", "optuna", "libsumo"}
+
+
+def test_the_defaults_and_the_present_set_are_tried_first_and_to_the_end(tmp_path, executor, fake):
+    run(tmp_path, executor, 2, score=fake)
+    first = EstimatorSettings(), load_settings("ekf-w99-3lane-paper")
+    assert fake.calls == [(settings, seed) for settings in first for seed in range(3)]
+    other = Fake()
+    run(tmp_path / "open", executor, 1, dataclasses.replace(TASK, privacy="corrected"), other)
+    assert other.calls == [(EstimatorSettings(), seed) for seed in range(3)]
+
+
+def test_bad_trials_stop_early_but_never_the_first_two(tmp_path, executor, fake):
+    study = run(tmp_path, executor, 30, score=fake)
+    pruned = [t for t in study.study.get_trials() if t.state == TrialState.PRUNED]
+    assert pruned
+    assert all(len(t.intermediate_values) < 3 for t in pruned)
+    assert not any("label" in t.user_attrs for t in pruned)
+
+
+def test_an_interrupted_study_comes_out_as_one_that_was_not(tmp_path, executor, fake):
+    complete = run(tmp_path / "complete", executor, 20, score=fake)
+    first = trials(run(tmp_path / "parts", executor, 13, score=fake))
+    path = journal_path(TASK, tmp_path / "parts")
+    lines = path.read_bytes().splitlines(keepends=True)
+    # Cut inside trial 12, as a kill in the middle of a write does, the lock still there.
+    started = max(i for i, line in enumerate(lines) if json.loads(line)["op_code"] == 4)
+    path.write_bytes(b"".join(lines[: started + 2]) + b'{"op_co')
+    (tmp_path / "parts" / f"{path.name}.lock").touch()
+    resumed = run(tmp_path / "parts", executor, 20, score=fake)
+    kept = [trial for trial in trials(resumed) if trial[0] != TrialState.FAIL]
+    assert len(trials(resumed)) == 21
+    assert first[:12] == kept[:12]
+    assert kept == trials(complete)
+    assert resumed.n_finished() == 20
+
+
+def test_a_finished_study_does_nothing_more(tmp_path, executor, fake):
+    run(tmp_path, executor, 5, score=fake)
+    again = Fake()
+    study = run(tmp_path, executor, 5, score=again)
+    study.write(tmp_path / "x.json")
+    assert again.calls == []
+    assert read_settings(tmp_path / "x.json") == EstimatorSettings(
+        **study.best().user_attrs["settings"]
+    )
+
+
+def test_a_stale_first_trial_is_run_again(tmp_path, executor):
+    def fail(task, settings, seed):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, executor, 5, score=fail)
+    study = run(tmp_path, executor, 5, score=made_up)
+    assert study.n_finished() == 5
+    assert study.labelled("defaults").intermediate_values
+    assert study.labelled("shipped").intermediate_values
+    states = [t.state.name for t in study.study.get_trials()]
+    assert states.count("FAIL") == 1
+    assert not {"RUNNING", "WAITING"} & set(states)
+
+
+def test_several_trials_at_once_make_the_number_wanted(tmp_path, fake):
+    finished = []
+    with ThreadPoolExecutor(3) as threads:
+        study = run(
+            tmp_path, threads, 10, score=fake, n_parallel=3, on_trial=lambda: finished.append(1)
+        )
+    assert study.n_finished() == len(study.study.get_trials()) == len(finished) == 10
+
+
+def test_a_score_that_is_not_finite_is_never_the_best(tmp_path, executor):
+    def score(task, settings, seed):
+        result = made_up(task, settings, seed)
+        bad = settings.process_noise[0] > EstimatorSettings().process_noise[0]
+        return dataclasses.replace(result, reward=math.nan) if bad else result
+
+    study = run(tmp_path, executor, 20, score=score)
+    assert any("not_finite" in trial.user_attrs for trial in study.study.get_trials())
+    assert study.best().params["process_noise.0"] <= 0.01
+    study = run(
+        tmp_path / "nothing", executor, 3,
+        score=lambda *args: dataclasses.replace(made_up(*args), reward=math.nan),
+    )  # fmt: skip
+    with pytest.raises(ValueError, match="ekf-w99-3lane-paper: no trial ran to its end"):
+        study.write(tmp_path / "x.json")
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"seeds": "0:2"}, "'seeds': '0:3'.*'seeds': '0:2'"),
+        ({"keywords": {"bandwidth": 3}}, "'bandwidth': 2"),
+    ],
+)
+def test_a_study_of_other_arguments_is_refused(changes, named, tmp_path, executor, fake):
+    run(tmp_path, executor, 2, score=fake)
+    with pytest.raises(ValueError, match=f"ekf-w99-3lane-paper.journal belongs to .*{named}"):
+        run(tmp_path, executor, 2, dataclasses.replace(TASK, **changes), fake)
+    with (
+        pytest.raises(ValueError, match="sampler_seed"),
+        locked_study(TASK, tmp_path, seed=1),
+    ):
+        pass
+
+
+def test_two_runs_do_not_write_one_journal(tmp_path):
+    with (
+        locked_study(TASK, tmp_path),
+        pytest.raises(BlockingIOError, match=r"another run is writing .*\.journal"),
+        locked_study(TASK, tmp_path),
+    ):
+        pass

@@ -1,0 +1,87 @@
+import dataclasses
+
+import pytest
+
+from agents.evaluation.episodes import run_episode
+from agents.search.tuning_task import TuningTask, score_episode
+from dptse_env.estimators import EstimatorSettings
+from dptse_env.model import ARZParameters
+from dptse_env.schedules import make_schedule
+from tests.agents.policies import save
+
+TASK = TuningTask(
+    env="dptse_env:dptse/ShortHighway-v0",
+    estimator="ekf",
+    parameters="w99-3lane",
+    privacy="paper",
+    seeds="0:3",
+    keywords={"epsilon": 1.0, "delta": 0.05, "bandwidth": 2},
+)
+
+
+def test_an_episode_is_what_an_evaluation_runs_with_another_noise_seed():
+    settings = EstimatorSettings(process_noise=(0.02, 0.03))
+    env = TASK.make(settings)
+    assert env.unwrapped.config.settings() == settings
+    schedule = make_schedule("paper", env)
+    expected = run_episode(env, schedule, traffic_seed=1, seed=1_000_001)
+    assert score_episode(TASK, settings, 1) == expected
+    assert score_episode(TASK, EstimatorSettings(), 1) != expected
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"seeds": "998:1002"}, "seeds must be training seeds, in 0:1000, got '998:1002'"),
+        ({"noise_seed": 2000}, "noise_seed must be an integer in 1000000..1999000, got 2000"),
+        ({"estimator": "open_loop"}, "'open_loop' has nothing to tune"),
+        ({"keywords": {"estimator": "ukf"}}, r"keywords\.estimator must be left out"),
+        ({"keywords": {"privacy": "paper"}}, r"keywords\.privacy must be a JSON object"),
+        ({"parameters": ARZParameters("a/b", 100.0, 300.0, 1.0, 30.0)}, "part of a file name"),
+    ],
+)
+def test_bad_tasks_are_named(changes, message):
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(TASK, **changes)
+
+
+def test_keywords_reach_the_environment_and_the_identity():
+    keywords = {"reward": "speed", "privacy": {"epsilon": 2.0, "cap": 9}}
+    task = dataclasses.replace(TASK, privacy="capped", keywords=keywords)
+    config = task.config()
+    assert config.reward == "speed"
+    privacy = config.privacy
+    assert (privacy.preset, privacy.epsilon, privacy.cap) == ("capped", 2.0, 9)
+    other = dataclasses.replace(task, keywords={**keywords, "reward": "joint"})
+    assert task.identity() != other.identity()
+    with pytest.raises(ValueError, match="cargo"):
+        dataclasses.replace(TASK, keywords={"cargo": 1}).config()
+
+
+def test_a_task_takes_parameters_of_its_own():
+    parameters = ARZParameters("mine", 100.0, 300.0, 1.0, 30.0)
+    task = dataclasses.replace(TASK, parameters=parameters, keywords={})
+    assert task.name == "ekf-mine-paper"
+    assert task.config().parameters == parameters
+    assert task.config().settings() == EstimatorSettings()
+    assert task.identity()["bandwidth"] == 2
+    with pytest.raises(ValueError, match=r"schedule must be one of .*, got 'best'"):
+        dataclasses.replace(TASK, schedule="best").config()
+
+
+def test_settings_can_be_tuned_for_a_saved_policy(tmp_path):
+    pytest.importorskip("torch")
+    path = save(tmp_path / "policy.zip", seed=1)
+    task = dataclasses.replace(TASK, schedule=str(path))
+    settings = EstimatorSettings(process_noise=(0.02, 0.03))
+    env = task.make(settings)
+    assert env.unwrapped.config.action == "slots"
+    expected = run_episode(env, task.source.load(env), traffic_seed=1, seed=1_000_001)
+    assert score_episode(task, settings, 1) == expected
+    assert score_episode(TASK, settings, 1) != expected
+    other = dataclasses.replace(TASK, schedule=str(save(tmp_path / "other.zip", seed=2)))
+    assert task.identity()["schedule"] != other.identity()["schedule"]  # by content, not by name
+    with pytest.raises(ValueError, match="bandwidth is 2 for the policy and 3"):
+        dataclasses.replace(task, keywords={"bandwidth": 3}).config()
+    with pytest.raises(FileNotFoundError, match=r"none\.zip"):
+        dataclasses.replace(task, schedule="none.zip")
