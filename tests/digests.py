@@ -30,16 +30,16 @@ from dptse_env.schedules import make_schedule
 
 IDS = ("PaperHighway", "PrivateHighway", "ShortHighway")
 ESTIMATORS = ("ekf", "ukf", "enkf", "mhe", "random_walk", "open_loop")
-PRESETS = ("paper", "corrected", "guaranteed")
+PRESETS = ("paper", "corrected", "capped")
 ACTIONS = ("mask", "scores", "slots", "sequential")
 VARIANTS: dict[str, dict[str, Any]] = {
-    "private boundary": {"privacy": {"preset": "guaranteed", "boundary_inputs": "private"}},
+    "private boundary": {"privacy": {"preset": "capped", "boundary_inputs": "private"}},
     "nominal boundary": {"privacy": {"preset": "paper", "boundary_inputs": "nominal"}},
-    "whole horizon": {"privacy": {"preset": "guaranteed", "unit": "horizon"}},
+    "whole horizon": {"privacy": {"preset": "capped", "unit": "horizon"}},
     "one event, added": {
-        "privacy": {"preset": "guaranteed", "unit": "event", "adjacency": "add_remove"}
+        "privacy": {"preset": "capped", "unit": "event", "adjacency": "add_remove"}
     },
-    "mean speeds": {"privacy": {"preset": "guaranteed", "speed_release": "mean", "cap": 9}},
+    "mean speeds": {"privacy": {"preset": "capped", "speed_release": "mean", "cap": 9}},
     "random start": {"horizon": 100, "random_start": True},
     "density reward": {"reward": "density"},
     "speed reward": {"reward": "speed", "bandwidth": 3},
@@ -152,7 +152,7 @@ def training(arguments: list[str], folder: Path) -> dict[str, str]:
     """Return digests of a short training: its weights and its learning curve."""
     command = [
         sys.executable, "scripts/train.py", "--env", "dptse_env:dptse/ShortHighway-v0",
-        "--keywords", json.dumps({"privacy": "guaranteed"}), "--traffic", "0:4",
+        "--keywords", json.dumps({"privacy": "capped"}), "--traffic", "0:4",
         "--validation", "1000:1002", "--output", str(folder), "--no-tensorboard",
     ]  # fmt: skip
     if "recipe:scores" in arguments:
@@ -190,7 +190,7 @@ def record() -> dict[str, dict[str, str]]:
         found[case] = episode("dptse_env:dptse/ShortHighway-v0", **{"action": "mask", **keywords})
     for name in SCHEDULES:
         found[f"schedule {name}"] = schedule(name)
-    for estimator, preset in itertools.product(ESTIMATORS[:4], ("paper", "guaranteed")):
+    for estimator, preset in itertools.product(ESTIMATORS[:4], ("paper", "capped")):
         case = f"ShortHighway {estimator} {preset} reference"
         found[case] = episode(
             "dptse_env:dptse/ShortHighway-v0", estimator=estimator, privacy=preset,

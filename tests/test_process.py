@@ -94,7 +94,7 @@ def test_forks_share_traffic_and_begin_no_episodes():
     exposures = process.release.contributions.exposures
     assert not np.shares_memory(fork.release.contributions.exposures, exposures)
     for forked in (fork, fork.fork()):
-        with pytest.raises(RuntimeError, match="reset the process that it was made of"):
+        with pytest.raises(RuntimeError, match="reset the process that it was made from"):
             forked.reset(ALL, generators(SEEDS))
     process.reset(ALL, generators(SEEDS))
 

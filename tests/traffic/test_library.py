@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from dptse_env.traffic import (
-    CORRIDORS,
     SHORT_HIGHWAY,
     Record,
     RecordingError,
@@ -85,7 +84,7 @@ def test_what_shapes_a_record_is_in_its_path(tmp_path, monkeypatch):
     records = RecordLibrary(tmp_path)
     paths = [
         records.record_path(corridor, seed)
-        for corridor in (*CORRIDORS.values(), randomised(SHORT_HIGHWAY))
+        for corridor in (PAPER_HIGHWAY, SHORT_HIGHWAY, randomised(SHORT_HIGHWAY))
         for seed in (0, 1)
     ]
     monkeypatch.setattr(library, "sumo_version", lambda: "1.28.1")

@@ -4,8 +4,8 @@ from dptse_env.traffic import CORRIDORS, PAPER_HIGHWAY, DemandDistribution, rand
 
 
 def test_presets_are_found_by_their_names():
-    assert set(CORRIDORS) == {"paper-highway", "short-highway"}
-    assert all(corridor.name == name for name, corridor in CORRIDORS.items())
+    for name in ("paper-highway", "short-highway"):
+        assert CORRIDORS[name].name == name
 
 
 def test_the_papers_demand_and_incident():
