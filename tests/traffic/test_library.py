@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from dptse_env.traffic import (
+    PAPER_HIGHWAY,
     SHORT_HIGHWAY,
     Record,
     RecordingError,
