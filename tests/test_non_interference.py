@@ -194,7 +194,7 @@ def test_realised_exposures_in_info_would_show(monkeypatch):
     info = process.info
 
     def telling(episode):
-        exposures = process.release.contributions.of_episode(
+        exposures = process.release.contributions.exposures_of(
             episode, process.traffic_index[episode]
         )
         return info(episode) | {"mu": float(exposures.max(initial=0))}

@@ -9,7 +9,7 @@ import pytest
 from dptse_env.estimators import ESTIMATORS
 from dptse_env.registration import ENVIRONMENTS
 from dptse_env.spaces.actions import ACTION_ENCODINGS
-from dptse_env.utils.threads import SMALLEST
+from dptse_env.utils.threads import SMALLEST_BLOCK
 
 from .vectors import COUNTED, assert_same, lock_step, short
 
@@ -38,7 +38,7 @@ def test_autoreset_is_that_of_gymnasium(mode, truth_in_info):
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 def test_threads_change_nothing(estimator):
-    n = 3 * SMALLEST
+    n = 3 * SMALLEST_BLOCK
     one, two = (short(n, estimator=estimator, threads=threads) for threads in (1, 2))
     assert_same(one.reset(seed=5), two.reset(seed=5), tolerance=0)
     one.action_space.seed(1)
@@ -54,7 +54,7 @@ def test_threads_change_nothing(estimator):
 def test_compiled_estimators_work_on_so_many_threads(
     estimator, threads_given, n_names, monkeypatch
 ):
-    env = short(2 * SMALLEST, estimator=estimator, threads=threads_given)
+    env = short(2 * SMALLEST_BLOCK, estimator=estimator, threads=threads_given)
     env.reset(seed=0)
     names, predict = set(), env.process.estimator.predict
 

@@ -72,30 +72,18 @@ def normalised_bounds(model: ARZModel, bounds: Bounds) -> tuple[FloatArray, Floa
 
 
 class Window(NamedTuple):
-    """A window's linearised problem: L stages, S segments, normalised.
+    """A window's linearised problem: L stages, S segments, normalised."""
 
-    Attributes:
-        arrival: `(2 S,)` mean of the first state.
-        arrival_variance: `(2,)` its variances, of rho and of psi.
-        transitions: `(L - 1, 2 S, 2 S)` A of each step.
-        offsets: `(L - 1, 2 S)` B u + c_1 of each step.
-        process_variance: `(2,)`.
-        observed: `(L, S)`.
-        rows: `(L, S, 2)` derivatives of the second release, speed or flow, by the
-            segment's rho and psi.
-        targets: `(L, S, 2)` density, and the other less the linearisation's constant c_2.
-        noise: `(L, 2)` variances of both.
-    """
-
-    arrival: FloatArray
-    arrival_variance: FloatArray
-    transitions: FloatArray
-    offsets: FloatArray
-    process_variance: FloatArray
-    observed: BoolArray
+    arrival: FloatArray  # (2 S,) mean of the first state
+    arrival_variance: FloatArray  # (2,) its variances, of rho and of psi
+    transitions: FloatArray  # (L - 1, 2 S, 2 S) A of each step
+    offsets: FloatArray  # (L - 1, 2 S) B u + c_1 of each step
+    process_variance: FloatArray  # (2,)
+    observed: BoolArray  # (L, S)
+    # (L, S, 2) derivatives of the second release, speed or flow, by the segment's rho and psi
     rows: FloatArray
-    targets: FloatArray
-    noise: FloatArray
+    targets: FloatArray  # (L, S, 2) density, and the other less the linearisation's constant c_2
+    noise: FloatArray  # (L, 2) variances of both
 
 
 def assemble(window: Window) -> tuple[FloatArray, FloatArray]:

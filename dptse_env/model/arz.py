@@ -13,7 +13,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from dptse_env.model.jacobian import step_jacobian
-from dptse_env.model.layout import Layout, RoadNetwork, layout_of
+from dptse_env.model.layout import Layout, RoadNetwork, make_layout
 from dptse_env.model.parameters import LARGEST_W, SECONDS_PER_HOUR, ARZParameters
 from dptse_env.model.relations import VACUUM, Relations
 from dptse_env.utils.arrays import FloatArray
@@ -82,7 +82,7 @@ class ARZModel:
         self.network = network
         self.parameters = parameters
         self.time_step = time_step
-        self.layout: Layout = layout_of(network)
+        self.layout: Layout = make_layout(network)
         self.relations = Relations(parameters.free_flow_speed, parameters.gamma)
         self.n_segments = self.layout.n_segments
         self.n_states = 2 * self.n_segments

@@ -6,10 +6,10 @@ import numpy as np
 from numba import njit
 
 from dptse_env.model.arz import ARZModel
-from dptse_env.model.kernels import advance, scratch_of
+from dptse_env.model.kernels import advance, make_scratch
 from dptse_env.model.layout import RoadNetwork
 from dptse_env.model.parameters import ARZParameters
-from dptse_env.model.road_arrays import Road, road_of
+from dptse_env.model.road_arrays import RoadArrays, make_road_arrays
 from dptse_env.utils.arrays import FloatArray
 
 
@@ -29,7 +29,7 @@ class CompiledARZModel(ARZModel):
     ) -> None:
         """See `ARZModel`."""
         super().__init__(network, parameters, time_step, reference_speed)
-        self.road = road_of(self)
+        self.road = make_road_arrays(self)
 
     def step(self, states: FloatArray, inputs: FloatArray) -> FloatArray:
         """States `(n, 2 S)` one time step later."""
@@ -47,8 +47,10 @@ class CompiledARZModel(ARZModel):
 
 
 @njit(cache=True, error_model="numpy")
-def _step_batch(road: Road, states: FloatArray, inputs: FloatArray, after: FloatArray) -> None:
-    scratch = scratch_of(road)
+def _step_batch(
+    road: RoadArrays, states: FloatArray, inputs: FloatArray, after: FloatArray
+) -> None:
+    scratch = make_scratch(road)
     blocks = np.empty((*road.neighbours.shape, 4))
     for i in range(states.shape[0]):
         advance(road, states[i], inputs[i], after[i], blocks, scratch)
@@ -56,9 +58,9 @@ def _step_batch(road: Road, states: FloatArray, inputs: FloatArray, after: Float
 
 @njit(cache=True, error_model="numpy")
 def _jacobian_batch(
-    road: Road, states: FloatArray, inputs: FloatArray, jacobian: FloatArray
+    road: RoadArrays, states: FloatArray, inputs: FloatArray, jacobian: FloatArray
 ) -> None:
-    scratch = scratch_of(road)
+    scratch = make_scratch(road)
     blocks = np.empty((*road.neighbours.shape, 4))
     after = np.empty(states.shape[1])
     for i in range(states.shape[0]):

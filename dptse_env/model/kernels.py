@@ -7,7 +7,7 @@ Jacobian is a weighted sum of the outflows' gradients; which goes where is a tab
 numba caches compiled code by the file it stands in, not by what it calls: after a change here,
 delete the `*.nbi` files of the packages that call these kernels.
 
-Nothing here allocates: callers bring scratch space (`scratch_of`), so that a kernel can run
+Nothing here allocates: callers bring scratch space (`make_scratch`), so that a kernel can run
 inside another one, once a step and episode.
 """
 
@@ -19,7 +19,7 @@ import numpy as np
 from numba import njit
 
 from dptse_env.model.relations import STANDING, VACUUM
-from dptse_env.model.road_arrays import EXIT, LINK, MERGE, Road
+from dptse_env.model.road_arrays import EXIT, LINK, MERGE, RoadArrays
 from dptse_env.utils.arrays import FloatArray
 
 # Columns of the table of cells: values, then partial derivatives by the cell's own rho and psi.
@@ -29,21 +29,15 @@ Outflow = tuple[float, float, float, float, float, float, float]
 
 
 class Scratch(NamedTuple):
-    """Working space of `advance`.
+    """Working space of `advance`."""
 
-    Attributes:
-        cells: `(S, 9)` w, speed and demand of each cell and their derivatives.
-        outflow: `(S, 2)` q and phi out of each cell.
-        gradient: `(S, 3, 4)` derivatives of (q, phi) by each party's (rho, psi).
-    """
-
-    cells: FloatArray
-    outflow: FloatArray
-    gradient: FloatArray
+    cells: FloatArray  # (S, 9) w, speed and demand of each cell and their derivatives
+    outflow: FloatArray  # (S, 2) q and phi out of each cell
+    gradient: FloatArray  # (S, 3, 4) derivatives of (q, phi) by each party's (rho, psi)
 
 
 @njit(cache=True, error_model="numpy")
-def scratch_of(road: Road) -> Scratch:
+def make_scratch(road: RoadArrays) -> Scratch:
     """Allocate the working space for a road."""
     n = road.jam.size
     return Scratch(np.empty((n, 9)), np.empty((n, 2)), np.zeros((n, 3, 4)))
@@ -71,7 +65,7 @@ def supply(
 
 
 @njit(cache=True, error_model="numpy")
-def _tabulate(road: Road, state: FloatArray, cells: FloatArray) -> None:
+def _tabulate(road: RoadArrays, state: FloatArray, cells: FloatArray) -> None:
     """Fill the table of cells: w, speed, demand and their derivatives."""
     v_f, gamma = road.free_flow_speed, road.gamma
     for c in range(road.jam.size):
@@ -199,7 +193,11 @@ def _exit(
 
 @njit(cache=True, error_model="numpy")
 def _flows_out(
-    road: Road, cells: FloatArray, inputs: FloatArray, outflow: FloatArray, gradient: FloatArray
+    road: RoadArrays,
+    cells: FloatArray,
+    inputs: FloatArray,
+    outflow: FloatArray,
+    gradient: FloatArray,
 ) -> None:
     """Outflow of every cell and its gradient by the cell's parties."""
     v_f, gamma = road.free_flow_speed, road.gamma
@@ -226,7 +224,7 @@ def _flows_out(
 
 @njit(cache=True, error_model="numpy")
 def _sources(
-    road: Road, cells: FloatArray, inputs: FloatArray, after: FloatArray, blocks: FloatArray
+    road: RoadArrays, cells: FloatArray, inputs: FloatArray, after: FloatArray, blocks: FloatArray
 ) -> None:
     """Add what enters from outside; demand that is not served vanishes."""
     for c in range(road.jam.size):
@@ -248,7 +246,7 @@ def _sources(
 
 @njit(cache=True, error_model="numpy")
 def advance(
-    road: Road,
+    road: RoadArrays,
     state: FloatArray,
     inputs: FloatArray,
     after: FloatArray,
@@ -258,13 +256,13 @@ def advance(
     """Write the state one step later and the step's Jacobian.
 
     Args:
-        road: The `Road`.
+        road: The `RoadArrays`.
         state: `(2 S,)` state.
         inputs: `(n_u,)` inputs.
         after: `(2 S,)` where the next state goes; may be `state` itself.
         blocks: `(S, K, 4)` where the Jacobian goes: the derivatives of a cell's next (rho, psi)
             by a neighbour's (rho, psi), row by row; the slots are those of `road.neighbours`.
-        scratch: From `scratch_of`.
+        scratch: From `make_scratch`.
     """
     cells, outflow, gradient = scratch.cells, scratch.outflow, scratch.gradient
     v_f, ratio, relaxation = road.free_flow_speed, road.step_ratio, road.relaxation

@@ -122,7 +122,7 @@ class Layout:
         return np.asarray(inflow | outflow, dtype=np.bool_)
 
 
-def layout_of(network: RoadNetwork) -> Layout:
+def make_layout(network: RoadNetwork) -> Layout:
     """Derive the index arrays of a network.
 
     Raises:

@@ -12,55 +12,35 @@ from dptse_env.utils.arrays import FloatArray, IntArray
 LINK, MERGE, DIVERGE, EXIT = 0, 1, 2, 3
 
 
-class Road(NamedTuple):
-    """A model as arrays and numbers, in a form that compiled code takes (S segments).
+class RoadArrays(NamedTuple):
+    """A model as arrays and numbers, in a form that compiled code takes (S segments)."""
 
-    Attributes:
-        free_flow_speed: v_f [km/h].
-        gamma: Exponent of the pressure.
-        step_ratio: T / l [h/km].
-        relaxation: T / tau.
-        jam: `(S,)` jam densities [veh/km].
-        outside_jam: `(S,)` jam density behind an exit [veh/km]; unused elsewhere.
-        kind: `(S,)` LINK, MERGE, DIVERGE or EXIT: the face a cell flows out through.
-        parties: `(S, 3)` the cell, the cell it flows into, and the third one at a junction
-            (the other branch of a merge, the off-ramp of a diverge), -1 where there is none.
-        share: `(S,)` exit share of a diverge.
-        entry: `(S,)` input column of the demand from outside, -1 for an inner cell.
-        exit: `(S,)` input column of the density outside, -1 for an inner cell.
-        edges: `(E, 2)` cells (from, to) between which vehicles pass.
-        edge_share: `(E,)` share of the outflow that passes.
-        neighbours: `(S, K)` cells that a cell's next state depends on, itself first, -1 padded.
-        degree: `(S,)` how many neighbours there are.
-        terms: `(M, 4)` (row cell, slot of its neighbour, outflow's cell, its party).
-        term_weight: `(M,)` weight of the outflow's gradient in the Jacobian [h/km].
-        reference_speed: v_0 [km/h] of the centred flow that sensors release; NaN where they
-            release the speed.
-        second_scale: unit of the second number that sensors release [km/h or veh/h].
-    """
-
-    free_flow_speed: float
-    gamma: float
-    step_ratio: float
-    relaxation: float
-    jam: FloatArray
-    outside_jam: FloatArray
-    kind: IntArray
+    free_flow_speed: float  # v_f [km/h]
+    gamma: float  # Exponent of the pressure
+    step_ratio: float  # T / l [h/km]
+    relaxation: float  # T / tau
+    jam: FloatArray  # (S,) jam densities [veh/km]
+    outside_jam: FloatArray  # (S,) jam density behind an exit [veh/km]; unused elsewhere
+    kind: IntArray  # (S,) LINK, MERGE, DIVERGE or EXIT: the face a cell flows out through
+    # (S, 3) the cell, the cell it flows into, and the third one at a junction (the other
+    # branch of a merge, the off-ramp of a diverge), -1 where there is none
     parties: IntArray
-    share: FloatArray
-    entry: IntArray
-    exit: IntArray
-    edges: IntArray
-    edge_share: FloatArray
+    share: FloatArray  # (S,) exit share of a diverge
+    entry: IntArray  # (S,) input column of the demand from outside, -1 for an inner cell
+    exit: IntArray  # (S,) input column of the density outside, -1 for an inner cell
+    edges: IntArray  # (E, 2) cells (from, to) between which vehicles pass
+    edge_share: FloatArray  # (E,) share of the outflow that passes
+    # (S, K) cells that a cell's next state depends on, itself first, -1 padded
     neighbours: IntArray
-    degree: IntArray
-    terms: IntArray
-    term_weight: FloatArray
+    degree: IntArray  # (S,) how many neighbours there are
+    terms: IntArray  # (M, 4) (row cell, slot of its neighbour, outflow's cell, its party)
+    term_weight: FloatArray  # (M,) weight of the outflow's gradient in the Jacobian [h/km]
+    # v_0 [km/h] of the centred flow that sensors release; NaN where they release the speed
     reference_speed: float
-    second_scale: float
+    second_scale: float  # unit of the second number that sensors release [km/h or veh/h]
 
 
-def road_of(model: ARZModel) -> Road:
+def make_road_arrays(model: ARZModel) -> RoadArrays:
     """Put a model into the form that compiled code takes."""
     layout, n = model.layout, model.n_segments
     kind = np.full(n, EXIT, dtype=np.int64)
@@ -88,7 +68,7 @@ def road_of(model: ARZModel) -> Road:
     edge_share = layout.routing[ends, starts]
     neighbours, degree = _neighbours(model)
     terms, weights = _terms(parties, edges, edge_share, neighbours)
-    return Road(
+    return RoadArrays(
         free_flow_speed=float(model.parameters.free_flow_speed),
         gamma=float(model.parameters.gamma),
         step_ratio=float(model.step_ratio),

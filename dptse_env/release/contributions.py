@@ -80,7 +80,7 @@ class Contributions:
         """Begin new episodes, shape (k,): nobody has counted yet."""
         self.exposures[episodes] = 0
 
-    def of_episode(self, episode: int, slot: int) -> NDArray[np.int32]:
+    def exposures_of(self, episode: int, slot: int) -> NDArray[np.int32]:
         """Return how often each vehicle of a slot's record has counted, shape (its vehicles,).
 
         It depends on the records of other episodes neither in value nor in length.

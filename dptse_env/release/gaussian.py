@@ -275,7 +275,7 @@ class Capped(GaussianRelease):
         shape only.
         """
         counted = [
-            self.contributions.of_episode(episode, index)
+            self.contributions.exposures_of(episode, index)
             for episode, index in zip(episodes, traffic, strict=True)
         ]
         # A vehicle that has counted k times has spent what one of cap k has in all.

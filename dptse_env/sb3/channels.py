@@ -27,12 +27,12 @@ CENTRES = {
 
 Constants rather than running statistics: nothing can be lost between training and use."""
 
-MAINLINE = (
+MAINLINE_BLOCKS = (
     "density", "speed", "density_log_std", "speed_log_std", "density_innovation",
     "speed_innovation", "age", "queried",
 )  # fmt: skip
-RAMP = ("density", "speed", "density_log_std", "speed_log_std")
-FIXED = ("fixed_density_innovation", "fixed_speed_innovation")
+RAMP_BLOCKS = ("density", "speed", "density_log_std", "speed_log_std")
+FIXED_SENSOR_BLOCKS = ("fixed_density_innovation", "fixed_speed_innovation")
 
 
 @dataclass(frozen=True)
@@ -86,16 +86,19 @@ class RoadChannels:
         leaves = {first + k: face - 1 for k, face in enumerate(corridor.off_ramps)}
         channels = [
             _channel(name, starts, {i: i for i in range(n)}, n, "mainline")
-            for name in (*MAINLINE, *released)
+            for name in (*MAINLINE_BLOCKS, *released)
         ]
         fixed = {s: k for k, s in enumerate(corridor.fixed_sensors)}
         for kind, ramps in (("on-ramp", joins), ("off-ramp", leaves)):
             channels += [
-                _channel(name, starts, {at: s for s, at in ramps.items()}, n, kind) for name in RAMP
+                _channel(name, starts, {at: s for s, at in ramps.items()}, n, kind)
+                for name in RAMP_BLOCKS
             ]
             watched = {at: fixed[s] for s, at in ramps.items() if s in fixed}
             if watched:
-                channels += [_channel(name, starts, watched, n, kind) for name in FIXED]
+                channels += [
+                    _channel(name, starts, watched, n, kind) for name in FIXED_SENSOR_BLOCKS
+                ]
         marks = [joins.values(), leaves.values(), [s for s in fixed if s < n]]
         return cls(
             n_mainline=n,

@@ -15,7 +15,7 @@ from dptse_env.sb3.kinds import Kind
 from dptse_env.spaces.actions import ACTION_ENCODINGS
 from dptse_env.traffic import Corridor
 
-FORMAT = "dptse-policy-1"
+POLICY_FORMAT = "dptse-policy-1"
 """Of policy files; raise its number whenever saved weights would change their meaning."""
 
 
@@ -84,7 +84,7 @@ def make_fit(config: EnvConfig, kind: Kind) -> dict[str, Any]:
     encoding = make_interface(config).observations
     sizes = [f"{name}:{place.stop - place.start}" for name, place in encoding.slices.items()]
     fit: dict[str, Any] = {
-        "format": FORMAT,
+        "format": POLICY_FORMAT,
         "observation": " ".join(sizes),
         "action": ACTION_ENCODINGS.name_of(config.action),
         "corridor": config.corridor.digest,

@@ -30,7 +30,7 @@ from dptse_env.sb3.fit import TrainedOn, check_fit, make_fit
 from dptse_env.sb3.kinds import KINDS, Shapes
 from dptse_env.utils.arrays import Action, Observation
 
-TEXT = "CARD.md"
+CARD_TEXT = "CARD.md"
 """Entry of a policy file with the card for people."""
 
 
@@ -226,7 +226,7 @@ def _packed(card: Mapping[str, Any], policy: BasePolicy) -> bytes:
     with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, entry in (
             (CARD, json.dumps(card, indent=2) + "\n"),
-            (TEXT, _text(card)),
+            (CARD_TEXT, _text(card)),
             (WEIGHTS, weights.getvalue()),
         ):
             # A fixed date: the same policy gives the same file.

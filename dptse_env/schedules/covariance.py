@@ -8,7 +8,7 @@ from typing import ClassVar, Protocol, cast
 
 import numpy as np
 
-from dptse_env.model.road_arrays import road_of
+from dptse_env.model.road_arrays import make_road_arrays
 from dptse_env.process import QueryProcess
 from dptse_env.schedules import greedy_kernels as kernels
 from dptse_env.schedules.base import ProcessSchedule
@@ -103,7 +103,7 @@ class CovarianceSchedule(ProcessSchedule):
             )
         self.inflation = inflation
         self._estimator = cast(HasCovariance, process.estimator)
-        self._road = tuple(road_of(process.model))
+        self._road = tuple(make_road_arrays(process.model))
         self._problem = tuple(_problem(process, inflation))
         self._covariances: FloatArray = self._estimator.covariances
         self._after = self._covariances.copy()

@@ -16,81 +16,54 @@ from numba import njit
 from dptse_env.estimators.compiled.algebra import propagate
 from dptse_env.estimators.compiled.ekf_kernels import measured, project, released
 from dptse_env.model.kernels import advance
-from dptse_env.model.road_arrays import Road
+from dptse_env.model.road_arrays import RoadArrays
 from dptse_env.utils.arrays import FloatArray, IntArray
 
 
 class Problem(NamedTuple):
-    """Constants of a road and an estimator, in a form that compiled code takes.
+    """Constants of a road and an estimator, in a form that compiled code takes."""
 
-    Attributes:
-        n_mainline: n.
-        bandwidth: B.
-        always: Segments with a fixed sensor, shape (F,).
-        can_query: Mainline segments without one, shape (A,).
-        noise: Variances of both releases, normalised, shape (2,).
-        process_variance: What a step adds, shape (2,): to rho and psi, normalised, or in a random
-            walk to rho over rho_m and v over v_f.
-        is_walk: Whether the estimator is a random walk, whose segments stay as they are.
-        is_box: Whether means are held to the box instead of the cone.
-        density_scale: rho_m [veh/km].
-        units: Scales of the reward over rho_m and v_f, shape (2,).
-        term_weights: What density and speed weigh in the reward, shape (2,).
-        length: Length of a segment [km] where speeds weigh as probably as there is a vehicle; 0
-            where they weigh in full.
-        speed_cap: Deviation in the reward's units beyond which that of a speed does not count.
-    """
-
-    n_mainline: int
-    bandwidth: int
-    always: IntArray
-    can_query: IntArray
-    noise: FloatArray
+    n_mainline: int  # n
+    bandwidth: int  # B
+    always: IntArray  # Segments with a fixed sensor, shape (F,)
+    can_query: IntArray  # Mainline segments without one, shape (A,)
+    noise: FloatArray  # Variances of both releases, normalised, shape (2,)
+    # What a step adds, shape (2,): to rho and psi, normalised, or in a random walk to rho
+    # over rho_m and v over v_f
     process_variance: FloatArray
-    is_walk: bool
-    is_box: bool
-    density_scale: float
-    units: FloatArray
-    term_weights: FloatArray
+    is_walk: bool  # Whether the estimator is a random walk, whose segments stay as they are
+    is_box: bool  # Whether means are held to the box instead of the cone
+    density_scale: float  # rho_m [veh/km]
+    units: FloatArray  # Scales of the reward over rho_m and v_f, shape (2,)
+    term_weights: FloatArray  # What density and speed weigh in the reward, shape (2,)
+    # Length of a segment [km] where speeds weigh as probably as there is a vehicle; 0 where
+    # they weigh in full
     length: float
-    speed_cap: float
+    speed_cap: float  # Deviation in the reward's units beyond which that of a speed does not count
 
 
 class Work(NamedTuple):
-    """Scratch of one episode.
+    """Scratch of one episode."""
 
-    Attributes:
-        mean: Predicted state, shape (2 S,) [veh/km, veh/h].
-        blocks: The blocks of F, shape (S, K, 4).
-        covariance: Shape (2 S, 2 S).
-        product: Shape (2 S, 2 S).
-        transposed: Shape (2 S, 2 S).
-        rows: Derivatives of the second release by the segment's rho and psi, shape (S, 2).
-        traffic: Covariance of density and speed over the mainline, shape (2 n, 2 n).
-        weights: What their variances weigh, shape (2 n,).
-        to_speed: Derivatives of a speed by rho and psi, in the reward's units, shape (S, 2).
-        traffic_rows: Derivatives of both releases by density and speed in the reward's units: the
-            first by density, the second by either, shape (n, 3).
-        vectors: Shape (2, 2 S).
-        sums: Each segment's share of a trace, then whether it is queried, shape (2, n).
-    """
-
-    mean: FloatArray
-    blocks: FloatArray
-    covariance: FloatArray
-    product: FloatArray
-    transposed: FloatArray
-    rows: FloatArray
-    traffic: FloatArray
-    weights: FloatArray
+    mean: FloatArray  # Predicted state, shape (2 S,) [veh/km, veh/h]
+    blocks: FloatArray  # The blocks of F, shape (S, K, 4)
+    covariance: FloatArray  # Shape (2 S, 2 S)
+    product: FloatArray  # Shape (2 S, 2 S)
+    transposed: FloatArray  # Shape (2 S, 2 S)
+    rows: FloatArray  # Derivatives of the second release by the segment's rho and psi, shape (S, 2)
+    traffic: FloatArray  # Covariance of density and speed over the mainline, shape (2 n, 2 n)
+    weights: FloatArray  # What their variances weigh, shape (2 n,)
+    # Derivatives of a speed by rho and psi, in the reward's units, shape (S, 2)
     to_speed: FloatArray
+    # Derivatives of both releases by density and speed in the reward's units: the first by
+    # density, the second by either, shape (n, 3)
     traffic_rows: FloatArray
-    vectors: FloatArray
-    sums: FloatArray
+    vectors: FloatArray  # Shape (2, 2 S)
+    sums: FloatArray  # Each segment's share of a trace, then whether it is queried, shape (2, n)
 
 
 @njit(cache=True, error_model="numpy")
-def work_of(road: Road, problem: Problem) -> Work:
+def make_work(road: RoadArrays, problem: Problem) -> Work:
     """Allocate the scratch."""
     s, n = road.jam.size, problem.n_mainline
     square = np.empty((3, 2 * s, 2 * s))
@@ -103,7 +76,7 @@ def work_of(road: Road, problem: Problem) -> Work:
 
 @njit(cache=True, error_model="numpy")
 def look_ahead(
-    road: Road,
+    road: RoadArrays,
     problem: Problem,
     mean: FloatArray,
     covariance: FloatArray,
@@ -128,7 +101,7 @@ def look_ahead(
 
 
 @njit(cache=True, error_model="numpy")
-def step(road: Road, problem: Problem, covariance: FloatArray, work: Work) -> None:
+def step(road: RoadArrays, problem: Problem, covariance: FloatArray, work: Work) -> None:
     """Replace a covariance by the next second's, F staying as it is."""
     if problem.is_walk:
         drift(problem, covariance, work)
@@ -151,7 +124,7 @@ def drift(problem: Problem, covariance: FloatArray, work: Work) -> None:
 
 
 @njit(cache=True, error_model="numpy")
-def _linearise(road: Road, problem: Problem, work: Work) -> None:
+def _linearise(road: RoadArrays, problem: Problem, work: Work) -> None:
     """Linearise releases and reward at the mean, and weigh the reward's terms."""
     v_f, scale, n = road.free_flow_speed, problem.density_scale, problem.n_mainline
     d_unit, v_unit = problem.units

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from dptse_env.model.kernels import scratch_of
-from dptse_env.model.road_arrays import Road
+from dptse_env.model.kernels import make_scratch
+from dptse_env.model.road_arrays import RoadArrays
 from dptse_env.schedules.covariance_kernels import (
     Problem,
     Work,
@@ -19,9 +19,9 @@ from dptse_env.schedules.covariance_kernels import (
     downdate,
     hold_speeds,
     look_ahead,
+    make_work,
     step,
     to_traffic,
-    work_of,
 )
 from dptse_env.utils.arrays import BoolArray, FloatArray
 
@@ -44,7 +44,7 @@ def choose_greedily(
     """Pick segments one after the other, for k episodes.
 
     Args:
-        road_: The `Road`.
+        road_: The `RoadArrays`.
         problem_: The `Problem`.
         criterion: TRACE or LOGDET.
         keeps: Whether `covariances` gets what the coming step leaves of them.
@@ -53,9 +53,9 @@ def choose_greedily(
         inputs: The model's inputs of the coming step, shape (k, n_u).
         queried: Where the sets go, shape (k, n_mainline).
     """
-    road, problem = Road(*road_), Problem(*problem_)
-    work = work_of(road, problem)
-    scratch = scratch_of(road)
+    road, problem = RoadArrays(*road_), Problem(*problem_)
+    work = make_work(road, problem)
+    scratch = make_scratch(road)
     for k in range(means.shape[0]):
         look_ahead(road, problem, means[k], covariances[k], inputs[k], work, scratch)
         condition(problem, problem.always, work.covariance, work)
@@ -163,9 +163,9 @@ def choose_by_swaps(
     Arguments are those of `choose_greedily`, and the steps to reckon with, the coming one included.
     `covariances` always gets what the coming step leaves of them.
     """
-    road, problem = Road(*road_), Problem(*problem_)
-    work, after = work_of(road, problem), np.empty(covariances.shape[1:])
-    scratch, ahead, best = scratch_of(road), np.empty_like(after), np.empty_like(after)
+    road, problem = RoadArrays(*road_), Problem(*problem_)
+    work, after = make_work(road, problem), np.empty(covariances.shape[1:])
+    scratch, ahead, best = make_scratch(road), np.empty_like(after), np.empty_like(after)
     for k in range(means.shape[0]):
         look_ahead(road, problem, means[k], covariances[k], inputs[k], work, scratch)
         condition(problem, problem.always, work.covariance, work)
@@ -193,7 +193,7 @@ def choose_by_swaps(
 
 @njit(cache=True, error_model="numpy")
 def _roll_out(
-    road: Road,
+    road: RoadArrays,
     problem: Problem,
     horizon: int,
     queried: BoolArray,

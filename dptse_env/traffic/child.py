@@ -28,7 +28,9 @@ def main() -> None:
                 failure = str(error)
             except Exception as error:
                 # Reported to the parent, which raises it; this child can serve the next task.
-                failure = str(RecordingError.of(corridor, seed, f"{type(error).__name__}: {error}"))
+                failure = str(
+                    RecordingError.from_cause(corridor, seed, f"{type(error).__name__}: {error}")
+                )
             print(json.dumps({"failure": failure}), file=answers, flush=True)
 
 

@@ -25,7 +25,7 @@ import platformdirs
 from tqdm import tqdm
 
 from dptse_env.traffic.corridor import Corridor
-from dptse_env.traffic.record import VERSION, InvalidRecordError, Record
+from dptse_env.traffic.record import RECORD_VERSION, InvalidRecordError, Record
 from dptse_env.traffic.sumo import (
     RecordingError,
     SumoVersionError,
@@ -152,7 +152,7 @@ class RecordLibrary:
 
     def record_path(self, corridor: Corridor, seed: int) -> Path:
         """Return the directory that holds a record, or will."""
-        folder = f"records-v{VERSION}-sumo-{sumo_version()}"
+        folder = f"records-v{RECORD_VERSION}-sumo-{sumo_version()}"
         return self.path / folder / corridor.digest[:32] / f"{seed:08d}"
 
     def _load_or_record(self, corridor: Corridor, seed: int) -> Record:
@@ -168,7 +168,7 @@ class RecordLibrary:
         try:
             return Record.load(path, source)
         except (OSError, InvalidRecordError) as error:
-            raise RecordingError.of(corridor, seed, str(error)) from error
+            raise RecordingError.from_cause(corridor, seed, str(error)) from error
 
     def _record(
         self, corridor: Corridor, seeds: list[int], n_workers: int = 1, progress: bool = False
@@ -178,7 +178,7 @@ class RecordLibrary:
         try:
             _prepare(folder)
         except OSError as error:
-            raise RecordingError.of(corridor, seeds[0], str(error)) from error
+            raise RecordingError.from_cause(corridor, seeds[0], str(error)) from error
         in_children = n_workers > 1 or simulation_is_loaded()
         logger.info(
             "%s: recording %d traffic seed(s) in %s into %s",
@@ -197,7 +197,7 @@ class RecordLibrary:
                         self.record_path(corridor, seed), _source(corridor, seed)
                     )
                 except OSError as error:
-                    raise RecordingError.of(corridor, seed, str(error)) from error
+                    raise RecordingError.from_cause(corridor, seed, str(error)) from error
                 bar.update()
 
     def _record_in_children(

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from dptse_env.utils.validation import integer, require
 
-FORMAT = "dptse-record"
-VERSION = 1
+RECORD_FORMAT = "dptse-record"
+RECORD_VERSION = 1
 """Raise it whenever a recording changes in content or layout: older records are then made again."""
 
 COLUMNS: dict[str, np.dtype[Any]] = {
@@ -179,8 +179,8 @@ class Record:
                     np.save(file, getattr(self, name), allow_pickle=False)
                     _sync(file.fileno())
             header = {
-                "format": FORMAT,
-                "version": VERSION,
+                "format": RECORD_FORMAT,
+                "version": RECORD_VERSION,
                 "n_steps": self.n_steps,
                 "n_columns": self.n_columns,
                 "source": dict(source),
@@ -213,8 +213,8 @@ class Record:
             manifest = json.loads((path / MANIFEST).read_text(encoding="utf-8"))
             checksum = manifest.pop("sha256")
             for key, expected in (
-                ("format", FORMAT),
-                ("version", VERSION),
+                ("format", RECORD_FORMAT),
+                ("version", RECORD_VERSION),
                 ("source", dict(source)),
             ):
                 if manifest[key] != expected:

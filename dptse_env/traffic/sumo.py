@@ -132,7 +132,7 @@ def running(corridor: Corridor, scenario: Scenario) -> Iterator[ModuleType]:
     with _one_at_a_time, tempfile.TemporaryDirectory(prefix="dptse-sumo-") as directory:
         if simulation_is_loaded():
             cause = "libsumo holds another simulation in this process"
-            raise RecordingError.of(corridor, scenario.seed, cause)
+            raise RecordingError.from_cause(corridor, scenario.seed, cause)
         libsumo = _import_libsumo()
         folder = Path(directory)
         messages = folder / "messages.txt"
@@ -143,7 +143,7 @@ def running(corridor: Corridor, scenario: Scenario) -> Iterator[ModuleType]:
         except Exception as error:
             said = messages.read_text(encoding="utf-8", errors="replace").strip()
             cause = f"{type(error).__name__}: {error}" + (f"\n{said}" if said else "")
-            raise RecordingError.of(corridor, scenario.seed, cause) from error
+            raise RecordingError.from_cause(corridor, scenario.seed, cause) from error
         finally:
             if libsumo.isLoaded():
                 libsumo.close()

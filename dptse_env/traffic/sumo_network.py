@@ -76,9 +76,9 @@ def network_xml(corridor: Corridor) -> str:
     Raises:
         NetworkError: if the geometry is no preset's and netconvert is missing or fails.
     """
-    geometry = Geometry.of(corridor)
+    geometry = Geometry.from_corridor(corridor)
     for preset in SHIPPED_CORRIDORS:
-        if Geometry.of(preset) == geometry:
+        if Geometry.from_corridor(preset) == geometry:
             return packaged_network(preset.name)
     return compile_network(geometry)
 

@@ -82,7 +82,7 @@ class Worker:
         except BrokenPipeError:
             answer = b""
         if not answer.endswith(b"\n"):  # the child died before, or while, it answered
-            raise WorkerDiedError.of(corridor, seed, self._last_words())
+            raise WorkerDiedError.from_cause(corridor, seed, self._last_words())
         failure = json.loads(answer)["failure"]
         if failure is not None:
             raise RecordingError(failure)

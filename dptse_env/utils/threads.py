@@ -13,7 +13,7 @@ from itertools import pairwise
 
 from dptse_env.utils.validation import integer
 
-SMALLEST = 16
+SMALLEST_BLOCK = 16
 """Smallest block of episodes that is worth a thread: handing one over takes some 50 us."""
 
 BLOCKS_PER_THREAD = 4
@@ -48,12 +48,12 @@ class EpisodeThreads:
 
         An exception in any of them is raised here, once all have stopped.
         """
-        n_threads = max(min(self.threads, n_rows // SMALLEST), 1)
+        n_threads = max(min(self.threads, n_rows // SMALLEST_BLOCK), 1)
         if n_threads == 1:
             work(slice(0, n_rows))
             return
         # More blocks than threads: one whose core is busy elsewhere then takes fewer of them.
-        n_blocks = min(BLOCKS_PER_THREAD * n_threads, n_rows // SMALLEST)
+        n_blocks = min(BLOCKS_PER_THREAD * n_threads, n_rows // SMALLEST_BLOCK)
         ends = [n_rows * k // n_blocks for k in range(n_blocks + 1)]
         blocks = iter([slice(*pair) for pair in pairwise(ends)])
 

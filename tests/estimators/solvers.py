@@ -4,7 +4,7 @@ import numpy as np
 import qpsolvers
 
 from dptse_env.estimators.compiled.ekf_kernels import Filters
-from dptse_env.estimators.compiled.mhe_kernels import Horizons, update
+from dptse_env.estimators.compiled.mhe_kernels import Windows, update
 
 
 def lying(problem, **_):
@@ -24,11 +24,11 @@ def missing(problem, **_):
     raise qpsolvers.SolverNotFound("no such solver")
 
 
-def unsolved(road, filters, horizons, *given):
+def unsolved(road, filters, windows, *given):
     """The update's kernel with its solution taken away."""
-    mine = Horizons(*horizons)
+    mine = Windows(*windows)
     kept = [(array, array.copy()) for array in (Filters(*filters).means, mine.solution, mine.side)]
-    update(road, filters, horizons, *given)
+    update(road, filters, windows, *given)
     for array, before in kept:
         array[:] = before
     mine.unsolved[:] = True

@@ -7,7 +7,7 @@ from dptse_env.estimators import EstimatorSettings
 from dptse_env.estimators.compiled.ekf_kernels import released
 from dptse_env.estimators.open_loop import estimated_traffic
 from dptse_env.model.relations import VACUUM
-from dptse_env.model.road_arrays import road_of
+from dptse_env.model.road_arrays import make_road_arrays
 
 from .episodes import RELEASES, model_of, scale_of, simulate, started
 
@@ -41,7 +41,7 @@ def test_a_release_and_its_derivatives_are_the_models(parameters, release):
     density[rng.random(shape) < 0.1] = 0.0
     states = model.states(density, rng.uniform(0.0, 1.1, shape) * model.speed_scale)
     states -= 0.01 * scale_of(model) * (rng.random(states.shape) < 0.1)  # some negative
-    road = road_of(model)
+    road = make_road_arrays(model)
     found = np.array(
         [
             [released(road, s, *pair) for s, pair in enumerate(state.reshape(-1, 2))]

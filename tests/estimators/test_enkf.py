@@ -94,7 +94,7 @@ def test_a_member_that_is_not_finite_is_found_and_its_episode_drawn_anew(backend
         run(each, episodes, range(10))
         each.predict(episodes.everyone, episodes.inputs[10])
     if backend == "compiled":
-        filters._ensembles.swarms[1, 4, 3] = np.nan
+        filters._ensembles.members[1, 4, 3] = np.nan
     else:
         filters.members[1, 3, 4] = np.nan
     observed = episodes.observed[10] & measured
@@ -166,7 +166,7 @@ def test_what_is_measured_does_not_change_how_members_are_disturbed(backend):
     assert not np.array_equal(seeing.members, blind.members)
     for filters in (seeing, blind):  # from the same members
         if backend == "compiled":
-            filters._ensembles.swarms[:] = episodes.start[:, :, None]
+            filters._ensembles.members[:] = episodes.start[:, :, None]
         else:
             filters.members[:] = episodes.start[:, None]
         filters.predict(episodes.everyone, episodes.inputs[11])

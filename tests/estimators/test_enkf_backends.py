@@ -11,7 +11,7 @@ from dptse_env.estimators import (
     EstimatorSettings,
     make_estimator,
 )
-from dptse_env.estimators.compiled.normals import bits_for, fill
+from dptse_env.estimators.compiled.normals import fill, make_bits
 
 from .episodes import RELEASES, SIGMA, random_streams, run, scale_of, simulate, started
 
@@ -30,7 +30,7 @@ class Replay:
 
     def standard_normal(self, shape):
         out = np.empty(shape[0] * shape[1], dtype=np.float32)
-        fill(self.stream, out, bits_for(out.size))
+        fill(self.stream, out, make_bits(out.size))
         return out.reshape(shape[1], shape[0]).T.astype(float)
 
 

@@ -40,7 +40,7 @@ def agree(episodes, steps, tolerance=1e-9, **horizon):
             compiled.innovations, reference.innovations, rtol=0, atol=1e3 * tolerance
         )
         assert not np.any(compiled.fallback | reference.fallback)
-        held.append(int((compiled._horizons.side != 0).sum()))
+        held.append(int((compiled._windows.side != 0).sum()))
     a, b = compiled.estimate(), reference.estimate()
     for field in ("density", "speed", "density_std", "speed_std"):
         np.testing.assert_allclose(getattr(a, field), getattr(b, field), rtol=1e-5, atol=1e-5)
@@ -84,7 +84,7 @@ def test_the_minimum_is_another_solvers(release):
     mhe = bounded_window(release=release)
     H, q = assemble(mhe.window(0))
     lower, upper = (np.tile(b, 11) for b in normalised_bounds(mhe.model, "box"))
-    z = mhe._horizons.solution[0, :, :38].ravel()
+    z = mhe._windows.solution[0, :, :38].ravel()
     factor = np.linalg.cholesky(H).T
     other = lsq_linear(factor, np.linalg.solve(factor.T, -q / 2), (lower, upper + 1e-15), "bvls")
     np.testing.assert_allclose(z, other.x, atol=1e-9)
@@ -159,7 +159,7 @@ def test_what_is_measured_later_changes_a_state_but_not_the_arrival():
     episodes = simulate(n_steps=20)
     mhe = mhe_of("reference", episodes)
     run(mhe, episodes, range(20))
-    oldest = mhe._horizons[0].stages[0]
+    oldest = mhe._windows[0].stages[0]
     assert np.abs(oldest.solution - oldest.predicted).max() > 1e-3
     np.testing.assert_array_equal(mhe.window(0).arrival, oldest.predicted)
 

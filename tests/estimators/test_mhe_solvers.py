@@ -70,7 +70,7 @@ def test_what_the_active_set_leaves_goes_to_the_other_solver(monkeypatch):
     assert helped.n_passed_on == 1
     assert not helped.fallback.any()
     np.testing.assert_allclose(helped.states, alone.states, rtol=1e-9, atol=1e-6)
-    np.testing.assert_array_equal(helped._horizons.side, alone._horizons.side)
+    np.testing.assert_array_equal(helped._windows.side, alone._windows.side)
 
 
 def random_program(n=30):

@@ -4,28 +4,37 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from dptse_env.estimators.compiled.normals import LANES, _draw_bits, bits_for, fill, stream_of
+from dptse_env.estimators.compiled.normals import (
+    STREAM_WIDTH,
+    _draw_bits,
+    fill,
+    make_bits,
+    make_stream,
+)
 
 
 def drawn(n, seed=0):
-    stream, out = stream_of(np.random.default_rng(seed)), np.empty(n, dtype=np.float32)
-    fill(stream, out, bits_for(n))
+    stream, out = make_stream(np.random.default_rng(seed)), np.empty(n, dtype=np.float32)
+    fill(stream, out, make_bits(n))
     return out.astype(float)
 
 
 def test_bits_are_those_of_xoshiro256_plus_plus():
     """Against the recurrence in Python's integers, lane by lane."""
-    stream = stream_of(np.random.default_rng(0))
-    states, out = stream.T.tolist(), np.empty(3 * LANES, dtype=np.uint64)
+    stream = make_stream(np.random.default_rng(0))
+    states, out = stream.T.tolist(), np.empty(3 * STREAM_WIDTH, dtype=np.uint64)
     _draw_bits(stream, out)
 
     def rotated(x, k):
         return ((x << k) | (x >> (64 - k))) % 2**64
 
-    for lane in (0, 7, LANES - 1):
+    for lane in (0, 7, STREAM_WIDTH - 1):
         s = states[lane]
         for block in range(3):
-            assert out[block * LANES + lane] == (rotated((s[0] + s[3]) % 2**64, 23) + s[0]) % 2**64
+            assert (
+                out[block * STREAM_WIDTH + lane]
+                == (rotated((s[0] + s[3]) % 2**64, 23) + s[0]) % 2**64
+            )
             t = (s[1] << 17) % 2**64
             s[2] ^= s[0]
             s[3] ^= s[1]
@@ -54,7 +63,7 @@ def test_pairs_and_neighbours_are_independent():
     for a, b in (
         (first, second),
         (x[:-1], x[1:]),
-        (x[:-LANES], x[LANES:]),
+        (x[:-STREAM_WIDTH], x[STREAM_WIDTH:]),
     ):
         for g in (np.asarray, np.abs, np.square):
             assert abs(np.corrcoef(g(a), g(b))[0, 1]) < 4.5 / np.sqrt(a.size)
@@ -64,21 +73,21 @@ def test_seeds_decide_and_streams_differ():
     np.testing.assert_array_equal(drawn(3800), drawn(3800))
     assert abs(np.corrcoef(drawn(200_000), drawn(200_000, seed=1))[0, 1]) < 0.01
     generator = np.random.default_rng(0)
-    first, second = stream_of(generator), stream_of(generator)
+    first, second = make_stream(generator), make_stream(generator)
     assert not (first == second).any()
 
 
 def test_a_stream_goes_on_where_it_stopped():
-    stream = stream_of(np.random.default_rng(0))
+    stream = make_stream(np.random.default_rng(0))
     chunks = np.empty((4, 100), dtype=np.float32)
     for chunk in chunks:
-        fill(stream, chunk, bits_for(100))
+        fill(stream, chunk, make_bits(100))
     assert len(np.unique(chunks)) == chunks.size
 
 
 @pytest.mark.parametrize("n", [2, 62, 64, 66, 2800, 3800])
 def test_any_even_length_is_filled_and_no_more(n):
-    stream, out = stream_of(np.random.default_rng(0)), np.full(n + 8, np.nan, dtype=np.float32)
-    fill(stream, out[:n], bits_for(n))
+    stream, out = make_stream(np.random.default_rng(0)), np.full(n + 8, np.nan, dtype=np.float32)
+    fill(stream, out[:n], make_bits(n))
     assert np.isfinite(out[:n]).all()
     assert np.isnan(out[n:]).all()

@@ -5,8 +5,8 @@ from hypothesis import strategies as st
 
 from dptse_env.model.arz import ARZModel
 from dptse_env.model.compiled import CompiledARZModel
-from dptse_env.model.kernels import advance, scratch_of
-from dptse_env.model.road_arrays import road_of
+from dptse_env.model.kernels import advance, make_scratch
+from dptse_env.model.road_arrays import make_road_arrays
 
 from .roads import HIGHWAY, NO_RELAXATION, PAPER, STRAIGHT, W99, Road, random_inputs, random_states
 
@@ -80,14 +80,14 @@ def test_kernel_may_overwrite_its_state():
     expected = model.step(states, inputs)[0]
     state = states[0].copy()
     blocks = np.empty((*model.road.neighbours.shape, 4))
-    advance(model.road, state, inputs[0], state, blocks, scratch_of(model.road))
+    advance(model.road, state, inputs[0], state, blocks, make_scratch(model.road))
     np.testing.assert_array_equal(state, expected)
 
 
 def test_a_road_says_what_sensors_release():
     for model_type in (ARZModel, CompiledARZModel):
         speed, flow = model_type(HIGHWAY, W99), model_type(HIGHWAY, W99, reference_speed=40.0)
-        assert np.isnan(road_of(speed).reference_speed)
-        assert road_of(flow).reference_speed == 40.0
-        assert road_of(speed).second_scale == W99.free_flow_speed
-        assert road_of(flow).second_scale == W99.jam_density * W99.free_flow_speed
+        assert np.isnan(make_road_arrays(speed).reference_speed)
+        assert make_road_arrays(flow).reference_speed == 40.0
+        assert make_road_arrays(speed).second_scale == W99.free_flow_speed
+        assert make_road_arrays(flow).second_scale == W99.jam_density * W99.free_flow_speed

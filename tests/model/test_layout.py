@@ -3,13 +3,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from dptse_env.model.layout import layout_of
+from dptse_env.model.layout import make_layout
 
 from .roads import HIGHWAY, Road
 
 
 def test_paper_highway_has_the_orders_of_state_and_input():
-    layout = layout_of(HIGHWAY)
+    layout = make_layout(HIGHWAY)
     assert layout.n_segments == 19
     assert layout.n_inputs == 9
     assert layout.n_boundaries == 6
@@ -24,7 +24,7 @@ def test_paper_highway_has_the_orders_of_state_and_input():
 
 
 def test_every_cell_flows_somewhere_exactly_once():
-    layout = layout_of(HIGHWAY)
+    layout = make_layout(HIGHWAY)
     leaving = layout.routing.sum(axis=0)
     expected = np.ones(19)
     expected[layout.exits] = 0.0
@@ -32,7 +32,7 @@ def test_every_cell_flows_somewhere_exactly_once():
 
 
 def test_a_row_depends_on_four_cells_at_most_on_the_paper_highway():
-    assert layout_of(HIGHWAY).sparsity().sum(axis=1).max() == 4
+    assert make_layout(HIGHWAY).sparsity().sum(axis=1).max() == 4
 
 
 @pytest.mark.parametrize(
@@ -50,7 +50,7 @@ def test_a_row_depends_on_four_cells_at_most_on_the_paper_highway():
 )
 def test_impossible_geometry_is_named(changes, message):
     with pytest.raises(ValueError, match=message):
-        layout_of(replace(HIGHWAY, **changes))
+        make_layout(replace(HIGHWAY, **changes))
 
 
 def test_lanes_must_be_given_for_every_segment():
@@ -59,4 +59,4 @@ def test_lanes_must_be_given_for_every_segment():
         segment_lanes: tuple[int, ...] = (3,)
 
     with pytest.raises(ValueError, match=r"network\.segment_lanes must have 15 entries, got 1"):
-        layout_of(Short())
+        make_layout(Short())

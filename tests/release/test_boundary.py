@@ -187,6 +187,6 @@ def test_appearances_on_boundary_segments_are_charged(boundary):
     expected = np.zeros(record.n_vehicles, dtype=int)
     for vehicle, segment in zip(record.vehicle[rows], record.segment[rows], strict=True):
         expected[vehicle] += segment in observed
-    exposures = playing.release.contributions.of_episode(0, 1)
+    exposures = playing.release.contributions.exposures_of(0, 1)
     np.testing.assert_array_equal(exposures, np.minimum(expected, 5))
     assert (expected > 5).any()

@@ -59,7 +59,7 @@ def test_counts_of_a_batch_are_those_by_hand(some, masks, cap, n_columns):
             np.testing.assert_array_equal(counts[k], expected[k][0][t - 1][0])
             np.testing.assert_allclose(speeds[k], expected[k][0][t - 1][1], rtol=1e-12)
     for k, episode in enumerate(episodes):
-        exposures = contributions.of_episode(episode, slots[k])
+        exposures = contributions.exposures_of(episode, slots[k])
         assert exposures.shape == (some[slots[k]].n_vehicles,)
         assert {v: n for v, n in enumerate(exposures) if n} == expected[k][1]
     assert not contributions.exposures[1].any()
@@ -116,11 +116,11 @@ def test_a_wider_record_loaded_later_keeps_what_was_counted():
     contributions.load(1, standing(40))
     assert contributions.exposures.shape == (1, 40)
     assert contributions.exposures.sum() == 2
-    assert contributions.of_episode(0, 0).tolist() == [1, 1]
+    assert contributions.exposures_of(0, 0).tolist() == [1, 1]
 
 
 @pytest.mark.parametrize("cap", [None, 2])
 def test_what_is_returned_is_not_the_account_itself(cap):
     contributions = loaded([standing(2)], 1, cap)
-    contributions.of_episode(0, 0)[:] = 99
+    contributions.exposures_of(0, 0)[:] = 99
     assert not contributions.exposures.any()

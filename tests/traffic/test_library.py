@@ -90,7 +90,7 @@ def test_what_shapes_a_record_is_in_its_path(tmp_path, monkeypatch):
     ]
     monkeypatch.setattr(library, "sumo_version", lambda: "1.28.1")
     paths.append(records.record_path(SHORT_HIGHWAY, 0))
-    monkeypatch.setattr(library, "VERSION", 99)
+    monkeypatch.setattr(library, "RECORD_VERSION", 99)
     paths.append(records.record_path(SHORT_HIGHWAY, 0))
     assert len(set(paths)) == len(paths)
 

@@ -152,7 +152,7 @@ def test_what_sumo_reports_is_not_tried_again(tmp_path, monkeypatch, caplog):
 
     def refused(self, corridor, seed, path, source):
         tasks.append(seed)
-        raise RecordingError.of(corridor, seed, "no valid route")
+        raise RecordingError.from_cause(corridor, seed, "no valid route")
 
     monkeypatch.setattr(Worker, "record", refused)
     with pytest.raises(RecordingError, match="no valid route"):

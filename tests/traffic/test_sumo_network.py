@@ -48,7 +48,7 @@ def test_merges_are_zippers(name):
 @needs_netconvert
 @pytest.mark.parametrize("name", CORRIDORS)
 def test_packaged_networks_are_what_netconvert_makes_of_the_presets(name):
-    assert compile_network(Geometry.of(CORRIDORS[name])) == packaged_network(name)
+    assert compile_network(Geometry.from_corridor(CORRIDORS[name])) == packaged_network(name)
 
 
 def test_a_preset_is_not_compiled(monkeypatch):
@@ -78,7 +78,7 @@ def test_a_geometry_of_ones_own_is_compiled_and_drives():
 
 @needs_netconvert
 def test_netconverts_own_words_are_in_the_error():
-    geometry = Geometry.of(PAPER_HIGHWAY)._replace(ramp_lanes=0)
+    geometry = Geometry.from_corridor(PAPER_HIGHWAY)._replace(ramp_lanes=0)
     with pytest.raises(NetworkError, match=r"netconvert refused.*\n.*Error"):
         compile_network(geometry)
 
@@ -91,4 +91,4 @@ def test_a_missing_netconvert_names_the_extra(monkeypatch):
 
     monkeypatch.setattr(importlib.util, "find_spec", without_sumo)
     with pytest.raises(NetworkError, match=r"pip install 'dptse-env\[corridors\]'"):
-        compile_network(Geometry.of(PAPER_HIGHWAY)._replace(n_mainline=21))
+        compile_network(Geometry.from_corridor(PAPER_HIGHWAY)._replace(n_mainline=21))

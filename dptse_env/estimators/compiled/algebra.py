@@ -10,19 +10,19 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from dptse_env.model.road_arrays import Road
+from dptse_env.model.road_arrays import RoadArrays
 from dptse_env.utils.arrays import FloatArray
 
-LANE = 8
+VECTOR_WIDTH = 8
 
 
 def padded(n: int) -> int:
     """Length of a padded row of n numbers."""
-    return -(-n // LANE) * LANE
+    return -(-n // VECTOR_WIDTH) * VECTOR_WIDTH
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _multiply(road: Road, blocks: FloatArray, right: FloatArray, out: FloatArray) -> None:
+def _multiply(road: RoadArrays, blocks: FloatArray, right: FloatArray, out: FloatArray) -> None:
     """Write F right to `out`, F being given by its 2x2 blocks."""
     width = right.shape[1]
     for c in range(road.jam.size):
@@ -46,7 +46,7 @@ def _multiply(road: Road, blocks: FloatArray, right: FloatArray, out: FloatArray
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def propagate(
-    road: Road,
+    road: RoadArrays,
     blocks: FloatArray,
     noise: FloatArray,
     covariance: FloatArray,
@@ -148,7 +148,7 @@ def segment_update(
     for i in range(n):
         x1, y1, x2, y2 = k1[i], rest1[i], k2[i], rest2[i]
         # Up to the diagonal, in whole registers.
-        for j in range((i // LANE + 1) * LANE):
+        for j in range((i // VECTOR_WIDTH + 1) * VECTOR_WIDTH):
             covariance[i, j] -= x1 * c1[j] + y1 * k1[j] + (x2 * c2[j] + y2 * k2[j])
     return True
 

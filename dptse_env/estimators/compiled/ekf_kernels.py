@@ -19,48 +19,36 @@ from dptse_env.estimators.compiled.algebra import (
     segment_update,
 )
 from dptse_env.model.arz import LEAST_DENSITY, LEAST_W, MEASUREMENT_FLOOR
-from dptse_env.model.kernels import advance, pressure, scratch_of
+from dptse_env.model.kernels import advance, make_scratch, pressure
 from dptse_env.model.parameters import LARGEST_W
 from dptse_env.model.relations import VACUUM
-from dptse_env.model.road_arrays import Road
+from dptse_env.model.road_arrays import RoadArrays
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 
-# A `Road` or `Filters` as a plain tuple: calling compiled code from Python with a named one costs
-# 2 us more, a tenth of a whole step. Functions that Python calls take these.
+# A `RoadArrays` or `Filters` as a plain tuple: calling compiled code from Python with a named tuple
+# costs 2 us more, a tenth of a step. Functions that Python calls take these.
 Packed = tuple[Any, ...]
 
 
 class Filters(NamedTuple):
-    """State of the filters of n episodes.
+    """State of the filters of n episodes."""
 
-    Attributes:
-        means: `(n, 2 S)` [veh/km, veh/h].
-        covariances: `(n, 2 S, padded)` normalised, the padding zero.
-        priors: `(n, 2 S)` means to go back to.
-        innovations: `(n, S, 2)`.
-        diverged: `(n,)`.
-        process_variance: `(2,)` normalised.
-        initial_variance: Normalised.
-        density_scale: rho_m [veh/km].
-        is_box: Whether means are held to the paper's box instead of the cone.
-    """
-
-    means: FloatArray
-    covariances: FloatArray
-    priors: FloatArray
-    innovations: FloatArray
-    diverged: BoolArray
-    process_variance: FloatArray
-    initial_variance: float
-    density_scale: float
-    is_box: bool
+    means: FloatArray  # (n, 2 S) [veh/km, veh/h]
+    covariances: FloatArray  # (n, 2 S, padded) normalised, the padding zero
+    priors: FloatArray  # (n, 2 S) means to go back to
+    innovations: FloatArray  # (n, S, 2)
+    diverged: BoolArray  # (n,)
+    process_variance: FloatArray  # (2,) normalised
+    initial_variance: float  # Normalised
+    density_scale: float  # rho_m [veh/km]
+    is_box: bool  # Whether means are held to the paper's box instead of the cone
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def predict(road_: Packed, filters_: Packed, episodes: IntArray, inputs: FloatArray) -> None:
     """Move episodes one step ahead under inputs `(k, n_u)`: x = f(x, u), P = F P F' + Q."""
-    road, filters = Road(*road_), Filters(*filters_)
-    scratch = scratch_of(road)
+    road, filters = RoadArrays(*road_), Filters(*filters_)
+    scratch = make_scratch(road)
     blocks = np.empty((*road.neighbours.shape, 4))
     product, transposed = np.empty((2, *filters.covariances.shape[1:]))
     v_f = road.free_flow_speed
@@ -84,7 +72,7 @@ def update(
     sigma: FloatArray,
 ) -> None:
     """Take in measurements; see `Estimator.update`."""
-    road, filters = Road(*road_), Filters(*filters_)
+    road, filters = RoadArrays(*road_), Filters(*filters_)
     shift = np.empty(filters.covariances.shape[2])
     work = scratch_vectors(shift.size)
     rows = np.empty((road.jam.size, 4))
@@ -132,7 +120,7 @@ def restart(filters: Filters, episode: int) -> None:
 
 
 @njit(cache=True, error_model="numpy")
-def project(road: Road, mean: FloatArray, is_box: bool) -> None:
+def project(road: RoadArrays, mean: FloatArray, is_box: bool) -> None:
     """Hold a mean to its bounds, as `ARZModel.project` does; a NaN stays one."""
     v_f = road.free_flow_speed
     for c in range(road.jam.size):
@@ -160,7 +148,7 @@ def measured(
 
 
 @njit(cache=True, error_model="numpy")
-def released(road: Road, s: int, rho: float, psi: float) -> tuple[float, float, float]:
+def released(road: RoadArrays, s: int, rho: float, psi: float) -> tuple[float, float, float]:
     """Speed or centred flow that a segment releases, and its derivatives by rho and psi."""
     jam, v_f, gamma = road.jam[s], road.free_flow_speed, road.gamma
     if np.isnan(road.reference_speed):
@@ -172,7 +160,7 @@ def released(road: Road, s: int, rho: float, psi: float) -> tuple[float, float, 
 
 @njit(cache=True, error_model="numpy")
 def _linearise(
-    road: Road,
+    road: RoadArrays,
     filters: Filters,
     mean: FloatArray,
     observed: BoolArray,
@@ -217,7 +205,7 @@ def _innovate(
 @njit(cache=True, error_model="numpy", nogil=True)
 def summarise(road_: Packed, filters_: Packed, out: FloatArray) -> None:
     """Write density, speed and their standard deviations to `out` `(4, n, S)`, physical units."""
-    road, filters = Road(*road_), Filters(*filters_)
+    road, filters = RoadArrays(*road_), Filters(*filters_)
     v_f, scale = road.free_flow_speed, filters.density_scale
     largest = LARGEST_W * v_f
     for e in range(filters.means.shape[0]):

@@ -11,11 +11,11 @@ from dptse_env.estimators.base import Estimate
 from dptse_env.estimators.batch import BatchEstimator, Measurements
 from dptse_env.estimators.compiled import enkf_kernels as kernels
 from dptse_env.estimators.compiled.algebra import padded
-from dptse_env.estimators.compiled.normals import LANES, stream_of
+from dptse_env.estimators.compiled.normals import STREAM_WIDTH, make_stream
 from dptse_env.estimators.localisation import tapers
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
-from dptse_env.model.road_arrays import road_of
+from dptse_env.model.road_arrays import make_road_arrays
 from dptse_env.utils.arrays import FloatArray, IntArray
 
 
@@ -44,12 +44,12 @@ class CompiledEnKF(BatchEstimator):
         priors = model.project(np.zeros((n_episodes, model.n_states)), settings.bounds)
         none = np.empty((0, 0))
         self.n_members = own.n_members
-        self._road = tuple(road_of(model))
+        self._road = tuple(make_road_arrays(model))
         self._ensembles = kernels.Ensembles(
-            swarms=np.repeat(priors[:, :, None], padded(self.n_members), axis=2),
+            members=np.repeat(priors[:, :, None], padded(self.n_members), axis=2),
             n_members=self.n_members,
             priors=priors,
-            streams=np.empty((n_episodes, 2, 4, LANES), dtype=np.uint64),
+            streams=np.empty((n_episodes, 2, 4, STREAM_WIDTH), dtype=np.uint64),
             innovations=self.innovations,
             diverged=self.diverged,
             process_deviation=np.array(settings.process_noise) * unit,
@@ -84,7 +84,7 @@ class CompiledEnKF(BatchEstimator):
     @property
     def _inner(self) -> FloatArray:
         """Members `(n, 2 S, M)` without the columns beyond them."""
-        return self._ensembles.swarms[:, :, : self.n_members]
+        return self._ensembles.members[:, :, : self.n_members]
 
     def _reset(
         self, episodes: IntArray, states: FloatArray, generators: Sequence[np.random.Generator]
@@ -97,7 +97,7 @@ class CompiledEnKF(BatchEstimator):
         """Start the streams of episodes, of process noise and of measurement noise."""
         for episode, generator in zip(episodes.tolist(), generators, strict=True):
             for kind in range(2):
-                self._ensembles.streams[episode, kind] = stream_of(generator)
+                self._ensembles.streams[episode, kind] = make_stream(generator)
 
     def _predict(self, episodes: IntArray, inputs: FloatArray) -> None:
         kernels.predict(self._road, self._packed, episodes, inputs)
@@ -110,5 +110,5 @@ class CompiledEnKF(BatchEstimator):
     def estimate(self) -> Estimate:
         """Current estimate of all episodes."""
         out = np.empty((4, self.n_episodes, self.model.n_segments))
-        kernels.summarise(self._road, self._ensembles.swarms, self.n_members, out)
+        kernels.summarise(self._road, self._ensembles.members, self.n_members, out)
         return Estimate(*out)

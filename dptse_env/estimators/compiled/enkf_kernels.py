@@ -16,76 +16,62 @@ from numpy.typing import NDArray
 
 from dptse_env.estimators.compiled.cholesky import solve
 from dptse_env.estimators.compiled.ekf_kernels import Packed
-from dptse_env.estimators.compiled.normals import Bits, Draws, bits_for, fill
-from dptse_env.estimators.compiled.swarm import (
-    advance_swarm,
-    flock_of,
+from dptse_env.estimators.compiled.normals import Bits, Draws, fill, make_bits
+from dptse_env.estimators.compiled.state_batch import (
+    advance_states,
+    make_batch_scratch,
     measured_speeds,
-    project_swarm,
-    released_swarm,
+    project_states,
+    released_by_states,
 )
 from dptse_env.model.parameters import LARGEST_W
-from dptse_env.model.road_arrays import Road
+from dptse_env.model.road_arrays import RoadArrays
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 
 
 class Ensembles(NamedTuple):
-    """Members of n episodes and what moves them.
+    """Members of n episodes and what moves them."""
 
-    Attributes:
-        swarms: `(n, 2 S, width)` a member a column [veh/km, veh/h]; columns beyond the members
-            repeat the first one or are moved along with it.
-        n_members: M.
-        priors: `(n, 2 S)` means to go back to.
-        streams: `(n, 2, 4, LANES)` of process noise and of measurement noise.
-        innovations: `(n, S, 2)`.
-        diverged: `(n,)`.
-        process_deviation: `(2,)` of what disturbs rho and psi in a step [veh/km, veh/h].
-        initial_deviation: `(2,)` of the members around a prior [veh/km, veh/h].
-        density_scale: rho_m [veh/km].
-        inflation: Factor on distances from the mean ahead of an update.
-        tapers: `(S, S)` weights of covariances between segments; `(0, 0)` for none.
-        is_box: Whether members are held to the paper's box instead of the cone.
-    """
-
-    swarms: FloatArray
-    n_members: int
-    priors: FloatArray
-    streams: NDArray[np.uint64]
-    innovations: FloatArray
-    diverged: BoolArray
-    process_deviation: FloatArray
-    initial_deviation: FloatArray
-    density_scale: float
-    inflation: float
-    tapers: FloatArray
-    is_box: bool
+    # (n, 2 S, width) a member a column [veh/km, veh/h]; columns beyond the members repeat the
+    # first one or are moved along with it
+    members: FloatArray
+    n_members: int  # M
+    priors: FloatArray  # (n, 2 S) means to go back to
+    streams: NDArray[np.uint64]  # (n, 2, 4, STREAM_WIDTH) of process noise and of measurement noise
+    innovations: FloatArray  # (n, S, 2)
+    diverged: BoolArray  # (n,)
+    process_deviation: FloatArray  # (2,) of what disturbs rho and psi in a step [veh/km, veh/h]
+    initial_deviation: FloatArray  # (2,) of the members around a prior [veh/km, veh/h]
+    density_scale: float  # rho_m [veh/km]
+    inflation: float  # Factor on distances from the mean ahead of an update
+    tapers: FloatArray  # (S, S) weights of covariances between segments; (0, 0) for none
+    is_box: bool  # Whether members are held to the paper's box instead of the cone
 
 
 @njit(cache=True, error_model="numpy")
 def restart(road_: Packed, ensembles_: Packed, episodes: IntArray) -> None:
     """Draw the members of episodes around their priors."""
-    road, ensembles = Road(*road_), Ensembles(*ensembles_)
+    road, ensembles = RoadArrays(*road_), Ensembles(*ensembles_)
     for e in episodes:
         _restart(road, ensembles, e)
 
 
 @njit(cache=True, error_model="numpy")
-def _restart(road: Road, ensembles: Ensembles, e: int) -> None:
-    swarm, n = ensembles.swarms[e], ensembles.n_members
-    for i in range(swarm.shape[0]):
-        swarm[i] = ensembles.priors[e, i]
-    draws = np.empty(swarm.shape[0] * n, dtype=np.float32)
-    fill(ensembles.streams[e, 0], draws, bits_for(draws.size))
-    _disturb(swarm, n, ensembles.initial_deviation, draws)
-    project_swarm(road, swarm, ensembles.is_box)
+def _restart(road: RoadArrays, ensembles: Ensembles, e: int) -> None:
+    members, n = ensembles.members[e], ensembles.n_members
+    for i in range(members.shape[0]):
+        members[i] = ensembles.priors[e, i]
+    draws = np.empty(members.shape[0] * n, dtype=np.float32)
+    fill(ensembles.streams[e, 0], draws, make_bits(draws.size))
+    _disturb(members, n, ensembles.initial_deviation, draws)
+    project_states(road, members, ensembles.is_box)
 
 
 @njit(cache=True, error_model="numpy")
-def _disturb(swarm: FloatArray, n: int, deviation: FloatArray, draws: Draws) -> None:
+def _disturb(members: FloatArray, n: int, deviation: FloatArray, draws: Draws) -> None:
     """Add noise to the first n columns; those beyond repeat the first."""
-    for i in range(swarm.shape[0]):
-        row, draw, size = swarm[i], draws[i * n : (i + 1) * n], deviation[i % 2]
+    for i in range(members.shape[0]):
+        row, draw, size = members[i], draws[i * n : (i + 1) * n], deviation[i % 2]
         for j in range(n):
             row[j] += size * draw[j]
         row[n:] = row[0]
@@ -94,18 +80,18 @@ def _disturb(swarm: FloatArray, n: int, deviation: FloatArray, draws: Draws) -> 
 @njit(cache=True, error_model="numpy", nogil=True)
 def predict(road_: Packed, ensembles_: Packed, episodes: IntArray, inputs: FloatArray) -> None:
     """Move the members one step ahead under inputs `(k, n_u)`, disturb each and project it."""
-    road, ensembles = Road(*road_), Ensembles(*ensembles_)
+    road, ensembles = RoadArrays(*road_), Ensembles(*ensembles_)
     n = ensembles.n_members
-    size, width = ensembles.swarms.shape[1:]
-    flock = flock_of(road, width)
+    size, width = ensembles.members.shape[1:]
+    scratch = make_batch_scratch(road, width)
     draws = np.empty(size * n, dtype=np.float32)
-    bits = bits_for(draws.size)
+    bits = make_bits(draws.size)
     for k in range(episodes.size):
-        swarm = ensembles.swarms[episodes[k]]
-        advance_swarm(road, swarm, inputs[k], flock)
+        members = ensembles.members[episodes[k]]
+        advance_states(road, members, inputs[k], scratch)
         fill(ensembles.streams[episodes[k], 0], draws, bits)
-        _disturb(swarm, n, ensembles.process_deviation, draws)
-        project_swarm(road, swarm, ensembles.is_box)
+        _disturb(members, n, ensembles.process_deviation, draws)
+        project_states(road, members, ensembles.is_box)
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
@@ -128,9 +114,9 @@ def _centre(row: FloatArray, n: int, unit: float, out: FloatArray) -> float:
 
 
 @njit(cache=True, error_model="numpy")
-def _inflate(swarm: FloatArray, n: int, factor: float) -> None:
-    for i in range(swarm.shape[0]):
-        row, mean = swarm[i], _mean(swarm[i], n)
+def _inflate(members: FloatArray, n: int, factor: float) -> None:
+    for i in range(members.shape[0]):
+        row, mean = members[i], _mean(members[i], n)
         for j in range(row.size):
             row[j] = mean + factor * (row[j] - mean)
 
@@ -145,10 +131,10 @@ def update(
     sigma: FloatArray,
 ) -> None:
     """Take in measurements, perturbed for each member; see `Estimator.update`."""
-    road, ensembles = Road(*road_), Ensembles(*ensembles_)
+    road, ensembles = RoadArrays(*road_), Ensembles(*ensembles_)
     n_segments = road.jam.size
     draws = np.empty(2 * n_segments * ensembles.n_members, dtype=np.float32)
-    bits = bits_for(draws.size)
+    bits = make_bits(draws.size)
     segments = np.empty(n_segments, dtype=np.int64)
     for k in range(episodes.size):
         e, n_seen = episodes[k], 0
@@ -157,21 +143,21 @@ def update(
                 segments[n_seen] = s
                 n_seen += 1
         ensembles.innovations[e] = 0.0
-        swarm, sound = ensembles.swarms[e], True
+        members, sound = ensembles.members[e], True
         if n_seen > 0:
             sound = _take_in(road, ensembles, e, segments[:n_seen], values[k], sigma, draws, bits)
-            project_swarm(road, swarm, ensembles.is_box)
-        ensembles.diverged[e] = not (sound and _is_finite(swarm))
+            project_states(road, members, ensembles.is_box)
+        ensembles.diverged[e] = not (sound and _is_finite(members))
         if ensembles.diverged[e]:
             ensembles.innovations[e] = 0.0
             _restart(road, ensembles, e)
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
-def _is_finite(swarm: FloatArray) -> bool:
+def _is_finite(members: FloatArray) -> bool:
     total = 0.0
-    for i in range(swarm.shape[0]):
-        row = swarm[i]
+    for i in range(members.shape[0]):
+        row = members[i]
         for j in range(row.size):
             total += 0.0 * row[j]
     return total == 0.0
@@ -179,7 +165,7 @@ def _is_finite(swarm: FloatArray) -> bool:
 
 @njit(cache=True, error_model="numpy")
 def _take_in(
-    road: Road,
+    road: RoadArrays,
     ensembles: Ensembles,
     e: int,
     segments: IntArray,
@@ -194,11 +180,11 @@ def _take_in(
         Whether S was definite and the members are finite, ahead of a projection that would bring
         infinities back into the bounds.
     """
-    swarm, n = ensembles.swarms[e], ensembles.n_members
+    members, n = ensembles.members[e], ensembles.n_members
     if ensembles.inflation != 1.0:
-        _inflate(swarm, n, ensembles.inflation)
-        project_swarm(road, swarm, ensembles.is_box)
-    m, width = 2 * segments.size, swarm.shape[1]
+        _inflate(members, n, ensembles.inflation)
+        project_states(road, members, ensembles.is_box)
+    m, width = 2 * segments.size, members.shape[1]
     used = draws[: m * n]
     fill(ensembles.streams[e, 1], used, bits)
     distances, residuals = np.empty((m, width)), np.empty((m, width))
@@ -208,9 +194,9 @@ def _take_in(
         road, ensembles, e, segments, values, units, noise, used, distances, residuals
     )
     # Whole vector registers for the solution; the rows beyond the states are zero.
-    states = np.zeros(((swarm.shape[0] + 7) // 8 * 8, width))
-    for i in range(swarm.shape[0]):
-        _centre(swarm[i], n, 1.0, states[i])
+    states = np.zeros(((members.shape[0] + 7) // 8 * 8, width))
+    for i in range(members.shape[0]):
+        _centre(members[i], n, 1.0, states[i])
     joint, gain = np.dot(distances, distances.T), np.dot(distances, states.T)
     if ensembles.tapers.size > 0:
         _taper(ensembles.tapers, segments, joint, gain)
@@ -224,16 +210,16 @@ def _take_in(
     if not solve(joint, gain):
         return False
     shift = np.dot(gain.T, residuals)
-    for i in range(swarm.shape[0]):
-        row, step = swarm[i], shift[i]
+    for i in range(members.shape[0]):
+        row, step = members[i], shift[i]
         for j in range(width):
             row[j] += inverse * step[j]
-    return _is_finite(swarm)
+    return _is_finite(members)
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _compare(
-    road: Road,
+    road: RoadArrays,
     ensembles: Ensembles,
     e: int,
     segments: IntArray,
@@ -245,12 +231,12 @@ def _compare(
     residuals: FloatArray,
 ) -> FloatArray:
     """Write outputs' distances from their mean and members' residuals; residuals of the mean."""
-    swarm, n = ensembles.swarms[e], ensembles.n_members
-    centres, second = np.empty(2 * segments.size), np.empty(swarm.shape[1])
+    members, n = ensembles.members[e], ensembles.n_members
+    centres, second = np.empty(2 * segments.size), np.empty(members.shape[1])
     for i in range(segments.size):
         s = segments[i]
-        rho, psi = swarm[2 * s], swarm[2 * s + 1]
-        released_swarm(road, s, rho, psi, second)
+        rho, psi = members[2 * s], members[2 * s + 1]
+        released_by_states(road, s, rho, psi, second)
         for kind in range(2):
             r, row = 2 * i + kind, rho if kind == 0 else second
             distance, residual, draw = distances[r], residuals[r], draws[r * n : (r + 1) * n]
@@ -275,14 +261,14 @@ def _taper(tapers: FloatArray, segments: IntArray, joint: FloatArray, gain: Floa
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def summarise(road_: Packed, swarms: FloatArray, n: int, out: FloatArray) -> None:
+def summarise(road_: Packed, members: FloatArray, n: int, out: FloatArray) -> None:
     """Write density and speed of the mean and the members' deviations to `out` `(4, E, S)`."""
-    road = Road(*road_)
-    v_f, gamma, width = road.free_flow_speed, road.gamma, swarms.shape[2]
+    road = RoadArrays(*road_)
+    v_f, gamma, width = road.free_flow_speed, road.gamma, members.shape[2]
     speed, mean = np.empty(width), np.empty((3, 1))
-    for e in range(swarms.shape[0]):
+    for e in range(members.shape[0]):
         for s in range(road.jam.size):
-            rho, psi = swarms[e, 2 * s], swarms[e, 2 * s + 1]
+            rho, psi = members[e, 2 * s], members[e, 2 * s + 1]
             mean[0, 0], out[2, e, s] = _moments(rho, n)
             mean[1, 0] = _mean(psi, n)
             measured_speeds(mean[0], mean[1], road.jam[s], v_f, gamma, mean[2])

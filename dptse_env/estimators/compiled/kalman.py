@@ -13,7 +13,7 @@ from dptse_env.estimators.compiled import ekf_kernels as kernels
 from dptse_env.estimators.compiled.algebra import padded
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
-from dptse_env.model.road_arrays import road_of
+from dptse_env.model.road_arrays import make_road_arrays
 from dptse_env.utils.arrays import FloatArray, IntArray
 
 
@@ -38,7 +38,7 @@ class CompiledFilter(BatchEstimator):
             density_scale=float(model.density_scale),
             is_box=settings.bounds == "box",
         )
-        self._packed = tuple(road_of(model)), tuple(self._filters)
+        self._packed = tuple(make_road_arrays(model)), tuple(self._filters)
         for episode in range(n_episodes):
             kernels.restart(self._filters, episode)
 

@@ -8,7 +8,7 @@ from dptse_env.estimators.batch import Measurements
 from dptse_env.estimators.compiled import mhe_kernels
 from dptse_env.estimators.compiled.algebra import padded
 from dptse_env.estimators.compiled.kalman import CompiledFilter
-from dptse_env.estimators.compiled.mhe_kernels import Horizons
+from dptse_env.estimators.compiled.mhe_kernels import Windows
 from dptse_env.estimators.horizon import (
     LEAST_DEVIATION,
     Window,
@@ -20,7 +20,7 @@ from dptse_env.estimators.horizon import (
 )
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
-from dptse_env.model.road_arrays import Road, road_of
+from dptse_env.model.road_arrays import RoadArrays, make_road_arrays
 from dptse_env.utils.arrays import FloatArray, IntArray
 
 
@@ -43,10 +43,10 @@ class CompiledMHE(CompiledFilter):
         self.horizon = own = settings.mhe
         self.n_passed_on = 0
         n, s, width = model.n_states, model.n_segments, padded(model.n_states)
-        self._road: Road = road_of(model)
+        self._road: RoadArrays = make_road_arrays(model)
         shape = (n_episodes, own.horizon + 1)
         lower, upper = normalised_bounds(model, own.bounds)
-        self._horizons = Horizons(
+        self._windows = Windows(
             length=np.ones(n_episodes, dtype=np.int64),
             arrival_variance=np.ones((n_episodes, 2)),
             predicted=np.zeros((*shape, n)),
@@ -66,32 +66,32 @@ class CompiledMHE(CompiledFilter):
             upper=upper,
             along=own.linearisation == "trajectory",
         )
-        self._windows_packed = (*self._packed, tuple(self._horizons))
+        self._windows_packed = (*self._packed, tuple(self._windows))
         self._scales = model.measurement_scale
         self._restart(np.arange(n_episodes))
 
     def window(self, episode: int) -> Window:
         """The linearised problem of one episode, dense, as `assemble` takes it."""
-        horizons, length = self._horizons, int(self._horizons.length[episode])
+        windows, length = self._windows, int(self._windows.length[episode])
         n, road = self.model.n_states, self._road
         transitions = np.zeros((length - 1, n, n))
         for c in range(self.model.n_segments):
             for slot in range(road.degree[c]):
                 b = road.neighbours[c, slot]
-                block = horizons.blocks[episode, : length - 1, c, slot].reshape(-1, 2, 2)
+                block = windows.blocks[episode, : length - 1, c, slot].reshape(-1, 2, 2)
                 transitions[:, 2 * c : 2 * c + 2, 2 * b : 2 * b + 2] = block
-        targets = horizons.values[episode, :length].copy()
-        targets[..., 1] -= horizons.constants[episode, :length]
+        targets = windows.values[episode, :length].copy()
+        targets[..., 1] -= windows.constants[episode, :length]
         return Window(
-            arrival=horizons.predicted[episode, 0],
-            arrival_variance=horizons.arrival_variance[episode],
+            arrival=windows.predicted[episode, 0],
+            arrival_variance=windows.arrival_variance[episode],
             transitions=transitions,
-            offsets=horizons.offsets[episode, : length - 1],
+            offsets=windows.offsets[episode, : length - 1],
             process_variance=self._filters.process_variance,
-            observed=horizons.observed[episode, :length],
-            rows=horizons.rows[episode, :length],
+            observed=windows.observed[episode, :length],
+            rows=windows.rows[episode, :length],
             targets=targets,
-            noise=horizons.noise[episode, :length],
+            noise=windows.noise[episode, :length],
         )
 
     def _predict(self, episodes: IntArray, inputs: FloatArray) -> None:
@@ -102,26 +102,26 @@ class CompiledMHE(CompiledFilter):
         mhe_kernels.update(
             *self._windows_packed, given.episodes, given.observed, given.values, sigma
         )
-        unsolved = given.episodes[self._horizons.unsolved[given.episodes]]
+        unsolved = given.episodes[self._windows.unsolved[given.episodes]]
         for episode in unsolved.tolist():
             self._pass_on(episode)
 
     def _pass_on(self, episode: int) -> None:
         """Let the reference's solver have a program that the active set did not solve."""
         self.n_passed_on += 1
-        horizons, n = self._horizons, self.model.n_states
-        length = int(horizons.length[episode])
-        lower, upper = np.tile(horizons.lower, length), np.tile(horizons.upper, length)
+        windows, n = self._windows, self.model.n_states
+        length = int(windows.length[episode])
+        lower, upper = np.tile(windows.lower, length), np.tile(windows.upper, length)
         z = solve(*assemble(self.window(episode)), lower, upper, self.horizon.solver)
         self.fallback[episode] = z is None
-        horizons.side[episode] = 0
+        windows.side[episode] = 0
         if z is None:
             return
         at_upper, at_lower = (z >= upper).astype(np.int64), (z <= lower).astype(np.int64)
-        horizons.side[episode, :length, :n] = (at_upper - at_lower).reshape(length, n)
-        solution = horizons.solution[episode].copy()
+        windows.side[episode, :length, :n] = (at_upper - at_lower).reshape(length, n)
+        solution = windows.solution[episode].copy()
         solution[:length, :n] = z.reshape(length, n)
-        mhe_kernels.accept(self._road, self._filters, horizons, episode, solution)
+        mhe_kernels.accept(self._road, self._filters, windows, episode, solution)
 
     def _restart(self, episodes: IntArray) -> None:
         for episode in episodes.tolist():

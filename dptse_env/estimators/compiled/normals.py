@@ -18,11 +18,11 @@ from numba import njit, types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-Stream = NDArray[np.uint64]  # (4, LANES)
+Stream = NDArray[np.uint64]  # (4, STREAM_WIDTH)
 Bits = NDArray[np.uint64]
 Draws = NDArray[np.float32]
 
-LANES = 32
+STREAM_WIDTH = 32
 _ROOT_HALF = 0x3F3504F3  # bits of sqrt(1/2)
 _MANTISSA = 23
 # Single precision throughout: numba would widen what meets a Python float.
@@ -37,15 +37,15 @@ _C2, _C4, _C6, _C8, _C10, _C12 = (
 )
 
 
-def stream_of(generator: np.random.Generator) -> Stream:
+def make_stream(generator: np.random.Generator) -> Stream:
     """Start a stream from what a generator draws next."""
-    return generator.integers(0, 2**64 - 1, size=(4, LANES), dtype=np.uint64, endpoint=True)
+    return generator.integers(0, 2**64 - 1, size=(4, STREAM_WIDTH), dtype=np.uint64, endpoint=True)
 
 
 @njit(cache=True, error_model="numpy")
-def bits_for(n: int) -> Bits:
+def make_bits(n: int) -> Bits:
     """Allocate the working space of `fill` for up to n normals."""
-    return np.empty(-(-n // (2 * LANES)) * LANES, dtype=np.uint64)
+    return np.empty(-(-n // (2 * STREAM_WIDTH)) * STREAM_WIDTH, dtype=np.uint64)
 
 
 def _split_of(context: Any, x: Any) -> Any:
@@ -70,11 +70,11 @@ _split: Any = intrinsic(_split_of)
 
 @njit(cache=True, error_model="numpy")
 def _draw_bits(stream: Stream, out: Bits) -> None:
-    """Fill `out`, whole blocks of LANES, by xoshiro256++."""
+    """Fill `out`, whole blocks of STREAM_WIDTH, by xoshiro256++."""
     first, second, third, fourth = stream[0], stream[1], stream[2], stream[3]
-    for start in range(0, out.size, LANES):
-        block = out[start : start + LANES]
-        for i in range(LANES):
+    for start in range(0, out.size, STREAM_WIDTH):
+        block = out[start : start + STREAM_WIDTH]
+        for i in range(STREAM_WIDTH):
             a, b, c, d = first[i], second[i], third[i], fourth[i]
             total = a + d
             block[i] = ((total << np.uint64(23)) | (total >> np.uint64(41))) + a
@@ -114,10 +114,10 @@ def fill(stream: Stream, out: Draws, bits: Bits) -> None:
     """Fill `out` `(n,)`, n even, with standard normals and move the stream on.
 
     Args:
-        stream: From `stream_of`.
+        stream: From `make_stream`.
         out: `(n,)`, n even.
-        bits: From `bits_for`, of n or more.
+        bits: From `make_bits`, of n or more.
     """
     half = out.size // 2
-    _draw_bits(stream, bits[: (half + LANES - 1) // LANES * LANES])
+    _draw_bits(stream, bits[: (half + STREAM_WIDTH - 1) // STREAM_WIDTH * STREAM_WIDTH])
     _transform(bits[:half], out[:half], out[half:])

@@ -18,34 +18,26 @@ from dptse_env.utils.arrays import BoolArray, FloatArray
 
 
 class Points(NamedTuple):
-    """Sigma points of n episodes.
+    """Sigma points of n episodes."""
 
-    Attributes:
-        swarms: `(n, 2 S, width)` projected points after the last motion [veh/km, veh/h]; the
-            mean's image first, then pairs; columns beyond 4 S + 1 repeat the first.
-        centres: `(n, 2 S)` their weighted means, before any projection.
-        moved: `(n,)` whether they moved since they last took in a measurement.
-        weight: W of every point but the first.
-        surplus: beta - alpha^2.
-        spread: Points are the mean plus and minus `spread` times columns of a root of P.
-    """
-
-    swarms: FloatArray
-    centres: FloatArray
-    moved: BoolArray
-    weight: float
-    surplus: float
-    spread: float
+    # (n, 2 S, width) projected points after the last motion [veh/km, veh/h]; the mean's image
+    # first, then pairs; columns beyond 4 S + 1 repeat the first
+    states: FloatArray
+    centres: FloatArray  # (n, 2 S) their weighted means, before any projection
+    moved: BoolArray  # (n,) whether they moved since they last took in a measurement
+    weight: float  # W of every point but the first
+    surplus: float  # beta - alpha^2
+    spread: float  # Points are the mean plus and minus spread times columns of a root of P
 
 
 @njit(cache=True, error_model="numpy")
 def draw(
-    mean: FloatArray, root: FloatArray, spread: float, scale: FloatArray, swarm: FloatArray
+    mean: FloatArray, root: FloatArray, spread: float, scale: FloatArray, states: FloatArray
 ) -> None:
     """Write the points of a mean and the upper root of its covariance."""
     n = mean.size
     for i in range(n):
-        row, centre = swarm[i], mean[i]
+        row, centre = states[i], mean[i]
         row[:] = centre
         step = spread * scale[i % 2]
         for k in range(i + 1):
@@ -74,10 +66,10 @@ def gather(
     covariance: FloatArray,
 ) -> None:
     """Write mean and covariance of one episode's points."""
-    swarm, n = points.swarms[e], shift.size
+    states, n = points.states[e], shift.size
     for i in range(n):
-        shift[i] = distances_from_first(swarm[i], scale[i % 2], points.weight, distances[i])
-        points.centres[e, i] = swarm[i, 0] + shift[i] * scale[i % 2]
+        shift[i] = distances_from_first(states[i], scale[i % 2], points.weight, distances[i])
+        points.centres[e, i] = states[i, 0] + shift[i] * scale[i % 2]
     products(distances, n, distances, n, True, covariance)
     for i in range(n):
         for j in range(i + 1):

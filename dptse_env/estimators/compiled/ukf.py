@@ -34,7 +34,7 @@ class CompiledUKF(CompiledFilter):
         )
         spread = own.alpha**2 * (n_states + own.kappa)
         self._points = Points(
-            swarms=np.zeros((n_episodes, n_states, padded(2 * n_states + 1))),
+            states=np.zeros((n_episodes, n_states, padded(2 * n_states + 1))),
             centres=np.zeros((n_episodes, n_states)),
             moved=np.zeros(n_episodes, dtype=np.bool_),
             weight=0.5 / spread,

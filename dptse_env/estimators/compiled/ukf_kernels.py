@@ -22,13 +22,13 @@ from dptse_env.estimators.compiled.sigma_points import (
     draw,
     gather,
 )
-from dptse_env.estimators.compiled.swarm import (
-    advance_swarm,
-    flock_of,
-    project_swarm,
-    released_swarm,
+from dptse_env.estimators.compiled.state_batch import (
+    advance_states,
+    make_batch_scratch,
+    project_states,
+    released_by_states,
 )
-from dptse_env.model.road_arrays import Road
+from dptse_env.model.road_arrays import RoadArrays
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 
 
@@ -37,20 +37,20 @@ def predict(
     road_: Packed, filters_: Packed, points_: Packed, episodes: IntArray, inputs: FloatArray
 ) -> None:
     """Move episodes one step ahead: draw points, move and project them, then mean and P."""
-    road, filters, points = Road(*road_), Filters(*filters_), Points(*points_)
-    n, width = points.swarms.shape[1:]
-    flock, distances = flock_of(road, width), np.empty((n, width))
+    road, filters, points = RoadArrays(*road_), Filters(*filters_), Points(*points_)
+    n, width = points.states.shape[1:]
+    scratch, distances = make_batch_scratch(road, width), np.empty((n, width))
     root, shift = np.empty(filters.covariances.shape[1:]), np.empty(n)
     scale = np.array([filters.density_scale, filters.density_scale * road.free_flow_speed])
     for k in range(episodes.size):
         e = episodes[k]
-        mean, covariance, swarm = filters.means[e], filters.covariances[e], points.swarms[e]
+        mean, covariance, states = filters.means[e], filters.covariances[e], points.states[e]
         root[:] = covariance
         if not factor(root, n):
             mean[:] = np.nan  # the update finds it and starts over
-        draw(mean, root, points.spread, scale, swarm)
-        advance_swarm(road, swarm, inputs[k], flock)
-        project_swarm(road, swarm, filters.is_box)
+        draw(mean, root, points.spread, scale, states)
+        advance_states(road, states, inputs[k], scratch)
+        project_states(road, states, filters.is_box)
         gather(points, e, scale, distances, shift, covariance)
         for i in range(n):
             covariance[i, i] += filters.process_variance[i % 2]
@@ -60,23 +60,15 @@ def predict(
 
 
 class Outputs(NamedTuple):
-    """Working space of `update`: what is measured, m numbers, densities first.
+    """Working space of `update`: what is measured, m numbers, densities first."""
 
-    Attributes:
-        distances: `(2 S, width)` of the points, normalised.
-        outputs: `(S, width)` distances of the speeds, or flows, measured.
-        shift: `(2 S,)` weighted sums of `distances`.
-        output_shift: `(S,)` weighted sums of `outputs`.
-        cross: `(2 S, padded)` covariance of `outputs` (rows) with states, then scratch.
-        joint: `(2 S, columns)` rows of outputs: S, then their covariance with states, then the
-            residual in the last column.
-    """
-
-    distances: FloatArray
-    outputs: FloatArray
-    shift: FloatArray
-    output_shift: FloatArray
-    cross: FloatArray
+    distances: FloatArray  # (2 S, width) of the points, normalised
+    outputs: FloatArray  # (S, width) distances of the speeds, or flows, measured
+    shift: FloatArray  # (2 S,) weighted sums of distances
+    output_shift: FloatArray  # (S,) weighted sums of outputs
+    cross: FloatArray  # (2 S, padded) covariance of outputs (rows) with states, then scratch
+    # (2 S, columns) rows of outputs: S, then their covariance with states, then the residual
+    # in the last column
     joint: FloatArray
 
 
@@ -91,8 +83,8 @@ def update(
     sigma: FloatArray,
 ) -> None:
     """Take in measurements; see `Estimator.update`."""
-    road, filters, points = Road(*road_), Filters(*filters_), Points(*points_)
-    n, width = points.swarms.shape[1:]
+    road, filters, points = RoadArrays(*road_), Filters(*filters_), Points(*points_)
+    n, width = points.states.shape[1:]
     padded = filters.covariances.shape[2]
     segments, n_seen = np.empty(road.jam.size, dtype=np.int64), 0
     work = Outputs(
@@ -129,7 +121,7 @@ def update(
 
 @njit(cache=True, error_model="numpy")
 def _stay(
-    road: Road, filters: Filters, points: Points, e: int, scale: FloatArray, work: Outputs
+    road: RoadArrays, filters: Filters, points: Points, e: int, scale: FloatArray, work: Outputs
 ) -> bool:
     """Draw points where nothing has moved since the last measurement: a motion by nothing."""
     n = filters.means.shape[1]
@@ -137,15 +129,15 @@ def _stay(
     root[:] = covariance
     if not factor(root, n):
         return False
-    draw(filters.means[e], root, points.spread, scale, points.swarms[e])
-    project_swarm(road, points.swarms[e], filters.is_box)
+    draw(filters.means[e], root, points.spread, scale, points.states[e])
+    project_states(road, points.states[e], filters.is_box)
     gather(points, e, scale, work.distances, work.shift, covariance)
     return True
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _take_in(
-    road: Road,
+    road: RoadArrays,
     filters: Filters,
     points: Points,
     e: int,
@@ -197,7 +189,7 @@ def _reduce(joint: FloatArray, width: int, start: int, covariance: FloatArray) -
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _measure(
-    road: Road,
+    road: RoadArrays,
     filters: Filters,
     points: Points,
     e: int,
@@ -213,15 +205,15 @@ def _measure(
     """
     n, m = filters.means.shape[1], segments.size
     start = (2 * m + 7) // 8 * 8
-    unit, swarm, joint = road.second_scale, points.swarms[e], work.joint
+    unit, states, joint = road.second_scale, points.states[e], work.joint
     for i in range(n):
         work.shift[i] = distances_from_first(
-            swarm[i], scale[i % 2], points.weight, work.distances[i]
+            states[i], scale[i % 2], points.weight, work.distances[i]
         )
     for i in range(m):
         s = segments[i]
         outputs = work.outputs[i]
-        released_swarm(road, s, swarm[2 * s], swarm[2 * s + 1], outputs)
+        released_by_states(road, s, states[2 * s], states[2 * s + 1], outputs)
         joint[m + i, start + n] = outputs[0] / unit
         work.output_shift[i] = distances_from_first(outputs, unit, points.weight, outputs)
         joint[m + i, start + n] += work.output_shift[i]

@@ -20,64 +20,43 @@ from dptse_env.estimators.compiled.algebra import (
     scratch_vectors,
     segment_update,
 )
-from dptse_env.model.road_arrays import Road
+from dptse_env.model.road_arrays import RoadArrays
 from dptse_env.utils.arrays import BoolArray, FloatArray
 
 
 class Chain(NamedTuple):
-    """A linearised window of L stages.
+    """A linearised window of L stages."""
 
-    Attributes:
-        arrival: `(2 S,)` mean of the first state.
-        arrival_variance: `(2,)`.
-        process_variance: `(2,)`.
-        blocks: `(>= L - 1, S, K, 4)` of the transitions.
-        offsets: `(>= L - 1, 2 S)`.
-        observed: `(>= L, S)`.
-        rows: `(>= L, S, 2)` derivatives of the second release, speed or flow, by the
-            segment's rho and psi.
-        constants: `(>= L, S)` what that is, linearised, at a state of zero.
-        values: `(>= L, S, 2)` density, and speed or flow.
-        noise: `(>= L, 2)` variances.
-    """
-
-    arrival: FloatArray
-    arrival_variance: FloatArray
-    process_variance: FloatArray
-    blocks: FloatArray
-    offsets: FloatArray
-    observed: BoolArray
+    arrival: FloatArray  # (2 S,) mean of the first state
+    arrival_variance: FloatArray  # (2,)
+    process_variance: FloatArray  # (2,)
+    blocks: FloatArray  # (>= L - 1, S, K, 4) of the transitions
+    offsets: FloatArray  # (>= L - 1, 2 S)
+    observed: BoolArray  # (>= L, S)
+    # (>= L, S, 2) derivatives of the second release, speed or flow, by the segment's rho and
+    # psi
     rows: FloatArray
-    constants: FloatArray
-    values: FloatArray
-    noise: FloatArray
+    constants: FloatArray  # (>= L, S) what that is, linearised, at a state of zero
+    values: FloatArray  # (>= L, S, 2) density, and speed or flow
+    noise: FloatArray  # (>= L, 2) variances
 
 
-class Space(NamedTuple):
-    """Working space for windows of up to L stages.
+class WindowScratch(NamedTuple):
+    """Working scratch for windows of up to L stages."""
 
-    Attributes:
-        factors: `(L, 2 S, padded)` filtered covariances.
-        before: `(2 S, padded)` the last one without its stage's measurements.
-        information: `(L, S, 3)` C' C / R: rho rho, rho psi, psi psi.
-        diagonal: `(L, padded)` of H.
-        product: `(2, 2 S, padded)` scratch.
-        sweep: `(4, padded)` scratch.
-    """
-
-    factors: FloatArray
-    before: FloatArray
-    information: FloatArray
-    diagonal: FloatArray
-    product: FloatArray
-    sweep: FloatArray
+    factors: FloatArray  # (L, 2 S, padded) filtered covariances
+    before: FloatArray  # (2 S, padded) the last one without its stage's measurements
+    information: FloatArray  # (L, S, 3) C' C / R: rho rho, rho psi, psi psi
+    diagonal: FloatArray  # (L, padded) of H
+    product: FloatArray  # (2, 2 S, padded) scratch
+    sweep: FloatArray  # (4, padded) scratch
 
 
 @njit(cache=True, error_model="numpy")
-def space_for(n_stages: int, n_segments: int, width: int) -> Space:
-    """Allocate the working space."""
+def make_window_scratch(n_stages: int, n_segments: int, width: int) -> WindowScratch:
+    """Allocate the working scratch."""
     n = 2 * n_segments
-    return Space(
+    return WindowScratch(
         np.zeros((n_stages, n, width)),
         np.zeros((n, width)),
         np.zeros((n_stages, n_segments, 3)),
@@ -88,54 +67,54 @@ def space_for(n_stages: int, n_segments: int, width: int) -> Space:
 
 
 @njit(cache=True, error_model="numpy")
-def factorise(road: Road, chain: Chain, n_stages: int, space: Space) -> bool:
+def factorise(road: RoadArrays, chain: Chain, n_stages: int, scratch: WindowScratch) -> bool:
     """Filter covariances through the window; returns whether all variances were sound."""
-    n, width = space.before.shape
+    n, width = scratch.before.shape
     row, shift, work = np.zeros(4), np.zeros(width), scratch_vectors(width)
     for t in range(n_stages):
-        P = space.factors[t]
+        P = scratch.factors[t]
         if t == 0:
             P[:] = 0.0
             for i in range(n):
                 P[i, i] = chain.arrival_variance[i % 2]
         else:
-            P[:] = space.factors[t - 1]
+            P[:] = scratch.factors[t - 1]
             propagate(
                 road,
                 chain.blocks[t - 1],
                 chain.process_variance,
                 P,
-                space.product[0],
-                space.product[1],
+                scratch.product[0],
+                scratch.product[1],
             )
         if t == n_stages - 1:
-            space.before[:] = P
+            scratch.before[:] = P
         for s in range(n // 2):
             if chain.observed[t, s]:
                 row[2], row[3] = chain.rows[t, s, 0], chain.rows[t, s, 1]
                 if not segment_update(P, s, row, chain.noise[t], shift, work):
                     return False
         mirror(P)
-    _inform(road, chain, n_stages, space)
+    _inform(road, chain, n_stages, scratch)
     return True
 
 
 @njit(cache=True, error_model="numpy")
-def _inform(road: Road, chain: Chain, n_stages: int, space: Space) -> None:
+def _inform(road: RoadArrays, chain: Chain, n_stages: int, scratch: WindowScratch) -> None:
     """Write the measurements' blocks of H and its diagonal."""
     w = 1.0 / chain.process_variance
     for t in range(n_stages):
-        diagonal = space.diagonal[t]
+        diagonal = scratch.diagonal[t]
         for s in range(road.jam.size):
             by_rho, by_psi = chain.rows[t, s, 0], chain.rows[t, s, 1]
             seen = 1.0 if chain.observed[t, s] else 0.0
             w_density, w_second = seen / chain.noise[t, 0], seen / chain.noise[t, 1]
-            space.information[t, s, 0] = w_density + w_second * by_rho * by_rho
-            space.information[t, s, 1] = w_second * by_rho * by_psi
-            space.information[t, s, 2] = w_second * by_psi * by_psi
+            scratch.information[t, s, 0] = w_density + w_second * by_rho * by_rho
+            scratch.information[t, s, 1] = w_second * by_rho * by_psi
+            scratch.information[t, s, 2] = w_second * by_psi * by_psi
             for i in range(2):
                 before = w[i] if t > 0 else 1.0 / chain.arrival_variance[i]
-                diagonal[2 * s + i] = before + space.information[t, s, 2 * i]
+                diagonal[2 * s + i] = before + scratch.information[t, s, 2 * i]
         if t == n_stages - 1:
             continue
         for c in range(road.jam.size):
@@ -146,7 +125,7 @@ def _inform(road: Road, chain: Chain, n_stages: int, space: Space) -> None:
 
 
 @njit(cache=True, error_model="numpy")
-def gradient(road: Road, chain: Chain, n_stages: int, z: FloatArray, out: FloatArray) -> None:
+def gradient(road: RoadArrays, chain: Chain, n_stages: int, z: FloatArray, out: FloatArray) -> None:
     """Write H z + q / 2, half the objective's gradient, `(L, padded)`."""
     n_segments, K = road.jam.size, chain.process_variance
     out[:n_stages] = 0.0
@@ -182,11 +161,11 @@ def gradient(road: Road, chain: Chain, n_stages: int, z: FloatArray, out: FloatA
 
 @njit(cache=True, error_model="numpy")
 def solve(
-    road: Road,
+    road: RoadArrays,
     chain: Chain,
     n_stages: int,
     first: int,
-    space: Space,
+    scratch: WindowScratch,
     right: FloatArray,
     out: FloatArray,
 ) -> None:
@@ -195,24 +174,24 @@ def solve(
     Forwards m = A m_before + P (r - C'C/R A m_before) as a filter's mean; backwards, with the
     costate a = A' l of the stage after, d = m + P a and l = r - C'C/R d + a.
     """
-    mean, change, costate, slope = space.sweep
+    mean, change, costate, slope = scratch.sweep
     width = mean.size
     mean[:] = 0.0
     out[:first] = 0.0
     for t in range(first, n_stages):
         if t > first:
             _move(road, chain.blocks[t - 1], out[t - 1], mean)
-        _weigh(space.information[t], mean, right[t], change)
+        _weigh(scratch.information[t], mean, right[t], change)
         out[t] = mean
-        _add_product(space.factors[t], change, out[t])
+        _add_product(scratch.factors[t], change, out[t])
     last = n_stages - 1
-    _weigh(space.information[last], out[last], right[last], costate)
+    _weigh(scratch.information[last], out[last], right[last], costate)
     for t in range(last - 1, -1, -1):
         _move_back(road, chain.blocks[t], costate, slope)
-        _add_product(space.factors[t], slope, out[t])
-        _weigh(space.information[t], out[t], right[t], costate)
+        _add_product(scratch.factors[t], slope, out[t])
+        _weigh(scratch.information[t], out[t], right[t], costate)
         if t < first:  # what `right` holds there is not part of r
-            _weigh(space.information[t], out[t], np.zeros(width), costate)
+            _weigh(scratch.information[t], out[t], np.zeros(width), costate)
         for i in range(width):
             costate[i] += slope[i]
 
@@ -240,7 +219,7 @@ def _add_product(P: FloatArray, x: FloatArray, out: FloatArray) -> None:
 
 
 @njit(cache=True, error_model="numpy")
-def _move(road: Road, blocks: FloatArray, x: FloatArray, out: FloatArray) -> None:
+def _move(road: RoadArrays, blocks: FloatArray, x: FloatArray, out: FloatArray) -> None:
     """Write A x."""
     for c in range(road.jam.size):
         first, second = 0.0, 0.0
@@ -252,7 +231,7 @@ def _move(road: Road, blocks: FloatArray, x: FloatArray, out: FloatArray) -> Non
 
 
 @njit(cache=True, error_model="numpy")
-def _move_back(road: Road, blocks: FloatArray, x: FloatArray, out: FloatArray) -> None:
+def _move_back(road: RoadArrays, blocks: FloatArray, x: FloatArray, out: FloatArray) -> None:
     """Write A' x."""
     out[:] = 0.0
     for c in range(road.jam.size):

@@ -51,7 +51,7 @@ class ReferenceEnKF(BatchEstimator):
         self._initial_deviation = np.sqrt(settings.initial_variance) * self._state_unit
         self._priors = model.project(np.zeros((n_episodes, model.n_states)), settings.bounds)
         self.members = np.repeat(self._priors[:, None], self.n_members, axis=1)
-        self._streams = [_streams_of(np.random.default_rng(0)) for _ in range(n_episodes)]
+        self._streams = [_make_streams(np.random.default_rng(0)) for _ in range(n_episodes)]
 
     @property
     def states(self) -> FloatArray:
@@ -77,7 +77,7 @@ class ReferenceEnKF(BatchEstimator):
     ) -> None:
         self._priors[episodes] = self.model.project(states, self.settings.bounds)
         for episode, generator in zip(episodes.tolist(), generators, strict=True):
-            self._streams[episode] = _streams_of(generator)
+            self._streams[episode] = _make_streams(generator)
             self._restart(episode)
 
     def _restart(self, episode: int) -> None:
@@ -153,6 +153,6 @@ class ReferenceEnKF(BatchEstimator):
         return np.asarray(((measured - mean) / np.sqrt(np.diag(joint))).reshape(-1, 2))
 
 
-def _streams_of(generator: np.random.Generator) -> _Streams:
+def _make_streams(generator: np.random.Generator) -> _Streams:
     seeds = generator.integers(0, 2**63, size=(2, 2))
     return _Streams(*(np.random.default_rng(seed.tolist()) for seed in seeds))

@@ -40,7 +40,7 @@ class _Stage:
     c_2: FloatArray = field(init=False)  # (S,)
 
 
-class _Horizon:
+class _EpisodeWindow:
     """One episode: its window and its estimate, the last state's mean and covariance.
 
     The covariance is that of the last update; a prediction leaves it alone.
@@ -175,18 +175,18 @@ class ReferenceMHE(ReferenceFilter):
 
     def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
         """See `make_estimator`."""
-        self._horizons: list[_Horizon] = []
+        self._windows: list[_EpisodeWindow] = []
         super().__init__(model, n_episodes, own_settings(settings))
 
     def window(self, episode: int) -> Window:
         """The linearised problem of one episode, as `assemble` takes it."""
-        return self._horizons[episode].window()
+        return self._windows[episode].window()
 
     def _filter(self) -> EpisodeFilter:
-        self._horizons.append(_Horizon(self.model, self.settings))
-        return self._horizons[-1]
+        self._windows.append(_EpisodeWindow(self.model, self.settings))
+        return self._windows[-1]
 
     def _update(self, given: Measurements) -> None:
         super()._update(given)
         for episode in given.episodes.tolist():
-            self.fallback[episode] = self._horizons[episode].unsolved
+            self.fallback[episode] = self._windows[episode].unsolved

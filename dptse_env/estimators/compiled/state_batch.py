@@ -1,6 +1,6 @@
 """The ARZ model for many states of one road at once: sigma points, members of an ensemble.
 
-The equations are those of `dptse_env.model.kernels` without derivatives. A swarm is stored by
+The equations are those of `dptse_env.model.kernels` without derivatives. A states is stored by
 component, `(2 S, width)`, one column a state, so that every inner loop runs over contiguous
 memory without a branch and compiles to vector instructions. Columns beyond the states in use are
 computed along and must hold some state.
@@ -17,36 +17,27 @@ from dptse_env.estimators.compiled.power import power
 from dptse_env.model.arz import LEAST_DENSITY, LEAST_W, MEASUREMENT_FLOOR
 from dptse_env.model.parameters import LARGEST_W
 from dptse_env.model.relations import VACUUM
-from dptse_env.model.road_arrays import EXIT, LINK, MERGE, Road
+from dptse_env.model.road_arrays import EXIT, LINK, MERGE, RoadArrays
 from dptse_env.utils.arrays import FloatArray
 
 
-class Flock(NamedTuple):
-    """Working space of `advance_swarm`, `(S, width)` each but the last.
+class BatchScratch(NamedTuple):
+    """Working space of `advance_states`, `(S, width)` each but the last."""
 
-    Attributes:
-        w: [km/h].
-        speed: [km/h].
-        demand: [veh/h].
-        root: `(w / ((1 + gamma) v_f)) ** (1 / gamma)`: critical density over jam density.
-        flow: q out of each cell [veh/h].
-        row: `(4, width)`.
-    """
-
-    w: FloatArray
-    speed: FloatArray
-    demand: FloatArray
-    root: FloatArray
-    flow: FloatArray
-    row: FloatArray
+    w: FloatArray  # [km/h]
+    speed: FloatArray  # [km/h]
+    demand: FloatArray  # [veh/h]
+    root: FloatArray  # (w / ((1 + gamma) v_f)) ** (1 / gamma): critical density over jam density
+    flow: FloatArray  # q out of each cell [veh/h]
+    row: FloatArray  # (4, width)
 
 
 @njit(cache=True, error_model="numpy")
-def flock_of(road: Road, width: int) -> Flock:
-    """Allocate the working space for a road and a swarm."""
+def make_batch_scratch(road: RoadArrays, width: int) -> BatchScratch:
+    """Allocate the working space for a road and a states."""
     n = road.jam.size
     table = np.empty((5, n, width))
-    return Flock(table[0], table[1], table[2], table[3], table[4], np.empty((4, width)))
+    return BatchScratch(table[0], table[1], table[2], table[3], table[4], np.empty((4, width)))
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
@@ -110,18 +101,18 @@ def _minimum(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
 
 @njit(cache=True, error_model="numpy")
 def _merge(
-    flock: Flock, c: int, down: int, other: int, jam: float, v_f: float, gamma: float
+    scratch: BatchScratch, c: int, down: int, other: int, jam: float, v_f: float, gamma: float
 ) -> None:
-    demand, other_demand = flock.demand[c], flock.demand[other]
-    w, other_w, flow = flock.w[c], flock.w[other], flock.flow[c]
-    mixed, root, supply = flock.row[0], flock.row[1], flock.row[2]
+    demand, other_demand = scratch.demand[c], scratch.demand[other]
+    w, other_w, flow = scratch.w[c], scratch.w[other], scratch.flow[c]
+    mixed, root, supply = scratch.row[0], scratch.row[1], scratch.row[2]
     by_w, exponent = 1.0 / ((1.0 + gamma) * v_f), 1.0 / gamma
     for j in range(mixed.size):
         total = demand[j] + other_demand[j]
         relative = demand[j] * w[j] + other_demand[j] * other_w[j]
         mixed[j] = v_f if total <= 0.0 else relative / total
         root[j] = power(mixed[j] * by_w, exponent)
-    _supplies(mixed, root, flock.speed[down], jam, v_f, gamma, supply)
+    _supplies(mixed, root, scratch.speed[down], jam, v_f, gamma, supply)
     for j in range(mixed.size):
         total = demand[j] + other_demand[j]
         served = demand[j] / total * supply[j]
@@ -129,16 +120,16 @@ def _merge(
 
 
 @njit(cache=True, error_model="numpy")
-def _flow_out(road: Road, flock: Flock, c: int, inputs: FloatArray) -> None:
+def _flow_out(road: RoadArrays, scratch: BatchScratch, c: int, inputs: FloatArray) -> None:
     v_f, gamma = road.free_flow_speed, road.gamma
     kind, down, third = road.kind[c], road.parties[c, 1], road.parties[c, 2]
-    w, root, demand, flow = flock.w[c], flock.root[c], flock.demand[c], flock.flow[c]
-    supply = flock.row[2]
+    w, root, demand, flow = scratch.w[c], scratch.root[c], scratch.demand[c], scratch.flow[c]
+    supply = scratch.row[2]
     if kind == MERGE:
-        _merge(flock, c, down, third, road.jam[down], v_f, gamma)
+        _merge(scratch, c, down, third, road.jam[down], v_f, gamma)
         return
     if kind == EXIT:
-        jam, speed = road.outside_jam[c], flock.row[0]
+        jam, speed = road.outside_jam[c], scratch.row[0]
         density = inputs[road.exit[c]]
         p = v_f * (max(density, 0.0) / jam) ** gamma if np.isfinite(density) else np.nan
         for j in range(speed.size):
@@ -146,13 +137,13 @@ def _flow_out(road: Road, flock: Flock, c: int, inputs: FloatArray) -> None:
             speed[j] = 0.0 if v < 0.0 else v
         _supplies(w, root, speed, jam, v_f, gamma, supply)
     else:
-        _supplies(w, root, flock.speed[down], road.jam[down], v_f, gamma, supply)
+        _supplies(w, root, scratch.speed[down], road.jam[down], v_f, gamma, supply)
         if kind != LINK:
-            share, off = road.share[c], flock.row[1]
+            share, off = road.share[c], scratch.row[1]
             for j in range(supply.size):
                 supply[j] = supply[j] / (1.0 - share)
             if share > 0.0:
-                _supplies(w, root, flock.speed[third], road.jam[third], v_f, gamma, off)
+                _supplies(w, root, scratch.speed[third], road.jam[third], v_f, gamma, off)
                 for j in range(supply.size):
                     branch = off[j] / share
                     supply[j] = branch if branch < supply[j] else supply[j]
@@ -160,15 +151,17 @@ def _flow_out(road: Road, flock: Flock, c: int, inputs: FloatArray) -> None:
 
 
 @njit(cache=True, error_model="numpy")
-def _enter(road: Road, flock: Flock, c: int, inputs: FloatArray, swarm: FloatArray) -> None:
+def _enter(
+    road: RoadArrays, scratch: BatchScratch, c: int, inputs: FloatArray, states: FloatArray
+) -> None:
     """Add what enters a cell from outside; demand that is not served vanishes."""
     v_f, gamma = road.free_flow_speed, road.gamma
     source, w_in = inputs[road.entry[c]], inputs[road.entry[c] + 1]
-    w, root, supply = flock.row[0], flock.row[1], flock.row[2]
+    w, root, supply = scratch.row[0], scratch.row[1], scratch.row[2]
     w[:] = w_in
     root[:] = (w_in / ((1.0 + gamma) * v_f)) ** (1.0 / gamma)
-    _supplies(w, root, flock.speed[c], road.jam[c], v_f, gamma, supply)
-    rho, psi = swarm[2 * c], swarm[2 * c + 1]
+    _supplies(w, root, scratch.speed[c], road.jam[c], v_f, gamma, supply)
+    rho, psi = states[2 * c], states[2 * c + 1]
     for j in range(supply.size):
         entered = road.step_ratio * (supply[j] if source > supply[j] else source)
         rho[j] += entered
@@ -197,25 +190,27 @@ def _arrive(
 
 
 @njit(cache=True, error_model="numpy")
-def advance_swarm(road: Road, swarm: FloatArray, inputs: FloatArray, flock: Flock) -> None:
-    """Move every column of `swarm` `(2 S, width)` one step ahead under inputs `(n_u,)`."""
+def advance_states(
+    road: RoadArrays, states: FloatArray, inputs: FloatArray, scratch: BatchScratch
+) -> None:
+    """Move every column of `states` `(2 S, width)` one step ahead under inputs `(n_u,)`."""
     v_f, gamma, ratio = road.free_flow_speed, road.gamma, road.step_ratio
     for c in range(road.jam.size):
         _tabulate(
-            swarm[2 * c], swarm[2 * c + 1], road.jam[c], v_f, gamma,
-            flock.w[c], flock.speed[c], flock.demand[c], flock.root[c],
+            states[2 * c], states[2 * c + 1], road.jam[c], v_f, gamma,
+            scratch.w[c], scratch.speed[c], scratch.demand[c], scratch.root[c],
         )  # fmt: skip
     for c in range(road.jam.size):
-        _flow_out(road, flock, c, inputs)
+        _flow_out(road, scratch, c, inputs)
     for c in range(road.jam.size):
-        rho, psi = swarm[2 * c], swarm[2 * c + 1]
-        _leave(rho, psi, flock.flow[c], flock.w[c], ratio, road.relaxation, v_f)
+        rho, psi = states[2 * c], states[2 * c + 1]
+        _leave(rho, psi, scratch.flow[c], scratch.w[c], ratio, road.relaxation, v_f)
         if road.entry[c] >= 0:
-            _enter(road, flock, c, inputs, swarm)
+            _enter(road, scratch, c, inputs, states)
     for e in range(road.edges.shape[0]):
         start, end = road.edges[e, 0], road.edges[e, 1]
         part = ratio * road.edge_share[e]
-        _arrive(swarm[2 * end], swarm[2 * end + 1], flock.flow[start], flock.w[start], part)
+        _arrive(states[2 * end], states[2 * end + 1], scratch.flow[start], scratch.w[start], part)
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
@@ -241,11 +236,11 @@ def _into_box(row: FloatArray, largest: float) -> None:
 
 
 @njit(cache=True, error_model="numpy")
-def project_swarm(road: Road, swarm: FloatArray, is_box: bool) -> None:
+def project_states(road: RoadArrays, states: FloatArray, is_box: bool) -> None:
     """Hold every column to its bounds, as `ARZModel.project` does; a NaN stays one."""
     v_f, gamma = road.free_flow_speed, road.gamma
     for c in range(road.jam.size):
-        rho, psi, jam = swarm[2 * c], swarm[2 * c + 1], road.jam[c]
+        rho, psi, jam = states[2 * c], states[2 * c + 1], road.jam[c]
         if is_box:
             _into_box(rho, jam)
             _into_box(psi, jam * v_f)
@@ -265,8 +260,8 @@ def measured_speeds(
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def released_swarm(
-    road: Road, s: int, rho_row: FloatArray, psi_row: FloatArray, out: FloatArray
+def released_by_states(
+    road: RoadArrays, s: int, rho_row: FloatArray, psi_row: FloatArray, out: FloatArray
 ) -> None:
     """Write the speeds [km/h] or centred flows [veh/h] that a sensor sees; as `measure` does."""
     jam, v_f, v_0 = road.jam[s], road.free_flow_speed, road.reference_speed

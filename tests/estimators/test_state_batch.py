@@ -5,15 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dptse_env.estimators.compiled.swarm import (
-    advance_swarm,
-    flock_of,
+from dptse_env.estimators.compiled.state_batch import (
+    advance_states,
+    make_batch_scratch,
     measured_speeds,
-    project_swarm,
-    released_swarm,
+    project_states,
+    released_by_states,
 )
 from dptse_env.model import ARZModel, load_parameters
-from dptse_env.model.road_arrays import road_of
+from dptse_env.model.road_arrays import make_road_arrays
 from dptse_env.traffic import PAPER_HIGHWAY, SHORT_HIGHWAY
 
 WIDTH = 104
@@ -63,8 +63,8 @@ def random_inputs(model, rng):
 
 
 def advanced(model, states, inputs):
-    road, swarm = road_of(model), states.T.copy()
-    advance_swarm(road, swarm, inputs, flock_of(road, len(states)))
+    road, swarm = make_road_arrays(model), states.T.copy()
+    advance_states(road, swarm, inputs, make_batch_scratch(road, len(states)))
     return swarm.T
 
 
@@ -102,7 +102,7 @@ def test_projects_as_the_model_does(corridor, parameters, bounds):
             size=scatter.shape
         )
         swarm = states.T.copy()
-        project_swarm(road_of(model), swarm, bounds == "box")
+        project_states(make_road_arrays(model), swarm, bounds == "box")
         expected = model.project(states, bounds)
         np.testing.assert_allclose(swarm.T / unit(model), expected / unit(model), atol=1e-13)
 
@@ -125,14 +125,14 @@ def test_measures_as_the_model_does(corridor, parameters):
 def test_releases_what_the_model_measures(corridor, parameters, reference_speed):
     """States with negative components among them, as those of members ahead of a projection."""
     model = ARZModel(corridor, parameters, reference_speed=reference_speed)
-    road, rng = road_of(model), np.random.default_rng(0)
+    road, rng = make_road_arrays(model), np.random.default_rng(0)
     states = random_states(model, rng)
     states += 0.02 * unit(model) * rng.normal(size=states.shape)
     expected = model.measure(states)[..., 1]
     out = np.empty(WIDTH)
     for s in range(model.n_segments):
         rho, psi = (np.ascontiguousarray(states[:, 2 * s + i]) for i in range(2))
-        released_swarm(road, s, rho, psi, out)
+        released_by_states(road, s, rho, psi, out)
         np.testing.assert_allclose(out, expected[:, s], rtol=0.0, atol=1e-9 * road.second_scale)
     assert (states[:, 0::2] < 0.0).any()
 
@@ -150,7 +150,7 @@ def test_what_is_not_finite_stays_so_in_its_column(corridor, parameters):
     np.testing.assert_array_equal(after[rows.size :], clean[rows.size :])
     for is_box in (False, True):
         swarm = poisoned.T.copy()
-        project_swarm(road_of(model), swarm, is_box)
+        project_states(make_road_arrays(model), swarm, is_box)
         assert np.isnan(swarm[rows, rows]).all()
 
 
