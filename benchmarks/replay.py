@@ -88,7 +88,7 @@ def recorded(
     traffic = release.setup.traffic
     traffic.load(np.arange(len(seeds)))
     indices = np.arange(n) % len(seeds)
-    boundary = [traffic.whole(index)[:n_steps, s:] for index in range(len(seeds))]
+    boundary = [traffic.complete(index)[:n_steps, s:] for index in range(len(seeds))]
     inputs = [model.boundary_inputs(ends[..., 0], ends[..., 1]) for ends in boundary]
     every = np.arange(n)
     release.reset(every, [np.random.default_rng([0, i]) for i in range(n)])

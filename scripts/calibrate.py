@@ -18,15 +18,15 @@ from agents.evaluation.terminal import make_table, print_table
 from agents.experiments.files import replacing
 from dptse_env.config import parse_seeds
 from dptse_env.model import ARZParameters, available_parameters, load_parameters
-from dptse_env.model.calibration import (
+from dptse_env.model.calibration import calibrate
+from dptse_env.model.compiled import CompiledARZModel
+from dptse_env.model.parameters import write_parameters
+from dptse_env.model.prediction import (
     PredictionError,
     TrafficSeries,
-    calibrate,
     persistence_error,
     prediction_error,
 )
-from dptse_env.model.compiled import CompiledARZModel
-from dptse_env.model.parameters import write_parameters
 from dptse_env.release.traffic_table import TrafficTable
 from dptse_env.traffic import Corridor, RecordLibrary, mean_dwell
 from scripts.cli import make_corridor, parse_keywords, run
@@ -68,7 +68,7 @@ def load_series(
     series = []
     for index in range(len(seeds)):
         traffic.load(index)
-        density, speed = np.moveaxis(traffic.whole(index), -1, 0)
+        density, speed = np.moveaxis(traffic.complete(index), -1, 0)
         series.append(TrafficSeries(density[:, :s], speed[:, :s], density[:, s:], speed[:, s:]))
     return series
 

@@ -1,8 +1,8 @@
-"""What every estimator is: the protocol and its output.
+"""The protocol of estimators and their output.
 
 An estimator follows a batch of episodes. A step is `predict` under the boundary inputs, then
-`update` by what was released, then `estimate`. Both take the indices of the episodes they
-concern; the others stay as they are.
+`update` by the released values, then `estimate`. Both take the indices of the episodes that they
+change.
 """
 
 from __future__ import annotations
@@ -48,15 +48,15 @@ class Estimator(Protocol):
     """Estimates the traffic state of a batch of episodes, S segments each.
 
     Attributes:
-        is_compiled: Whether `predict` and `update` give Python's lock away, so that blocks of
-            episodes gain by threads.
+        is_compiled: Whether `predict` and `update` release Python's global interpreter lock, so
+            that blocks of episodes benefit from threads.
         n_episodes: Episodes n in the batch.
         innovations: `(n, S, 2)` residuals of both releases before the last update, over their
             predicted standard deviations; 0 where nothing was observed.
         diverged: `(n,)` whether the last update found the filter non-finite or indefinite and
-            put it back to its prior.
-        fallback: `(n,)` whether the last update could not be solved for and left the estimate at
-            the prediction.
+            reset it to its prior.
+        fallback: `(n,)` whether the last update had no solution and left the estimate at the
+            prediction.
     """
 
     is_compiled: ClassVar[bool]
@@ -71,26 +71,26 @@ class Estimator(Protocol):
         states: FloatArray,
         generators: Sequence[np.random.Generator],
     ) -> None:
-        """Start episodes over.
+        """Reset episodes.
 
         Args:
             episodes: `(k,)` distinct indices.
             states: `(k, 2 S)` prior means.
-            generators: One random stream an episode, for estimators that draw.
+            generators: A random stream per episode, for estimators that draw.
         """
 
     def predict(self, episodes: IntArray, inputs: FloatArray) -> None:
-        """Move episodes `(k,)` one step ahead under the model's inputs `(k, n_u)`."""
+        """Predict episodes `(k,)` one step ahead under the model's inputs `(k, n_u)`."""
 
     def update(
         self, episodes: IntArray, observed: BoolArray, values: FloatArray, sigma: FloatArray
     ) -> None:
-        """Take in measurements.
+        """Update episodes by measurements.
 
         Args:
             episodes: `(k,)` distinct indices.
-            observed: `(k, S)` which segments were measured.
-            values: `(k, S, 2)` density [veh/km] and, as the model measures, speed [km/h] or
+            observed: `(k, S)` flags of the measured segments.
+            values: `(k, S, 2)` density [veh/km] and, depending on the model, speed [km/h] or
                 centred flow [veh/h]; ignored where not observed.
             sigma: `(2,)` standard deviations of their noise, in the same units.
         """

@@ -1,4 +1,4 @@
-"""The base of estimators: the batch, its flags, and checks of arguments."""
+"""Base class of estimators: batch size, flags, and checks of arguments."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ class Measurements(NamedTuple):
 
 
 def checked_episodes(episodes: IntArray, n_episodes: int) -> IntArray:
-    """Indices as contiguous int64, refused where there is no such episode."""
+    """Return indices as contiguous int64; indices of no episode are refused."""
     indices = np.ascontiguousarray(episodes, dtype=np.int64)
     if indices.ndim != 1:
         raise ValueError(f"episodes must be a vector of indices, got shape {indices.shape}")
-    # A list of Python ints compares faster than numpy reduces, as long as it is short.
+    # For short arrays, comparing Python ints is faster than a reduction in numpy.
     for index in indices.tolist():
         if not 0 <= index < n_episodes:
             raise ValueError(f"episodes must be in 0..{n_episodes - 1}, got {index}")
@@ -36,7 +36,7 @@ def checked_episodes(episodes: IntArray, n_episodes: int) -> IntArray:
 
 
 def checked_rows(name: str, rows: FloatArray, shape: tuple[int, ...]) -> FloatArray:
-    """An array as contiguous float64, refused if its shape is not the one expected."""
+    """Return an array as contiguous float64; another shape than the expected one is refused."""
     array = np.ascontiguousarray(rows, dtype=np.float64)
     if array.shape != shape:
         raise ValueError(f"{name} must have shape {shape}, got {array.shape}")
@@ -51,10 +51,10 @@ def checked_measurements(
     values: FloatArray,
     sigma: FloatArray,
 ) -> Measurements:
-    """Check what `Estimator.update` is given.
+    """Check the arguments of `Estimator.update`.
 
     Raises:
-        ValueError: naming the argument, what is wrong with it and what is allowed.
+        ValueError: An argument is malformed; the message names it.
     """
     indices = checked_episodes(episodes, n_episodes)
     mask = np.ascontiguousarray(observed, dtype=np.bool_)
@@ -72,7 +72,7 @@ def checked_measurements(
 class BatchEstimator(ABC):
     """An estimator of a batch of episodes; subclasses get checked, contiguous arguments.
 
-    `Estimator` documents the public methods. A subclass writes `innovations` and `diverged` of
+    Public methods are documented in `Estimator`. A subclass writes `innovations` and `diverged` of
     the episodes that it updates, and `fallback` where its update can fail.
     """
 
@@ -91,7 +91,7 @@ class BatchEstimator(ABC):
     def reset(
         self, episodes: IntArray, states: FloatArray, generators: Sequence[np.random.Generator]
     ) -> None:
-        """Start episodes over from prior means `(k, 2 S)`."""
+        """See `Estimator.reset`."""
         indices = checked_episodes(episodes, self.n_episodes)
         states = checked_rows("states", states, (indices.size, self.model.n_states))
         self.innovations[indices] = 0.0
@@ -100,14 +100,14 @@ class BatchEstimator(ABC):
         self._reset(indices, states, generators)
 
     def predict(self, episodes: IntArray, inputs: FloatArray) -> None:
-        """Move episodes one step ahead under inputs `(k, n_u)`."""
+        """See `Estimator.predict`."""
         indices = checked_episodes(episodes, self.n_episodes)
         self._predict(indices, checked_rows("inputs", inputs, (indices.size, self.model.n_inputs)))
 
     def update(
         self, episodes: IntArray, observed: BoolArray, values: FloatArray, sigma: FloatArray
     ) -> None:
-        """Take in measurements; what is not finite where observed makes a filter diverge."""
+        """See `Estimator.update`; observed values that are not finite make a filter diverge."""
         n_segments = self.model.n_segments
         given = checked_measurements(self.n_episodes, n_segments, episodes, observed, values, sigma)
         self.fallback[given.episodes] = False

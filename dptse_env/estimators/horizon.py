@@ -1,4 +1,4 @@
-"""What both moving horizon estimators share: their settings and the window's quadratic program.
+"""Settings and quadratic program of the window, shared by both moving horizon estimators.
 
 All quantities here are normalised, rho by rho_m, psi and flows by rho_m v_f and speeds by v_f. A
 window holds L = T + 1 stages; z stacks their states. The program is the paper's, eq. 17:
@@ -24,29 +24,29 @@ from dptse_env.utils.validation import positive
 
 # Largest natural residual of an optimum, in normalised states.
 RESIDUAL = 1e-8
-# What is so near to a bound is put there: a speed is a quotient of two numbers that may vanish.
+# Components so near to a bound are set to it: a speed is a quotient of numbers that may vanish.
 AT_BOUND = 1e-13
-# An answer with a larger residual is no optimum that lacks digits, but a false one. Of piqp's the
-# largest seen is 4e-5, and 2e-2 where measurements are taken for exact.
+# Solutions with a larger residual are not inaccurate optima, but wrong. The largest one of piqp is
+# 4e-5, and 2e-2 where measurements are treated as exact.
 ROUGH = 0.05
-# How often an answer is polished; the second time mostly finds what the first one missed.
+# Number of polishing steps; a second step mostly corrects what the first one missed.
 POLISHES = 10
-# Least deviation of a measurement, normalised: an exact one would weigh infinitely much.
+# Least deviation of a measurement, normalised: an exact one would have an infinite weight.
 LEAST_DEVIATION = 1e-3
 
 
 def process_variance(settings: EstimatorSettings) -> FloatArray:
-    """Variances `(2,)` behind w_2, refused if there is none."""
+    """Return the variances `(2,)` behind w_2; a zero is refused."""
     for i, value in enumerate(settings.process_noise):
         positive(f"estimator_settings.process_noise[{i}]", value)
     return np.square(np.array(settings.process_noise, dtype=np.float64))
 
 
-def own_settings(settings: EstimatorSettings) -> EstimatorSettings:
-    """Settings under which means are held to the bounds of the MHE, which are its own.
+def settings_of_mhe(settings: EstimatorSettings) -> EstimatorSettings:
+    """Return the settings with the bounds of the MHE, which differ from those of other estimators.
 
     Warns:
-        RuntimeWarning: The solver is not installed. What needs it falls back to the prediction.
+        RuntimeWarning: The solver is not installed; steps that need it keep the prediction.
     """
     import qpsolvers  # noqa: PLC0415
 
@@ -62,7 +62,7 @@ def own_settings(settings: EstimatorSettings) -> EstimatorSettings:
 
 
 def normalised_bounds(model: ARZModel, bounds: Bounds) -> tuple[FloatArray, FloatArray]:
-    """Least and largest normalised state `(2 S,)` of the program."""
+    """Return the least and the largest normalised state `(2 S,)` of the program."""
     share = model.jam_density / model.density_scale
     lower, upper = np.zeros(model.n_states), np.repeat(share, 2)
     if bounds == "cone":
@@ -87,7 +87,7 @@ class Window(NamedTuple):
 
 
 def assemble(window: Window) -> tuple[FloatArray, FloatArray]:
-    """H `(L 2 S, L 2 S)` and q `(L 2 S,)` of the paper's eq. 17."""
+    """Return H `(L 2 S, L 2 S)` and q `(L 2 S,)` of the paper's eq. 17."""
     n_stages, n_segments = window.observed.shape
     n = 2 * n_segments
     H, q = np.zeros((n_stages * n, n_stages * n)), np.zeros(n_stages * n)
@@ -113,7 +113,7 @@ def assemble(window: Window) -> tuple[FloatArray, FloatArray]:
 
 
 def measurement_matrix(observed: BoolArray, rows: FloatArray) -> FloatArray:
-    """C `(m, 2 S)` of one stage: both releases of each observed segment in turn."""
+    """Return C `(m, 2 S)` of a stage: both releases of each observed segment in turn."""
     segments = np.flatnonzero(observed)
     C = np.zeros((segments.size, 2, 2 * observed.size))
     C[np.arange(segments.size), 0, 2 * segments] = 1.0
@@ -127,8 +127,8 @@ def natural_residual(
 ) -> float:
     """Largest |z - clip(z - g / diag(2 H), lower, upper)|, g = 2 H z + q; 0 at the optimum only.
 
-    The gradient is scaled by the diagonal so that the residual is in units of z, whatever the
-    weights are. It is NaN where z is.
+    The gradient is scaled by the diagonal, so that the residual is in units of z for any weights.
+    It is NaN where z is.
     """
     step = (2.0 * H @ z + q) / (2.0 * np.diag(H))
     return float(np.max(np.abs(z - np.clip(z - step, lower, upper))))
@@ -139,12 +139,12 @@ def solve(
 ) -> FloatArray | None:
     """Minimise z' H z + q' z within bounds by qpsolvers; None where it finds no optimum.
 
-    An interior point method stops short of the bounds. The answer is polished: what is nearly at
-    a bound and pressed on to it is put there and the rest solved for, a few times over, and the
-    best of all is taken. Whether an answer is worth polishing, and the result an optimum, is judged
-    by its `natural_residual` alone, not by what the solver says.
+    An interior point method stops short of the bounds, so its solution is polished several times:
+    components that are nearly at a bound and pressed against it are set to it, and the others are
+    solved for. The best solution is returned. The `natural_residual`, not the solver's status,
+    decides whether a solution is worth polishing and whether the result is an optimum.
     """
-    # qpsolvers is needed where this is called, which in compiled code is nearly never.
+    # Imported here, since the compiled estimator rarely needs it.
     import qpsolvers  # noqa: PLC0415
 
     P = sp.csc_matrix(2.0 * H)  # qpsolvers minimises z' P z / 2 + q' z
@@ -162,10 +162,10 @@ def solve(
     for _ in range(POLISHES):
         try:
             z = _polish(P, q, lower, upper, z)
-        except RuntimeError:  # of splu: singular; the best answer so far is judged as it is
+        except RuntimeError:  # splu: the matrix is singular
             break
         pair = best, np.clip(z, lower, upper)
-        best = min(pair, key=lambda answer: natural_residual(H, q, lower, upper, answer))
+        best = min(pair, key=lambda z: natural_residual(H, q, lower, upper, z))
     best = np.where(best < lower + AT_BOUND, lower, np.where(best > upper - AT_BOUND, upper, best))
     return best if natural_residual(H, q, lower, upper, best) <= RESIDUAL else None
 
@@ -173,12 +173,12 @@ def solve(
 def _polish(
     P: sp.csc_matrix, q: FloatArray, lower: FloatArray, upper: FloatArray, z: FloatArray
 ) -> FloatArray:
-    """Solve for what is free when variables found pressed on to their bounds are put there."""
+    """Set variables that are pressed against a bound to it, and solve for the others."""
     step = (P @ z + q) / P.diagonal()
     at_lower, at_upper = z - lower <= step, upper - z <= -step
     free = ~(at_lower | at_upper)
     exact: FloatArray = np.where(at_lower, lower, np.where(at_upper, upper, 0.0))
     factors = splu(P[free][:, free].tocsc())
-    for _ in range(2):  # the second pass takes out what rounding left
+    for _ in range(2):  # the second pass corrects rounding errors
         exact[free] += factors.solve(-(q + P @ exact)[free])
     return exact

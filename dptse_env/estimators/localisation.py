@@ -1,4 +1,4 @@
-"""Localisation: how much of a sampled covariance between two places on the road is believed."""
+"""Localisation: weights of sampled covariances by the distance along the road."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dptse_env.utils.arrays import FloatArray
 
 
 def positions(network: RoadNetwork) -> FloatArray:
-    """Where segments lie along the road `(S,)` [km], from its upstream end.
+    """Return the positions of segments along the road `(S,)` [km], from its upstream end.
 
     Mainline segments lie at their centres, ramps at the face where they join or leave.
     """
@@ -21,8 +21,8 @@ def positions(network: RoadNetwork) -> FloatArray:
 def gaspari_cohn(distance: FloatArray, reach: float) -> FloatArray:
     """Correlation with compact support (Gaspari and Cohn, 1999, eq. 4.10).
 
-    A fifth-order piecewise rational function, close to a normal density in shape: 1 at no
-    distance, 5/24 at half of `reach`, 0 from `reach` on.
+    A fifth-order piecewise rational function, close to a normal density in shape: 1 at distance 0,
+    5/24 at half of `reach`, 0 from `reach` on.
 
     Args:
         distance: Any shape, >= 0.
@@ -30,22 +30,22 @@ def gaspari_cohn(distance: FloatArray, reach: float) -> FloatArray:
     """
     z = 2.0 * np.asarray(distance, dtype=np.float64) / reach
     near = 1.0 + z**2 * (-5.0 / 3.0 + z * (5.0 / 8.0 + z * (0.5 - 0.25 * z)))
-    away = np.clip(z, 1.0, 2.0)  # keeps the branch that is not taken from dividing by zero
+    away = np.clip(z, 1.0, 2.0)  # avoids a division by zero in the unused branch
     inner = 5.0 / 3.0 + away * (5.0 / 8.0 + away * (-0.5 + away / 12.0))
     far = 4.0 + away * (-5.0 + away * inner) - 2.0 / (3.0 * away)
     return np.where(z <= 1.0, near, np.where(z < 2.0, np.maximum(far, 0.0), 0.0))
 
 
 def tapers(network: RoadNetwork, reach: float) -> FloatArray:
-    """Weights `(S, S)` of covariances between segments, by their distance along the road.
+    """Return weights `(S, S)` of covariances between segments, by their distance along the road.
 
-    Every segment has one position on one line, where the function is a correlation: the matrix
-    is positive semidefinite, and so is its element-wise product with a covariance (Schur).
-    Distances that lead into the ramps would not promise that.
+    Every segment has a position on a line, where the function is a correlation: the matrix is
+    positive semidefinite, and so is its element-wise product with a covariance (Schur). Distances
+    that include the ramps would not guarantee that.
 
     Args:
         network: The road.
-        reach: Distance [km] from which covariances are dropped.
+        reach: Distance [km] from which covariances are neglected.
     """
     x = positions(network)
     return gaspari_cohn(np.abs(x[:, None] - x), reach)

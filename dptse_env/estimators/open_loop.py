@@ -1,4 +1,4 @@
-"""The traffic model alone: what an estimator is worth without measurements."""
+"""The traffic model alone, without measurements: a baseline of estimators."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from dptse_env.utils.arrays import FloatArray, IntArray
 
 
 class OpenLoop(BatchEstimator):
-    """Follows the model from the prior and takes in no measurement.
+    """Predictions of the model from the prior; measurements are ignored.
 
-    It claims no uncertainty: standard deviations and innovations are zero. An episode whose state
-    has become non-finite goes back to its prior at the next update.
+    Standard deviations and innovations are zero. An episode whose state has become non-finite is
+    reset to its prior at the next update.
     """
 
     def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
@@ -49,8 +49,8 @@ class OpenLoop(BatchEstimator):
 
 
 def estimated_traffic(model: ARZModel, states: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Density [veh/km] and speed [km/h] of states, the speed held to what drivers can reach.
+    """Return density [veh/km] and speed [km/h] of states, the speed at most 1.1 v_f.
 
-    The cone holds it there anyway; in the paper's box w = psi / rho has no bound.
+    In the cone it never exceeds that; in the paper's box w = psi / rho has no bound.
     """
     return model.density(states), np.minimum(model.speed(states), model.largest_speed)

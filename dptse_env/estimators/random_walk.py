@@ -1,4 +1,4 @@
-"""An estimator without a traffic model: density and speed of each segment wander by themselves."""
+"""An estimator without a traffic model: a random walk of each segment's density and speed."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 
 
 class RandomWalk(BatchEstimator):
-    """Independent scalar Kalman filters on (rho, v) of each segment, plain numpy over the batch.
+    """Independent scalar Kalman filters on (rho, v) of each segment, a baseline of estimators.
 
-    What any estimator with a model must beat. Means are held to [0, rho_m] and [0, 1.1 v_f]. Where
-    sensors release the flow rho (v - v_0), it is read as a speed at the density just estimated,
-    with that density taken for exact and for a hundredth of rho_m at least.
+    Means are clipped to [0, rho_m] and [0, 1.1 v_f]. A released flow rho (v - v_0) is converted to
+    a speed by the density just estimated, which is treated as exact and at least a hundredth of
+    rho_m.
     """
 
     def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
@@ -54,10 +54,10 @@ class RandomWalk(BatchEstimator):
         inverse /= np.array([[rho_m], [rho_m * v_f]])
         blocks = inverse * self.variances[..., None, :] @ inverse.swapaxes(-1, -2)
         n_episodes, n_segments = self.means.shape[:2]
-        whole = np.zeros((n_episodes, n_segments, 2, n_segments, 2))
+        joint = np.zeros((n_episodes, n_segments, 2, n_segments, 2))
         every = np.arange(n_segments)
-        whole[:, every, :, every] = blocks.swapaxes(0, 1)
-        return whole.reshape(n_episodes, 2 * n_segments, 2 * n_segments)
+        joint[:, every, :, every] = blocks.swapaxes(0, 1)
+        return joint.reshape(n_episodes, 2 * n_segments, 2 * n_segments)
 
     def _reset(
         self, episodes: IntArray, states: FloatArray, generators: Sequence[np.random.Generator]
@@ -67,21 +67,21 @@ class RandomWalk(BatchEstimator):
         self.variances[episodes] = self._initial_variance
 
     def _predict(self, episodes: IntArray, inputs: FloatArray) -> None:
-        # The inputs say nothing to a walk.
+        # A random walk does not depend on the inputs.
         self.variances[episodes] += self._process_variance
 
     def _update(self, given: Measurements) -> None:
-        self._take_in(given, slice(0, 1), given.values[..., :1], given.sigma[:1])
+        self._update_quantity(given, slice(0, 1), given.values[..., :1], given.sigma[:1])
         speeds, sigma = given.values[..., 1:], given.sigma[1:]
         if self.model.reference_speed is not None:
             density = np.maximum(self.means[given.episodes, :, :1], self._least_density)
             speeds = self.model.reference_speed + speeds / density
             sigma = sigma / density
-        self._take_in(given, slice(1, 2), speeds, sigma)
+        self._update_quantity(given, slice(1, 2), speeds, sigma)
         finite = np.isfinite(given.values).all(axis=2) | ~given.observed
         self._restart(given.episodes, np.all(finite, axis=1))
 
-    def _take_in(
+    def _update_quantity(
         self, given: Measurements, which: slice, values: FloatArray, sigma: FloatArray
     ) -> None:
         """Update densities or speeds `(k, S, 1)`."""
@@ -89,7 +89,7 @@ class RandomWalk(BatchEstimator):
         mean, variance = self.means[episodes, :, which], self.variances[episodes, :, which]
         noise = sigma**2
         total = variance + noise
-        # What is not finite moves nothing here: the episode starts over.
+        # Values that are not finite have no effect here: the episode is reset.
         informative = seen & (total > 0.0) & np.isfinite(values)
         held = np.where(informative, total, 1.0)
         residual = np.where(informative, values, mean) - mean
@@ -111,7 +111,7 @@ class RandomWalk(BatchEstimator):
         )
 
     def _restart(self, episodes: IntArray, sound: BoolArray) -> None:
-        """Put episodes that are not sound or not finite back to their prior, and flag them."""
+        """Reset episodes that are not sound or not finite to their prior, and flag them."""
         finite = np.isfinite(self.means[episodes]).all(axis=(1, 2))
         self.diverged[episodes] = ~(sound & finite)
         lost = episodes[self.diverged[episodes]]

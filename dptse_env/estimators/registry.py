@@ -16,7 +16,7 @@ from dptse_env.utils.registry import Registry, is_foreign, missing_methods, name
 class Backends(NamedTuple):
     """The classes of an estimator that ships with the package, as ``"module:Class"``.
 
-    Modules are imported when they are needed: neither backend needs the other's libraries.
+    Modules are imported on demand, since the backends need different libraries.
     """
 
     compiled: str
@@ -53,8 +53,8 @@ ESTIMATORS = Registry(
     },
     check=_expected,
 )
-"""Estimators by name. One of another package is a class, or a function, of (model, n_episodes,
-settings); its attribute ``settings_type`` may name a dataclass of its own settings."""
+"""Estimators by name. Those of other packages are classes or functions of (model, n_episodes,
+settings); their attribute ``settings_type`` may be a dataclass of other settings."""
 BACKENDS = get_args(Backend)
 
 
@@ -71,14 +71,14 @@ def make_estimator(
         estimator: `ekf`, `ukf`, `enkf`, `mhe`, `random_walk` (no traffic model), `open_loop` (no
             measurements), a registered name, ``"package.module:Class"`` or a class.
         backend: `compiled` (numba) or `reference` (numpy, filterpy, qpsolvers); the random walk
-            is plain numpy under both. For a class of another package it chooses the model alone.
+            is plain numpy under both. For a class of another package it selects the model alone.
         model: The traffic model.
-        n_episodes: Episodes to follow, >= 1.
-        settings: Tuning; defaults if left out.
+        n_episodes: Number of episodes, >= 1.
+        settings: Settings; None for the defaults.
 
     Raises:
-        ValueError: for an unknown name or backend, no episodes, or an estimator that lacks a method
-            or an attribute; says what is allowed.
+        ValueError: Name or backend is unknown, there are no episodes, or the estimator lacks a
+            method or an attribute.
     """
     if n_episodes < 1:
         raise ValueError(f"n_episodes must be >= 1, got {n_episodes}")
@@ -102,10 +102,10 @@ def settings_type(estimator: Any) -> type:
 
 
 def check_estimator(estimator: Any, backend: str) -> None:
-    """Refuse an estimator or a backend that there is not; nothing that ships is imported.
+    """Refuse an unknown estimator or backend; no estimator of this package is imported.
 
     Raises:
-        ValueError: for an unknown estimator or backend, or an estimator that lacks a method.
+        ValueError: Estimator or backend is unknown, or the estimator lacks a method.
     """
     ESTIMATORS.find(estimator)
     if backend not in BACKENDS:
@@ -115,10 +115,10 @@ def check_estimator(estimator: Any, backend: str) -> None:
 def check_estimate(estimator: Estimator, estimate: Estimate, n_segments: int) -> None:
     """Refuse an estimate that is not finite or not of shape (n, S).
 
-    Estimators of the package restart where they diverge; this holds those of others to it.
+    Estimators of this package are reset when they diverge; those of other packages may not be.
 
     Raises:
-        ValueError: naming the class, what is wrong and what is expected.
+        ValueError: The estimate is malformed; the message names the estimator's class.
     """
     shape = estimator.n_episodes, n_segments
     for name in ("density", "speed", "density_std", "speed_std"):
@@ -131,7 +131,7 @@ def check_estimate(estimator: Estimator, estimate: Estimate, n_segments: int) ->
 
 
 def _check_attributes(estimator: Estimator, model: ARZModel, n_episodes: int) -> None:
-    """Refuse an estimator whose class, methods or arrays are not those of the protocol."""
+    """Refuse an estimator whose methods, arrays or attributes do not follow the protocol."""
     name = name_of_class(estimator)
     missing = missing_methods(estimator, ("reset", "predict", "update", "estimate"))
     if missing is not None:

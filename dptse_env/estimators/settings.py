@@ -10,7 +10,7 @@ from dptse_env.utils.fields import Interval, checked_fields
 
 Linearisation = Literal["paper", "trajectory"]
 
-# qpsolvers passes these on although they return false optima of such programs as found.
+# Solvers of qpsolvers that report false optima of these programs as found.
 REFUSED_SOLVERS = ("highs",)
 
 _PATH = "estimator_settings"
@@ -18,7 +18,7 @@ _PATH = "estimator_settings"
 Deviation = Annotated[float, Interval(0, 10)]
 """A standard deviation in units of rho_m or v_f."""
 ArrivalDeviation = Annotated[float, Interval(1e-6, 10)]
-"""The same, more than none."""
+"""A positive standard deviation in units of rho_m or v_f."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class SigmaPointSettings:
         kappa: Secondary spread; above minus the number of states.
 
     Raises:
-        ValueError: naming the field, its value and what is allowed.
+        ValueError: A value is out of range.
     """
 
     alpha: Annotated[float, Interval(1e-3, 1)] = 0.1
@@ -50,12 +50,12 @@ class EnsembleSettings:
     Attributes:
         n_members: Members of an ensemble.
         inflation: Factor on the members' distances from their mean ahead of every update
-            (Anderson and Anderson, 1999); 1 leaves them as they are.
-        taper: Distance along the road [km] from which a measurement no longer acts on a state
+            (Anderson and Anderson, 1999); 1 has no effect.
+        taper: Distance along the road [km] from which a measurement does not affect a state
             (Gaspari and Cohn, 1999); None for no limit.
 
     Raises:
-        ValueError: naming the field, its value and what is allowed.
+        ValueError: A value is out of range.
     """
 
     n_members: Annotated[int, Interval(2, 10_000)] = 100
@@ -77,17 +77,17 @@ class HorizonSettings:
     `EstimatorSettings.initial_variance`.
 
     Attributes:
-        horizon: N, steps that the window reaches back.
+        horizon: N, length of the window in steps.
         arrival_noise: Standard deviations of the predicted state at the window's start, of rho
             over rho_m and psi over rho_m v_f.
-        linearisation: `paper`: each stage once, where it enters the window, at the mean of the
-            solution before; `trajectory`: all stages anew at every step along that solution.
-        bounds: `box`, the paper's, or `cone`: the program is held to the smallest box around the
-            cone of physical states, and its last state is projected into the cone.
+        linearisation: `paper`: each stage once, when it enters the window, at the mean of the last
+            solution; `trajectory`: all stages at every step along the last solution.
+        bounds: `box`, the paper's, or `cone`: the smallest box around the cone of physical states
+            bounds the program, and its last state is projected into the cone.
         solver: Name of a solver of qpsolvers.
 
     Raises:
-        ValueError: naming the field, its value and what is allowed.
+        ValueError: A value is out of range.
     """
 
     horizon: Annotated[int, Interval(1, 1000)] = 10
@@ -97,7 +97,7 @@ class HorizonSettings:
     solver: str = "piqp"
 
     def __post_init__(self) -> None:
-        """Check values; lists, as JSON has them, become tuples."""
+        """Check values; lists become tuples."""
         checked_fields(self, f"{_PATH}.mhe")
         if self.solver in REFUSED_SOLVERS:
             raise ValueError(
@@ -114,16 +114,17 @@ class EstimatorSettings:
         process_noise: Standard deviations of the process noise of one step: of rho over rho_m, of
             psi over rho_m v_f.
         walk_noise: The same of the random walk: of rho over rho_m, of v over v_f.
-        noise_scale: Factor on the known standard deviations of the measurements' noise, for an R
-            that also covers what a count of vehicles says of a density; 1 is the mechanism's own.
+        noise_scale: Factor on the standard deviations of the mechanism's noise, for an R that also
+            covers the difference of vehicle counts and densities.
         initial_variance: Variance of each normalised component of the prior.
-        bounds: Set to which means are held: the `cone` of physical states or the paper's `box`.
+        bounds: Set into which means are projected: the `cone` of physical states or the paper's
+            `box`.
         ukf: Further settings of the unscented Kalman filter.
         enkf: Further settings of the ensemble Kalman filter.
-        mhe: Further settings of the moving horizon estimator, which has bounds of its own.
+        mhe: Further settings of the moving horizon estimator, with separate bounds.
 
     Raises:
-        ValueError: naming the field, its value and what is allowed.
+        ValueError: A value is out of range.
     """
 
     process_noise: tuple[Deviation, Deviation] = (0.01, 0.01)
@@ -136,5 +137,5 @@ class EstimatorSettings:
     mhe: HorizonSettings = field(default_factory=HorizonSettings)
 
     def __post_init__(self) -> None:
-        """Check values; lists, as JSON has them, become tuples."""
+        """Check values; lists become tuples."""
         checked_fields(self, _PATH)

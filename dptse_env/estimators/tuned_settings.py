@@ -1,7 +1,7 @@
-"""Tuned estimator settings: the named sets that ship with the package, and files of that shape.
+"""Tuned estimator settings: named sets that ship with the package, and files of the same format.
 
-A set holds what was tuned for one estimator with one ARZ parameter set under one privacy preset;
-what it leaves out keeps the defaults of `EstimatorSettings`. ``scripts/tune.py`` makes them.
+A set has the settings tuned for an estimator with an ARZ parameter set under a privacy preset;
+others keep the defaults of `EstimatorSettings`. ``scripts/tune.py`` makes them.
 """
 
 from __future__ import annotations
@@ -10,15 +10,13 @@ import json
 import warnings
 from collections.abc import Mapping
 from functools import cache
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.utils.fields import from_mapping
-from dptse_env.utils.json_object import parse_object
+from dptse_env.utils.json_object import parse_object, shipped_texts
 
-_SETS = resources.files("dptse_env.estimators") / "tuned"
 _PATH = "estimator_settings"
 _KEYS = {
     "name": str,
@@ -36,17 +34,20 @@ def settings_name(estimator: str, parameters: str, privacy: str) -> str:
 
 
 @cache
+def _shipped() -> dict[str, str]:
+    return shipped_texts("dptse_env.estimators", "tuned")
+
+
 def available_settings() -> tuple[str, ...]:
     """Names of the sets that ship with the package, sorted."""
-    names = (entry.name for entry in _SETS.iterdir())
-    return tuple(sorted(name.removesuffix(".json") for name in names if name.endswith(".json")))
+    return tuple(_shipped())
 
 
 def load_settings(name: str) -> EstimatorSettings:
     """Load a set that ships with the package.
 
     Raises:
-        ValueError: if there is no such set; the message lists those there are.
+        ValueError: There is no such set; the message lists the available ones.
     """
     return _load(known_settings(name))
 
@@ -55,7 +56,7 @@ def known_settings(name: str) -> str:
     """Return the name of a set that ships with the package, given its present or former name.
 
     Raises:
-        ValueError: if there is no such set; the message lists those there are.
+        ValueError: There is no such set; the message lists the available ones.
     """
     if name in available_settings():
         return name
@@ -69,15 +70,14 @@ def known_settings(name: str) -> str:
 
 @cache
 def _load(name: str) -> EstimatorSettings:
-    entry = _SETS.joinpath(f"{name}.json")
-    return _parse(entry.read_text(encoding="utf-8"), str(entry))
+    return _parse(_shipped()[name], name)
 
 
 def read_settings(path: str | Path) -> EstimatorSettings:
-    """Read a set from a JSON file of the shape that `write_settings` leaves.
+    """Read a set from a JSON file, as written by `write_settings`.
 
     Raises:
-        ValueError: if the file has another shape or a setting is out of range; the message starts
+        ValueError: The file has another format, or a setting is out of range; the message starts
             with the path of the file.
     """
     return _parse(Path(path).read_text(encoding="utf-8"), str(path))
@@ -92,18 +92,18 @@ def write_settings(
     settings: Mapping[str, Any],
     provenance: Mapping[str, Any],
 ) -> None:
-    """Write a set and where it comes from as JSON.
+    """Write a set and its provenance as JSON.
 
     Args:
         path: The file.
         estimator: Name of the estimator.
         parameters: Name of the ARZ parameter set of its model.
-        privacy: Privacy preset whose noise it met.
+        privacy: Privacy preset whose noise it was tuned for.
         settings: The tuned fields of `EstimatorSettings`, nested ones as mappings.
         provenance: Traffic, noise, scores, date and versions.
 
     Raises:
-        ValueError: if a setting is unknown or out of range; nothing is written then.
+        ValueError: A setting is unknown or out of range; nothing is written then.
     """
     content = {
         "name": settings_name(estimator, parameters, privacy),

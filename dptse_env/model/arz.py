@@ -2,8 +2,8 @@
 
 State `x = [rho_0, psi_0, rho_1, psi_1, ...]` over the S segments, with density rho [veh/km] and
 relative flow psi = rho w [veh/h], where w = v + p(rho) [km/h] is what drivers carry with them.
-Inputs `u = [D_in, w_in, rho_out, D_on1, w_on1, ..., rho_off1, ...]`: what the road's surroundings
-demand [veh/h, km/h] and how full they are [veh/km]. Every array has a leading batch axis n.
+Inputs `u = [D_in, w_in, rho_out, D_on1, w_on1, ..., rho_off1, ...]`: demands at the entries [veh/h]
+with their w [km/h], and densities behind the exits [veh/km]. Arrays have a leading batch axis n.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from dptse_env.utils.validation import non_negative
 Bounds = Literal["cone", "box"]
 
 # The cone of physical states: 1 veh/km <= rho <= rho_m, v >= 0 and 0.4 v_f <= w <= 1.1 v_f. The
-# lower bound on w keeps a nearly empty cell from standing still: there the supply changes with the
-# state as w / rho, and a filter that believes it diverges.
+# lower bound on w excludes standing traffic in nearly empty cells, where the supply depends on the
+# state as w / rho, which makes filters diverge.
 LEAST_DENSITY = 1.0
 LEAST_W = 0.4
-# Share of the jam density below which a measurement takes the density for constant: dv/drho
-# grows as psi / rho^2, and a filter that believes it diverges.
+# Share of the jam density below which a measurement treats the density as constant: dv/drho grows
+# as psi / rho^2, which makes filters diverge.
 MEASUREMENT_FLOOR = 0.01
 
 
 class Cells(NamedTuple):
-    """Every cell's view of a state, `(n, S)` each: rho, w, v = max(w - p, 0) and demand D."""
+    """Quantities of every cell, `(n, S)` each: rho, w, v = max(w - p, 0) and demand D."""
 
     density: FloatArray
     w: FloatArray
@@ -67,8 +67,8 @@ class ARZModel:
             None where they release the speed.
 
     Raises:
-        ValueError: for an impossible network, a time step that violates the CFL condition or a
-            reference speed that is negative or not finite.
+        ValueError: The network is impossible, the time step violates the CFL condition, or the
+            reference speed is negative or not finite.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class ARZModel:
         self.jam_density = per_lane * self.layout.lanes
         self.entry_jam_density = per_lane * self.layout.entry_lanes
         self.exit_jam_density = per_lane * self.layout.exit_lanes
-        # One scale for all cells, that of the mainline, so that equal numbers mean equal things.
+        # The scale of the mainline for all cells, so that equal numbers have an equal meaning.
         self.density_scale = per_lane * network.lanes
         self.speed_scale = parameters.free_flow_speed
         self.reference_speed: float | None = None
@@ -105,11 +105,6 @@ class ARZModel:
         parameters.require_time_step(time_step, network.segment_length)
         self.step_ratio = time_step / SECONDS_PER_HOUR / network.segment_length  # T / l [h/km]
         self.relaxation = time_step / parameters.relaxation_time  # T / tau
-
-    @property
-    def largest_time_step(self) -> float:
-        """Largest T [s] of the CFL condition, see `ARZParameters.largest_time_step`."""
-        return self.parameters.largest_time_step(self.network.segment_length)
 
     # States -------------------------------------------------------------------------------------
 
@@ -193,8 +188,6 @@ class ARZModel:
 
     def jacobian(self, states: FloatArray, inputs: FloatArray) -> FloatArray:
         """Analytic derivative of `step` by the state, `(n, 2 S, 2 S)`."""
-        # Imported here because the derivative is built on the model.
-
         return step_jacobian(self, states, inputs)
 
     def merged(self, cells: Cells) -> tuple[FloatArray, FloatArray]:
@@ -207,7 +200,7 @@ class ARZModel:
         return total, np.where(total > 0.0, relative / np.where(total > 0.0, total, 1.0), v_f)
 
     def diverge_supplies(self, cells: Cells) -> FloatArray:
-        """Flow before each diverge that each branch (mainline, off-ramp) allows, `(2, n, O)`."""
+        """Flow before each diverge that each branch (mainline, off-ramp) admits, `(2, n, O)`."""
         up, main, off = self.layout.diverges
         supply, jam = self.relations.supply, self.jam_density
         share = self.layout.exit_shares
@@ -220,15 +213,15 @@ class ARZModel:
         )
 
     def exit_speed(self, w: FloatArray, density: FloatArray) -> FloatArray:
-        """Speed `(n, 1 + O)` [km/h] that drivers w take up behind an exit of the given density."""
+        """Speed `(n, 1 + O)` [km/h] of drivers w behind an exit of the given density."""
         return np.maximum(w - self.relations.pressure(density, self.exit_jam_density), 0.0)
 
     def boundary_inputs(self, density: FloatArray, speed: FloatArray) -> FloatArray:
         """Inputs `(n, n_u)` of the boundary cells' densities and speeds `(n, R)`.
 
-        Boundary cells: upstream, downstream, before each on-ramp, after each off-ramp. An empty
-        cell demands nothing, whatever its speed is said to be, NaN included. w is held within
-        [0, 1.1 v_f], so that no input breaks the CFL condition.
+        Boundary cells: upstream, downstream, before each on-ramp, after each off-ramp. The demand
+        of an empty cell is zero for any speed, NaN included. w is clipped to [0, 1.1 v_f], so that
+        no input violates the CFL condition.
         """
         layout, v_f = self.layout, self.parameters.free_flow_speed
         inputs = np.empty((density.shape[0], self.n_inputs))
@@ -257,7 +250,7 @@ class ARZModel:
         return np.stack([rho, psi - rho * carried], axis=-1)
 
     def measurement_jacobian(self, states: FloatArray) -> FloatArray:
-        """Derivative of `measure`, `(n, S, 2, 2)`: by the segment's own (rho, psi), others zero."""
+        """Derivative of `measure`, `(n, S, 2, 2)`, by the segment's (rho, psi)."""
         if self.reference_speed is None:
             return self.traffic_jacobian(states)
         pressure = self.relations.pressure(states[..., 0::2], self.jam_density)
@@ -275,7 +268,7 @@ class ARZModel:
         return np.stack([rho, speed], axis=-1)
 
     def traffic_jacobian(self, states: FloatArray) -> FloatArray:
-        """Derivative of `traffic`, `(n, S, 2, 2)`: by the segment's own (rho, psi)."""
+        """Derivative of `traffic`, `(n, S, 2, 2)`, by the segment's (rho, psi)."""
         rho, psi = states[..., 0::2], states[..., 1::2]
         floor = MEASUREMENT_FLOOR * self.jam_density
         floored = np.maximum(rho, floor)

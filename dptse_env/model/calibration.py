@@ -1,8 +1,8 @@
 """Fit the ARZ parameters to recorded traffic.
 
 Two stages. Densities are binned and the equilibrium speed `V_e = v_f (1 - (rho/rho_m)^gamma)` is
-fitted to the bins: a start. Then (v_f, rho_m, gamma, tau) are moved to where the model, started
-from the true state, predicts the next 5 to 30 s best.
+fitted to the bins as a start. Then (v_f, rho_m, gamma, tau) are optimised for the predictions of
+the next 5 to 30 s by the model, started from the true state.
 """
 
 from __future__ import annotations
@@ -25,19 +25,8 @@ from dptse_env.model.prediction import (
 )
 from dptse_env.utils.arrays import FloatArray
 
-__all__ = [
-    "HORIZONS",
-    "Calibration",
-    "PredictionError",
-    "TrafficSeries",
-    "calibrate",
-    "persistence_error",
-    "prediction_error",
-    "starting_parameters",
-]
-
 # Bounds of the search: v_f [km/h], rho_m as a multiple of the least admissible one, gamma, tau [s].
-# Beyond 150 km/h predictions still gain a little from a higher v_f, and a filter loses.
+# Beyond 150 km/h a higher v_f still improves predictions a little, but not filters.
 _LOWEST = np.array([30.0, 1.0, 0.1, 5.0])
 _HIGHEST = np.array([150.0, 4.0, 5.0, 500.0])
 _WIDTH = 0.2  # first steps of the search, as shares of the values
@@ -50,13 +39,13 @@ class Calibration:
 
     Attributes:
         parameters: The fitted parameters.
-        start: Where the search began.
-        error: Prediction error of the fit on the data it was fitted to.
-        persistence: That of persistence on the same data.
-        loss: Mean over horizons of error over persistence's; below 1 the model is the better one.
-        n_evaluations: Models tried.
-        at_bounds: Parameters that ended where the search may not go further: the data do not
-            tell them apart from larger or smaller ones. v_f and gamma often trade off so.
+        start: Start of the search.
+        error: Prediction error of the fit on the training data.
+        persistence: Prediction error of persistence on the same data.
+        loss: Mean over horizons of error over persistence's; below 1 the model is better.
+        n_evaluations: Number of models tried.
+        at_bounds: Parameters at a bound of the search: the data do not distinguish them from larger
+            or smaller ones, often since v_f and gamma compensate for each other.
     """
 
     parameters: ARZParameters
@@ -83,7 +72,7 @@ def starting_parameters(
         bin_width: Width of a bin [veh/km].
 
     Raises:
-        ValueError: if the data fill fewer than four bins.
+        ValueError: The data fill fewer than four bins.
     """
     n = network.n_mainline
     density = np.concatenate([series.density[:, :n].ravel() for series in data])
@@ -120,19 +109,19 @@ def calibrate(
     time_step: float = 1.0,
     max_evaluations: int = 400,
 ) -> Calibration:
-    """Fit (v_f, rho_m, gamma, tau) to runs of traffic; report on other runs than these.
+    """Fit (v_f, rho_m, gamma, tau) to runs of traffic, to be tested on other runs.
 
     The jam density stays above the largest density in the data, and the CFL condition holds.
 
     Args:
-        network: The road that the data are from.
+        network: The road of the data.
         data: Training runs.
         name: Name of the fitted set.
-        start: Where the search begins; by default `starting_parameters`.
+        start: Start of the search; by default `starting_parameters`.
         horizons: Steps ahead whose errors count, ascending.
         stride: Steps between two starts of a prediction.
         time_step: Seconds between two rows of the data.
-        max_evaluations: Models to try at most.
+        max_evaluations: Largest number of models to try.
     """
     start = start or starting_parameters(network, data)
     least_jam = _least_jam_density(network, data)
@@ -145,7 +134,7 @@ def calibrate(
     def loss(values: FloatArray) -> float:
         try:
             model = CompiledARZModel(network, parameters_at(values), time_step)
-        except ValueError:  # the CFL condition: not a model, so not a candidate
+        except ValueError:  # violates the CFL condition
             return _REFUSED
         return _relative(prediction_error(model, data, horizons, stride), persistence)
 
@@ -169,7 +158,7 @@ def calibrate(
         CompiledARZModel(network, parameters, time_step), data, horizons, stride
     )
     names = ("free_flow_speed", "jam_density", "gamma", "relaxation_time")
-    room = np.minimum(found.x - np.log(_LOWEST), np.log(_HIGHEST) - found.x)
+    distance = np.minimum(found.x - np.log(_LOWEST), np.log(_HIGHEST) - found.x)
     return Calibration(
         parameters,
         start,
@@ -177,19 +166,19 @@ def calibrate(
         persistence,
         loss=float(found.fun),
         n_evaluations=int(found.nfev),
-        at_bounds=tuple(name for name, gap in zip(names, room, strict=True) if gap < 0.01),
+        at_bounds=tuple(name for name, gap in zip(names, distance, strict=True) if gap < 0.01),
     )
 
 
 def _simplex(start: FloatArray) -> FloatArray:
-    """Corners of a search in logarithms, wide in every direction, a start on a bound included."""
+    """Return the first simplex of a search in logarithms, within bounds and not degenerate."""
     low, high = np.log(_LOWEST), np.log(_HIGHEST)
     first = np.clip(start, low, high - _WIDTH)
     return np.vstack([first, first + _WIDTH * np.eye(first.size)])
 
 
 def _least_jam_density(network: RoadNetwork, data: Sequence[TrafficSeries]) -> float:
-    """Just above the largest density seen, per lane, on a road of `network.lanes` lanes."""
+    """Return just above the largest density per lane, for a road of `network.lanes` lanes."""
     lanes = np.asarray(network.segment_lanes, dtype=np.float64)
     largest = max(float(np.max(series.density / lanes)) for series in data)
     return 1.01 * largest * network.lanes

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class Gradients(NamedTuple):
-    """Derivatives of a cell's w, speed and demand by its own (rho, psi), `(n, S, 2)` each."""
+    """Derivatives of a cell's w, speed and demand by its (rho, psi), `(n, S, 2)` each."""
 
     w: FloatArray
     speed: FloatArray
@@ -30,14 +30,14 @@ def step_jacobian(model: ARZModel, states: FloatArray, inputs: FloatArray) -> Fl
     """Derivative `(n, 2 S, 2 S)` of `model.step`."""
     layout = model.layout
     cells = model.cells(states)
-    own = _gradients(model, states, cells)
+    gradients = _gradients(model, states, cells)
     flux = model.fluxes(states, inputs)
-    by = _outflow_gradient(model, cells, own, inputs)
-    source_by = _source_gradient(model, cells, own, inputs)
+    by = _outflow_gradient(model, cells, gradients, inputs)
+    source_by = _source_gradient(model, cells, gradients, inputs)
 
     each = np.arange(model.n_segments)
     relative_by = cells.w[:, :, None, None] * by
-    relative_by[:, each, each] += flux.outflow[:, :, None] * own.w
+    relative_by[:, each, each] += flux.outflow[:, :, None] * gradients.w
 
     balance = model.step_ratio * (layout.routing - np.eye(model.n_segments))
     blocks = np.empty((*by.shape[:3], 2, 2))  # n, row's cell, column's cell, row, column
@@ -76,28 +76,28 @@ def _gradients(model: ARZModel, states: FloatArray, cells: Cells) -> Gradients:
 
 
 def _outflow_gradient(
-    model: ARZModel, cells: Cells, own: Gradients, inputs: FloatArray
+    model: ARZModel, cells: Cells, gradients: Gradients, inputs: FloatArray
 ) -> FloatArray:
     n, s = cells.density.shape
     by = np.zeros((n, s, s, 2))
-    _links(model, cells, own, by)
-    _merges(model, cells, own, by)
-    _diverges(model, cells, own, by)
-    _exits(model, cells, own, inputs, by)
+    _links(model, cells, gradients, by)
+    _merges(model, cells, gradients, by)
+    _diverges(model, cells, gradients, by)
+    _exits(model, cells, gradients, inputs, by)
     return by
 
 
-def _links(model: ARZModel, cells: Cells, own: Gradients, by: FloatArray) -> None:
+def _links(model: ARZModel, cells: Cells, gradients: Gradients, by: FloatArray) -> None:
     up, down = model.layout.links
     jam = model.jam_density[down]
     w, speed = cells.w[:, up], cells.speed[:, down]
     sends = cells.demand[:, up] <= model.relations.supply(w, speed, jam)
     by_w, by_speed = model.relations.supply_gradient(w, speed, jam)
-    by[:, up, up] = _choose(sends, own.demand[:, up], by_w[..., None] * own.w[:, up])
-    by[:, up, down] = _choose(sends, 0.0, by_speed[..., None] * own.speed[:, down])
+    by[:, up, up] = _choose(sends, gradients.demand[:, up], by_w[..., None] * gradients.w[:, up])
+    by[:, up, down] = _choose(sends, 0.0, by_speed[..., None] * gradients.speed[:, down])
 
 
-def _merges(model: ARZModel, cells: Cells, own: Gradients, by: FloatArray) -> None:
+def _merges(model: ARZModel, cells: Cells, gradients: Gradients, by: FloatArray) -> None:
     main, ramp, down = model.layout.merges
     jam, demand, speed = model.jam_density[down], cells.demand, cells.speed[:, down]
     total, mixed_w = model.merged(cells)
@@ -112,16 +112,19 @@ def _merges(model: ARZModel, cells: Cells, own: Gradients, by: FloatArray) -> No
         for other in (main, ramp):
             other_share = (demand[:, other] / held)[..., None]
             surplus_w = (cells.w[:, other] - mixed_w) / held
-            mixed_by = other_share * own.w[:, other] + surplus_w[..., None] * own.demand[:, other]
+            mixed_by = (
+                other_share * gradients.w[:, other]
+                + surplus_w[..., None] * gradients.demand[:, other]
+            )
             same = 1.0 if cell is other else 0.0
-            share_by = ((same - share) / held)[..., None] * own.demand[:, other]
+            share_by = ((same - share) / held)[..., None] * gradients.demand[:, other]
             limited = share[..., None] * by_w[..., None] * mixed_by + supply[..., None] * share_by
-            by[:, cell, other] = _choose(serves_all, same * own.demand[:, other], limited)
-        limited = (share * by_speed)[..., None] * own.speed[:, down]
+            by[:, cell, other] = _choose(serves_all, same * gradients.demand[:, other], limited)
+        limited = (share * by_speed)[..., None] * gradients.speed[:, down]
         by[:, cell, down] = _choose(serves_all, 0.0, limited)
 
 
-def _diverges(model: ARZModel, cells: Cells, own: Gradients, by: FloatArray) -> None:
+def _diverges(model: ARZModel, cells: Cells, gradients: Gradients, by: FloatArray) -> None:
     up, main, off = model.layout.diverges
     share = model.layout.exit_shares
     on_main, on_ramp = model.diverge_supplies(cells)
@@ -129,18 +132,18 @@ def _diverges(model: ARZModel, cells: Cells, own: Gradients, by: FloatArray) -> 
     # Two blocked branches tie: rounding must not choose between them.
     tie = STANDING * model.jam_density[main] * model.parameters.free_flow_speed
     by_main = on_main - tie <= on_ramp
-    by[:, up, up] = _choose(sends, own.demand[:, up], 0.0)
+    by[:, up, up] = _choose(sends, gradients.demand[:, up], 0.0)
     for branch, allows, part in ((main, by_main, 1.0 - share), (off, ~by_main, share)):
         limits = (~sends & allows).astype(np.float64) / np.where(part > 0.0, part, 1.0)
         by_w, by_speed = model.relations.supply_gradient(
             cells.w[:, up], cells.speed[:, branch], model.jam_density[branch]
         )
-        by[:, up, up] += (limits * by_w)[..., None] * own.w[:, up]
-        by[:, up, branch] = (limits * by_speed)[..., None] * own.speed[:, branch]
+        by[:, up, up] += (limits * by_w)[..., None] * gradients.w[:, up]
+        by[:, up, branch] = (limits * by_speed)[..., None] * gradients.speed[:, branch]
 
 
 def _exits(
-    model: ARZModel, cells: Cells, own: Gradients, inputs: FloatArray, by: FloatArray
+    model: ARZModel, cells: Cells, gradients: Gradients, inputs: FloatArray, by: FloatArray
 ) -> None:
     exits, jam = model.layout.exits, model.exit_jam_density
     w = cells.w[:, exits]
@@ -149,11 +152,13 @@ def _exits(
     by_w, by_speed = model.relations.supply_gradient(w, speed, jam)
     # The speed behind the exit is w - p(rho_out): it moves with w unless the exit is blocked.
     total = by_w + np.where(speed > 0.0, by_speed, 0.0)
-    by[:, exits, exits] = _choose(sends, own.demand[:, exits], total[..., None] * own.w[:, exits])
+    by[:, exits, exits] = _choose(
+        sends, gradients.demand[:, exits], total[..., None] * gradients.w[:, exits]
+    )
 
 
 def _source_gradient(
-    model: ARZModel, cells: Cells, own: Gradients, inputs: FloatArray
+    model: ARZModel, cells: Cells, gradients: Gradients, inputs: FloatArray
 ) -> FloatArray:
     layout = model.layout
     entries, jam = layout.entries, model.jam_density[layout.entries]
@@ -161,7 +166,7 @@ def _source_gradient(
     speed = cells.speed[:, entries]
     _, by_speed = model.relations.supply_gradient(w_in, speed, jam)
     unlimited = demand <= model.relations.supply(w_in, speed, jam)
-    return _choose(unlimited, 0.0, by_speed[..., None] * own.speed[:, entries])
+    return _choose(unlimited, 0.0, by_speed[..., None] * gradients.speed[:, entries])
 
 
 def _choose(

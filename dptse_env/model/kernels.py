@@ -2,13 +2,13 @@
 
 The equations are those of `dptse_env.model.arz`, written for one cell at a time. A cell's outflow
 depends on at most three cells, its parties: itself and those at its downstream face. A step's
-Jacobian is a weighted sum of the outflows' gradients; which goes where is a table of the road.
+Jacobian is a weighted sum of the outflows' gradients, by a table of the road.
 
-numba caches compiled code by the file it stands in, not by what it calls: after a change here,
-delete the `*.nbi` files of the packages that call these kernels.
+numba caches compiled code by the file of a function, not by the functions it calls: after a change
+here, delete the `*.nbi` files of the packages that call these kernels.
 
-Nothing here allocates: callers bring scratch space (`make_scratch`), so that a kernel can run
-inside another one, once a step and episode.
+Kernels do not allocate: callers pass scratch space (`make_scratch`), so that a kernel can run
+inside another one, once per step and episode.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from dptse_env.model.relations import STANDING, VACUUM
 from dptse_env.model.road_arrays import EXIT, LINK, MERGE, RoadArrays
 from dptse_env.utils.arrays import FloatArray
 
-# Columns of the table of cells: values, then partial derivatives by the cell's own rho and psi.
+# Columns of the table of cells: values, then partial derivatives by the cell's rho and psi.
 _W, _V, _D, _W_RHO, _W_PSI, _V_RHO, _V_PSI, _D_RHO, _D_PSI = range(9)
 
 Outflow = tuple[float, float, float, float, float, float, float]
@@ -95,9 +95,9 @@ def _tabulate(road: RoadArrays, state: FloatArray, cells: FloatArray) -> None:
             cells[c, _D_PSI] = critical * w_psi
 
 
-# The four faces. Each returns q, then its derivatives by (rho, psi) of the cell's three parties.
-# They take cells by index and numbers instead of the road: a view or a tuple of arrays would cost
-# more in reference counts than the arithmetic does.
+# The four kinds of faces. Each function returns q and its derivatives by (rho, psi) of the three
+# parties. Arguments are indices and numbers instead of the road: reference counts of a view or a
+# tuple of arrays would take more time than the arithmetic.
 
 
 @njit(cache=True, error_model="numpy")
@@ -226,7 +226,7 @@ def _flows_out(
 def _sources(
     road: RoadArrays, cells: FloatArray, inputs: FloatArray, after: FloatArray, blocks: FloatArray
 ) -> None:
-    """Add what enters from outside; demand that is not served vanishes."""
+    """Add inflows from outside; demand that is not served is lost."""
     for c in range(road.jam.size):
         column = road.entry[c]
         if column < 0:

@@ -1,4 +1,4 @@
-"""The road as the model sees it: which cells flow into which, and the lanes of each cell."""
+"""Layout of a road in the model: connections of cells, and the lanes of each cell."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class RoadNetwork(Protocol):
 
     @property
     def off_ramps(self) -> Sequence[int]:
-        """For each off-ramp the mainline segment behind its nose."""
+        """For each off-ramp the mainline segment downstream of it."""
 
     @property
     def exit_shares(self) -> Sequence[float]:
@@ -111,7 +111,7 @@ class Layout:
         return np.array([1, *range(first, self.n_boundaries)], dtype=np.int64)
 
     def sparsity(self) -> BoolArray:
-        """`(S, S)`: whether a row's cell after one step depends on a column's cell before it."""
+        """`(S, S)` flags: the cell of a row after a step depends on that of a column before it."""
         # The outflow of a cell depends on every cell at its downstream face.
         outflow = np.eye(self.n_segments, dtype=bool)
         for cells in (*self.links.T, *self.diverges.T):
@@ -126,7 +126,7 @@ def make_layout(network: RoadNetwork) -> Layout:
     """Derive the index arrays of a network.
 
     Raises:
-        ValueError: for a geometry the model cannot hold, naming the offending field.
+        ValueError: The model does not cover the geometry; the message names the field.
     """
     _check(network)
     n, n_on, n_off = network.n_mainline, len(network.on_ramps), len(network.off_ramps)
@@ -184,7 +184,7 @@ def _check(network: RoadNetwork) -> None:
             taken.add(face)
     if len(network.exit_shares) != len(network.off_ramps):
         raise ValueError(
-            f"network.exit_shares must have {len(network.off_ramps)} entries, one an off-ramp, "
+            f"network.exit_shares must have {len(network.off_ramps)} entries, one per off-ramp, "
             f"got {len(network.exit_shares)}"
         )
     for i, share in enumerate(network.exit_shares):

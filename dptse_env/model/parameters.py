@@ -1,4 +1,4 @@
-"""Parameters of the ARZ model: validated values and the named sets that ship with the package."""
+"""Parameters of the ARZ model, and the named sets that ship with the package."""
 
 from __future__ import annotations
 
@@ -7,14 +7,11 @@ import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import cache
-from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any
 
 from dptse_env.utils.fields import Interval, checked_fields, from_mapping
-from dptse_env.utils.json_object import parse_object
-
-_SETS = resources.files("dptse_env.model") / "sets"
+from dptse_env.utils.json_object import parse_object, shipped_texts
 
 SECONDS_PER_HOUR = 3600.0
 LARGEST_W = 1.1
@@ -29,12 +26,12 @@ class ARZParameters:
         name: Name of the set in tables and messages.
         free_flow_speed: v_f [km/h]; also the w that drivers relax towards.
         jam_density: rho_m [veh/km] of a road of `lanes` lanes; other cells scale with their lanes.
-        gamma: Exponent of the pressure [-]; fits of real traffic reach down to 0.4.
+        gamma: Exponent of the pressure [-]; fits of real traffic may be as low as 0.4.
         relaxation_time: tau [s]; infinite for no relaxation.
-        lanes: Lanes of the road that `jam_density` is for.
+        lanes: Lanes of the road to which `jam_density` applies.
 
     Raises:
-        ValueError: naming the field, its value and what is allowed.
+        ValueError: A value is out of range.
     """
 
     name: str
@@ -45,12 +42,12 @@ class ARZParameters:
     lanes: Annotated[int, Interval(1, 16)] = 3
 
     def __post_init__(self) -> None:
-        """Refuse values without physical meaning."""
+        """Check values."""
         checked_fields(self, "parameters")
 
     @classmethod
     def from_mapping(cls, mapping: Mapping[str, Any]) -> ARZParameters:
-        """Build from a mapping of field names; unknown and missing keys are refused by name."""
+        """Return the parameters in a mapping; unknown and missing keys are refused."""
         return from_mapping(cls, mapping, "parameters")
 
     def largest_time_step(self, segment_length: float) -> float:
@@ -71,7 +68,7 @@ class ARZParameters:
         """
         largest = self.largest_time_step(segment_length)
         if not 0.0 < time_step <= largest:
-            # Rounded down, so that the number named is itself admissible.
+            # Rounded down, so that the number in the message is admissible.
             named = math.floor(100.0 * largest) / 100.0
             raise ValueError(
                 f"model.time_step must be > 0 and at most {named:.2f} s (CFL condition of "
@@ -80,10 +77,13 @@ class ARZParameters:
 
 
 @cache
+def _shipped() -> dict[str, str]:
+    return shipped_texts("dptse_env.model", "sets")
+
+
 def available_parameters() -> tuple[str, ...]:
     """Names of the sets that ship with the package, sorted."""
-    names = (entry.name for entry in _SETS.iterdir())
-    return tuple(sorted(name.removesuffix(".json") for name in names if name.endswith(".json")))
+    return tuple(_shipped())
 
 
 @cache
@@ -91,21 +91,20 @@ def load_parameters(name: str) -> ARZParameters:
     """Load a set that ships with the package.
 
     Raises:
-        ValueError: if there is no such set; the message lists those there are.
+        ValueError: There is no such set; the message lists the available ones.
     """
     if name not in available_parameters():
         raise ValueError(
             f"parameters must be one of {', '.join(available_parameters())}, got {name!r}"
         )
-    entry = _SETS.joinpath(f"{name}.json")
-    return _parse(entry.read_text(encoding="utf-8"), str(entry))
+    return _parse(_shipped()[name], name)
 
 
 def read_parameters(path: str | Path) -> ARZParameters:
-    """Read a set from a JSON file of the shape that `write_parameters` leaves.
+    """Read a set from a JSON file, as written by `write_parameters`.
 
     Raises:
-        ValueError: The file has another shape or a value is out of range; the message starts with
+        ValueError: The file has another format or a value is out of range; the message starts with
             the path of the file.
     """
     return _parse(Path(path).read_text(encoding="utf-8"), str(path))
@@ -114,7 +113,7 @@ def read_parameters(path: str | Path) -> ARZParameters:
 def write_parameters(
     path: str | Path, parameters: ARZParameters, provenance: Mapping[str, Any]
 ) -> None:
-    """Write a set and where it comes from (data, method, errors reached) as JSON."""
+    """Write a set and its provenance (data, method, errors) as JSON."""
     content = {"parameters": asdict(parameters), "provenance": dict(provenance)}
     Path(path).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 

@@ -1,4 +1,4 @@
-"""How well a model predicts recorded traffic, beside persistence: the line to beat."""
+"""Errors of a model's predictions of recorded traffic, and those of persistence."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ HORIZONS = (5, 10, 15, 20, 25, 30)
 
 @dataclass(frozen=True)
 class TrafficSeries:
-    """Traffic of one run over K steps, all that calibration looks at.
+    """Traffic of a run over K steps.
 
     Attributes:
         density: `(K, S)` density of each segment [veh/km].
@@ -24,7 +24,7 @@ class TrafficSeries:
         boundary_speed: `(K, R)` mean speed of the boundary cells [km/h]; ignored where empty.
 
     Raises:
-        ValueError: if shapes disagree, or a density or an occupied segment's speed is no
+        ValueError: Shapes disagree, or a density or an occupied segment's speed is no
             non-negative number.
     """
 
@@ -55,12 +55,12 @@ class TrafficSeries:
 
 @dataclass(frozen=True)
 class PredictionError:
-    """Root mean square errors over the mainline, one entry a horizon.
+    """Root mean square errors over the mainline, an entry per horizon.
 
     Attributes:
         horizons: Steps ahead.
-        density: Of the density [veh/km].
-        speed: Of the speed [km/h], over segments that hold a vehicle at the time predicted.
+        density: Errors of the density [veh/km].
+        speed: Errors of the speed [km/h], over segments with a vehicle at the predicted time.
     """
 
     horizons: tuple[int, ...]
@@ -77,13 +77,13 @@ def prediction_error(
     """Error of the model alone, started from the true state at every `stride`-th step.
 
     Args:
-        model: The model; a `CompiledARZModel` is the fast one.
+        model: The model; a `CompiledARZModel` is faster.
         data: Runs of traffic; the true boundary cells drive the model.
-        horizons: How many steps ahead, ascending.
+        horizons: Steps ahead, ascending.
         stride: Steps between two starts.
 
     Raises:
-        ValueError: if the horizons do not ascend or no run is longer than the longest of them.
+        ValueError: The horizons do not ascend, or no run is longer than the longest of them.
     """
     _check_horizons(data, horizons, stride)
     errors = _Errors(horizons, model.network.n_mainline)
@@ -106,9 +106,9 @@ def persistence_error(
     horizons: Sequence[int] = HORIZONS,
     stride: int = 5,
 ) -> PredictionError:
-    """Error of taking the traffic of now for that of then, on the pairs of `prediction_error`.
+    """Error of predicting no change, for the same times as `prediction_error`.
 
-    A segment empty now has no speed to persist and is left out of the speed's error.
+    A segment that is empty at the start has no speed and is left out of the speed's error.
     """
     _check_horizons(data, horizons, stride)
     errors = _Errors(horizons, n_mainline)
@@ -155,7 +155,7 @@ class _Errors:
 
 
 def _true_states(model: ARZModel, series: TrafficSeries) -> FloatArray:
-    """States of the recorded traffic; an empty segment is entered at free flow."""
+    """Return the states of the recorded traffic, with the free speed on empty segments."""
     v_f = model.parameters.free_flow_speed
     speed = np.where(series.density > 0.0, series.speed, v_f)
     return model.project(model.states(series.density, speed))

@@ -1,7 +1,7 @@
 """Constitutive relations of the ARZ model (Aw-Rascle 2000, Zhang 2002): pressure, demand, supply.
 
 Along drivers of one characteristic w the flow is `q_w(rho) = rho (w - p(rho))`. Demand is what a
-cell can send, supply what the cell behind a face can take in from drivers w. Arrays broadcast.
+cell can send, supply what the next cell can receive of drivers w. Arrays broadcast.
 """
 
 from __future__ import annotations
@@ -12,17 +12,17 @@ import numpy as np
 
 from dptse_env.utils.arrays import FloatArray
 
-# Below this share of its jam density a cell is a vacuum: it sends nothing, and w is v_f there.
+# Below this share of its jam density a cell is a vacuum: its demand is zero and its w is v_f.
 VACUUM = 1e-12
-# A speed of zero is a kink, and projection puts states right on it. Within this share of v_f the
-# derivative of moving traffic is taken (and that of the mainline where both branches of a diverge
-# stand), so that rounding does not decide.
+# A speed of zero is a kink, and projected states may lie on it. Within this share of v_f the
+# derivative of moving traffic is used (and that of the mainline where both branches of a diverge
+# stand), so that it does not depend on rounding.
 STANDING = 1e-9
 
 
 @dataclass(frozen=True)
 class Relations:
-    """The relations of one parameter set; a cell brings its own jam density.
+    """The relations of a parameter set; jam densities are arguments.
 
     Attributes:
         free_flow_speed: v_f [km/h].
@@ -49,7 +49,7 @@ class Relations:
         return self.critical_density(w, jam) * w * (self.gamma / (1.0 + self.gamma))
 
     def demand(self, density: FloatArray, w: FloatArray, jam: FloatArray) -> FloatArray:
-        """Flow a cell can send [veh/h]: q_w(rho) up to the critical density, q_max(w) beyond."""
+        """Largest outflow [veh/h]: q_w(rho) up to the critical density, q_max(w) beyond."""
         pressure = self.pressure(density, jam)
         free = (1.0 + self.gamma) * pressure <= w
         return np.where(free, density * (w - pressure), self.capacity(w, jam))
@@ -64,10 +64,10 @@ class Relations:
         return by_density, np.where(free, density, self.critical_density(w, jam))
 
     def supply(self, w: FloatArray, speed: FloatArray, jam: FloatArray) -> FloatArray:
-        """Flow of drivers w [veh/h] that a cell of the given speed can take in.
+        """Largest inflow of drivers w [veh/h] into a cell of the given speed.
 
-        Entering drivers settle at the density `rho_M = p^-1(w - v)` of the cell's own speed, and
-        that wave runs upstream, unless their critical density comes before it.
+        Entering drivers reach the density `rho_M = p^-1(w - v)` at the cell's speed, and that wave
+        runs upstream, unless it exceeds their critical density.
         """
         settled = self.inverse_pressure(w - speed, jam)
         ample = speed >= w * (self.gamma / (1.0 + self.gamma))

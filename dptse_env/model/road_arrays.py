@@ -1,4 +1,4 @@
-"""A model as plain arrays and numbers, the form in which compiled code takes it."""
+"""A model as arrays and numbers, for compiled code."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ LINK, MERGE, DIVERGE, EXIT = 0, 1, 2, 3
 
 
 class RoadArrays(NamedTuple):
-    """A model as arrays and numbers, in a form that compiled code takes (S segments)."""
+    """A model of S segments as arrays and numbers, for compiled code."""
 
     free_flow_speed: float  # v_f [km/h]
     gamma: float  # Exponent of the pressure
@@ -41,7 +41,7 @@ class RoadArrays(NamedTuple):
 
 
 def make_road_arrays(model: ARZModel) -> RoadArrays:
-    """Put a model into the form that compiled code takes."""
+    """Return a model as arrays and numbers."""
     layout, n = model.layout, model.n_segments
     kind = np.full(n, EXIT, dtype=np.int64)
     parties = np.full((n, 3), -1, dtype=np.int64)
@@ -96,15 +96,15 @@ def _neighbours(model: ARZModel) -> tuple[IntArray, IntArray]:
     degree = sparsity.sum(axis=1).astype(np.int64)
     neighbours = np.full((model.n_segments, int(degree.max())), -1, dtype=np.int64)
     for cell, row in enumerate(sparsity):
-        others = np.flatnonzero(row)
-        neighbours[cell, : degree[cell]] = [cell, *others[others != cell]]
+        cells = np.flatnonzero(row)
+        neighbours[cell, : degree[cell]] = [cell, *cells[cells != cell]]
     return neighbours, degree
 
 
 def _terms(
     parties: IntArray, edges: IntArray, edge_share: FloatArray, neighbours: IntArray
 ) -> tuple[IntArray, FloatArray]:
-    """Where each outflow's gradient enters the Jacobian: in its own row and where it flows to."""
+    """List the rows of the Jacobian that each outflow's gradient enters, with its weights."""
     flows = [(cell, cell, -1.0) for cell in range(len(parties))]
     flows += [(start, end, part) for (start, end), part in zip(edges, edge_share, strict=True)]
     terms, weights = [], []

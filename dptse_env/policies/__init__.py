@@ -1,4 +1,4 @@
-"""Saved policies: reading their files without torch, and those that come with the package."""
+"""Saved policies: files are read without torch; some policies come with the package."""
 
 from __future__ import annotations
 
@@ -32,8 +32,7 @@ def read_policy(source: str | os.PathLike[str]) -> PolicyFile:
     """Read a saved policy.
 
     Args:
-        source: A file, or the name of a policy that comes with the package; such a name comes
-            first.
+        source: The name of a policy that comes with the package, or a file.
 
     Raises:
         FileNotFoundError: There is no such file, nor such a name.

@@ -6,13 +6,13 @@ import io
 import zipfile
 
 MOST_ENTRIES = 1000
-"""Entries in an archive, at most."""
+"""Largest number of entries in an archive."""
 
 _DIRECTORY_SIGNATURE = b"PK\x01\x02"
 
 
 def open_archive(content: bytes) -> zipfile.ZipFile:
-    """Return an archive whose directory is not too long to be read.
+    """Return an archive with a directory of limited length.
 
     Raises:
         ValueError: It has too many entries.
@@ -24,19 +24,19 @@ def open_archive(content: bytes) -> zipfile.ZipFile:
 
 
 def read_entry(archive: zipfile.ZipFile, name: str, largest: int) -> bytes:
-    """Return the content of an entry, whatever size its header declares.
+    """Return the content of an entry; the size in its header is not relied on.
 
     Args:
         archive: The archive.
-        name: Of the entry.
-        largest: Size of the content, at most [bytes].
+        name: Name of the entry.
+        largest: Largest size of the content [bytes].
 
     Raises:
-        ValueError: The content is larger, or compressed in an unusual way.
+        ValueError: The content is larger, or compressed by another method than deflate.
         KeyError: There is no such entry.
     """
     entry = archive.getinfo(name)
-    # Other methods are decompressed in one go, however large the content is.
+    # Other methods decompress the complete content at once, however large it is.
     if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise ValueError(f"entry {name!r} must be stored or deflated")
     with archive.open(entry) as file:

@@ -1,4 +1,4 @@
-"""Bounded reading of policy files: whatever a file holds, it takes little time and memory."""
+"""Reading of policy files within bounds of time and memory, for files of unknown origin."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ CARD, WEIGHTS = "card.json", "weights.pt"
 """Entries of a policy file: its card, plain JSON that describes the policy, and its weights."""
 
 LARGEST_FILE = 2**24
-"""Size of a file and of its weights, at most [bytes]; the shipped policy has 77 kB."""
+"""Largest size of a file and of its weights [bytes]; the shipped policy has 77 kB."""
 
 LARGEST_CARD = 2**16
-"""Size of a card, at most [bytes]."""
+"""Largest size of a card [bytes]."""
 
 DEEPEST_CARD = 16
-"""Nesting of a card, at most."""
+"""Largest nesting of a card."""
 
 LONGEST_TEXT = 2000
-"""Length of the texts in a card that messages quote, at most."""
+"""Largest length of the texts in a card that messages quote."""
 
 _FIELDS: Mapping[str, type] = {
     "fits": dict, "fits.format": str, "fits.observation": str, "fits.action": str,
@@ -42,12 +42,12 @@ _FIELDS: Mapping[str, type] = {
 
 @dataclass(frozen=True)
 class PolicyFile:
-    """A saved policy, as far as it can be read without torch.
+    """The content of a policy file, read without torch.
 
     Attributes:
         source: The file, or the name of a policy that comes with the package.
         sha256: Digest of the file.
-        card: Description of the policy: its class, its training, and what it fits.
+        card: Description of the policy: its class, its training, and the environments it fits.
         weights: Arrays by name; all values are finite.
     """
 
@@ -62,7 +62,7 @@ def parse_policy(content: bytes, source: str) -> PolicyFile:
 
     Args:
         content: The content.
-        source: Names the file in errors.
+        source: Name of the file, for error messages.
 
     Raises:
         ValueError: It is not a saved policy, is damaged, or exceeds a limit of this module.
@@ -75,7 +75,7 @@ def parse_policy(content: bytes, source: str) -> PolicyFile:
             weights = read_entry(archive, WEIGHTS, LARGEST_FILE)
         with open_archive(weights) as archive:
             tensors = read_tensors(archive, LARGEST_FILE)
-    # All that Python's modules raise on damaged archives.
+    # All exceptions of Python's modules on damaged archives.
     except (
         zipfile.BadZipFile, zlib.error, struct.error, EOFError, LookupError, OverflowError,
         RuntimeError, ValueError,
@@ -94,14 +94,11 @@ def _parse_card(content: bytes) -> dict[str, Any]:
     """
     try:
         card = json.loads(content, parse_constant=_refuse_constant)
-    except RecursionError as problem:
-        raise ValueError(f"its card is nested more than {DEEPEST_CARD} levels deep") from problem
-    level, depth = [card], 0
-    while level:
-        depth += 1
-        if depth > DEEPEST_CARD:
-            raise ValueError(f"its card is nested more than {DEEPEST_CARD} levels deep")
-        level = [item for node in level for item in _items(node)]
+        is_deep = _depth(card) > DEEPEST_CARD
+    except RecursionError:
+        is_deep = True
+    if is_deep:
+        raise ValueError(f"its card is nested more than {DEEPEST_CARD} levels deep")
     for path, kind in _FIELDS.items():
         value = card
         for key in path.split("."):
@@ -114,10 +111,12 @@ def _parse_card(content: bytes) -> dict[str, Any]:
     return checked
 
 
-def _items(node: object) -> list[Any]:
+def _depth(node: Any) -> int:
     if isinstance(node, dict):
-        return list(node.values())
-    return node if isinstance(node, list) else []
+        node = node.values()
+    elif not isinstance(node, list):
+        return 1
+    return 1 + max(map(_depth, node), default=0)
 
 
 def _refuse_constant(name: str) -> float:

@@ -12,10 +12,10 @@ from dptse_env.policies.archive import read_entry
 from dptse_env.policies.tensor_table import TensorEntry, read_table
 
 MOST_TENSORS = 256
-"""Tensors in a file, at most."""
+"""Largest number of tensors in a file."""
 
 LARGEST_TABLE = 2**16
-"""Size of the table of tensors, at most [bytes]."""
+"""Largest size of the table of tensors [bytes]."""
 
 _ITEM = 4
 """Size of a float32 [bytes]."""
@@ -25,11 +25,11 @@ def read_tensors(archive: zipfile.ZipFile, largest: int) -> dict[str, NDArray[np
     """Return the tensors of an archive by name, all of float32 and finite.
 
     Args:
-        archive: As ``torch.save`` writes a mapping of names to tensors.
-        largest: Size of all their values, at most [bytes].
+        archive: A mapping of names to tensors, as written by ``torch.save``.
+        largest: Largest size of all values [bytes].
 
     Raises:
-        ValueError: The archive holds something else, or too much of it.
+        ValueError: The archive has another content, or exceeds a limit.
         KeyError: An entry of the archive is missing.
     """
     tables = [name for name in archive.namelist() if name.endswith("/data.pkl")]

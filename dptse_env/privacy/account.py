@@ -1,4 +1,4 @@
-"""Account of what the releases of an episode have cost so far."""
+"""Running privacy loss of an episode's releases."""
 
 from functools import cached_property
 
@@ -7,20 +7,18 @@ import numpy as np
 from dptse_env.privacy.gaussian import epsilon_of
 from dptse_env.utils.arrays import FloatArray, IntArray
 
-__all__ = ["ReleaseAccount"]
-
 
 class ReleaseAccount:
-    """Privacy loss of a vehicle by the number of released steps that it can have entered.
+    """Privacy loss of a vehicle by the number of released steps that its data may have entered.
 
     Attributes:
-        mu: Of a whole episode, the parameter of Gaussian differential privacy.
-        delta: At which epsilon is given.
+        mu: Parameter of Gaussian differential privacy of a complete episode.
+        delta: The delta at which epsilon is given.
         contributions: C, released steps that a vehicle's data can enter; None if not bounded.
     """
 
     def __init__(self, mu: float, delta: float, contributions: int | None) -> None:
-        """Keep the numbers of a whole episode."""
+        """Store the numbers of a complete episode."""
         self.mu, self.delta, self.contributions = mu, delta, contributions
 
     @cached_property
@@ -32,10 +30,10 @@ class ReleaseAccount:
         return mu, np.array(epsilon)
 
     def spent(self, steps: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Return what releases have revealed of a vehicle at most, if the sensitivities hold.
+        """Return upper bounds on the privacy loss of a vehicle, if the sensitivities hold.
 
-        Where contributions are bounded, a vehicle has made at most one a step. The paper's
-        sensitivities bound a whole episode and say nothing of a part of it: the whole is charged
+        Where contributions are bounded, a vehicle makes at most one per step. The paper's
+        sensitivities bound a complete episode and no part of it, so a complete episode is charged
         from the start.
 
         Args:

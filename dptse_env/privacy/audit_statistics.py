@@ -1,4 +1,4 @@
-r"""The statistics of an audit: from the scores of two worlds to a lower bound on what leaks.
+r"""Statistics of a privacy audit: lower bounds on the privacy loss from scores in two worlds.
 
 An adversary meets a mechanism many times in each of two adjacent worlds and gives every run a
 score, the higher the more the run looks like world 1. A threshold on the score is a test with two
@@ -12,12 +12,12 @@ with $\alpha$ the rate of false positives and $\beta$ that of false negatives (D
 2022, section 2). One half of the runs chooses the thresholds. The other half counts the errors,
 and exact upper bounds on their rates (Clopper and Pearson 1934) turn into lower bounds here.
 
-An audit can refute a claim and never prove one. Nothing here knows of traffic.
+An audit can refute a claim and never prove one. Nothing here depends on traffic.
 """
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -26,48 +26,37 @@ from scipy.special import ndtr, ndtri
 from scipy.stats import beta, binom
 
 from dptse_env.utils.arrays import FloatArray
+from dptse_env.utils.fields import POSITIVE, Interval, checked_fields
 from dptse_env.utils.validation import inside, integer, positive, require
-
-__all__ = [
-    "AuditResult",
-    "Claim",
-    "LowerBound",
-    "audit",
-    "detectable_mu",
-    "error_bound",
-    "rejection_probability",
-]
 
 _N_RATES = 4  # two thresholds, one for mu and one for epsilon, with two error rates each
 
 # Thresholds are chosen by bounds of this risk. For Gaussian releases every threshold would show
 # the same mu, were the rates known: wide bounds keep the choice where rates are known best, and
-# not where they came out by luck.
+# not where the estimated rates are low by chance.
 _RISK_OF_CHOICE = 1e-5
 
 
 @dataclass(frozen=True)
 class Claim:
-    """What is put to the test.
+    """Claimed privacy parameters, which an audit tests.
 
     Attributes:
-        mu: of Gaussian differential privacy, > 0.
-        epsilon: > 0.
-        delta: in (0, 0.5).
+        mu: parameter of Gaussian differential privacy.
+        epsilon: privacy parameter.
+        delta: privacy parameter.
 
     Raises:
-        ValueError: if a number is out of range.
+        ValueError: A number is out of range.
     """
 
-    mu: float
-    epsilon: float
-    delta: float
+    mu: Annotated[float, POSITIVE]
+    epsilon: Annotated[float, POSITIVE]
+    delta: Annotated[float, Interval(0, 0.5, open_low=True, open_high=True)]
 
     def __post_init__(self) -> None:
         """Check the numbers."""
-        positive("claim.mu", self.mu)
-        positive("claim.epsilon", self.epsilon)
-        inside("claim.delta", self.delta, 0.0, 0.5)
+        checked_fields(self, "claim")
 
 
 @dataclass(frozen=True)
@@ -76,7 +65,7 @@ class LowerBound:
 
     Attributes:
         value: the bound, >= 0.
-        threshold: scores above it are taken for world 1.
+        threshold: score above which a run is classified as world 1.
         false_positives: upper bound on the rate of runs in world 0 that score above it.
         false_negatives: upper bound on the rate of runs in world 1 that do not.
     """
@@ -89,14 +78,14 @@ class LowerBound:
 
 @dataclass(frozen=True)
 class AuditResult:
-    """What the scores say about a claim.
+    """Outcome of an audit.
 
     Attributes:
-        claim: what was tested.
+        claim: the claim that was tested.
         mu: lower bound on mu.
-        epsilon: lower bound on epsilon at the claim's delta, whatever the mechanism is. It takes
-            rare errors to see a large epsilon, so that it lies well below the truth.
-        confidence: with which both bounds hold together.
+        epsilon: lower bound on epsilon at the claim's delta, for any mechanism. A large
+            epsilon shows in rare errors only, so the bound lies well below the truth.
+        confidence: probability with which both bounds hold together.
     """
 
     claim: Claim
@@ -106,7 +95,7 @@ class AuditResult:
 
     @property
     def verdict(self) -> Literal["rejected", "not rejected"]:
-        """Whether a bound lies above the claim."""
+        """``rejected`` if a bound lies above the claim."""
         exceeds = self.mu.value > self.claim.mu or self.epsilon.value > self.claim.epsilon
         return "rejected" if exceeds else "not rejected"
 
@@ -119,11 +108,11 @@ def audit(
     Args:
         scores_0: (n,) scores of the runs in world 0, n >= 2.
         scores_1: (n,) scores of the runs in world 1.
-        claim: what to test; true claims are rejected with probability 1 - confidence at most.
+        claim: the claim to test; a true one is rejected with probability 1 - confidence at most.
         confidence: in (0, 1).
 
     Raises:
-        ValueError: if there are too few scores, they differ in number, or one is not finite.
+        ValueError: There are too few scores, they differ in number, or one is not finite.
     """
     worlds = np.asarray(scores_0, dtype=np.float64), np.asarray(scores_1, dtype=np.float64)
     for name, scores in zip(("scores_0", "scores_1"), worlds, strict=True):
@@ -174,18 +163,18 @@ def error_bound(errors: npt.ArrayLike, trials: int, risk: float) -> FloatArray:
 
 
 def rejection_probability(mu: float, claimed_mu: float, n: int, confidence: float = 0.95) -> float:
-    """Power: how likely the bound on mu rejects a claim, if the truth is `mu`.
+    """Power of an audit: probability that it rejects a claim on mu when the truth is `mu`.
 
     The truth is a Gaussian release that the adversary scores by its likelihood ratio, and the
-    threshold is the best one, midway. Both error counts are then binomial, and the sum over them
-    is exact. `audit` has to find its threshold first, which costs a few hundredths where the power
-    is neither near 0 nor near 1.
+    threshold is the optimal one, midway. Both error counts are then binomial, and the sum over them
+    is exact. `audit` has to find its threshold first, which reduces the power by a few hundredths
+    where it is neither near 0 nor near 1.
 
     Args:
         mu: true parameter, > 0.
         claimed_mu: the claim, > 0.
         n: runs per world, of which `audit` counts the errors in the second half.
-        confidence: of the audit.
+        confidence: confidence of the audit.
 
     Returns:
         A probability; at `mu` = `claimed_mu` that of a false alarm by this bound.
@@ -195,7 +184,7 @@ def rejection_probability(mu: float, claimed_mu: float, n: int, confidence: floa
     trials = n - n // 2
     risk = (1.0 - inside("confidence", confidence, 0.0, 1.0)) / _N_RATES
     counts = np.arange(trials + 1)
-    # Falls as the errors grow in number; the two worlds' values add to the bound on mu.
+    # Decreases in the number of errors; the two worlds' values add up to the bound on mu.
     evidence = -ndtri(error_bound(counts, trials, risk))
     most = np.searchsorted(-evidence, evidence - claimed_mu) - 1
     rate = float(ndtr(-0.5 * mu))
@@ -210,11 +199,11 @@ def detectable_mu(
     Args:
         claimed_mu: the claim, > 0.
         n: runs per world.
-        confidence: of the audit.
+        confidence: confidence of the audit.
         probability: in (0, 1).
 
     Returns:
-        mu, or infinity where so few runs cannot reject the claim however much leaks.
+        mu, or infinity where so few runs cannot reject the claim at any mu.
     """
     probability = inside("probability", probability, 0.0, 1.0)
 
@@ -230,7 +219,7 @@ def detectable_mu(
 
 
 def _between(scores: FloatArray) -> FloatArray:
-    """Midpoints of increasing scores: where worlds do not overlap, a threshold keeps off both."""
+    """Midpoints of increasing scores, so that a threshold separates worlds that do not overlap."""
     return 0.5 * (scores[1:] + scores[:-1]) if len(scores) > 1 else scores
 
 
@@ -238,7 +227,7 @@ def _error_bounds(
     scores: list[FloatArray], thresholds: FloatArray, risk: float
 ) -> tuple[FloatArray, FloatArray]:
     """Upper bounds on both error rates of each threshold; `scores` are sorted."""
-    below_0, below_1 = (np.searchsorted(own, thresholds, side="right") for own in scores)
+    below_0, below_1 = (np.searchsorted(world, thresholds, side="right") for world in scores)
     trials = len(scores[0])
     return error_bound(trials - below_0, trials, risk), error_bound(below_1, trials, risk)
 
@@ -249,7 +238,7 @@ def _mu(false_positives: FloatArray, false_negatives: FloatArray) -> FloatArray:
 
 
 def _epsilon(false_positives: FloatArray, false_negatives: FloatArray, delta: float) -> FloatArray:
-    """The larger of the two bounds; zero where neither says anything."""
+    """The larger of the two bounds; zero where neither is informative."""
     ratios = np.maximum(
         (1.0 - delta - false_negatives) / false_positives,
         (1.0 - delta - false_positives) / false_negatives,

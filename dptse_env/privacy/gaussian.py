@@ -1,7 +1,7 @@
 r"""Exact relations of Gaussian differential privacy.
 
-Everything a Gaussian release reveals is one number, $\mu = \Delta / \sigma$: the L2 sensitivity of
-what is released over the standard deviation of the noise. A release with parameter $\mu$ is
+A single number describes the privacy loss of a Gaussian release, $\mu = \Delta / \sigma$: its L2
+sensitivity over the standard deviation of the noise. A release with parameter $\mu$ is
 $(\varepsilon, \delta)$-private exactly for the pairs with (Balle and Wang 2018, theorem 8)
 
 $$\delta = \Phi(\mu/2 - \varepsilon/\mu) - e^{\varepsilon}\,\Phi(-\mu/2 - \varepsilon/\mu),$$
@@ -10,7 +10,8 @@ and releases compose as $\mu^2 = \sum_i \mu_i^2$, also without loss (Dong, Roth 
 corollary 3.3).
 
 All numbers here are dimensionless floats. `epsilon` is finite and above zero, `delta` lies in
-(0, 0.5), `mu` is finite and above zero. The difference above is never formed in that shape:
+(0, 0.5), `mu`, the sensitivity over the noise's standard deviation, is finite and above zero;
+functions raise ValueError for other arguments. The difference above is never formed in that shape:
 `e^epsilon` overflows from epsilon 710, and both terms underflow together in the tail. With the
 normal density $\varphi$, $\varphi(a) = e^{\varepsilon} \varphi(b)$ for the two arguments $a$ and
 $b$, so the second term is $\varphi(a)$ times a ratio that stays of order one.
@@ -24,8 +25,6 @@ from scipy.special import erfcx, log_ndtr, ndtri
 
 from dptse_env.utils.validation import inside, positive
 
-__all__ = ["analytic_multiplier", "compose", "delta_of", "epsilon_of", "le_ny_kappa", "mu_of"]
-
 _RELATIVE_TOLERANCE = 4 * 2.0**-52  # the tightest that brentq accepts
 _SQRT_TWO = math.sqrt(2.0)
 _SQRT_HALF_PI = math.sqrt(0.5 * math.pi)
@@ -37,17 +36,8 @@ _SMALL_MU = 1e-3  # below it the two terms of delta agree in too many digits to 
 def delta_of(mu: float, epsilon: float) -> float:
     """Smallest delta for which a release of parameter `mu` is (epsilon, delta)-private.
 
-    Zero when the exact value is below the smallest positive float.
-
-    Args:
-        mu: sensitivity over noise standard deviation.
-        epsilon: privacy parameter; 0 is allowed here and gives the total variation distance.
-
-    Returns:
-        delta in [0, 1] (Balle and Wang 2018, theorem 8).
-
-    Raises:
-        ValueError: if `mu` is not finite and above zero, or `epsilon` is negative or infinite.
+    It lies in [0, 1], and is zero when the exact value is below the smallest positive float (Balle
+    and Wang 2018, theorem 8). An `epsilon` of 0 is allowed and gives the total variation distance.
     """
     mu = positive("mu", mu)
     if epsilon != 0:
@@ -58,18 +48,10 @@ def delta_of(mu: float, epsilon: float) -> float:
 def epsilon_of(mu: float, delta: float) -> float:
     """Smallest epsilon >= 0 for which a release of parameter `mu` is (epsilon, delta)-private.
 
-    Zero when the release is (0, delta)-private already.
-
-    Args:
-        mu: sensitivity over noise standard deviation.
-        delta: in (0, 0.5).
-
-    Returns:
-        epsilon, to ten digits or better up to a mu of 1e3.
+    It is exact to ten digits or better up to a mu of 1e3.
 
     Raises:
-        ValueError: if `mu` or `delta` is out of range.
-        OverflowError: if epsilon is beyond the largest float, from a mu of about 1e154.
+        OverflowError: epsilon is beyond the largest float, from a mu of about 1e154.
     """
     mu = positive("mu", mu)
     delta = _checked_delta(delta)
@@ -91,17 +73,9 @@ def epsilon_of(mu: float, delta: float) -> float:
 def mu_of(epsilon: float, delta: float) -> float:
     """Largest parameter mu of a release that is (epsilon, delta)-private.
 
-    Args:
-        epsilon: above zero.
-        delta: in (0, 0.5).
-
-    Returns:
-        mu, to ten digits or better; the inverse of `delta_of` in its first argument.
-
-    Raises:
-        ValueError: if `epsilon` or `delta` is out of range.
+    The inverse of `delta_of` in its first argument, to ten digits or better.
     """
-    epsilon, delta = _checked_epsilon(epsilon), _checked_delta(delta)
+    epsilon, delta = positive("epsilon", epsilon), _checked_delta(delta)
     log_delta = math.log(delta)
 
     def excess(mu: float) -> float:
@@ -119,14 +93,7 @@ def mu_of(epsilon: float, delta: float) -> float:
 def compose(mus: Iterable[float]) -> float:
     """Parameter of several Gaussian releases of the same data taken together.
 
-    Args:
-        mus: the parameter of each release; none at all composes to 0, nothing released.
-
-    Returns:
-        The root of the sum of squares (Dong, Roth and Su 2022, corollary 3.3).
-
-    Raises:
-        ValueError: if one of them is not finite and above zero.
+    It is the root of the sum of squares (Dong, Roth and Su 2022, corollary 3.3), 0 without any.
     """
     return math.hypot(*(positive("mu", mu) for mu in mus))
 
@@ -134,15 +101,7 @@ def compose(mus: Iterable[float]) -> float:
 def analytic_multiplier(epsilon: float, delta: float) -> float:
     """Least noise standard deviation per unit of sensitivity for (epsilon, delta)-privacy.
 
-    Args:
-        epsilon: above zero.
-        delta: in (0, 0.5).
-
-    Returns:
-        1 / mu_of(epsilon, delta), the analytic calibration of Balle and Wang (2018).
-
-    Raises:
-        ValueError: if `epsilon` or `delta` is out of range.
+    The analytic calibration of Balle and Wang (2018).
     """
     return 1.0 / mu_of(epsilon, delta)
 
@@ -150,27 +109,13 @@ def analytic_multiplier(epsilon: float, delta: float) -> float:
 def le_ny_kappa(epsilon: float, delta: float) -> float:
     """Noise standard deviation per unit of sensitivity that suffices, in closed form.
 
-    Always above `analytic_multiplier`: it bounds delta by the first of its two terms, and is the
-    exact root of that bound.
-
-    Args:
-        epsilon: above zero.
-        delta: in (0, 0.5).
-
-    Returns:
-        (K + sqrt(K^2 + 2 epsilon)) / (2 epsilon) with K the upper delta-quantile of the standard
-        normal (Le Ny and Pappas 2014, theorem 3; section III of the paper).
-
-    Raises:
-        ValueError: if `epsilon` or `delta` is out of range.
+    It is (K + sqrt(K^2 + 2 epsilon)) / (2 epsilon) with K the upper delta-quantile of the standard
+    normal (Le Ny and Pappas 2014, theorem 3; section III of the paper). That bounds delta by the
+    first of its two terms, so the result is always above `analytic_multiplier`.
     """
-    epsilon, delta = _checked_epsilon(epsilon), _checked_delta(delta)
+    epsilon, delta = positive("epsilon", epsilon), _checked_delta(delta)
     quantile = -float(ndtri(delta))
     return (quantile + math.sqrt(quantile * quantile + 2.0 * epsilon)) / (2.0 * epsilon)
-
-
-def _checked_epsilon(epsilon: float) -> float:
-    return positive("epsilon", epsilon)
 
 
 def _checked_delta(delta: float) -> float:
@@ -178,7 +123,7 @@ def _checked_delta(delta: float) -> float:
 
 
 def _log_delta(mu: float, epsilon: float) -> float:
-    """Natural logarithm of delta, without overflow or underflow; see the head of this module."""
+    """Natural logarithm of delta, without overflow or underflow; see the module's docstring."""
     upper = 0.5 * mu - epsilon / mu
     if upper < _ZERO_BELOW:
         return -math.inf

@@ -1,4 +1,4 @@
-"""Standard deviations of the noise that a privacy parameter asks for, three ways.
+"""Standard deviations of the noise for given privacy parameters, by three calibrations.
 
 Each function returns one standard deviation for each release, in the release's own unit: for the
 paper's sensitivities [veh/km, km/h].
@@ -9,11 +9,9 @@ import math
 from dptse_env.privacy.gaussian import le_ny_kappa, mu_of
 from dptse_env.privacy.sensitivity import Sensitivity
 
-__all__ = ["joint_noise_std", "printed_noise_std", "single_noise_std"]
-
 
 def printed_noise_std(sensitivity: Sensitivity, epsilon: float, delta: float) -> tuple[float, ...]:
-    """Noise of *variance* kappa^2 Delta, the paper's section III to the letter.
+    """Noise of *variance* kappa^2 Delta, as printed in section III of the paper.
 
     A variance in veh/km cannot be right: the number depends on the units, here veh/km and km/h.
     """
@@ -35,11 +33,11 @@ def joint_noise_std(
 ) -> tuple[float, ...]:
     """Noise under which two releases together are (epsilon, delta)-private, analytic calibration.
 
-    The budget mu^2 is divided among what can be met together first; a release that can weigh more
-    when it is met alone gets the noise that this needs.
+    The budget mu^2 is divided between the sensitivities that can occur together. A release that
+    has a larger sensitivity on its own gets the noise that this needs.
 
     Args:
-        sensitivity: Of the two releases.
+        sensitivity: Sensitivities of the two releases.
         epsilon: Privacy parameter.
         delta: Privacy parameter.
         share: Part of mu^2 that the first release gets, in (0, 1).

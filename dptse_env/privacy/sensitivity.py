@@ -1,4 +1,4 @@
-"""How far one vehicle can move what is released: the L2 sensitivities of the transcript.
+"""L2 sensitivities of the transcript: the largest change that one vehicle can cause.
 
 A transcript is everything released in one episode: at every step the density and the speed, or the
 flow, of each observed segment. Its sensitivity is the largest L2 distance between the transcripts
@@ -12,14 +12,6 @@ from typing import Literal
 
 from dptse_env.utils.validation import integer, positive
 
-__all__ = [
-    "Adjacency",
-    "ReleaseSensitivity",
-    "Sensitivity",
-    "contribution_sensitivity",
-    "paper_sensitivity",
-]
-
 Adjacency = Literal["replace", "add_remove"]
 """How two records differ: one vehicle's data replaced by another's, or one vehicle more."""
 
@@ -29,7 +21,7 @@ class ReleaseSensitivity:
     """Sensitivity of one of the released quantities over a whole episode.
 
     Attributes:
-        quantity: what is released.
+        quantity: name of the released quantity.
         unit: unit of the quantity, of `bound` and of the noise added to it.
         bound: L2 sensitivity, in `unit`.
     """
@@ -41,13 +33,13 @@ class ReleaseSensitivity:
 
 @dataclass(frozen=True)
 class Sensitivity:
-    """Sensitivities of all released quantities, and what they rest on.
+    """Sensitivities of all released quantities, with the assumptions behind them.
 
     Attributes:
         releases: one for each released quantity, in the order of the last axis of a release.
         assumptions: the public numbers the bounds were computed from, by name with unit.
-        extremes: the bounds that can be met together, each with one number for each release in its
-            unit; left out, all bounds can be met at once.
+        extremes: the bounds that can be attained together, each with one number for each release
+            in its unit; empty where all bounds can be attained at once.
         contributions: C, released steps that a vehicle's data can enter; None if not bounded.
     """
 
@@ -61,9 +53,6 @@ class Sensitivity:
 
         Args:
             noise_std: one standard deviation for each release, in its unit.
-
-        Returns:
-            The largest over what can be met together of the root of the sum of squares.
         """
         stds = tuple(noise_std)
         extremes = self.extremes or (tuple(release.bound for release in self.releases),)
@@ -86,7 +75,7 @@ def paper_sensitivity(
     The differing vehicle passes each of `n_sensors` static sensors once in either record, at
     different times, and stays for `average_dwell` steps. While it does, the density there differs
     by one vehicle over the segment's length, and the speed by the slope of the equilibrium
-    relation (with exponent 1) times that. ``docs/privacy.md`` says what this overlooks.
+    relation (with exponent 1) times that. ``docs/privacy.md`` lists the cases that this overlooks.
 
     Args:
         n_sensors: observed segments at a step: queried segments plus fixed sensors.
@@ -101,7 +90,7 @@ def paper_sensitivity(
         "Sensitivity relations").
 
     Raises:
-        ValueError: if an argument is not finite and above zero, or `n_sensors` is not whole.
+        ValueError: An argument is not finite and above zero, or `n_sensors` is no integer.
     """
     n_sensors = integer("n_sensors", n_sensors, 1)
     average_dwell = positive("average_dwell", average_dwell)
@@ -128,16 +117,16 @@ def contribution_sensitivity(
     largest_speed: float,
     mean_speed_slope: float | None = None,
 ) -> Sensitivity:
-    """Sensitivities of density and centred flow where a vehicle counts in so many steps at most.
+    """Sensitivities of density and centred flow for vehicles with bounded contributions.
 
-    A vehicle is on one segment at a step. Whatever policy asks, both worlds see the same queries
-    given the same answers, so a vehicle's data enters at most `contributions` released steps of
+    A vehicle is on one segment at a step. Under any policy both worlds have the same queries
+    given the same releases, so a vehicle's data enters at most `contributions` released steps of
     one segment each. There it adds 1 / l to the density and (v - v_0) / l to the flow, with its
     speed v clipped to [0, v_max] and v_0 = v_max / 2: at most v_0 / l in size.
 
-    One vehicle more: sqrt(C) times that. One vehicle replaced by another: the two may be counted
-    on different segments, sqrt(2 C) times that in both quantities; or on the same segments at
-    opposite speeds, where densities agree and flows differ by v_max / l, in all 2 sqrt(C) v_0 / l.
+    One vehicle added: sqrt(C) times that. One vehicle replaced by another: the two may count on
+    different segments, which gives sqrt(2 C) times that in both quantities; or on the same segments
+    at opposite speeds: densities agree and flows differ by v_max / l, in all 2 sqrt(C) v_0 / l.
 
     Args:
         contributions: C, released steps that a vehicle's data can enter, >= 1.
@@ -148,9 +137,9 @@ def contribution_sensitivity(
             Delta_v / Delta_rho [km/h per veh/km], which does not hold.
 
     Raises:
-        ValueError: if a number is out of range.
+        ValueError: A number is out of range.
     """
-    # One vehicle more or less; a replaced one is there in both worlds, on two segments or on one.
+    # Adding or removing; a replaced vehicle is in both worlds, on two segments or on the same.
     c = math.sqrt(integer("contributions", contributions, 1))
     density = c / positive("segment_length", segment_length)
     flow = density * positive("largest_speed", largest_speed) / 2.0

@@ -1,4 +1,4 @@
-"""Everything that leaves the road: the true traffic, release models, and boundary inputs."""
+"""Release of traffic data: true traffic, release models, and boundary inputs."""
 
 from dptse_env.release.base import (
     Released,
@@ -32,8 +32,8 @@ RELEASE_MODELS = Registry(
     ),
     aliases={"guaranteed": "capped"},
 )
-"""Release models by name: the noise as printed in the paper, as its cited theorem needs it, and
-capped contributions, with a guarantee for every query policy."""
+"""Release models by name: with the noise as printed in the paper, with the noise that its cited
+theorem needs, and with capped contributions, which gives a guarantee for every query policy."""
 
 __all__ = [
     "BOUNDARIES",

@@ -1,4 +1,4 @@
-"""The release model: what leaves the road, how private it is, and what it costs."""
+"""Base class of release models: released values, privacy account and privacy report."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from dptse_env.utils.vector_info import Rows
 
 @dataclass(frozen=True)
 class ReleaseSetup:
-    """Everything that a release model is made for.
+    """Configuration that a release model is made for.
 
     Attributes:
         name: Name of the model, for reports.
-        settings: What the user asked for.
+        settings: The privacy settings.
         traffic: The true traffic, with its corridor.
-        bandwidth: Most mainline segments queried a step.
+        bandwidth: Largest number of mainline segments queried in a step.
         horizon: Steps of an episode.
         n_episodes: Size n of the batch.
     """
@@ -66,7 +66,7 @@ class ReleaseSetup:
 
 
 class Prediction(Protocol):
-    """The estimator's output before it reads the release."""
+    """The estimator's output before its update by the release."""
 
     @property
     def density(self) -> FloatArray:
@@ -82,15 +82,15 @@ def _no_prediction() -> Prediction:
 
 
 class ReleaseRequest(NamedTuple):
-    """One second of k episodes, of which something is to be released.
+    """A second of k episodes whose data is to be released.
 
     Attributes:
         episodes: Distinct rows of the batch, shape (k,).
         traffic: Index of each episode's traffic seed, shape (k,).
         times: Second of the record, shape (k,).
         observed: Columns that were queried or are always observed, shape (k, n_columns).
-        prediction: Returns the estimator's prediction for this second, which is public: made of
-            earlier releases and the configuration alone. Raises where there is no estimator.
+        prediction: Returns the estimator's prediction for this second, which is public: it depends
+            on earlier releases and the configuration alone. Raises where there is no estimator.
     """
 
     episodes: IntArray
@@ -101,11 +101,11 @@ class ReleaseRequest(NamedTuple):
 
 
 class Released(NamedTuple):
-    """What left the road in one second of k episodes.
+    """Released values of a second of k episodes.
 
     Attributes:
         values: Density [veh/km] and mean speed [km/h] or centred flow [veh/h] of every column,
-            shape (k, n_columns, 2), in a fresh array; those not observed are to be dropped.
+            shape (k, n_columns, 2), in a fresh array; those not observed are to be discarded.
         sigma: Standard deviations of their noise, shape (2,), in the same units.
     """
 
@@ -116,17 +116,17 @@ class Released(NamedTuple):
 class ReleaseModel(ABC):
     """Base class of release models, for a batch of episodes.
 
-    Everything that an estimator, an observation or a policy learns of the traffic comes through
-    `release`, but for the boundary inputs (`dptse_env.release.boundary`). A subclass may read true
-    traffic from ``setup.traffic``. Its constructor must be cheap: nothing is loaded before `load`.
+    Estimators, observations and policies learn of the traffic through `release` and the boundary
+    inputs (`dptse_env.release.boundary`) alone. A subclass may read true traffic from
+    ``setup.traffic``. Its constructor must be cheap: nothing is loaded before `load`.
 
-    One that gives a guarantee overrides `report` and `spent`; otherwise no guarantee is reported.
+    A model with a guarantee overrides `report` and `spent`; otherwise no guarantee is reported.
     """
 
     settings_type: ClassVar[type[PrivacySettings]] = PrivacySettings
-    """Dataclass of what a user may ask, under the keyword ``privacy``."""
+    """Dataclass of the settings under the keyword ``privacy``."""
     claims_guarantee: ClassVar[bool] = False
-    """Whether users take it for a guarantee, so that a warning is due where that is void."""
+    """Whether users expect a guarantee, so that a warning is due where it is void."""
 
     @classmethod
     def flow_centre(cls, corridor: Corridor, settings: Any) -> float | None:
@@ -137,7 +137,7 @@ class ReleaseModel(ABC):
         return None
 
     def __init__(self, setup: ReleaseSetup) -> None:
-        """Keep what the model is made for."""
+        """Store the configuration."""
         self.setup = setup
 
     @property
@@ -151,15 +151,15 @@ class ReleaseModel(ABC):
 
         Args:
             episodes: Distinct rows of the batch, shape (k,).
-            generators: k streams of noise; the model is their only user from now on.
+            generators: k noise streams; only the model uses them from now on.
         """
 
     @abstractmethod
     def release(self, request: ReleaseRequest) -> Released:
         """Release one second of some episodes.
 
-        Noise should be drawn for all columns whatever is observed, so that policies that are run
-        with one seed meet the same noise.
+        Noise should be drawn for all columns, observed or not, so that different policies with the
+        same seed have common random numbers.
         """
 
     def load(self, index: int, record: Record) -> None:  # noqa: B027 (nothing by default)
@@ -176,7 +176,7 @@ class ReleaseModel(ABC):
         return unknown, unknown.copy()
 
     def report(self) -> PrivacyReport:
-        """Return the privacy report; this one claims nothing."""
+        """Return the privacy report; that of the base class claims no guarantee."""
         settings, setup = self.setup.settings, self.setup
         flow = self.flow_centre(setup.corridor, settings) is not None
         return PrivacyReport(
@@ -191,10 +191,10 @@ class ReleaseModel(ABC):
         )
 
     def private_info(self, episodes: IntArray, traffic: IntArray) -> Rows:
-        """Return what only ``info["truth"]`` may show, rows of k episodes; by default nothing.
+        """Return private data for ``info["truth"]`` alone, rows of k episodes; by default none.
 
         Args:
             episodes: Shape (k,).
-            traffic: Index of each one's traffic seed, shape (k,).
+            traffic: Index of each episode's traffic seed, shape (k,).
         """
         return {}

@@ -1,4 +1,4 @@
-"""The model's inputs at the road's ends and ramps: true, nominal or private."""
+"""Inputs of the traffic model at the road's ends and ramps: true, nominal or private."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class BoundaryModel(ABC):
 
         Args:
             episodes: Shape (k,).
-            traffic: Index of each one's traffic seed, shape (k,).
+            traffic: Index of each episode's traffic seed, shape (k,).
             times: Second of the record, shape (k,).
         """
 
@@ -45,7 +45,7 @@ class BoundaryModel(ABC):
         """Begin new episodes, shape (k,)."""
 
     def update(self, episodes: IntArray, released: FloatArray) -> None:  # noqa: B027
-        """Read what the boundary segments released, shape (k, R, 2); (k, 0, 2) if they do not."""
+        """Take the releases of the boundary segments, shape (k, R, 2); (k, 0, 2) without any."""
 
 
 class TrueBoundary(BoundaryModel):
@@ -66,8 +66,8 @@ class TrueBoundary(BoundaryModel):
         return (self._table,)
 
     def load(self, index: int) -> None:
-        """Work out the inputs of a whole record."""
-        traffic = self._traffic.whole(index)[:, self._model.n_segments :]
+        """Compute the inputs of a complete record."""
+        traffic = self._traffic.complete(index)[:, self._model.n_segments :]
         self._table[index] = self._model.boundary_inputs(traffic[..., 0], traffic[..., 1])
 
     def inputs(self, episodes: IntArray, traffic: IntArray, times: IntArray) -> FloatArray:
@@ -80,7 +80,7 @@ class NominalBoundary(BoundaryModel):
     """The published demand, the same for every traffic seed."""
 
     def __init__(self, traffic: TrafficTable, model: ARZModel, n_episodes: int) -> None:
-        """Work out the inputs of every second."""
+        """Compute the inputs of every second."""
         self._table = nominal_inputs(traffic.corridor, model)
 
     @property
@@ -95,14 +95,14 @@ class NominalBoundary(BoundaryModel):
 
 
 class PrivateBoundary(NominalBoundary):
-    """Inputs from what the boundary segments released a step ago; the published demand at first.
+    """Inputs from the boundary segments' releases a step ago; the published demand at first.
 
-    A released flow is a speed at the density released with it, v_0 + q / rho; what a density
-    below one vehicle per segment says of a speed is noise, and the free speed is taken.
+    A released flow gives a speed by the density released with it, v_0 + q / rho; below a density
+    of one vehicle per segment that is mostly noise, and the free speed is used.
     """
 
     def __init__(self, traffic: TrafficTable, model: ARZModel, n_episodes: int) -> None:
-        """Begin with nothing released."""
+        """Prepare for episodes without any release yet."""
         super().__init__(traffic, model, n_episodes)
         self._model, self._least_density = model, 1.0 / traffic.corridor.segment_length
         layout = model.layout

@@ -14,7 +14,7 @@ def check_released(release: ReleaseModel, released: Any, request: ReleaseRequest
     """Refuse a release of a wrong shape, or one that is not finite where it was observed.
 
     Raises:
-        ValueError: naming the class, what is wrong and what is expected.
+        ValueError: The release is malformed; the message names its class and the expected form.
     """
     name = name_of_class(release)
     shape = (*request.observed.shape, 2)

@@ -1,8 +1,8 @@
-"""What vehicles contribute to the answers of queried segments, each a bounded number of times.
+"""Bounded contributions of vehicles to the releases of queried segments.
 
-A vehicle counts in the first C steps in which the segment it is on was asked, and in no later one.
-Whether it counts depends on its own trajectory and on the queries, which are public, and never on
-other vehicles: taking one vehicle out of a record leaves what all others contribute as it was.
+A vehicle counts in the first C steps in which its segment is queried, and in no later one. Whether
+it counts depends on its trajectory and on the queries, which are public, and never on other
+vehicles: removing a vehicle from a record does not change the contributions of the others.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray, IntArray
 
 NumberT = TypeVar("NumberT", bound=np.generic)
 
-GROWTH = 1.5  # of the tables, when one more record no longer fits
+GROWTH = 1.5  # factor on the size of full tables
 
 
 class Contributions:
-    """Vehicle tables of a set of records, and how often each vehicle counted in each episode.
+    """Vehicle tables of a set of records, with the contributions of each vehicle in each episode.
 
     Attributes:
-        cap: C, steps in which a vehicle counts; None if in all.
+        cap: C, steps in which a vehicle counts; None if it counts in all of them.
         exposures: Shape (n_episodes, n_vehicles), steps in which each vehicle has counted; as wide
             as the largest record loaded.
     """
@@ -36,8 +36,8 @@ class Contributions:
         """Prepare for records of `n_steps` steps; none is loaded yet.
 
         Args:
-            n_slots: Records to hold at most.
-            n_steps: Steps of each.
+            n_slots: Largest number of records.
+            n_steps: Steps of a record.
             n_episodes: Size of the batch.
             largest_speed: Speeds are clipped to [0, `largest_speed`] [km/h].
             cap: C, or None.
@@ -54,11 +54,11 @@ class Contributions:
 
     @property
     def tables(self) -> tuple[AnyArray, ...]:
-        """The vehicle tables of all records, which no episode changes."""
+        """Vehicle tables of all records, which no episode changes."""
         return self._start, self._n_vehicles, self._vehicle, self._segment, self._speed
 
     def load(self, slot: int, record: Record) -> None:
-        """Take in the vehicle table of one record."""
+        """Append the vehicle table of a record."""
         end = self._rows + record.n_rows
         if end > len(self._vehicle):
             size = max(end, int(GROWTH * len(self._vehicle)))
@@ -77,13 +77,13 @@ class Contributions:
         self._rows = end
 
     def reset(self, episodes: IntArray) -> None:
-        """Begin new episodes, shape (k,): nobody has counted yet."""
+        """Begin new episodes, shape (k,): no vehicle has counted yet."""
         self.exposures[episodes] = 0
 
     def exposures_of(self, episode: int, slot: int) -> NDArray[np.int32]:
-        """Return how often each vehicle of a slot's record has counted, shape (its vehicles,).
+        """Return the contributions of each vehicle of a slot's record, shape (n_vehicles,).
 
-        It depends on the records of other episodes neither in value nor in length.
+        Neither values nor length depend on the records of other episodes.
         """
         return self.exposures[episode, : self._n_vehicles[slot]].copy()
 
@@ -93,14 +93,14 @@ class Contributions:
         """Count the vehicles of one step on the observed segments, and charge them.
 
         Args:
-            episodes: Which episodes, shape (k,).
-            slots: Which record each replays, shape (k,).
-            times: Which second of it, shape (k,).
-            observed: Which record columns were asked, shape (k, n_columns).
+            episodes: Indices of the episodes, shape (k,).
+            slots: Slot of each episode's record, shape (k,).
+            times: Second of the record, shape (k,).
+            observed: Observed record columns, shape (k, n_columns).
 
         Returns:
             Vehicles that count, and the sum of their clipped speeds [km/h], both (k, n_columns);
-            zero where nobody asked.
+            zero in columns that are not observed.
         """
         counts, speeds = np.zeros((2, *observed.shape))
         _collect(
@@ -111,7 +111,7 @@ class Contributions:
 
 
 def _grown(column: NDArray[NumberT], size: int) -> NDArray[NumberT]:
-    """A longer copy of a column; what lies beyond its end is not yet written."""
+    """Return a longer copy of a column; values beyond its end are undefined."""
     longer = np.empty(size, dtype=column.dtype)
     longer[: len(column)] = column
     return longer

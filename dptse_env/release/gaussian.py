@@ -29,14 +29,14 @@ from dptse_env.utils.vector_info import Rows, object_array
 
 
 class GaussianRelease(ReleaseModel):
-    """A release of true values plus Gaussian noise; a subclass has the values and the sensitivity.
+    """Release of true values plus Gaussian noise; subclasses define values and sensitivity.
 
     Attributes:
         sensitivity: L2 sensitivities of both released quantities over an episode.
     """
 
     def __init__(self, setup: ReleaseSetup) -> None:
-        """Work out sensitivity and noise; nothing is loaded."""
+        """Compute sensitivity and noise; nothing is loaded."""
         super().__init__(setup)
         self.sensitivity = self._sensitivity()
         self.mechanism = GaussianMechanism(
@@ -45,7 +45,7 @@ class GaussianRelease(ReleaseModel):
 
     @property
     def mechanism(self) -> Mechanism:
-        """The mechanism that adds the noise; account and report follow the one in force."""
+        """The mechanism that adds the noise; account and report describe it."""
         return self._mechanism
 
     @mechanism.setter
@@ -76,7 +76,7 @@ class GaussianRelease(ReleaseModel):
 
     @property
     def protects(self) -> str:
-        """Whose data is protected, and what counts as a change of it."""
+        """Description of the protected data and of the change that is protected."""
         return "one vehicle's trip, replaced by another"
 
     @property
@@ -103,7 +103,7 @@ class GaussianRelease(ReleaseModel):
         stds, mu = self.sigma.tolist(), self._account.mu
         epsilon = epsilon_of(mu, settings.delta)
         found = list(self._void_reasons())
-        # Le Ny's kappa is loose enough at times that even two releases stay below epsilon together.
+        # Le Ny's kappa may be so loose that even both releases together stay below epsilon.
         if epsilon > settings.epsilon * (1.0 + 1e-9):
             found.append("releases_not_composed")
         flow = self.flow_centre(self.setup.corridor, settings) is not None
@@ -120,15 +120,15 @@ class GaussianRelease(ReleaseModel):
             epsilon=epsilon,
             epsilon_strict=epsilon_of(mu, STRICT_DELTA),
             releases=tuple(
-                QuantityReport(one.quantity, one.unit, one.bound, std, one.bound / std)
-                for one, std in zip(sensitivity.releases, stds, strict=True)
+                QuantityReport(item.quantity, item.unit, item.bound, std, item.bound / std)
+                for item, std in zip(sensitivity.releases, stds, strict=True)
             ),
             assumptions=dict(sensitivity.assumptions),
             details=self._details(),
         )
 
     def _details(self) -> Mapping[str, Any]:
-        """Return the settings of this model alone, for the report; none of them is None."""
+        """Return the settings specific to this model, for the report; none of them is None."""
         return {"adjacency": "replace"}
 
     def _guarantee(self) -> str:
@@ -195,7 +195,7 @@ class Capped(GaussianRelease):
         return 0.5 * corridor.speed_limit if settings.speed_release == "flow" else None
 
     def __init__(self, setup: ReleaseSetup) -> None:
-        """See `GaussianRelease`; contributions of vehicles are counted from `load` on."""
+        """See `GaussianRelease`; the vehicle tables are empty until `load`."""
         assert isinstance(setup.settings, CappedSettings)
         self._settings = setup.settings
         super().__init__(setup)
@@ -278,7 +278,7 @@ class Capped(GaussianRelease):
             self.contributions.exposures_of(episode, index)
             for episode, index in zip(episodes, traffic, strict=True)
         ]
-        # A vehicle that has counted k times has spent what one of cap k has in all.
+        # A vehicle that has counted k times has spent the budget of a cap of k.
         spent = [self.spent(steps.astype(np.int64))[1].tolist() for steps in counted]
         return {
             "exposures": object_array([steps.tolist() for steps in counted]),

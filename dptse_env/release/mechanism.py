@@ -1,4 +1,4 @@
-"""The mechanism: true aggregates in, released values out."""
+"""Mechanisms, which turn true aggregates into released values."""
 
 from collections.abc import Sequence
 from typing import Protocol
@@ -9,14 +9,12 @@ import numpy.typing as npt
 from dptse_env.utils.arrays import FloatArray, IntArray
 from dptse_env.utils.validation import integer
 
-__all__ = ["GaussianMechanism", "Mechanism"]
-
 GRID_SHARE = 2.0**-10
-"""Spacing of the released grid over the noise's standard deviation, at most."""
+"""Largest spacing of the released grid over the noise's standard deviation."""
 
 
 class Mechanism(Protocol):
-    """What the decision process needs of a mechanism, for a batch of n episodes of S segments."""
+    """Interface of mechanisms, for a batch of n episodes of S segments."""
 
     @property
     def sigma(self) -> FloatArray:
@@ -27,7 +25,7 @@ class Mechanism(Protocol):
 
         Args:
             episodes: (k,) distinct rows of the batch.
-            generators: k noise streams, one for each; the mechanism is their only user from now.
+            generators: k noise streams, one for each; only the mechanism uses them from now on.
         """
 
     def release(self, episodes: IntArray, values: FloatArray) -> FloatArray:
@@ -36,7 +34,7 @@ class Mechanism(Protocol):
         Args:
             episodes: (k,) distinct rows of the batch.
             values: (k, S, 2) true density [veh/km] and speed [km/h] of all segments; those of
-                segments that nobody asked for may be anything, and their release is to be dropped.
+                unobserved segments are arbitrary, and their release is to be discarded.
 
         Returns:
             (k, S, 2) a fresh array of released values, in the same units.
@@ -46,15 +44,15 @@ class Mechanism(Protocol):
 class GaussianMechanism:
     """Adds independent Gaussian noise to every value and rounds the sum to a public grid.
 
-    The low bits of a sum in double precision tell which true value went into it: released as they
-    are, they would prove that a segment is empty (Mironov, 2012). Rounding to a grid of spacing
+    The low bits of a sum in double precision depend on the true value: released unrounded, they
+    would prove that a segment is empty (Mironov, 2012). Rounding to a grid of spacing
     `grid`, a power of two between sigma / 2048 and sigma / 1024, removes them. It depends on sigma
     alone and raises the variance by less than a millionth.
 
-    Noise is drawn for all segments at every step, whatever was asked: two policies that are run on
-    the same streams meet the same noise, and an episode's noise depends neither on the batch it is
-    in nor on how the other episodes go. It is drawn ahead in blocks of steps, since one large draw
-    costs far less than many small ones; the size of the blocks does not change the noise.
+    Noise is drawn for all segments at every step, observed or not: different policies on the same
+    streams have common random numbers, and an episode's noise depends neither on its batch nor on
+    the other episodes. It is drawn in blocks of steps, since a large draw costs far less than many
+    small ones; the size of the blocks does not change the noise.
     """
 
     def __init__(
@@ -69,7 +67,7 @@ class GaussianMechanism:
             block: steps of noise to draw at a time.
 
         Raises:
-            ValueError: if `sigma` is not two finite numbers above zero, or a size is below one.
+            ValueError: `sigma` is not two finite numbers above zero, or a size is below 1.
         """
         std = np.array(sigma, dtype=np.float64)
         if std.shape != (2,) or not (np.isfinite(std).all() and (std > 0.0).all()):
@@ -86,15 +84,15 @@ class GaussianMechanism:
         self._block = block
         self._generators: list[np.random.Generator | None] = [None] * n_episodes
         self._noise = np.empty((n_episodes, block, n_segments, 2))
-        # Next unused step of each block. An episode that was never reset has a spent block, so
+        # Next unused step of each block. An episode that was never reset has a used-up block, so
         # that it cannot be released without noise.
         self._next = np.full(n_episodes, block)
-        # Releases that are sure to find noise in every block: spares a look at `_next` each step.
+        # Releases for which every block certainly has noise: saves a look at `_next` at each step.
         self._sure = 0
 
     @property
     def sigma(self) -> FloatArray:
-        """Noise standard deviation of the two released quantities, (2,) [veh/km, km/h]."""
+        """See `Mechanism.sigma`."""
         return self._sigma
 
     @property
@@ -108,14 +106,10 @@ class GaussianMechanism:
         return len(self._generators)
 
     def reset(self, episodes: IntArray, generators: Sequence[np.random.Generator]) -> None:
-        """Begin new episodes, each with a noise stream of its own.
-
-        Args:
-            episodes: (k,) distinct rows of the batch.
-            generators: k noise streams; the mechanism is their only user from now on.
+        """See `Mechanism.reset`.
 
         Raises:
-            ValueError: if there is not exactly one stream for each episode.
+            ValueError: There is not exactly one stream for each episode.
         """
         rows = episodes.tolist()
         if len(generators) != len(rows):
@@ -128,20 +122,11 @@ class GaussianMechanism:
         self._sure = self._block - int(self._next.max())
 
     def release(self, episodes: IntArray, values: FloatArray) -> FloatArray:
-        """Release one step of some episodes, and move their noise streams on by one step.
-
-        Args:
-            episodes: (k,) distinct rows of the batch.
-            values: (k, S, 2) true density [veh/km] and speed [km/h] of all segments. Finite values
-                are not required of a segment that nobody asked for.
-
-        Returns:
-            (k, S, 2) a fresh array: values plus noise of standard deviation `sigma`, rounded to
-            multiples of `grid`.
+        """See `Mechanism.release`; releases are multiples of `grid`.
 
         Raises:
-            RuntimeError: if an episode was never reset.
-            ValueError: if `values` has another shape.
+            RuntimeError: An episode was never reset.
+            ValueError: `values` has another shape.
         """
         if self._sure <= 0:
             self._refill(episodes)
@@ -159,7 +144,7 @@ class GaussianMechanism:
         return released
 
     def _refill(self, episodes: IntArray) -> None:
-        """Draw a new block for those of `episodes` whose block is spent."""
+        """Draw new blocks for those of `episodes` whose block is used up."""
         for row in episodes[self._next[episodes] == self._block].tolist():
             generator = self._generators[row]
             if generator is None:

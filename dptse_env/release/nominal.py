@@ -1,4 +1,4 @@
-"""Nominal flows, inputs and states: what the published demand alone says about the road."""
+"""Nominal flows, inputs and states, derived from the published demand alone."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def nominal_flows(corridor: Corridor, times: npt.ArrayLike) -> FloatArray:
     """Return the flow through each segment at the published demand [veh/h], shape (..., S).
 
     Args:
-        corridor: The road; a demand distribution counts with its base.
+        corridor: The road; of a demand distribution the base is used.
         times: Seconds of the record [s], shape (...).
     """
     demand = _published(corridor)
@@ -58,8 +58,8 @@ def _free_density(model: ARZModel, flow: FloatArray, jam: FloatArray) -> FloatAr
 def nominal_inputs(corridor: Corridor, model: ARZModel) -> FloatArray:
     """Return the model's inputs at the published demand for every second, shape (T + 1, n_u).
 
-    What enters does so at free speed; behind the exits traffic flows freely, at the density of
-    the flow that reaches them. No incident is known.
+    Vehicles enter at free speed; behind the exits traffic flows freely, at the density of the flow
+    that reaches them. Incidents are not considered.
     """
     layout, v_f = model.layout, model.parameters.free_flow_speed
     n, n_on = corridor.n_mainline, len(corridor.on_ramps)

@@ -1,4 +1,4 @@
-"""The privacy report of an environment: what its releases cost, and what may be claimed."""
+"""Privacy report of an environment: privacy loss of its releases, and the guarantee."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from typing import Any
 from dptse_env.release.void_reasons import VOID_REASONS
 
 STRICT_DELTA = 1e-4
-"""A delta at which epsilon is reported beside the one asked for, which is often weak."""
+"""A delta at which epsilon is also reported, since the configured one is often weak."""
 
 
 @dataclass(frozen=True)
 class QuantityReport:
-    """One released quantity: how far a vehicle may move it, and the noise that hides it.
+    """Sensitivity and noise of a released quantity.
 
     Attributes:
         quantity: Name of the released quantity.
         unit: Unit of `sensitivity` and `noise_std`.
-        sensitivity: L2, over a whole episode.
+        sensitivity: L2 sensitivity over a complete episode.
         noise_std: Standard deviation of the noise on each value.
         mu: sensitivity / noise_std.
     """
@@ -36,23 +36,23 @@ class QuantityReport:
 class PrivacyReport:
     """Public account of the release model in force; nothing in it depends on an episode's traffic.
 
-    `mu`, `epsilon` and `epsilon_strict` are what an episode's releases reveal together *if the
-    sensitivities hold*, and if nothing but the releases is used. They are no guarantee while
+    `mu`, `epsilon` and `epsilon_strict` are the privacy loss of all releases of an episode together
+    *if the sensitivities hold*, and if only the releases are used. They are no guarantee while
     `void_reasons` has an entry.
 
     Attributes:
         preset: Name of the release model, or ``"package.module:Class"``.
-        guarantee: The claim, or "none".
-        void_reasons: Why not; empty if and only if something may be claimed.
-        protects: Whose data is protected, and what counts as a change of it.
-        claimed_epsilon: The epsilon asked for.
-        claimed_delta: The delta asked for.
+        guarantee: The guarantee, or "none".
+        void_reasons: Reasons against a guarantee; empty if and only if there is one.
+        protects: Description of the protected data and of the change that is protected.
+        claimed_epsilon: The configured epsilon.
+        claimed_delta: The configured delta.
         speed_release: How speeds are released: ``mean`` or ``flow``.
-        boundary_inputs: Where the estimator's inputs at the boundary come from.
-        mu: Of all releases together.
-        epsilon: Of all releases together, at `claimed_delta`.
-        epsilon_strict: Of all releases together, at `strict_delta`.
-        releases: One for each released quantity.
+        boundary_inputs: Source of the estimator's inputs at the boundary.
+        mu: Parameter of all releases together.
+        epsilon: Epsilon of all releases together, at `claimed_delta`.
+        epsilon_strict: Epsilon of all releases together, at `strict_delta`.
+        releases: A report for each released quantity.
         assumptions: The public numbers the sensitivities were computed from, by name with unit.
         details: Settings of this release model alone, such as unit, cap, adjacency and share.
         strict_delta: The smaller delta at which `epsilon_strict` is given.
@@ -75,14 +75,14 @@ class PrivacyReport:
     strict_delta: float = STRICT_DELTA
 
     def voided(self, reasons: Iterable[str]) -> PrivacyReport:
-        """Return the report with further reasons for which nothing may be claimed."""
+        """Return the report with further reasons against a guarantee."""
         found = {*self.void_reasons, *reasons}
         if found == set(self.void_reasons):
             return self
         return replace(self, guarantee="none", void_reasons=in_order(found))
 
     def to_dict(self) -> dict[str, Any]:
-        """Return a fresh dict of plain str, float, int, dict and list; `details` stand beside."""
+        """Return a fresh dict of plain JSON values, which includes the entries of `details`."""
         report: dict[str, Any] = asdict(self)
         report["void_reasons"] = list(self.void_reasons)
         report["releases"] = [asdict(quantity) for quantity in self.releases]
@@ -91,7 +91,7 @@ class PrivacyReport:
 
 
 def in_order(reasons: Iterable[str]) -> tuple[str, ...]:
-    """Return reasons in the order of `VOID_REASONS`, others behind them."""
+    """Return reasons in the order of `VOID_REASONS`, then others sorted by name."""
     found = set(reasons)
     known = [reason for reason in VOID_REASONS if reason in found]
     return (*known, *sorted(found - set(known)))

@@ -1,4 +1,4 @@
-"""What a user asks of a release model: the keyword ``privacy`` of an environment."""
+"""Settings of release models: the keyword ``privacy`` of an environment."""
 
 from __future__ import annotations
 
@@ -9,27 +9,27 @@ from dptse_env.privacy import Adjacency
 from dptse_env.utils.fields import Interval, checked_fields
 
 Unit = Literal["trip", "horizon", "event"]
-"""What is protected: a trip of capped contributions, of any length, or one second of it."""
+"""Unit of protection: a trip with capped contributions, a complete trip, or a second of it."""
 
 SpeedRelease = Literal["mean", "flow"]
-"""How speeds are released: their mean over a segment's vehicles, or a sum, the centred flow."""
+"""Release of speeds: as their mean over a segment's vehicles, or as a sum, the centred flow."""
 
 BoundaryInputs = Literal["true", "nominal", "private"]
-"""Where the estimator's inputs at the boundary come from: measured traffic, public demand, or the
+"""Source of the estimator's inputs at the boundary: measured traffic, public demand, or the
 boundary segments' releases."""
 
 
 @dataclass(frozen=True)
 class PrivacySettings:
-    """What every release model is asked for; one that needs more has a class of its own.
+    """Settings of every release model; subclasses add further ones.
 
     Attributes:
         preset: The release model: ``paper``, ``corrected``, ``capped``, a registered name,
             ``"package.module:Class"``, or a class.
         epsilon: Privacy parameter epsilon.
         delta: Privacy parameter delta.
-        boundary_inputs: Where the estimator's inputs at the boundary come from: ``true``,
-            ``nominal`` or ``private``; None for the model's default.
+        boundary_inputs: Source of the estimator's inputs at the boundary: ``true``, ``nominal`` or
+            ``private``; None for the model's default.
 
     Raises:
         ValueError: A field is out of range; the message names its path below ``privacy``.
@@ -43,26 +43,26 @@ class PrivacySettings:
     boundary_inputs: BoundaryInputs | None = None
 
     def __post_init__(self) -> None:
-        """Check each field, and keep the numbers as plain floats."""
+        """Check the fields."""
         checked_fields(self, "privacy")
 
     @property
     def boundary(self) -> BoundaryInputs:
-        """Where the estimator's inputs at the boundary come from."""
+        """Source of the estimator's inputs at the boundary."""
         return self.boundary_inputs or self.default_boundary
 
 
 @dataclass(frozen=True)
 class CappedSettings(PrivacySettings):
-    """What `dptse_env.release.Capped` is asked for beside `PrivacySettings`.
+    """Settings of `dptse_env.release.Capped`.
 
     Attributes:
-        unit: What is protected: ``trip``, a vehicle's trip, which counts in its first ``cap``
+        unit: Unit of protection: ``trip``, a vehicle's trip, which counts in its first ``cap``
             queried steps; ``horizon``, a trip without a cap, charged for every step of an episode;
             ``event``, one second of a trip.
-        cap: Of unit ``trip``, queried steps in which a vehicle counts.
-        adjacency: How two adjacent records differ: ``replace`` or ``add_remove``.
-        share: Part of the budget mu^2 that density gets.
+        cap: Queried steps in which a vehicle counts, for the unit ``trip``.
+        adjacency: Difference of two adjacent records: ``replace`` or ``add_remove``.
+        share: Part of the budget mu^2 for the density.
         speed_release: ``flow``, or ``mean`` for mean speeds, which void the guarantee.
 
     Raises:
@@ -79,7 +79,7 @@ class CappedSettings(PrivacySettings):
     speed_release: SpeedRelease = "flow"
 
     def __post_init__(self) -> None:
-        """Check each field, and that they go together."""
+        """Check the fields, and that they are compatible."""
         super().__post_init__()
         if self.speed_release == "mean" and self.adjacency == "add_remove":
             raise ValueError(
@@ -89,16 +89,16 @@ class CappedSettings(PrivacySettings):
 
     @property
     def contribution_cap(self) -> int | None:
-        """Queried steps in which a vehicle counts; None if in all of them."""
+        """Queried steps in which a vehicle counts; None if it counts in all of them."""
         return self.cap if self.unit == "trip" else None
 
     def contributions(self, horizon: int) -> int:
-        """Return in how many of an episode's ``horizon`` steps the protected unit can count."""
+        """Return the most steps of ``horizon`` in which the protected unit can count."""
         return {"trip": min(self.cap, horizon), "horizon": horizon, "event": 1}[self.unit]
 
     @property
     def protected(self) -> str:
-        """Description of what the guarantee protects."""
+        """Description of the protected data and of the change that is protected."""
         change = "replaced by another" if self.adjacency == "replace" else "added or removed"
         return {
             "trip": f"one vehicle's trip, {change}, which counts in {self.cap} queried steps",

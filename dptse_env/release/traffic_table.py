@@ -12,9 +12,9 @@ from dptse_env.utils.arrays import FloatArray, IntArray
 class TrafficTable:
     """The true traffic of a set of traffic seeds, in memory.
 
-    Aggregates are made once per record and kept in one table, so that a batch of episodes reads
-    its traffic with a single index. A mean speed is over vehicles; an empty segment has the road's
-    speed limit, so that no gap tells that nobody is there.
+    Aggregates are computed once per record and stored in one table, so that a batch of episodes
+    reads its traffic with a single index. A mean speed is over vehicles; an empty segment has the
+    road's speed limit, so that no gap reveals that it is empty.
     """
 
     def __init__(
@@ -23,20 +23,20 @@ class TrafficTable:
         """Prepare a table for ``traffic_seeds``; nothing is loaded or recorded yet."""
         self.corridor, self.traffic_seeds, self.library = corridor, traffic_seeds, library
         columns = corridor.n_segments + corridor.n_boundaries
-        # np.empty takes address space, not memory, until a record is written into its place.
+        # np.empty takes address space, not memory, until a record is written.
         self._table = np.empty((len(traffic_seeds), corridor.duration + 1, columns, 2))
         self._loaded = np.zeros(len(traffic_seeds), dtype=bool)
 
     def load(self, indices: npt.ArrayLike) -> list[tuple[int, Record]]:
-        """Read or make the records of some traffic seeds; return those that are new in memory.
+        """Load the records of some traffic seeds; return those that were not in memory before.
 
-        Several that are missing on disk are recorded at once, on all cores.
+        Records that are missing on disk are made, on all cores where there are several.
 
         Args:
             indices: Into ``traffic_seeds``, one or more.
 
         Returns:
-            The index and the record of each that was not in memory before.
+            Index and record of each.
         """
         new = [index for index in np.unique(indices).tolist() if not self._loaded[index]]
         if len(new) > 1:
@@ -53,7 +53,7 @@ class TrafficTable:
         return records
 
     def record(self, index: int) -> Record:
-        """Return the record of ``traffic_seeds[index]``, made now if there is none."""
+        """Return the record of ``traffic_seeds[index]``, which is made now if it is missing."""
         return self.library.get(self.corridor, self.traffic_seeds[index])
 
     def aggregates(
@@ -62,15 +62,15 @@ class TrafficTable:
         """Return (density [veh/km], speed [km/h]) of every segment, shape (k, S, 2).
 
         Args:
-            indices: Of the traffic seeds, shape (k,); loaded before.
+            indices: Indices of loaded traffic seeds, shape (k,).
             times: Seconds of their records, shape (k,).
-            n_columns: Number of columns, if not the S segments.
+            n_columns: Number of columns; None for the S segments.
         """
         rows: FloatArray = self._table[indices, times, : n_columns or self.corridor.n_segments]
         return rows
 
-    def whole(self, index: int) -> FloatArray:
-        """Return the same for all segments over a whole record, shape (T + 1, S + R, 2).
+    def complete(self, index: int) -> FloatArray:
+        """Return density and speed of all segments over a complete record, (T + 1, S + R, 2).
 
         The boundary segments come last, in the order of `dptse_env.traffic.corridor`.
         """

@@ -3,8 +3,6 @@
 from collections.abc import Mapping
 from types import MappingProxyType
 
-__all__ = ["VOID_REASONS"]
-
 VOID_REASONS: Mapping[str, str] = MappingProxyType(
     {
         "not_stated": "the release model states no guarantee",
@@ -33,4 +31,4 @@ VOID_REASONS: Mapping[str, str] = MappingProxyType(
         "truth_in_info": "info['truth'] shows the true traffic and what each vehicle contributed",
     }
 )
-"""Each reason with one sentence of explanation, in the order in which reports list them."""
+"""Reasons with an explanation each, in the order of reports."""

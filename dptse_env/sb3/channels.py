@@ -23,9 +23,8 @@ CENTRES = {
     "fixed_density_innovation": (0.0, 1.5),
     "fixed_speed_innovation": (0.0, 1.5),
 }
-"""Centre and scale of each block's values, chosen so that channels are of order one.
-
-Constants rather than running statistics: nothing can be lost between training and use."""
+"""Centre and scale of each block's values, chosen so that channels are of order one. They are
+constants rather than running statistics, which could be lost between training and use."""
 
 MAINLINE_BLOCKS = (
     "density", "speed", "density_log_std", "speed_log_std", "density_innovation",
@@ -37,7 +36,7 @@ FIXED_SENSOR_BLOCKS = ("fixed_density_innovation", "fixed_speed_innovation")
 
 @dataclass(frozen=True)
 class Channel:
-    """One value for each mainline segment.
+    """A channel of the observation, with a value for each mainline segment.
 
     Attributes:
         name: Kind of segment and observation block, such as ``"off-ramp density"``.
@@ -60,13 +59,13 @@ class RoadChannels:
     A ramp's values are assigned to the segment that it joins or leaves: an on-ramp at face j to
     segment j, downstream of the face, an off-ramp to segment j - 1. The bandwidth and epsilon are
     left out: they are constant during a training, so their weights would remain untrained and
-    would spoil the policy elsewhere. Their effect shows in the deviations and ages.
+    would harm the policy elsewhere. Their effect shows in the deviations and ages.
 
     Attributes:
         n_mainline: Segments n along the road.
         size: Length of an observation.
         channels: The channels with values from the observation.
-        marks: Constant channels of 0 or 1 per segment: on-ramp, off-ramp, fixed sensor.
+        marks: Constant channels of 0 or 1 per segment, for on-ramps, off-ramps and fixed sensors.
     """
 
     n_mainline: int

@@ -1,4 +1,4 @@
-"""Fit of a saved policy and an environment: what they must share, and what may differ."""
+"""Fit of a saved policy and an environment: properties that must agree, and allowed differences."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from dptse_env.spaces.actions import ACTION_ENCODINGS
 from dptse_env.traffic import Corridor
 
 POLICY_FORMAT = "dptse-policy-1"
-"""Of policy files; raise its number whenever saved weights would change their meaning."""
+"""Format of policy files; its number is raised when saved weights change their meaning."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class TrainedOn:
 
 
 def make_fit(config: EnvConfig, kind: Kind) -> dict[str, Any]:
-    """Return what a policy for an environment of ``config`` must fit, as plain JSON."""
+    """Return the properties that a policy for ``config`` must fit, as plain JSON."""
     encoding = make_interface(config).observations
     sizes = [f"{name}:{place.stop - place.start}" for name, place in encoding.slices.items()]
     fit: dict[str, Any] = {
@@ -101,9 +101,9 @@ def check_fit(
     """Refuse a policy that does not fit an environment.
 
     Args:
-        card: Of the policy.
-        kind: Of the policy.
-        config: Of the environment.
+        card: Card of the policy.
+        kind: Kind of the policy.
+        config: Configuration of the environment.
         allow: Properties that may differ on purpose.
 
     Raises:
@@ -116,7 +116,7 @@ def check_fit(
     if channels:
         problems["channels"] = channels
     elif there["observation"] != here["observation"]:
-        # A shared network acts on more or fewer segments: that is another corridor for it.
+        # For a shared network, another number of segments is a matter of the corridor.
         key = "corridor" if kind.is_shared else "observation"
         problems[key] = _difference("observation", there["observation"], here["observation"])
         if not kind.is_shared:
@@ -140,7 +140,7 @@ def _difference(key: str, there: object, here: object) -> str:
 
 
 def _channel_difference(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
-    """Return in which channels two roads differ, whatever their sizes; empty where in none."""
+    """Describe the channels that two roads do not share, of any sizes; empty without any."""
     if "channels" in there:
         channels = there["channels"], here["channels"]
     else:
@@ -155,7 +155,7 @@ def _channel_difference(there: Mapping[str, Any], here: Mapping[str, Any]) -> st
 
 
 def _blocks(fit: Mapping[str, Any]) -> list[str]:
-    """Return the names of the observation blocks that a road's size does not matter for."""
+    """Return the names of observation blocks, without their sizes."""
     return [part.partition(":")[0] for part in fit["observation"].split()]
 
 

@@ -1,4 +1,4 @@
-"""Kinds of policies that can be saved: how each is described on a card, and made from it."""
+"""Kinds of policies that can be saved, each with its description on a card."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from dptse_env.utils.validation import integer
 Shapes: TypeAlias = dict[str, tuple[int, ...]]
 
 LARGEST_LAYER = 100_000
-"""Units of a layer, at most."""
+"""Largest number of units of a layer."""
 
 LARGEST_WEIGHT = 1e6
-"""Initial weight of a rule, at most, either way."""
+"""Largest magnitude of an initial weight of a rule."""
 
 
 class Kind(ABC):
-    """A class of policies, as far as saving and loading them goes.
+    """Saving and loading of a class of policies.
 
     Attributes:
         is_shared: Whether the network is shared by all segments, so that the policy can act on a
@@ -134,7 +134,7 @@ class _Perceptron(Kind):
         return shapes
 
     def make(self, config: EnvConfig, arguments: Mapping[str, Any]) -> BasePolicy:
-        # The weights are replaced, so they need no orthogonal start, which takes long.
+        # The weights are replaced, so the slow orthogonal initialisation is not needed.
         return ActorCriticPolicy(*_spaces(config), _no_rate, ortho_init=False, **arguments)
 
 

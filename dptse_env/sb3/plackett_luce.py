@@ -32,8 +32,8 @@ class PlackettLuce:
             raise ValueError(f"size must be in 1..{n}, got {size}")
         if not bool(torch.isfinite(scores).all()):
             raise ValueError("scores must be finite; a diverged training makes them NaN")
-        # Only differences count. Centred, the largest is 0 and no exponential overflows; sums of
-        # a few of the lowest do not, either.
+        # Only differences matter. Centred scores are at most 0, so no exponential overflows, and
+        # neither do sums of a few of the lowest scores.
         centred = scores - scores.max(dim=-1, keepdim=True).values.detach()
         self.scores = centred.clamp_min(torch.finfo(scores.dtype).min / (4 * n))
         self.size = size

@@ -27,8 +27,8 @@ class PlackettLucePolicy(BasePolicy):
     (`dptse_env.sb3.torch_modules.Scorer`) starts as a rule and learns a correction to it.
 
     One set of weights serves any B, any estimator, any privacy and roads of any length whose
-    channels are the same (`RoadChannels`): nothing in it is tied to a segment. What it has learned
-    may suit another road less.
+    channels are the same (`RoadChannels`): nothing in it is tied to a segment. It may perform worse
+    on another road.
 
     The policy has no critic and no optimizer: it is trained by regression and rounds of swaps
     (``scripts/train.py``), not by PPO.
@@ -39,7 +39,7 @@ class PlackettLucePolicy(BasePolicy):
         width: Features per segment.
         rule: Initial weights of the rule by observation block.
         features: Module that arranges observations along the road.
-        scorer: Module that scores segments; all learned weights are its own.
+        scorer: Module that scores segments; it has all learned weights.
     """
 
     def __init__(
@@ -100,7 +100,7 @@ def _bandwidth(
     """Return B of an action space, or refuse spaces that do not fit the layout."""
     if observations.shape != (road.size,):
         raise ValueError(
-            f"observation_space must have shape {(road.size,)} as road has, got {observations}"
+            f"observation_space must have shape {(road.size,)}, as in road, got {observations}"
         )
     if (
         not isinstance(actions, spaces.MultiDiscrete)

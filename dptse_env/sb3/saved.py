@@ -1,4 +1,4 @@
-"""Trained policies as small files, checked when they are read and refused where they do not fit."""
+"""Trained policies as small files, which are checked against the environment when loaded."""
 
 from __future__ import annotations
 
@@ -31,20 +31,20 @@ from dptse_env.sb3.kinds import KINDS, Shapes
 from dptse_env.utils.arrays import Action, Observation
 
 CARD_TEXT = "CARD.md"
-"""Entry of a policy file with the card for people."""
+"""Entry of a policy file with the readable card."""
 
 
 class ActingPolicy:
     """A policy of stable-baselines3 that acts by observations alone.
 
     Attributes:
-        interface: Of the environment that it acts in.
+        interface: Interface of its environment.
     """
 
     def __init__(self, policy: BasePolicy, interface: QueryInterface) -> None:
         """Bind a policy to an environment's interface."""
         self._policy, self.interface = policy, interface
-        # A maskable policy expects masks beside the observation, which holds them, too.
+        # A maskable policy expects masks as an argument; they are part of the observation.
         self._takes_masks = type(policy).__name__ == "MaskableActorCriticPolicy"
 
     def predict(
@@ -75,9 +75,9 @@ class SavedPolicy(ActingPolicy):
     """A trained policy with the ``predict`` of stable-baselines3.
 
     Attributes:
-        card: Description of the policy, its training, and what it fits.
+        card: Description of the policy, its training, and the environments it fits.
         trained_on: The road that it was trained on.
-        interface: Of the environment that it acts in.
+        interface: Interface of its environment.
     """
 
     def __init__(
@@ -98,22 +98,22 @@ def save_policy(
     training: Mapping[str, Any],
     figures: Mapping[str, Any],
 ) -> None:
-    """Write what acting needs of a policy: its weights and a card.
+    """Write a policy's weights and its card to a file.
 
-    The file is put in place when it is complete; an older one stays until then.
+    An existing file is replaced when the new one is complete.
 
     Args:
         path: A file that ends in ``.zip``.
         policy: One of `PlackettLucePolicy`, ``ActorCriticPolicy``, ``MaskableActorCriticPolicy``.
-        config: Of the environment that it was trained on.
+        config: Configuration of the environment that it was trained on.
         env: Id of that environment.
-        keywords: Those of the environment, plain JSON.
+        keywords: Keywords of that environment, plain JSON.
         training: Recipe, seeds, steps; plain JSON.
         figures: Results, by name; plain JSON.
 
     Raises:
-        ValueError: The policy could not be loaded again: it is of another class, has parts of
-            its own, is too large, or has weights that are not finite. Or the path does not end
+        ValueError: The policy could not be loaded again: it is of another class, has additional
+            parts, is too large, or has weights that are not finite. Or the path does not end
             in ``.zip``.
         OSError: The file cannot be written.
     """
@@ -162,8 +162,8 @@ def load_policy(
     Args:
         source: A file, or the name of a policy that comes with the package
             (`dptse_env.policies`).
-        env: The environment in which it is to act: of this package, scalar or vector, wrapped or
-            not, or as an `SB3VecEnv`.
+        env: The environment in which it acts: of this package, scalar or vector, wrapped or not,
+            or as an `SB3VecEnv`.
         allow: Properties that may differ on purpose, of `TRANSFERABLE`. Estimator, privacy and
             traffic model may always differ. With ``"corridor"`` a `PlackettLucePolicy` acts on
             roads of any size whose observations have the same channels (`RoadChannels`); a
@@ -197,7 +197,8 @@ def _bind(file: PolicyFile, config: EnvConfig, allow: Collection[str]) -> SavedP
     kind = KINDS[name]
     check_fit(file.card, kind, config, allow)
     _check_weights(file, kind.shapes(config, arguments))
-    with torch.random.fork_rng(devices=[]):  # initial weights, which are replaced, take no draws
+    # The random initial weights are replaced; torch's generator is left unchanged.
+    with torch.random.fork_rng(devices=[]):
         policy = kind.make(config, arguments)
     weights = {name: torch.from_numpy(array) for name, array in file.weights.items()}
     policy.load_state_dict(weights)
@@ -229,7 +230,7 @@ def _packed(card: Mapping[str, Any], policy: BasePolicy) -> bytes:
             (CARD_TEXT, _text(card)),
             (WEIGHTS, weights.getvalue()),
         ):
-            # A fixed date: the same policy gives the same file.
+            # ZipInfo has a fixed date, so that the same policy gives the same file.
             archive.writestr(zipfile.ZipInfo(name), entry, zipfile.ZIP_DEFLATED)
     return content.getvalue()
 
@@ -243,7 +244,7 @@ def _config_of(env: Any) -> EnvConfig:
 
 
 def _text(card: Mapping[str, Any]) -> str:
-    """Return the card for people."""
+    """Return the readable card."""
     fits, training = card["fits"], card["training"]
     lines = [
         f"# {card['policy']['class']} for {card['env'].rpartition(':')[2]}",

@@ -90,7 +90,7 @@ class Scorer(nn.Module):
         self.rule = nn.Parameter(torch.tensor(list(rule.values()), dtype=torch.float32))
         self.trunk = Trunk(road.n_channels, width)
         self.correction = nn.Conv1d(width, 1, 1, bias=False)
-        # Small rather than zero: behind a zero the trunk would not learn at first.
+        # Small rather than zero, which would keep the trunk's gradient at zero at first.
         with torch.no_grad():
             self.correction.weight *= 0.1
 

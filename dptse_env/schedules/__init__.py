@@ -1,4 +1,4 @@
-"""Query schedules: policies that need no training, from a clock to a rollout, and oracles.
+"""Query schedules: policies without training, and oracles.
 
 Every schedule has the ``predict`` of a stable-baselines3 policy, so one loop serves schedules and
 learned policies alike. Its memory between steps travels in ``state``, so one schedule serves any
@@ -13,7 +13,7 @@ schedules                use          extra cost of a step
                          estimator's
                          covariance
 `PLANS`                  a clock      none; optimised beforehand on training traffic
-`ORACLES`                the truth    they are bounds, no policies: ``uses_truth`` is True
+`ORACLES`                the truth    bounds, not policies: ``uses_truth`` is True
 ======================== ============ ====================================================
 """
 
@@ -97,7 +97,7 @@ OBSERVATION_SCHEDULES: dict[str, Any] = {
     "stale-variance": StaleVariance,
     "all": Everything,
 }
-"""Schedules that use nothing but the observation, each made of (interface, seed)."""
+"""Schedules that use the observation alone, each made of (interface, seed)."""
 
 COVARIANCE_SCHEDULES: dict[str, type[ProcessSchedule]] = {
     "greedy-trace": GreedyTrace,
@@ -112,7 +112,7 @@ ORACLES: dict[str, type[ProcessSchedule]] = {
     "oracle-greedy": OracleGreedy,
     "oracle-brute-force": OracleBruteForce,
 }
-"""Bounds that see the truth, each made of (process, seed). They are no policies."""
+"""Bounds that use the truth, each made of (process, seed); they are not policies."""
 
 
 def _expected(part: Any) -> str | None:
@@ -140,7 +140,7 @@ def make_schedule(schedule: Any, env: Any, seed: int | None = None) -> Any:
             ``"package.module:Class"``, a subclass of `Schedule`, or an object with ``predict``,
             which is returned as it is.
         env: An environment of this package, scalar or vector, wrapped or not.
-        seed: Seed of the schedule's own choices.
+        seed: Seed of the schedule's random choices.
 
     Raises:
         ValueError: The name is unknown or the schedule does not suit the environment.

@@ -1,4 +1,4 @@
-"""The base of schedules: `predict` around a choice of segments."""
+"""Base classes of schedules, whose `predict` turns chosen segments into actions."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Schedule(ABC):
 
     Attributes:
         uses_truth: Whether the choice depends on the true traffic. Such a schedule is a bound on
-            policies, and no policy.
+            policies, not a policy.
     """
 
     uses_truth: ClassVar[bool] = False
@@ -39,7 +39,7 @@ class Schedule(ABC):
 
         Args:
             interface: Interface of the environment (``env.unwrapped.interface``).
-            seed: Seed of the schedule's own choices, for those that draw any.
+            seed: Seed of random choices.
         """
         self.interface = interface
         self.n_mainline = interface.n_mainline
@@ -68,8 +68,7 @@ class Schedule(ABC):
             observation: Shape (size,) or (k, size).
             state: The state returned by the last call, None at the first.
             episode_start: Which episodes have just begun, shape (k,) or a single flag.
-            deterministic: Accepted for the sake of the common signature. A schedule does the
-                same either way; the random one draws in both cases.
+            deterministic: Part of the common signature, without effect.
         """
         del deterministic
         batch = np.atleast_2d(observation)
@@ -85,7 +84,7 @@ class Schedule(ABC):
         return (action[0] if np.ndim(observation) == 1 else action), new_state
 
     def _choose(self, rows: IntArray, step: IntArray, observation: Observation) -> BoolArray:
-        """Return `select` of some ``rows`` of the batch; all arrays are of these alone."""
+        """Return `select` for some ``rows`` of the batch; all arrays have these rows alone."""
         del rows
         return self.select(step, observation)
 
@@ -120,8 +119,8 @@ class Schedule(ABC):
         """Return the ``bandwidth`` segments of the highest value (k, n_mainline).
 
         Ties rotate along the road with the step: breaking them from one end would query the
-        segments there half as often again. A mainline segment with a fixed sensor is observed
-        without a query, so it comes last, whatever its value.
+        segments there 1.5 times as often. A mainline segment with a fixed sensor is observed
+        without a query, so it comes last for any value.
         """
         fixed = self.interface.observations.fixed_sensors
         score = np.array(value, dtype=np.float64)
@@ -131,9 +130,9 @@ class Schedule(ABC):
 
 
 class ProcessSchedule(Schedule):
-    """A schedule that reads the state of its environment's process beside the observation.
+    """A schedule that uses the state of its environment's process beside the observation.
 
-    Its batch is that process's episodes, all of them and in order.
+    Its batch is all episodes of that process, in order; `predict` refuses another one.
     """
 
     name: ClassVar[str]
@@ -143,28 +142,18 @@ class ProcessSchedule(Schedule):
         super().__init__(process.interface, seed)
         self.process = process
 
-    def predict(
-        self,
-        observation: Observation,
-        state: tuple[Any, ...] | None = None,
-        episode_start: Any = None,
-        deterministic: bool = False,
-    ) -> tuple[Action, tuple[Any, ...]]:
-        """See `Schedule.predict`.
-
-        Raises:
-            ValueError: The batch is not of the process's size.
-        """
-        k, n = len(np.atleast_2d(observation)), self.process.n_episodes
-        if k != n:
+    def _resume(
+        self, k: int, state: tuple[Any, ...] | None, episode_start: Any
+    ) -> tuple[IntArray, BoolArray]:
+        if k != self.process.n_episodes:
             raise ValueError(
-                f"schedule {self.name!r} follows the {n} episodes of its environment, all of them "
-                f"and in order; got a batch of {k}"
+                f"schedule {self.name!r} follows the {self.process.n_episodes} episodes of its "
+                f"environment, all of them and in order; got a batch of {k}"
             )
-        return super().predict(observation, state, episode_start, deterministic)
+        return super()._resume(k, state, episode_start)
 
     def select(self, step: IntArray, observation: Observation) -> BoolArray:
-        """See `Schedule.select`; for all episodes."""
+        """See `Schedule.select`; the batch is all episodes."""
         return self._choose(np.arange(self.process.n_episodes), step, observation)
 
     @abstractmethod

@@ -1,32 +1,33 @@
-"""Schedules that use the estimator's covariance: the operator's own knowledge, not the truth."""
+"""Schedules that use the estimator's covariance, which is public, unlike the truth."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar, Protocol, cast
+from typing import Annotated, ClassVar, Protocol, cast
 
 import numpy as np
 
+from dptse_env.estimators.settings import Deviation
 from dptse_env.model.road_arrays import make_road_arrays
 from dptse_env.process import QueryProcess
 from dptse_env.schedules import greedy_kernels as kernels
 from dptse_env.schedules.base import ProcessSchedule
 from dptse_env.schedules.covariance_kernels import Problem
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray, Observation
-from dptse_env.utils.validation import non_negative, positive, sequence
+from dptse_env.utils.fields import POSITIVE, checked_fields
 
 
 @dataclass(frozen=True)
 class CovarianceInflation:
-    """Inflation of the covariance by which a schedule chooses, and weights of its variances.
+    """Inflation of the covariance that a schedule uses, and weights of its variances.
 
     Attributes:
         process_noise: Standard deviations of the process noise of a step, of rho over rho_m and of
-            psi over rho_m v_f. With them the schedule propagates a covariance of its own, starting
-            from the estimator's prior. None takes the estimator's present covariance and settings.
+            psi over rho_m v_f, with which the schedule propagates a separate covariance, starting
+            from the estimator's prior. None for the estimator's present covariance and settings.
         occupied: Whether the variance of a speed is weighted by the probability that the segment
-            has a vehicle, 1 - exp(-rho l); an empty segment has no speed to be wrong about.
+            has a vehicle, 1 - exp(-rho l); an empty segment has no speed error.
         speed_cap: Standard deviation of a speed, in the reward's scale, beyond which it does not
             count.
 
@@ -34,25 +35,20 @@ class CovarianceInflation:
         ValueError: A value is out of range.
     """
 
-    process_noise: tuple[float, float] | None = None
+    process_noise: tuple[Deviation, Deviation] | None = None
     occupied: bool = False
-    speed_cap: float | None = None
+    speed_cap: Annotated[float, POSITIVE] | None = None
 
     def __post_init__(self) -> None:
         """Check values."""
-        if self.process_noise is not None:
-            pair = sequence("inflation.process_noise", self.process_noise, length=2)
-            for i, value in enumerate(pair):
-                non_negative(f"inflation.process_noise[{i}]", value)
-        if self.speed_cap is not None:
-            positive("inflation.speed_cap", self.speed_cap)
+        checked_fields(self, "inflation")
 
 
 NO_INFLATION = CovarianceInflation()
 """The estimator's covariance as it is."""
 
 INFLATED = CovarianceInflation(process_noise=(0.1, 0.03), occupied=True, speed_cap=0.1)
-"""Chosen on validation traffic among inflations that differ from it by factors of three."""
+"""Selected on validation traffic among inflations that differ from it by factors of three."""
 
 
 class HasCovariance(Protocol):
@@ -71,8 +67,8 @@ class CovarianceSchedule(ProcessSchedule):
     """A schedule that predicts a covariance one step ahead.
 
     The prediction is that of the EKF, x = f(x, u), P = F P F' + Q at the present estimate, with the
-    inputs that the estimator will be given. For other estimators with a model it is a linearisation
-    of theirs; a random walk adds its own variance and leaves segments as they are. Releases and
+    inputs that the estimator will be given. For other estimators with a model it linearises their
+    prediction; for a random walk it adds the walk's variance to each segment. Releases and
     traffic are linearised at the predicted mean.
     """
 
@@ -130,8 +126,8 @@ class CovarianceSchedule(ProcessSchedule):
         if self.inflation.process_noise is None:
             covariances: FloatArray = self._estimator.covariances
             return covariances if len(rows) == len(covariances) else covariances[rows]
-        # Called again in the same second, it starts where it started before; after a second without
-        # a call, as after a reset, it starts anew from the estimator's.
+        # A repeated call in the same second starts from the same covariance; after a second
+        # without a call, as after a reset, the estimator's is the start.
         second = self.process.elapsed[rows]
         missed = (second == 0) | (second > self._second[rows] + 1) | (second < self._second[rows])
         moved = second == self._second[rows] + 1
@@ -144,7 +140,7 @@ class CovarianceSchedule(ProcessSchedule):
 
 
 class Greedy(CovarianceSchedule):
-    """Greedy design: segments one after the other, each the most informative given those before.
+    """Greedy design: segments are chosen in turn, each the most informative given those before.
 
     C is the predicted covariance of density and speed over the mainline, in the reward's units,
     after an update by the fixed sensors. A query of segment s, with its two rows H_s and the noise
@@ -156,8 +152,8 @@ class Greedy(CovarianceSchedule):
       determinant of the whole state's covariance. It is the same in all units, so it does not
       depend on the reward. The gain is submodular: greedy reaches 63 % of the best set's.
 
-    One rank-2 downdate of C a pick, O(B n^2), after a prediction of the cost of the EKF's own.
-    About 1.2 EKF steps in all at n = 15, B = 5, with an inflated covariance about 1.5.
+    The cost is a rank-2 downdate of C per pick, O(B n^2), after a prediction that costs as much as
+    the EKF's: about 1.2 EKF steps at n = 15, B = 5, or 1.5 with an inflated covariance.
     """
 
     criterion: ClassVar[int]
@@ -188,9 +184,9 @@ class GreedyLogdet(Greedy):
 class InflatedTrace(GreedyTrace):
     """`GreedyTrace` with an inflated covariance, `INFLATED` by default.
 
-    An estimator that is overconfident about segments it has not seen for long keeps its errors
-    there. The larger process noise lets variances grow back within seconds; the cap keeps the
-    speeds of nearly empty segments from outweighing everything else.
+    An estimator that is overconfident about segments without recent measurements keeps its errors
+    there. The larger process noise lets variances grow within seconds; the cap limits the weight of
+    the speeds of nearly empty segments.
     """
 
     name: ClassVar[str] = "inflated-trace"

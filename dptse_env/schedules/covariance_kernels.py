@@ -1,9 +1,9 @@
 """Compiled kernels that propagate and update the estimator's covariance over the coming second.
 
-One episode after the other, as in `dptse_env.estimators.compiled`. States are normalised: rho by
+They treat episodes one by one, as in `dptse_env.estimators.compiled`. States are normalised: rho by
 rho_m, psi by rho_m v_f. Over the mainline, traffic is in the reward's units: all densities, then
-all speeds. What a segment releases depends on that segment alone, so that its row in either
-coordinates has two entries.
+all speeds. A segment's releases depend on that segment alone, so that its row in either coordinates
+has two entries.
 """
 
 from __future__ import annotations
@@ -21,50 +21,48 @@ from dptse_env.utils.arrays import FloatArray, IntArray
 
 
 class Problem(NamedTuple):
-    """Constants of a road and an estimator, in a form that compiled code takes."""
+    """Constants of a road and an estimator, for compiled code."""
 
     n_mainline: int  # n
     bandwidth: int  # B
-    always: IntArray  # Segments with a fixed sensor, shape (F,)
-    can_query: IntArray  # Mainline segments without one, shape (A,)
-    noise: FloatArray  # Variances of both releases, normalised, shape (2,)
-    # What a step adds, shape (2,): to rho and psi, normalised, or in a random walk to rho
-    # over rho_m and v over v_f
+    always: IntArray  # (F,) segments with a fixed sensor
+    can_query: IntArray  # (A,) mainline segments without a fixed sensor
+    noise: FloatArray  # (2,) variances of both releases, normalised
+    # (2,) of a step: of rho and psi, normalised, or for a random walk of rho / rho_m and v / v_f
     process_variance: FloatArray
-    is_walk: bool  # Whether the estimator is a random walk, whose segments stay as they are
-    is_box: bool  # Whether means are held to the box instead of the cone
+    is_walk: bool  # whether the estimator is a random walk
+    is_box: bool  # whether means are projected into the box, not the cone
     density_scale: float  # rho_m [veh/km]
-    units: FloatArray  # Scales of the reward over rho_m and v_f, shape (2,)
-    term_weights: FloatArray  # What density and speed weigh in the reward, shape (2,)
-    # Length of a segment [km] where speeds weigh as probably as there is a vehicle; 0 where
-    # they weigh in full
+    units: FloatArray  # (2,) scales of the reward over rho_m and v_f
+    term_weights: FloatArray  # (2,) weights of density and speed in the reward
+    # length of a segment [km] where speeds are weighted by the probability of a vehicle, else 0
     length: float
-    speed_cap: float  # Deviation in the reward's units beyond which that of a speed does not count
+    speed_cap: float  # largest deviation of a speed that counts, in the reward's units
 
 
 class Work(NamedTuple):
-    """Scratch of one episode."""
+    """Scratch space of an episode."""
 
-    mean: FloatArray  # Predicted state, shape (2 S,) [veh/km, veh/h]
-    blocks: FloatArray  # The blocks of F, shape (S, K, 4)
-    covariance: FloatArray  # Shape (2 S, 2 S)
-    product: FloatArray  # Shape (2 S, 2 S)
-    transposed: FloatArray  # Shape (2 S, 2 S)
-    rows: FloatArray  # Derivatives of the second release by the segment's rho and psi, shape (S, 2)
-    traffic: FloatArray  # Covariance of density and speed over the mainline, shape (2 n, 2 n)
-    weights: FloatArray  # What their variances weigh, shape (2 n,)
-    # Derivatives of a speed by rho and psi, in the reward's units, shape (S, 2)
+    mean: FloatArray  # (2 S,) predicted state [veh/km, veh/h]
+    blocks: FloatArray  # (S, K, 4) blocks of F
+    covariance: FloatArray  # (2 S, 2 S)
+    product: FloatArray  # (2 S, 2 S)
+    transposed: FloatArray  # (2 S, 2 S)
+    rows: FloatArray  # (S, 2) derivatives of the second release by the segment's rho and psi
+    traffic: FloatArray  # (2 n, 2 n) covariance of density and speed over the mainline
+    weights: FloatArray  # (2 n,) weights of their variances
+    # (S, 2) derivatives of a speed by rho and psi, in the reward's units
     to_speed: FloatArray
-    # Derivatives of both releases by density and speed in the reward's units: the first by
-    # density, the second by either, shape (n, 3)
+    # (n, 3) derivatives of the first release by density, and of the second by density and speed,
+    # in the reward's units
     traffic_rows: FloatArray
-    vectors: FloatArray  # Shape (2, 2 S)
-    sums: FloatArray  # Each segment's share of a trace, then whether it is queried, shape (2, n)
+    vectors: FloatArray  # (2, 2 S)
+    sums: FloatArray  # (2, n) each segment's share of a trace, then whether it is queried
 
 
 @njit(cache=True, error_model="numpy")
 def make_work(road: RoadArrays, problem: Problem) -> Work:
-    """Allocate the scratch."""
+    """Allocate the scratch space."""
     s, n = road.jam.size, problem.n_mainline
     square = np.empty((3, 2 * s, 2 * s))
     return Work(
@@ -102,7 +100,7 @@ def look_ahead(
 
 @njit(cache=True, error_model="numpy")
 def step(road: RoadArrays, problem: Problem, covariance: FloatArray, work: Work) -> None:
-    """Replace a covariance by the next second's, F staying as it is."""
+    """Replace a covariance by that of the next second, with the same F."""
     if problem.is_walk:
         drift(problem, covariance, work)
     else:
@@ -112,7 +110,7 @@ def step(road: RoadArrays, problem: Problem, covariance: FloatArray, work: Work)
 
 @njit(cache=True, error_model="numpy")
 def drift(problem: Problem, covariance: FloatArray, work: Work) -> None:
-    """Let density and speed of every segment walk: each segment's block gets T^-1 Q T^-T."""
+    """Add a random walk of density and speed: T^-1 Q T^-T to each segment's block."""
     for s in range(work.rows.shape[0]):
         # T = [[1, 0], [p, q]], normalised.
         p, q = work.to_speed[s, 0] * problem.units[1], work.to_speed[s, 1] * problem.units[1]
@@ -159,7 +157,7 @@ def downdate(
     """Update by both releases of a segment: P - P H' (H P H' + R)^-1 H P, of rank two.
 
     With L L' = H P H' + R, the rows of L^-1 H P are written to `vectors` and their products
-    taken from P.
+    subtracted from P.
 
     Args:
         covariance: Shape (m, m), replaced.
@@ -171,25 +169,25 @@ def downdate(
         vectors: Scratch, shape (2, at least m).
     """
     m = covariance.shape[0]
-    one, two = vectors[0], vectors[1]
+    row1, row2 = vectors[0], vectors[1]
     a, b = by_second
-    # Elements, not views of rows: those cost more in reference counts than the arithmetic does.
+    # Elements, not views of rows, whose reference counts would take more time than the arithmetic.
     for j in range(m):
-        one[j] = by_first * covariance[first, j]
-        two[j] = a * covariance[first, j] + b * covariance[second, j]
-    s11 = by_first * one[first] + noise[0]
-    s12 = by_first * two[first]
-    s22 = a * two[first] + b * two[second] + noise[1]
+        row1[j] = by_first * covariance[first, j]
+        row2[j] = a * covariance[first, j] + b * covariance[second, j]
+    s11 = by_first * row1[first] + noise[0]
+    s12 = by_first * row2[first]
+    s22 = a * row2[first] + b * row2[second] + noise[1]
     l11 = 1.0 / np.sqrt(s11)
     l21 = s12 / s11
     l22 = 1.0 / np.sqrt(s22 - s12 * l21)
     for j in range(m):
-        two[j] = (two[j] - l21 * one[j]) * l22
-        one[j] *= l11
+        row2[j] = (row2[j] - l21 * row1[j]) * l22
+        row1[j] *= l11
     for i in range(m):
-        x, y = one[i], two[i]
+        x, y = row1[i], row2[i]
         for j in range(m):
-            covariance[i, j] -= x * one[j] + y * two[j]
+            covariance[i, j] -= x * row1[j] + y * row2[j]
 
 
 @njit(cache=True, error_model="numpy")
@@ -221,7 +219,7 @@ def to_traffic(problem: Problem, covariance: FloatArray, work: Work) -> None:
 
 @njit(cache=True, error_model="numpy")
 def hold_speeds(problem: Problem, work: Work) -> None:
-    """Weigh each speed such that its variance counts for the square of the cap at most."""
+    """Limit the weight of each speed, so that its variance counts up to the square of the cap."""
     n, largest = problem.n_mainline, problem.speed_cap**2
     for s in range(n, 2 * n):
         work.weights[s] *= min(1.0, largest / work.traffic[s, s])

@@ -15,7 +15,7 @@ from dptse_env.utils.arrays import BoolArray, IntArray, Observation
 class Shifting(Schedule):
     """An evenly spread set that moves one segment downstream every ``period`` steps.
 
-    The set starts at floor(n i / B) for i = 0 .. B-1; what leaves the road downstream comes back
+    The set starts at floor(n i / B) for i = 0 .. B-1; segments beyond the downstream end continue
     upstream. ``period=4`` is the schedule of Vishnoi et al. (section IV-A), ``period=1`` a round
     robin, ``period=None`` a static set.
     """
@@ -37,7 +37,7 @@ class Shifting(Schedule):
 
 
 class Random(Schedule):
-    """``bandwidth`` different segments, drawn anew at every step."""
+    """A random set of ``bandwidth`` segments at every step."""
 
     def select(self, step: IntArray, observation: Observation) -> BoolArray:
         """See `Schedule.select`."""
@@ -46,10 +46,10 @@ class Random(Schedule):
 
 
 class OldestFirst(Schedule):
-    """The segments that have not been observed for longest; ties go round the road.
+    """The segments that have been unobserved for longest; ties rotate along the road.
 
-    A segment with a fixed sensor is observed at every step and so is never queried, unless there
-    is bandwidth to spare.
+    A segment with a fixed sensor is observed at every step, so it is queried only if bandwidth
+    remains.
     """
 
     def select(self, step: IntArray, observation: Observation) -> BoolArray:
@@ -60,15 +60,15 @@ class OldestFirst(Schedule):
 class LargestVariance(Schedule):
     """The segments of the largest posterior variance in the reward's metric.
 
-    With the standard deviations s_rho and s_v of the observation, which are in the reward's units
-    already, that is s_rho^2 + s_v^2; for a reward, or a ``term``, of one of them, that one alone.
-    The blocks are clipped at exp(-10) and exp(5); what lies beyond is a tie. It costs a sort.
+    With the standard deviations s_rho and s_v of the observation, in the reward's units, it is
+    s_rho^2 + s_v^2, or one of the two for a reward, or a ``term``, of density or speed alone. The
+    blocks are clipped at exp(-10) and exp(5), beyond which segments tie. It costs a sort.
     """
 
     def __init__(
         self, interface: QueryInterface, seed: int | None = None, *, term: str | None = None
     ) -> None:
-        """Bind the schedule; ``term`` is one of the reward's, its own if None."""
+        """Bind the schedule; a ``term`` of None is that of the reward."""
         super().__init__(interface, seed)
         term = interface.reward.term if term is None else term
         if term not in _BLOCKS:
@@ -90,13 +90,13 @@ _BLOCKS = {
 
 
 class StaleVariance(Schedule):
-    """The segments of the largest variance, grown with the square of the time since the last look.
+    """The segments of the largest variance times the square of the time since the last measurement.
 
     Scores are ``(age + 1)^2 (s_rho^2 + min(s_v, 0.1)^2)`` with the age in seconds and deviations in
-    the reward's units; a reward of one term takes that term. The age makes up for an estimator that
-    is overconfident about segments it has not seen for long, the cap of a tenth of the free speed
-    for one that is underconfident about speeds on nearly empty segments. Both were chosen on
-    validation traffic. It costs a sort.
+    the reward's units; for a reward of one term, that term alone. The age compensates for an
+    estimator that is overconfident about segments without recent measurements, the cap of a tenth
+    of the free speed for one that is underconfident about speeds on nearly empty segments. Both
+    were selected on validation traffic. It costs a sort.
     """
 
     age_power: ClassVar[float] = 2.0
@@ -118,7 +118,7 @@ class StaleVariance(Schedule):
 
 
 class Nothing(Schedule):
-    """No query at all: the fixed sensors alone. A lower mark (mask actions only)."""
+    """No query: a lower bound, from the fixed sensors alone (mask actions only)."""
 
     def select(self, step: IntArray, observation: Observation) -> BoolArray:
         """See `Schedule.select`."""
@@ -126,10 +126,10 @@ class Nothing(Schedule):
 
 
 class Everything(Schedule):
-    """Every segment at every step. An upper mark: it needs ``bandwidth`` equal to the road.
+    """All segments at every step; ``bandwidth`` must equal the number of mainline segments.
 
-    With the paper's mechanism more sensors mean more noise on each, so this is the upper mark of
-    coverage, not of accuracy.
+    With the paper's mechanism more sensors mean more noise on each, so this bounds coverage, not
+    accuracy.
     """
 
     def __init__(self, interface: QueryInterface, seed: int | None = None) -> None:

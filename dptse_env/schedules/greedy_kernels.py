@@ -1,15 +1,11 @@
-"""Compiled kernels of the schedules that use the estimator's covariance.
-
-One episode after the other, as in `dptse_env.estimators.compiled`.
-"""
+"""Compiled kernels of the schedules that use the estimator's covariance, episode by episode."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import numpy as np
 from numba import njit
 
+from dptse_env.estimators.compiled.ekf_kernels import Packed
 from dptse_env.model.kernels import make_scratch
 from dptse_env.model.road_arrays import RoadArrays
 from dptse_env.schedules.covariance_kernels import (
@@ -25,8 +21,6 @@ from dptse_env.schedules.covariance_kernels import (
 )
 from dptse_env.utils.arrays import BoolArray, FloatArray
 
-Packed = tuple[Any, ...]
-
 TRACE, LOGDET = 0, 1
 
 
@@ -41,17 +35,17 @@ def choose_greedily(
     inputs: FloatArray,
     queried: BoolArray,
 ) -> None:
-    """Pick segments one after the other, for k episodes.
+    """Pick segments in turn, for k episodes.
 
     Args:
         road_: The `RoadArrays`.
         problem_: The `Problem`.
         criterion: TRACE or LOGDET.
-        keeps: Whether `covariances` gets what the coming step leaves of them.
+        keeps: Whether to replace `covariances` by those after the coming step.
         means: Present states, shape (k, 2 S) [veh/km, veh/h].
-        covariances: Theirs, normalised, shape (k, 2 S, 2 S).
+        covariances: Their normalised covariances, shape (k, 2 S, 2 S).
         inputs: The model's inputs of the coming step, shape (k, n_u).
-        queried: Where the sets go, shape (k, n_mainline).
+        queried: Output, the sets, shape (k, n_mainline).
     """
     road, problem = RoadArrays(*road_), Problem(*problem_)
     work = make_work(road, problem)
@@ -69,7 +63,7 @@ def choose_greedily(
 
 @njit(cache=True, error_model="numpy")
 def pick(problem: Problem, criterion: int, work: Work, queried: BoolArray) -> None:
-    """Pick B segments, each the one of the largest gain given those before."""
+    """Pick B segments, each with the largest gain given those before."""
     n, bandwidth, can_query, noise = (
         problem.n_mainline, problem.bandwidth, problem.can_query, problem.noise,
     )  # fmt: skip
@@ -96,7 +90,7 @@ def pick(problem: Problem, criterion: int, work: Work, queried: BoolArray) -> No
 
 @njit(cache=True, error_model="numpy")
 def _fill_up(n_left: int, queried: BoolArray) -> None:
-    """Spend the bandwidth to spare on segments with a fixed sensor, where it gains nothing."""
+    """Use remaining bandwidth on segments with a fixed sensor, without gain."""
     for s in range(queried.size):
         if n_left > 0 and not queried[s]:
             queried[s] = True
@@ -130,8 +124,8 @@ def _gain(
 ) -> float:
     """Reduction of the weighted trace, or of the log determinant, by querying a segment.
 
-    It takes its arrays one by one: a tuple of twenty costs more in reference counts than the
-    arithmetic does.
+    Arrays are separate arguments: reference counts of a tuple would take more time than the
+    arithmetic.
     """
     f, a, b = rows[s, 0], rows[s, 1], rows[s, 2]
     x, y, z = traffic[s, s], traffic[s, n + s], traffic[n + s, n + s]
@@ -158,10 +152,10 @@ def choose_by_swaps(
     inputs: FloatArray,
     queried: BoolArray,
 ) -> None:
-    """Pick greedily by the trace, then take the best of all single swaps over a horizon.
+    """Pick greedily by the trace, then choose the best of all single swaps over a horizon.
 
-    Arguments are those of `choose_greedily`, and the steps to reckon with, the coming one included.
-    `covariances` always gets what the coming step leaves of them.
+    Arguments are those of `choose_greedily`, and the horizon in steps, including the coming one.
+    `covariances` are always replaced by those after the coming step.
     """
     road, problem = RoadArrays(*road_), Problem(*problem_)
     work, after = make_work(road, problem), np.empty(covariances.shape[1:])
@@ -202,7 +196,7 @@ def _roll_out(
     first: FloatArray,
     work: Work,
 ) -> float:
-    """Return the sum of weighted traces over the horizon; `first` gets the coming step's P."""
+    """Return the sum of weighted traces over the horizon; write the coming step's P to `first`."""
     after[:] = ahead
     condition(problem, np.flatnonzero(queried), after, work)
     first[:] = after
@@ -211,7 +205,7 @@ def _roll_out(
         step(road, problem, after, work)
         condition(problem, problem.always, after, work)
         _spread(problem, after, work)
-        # The rule from then on: the largest weighted variance.
+        # Afterwards segments are queried by the largest weighted variance.
         for _ in range(min(problem.bandwidth, problem.can_query.size)):
             best, largest = -1, -np.inf
             for s in problem.can_query:
@@ -226,7 +220,7 @@ def _roll_out(
 
 @njit(cache=True, error_model="numpy")
 def _spread(problem: Problem, covariance: FloatArray, work: Work) -> float:
-    """Return the weighted trace; `work.sums` gets each segment's share of it, then zeros."""
+    """Return the weighted trace; write each segment's share of it, and zeros, to `work.sums`."""
     n, d, total = problem.n_mainline, 1.0 / problem.units[0], 0.0
     for s in range(n):
         p, q = work.to_speed[s, 0], work.to_speed[s, 1]

@@ -1,4 +1,4 @@
-"""Oracles: schedules that see the true traffic. They are bounds on policies, and no policies."""
+"""Oracles: schedules that use the true traffic, as bounds on policies."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from dptse_env.spaces.rewards import ScoredSecond, estimation_error
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray, Observation
 
 MOST_SETS = 1_000
-"""Sets of segments that the brute force tries at most in a step."""
+"""Largest number of sets that the brute force tries in a step."""
 
 
 class OracleError(ProcessSchedule):
-    """The segments where the present estimate is worst, in the reward's metric.
+    """The segments with the largest errors of the present estimate, in the reward's metric.
 
     The squared error is ``((rho_est - rho) / rho_0)^2 + m ((v_est - v) / v_0)^2`` with the
-    reward's scales and m = 1 where there is a vehicle, else 0; a reward of one term takes that
-    term. It costs a sort.
+    reward's scales and m = 1 where there is a vehicle, else 0; for a reward of one term, that
+    term alone. It costs a sort.
     """
 
     name: ClassVar[str] = "oracle-error"
@@ -48,7 +48,7 @@ class OracleError(ProcessSchedule):
 
 @dataclass(frozen=True)
 class _NextSecond:
-    """The coming second of k episodes: everything that an update needs but the set of segments."""
+    """Truth, releases and estimator of the coming second of k episodes."""
 
     episodes: IntArray
     truth: FloatArray
@@ -57,10 +57,10 @@ class _NextSecond:
 
 
 class _Realised(ProcessSchedule):
-    """Tries updates of the coming second with the true values and the noise that will come.
+    """Evaluates updates of the coming second with the true values and the actual noise.
 
-    Everything is tried on copies: noise, contributions and estimator of the process stay as they
-    are, so an episode under an oracle meets the noise that it would have met anyway.
+    It works on copies: noise, contributions and estimator of the process are unchanged, so an
+    episode has the same noise as under any other policy.
     """
 
     uses_truth: ClassVar[bool] = True
@@ -112,11 +112,11 @@ class _Realised(ProcessSchedule):
 
 
 class OracleGreedy(_Realised):
-    """Segments one after the other, each the one that raises the realised reward most.
+    """Segments chosen in turn, each the one that increases the realised reward most.
 
-    The reward is that of the coming second after an update by the set so far: it sees truth and
-    noise. Segments are added until there are B, even where one does harm. About B n updates of the
-    estimator a step, 70 times an environment's own work at B = 5, n = 15.
+    The reward is that of the coming second after an update by the set so far, with truth and
+    noise. B segments are chosen, even where some reduce the reward. That takes about B n updates of
+    the estimator per step, 70 times the time of the environment at B = 5, n = 15.
     """
 
     name: ClassVar[str] = "oracle-greedy"
@@ -137,9 +137,9 @@ class OracleGreedy(_Realised):
 
 
 class OracleBruteForce(_Realised):
-    """The set of B segments of the largest realised reward of the coming second, of all sets.
+    """The set of B segments with the largest realised reward of the coming second.
 
-    n over B updates of the estimator a step: 455 at B = 3, n = 15.
+    It takes n over B updates of the estimator per step: 455 at B = 3, n = 15.
     """
 
     name: ClassVar[str] = "oracle-brute-force"

@@ -6,7 +6,6 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
-from importlib import resources
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -17,10 +16,10 @@ from dptse_env.estimators import ESTIMATORS
 from dptse_env.process import QueryProcess
 from dptse_env.schedules.base import Schedule
 from dptse_env.utils.arrays import BoolArray, IntArray, Observation
-from dptse_env.utils.json_object import parse_object
+from dptse_env.utils.json_object import parse_object, shipped_texts
 
 PLANS = ("best-static", "optimised-plan")
-"""Kinds of plans: one set for all time, a period of sets."""
+"""Kinds of plans: a single set, or a periodic sequence of sets."""
 
 PLAN_ALIASES = {"offline": "optimised-plan"}
 """Former names of kinds."""
@@ -49,7 +48,7 @@ class PlanContext:
         return cls(corridor.name, corridor.digest, estimator, config.bandwidth)
 
     def __str__(self) -> str:
-        """Return it in one line."""
+        """Return the context in one line."""
         return (
             f"{self.corridor} (traffic {self.digest[:8]}), {self.estimator}, "
             f"bandwidth {self.bandwidth}"
@@ -75,8 +74,9 @@ class Plan:
     @property
     def name(self) -> str:
         """Name of the file it ships in, without the suffix."""
-        to = self.context
-        return "-".join((self.kind, to.corridor, to.digest[:8], to.estimator, f"b{to.bandwidth}"))
+        road, estimator = self.context.corridor, self.context.estimator
+        parts = self.kind, road, self.context.digest[:8], estimator, f"b{self.context.bandwidth}"
+        return "-".join(parts)
 
 
 def available_plans() -> dict[str, Plan]:
@@ -88,7 +88,7 @@ def find_plan(kind: str, context: PlanContext) -> Plan:
     """Return the shipped plan of a kind for a context.
 
     Raises:
-        ValueError: There is none; the message names those that there are.
+        ValueError: There is none; the message lists the available ones.
     """
     of_kind = [plan for plan in _shipped().values() if plan.kind == kind]
     for plan in of_kind:
@@ -114,7 +114,7 @@ def write_plan(path: str | Path, plan: Plan) -> None:
     """Write a plan as JSON, one set a line.
 
     Raises:
-        ValueError: The plan is not one that can be read back; nothing is written then.
+        ValueError: The plan could not be read back; nothing is written then.
     """
     head = {"kind": plan.kind, **vars(plan.context), "provenance": dict(plan.provenance)}
     rows = ",\n".join(f"    {json.dumps(list(segments))}" for segments in plan.sets)
@@ -124,10 +124,10 @@ def write_plan(path: str | Path, plan: Plan) -> None:
 
 
 class Planned(Schedule):
-    """Queries the sets of a plan, period after period: an open-loop schedule.
+    """Queries the sets of a plan periodically: an open-loop schedule.
 
-    The plan was optimised on training traffic for the mean reward, under one estimator. Another
-    estimator may follow it; another road, traffic or bandwidth may not. It costs an index.
+    The plan was optimised for the mean reward on training traffic, with a certain estimator. It may
+    be used with another estimator, but not with another road, traffic or bandwidth.
     """
 
     name: ClassVar[str] = "plan"
@@ -167,12 +167,8 @@ _KEYS = {
 
 @cache
 def _shipped() -> dict[str, Plan]:
-    folder = resources.files("dptse_env.schedules") / "plans"
-    plans = [
-        _parse(entry.read_text(encoding="utf-8"), entry.name)
-        for entry in sorted(folder.iterdir(), key=lambda entry: entry.name)
-        if entry.name.endswith(".json")
-    ]
+    texts = shipped_texts("dptse_env.schedules", "plans")
+    plans = [_parse(text, name) for name, text in texts.items()]
     return {plan.name: plan for plan in plans}
 
 

@@ -12,16 +12,16 @@ from dptse_env.utils.validation import integer
 
 
 class Rollout(CovarianceSchedule):
-    """The set of `InflatedTrace`, or one that differs by a single swap, whichever promises most.
+    """The best of the set of `InflatedTrace` and all sets that differ from it by a single swap.
 
     Each of the B (n - F - B) swaps, F fixed sensors on the mainline, is evaluated in simulation:
-    from then on the segments of largest weighted variance are queried at each step, and covariances
-    evolve by ``P = F P F' + Q`` and the Kalman update, with F, H and weights as they are now. The
-    set with the least sum of weighted traces over the horizon is taken, the greedy one in a tie. It
+    afterwards the segments of largest weighted variance are queried at each step, and covariances
+    evolve by ``P = F P F' + Q`` and the Kalman update, with the present F, H and weights. The set
+    with the smallest sum of weighted traces over the horizon is chosen, the greedy one in a tie. It
     looks further ahead than the greedy design and relies more on the model.
 
-    A set costs about an EKF's step per second of the horizon. At n = 15, B = 5 there are 46 sets:
-    some 230 EKF steps at a horizon of 5.
+    A set costs about an EKF step per second of the horizon. At n = 15, B = 5 there are 46 sets:
+    about 230 EKF steps at a horizon of 5.
     """
 
     name: ClassVar[str] = "rollout"

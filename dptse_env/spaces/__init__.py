@@ -1,1 +1,1 @@
-"""What a policy sees and does: action encodings, observation blocks and rewards."""
+"""Action encodings, observation blocks and rewards."""

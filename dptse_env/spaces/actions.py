@@ -2,9 +2,9 @@
 
 Every encoding turns a batch of actions into at most ``bandwidth`` queried mainline segments per
 episode, and turns a set of segments back into an action. An encoding holds its Gymnasium space,
-so the two cannot drift apart, and no state: what is pending between actions lives in the process
-(`PendingPicks`). Requests are cut or filled in by a rotating pointer that knows nothing of the
-traffic.
+so the two cannot drift apart, and no state: the state between actions is part of the process
+(`PendingPicks`). Surplus requests are dropped, and missing ones added, from a rotating pointer that
+does not depend on the traffic.
 
 Any action that the space can sample is valid. A wrong shape, a wrong dtype, a NaN or an index
 outside the road raises ``ValueError``.
@@ -29,18 +29,18 @@ class PendingPicks:
     Attributes:
         picked: Segments picked so far for a decision in progress, shape (n, n_mainline); always
             empty but for the sequential encoding.
-        pointer: Segment from which requests are cut or filled in next, shape (n,).
+        pointer: Segment from which requests are kept or added next, shape (n,).
         n_replaced: Picks of the decision in progress that were replaced, shape (n,).
     """
 
     def __init__(self, n_episodes: int, n_mainline: int) -> None:
-        """Begin n episodes without any pick."""
+        """Make the state of n episodes without any pick."""
         self.picked = np.zeros((n_episodes, n_mainline), dtype=bool)
         self.pointer = np.zeros(n_episodes, dtype=np.int64)
         self.n_replaced = np.zeros(n_episodes, dtype=np.int64)
 
     def reset(self, episodes: IntArray) -> None:
-        """Forget what earlier actions of ``episodes`` left behind."""
+        """Clear the state of ``episodes``."""
         self.picked[episodes] = False
         self.pointer[episodes] = 0
         self.n_replaced[episodes] = 0
@@ -51,7 +51,7 @@ class PendingPicks:
         Args:
             episodes: Shape (k,).
             wanted: Shape (k, n_mainline).
-            limit: Segments to keep of each episode, shape (k,).
+            limit: Number of segments to keep in each episode, shape (k,).
         """
         n = wanted.shape[1]
         order = (self.pointer[episodes, None] + np.arange(n)) % n
@@ -67,13 +67,13 @@ class PendingPicks:
 
 @dataclass(frozen=True)
 class Decision:
-    """The queries that a batch of actions decides on.
+    """The queries of a batch of actions.
 
     Attributes:
         queried: Segments to query, shape (k, n_mainline).
-        n_dropped: Requests that were cut, repeated or replaced, shape (k,).
-        complete: Whether the decision is ready to be carried out, shape (k,). Only the sequential
-            encoding needs several actions for one decision.
+        n_dropped: Number of requests that were dropped, repeated or replaced, shape (k,).
+        complete: Whether the decision is complete, shape (k,). Only the sequential encoding needs
+            several actions for a decision.
     """
 
     queried: BoolArray
@@ -87,8 +87,8 @@ class ActionEncoding(ABC):
     Attributes:
         space: The Gymnasium space of one action.
         n_mainline: Segments that can be queried, n.
-        bandwidth: Most queries a step, B.
-        actions_per_step: Actions that make one decision.
+        bandwidth: Largest number of queries in a step, B.
+        actions_per_step: Number of actions per decision.
         picks_one_by_one: Whether an action picks one segment, so that segments already picked can
             be masked.
     """
@@ -97,7 +97,7 @@ class ActionEncoding(ABC):
     picks_one_by_one: ClassVar[bool] = False
 
     def __init__(self, space: spaces.Space[Any], n_mainline: int, bandwidth: int) -> None:
-        """Keep the space and the sizes."""
+        """Store the space and the sizes."""
         self.space = space
         self.n_mainline, self.bandwidth = n_mainline, bandwidth
 
@@ -111,7 +111,7 @@ class ActionEncoding(ABC):
             pending: State of all episodes; that of ``episodes`` is moved on.
 
         Raises:
-            ValueError: A wrong shape, dtype or value; nothing is changed then.
+            ValueError: Shape, dtype or a value is wrong; nothing is changed then.
         """
 
     @abstractmethod
@@ -120,14 +120,14 @@ class ActionEncoding(ABC):
 
         Args:
             queried: Wanted segments, shape (k, n_mainline).
-            picked: Those already chosen for this decision, shape (k, n_mainline).
+            picked: Segments already chosen for this decision, shape (k, n_mainline).
 
         Raises:
             ValueError: The encoding cannot express that set of segments.
         """
 
     def _checked(self, episodes: IntArray, actions: Action) -> Action:
-        """Return ``actions`` as an array of the right shape, or say what was wrong."""
+        """Return ``actions`` as an array, checked for its shape and for a numeric dtype."""
         array = np.asarray(actions)
         expected = (len(episodes), *(self.space.shape or ()))
         if array.shape != expected:
@@ -162,8 +162,8 @@ def _all_complete(queried: BoolArray, n_dropped: IntArray) -> Decision:
 class MaskAction(ActionEncoding):
     """``MultiBinary(n)``: one flag per segment.
 
-    More than ``bandwidth`` requests are cut by a rotating pointer. Arrays of any real dtype are
-    taken as long as they hold exactly 0 and 1, since learning libraries send flags as floats.
+    Requests beyond ``bandwidth`` are dropped in rotation. Arrays of any real dtype are accepted if
+    all values are exactly 0 or 1, since learning libraries send flags as floats.
     """
 
     def __init__(self, n_mainline: int, bandwidth: int) -> None:
@@ -212,7 +212,7 @@ class ScoresAction(ActionEncoding):
 
 
 class SlotsAction(ActionEncoding):
-    """``MultiDiscrete([n] * bandwidth)``: a segment per slot; repeats are refilled in rotation."""
+    """``MultiDiscrete([n] * bandwidth)``: a segment per slot; repeats are replaced in rotation."""
 
     def __init__(self, n_mainline: int, bandwidth: int) -> None:
         """Make the encoding for ``n_mainline`` segments and ``bandwidth`` queries a step."""
@@ -238,8 +238,8 @@ class SlotsAction(ActionEncoding):
 class SequentialAction(ActionEncoding):
     """``Discrete(n)``: one segment per action, ``bandwidth`` actions a step.
 
-    The traffic stands still until the last pick. Segments that are not picked yet may be picked
-    next, for policies that mask invalid actions; a pick of a taken segment is replaced in rotation.
+    The traffic does not advance until the last pick. Valid actions, for policies with masks, are
+    the segments that are not picked yet; a repeated pick is replaced in rotation.
     """
 
     picks_one_by_one: ClassVar[bool] = True
@@ -256,8 +256,8 @@ class SequentialAction(ActionEncoding):
         pending.picked[episodes, picks] = True
         if taken.any():
             again = episodes[taken]
-            one = np.ones(len(again), dtype=np.int64)
-            pending.picked[again] |= pending.in_turn(again, ~pending.picked[again], one)
+            limit = np.ones(len(again), dtype=np.int64)
+            pending.picked[again] |= pending.in_turn(again, ~pending.picked[again], limit)
             pending.n_replaced[again] += 1
         queried = pending.picked[episodes]
         complete = queried.sum(axis=1) == self.bandwidth
@@ -277,7 +277,7 @@ def check_decision(encoding: ActionEncoding, decision: Any, n_actions: int) -> N
     """Refuse a decision of another package that is malformed or exceeds the bandwidth.
 
     Raises:
-        ValueError: naming the class, what is wrong and what is expected.
+        ValueError: The decision is malformed; the message names its class and the expected form.
     """
     name, shape = name_of_class(encoding), (n_actions, encoding.n_mainline)
     queried, complete = np.asarray(decision.queried), np.asarray(decision.complete)

@@ -1,9 +1,9 @@
-"""The observation: what the operator knows, as one flat float32 vector.
+"""The observation: the operator's knowledge as a flat float32 vector.
 
-It is made of named blocks, each with fixed bounds and scaled by physical constants of the
-corridor, so there are no running statistics that could be lost between training and use. It holds
-released values, the estimator's output, the query history and public settings. It never holds the
-truth, a clock, or anything that tells an empty segment from an occupied one.
+It consists of named blocks, each with fixed bounds and scaled by physical constants of the
+corridor, so there are no running statistics that could be lost between training and use. It has
+released values, the estimator's output, the query history and public settings, but neither the
+truth, nor a clock, nor anything that distinguishes an empty segment from an occupied one.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray, IntArray, Ob
 from dptse_env.utils.registry import Registry, is_foreign, missing_methods, name_of_class
 
 AGE_CAP = 60
-"""Age [s] beyond which a segment counts as not seen for long."""
+"""Largest age of a segment [s] that observations distinguish."""
 
 DEFAULT = "default"
-"""Stands for all default blocks where blocks are named."""
+"""Name that stands for all default blocks."""
 
 
 @dataclass(frozen=True)
 class PublicState:
-    """The operator's knowledge about k episodes, in physical units; nothing of it is the truth.
+    """The operator's knowledge about k episodes, in physical units; the truth is no part of it.
 
     Attributes:
         estimate: Densities [veh/km], speeds [km/h] and their standard deviations, each (k, S).
@@ -77,10 +77,10 @@ class ObservationSetup:
 
 
 class ObservationBlock(Protocol):
-    """A named part of the observation; a class of them is made without arguments.
+    """A named part of the observation; classes of blocks take no arguments.
 
     Attributes:
-        name: Its name, other than those of the blocks that ship with the package.
+        name: Name, different from those of the blocks that ship with the package.
         low: Lower bound; values below are clipped.
         high: Upper bound; values above are clipped.
     """
@@ -115,12 +115,12 @@ class Block:
         return self.value(state, setup)
 
     def __reduce__(self) -> tuple[Callable[[str], Block], tuple[str]]:
-        """Travel as the name: functions without one cannot be pickled."""
+        """Pickle as the name, since lambda functions cannot be pickled."""
         return _shipped_block, (self.name,)
 
 
 def _log(deviation: FloatArray) -> FloatArray:
-    # A zero has no logarithm; the smallest number ends at the lower bound just as well.
+    # Zero has no logarithm; that of the smallest number is clipped to the lower bound.
     return np.log(np.maximum(deviation, np.finfo(np.float64).tiny))
 
 
@@ -195,7 +195,7 @@ BLOCKS = Registry("observation", {block.name: block for block in _BLOCKS}, check
 
 
 def default_blocks(setup: ObservationSetup) -> list[str]:
-    """Return the names of the blocks that an observation has unless others are asked for."""
+    """Return the names of the default blocks."""
     left_out = {"released_speed" if setup.releases_flow else "released_flow"}
     if not setup.picks_one_by_one:
         left_out.add("picked")
@@ -203,7 +203,7 @@ def default_blocks(setup: ObservationSetup) -> list[str]:
 
 
 class ObservationEncoding:
-    """Lays knowledge out in a vector; holds the space and the place of every block.
+    """Encoding of public states as vectors, with the space and the position of every block.
 
     Default blocks, in order, with S segments (mainline, on-ramps, off-ramps), n mainline segments
     and F fixed sensors:
@@ -234,16 +234,16 @@ class ObservationEncoding:
     Attributes:
         setup: The public configuration.
         space: The Gymnasium space, a float32 ``Box``.
-        slices: The place of each block, by name.
+        slices: Position of each block, by name.
     """
 
     def __init__(self, setup: ObservationSetup, blocks: Sequence[Any] = (DEFAULT,)) -> None:
-        """Lay out blocks.
+        """Arrange blocks in a vector.
 
         Args:
             setup: The public configuration.
             blocks: Names, ``"package.module:Class"``, objects or classes; ``"default"`` stands for
-                all default ones.
+                all default blocks.
 
         Raises:
             ValueError: There is no such block, it lacks a method, or two have the same name.
@@ -294,12 +294,12 @@ def _expanded(value: Any, setup: ObservationSetup) -> list[Any]:
 
 
 def _made(value: Any) -> ObservationBlock:
-    """Return a block; one of another package must have a name of its own and sound bounds."""
+    """Return a block; one of another package must have a new name and valid bounds."""
     block = BLOCKS.find(value)
     block = block() if isinstance(block, type) else block
     if is_foreign(block):
         name = name_of_class(block)
-        if block.name in {own.name for own in _BLOCKS}:
+        if block.name in {shipped.name for shipped in _BLOCKS}:
             raise ValueError(
                 f"observation {name} must not be named {block.name!r}, which is a block of "
                 "dptse_env"

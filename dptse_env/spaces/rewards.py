@@ -1,4 +1,4 @@
-"""The error of an estimate, and the rewards made of it."""
+"""Estimation errors, and the rewards that are derived from them."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def estimation_error(
 
 
 class ScoredSecond(NamedTuple):
-    """One second of k episodes, as a reward sees it.
+    """The arguments of a reward: a second of k episodes.
 
     Attributes:
         error: Error of the estimate over the mainline.
@@ -74,7 +74,7 @@ class ScoredSecond(NamedTuple):
 
 
 class Reward(Protocol):
-    """A function of a second; a class of them is made without arguments."""
+    """A function of a second; classes of rewards take no arguments."""
 
     def __call__(self, second: ScoredSecond) -> FloatArray:
         """Return the rewards of k episodes, shape (k,), all finite."""
@@ -84,7 +84,7 @@ class ErrorReward:
     """Minus the scaled root mean squared error over the mainline.
 
     ``joint`` pools density and speed errors, each in units of its scale; ``density`` and
-    ``speed`` take one of them. The scales are constants of the corridor, so that rewards compare
+    ``speed`` use one of them. The scales are constants of the corridor, so that rewards compare
     across estimators and model parameters.
 
     Attributes:
@@ -109,7 +109,7 @@ class ErrorReward:
 
 
 class _CheckedReward:
-    """A reward of another package, held to what is expected."""
+    """A reward of another package whose values are checked."""
 
     def __init__(self, reward: Reward) -> None:
         self.reward = reward
@@ -137,7 +137,7 @@ REWARDS = Registry(
 def make_reward(value: Any) -> Any:
     """Return the reward that a keyword's value stands for: a name, a function, object or class.
 
-    Its attribute ``term`` says which errors greedy schedules weigh; ``joint`` where it has none.
+    Its attribute ``term`` determines the errors that greedy schedules weigh, by default ``joint``.
 
     Raises:
         ValueError: There is no such reward, or it cannot be called.

@@ -1,4 +1,4 @@
-"""The child process of `dptse_env.traffic.worker`: reads tasks from stdin, answers on stdout."""
+"""Child process of `dptse_env.traffic.worker`: tasks come from stdin, results go to stdout."""
 
 import json
 import os
@@ -11,10 +11,10 @@ from dptse_env.traffic.sumo import RecordingError, simulate
 
 def main() -> None:
     """Serve pickled tasks (corridor, seed, path, source) until stdin ends, one JSON line each."""
-    # Ctrl-C reaches the whole process group. What it ends is the parent's choice, told by stdin.
+    # Ctrl-C reaches all processes of the group; the parent decides, and closes stdin, when to end.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    # Whatever SUMO prints goes to stderr; the answers keep the original stdout to themselves.
-    with os.fdopen(os.dup(1), "w", encoding="utf-8") as answers:
+    # SUMO's output is redirected to stderr, so that the original stdout has the results alone.
+    with os.fdopen(os.dup(1), "w", encoding="utf-8") as results:
         os.dup2(2, 1)
         while True:
             try:
@@ -31,7 +31,7 @@ def main() -> None:
                 failure = str(
                     RecordingError.from_cause(corridor, seed, f"{type(error).__name__}: {error}")
                 )
-            print(json.dumps({"failure": failure}), file=answers, flush=True)
+            print(json.dumps({"failure": failure}), file=results, flush=True)
 
 
 if __name__ == "__main__":

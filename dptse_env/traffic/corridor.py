@@ -1,4 +1,4 @@
-"""The road: its geometry, its demand and its incident.
+"""Corridors: geometry, demand and incident of a road.
 
 Segments are numbered from 0: the mainline first, then the on-ramps, then the off-ramps. A ramp at
 face j sits between the mainline segments j-1 and j. Around these S segments lie boundary segments
@@ -21,7 +21,7 @@ from dptse_env.utils.fields import Interval, checked_fields
 from dptse_env.utils.validation import integer, require
 
 NOT_TRAFFIC = ("name", "fixed_sensors", "density_scale", "speed_scale", "average_dwell")
-"""Fields that describe how the traffic is observed and leave the traffic itself alone."""
+"""Fields that describe the observation of the traffic and do not change the traffic itself."""
 
 Face = Annotated[int, Interval(1, 999)]
 """Number of a face between two mainline segments."""
@@ -51,11 +51,11 @@ class Corridor:
         speed_limit: speed limit outside incidents [km/h].
         density_scale: constant that scales densities in rewards and observations [veh/km].
         speed_scale: constant that scales speeds in rewards and observations [km/h].
-        average_dwell: T_avg of the paper's eq. (6): how long a vehicle stays on a mainline segment
-            on average [s], measured from records (`dptse_env.traffic.record.mean_dwell`).
+        average_dwell: T_avg of the paper's eq. (6): average time of a vehicle on a mainline
+            segment [s], measured from records (`dptse_env.traffic.record.mean_dwell`).
 
     Raises:
-        ValueError: if the geometry is impossible, or demand, incident or sensors do not fit it.
+        ValueError: The geometry is impossible, or demand, incident or sensors do not fit it.
     """
 
     name: str
@@ -78,26 +78,21 @@ class Corridor:
 
     def __post_init__(self) -> None:
         """Check the fields and bring them to their declared types."""
-        require(
-            bool(re.fullmatch(r"[a-z0-9][a-z0-9-]*", str(self.name))),
-            "corridor.name",
-            "lower-case letters, digits and hyphens",
-            self.name,
-        )
         checked_fields(self, "corridor")
-        require(
-            self.ramp_lanes <= self.lanes,
-            "corridor.ramp_lanes",
-            f"<= {self.lanes} lanes",
-            self.ramp_lanes,
-        )
+        is_name = bool(re.fullmatch(r"[a-z0-9][a-z0-9-]*", self.name))
+        require(is_name, "corridor.name", "lower-case letters, digits and hyphens", self.name)
+        allowed = f"<= {self.lanes} lanes"
+        require(self.ramp_lanes <= self.lanes, "corridor.ramp_lanes", allowed, self.ramp_lanes)
         self._check_ramps()
         sensors = self.fixed_sensors
         for i, sensor in enumerate(sensors):
             integer(f"corridor.fixed_sensors[{i}]", sensor, 0, self.n_segments - 1)
         unique = len(set(sensors)) == len(sensors)
         require(unique, "corridor.fixed_sensors", "free of duplicates", sensors)
-        self._check_demand()
+        demand = self.demand.base if isinstance(self.demand, DemandDistribution) else self.demand
+        allowed = f"one rate for each of the {self.n_on_ramps} on-ramps"
+        fits = len(demand.on_ramps) == self.n_on_ramps
+        require(fits, "corridor.demand.on_ramps", allowed, demand.on_ramps)
         self._check_incident()
 
     def _check_ramps(self) -> None:
@@ -107,41 +102,17 @@ class Corridor:
                 integer(f"corridor.{field}[{i}]", face, 1, self.n_mainline - 1)
             increasing = list(faces) == sorted(set(faces))
             require(increasing, f"corridor.{field}", "increasing", faces)
-        require(
-            not set(self.on_ramps) & set(self.off_ramps),
-            "corridor.off_ramps",
-            f"at other faces than the on-ramps {self.on_ramps}",
-            self.off_ramps,
-        )
-        require(
-            len(self.exit_shares) == len(self.off_ramps),
-            "corridor.exit_shares",
-            f"one share for each of the {len(self.off_ramps)} off-ramps",
-            self.exit_shares,
-        )
-
-    def _check_demand(self) -> None:
-        demand = self.demand.base if isinstance(self.demand, DemandDistribution) else self.demand
-        require(
-            isinstance(demand, Demand), "corridor.demand", "a Demand or DemandDistribution", demand
-        )
-        require(
-            len(demand.on_ramps) == self.n_on_ramps,
-            "corridor.demand.on_ramps",
-            f"one rate for each of the {self.n_on_ramps} on-ramps",
-            demand.on_ramps,
-        )
+        allowed = f"at other faces than the on-ramps {self.on_ramps}"
+        disjoint = not set(self.on_ramps) & set(self.off_ramps)
+        require(disjoint, "corridor.off_ramps", allowed, self.off_ramps)
+        allowed = f"one share for each of the {self.n_off_ramps} off-ramps"
+        fits = len(self.exit_shares) == self.n_off_ramps
+        require(fits, "corridor.exit_shares", allowed, self.exit_shares)
 
     def _check_incident(self) -> None:
         incident = self.incident
         if incident is None:
             return
-        require(
-            isinstance(incident, Incident | IncidentDistribution),
-            "corridor.incident",
-            "an Incident, an IncidentDistribution or None",
-            incident,
-        )
         if isinstance(incident, Incident):
             segments, start = [incident.segment], incident.start
         else:
@@ -187,10 +158,10 @@ class Corridor:
 
     @cached_property
     def digest(self) -> str:
-        """SHA-256 (hex) of everything that shapes the traffic, stable across processes.
+        """SHA-256 (hex) of the fields that determine the traffic, stable across processes.
 
-        Name, sensors, scales and the measured dwell are left out: corridors that differ only in
-        how they are observed share their records.
+        The fields of `NOT_TRAFFIC` are left out: corridors that differ in these alone share their
+        records.
         """
         content = dataclasses.asdict(self)
         for field in NOT_TRAFFIC:

@@ -26,7 +26,7 @@ class Demand:
         on_ramps: one constant rate [veh/h] per on-ramp.
 
     Raises:
-        ValueError: if a rate is negative or the times do not start at 0 and increase.
+        ValueError: A rate is negative, or the times do not start at 0 and increase.
     """
 
     mainline: tuple[tuple[Second, Rate], ...]
@@ -36,12 +36,9 @@ class Demand:
         """Check the fields and bring them to their declared types."""
         checked_fields(self, "demand")
         times = np.array([time for time, _ in self.mainline])
-        require(
-            len(times) > 0 and times[0] == 0.0 and bool(np.all(np.diff(times) > 0)),
-            "demand.mainline",
-            "steps (time, rate) whose times start at 0 and increase",
-            self.mainline,
-        )
+        increasing = len(times) > 0 and times[0] == 0.0 and bool(np.all(np.diff(times) > 0))
+        allowed = "steps (time, rate) whose times start at 0 and increase"
+        require(increasing, "demand.mainline", allowed, self.mainline)
 
     def scaled(self, factor: float) -> "Demand":
         """Return this demand with every rate multiplied by `factor` [-]."""
@@ -60,7 +57,7 @@ class DemandDistribution:
         scale: range (low, high) [-] of the factor on every rate, drawn uniformly.
 
     Raises:
-        ValueError: if the range is not positive and ordered.
+        ValueError: The range is not positive and ordered.
     """
 
     base: Demand

@@ -14,7 +14,7 @@ Segment = Annotated[int, Interval(0, 999)]
 Limit = Annotated[float, Interval(0, 1000, open_low=True)]
 """Speed limit [km/h]."""
 Duration = Annotated[float, Interval(0, 1e6, open_low=True)]
-"""Seconds, more than none."""
+"""A positive number of seconds."""
 
 
 @dataclass(frozen=True)
@@ -24,10 +24,10 @@ class Incident:
     Attributes:
         segment: index of the mainline segment.
         phases: (start [s], end [s], speed limit [km/h]), in order and not overlapping. Outside
-            the phases the corridor's own limit holds.
+            the phases the corridor's limit holds.
 
     Raises:
-        ValueError: if a phase is empty, out of order, or has a limit that is not positive.
+        ValueError: A phase is empty, out of order, or has a limit that is not positive.
     """
 
     segment: Segment
@@ -61,7 +61,7 @@ class Incident:
         changes: list[tuple[float, float]] = []
         for start, end, limit in self.phases:
             if changes and changes[-1][0] == start:
-                changes.pop()  # the next phase follows at once: the limit never returns in between
+                changes.pop()  # the next phase follows directly, without the usual limit in between
             changes += [(start, limit), (end, speed_limit)]
         return changes
 
@@ -70,7 +70,7 @@ class Incident:
 class IncidentDistribution:
     """Ranges from which every traffic seed draws its own incident, each uniformly.
 
-    The incident has the two phases of the paper's: a blockage, then a slower recovery.
+    The incident has two phases, as in the paper: a blockage, then a slower recovery.
 
     Attributes:
         segments: candidate mainline segments.
@@ -81,7 +81,7 @@ class IncidentDistribution:
         recovery_speed_limit: range of the speed limit during the recovery [km/h].
 
     Raises:
-        ValueError: if there is no candidate segment, or a range is not positive and ordered.
+        ValueError: There is no candidate segment, or a range is not positive and ordered.
     """
 
     segments: tuple[Segment, ...]
@@ -102,10 +102,8 @@ class IncidentDistribution:
             "recovery_duration",
             "recovery_speed_limit",
         ):
-            low, high = getattr(self, name)
-            require(
-                low <= high, f"incident.{name}", "a pair (low, high) with low <= high", (low, high)
-            )
+            low, high = pair = getattr(self, name)
+            require(low <= high, f"incident.{name}", "a pair (low, high) with low <= high", pair)
 
     def draw(self, generator: np.random.Generator) -> Incident:
         """Draw one incident."""

@@ -4,8 +4,8 @@ A record is found by the corridor's digest, the traffic seed, SUMO's version and
 when any of them changes, another record is made. Several processes may use a library at once.
 
 A record appears under its name when it is complete, so a writer that is killed leaves a hidden
-folder at most. Nobody can tell by it whether its writer lives, perhaps on another machine, so such
-a folder is removed by its age.
+folder at most. Its writer may still run, perhaps on another machine, so such a folder is removed
+when it has reached a certain age.
 """
 
 import contextlib
@@ -39,10 +39,10 @@ from dptse_env.utils.threads import n_cores
 from dptse_env.utils.validation import integer
 
 CACHE_VARIABLE = "DPTSE_CACHE"
-"""Environment variable that overrides where records are kept."""
+"""Environment variable with the directory of the records."""
 
 LEFTOVER_AGE = 6 * 3600.0
-"""Age [s] from which on a hidden folder is taken for a dead writer's. Writing takes a second."""
+"""Age [s] at which a hidden folder is considered abandoned. Writing takes a second."""
 
 logger = logging.getLogger(__name__)
 
@@ -59,22 +59,22 @@ class RecordLibrary:
     Args:
         path: the library's directory; created when the first record is written. Default:
             `default_path`.
-        n_open: how many records stay open, at four file descriptors each; opening one again takes
-            a few milliseconds.
+        n_open: largest number of open records, at four file descriptors each; opening a record
+            again takes a few milliseconds.
 
     Raises:
-        ValueError: if `n_open` is not positive.
+        ValueError: `n_open` is not positive.
     """
 
     def __init__(self, path: str | os.PathLike[str] | None = None, n_open: int = 64) -> None:
-        """Remember the path; nothing is read or written yet."""
+        """Store the path; nothing is read or written yet."""
         self.path = default_path() if path is None else Path(path).expanduser()
         self.n_open = integer("library.n_open", n_open, 1)
         self._open: OrderedDict[tuple[str, int], Record] = OrderedDict()
         self._lock = threading.Lock()
 
     def __reduce__(self) -> tuple[type["RecordLibrary"], tuple[Path, int]]:
-        """Pickle as the path alone: another process opens its own records."""
+        """Pickle as the path alone: each process opens the records itself."""
         return type(self), (self.path, self.n_open)
 
     def get(self, corridor: Corridor, seed: int) -> Record:
@@ -85,18 +85,17 @@ class RecordLibrary:
             seed: traffic seed, a non-negative integer.
 
         Raises:
-            ValueError: if the seed is negative or no integer.
-            RecordingError: if the record cannot be made; the message names the library and the
-                seed.
-            NetworkError: if the corridor has to be compiled and cannot be.
-            SumoVersionError: if libsumo is missing, broken or of another release series.
+            ValueError: The seed is negative or no integer.
+            RecordingError: The record cannot be made; the message names the library and the seed.
+            NetworkError: The corridor has to be compiled and cannot be.
+            SumoVersionError: libsumo is missing, broken or of another release series.
         """
         seed = integer("traffic seed", seed, 0)
         key = corridor.digest, seed
         with self._lock:
             record = self._open.get(key)
             if record is None:
-                with self._naming_what_it_holds(corridor, [seed]):
+                with self._explained_errors(corridor, [seed]):
                     record = self._open[key] = self._load_or_record(corridor, seed)
                 if len(self._open) > self.n_open:
                     self._open.popitem(last=False)
@@ -105,13 +104,13 @@ class RecordLibrary:
             return record
 
     def missing(self, corridor: Corridor, seeds: Iterable[int]) -> list[int]:
-        """Return which of `seeds` have no record yet, each once and in the order given.
+        """Return those of `seeds` that have no record yet, each once and in the order given.
 
-        Nothing is opened: a damaged record counts as one, and `get` makes it again.
+        Nothing is opened: a damaged record counts as present, and `get` makes it again.
 
         Raises:
-            ValueError: if a seed is negative or no integer.
-            SumoVersionError: if libsumo is missing or of another release series.
+            ValueError: A seed is negative or no integer.
+            SumoVersionError: libsumo is missing or of another release series.
         """
         wanted = dict.fromkeys(integer("traffic seed", seed, 0) for seed in seeds)
         return [seed for seed in wanted if not self.record_path(corridor, seed).is_dir()]
@@ -123,9 +122,9 @@ class RecordLibrary:
         workers: int | None = None,
         progress: bool = False,
     ) -> None:
-        """Record whichever of `seeds` are missing, several at once.
+        """Make the missing records of `seeds`, several at once.
 
-        A single one, and all of them with one worker, are made in this process unless libsumo
+        A single record, or all of them with one worker, are made in this process unless libsumo
         holds another simulation here. A worker that dies is replaced and its record tried again
         (see `WorkerPool.record`).
 
@@ -136,22 +135,21 @@ class RecordLibrary:
             progress: whether to show a progress bar on stderr.
 
         Raises:
-            ValueError: if a seed or the number of workers is out of range.
-            RecordingError: if one of them fails; the message says how many of the records the
-                library holds and names the seed. The others that were already running are
-                finished and kept, the rest is not begun.
-            NetworkError: if the corridor has to be compiled and cannot be.
-            SumoVersionError: if libsumo is missing, broken or of another release series.
+            ValueError: A seed or the number of workers is out of range.
+            RecordingError: A recording fails; the message names its seed and the number of records
+                in the library. Recordings in progress are finished and kept, no other is started.
+            NetworkError: The corridor has to be compiled and cannot be.
+            SumoVersionError: libsumo is missing, broken or of another release series.
         """
         n_workers = n_cores() if workers is None else integer("workers", workers, 1)
         wanted = list(dict.fromkeys(integer("traffic seed", seed, 0) for seed in seeds))
-        with self._naming_what_it_holds(corridor, wanted):
+        with self._explained_errors(corridor, wanted):
             missing = self.missing(corridor, wanted)
             if missing:
                 self._record(corridor, missing, min(n_workers, len(missing)), progress)
 
     def record_path(self, corridor: Corridor, seed: int) -> Path:
-        """Return the directory that holds a record, or will."""
+        """Return the directory of a record, whether it exists or not."""
         folder = f"records-v{RECORD_VERSION}-sumo-{sumo_version()}"
         return self.path / folder / corridor.digest[:32] / f"{seed:08d}"
 
@@ -173,7 +171,7 @@ class RecordLibrary:
     def _record(
         self, corridor: Corridor, seeds: list[int], n_workers: int = 1, progress: bool = False
     ) -> None:
-        """Make the records of `seeds`, at least one, here or in `n_workers` processes."""
+        """Make the records of one or more `seeds`, in this process or in `n_workers` others."""
         folder = self.record_path(corridor, seeds[0]).parent
         try:
             _prepare(folder)
@@ -223,22 +221,22 @@ class RecordLibrary:
                 raise
 
     @contextlib.contextmanager
-    def _naming_what_it_holds(self, corridor: Corridor, seeds: list[int]) -> Iterator[None]:
-        """Add to an error in the body where the library is and how many of `seeds` it holds."""
-        asked = f"the {len(seeds)} record(s) of {corridor.name} asked for"
+    def _explained_errors(self, corridor: Corridor, seeds: list[int]) -> Iterator[None]:
+        """Add the library's path and how many of `seeds` it holds to an error in the body."""
+        wanted = f"the {len(seeds)} requested record(s) of {corridor.name}"
         try:
             yield
         except (RecordingError, NetworkError, SumoVersionError) as error:
             try:
                 n_held = len(seeds) - len(self.missing(corridor, seeds))
             except SumoVersionError:  # its release is part of every record's path
-                said = f"the library at {self.path} can neither find nor make {asked}: {error}"
+                message = f"the library at {self.path} can neither find nor make {wanted}: {error}"
             else:
-                said = (
-                    f"the library at {self.path} holds {n_held} of {asked}, and the rest cannot be "
-                    f"made: {error}"
+                message = (
+                    f"the library at {self.path} holds {n_held} of {wanted}, and the rest cannot "
+                    f"be made: {error}"
                 )
-            raise type(error)(said) from error
+            raise type(error)(message) from error
 
 
 def _source(corridor: Corridor, seed: int) -> dict[str, object]:
@@ -246,26 +244,26 @@ def _source(corridor: Corridor, seed: int) -> dict[str, object]:
 
 
 def _discard(path: Path) -> None:
-    """Remove a record by moving it aside first, so that nobody finds or finishes half of it."""
-    aside = path.parent / f".{path.name}-{uuid.uuid4().hex}"
+    """Remove a record; it is renamed first, so that no process reads or completes a part of it."""
+    temporary = path.parent / f".{path.name}-{uuid.uuid4().hex}"
     try:
-        path.rename(aside)
+        path.rename(temporary)
     except FileNotFoundError:
         return  # another process has discarded it already
-    shutil.rmtree(aside, ignore_errors=True)
+    shutil.rmtree(temporary, ignore_errors=True)
 
 
 def _prepare(folder: Path) -> None:
-    """Create the folder, see that it can be written to, and remove what dead writers left in it.
+    """Create the folder, check that it is writable, and remove abandoned records in it.
 
     Raises:
-        OSError: if it cannot be created or written to.
+        OSError: It cannot be created or written to.
     """
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=".probe-", dir=folder):
         pass
     for leftover in folder.glob(".*-*/"):
-        # Either its writer finished just now, or it is another user's to remove.
+        # Its writer may finish just now, and another user may own it.
         with contextlib.suppress(FileNotFoundError, PermissionError):
             if time.time() - leftover.stat().st_mtime > LEFTOVER_AGE:
                 _discard(leftover)

@@ -28,7 +28,7 @@ PAPER_HIGHWAY = Corridor(
 )
 """The paper's 1.5 km stretch (section IV), its demand and its incident on segment 11.
 
-The paper leaves open, and this fixes: three lanes, exit shares of 10 % and an end after 700 s.
+The paper does not state the three lanes, the exit shares of 10 % and the end after 700 s.
 """
 
 SHORT_HIGHWAY = Corridor(
@@ -45,10 +45,10 @@ SHORT_HIGHWAY = Corridor(
     density_scale=222.0,
     average_dwell=9.95,
 )
-"""A 0.6 km stretch with one ramp of each kind and a jam of its own, for tests and first trials."""
+"""A 0.6 km stretch with one ramp of each kind and a jam, for tests and first trials."""
 
 SHIPPED_CORRIDORS = (PAPER_HIGHWAY, SHORT_HIGHWAY)
-"""The corridors whose networks come compiled with the package."""
+"""Corridors whose compiled networks come with the package."""
 
 CORRIDORS = Registry(
     "corridor",

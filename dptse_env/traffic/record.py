@@ -1,4 +1,4 @@
-"""A record: which vehicle was where, how fast, at every second. Everything else derives from it."""
+"""Records: segment and speed of each vehicle at every second."""
 
 import errno
 import hashlib
@@ -19,7 +19,7 @@ from dptse_env.utils.validation import integer, require
 
 RECORD_FORMAT = "dptse-record"
 RECORD_VERSION = 1
-"""Raise it whenever a recording changes in content or layout: older records are then made again."""
+"""Version of the format, raised when content or layout change: older records are made again."""
 
 COLUMNS: dict[str, np.dtype[Any]] = {
     "step": np.dtype("<i4"),
@@ -33,7 +33,7 @@ MANIFEST = "manifest.json"
 
 
 class InvalidRecordError(ValueError):
-    """A stored record is damaged, incomplete, or not the one that was asked for."""
+    """A stored record is damaged, incomplete, or not the requested one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +52,7 @@ class Record:
         n_columns: number of record columns, S + R.
 
     Raises:
-        ValueError: if the columns differ in length, are not ordered by step, leave their range, or
+        ValueError: The columns differ in length, are not ordered by step, leave their range, or
             have a vehicle twice in one step.
     """
 
@@ -70,12 +70,8 @@ class Record:
         for name, dtype in COLUMNS.items():
             column = np.asarray(getattr(self, name), dtype=dtype)
             require(column.ndim == 1, f"record.{name}", "one-dimensional", column.shape)
-            require(
-                len(column) == len(self.step),
-                f"record.{name}",
-                f"as long as record.step ({len(self.step)})",
-                len(column),
-            )
+            allowed = f"as long as record.step ({len(self.step)})"
+            require(len(column) == len(self.step), f"record.{name}", allowed, len(column))
             if column.flags.writeable:
                 column = column.copy()
                 column.flags.writeable = False
@@ -91,7 +87,7 @@ class Record:
         require(int(self.vehicle.min()) >= 0, "record.vehicle", ">= 0", int(self.vehicle.min()))
         valid = bool(np.isfinite(self.speed).all() and self.speed.min() >= 0.0)
         require(valid, "record.speed", "finite and >= 0", self.speed.min())
-        # Privacy rests on it: a vehicle is on one segment at a step and counts there once.
+        # Privacy relies on this: a vehicle is on one segment at a step and counts there once.
         places = np.sort(self.step.astype(np.int64) * self.n_vehicles + self.vehicle)
         twice = np.flatnonzero(places[1:] == places[:-1])
         if len(twice):
@@ -108,7 +104,7 @@ class Record:
 
     @cached_property
     def n_vehicles(self) -> int:
-        """One more than the largest vehicle index: the length of any array with one entry each."""
+        """Largest vehicle index plus one: the length of an array with one entry per vehicle."""
         return int(self.vehicle.max()) + 1 if self.n_rows else 0
 
     @cached_property
@@ -120,8 +116,8 @@ class Record:
     def speed_sums(self) -> NDArray[np.float64]:
         """(n_steps, n_columns) sum of the vehicles' speeds on each segment at each step [km/h].
 
-        Divided by `counts` it is the mean speed over vehicles. SUMO's own mean speed of an edge
-        counts an empty lane as a vehicle at the limit, and is not used anywhere.
+        Divided by `counts` it is the mean speed over vehicles. SUMO's mean speed of an edge is not
+        used: it counts an empty lane as a vehicle at the limit.
         """
         return self._per_cell(self.speed, np.float64)
 
@@ -145,9 +141,9 @@ class Record:
         return slice(int(self.offsets[step]), int(self.offsets[step + 1]))
 
     def without(self, vehicle: int) -> "Record":
-        """Return the adjacent record in the sense of differential privacy: one vehicle removed.
+        """Return the adjacent record, in the sense of differential privacy, without a vehicle.
 
-        The other vehicles move as they did; they are not simulated again.
+        The other vehicles move as before; they are not simulated again.
         """
         keep = self.vehicle != vehicle
         columns = {name: getattr(self, name)[keep] for name in COLUMNS}
@@ -161,14 +157,14 @@ class Record:
     def save(self, path: Path, source: Mapping[str, object]) -> None:
         """Write the record to the directory `path`, completely or not at all.
 
-        A record that is already there stays: recording is deterministic, so it is the same.
+        An existing record stays: recording is deterministic, so it is the same.
 
         Args:
             path: directory to create; its parents are created too.
-            source: JSON-able description of what was recorded, checked again by `load`.
+            source: JSON description of the recorded scenario, checked again by `load`.
 
         Raises:
-            OSError: if it cannot be written; `path` is then left as it was.
+            OSError: It cannot be written; `path` is then unchanged.
         """
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary = path.parent / f".{path.name}-{uuid.uuid4().hex}"
@@ -200,23 +196,20 @@ class Record:
 
         Args:
             path: the record's directory.
-            source: what the record is expected to hold, as given to `save`.
+            source: the expected description, as given to `save`.
 
         Raises:
-            FileNotFoundError: if there is no such directory.
-            InvalidRecordError: if the record is damaged, incomplete, of another format version, or
-                of another source.
+            FileNotFoundError: There is no such directory.
+            InvalidRecordError: The record is damaged, incomplete, of another format version, or of
+                another source.
         """
         if not path.is_dir():
             raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path))
         try:
             manifest = json.loads((path / MANIFEST).read_text(encoding="utf-8"))
             checksum = manifest.pop("sha256")
-            for key, expected in (
-                ("format", RECORD_FORMAT),
-                ("version", RECORD_VERSION),
-                ("source", dict(source)),
-            ):
+            wanted = {"format": RECORD_FORMAT, "version": RECORD_VERSION, "source": dict(source)}
+            for key, expected in wanted.items():
                 if manifest[key] != expected:
                     found = manifest[key]
                     raise InvalidRecordError(f"{path}: {key} is {found!r}, not {expected!r}")
@@ -229,7 +222,7 @@ class Record:
         except (
             OSError,
             ValueError,
-            KeyError,
+            LookupError,
             TypeError,
             AttributeError,
             RecursionError,
@@ -238,18 +231,18 @@ class Record:
 
 
 def mean_dwell(records: Iterable[Record], n_mainline: int) -> float:
-    """Measure T_avg of the paper's eq. (6): how long a vehicle stays on a mainline segment.
+    """Measure T_avg of the paper's eq. (6): the average time of a vehicle on a mainline segment.
 
     Args:
         records: records of one corridor.
         n_mainline: the corridor's number of mainline segments, those that can be queried.
 
     Returns:
-        The mean, over all passages of a vehicle over a mainline segment, of the number of
-        consecutive steps [s] at which it is there. A passage between two steps is not counted.
+        Mean number of consecutive steps [s] of a vehicle on a mainline segment, over all passages.
+        A passage between two steps is not counted.
 
     Raises:
-        ValueError: if no vehicle was ever on the mainline.
+        ValueError: No vehicle was ever on the mainline.
     """
     n_rows = n_passages = 0
     for record in records:
@@ -282,12 +275,12 @@ def _checksum(directory: Path, header: Mapping[str, object]) -> str:
 
 
 def _sync(descriptor: int) -> None:
-    """Have the operating system write a file's content out before its name appears."""
+    """Write a file's content to disk, so that it is there before its name is."""
     os.fsync(descriptor)
 
 
 def _publish(temporary: Path, path: Path) -> None:
-    """Give the finished directory its name, unless another process was faster."""
+    """Rename the finished directory, unless another process has published the record."""
     try:
         temporary.rename(path)
     except OSError as error:

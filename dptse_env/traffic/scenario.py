@@ -1,7 +1,7 @@
-"""One realisation of a corridor's traffic: who departs when, from where to where, and the incident.
+"""Scenarios: departures, routes and the incident of one traffic seed.
 
 All of it comes from numpy generators seeded by the traffic seed, so a scenario does not depend on
-SUMO; SUMO only adds how the vehicles then drive.
+SUMO, which simulates the driving only.
 """
 
 from dataclasses import dataclass
@@ -22,13 +22,13 @@ MAINLINE = -1
 
 @dataclass(frozen=True, eq=False)
 class Scenario:
-    """What happens on a corridor under one traffic seed.
+    """Realised demand and incident of a corridor under one traffic seed.
 
     Attributes:
         seed: the traffic seed.
         demand: the realised mean rates.
         incident: the realised incident, or None.
-        departures: (V,) wanted departure times [s], non-decreasing; a vehicle's index is its id.
+        departures: (V,) desired departure times [s], non-decreasing; a vehicle's index is its id.
         origins: (V,) index of the on-ramp, or `MAINLINE`.
         exits: (V,) index of the off-ramp, or `MAINLINE`.
         sumo_seed: seed of SUMO's own randomness (desired speeds).
@@ -51,8 +51,8 @@ class Scenario:
 def draw_scenario(corridor: "Corridor", seed: int) -> Scenario:
     """Draw the scenario of a traffic seed; the same seed gives the same scenario.
 
-    Demand, incident, arrivals and SUMO have a stream each, so that changing one of them leaves the
-    others as they are.
+    Demand, incident, arrivals and SUMO have separate random streams, so that a change of one does
+    not affect the others.
 
     Args:
         corridor: the road and its demand and incident, fixed or as distributions.

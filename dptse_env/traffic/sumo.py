@@ -1,14 +1,14 @@
 """Running SUMO: one scenario in, one record out.
 
-libsumo is one simulation per process: starting a second one silently replaces the first. A
-recording therefore moves to a child process when another simulation lives in this one.
+libsumo has one simulation per process: starting a second one silently replaces the first. A
+recording therefore takes place in a child process when this one holds another simulation.
 
 Two settings were chosen by measurement on the paper's corridor (W99, 12 seeds):
 
 - internal links are off. With them, a vehicle of the ramp and one of the mainline can block each
-  other inside a merge for the rest of the run, which silenced a ramp in half of the runs;
+  other inside a merge for the rest of the run, which blocked a ramp in half of the runs;
 - collisions have no consequence. About six vehicles of 730 overlap another for a moment while
-  merging; SUMO's default would take it off the road and put it down elsewhere.
+  merging; SUMO's default would remove it from the road and insert it elsewhere.
 """
 
 import contextlib
@@ -31,7 +31,7 @@ from dptse_env.traffic.scenario import MAINLINE, Scenario
 from dptse_env.traffic.sumo_network import edge_ids, network_xml
 
 SUPPORTED_SUMO = "1.28"
-"""Release series that records are made with: another one drives the same scenario differently."""
+"""Release series that records are made with: others simulate the same scenario differently."""
 
 STEP_LENGTH = 0.5
 """SUMO's time step [s]: at 1 s, W99 brakes in emergency four times as often (377 against 85 times
@@ -42,24 +42,18 @@ KMH = 3.6
 """Factor from m/s to km/h."""
 
 OPTIONS = (
-    "--step-length",
-    str(STEP_LENGTH),
+    f"--step-length={STEP_LENGTH}",
     "--no-internal-links",
-    "--collision.action",
-    "none",
-    # Nobody is taken off the road for standing still: standing still is what a jam is.
-    "--time-to-teleport",
-    "-1",
+    "--collision.action=none",
+    # Vehicles that stand still in a jam are not removed.
+    "--time-to-teleport=-1",
     "--no-step-log",
     "--duration-log.disable",
     "--no-warnings",
     # Validation would look for schemas under SUMO_HOME, which is not needed otherwise.
-    "--xml-validation",
-    "never",
-    "--xml-validation.net",
-    "never",
-    "--xml-validation.routes",
-    "never",
+    "--xml-validation=never",
+    "--xml-validation.net=never",
+    "--xml-validation.routes=never",
 )
 
 _one_at_a_time = threading.Lock()
@@ -69,8 +63,8 @@ class RecordingError(RuntimeError):
     """A scenario could not be recorded; the message names corridor, seed and cause."""
 
     @classmethod
-    def of(cls, corridor: Corridor, seed: int, cause: str) -> Self:
-        """Name what was being recorded and why it failed."""
+    def from_cause(cls, corridor: Corridor, seed: int, cause: str) -> Self:
+        """Make the error of a scenario, given the cause of its failure."""
         return cls(f"recording {corridor.name} with traffic seed {seed} failed: {cause}")
 
 
@@ -82,7 +76,7 @@ def sumo_version() -> str:
     """Return the version of the installed libsumo, without importing it.
 
     Raises:
-        SumoVersionError: if libsumo is missing or of another release series.
+        SumoVersionError: libsumo is missing or of another release series.
     """
     try:
         version = importlib.metadata.version("libsumo")
@@ -95,7 +89,7 @@ def sumo_version() -> str:
 
 
 def simulation_is_loaded() -> bool:
-    """Tell whether libsumo already holds a simulation in this process."""
+    """Return whether libsumo holds a simulation in this process."""
     libsumo = sys.modules.get("libsumo")
     return libsumo is not None and bool(libsumo.isLoaded())
 
@@ -106,10 +100,10 @@ def simulate(corridor: Corridor, seed: int) -> Record:
     The same corridor and seed give the same record, bit for bit, in any process.
 
     Raises:
-        RecordingError: if SUMO fails, with its own words; or if libsumo already holds a
-            simulation here, which is left alone (see `dptse_env.traffic.worker`).
-        NetworkError: if the corridor has to be compiled and cannot be.
-        SumoVersionError: if libsumo is missing, broken or of another release series.
+        RecordingError: SUMO fails, or libsumo already holds a simulation in this process, which
+            is left unchanged (see `dptse_env.traffic.worker`).
+        NetworkError: The corridor has to be compiled and cannot be.
+        SumoVersionError: libsumo is missing, broken or of another release series.
     """
     scenario = corridor.draw(seed)
     with running(corridor, scenario) as libsumo:
@@ -118,15 +112,12 @@ def simulate(corridor: Corridor, seed: int) -> Record:
 
 @contextlib.contextmanager
 def running(corridor: Corridor, scenario: Scenario) -> Iterator[ModuleType]:
-    """Hold SUMO loaded with a scenario, at second 0, and close it afterwards.
+    """Load a scenario into SUMO, at second 0, and close it afterwards.
+
+    Errors are those of `simulate`; a failure of SUMO in the body is one of them.
 
     Yields:
-        The module libsumo; `seconds` moves its simulation on.
-
-    Raises:
-        RecordingError: if SUMO fails, now or in the body; or if libsumo already holds a simulation.
-        NetworkError: as `simulate`.
-        SumoVersionError: as `simulate`.
+        The module libsumo; `seconds` advances its simulation.
     """
     network = network_xml(corridor)
     with _one_at_a_time, tempfile.TemporaryDirectory(prefix="dptse-sumo-") as directory:
@@ -141,8 +132,8 @@ def running(corridor: Corridor, scenario: Scenario) -> Iterator[ModuleType]:
                 libsumo.start(_command(folder, network, corridor, scenario))
             yield libsumo
         except Exception as error:
-            said = messages.read_text(encoding="utf-8", errors="replace").strip()
-            cause = f"{type(error).__name__}: {error}" + (f"\n{said}" if said else "")
+            output = messages.read_text(encoding="utf-8", errors="replace").strip()
+            cause = f"{type(error).__name__}: {error}" + (f"\n{output}" if output else "")
             raise RecordingError.from_cause(corridor, scenario.seed, cause) from error
         finally:
             if libsumo.isLoaded():
@@ -150,7 +141,7 @@ def running(corridor: Corridor, scenario: Scenario) -> Iterator[ModuleType]:
 
 
 def seconds(libsumo: ModuleType, corridor: Corridor, scenario: Scenario) -> Iterator[int]:
-    """Move a loaded simulation on by a second at a time, with the scenario's incident.
+    """Advance a loaded simulation second by second, with the scenario's incident.
 
     Yields:
         0, 1, ..., `corridor.duration`: the second [s] whose state libsumo holds.
@@ -171,7 +162,7 @@ def seconds(libsumo: ModuleType, corridor: Corridor, scenario: Scenario) -> Iter
 
 
 def _import_libsumo() -> ModuleType:
-    """Import libsumo and check what is really there: libtraci's wheel overwrites it with 1.18."""
+    """Import libsumo and check its version: libtraci's wheel overwrites it with 1.18."""
     expected = sumo_version()
     try:
         import libsumo  # noqa: PLC0415  (heavy, and only a recording needs it)
@@ -183,7 +174,7 @@ def _import_libsumo() -> ModuleType:
     _check_series(version)
     if version != expected:
         raise SumoVersionError(
-            f"libsumo calls itself {version} but is installed as {expected}: reinstall libsumo"
+            f"libsumo reports version {version} but is installed as {expected}: reinstall libsumo"
         )
     return libsumo  # type: ignore[no-any-return]
 
@@ -200,8 +191,8 @@ def _check_series(version: str) -> None:
 def _stderr_to(path: Path) -> Iterator[None]:
     """Divert the process's stderr to a file.
 
-    libsumo's exception often says only "Process Error"; the reason goes to stderr, and SUMO's own
-    error log is not flushed before the process ends. Loading takes a few milliseconds.
+    libsumo's exception is often just "Process Error"; the reason goes to stderr, and SUMO's error
+    log is not flushed before the process ends.
     """
     sys.stderr.flush()
     original = os.dup(2)
@@ -250,9 +241,9 @@ def _routes(corridor: Corridor, scenario: Scenario) -> ElementTree.Element:
             route=f"{origin}:{end}",
             depart=f"{departure:.3f}",
             # As fast as is safe, on the lane that suits the route, and by default at the start of
-            # the boundary segment, so that it is measured there. About 4,700 veh/h can enter the
-            # paper's mainline so; what exceeds it queues outside. `departPos="last"` lets 9 % more
-            # in, but drops a vehicle at the far end of an empty boundary segment.
+            # the boundary segment, so that it is measured there. About 4,700 veh/h can then enter
+            # the paper's mainline; others queue outside. With `departPos="last"` 9 % more can
+            # enter, but vehicles start at the far end of an empty boundary segment.
             departSpeed="max",
             departLane="best",
         )
@@ -272,8 +263,8 @@ def _observe(libsumo: ModuleType, corridor: Corridor, scenario: Scenario) -> Rec
             n_on.append(len(here))
             names += here
             speed += map(speed_of, here)
-    # Whatever a row needs beside SUMO's own answers is made once at the end: this loop is all that
-    # recording adds to a bare simulation.
+    # The other columns are made once at the end: this loop is all that recording adds to a bare
+    # simulation.
     cells = np.repeat(np.arange(len(n_on)), n_on)
     return Record(
         step=(cells // len(edges)).astype(np.int32),

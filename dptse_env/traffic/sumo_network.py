@@ -1,7 +1,7 @@
-"""The corridor as a SUMO network: one edge per segment, compiled by netconvert.
+"""Networks of corridors for SUMO: one edge per segment, compiled by netconvert.
 
-The networks of the presets come with the package, so that using them needs no compiler; any other
-geometry is compiled on demand, which takes `eclipse-sumo` (extra ``corridors``).
+The networks of the presets come with the package; any other geometry is compiled on demand, which
+needs `eclipse-sumo` (extra ``corridors``).
 
 Every edge declares the nominal segment length, and the recording runs with SUMO's internal links
 switched off: every vehicle is then on exactly one segment, and all segments are equally long.
@@ -36,7 +36,7 @@ NETCONVERT_OPTIONS = (
 
 
 class NetworkError(RuntimeError):
-    """netconvert is missing, or refused the network."""
+    """A network cannot be compiled: netconvert is missing or refused it."""
 
 
 class Geometry(NamedTuple):
@@ -51,13 +51,13 @@ class Geometry(NamedTuple):
     speed_limit: float
 
     @classmethod
-    def of(cls, corridor: Corridor) -> "Geometry":
-        """Take the geometry of a corridor."""
+    def from_corridor(cls, corridor: Corridor) -> "Geometry":
+        """Return the geometry of a corridor."""
         return cls(*(getattr(corridor, field) for field in cls._fields))
 
 
 def edge_ids(corridor: Corridor) -> tuple[str, ...]:
-    """Name the SUMO edge of each record column: the S segments, then the R boundary segments."""
+    """Return the SUMO edge of each record column: the S segments, then the R boundary segments."""
     on_ramps, off_ramps = range(corridor.n_on_ramps), range(corridor.n_off_ramps)
     return (
         *(f"main_{i}" for i in range(corridor.n_mainline)),
@@ -74,7 +74,7 @@ def network_xml(corridor: Corridor) -> str:
     """Return the corridor's compiled network: the packaged one, else a fresh compilation.
 
     Raises:
-        NetworkError: if the geometry is no preset's and netconvert is missing or fails.
+        NetworkError: The geometry is not that of a preset, and netconvert is missing or fails.
     """
     geometry = Geometry.from_corridor(corridor)
     for preset in SHIPPED_CORRIDORS:
@@ -99,7 +99,7 @@ def compile_network(geometry: Geometry) -> str:
         same geometry always gives the same text.
 
     Raises:
-        NetworkError: if `eclipse-sumo` is not installed, or netconvert fails.
+        NetworkError: `eclipse-sumo` is not installed, or netconvert fails.
     """
     command = [str(_netconvert()), *NETCONVERT_OPTIONS]
     with tempfile.TemporaryDirectory(prefix="dptse-network-") as directory:
@@ -121,11 +121,11 @@ def compile_network(geometry: Geometry) -> str:
 
 
 def _netconvert() -> Path:
-    """Locate the netconvert that `eclipse-sumo` brings; SUMO_HOME is not asked."""
+    """Return the path of the netconvert of `eclipse-sumo`; SUMO_HOME is not used."""
     spec = importlib.util.find_spec("sumo")
     if spec is None or spec.origin is None:
         raise NetworkError(
-            "a corridor with a geometry of its own is compiled by netconvert, which comes with "
+            "a corridor with another geometry is compiled by netconvert, which comes with "
             "eclipse-sumo: pip install 'dptse-env[corridors]'"
         )
     suffix = ".exe" if os.name == "nt" else ""

@@ -1,10 +1,10 @@
-"""Recording in child processes: for isolation from another simulation, and for many at once.
+"""Recording in child processes, separate from another simulation or several at once.
 
 The child is a plain ``python -m dptse_env.traffic.child``. Unlike a multiprocessing worker it never
 imports the caller's ``__main__``, so it works from a notebook, a pipe or an unguarded script.
 
-No child outlives its parent for long: when the parent goes, however it does, the child's stdin
-ends, and the child with it after the record it is making.
+When the parent ends in any way, the child's stdin is closed, and the child ends after the record in
+progress.
 """
 
 import contextlib
@@ -25,14 +25,14 @@ from dptse_env.traffic.record import Record
 from dptse_env.traffic.sumo import RecordingError
 
 ATTEMPTS = 3
-"""How often a record is tried whose worker is killed each time, by a lack of memory for instance.
-A failure that the worker reports is final: the same seed would fail in the same way again."""
+"""Attempts to make a record whose worker is killed, for instance for lack of memory. A failure that
+the worker reports is final, since the same seed would fail in the same way again."""
 
 logger = logging.getLogger(__name__)
 
 
 class WorkerDiedError(RecordingError):
-    """A child process ended without an answer; the message names corridor, seed and exit code."""
+    """A child process ended without a result; the message names corridor, seed and exit code."""
 
 
 class Worker:
@@ -40,11 +40,10 @@ class Worker:
 
     def __init__(self) -> None:
         """Start the child."""
-        # The parent's own path, so that the child finds the same packages wherever it stands.
+        # The parent's path, so that the child finds the same packages in any working directory.
         path = os.pathsep.join(entry or str(Path.cwd()) for entry in sys.path)
-        # Open as long as the child lives.
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115
-        # The child's temporary files go with it, even if it is killed.
+        # Removed with the child, even if it is killed.
         self._folder = tempfile.TemporaryDirectory(prefix="dptse-worker-")
         self._process = subprocess.Popen(
             [sys.executable, "-P", "-m", "dptse_env.traffic.child"],
@@ -61,7 +60,7 @@ class Worker:
 
     @property
     def alive(self) -> bool:
-        """Whether the child is still running."""
+        """True while the child is running."""
         return self._process.poll() is None
 
     def record(
@@ -70,25 +69,25 @@ class Worker:
         """Record one scenario and save it to `path` (see `Record.save`).
 
         Raises:
-            RecordingError: if the recording fails.
-            WorkerDiedError: if the child dies.
+            RecordingError: The recording fails.
+            WorkerDiedError: The child dies.
         """
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         try:
             pickle.dump((corridor, seed, path, dict(source)), self._process.stdin)
             self._process.stdin.flush()
-            answer = self._process.stdout.readline()
+            result = self._process.stdout.readline()
         except BrokenPipeError:
-            answer = b""
-        if not answer.endswith(b"\n"):  # the child died before, or while, it answered
-            raise WorkerDiedError.from_cause(corridor, seed, self._last_words())
-        failure = json.loads(answer)["failure"]
+            result = b""
+        if not result.endswith(b"\n"):  # the child died before the result was complete
+            raise WorkerDiedError.from_cause(corridor, seed, self._cause_of_death())
+        failure = json.loads(result)["failure"]
         if failure is not None:
             raise RecordingError(failure)
 
     def close(self) -> None:
-        """Let the child end; it finishes what it is writing. Closing twice is fine."""
+        """Let the child end after the record in progress; closing again does nothing."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         with contextlib.suppress(BrokenPipeError):  # dead already, with a task unread in the pipe
@@ -98,22 +97,22 @@ class Worker:
         self._errors.close()
         self._folder.cleanup()
 
-    def _last_words(self) -> str:
+    def _cause_of_death(self) -> str:
         code = self._process.wait()
         self._errors.seek(0)
-        said = self._errors.read().decode(errors="replace").strip()[-2000:]
-        return f"the recording process ended with code {code}" + (f"\n{said}" if said else "")
+        errors = self._errors.read().decode(errors="replace").strip()[-2000:]
+        return f"the recording process ended with code {code}" + (f"\n{errors}" if errors else "")
 
 
 class WorkerPool:
-    """Workers for several threads: each recording borrows an idle one, or starts another."""
+    """Workers for several threads: each recording uses an idle worker, or starts another."""
 
     def __init__(self) -> None:
-        """Start nothing yet."""
+        """Make a pool without workers."""
         self._idle: queue.SimpleQueue[Worker] = queue.SimpleQueue()
 
     def __enter__(self) -> "WorkerPool":
-        """Enter."""
+        """Return the pool."""
         return self
 
     def __exit__(
@@ -122,17 +121,17 @@ class WorkerPool:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        """Let the idle workers end; all are idle once every `record` has returned."""
+        """Close the idle workers; all are idle once every `record` has returned."""
         while not self._idle.empty():
             self._idle.get().close()
 
     def record(
         self, corridor: Corridor, seed: int, path: Path, source: Mapping[str, object]
     ) -> None:
-        """Record in some worker, and again in another one if it dies.
+        """Record in a worker, and again in another one if it dies.
 
         Raises:
-            RecordingError: if the recording fails, or `ATTEMPTS` workers in a row died on it.
+            RecordingError: The recording fails, or `ATTEMPTS` workers in a row died on it.
         """
         for attempt in range(1, ATTEMPTS + 1):
             try:
@@ -162,14 +161,14 @@ class WorkerPool:
 
 
 def simulate_in_child(corridor: Corridor, seed: int) -> Record:
-    """Do what `dptse_env.traffic.sumo.simulate` does, in a child process.
+    """Simulate and record one scenario in a child process; see `dptse_env.traffic.sumo.simulate`.
 
     Raises:
-        RecordingError: if the recording fails, or the child dies `ATTEMPTS` times.
+        RecordingError: The recording fails, or the child dies `ATTEMPTS` times.
     """
     with tempfile.TemporaryDirectory(prefix="dptse-record-") as directory, WorkerPool() as pool:
         path = Path(directory) / "record"
         pool.record(corridor, seed, path, {})
         record = Record.load(path, {})
-        # Off the files, which vanish with the directory.
+        # The files are removed with the directory.
         return record.in_memory()

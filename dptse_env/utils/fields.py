@@ -21,9 +21,10 @@ from typing import Any, TypeVar
 import numpy as np
 
 T = TypeVar("T")
+N = TypeVar("N", int, float)
 
 LONGEST_SEQUENCE = 100_000
-"""Items of a sequence at most; checking more would take minutes."""
+"""Largest number of items in a sequence; checking more would take minutes."""
 
 
 @dataclass(frozen=True)
@@ -49,8 +50,14 @@ class Interval:
 
     def __str__(self) -> str:
         """Return the range in mathematical notation."""
+        if self.high == math.inf and self.open_high:
+            return f"{'>' if self.open_low else '>='} {self.low:g}"
         left, right = "(" if self.open_low else "[", ")" if self.open_high else "]"
         return f"in {left}{self.low:g}, {self.high:g}{right}"
+
+
+POSITIVE = Interval(0, math.inf, open_low=True, open_high=True)
+"""The finite numbers above zero."""
 
 
 def from_mapping(cls: type[T], values: Any, path: str, base: T | None = None) -> T:
@@ -146,7 +153,7 @@ def convert(hint: Any, value: Any, path: str, base: Any = None) -> Any:
     if kind is Any:
         return value
     if kind is int or kind is float:
-        return _number(kind, value, path, interval)
+        return number(kind, value, path, interval)
     if origin in (typing.Union, types.UnionType):
         return _convert_union(items, value, path, base)
     if dataclasses.is_dataclass(kind):
@@ -164,7 +171,7 @@ def convert(hint: Any, value: Any, path: str, base: Any = None) -> Any:
 
 @cache
 def _parsed(hint: Any) -> tuple[Any, Interval | None, Any, tuple[Any, ...]]:
-    """Return the type behind an annotation, its range, and what the type is made of."""
+    """Return the type of an annotation, its range, its origin and its arguments."""
     interval = None
     if typing.get_origin(hint) is typing.Annotated:
         hint, *extras = typing.get_args(hint)
@@ -172,27 +179,34 @@ def _parsed(hint: Any) -> tuple[Any, Interval | None, Any, tuple[Any, ...]]:
     return hint, interval, typing.get_origin(hint), typing.get_args(hint)
 
 
-def _number(kind: type, value: Any, path: str, interval: Interval | None) -> int | float:
-    """Return an int or float, held to its range; a bool is no number here."""
-    number: Any = value
+def number(kind: type[N], value: Any, path: str, interval: Interval | None) -> N:
+    """Return ``value`` as an int or a float within an interval; a bool is no number here.
+
+    Raises:
+        ValueError: It is of another type or out of range; the message starts with ``path``.
+    """
+    converted: Any = value
     if type(value) is not kind:
         is_number = isinstance(value, Integral if kind is int else Real)
         try:
-            number = kind(value) if is_number and not isinstance(value, bool) else math.nan
+            converted = kind(value) if is_number and not isinstance(value, bool) else math.nan
         except OverflowError:
-            number = math.nan
-    if number in interval if interval is not None else math.isfinite(number):
-        return typing.cast("int | float", number)
+            converted = math.nan
+    if converted in interval if interval is not None else math.isfinite(converted):
+        return typing.cast(N, converted)
     raise ValueError(f"{path} must be {allowed_numbers(kind, interval)}, got {_shown(value)}")
 
 
 def allowed_numbers(kind: type, interval: Interval | None) -> str:
-    """Return in words which numbers are allowed."""
+    """Describe the allowed numbers in words."""
     if interval is None:
         return "an integer" if kind is int else "a finite number"
-    if kind is int:
+    if kind is int and interval.high < math.inf:
         return f"an integer in {interval.low:.0f}..{interval.high:.0f}"
-    return f"a number {interval}"
+    if kind is int:
+        return f"an integer >= {interval.low:.0f}"
+    finite = "finite " if interval.high == math.inf and interval.open_high else ""
+    return f"a {finite}number {interval}"
 
 
 def _choice(allowed: tuple[Any, ...], value: Any, path: str) -> Any:
@@ -219,7 +233,7 @@ def _convert_tuple(items: tuple[Any, ...], value: Any, path: str) -> tuple[Any, 
 
 
 def _convert_union(options: tuple[Any, ...], value: Any, path: str, base: Any) -> Any:
-    """Take the option that fits; among dataclasses, the one that knows all the keys."""
+    """Convert to the option that fits; among dataclasses, to the one that has all the keys."""
     if isinstance(value, Mapping):
         classes: list[Any] = [option for option in options if dataclasses.is_dataclass(option)]
         fits = [cls for cls in classes if set(value) <= set(_field_hints(cls))]
@@ -235,7 +249,7 @@ def _convert_union(options: tuple[Any, ...], value: Any, path: str, base: Any) -
             return convert(options[0], value, path, base)
         except ValueError as problem:
             head = f"{path} must be "
-            if not str(problem).startswith(head):  # of something inside the value
+            if not str(problem).startswith(head):  # concerns an item of the value
                 raise
             raise ValueError(str(problem).replace(", got ", f"{suffix}, got ", 1)) from None
     if all(dataclasses.is_dataclass(option) for option in options):

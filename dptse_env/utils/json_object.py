@@ -1,14 +1,25 @@
-"""Parsing of JSON objects with known keys, the format of the package's files."""
+"""JSON objects with known keys, the format of the package's files."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from importlib.resources import files
 from typing import Any
 
 
+def shipped_texts(package: str, folder: str) -> dict[str, str]:
+    """Return the JSON files in a folder of a package by name, without the suffix and sorted."""
+    entries = sorted((files(package) / folder).iterdir(), key=lambda entry: entry.name)
+    return {
+        entry.name.removesuffix(".json"): entry.read_text(encoding="utf-8")
+        for entry in entries
+        if entry.name.endswith(".json")
+    }
+
+
 def parse_object(text: str, path: str, keys: Mapping[str, type]) -> dict[str, Any]:
-    """Parse a JSON object that has exactly some keys.
+    """Parse a JSON object that has exactly the given keys.
 
     Args:
         text: The JSON.

@@ -14,7 +14,7 @@ from itertools import pairwise
 from dptse_env.utils.validation import integer
 
 SMALLEST_BLOCK = 16
-"""Smallest block of episodes that is worth a thread: handing one over takes some 50 us."""
+"""Smallest block of episodes that is worth a thread: handing over a block takes some 50 us."""
 
 BLOCKS_PER_THREAD = 4
 
@@ -27,10 +27,10 @@ class EpisodeThreads:
     """
 
     def __init__(self, threads: int | None = None) -> None:
-        """Start nothing yet.
+        """Set the number of threads; none is started yet.
 
         Args:
-            threads: Threads to use at most; None for one per usable core.
+            threads: Largest number of threads; None for one per usable core.
 
         Raises:
             ValueError: ``threads`` is below 1.
@@ -52,7 +52,7 @@ class EpisodeThreads:
         if n_threads == 1:
             work(slice(0, n_rows))
             return
-        # More blocks than threads: one whose core is busy elsewhere then takes fewer of them.
+        # More blocks than threads: a thread whose core is busy elsewhere then runs fewer of them.
         n_blocks = min(BLOCKS_PER_THREAD * n_threads, n_rows // SMALLEST_BLOCK)
         ends = [n_rows * k // n_blocks for k in range(n_blocks + 1)]
         blocks = iter([slice(*pair) for pair in pairwise(ends)])
@@ -61,13 +61,13 @@ class EpisodeThreads:
             for block in blocks:
                 work(block)
 
-        others = [self._threads().submit(drain) for _ in range(n_threads - 1)]
+        futures = [self._threads().submit(drain) for _ in range(n_threads - 1)]
         try:
             drain()
         finally:
-            wait(others)
-        for other in others:
-            other.result()
+            wait(futures)
+        for future in futures:
+            future.result()
 
     def _threads(self) -> ThreadPoolExecutor:
         # A forked process has the pool, but not its threads.

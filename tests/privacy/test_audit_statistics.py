@@ -169,5 +169,5 @@ def test_bad_claims_are_named(field, value):
 
 
 def test_bad_confidence_is_named():
-    with pytest.raises(ValueError, match="confidence must be in"):
+    with pytest.raises(ValueError, match="confidence must be a number in"):
         audit(np.zeros(2), np.zeros(2), claim_at(1.0), 1.0)

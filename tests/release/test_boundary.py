@@ -47,7 +47,7 @@ def test_true_inputs_are_those_of_the_boundary_segments(traffic):
     for index in range(2):
         boundary.load(index)
     for index, time in ((0, 0), (0, 150), (1, 150), (1, 240)):
-        ends = traffic.whole(index)[[time], arz.n_segments :]
+        ends = traffic.complete(index)[[time], arz.n_segments :]
         expected = arz.boundary_inputs(ends[..., 0], ends[..., 1])[0]
         np.testing.assert_array_equal(at(boundary, time, index), expected)
     assert (at(boundary, 150, 0) != at(boundary, 150, 1)).any()

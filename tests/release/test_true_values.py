@@ -37,7 +37,7 @@ def test_aggregates_are_counts_and_means_over_vehicles(traffic):
 
 
 def test_an_empty_segment_answers_with_the_speed_limit(traffic):
-    whole = traffic.whole(0)
+    whole = traffic.complete(0)
     empty = whole[..., 0] == 0
     assert empty[0].all()  # the road is empty at second 0
     assert 0 < empty[100:].sum() < empty[100:].size
@@ -66,7 +66,7 @@ def test_missing_records_are_made_together(tmp_path, monkeypatch):
 
 
 def test_boundary_segments_come_last(traffic):
-    whole = traffic.whole(0)
+    whole = traffic.complete(0)
     assert whole.shape == (241, SHORT_HIGHWAY.n_segments + SHORT_HIGHWAY.n_boundaries, 2)
     segments = traffic.aggregates(np.zeros(241, dtype=np.int64), np.arange(241))
     np.testing.assert_array_equal(whole[:, : SHORT_HIGHWAY.n_segments], segments)

@@ -248,13 +248,15 @@ def test_a_library_that_cannot_grow_says_what_it_holds_and_why(tmp_path, monkeyp
     monkeypatch.setattr("tempfile.mkdtemp", refuse)
     monkeypatch.setattr(library, "simulate", None)  # it is known before an hour of simulation
     pattern = (
-        rf"the library at {tmp_path} holds 3 of the 5 record\(s\) of short-highway asked for, and "
+        rf"the library at {tmp_path} holds 3 of the 5 requested record\(s\) of short-highway, and "
         rf"the rest cannot be made: .*traffic seed 3 failed: .*{os.strerror(code)}"
     )
     for workers in (1, 2):
         with pytest.raises(RecordingError, match=pattern):
             records.ensure(SHORT_HIGHWAY, range(5), workers=workers)
-    with pytest.raises(RecordingError, match=r"holds 0 of the 1 record\(s\).*seed 4 failed"):
+    with pytest.raises(
+        RecordingError, match=r"holds 0 of the 1 requested record\(s\).*seed 4 failed"
+    ):
         records.get(SHORT_HIGHWAY, 4)
     records.ensure(SHORT_HIGHWAY, range(3))
     assert records.get(SHORT_HIGHWAY, 1).n_rows == 1

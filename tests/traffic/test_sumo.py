@@ -212,7 +212,9 @@ def test_a_library_that_is_not_what_is_installed_is_refused(monkeypatch):
     import libsumo
 
     monkeypatch.setattr(libsumo, "getVersion", lambda: (22, "SUMO 1.28.9"))
-    with pytest.raises(SumoVersionError, match=r"calls itself 1\.28\.9 but is installed as 1\.28"):
+    with pytest.raises(
+        SumoVersionError, match=r"reports version 1\.28\.9 but is installed as 1\.28"
+    ):
         simulate(SHORT_HIGHWAY, 0)
 
 

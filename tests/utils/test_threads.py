@@ -5,11 +5,11 @@ import time
 import numpy as np
 import pytest
 
-from dptse_env.utils.threads import SMALLEST, EpisodeThreads
+from dptse_env.utils.threads import SMALLEST_BLOCK, EpisodeThreads
 
 
 @pytest.mark.parametrize("threads", [1, 2, 3])
-@pytest.mark.parametrize("n_rows", [0, 1, SMALLEST - 1, 2 * SMALLEST, 1000])
+@pytest.mark.parametrize("n_rows", [0, 1, SMALLEST_BLOCK - 1, 2 * SMALLEST_BLOCK, 1000])
 def test_every_row_is_worked_on_once(threads, n_rows):
     seen = np.zeros(n_rows, dtype=int)
 
@@ -28,9 +28,9 @@ def test_large_batches_use_the_threads_and_small_ones_do_not():
         time.sleep(0.01)
 
     blocks = EpisodeThreads(2)
-    blocks.run(2 * SMALLEST - 1, work)
+    blocks.run(2 * SMALLEST_BLOCK - 1, work)
     assert names == {threading.current_thread().name}
-    blocks.run(2 * SMALLEST, work)
+    blocks.run(2 * SMALLEST_BLOCK, work)
     assert len(names) == 2
 
 
@@ -48,13 +48,13 @@ def test_an_exception_is_raised_once_nobody_works_any_more(own):
             raise ZeroDivisionError
 
     with pytest.raises(ZeroDivisionError):
-        EpisodeThreads(2).run(2 * SMALLEST, work)
+        EpisodeThreads(2).run(2 * SMALLEST_BLOCK, work)
     assert not running
 
 
 def test_the_threads_stay_behind_when_it_travels():
     blocks = EpisodeThreads(2)
-    blocks.run(2 * SMALLEST, lambda rows: None)
+    blocks.run(2 * SMALLEST_BLOCK, lambda rows: None)
     assert pickle.loads(pickle.dumps(blocks)).threads == 2
 
 

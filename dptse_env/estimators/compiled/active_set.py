@@ -1,10 +1,10 @@
-"""A compiled active set for the bounded program of a window.
+"""Compiled active-set method for the bounded program of a window.
 
-Minimiser of `z' H z + q' z` within bounds: a set of variables is active at bounds, what is found
-outside joins it and what no longer presses on its bound leaves it, until nothing changes (the
-primal-dual active set of Hintermueller, Ito and Kunisch, 2002). H is factorised once, whatever
-the set: holding m variables takes m columns of its inverse, kept from round to round, and an
-m x m system. Where that does not end the caller is told and has another solver.
+It minimises `z' H z + q' z` within bounds by a primal-dual active set (Hintermueller, Ito and
+Kunisch, 2002): variables of the set are fixed at a bound; variables outside their bounds join it,
+and those whose multiplier points inwards leave it, until it does not change. H is factorised once:
+fixing m variables takes m columns of its inverse, kept from round to round, and an m x m system.
+The caller uses another solver where the method does not converge.
 """
 
 from __future__ import annotations
@@ -20,27 +20,27 @@ from dptse_env.model.road_arrays import RoadArrays
 from dptse_env.utils.arrays import FloatArray, IntArray
 
 LARGEST_SET = 96
-# Rounds that change all at once, which is quick and may cycle, and rounds in all; the later ones
-# change the first variable in line only, which does not cycle (Murty, 1974).
-BOLD_ROUNDS, ROUNDS = 12, 80
-# How far outside a bound (and how near to it without being put there) a variable must be.
+# Rounds that change all variables at once, which is fast but may cycle, and all rounds; the later
+# ones change the first violating variable only, which does not cycle (Murty, 1974).
+BLOCK_ROUNDS, ROUNDS = 12, 80
+# Tolerance of violated bounds; variables within it of a bound are set to the bound.
 SLACK = AT_BOUND
-# The natural residual that is corrected once more, and the largest one that is accepted.
+# The natural residual above which a solution is corrected again, and the largest accepted one.
 REFINED, ACCEPTED = 3e-13, 1e-9
 
 
 class ActiveSet(NamedTuple):
-    """Working scratch of the active set."""
+    """The active set, with scratch space."""
 
     side: IntArray  # (L, padded) -1 at the lower bound, 1 at the upper, 0 free; in and out
-    slot: IntArray  # (L, padded) which column a variable has, -1 for none
+    slot: IntArray  # (L, padded) index of a variable's column, -1 for none
     columns: FloatArray  # (LARGEST_SET, L, padded) columns of H^-1
-    members: IntArray  # (LARGEST_SET, 2) stage and component of the variables active
+    members: IntArray  # (LARGEST_SET, 2) stage and component of active variables
 
 
 @njit(cache=True, error_model="numpy")
 def make_active_set(n_stages: int, width: int) -> ActiveSet:
-    """Allocate the working scratch."""
+    """Allocate an empty active set."""
     return ActiveSet(
         np.zeros((n_stages, width), np.int64),
         np.full((n_stages, width), -1, np.int64),
@@ -60,10 +60,10 @@ def minimise(
     active: ActiveSet,
     z: FloatArray,
 ) -> bool:
-    """Replace `z` `(L, padded)`, a guess, by the minimiser; returns whether it was found.
+    """Replace `z` `(L, padded)`, a guess, by the minimiser; return whether it was found.
 
-    `lower` and `upper` `(2 S,)` bound every stage. What is found is judged by the natural
-    residual |z - clip(z - g / diag H, lower, upper)|.
+    `lower` and `upper` `(2 S,)` bound every stage. A solution is accepted by its natural residual
+    |z - clip(z - g / diag H, lower, upper)|.
     """
     n, width = lower.size, z.shape[1]
     slope, step, free = np.zeros((3, n_stages, width))
@@ -87,14 +87,14 @@ def minimise(
         z[:n_stages] = free
         for a in range(m):
             _subtract(pull[a], _column(active, a), z, n_stages)
-        if not _revise(n_stages, lower, upper, active, pull, z, turn >= BOLD_ROUNDS):
+        if not _revise(n_stages, lower, upper, active, pull, z, turn >= BLOCK_ROUNDS):
             settled = True
             break
     if not settled:
         return False
     for trial in range(6):
-        _snap(active, m, lower, upper, z)
-        _settle(n_stages, lower, upper, z)
+        _fix(active, m, lower, upper, z)
+        _set_near_bounds(n_stages, lower, upper, z)
         gradient(road, chain, n_stages, z, slope)
         residual = _natural_residual(n_stages, scratch, lower, upper, slope, z)
         if residual <= REFINED or trial == 5:
@@ -111,7 +111,7 @@ def minimise(
 
 @njit(cache=True, error_model="numpy")
 def _members(n_stages: int, n: int, active: ActiveSet) -> int:
-    """List the variables active; -1 if they are too many."""
+    """List the active variables and return their number, -1 if there are too many."""
     m = 0
     for t in range(n_stages):
         for i in range(n):
@@ -134,7 +134,7 @@ def _columns(
     n_columns: int,
     unit: FloatArray,
 ) -> int:
-    """Solve for missing columns of H^-1; returns how many there are, -1 if too many."""
+    """Solve for missing columns of H^-1; return the number of columns, -1 if there are too many."""
     unit[:] = 0.0
     for a in range(m):
         t, i = active.members[a]
@@ -158,7 +158,7 @@ def _column(active: ActiveSet, a: int) -> FloatArray:
 
 @njit(cache=True, error_model="numpy")
 def _hold(active: ActiveSet, m: int, excess: FloatArray) -> FloatArray:
-    """Multipliers that take the excess off the variables active: a Cholesky solve, m x m."""
+    """Return the multipliers that remove the excess of active variables, by a Cholesky solve."""
     L, x = np.empty((m, m)), excess.copy()
     for a in range(m):
         column = _column(active, a)
@@ -200,13 +200,13 @@ def _revise(
     z: FloatArray,
     only_first: bool,
 ) -> bool:
-    """Let go what pulls inwards, hold what is outside; returns whether anything changed."""
+    """Release variables that pull inwards, add those outside; return whether the set changed."""
     changed, a = False, 0
     for t in range(n_stages):
         for i in range(lower.size):
             side = active.side[t, i]
-            if side != 0:  # the members are in this order, too
-                # At the lower bound the free minimum lies below: the pull on it is negative.
+            if side != 0:  # the members have this order
+                # At the lower bound the free minimum lies below: its multiplier is negative.
                 wrong, side, a = pull[a] * side < 0.0, 0, a + 1
             elif z[t, i] < lower[i] - SLACK:
                 wrong, side = True, -1
@@ -220,8 +220,8 @@ def _revise(
 
 
 @njit(cache=True, error_model="numpy")
-def _settle(n_stages: int, lower: FloatArray, upper: FloatArray, z: FloatArray) -> None:
-    """Put what lies at a bound but for rounding there: a speed is a quotient of two of them."""
+def _set_near_bounds(n_stages: int, lower: FloatArray, upper: FloatArray, z: FloatArray) -> None:
+    """Set components within rounding of a bound to it: speeds are quotients of components."""
     for t in range(n_stages):
         for i in range(lower.size):
             if z[t, i] < lower[i] + SLACK:
@@ -231,7 +231,7 @@ def _settle(n_stages: int, lower: FloatArray, upper: FloatArray, z: FloatArray) 
 
 
 @njit(cache=True, error_model="numpy")
-def _snap(active: ActiveSet, m: int, lower: FloatArray, upper: FloatArray, z: FloatArray) -> None:
+def _fix(active: ActiveSet, m: int, lower: FloatArray, upper: FloatArray, z: FloatArray) -> None:
     for a in range(m):
         t, i = active.members[a]
         z[t, i] = lower[i] if active.side[t, i] < 0 else upper[i]
@@ -251,6 +251,6 @@ def _natural_residual(
         for i in range(lower.size):
             target = z[t, i] - slope[t, i] / scratch.diagonal[t, i]
             gap = abs(z[t, i] - min(max(target, lower[i]), upper[i]))
-            if not gap <= largest:  # a NaN stays one
+            if not gap <= largest:  # also true for a NaN
                 largest = gap
     return largest

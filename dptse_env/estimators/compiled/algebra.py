@@ -1,8 +1,8 @@
 """Compiled linear algebra of a Kalman filter: sparse propagation, scalar Joseph updates.
 
 Covariances are stored with rows padded to a multiple of eight numbers, the padding zero, so that
-every inner loop runs over whole vector registers of contiguous memory. `contract` allows fused
-multiply-adds and assumes nothing about finite numbers: a NaN must stay one, to be found.
+every inner loop runs over full vector registers of contiguous memory. `contract` allows fused
+multiply-adds and, unlike other options, keeps NaNs, by which divergence is detected.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from numba import njit
 from dptse_env.model.road_arrays import RoadArrays
 from dptse_env.utils.arrays import FloatArray
 
-VECTOR_WIDTH = 8
+VECTOR_WIDTH = 8  # numbers in a register
 
 
 def padded(n: int) -> int:
@@ -23,7 +23,7 @@ def padded(n: int) -> int:
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _multiply(road: RoadArrays, blocks: FloatArray, right: FloatArray, out: FloatArray) -> None:
-    """Write F right to `out`, F being given by its 2x2 blocks."""
+    """Write F right to `out`, with F given by its 2x2 blocks."""
     width = right.shape[1]
     for c in range(road.jam.size):
         upper, lower = out[2 * c], out[2 * c + 1]
@@ -31,7 +31,7 @@ def _multiply(road: RoadArrays, blocks: FloatArray, right: FloatArray, out: Floa
             a, b = blocks[c, slot, 0], blocks[c, slot, 1]
             d, e = blocks[c, slot, 2], blocks[c, slot, 3]
             if slot > 0 and a == 0.0 and b == 0.0 and d == 0.0 and e == 0.0:
-                continue  # demand or supply decides at a face, never both
+                continue  # a flow depends on either demand or supply
             neighbour = road.neighbours[c, slot]
             first, second = right[2 * neighbour], right[2 * neighbour + 1]
             if slot == 0:
@@ -56,8 +56,8 @@ def propagate(
     """Replace the covariance by F P F' + Q.
 
     Args:
-        road: Tells which cells the blocks belong to.
-        blocks: `(S, K, 4)` the blocks of F, as `dptse_env.model.kernels.advance` leaves them.
+        road: The road, for the cells of the blocks.
+        blocks: `(S, K, 4)` blocks of F, as written by `dptse_env.model.kernels.advance`.
         noise: `(2,)` variances that Q adds to every rho and every psi.
         covariance: `(2 S, padded)`, replaced.
         product: `(2 S, padded)` scratch.
@@ -99,12 +99,12 @@ def segment_update(
     shift: FloatArray,
     work: tuple[FloatArray, ...],
 ) -> bool:
-    """Two scalar measurements of one segment, its density and its speed or flow, in Joseph form.
+    """Update by two scalar measurements of a segment, density and speed or flow, in Joseph form.
 
     With c = P h, s = h' c + r and K = c / s, `(I - K h') P (I - K h')' + K r K'` is
-    `P - K c' - (c - s K) K'`; the last factor is the rounding that Joseph's form makes good. The
-    second measurement's c follows from the first one's vectors, so that P is gone through once.
-    Only the lower half of P is read and written; `mirror` it after the last segment.
+    `P - K c' - (c - s K) K'`; the last factor is the rounding error that Joseph's form corrects.
+    The second measurement's c follows from the first one's vectors, so that P is traversed once.
+    Only the lower half of P is read and written; call `mirror` after the last segment.
 
     Args:
         covariance: `(n, padded)`, its lower half replaced.
@@ -112,11 +112,11 @@ def segment_update(
         row: Residuals of both at the point of linearisation, then the derivatives of the
             second by the segment's two components.
         noise: `(2,)` variances of the measurements.
-        shift: `(padded,)` what earlier measurements moved the mean by; moved on.
+        shift: `(padded,)` change of the mean by earlier measurements; updated.
         work: Six scratch vectors `(padded,)`, their padding zero.
 
     Returns:
-        Whether both predicted variances were some: finite, positive, no less than the noise.
+        Whether both predicted variances are finite, positive and no less than the noise.
     """
     n, width = covariance.shape
     first, second = 2 * segment, 2 * segment + 1
@@ -173,10 +173,10 @@ def _is_variance(total: float, noise: float) -> bool:
 
 @njit(cache=True, error_model="numpy")
 def is_covariance(covariance: FloatArray, variances: FloatArray) -> bool:
-    """Whether variances are finite and not negative and no correlation exceeds one.
+    """Return whether variances are finite and not negative and no correlation exceeds one.
 
-    Cheaper than a factorisation and enough to catch a filter that has come apart: a matrix with
-    a correlation above one is indefinite.
+    It is cheaper than a factorisation and detects a diverged filter: a matrix with a correlation
+    above one is indefinite.
 
     Args:
         covariance: `(n, padded)`.

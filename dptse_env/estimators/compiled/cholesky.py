@@ -1,4 +1,4 @@
-"""Linear equations of a small definite matrix and many right-hand sides, compiled."""
+"""Compiled solution of linear equations with a small definite matrix and many right-hand sides."""
 
 from __future__ import annotations
 
@@ -10,10 +10,9 @@ from dptse_env.utils.arrays import FloatArray
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
 def _factor(matrix: FloatArray) -> bool:
-    """Replace the lower half of a symmetric matrix by L, L L' = matrix, its diagonal inverted.
+    """Replace the lower half of a symmetric matrix by L, L L' = matrix, with its diagonal inverted.
 
-    Returns:
-        Whether all pivots were positive and finite.
+    Returns whether all pivots were positive and finite.
     """
     for i in range(matrix.shape[0]):
         row = matrix[i]
@@ -32,7 +31,7 @@ def _factor(matrix: FloatArray) -> bool:
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _subtract(right: FloatArray, i: int, first: int, last: int, factors: FloatArray) -> None:
-    """Take `factors` times rows first..last-1 from row i, four at a time."""
+    """Subtract `factors` times rows first..last-1 from row i, four at a time."""
     row = right[i]
     four = first + (last - first) // 4 * 4
     for k in range(first, four, 4):
@@ -48,7 +47,7 @@ def _subtract(right: FloatArray, i: int, first: int, last: int, factors: FloatAr
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def solve(matrix: FloatArray, right: FloatArray) -> bool:
-    """Replace `right` by `matrix^-1 right` and the matrix by its factor; whether it had one."""
+    """Replace `right` by `matrix^-1 right`, the matrix by its factor; return whether it has one."""
     if not _factor(matrix):
         return False
     m = matrix.shape[0]

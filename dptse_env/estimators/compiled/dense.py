@@ -8,38 +8,29 @@ from numba import njit
 from dptse_env.utils.arrays import FloatArray
 
 
-@njit(cache=True, error_model="numpy")
-def factor(matrix: FloatArray, n: int) -> bool:
-    """Replace the upper half of a symmetric `(n, width)` matrix by U with U' U = matrix.
-
-    Returns:
-        Whether all pivots were positive.
-    """
-    return eliminate(matrix, n, matrix.shape[1])
-
-
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def eliminate(matrix: FloatArray, n: int, width: int) -> bool:
     """Replace rows [S, C] by [U, V] with U' U = S and V' V = C' S^-1 C.
 
     Args:
-        matrix: `(n or more, width or more)`; S the first n columns, its upper half is read.
-        n: Rows.
-        width: Columns, a multiple of 8.
+        matrix: `(n or more, width or more)`; S is the first n columns, of which the upper half is
+            read.
+        n: Number of rows.
+        width: Number of columns, a multiple of 8.
 
     Returns:
-        Whether all pivots were positive.
+        Whether all pivots are positive.
     """
     for i in range(n):
         row, start = matrix[i], i // 8 * 8
-        # Four rows above at a time: a row is loaded and stored once for four multiplications.
-        whole = i // 4 * 4
-        for k in range(0, whole, 4):
+        # Four rows at a time: a row is loaded and stored once for four multiplications.
+        last = i // 4 * 4
+        for k in range(0, last, 4):
             a, b, c, d = matrix[k, i], matrix[k + 1, i], matrix[k + 2, i], matrix[k + 3, i]
             r0, r1, r2, r3 = matrix[k], matrix[k + 1], matrix[k + 2], matrix[k + 3]
             for j in range(start, width):
                 row[j] -= (a * r0[j] + b * r1[j]) + (c * r2[j] + d * r3[j])
-        for k in range(whole, i):
+        for k in range(last, i):
             head, above = matrix[k, i], matrix[k]
             for j in range(start, width):
                 row[j] -= head * above[j]
@@ -56,7 +47,7 @@ def eliminate(matrix: FloatArray, n: int, width: int) -> bool:
 def products(
     left: FloatArray, n_left: int, right: FloatArray, n_right: int, is_lower: bool, out: FloatArray
 ) -> None:
-    """Write inner products of rows; where `is_lower`, those up to the diagonal and a few more."""
+    """Write inner products of rows; if `is_lower`, those up to the diagonal and a few more."""
     width = left.shape[1]
     for i in range(0, n_left, 2):
         a0, a1 = left[i], left[min(i + 1, n_left - 1)]

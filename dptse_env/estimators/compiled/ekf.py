@@ -12,8 +12,8 @@ class CompiledEKF(CompiledFilter):
     """Extended Kalman filter on the ARZ model, analytic Jacobians, sequential Joseph updates.
 
     All rows of a step are linearised at its prediction, which makes the sequence of scalar
-    updates equal to one update by all rows. Means are projected after predict and update;
-    covariances are not touched by it.
+    updates equal to a joint update by all rows. Means are projected after predict and update;
+    covariances are not.
     """
 
     def _predict(self, episodes: IntArray, inputs: FloatArray) -> None:

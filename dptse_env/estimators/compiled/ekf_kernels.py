@@ -35,18 +35,18 @@ class Filters(NamedTuple):
 
     means: FloatArray  # (n, 2 S) [veh/km, veh/h]
     covariances: FloatArray  # (n, 2 S, padded) normalised, the padding zero
-    priors: FloatArray  # (n, 2 S) means to go back to
+    priors: FloatArray  # (n, 2 S) prior means
     innovations: FloatArray  # (n, S, 2)
     diverged: BoolArray  # (n,)
     process_variance: FloatArray  # (2,) normalised
-    initial_variance: float  # Normalised
+    initial_variance: float  # normalised
     density_scale: float  # rho_m [veh/km]
-    is_box: bool  # Whether means are held to the paper's box instead of the cone
+    is_box: bool  # whether means are projected into the paper's box, not the cone
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def predict(road_: Packed, filters_: Packed, episodes: IntArray, inputs: FloatArray) -> None:
-    """Move episodes one step ahead under inputs `(k, n_u)`: x = f(x, u), P = F P F' + Q."""
+    """Predict one step ahead under inputs `(k, n_u)`: x = f(x, u), P = F P F' + Q."""
     road, filters = RoadArrays(*road_), Filters(*filters_)
     scratch = make_scratch(road)
     blocks = np.empty((*road.neighbours.shape, 4))
@@ -71,7 +71,7 @@ def update(
     values: FloatArray,
     sigma: FloatArray,
 ) -> None:
-    """Take in measurements; see `Estimator.update`."""
+    """Update by measurements; see `Estimator.update`."""
     road, filters = RoadArrays(*road_), Filters(*filters_)
     shift = np.empty(filters.covariances.shape[2])
     work = scratch_vectors(shift.size)
@@ -93,7 +93,7 @@ def update(
         for s in range(road.jam.size):
             if not (observed[k, s] and sound):
                 continue
-            # All rows are linearised at the prediction, so their order does not matter.
+            # All rows are linearised at the prediction, so their order is irrelevant.
             sound = segment_update(covariance, s, rows[s], noise, shift, work)
         if observed[k].any():
             mirror(covariance)
@@ -110,7 +110,7 @@ def update(
 
 @njit(cache=True, error_model="numpy")
 def restart(filters: Filters, episode: int) -> None:
-    """Put one episode's filter to its prior."""
+    """Reset an episode's filter to its prior."""
     filters.means[episode] = filters.priors[episode]
     filters.innovations[episode] = 0.0
     covariance = filters.covariances[episode]
@@ -121,7 +121,7 @@ def restart(filters: Filters, episode: int) -> None:
 
 @njit(cache=True, error_model="numpy")
 def project(road: RoadArrays, mean: FloatArray, is_box: bool) -> None:
-    """Hold a mean to its bounds, as `ARZModel.project` does; a NaN stays one."""
+    """Project a mean into its bounds, as `ARZModel.project`; a NaN stays NaN."""
     v_f = road.free_flow_speed
     for c in range(road.jam.size):
         rho, psi, jam = mean[2 * c], mean[2 * c + 1], road.jam[c]
@@ -139,7 +139,7 @@ def project(road: RoadArrays, mean: FloatArray, is_box: bool) -> None:
 def measured(
     rho: float, psi: float, jam: float, v_f: float, gamma: float
 ) -> tuple[float, float, float]:
-    """Speed [km/h] as a sensor sees it and its derivatives by rho and psi, density floored."""
+    """Return the measured speed [km/h], density floored, and its derivatives by rho and psi."""
     floor = MEASUREMENT_FLOOR * jam
     floored = max(rho, floor)
     p = pressure(floored, jam, v_f, gamma)
@@ -149,7 +149,7 @@ def measured(
 
 @njit(cache=True, error_model="numpy")
 def released(road: RoadArrays, s: int, rho: float, psi: float) -> tuple[float, float, float]:
-    """Speed or centred flow that a segment releases, and its derivatives by rho and psi."""
+    """Return a segment's released speed or centred flow, and its derivatives by rho and psi."""
     jam, v_f, gamma = road.jam[s], road.free_flow_speed, road.gamma
     if np.isnan(road.reference_speed):
         return measured(rho, psi, jam, v_f, gamma)
@@ -167,7 +167,7 @@ def _linearise(
     values: FloatArray,
     rows: FloatArray,
 ) -> None:
-    """Write the residuals of both releases and the second one's row of H, all normalised."""
+    """Write the residuals of both releases and the second row of H, all normalised."""
     scale, unit = filters.density_scale, road.second_scale
     for s in range(road.jam.size):
         if observed[s]:
@@ -187,7 +187,7 @@ def _innovate(
     noise: FloatArray,
     innovations: FloatArray,
 ) -> None:
-    """Write residuals over their predicted deviations, before any of them is taken in."""
+    """Write residuals over their predicted deviations, before the update."""
     innovations[:] = 0.0
     for s in range(observed.size):
         if observed[s]:

@@ -22,16 +22,15 @@ from dptse_env.utils.arrays import FloatArray, IntArray
 class CompiledEnKF(BatchEstimator):
     """Ensemble Kalman filter with perturbed observations (Evensen, 2003; Burgers et al., 1998).
 
-    Every member is moved, disturbed by process noise, projected; takes the measurements in with
-    noise of its own; and is projected again. Each episode draws from streams of its own, seeded
-    by the generator that `reset` gets; process and measurement noise do not share one, so that
-    what is measured does not change how the members are disturbed.
+    Every member is predicted, perturbed by process noise and projected; updated by perturbed
+    measurements; and projected again. Each episode has separate streams, seeded by the generator
+    given to `reset`, for process and for measurement noise, so that the measurements do not change
+    the process noise.
 
     Options, off by default (`EnsembleSettings`): `inflation` moves members away from their mean
-    ahead of every update that has measurements, and projects them; `taper` weighs the sampled
-    covariances by distance, of outputs with states and of outputs among themselves. Both, as an
-    S that holds covariances which the gain leaves out would make the measurements count for less
-    than they are worth; it costs nothing to speak of.
+    before every update that has measurements, and projects them; `taper` weighs the sampled
+    covariances by distance, those of outputs with states and those among outputs. An S with
+    covariances that the gain neglects would give the measurements too little weight.
     """
 
     is_compiled: ClassVar[bool] = True
@@ -39,11 +38,10 @@ class CompiledEnKF(BatchEstimator):
     def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
         """See `make_estimator`."""
         super().__init__(model, n_episodes, settings)
-        own = settings.enkf
         unit = model.density_scale * np.array([1.0, model.speed_scale])
         priors = model.project(np.zeros((n_episodes, model.n_states)), settings.bounds)
-        none = np.empty((0, 0))
-        self.n_members = own.n_members
+        taper, none = settings.enkf.taper, np.empty((0, 0))
+        self.n_members = settings.enkf.n_members
         self._road = tuple(make_road_arrays(model))
         self._ensembles = kernels.Ensembles(
             members=np.repeat(priors[:, :, None], padded(self.n_members), axis=2),
@@ -55,8 +53,8 @@ class CompiledEnKF(BatchEstimator):
             process_deviation=np.array(settings.process_noise) * unit,
             initial_deviation=float(np.sqrt(settings.initial_variance)) * unit,
             density_scale=model.density_scale,
-            inflation=own.inflation,
-            tapers=none if own.taper is None else tapers(model.network, own.taper),
+            inflation=settings.enkf.inflation,
+            tapers=none if taper is None else tapers(model.network, taper),
             is_box=settings.bounds == "box",
         )
         self._packed = tuple(self._ensembles)
@@ -74,7 +72,7 @@ class CompiledEnKF(BatchEstimator):
 
     @property
     def covariances(self) -> FloatArray:
-        """Of the members, `(n, 2 S, 2 S)`, rho normalised by rho_m and psi by rho_m v_f."""
+        """Sample covariances `(n, 2 S, 2 S)`, rho normalised by rho_m and psi by rho_m v_f."""
         scale = self.model.density_scale * np.array([1.0, self.model.speed_scale])
         rest = self._inner - self.states[:, :, None]
         rest /= np.tile(scale, self.model.n_segments)[:, None]
@@ -83,7 +81,7 @@ class CompiledEnKF(BatchEstimator):
 
     @property
     def _inner(self) -> FloatArray:
-        """Members `(n, 2 S, M)` without the columns beyond them."""
+        """Members `(n, 2 S, M)` without padding."""
         return self._ensembles.members[:, :, : self.n_members]
 
     def _reset(
@@ -94,7 +92,7 @@ class CompiledEnKF(BatchEstimator):
         kernels.restart(self._road, self._packed, episodes)
 
     def _seed(self, episodes: IntArray, generators: Sequence[np.random.Generator]) -> None:
-        """Start the streams of episodes, of process noise and of measurement noise."""
+        """Seed the streams of process noise and of measurement noise."""
         for episode, generator in zip(episodes.tolist(), generators, strict=True):
             for kind in range(2):
                 self._ensembles.streams[episode, kind] = make_stream(generator)

@@ -1,9 +1,9 @@
 """Compiled kernels of the ensemble Kalman filter: a batch of episodes, one after the other.
 
-With D the outputs' distances from their mean and X the states', one member a column, the update
-is `x += X D' (D D' + (M - 1) R)^-1 (z + noise - y)` for every member: S is factorised and solved
-for the gain, which has fewer columns than there are members. Products of matrices are BLAS's,
-small enough to stay on one thread.
+With D the deviations of outputs from their mean and X those of states, a member per column, the
+update is `x += X D' (D D' + (M - 1) R)^-1 (z + noise - y)` for every member: S is factorised and
+solved for the gain, which has fewer columns than there are members. Products of matrices use BLAS
+and are small enough for one thread.
 """
 
 from __future__ import annotations
@@ -30,22 +30,22 @@ from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 
 
 class Ensembles(NamedTuple):
-    """Members of n episodes and what moves them."""
+    """Members of n episodes and the parameters of their updates."""
 
-    # (n, 2 S, width) a member a column [veh/km, veh/h]; columns beyond the members repeat the
-    # first one or are moved along with it
+    # (n, 2 S, width) a member per column [veh/km, veh/h]; columns beyond the members are padding
+    # with copies of the first one
     members: FloatArray
     n_members: int  # M
-    priors: FloatArray  # (n, 2 S) means to go back to
+    priors: FloatArray  # (n, 2 S) prior means
     streams: NDArray[np.uint64]  # (n, 2, 4, STREAM_WIDTH) of process noise and of measurement noise
     innovations: FloatArray  # (n, S, 2)
     diverged: BoolArray  # (n,)
-    process_deviation: FloatArray  # (2,) of what disturbs rho and psi in a step [veh/km, veh/h]
+    process_deviation: FloatArray  # (2,) of rho and psi in a step [veh/km, veh/h]
     initial_deviation: FloatArray  # (2,) of the members around a prior [veh/km, veh/h]
     density_scale: float  # rho_m [veh/km]
-    inflation: float  # Factor on distances from the mean ahead of an update
+    inflation: float  # factor on distances from the mean before an update
     tapers: FloatArray  # (S, S) weights of covariances between segments; (0, 0) for none
-    is_box: bool  # Whether members are held to the paper's box instead of the cone
+    is_box: bool  # whether members are projected into the paper's box, not the cone
 
 
 @njit(cache=True, error_model="numpy")
@@ -63,12 +63,12 @@ def _restart(road: RoadArrays, ensembles: Ensembles, e: int) -> None:
         members[i] = ensembles.priors[e, i]
     draws = np.empty(members.shape[0] * n, dtype=np.float32)
     fill(ensembles.streams[e, 0], draws, make_bits(draws.size))
-    _disturb(members, n, ensembles.initial_deviation, draws)
+    _perturb(members, n, ensembles.initial_deviation, draws)
     project_states(road, members, ensembles.is_box)
 
 
 @njit(cache=True, error_model="numpy")
-def _disturb(members: FloatArray, n: int, deviation: FloatArray, draws: Draws) -> None:
+def _perturb(members: FloatArray, n: int, deviation: FloatArray, draws: Draws) -> None:
     """Add noise to the first n columns; those beyond repeat the first."""
     for i in range(members.shape[0]):
         row, draw, size = members[i], draws[i * n : (i + 1) * n], deviation[i % 2]
@@ -79,7 +79,7 @@ def _disturb(members: FloatArray, n: int, deviation: FloatArray, draws: Draws) -
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def predict(road_: Packed, ensembles_: Packed, episodes: IntArray, inputs: FloatArray) -> None:
-    """Move the members one step ahead under inputs `(k, n_u)`, disturb each and project it."""
+    """Predict members one step ahead under inputs `(k, n_u)`, with noise, and project them."""
     road, ensembles = RoadArrays(*road_), Ensembles(*ensembles_)
     n = ensembles.n_members
     size, width = ensembles.members.shape[1:]
@@ -90,13 +90,13 @@ def predict(road_: Packed, ensembles_: Packed, episodes: IntArray, inputs: Float
         members = ensembles.members[episodes[k]]
         advance_states(road, members, inputs[k], scratch)
         fill(ensembles.streams[episodes[k], 0], draws, bits)
-        _disturb(members, n, ensembles.process_deviation, draws)
+        _perturb(members, n, ensembles.process_deviation, draws)
         project_states(road, members, ensembles.is_box)
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
 def _mean(row: FloatArray, n: int) -> float:
-    """Mean of the first n, from the first: equal numbers have no spread to rounding."""
+    """Return the mean of the first n relative to the first, exact for equal numbers."""
     first, total = row[0], 0.0
     for j in range(n):
         total += row[j] - first
@@ -130,7 +130,7 @@ def update(
     values: FloatArray,
     sigma: FloatArray,
 ) -> None:
-    """Take in measurements, perturbed for each member; see `Estimator.update`."""
+    """Update by measurements, perturbed for each member; see `Estimator.update`."""
     road, ensembles = RoadArrays(*road_), Ensembles(*ensembles_)
     n_segments = road.jam.size
     draws = np.empty(2 * n_segments * ensembles.n_members, dtype=np.float32)
@@ -145,7 +145,9 @@ def update(
         ensembles.innovations[e] = 0.0
         members, sound = ensembles.members[e], True
         if n_seen > 0:
-            sound = _take_in(road, ensembles, e, segments[:n_seen], values[k], sigma, draws, bits)
+            sound = _update_members(
+                road, ensembles, e, segments[:n_seen], values[k], sigma, draws, bits
+            )
             project_states(road, members, ensembles.is_box)
         ensembles.diverged[e] = not (sound and _is_finite(members))
         if ensembles.diverged[e]:
@@ -164,7 +166,7 @@ def _is_finite(members: FloatArray) -> bool:
 
 
 @njit(cache=True, error_model="numpy")
-def _take_in(
+def _update_members(
     road: RoadArrays,
     ensembles: Ensembles,
     e: int,
@@ -174,10 +176,10 @@ def _take_in(
     draws: Draws,
     bits: Bits,
 ) -> bool:
-    """Move the members of one episode by what was measured.
+    """Update the members of an episode by its measurements.
 
     Returns:
-        Whether S was definite and the members are finite, ahead of a projection that would bring
+        Whether S is definite and the members are finite, before a projection that would bring
         infinities back into the bounds.
     """
     members, n = ensembles.members[e], ensembles.n_members
@@ -193,7 +195,7 @@ def _take_in(
     centres = _compare(
         road, ensembles, e, segments, values, units, noise, used, distances, residuals
     )
-    # Whole vector registers for the solution; the rows beyond the states are zero.
+    # Full vector registers for the solution; rows beyond the states are zero.
     states = np.zeros(((members.shape[0] + 7) // 8 * 8, width))
     for i in range(members.shape[0]):
         _centre(members[i], n, 1.0, states[i])
@@ -230,7 +232,7 @@ def _compare(
     distances: FloatArray,
     residuals: FloatArray,
 ) -> FloatArray:
-    """Write outputs' distances from their mean and members' residuals; residuals of the mean."""
+    """Write deviations of outputs and residuals of members; return the residuals of the mean."""
     members, n = ensembles.members[e], ensembles.n_members
     centres, second = np.empty(2 * segments.size), np.empty(members.shape[1])
     for i in range(segments.size):
@@ -251,7 +253,7 @@ def _compare(
 
 @njit(cache=True, error_model="numpy")
 def _taper(tapers: FloatArray, segments: IntArray, joint: FloatArray, gain: FloatArray) -> None:
-    """Weigh covariances of outputs among themselves and with the states by distance."""
+    """Weigh covariances among outputs, and those with the states, by distance."""
     for i in range(joint.shape[0]):
         weights = tapers[segments[i // 2]]
         for j in range(joint.shape[1]):
@@ -262,7 +264,7 @@ def _taper(tapers: FloatArray, segments: IntArray, joint: FloatArray, gain: Floa
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def summarise(road_: Packed, members: FloatArray, n: int, out: FloatArray) -> None:
-    """Write density and speed of the mean and the members' deviations to `out` `(4, E, S)`."""
+    """Write density and speed of the mean and the deviations of members to `out` `(4, n, S)`."""
     road = RoadArrays(*road_)
     v_f, gamma, width = road.free_flow_speed, road.gamma, members.shape[2]
     speed, mean = np.empty(width), np.empty((3, 1))
@@ -280,7 +282,7 @@ def summarise(road_: Packed, members: FloatArray, n: int, out: FloatArray) -> No
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
 def _moments(row: FloatArray, n: int) -> tuple[float, float]:
-    """Mean and deviation of the first n."""
+    """Return mean and standard deviation of the first n."""
     mean, total = _mean(row, n), 0.0
     for j in range(n):
         total += (row[j] - mean) ** 2

@@ -1,4 +1,4 @@
-"""What the compiled filters with a covariance share: their state and its summary."""
+"""Base class of compiled filters with a covariance: their state and its summary."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from dptse_env.utils.arrays import FloatArray, IntArray
 
 
 class CompiledFilter(BatchEstimator):
-    """Mean and covariance of each episode, kept where kernels can reach them."""
+    """Means and covariances of all episodes as arrays for kernels."""
 
     is_compiled: ClassVar[bool] = True
 

@@ -14,8 +14,8 @@ from dptse_env.estimators.horizon import (
     Window,
     assemble,
     normalised_bounds,
-    own_settings,
     process_variance,
+    settings_of_mhe,
     solve,
 )
 from dptse_env.estimators.settings import EstimatorSettings
@@ -27,25 +27,25 @@ from dptse_env.utils.arrays import FloatArray, IntArray
 class CompiledMHE(CompiledFilter):
     """Moving horizon estimation (paper, eq. 14 to 17), compiled.
 
-    `dptse_env.estimators.reference.mhe.ReferenceMHE` says what the estimate, its deviations and
-    the model are. Here the program is solved exactly: a filter's forward pass factorises H and an
-    active set, begun with the last step's, finds what lies at a bound. Where it finds no optimum
-    within its rounds, the reference's solver is asked, then the prediction taken.
+    Estimate, deviations and model are those of `dptse_env.estimators.reference.mhe.ReferenceMHE`.
+    The program is solved exactly: a filter's forward pass factorises H, and an active-set method,
+    started from the last step's set, finds the components at a bound. Where it does not converge
+    the reference's solver is used, and where that fails, the prediction.
 
     Attributes:
-        n_passed_on: Programs so far that went to the reference's solver.
+        n_passed_on: Number of programs passed on to the reference's solver.
     """
 
     def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
         """See `make_estimator`."""
-        process_variance(settings)  # refused before anything is built
-        super().__init__(model, n_episodes, own_settings(settings))
-        self.horizon = own = settings.mhe
+        process_variance(settings)  # check before allocation
+        super().__init__(model, n_episodes, settings_of_mhe(settings))
+        mhe = settings.mhe
         self.n_passed_on = 0
         n, s, width = model.n_states, model.n_segments, padded(model.n_states)
         self._road: RoadArrays = make_road_arrays(model)
-        shape = (n_episodes, own.horizon + 1)
-        lower, upper = normalised_bounds(model, own.bounds)
+        shape = (n_episodes, mhe.horizon + 1)
+        lower, upper = normalised_bounds(model, mhe.bounds)
         self._windows = Windows(
             length=np.ones(n_episodes, dtype=np.int64),
             arrival_variance=np.ones((n_episodes, 2)),
@@ -61,17 +61,17 @@ class CompiledMHE(CompiledFilter):
             solution=np.zeros((*shape, width)),
             side=np.zeros((*shape, width), dtype=np.int64),
             unsolved=np.zeros(n_episodes, dtype=np.bool_),
-            moving_variance=np.square(np.array(own.arrival_noise, dtype=np.float64)),
+            moving_variance=np.square(np.array(mhe.arrival_noise, dtype=np.float64)),
             lower=lower,
             upper=upper,
-            along=own.linearisation == "trajectory",
+            along=mhe.linearisation == "trajectory",
         )
         self._windows_packed = (*self._packed, tuple(self._windows))
         self._scales = model.measurement_scale
         self._restart(np.arange(n_episodes))
 
     def window(self, episode: int) -> Window:
-        """The linearised problem of one episode, dense, as `assemble` takes it."""
+        """Return the linearised problem of an episode, dense, for `assemble`."""
         windows, length = self._windows, int(self._windows.length[episode])
         n, road = self.model.n_states, self._road
         transitions = np.zeros((length - 1, n, n))
@@ -107,12 +107,12 @@ class CompiledMHE(CompiledFilter):
             self._pass_on(episode)
 
     def _pass_on(self, episode: int) -> None:
-        """Let the reference's solver have a program that the active set did not solve."""
+        """Pass a program that the active-set method did not solve on to the reference's solver."""
         self.n_passed_on += 1
         windows, n = self._windows, self.model.n_states
         length = int(windows.length[episode])
         lower, upper = np.tile(windows.lower, length), np.tile(windows.upper, length)
-        z = solve(*assemble(self.window(episode)), lower, upper, self.horizon.solver)
+        z = solve(*assemble(self.window(episode)), lower, upper, self.settings.mhe.solver)
         self.fallback[episode] = z is None
         windows.side[episode] = 0
         if z is None:

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
 from dptse_env.estimators.compiled import ekf_kernels as kernels
 from dptse_env.estimators.compiled.active_set import make_active_set, minimise
-from dptse_env.estimators.compiled.ekf_kernels import Filters, project, released
+from dptse_env.estimators.compiled.ekf_kernels import Filters, Packed, project, released
 from dptse_env.estimators.compiled.window import Chain, factorise, make_window_scratch
 from dptse_env.model.kernels import advance, make_scratch
 from dptse_env.model.road_arrays import RoadArrays
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
-
-Packed = tuple[Any, ...]
 
 
 class Windows(NamedTuple):
@@ -33,17 +31,17 @@ class Windows(NamedTuple):
     rows: FloatArray  # (n, L, S, 2)
     constants: FloatArray  # (n, L, S)
     solution: FloatArray  # (n, L, padded)
-    side: IntArray  # (n, L, padded) which bound each variable was last active at
-    unsolved: BoolArray  # (n,) whether the active set found no optimum
+    side: IntArray  # (n, L, padded) bound at which each variable was last active
+    unsolved: BoolArray  # (n,) whether the active-set method found no optimum
     moving_variance: FloatArray  # (2,) arrival variance of a window that moves
     lower: FloatArray  # (2 S,)
     upper: FloatArray  # (2 S,)
-    along: bool  # Whether to linearise along the last solution
+    along: bool  # whether to linearise along the last solution
 
 
 @njit(cache=True, error_model="numpy")
 def restart(road_: Packed, filters_: Packed, windows_: Packed, episode: int) -> None:
-    """Put one episode to a window of one stage, its prior."""
+    """Reset an episode to a window of a single stage, its prior."""
     road, filters, windows = RoadArrays(*road_), Filters(*filters_), Windows(*windows_)
     kernels.restart(filters, episode)
     windows.length[episode] = 1
@@ -55,7 +53,7 @@ def restart(road_: Packed, filters_: Packed, windows_: Packed, episode: int) -> 
 
 @njit(cache=True, error_model="numpy")
 def _enter(road: RoadArrays, filters: Filters, windows: Windows, e: int, t: int) -> None:
-    """Let the mean be a new stage, without measurements."""
+    """Add the mean as a stage without measurements."""
     scale = filters.density_scale
     for i in range(filters.means.shape[1]):
         unit = scale if i % 2 == 0 else scale * road.free_flow_speed
@@ -103,7 +101,7 @@ def predict(
 
 @njit(cache=True, error_model="numpy")
 def _shift(windows: Windows, e: int) -> None:
-    """Forget the oldest stage."""
+    """Drop the oldest stage."""
     windows.arrival_variance[e] = windows.moving_variance
     for t in range(windows.solution.shape[1] - 1):
         windows.predicted[e, t] = windows.predicted[e, t + 1]
@@ -121,7 +119,7 @@ def _shift(windows: Windows, e: int) -> None:
 
 @njit(cache=True, error_model="numpy")
 def _physical(road: RoadArrays, filters: Filters, point: FloatArray) -> FloatArray:
-    """The state in the cone nearest to a normalised point."""
+    """Return the state in the cone nearest to a normalised point."""
     state = np.empty(filters.means.shape[1])
     for i in range(state.size):
         unit = filters.density_scale if i % 2 == 0 else filters.density_scale * road.free_flow_speed
@@ -173,7 +171,7 @@ def update(
     values: FloatArray,
     sigma: FloatArray,
 ) -> None:
-    """Take in measurements, `sigma` no less than allowed; see `Estimator.update`."""
+    """Update by measurements, `sigma` no less than allowed; see `Estimator.update`."""
     road, filters, windows = RoadArrays(*road_), Filters(*filters_), Windows(*windows_)
     n_segments, capacity, width = road.jam.size, *windows.solution.shape[1:]
     scratch, active = (
@@ -214,7 +212,7 @@ def update(
                 if not windows.unsolved[e]:
                     windows.side[e] = active.side
                     accept(road, filters, windows, e, z)
-            # An optimum that is not finite has no residual, hence is unsolved.
+            # An optimum that is not finite has no residual and counts as unsolved.
             sound = bool(np.isfinite(filters.covariances[e]).all())
         else:
             sound = False
@@ -241,7 +239,7 @@ def _chain(filters: Filters, windows: Windows, e: int) -> Chain:
 
 @njit(cache=True, error_model="numpy")
 def accept(road: RoadArrays, filters: Filters, windows: Windows, e: int, z: FloatArray) -> None:
-    """Take a solution `(L, padded)`: its last state is the estimate."""
+    """Accept a solution `(L, padded)`, whose last state is the estimate."""
     windows.solution[e] = z
     last, scale = windows.length[e] - 1, filters.density_scale
     for i in range(filters.means.shape[1]):

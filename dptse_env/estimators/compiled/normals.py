@@ -1,10 +1,10 @@
-"""Normal numbers in bulk, for ensembles: nine times as fast as numpy draws its own.
+"""Normal random numbers for ensembles, nine times as fast as numpy's.
 
-A stream is a set of generators xoshiro256++ (Blackman and Vigna, 2021) that run side by side,
-one a column, so that the loop over them compiles to vector instructions. Their states come from
-the `numpy.random.Generator` of an episode. Pairs of normals follow from pairs of uniform numbers
-by the transform of Box and Muller (1958), in single precision, which is far finer than what any
-ensemble resolves; the tails end at 6.8 standard deviations.
+A stream is a set of parallel generators xoshiro256++ (Blackman and Vigna, 2021), a column each, so
+that the loop over them compiles to vector instructions. Their states come from the
+`numpy.random.Generator` of an episode. Pairs of normal numbers follow from pairs of uniform numbers
+by the transform of Box and Muller (1958), in single precision, which is sufficient for ensembles;
+the tails end at 6.8 standard deviations.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ Stream = NDArray[np.uint64]  # (4, STREAM_WIDTH)
 Bits = NDArray[np.uint64]
 Draws = NDArray[np.float32]
 
-STREAM_WIDTH = 32
+STREAM_WIDTH = 32  # generators in a stream
 _ROOT_HALF = 0x3F3504F3  # bits of sqrt(1/2)
 _MANTISSA = 23
-# Single precision throughout: numba would widen what meets a Python float.
+# Single precision throughout: numba would convert products with a Python float to double.
 _F = np.float32
 _ONE, _FOUR, _LN4 = _F(1.0), _F(4.0), _F(math.log(4.0))
 _UNIT, _HALF_UNIT = _F(2.0**-32), _F(2.0**-33)
@@ -38,18 +38,18 @@ _C2, _C4, _C6, _C8, _C10, _C12 = (
 
 
 def make_stream(generator: np.random.Generator) -> Stream:
-    """Start a stream from what a generator draws next."""
+    """Seed a stream with the next numbers of a generator."""
     return generator.integers(0, 2**64 - 1, size=(4, STREAM_WIDTH), dtype=np.uint64, endpoint=True)
 
 
 @njit(cache=True, error_model="numpy")
 def make_bits(n: int) -> Bits:
-    """Allocate the working space of `fill` for up to n normals."""
+    """Allocate the scratch space of `fill` for up to n numbers."""
     return np.empty(-(-n // (2 * STREAM_WIDTH)) * STREAM_WIDTH, dtype=np.uint64)
 
 
 def _split_of(context: Any, x: Any) -> Any:
-    """Factors of a float32 `x = 2^k z` with z in [sqrt(1/2), sqrt(2)): (z, k)."""
+    """Split a float32 `x = 2^k z` with z in [sqrt(1/2), sqrt(2)): (z, k)."""
     del context, x
 
     def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -63,14 +63,14 @@ def _split_of(context: Any, x: Any) -> Any:
     return _tuple_of(types.float32, 2)(types.float32), code
 
 
-_tuple_of: Any = types.UniTuple  # has no type of its own
+_tuple_of: Any = types.UniTuple  # untyped
 # Not as a decorator: a type checker would see the arguments of the function that makes the code.
 _split: Any = intrinsic(_split_of)
 
 
 @njit(cache=True, error_model="numpy")
 def _draw_bits(stream: Stream, out: Bits) -> None:
-    """Fill `out`, whole blocks of STREAM_WIDTH, by xoshiro256++."""
+    """Fill `out`, in complete blocks of STREAM_WIDTH, by xoshiro256++."""
     first, second, third, fourth = stream[0], stream[1], stream[2], stream[3]
     for start in range(0, out.size, STREAM_WIDTH):
         block = out[start : start + STREAM_WIDTH]
@@ -88,7 +88,7 @@ def _draw_bits(stream: Stream, out: Bits) -> None:
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _transform(bits: Bits, first: Draws, second: Draws) -> None:
-    """Two normals of each number: the upper half is the radius, the lower one angle and sign."""
+    """Turn each number into two normals: its upper half gives the radius, the lower the angle."""
     for i in range(bits.size):
         upper = np.float32(np.int64(bits[i] >> np.uint64(32)))
         # -2 log u, by log z = 2 atanh((z - 1) / (z + 1)).
@@ -99,7 +99,7 @@ def _transform(bits: Bits, first: Draws, second: Draws) -> None:
         radius = np.sqrt(-(k * _LN4 + _FOUR * (s + s * t * series)))
         lower = np.int64(bits[i] & np.uint64(0xFFFFFFFF)) - np.int64(2**31)
         radius = radius if lower >= 0 else -radius
-        # From -pi/2 to pi/2; the sign makes it the whole circle.
+        # From -pi/2 to pi/2; the sign extends it to the full circle.
         turned = lower if lower >= 0 else lower + np.int64(2**31)
         a = np.float32(turned) * _ANGLE - _QUARTER
         q = a * a
@@ -111,12 +111,12 @@ def _transform(bits: Bits, first: Draws, second: Draws) -> None:
 
 @njit(cache=True, error_model="numpy")
 def fill(stream: Stream, out: Draws, bits: Bits) -> None:
-    """Fill `out` `(n,)`, n even, with standard normals and move the stream on.
+    """Fill `out` with standard normal numbers and advance the stream.
 
     Args:
         stream: From `make_stream`.
         out: `(n,)`, n even.
-        bits: From `make_bits`, of n or more.
+        bits: From `make_bits`, for n or more numbers.
     """
     half = out.size // 2
     _draw_bits(stream, bits[: (half + STREAM_WIDTH - 1) // STREAM_WIDTH * STREAM_WIDTH])

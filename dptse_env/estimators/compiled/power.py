@@ -1,4 +1,4 @@
-"""Powers that compile to vector instructions, as a loop around the C library's `pow` does not."""
+"""Powers that compile to vector instructions, unlike loops around the C library's `pow`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ LEAST_BASE, LARGEST_BASE = 1e-30, 1e30
 
 
 def _bits_of(context: Any, x: Any) -> Any:
-    """Bits of a float64 as int64."""
+    """Reinterpret a float64 as int64."""
     del context, x
 
     def code(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
@@ -27,7 +27,7 @@ def _bits_of(context: Any, x: Any) -> Any:
 
 
 def _float_of(context: Any, x: Any) -> Any:
-    """The float64 of an int64's bits."""
+    """Reinterpret an int64 as float64."""
     del context, x
 
     def code(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
@@ -43,9 +43,9 @@ _float: Any = intrinsic(_float_of)
 
 @njit(cache=True, error_model="numpy", inline="always")
 def power(base: float, exponent: float) -> float:
-    """`base ** exponent` to a few units of the last place, for exponents from 0.05 to 10.
+    """Return `base ** exponent` to a few units in the last place, for exponents from 0.05 to 10.
 
-    What lies outside [1e-30, 1e30], zero, infinity and NaN among it, is returned as it is.
+    A base outside [1e-30, 1e30], such as zero, infinity and NaN, is returned unchanged.
     """
     x = base if LEAST_BASE < base < LARGEST_BASE else 1.0
     # x = 2^k z with z in [sqrt(1/2), sqrt(2)); log z = 2 atanh((z - 1) / (z + 1)).

@@ -1,9 +1,9 @@
-"""Compiled sigma points of n episodes: drawn around a mean, and gathered to mean and covariance.
+"""Compiled sigma points of n episodes, made from mean and covariance and summarised as these.
 
 With d_i the points' distances from the first one, d = W sum d_i and W the weight of all points
 but the first, the weighted covariance is `W sum d_i d_i' + (beta - alpha^2) d d'`: the large
-negative weights of the first point cancel, nothing is lost to rounding, and what the points say
-of a state and its measurement is a covariance by construction, projected or not.
+negative weights of the first point cancel without rounding errors, and the joint covariance of
+states and measurements is positive semidefinite by construction, also of projected points.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from dptse_env.utils.arrays import BoolArray, FloatArray
 class Points(NamedTuple):
     """Sigma points of n episodes."""
 
-    # (n, 2 S, width) projected points after the last motion [veh/km, veh/h]; the mean's image
-    # first, then pairs; columns beyond 4 S + 1 repeat the first
+    # (n, 2 S, width) projected points after the last prediction [veh/km, veh/h]: that of the mean,
+    # then pairs; columns beyond 4 S + 1 repeat the first
     states: FloatArray
     centres: FloatArray  # (n, 2 S) their weighted means, before any projection
-    moved: BoolArray  # (n,) whether they moved since they last took in a measurement
+    moved: BoolArray  # (n,) whether they were predicted since their last update
     weight: float  # W of every point but the first
     surplus: float  # beta - alpha^2
-    spread: float  # Points are the mean plus and minus spread times columns of a root of P
+    spread: float  # points are the mean plus and minus spread times columns of a root of P
 
 
 @njit(cache=True, error_model="numpy")

@@ -1,9 +1,8 @@
-"""The ARZ model for many states of one road at once: sigma points, members of an ensemble.
+"""The ARZ model for a batch of states of a road: sigma points, or members of an ensemble.
 
-The equations are those of `dptse_env.model.kernels` without derivatives. A states is stored by
-component, `(2 S, width)`, one column a state, so that every inner loop runs over contiguous
-memory without a branch and compiles to vector instructions. Columns beyond the states in use are
-computed along and must hold some state.
+The equations are those of `dptse_env.model.kernels` without derivatives. States are stored by
+component, `(2 S, width)`, a column each, so that every inner loop runs over contiguous memory
+without a branch and compiles to vector instructions. Padding columns must also be states.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from dptse_env.utils.arrays import FloatArray
 
 
 class BatchScratch(NamedTuple):
-    """Working space of `advance_states`, `(S, width)` each but the last."""
+    """Scratch space of `advance_states`, `(S, width)` each but the last."""
 
     w: FloatArray  # [km/h]
     speed: FloatArray  # [km/h]
@@ -34,7 +33,7 @@ class BatchScratch(NamedTuple):
 
 @njit(cache=True, error_model="numpy")
 def make_batch_scratch(road: RoadArrays, width: int) -> BatchScratch:
-    """Allocate the working space for a road and a states."""
+    """Allocate the scratch space for a road and a batch of states."""
     n = road.jam.size
     table = np.empty((5, n, width))
     return BatchScratch(table[0], table[1], table[2], table[3], table[4], np.empty((4, width)))
@@ -53,8 +52,8 @@ def _tabulate(
     root: FloatArray,
 ) -> None:
     """Write w, speed, demand and critical density over jam density of one cell."""
-    share, empty_below, one_more = gamma / (1.0 + gamma), VACUUM * jam, 1.0 + gamma
-    by_jam, by_w = 1.0 / jam, 1.0 / (one_more * v_f)
+    share, empty_below, factor = gamma / (1.0 + gamma), VACUUM * jam, 1.0 + gamma
+    by_jam, by_w = 1.0 / jam, 1.0 / (factor * v_f)
     for j in range(rho_row.size):
         rho = 0.0 if rho_row[j] < 0.0 else rho_row[j]
         psi = 0.0 if psi_row[j] < 0.0 else psi_row[j]
@@ -63,7 +62,7 @@ def _tabulate(
         w = v_f if is_empty else psi / rho
         v = w - p
         critical = power(w * by_w, 1.0 / gamma)
-        d = rho * v if one_more * p <= w else jam * critical * w * share
+        d = rho * v if factor * p <= w else jam * critical * w * share
         w_row[j] = w
         speed[j] = 0.0 if v < 0.0 else v
         demand[j] = 0.0 if is_empty else d
@@ -80,7 +79,7 @@ def _supplies(
     gamma: float,
     out: FloatArray,
 ) -> None:
-    """Write what a cell moving at `speed` takes in of drivers w [veh/h]."""
+    """Write the supply of a cell moving at `speed` for drivers w [veh/h]."""
     share, exponent, by_v_f = gamma / (1.0 + gamma), 1.0 / gamma, 1.0 / v_f
     congested = 0
     for j in range(w_row.size):
@@ -154,7 +153,7 @@ def _flow_out(road: RoadArrays, scratch: BatchScratch, c: int, inputs: FloatArra
 def _enter(
     road: RoadArrays, scratch: BatchScratch, c: int, inputs: FloatArray, states: FloatArray
 ) -> None:
-    """Add what enters a cell from outside; demand that is not served vanishes."""
+    """Add inflow from outside; demand that is not served is lost."""
     v_f, gamma = road.free_flow_speed, road.gamma
     source, w_in = inputs[road.entry[c]], inputs[road.entry[c] + 1]
     w, root, supply = scratch.row[0], scratch.row[1], scratch.row[2]
@@ -193,7 +192,7 @@ def _arrive(
 def advance_states(
     road: RoadArrays, states: FloatArray, inputs: FloatArray, scratch: BatchScratch
 ) -> None:
-    """Move every column of `states` `(2 S, width)` one step ahead under inputs `(n_u,)`."""
+    """Predict every column of `states` `(2 S, width)` one step ahead under inputs `(n_u,)`."""
     v_f, gamma, ratio = road.free_flow_speed, road.gamma, road.step_ratio
     for c in range(road.jam.size):
         _tabulate(
@@ -237,7 +236,7 @@ def _into_box(row: FloatArray, largest: float) -> None:
 
 @njit(cache=True, error_model="numpy")
 def project_states(road: RoadArrays, states: FloatArray, is_box: bool) -> None:
-    """Hold every column to its bounds, as `ARZModel.project` does; a NaN stays one."""
+    """Project every column into its bounds, as `ARZModel.project`; a NaN stays NaN."""
     v_f, gamma = road.free_flow_speed, road.gamma
     for c in range(road.jam.size):
         rho, psi, jam = states[2 * c], states[2 * c + 1], road.jam[c]
@@ -252,7 +251,7 @@ def project_states(road: RoadArrays, states: FloatArray, is_box: bool) -> None:
 def measured_speeds(
     rho_row: FloatArray, psi_row: FloatArray, jam: float, v_f: float, gamma: float, out: FloatArray
 ) -> None:
-    """Write the speeds [km/h] that a sensor sees, density floored as in `ARZModel.measure`."""
+    """Write the measured speeds [km/h], with floored density as in `ARZModel.measure`."""
     floor, by_jam = MEASUREMENT_FLOOR * jam, 1.0 / jam
     for j in range(rho_row.size):
         rho = floor if rho_row[j] < floor else rho_row[j]
@@ -263,7 +262,7 @@ def measured_speeds(
 def released_by_states(
     road: RoadArrays, s: int, rho_row: FloatArray, psi_row: FloatArray, out: FloatArray
 ) -> None:
-    """Write the speeds [km/h] or centred flows [veh/h] that a sensor sees; as `measure` does."""
+    """Write the measured speeds [km/h] or centred flows [veh/h], as `ARZModel.measure`."""
     jam, v_f, v_0 = road.jam[s], road.free_flow_speed, road.reference_speed
     if np.isnan(v_0):
         measured_speeds(rho_row, psi_row, jam, v_f, road.gamma, out)

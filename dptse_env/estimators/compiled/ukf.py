@@ -18,27 +18,25 @@ from dptse_env.utils.validation import require
 class CompiledUKF(CompiledFilter):
     """Unscented Kalman filter on the ARZ model (Wan and van der Merwe, 2000), paper's weights.
 
-    Points are drawn once a step, moved and projected one by one; mean, covariance and what is
-    measured are all computed from these same points, never redrawn. The step's process noise is
-    added to P after the points have moved, and first carried by those of the next step. Means
-    are projected after predict and update, too.
+    Points are made once per step, predicted and projected; mean, covariance and measurements are
+    all computed from these points, without new ones for the update. The step's process noise is
+    added to P after the prediction, so it affects the points of the next step. Means are also
+    projected after predict and update.
     """
 
     def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
         """See `make_estimator`."""
         super().__init__(model, n_episodes, settings)
         n_states = model.n_states
-        own = settings.ukf
-        require(
-            n_states + own.kappa > 0.0, "estimator_settings.ukf.kappa", f"> -{n_states}", own.kappa
-        )
-        spread = own.alpha**2 * (n_states + own.kappa)
+        alpha, beta, kappa = settings.ukf.alpha, settings.ukf.beta, settings.ukf.kappa
+        require(n_states + kappa > 0.0, "estimator_settings.ukf.kappa", f"> -{n_states}", kappa)
+        spread = alpha**2 * (n_states + kappa)
         self._points = Points(
             states=np.zeros((n_episodes, n_states, padded(2 * n_states + 1))),
             centres=np.zeros((n_episodes, n_states)),
             moved=np.zeros(n_episodes, dtype=np.bool_),
             weight=0.5 / spread,
-            surplus=own.beta - own.alpha**2,
+            surplus=beta - alpha**2,
             spread=float(np.sqrt(spread)),
         )
         self._points_packed = tuple(self._points)

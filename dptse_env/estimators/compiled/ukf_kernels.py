@@ -1,9 +1,10 @@
 """Compiled kernels of the unscented Kalman filter: a batch of episodes, one after the other.
 
-The points of a step carry the process noise of earlier steps, not its own: P gets Q after they
-have moved, and the next points are drawn from that. On a linear system this is the Kalman filter
-of x' = F (x + w), noise ahead of the motion. Adding the derivative's `H Q H'` to what is measured
-would put it behind; on recorded traffic that filter is no better, and much worse at small alpha.
+The points of a step include the process noise of earlier steps only: Q is added to P after their
+prediction, and the next points are made from that. On a linear system this is the Kalman filter of
+x' = F (x + w), with noise before the motion. Adding the derivative's `H Q H'` to the covariance of
+measurements would place it after the motion; on recorded traffic that filter is no better, and much
+worse at small alpha.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import numpy as np
 from numba import njit
 
 from dptse_env.estimators.compiled.algebra import is_covariance, mirror
-from dptse_env.estimators.compiled.dense import eliminate, factor, products
+from dptse_env.estimators.compiled.dense import eliminate, products
 from dptse_env.estimators.compiled.ekf_kernels import Filters, Packed, project, restart
 from dptse_env.estimators.compiled.sigma_points import (
     Points,
@@ -36,7 +37,7 @@ from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 def predict(
     road_: Packed, filters_: Packed, points_: Packed, episodes: IntArray, inputs: FloatArray
 ) -> None:
-    """Move episodes one step ahead: draw points, move and project them, then mean and P."""
+    """Predict one step ahead by points, which are made, predicted and projected."""
     road, filters, points = RoadArrays(*road_), Filters(*filters_), Points(*points_)
     n, width = points.states.shape[1:]
     scratch, distances = make_batch_scratch(road, width), np.empty((n, width))
@@ -46,8 +47,8 @@ def predict(
         e = episodes[k]
         mean, covariance, states = filters.means[e], filters.covariances[e], points.states[e]
         root[:] = covariance
-        if not factor(root, n):
-            mean[:] = np.nan  # the update finds it and starts over
+        if not eliminate(root, n, filters.covariances.shape[2]):
+            mean[:] = np.nan  # detected by the update, which resets the filter
         draw(mean, root, points.spread, scale, states)
         advance_states(road, states, inputs[k], scratch)
         project_states(road, states, filters.is_box)
@@ -60,7 +61,7 @@ def predict(
 
 
 class Outputs(NamedTuple):
-    """Working space of `update`: what is measured, m numbers, densities first."""
+    """Scratch space of `update`, for m measured numbers, densities first."""
 
     distances: FloatArray  # (2 S, width) of the points, normalised
     outputs: FloatArray  # (S, width) distances of the speeds, or flows, measured
@@ -82,7 +83,7 @@ def update(
     values: FloatArray,
     sigma: FloatArray,
 ) -> None:
-    """Take in measurements; see `Estimator.update`."""
+    """Update by measurements; see `Estimator.update`."""
     road, filters, points = RoadArrays(*road_), Filters(*filters_), Points(*points_)
     n, width = points.states.shape[1:]
     padded = filters.covariances.shape[2]
@@ -106,7 +107,7 @@ def update(
         if n_seen > 0:
             if not points.moved[e]:
                 sound = _stay(road, filters, points, e, scale, work)
-            sound = sound and _take_in(
+            sound = sound and _update_episode(
                 road, filters, points, e, segments[:n_seen], values[k], noise, scale, work
             )
             points.moved[e] = False
@@ -123,11 +124,11 @@ def update(
 def _stay(
     road: RoadArrays, filters: Filters, points: Points, e: int, scale: FloatArray, work: Outputs
 ) -> bool:
-    """Draw points where nothing has moved since the last measurement: a motion by nothing."""
+    """Make points without a prediction, after another update in the same step."""
     n = filters.means.shape[1]
     covariance, root = filters.covariances[e], work.cross
     root[:] = covariance
-    if not factor(root, n):
+    if not eliminate(root, n, filters.covariances.shape[2]):
         return False
     draw(filters.means[e], root, points.spread, scale, points.states[e])
     project_states(road, points.states[e], filters.is_box)
@@ -136,7 +137,7 @@ def _stay(
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _take_in(
+def _update_episode(
     road: RoadArrays,
     filters: Filters,
     points: Points,
@@ -176,7 +177,7 @@ def _take_in(
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _reduce(joint: FloatArray, width: int, start: int, covariance: FloatArray) -> None:
-    """Take V' V from the lower half of the covariance, two rows of V at a time."""
+    """Subtract V' V from the lower half of the covariance, two rows of V at a time."""
     n = covariance.shape[0]
     for r in range(0, width - width % 2, 2):
         first, second = joint[r, start : start + n + 2], joint[r + 1, start : start + n + 2]
@@ -199,9 +200,9 @@ def _measure(
     scale: FloatArray,
     work: Outputs,
 ) -> None:
-    """Write the outputs' covariance S, theirs with the states, and the residuals to `joint`.
+    """Write the covariance S of outputs, theirs with the states, and the residuals to `joint`.
 
-    Densities among themselves: the covariance of the points is P less the step's process noise.
+    The densities' covariance in the points is P less the step's process noise.
     """
     n, m = filters.means.shape[1], segments.size
     start = (2 * m + 7) // 8 * 8

@@ -1,10 +1,9 @@
-"""Compiled algebra of one window: the gradient, factor and inverse of its block-tridiagonal H.
+"""Compiled algebra of a window: gradient, factor and inverse of its block-tridiagonal H.
 
 H is the inverse covariance of a chain of states, so its block factorisation in the order of time
-is a Kalman filter's forward pass: the filtered covariances are the inverses of the pivots that
-the past leaves. With them H d = r takes a sweep forwards and one backwards (the smoother of
-Bryson and Frazier, 1963), which invert nothing. All quantities are normalised, vectors and rows
-are padded as in `algebra`.
+is a Kalman filter's forward pass: the filtered covariances are the inverses of the pivots. With
+them H d = r takes a forward and a backward sweep (the smoother of Bryson and Frazier, 1963) without
+further inverses. All quantities are normalised; vectors and rows are padded as in `algebra`.
 """
 
 from __future__ import annotations
@@ -36,13 +35,13 @@ class Chain(NamedTuple):
     # (>= L, S, 2) derivatives of the second release, speed or flow, by the segment's rho and
     # psi
     rows: FloatArray
-    constants: FloatArray  # (>= L, S) what that is, linearised, at a state of zero
+    constants: FloatArray  # (>= L, S) constant of the linearised second release
     values: FloatArray  # (>= L, S, 2) density, and speed or flow
     noise: FloatArray  # (>= L, 2) variances
 
 
 class WindowScratch(NamedTuple):
-    """Working scratch for windows of up to L stages."""
+    """Scratch space for windows of up to L stages."""
 
     factors: FloatArray  # (L, 2 S, padded) filtered covariances
     before: FloatArray  # (2 S, padded) the last one without its stage's measurements
@@ -54,7 +53,7 @@ class WindowScratch(NamedTuple):
 
 @njit(cache=True, error_model="numpy")
 def make_window_scratch(n_stages: int, n_segments: int, width: int) -> WindowScratch:
-    """Allocate the working scratch."""
+    """Allocate the scratch space."""
     n = 2 * n_segments
     return WindowScratch(
         np.zeros((n_stages, n, width)),
@@ -68,7 +67,7 @@ def make_window_scratch(n_stages: int, n_segments: int, width: int) -> WindowScr
 
 @njit(cache=True, error_model="numpy")
 def factorise(road: RoadArrays, chain: Chain, n_stages: int, scratch: WindowScratch) -> bool:
-    """Filter covariances through the window; returns whether all variances were sound."""
+    """Filter covariances through the window; return whether all variances are sound."""
     n, width = scratch.before.shape
     row, shift, work = np.zeros(4), np.zeros(width), scratch_vectors(width)
     for t in range(n_stages):
@@ -101,7 +100,7 @@ def factorise(road: RoadArrays, chain: Chain, n_stages: int, scratch: WindowScra
 
 @njit(cache=True, error_model="numpy")
 def _inform(road: RoadArrays, chain: Chain, n_stages: int, scratch: WindowScratch) -> None:
-    """Write the measurements' blocks of H and its diagonal."""
+    """Write the blocks of H from measurements, and its diagonal."""
     w = 1.0 / chain.process_variance
     for t in range(n_stages):
         diagonal = scratch.diagonal[t]
@@ -171,8 +170,8 @@ def solve(
 ) -> None:
     """Write H^-1 r `(L, padded)` of an r whose stages before `first` are zero.
 
-    Forwards m = A m_before + P (r - C'C/R A m_before) as a filter's mean; backwards, with the
-    costate a = A' l of the stage after, d = m + P a and l = r - C'C/R d + a.
+    Forwards, m = A m_before + P (r - C'C/R A m_before), like a filter's mean; backwards, with the
+    costate a = A' l of the next stage, d = m + P a and l = r - C'C/R d + a.
     """
     mean, change, costate, slope = scratch.sweep
     width = mean.size
@@ -190,7 +189,7 @@ def solve(
         _move_back(road, chain.blocks[t], costate, slope)
         _add_product(scratch.factors[t], slope, out[t])
         _weigh(scratch.information[t], out[t], right[t], costate)
-        if t < first:  # what `right` holds there is not part of r
+        if t < first:  # r is zero there, whatever `right` is
             _weigh(scratch.information[t], out[t], np.zeros(width), costate)
         for i in range(width):
             costate[i] += slope[i]

@@ -1,30 +1,27 @@
-"""The extended Kalman filter on filterpy: what the compiled one is checked against."""
+"""Extended Kalman filter by filterpy, a reference for the compiled one."""
 
 from __future__ import annotations
 
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 
-from dptse_env.estimators.reference.kalman import EpisodeFilter, ReferenceFilter, linearise
+from dptse_env.estimators.reference.kalman import (
+    EpisodeFilter,
+    ReferenceFilter,
+    configure,
+    linearise,
+)
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
 from dptse_env.utils.arrays import BoolArray, FloatArray
 
 
 class _Filter(ExtendedKalmanFilter):  # type: ignore[misc]
-    """One episode's filter in normalised units; filterpy's equations, the ARZ model's motion."""
+    """Filter of an episode in normalised units: filterpy's equations with the ARZ model."""
 
     def __init__(self, model: ARZModel, settings: EstimatorSettings) -> None:
         super().__init__(dim_x=model.n_states, dim_z=2 * model.n_segments)
-        self.model = model
-        self.bounds = settings.bounds
-        rho_m, v_f = model.density_scale, model.speed_scale
-        self.scale = np.tile([rho_m, rho_m * v_f], model.n_segments)
-        self.measurement_scale = model.measurement_scale
-        self.Q = np.diag(np.tile(np.square(settings.process_noise), model.n_segments))
-        self.prior = np.zeros(model.n_states)
-        self.prior_covariance = settings.initial_variance * np.eye(model.n_states)
-        self.restart()
+        configure(self, model, settings)
 
     @property
     def state(self) -> FloatArray:
@@ -40,17 +37,17 @@ class _Filter(ExtendedKalmanFilter):  # type: ignore[misc]
         self.P = self.prior_covariance.copy()
 
     def predict_x(self, u: FloatArray) -> None:
-        """Replace filterpy's linear motion by the model's."""
+        """Predict by the ARZ model instead of a matrix."""
         before, inputs = self.state, u[None]
         jacobian = self.model.jacobian(before, inputs)[0]
         self.F = jacobian * self.scale[None] / self.scale[:, None]
         self.state = self.model.step(before, inputs)
 
-    def move(self, u: FloatArray) -> None:
+    def advance(self, u: FloatArray) -> None:
         self.predict(u)
 
-    def take_in(self, observed: BoolArray, values: FloatArray, sigma: FloatArray) -> FloatArray:
-        """Update by the observed segments; returns their normalised innovations `(m, 2)`."""
+    def assimilate(self, observed: BoolArray, values: FloatArray, sigma: FloatArray) -> FloatArray:
+        """See `EpisodeFilter.assimilate`."""
         if not observed.any():
             return np.zeros((0, 2))
         predicted = self.model.measure(self.state)[0] / self.measurement_scale
@@ -63,7 +60,7 @@ class _Filter(ExtendedKalmanFilter):  # type: ignore[misc]
 
 
 class ReferenceEKF(ReferenceFilter):
-    """Extended Kalman filter on the ARZ model by filterpy, one filter an episode."""
+    """Extended Kalman filter on the ARZ model by filterpy, a filter per episode."""
 
     def _filter(self) -> EpisodeFilter:
         return _Filter(self.model, self.settings)

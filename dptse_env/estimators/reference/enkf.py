@@ -1,7 +1,7 @@
-"""The ensemble Kalman filter in plain numpy: what the compiled one is checked against.
+"""Ensemble Kalman filter in numpy, a reference for the compiled one.
 
-filterpy's `EnsembleKalmanFilter` cannot serve: it draws from numpy's global generator, fixes the
-number of outputs when it is built and moves members one by one.
+filterpy's `EnsembleKalmanFilter` is not suitable: it draws from numpy's global generator, has a
+fixed number of outputs and predicts members one by one.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 
 
 class _Streams(NamedTuple):
-    """Generators of one episode; measurements do not change how members are disturbed."""
+    """Generators of an episode, separate so that measurements do not change the process noise."""
 
     process: np.random.Generator
     measurement: np.random.Generator
@@ -30,7 +30,7 @@ class _Streams(NamedTuple):
 class ReferenceEnKF(BatchEstimator):
     """Ensemble Kalman filter with perturbed observations (Evensen, 2003; Burgers et al., 1998).
 
-    Equal to `CompiledEnKF` in distribution; it draws other numbers.
+    Equal to `CompiledEnKF` in distribution; its random numbers differ.
 
     Attributes:
         members: `(n, M, 2 S)` [veh/km, veh/h].
@@ -39,10 +39,10 @@ class ReferenceEnKF(BatchEstimator):
     def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
         """See `make_estimator`."""
         super().__init__(model, n_episodes, settings)
-        own = settings.enkf
-        self.n_members, self._inflation = own.n_members, own.inflation
+        enkf = settings.enkf
+        self.n_members, self._inflation = enkf.n_members, enkf.inflation
         everywhere = np.ones((model.n_segments, model.n_segments))
-        self._tapers = everywhere if own.taper is None else tapers(model.network, own.taper)
+        self._tapers = everywhere if enkf.taper is None else tapers(model.network, enkf.taper)
         rho_m, v_f = model.density_scale, model.speed_scale
         self._state_unit = np.tile([rho_m, rho_m * v_f], model.n_segments)
         self._output_unit = model.measurement_scale
@@ -60,13 +60,13 @@ class ReferenceEnKF(BatchEstimator):
 
     @property
     def covariances(self) -> FloatArray:
-        """Of the members, `(n, 2 S, 2 S)`, rho normalised by rho_m and psi by rho_m v_f."""
+        """Sample covariances `(n, 2 S, 2 S)`, rho normalised by rho_m and psi by rho_m v_f."""
         rest = (self.members - self.states[:, None]) / self._state_unit
         return np.asarray(rest.swapaxes(1, 2) @ rest / (self.n_members - 1))
 
     def estimate(self) -> Estimate:
-        """Current estimate of all episodes: of the mean, and how the members spread."""
-        # Both sets of bounds are convex: the projection takes nothing but rounding from a mean.
+        """Current estimate of all episodes: the mean, and the deviations of the members."""
+        # Both sets of bounds are convex: the projection removes rounding errors of the mean.
         mean = self.model.traffic(self._projected(self.states))
         spread = self.model.traffic(self.members).std(axis=1, ddof=1)
         speed = np.clip(mean[..., 1], 0.0, self.model.largest_speed)
@@ -83,9 +83,9 @@ class ReferenceEnKF(BatchEstimator):
     def _restart(self, episode: int) -> None:
         """Draw the members of one episode around its prior."""
         prior = np.repeat(self._priors[episode, None], self.n_members, axis=0)
-        self.members[episode] = self._disturbed(episode, prior, self._initial_deviation)
+        self.members[episode] = self._perturbed(episode, prior, self._initial_deviation)
 
-    def _disturbed(self, episode: int, members: FloatArray, deviation: FloatArray) -> FloatArray:
+    def _perturbed(self, episode: int, members: FloatArray, deviation: FloatArray) -> FloatArray:
         noise = self._streams[episode].process.standard_normal(members.shape)
         return self._projected(members + deviation * noise)
 
@@ -93,13 +93,13 @@ class ReferenceEnKF(BatchEstimator):
         return self.model.project(members, self.settings.bounds)
 
     def _predict(self, episodes: IntArray, inputs: FloatArray) -> None:
-        """Move all members of all episodes at once, then disturb them."""
-        with np.errstate(all="ignore"):  # what overflows here is found by the update
+        """Predict all members of all episodes at once, then add process noise."""
+        with np.errstate(all="ignore"):  # the update detects overflows
             states = self.members[episodes].reshape(-1, self.model.n_states)
             moved = self.model.step(states, np.repeat(inputs, self.n_members, axis=0))
             shape = (self.n_members, self.model.n_states)
             for episode, members in zip(episodes.tolist(), moved.reshape(-1, *shape), strict=True):
-                self.members[episode] = self._disturbed(episode, members, self._process_deviation)
+                self.members[episode] = self._perturbed(episode, members, self._process_deviation)
 
     def _update(self, given: Measurements) -> None:
         with np.errstate(all="ignore"):
@@ -115,7 +115,7 @@ class ReferenceEnKF(BatchEstimator):
         sound = True
         if observed.any():
             try:
-                self.innovations[episode, observed] = self._take_in(
+                self.innovations[episode, observed] = self._assimilate(
                     episode, observed, values[observed], sigma
                 )
             except LinAlgError:  # something is not finite, or S not definite
@@ -125,10 +125,10 @@ class ReferenceEnKF(BatchEstimator):
             self.innovations[episode] = 0.0
             self._restart(episode)
 
-    def _take_in(
+    def _assimilate(
         self, episode: int, observed: BoolArray, values: FloatArray, sigma: FloatArray
     ) -> FloatArray:
-        """Move members by measurements `(m, 2)`; returns their normalised innovations."""
+        """Update members by measurements `(m, 2)`; return their normalised innovations."""
         members = self.members[episode]
         if self._inflation != 1.0:
             mean = members.mean(axis=0)
@@ -138,8 +138,8 @@ class ReferenceEnKF(BatchEstimator):
         mean, noise = outputs.mean(axis=0), np.tile(sigma / self._output_unit, len(values))
         states, rest = members - members.mean(axis=0), outputs - mean
         segment = np.repeat(np.flatnonzero(observed), 2)
-        everything = np.repeat(np.arange(self.model.n_segments), 2)
-        cross = states.T @ rest / (self.n_members - 1) * self._tapers[np.ix_(everything, segment)]
+        segments = np.repeat(np.arange(self.model.n_segments), 2)
+        cross = states.T @ rest / (self.n_members - 1) * self._tapers[np.ix_(segments, segment)]
         joint = rest.T @ rest / (self.n_members - 1) * self._tapers[np.ix_(segment, segment)]
         joint += np.diag(noise**2)
         if not (np.isfinite(joint).all() and np.isfinite(values).all()):

@@ -1,11 +1,11 @@
-"""What the reference filters share: one filter an episode, its soundness and its summary."""
+"""Base class of reference filters: a filter per episode, with its checks and its summary."""
 
 from __future__ import annotations
 
 import warnings
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from scipy.linalg import LinAlgError, LinAlgWarning
@@ -19,7 +19,7 @@ from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 
 
 class EpisodeFilter(Protocol):
-    """One episode's filter, normalised: rho by rho_m, psi by rho_m v_f, releases by their units."""
+    """Filter of an episode, normalised: rho by rho_m, psi by rho_m v_f, releases by their units."""
 
     x: FloatArray
     P: FloatArray
@@ -32,45 +32,60 @@ class EpisodeFilter(Protocol):
         """Mean `(1, 2 S)` in physical units."""
 
     def restart(self) -> None:
-        """Go back to the prior."""
+        """Reset to the prior."""
 
-    def move(self, u: FloatArray) -> None:
+    def advance(self, u: FloatArray) -> None:
         """Predict one step under inputs `(n_u,)`."""
 
-    def take_in(self, observed: BoolArray, values: FloatArray, sigma: FloatArray) -> FloatArray:
-        """Update by the observed segments; returns their normalised innovations `(m, 2)`."""
+    def assimilate(self, observed: BoolArray, values: FloatArray, sigma: FloatArray) -> FloatArray:
+        """Update by the observed segments; return their normalised innovations `(m, 2)`."""
 
 
-def is_sound(one: EpisodeFilter) -> bool:
-    """Whether the mean is finite and no variance is negative and no correlation above one."""
-    if not (np.isfinite(one.x).all() and np.isfinite(one.P).all()):
+def is_sound(episode_filter: EpisodeFilter) -> bool:
+    """Return whether mean and variances are valid and no correlation is above one."""
+    if not (np.isfinite(episode_filter.x).all() and np.isfinite(episode_filter.P).all()):
         return False
-    variance = np.diag(one.P)
+    variance = np.diag(episode_filter.P)
     allowed = (1.0 + 1e-9) * np.outer(variance, variance) + 1e-24
-    return bool(np.all(variance >= 0.0) and np.all(allowed >= one.P**2))
+    return bool(np.all(variance >= 0.0) and np.all(allowed >= episode_filter.P**2))
 
 
-def linearise(model: ARZModel, one: EpisodeFilter, observed: BoolArray) -> FloatArray:
-    """Jacobian `(m, 2 S)` at the mean of what the observed segments measure, normalised."""
-    blocks = model.measurement_jacobian(one.x[None] * one.scale)[0]
+def linearise(model: ARZModel, episode_filter: EpisodeFilter, observed: BoolArray) -> FloatArray:
+    """Return the normalised Jacobian `(m, 2 S)` of the observed segments' measurements."""
+    blocks = model.measurement_jacobian(episode_filter.x[None] * episode_filter.scale)[0]
     jacobian = np.zeros((model.n_segments, 2, model.n_states))
     for s in range(model.n_segments):
         jacobian[s, :, 2 * s : 2 * s + 2] = blocks[s]
-    jacobian *= one.scale / one.measurement_scale[:, None]
+    jacobian *= episode_filter.scale / episode_filter.measurement_scale[:, None]
     return np.asarray(jacobian[observed].reshape(-1, model.n_states))
 
 
-def traffic_variance(model: ARZModel, one: EpisodeFilter) -> FloatArray:
-    """Variances `(S, 2)` of density [veh/km] and speed [km/h] that a covariance implies."""
-    jacobian = model.traffic_jacobian(one.x[None] * one.scale)[0] * one.scale[:2]
-    own = one.P.reshape(model.n_segments, 2, model.n_segments, 2)
-    blocks = own[np.arange(model.n_segments), :, np.arange(model.n_segments)]
+def traffic_variance(model: ARZModel, episode_filter: EpisodeFilter) -> FloatArray:
+    """Return the variances `(S, 2)` of density [veh/km] and speed [km/h]."""
+    jacobian = (
+        model.traffic_jacobian(episode_filter.x[None] * episode_filter.scale)[0]
+        * episode_filter.scale[:2]
+    )
+    joint = episode_filter.P.reshape(model.n_segments, 2, model.n_segments, 2)
+    blocks = joint[np.arange(model.n_segments), :, np.arange(model.n_segments)]
     variance = np.einsum("sij,sjk,sik->si", jacobian, blocks, jacobian)
     return np.asarray(np.maximum(variance, 0.0))
 
 
+def configure(episode_filter: Any, model: ARZModel, settings: EstimatorSettings) -> None:
+    """Set the scales, noise and prior of a filter of filterpy, and reset it to a prior of zero."""
+    rho_m, v_f = model.density_scale, model.speed_scale
+    episode_filter.model, episode_filter.bounds = model, settings.bounds
+    episode_filter.scale = np.tile([rho_m, rho_m * v_f], model.n_segments)
+    episode_filter.measurement_scale = model.measurement_scale
+    episode_filter.Q = np.diag(np.tile(np.square(settings.process_noise), model.n_segments))
+    episode_filter.prior = np.zeros(model.n_states)
+    episode_filter.prior_covariance = settings.initial_variance * np.eye(model.n_states)
+    episode_filter.restart()
+
+
 class ReferenceFilter(BatchEstimator):
-    """A batch of filters, one an episode."""
+    """A batch of filters, one per episode."""
 
     def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
         """See `make_estimator`."""
@@ -79,22 +94,24 @@ class ReferenceFilter(BatchEstimator):
 
     @abstractmethod
     def _filter(self) -> EpisodeFilter:
-        """Make the filter of one episode."""
+        """Make the filter of an episode."""
 
     @property
     def states(self) -> FloatArray:
         """Means `(n, 2 S)` [veh/km, veh/h]."""
-        return np.concatenate([one.state for one in self._filters])
+        return np.concatenate([episode_filter.state for episode_filter in self._filters])
 
     @property
     def covariances(self) -> FloatArray:
         """Covariances `(n, 2 S, 2 S)`, rho normalised by rho_m and psi by rho_m v_f."""
-        return np.stack([one.P for one in self._filters])
+        return np.stack([episode_filter.P for episode_filter in self._filters])
 
     def estimate(self) -> Estimate:
         """Current estimate of all episodes."""
         density, speed = estimated_traffic(self.model, self.states)
-        deviation = np.sqrt([traffic_variance(self.model, one) for one in self._filters])
+        deviation = np.sqrt(
+            [traffic_variance(self.model, episode_filter) for episode_filter in self._filters]
+        )
         return Estimate(density, speed, deviation[..., 0].copy(), deviation[..., 1].copy())
 
     def _reset(
@@ -106,11 +123,11 @@ class ReferenceFilter(BatchEstimator):
             self._filters[episode].restart()
 
     def _predict(self, episodes: IntArray, inputs: FloatArray) -> None:
-        with np.errstate(all="ignore"):  # what overflows here is found by the update
+        with np.errstate(all="ignore"):  # the update detects overflows
             for episode, u in zip(episodes.tolist(), inputs, strict=True):
                 try:
-                    self._filters[episode].move(u)
-                except LinAlgError:  # no root of P; the update finds it and starts over
+                    self._filters[episode].advance(u)
+                except LinAlgError:  # no root of P; the update resets the filter
                     self._filters[episode].x[:] = np.nan
 
     def _update(self, given: Measurements) -> None:
@@ -124,16 +141,18 @@ class ReferenceFilter(BatchEstimator):
     def _update_one(
         self, episode: int, observed: BoolArray, values: FloatArray, sigma: FloatArray
     ) -> None:
-        one = self._filters[episode]
+        episode_filter = self._filters[episode]
         self.innovations[episode] = 0.0
-        sound = is_sound(one) and bool(np.isfinite(values[observed]).all())
+        sound = is_sound(episode_filter) and bool(np.isfinite(values[observed]).all())
         if sound:
             try:
-                self.innovations[episode, observed] = one.take_in(observed, values, sigma)
-                sound = is_sound(one)
-            except (LinAlgError, LinAlgWarning):  # no inverse to be had, or none to be trusted
+                self.innovations[episode, observed] = episode_filter.assimilate(
+                    observed, values, sigma
+                )
+                sound = is_sound(episode_filter)
+            except (LinAlgError, LinAlgWarning):  # no inverse, or an inaccurate one
                 sound = False
         self.diverged[episode] = not sound
         if not sound:
-            one.restart()
+            episode_filter.restart()
             self.innovations[episode] = 0.0

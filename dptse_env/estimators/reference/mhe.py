@@ -1,4 +1,4 @@
-"""Moving horizon estimation by a general solver: what the compiled one is checked against."""
+"""Moving horizon estimation by a general solver, a reference for the compiled one."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from dptse_env.estimators.horizon import (
     assemble,
     measurement_matrix,
     normalised_bounds,
-    own_settings,
     process_variance,
+    settings_of_mhe,
     solve,
 )
 from dptse_env.estimators.reference.kalman import EpisodeFilter, ReferenceFilter
@@ -25,7 +25,7 @@ from dptse_env.utils.arrays import BoolArray, FloatArray
 
 @dataclass
 class _Stage:
-    """One time of the window, normalised; the transition leads to the next one."""
+    """Stage of the window, normalised, with the transition to the next one."""
 
     predicted: FloatArray  # (2 S,)
     solution: FloatArray  # (2 S,)
@@ -41,18 +41,18 @@ class _Stage:
 
 
 class _EpisodeWindow:
-    """One episode: its window and its estimate, the last state's mean and covariance.
+    """Window of an episode and its estimate, mean and covariance of the last state.
 
-    The covariance is that of the last update; a prediction leaves it alone.
+    The covariance is that of the last update; predictions do not change it.
     """
 
     def __init__(self, model: ARZModel, settings: EstimatorSettings) -> None:
-        self.model, self.settings, self.own = model, settings, settings.mhe
+        self.model, self.settings, self.mhe = model, settings, settings.mhe
         rho_m, v_f = model.density_scale, model.speed_scale
         self.scale = np.tile([rho_m, rho_m * v_f], model.n_segments)
         self.measurement_scale = model.measurement_scale
         self.process_variance = process_variance(settings)
-        self.bounds = normalised_bounds(model, self.own.bounds)
+        self.bounds = normalised_bounds(model, self.mhe.bounds)
         self.prior = np.zeros(model.n_states)
         self.restart()
 
@@ -65,75 +65,75 @@ class _EpisodeWindow:
 
     @state.setter
     def state(self, state: FloatArray) -> None:
-        self.x = self.model.project(state, self.own.bounds)[0] / self.scale
+        self.x = self.model.project(state, self.mhe.bounds)[0] / self.scale
 
     def restart(self) -> None:
-        """Begin a window of one stage at the prior."""
+        """Reset to a window of a single stage, the prior."""
         self.state, self.unsolved = self.prior[None], False
         self.P = self.settings.initial_variance * np.eye(self.model.n_states)
         self.arrival_variance = np.full(2, self.settings.initial_variance)
         self.stages = [self._stage()]
         self._linearise_measurement(self.stages[0], self.x)
 
-    def move(self, inputs: FloatArray) -> None:
-        """Append a stage, the model's prediction, and drop the oldest of a full window."""
+    def advance(self, inputs: FloatArray) -> None:
+        """Append the model's prediction as a stage, and drop the oldest one of a full window."""
         mean = np.mean([stage.solution for stage in self.stages], axis=0)
         before = self.stages[-1]
         before.inputs = inputs
         self.state = self.model.step(self.model.project(self.state), inputs[None])
         self.stages.append(self._stage())
-        if self.own.linearisation == "paper":
+        if self.mhe.linearisation == "paper":
             self._linearise_step(before, mean)
             self._linearise_measurement(self.stages[-1], mean)
-        if len(self.stages) > self.own.horizon + 1:
+        if len(self.stages) > self.mhe.horizon + 1:
             self.stages.pop(0)
-            self.arrival_variance[:] = [one**2 for one in self.own.arrival_noise]
+            self.arrival_variance[:] = np.square(self.mhe.arrival_noise)
 
-    def take_in(self, observed: BoolArray, values: FloatArray, sigma: FloatArray) -> FloatArray:
-        """Estimate the window with the newest stage's measurements; returns their innovations."""
+    def assimilate(self, observed: BoolArray, values: FloatArray, sigma: FloatArray) -> FloatArray:
+        """Update by measurements of the last stage; return their normalised innovations."""
         stage, self.unsolved = self.stages[-1], False
         stage.observed = observed
         stage.values = np.where(observed[:, None], values, 0.0) / self.measurement_scale
         stage.noise = np.square(np.maximum(sigma / self.measurement_scale, LEAST_DEVIATION))
-        if self.own.linearisation == "trajectory":
-            for one in self.stages:
-                self._linearise_measurement(one, one.solution)
-                if one is not stage:
-                    self._linearise_step(one, one.solution)
+        if self.mhe.linearisation == "trajectory":
+            for earlier in self.stages:
+                self._linearise_measurement(earlier, earlier.solution)
+                if earlier is not stage:
+                    self._linearise_step(earlier, earlier.solution)
         H, q = assemble(self.window())
         n = self.model.n_states
         self.P = np.asarray(np.linalg.solve(H, np.eye(len(H))[:, -n:])[-n:], dtype=np.float64)
         innovations = self._innovations()
         if observed.any():  # else the prediction stands
             lower, upper = (np.tile(bound, len(self.stages)) for bound in self.bounds)
-            z = solve(H, q, lower, upper, self.own.solver)
+            z = solve(H, q, lower, upper, self.mhe.solver)
             self.unsolved = z is None
             if z is not None:
-                for one, solution in zip(self.stages, z.reshape(-1, n), strict=True):
-                    one.solution = solution
+                for earlier, solution in zip(self.stages, z.reshape(-1, n), strict=True):
+                    earlier.solution = solution
                 self.state = (z[-n:] * self.scale)[None]
         return innovations
 
     def window(self) -> Window:
-        """The linearised problem as arrays."""
+        """Return the linearised problem as arrays."""
         stages = self.stages
         n = self.model.n_states
-        targets = np.stack([one.values for one in stages])
-        targets[..., 1] -= np.stack([one.c_2 for one in stages])
+        targets = np.stack([stage.values for stage in stages])
+        targets[..., 1] -= np.stack([stage.c_2 for stage in stages])
         return Window(
             arrival=stages[0].predicted,
             arrival_variance=self.arrival_variance,
-            transitions=np.array([one.A for one in stages[:-1]]).reshape(-1, n, n),
-            offsets=np.array([one.c_1 for one in stages[:-1]]).reshape(-1, n),
+            transitions=np.array([stage.A for stage in stages[:-1]]).reshape(-1, n, n),
+            offsets=np.array([stage.c_1 for stage in stages[:-1]]).reshape(-1, n),
             process_variance=self.process_variance,
-            observed=np.stack([one.observed for one in stages]),
-            rows=np.stack([one.rows for one in stages]),
+            observed=np.stack([stage.observed for stage in stages]),
+            rows=np.stack([stage.rows for stage in stages]),
             targets=targets,
-            noise=np.stack([one.noise for one in stages]),
+            noise=np.stack([stage.noise for stage in stages]),
         )
 
     def _innovations(self) -> FloatArray:
-        """Residuals `(m, 2)` at the prediction, over the deviations that the window expects."""
+        """Return residuals `(m, 2)` at the prediction over their predicted deviations."""
         stage = self.stages[-1]
         C = measurement_matrix(stage.observed, stage.rows)
         R = np.tile(stage.noise, len(C) // 2)
@@ -148,7 +148,7 @@ class _EpisodeWindow:
         return _Stage(self.x, self.x, nothing, np.zeros((n_segments, 2)), np.ones(2))
 
     def _linearise_step(self, stage: _Stage, point: FloatArray) -> None:
-        """A and B u + c_1 at the physical state nearest to a point."""
+        """Set A and B u + c_1 at the physical state nearest to a point."""
         state = self.model.project((point * self.scale)[None])
         inputs = stage.inputs[None]
         stage.A = self.model.jacobian(state, inputs)[0] * self.scale / self.scale[:, None]
@@ -156,7 +156,7 @@ class _EpisodeWindow:
         stage.c_1 = after - stage.A @ (state[0] / self.scale)
 
     def _linearise_measurement(self, stage: _Stage, point: FloatArray) -> None:
-        """The second output's rows of C and its c_2 at the physical state nearest to a point."""
+        """Set the second output's rows of C and c_2 at the physical state nearest to a point."""
         state = self.model.project((point * self.scale)[None])
         unit = self.measurement_scale[1]
         by_state = self.model.measurement_jacobian(state)[0, :, 1]
@@ -166,20 +166,20 @@ class _EpisodeWindow:
 
 
 class ReferenceMHE(ReferenceFilter):
-    """Moving horizon estimation (paper, eq. 14 to 17) by qpsolvers, one window an episode.
+    """Moving horizon estimation (paper, eq. 14 to 17) by qpsolvers, a window per episode.
 
-    The standard deviations are those of the last block of H's inverse: the last state's
-    covariance given the window, bounds left aside. The model is linearised, and predicts, from
-    the nearest state in the cone: in the paper's box w has no bound and the model none either.
+    Standard deviations are those of the last block of H's inverse: the last state's covariance
+    given the window, without bounds. The model is linearised, and predicts, at the nearest state
+    in the cone, since in the paper's box w is unbounded.
     """
 
     def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
         """See `make_estimator`."""
         self._windows: list[_EpisodeWindow] = []
-        super().__init__(model, n_episodes, own_settings(settings))
+        super().__init__(model, n_episodes, settings_of_mhe(settings))
 
     def window(self, episode: int) -> Window:
-        """The linearised problem of one episode, as `assemble` takes it."""
+        """Return the linearised problem of an episode, for `assemble`."""
         return self._windows[episode].window()
 
     def _filter(self) -> EpisodeFilter:

@@ -1,18 +1,18 @@
-"""The unscented Kalman filter on filterpy: what the compiled one is checked against."""
+"""Unscented Kalman filter by filterpy, a reference for the compiled one."""
 
 from __future__ import annotations
 
 import numpy as np
 from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter, unscented_transform
 
-from dptse_env.estimators.reference.kalman import EpisodeFilter, ReferenceFilter
+from dptse_env.estimators.reference.kalman import EpisodeFilter, ReferenceFilter, configure
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
 from dptse_env.utils.arrays import BoolArray, FloatArray
 
 
 class _Points(MerweScaledSigmaPoints):  # type: ignore[misc]
-    """Sigma points that `predict` draws once: the second call in a step gives the moved ones."""
+    """Sigma points made by `predict`; the second call in a step returns the predicted ones."""
 
     moved: FloatArray | None = None
 
@@ -24,44 +24,28 @@ class _Points(MerweScaledSigmaPoints):  # type: ignore[misc]
 
 
 def _mean(points: FloatArray, weights: FloatArray) -> FloatArray:
-    """Weighted mean, from the first point: weights near -110 lose two digits to rounding."""
+    """Weighted mean relative to the first point: weights near -110 would lose two digits."""
     return np.asarray(points[0] + weights[1:] @ (points[1:] - points[0]))
 
 
 class _Filter(UnscentedKalmanFilter):  # type: ignore[misc]
-    """One episode's filter in normalised units; filterpy's equations, the ARZ model's motion.
+    """Filter of an episode in normalised units: filterpy's equations with the ARZ model.
 
-    filterpy would draw new points at the end of `predict`. With projected points these no longer
-    belong to the mean and the covariance, and P loses definiteness within a few steps.
+    filterpy would make new points at the end of `predict`. With projected points these would not
+    agree with mean and covariance, and P would become indefinite within a few steps.
     """
 
     def __init__(self, model: ARZModel, settings: EstimatorSettings) -> None:
-        own = settings.ukf
-        points = _Points(model.n_states, alpha=own.alpha, beta=own.beta, kappa=own.kappa)
-        super().__init__(
-            model.n_states,
-            2 * model.n_segments,
-            model.time_step,
-            None,
-            None,
-            points,
-            x_mean_fn=_mean,
-            z_mean_fn=_mean,
-        )
-        self.model = model
-        self.bounds = settings.bounds
-        rho_m, v_f = model.density_scale, model.speed_scale
-        self.scale = np.tile([rho_m, rho_m * v_f], model.n_segments)
-        self.measurement_scale = model.measurement_scale
-        self.Q = np.diag(np.tile(np.square(settings.process_noise), model.n_segments))
-        self.prior = np.zeros(model.n_states)
-        self.prior_covariance = settings.initial_variance * np.eye(model.n_states)
-        self.restart()
+        ukf = settings.ukf
+        points = _Points(model.n_states, alpha=ukf.alpha, beta=ukf.beta, kappa=ukf.kappa)
+        sizes = model.n_states, 2 * model.n_segments, model.time_step
+        super().__init__(*sizes, None, None, points, x_mean_fn=_mean, z_mean_fn=_mean)
+        configure(self, model, settings)
 
     @property
     def state(self) -> FloatArray:
         """Mean `(1, 2 S)` in physical units, projected."""
-        return self.model.project(self.x[None] * self.scale, self.bounds)
+        return np.asarray(self.model.project(self.x[None] * self.scale, self.bounds))
 
     def restart(self) -> None:
         self.points_fn.moved = None
@@ -72,7 +56,7 @@ class _Filter(UnscentedKalmanFilter):  # type: ignore[misc]
     def compute_process_sigmas(
         self, dt: float, fx: object = None, inputs: FloatArray | None = None
     ) -> None:
-        """Draw points, move all of them at once and project them; without inputs they stay."""
+        """Make points, predict all of them at once, if there are inputs, and project them."""
         self.x = self.state[0] / self.scale
         points = self.points_fn.sigma_points(self.x, self.P) * self.scale
         if inputs is not None:
@@ -83,15 +67,15 @@ class _Filter(UnscentedKalmanFilter):  # type: ignore[misc]
     def cross_variance(
         self, x: FloatArray, z: FloatArray, sigmas_f: FloatArray, sigmas_h: FloatArray
     ) -> FloatArray:
-        """Compute filterpy's loop over points at once."""
+        """Replace filterpy's loop over points by a product of matrices."""
         return np.asarray((sigmas_f - x).T @ (self.Wc[:, None] * (sigmas_h - z)))
 
-    def move(self, inputs: FloatArray) -> None:
+    def advance(self, inputs: FloatArray) -> None:
         self.predict(inputs=inputs)
         self.has_moved = True
 
-    def take_in(self, observed: BoolArray, values: FloatArray, sigma: FloatArray) -> FloatArray:
-        """Update by the observed segments; returns their normalised innovations `(m, 2)`."""
+    def assimilate(self, observed: BoolArray, values: FloatArray, sigma: FloatArray) -> FloatArray:
+        """See `EpisodeFilter.assimilate`."""
         if not observed.any():
             return np.zeros((0, 2))
         if not self.has_moved:
@@ -109,7 +93,7 @@ class _Filter(UnscentedKalmanFilter):  # type: ignore[misc]
 
 
 class ReferenceUKF(ReferenceFilter):
-    """Unscented Kalman filter on the ARZ model by filterpy, one filter an episode."""
+    """Unscented Kalman filter on the ARZ model by filterpy, a filter per episode."""
 
     def _filter(self) -> EpisodeFilter:
         return _Filter(self.model, self.settings)

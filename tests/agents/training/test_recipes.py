@@ -38,9 +38,9 @@ def test_the_learning_rate_falls_to_its_end():
     [
         ("n_envs", 0, r"recipe\.n_envs must be an integer >= 1, got 0"),
         ("n_epochs", 1.5, r"recipe\.n_epochs must be an integer"),
-        ("gamma", 1.0, r"recipe\.gamma must be in \(0, 1\), got 1\.0"),
-        ("learning_rate", 0.0, r"recipe\.learning_rate must be > 0"),
-        ("ent_coef", -0.1, r"recipe\.ent_coef must be >= 0"),
+        ("gamma", 1.0, r"recipe\.gamma must be a number in \(0, 1\), got 1\.0"),
+        ("learning_rate", 0.0, r"recipe\.learning_rate must be a finite number > 0"),
+        ("ent_coef", -0.1, r"recipe\.ent_coef must be a finite number >= 0"),
         ("replicas", 3, r"recipe\.n_envs must be a multiple of replicas 3, got 128"),
     ],
 )
@@ -55,9 +55,9 @@ def test_bad_values_are_named(name, value, message):
         ("rounds", -1, r"recipe\.swaps\.rounds must be an integer in 0\.\.99, got -1"),
         ("episodes", 10_000, r"recipe\.swaps\.episodes must be an integer in 1\.\.9999"),
         ("trials", 0, r"recipe\.swaps\.trials must be an integer >= 1"),
-        ("step", 0.0, r"recipe\.swaps\.step must be > 0"),
-        ("final_step", -1.0, r"recipe\.swaps\.final_step must be > 0"),
-        ("price", -0.1, r"recipe\.swaps\.price must be >= 0"),
+        ("step", 0.0, r"recipe\.swaps\.step must be a finite number > 0"),
+        ("final_step", -1.0, r"recipe\.swaps\.final_step must be a finite number > 0"),
+        ("price", -0.1, r"recipe\.swaps\.price must be a finite number >= 0"),
     ],
 )
 def test_bad_values_of_swap_rounds_are_named(name, value, message):
@@ -70,8 +70,8 @@ def test_bad_values_of_swap_rounds_are_named(name, value, message):
     [
         ("rounds", -1, r"recipe\.regression\.rounds must be an integer >= 0, got -1"),
         ("interval", 0, r"recipe\.regression\.interval must be an integer >= 1"),
-        ("rate", 0.0, r"recipe\.regression\.rate must be > 0"),
-        ("age_bonus", -0.1, r"recipe\.regression\.age_bonus must be >= 0"),
+        ("rate", 0.0, r"recipe\.regression\.rate must be a finite number > 0"),
+        ("age_bonus", -0.1, r"recipe\.regression\.age_bonus must be a finite number >= 0"),
     ],
 )
 def test_bad_values_of_regression_rounds_are_named(name, value, message):
