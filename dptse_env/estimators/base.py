@@ -66,10 +66,7 @@ class Estimator(Protocol):
     fallback: BoolArray
 
     def reset(
-        self,
-        episodes: IntArray,
-        states: FloatArray,
-        generators: Sequence[np.random.Generator],
+        self, episodes: IntArray, states: FloatArray, generators: Sequence[np.random.Generator]
     ) -> None:
         """Reset episodes.
 

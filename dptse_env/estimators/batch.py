@@ -1,7 +1,5 @@
 """Base class of estimators: batch size, flags, and checks of arguments."""
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -51,11 +49,7 @@ def checked_measurements(
     values: FloatArray,
     sigma: FloatArray,
 ) -> Measurements:
-    """Check the arguments of `Estimator.update`.
-
-    Raises:
-        ValueError: An argument is malformed; the message names it.
-    """
+    """Return the arguments of `Estimator.update` as contiguous arrays; refuse malformed ones."""
     indices = checked_episodes(episodes, n_episodes)
     mask = np.ascontiguousarray(observed, dtype=np.bool_)
     if mask.shape != (indices.size, n_segments):

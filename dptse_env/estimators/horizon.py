@@ -5,8 +5,6 @@ window holds L = T + 1 stages; z stacks their states. The program is the paper's
 `minimise z' H z + q' z with lower <= z <= upper`.
 """
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import replace
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """Localisation: weights of sampled covariances by the distance along the road."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from dptse_env.model.layout import RoadNetwork
@@ -22,11 +20,7 @@ def gaspari_cohn(distance: FloatArray, reach: float) -> FloatArray:
     """Correlation with compact support (Gaspari and Cohn, 1999, eq. 4.10).
 
     A fifth-order piecewise rational function, close to a normal density in shape: 1 at distance 0,
-    5/24 at half of `reach`, 0 from `reach` on.
-
-    Args:
-        distance: Any shape, >= 0.
-        reach: > 0, in the same unit.
+    5/24 at half of `reach` > 0, 0 from `reach` on. Distances >= 0 have any shape.
     """
     z = 2.0 * np.asarray(distance, dtype=np.float64) / reach
     near = 1.0 + z**2 * (-5.0 / 3.0 + z * (5.0 / 8.0 + z * (0.5 - 0.25 * z)))
@@ -37,15 +31,11 @@ def gaspari_cohn(distance: FloatArray, reach: float) -> FloatArray:
 
 
 def tapers(network: RoadNetwork, reach: float) -> FloatArray:
-    """Return weights `(S, S)` of covariances between segments, by their distance along the road.
+    """Return weights `(S, S)` of covariances between segments, zero beyond a reach [km].
 
     Every segment has a position on a line, where the function is a correlation: the matrix is
     positive semidefinite, and so is its element-wise product with a covariance (Schur). Distances
     that include the ramps would not guarantee that.
-
-    Args:
-        network: The road.
-        reach: Distance [km] from which covariances are neglected.
     """
     x = positions(network)
     return gaspari_cohn(np.abs(x[:, None] - x), reach)

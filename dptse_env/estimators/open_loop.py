@@ -1,7 +1,5 @@
 """The traffic model alone, without measurements: a baseline of estimators."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """An estimator without a traffic model: a random walk of each segment's density and speed."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

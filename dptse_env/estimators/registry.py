@@ -1,7 +1,5 @@
 """Estimators by name and backend."""
 
-from __future__ import annotations
-
 import importlib
 from typing import Any, NamedTuple, get_args
 
@@ -59,11 +57,7 @@ BACKENDS = get_args(Backend)
 
 
 def make_estimator(
-    estimator: Any,
-    backend: str,
-    model: ARZModel,
-    n_episodes: int,
-    settings: Any = None,
+    estimator: Any, backend: str, model: ARZModel, n_episodes: int, settings: Any = None
 ) -> Estimator:
     """Build an estimator for a batch of episodes.
 
@@ -102,11 +96,7 @@ def settings_type(estimator: Any) -> type:
 
 
 def check_estimator(estimator: Any, backend: str) -> None:
-    """Refuse an unknown estimator or backend; no estimator of this package is imported.
-
-    Raises:
-        ValueError: Estimator or backend is unknown, or the estimator lacks a method.
-    """
+    """Refuse an unknown estimator or backend; no estimator of this package is imported."""
     ESTIMATORS.find(estimator)
     if backend not in BACKENDS:
         raise ValueError(f"backend must be one of {', '.join(BACKENDS)}, got {backend!r}")
@@ -116,9 +106,6 @@ def check_estimate(estimator: Estimator, estimate: Estimate, n_segments: int) ->
     """Refuse an estimate that is not finite or not of shape (n, S).
 
     Estimators of this package are reset when they diverge; those of other packages may not be.
-
-    Raises:
-        ValueError: The estimate is malformed; the message names the estimator's class.
     """
     shape = estimator.n_episodes, n_segments
     for name in ("density", "speed", "density_std", "speed_std"):

@@ -1,7 +1,5 @@
 """Settings of the estimators: frozen dataclasses, reachable from plain JSON."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 

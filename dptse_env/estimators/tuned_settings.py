@@ -4,8 +4,6 @@ A set has the settings tuned for an estimator with an ARZ parameter set under a 
 others keep the defaults of `EstimatorSettings`. ``scripts/tune.py`` makes them.
 """
 
-from __future__ import annotations
-
 import json
 import warnings
 from collections.abc import Mapping
@@ -92,15 +90,7 @@ def write_settings(
     settings: Mapping[str, Any],
     provenance: Mapping[str, Any],
 ) -> None:
-    """Write a set and its provenance as JSON.
-
-    Args:
-        path: The file.
-        estimator: Name of the estimator.
-        parameters: Name of the ARZ parameter set of its model.
-        privacy: Privacy preset whose noise it was tuned for.
-        settings: The tuned fields of `EstimatorSettings`, nested ones as mappings.
-        provenance: Traffic, noise, scores, date and versions.
+    """Write the tuned fields of `EstimatorSettings` and their provenance as JSON.
 
     Raises:
         ValueError: A setting is unknown or out of range; nothing is written then.

@@ -6,8 +6,6 @@ Inputs `u = [D_in, w_in, rho_out, D_on1, w_on1, ..., rho_off1, ...]`: demands at
 with their w [km/h], and densities behind the exits [veh/km]. Arrays have a leading batch axis n.
 """
 
-from __future__ import annotations
-
 from typing import Literal, NamedTuple
 
 import numpy as np

@@ -5,8 +5,6 @@ fitted to the bins as a start. Then (v_f, rho_m, gamma, tau) are optimised for t
 the next 5 to 30 s by the model, started from the true state.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -63,13 +61,7 @@ def starting_parameters(
     name: str = "start",
     bin_width: float = 10.0,
 ) -> ARZParameters:
-    """Fit the equilibrium speed to density-binned mean speeds of the mainline.
-
-    Args:
-        network: The road; its `lanes` are the lanes of the parameters.
-        data: Runs of traffic.
-        name: Name of the parameters.
-        bin_width: Width of a bin [veh/km].
+    """Fit the equilibrium speed to mean speeds of the mainline in density bins [veh/km].
 
     Raises:
         ValueError: The data fill fewer than four bins.

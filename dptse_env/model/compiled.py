@@ -1,35 +1,23 @@
-"""The ARZ model with compiled dynamics: same interface and same numbers as `ARZModel`."""
+"""The ARZ model with compiled dynamics: same interface and numbers as `ARZModel`."""
 
-from __future__ import annotations
+from functools import cached_property
 
 import numpy as np
 from numba import njit
 
 from dptse_env.model.arz import ARZModel
 from dptse_env.model.kernels import advance, make_scratch
-from dptse_env.model.layout import RoadNetwork
-from dptse_env.model.parameters import ARZParameters
 from dptse_env.model.road_arrays import RoadArrays, make_road_arrays
 from dptse_env.utils.arrays import FloatArray
 
 
 class CompiledARZModel(ARZModel):
-    """`ARZModel` with `step` and `jacobian` compiled; the rest is inherited.
+    """`ARZModel` with compiled `step` and `jacobian`."""
 
-    Attributes:
-        road: The model in the form that the kernels of `dptse_env.model.kernels` take.
-    """
-
-    def __init__(
-        self,
-        network: RoadNetwork,
-        parameters: ARZParameters,
-        time_step: float = 1.0,
-        reference_speed: float | None = None,
-    ) -> None:
-        """See `ARZModel`."""
-        super().__init__(network, parameters, time_step, reference_speed)
-        self.road = make_road_arrays(self)
+    @cached_property
+    def road(self) -> RoadArrays:
+        """The model as arrays, for the kernels of `dptse_env.model.kernels`."""
+        return make_road_arrays(self)
 
     def step(self, states: FloatArray, inputs: FloatArray) -> FloatArray:
         """States `(n, 2 S)` one time step later."""

@@ -32,7 +32,11 @@ def step_jacobian(model: ARZModel, states: FloatArray, inputs: FloatArray) -> Fl
     cells = model.cells(states)
     gradients = _gradients(model, states, cells)
     flux = model.fluxes(states, inputs)
-    by = _outflow_gradient(model, cells, gradients, inputs)
+    by = np.zeros((*cells.density.shape, model.n_segments, 2))
+    _links(model, cells, gradients, by)
+    _merges(model, cells, gradients, by)
+    _diverges(model, cells, gradients, by)
+    _exits(model, cells, gradients, inputs, by)
     source_by = _source_gradient(model, cells, gradients, inputs)
 
     each = np.arange(model.n_segments)
@@ -73,18 +77,6 @@ def _gradients(model: ARZModel, states: FloatArray, cells: Cells) -> Gradients:
     demand[..., 0] += by_density
     demand[empty] = 0.0
     return Gradients(w, speed, demand)
-
-
-def _outflow_gradient(
-    model: ARZModel, cells: Cells, gradients: Gradients, inputs: FloatArray
-) -> FloatArray:
-    n, s = cells.density.shape
-    by = np.zeros((n, s, s, 2))
-    _links(model, cells, gradients, by)
-    _merges(model, cells, gradients, by)
-    _diverges(model, cells, gradients, by)
-    _exits(model, cells, gradients, inputs, by)
-    return by
 
 
 def _links(model: ARZModel, cells: Cells, gradients: Gradients, by: FloatArray) -> None:

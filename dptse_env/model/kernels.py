@@ -11,8 +11,6 @@ Kernels do not allocate: callers pass scratch space (`make_scratch`), so that a 
 inside another one, once per step and episode.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
@@ -256,12 +254,12 @@ def advance(
     """Write the state one step later and the step's Jacobian.
 
     Args:
-        road: The `RoadArrays`.
-        state: `(2 S,)` state.
-        inputs: `(n_u,)` inputs.
-        after: `(2 S,)` where the next state goes; may be `state` itself.
-        blocks: `(S, K, 4)` where the Jacobian goes: the derivatives of a cell's next (rho, psi)
-            by a neighbour's (rho, psi), row by row; the slots are those of `road.neighbours`.
+        road: The road.
+        state: `(2 S,)`.
+        inputs: `(n_u,)`.
+        after: `(2 S,)` output, the next state; may be `state` itself.
+        blocks: `(S, K, 4)` output, the Jacobian: derivatives of a cell's next (rho, psi) by a
+            neighbour's (rho, psi), row by row, in the order of `road.neighbours`.
         scratch: From `make_scratch`.
     """
     cells, outflow, gradient = scratch.cells, scratch.outflow, scratch.gradient

@@ -1,7 +1,5 @@
 """Layout of a road in the model: connections of cells, and the lanes of each cell."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -54,35 +52,20 @@ class RoadNetwork(Protocol):
 
 @dataclass(frozen=True)
 class Layout:
-    """Index arrays of a road network, each face in exactly one group.
+    """Index arrays of a road network, each face in exactly one group."""
 
-    Attributes:
-        links: `(2, L)` cells (upstream, downstream) of 1-to-1 faces.
-        merges: `(3, I)` cells (mainline, on-ramp, downstream).
-        diverges: `(3, O)` cells (upstream, mainline, off-ramp).
-        exit_shares: `(O,)` share of the flow that leaves at each diverge.
-        entries: `(1 + I,)` cells fed from outside: segment 0, then the on-ramps.
-        entry_inputs: `(1 + I,)` input column of each entry's demand; its w follows.
-        exits: `(1 + O,)` cells that flow outside: segment N-1, then the off-ramps.
-        exit_inputs: `(1 + O,)` input column of each exit's downstream density.
-        routing: `(S, S)` share of the outflow of a column's cell that enters a row's cell.
-        lanes: `(S,)` lanes of the segments.
-        entry_lanes: `(1 + I,)` lanes of the boundary cells before the entries.
-        exit_lanes: `(1 + O,)` lanes of the boundary cells after the exits.
-    """
-
-    links: IntArray
-    merges: IntArray
-    diverges: IntArray
-    exit_shares: FloatArray
-    entries: IntArray
-    entry_inputs: IntArray
-    exits: IntArray
-    exit_inputs: IntArray
-    routing: FloatArray
-    lanes: FloatArray
-    entry_lanes: FloatArray
-    exit_lanes: FloatArray
+    links: IntArray  # (2, L) cells (upstream, downstream) of 1-to-1 faces
+    merges: IntArray  # (3, I) cells (mainline, on-ramp, downstream)
+    diverges: IntArray  # (3, O) cells (upstream, mainline, off-ramp)
+    exit_shares: FloatArray  # (O,) share of the flow that leaves at each diverge
+    entries: IntArray  # (1 + I,) cells with inflow from outside: segment 0, then the on-ramps
+    entry_inputs: IntArray  # (1 + I,) input column of each entry's demand; its w follows
+    exits: IntArray  # (1 + O,) cells with outflow to outside: segment N-1, then the off-ramps
+    exit_inputs: IntArray  # (1 + O,) input column of each exit's downstream density
+    routing: FloatArray  # (S, S) share of the outflow of a column's cell into a row's cell
+    lanes: FloatArray  # (S,) lanes of the segments
+    entry_lanes: FloatArray  # (1 + I,) lanes of the boundary cells before the entries
+    exit_lanes: FloatArray  # (1 + O,) lanes of the boundary cells after the exits
 
     @property
     def n_segments(self) -> int:
@@ -154,10 +137,7 @@ def make_layout(network: RoadNetwork) -> Layout:
         entries=np.array([0, *on_cells.values()], dtype=np.int64),
         entry_inputs=np.array([0, *range(3, 3 + 2 * n_on, 2)], dtype=np.int64),
         exits=np.array([n - 1, *off_cells.values()], dtype=np.int64),
-        exit_inputs=np.array(
-            [2, *range(3 + 2 * n_on, 3 + 2 * n_on + n_off)],
-            dtype=np.int64,
-        ),
+        exit_inputs=np.array([2, *range(3 + 2 * n_on, 3 + 2 * n_on + n_off)], dtype=np.int64),
         routing=routing,
         lanes=np.asarray(network.segment_lanes, dtype=np.float64),
         entry_lanes=np.array([network.lanes, *[network.ramp_lanes] * n_on], dtype=np.float64),
@@ -199,10 +179,6 @@ def _check(network: RoadNetwork) -> None:
             f"got {len(network.segment_lanes)}"
         )
     lanes = {f"segment_lanes[{i}]": count for i, count in enumerate(network.segment_lanes)}
-    for field, count in {
-        **lanes,
-        "lanes": network.lanes,
-        "ramp_lanes": network.ramp_lanes,
-    }.items():
+    for field, count in {**lanes, "lanes": network.lanes, "ramp_lanes": network.ramp_lanes}.items():
         if count < 1:
             raise ValueError(f"network.{field} must be >= 1, got {count}")

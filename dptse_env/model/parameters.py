@@ -61,11 +61,7 @@ class ARZParameters:
         return min(forwards, crossing / self.gamma)
 
     def require_time_step(self, time_step: float, segment_length: float) -> None:
-        """Refuse a time step [s] that violates the CFL condition.
-
-        Raises:
-            ValueError: It does; the message names the largest one that does not.
-        """
+        """Refuse a time step [s] that violates the CFL condition."""
         largest = self.largest_time_step(segment_length)
         if not 0.0 < time_step <= largest:
             # Rounded down, so that the number in the message is admissible.

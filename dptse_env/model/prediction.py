@@ -1,7 +1,5 @@
 """Errors of a model's predictions of recorded traffic, and those of persistence."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -76,11 +74,7 @@ def prediction_error(
 ) -> PredictionError:
     """Error of the model alone, started from the true state at every `stride`-th step.
 
-    Args:
-        model: The model; a `CompiledARZModel` is faster.
-        data: Runs of traffic; the true boundary cells drive the model.
-        horizons: Steps ahead, ascending.
-        stride: Steps between two starts.
+    The true boundary cells drive the model. Horizons are numbers of steps, ascending.
 
     Raises:
         ValueError: The horizons do not ascend, or no run is longer than the longest of them.

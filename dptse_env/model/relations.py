@@ -4,8 +4,6 @@ Along drivers of one characteristic w the flow is `q_w(rho) = rho (w - p(rho))`.
 cell can send, supply what the next cell can receive of drivers w. Arrays broadcast.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A model as arrays and numbers, for compiled code."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

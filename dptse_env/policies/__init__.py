@@ -1,7 +1,5 @@
 """Saved policies: files are read without torch; some policies come with the package."""
 
-from __future__ import annotations
-
 import os
 from importlib.resources import files
 from pathlib import Path

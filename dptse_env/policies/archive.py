@@ -1,7 +1,5 @@
 """Zip archives of unknown origin, read with bounds."""
 
-from __future__ import annotations
-
 import io
 import zipfile
 
@@ -26,13 +24,8 @@ def open_archive(content: bytes) -> zipfile.ZipFile:
 def read_entry(archive: zipfile.ZipFile, name: str, largest: int) -> bytes:
     """Return the content of an entry; the size in its header is not relied on.
 
-    Args:
-        archive: The archive.
-        name: Name of the entry.
-        largest: Largest size of the content [bytes].
-
     Raises:
-        ValueError: The content is larger, or compressed by another method than deflate.
+        ValueError: It has more than `largest` bytes, or another compression than deflate.
         KeyError: There is no such entry.
     """
     entry = archive.getinfo(name)

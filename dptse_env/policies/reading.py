@@ -1,7 +1,5 @@
 """Reading of policy files within bounds of time and memory, for files of unknown origin."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import struct
@@ -58,11 +56,7 @@ class PolicyFile:
 
 
 def parse_policy(content: bytes, source: str) -> PolicyFile:
-    """Return the policy in the content of a file.
-
-    Args:
-        content: The content.
-        source: Name of the file, for error messages.
+    """Return the policy in the content of a file, named `source` in error messages.
 
     Raises:
         ValueError: It is not a saved policy, is damaged, or exceeds a limit of this module.

@@ -4,8 +4,6 @@ A pickle is a program for a stack machine. The few instructions that tensors nee
 here and any other is refused, so nothing that is named in a file is imported or called.
 """
 
-from __future__ import annotations
-
 import math
 import pickletools
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Tensors written by ``torch.save``, read without torch."""
 
-from __future__ import annotations
-
 import math
 import zipfile
 
@@ -22,14 +20,11 @@ _ITEM = 4
 
 
 def read_tensors(archive: zipfile.ZipFile, largest: int) -> dict[str, NDArray[np.float32]]:
-    """Return the tensors of an archive by name, all of float32 and finite.
-
-    Args:
-        archive: A mapping of names to tensors, as written by ``torch.save``.
-        largest: Largest size of all values [bytes].
+    """Return the float32 tensors of an archive by name, as written by ``torch.save``.
 
     Raises:
-        ValueError: The archive has another content, or exceeds a limit.
+        ValueError: The archive has another content, values are not finite, or have more than
+            `largest` bytes in all.
         KeyError: An entry of the archive is missing.
     """
     tables = [name for name in archive.namelist() if name.endswith("/data.pkl")]

@@ -34,13 +34,8 @@ class ReleaseAccount:
 
         Where contributions are bounded, a vehicle makes at most one per step. The paper's
         sensitivities bound a complete episode and no part of it, so a complete episode is charged
-        from the start.
-
-        Args:
-            steps: Steps released so far in each of k episodes, shape (k,).
-
-        Returns:
-            mu and epsilon at `delta`, shape (k,) each, of all releases together.
+        from the start. `steps` is the number of steps released so far in each of k episodes, and
+        the result mu and epsilon at `delta` of all releases together, shape (k,) each.
         """
         mu, epsilon = self._tables
         charged = np.minimum(steps, len(mu) - 1)

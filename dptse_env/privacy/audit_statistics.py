@@ -144,15 +144,10 @@ def audit(
 
 
 def error_bound(errors: npt.ArrayLike, trials: int, risk: float) -> FloatArray:
-    """Exact upper confidence bound on an error rate (Clopper and Pearson 1934).
+    """Exact upper confidence bound on an error rate (Clopper and Pearson 1934), of any shape.
 
-    Args:
-        errors: errors counted among the trials, any shape, in 0..trials.
-        trials: >= 1.
-        risk: probability that the true rate may lie above the bound, in (0, 1).
-
-    Returns:
-        The rates at which so few errors or fewer have probability `risk`; 1 where all are errors.
+    It is the rate at which so few errors among the trials or fewer have probability `risk`, in
+    (0, 1), and 1 where all trials are errors.
     """
     counts = np.asarray(errors, dtype=np.float64)
     # Where all trials are errors the distribution has no second parameter above zero.
@@ -167,17 +162,9 @@ def rejection_probability(mu: float, claimed_mu: float, n: int, confidence: floa
 
     The truth is a Gaussian release that the adversary scores by its likelihood ratio, and the
     threshold is the optimal one, midway. Both error counts are then binomial, and the sum over them
-    is exact. `audit` has to find its threshold first, which reduces the power by a few hundredths
-    where it is neither near 0 nor near 1.
-
-    Args:
-        mu: true parameter, > 0.
-        claimed_mu: the claim, > 0.
-        n: runs per world, of which `audit` counts the errors in the second half.
-        confidence: confidence of the audit.
-
-    Returns:
-        A probability; at `mu` = `claimed_mu` that of a false alarm by this bound.
+    is exact. `audit` has to find its threshold first, on half of the n runs per world, which
+    reduces the power by a few hundredths where it is neither near 0 nor near 1. At `mu` =
+    `claimed_mu` it is the probability of a false alarm.
     """
     mu, claimed_mu = positive("mu", mu), positive("claimed_mu", claimed_mu)
     n = integer("n", n, 2)
@@ -194,16 +181,9 @@ def rejection_probability(mu: float, claimed_mu: float, n: int, confidence: floa
 def detectable_mu(
     claimed_mu: float, n: int, confidence: float = 0.95, probability: float = 0.95
 ) -> float:
-    """Smallest true mu at which a claim is rejected with the given probability.
+    """Smallest true mu at which `rejection_probability` reaches the given probability.
 
-    Args:
-        claimed_mu: the claim, > 0.
-        n: runs per world.
-        confidence: confidence of the audit.
-        probability: in (0, 1).
-
-    Returns:
-        mu, or infinity where so few runs cannot reject the claim at any mu.
+    It is infinite where so few runs cannot reject the claim at any mu.
     """
     probability = inside("probability", probability, 0.0, 1.0)
 

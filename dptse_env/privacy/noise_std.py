@@ -34,13 +34,8 @@ def joint_noise_std(
     """Noise under which two releases together are (epsilon, delta)-private, analytic calibration.
 
     The budget mu^2 is divided between the sensitivities that can occur together. A release that
-    has a larger sensitivity on its own gets the noise that this needs.
-
-    Args:
-        sensitivity: Sensitivities of the two releases.
-        epsilon: Privacy parameter.
-        delta: Privacy parameter.
-        share: Part of mu^2 that the first release gets, in (0, 1).
+    has a larger sensitivity on its own gets the noise that this needs. `share`, in (0, 1), is the
+    part of mu^2 for the first release.
     """
     mu = mu_of(epsilon, delta)
     alone = tuple(release.bound for release in sensitivity.releases)

@@ -49,11 +49,7 @@ class Sensitivity:
     contributions: int | None = None
 
     def joint_mu(self, noise_std: Iterable[float]) -> float:
-        """Parameter of all releases together, the L2 sensitivity in units of the noise.
-
-        Args:
-            noise_std: one standard deviation for each release, in its unit.
-        """
+        """Parameter of all releases together: the L2 sensitivity over the noise's deviations."""
         stds = tuple(noise_std)
         extremes = self.extremes or (tuple(release.bound for release in self.releases),)
         return max(

@@ -1,11 +1,6 @@
 """Release of traffic data: true traffic, release models, and boundary inputs."""
 
-from dptse_env.release.base import (
-    Released,
-    ReleaseModel,
-    ReleaseRequest,
-    ReleaseSetup,
-)
+from dptse_env.release.base import Released, ReleaseModel, ReleaseRequest, ReleaseSetup
 from dptse_env.release.boundary import BOUNDARIES, BoundaryModel, make_boundary
 from dptse_env.release.checks import check_released
 from dptse_env.release.gaussian import Capped, Corrected, GaussianRelease, Paper

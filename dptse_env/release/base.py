@@ -1,7 +1,5 @@
 """Base class of release models: released values, privacy account and privacy report."""
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
@@ -191,10 +189,5 @@ class ReleaseModel(ABC):
         )
 
     def private_info(self, episodes: IntArray, traffic: IntArray) -> Rows:
-        """Return private data for ``info["truth"]`` alone, rows of k episodes; by default none.
-
-        Args:
-            episodes: Shape (k,).
-            traffic: Index of each episode's traffic seed, shape (k,).
-        """
+        """Return private data for ``info["truth"]`` alone, rows of k episodes; by default none."""
         return {}

@@ -1,7 +1,5 @@
 """Inputs of the traffic model at the road's ends and ramps: true, nominal or private."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from typing import ClassVar
 
@@ -30,13 +28,7 @@ class BoundaryModel(ABC):
 
     @abstractmethod
     def inputs(self, episodes: IntArray, traffic: IntArray, times: IntArray) -> FloatArray:
-        """Return the inputs of some episodes, shape (k, n_u).
-
-        Args:
-            episodes: Shape (k,).
-            traffic: Index of each episode's traffic seed, shape (k,).
-            times: Second of the record, shape (k,).
-        """
+        """Return inputs (k, n_u) of episodes (k,), by index of the traffic seed and second (k,)."""
 
     def load(self, index: int) -> None:  # noqa: B027 (nothing by default)
         """Prepare for the traffic of an index, which the traffic table has loaded."""

@@ -1,7 +1,5 @@
 """Checks of what release models of other packages release."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -11,11 +9,7 @@ from dptse_env.utils.registry import name_of_class
 
 
 def check_released(release: ReleaseModel, released: Any, request: ReleaseRequest) -> None:
-    """Refuse a release of a wrong shape, or one that is not finite where it was observed.
-
-    Raises:
-        ValueError: The release is malformed; the message names its class and the expected form.
-    """
+    """Refuse a release of a wrong shape, or one that is not finite where it was observed."""
     name = name_of_class(release)
     shape = (*request.observed.shape, 2)
     values, sigma = (np.asarray(part) for part in released)

@@ -5,8 +5,6 @@ it counts depends on its trajectory and on the queries, which are public, and ne
 vehicles: removing a vehicle from a record does not change the contributions of the others.
 """
 
-from __future__ import annotations
-
 from typing import TypeVar
 
 import numpy as np
@@ -33,15 +31,7 @@ class Contributions:
     def __init__(
         self, n_slots: int, n_steps: int, n_episodes: int, largest_speed: float, cap: int | None
     ) -> None:
-        """Prepare for records of `n_steps` steps; none is loaded yet.
-
-        Args:
-            n_slots: Largest number of records.
-            n_steps: Steps of a record.
-            n_episodes: Size of the batch.
-            largest_speed: Speeds are clipped to [0, `largest_speed`] [km/h].
-            cap: C, or None.
-        """
+        """Prepare for up to `n_slots` records; speeds are clipped to `largest_speed` [km/h]."""
         self.cap, self.largest_speed = cap, largest_speed
         self._limit = n_steps if cap is None else cap
         self._start = np.zeros((n_slots, n_steps + 1), dtype=np.int64)
@@ -90,17 +80,11 @@ class Contributions:
     def collect(
         self, episodes: IntArray, slots: IntArray, times: IntArray, observed: BoolArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Count the vehicles of one step on the observed segments, and charge them.
+        """Count the vehicles of a step in the observed record columns, and charge them.
 
-        Args:
-            episodes: Indices of the episodes, shape (k,).
-            slots: Slot of each episode's record, shape (k,).
-            times: Second of the record, shape (k,).
-            observed: Observed record columns, shape (k, n_columns).
-
-        Returns:
-            Vehicles that count, and the sum of their clipped speeds [km/h], both (k, n_columns);
-            zero in columns that are not observed.
+        Episodes, slots of their records and seconds of these have shape (k,). Returned are the
+        number of vehicles that count and the sum of their clipped speeds [km/h], both of shape
+        (k, n_columns) and zero in columns that are not observed.
         """
         counts, speeds = np.zeros((2, *observed.shape))
         _collect(

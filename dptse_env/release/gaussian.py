@@ -1,7 +1,5 @@
 """Release models with Gaussian noise: `Paper`, `Corrected` and `Capped`."""
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar

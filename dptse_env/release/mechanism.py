@@ -58,13 +58,9 @@ class GaussianMechanism:
     def __init__(
         self, sigma: npt.ArrayLike, *, n_episodes: int, n_segments: int, block: int = 32
     ) -> None:
-        """Make a mechanism for a batch of episodes; each needs a `reset` before its first release.
+        """Make a mechanism; each episode needs a `reset` before its first release.
 
-        Args:
-            sigma: (2,) noise standard deviation of density [veh/km] and speed [km/h].
-            n_episodes: size n of the batch.
-            n_segments: number S of segments.
-            block: steps of noise to draw at a time.
+        `block` is the number of steps for which noise is drawn at a time.
 
         Raises:
             ValueError: `sigma` is not two finite numbers above zero, or a size is below 1.

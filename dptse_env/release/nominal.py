@@ -1,7 +1,5 @@
 """Nominal flows, inputs and states, derived from the published demand alone."""
 
-from __future__ import annotations
-
 import numpy as np
 import numpy.typing as npt
 
@@ -16,12 +14,7 @@ def _published(corridor: Corridor) -> Demand:
 
 
 def nominal_flows(corridor: Corridor, times: npt.ArrayLike) -> FloatArray:
-    """Return the flow through each segment at the published demand [veh/h], shape (..., S).
-
-    Args:
-        corridor: The road; of a demand distribution the base is used.
-        times: Seconds of the record [s], shape (...).
-    """
+    """Return the flows [veh/h] at the published demand, (..., S), at times [s] of shape (...)."""
     demand = _published(corridor)
     starts, rates = np.array(demand.mainline).T
     flow = rates[np.searchsorted(starts, times, side="right") - 1]
@@ -77,12 +70,8 @@ def nominal_inputs(corridor: Corridor, model: ARZModel) -> FloatArray:
 def nominal_state(corridor: Corridor, model: ARZModel, times: npt.ArrayLike) -> FloatArray:
     """Return the free-flow equilibrium of the published demand, shape (..., n_x).
 
-    It is public: it depends on the corridor's description and the clock, never on a record.
-
-    Args:
-        corridor: The road.
-        model: Its traffic model.
-        times: Seconds of the record [s], shape (...).
+    It is public: it depends on the corridor's description and on the times [s] of shape (...),
+    never on a record.
     """
     density = free_flow_density(model, nominal_flows(corridor, times))
     v_f, gamma = model.parameters.free_flow_speed, model.parameters.gamma

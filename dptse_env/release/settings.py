@@ -1,7 +1,5 @@
 """Settings of release models: the keyword ``privacy`` of an environment."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal
 

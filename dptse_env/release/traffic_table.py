@@ -1,7 +1,5 @@
 """True density and mean speed of every segment, by traffic seed and second."""
 
-from __future__ import annotations
-
 import numpy as np
 import numpy.typing as npt
 
@@ -30,13 +28,8 @@ class TrafficTable:
     def load(self, indices: npt.ArrayLike) -> list[tuple[int, Record]]:
         """Load the records of some traffic seeds; return those that were not in memory before.
 
-        Records that are missing on disk are made, on all cores where there are several.
-
-        Args:
-            indices: Into ``traffic_seeds``, one or more.
-
-        Returns:
-            Index and record of each.
+        Records that are missing on disk are made, on all cores where there are several. The result
+        has the index into ``traffic_seeds`` and the record of each.
         """
         new = [index for index in np.unique(indices).tolist() if not self._loaded[index]]
         if len(new) > 1:

@@ -100,14 +100,8 @@ def check_fit(
 ) -> None:
     """Refuse a policy that does not fit an environment.
 
-    Args:
-        card: Card of the policy.
-        kind: Kind of the policy.
-        config: Configuration of the environment.
-        allow: Properties that may differ on purpose.
-
     Raises:
-        ValueError: A property differs; the message names the values of both.
+        ValueError: A property outside `allow` differs; the message names the values of both.
     """
     there, here = card["fits"], make_fit(config, kind)
     differing = [key for key in ("format", "action", "bandwidth") if there[key] != here[key]]

@@ -1,7 +1,5 @@
 """Kinds of policies that can be saved, each with its description on a card."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """`PlackettLuce`: a distribution over ordered sets of distinct items."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

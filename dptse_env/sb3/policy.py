@@ -1,7 +1,5 @@
 """`PlackettLucePolicy`: a policy that scores segments and queries an ordered set of them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

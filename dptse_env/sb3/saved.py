@@ -1,7 +1,5 @@
 """Trained policies as small files, which are checked against the environment when loaded."""
 
-from __future__ import annotations
-
 import io
 import json
 import os
@@ -18,14 +16,7 @@ from stable_baselines3.common.policies import BasePolicy
 from dptse_env.config import EnvConfig
 from dptse_env.estimators import ESTIMATORS
 from dptse_env.parts import QueryInterface, make_interface
-from dptse_env.policies import (
-    CARD,
-    TRANSFERABLE,
-    WEIGHTS,
-    PolicyFile,
-    parse_policy,
-    read_policy,
-)
+from dptse_env.policies import CARD, TRANSFERABLE, WEIGHTS, PolicyFile, parse_policy, read_policy
 from dptse_env.sb3.fit import TrainedOn, check_fit, make_fit
 from dptse_env.sb3.kinds import KINDS, Shapes
 from dptse_env.utils.arrays import Action, Observation

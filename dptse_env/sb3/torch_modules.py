@@ -3,8 +3,6 @@
 The names of parameters are those of the weights in saved policies.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import torch
@@ -74,12 +72,7 @@ class Scorer(nn.Module):
     rule_channels: Tensor
 
     def __init__(self, road: RoadChannels, width: int, rule: Mapping[str, float]) -> None:
-        """Make a scorer.
-
-        Args:
-            road: Layout of the observations.
-            width: Features per segment.
-            rule: Initial weights of the rule by observation block.
+        """Make a scorer of ``width`` features per segment with the initial weights of a rule.
 
         Raises:
             ValueError: A block of the rule is no mainline channel of the road.

@@ -1,7 +1,5 @@
 """`SB3VecEnv`: many episodes of one process as an environment of stable-baselines3."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
@@ -39,11 +37,7 @@ class SB3VecEnv(VecEnv):
     """
 
     def __init__(self, env: gym.vector.VectorEnv[Any, Any, Any]) -> None:
-        """Wrap ``env``.
-
-        Args:
-            env: A `SensorQueryVectorEnv` without wrappers, made with
-                ``autoreset_mode="SameStep"``.
+        """Wrap a `SensorQueryVectorEnv` without wrappers, made with ``autoreset_mode="SameStep"``.
 
         Raises:
             ValueError: The environment is of another class, or has another autoreset mode.
@@ -129,11 +123,7 @@ class SB3VecEnv(VecEnv):
         return [getattr(self.env, attr_name)] * len(episodes)
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Refuse: the episodes share one environment.
-
-        Raises:
-            AttributeError: Always.
-        """
+        """Raise ``AttributeError``: the episodes share one environment."""
         raise AttributeError(
             f"{attr_name} cannot be set: the episodes share one environment; make another one"
         )

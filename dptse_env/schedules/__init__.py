@@ -17,8 +17,6 @@ schedules                use          extra cost of a step
 ======================== ============ ====================================================
 """
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 

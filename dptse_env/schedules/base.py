@@ -1,7 +1,5 @@
 """Base classes of schedules, whose `predict` turns chosen segments into actions."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from typing import Any, ClassVar, NamedTuple
 
@@ -35,12 +33,7 @@ class Schedule(ABC):
     uses_truth: ClassVar[bool] = False
 
     def __init__(self, interface: QueryInterface, seed: int | None = None) -> None:
-        """Bind the schedule to an environment's ``interface``.
-
-        Args:
-            interface: Interface of the environment (``env.unwrapped.interface``).
-            seed: Seed of random choices.
-        """
+        """Bind the schedule to an environment's interface (``env.unwrapped.interface``)."""
         self.interface = interface
         self.n_mainline = interface.n_mainline
         self.bandwidth = interface.bandwidth

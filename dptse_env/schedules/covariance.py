@@ -1,7 +1,5 @@
 """Schedules that use the estimator's covariance, which is public, unlike the truth."""
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Protocol, cast
@@ -81,12 +79,7 @@ class CovarianceSchedule(ProcessSchedule):
         *,
         inflation: CovarianceInflation = NO_INFLATION,
     ) -> None:
-        """Bind the schedule.
-
-        Args:
-            process: The process (``env.unwrapped.process``).
-            seed: Unused; nothing is drawn.
-            inflation: Inflation of the covariance.
+        """Bind the schedule to a process (``env.unwrapped.process``).
 
         Raises:
             ValueError: The estimator has no covariance.

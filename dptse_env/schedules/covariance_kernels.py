@@ -6,8 +6,6 @@ all speeds. A segment's releases depend on that segment alone, so that its row i
 has two entries.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -159,14 +157,8 @@ def downdate(
     With L L' = H P H' + R, the rows of L^-1 H P are written to `vectors` and their products
     subtracted from P.
 
-    Args:
-        covariance: Shape (m, m), replaced.
-        first: Row of the segment's density.
-        second: Row of its other component.
-        by_first: Derivative of the first release by the density.
-        by_second: Derivatives of the second release by both.
-        noise: Shape (2,).
-        vectors: Scratch, shape (2, at least m).
+    The density is component `first` of the covariance (m, m) and the other quantity component
+    `second`; `by_first` and `by_second` are derivatives of the releases by them.
     """
     m = covariance.shape[0]
     row1, row2 = vectors[0], vectors[1]

@@ -1,7 +1,5 @@
 """Schedules that use a clock, or the ages and variances in the observation."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Compiled kernels of the schedules that use the estimator's covariance, episode by episode."""
 
-from __future__ import annotations
-
 import numpy as np
 from numba import njit
 

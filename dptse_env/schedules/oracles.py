@@ -1,7 +1,5 @@
 """Oracles: schedules that use the true traffic, as bounds on policies."""
 
-from __future__ import annotations
-
 import copy
 from abc import abstractmethod
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """A rollout over single swaps of a greedy set."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 from dptse_env.process import QueryProcess

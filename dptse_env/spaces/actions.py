@@ -10,8 +10,6 @@ Any action that the space can sample is valid. A wrong shape, a wrong dtype, a N
 outside the road raises ``ValueError``.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -46,13 +44,7 @@ class PendingPicks:
         self.n_replaced[episodes] = 0
 
     def in_turn(self, episodes: IntArray, wanted: BoolArray, limit: IntArray) -> BoolArray:
-        """Keep the first ``limit`` wanted segments from the pointer on, and move it past them.
-
-        Args:
-            episodes: Shape (k,).
-            wanted: Shape (k, n_mainline).
-            limit: Number of segments to keep in each episode, shape (k,).
-        """
+        """Keep ``limit`` (k,) wanted segments (k, n) from the pointer on, and move it past them."""
         n = wanted.shape[1]
         order = (self.pointer[episodes, None] + np.arange(n)) % n
         turned = np.take_along_axis(wanted, order, axis=1)
@@ -274,23 +266,16 @@ class SequentialAction(ActionEncoding):
 
 
 def check_decision(encoding: ActionEncoding, decision: Any, n_actions: int) -> None:
-    """Refuse a decision of another package that is malformed or exceeds the bandwidth.
-
-    Raises:
-        ValueError: The decision is malformed; the message names its class and the expected form.
-    """
+    """Refuse a decision of another package that is malformed or exceeds the bandwidth."""
     name, shape = name_of_class(encoding), (n_actions, encoding.n_mainline)
     queried, complete = np.asarray(decision.queried), np.asarray(decision.complete)
-    if queried.shape != shape or queried.dtype != np.bool_:
-        raise ValueError(
-            f"action {name}.decode() must return flags of shape {shape} as queried, got "
-            f"{queried.dtype} of shape {queried.shape}"
-        )
-    if complete.shape != shape[:1] or complete.dtype != np.bool_:
-        raise ValueError(
-            f"action {name}.decode() must return flags of shape {shape[:1]} as complete, got "
-            f"{complete.dtype} of shape {complete.shape}"
-        )
+    expected = {"queried": (queried, shape), "complete": (complete, shape[:1])}
+    for field, (flags, flags_shape) in expected.items():
+        if flags.shape != flags_shape or flags.dtype != np.bool_:
+            raise ValueError(
+                f"action {name}.decode() must return flags of shape {flags_shape} as {field}, got "
+                f"{flags.dtype} of shape {flags.shape}"
+            )
     if np.shape(decision.n_dropped) != shape[:1]:
         raise ValueError(
             f"action {name}.decode() must return n_dropped of shape {shape[:1]}, got "

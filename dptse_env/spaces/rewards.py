@@ -1,7 +1,5 @@
 """Estimation errors, and the rewards that are derived from them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
@@ -33,10 +31,7 @@ class EstimationError:
 
 
 def estimation_error(
-    true_density: FloatArray,
-    true_speed: FloatArray,
-    density: FloatArray,
-    speed: FloatArray,
+    true_density: FloatArray, true_speed: FloatArray, density: FloatArray, speed: FloatArray
 ) -> EstimationError:
     """Compare estimates with the truth; all arrays (k, n_mainline), in [veh/km] and [km/h].
 

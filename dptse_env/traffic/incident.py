@@ -50,13 +50,9 @@ class Incident:
         return self.phases[0][0]
 
     def limit_changes(self, speed_limit: float) -> list[tuple[float, float]]:
-        """List the moments at which the segment's limit changes.
+        """Return the changes of the segment's limit as pairs (time [s], new limit [km/h]).
 
-        Args:
-            speed_limit: the limit outside the phases [km/h].
-
-        Returns:
-            Pairs (time [s], new limit [km/h]) in order of time.
+        `speed_limit` is the limit outside the phases [km/h].
         """
         changes: list[tuple[float, float]] = []
         for start, end, limit in self.phases:

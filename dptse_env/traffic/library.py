@@ -78,11 +78,7 @@ class RecordLibrary:
         return type(self), (self.path, self.n_open)
 
     def get(self, corridor: Corridor, seed: int) -> Record:
-        """Return a record, made now if it is missing or damaged.
-
-        Args:
-            corridor: the corridor.
-            seed: traffic seed, a non-negative integer.
+        """Return the record of a traffic seed, which is made now if it is missing or damaged.
 
         Raises:
             ValueError: The seed is negative or no integer.
@@ -128,11 +124,7 @@ class RecordLibrary:
         holds another simulation here. A worker that dies is replaced and its record tried again
         (see `WorkerPool.record`).
 
-        Args:
-            corridor: the corridor.
-            seeds: traffic seeds.
-            workers: number of processes; default: the number of usable cores.
-            progress: whether to show a progress bar on stderr.
+        The default number of `workers` is that of usable cores; `progress` shows a progress bar.
 
         Raises:
             ValueError: A seed or the number of workers is out of range.

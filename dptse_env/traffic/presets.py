@@ -61,10 +61,7 @@ CORRIDORS = Registry(
 
 
 def find_corridor(value: Any) -> Corridor:
-    """Return the corridor that a keyword's value stands for.
-
-    Args:
-        value: A name, ``"package.module:NAME"``, a `Corridor`, or a function that returns one.
+    """Return a corridor by name or ``"package.module:NAME"``, a `Corridor`, or that of a function.
 
     Raises:
         ValueError: There is none, or it is no `Corridor`.
@@ -82,14 +79,8 @@ def randomised(corridor: Corridor) -> Corridor:
 
     The demand varies by a fifth either way. The incident may block any mainline segment but the
     last, at any time that leaves a third of the record for the jam, with ranges in proportion to
-    the record's duration.
-
-    Args:
-        corridor: a corridor; its incident is dropped, its demand is kept as the base. Everything
-            else stays, `average_dwell` included: measure it again where it matters.
-
-    Returns:
-        The corridor with a `DemandDistribution` and an `IncidentDistribution`.
+    the record's duration. The demand of `corridor` is the base of the distribution; its incident is
+    dropped. Other fields are unchanged, also `average_dwell`, which should be measured again.
     """
     demand = corridor.demand
     base = demand.base if isinstance(demand, DemandDistribution) else demand

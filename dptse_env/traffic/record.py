@@ -233,13 +233,8 @@ class Record:
 def mean_dwell(records: Iterable[Record], n_mainline: int) -> float:
     """Measure T_avg of the paper's eq. (6): the average time of a vehicle on a mainline segment.
 
-    Args:
-        records: records of one corridor.
-        n_mainline: the corridor's number of mainline segments, those that can be queried.
-
-    Returns:
-        Mean number of consecutive steps [s] of a vehicle on a mainline segment, over all passages.
-        A passage between two steps is not counted.
+    It is the mean number of consecutive steps [s] of a vehicle on a mainline segment, over all
+    passages. A passage between two steps is not counted.
 
     Raises:
         ValueError: No vehicle was ever on the mainline.

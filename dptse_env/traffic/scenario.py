@@ -53,10 +53,6 @@ def draw_scenario(corridor: "Corridor", seed: int) -> Scenario:
 
     Demand, incident, arrivals and SUMO have separate random streams, so that a change of one does
     not affect the others.
-
-    Args:
-        corridor: the road and its demand and incident, fixed or as distributions.
-        seed: a non-negative integer.
     """
     demand_seed, incident_seed, arrival_seed, sumo_seed = np.random.SeedSequence(seed).spawn(4)
     demand, incident = corridor.demand, corridor.incident

@@ -6,8 +6,6 @@ dictionaries, lists, strings and numbers. The annotation of a field declares its
 generated from it. An error is one line: ``<path> must be <allowed>, got <value>``.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import types
@@ -29,14 +27,7 @@ LONGEST_SEQUENCE = 100_000
 
 @dataclass(frozen=True)
 class Interval:
-    """Range of a number; an end is part of it unless it is open or infinite.
-
-    Attributes:
-        low: Lower end.
-        high: Upper end.
-        open_low: Whether the lower end is left out.
-        open_high: Whether the upper end is left out.
-    """
+    """Range of a number; an end is part of it unless it is open."""
 
     low: float
     high: float
@@ -78,7 +69,7 @@ def from_mapping(cls: type[T], values: Any, path: str, base: T | None = None) ->
     if not isinstance(values, Mapping):
         raise ValueError(f"{path} must be a mapping or {cls.__name__}, got {_shown(values)}")
     prefix = f"{path}." if path else ""
-    hints = field_hints(cls)
+    hints = field_hints(typing.cast(Any, cls))
     for key in values:
         if key not in hints:
             raise ValueError(f"{prefix}{key} is unknown; allowed: {', '.join(hints)}")
@@ -90,10 +81,11 @@ def from_mapping(cls: type[T], values: Any, path: str, base: T | None = None) ->
         return base
     if base is not None:
         return dataclasses.replace(base, **built)  # type: ignore[type-var]
-    hashable: Any = cls
-    for name in _required(hashable):
-        if name not in built:
-            raise ValueError(f"{prefix}{name} is missing")
+    missing = dataclasses.MISSING
+    for field in dataclasses.fields(cls):  # type: ignore[arg-type]
+        has_default = field.default is not missing or field.default_factory is not missing
+        if field.name not in built and not has_default:
+            raise ValueError(f"{prefix}{field.name} is missing")
     return cls(**built)
 
 
@@ -106,43 +98,25 @@ def checked_fields(instance: Any, path: str) -> None:
         ValueError: A value has the wrong type or range; the message starts with its path.
     """
     prefix = f"{path}." if path else ""
-    for name, hint in field_hints(type(instance)).items():
+    cls: Any = type(instance)
+    for name, hint in field_hints(cls).items():
         value = getattr(instance, name)
         converted = convert(hint, value, f"{prefix}{name}", value)
         if converted is not value:
             object.__setattr__(instance, name, converted)
 
 
-def field_hints(cls: type) -> Mapping[str, Any]:
-    """Return the annotations of a dataclass's fields by name, in order."""
-    hashable: Any = cls
-    return _field_hints(hashable)
-
-
 @cache
-def _field_hints(cls: Any) -> Mapping[str, Any]:
+def field_hints(cls: Any) -> Mapping[str, Any]:
+    """Return the annotations of a dataclass's fields by name, in order."""
     hints = typing.get_type_hints(cls, include_extras=True)
     return {field.name: hints[field.name] for field in dataclasses.fields(cls) if field.init}
 
 
-@cache
-def _required(cls: Any) -> tuple[str, ...]:
-    missing = dataclasses.MISSING
-    return tuple(
-        field.name
-        for field in dataclasses.fields(cls)
-        if field.default is missing and field.default_factory is missing
-    )
-
-
 def convert(hint: Any, value: Any, path: str, base: Any = None) -> Any:
-    """Return ``value`` as the annotated type ``hint``.
+    """Return ``value``, which may be plain JSON, as the annotated type ``hint``.
 
-    Args:
-        hint: An annotation.
-        value: The value, or plain JSON for it.
-        path: Its path, for error messages.
-        base: For a dataclass, supplies the fields that a mapping leaves out.
+    A ``base`` of a dataclass has the values of fields that a mapping leaves out.
 
     Raises:
         ValueError: The value has the wrong type or range; the message starts with ``path``.
@@ -236,7 +210,7 @@ def _convert_union(options: tuple[Any, ...], value: Any, path: str, base: Any) -
     """Convert to the option that fits; among dataclasses, to the one that has all the keys."""
     if isinstance(value, Mapping):
         classes: list[Any] = [option for option in options if dataclasses.is_dataclass(option)]
-        fits = [cls for cls in classes if set(value) <= set(_field_hints(cls))]
+        fits = [cls for cls in classes if set(value) <= set(field_hints(cls))]
         if classes:
             return convert((fits or classes)[0], value, path, base)
     if value is not None and types.NoneType in options:

@@ -1,7 +1,5 @@
 """JSON objects with known keys, the format of the package's files."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from importlib.resources import files

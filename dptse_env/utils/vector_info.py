@@ -5,8 +5,6 @@ Gymnasium's vector form has arrays over all n episodes and, under the same key w
 underscore, the flags of the episodes that have a value.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -7,8 +7,6 @@ fixing m variables takes m columns of its inverse, kept from round to round, and
 The caller uses another solver where the method does not converge.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

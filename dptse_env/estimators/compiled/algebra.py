@@ -5,8 +5,6 @@ every inner loop runs over full vector registers of contiguous memory. `contract
 multiply-adds and, unlike other options, keeps NaNs, by which divergence is detected.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numba import njit
 

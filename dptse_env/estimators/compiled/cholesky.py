@@ -1,7 +1,5 @@
 """Compiled solution of linear equations with a small definite matrix and many right-hand sides."""
 
-from __future__ import annotations
-
 import numpy as np
 from numba import njit
 

@@ -1,7 +1,5 @@
 """Compiled linear algebra on dense, padded matrices that several filters share."""
 
-from __future__ import annotations
-
 import numpy as np
 from numba import njit
 

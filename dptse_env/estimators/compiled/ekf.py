@@ -1,7 +1,5 @@
 """The extended Kalman filter, compiled: the default estimator."""
 
-from __future__ import annotations
-
 from dptse_env.estimators.batch import Measurements
 from dptse_env.estimators.compiled import ekf_kernels as kernels
 from dptse_env.estimators.compiled.kalman import CompiledFilter

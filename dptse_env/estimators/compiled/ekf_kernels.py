@@ -4,8 +4,6 @@ Means are in physical units, as the model takes them; covariances are normalised
 psi by rho_m v_f, so that variances of all components are of one order.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -76,12 +74,7 @@ def update(
     shift = np.empty(filters.covariances.shape[2])
     work = scratch_vectors(shift.size)
     rows = np.empty((road.jam.size, 4))
-    noise = np.array(
-        [
-            (sigma[0] / filters.density_scale) ** 2,
-            (sigma[1] / road.second_scale) ** 2,
-        ]
-    )
+    noise = np.array([(sigma[0] / filters.density_scale) ** 2, (sigma[1] / road.second_scale) ** 2])
     for k in range(episodes.size):
         e = episodes[k]
         mean, covariance = filters.means[e], filters.covariances[e]

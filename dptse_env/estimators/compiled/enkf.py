@@ -1,7 +1,5 @@
 """The ensemble Kalman filter, compiled."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import ClassVar
 

@@ -6,8 +6,6 @@ solved for the gain, which has fewer columns than there are members. Products of
 and are small enough for one thread.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

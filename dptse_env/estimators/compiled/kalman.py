@@ -1,7 +1,5 @@
 """Base class of compiled filters with a covariance: their state and its summary."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import ClassVar
 

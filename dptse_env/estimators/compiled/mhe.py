@@ -1,7 +1,5 @@
 """Moving horizon estimation, compiled."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from dptse_env.estimators.batch import Measurements

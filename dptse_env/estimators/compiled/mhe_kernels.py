@@ -1,7 +1,5 @@
 """Compiled kernels of the moving horizon estimator: a batch of episodes, one after the other."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

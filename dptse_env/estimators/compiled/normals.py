@@ -7,8 +7,6 @@ by the transform of Box and Muller (1958), in single precision, which is suffici
 the tails end at 6.8 standard deviations.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

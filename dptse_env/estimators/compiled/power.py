@@ -1,7 +1,5 @@
 """Powers that compile to vector instructions, unlike loops around the C library's `pow`."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -6,8 +6,6 @@ negative weights of the first point cancel without rounding errors, and the join
 states and measurements is positive semidefinite by construction, also of projected points.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 from numba import njit

@@ -5,8 +5,6 @@ component, `(2 S, width)`, a column each, so that every inner loop runs over con
 without a branch and compiles to vector instructions. Padding columns must also be states.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The unscented Kalman filter, compiled."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from dptse_env.estimators.batch import Measurements

@@ -7,8 +7,6 @@ measurements would place it after the motion; on recorded traffic that filter is
 worse at small alpha.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
@@ -17,12 +15,7 @@ from numba import njit
 from dptse_env.estimators.compiled.algebra import is_covariance, mirror
 from dptse_env.estimators.compiled.dense import eliminate, products
 from dptse_env.estimators.compiled.ekf_kernels import Filters, Packed, project, restart
-from dptse_env.estimators.compiled.sigma_points import (
-    Points,
-    distances_from_first,
-    draw,
-    gather,
-)
+from dptse_env.estimators.compiled.sigma_points import Points, distances_from_first, draw, gather
 from dptse_env.estimators.compiled.state_batch import (
     advance_states,
     make_batch_scratch,

@@ -6,19 +6,12 @@ them H d = r takes a forward and a backward sweep (the smoother of Bryson and Fr
 further inverses. All quantities are normalised; vectors and rows are padded as in `algebra`.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
-from dptse_env.estimators.compiled.algebra import (
-    mirror,
-    propagate,
-    scratch_vectors,
-    segment_update,
-)
+from dptse_env.estimators.compiled.algebra import mirror, propagate, scratch_vectors, segment_update
 from dptse_env.model.road_arrays import RoadArrays
 from dptse_env.utils.arrays import BoolArray, FloatArray
 

@@ -1,7 +1,5 @@
 """Extended Kalman filter by filterpy, a reference for the compiled one."""
 
-from __future__ import annotations
-
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 

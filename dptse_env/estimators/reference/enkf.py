@@ -4,8 +4,6 @@ filterpy's `EnsembleKalmanFilter` is not suitable: it draws from numpy's global 
 fixed number of outputs and predicts members one by one.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Base class of reference filters: a filter per episode, with its checks and its summary."""
 
-from __future__ import annotations
-
 import warnings
 from abc import abstractmethod
 from collections.abc import Sequence

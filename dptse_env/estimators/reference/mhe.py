@@ -1,7 +1,5 @@
 """Moving horizon estimation by a general solver, a reference for the compiled one."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np
