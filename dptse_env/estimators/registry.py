@@ -135,14 +135,12 @@ def _check_attributes(estimator: Estimator, model: ARZModel, n_episodes: int) ->
             raise ValueError(
                 f"estimator {name} must have an array {attribute!r} of shape {shape}, got {got}"
             )
-    for attribute, expected in (("n_episodes", n_episodes), ("is_compiled", None)):
-        found = getattr(estimator, attribute, None)
-        if found is None or (expected is not None and found != expected):
-            raise ValueError(
-                f"estimator {name} must have {attribute!r}"
-                + (f" equal to {expected}" if expected is not None else "")
-                + f", got {found!r}"
-            )
+    found = getattr(estimator, "n_episodes", None)
+    if found != n_episodes:
+        message = f"estimator {name} must have 'n_episodes' equal to {n_episodes}, got {found!r}"
+        raise ValueError(message)
+    if getattr(estimator, "is_compiled", None) is None:
+        raise ValueError(f"estimator {name} must have 'is_compiled', got None")
     check_estimate(estimator, estimator.estimate(), model.n_segments)
 
 

@@ -39,19 +39,12 @@ class Cells(NamedTuple):
 
 
 class Fluxes(NamedTuple):
-    """Flows of one step: vehicles q [veh/h] and relative flow phi = q w [veh km/h^2].
+    """Flows of a step: vehicles q [veh/h] and relative flow phi = q w [veh km/h^2]."""
 
-    Attributes:
-        outflow: `(n, S)` q that leaves each cell; at the cells `layout.exits` it leaves the road.
-        relative_outflow: `(n, S)` phi that leaves each cell.
-        source: `(n, 1 + I)` q that enters the road at the cells `layout.entries`.
-        relative_source: `(n, 1 + I)` phi that enters the road there.
-    """
-
-    outflow: FloatArray
-    relative_outflow: FloatArray
-    source: FloatArray
-    relative_source: FloatArray
+    outflow: FloatArray  # (n, S) q out of each cell; at the cells layout.exits out of the road
+    relative_outflow: FloatArray  # (n, S) phi out of each cell
+    source: FloatArray  # (n, 1 + I) q into the road at the cells layout.entries
+    relative_source: FloatArray  # (n, 1 + I) phi into the road there
 
 
 class ARZModel:

@@ -4,10 +4,11 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
+from dptse_env.estimators import Estimate
 from dptse_env.release.report import PrivacyReport
 from dptse_env.release.settings import PrivacySettings
 from dptse_env.release.traffic_table import TrafficTable
@@ -63,19 +64,7 @@ class ReleaseSetup:
         return observed
 
 
-class Prediction(Protocol):
-    """The estimator's output before its update by the release."""
-
-    @property
-    def density(self) -> FloatArray:
-        """Shape (k, S) [veh/km]."""
-
-    @property
-    def speed(self) -> FloatArray:
-        """Shape (k, S) [km/h]."""
-
-
-def _no_prediction() -> Prediction:
+def _no_prediction() -> Estimate:
     raise RuntimeError("this release request carries no prediction")
 
 
@@ -95,7 +84,7 @@ class ReleaseRequest(NamedTuple):
     traffic: IntArray
     times: IntArray
     observed: BoolArray
-    prediction: Callable[[], Prediction] = _no_prediction
+    prediction: Callable[[], Estimate] = _no_prediction
 
 
 class Released(NamedTuple):

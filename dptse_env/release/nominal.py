@@ -31,16 +31,15 @@ def nominal_flows(corridor: Corridor, times: npt.ArrayLike) -> FloatArray:
     return np.stack([*mainline, *entries, *exits], axis=-1)
 
 
-def free_flow_density(model: ARZModel, flow: FloatArray) -> FloatArray:
+def free_flow_density(
+    model: ARZModel, flow: FloatArray, jam: FloatArray | None = None
+) -> FloatArray:
     """Return the density [veh/km] at which each segment carries ``flow`` freely, both (..., S).
 
     The smaller root of q = rho (v_f - p(rho)); a flow above the capacity gives the critical
-    density.
+    density. Jam densities are by default those of the segments.
     """
-    return _free_density(model, flow, model.jam_density)
-
-
-def _free_density(model: ARZModel, flow: FloatArray, jam: FloatArray) -> FloatArray:
+    jam = model.jam_density if jam is None else jam
     v_f, gamma = model.parameters.free_flow_speed, model.parameters.gamma
     filling = np.linspace(0.0, (1.0 + gamma) ** (-1.0 / gamma), 4096)
     scaled_flow = filling * (1.0 - filling**gamma)
@@ -63,7 +62,7 @@ def nominal_inputs(corridor: Corridor, model: ARZModel) -> FloatArray:
     inputs[:, layout.entry_inputs[1:]] = demand.on_ramps
     inputs[:, layout.entry_inputs + 1] = v_f
     leaving = flows[:, [n - 1, *range(n + n_on, corridor.n_segments)]]
-    inputs[:, layout.exit_inputs] = _free_density(model, leaving, model.exit_jam_density)
+    inputs[:, layout.exit_inputs] = free_flow_density(model, leaving, model.exit_jam_density)
     return inputs
 
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, ClassVar
 
 import numpy as np
@@ -79,9 +80,12 @@ class Plan:
         return "-".join(parts)
 
 
-def available_plans() -> dict[str, Plan]:
+@cache
+def available_plans() -> Mapping[str, Plan]:
     """Return the plans that ship with the package, by name."""
-    return dict(_shipped())
+    texts = shipped_texts("dptse_env.schedules", "plans")
+    plans = [_parse(text, name) for name, text in texts.items()]
+    return MappingProxyType({plan.name: plan for plan in plans})
 
 
 def find_plan(kind: str, context: PlanContext) -> Plan:
@@ -90,7 +94,7 @@ def find_plan(kind: str, context: PlanContext) -> Plan:
     Raises:
         ValueError: There is none; the message lists the available ones.
     """
-    of_kind = [plan for plan in _shipped().values() if plan.kind == kind]
+    of_kind = [plan for plan in available_plans().values() if plan.kind == kind]
     for plan in of_kind:
         if plan.context == context:
             return plan
@@ -163,13 +167,6 @@ _KEYS = {
     "kind": str, "corridor": str, "digest": str, "estimator": str, "bandwidth": int,
     "provenance": dict, "sets": list,
 }  # fmt: skip
-
-
-@cache
-def _shipped() -> dict[str, Plan]:
-    texts = shipped_texts("dptse_env.schedules", "plans")
-    plans = [_parse(text, name) for name, text in texts.items()]
-    return {plan.name: plan for plan in plans}
 
 
 def _first_with(plan: Plan, segment: int) -> int:

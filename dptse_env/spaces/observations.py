@@ -101,18 +101,10 @@ class Block:
     """A block that ships with the package, see `ObservationBlock`."""
 
     name: str
-    length: Callable[[ObservationSetup], int]
+    size: Callable[[ObservationSetup], int]
     low: float
     high: float
-    value: Callable[[PublicState, ObservationSetup], NDArray[Any] | float]
-
-    def size(self, setup: ObservationSetup) -> int:
-        """See `ObservationBlock.size`."""
-        return self.length(setup)
-
-    def values(self, state: PublicState, setup: ObservationSetup) -> NDArray[Any] | float:
-        """See `ObservationBlock.values`."""
-        return self.value(state, setup)
+    values: Callable[[PublicState, ObservationSetup], NDArray[Any] | float]
 
     def __reduce__(self) -> tuple[Callable[[str], Block], tuple[str]]:
         """Pickle as the name, since lambda functions cannot be pickled."""

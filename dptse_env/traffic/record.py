@@ -173,7 +173,7 @@ class Record:
             for name in COLUMNS:
                 with _column_path(temporary, name).open("wb") as file:
                     np.save(file, getattr(self, name), allow_pickle=False)
-                    _sync(file.fileno())
+                    os.fsync(file.fileno())
             header = {
                 "format": RECORD_FORMAT,
                 "version": RECORD_VERSION,
@@ -185,7 +185,7 @@ class Record:
             with (temporary / MANIFEST).open("w", encoding="utf-8") as text:
                 json.dump(manifest, text, indent=2)
                 text.flush()
-                _sync(text.fileno())
+                os.fsync(text.fileno())
             _publish(temporary, path)
         finally:
             shutil.rmtree(temporary, ignore_errors=True)
@@ -269,11 +269,6 @@ def _checksum(directory: Path, header: Mapping[str, object]) -> str:
     return digest.hexdigest()
 
 
-def _sync(descriptor: int) -> None:
-    """Write a file's content to disk, so that it is there before its name is."""
-    os.fsync(descriptor)
-
-
 def _publish(temporary: Path, path: Path) -> None:
     """Rename the finished directory, unless another process has published the record."""
     try:
@@ -285,6 +280,6 @@ def _publish(temporary: Path, path: Path) -> None:
     if os.name == "posix":
         parent = os.open(path.parent, os.O_RDONLY)
         try:
-            _sync(parent)
+            os.fsync(parent)
         finally:
             os.close(parent)

@@ -18,7 +18,6 @@ import sys
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
-from types import TracebackType
 
 from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.record import Record
@@ -104,23 +103,14 @@ class Worker:
         return f"the recording process ended with code {code}" + (f"\n{errors}" if errors else "")
 
 
-class WorkerPool:
+class WorkerPool(contextlib.AbstractContextManager["WorkerPool"]):
     """Workers for several threads: each recording uses an idle worker, or starts another."""
 
     def __init__(self) -> None:
         """Make a pool without workers."""
         self._idle: queue.SimpleQueue[Worker] = queue.SimpleQueue()
 
-    def __enter__(self) -> "WorkerPool":
-        """Return the pool."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Close the idle workers; all are idle once every `record` has returned."""
         while not self._idle.empty():
             self._idle.get().close()

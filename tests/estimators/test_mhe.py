@@ -178,7 +178,9 @@ def test_an_exact_measurement_is_weighed_as_a_very_good_one(backend):
 @both_backends
 def test_a_perfect_model_has_no_weight(backend):
     settings = EstimatorSettings(process_noise=(0.0, 0.01))
-    with pytest.raises(ValueError, match=r"estimator_settings.process_noise\[0\] must be > 0"):
+    with pytest.raises(
+        ValueError, match=r"process_noise\[0\] must be a finite number > 0"
+    ):
         started("mhe", backend, simulate(n_steps=1), settings)
 
 

@@ -3,7 +3,6 @@ import json
 import pytest
 
 from dptse_env.estimators import ESTIMATORS, EstimatorSettings, HorizonSettings
-from dptse_env.estimators import tuned_settings as module
 from dptse_env.estimators.tuned_settings import (
     available_settings,
     load_settings,
@@ -13,6 +12,7 @@ from dptse_env.estimators.tuned_settings import (
 )
 from dptse_env.model import available_parameters
 from dptse_env.release import RELEASE_MODELS
+from dptse_env.utils.json_object import shipped_texts
 
 GOOD = {
     "estimator": "mhe",
@@ -25,8 +25,8 @@ GOOD = {
 
 def test_shipped_sets_are_named_after_what_they_are_for():
     assert "ekf-w99-3lane-paper" in available_settings()
-    for name in available_settings():
-        content = json.loads(module._SETS.joinpath(f"{name}.json").read_text())
+    for name, text in shipped_texts("dptse_env.estimators", "tuned").items():
+        content = json.loads(text)
         assert content["name"] == name
         assert content["estimator"] in ESTIMATORS
         assert content["parameters"] in available_parameters()

@@ -5,8 +5,8 @@ import pytest
 from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 
 from dptse_env.estimators import EstimatorSettings, SigmaPointSettings
+from dptse_env.estimators.compiled.dense import eliminate
 from dptse_env.estimators.compiled.ukf import CompiledUKF
-from dptse_env.estimators.compiled.ukf_kernels import factor
 from dptse_env.model import ARZModel, load_parameters
 from dptse_env.traffic import PAPER_HIGHWAY
 
@@ -104,13 +104,13 @@ def test_a_root_is_one_and_what_has_none_is_refused():
     matrix = np.zeros((38, 40))
     matrix[:, :38] = root @ root.T + np.eye(38)
     upper = matrix.copy()
-    assert factor(upper, 38)
+    assert eliminate(upper, 38, upper.shape[1])
     triangle = np.triu(upper[:, :38])
     np.testing.assert_allclose(triangle.T @ triangle, matrix[:, :38], rtol=1e-11, atol=1e-11)
     for bad in (np.nan, -1.0, np.inf):
         broken = matrix.copy()
         broken[20, 20] = bad
-        assert not factor(broken, 38)
+        assert not eliminate(broken, 38, broken.shape[1])
 
 
 @both_backends

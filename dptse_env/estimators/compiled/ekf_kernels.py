@@ -184,15 +184,17 @@ def _innovate(
     innovations[:] = 0.0
     for s in range(observed.size):
         if observed[s]:
-            a, b, c = (
-                covariance[2 * s, 2 * s],
-                covariance[2 * s, 2 * s + 1],
-                covariance[2 * s + 1, 2 * s + 1],
-            )
-            by_rho, by_psi = rows[s, 2], rows[s, 3]
-            speed_variance = by_rho * by_rho * a + 2.0 * by_rho * by_psi * b + by_psi * by_psi * c
-            innovations[s, 0] = rows[s, 0] / np.sqrt(a + noise[0])
-            innovations[s, 1] = rows[s, 1] / np.sqrt(speed_variance + noise[1])
+            variance = variance_along(covariance, s, rows[s, 2], rows[s, 3])
+            innovations[s, 0] = rows[s, 0] / np.sqrt(covariance[2 * s, 2 * s] + noise[0])
+            innovations[s, 1] = rows[s, 1] / np.sqrt(variance + noise[1])
+
+
+@njit(cache=True, error_model="numpy")
+def variance_along(covariance: FloatArray, s: int, by_rho: float, by_psi: float) -> float:
+    """Return the variance of a quantity with these derivatives by a segment's rho and psi."""
+    a, b = covariance[2 * s, 2 * s], covariance[2 * s, 2 * s + 1]
+    c = covariance[2 * s + 1, 2 * s + 1]
+    return float(by_rho * by_rho * a + 2.0 * by_rho * by_psi * b + by_psi * by_psi * c)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -208,17 +210,11 @@ def summarise(road_: Packed, filters_: Packed, out: FloatArray) -> None:
             p = pressure(rho, jam, v_f, road.gamma)
             w = psi / rho if rho > VACUUM * jam else v_f
             _, by_rho, by_psi = measured(rho, psi, jam, v_f, road.gamma)
-            by_rho, by_psi = by_rho * scale, by_psi * scale * v_f
-            a, b, c = (
-                covariance[2 * s, 2 * s],
-                covariance[2 * s, 2 * s + 1],
-                covariance[2 * s + 1, 2 * s + 1],
-            )
-            speed_variance = by_rho * by_rho * a + 2.0 * by_rho * by_psi * b + by_psi * by_psi * c
+            variance = variance_along(covariance, s, by_rho * scale, by_psi * scale * v_f)
             out[0, e, s] = rho
             out[1, e, s] = _clip(w - p, 0.0, largest)
-            out[2, e, s] = scale * np.sqrt(max(a, 0.0))
-            out[3, e, s] = np.sqrt(max(speed_variance, 0.0))
+            out[2, e, s] = scale * np.sqrt(max(covariance[2 * s, 2 * s], 0.0))
+            out[3, e, s] = np.sqrt(max(variance, 0.0))
 
 
 @njit(cache=True, error_model="numpy")

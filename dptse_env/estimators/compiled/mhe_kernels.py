@@ -7,7 +7,13 @@ from numba import njit
 
 from dptse_env.estimators.compiled import ekf_kernels as kernels
 from dptse_env.estimators.compiled.active_set import make_active_set, minimise
-from dptse_env.estimators.compiled.ekf_kernels import Filters, Packed, project, released
+from dptse_env.estimators.compiled.ekf_kernels import (
+    Filters,
+    Packed,
+    project,
+    released,
+    variance_along,
+)
 from dptse_env.estimators.compiled.window import Chain, factorise, make_window_scratch
 from dptse_env.model.kernels import advance, make_scratch
 from dptse_env.model.road_arrays import RoadArrays
@@ -261,9 +267,7 @@ def _innovate(
         rho, psi = filters.means[e, 2 * s], filters.means[e, 2 * s + 1]
         expected, _, _ = released(road, s, rho, psi)
         by_rho, by_psi = windows.rows[e, last, s]
-        a, b = before[2 * s, 2 * s], before[2 * s, 2 * s + 1]
-        c = before[2 * s + 1, 2 * s + 1]
-        variance = by_rho * by_rho * a + 2.0 * by_rho * by_psi * b + by_psi * by_psi * c
+        variance = variance_along(before, s, by_rho, by_psi)
         density, second = windows.values[e, last, s]
-        innovations[s, 0] = (density - rho / scale) / np.sqrt(a + noise[0])
+        innovations[s, 0] = (density - rho / scale) / np.sqrt(before[2 * s, 2 * s] + noise[0])
         innovations[s, 1] = (second - expected / unit) / np.sqrt(variance + noise[1])
