@@ -1,4 +1,4 @@
-"""Traffic state estimators behind one protocol."""
+"""Traffic state estimators with a common protocol."""
 
 from dptse_env.estimators.base import Estimate, Estimator
 from dptse_env.estimators.registry import (

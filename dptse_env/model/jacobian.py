@@ -1,4 +1,4 @@
-"""Analytic derivative of one step of the ARZ model by its state.
+"""Analytic derivative of a step of the ARZ model by its state.
 
 The outflow of a cell depends on the cells at its downstream face only. Its derivative is kept as
 `by[n, cell, other, (rho, psi)]`; the step's Jacobian is then the balance of these, as the step is

@@ -1,4 +1,4 @@
-"""Compiled kernels of the ARZ model: one state vector, its next state and its sparse Jacobian.
+"""Compiled kernels of the ARZ model: the next state of a state vector, and the sparse Jacobian.
 
 The equations are those of `dptse_env.model.arz`, written for one cell at a time. A cell's outflow
 depends on at most three cells, its parties: itself and those at its downstream face. A step's
@@ -8,7 +8,7 @@ numba caches compiled code by the file of a function, not by the functions it ca
 here, delete the `*.nbi` files of the packages that call these kernels.
 
 Kernels do not allocate: callers pass scratch space (`make_scratch`), so that a kernel can run
-inside another one, once per step and episode.
+inside another, once per step and episode.
 """
 
 from typing import NamedTuple

@@ -1,6 +1,6 @@
 """Standard deviations of the noise for given privacy parameters, by three calibrations.
 
-Each function returns one standard deviation for each release, in the release's own unit: for the
+Each function returns one standard deviation for each release, in the release's unit: for the
 paper's sensitivities [veh/km, km/h].
 """
 

@@ -13,12 +13,12 @@ from typing import Literal
 from dptse_env.utils.validation import integer, positive
 
 Adjacency = Literal["replace", "add_remove"]
-"""How two records differ: one vehicle's data replaced by another's, or one vehicle more."""
+"""Difference of adjacent records: a vehicle's data replaced by another's, or a vehicle added."""
 
 
 @dataclass(frozen=True)
 class ReleaseSensitivity:
-    """Sensitivity of one of the released quantities over a whole episode.
+    """Sensitivity of a released quantity over a complete episode.
 
     Attributes:
         quantity: name of the released quantity.
@@ -78,7 +78,7 @@ def paper_sensitivity(
         average_dwell: average time on a segment, in released steps.
         segment_length: [km].
         free_flow_speed: [km/h].
-        jam_density: of a mainline segment, all lanes [veh/km].
+        jam_density: jam density of a mainline segment, all lanes [veh/km].
 
     Returns:
         Delta_rho = sqrt(2 n_sensors average_dwell) / segment_length [veh/km] and
@@ -126,11 +126,11 @@ def contribution_sensitivity(
 
     Args:
         contributions: C, released steps that a vehicle's data can enter, >= 1.
-        adjacency: how two records differ.
+        adjacency: difference of adjacent records.
         segment_length: l [km].
         largest_speed: v_max [km/h], a public constant that recorded speeds are clipped to.
-        mean_speed_slope: where mean speeds are released in place of flows, the paper's relation
-            Delta_v / Delta_rho [km/h per veh/km], which does not hold.
+        mean_speed_slope: the paper's relation Delta_v / Delta_rho [km/h per veh/km], which does
+            not hold, where mean speeds are released in place of flows; else None.
 
     Raises:
         ValueError: A number is out of range.

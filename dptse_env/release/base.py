@@ -113,7 +113,7 @@ class ReleaseModel(ABC):
     settings_type: ClassVar[type[PrivacySettings]] = PrivacySettings
     """Dataclass of the settings under the keyword ``privacy``."""
     claims_guarantee: ClassVar[bool] = False
-    """Whether users expect a guarantee, so that a warning is due where it is void."""
+    """True where users expect a guarantee, so that a warning is due if it is void."""
 
     @classmethod
     def flow_centre(cls, corridor: Corridor, settings: Any) -> float | None:

@@ -2,6 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -104,16 +105,11 @@ class GaussianRelease(ReleaseModel):
         # Le Ny's kappa may be so loose that even both releases together stay below epsilon.
         if epsilon > settings.epsilon * (1.0 + 1e-9):
             found.append("releases_not_composed")
-        flow = self.flow_centre(self.setup.corridor, settings) is not None
-        return PrivacyReport(
-            preset=self.setup.name,
+        return replace(
+            super().report(),
             guarantee="none" if found else self._guarantee(),
             void_reasons=in_order(found),
             protects=self.protects,
-            claimed_epsilon=settings.epsilon,
-            claimed_delta=settings.delta,
-            speed_release="flow" if flow else "mean",
-            boundary_inputs=settings.boundary,
             mu=mu,
             epsilon=epsilon,
             epsilon_strict=epsilon_of(mu, STRICT_DELTA),

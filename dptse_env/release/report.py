@@ -47,7 +47,7 @@ class PrivacyReport:
         protects: Description of the protected data and of the change that is protected.
         claimed_epsilon: The configured epsilon.
         claimed_delta: The configured delta.
-        speed_release: How speeds are released: ``mean`` or ``flow``.
+        speed_release: Release of speeds: ``mean`` or ``flow``.
         boundary_inputs: Source of the estimator's inputs at the boundary.
         mu: Parameter of all releases together.
         epsilon: Epsilon of all releases together, at `claimed_delta`.

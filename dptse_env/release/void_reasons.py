@@ -26,7 +26,7 @@ VOID_REASONS: Mapping[str, str] = MappingProxyType(
             "the estimator is fed the true state of the boundary segments without noise"
         ),
         "releases_not_composed": (
-            "density and speed together reveal more than the epsilon asked for"
+            "density and speed together reveal more than the configured epsilon"
         ),
         "truth_in_info": "info['truth'] shows the true traffic and what each vehicle contributed",
     }

@@ -5,7 +5,7 @@ from torch import Tensor
 
 
 class PlackettLuce:
-    """Draws B distinct items of n, one after the other, each by softmax over the remaining ones.
+    """Draws B distinct items of n in turn, each by softmax over the remaining ones.
 
     With scores s the probability of the ordered set a_1, .., a_B is
 
@@ -70,7 +70,7 @@ class PlackettLuce:
             raise ValueError(f"chosen must lie in [0, {n - 1}], got {chosen.tolist()}")
         ordered = chosen.sort(dim=1).values
         if bool((ordered[:, 1:] == ordered[:, :-1]).any()):
-            raise ValueError("chosen must hold distinct items, one appears twice")
+            raise ValueError("chosen must hold distinct items, an item appears twice")
         return chosen
 
     def _largest(self, keys: Tensor) -> Tensor:

@@ -60,7 +60,7 @@ class Schedule(ABC):
         Args:
             observation: Shape (size,) or (k, size).
             state: The state returned by the last call, None at the first.
-            episode_start: Which episodes have just begun, shape (k,) or a single flag.
+            episode_start: Flags of episodes that have just begun, shape (k,) or a single flag.
             deterministic: Part of the common signature, without effect.
         """
         del deterministic

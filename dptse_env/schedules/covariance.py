@@ -142,7 +142,7 @@ class Greedy(CovarianceSchedule):
     - ``trace`` (A-optimal): the trace of that reduction, weighted as in `CovarianceInflation`. The
       full trace is the squared error that the estimator expects in the reward's metric.
     - ``logdet`` (D-optimal): ``log det(H_s C H_s' + R) - log det R``, the reduction of the log
-      determinant of the whole state's covariance. It is the same in all units, so it does not
+      determinant of the covariance of the full state. It is the same in all units, so it does not
       depend on the reward. The gain is submodular: greedy reaches 63 % of the best set's.
 
     The cost is a rank-2 downdate of C per pick, O(B n^2), after a prediction that costs as much as

@@ -80,12 +80,12 @@ class _Realised(ProcessSchedule):
         traffic, times = ahead.traffic_index[episodes], ahead.time[episodes]
         n = ahead.config.corridor.n_segments
         ahead.estimator.predict(episodes, ahead.boundary.inputs(episodes, traffic, times))
-        everywhere = np.ones((len(episodes), ahead.release.setup.n_columns), dtype=bool)
+        all_columns = np.ones((len(episodes), ahead.release.setup.n_columns), dtype=bool)
         request = ReleaseRequest(
             episodes,
             traffic,
             times + 1,
-            everywhere,
+            all_columns,
             lambda: ahead.estimator.estimate().at(episodes),
         )
         released = ahead.release.release(request).values

@@ -100,22 +100,22 @@ def find_plan(kind: str, context: PlanContext) -> Plan:
             return plan
     known = "; ".join(str(plan.context) for plan in of_kind) or "none at all"
     raise ValueError(
-        f"no plan {kind!r} ships for {context}; there is one for: {known}. "
-        "scripts/search_plan.py makes one; pass its file as the schedule"
+        f"no plan {kind!r} ships for {context}; plans exist for: {known}. "
+        "scripts/search_plan.py makes plans; pass its file as the schedule"
     )
 
 
 def read_plan(path: str | Path) -> Plan:
-    """Read a plan from a JSON file of the shape that `write_plan` leaves.
+    """Read a plan from a JSON file, as written by `write_plan`.
 
     Raises:
-        ValueError: The file has another shape; the message starts with its path.
+        ValueError: The file has another format; the message starts with its path.
     """
     return _parse(Path(path).read_text(encoding="utf-8"), str(path))
 
 
 def write_plan(path: str | Path, plan: Plan) -> None:
-    """Write a plan as JSON, one set a line.
+    """Write a plan as JSON, with a line per set.
 
     Raises:
         ValueError: The plan could not be read back; nothing is written then.

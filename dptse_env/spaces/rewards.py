@@ -16,7 +16,7 @@ REWARD_TERMS = ("joint", "density", "speed")
 
 @dataclass(frozen=True)
 class EstimationError:
-    """The error over the mainline of k episodes at one step.
+    """The error over the mainline of k episodes at a step.
 
     Attributes:
         density: Root mean squared density error over all mainline segments [veh/km], shape (k,).

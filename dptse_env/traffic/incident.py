@@ -19,7 +19,7 @@ Duration = Annotated[float, Interval(0, 1e6, open_low=True)]
 
 @dataclass(frozen=True)
 class Incident:
-    """A temporary speed limit on one mainline segment, as a variable speed sign sets it.
+    """A temporary speed limit on a mainline segment, as by a variable speed sign.
 
     Attributes:
         segment: index of the mainline segment.
@@ -64,7 +64,7 @@ class Incident:
 
 @dataclass(frozen=True)
 class IncidentDistribution:
-    """Ranges from which every traffic seed draws its own incident, each uniformly.
+    """Ranges from which the incident of each traffic seed is drawn uniformly.
 
     The incident has two phases, as in the paper: a blockage, then a slower recovery.
 

@@ -75,7 +75,7 @@ def find_corridor(value: Any) -> Corridor:
 
 
 def randomised(corridor: Corridor) -> Corridor:
-    """Return `corridor` with a demand level and an incident drawn anew for every traffic seed.
+    """Return `corridor` with a random demand level and incident for every traffic seed.
 
     The demand varies by a fifth either way. The incident may block any mainline segment but the
     last, at any time that leaves a third of the record for the jam, with ranges in proportion to

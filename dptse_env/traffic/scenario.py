@@ -31,7 +31,7 @@ class Scenario:
         departures: (V,) desired departure times [s], non-decreasing; a vehicle's index is its id.
         origins: (V,) index of the on-ramp, or `MAINLINE`.
         exits: (V,) index of the off-ramp, or `MAINLINE`.
-        sumo_seed: seed of SUMO's own randomness (desired speeds).
+        sumo_seed: seed of SUMO's random desired speeds.
     """
 
     seed: int

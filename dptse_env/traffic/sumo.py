@@ -1,4 +1,4 @@
-"""Running SUMO: one scenario in, one record out.
+"""Simulation of scenarios by SUMO, which gives records.
 
 libsumo has one simulation per process: starting a second one silently replaces the first. A
 recording therefore takes place in a child process when this one holds another simulation.

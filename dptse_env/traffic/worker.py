@@ -35,7 +35,7 @@ class WorkerDiedError(RecordingError):
 
 
 class Worker:
-    """A child process that records scenarios one after another."""
+    """A child process that records scenarios sequentially."""
 
     def __init__(self) -> None:
         """Start the child."""

@@ -145,7 +145,7 @@ def segment_update(
 
     for i in range(n):
         x1, y1, x2, y2 = k1[i], rest1[i], k2[i], rest2[i]
-        # Up to the diagonal, in whole registers.
+        # Up to the diagonal, in full registers.
         for j in range((i // VECTOR_WIDTH + 1) * VECTOR_WIDTH):
             covariance[i, j] -= x1 * c1[j] + y1 * k1[j] + (x2 * c2[j] + y2 * k2[j])
     return True

@@ -1,4 +1,4 @@
-"""Compiled kernels of the extended Kalman filter: a batch of episodes, one after the other.
+"""Compiled kernels of the extended Kalman filter, episode by episode.
 
 Means are in physical units, as the model takes them; covariances are normalised, rho by rho_m and
 psi by rho_m v_f, so that variances of all components are of one order.

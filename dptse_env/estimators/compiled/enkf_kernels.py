@@ -1,4 +1,4 @@
-"""Compiled kernels of the ensemble Kalman filter: a batch of episodes, one after the other.
+"""Compiled kernels of the ensemble Kalman filter, episode by episode.
 
 With D the deviations of outputs from their mean and X those of states, a member per column, the
 update is `x += X D' (D D' + (M - 1) R)^-1 (z + noise - y)` for every member: S is factorised and

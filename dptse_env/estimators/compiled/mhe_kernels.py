@@ -1,4 +1,4 @@
-"""Compiled kernels of the moving horizon estimator: a batch of episodes, one after the other."""
+"""Compiled kernels of the moving horizon estimator, episode by episode."""
 
 from typing import NamedTuple
 
@@ -25,7 +25,7 @@ class Windows(NamedTuple):
 
     length: IntArray  # (n,) stages in use
     arrival_variance: FloatArray  # (n, 2) in use
-    predicted: FloatArray  # (n, L, 2 S) each stage's prediction, the first one the arrival's mean
+    predicted: FloatArray  # (n, L, 2 S) predictions of stages; the first is the arrival's mean
     inputs: FloatArray  # (n, L, n_u) of the step that leaves each stage
     observed: BoolArray  # (n, L, S)
     values: FloatArray  # (n, L, S, 2)

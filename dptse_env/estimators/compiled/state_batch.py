@@ -91,12 +91,6 @@ def _supplies(
 
 
 @njit(cache=True, error_model="numpy")
-def _minimum(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
-    for j in range(out.size):
-        out[j] = a[j] if a[j] <= b[j] else b[j]
-
-
-@njit(cache=True, error_model="numpy")
 def _merge(
     scratch: BatchScratch, c: int, down: int, other: int, jam: float, v_f: float, gamma: float
 ) -> None:
@@ -144,7 +138,8 @@ def _flow_out(road: RoadArrays, scratch: BatchScratch, c: int, inputs: FloatArra
                 for j in range(supply.size):
                     branch = off[j] / share
                     supply[j] = branch if branch < supply[j] else supply[j]
-    _minimum(demand, supply, flow)
+    for j in range(flow.size):
+        flow[j] = demand[j] if demand[j] <= supply[j] else supply[j]
 
 
 @njit(cache=True, error_model="numpy")

@@ -1,4 +1,4 @@
-"""Compiled kernels of the unscented Kalman filter: a batch of episodes, one after the other.
+"""Compiled kernels of the unscented Kalman filter, episode by episode.
 
 The points of a step include the process noise of earlier steps only: Q is added to P after their
 prediction, and the next points are made from that. On a linear system this is the Kalman filter of

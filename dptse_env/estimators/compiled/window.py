@@ -37,7 +37,7 @@ class WindowScratch(NamedTuple):
     """Scratch space for windows of up to L stages."""
 
     factors: FloatArray  # (L, 2 S, padded) filtered covariances
-    before: FloatArray  # (2 S, padded) the last one without its stage's measurements
+    before: FloatArray  # (2 S, padded) the last covariance before its stage's measurements
     information: FloatArray  # (L, S, 3) C' C / R: rho rho, rho psi, psi psi
     diagonal: FloatArray  # (L, padded) of H
     product: FloatArray  # (2, 2 S, padded) scratch

@@ -1,1 +1,1 @@
-"""Estimators on filterpy: what a reader checks the equations against."""
+"""Reference estimators by filterpy, numpy and qpsolvers, which follow the equations closely."""
