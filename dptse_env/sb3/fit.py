@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 from dptse_env.config import PRESETS, EnvConfig
@@ -67,10 +67,6 @@ class TrainedOn:
             } if _is_name(name):
                 return cls(name, n_mainline, lanes, length)
         raise ValueError("its card does not describe the road that it was trained on")
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the description as plain JSON."""
-        return asdict(self)
 
     def __str__(self) -> str:
         """Return the name and the sizes in words."""

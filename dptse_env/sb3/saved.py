@@ -5,6 +5,7 @@ import json
 import os
 import zipfile
 from collections.abc import Collection, Mapping
+from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -122,7 +123,7 @@ def save_policy(
         "env": env,
         "keywords": dict(keywords),
         "corridor": config.corridor.name,
-        "trained_on": TrainedOn.from_corridor(config.corridor).to_dict(),
+        "trained_on": asdict(TrainedOn.from_corridor(config.corridor)),
         "estimator": ESTIMATORS.name_of(config.estimator),
         "epsilon": config.privacy.epsilon,
         "versions": {name: version(name) for name in ("dptse-env", "stable-baselines3", "torch")},

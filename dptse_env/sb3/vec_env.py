@@ -115,7 +115,7 @@ class SB3VecEnv(VecEnv):
                 self.env.interface.require_sequential()
             except ValueError as problem:
                 raise AttributeError(str(problem)) from problem
-            return [lambda e=e: self._masks()[e] for e in episodes]
+            return [lambda e=e: self.env.action_masks()[e] for e in episodes]
         if attr_name in ("action_space", "observation_space"):
             return [getattr(self, attr_name)] * len(episodes)
         if attr_name in ("np_random", "np_random_seed"):
@@ -146,7 +146,7 @@ class SB3VecEnv(VecEnv):
                 "environment, use its methods"
             )
         self.get_attr(_MASKS, indices)
-        masks = self._masks()
+        masks = self.env.action_masks()
         return [masks[e] for e in self._get_indices(indices)]
 
     def env_is_wrapped(
@@ -154,9 +154,6 @@ class SB3VecEnv(VecEnv):
     ) -> list[bool]:
         """Return False for each: scalar wrappers have nothing to wrap here."""
         return [False for _ in self._get_indices(indices)]
-
-    def _masks(self) -> NDArray[np.bool_]:
-        return self.env.action_masks()
 
     def _note_resets(self, episodes: Sequence[int] | NDArray[np.int64] | range) -> None:
         """Store the infos of resets where stable-baselines3 looks for them."""

@@ -3,18 +3,6 @@
 Every schedule has the ``predict`` of a stable-baselines3 policy, so one loop serves schedules and
 learned policies alike. Its memory between steps travels in ``state``, so one schedule serves any
 number of episodes at once.
-
-======================== ============ ====================================================
-schedules                use          extra cost of a step
-======================== ============ ====================================================
-`OBSERVATION_SCHEDULES`  the          a sort at most
-                         observation
-`COVARIANCE_SCHEDULES`   the          an EKF's step or two; ``rollout`` some hundred of them
-                         estimator's
-                         covariance
-`PLANS`                  a clock      none; optimised beforehand on training traffic
-`ORACLES`                the truth    bounds, not policies: ``uses_truth`` is True
-======================== ============ ====================================================
 """
 
 from functools import partial
@@ -95,7 +83,8 @@ OBSERVATION_SCHEDULES: dict[str, Any] = {
     "stale-variance": StaleVariance,
     "all": Everything,
 }
-"""Schedules that use the observation alone, each made of (interface, seed)."""
+"""Schedules that use the observation alone, each made of (interface, seed); a step costs at most a
+sort."""
 
 COVARIANCE_SCHEDULES: dict[str, type[ProcessSchedule]] = {
     "greedy-trace": GreedyTrace,
@@ -103,7 +92,8 @@ COVARIANCE_SCHEDULES: dict[str, type[ProcessSchedule]] = {
     "inflated-trace": InflatedTrace,
     "rollout": Rollout,
 }
-"""Schedules that use the estimator's covariance, each made of (process, seed)."""
+"""Schedules that use the estimator's covariance, each made of (process, seed); a step costs one or
+two steps of the EKF, of ``rollout`` some hundred."""
 
 ORACLES: dict[str, type[ProcessSchedule]] = {
     "oracle-error": OracleError,

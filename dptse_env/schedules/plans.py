@@ -28,19 +28,12 @@ PLAN_ALIASES = {"offline": "optimised-plan"}
 
 @dataclass(frozen=True)
 class PlanContext:
-    """The road, traffic, estimator and bandwidth that a plan was optimised for.
+    """The road, traffic, estimator and bandwidth that a plan was optimised for."""
 
-    Attributes:
-        corridor: Name of the road.
-        digest: Digest of its traffic (`dptse_env.traffic.Corridor.digest`).
-        estimator: Name of the estimator.
-        bandwidth: Queries a step.
-    """
-
-    corridor: str
-    digest: str
-    estimator: str
-    bandwidth: int
+    corridor: str  # name of the road
+    digest: str  # of its traffic, `dptse_env.traffic.Corridor.digest`
+    estimator: str  # name of the estimator
+    bandwidth: int  # queries per step
 
     @classmethod
     def from_config(cls, config: EnvConfig) -> PlanContext:
@@ -58,19 +51,12 @@ class PlanContext:
 
 @dataclass(frozen=True)
 class Plan:
-    """A period of sets of segments.
+    """A periodic sequence of sets of segments."""
 
-    Attributes:
-        kind: One of `PLANS`.
-        context: The configuration that it was optimised for.
-        sets: The segments of each step of the period.
-        provenance: Traffic, noise, scores, date and versions.
-    """
-
-    kind: str
+    kind: str  # one of `PLANS`
     context: PlanContext
-    sets: tuple[tuple[int, ...], ...]
-    provenance: Mapping[str, Any]
+    sets: tuple[tuple[int, ...], ...]  # segments of each step of the period
+    provenance: Mapping[str, Any]  # traffic, noise, scores, date and versions
 
     @property
     def name(self) -> str:
