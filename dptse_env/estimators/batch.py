@@ -102,10 +102,10 @@ class BatchEstimator(ABC):
         self, episodes: IntArray, observed: BoolArray, values: FloatArray, sigma: FloatArray
     ) -> None:
         """See `Estimator.update`; observed values that are not finite make a filter diverge."""
-        n_segments = self.model.n_segments
-        given = checked_measurements(self.n_episodes, n_segments, episodes, observed, values, sigma)
-        self.fallback[given.episodes] = False
-        self._update(given._replace(sigma=self._noise_scale * given.sigma))
+        sizes = self.n_episodes, self.model.n_segments
+        measured = checked_measurements(*sizes, episodes, observed, values, sigma)
+        self.fallback[measured.episodes] = False
+        self._update(measured._replace(sigma=self._noise_scale * measured.sigma))
 
     @abstractmethod
     def estimate(self) -> Estimate:
@@ -120,4 +120,4 @@ class BatchEstimator(ABC):
     def _predict(self, episodes: IntArray, inputs: FloatArray) -> None: ...
 
     @abstractmethod
-    def _update(self, given: Measurements) -> None: ...
+    def _update(self, measured: Measurements) -> None: ...

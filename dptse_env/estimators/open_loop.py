@@ -34,8 +34,8 @@ class OpenLoop(BatchEstimator):
         after = self.model.step(self.states[episodes], inputs)
         self.states[episodes] = self.model.project(after, self.settings.bounds)
 
-    def _update(self, given: Measurements) -> None:
-        episodes = given.episodes
+    def _update(self, measured: Measurements) -> None:
+        episodes = measured.episodes
         self.diverged[episodes] = ~np.all(np.isfinite(self.states[episodes]), axis=1)
         lost = episodes[self.diverged[episodes]]
         self.states[lost] = self._prior[lost]

@@ -68,22 +68,22 @@ class RandomWalk(BatchEstimator):
         # A random walk does not depend on the inputs.
         self.variances[episodes] += self._process_variance
 
-    def _update(self, given: Measurements) -> None:
-        self._update_quantity(given, slice(0, 1), given.values[..., :1], given.sigma[:1])
-        speeds, sigma = given.values[..., 1:], given.sigma[1:]
+    def _update(self, measured: Measurements) -> None:
+        self._update_quantity(measured, slice(0, 1), measured.values[..., :1], measured.sigma[:1])
+        speeds, sigma = measured.values[..., 1:], measured.sigma[1:]
         if self.model.reference_speed is not None:
-            density = np.maximum(self.means[given.episodes, :, :1], self._least_density)
+            density = np.maximum(self.means[measured.episodes, :, :1], self._least_density)
             speeds = self.model.reference_speed + speeds / density
             sigma = sigma / density
-        self._update_quantity(given, slice(1, 2), speeds, sigma)
-        finite = np.isfinite(given.values).all(axis=2) | ~given.observed
-        self._restart(given.episodes, np.all(finite, axis=1))
+        self._update_quantity(measured, slice(1, 2), speeds, sigma)
+        finite = np.isfinite(measured.values).all(axis=2) | ~measured.observed
+        self._restart(measured.episodes, np.all(finite, axis=1))
 
     def _update_quantity(
-        self, given: Measurements, which: slice, values: FloatArray, sigma: FloatArray
+        self, measured: Measurements, which: slice, values: FloatArray, sigma: FloatArray
     ) -> None:
         """Update densities or speeds `(k, S, 1)`."""
-        episodes, seen = given.episodes, given.observed[:, :, None]
+        episodes, seen = measured.episodes, measured.observed[:, :, None]
         mean, variance = self.means[episodes, :, which], self.variances[episodes, :, which]
         noise = sigma**2
         total = variance + noise

@@ -81,11 +81,11 @@ def minimise(
         for a in range(m):
             t, i = active.members[a]
             excess[a] = free[t, i] - (lower[i] if active.side[t, i] < 0 else upper[i])
-        pull = _hold(active, m, excess)
+        multipliers = _solve_multipliers(active, m, excess)
         z[:n_stages] = free
         for a in range(m):
-            _subtract(pull[a], _column(active, a), z, n_stages)
-        if not _revise(n_stages, lower, upper, active, pull, z, turn >= BLOCK_ROUNDS):
+            _subtract(multipliers[a], _column(active, a), z, n_stages)
+        if not _revise(n_stages, lower, upper, active, multipliers, z, turn >= BLOCK_ROUNDS):
             settled = True
             break
     if not settled:
@@ -100,10 +100,10 @@ def minimise(
         solve(road, chain, n_stages, 0, scratch, slope, step)
         for a in range(m):
             excess[a] = -step[active.members[a, 0], active.members[a, 1]]
-        pull = _hold(active, m, excess)
+        multipliers = _solve_multipliers(active, m, excess)
         _subtract(1.0, step, z, n_stages)
         for a in range(m):
-            _subtract(pull[a], _column(active, a), z, n_stages)
+            _subtract(multipliers[a], _column(active, a), z, n_stages)
     return False
 
 
@@ -155,7 +155,7 @@ def _column(active: ActiveSet, a: int) -> FloatArray:
 
 
 @njit(cache=True, error_model="numpy")
-def _hold(active: ActiveSet, m: int, excess: FloatArray) -> FloatArray:
+def _solve_multipliers(active: ActiveSet, m: int, excess: FloatArray) -> FloatArray:
     """Return the multipliers that remove the excess of active variables, by a Cholesky solve."""
     L, x = np.empty((m, m)), excess.copy()
     for a in range(m):
@@ -194,7 +194,7 @@ def _revise(
     lower: FloatArray,
     upper: FloatArray,
     active: ActiveSet,
-    pull: FloatArray,
+    multipliers: FloatArray,
     z: FloatArray,
     only_first: bool,
 ) -> bool:
@@ -205,7 +205,7 @@ def _revise(
             side = active.side[t, i]
             if side != 0:  # the members have this order
                 # At the lower bound the free minimum lies below: its multiplier is negative.
-                wrong, side, a = pull[a] * side < 0.0, 0, a + 1
+                wrong, side, a = multipliers[a] * side < 0.0, 0, a + 1
             elif z[t, i] < lower[i] - SLACK:
                 wrong, side = True, -1
             else:

@@ -17,6 +17,6 @@ class CompiledEKF(CompiledFilter):
     def _predict(self, episodes: IntArray, inputs: FloatArray) -> None:
         kernels.predict(*self._packed, episodes, inputs)
 
-    def _update(self, given: Measurements) -> None:
-        observed, values, sigma = given.observed, given.values, given.sigma
-        kernels.update(*self._packed, given.episodes, observed, values, sigma)
+    def _update(self, measured: Measurements) -> None:
+        observed, values, sigma = measured.observed, measured.values, measured.sigma
+        kernels.update(*self._packed, measured.episodes, observed, values, sigma)

@@ -98,9 +98,14 @@ class CompiledEnKF(BatchEstimator):
     def _predict(self, episodes: IntArray, inputs: FloatArray) -> None:
         kernels.predict(self._road, self._packed, episodes, inputs)
 
-    def _update(self, given: Measurements) -> None:
+    def _update(self, measured: Measurements) -> None:
         kernels.update(
-            self._road, self._packed, given.episodes, given.observed, given.values, given.sigma
+            self._road,
+            self._packed,
+            measured.episodes,
+            measured.observed,
+            measured.values,
+            measured.sigma,
         )
 
     def estimate(self) -> Estimate:

@@ -95,12 +95,12 @@ class CompiledMHE(CompiledFilter):
     def _predict(self, episodes: IntArray, inputs: FloatArray) -> None:
         mhe_kernels.predict(*self._windows_packed, episodes, inputs)
 
-    def _update(self, given: Measurements) -> None:
-        sigma = np.maximum(given.sigma, LEAST_DEVIATION * self._scales)
+    def _update(self, measured: Measurements) -> None:
+        sigma = np.maximum(measured.sigma, LEAST_DEVIATION * self._scales)
         mhe_kernels.update(
-            *self._windows_packed, given.episodes, given.observed, given.values, sigma
+            *self._windows_packed, measured.episodes, measured.observed, measured.values, sigma
         )
-        unsolved = given.episodes[self._windows.unsolved[given.episodes]]
+        unsolved = measured.episodes[self._windows.unsolved[measured.episodes]]
         for episode in unsolved.tolist():
             self._pass_on(episode)
 

@@ -42,10 +42,10 @@ class CompiledUKF(CompiledFilter):
     def _predict(self, episodes: IntArray, inputs: FloatArray) -> None:
         ukf_kernels.predict(*self._packed, self._points_packed, episodes, inputs)
 
-    def _update(self, given: Measurements) -> None:
-        observed, values, sigma = given.observed, given.values, given.sigma
+    def _update(self, measured: Measurements) -> None:
+        observed, values, sigma = measured.observed, measured.values, measured.sigma
         ukf_kernels.update(
-            *self._packed, self._points_packed, given.episodes, observed, values, sigma
+            *self._packed, self._points_packed, measured.episodes, observed, values, sigma
         )
 
     def _restart(self, episodes: IntArray) -> None:

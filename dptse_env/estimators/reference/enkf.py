@@ -99,12 +99,12 @@ class ReferenceEnKF(BatchEstimator):
             for episode, members in zip(episodes.tolist(), moved.reshape(-1, *shape), strict=True):
                 self.members[episode] = self._perturbed(episode, members, self._process_deviation)
 
-    def _update(self, given: Measurements) -> None:
+    def _update(self, measured: Measurements) -> None:
         with np.errstate(all="ignore"):
             for episode, mask, row in zip(
-                given.episodes.tolist(), given.observed, given.values, strict=True
+                measured.episodes.tolist(), measured.observed, measured.values, strict=True
             ):
-                self._update_one(episode, mask, row, given.sigma)
+                self._update_one(episode, mask, row, measured.sigma)
 
     def _update_one(
         self, episode: int, observed: BoolArray, values: FloatArray, sigma: FloatArray

@@ -128,13 +128,13 @@ class ReferenceFilter(BatchEstimator):
                 except LinAlgError:  # no root of P; the update resets the filter
                     self._filters[episode].x[:] = np.nan
 
-    def _update(self, given: Measurements) -> None:
+    def _update(self, measured: Measurements) -> None:
         with np.errstate(all="ignore"), warnings.catch_warnings():
             warnings.simplefilter("error", LinAlgWarning)
             for episode, mask, row in zip(
-                given.episodes.tolist(), given.observed, given.values, strict=True
+                measured.episodes.tolist(), measured.observed, measured.values, strict=True
             ):
-                self._update_one(episode, mask, row, given.sigma)
+                self._update_one(episode, mask, row, measured.sigma)
 
     def _update_one(
         self, episode: int, observed: BoolArray, values: FloatArray, sigma: FloatArray

@@ -184,7 +184,7 @@ class ReferenceMHE(ReferenceFilter):
         self._windows.append(_EpisodeWindow(self.model, self.settings))
         return self._windows[-1]
 
-    def _update(self, given: Measurements) -> None:
-        super()._update(given)
-        for episode in given.episodes.tolist():
+    def _update(self, measured: Measurements) -> None:
+        super()._update(measured)
+        for episode in measured.episodes.tolist():
             self.fallback[episode] = self._windows[episode].unsolved
