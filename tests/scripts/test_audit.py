@@ -95,7 +95,7 @@ def test_two_audits_agree(tmp_path):
         ({"policy": "random"}, "policy must be one of"),
         ({"runs": 1}, "runs must be an integer >= 2, got 1"),
         ({"noise_factor": 0.0}, "noise_factor must be a finite number > 0"),
-        ({"confidence": 1.0}, r"confidence must be in \(0, 1\)"),
+        ({"confidence": 1.0}, r"confidence must be a number in \(0, 1\)"),
         ({"traffic_seed": -1}, "traffic_seed must be an integer >= 0"),
         ({"seed": -1}, "seed must be an integer >= 0"),
         ({"privacy": "none"}, r"privacy\.preset must be one of"),
