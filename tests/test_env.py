@@ -171,7 +171,7 @@ def test_privacy_report_is_plain_json():
     assert "boundary_inputs" in report["void_reasons"]
 
 
-def test_truth_is_shown_only_when_asked_for():
+def test_truth_is_shown_only_on_request():
     assert "truth" not in short().reset(seed=0)[1]
     info = short(truth_in_info=True).reset(seed=0)[1]
     assert set(info["truth"]) == {"density", "speed", "traffic_seed", "time"}

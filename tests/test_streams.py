@@ -1,4 +1,4 @@
-"""Which noise an episode meets, and at which second it is scored."""
+"""An episode's noise follows its seed alone, and its score the record's second."""
 
 import numpy as np
 import pytest
