@@ -23,7 +23,7 @@ def computed(bases, exponent):
 
 
 def tolerance(bases, exponent):
-    """Relative error of the result: rounding of its base-2 logarithm, and a few units in the last place."""
+    """Relative error: rounding of the base-2 logarithm, and a few units in the last place."""
     return (8.0 + np.abs(exponent * np.log2(bases))) * np.finfo(float).eps
 
 
