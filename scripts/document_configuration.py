@@ -123,61 +123,47 @@ def describe_default(value: Any) -> str:
     return f"`{value!r}`"
 
 
-def make_table(rows: Iterable[tuple[str, str, str, str]]) -> str:
-    """Return a Markdown table of name, values, default and meaning."""
-    head = "| keyword | values | default | meaning |\n| :-- | :-- | :-- | :-- |\n"
-    return head + "".join(
-        f"| `{name}` | {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |\n"
-        for name, *cells in rows
-    )
-
-
-def document_fields(cls: type, defaults: Any = None) -> str:
-    """Return the table of a dataclass's fields.
+def make_table(names: Iterable[str], documented: Any, defaults: Mapping[str, Any]) -> str:
+    """Return a Markdown table of keywords: values, default and meaning.
 
     Args:
-        cls: The dataclass.
-        defaults: Supplies the defaults, if not the class.
+        names: The keywords.
+        documented: A dataclass, or a constructor, with annotations and a docstring.
+        defaults: Defaults by name.
     """
-    meanings, rows = _inherited_meanings(cls), []
-    base = cls.__mro__[1]
-    shown = field_hints(base) if base is PrivacySettings else {}
+    meanings: dict[str, str] = {}
+    if inspect.isclass(documented):
+        hints = dict(field_hints(documented))
+        for cls in reversed(documented.__mro__):
+            meanings |= read_meanings(cls, "Attributes")
+    else:
+        hints = typing.get_type_hints(documented, include_extras=True)
+        meanings = read_meanings(documented, "Args")
+    rows = ["| keyword | values | default | meaning |", "| :-- | :-- | :-- | :-- |"]
+    for name in names:
+        meaning = meanings[name].replace("``", "`")
+        meaning = meaning[0].upper() + meaning[1:]
+        cells = describe_type(hints[name]), describe_default(defaults[name]), meaning
+        rows.append(f"| `{name}` | {' | '.join(cells)} |")
+    return "\n".join(rows) + "\n"
+
+
+def document_fields(cls: Any, reference: Any = None) -> str:
+    """Return the table of a dataclass's fields; ``reference`` has the defaults, if not the class."""
+    defaults = {}
     for field in dataclasses.fields(cls):
-        if field.name in shown or field.name == "inherited":
-            continue
-        default = field.default
-        if defaults is not None:
-            default = getattr(defaults, field.name)
-        elif field.default_factory is not dataclasses.MISSING:
-            default = field.default_factory()
-        hint = field_hints(cls)[field.name]
-        rows.append(
-            (
-                field.name,
-                describe_type(hint),
-                describe_default(default),
-                _sentence(meanings[field.name]),
-            )
-        )
-    return make_table(rows)
+        factory = field.default_factory
+        default = field.default if factory is dataclasses.MISSING else factory()
+        defaults[field.name] = getattr(reference, field.name, default)
+    above = field_hints(PrivacySettings) if cls is CappedSettings else ()
+    return make_table([n for n in defaults if n not in (*above, "inherited")], cls, defaults)
 
 
 def document_constructor(constructor: Callable[..., None]) -> str:
     """Return the table of the keywords that an environment has beside its configuration."""
-    signature = inspect.signature(constructor)
-    meanings = read_meanings(constructor, "Args")
-    hints = typing.get_type_hints(constructor, include_extras=True)
-    rows = [
-        (
-            name,
-            describe_type(hints[name]),
-            describe_default(parameter.default),
-            _sentence(meanings[name]),
-        )
-        for name, parameter in signature.parameters.items()
-        if parameter.kind is inspect.Parameter.KEYWORD_ONLY
-    ]
-    return make_table(rows)
+    parameters = inspect.signature(constructor).parameters.values()
+    defaults = {p.name: p.default for p in parameters if p.kind is inspect.Parameter.KEYWORD_ONLY}
+    return make_table(defaults, constructor, defaults)
 
 
 def document_ids() -> str:
@@ -211,14 +197,6 @@ def render() -> str:
     return "\n".join(parts)
 
 
-def _inherited_meanings(cls: type) -> dict[str, str]:
-    meanings: dict[str, str] = {}
-    for parent in reversed(cls.__mro__):
-        if dataclasses.is_dataclass(parent):
-            meanings |= read_meanings(parent, "Attributes")
-    return meanings
-
-
 def _differences(reference: Any, other: Any, path: str) -> Iterable[str]:
     for field in dataclasses.fields(other):
         value = getattr(other, field.name)
@@ -233,11 +211,6 @@ def _differences(reference: Any, other: Any, path: str) -> Iterable[str]:
             yield f"`{path}{field.name}` {kind}"
         else:
             yield f"`{path}{field.name}={value!r}`"
-
-
-def _sentence(text: str) -> str:
-    text = text.replace("``", "`")
-    return text[0].upper() + text[1:]
 
 
 def _anchor(heading: str) -> str:
