@@ -149,7 +149,7 @@ def make_table(names: Iterable[str], documented: Any, defaults: Mapping[str, Any
 
 
 def document_fields(cls: Any, reference: Any = None) -> str:
-    """Return the table of a dataclass's fields; ``reference`` has the defaults, if not the class."""
+    """Return the table of a dataclass; ``reference`` supplies defaults in place of the class."""
     defaults = {}
     for field in dataclasses.fields(cls):
         factory = field.default_factory
