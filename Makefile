@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 
 export OMP_NUM_THREADS = 1
 
-.PHONY: help setup demo policy-study audit test test-slow lint format benchmark wheel-test clean clean-kernels reproduce privacy-study
+.PHONY: help setup docs demo policy-study audit test test-slow lint format benchmark wheel-test clean clean-kernels reproduce privacy-study
 
 help:  ## Show this list.
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -52,6 +52,9 @@ test: setup  ## Run the tests, without the slow ones.
 test-slow: setup  ## Run the slow tests: before a release, and after a change to kernels, workers or benchmarks.
 	$(BIN)/python -m pytest -m slow
 
+docs: setup  ## Write the generated page of keywords anew: docs/configuration.md.
+	$(BIN)/python scripts/document_configuration.py
+
 lint: setup  ## Check style, types and import rules.
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
@@ -74,5 +77,5 @@ wheel-test: setup  ## Build the wheel, install it elsewhere and use it there.
 clean-kernels:  ## Drop numba's compiled kernels, as needed after a change to one.
 	find dptse_env -name '*.nb[ic]' -delete
 
-clean:  ## Remove what the other targets made, the virtual environment included.
-	rm -rf $(VENV) build dist results .mypy_cache .pytest_cache .ruff_cache .hypothesis
+clean:  ## Remove the virtual environment, builds and caches; results/ stays.
+	rm -rf $(VENV) build dist .mypy_cache .pytest_cache .ruff_cache .hypothesis

@@ -275,6 +275,6 @@ def test_a_void_guarantee_is_warned_of_with_its_reason(reason, privacy):
     "privacy",
     ["paper", "corrected", "capped", {"boundary_inputs": "private", "unit": "horizon"}],
 )
-def test_nothing_is_warned_of_where_no_guarantee_is_asked_for_or_it_holds(privacy):
+def test_no_warning_where_no_guarantee_is_requested_or_it_holds(privacy):
     # Warnings are errors in these tests.
     warn_where_void(resolve("private-highway", {"privacy": privacy}))

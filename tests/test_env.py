@@ -119,6 +119,22 @@ def test_sequential_actions_move_the_traffic_on_their_last_pick():
     assert [reward == 0 for reward in rewards] == [True, True, False] * 5
 
 
+def make_with_frameskip(env_id, **keywords):
+    """Make an environment as TorchRL's GymEnv does: with frameskip, and without if refused."""
+    try:
+        return gym.make(env_id, frameskip=1, **keywords)
+    except TypeError as problem:
+        if "unexpected keyword argument 'frameskip'" not in str(problem):
+            raise
+        return gym.make(env_id, **keywords)
+
+
+def test_libraries_that_try_keywords_find_out_which_are_unknown():
+    assert make_with_frameskip(SHORT).unwrapped.config.bandwidth == 2
+    with pytest.raises(ValueError, match=r"^frameskip is unknown; allowed: corridor, "):
+        gym.make(SHORT, frameskip=1)
+
+
 def test_action_masks_are_for_sequential_actions():
     with pytest.raises(ValueError, match=r"needs action='sequential' or .*, got .*:MaskAction"):
         short().unwrapped.action_masks()
@@ -155,7 +171,7 @@ def test_privacy_report_is_plain_json():
     assert "boundary_inputs" in report["void_reasons"]
 
 
-def test_truth_is_shown_only_when_asked_for():
+def test_truth_is_shown_only_on_request():
     assert "truth" not in short().reset(seed=0)[1]
     info = short(truth_in_info=True).reset(seed=0)[1]
     assert set(info["truth"]) == {"density", "speed", "traffic_seed", "time"}

@@ -46,7 +46,7 @@ def test_making_an_environment_loads_nothing_and_opens_no_account():
     assert env._process is None
 
 
-def test_who_was_counted_is_told_only_with_the_truth():
+def test_counted_vehicles_are_shown_only_with_the_truth():
     _, _, _, _, hidden = play(guaranteed(), 30)[-1]
     assert not {"exposures", "individual_epsilon", "truth"} & set(hidden)
     env = guaranteed(truth_in_info=True)
@@ -66,7 +66,7 @@ def test_who_was_counted_is_told_only_with_the_truth():
     assert not any(again["truth"]["individual_epsilon"])
 
 
-def test_what_is_told_of_vehicles_does_not_depend_on_other_episodes():
+def test_contributions_do_not_depend_on_other_episodes():
     alone, after = guaranteed(truth_in_info=True), guaranteed(truth_in_info=True)
     after.reset(seed=9, options={"traffic_seed": 1})
     after.reset(seed=9, options={"traffic_seed": 2})

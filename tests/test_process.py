@@ -161,7 +161,7 @@ def test_residuals_are_the_noise_that_is_declared(keywords):
     assert abs(np.mean(r[:, 1:] * r[:, :-1])) < bound
 
 
-def test_what_is_asked_does_not_change_the_noise():
+def test_queries_do_not_change_the_noise():
     released = []
     for actions in (np.zeros((1, 6), dtype=np.int8), np.ones((1, 6), dtype=np.int8)):
         process = make(1)
@@ -172,7 +172,7 @@ def test_what_is_asked_does_not_change_the_noise():
     np.testing.assert_array_equal(*released)
 
 
-def test_released_values_are_kept_until_asked_again():
+def test_released_values_are_kept_until_the_next_query():
     process = make(1)
     process.reset(ALL[:1], generators([4]))
     first = np.array([[1, 1, 0, 0, 0, 0]], dtype=np.int8)
@@ -252,7 +252,7 @@ def test_a_step_that_is_not_solved_for_keeps_the_prediction_and_says_so(
     assert (process.estimate.density[0] != predicted["density"][0]).any()
 
 
-def test_a_solver_that_is_not_installed_is_said_at_once_and_at_every_step():
+def test_a_missing_solver_is_reported_at_once_and_at_every_step():
     settings = {"mhe": {"solver": "gurobi"}}
     with pytest.warns(RuntimeWarning, match=r"'gurobi' is not installed"):
         process = make(1, estimator="mhe", backend="reference", estimator_settings=settings)

@@ -1,4 +1,4 @@
-"""Whether the throughput table says what was measured, and what was not; never how fast it is."""
+"""The throughput table shows what was measured and what was not; no test depends on speed."""
 
 import csv
 import json

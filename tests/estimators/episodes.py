@@ -167,7 +167,7 @@ def scale_of(model: ARZModel) -> FloatArray:
 
 
 class Snapshot(NamedTuple):
-    """All that an estimator shows."""
+    """Everything that an estimator exposes."""
 
     density: np.ndarray
     speed: np.ndarray

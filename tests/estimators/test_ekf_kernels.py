@@ -1,4 +1,4 @@
-"""What the compiled filters say of a state is what the model says of it."""
+"""Compiled filters agree with the model about densities, speeds and their Jacobians."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What is the ensemble Kalman filter's own: its options, its members and its draws."""
+"""The ensemble Kalman filter's options, members and draws."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Where all is linear and Gaussian, every filter is the Kalman filter."""
+"""On linear and Gaussian problems every filter equals the Kalman filter."""
 
 from dataclasses import replace
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""What the moving horizon estimators make of solvers that fail, lie or are not there."""
+"""Moving horizon estimators with solvers that fail, return false optima or are missing."""
 
 import numpy as np
 import pytest

@@ -23,7 +23,7 @@ def computed(bases, exponent):
 
 
 def tolerance(bases, exponent):
-    """Of the result, relative: rounding of its logarithm to base 2, and a few units of its own."""
+    """Relative error: rounding of the base-2 logarithm, and a few units in the last place."""
     return (8.0 + np.abs(exponent * np.log2(bases))) * np.finfo(float).eps
 
 

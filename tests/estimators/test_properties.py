@@ -1,4 +1,4 @@
-"""What holds for every estimator: any name, either backend, both sets of bounds and releases."""
+"""Properties of every estimator: any name, either backend, both sets of bounds and releases."""
 
 from dataclasses import fields, replace
 

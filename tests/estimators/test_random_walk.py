@@ -16,7 +16,7 @@ def started(episodes, settings=SETTINGS, start=None):
 
 
 def speed_of(value, sigma, density):
-    """What a flow and its deviation say of the speed at a density [veh/km]."""
+    """The speed, and its deviation, that a flow gives at a density [veh/km]."""
     density = max(density, 3.33)
     return REFERENCE_SPEED + value / density, sigma / density
 

@@ -35,7 +35,7 @@ def test_every_name_and_backend_follows_the_protocol(name, backend):
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("name", ESTIMATORS)
 @pytest.mark.parametrize("reference_speed", [None, 40.0])
-def test_every_estimator_measures_what_its_model_was_told_to(name, backend, reference_speed):
+def test_every_estimator_measures_as_its_model_does(name, backend, reference_speed):
     model = ARZModel(PAPER_HIGHWAY, load_parameters("paper"), 0.5, reference_speed)
     own = make_estimator(name, backend, model, 1).model
     assert own.reference_speed == reference_speed

@@ -47,7 +47,7 @@ def step_together(episodes, settings, **tolerance):
 def test_backends_take_the_same_step_from_every_state_of_an_episode(parameters, bounds, release):
     # In the box w has no bound: points that break the CFL condition blow up rounding.
     tolerance = {"rtol": 0.0, "atol": 1e-9} if bounds == "cone" else {"rtol": 1e-6, "atol": 1e-6}
-    episodes = simulate(parameters, release=release)
+    episodes = simulate(parameters, n_steps=250, release=release)
     step_together(episodes, EstimatorSettings(bounds=bounds), **tolerance)
 
 

@@ -76,7 +76,7 @@ def test_golden_noise_of_capped_contributions(epsilon, stds):
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
 @pytest.mark.parametrize("delta", [0.4, 0.05, 1e-3, 1e-6, 1e-12])
 @pytest.mark.parametrize("epsilon", [0.01, 0.1, 1.0, 5.0, 10.0, 50.0])
-def test_the_releases_together_cost_the_epsilon_asked_for(epsilon, delta, share, adjacency):
+def test_the_releases_together_cost_the_requested_epsilon(epsilon, delta, share, adjacency):
     """Against dp-accounting: the sensitivity of the whole transcript in units of the noise."""
     sensitivity = bounded(adjacency=adjacency)
     mu = sensitivity.joint_mu(joint_noise_std(sensitivity, epsilon, delta, share))
@@ -84,7 +84,7 @@ def test_the_releases_together_cost_the_epsilon_asked_for(epsilon, delta, share,
 
 
 @pytest.mark.parametrize("adjacency", ["replace", "add_remove"])
-def test_step_by_step_the_releases_compose_to_the_epsilon_asked_for(adjacency):
+def test_step_by_step_the_releases_compose_to_the_requested_epsilon(adjacency):
     """A vehicle that moves both releases in each of its steps, composed by dp-accounting."""
     cap = 16
     density, flow = joint_noise_std(bounded(cap, adjacency), 2.0, 0.01, 0.5)

@@ -169,7 +169,7 @@ def test_an_episode_meets_the_same_noise_in_any_batch_and_interleaving(data, blo
             np.testing.assert_array_equal(found, expected)
 
 
-def test_noise_does_not_depend_on_what_was_asked():
+def test_noise_does_not_depend_on_the_queries():
     """Unasked segments may hold anything, not-a-number included; the rest meet the same noise."""
     everything, few = started(3), started(3)
     values = np.random.default_rng(0).uniform(0.0, 300.0, (1, S, 2))

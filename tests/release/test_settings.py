@@ -88,5 +88,5 @@ def test_a_unit_bounds_how_often_it_can_count(unit, contributions, cap):
         (CappedSettings(boundary_inputs="true"), "true"),
     ],
 )
-def test_the_boundary_is_the_model_s_own_unless_asked_otherwise(settings, boundary):
+def test_the_boundary_is_the_model_s_default_unless_given(settings, boundary):
     assert settings.boundary == boundary

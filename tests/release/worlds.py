@@ -37,7 +37,7 @@ class Worlds:
         return self.records[seed]
 
     def ensure(self, corridor, seeds):
-        """All are there."""
+        """All vehicles are present."""
 
     def release(self, settings, counted=None, horizon=None):
         """A release model of all record columns, with other contributions if any are given."""

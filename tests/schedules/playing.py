@@ -1,4 +1,4 @@
-"""What the tests of schedules share: environments on cached traffic, and runs of a schedule."""
+"""Environments on cached traffic and runs of a schedule, for the tests of schedules."""
 
 import gymnasium as gym
 import numpy as np

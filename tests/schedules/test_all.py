@@ -1,4 +1,4 @@
-"""What holds for every schedule, whatever it rests on."""
+"""Properties of every schedule."""
 
 import numpy as np
 import pytest
@@ -101,7 +101,7 @@ def test_only_oracles_use_the_truth():
     assert not set(ORACLES) & {*OBSERVATION_SCHEDULES, *COVARIANCE_SCHEDULES, *PLANS}
 
 
-def test_unknown_names_are_told_all_names():
+def test_an_unknown_name_is_refused_with_a_list_of_all():
     with pytest.raises(
         ValueError, match=r"schedule must be one of none, .*oracle-error.*, got 'best'"
     ):

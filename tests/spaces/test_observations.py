@@ -100,7 +100,7 @@ def test_a_released_flow_has_its_own_name_and_scale():
     np.testing.assert_allclose(encoder.block(observation, "epsilon"), np.log10(5.0), rtol=1e-6)
 
 
-def test_blocks_can_be_chosen_and_come_in_the_order_asked_for():
+def test_blocks_can_be_chosen_and_come_in_the_given_order():
     encoder = encoding(("age", "speed"))
     assert list(encoder.slices) == ["age", "speed"]
     observation = encoder.encode(state())

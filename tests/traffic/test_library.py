@@ -107,7 +107,7 @@ def test_ensure_records_what_is_missing_and_leaves_the_rest(tmp_path, short_reco
     assert len(everything_in(tmp_path)) == 4 * (len(COLUMNS) + 1)
 
 
-def test_ensure_shows_a_progress_bar_on_stderr_only_when_asked(tmp_path, capsys):
+def test_ensure_shows_a_progress_bar_on_stderr_only_on_request(tmp_path, capsys):
     records = RecordLibrary(tmp_path)
     records.ensure(SHORT_HIGHWAY, [0])
     assert capsys.readouterr() == ("", "")

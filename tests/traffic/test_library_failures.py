@@ -139,7 +139,9 @@ def test_a_record_whose_worker_is_killed_is_made_by_another(tmp_path, monkeypatc
 def test_a_record_whose_worker_is_always_killed_is_given_up(tmp_path, monkeypatch, caplog):
     killed = kill_while_it_simulates(monkeypatch, times=99)
     monkeypatch.setattr(library, "simulation_is_loaded", lambda: True)
-    pattern = r"holds 0 of the 1 requested record.*\n?.*traffic seed 5 failed: .*code -9\n\(tried 3 times"
+    pattern = (
+        r"holds 0 of the 1 requested record.*\n?.*traffic seed 5 failed: .*code -9\n\(tried 3 times"
+    )
     with pytest.raises(RecordingError, match=pattern):
         RecordLibrary(tmp_path).get(LONG_HIGHWAY, 5)
     assert len(set(killed)) == 3

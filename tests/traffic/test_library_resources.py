@@ -1,4 +1,4 @@
-"""What a library of many records keeps open and in memory."""
+"""Open files and memory of a library with many records."""
 
 import gc
 import os

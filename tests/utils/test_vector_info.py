@@ -30,7 +30,7 @@ def test_objects_are_kept_as_they_are():
     assert objects[1] is arrays[1]
 
 
-def test_vector_form_marks_of_whom_something_is_said():
+def test_vector_form_marks_the_episodes_that_have_a_value():
     infos = in_vector_form(ROWS, np.array([3, 1]), 4)
     assert infos.keys() == {"error", "_error", "queried", "_queried", "truth", "_truth"}
     assert infos["error"].tolist() == [0.0, 2.5, 0.0, 1.5]
@@ -43,7 +43,7 @@ def test_vector_form_marks_of_whom_something_is_said():
     assert infos["_error"] is not infos["_queried"]
 
 
-def test_the_same_said_of_several():
+def test_one_value_is_repeated_for_several_episodes():
     info = {"mu": 0.5, "cap": None, "preset": "paper", "reasons": ["a"], "more": {"n": 3}}
     rows = repeated_rows(info, 2)
     assert rows["mu"].tolist() == [0.5, 0.5]

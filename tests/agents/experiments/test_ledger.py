@@ -79,7 +79,7 @@ def test_sorting_forgets_the_order_of_the_run(path, tmp_path):
     assert Ledger(path, PaperCell, EpisodeScore).rows == other.rows
 
 
-def test_cells_are_told_apart_by_every_field(path):
+def test_cells_differ_by_every_field(path):
     ledger = Ledger(path, PaperCell, EpisodeScore)
     cells = [CELL, dataclasses.replace(CELL, epsilon=2.0), dataclasses.replace(CELL, bandwidth=6)]
     for cell in cells:
