@@ -69,7 +69,7 @@ def from_mapping(cls: type[T], values: Any, path: str, base: T | None = None) ->
     if not isinstance(values, Mapping):
         raise ValueError(f"{path} must be a mapping or {cls.__name__}, got {_shown(values)}")
     prefix = f"{path}." if path else ""
-    hints = field_hints(typing.cast(Any, cls))
+    hints = field_hints(cls)
     for key in values:
         if key not in hints:
             raise ValueError(f"{prefix}{key} is unknown; allowed: {', '.join(hints)}")
@@ -81,8 +81,8 @@ def from_mapping(cls: type[T], values: Any, path: str, base: T | None = None) ->
         return base
     if base is not None:
         return dataclasses.replace(base, **built)  # type: ignore[type-var]
-    missing = dataclasses.MISSING
-    for field in dataclasses.fields(cls):  # type: ignore[arg-type]
+    missing, checked_type = dataclasses.MISSING, typing.cast(Any, cls)
+    for field in dataclasses.fields(checked_type):
         has_default = field.default is not missing or field.default_factory is not missing
         if field.name not in built and not has_default:
             raise ValueError(f"{prefix}{field.name} is missing")
@@ -98,17 +98,21 @@ def checked_fields(instance: Any, path: str) -> None:
         ValueError: A value has the wrong type or range; the message starts with its path.
     """
     prefix = f"{path}." if path else ""
-    cls: Any = type(instance)
-    for name, hint in field_hints(cls).items():
+    for name, hint in field_hints(type(instance)).items():
         value = getattr(instance, name)
         converted = convert(hint, value, f"{prefix}{name}", value)
         if converted is not value:
             object.__setattr__(instance, name, converted)
 
 
-@cache
-def field_hints(cls: Any) -> Mapping[str, Any]:
+def field_hints(cls: type) -> Mapping[str, Any]:
     """Return the annotations of a dataclass's fields by name, in order."""
+    hashable: Any = cls
+    return _field_hints(hashable)
+
+
+@cache
+def _field_hints(cls: Any) -> Mapping[str, Any]:
     hints = typing.get_type_hints(cls, include_extras=True)
     return {field.name: hints[field.name] for field in dataclasses.fields(cls) if field.init}
 
