@@ -10,7 +10,7 @@ from pathlib import Path
 
 from benchmarks.throughput.measure import Measured, resident, take_turns
 from dptse_env.config import resolve
-from dptse_env.traffic import Corridor, RecordLibrary
+from dptse_env.traffic import Corridor, RecordLibrary, draw_scenario
 from dptse_env.traffic.sumo import running
 from dptse_env.traffic.sumo import seconds as seconds_of
 
@@ -21,7 +21,7 @@ def bare(corridor: Corridor, seed: int) -> int:
     Returns:
         Its seconds.
     """
-    scenario = corridor.draw(seed)
+    scenario = draw_scenario(corridor, seed)
     with running(corridor, scenario) as libsumo:
         for _ in seconds_of(libsumo, corridor, scenario):
             pass

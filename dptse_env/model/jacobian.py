@@ -7,15 +7,13 @@ the balance of the flows. At a kink (demand = supply) the branch of the demand i
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from dptse_env.model.dynamics import ARZDynamics, Cells
 from dptse_env.model.relations import STANDING, VACUUM
 from dptse_env.utils.arrays import BoolArray, FloatArray
-
-if TYPE_CHECKING:
-    from dptse_env.model.arz import ARZModel, Cells
 
 
 class Gradients(NamedTuple):
@@ -26,7 +24,7 @@ class Gradients(NamedTuple):
     demand: FloatArray
 
 
-def step_jacobian(model: ARZModel, states: FloatArray, inputs: FloatArray) -> FloatArray:
+def step_jacobian(model: ARZDynamics, states: FloatArray, inputs: FloatArray) -> FloatArray:
     """Derivative `(n, 2 S, 2 S)` of `model.step`."""
     layout = model.layout
     cells = model.cells(states)
@@ -59,7 +57,7 @@ def step_jacobian(model: ARZModel, states: FloatArray, inputs: FloatArray) -> Fl
     return blocks.transpose(0, 1, 3, 2, 4).reshape(-1, model.n_states, model.n_states)
 
 
-def _gradients(model: ARZModel, states: FloatArray, cells: Cells) -> Gradients:
+def _gradients(model: ARZDynamics, states: FloatArray, cells: Cells) -> Gradients:
     jam, relations = model.jam_density, model.relations
     rho = cells.density
     empty = rho <= VACUUM * jam
@@ -79,7 +77,7 @@ def _gradients(model: ARZModel, states: FloatArray, cells: Cells) -> Gradients:
     return Gradients(w, speed, demand)
 
 
-def _links(model: ARZModel, cells: Cells, gradients: Gradients, by: FloatArray) -> None:
+def _links(model: ARZDynamics, cells: Cells, gradients: Gradients, by: FloatArray) -> None:
     up, down = model.layout.links
     jam = model.jam_density[down]
     w, speed = cells.w[:, up], cells.speed[:, down]
@@ -89,7 +87,7 @@ def _links(model: ARZModel, cells: Cells, gradients: Gradients, by: FloatArray) 
     by[:, up, down] = _choose(sends, 0.0, by_speed[..., None] * gradients.speed[:, down])
 
 
-def _merges(model: ARZModel, cells: Cells, gradients: Gradients, by: FloatArray) -> None:
+def _merges(model: ARZDynamics, cells: Cells, gradients: Gradients, by: FloatArray) -> None:
     main, ramp, down = model.layout.merges
     jam, demand, speed = model.jam_density[down], cells.demand, cells.speed[:, down]
     total, mixed_w = model.merged(cells)
@@ -116,7 +114,7 @@ def _merges(model: ARZModel, cells: Cells, gradients: Gradients, by: FloatArray)
         by[:, cell, down] = _choose(serves_all, 0.0, limited)
 
 
-def _diverges(model: ARZModel, cells: Cells, gradients: Gradients, by: FloatArray) -> None:
+def _diverges(model: ARZDynamics, cells: Cells, gradients: Gradients, by: FloatArray) -> None:
     up, main, off = model.layout.diverges
     share = model.layout.exit_shares
     on_main, on_ramp = model.diverge_supplies(cells)
@@ -135,7 +133,7 @@ def _diverges(model: ARZModel, cells: Cells, gradients: Gradients, by: FloatArra
 
 
 def _exits(
-    model: ARZModel, cells: Cells, gradients: Gradients, inputs: FloatArray, by: FloatArray
+    model: ARZDynamics, cells: Cells, gradients: Gradients, inputs: FloatArray, by: FloatArray
 ) -> None:
     exits, jam = model.layout.exits, model.exit_jam_density
     w = cells.w[:, exits]
@@ -150,7 +148,7 @@ def _exits(
 
 
 def _source_gradient(
-    model: ARZModel, cells: Cells, gradients: Gradients, inputs: FloatArray
+    model: ARZDynamics, cells: Cells, gradients: Gradients, inputs: FloatArray
 ) -> FloatArray:
     layout = model.layout
     entries, jam = layout.entries, model.jam_density[layout.entries]

@@ -6,6 +6,7 @@ here and any other is refused, so nothing that is named in a file is imported or
 
 import math
 import pickletools
+import warnings
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any
@@ -44,9 +45,12 @@ def read_table(pickled: bytes) -> dict[str, TensorEntry]:
     """
     machine = _Machine()
     try:
-        for opcode, argument, _ in pickletools.genops(pickled):
-            machine.execute(opcode.name, argument)
-    except (IndexError, KeyError) as problem:
+        with warnings.catch_warnings():
+            # Raised for a name with an invalid escape sequence, which no saved policy holds.
+            warnings.simplefilter("error", DeprecationWarning)
+            for opcode, argument, _ in pickletools.genops(pickled):
+                machine.execute(opcode.name, argument)
+    except (IndexError, KeyError, DeprecationWarning) as problem:
         raise ValueError("its table of weights is damaged") from problem
     match machine.stack:
         case [dict() as table]:

@@ -15,7 +15,7 @@ from dptse_env.traffic.presets import (
     randomised,
 )
 from dptse_env.traffic.record import InvalidRecordError, Record, mean_dwell
-from dptse_env.traffic.scenario import MAINLINE, Scenario
+from dptse_env.traffic.scenario import MAINLINE, Scenario, draw_scenario
 from dptse_env.traffic.sumo import RecordingError, SumoVersionError, simulate
 from dptse_env.traffic.sumo_network import NetworkError
 from dptse_env.traffic.worker import simulate_in_child
@@ -37,6 +37,7 @@ __all__ = [
     "RecordingError",
     "Scenario",
     "SumoVersionError",
+    "draw_scenario",
     "find_corridor",
     "mean_dwell",
     "randomised",

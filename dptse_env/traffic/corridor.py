@@ -16,7 +16,6 @@ from typing import Annotated
 
 from dptse_env.traffic.demand import Demand, DemandDistribution
 from dptse_env.traffic.incident import Incident, IncidentDistribution
-from dptse_env.traffic.scenario import Scenario, draw_scenario
 from dptse_env.utils.fields import Interval, checked_fields
 from dptse_env.utils.validation import integer, require
 
@@ -169,7 +168,3 @@ class Corridor:
         content["kinds"] = [type(self.demand).__name__, type(self.incident).__name__]
         text = json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)
         return hashlib.sha256(text.encode()).hexdigest()
-
-    def draw(self, seed: int) -> Scenario:
-        """Draw the scenario of a traffic seed (`dptse_env.traffic.scenario.draw_scenario`)."""
-        return draw_scenario(self, integer("traffic seed", seed, 0))

@@ -5,16 +5,14 @@ SUMO, which simulates the driving only.
 """
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.demand import Demand, DemandDistribution
 from dptse_env.traffic.incident import Incident, IncidentDistribution
-
-if TYPE_CHECKING:
-    from dptse_env.traffic.corridor import Corridor
+from dptse_env.utils.validation import integer
 
 MAINLINE = -1
 """Origin or exit of a vehicle that enters or leaves by the mainline instead of a ramp."""
@@ -48,12 +46,16 @@ class Scenario:
         return len(self.departures)
 
 
-def draw_scenario(corridor: "Corridor", seed: int) -> Scenario:
+def draw_scenario(corridor: Corridor, seed: int) -> Scenario:
     """Draw the scenario of a traffic seed; the same seed gives the same scenario.
 
     Demand, incident, arrivals and SUMO have separate random streams, so that a change of one does
     not affect the others.
+
+    Raises:
+        ValueError: The seed is not an integer >= 0.
     """
+    integer("traffic seed", seed, 0)
     demand_seed, incident_seed, arrival_seed, sumo_seed = np.random.SeedSequence(seed).spawn(4)
     demand, incident = corridor.demand, corridor.incident
     if isinstance(demand, DemandDistribution):
@@ -94,7 +96,7 @@ def _arrivals(
 
 
 def _exits(
-    corridor: "Corridor", origins: NDArray[np.int64], generator: np.random.Generator
+    corridor: Corridor, origins: NDArray[np.int64], generator: np.random.Generator
 ) -> NDArray[np.int64]:
     """Let each vehicle choose at each diverge that it passes, until it has left."""
     entry_face = np.array([*corridor.on_ramps, 0], dtype=np.int64)[origins]

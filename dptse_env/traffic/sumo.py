@@ -27,7 +27,7 @@ import numpy as np
 
 from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.record import Record
-from dptse_env.traffic.scenario import MAINLINE, Scenario
+from dptse_env.traffic.scenario import MAINLINE, Scenario, draw_scenario
 from dptse_env.traffic.sumo_network import edge_ids, network_xml
 
 SUPPORTED_SUMO = "1.28"
@@ -105,7 +105,7 @@ def simulate(corridor: Corridor, seed: int) -> Record:
         NetworkError: The corridor has to be compiled and cannot be.
         SumoVersionError: libsumo is missing, broken or of another release series.
     """
-    scenario = corridor.draw(seed)
+    scenario = draw_scenario(corridor, seed)
     with running(corridor, scenario) as libsumo:
         return _observe(libsumo, corridor, scenario)
 

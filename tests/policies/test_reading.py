@@ -109,6 +109,16 @@ def test_damaged_weights_are_refused_or_read(data):
     accepted_or_refused(with_weights(change))
 
 
+def test_an_invalid_escape_in_a_name_is_damage():
+    def change(weights):
+        content = bytearray(weights["archive/data.pkl"])
+        content[content.index(b"torch") + 2 : content.index(b"torch") + 4] = b"\\o"
+        return {**weights, "archive/data.pkl": bytes(content)}
+
+    with pytest.raises(ValueError, match="its table of weights is damaged"):
+        parse_policy(with_weights(change), "some.zip")
+
+
 json_values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=4), inner),

@@ -12,6 +12,7 @@ from dptse_env.traffic import (
     SHORT_HIGHWAY,
     RecordingError,
     SumoVersionError,
+    draw_scenario,
     mean_dwell,
     simulate,
     sumo,
@@ -56,7 +57,7 @@ def test_vehicles_follow_their_routes_without_a_gap(name, short_record, paper_re
     """No vehicle vanishes, reappears, turns back, or is somewhere off its route."""
     corridor = CORRIDORS[name]
     record = short_record if name == "short-highway" else paper_records[0]
-    scenario = corridor.draw(0)
+    scenario = draw_scenario(corridor, 0)
     n, s = corridor.n_mainline, corridor.n_segments
     for vehicle in range(0, record.n_vehicles, 5):
         rows = record.vehicle == vehicle
@@ -77,7 +78,7 @@ def test_vehicles_follow_their_routes_without_a_gap(name, short_record, paper_re
 
 def test_nobody_departs_early_and_nearly_everybody_gets_in(paper_records):
     for seed, record in enumerate(paper_records):
-        departures = PAPER_HIGHWAY.draw(seed).departures
+        departures = draw_scenario(PAPER_HIGHWAY, seed).departures
         vehicles, rows = np.unique(record.vehicle, return_index=True)
         assert np.all(record.step[rows] >= departures[vehicles])
         assert len(vehicles) > 0.95 * len(departures)
@@ -145,7 +146,7 @@ def test_the_same_seed_gives_the_same_record_and_another_seed_another(short_reco
 
 
 def test_a_bare_run_is_the_run_that_is_recorded(short_record):
-    scenario = SHORT_HIGHWAY.draw(0)
+    scenario = draw_scenario(SHORT_HIGHWAY, 0)
     with running(SHORT_HIGHWAY, scenario) as libsumo:
         counts = [libsumo.vehicle.getIDCount() for _ in seconds(libsumo, SHORT_HIGHWAY, scenario)]
         assert libsumo.simulation.getTime() == SHORT_HIGHWAY.duration
@@ -155,7 +156,7 @@ def test_a_bare_run_is_the_run_that_is_recorded(short_record):
 def test_a_run_is_closed_however_it_ends():
     import libsumo
 
-    scenario = SHORT_HIGHWAY.draw(3)
+    scenario = draw_scenario(SHORT_HIGHWAY, 3)
 
     def interrupted():
         assert libsumo.isLoaded()
