@@ -1,9 +1,9 @@
-"""How many environment steps a second: SUMO, its records, one episode, thousands, PPO, and peers.
+"""Environment steps a second: SUMO, its records, one episode, thousands, PPO, and peers.
 
 python benchmarks/bench_throughput.py
 
-Prints the tables and writes them to `results/throughput`. Rows run one at a time, each in a process
-of its own; nothing else should run beside them.
+Prints the tables and writes them to `results/throughput`. Rows run one at a time, each in a
+separate process; nothing else should run beside them.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ import json
 import platform
 import signal
 import sys
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
 
 from benchmarks.throughput import tables
-from benchmarks.throughput.children import measure_all, to_plain
+from benchmarks.throughput.children import measure_all
 from benchmarks.throughput.results import Results
 from benchmarks.throughput.rows import HORIZON, QUICK, Row, Sizes, catalogue, chosen
 from benchmarks.throughput.targets import targets
@@ -64,19 +64,16 @@ class Args:
 
 
 def record(rows: list[Row]) -> None:
-    """Record what rows replay and is not there yet, off the clock."""
-    wanted: dict[str, set[int]] = {}
+    """Record the traffic of rows that is not there yet, off the clock."""
     for row in rows:
         name = PRESET_OF.get(row.options.get("preset", ""))
         if name is not None:
             seeds = parse_seeds(row.options["traffic_seeds"])
-            wanted.setdefault(name, set()).update(seeds)
-    for name, seeds in wanted.items():
-        RecordLibrary().ensure(PRESETS[name].corridor, sorted(seeds), progress=True)
+            RecordLibrary().ensure(PRESETS[name].corridor, seeds, progress=True)
 
 
 def report(results: Results, repeats: int) -> str:
-    """Return all tables and what they were made with."""
+    """Return all tables and their origin."""
     versions = ("dptse-env", "libsumo", "gymnasium", "numba", "numpy", "stable-baselines3")
     made = ", ".join(f"{name} {version(name)}" for name in versions)
     machine = f"python {platform.python_version()}, {n_cores()} cores ({platform.machine()})"
@@ -84,12 +81,8 @@ def report(results: Results, repeats: int) -> str:
         "Targets": [tables.judged(targets(results))],
         "In short": [tables.summary(results)],
         "Native vectorisation": [tables.vectorised(results)],
-        "Everything else": [tables.others(results)],
-        "Where the time goes": [
-            tables.shares(results, "ppo", "PPO"),
-            tables.shares(results, "profile-ekf", "1,024 episodes, EKF"),
-            tables.shares(results, "profile-ukf", "1,024 episodes, UKF"),
-        ],
+        "Everything else": [tables.remaining(results)],
+        "Where the time goes": [tables.shares(results, "ppo", "PPO")],
         "Not measured": [tables.problems(results)],
         "Origin": [tables.disturbance(results), f"{made}, {machine}.\n"],
     }
@@ -121,8 +114,13 @@ def main(args: Args) -> None:
     (args.output / "REPORT.md").write_text(text, encoding="utf-8")
     (args.output / "table.md").write_text(tables.summary(results), encoding="utf-8")
     tables.write_csv(args.output / "throughput.csv", results)
-    plain = json.dumps([to_plain(result) for result in results.values()], indent=1)
-    (args.output / "throughput.json").write_text(plain + "\n", encoding="utf-8")
+    plain = [
+        {"row": each.row.name, "work": each.row.work, "options": each.row.options,
+         "problem": each.problem, "repeats": [asdict(measured) for measured in each.repeats]}
+        for each in results.values()
+    ]  # fmt: skip
+    content = json.dumps(plain, indent=1) + "\n"
+    (args.output / "throughput.json").write_text(content, encoding="utf-8")
     if found := tables.problems(results):
         print(f"not measured:\n{found}", file=sys.stderr)
         raise SystemExit(1)

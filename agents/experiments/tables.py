@@ -15,9 +15,11 @@ from agents.experiments.cells import METRICS, Results
 from agents.experiments.files import write_atomically
 
 
-def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a Markdown table; the first column is left-aligned, the others centred."""
-    lines = [header, ["---", *[":-:"] * (len(header) - 1)], *rows]
+def markdown(
+    header: Sequence[str], rows: Iterable[Sequence[str]], first: str = "---", rest: str = ":-:"
+) -> str:
+    """Return a Markdown table, its first column and the rest with the given rules below them."""
+    lines = [header, [first, *[rest] * (len(header) - 1)], *rows]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 

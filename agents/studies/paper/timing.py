@@ -43,10 +43,10 @@ class Stopwatch:
             setattr(timed, name, self._timed(getattr(timed, name)))
 
     def _timed(self, method: Callable[..., Any]) -> Callable[..., Any]:
-        def call(*args: Any) -> Any:
+        def call(*args: Any, **keywords: Any) -> Any:
             start = time.perf_counter()
             try:
-                return method(*args)
+                return method(*args, **keywords)
             finally:
                 self.seconds += time.perf_counter() - start
 
