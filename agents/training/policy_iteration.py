@@ -41,21 +41,10 @@ def swap_round(
     seed: int,
     progress: Callable[[str, float], None],
 ) -> float:
-    """Try swaps under a policy, and improve it by them.
-
-    Args:
-        policy: Changed in place.
-        env: As `collect_swaps` takes it.
-        settings: Of rounds.
-        index: Number of the round, counted from 0.
-        seed: Training seed.
-        progress: Called with the name of a stage and the fraction of it that is done.
+    """Try swaps under a policy and improve it by them, in place; see `collect_swaps`.
 
     Returns:
         The mean one-second error under the policy before the round.
-
-    Raises:
-        ValueError: There is nothing to swap, or the horizon is too short (`try_swaps`).
     """
     swaps = collect_swaps(policy, env, settings, index, seed, progress)
     raise_scores(policy, swaps, settings, settings.step_of(index), partial(progress, "fit"))
