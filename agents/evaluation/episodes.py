@@ -55,10 +55,6 @@ def unwrap(env: gym.Env[Any, Any]) -> SensorQueryEnv:
 def make_config(env: str, keywords: Mapping[str, Any]) -> EnvConfig:
     """Return the configuration of an environment.
 
-    Args:
-        env: Environment id.
-        keywords: Keywords of ``gym.make``.
-
     Raises:
         ValueError: A keyword is unknown or out of range.
     """
@@ -157,11 +153,6 @@ def run_episode(
 
 def make_vector(env: str, n_episodes: int, keywords: Mapping[str, Any]) -> SensorQueryVectorEnv:
     """Make a vector environment of whole episodes, as `run_episodes` takes it.
-
-    Args:
-        env: Environment id.
-        n_episodes: Episodes at once.
-        keywords: Of ``gym.make_vec``, but for ``autoreset_mode``.
 
     Raises:
         ValueError: A keyword is unknown or out of range.

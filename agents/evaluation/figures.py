@@ -116,7 +116,6 @@ class RoadMap:
     """A panel over space and time.
 
     Attributes:
-        title: Title of the panel.
         values: Densities [veh/km] or flags of queried segments, shape (n_mainline, n_seconds).
         history: The episode, for its scales.
     """

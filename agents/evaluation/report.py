@@ -26,8 +26,6 @@ class Row:
     """The scores of one policy with one estimator, summarised.
 
     Attributes:
-        estimator: Name of the estimator.
-        policy: Name of the policy.
         mean: By metric, the mean over episodes with its 95 % interval.
         difference: By metric, the mean paired difference to the reference policy.
         n_diverged: Seconds over all episodes in which the estimator had to start over.
@@ -46,12 +44,7 @@ class Report:
     def __init__(
         self, scores: Mapping[tuple[str, str], list[EpisodeScore]], reference: str, title: str
     ) -> None:
-        """Summarise scores.
-
-        Args:
-            scores: By (estimator, policy): one score per episode, in one order for all.
-            reference: Policy that the others are compared with; it is in ``scores``.
-            title: Environment, settings and episodes.
+        """Summarise scores by (estimator, policy), one per episode, in one order for all.
 
         Raises:
             ValueError: There are fewer than two episodes.
@@ -65,16 +58,12 @@ class Report:
         def values(scores: list[EpisodeScore], metric: str) -> list[float]:
             return [getattr(score, metric) for score in scores]
 
-        return Row(
-            estimator,
-            policy,
-            {name: mean_interval(values(cell, name)) for name in METRICS},
-            {
-                name: paired_difference(values(cell, name), values(reference, name))
-                for name in METRICS
-            },
-            sum(score.n_diverged for score in cell),
-        )
+        means = {name: mean_interval(values(cell, name)) for name in METRICS}
+        differences = {
+            name: paired_difference(values(cell, name), values(reference, name)) for name in METRICS
+        }
+        n_diverged = sum(score.n_diverged for score in cell)
+        return Row(estimator, policy, means, differences, n_diverged)
 
     def ranked(self, estimator: str) -> list[str]:
         """Return the policies by mean density error, best first."""

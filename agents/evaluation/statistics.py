@@ -14,12 +14,9 @@ from dptse_env.utils.arrays import FloatArray
 
 @dataclass(frozen=True)
 class Interval:
-    """A mean with its confidence interval.
+    """A mean with the ends of its confidence interval.
 
     Attributes:
-        mean: The mean.
-        low: Lower end.
-        high: Upper end.
         n: Number of values behind it.
     """
 

@@ -113,12 +113,7 @@ def run_all(
 ) -> None:
     """Run tasks, add their records to a ledger as they end, and sort it.
 
-    Args:
-        tasks: The tasks.
-        ledger: Takes the records.
-        engine: Runs the tasks.
-        work: Runs a task and returns a record for each of its seeds.
-        progress: Whether to show a progress bar.
+    ``work`` runs a task and returns a record for each of its seeds.
     """
     total = sum(len(task.seeds) for task in tasks)
     bar = tqdm(total=total, desc="episodes", unit="episode", mininterval=0.5, disable=not progress)

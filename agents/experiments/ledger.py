@@ -40,12 +40,7 @@ class Ledger(Generic[KeyT, ScoredT]):
     """
 
     def __init__(self, path: Path, key_type: type[KeyT], record_type: type[ScoredT]) -> None:
-        """Read the file, if there is one.
-
-        Args:
-            path: The CSV file.
-            key_type: Type of the keys; its fields are the first columns.
-            record_type: Type of the records; its fields are the other columns.
+        """Read the file, if there is one; the fields of both types are its columns, in order.
 
         Raises:
             ValueError: A line other than a torn last one is not as this class writes it.

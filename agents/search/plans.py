@@ -159,7 +159,6 @@ class PlanSearch:
 
     Attributes:
         best: The best plan so far, shape (period, n).
-        n_rounds: Finished rounds.
         n_adopted: Neighbours that replaced it.
     """
 

@@ -71,11 +71,7 @@ SPACE: dict[str, Mapping[str, Knob]] = {
 
 
 def search_space(estimator: str, with_noise_scale: bool = False) -> dict[str, Knob]:
-    """Return the search space of an estimator.
-
-    Args:
-        estimator: Its name.
-        with_noise_scale: Whether to search the scale of R, too.
+    """Return the search space of an estimator, with or without the scale of R.
 
     Raises:
         ValueError: There is nothing to tune, or no such estimator.

@@ -135,12 +135,7 @@ class TuningStudy:
         """Run trials until ``n_trials`` are finished, those of earlier runs included.
 
         With one trial at a time, a study that was interrupted comes out as one that was not.
-
-        Args:
-            n_trials: Total number of trials.
-            executor: Runs the episodes.
-            n_parallel: Trials under way at once.
-            on_trial: Called after every finished trial.
+        ``on_trial`` is called after every finished trial.
         """
         running: dict[Future[EpisodeScore], _Running] = {}
         try:
@@ -253,12 +248,6 @@ def locked_study(
     task: TuningTask, folder: Path, seed: int = 0, score: Score = score_episode
 ) -> Iterator[TuningStudy]:
     """Begin a study or go on with it, and keep other processes out of it meanwhile.
-
-    Args:
-        task: The task.
-        folder: Folder of the journal; made if missing.
-        seed: Seeds the sampler.
-        score: Scores settings on a traffic seed.
 
     Raises:
         ValueError: The journal is of a study with other arguments.

@@ -93,19 +93,12 @@ def raise_scores(
     step: float,
     progress: Callable[[float], None] | None = None,
 ) -> None:
-    """Raise the scores of ``policy`` by ``step`` times the expected gain of a query.
+    """Raise the scores of ``policy`` in place by ``step`` times the expected gain of a query.
 
     Gains are in units of the policy's mean one-second error, so that settings carry over to other
     environments. The price of contributions is subtracted from each: vehicles that have reached
     their cap are missing from the releases for the rest of an episode, long after the seconds in
     which a gain is measured.
-
-    Args:
-        policy: Changed in place.
-        swaps: Tried under this policy.
-        settings: Price, minibatches and learning rate.
-        step: Rise of a score for an expected gain of one mean one-second error.
-        progress: Called with the fraction that is done, every so often.
     """
     unit = swaps.error.mean()
     gains = np.clip(swaps.gain / unit, -LARGEST_GAIN, LARGEST_GAIN)

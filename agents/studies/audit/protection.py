@@ -1,4 +1,4 @@
-"""What a configuration protects, as the adversary reads it from the public settings."""
+"""The protected unit of a configuration, as the adversary reads it from the public settings."""
 
 from __future__ import annotations
 

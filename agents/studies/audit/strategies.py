@@ -30,9 +30,7 @@ class AdversaryPolicy(Protocol):
     def queries(self, step: int, belief: FloatArray) -> BoolArray:
         """Return the segments to query, shape (k, n_mainline).
 
-        Args:
-            step: Steps released so far.
-            belief: Log-likelihood ratio of world 1 of each run's transcript so far, shape (k,).
+        ``belief`` is the log-likelihood ratio of world 1 of each run's transcript so far, (k,).
         """
 
 

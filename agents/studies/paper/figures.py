@@ -51,9 +51,7 @@ class SweepLayout:
     """Layout of a figure of a sweep.
 
     Attributes:
-        field: The sweep.
         metrics: One block of rows each.
-        columns: Panels side by side.
         log: Whether the vertical axis is logarithmic.
         log_places: Whether the horizontal axis is.
     """

@@ -40,11 +40,6 @@ def run(design: PaperDesign, place: Workplace, command: str) -> None:
     Result 2 shows episodes, so its picture is drawn again only if it is missing or anything was
     run.
 
-    Args:
-        design: The plan.
-        place: Where it runs and leaves its results.
-        command: The command that makes this report.
-
     Raises:
         ValueError: A value of the design is out of range, or the folder has other results.
     """

@@ -25,7 +25,6 @@ class StepTime:
     """Time of an estimator in one episode.
 
     Attributes:
-        traffic_seed: The traffic it followed.
         seconds: Wall time of predict, update and estimate, mean over the episode's steps [s].
     """
 

@@ -18,8 +18,6 @@ class Curve:
     """The error of a training on its validation traffic.
 
     Attributes:
-        recipe: Its recipe.
-        training_seed: Its seed.
         steps: Seconds of traffic simulated so far.
         errors: Normalised RMSE × 1000 with deterministic actions, at each of the steps.
     """

@@ -119,13 +119,7 @@ def begin(folder: Path, drafted: Manifest) -> Manifest:
 def choose(
     design: PolicyDesign, manifest: Manifest, ledger: Ledger[Entry, EpisodeScore]
 ) -> Manifest:
-    """Return the manifest with the choices of validation traffic, frozen.
-
-    Args:
-        design: The design.
-        manifest: The draft.
-        ledger: Scores on validation traffic of all its entries without bounds.
-    """
+    """Return a draft with the choices of validation traffic, by its scores in a ledger, frozen."""
     choices = {cell.name: _choice(cell, design, manifest, ledger) for cell in design.cells}
     time = datetime.now(UTC).isoformat(timespec="seconds")
     return dataclasses.replace(manifest, choices=choices, frozen=time)

@@ -36,10 +36,8 @@ class Comparison:
     """A learned policy against the best baseline of its cell.
 
     Attributes:
-        learner: The policy.
         baseline: The baseline, chosen on validation traffic.
         below: How far its error lies below the baseline's [%], two-level bootstrap.
-        difference: Error of the baseline minus that of the policy, crossed t.
         p_value: Of a zero difference, crossed t.
         adjusted: The p-value after Holm over all secondary comparisons.
     """
@@ -64,8 +62,6 @@ class PolicyResults:
     """Scores, queries and learning curves of a design.
 
     Attributes:
-        design: The design.
-        manifest: The policies and choices that were frozen.
         scores: Score by entry and test seed.
         queries: Queries by entry of the primary cell and test seed.
         curves: Learning curves of the policies of the primary cell.

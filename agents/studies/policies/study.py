@@ -66,13 +66,6 @@ def freeze(
 ) -> tuple[Manifest, bool]:
     """Fix policies and choices before test traffic is touched.
 
-    Args:
-        design: The plan.
-        place: Where it runs and leaves its results.
-        command: The command that freezes.
-        checkpoints: Learned policies.
-        tuned: Estimator settings tuned for single policies.
-
     Returns:
         The manifest, and whether it was frozen by this call.
 
@@ -95,10 +88,6 @@ def freeze(
 
 def run(place: Workplace, n_resamples: int = 10_000) -> None:
     """Run the frozen policies and choices on test traffic, and report.
-
-    Args:
-        place: Where it runs and leaves its results.
-        n_resamples: Resamples of every bootstrap.
 
     Raises:
         FileNotFoundError: Nothing was frozen, or a frozen policy is gone that is still to be run.

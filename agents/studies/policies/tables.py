@@ -22,7 +22,6 @@ class Rank:
     """A policy of a cell with its errors.
 
     Attributes:
-        label: Its name.
         kind: ``baseline``, ``bound`` or ``learned``.
         n_runs: Training seeds behind it; 0 where nothing is trained.
         errors: By metric, errors on test traffic, shape (n_runs or 1, n_seeds).

@@ -92,7 +92,6 @@ class Abscissa(NamedTuple):
     """A kind of epsilon that errors are drawn over.
 
     Attributes:
-        label: Label of the axis.
         value: Returns it from an account.
         is_claimed: Whether it is the epsilon that the configuration names.
     """

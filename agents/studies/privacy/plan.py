@@ -43,14 +43,9 @@ class PrivacyCell:
     """One configuration, run on every traffic seed.
 
     Attributes:
-        estimator: Name of the estimator.
-        preset: Privacy preset.
         unit: Protected unit; `UNBOUNDED` where the preset bounds no contributions.
         cap: Queried steps in which a vehicle counts; 0 where none is set.
         boundary_inputs: ``true``, ``nominal`` or ``private``.
-        epsilon: Privacy parameter of the configuration.
-        delta: Privacy parameter of the configuration.
-        bandwidth: Segments queried a second.
     """
 
     estimator: str

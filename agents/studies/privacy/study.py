@@ -40,11 +40,6 @@ TEMPLATES = Path(__file__).parent
 def run(design: PrivacyDesign, place: Workplace, command: str) -> None:
     """Run the episodes that are missing, then draw and report.
 
-    Args:
-        design: The plan.
-        place: Where it runs and leaves its results.
-        command: The command that makes this report.
-
     Raises:
         ValueError: A value of the design is out of range, or the folder has other results.
     """
