@@ -23,9 +23,8 @@ from dptse_env.parts import privacy_report
 from dptse_env.privacy import mu_of
 from dptse_env.privacy.audit_statistics import Claim, audit
 from dptse_env.release import PrivacyReport
-from dptse_env.traffic import RecordLibrary
 from dptse_env.utils.validation import inside, integer, positive, require
-from scripts.cli import run
+from scripts.cli import Recording, run
 
 
 @dataclass(frozen=True)
@@ -108,8 +107,7 @@ def run_audit(args: Args) -> Finding:
     """Choose two worlds, play them, and test the claim."""
     check(args)
     config = attacked_config(args)
-    library = RecordLibrary(args.records)
-    library.ensure(config.corridor, [args.traffic_seed], progress=True)
+    library = Recording(records=args.records).library(config.corridor, [args.traffic_seed])
     record = library.get(config.corridor, args.traffic_seed)
     target = choose_target(config, record, args.target, args.policy)
     policy = make_policy(config, args.policy, target.worlds)

@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
@@ -45,6 +46,21 @@ def add_frame(axis: Axes, lines: Literal["both", "x", "y"] = "both") -> None:
     axis.tick_params(labelsize=8)
 
 
+def finish_figure(
+    figure: Figure,
+    named: Iterable[Axes] | None = None,
+    columns: int = 5,
+    margin: float | None = None,
+) -> Figure:
+    """Frame all panels, and name the curves of some of them, by default of all, below them."""
+    for axis in figure.axes:
+        add_frame(axis)
+        if margin is not None:
+            axis.margins(x=margin)
+    add_legend(figure, figure.axes if named is None else named, columns)
+    return figure
+
+
 def add_legend(figure: Figure, axes: Iterable[Axes], columns: int = 5) -> None:
     """Name each label of some axes once below all panels."""
     named: dict[str, Any] = {}
@@ -60,6 +76,13 @@ def add_legend(figure: Figure, axes: Iterable[Axes], columns: int = 5) -> None:
             frameon=False,
             fontsize=8,
         )
+
+
+def set_log_ticks(axis: Axis, ticks: Sequence[float]) -> None:
+    """Put plain numbers at some ticks of a logarithmic axis, and nothing between them."""
+    axis.set_major_locator(FixedLocator(list(ticks)))
+    axis.set_minor_locator(NullLocator())
+    axis.set_major_formatter("{x:g}")
 
 
 def draw_dot(axis: Axes, interval: Interval, place: float, colour: str, label: str | None) -> None:
@@ -100,9 +123,7 @@ def save_errors(
                 colour = COLOURS[k % len(COLOURS)]
                 draw_dot(axis, intervals[row][metric], place + shift, colour, label)
         axis.set_xscale("log")
-        axis.xaxis.set_major_locator(FixedLocator(ERROR_TICKS))
-        axis.xaxis.set_minor_locator(NullLocator())
-        axis.xaxis.set_major_formatter("{x:g}")
+        set_log_ticks(axis.xaxis, ERROR_TICKS)
         axis.margins(x=0.12)
         axis.set_xlabel(("density RMSE [veh/km]", "speed RMSE [km/h]")[metric])
         add_frame(axis, "x")

@@ -228,16 +228,6 @@ def holm(p_values: Mapping[str, float]) -> dict[str, float]:
     return {name: adjusted[name] for name in p_values}
 
 
-def worst_row(table: ArrayLike) -> int:
-    """Return the index of the training seed with the largest mean error over the traffic seeds.
-
-    Raises:
-        ValueError: The table is too small or not finite.
-    """
-    (values,) = _paired_tables([table])
-    return int(np.argmax(values.mean(axis=1)))
-
-
 def _paired_tables(tables: Sequence[ArrayLike]) -> list[FloatArray]:
     """Return tables as arrays (S, T), checked."""
     checked = []

@@ -7,8 +7,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
-from matplotlib.ticker import FixedLocator, NullLocator
 from numpy.typing import ArrayLike
 
 from agents.evaluation.statistics import Interval
@@ -73,10 +71,3 @@ def shifted(places: Sequence[float], share: float, log: bool) -> FloatArray:
     first, last = float(array[0]), float(array[-1])
     moved: FloatArray = array * (last / first) ** share if log else array + share * (last - first)
     return moved
-
-
-def set_log_ticks(axis: Axis, ticks: Sequence[float]) -> None:
-    """Put plain numbers at some ticks of a logarithmic axis, and nothing between them."""
-    axis.set_major_locator(FixedLocator(list(ticks)))
-    axis.set_minor_locator(NullLocator())
-    axis.set_major_formatter("{x:g}")

@@ -71,8 +71,11 @@ def health_table(
     return markdown([*header, *fields.values(), "episodes"], rows)
 
 
-def versions_table(versions: Mapping[str, Any], provenance: Mapping[str, Any]) -> str:
+def versions_table(provenance: Mapping[str, Any]) -> str:
     """Return the versions behind results: packages, states of the code, and the machine."""
+    made_with = provenance["made_with"]
+    # Results of several environments have the same versions under each of them.
+    versions = made_with.get("versions") or next(iter(made_with["cells"].values()))["versions"]
     sources = {"source of dptse_env": ", ".join(provenance["sources"])}
     rows = {**versions, **sources, **provenance["machine"]}
     return markdown(["version of", ""], [[name, str(value)] for name, value in rows.items()])

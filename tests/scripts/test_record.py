@@ -42,7 +42,7 @@ def test_the_command_records_into_the_library_and_reports_the_dwell(tmp_path):
 
 
 def test_random_traffic_is_recorded_on_request(tmp_path, capsys):
-    main(Args("short-highway", seeds="0:1", random=True, workers=1, records=tmp_path))
+    main(Args(corridor="short-highway", seeds="0:1", random=True, workers=1, records=tmp_path))
     assert RecordLibrary(tmp_path).record_path(randomised(SHORT_HIGHWAY), 0).is_dir()
     assert "1 record(s)" in capsys.readouterr().out
 

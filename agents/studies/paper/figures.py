@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,7 +19,7 @@ from agents.evaluation.figures import (
     draw_maps,
     estimate_map,
     make_figure,
-    save_figure,
+    set_log_ticks,
     truth_map,
 )
 from agents.evaluation.statistics import Interval, geometric_mean_interval, mean_interval
@@ -31,7 +29,6 @@ from agents.experiments.plots import (
     LABELS,
     draw_curve,
     draw_level,
-    set_log_ticks,
     shifted,
 )
 from agents.experiments.runner import make_env
@@ -229,11 +226,3 @@ def draw_pictures(design: PaperDesign, watched: Watched) -> Figure:
             maps.append(estimate_map(history, score, LABELS[name]))
         columns.append(maps)
     return draw_maps(columns, width=14.0)
-
-
-def draw_figures(folder: Path, results: PaperResults, titles: Sequence[str]) -> None:
-    """Save the figures of results 1, 3, 4 and 5, with their titles in this order."""
-    figures = {name: draw_sweeps(results, layout) for name, layout in LAYOUTS.items()}
-    figures["fig5_run_time.png"] = draw_times(results)
-    for (name, figure), title in zip(figures.items(), titles, strict=True):
-        save_figure(figure, folder / name, title)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from agents.evaluation.figures import ERROR_TICKS, add_frame, add_legend, make_figure
+from agents.evaluation.figures import ERROR_TICKS, finish_figure, make_figure, set_log_ticks
 from agents.evaluation.statistics import Interval
 from agents.experiments.cells import DENSITY, METRICS, SPEED
 from agents.experiments.plots import (
@@ -19,7 +19,6 @@ from agents.experiments.plots import (
     Look,
     draw_curve,
     draw_level,
-    set_log_ticks,
     shifted,
 )
 from agents.studies.privacy.account import Account
@@ -56,7 +55,7 @@ def draw_epsilon(results: PrivacyResults) -> Figure:
         row[0].set_ylabel(_axis_label(metric))
     for axis in axes[-1]:
         axis.set_xlabel("ε")
-    return _finish(figure, axes.flat)
+    return finish_figure(figure, axes.flat, columns=6)
 
 
 def draw_modes(results: PrivacyResults) -> Figure:
@@ -85,7 +84,7 @@ def draw_modes(results: PrivacyResults) -> Figure:
             axis.set_ylim(bottom=0.0)
     axes[1, 0].set_xlabel("boundary inputs of the estimator")
     axes[1, 1].set_xlabel("segments queried a second")
-    return _finish(figure, axes[0])
+    return finish_figure(figure, axes[0], columns=6)
 
 
 class Abscissa(NamedTuple):
@@ -117,7 +116,7 @@ def draw_claimed(results: PrivacyResults) -> Figure:
     for row, metric in zip(axes, (DENSITY, SPEED), strict=True):
         _errors(row[1], results, metric, claimed)
         _errors(row[2], results, metric, alone)
-    return _finish(figure, [*axes[:, 1], axes[0, 2]])
+    return finish_figure(figure, [*axes[:, 1], axes[0, 2]], columns=6)
 
 
 def _errors(axis: Axes, results: PrivacyResults, metric: str, over: Abscissa) -> None:
@@ -202,12 +201,3 @@ def _set_log(axis: Axes, ticks: Sequence[float]) -> None:
 def _axis_label(metric: str) -> str:
     name, unit = METRICS[metric]
     return f"{name} RMSE [{unit}]"
-
-
-def _finish(figure: Figure, named: Iterable[Axes]) -> Figure:
-    """Frame all panels, and name the curves of some below them."""
-    named = list(named)
-    for axis in figure.axes:
-        add_frame(axis)
-    add_legend(figure, named, columns=6)
-    return figure
