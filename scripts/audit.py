@@ -109,18 +109,16 @@ def run_audit(args: Args) -> Finding:
     config = attacked_config(args)
     library = Recording(records=args.records).library(config.corridor, [args.traffic_seed])
     record = library.get(config.corridor, args.traffic_seed)
-    target = choose_target(config, record, args.target, args.policy)
-    policy = make_policy(config, args.policy, target.worlds)
+    worlds = choose_target(config, record, args.target, args.policy)
+    policy = make_policy(config, args.policy, worlds)
     start = time.perf_counter()
-    runs = attack(
-        config, target.worlds, policy, args.runs, noise_factor=args.noise_factor, seed=args.seed
-    )
+    runs = attack(config, worlds, policy, args.runs, noise_factor=args.noise_factor, seed=args.seed)
     seconds = time.perf_counter() - start
     privacy, report = config.privacy, privacy_report(config)
     claim = f"({privacy.epsilon:g}, {privacy.delta:g})"
     return Finding(
         title=f"{args.env.rpartition('/')[2]}, preset {privacy.preset} at {claim}",
-        target=target.description,
+        target=worlds.description,
         policy=args.policy,
         n_runs=args.runs,
         noise_factor=args.noise_factor,

@@ -28,9 +28,7 @@ from agents.evaluation.figures import (
     RoadMap,
     draw_maps,
     estimate_map,
-    query_map,
     save_figure,
-    truth_map,
 )
 from agents.evaluation.policies import PolicySource, SavedPolicy, find_policy, read_saved_policy
 from agents.evaluation.report import Report
@@ -176,9 +174,9 @@ def draw_traffic(
         policy = load(args, sources[name], env)
         score, history = watch_episode(env, policy, traffic_seed=seed, seed=args.noise_seed + seed)
         maps += [
-            *([] if maps else [truth_map(history)]),
+            *([] if maps else [RoadMap("true density", history.truth, history)]),
             estimate_map(history, score, f"{name}: estimate"),
-            query_map(history, f"{name}: queried"),
+            RoadMap(f"{name}: queried", history.queried, history),
         ]
     title = f"Traffic seed {seed}, {estimator}, {noise}"
     save_figure(draw_maps([maps], width=8.4), args.output / "space_time.png", title)

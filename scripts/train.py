@@ -22,12 +22,7 @@ import tyro
 from tqdm import tqdm
 
 from agents.training.plan import TrainingPlan
-from agents.training.recipes import (
-    MaskablePPORecipe,
-    MaskRecipe,
-    PlackettLuceRecipe,
-    ScoresRecipe,
-)
+from agents.training.recipes import MaskablePPORecipe, MaskRecipe, PlackettLuceRecipe, ScoresRecipe
 from agents.training.run_files import Row
 from agents.training.tensorboard_writer import make_tensorboard_writer
 from agents.training.training import BEST, POLICY, Training

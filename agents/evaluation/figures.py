@@ -137,34 +137,24 @@ class RoadMap:
     """A panel over space and time.
 
     Attributes:
-        values: Densities [veh/km] or flags of queried segments, shape (n_mainline, n_seconds).
+        seconds: Densities [veh/km] or flags of queried segments by second, (n_mainline,) each.
         history: The episode, for its scales.
     """
 
     title: str
-    values: NDArray[Any]
+    seconds: Sequence[NDArray[Any]]
     history: History
 
     @property
     def is_flags(self) -> bool:
         """True for a panel of queried segments."""
-        return self.values.dtype == bool
-
-
-def truth_map(history: History, title: str = "true density") -> RoadMap:
-    """Return the panel of the true density."""
-    return RoadMap(title, np.array(history.truth).T, history)
+        return self.seconds[0].dtype == bool
 
 
 def estimate_map(history: History, score: EpisodeScore, title: str) -> RoadMap:
     """Return the panel of the estimated density; its title ends with the RMSE of the score."""
     title = f"{title}, RMSE {score.rmse_density:.1f} veh/km"
-    return RoadMap(title, np.array(history.estimate).T, history)
-
-
-def query_map(history: History, title: str) -> RoadMap:
-    """Return the panel of the queried segments."""
-    return RoadMap(title, np.array(history.queried).T, history)
+    return RoadMap(title, history.estimate, history)
 
 
 def draw_maps(columns: Sequence[Sequence[RoadMap]], width: float) -> Figure:
@@ -197,14 +187,14 @@ def draw_maps(columns: Sequence[Sequence[RoadMap]], width: float) -> Figure:
 
 
 def _draw_map(axis: Axes, panel: RoadMap) -> AxesImage:
-    n, n_seconds = panel.values.shape
+    values = np.array(panel.seconds).T
     axis.set_title(panel.title, loc="left", fontsize=9, pad=3, color=QUERY_COLOUR)
     axis.tick_params(labelsize=8)
     return axis.imshow(
-        panel.values,
+        values,
         origin="lower",
         aspect="auto",
-        extent=(-0.5, n_seconds - 0.5, 0.0, n * panel.history.segment_length),
+        extent=(-0.5, values.shape[1] - 0.5, 0.0, len(values) * panel.history.segment_length),
         cmap="Greys" if panel.is_flags else DENSITY_MAP,
         vmin=0.0,
         vmax=1.0 if panel.is_flags else panel.history.density_scale,

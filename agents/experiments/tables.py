@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
-import io
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,7 +10,7 @@ from typing import Any
 from agents.evaluation.episodes import EpisodeScore
 from agents.evaluation.statistics import Interval
 from agents.experiments.cells import METRICS, Results
-from agents.experiments.files import write_atomically
+from agents.experiments.files import write_csv
 
 
 def markdown(
@@ -108,15 +106,6 @@ def _one_line(settings: Mapping[str, Any]) -> str:
         f"{key} ({_one_line(value)})" if isinstance(value, Mapping) else f"{key} {value}"
         for key, value in settings.items()
     )
-
-
-def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    """Write a CSV file in one piece."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows(rows)
-    write_atomically(path, text.getvalue())
 
 
 def interval_columns(interval: Interval) -> list[str]:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from agents.experiments import tables
+from agents.experiments.files import write_csv as write_rows
 from agents.experiments.plots import LABELS
 from benchmarks.throughput.results import Result, Results, best, find
 from benchmarks.throughput.rows import ESTIMATORS, FEW, SIZES, THREADS, vector_name
@@ -203,4 +204,4 @@ def write_csv(path: Path, results: Results) -> None:
             if result.problem:
                 yield [name, *[""] * 9, result.problem]
 
-    tables.write_csv(path, columns, rows())
+    write_rows(path, columns, rows())

@@ -14,23 +14,17 @@ from matplotlib.ticker import NullFormatter
 from agents.evaluation.episodes import EpisodeScore, watch_episode
 from agents.evaluation.figures import (
     ERROR_TICKS,
+    RoadMap,
     add_frame,
     add_legend,
     draw_maps,
     estimate_map,
     make_figure,
     set_log_ticks,
-    truth_map,
 )
 from agents.evaluation.statistics import Interval, geometric_mean_interval, mean_interval
 from agents.experiments.cells import DENSITY, METRICS, SPEED
-from agents.experiments.plots import (
-    ESTIMATOR_LOOKS,
-    LABELS,
-    draw_curve,
-    draw_level,
-    shifted,
-)
+from agents.experiments.plots import ESTIMATOR_LOOKS, LABELS, draw_curve, draw_level, shifted
 from agents.experiments.runner import make_env
 from agents.studies.paper.plan import PAPER_ESTIMATORS, SETTINGS, PaperCell, PaperDesign, Setting
 from agents.studies.paper.results import PaperResults
@@ -221,7 +215,7 @@ def draw_pictures(design: PaperDesign, watched: Watched) -> Figure:
     columns = []
     for setting in SETTINGS:
         episodes = [watched[design.picture(name, setting)] for name in design.all_estimators]
-        maps = [truth_map(episodes[0][1], f"{setting}\ntruth")]
+        maps = [RoadMap(f"{setting}\ntruth", episodes[0][1].truth, episodes[0][1])]
         for name, (score, history) in zip(design.all_estimators, episodes, strict=True):
             maps.append(estimate_map(history, score, LABELS[name]))
         columns.append(maps)

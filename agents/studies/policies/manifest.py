@@ -189,13 +189,9 @@ class Manifest:
 
     def runs(self, learner: Learner) -> tuple[int, ...]:
         """Return the training seeds of a learner, ascending."""
-        return tuple(
-            sorted(
-                checkpoint.training_seed
-                for checkpoint in self.checkpoints
-                if (checkpoint.cell, checkpoint.recipe) == (learner.trained_in, learner.policy)
-            )
-        )
+        trained = (learner.trained_in, learner.policy)
+        found = (each for each in self.checkpoints if (each.cell, each.recipe) == trained)
+        return tuple(sorted(each.training_seed for each in found))
 
     def entries(self, design: PolicyDesign, bounds: bool = True) -> list[Entry]:
         """Return all policies that are run, in every cell, with or without oracles."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -147,32 +147,17 @@ class PolicyResults:
     @cached_property
     def comparisons(self) -> list[Comparison]:
         """Comparisons of all learned policies of the secondary cells with the best baseline."""
-        pairs = [
-            (learner, self.choice(cell.name).baseline)
-            for cell in self.design.cells[1:]
-            for learner in self.chosen(cell.name)
-        ]
-        tests = {}
-        for learner, name in pairs:
-            difference = self.schedule(learner.cell, name) - self.learned(learner)
-            tests[_key(learner)] = crossed_t(difference)
-        adjusted = holm({key: p_value for key, (_, p_value) in tests.items()})
-        return [
-            Comparison(
-                learner,
-                name,
-                self.below(self.learned(learner), self.schedule(learner.cell, name)),
-                *tests[_key(learner)],
-                adjusted[_key(learner)],
-            )
-            for learner, name in pairs
-        ]
+        learners = [each for cell in self.design.cells[1:] for each in self.chosen(cell.name)]
+        names = [self.choice(learner.cell).baseline for learner in learners]
+        found = []
+        for learner, name in zip(learners, names, strict=True):
+            errors, reference = self.learned(learner), self.schedule(learner.cell, name)
+            test = crossed_t(reference - errors)
+            found.append(Comparison(learner, name, self.below(errors, reference), *test, 1.0))
+        adjusted = holm({str(each.learner): each.p_value for each in found})
+        return [replace(each, adjusted=adjusted[str(each.learner)]) for each in found]
 
     @property
     def references(self) -> tuple[str, str]:
         """The best baseline of the primary cell, and the paper's schedule."""
         return self.choice(PRIMARY).baseline, REFERENCE
-
-
-def _key(learner: Learner) -> str:
-    return f"{learner.cell}, {learner.label}"

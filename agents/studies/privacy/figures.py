@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -87,48 +86,38 @@ def draw_modes(results: PrivacyResults) -> Figure:
     return finish_figure(figure, axes[0], columns=6)
 
 
-class Abscissa(NamedTuple):
-    """A kind of epsilon that errors are drawn over.
-
-    Attributes:
-        value: Returns it from an account.
-        is_claimed: Whether it is the epsilon that the configuration names.
-    """
-
-    label: str
-    value: Callable[[Account], float]
-    is_claimed: bool = False
-
-
 def draw_claimed(results: PrivacyResults) -> Figure:
     """Draw epsilon claimed against true, and the first estimator's errors over both."""
     figure = make_figure(13.6, 7.8, dpi=130)
     axes = figure.subplots(2, 3)
     cap, _ = results.meetings
-    claimed = Abscissa("ε claimed", lambda account: account.claimed, is_claimed=True)
-    met = Abscissa(f"ε true of densities alone,\nmet {cap} times", lambda account: account.met[cap])
-    alone = Abscissa(
-        f"ε true of both releases,\nmet {cap} times, alone and standing",
-        lambda account: account.alone[cap],
-    )
     _true_epsilon(axes[0, 0], results)
-    _errors(axes[1, 0], results, DENSITY, met)
+    _errors(axes[1, 0], results, DENSITY, lambda account: account.met[cap])
+    axes[1, 0].set_xlabel(f"ε true of densities alone,\nmet {cap} times")
     for row, metric in zip(axes, (DENSITY, SPEED), strict=True):
-        _errors(row[1], results, metric, claimed)
-        _errors(row[2], results, metric, alone)
+        _errors(row[1], results, metric, lambda account: account.claimed, shift=0.008)
+        row[1].set_xlabel("ε claimed")
+        _errors(row[2], results, metric, lambda account: account.alone[cap])
+        row[2].set_xlabel(f"ε true of both releases,\nmet {cap} times, alone and standing")
     return finish_figure(figure, [*axes[:, 1], axes[0, 2]], columns=6)
 
 
-def _errors(axis: Axes, results: PrivacyResults, metric: str, over: Abscissa) -> None:
+def _errors(
+    axis: Axes,
+    results: PrivacyResults,
+    metric: str,
+    epsilon: Callable[[Account], float],
+    shift: float = 0.0,
+) -> None:
     """Draw errors under the paper's noise and under a guarantee over one kind of epsilon."""
     design = results.design
     name = design.estimators[0]
     drawn: list[float] = []
     for k, protection in enumerate((*design.printed, design.base)):
-        places = [over.value(account) for account in results.accounts[protection]]
+        places = [epsilon(account) for account in results.accounts[protection]]
         drawn += places
         means = _means(results, design.along_epsilon(name, protection), metric)
-        moved = shifted(places, 0.008 * (k - 1) if over.is_claimed else 0.0, log=True)
+        moved = shifted(places, shift * (k - 1), log=True)
         label = str(protection).replace("`", "")
         draw_curve(axis, moved, means, _look(results, protection), label)
     for mode, line in (("nominal", ":"), ("true", "--")):
@@ -136,7 +125,6 @@ def _errors(axis: Axes, results: PrivacyResults, metric: str, over: Abscissa) ->
         draw_level(axis, alone, line, f"open loop, {mode} boundary")
     _set_log(axis, _ticks(drawn))
     axis.set_ylabel(f"{LABELS[name]}: {_axis_label(metric)}")
-    axis.set_xlabel(over.label)
 
 
 def _true_epsilon(axis: Axes, results: PrivacyResults) -> None:
