@@ -30,7 +30,7 @@ from dptse_env.traffic import (
 
 @dataclass(frozen=True)
 class Recording:
-    """Where missing traffic is recorded, and by how many processes."""
+    """Options for recording missing traffic."""
 
     workers: int | None = None
     """Processes that record missing traffic; all cores if not given."""

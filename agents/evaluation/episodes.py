@@ -176,8 +176,8 @@ def run_episodes(
 ) -> list[EpisodeScore]:
     """Run a batch of episodes at once and pool the errors of each; see `run_episode`.
 
-    The environment is bare and made with ``autoreset_mode="Disabled"`` (`make_vector`); it has an
-    episode for each of the n traffic seeds, which are its own, and for each of the n seeds.
+    The environment is bare and made with ``autoreset_mode="Disabled"`` (`make_vector`). Its n
+    episodes are in the order of the n traffic seeds and the n seeds of noise and estimator.
     The scores are those of `run_episode` for each pair of seeds, but for policies that draw at
     random: they draw for the whole batch at once, so other numbers from the same distribution.
 

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from agents.evaluation.episodes import EpisodeScore
 from agents.evaluation.statistics import Interval
 from dptse_env.rendering import DENSITY_MAP, QUERY_COLOUR, History
+from dptse_env.utils.arrays import FloatArray
 
 COLOURS = ("#1b4f72", "#c1272d", "#5d8233", "#7d5ba6", "#b9770e")
 GRID_COLOUR = "#e3e6ea"
@@ -85,11 +86,15 @@ def set_log_ticks(axis: Axis, ticks: Sequence[float]) -> None:
     axis.set_major_formatter("{x:g}")
 
 
+def spread(intervals: Sequence[Interval]) -> FloatArray:
+    """Return the lengths of error bars below and above the means, shape (2, n)."""
+    return np.array([[each.mean - each.low, each.high - each.mean] for each in intervals]).T
+
+
 def draw_dot(axis: Axes, interval: Interval, place: float, colour: str, label: str | None) -> None:
     """Draw a mean with its interval at a height, and its value beside it."""
-    spread = [[interval.mean - interval.low], [interval.high - interval.mean]]
     axis.errorbar(
-        [interval.mean], [place], xerr=spread, color=colour, label=label,
+        [interval.mean], [place], xerr=spread([interval]), color=colour, label=label,
         fmt="o", markersize=4, capsize=2.5, linewidth=1.2,
     )  # fmt: skip
     axis.annotate(
@@ -101,7 +106,7 @@ def draw_dot(axis: Axes, interval: Interval, place: float, colour: str, label: s
 def save_errors(
     path: Path,
     rows: Sequence[str],
-    series: Mapping[str, Mapping[str, tuple[Interval, Interval]]],
+    series: Mapping[str, Mapping[str, Mapping[str, Interval]]],
     title: str,
 ) -> None:
     """Save the errors of every policy as dots with 95 % intervals, density beside speed.
@@ -109,13 +114,14 @@ def save_errors(
     Args:
         path: Where to save the PNG.
         rows: Policies, from top to bottom.
-        series: By estimator, then by policy: (density [veh/km], speed [km/h]) intervals.
+        series: By estimator, policy and field of `EpisodeScore`: intervals.
         title: Title of the figure.
     """
     figure = make_figure(8.4, 1.6 + 0.42 * len(rows), dpi=150)
     axes = figure.subplots(1, 2, sharey=True)
     places = np.arange(len(rows))[::-1]
-    for metric, axis in enumerate(axes):
+    labels = {"rmse_density": "density RMSE [veh/km]", "rmse_speed": "speed RMSE [km/h]"}
+    for axis, (metric, axis_label) in zip(axes, labels.items(), strict=True):
         for k, (name, intervals) in enumerate(series.items()):
             shift = ((len(series) - 1) / 2 - k) * 0.3
             for place, row in zip(places, rows, strict=True):
@@ -125,7 +131,7 @@ def save_errors(
         axis.set_xscale("log")
         set_log_ticks(axis.xaxis, ERROR_TICKS)
         axis.margins(x=0.12)
-        axis.set_xlabel(("density RMSE [veh/km]", "speed RMSE [km/h]")[metric])
+        axis.set_xlabel(axis_label)
         add_frame(axis, "x")
     axes[0].set_yticks(places, rows)
     add_legend(figure, axes[:1])

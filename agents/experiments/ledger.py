@@ -29,7 +29,7 @@ ScoredT = TypeVar("ScoredT", bound=Scored)
 
 
 class Ledger(Generic[KeyT, ScoredT]):
-    """One record for each key and traffic seed, on disk as soon as it is added.
+    """A record for each key and traffic seed, on disk as soon as it is added.
 
     A process that dies while it writes leaves a last line without its end. Such a line is dropped
     when the file is opened again, and its episode is run again.

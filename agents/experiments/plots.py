@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import ArrayLike
 
+from agents.evaluation.figures import spread
 from agents.evaluation.statistics import Interval
 from dptse_env.utils.arrays import FloatArray
 
@@ -50,10 +51,9 @@ def draw_curve(
     label: str | None = None,
 ) -> None:
     """Draw means at their places with intervals as bars."""
-    means = np.array([interval.mean for interval in intervals])
-    spread = np.array([[each.mean - each.low, each.high - each.mean] for each in intervals]).T
+    means = [interval.mean for interval in intervals]
     axis.errorbar(
-        np.asarray(places), means, yerr=spread,
+        np.asarray(places), means, yerr=spread(intervals),
         color=look.colour, marker=look.marker, linestyle=look.line,
         markersize=4, linewidth=1.2, capsize=2, label=label,
     )  # fmt: skip

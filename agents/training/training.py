@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 
@@ -28,15 +28,8 @@ from dptse_env.sb3.saved import ActingPolicy, save_policy
 POLICY, BEST = "policy.zip", "best.zip"
 
 
-class Watcher(Protocol):
-    """Receives every row of the learning curve as it comes."""
-
-    def __call__(self, row: Row) -> None:
-        """Take a row."""
-
-
-def _ignore(_stage: str, _fraction: float) -> None:
-    """Report nothing."""
+Watcher = Callable[[Row], None]
+"""Receives every row of the learning curve as it comes."""
 
 
 class Training:
@@ -61,7 +54,7 @@ class Training:
         records: str | None = None,
         commit: str | None = None,
         watchers: tuple[Watcher, ...] = (),
-        progress: Callable[[str, float], None] = _ignore,
+        progress: Callable[[str, float], None] = lambda stage, fraction: None,
     ) -> None:
         """Take the folder and restore its state.
 

@@ -40,7 +40,7 @@ class Row:
 
     @property
     def missing(self) -> str | None:
-        """What is not installed and how to get it; None where everything is."""
+        """Description of missing modules, and how to get them; None where all are installed."""
         absent = [name for name in self.needs if importlib.util.find_spec(name) is None]
         install = "pip install 'dptse-env[benchmark]'"
         return f"{' and '.join(absent)} not installed: {install}" if absent else None

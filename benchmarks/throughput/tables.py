@@ -13,7 +13,6 @@ from agents.experiments.files import write_csv as write_rows
 from agents.experiments.plots import LABELS
 from benchmarks.throughput.results import Result, Results, best, find
 from benchmarks.throughput.rows import ESTIMATORS, FEW, SIZES, THREADS, vector_name
-from benchmarks.throughput.targets import Target
 
 PEERS = {"ekf": "filterpy", "ukf": "filterpy", "enkf": "filterpy", "mhe": "qpsolvers"}
 SECONDS = {"sumo-rl": 5.0}
@@ -139,49 +138,15 @@ def remaining(results: Results) -> str:
     return markdown(header, lines)
 
 
-def shares(results: Results, row: str, title: str) -> str:
-    """Return the notes of a row, shares of its time; nothing if it was not measured."""
-    result = find(results, row)
-    if not result.repeats:
-        return ""
-    lines = [(name, number(result.note(name), "{:.0%}")) for name in result.repeats[0].notes]
-    return markdown((title, "share"), lines)
-
-
-def judged(found: Iterable[Target]) -> str:
-    """Return the targets and their verdicts."""
-    rows = [
-        [
-            target.description,
-            ("≥ " if target.is_floor else "< ") + target.form.format(target.bound),
-            number(target.measured, target.form),
-            target.verdict,
-        ]
-        for target in found
-    ]
-    return markdown(("target", "bound", "measured", ""), rows)
-
-
-def problems(results: Results) -> str:
-    """Return the rows without a result, a line each."""
-    return "".join(f"- {n}: {r.problem}\n" for n, r in results.items() if r.problem)
-
-
-def disturbance(results: Results) -> str:
-    """Return the share of a core that single-threaded work had: below one on a busy machine."""
-    cores = [
+def cores(results: Results) -> list[float]:
+    """Return the shares of a core that single-threaded work had: below one on a busy machine."""
+    return [
         samples.cores
         for result in results.values()
         for measured in result.repeats
         for arm, samples in measured.arms.items()
         if arm in ("bare", "recording", "one thread", "kernel") and samples.cores is not None
     ]
-    if not cores:
-        return ""
-    return (
-        f"Single-threaded work had {statistics.median(cores):.2f} of a core in the median and "
-        f"{min(cores):.2f} at least, in {len(cores)} measurements.\n"
-    )
 
 
 def write_csv(path: Path, results: Results) -> None:

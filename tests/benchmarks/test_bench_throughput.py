@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.bench_throughput import report
 from benchmarks.throughput import tables
 from benchmarks.throughput.children import RowError, measure, measure_all
 from benchmarks.throughput.environments import Driver, Kernel, make_batch
@@ -95,7 +96,9 @@ def test_tables_name_what_is_missing():
     assert "| AsyncVectorEnv of 4, EKF | – | 4,400 ± 0% | 2 | 300 (200) |" in lines
     assert "| SyncVectorEnv of 8, EKF | failed: no lane | – | – | – |" in lines
     assert not any("UKF" in line for line in lines)
-    assert tables.problems(found) == ("- scalar-ekf: failed: no road\n- sync-8: failed: no lane\n")
+    text = report(found, 1)
+    assert "## Not measured\n\n- scalar-ekf: failed: no road\n- sync-8: failed: no lane\n\n" in text
+    assert "## Not measured" not in report(results(result("ppo", PPO=[1.0])), 1)
 
 
 def test_a_module_that_is_absent_is_reported_and_the_rest_is_measured():

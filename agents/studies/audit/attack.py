@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from tqdm import tqdm
 
-from agents.studies.audit.strategies import AdversaryPolicy
+from agents.studies.audit.strategies import FixedQueries
 from agents.studies.audit.worlds import AdjacentWorlds
 from dptse_env.config import EnvConfig
 from dptse_env.parts import make_parts, make_release
@@ -129,7 +129,7 @@ def planned_distance(
 def attack(
     config: EnvConfig,
     worlds: AdjacentWorlds,
-    policy: AdversaryPolicy,
+    policy: FixedQueries,
     n_runs: int,
     *,
     noise_factor: float = 1.0,

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import numpy as np
 
 from agents.studies.audit.distances import ReleaseDistances, plan_contributions
@@ -24,16 +22,6 @@ STRATEGIES = ("hunter", "adaptive", *PUBLIC_SCHEDULES)
 """Names of the policies."""
 
 
-class AdversaryPolicy(Protocol):
-    """Chooses queries from past releases and the adversary's knowledge."""
-
-    def queries(self, step: int, belief: FloatArray) -> BoolArray:
-        """Return the segments to query, shape (k, n_mainline).
-
-        ``belief`` is the log-likelihood ratio of world 1 of each run's transcript so far, (k,).
-        """
-
-
 class FixedQueries:
     """Queries by a plan, whatever is released.
 
@@ -46,7 +34,10 @@ class FixedQueries:
         self.plan = plan
 
     def queries(self, step: int, belief: FloatArray) -> BoolArray:
-        """See `AdversaryPolicy.queries`."""
+        """Return the segments to query, shape (k, n_mainline).
+
+        ``belief`` is the log-likelihood ratio of world 1 of each run's transcript so far, (k,).
+        """
         return np.tile(self.plan[step], (len(belief), 1))
 
 
@@ -54,7 +45,7 @@ class AdaptiveQueries(FixedQueries):
     """Follows its plan while it is undecided, and stops querying from then on."""
 
     def queries(self, step: int, belief: FloatArray) -> BoolArray:
-        """See `AdversaryPolicy.queries`."""
+        """See `FixedQueries.queries`."""
         undecided = np.abs(belief) < DECISION_THRESHOLD
         queries: BoolArray = self.plan[step] & undecided[:, None]
         return queries

@@ -21,6 +21,7 @@ from agents.evaluation.figures import (
     estimate_map,
     make_figure,
     set_log_ticks,
+    spread,
 )
 from agents.evaluation.statistics import Interval, geometric_mean_interval, mean_interval
 from agents.experiments.cells import DENSITY, METRICS, SPEED
@@ -127,12 +128,8 @@ def draw_open_loop(
         return
     axis.annotate(
         f"open loop {alone.mean:.1f} ± {alone.half_width:.1f} {unit}, off the scale ↑",
-        (0.98, 0.985),
-        xycoords="axes fraction",
-        ha="right",
-        va="top",
-        fontsize=7.5,
-    )
+        (0.98, 0.985), xycoords="axes fraction", ha="right", va="top", fontsize=7.5,
+    )  # fmt: skip
     low, high = axis.get_ylim()
     axis.set_ylim(low, high + 0.08 * (high - low))  # space for the text
 
@@ -171,28 +168,19 @@ def _time_panel(axis: Axes, results: PaperResults, places: Any, relative: bool) 
     shades = ("#0072b2", "#56b4e9", "#d55e00", "#e69f00")
     for k, setting in enumerate(SETTINGS):
         reference = results.seconds("ekf", setting) if relative else 1e-3
-        for place, name in zip(places, names, strict=True):
-            time = geometric_mean_interval(results.seconds(name, setting) / reference)
-            axis.errorbar(
-                [time.mean],
-                [place + 0.24 - 0.16 * k],
-                xerr=[[time.mean - time.low], [time.high - time.mean]],
-                fmt="o",
-                markersize=4,
-                capsize=2,
-                color=shades[k],
-                label=f"here, {setting}" if name == names[0] else None,
-            )
+        times = [
+            geometric_mean_interval(results.seconds(name, setting) / reference) for name in names
+        ]
+        axis.errorbar(
+            [time.mean for time in times], places + 0.24 - 0.16 * k, xerr=spread(times),
+            fmt="o", markersize=4, capsize=2, color=shades[k], label=f"here, {setting}",
+        )  # fmt: skip
     scale = PAPER_SECONDS["ekf"] if relative else 1e-3
     published = [k for k, name in enumerate(names) if name in PAPER_ESTIMATORS]
     axis.plot(
-        [PAPER_SECONDS[names[k]] / scale for k in published],
-        [places[k] for k in published],
-        linestyle="none",
-        marker="x",
-        color="#000000",
-        label="the paper",
-    )
+        [PAPER_SECONDS[names[k]] / scale for k in published], [places[k] for k in published],
+        linestyle="none", marker="x", color="#000000", label="the paper",
+    )  # fmt: skip
 
 
 Watched = dict[PaperCell, tuple[EpisodeScore, History]]

@@ -38,7 +38,7 @@ SETTINGS = tuple(
 
 @dataclass(frozen=True)
 class PaperCell:
-    """One configuration, run on every traffic seed.
+    """A configuration, run on every traffic seed.
 
     Attributes:
         bandwidth: CV segments queried a second.

@@ -83,20 +83,7 @@ def _check_tuned(design: PolicyDesign, manifest: Manifest) -> None:
             )
 
 
-def check_untouched(folder: Path) -> None:
-    """Refuse a folder in which test traffic was run.
-
-    Raises:
-        ValueError: It was.
-    """
-    if (folder / TEST).exists():
-        raise ValueError(
-            f"{folder / TEST} exists: test traffic has been run, nothing can be frozen any more. "
-            "Choose another --output"
-        )
-
-
-def begin(folder: Path, drafted: Manifest) -> Manifest:
+def write_draft(folder: Path, drafted: Manifest) -> Manifest:
     """Put a draft into a folder, or go on with the same draft there.
 
     Raises:

@@ -84,7 +84,7 @@ class CellChoice:
 
 @dataclass(frozen=True)
 class Manifest:
-    """Everything that is fixed before test traffic is touched.
+    """The policies and choices that are fixed before test traffic is touched.
 
     Attributes:
         design: The design, as plain JSON.

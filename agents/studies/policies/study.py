@@ -9,7 +9,7 @@ from typing import Any
 from agents.evaluation.episodes import EpisodeScore
 from agents.evaluation.figures import save_figure
 from agents.evaluation.statistics import crossed_t
-from agents.experiments import seeds
+from agents.experiments import seeds as noise_seeds
 from agents.experiments.engine import run_all
 from agents.experiments.ledger import Ledger, ScoredT
 from agents.experiments.provenance import check_folder, take_folder
@@ -23,11 +23,10 @@ from agents.studies.policies.freezing import (
     QUERIES,
     TEST,
     VALIDATION,
-    begin,
-    check_untouched,
     choose,
     design_provenance,
     draft,
+    write_draft,
 )
 from agents.studies.policies.manifest import Checkpoint, Manifest, Tuned
 from agents.studies.policies.plan import DETERMINISTIC, MODES, PRIMARY, Entry, Learner, PolicyDesign
@@ -63,10 +62,14 @@ def freeze(
     Raises:
         ValueError: Test traffic has been run, or the folder is of something else.
     """
-    check_untouched(place.folder)
+    if (place.folder / TEST).exists():
+        raise ValueError(
+            f"{place.folder / TEST} exists: test traffic has been run, nothing can be frozen any "
+            "more. Choose another --output"
+        )
     drafted = draft(design, checkpoints, tuned, command)
     take_folder(place.folder, design_provenance(design))
-    manifest = begin(place.folder, drafted)
+    manifest = write_draft(place.folder, drafted)
     if manifest.frozen:
         return manifest, False
     ledger = Ledger(place.folder / VALIDATION, Entry, EpisodeScore)
@@ -174,7 +177,7 @@ def report(folder: Path, results: PolicyResults, recorded: Mapping[str, Any]) ->
         "results": results,
         "tables": tables,
         "rules": rules,
-        "seeds": seeds,
+        "seeds": noise_seeds,
         "best_baseline": results.references[0],
         "reference": results.references[1],
         "best_below_paper": results.below(best, paper),

@@ -40,7 +40,7 @@ class Protection(NamedTuple):
 
 @dataclass(frozen=True)
 class PrivacyCell:
-    """One configuration, run on every traffic seed.
+    """A configuration, run on every traffic seed.
 
     Attributes:
         unit: Protected unit; `UNBOUNDED` where the preset bounds no contributions.
@@ -121,7 +121,7 @@ class PrivacyDesign(Design[PrivacyCell]):
 
     @property
     def all_estimators(self) -> tuple[str, ...]:
-        """Every estimator that is run."""
+        """The estimators, then the open loop."""
         return (*self.estimators, OPEN_LOOP)
 
     @property

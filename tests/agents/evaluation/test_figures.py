@@ -55,7 +55,9 @@ def test_maps_stand_in_columns_with_one_bar(watched, tmp_path):
 
 
 def test_errors_of_every_policy_are_drawn(tmp_path):
-    pair = Interval(10.0, 9.0, 11.0, 3), Interval(5.0, 4.0, 6.0, 3)
+    pair = {
+        "rmse_density": Interval(10.0, 9.0, 11.0, 3), "rmse_speed": Interval(5.0, 4.0, 6.0, 3),
+    }  # fmt: skip
     rows = ["paper", "round-robin"]
     series = {name: dict.fromkeys(rows, pair) for name in ("ekf", "ukf")}
     save_errors(tmp_path / "errors.png", rows, series, "title")
