@@ -14,7 +14,7 @@ from agents.experiments.seeds import training_seed
 from agents.training.episodes import make_episodes
 from agents.training.learner import Record
 from agents.training.plan import TrainingPlan
-from agents.training.policy_iteration import swap_round
+from agents.training.policy_iteration import collect_swaps, raise_scores
 from agents.training.recipes import PlackettLuceRecipe
 from agents.training.regression import regress
 from dptse_env.parts import make_interface
@@ -85,6 +85,10 @@ class PlackettLuceLearner:
         env = make_vector(plan.env, settings.episodes, keywords)
         while self._rounds < settings.rounds:
             start = time.perf_counter()
-            error = swap_round(self.policy, env, settings, self._rounds, plan.seed, self._progress)
+            swaps = collect_swaps(
+                self.policy, env, settings, self._rounds, plan.seed, self._progress
+            )
+            step, progress = settings.step_of(self._rounds), partial(self._progress, "fit")
+            raise_scores(self.policy, swaps, settings, step, progress)
             self._rounds += 1
-            record(time.perf_counter() - start, {"error": error})
+            record(time.perf_counter() - start, {"error": float(swaps.error.mean())})

@@ -9,7 +9,6 @@ are measured anew, under the new policy.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 
 import numpy as np
 import torch
@@ -31,24 +30,6 @@ SEED_STRIDE = 10_000
 
 REPORT_INTERVAL = 50
 """Minibatches between two reports of progress."""
-
-
-def swap_round(
-    policy: PlackettLucePolicy,
-    env: SensorQueryVectorEnv,
-    settings: SwapRounds,
-    index: int,
-    seed: int,
-    progress: Callable[[str, float], None],
-) -> float:
-    """Try swaps under a policy and improve it by them, in place; see `collect_swaps`.
-
-    Returns:
-        The mean one-second error under the policy before the round.
-    """
-    swaps = collect_swaps(policy, env, settings, index, seed, progress)
-    raise_scores(policy, swaps, settings, settings.step_of(index), partial(progress, "fit"))
-    return float(swaps.error.mean())
 
 
 def collect_swaps(

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from agents.studies.audit.distances import ReleaseDistances, plan_contributions
-from agents.studies.audit.protection import contribution_cap
+from agents.studies.audit.distances import (
+    ReleaseDistances,
+    contribution_cap,
+    plan_contributions,
+)
 from agents.studies.audit.worlds import AdjacentWorlds
 from dptse_env.config import EnvConfig
 from dptse_env.parts import make_interface, make_release

@@ -7,8 +7,13 @@ from itertools import pairwise
 import numpy as np
 
 from agents.studies.audit.attack import planned_distance
-from agents.studies.audit.distances import ReleaseDistances, plan_contributions
-from agents.studies.audit.protection import contribution_cap, protects_seconds, replaces
+from agents.studies.audit.distances import (
+    ReleaseDistances,
+    contribution_cap,
+    plan_contributions,
+    protects_seconds,
+    replaces,
+)
 from agents.studies.audit.strategies import (
     PUBLIC_SCHEDULES,
     always_observed,

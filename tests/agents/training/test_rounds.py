@@ -10,7 +10,7 @@ import torch
 
 from agents.evaluation.episodes import make_vector
 from agents.experiments.seeds import training_seed
-from agents.training.policy_iteration import collect_swaps, swap_round
+from agents.training.policy_iteration import collect_swaps, raise_scores
 from agents.training.recipes import SwapRounds
 from agents.training.run_files import read_progress
 from agents.training.training import BEST, POLICY, Training
@@ -76,7 +76,8 @@ def ignore(stage, fraction):
 
 def weights_after(settings, index):
     policy = make_policy()
-    swap_round(policy, make_batch(), settings, index, SEED, ignore)
+    swaps = collect_swaps(policy, make_batch(), settings, index, SEED, ignore)
+    raise_scores(policy, swaps, settings, settings.step_of(index))
     return torch.nn.utils.parameters_to_vector(policy.parameters()).detach().numpy()
 
 
