@@ -51,7 +51,7 @@ def draw_curve(
     label: str | None = None,
 ) -> None:
     """Draw means at their places with intervals as bars."""
-    means = [interval.mean for interval in intervals]
+    means = np.array([interval.mean for interval in intervals])
     axis.errorbar(
         np.asarray(places), means, yerr=spread(intervals),
         color=look.colour, marker=look.marker, linestyle=look.line,
