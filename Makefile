@@ -65,10 +65,9 @@ format: setup  ## Format the code.
 	$(BIN)/ruff check --fix
 	$(BIN)/ruff format
 
-benchmark: setup  ## Time the estimators, one step, and thousands of episodes beside their peers; results/throughput.
+benchmark: setup  ## Time the estimators and thousands of episodes beside their peers; results/throughput.
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[benchmark]'
 	$(BIN)/python benchmarks/bench_estimators.py
-	$(BIN)/python benchmarks/bench_env.py
 	$(BIN)/python benchmarks/bench_throughput.py
 
 wheel-test: setup  ## Build the wheel, install it elsewhere and use it there.

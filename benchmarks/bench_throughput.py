@@ -1,9 +1,9 @@
-"""How many environment steps a second: SUMO, its records, one episode, thousands, PPO, and peers.
+"""Environment steps a second: SUMO, its records, one episode, thousands, PPO, and peers.
 
 python benchmarks/bench_throughput.py
 
-Prints the tables and writes them to `results/throughput`. Rows run one at a time, each in a process
-of its own; nothing else should run beside them.
+Prints the tables and writes them to `results/throughput`. Rows run one at a time, each in a
+separate process; nothing else should run beside them.
 """
 
 from __future__ import annotations
@@ -11,13 +11,15 @@ from __future__ import annotations
 import json
 import platform
 import signal
+import statistics
 import sys
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
 
+from agents.experiments.reports import fill
 from benchmarks.throughput import tables
-from benchmarks.throughput.children import measure_all, to_plain
+from benchmarks.throughput.children import measure_all
 from benchmarks.throughput.results import Results
 from benchmarks.throughput.rows import HORIZON, QUICK, Row, Sizes, catalogue, chosen
 from benchmarks.throughput.targets import targets
@@ -26,24 +28,7 @@ from dptse_env.traffic import RecordLibrary
 from dptse_env.utils.threads import n_cores
 from scripts.cli import run
 
-METHOD = """\
-All figures come from one run; compare their ratios, since absolute rates drift between machines
-and moments. Each row is a process of its own, one after the other, and the whole list is measured
-{} times. What a ratio compares closely (an environment and its bare estimator, libsumo and its
-recording) takes turns within one process. A rate is the median over turns, ± half the distance of
-their 10th and 90th percentile.
-
-A step is one simulated second, but for sumo-rl, whose actions last five; there, times libsumo is
-in simulated seconds. Environments are PaperHighway with ARZ set w99-3lane, episodes of {} s that
-start anywhere in a record, random queries of 5 of 15 segments a step where no number is given;
-resets are left out. filterpy's filters in a loop call the compiled model, the environment's
-reference backends numpy's. The bare estimator is given exactly what the environment's was given.
-Memory is the most that was resident, in brackets what was once libraries were loaded and one
-episode had taken a step; for AsyncVectorEnv, what its processes have beside the first one is
-added. PPO has the defaults of stable-baselines3 (10 epochs, 64 by 64 units) with rollouts of 1,024
-episodes by 32 steps and minibatches of 2,048.
-"""
-
+TEMPLATES = Path(tables.__file__).parent
 PRESET_OF = {"PaperHighway": "paper-highway", "PrivateHighway": "private-highway"}
 
 
@@ -64,40 +49,29 @@ class Args:
 
 
 def record(rows: list[Row]) -> None:
-    """Record what rows replay and is not there yet, off the clock."""
-    wanted: dict[str, set[int]] = {}
+    """Record the traffic of rows that is not there yet, off the clock."""
     for row in rows:
         name = PRESET_OF.get(row.options.get("preset", ""))
         if name is not None:
             seeds = parse_seeds(row.options["traffic_seeds"])
-            wanted.setdefault(name, set()).update(seeds)
-    for name, seeds in wanted.items():
-        RecordLibrary().ensure(PRESETS[name].corridor, sorted(seeds), progress=True)
+            RecordLibrary().ensure(PRESETS[name].corridor, seeds, progress=True)
 
 
 def report(results: Results, repeats: int) -> str:
-    """Return all tables and what they were made with."""
-    versions = ("dptse-env", "libsumo", "gymnasium", "numba", "numpy", "stable-baselines3")
-    made = ", ".join(f"{name} {version(name)}" for name in versions)
-    machine = f"python {platform.python_version()}, {n_cores()} cores ({platform.machine()})"
-    sections = {
-        "Targets": [tables.judged(targets(results))],
-        "In short": [tables.summary(results)],
-        "Native vectorisation": [tables.vectorised(results)],
-        "Everything else": [tables.others(results)],
-        "Where the time goes": [
-            tables.shares(results, "ppo", "PPO"),
-            tables.shares(results, "profile-ekf", "1,024 episodes, EKF"),
-            tables.shares(results, "profile-ukf", "1,024 episodes, UKF"),
-        ],
-        "Not measured": [tables.problems(results)],
-        "Origin": [tables.disturbance(results), f"{made}, {machine}.\n"],
+    """Return all tables and their origin."""
+    packages = ("dptse-env", "libsumo", "gymnasium", "numba", "numpy", "stable-baselines3")
+    content = {
+        "results": results,
+        "repeats": repeats,
+        "horizon": HORIZON,
+        "tables": tables,
+        "cores": tables.cores(results),
+        "median": statistics.median,
+        "targets": list(targets(results)),
+        "versions": {name: version(name) for name in packages},
+        "machine": f"python {platform.python_version()}, {n_cores()} cores ({platform.machine()})",
     }
-    parts = ["# Throughput\n", METHOD.format(repeats, HORIZON)]
-    for title, texts in sections.items():
-        if any(texts):
-            parts += [f"## {title}\n", *filter(None, texts)]
-    return "\n".join(parts)
+    return fill(TEMPLATES, content)
 
 
 def main(args: Args) -> None:
@@ -121,10 +95,14 @@ def main(args: Args) -> None:
     (args.output / "REPORT.md").write_text(text, encoding="utf-8")
     (args.output / "table.md").write_text(tables.summary(results), encoding="utf-8")
     tables.write_csv(args.output / "throughput.csv", results)
-    plain = json.dumps([to_plain(result) for result in results.values()], indent=1)
-    (args.output / "throughput.json").write_text(plain + "\n", encoding="utf-8")
-    if found := tables.problems(results):
-        print(f"not measured:\n{found}", file=sys.stderr)
+    plain = [
+        {"row": each.row.name, "work": each.row.work, "options": each.row.options,
+         "problem": each.problem, "repeats": [asdict(measured) for measured in each.repeats]}
+        for each in results.values()
+    ]  # fmt: skip
+    content = json.dumps(plain, indent=1) + "\n"
+    (args.output / "throughput.json").write_text(content, encoding="utf-8")
+    if any(result.problem for result in results.values()):
         raise SystemExit(1)
 
 

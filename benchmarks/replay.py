@@ -1,7 +1,8 @@
-"""Recorded traffic as an estimator meets it: what drives it, and what is released to it."""
+"""Recorded traffic as an estimator meets it: its inputs, and the releases it is given."""
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,12 +24,12 @@ class Replay:
 
     Attributes:
         model: Model of the estimators.
-        settings: Theirs: the paper's sizes and weights, the process noise of the parameter set.
-        start: `(n, 2 S)` prior means.
-        inputs: `(K, n, n_u)` what drives each step.
-        observed: `(K, n, S)`, as many segments in every step.
-        values: `(K, n, S, 2)` releases [veh/km, km/h].
-        sigma: `(2,)` standard deviations of their noise.
+        settings: The paper's sizes and weights, the process noise of the parameter set.
+        start: Prior means, shape (n, 2 S).
+        inputs: Inputs of the model in each step, shape (K, n, n_u).
+        observed: Flags of observed segments, as many in every step, shape (K, n, S).
+        values: Releases [veh/km, km/h], shape (K, n, S, 2).
+        sigma: Standard deviations of their noise, shape (2,).
     """
 
     model: ARZModel
@@ -40,22 +41,16 @@ class Replay:
     sigma: FloatArray
 
     @property
-    def n_steps(self) -> int:
-        """K."""
-        return len(self.inputs)
-
-    @property
     def n_outputs(self) -> int:
-        """Numbers measured in every step."""
+        """Number of values that are measured in every step."""
         return 2 * int(self.observed[0, 0].sum())
 
     def first(self, n_episodes: int) -> Replay:
         """Return the first episodes alone."""
-        n = slice(n_episodes)
-        return Replay(
-            self.model, self.settings, self.start[n], self.inputs[:, n], self.observed[:, n],
-            self.values[:, n], self.sigma,
-        )  # fmt: skip
+        tables = {
+            name: getattr(self, name)[:, :n_episodes] for name in ("inputs", "observed", "values")
+        }
+        return dataclasses.replace(self, start=self.start[:n_episodes], **tables)
 
 
 def recorded(
@@ -63,12 +58,12 @@ def recorded(
 ) -> Replay:
     """Replay the paper's highway under the paper's schedule and privacy.
 
-    The schedule runs over the mainline segments that have no sensor of their own, so that queries
-    and sensors never fall together and every step has equally many outputs.
+    The schedule runs over the mainline segments without a fixed sensor, so that queries and sensors
+    never fall together and every step has equally many outputs.
 
     Args:
         parameters: ARZ parameter set.
-        seeds: Traffic seeds; the episodes take them in turns, each with noise of its own.
+        seeds: Traffic seeds; the episodes take them in turns, each with separate noise.
         n_episodes: n.
         n_queried: Segments queried a step.
         n_steps: K, from the empty road on.
@@ -76,27 +71,21 @@ def recorded(
     Raises:
         ValueError: There are more steps than a record has, or none.
     """
-    config = resolve(
-        "paper-highway",
-        {"parameters": parameters, "bandwidth": n_queried, "traffic_seeds": seeds},
-    )
+    keywords = {"parameters": parameters, "bandwidth": n_queried, "traffic_seeds": seeds}
+    config = resolve("paper-highway", keywords)
     corridor, model, n = config.corridor, make_model(config), n_episodes
     if not 1 <= n_steps <= corridor.duration:
         raise ValueError(f"steps must be in 1..{corridor.duration}, got {n_steps}")
-    s = corridor.n_segments
-    release = make_release(config, n)
+    s, release = corridor.n_segments, make_release(config, n)
     traffic = release.setup.traffic
     traffic.load(np.arange(len(seeds)))
-    indices = np.arange(n) % len(seeds)
+    episodes, indices = np.arange(n), np.arange(n) % len(seeds)
     boundary = [traffic.complete(index)[:n_steps, s:] for index in range(len(seeds))]
     inputs = [model.boundary_inputs(ends[..., 0], ends[..., 1]) for ends in boundary]
-    every = np.arange(n)
-    release.reset(every, [np.random.default_rng([0, i]) for i in range(n)])
-    queried = np.zeros((n, corridor.n_mainline), dtype=bool)
+    release.reset(episodes, [np.random.default_rng([0, i]) for i in range(n)])
+    sensors = release.setup.observed(np.zeros((n, corridor.n_mainline), dtype=bool))
     values = [
-        release.release(
-            ReleaseRequest(every, indices, np.full(n, k + 1), release.setup.observed(queried))
-        ).values
+        release.release(ReleaseRequest(episodes, indices, np.full(n, k + 1), sensors)).values
         for k in range(n_steps)
     ]
     roaming = np.setdiff1d(np.arange(corridor.n_mainline), corridor.fixed_sensors)

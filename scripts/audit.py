@@ -23,9 +23,8 @@ from dptse_env.parts import privacy_report
 from dptse_env.privacy import mu_of
 from dptse_env.privacy.audit_statistics import Claim, audit
 from dptse_env.release import PrivacyReport
-from dptse_env.traffic import RecordLibrary
 from dptse_env.utils.validation import inside, integer, positive, require
-from scripts.cli import run
+from scripts.cli import Recording, run
 
 
 @dataclass(frozen=True)
@@ -108,21 +107,18 @@ def run_audit(args: Args) -> Finding:
     """Choose two worlds, play them, and test the claim."""
     check(args)
     config = attacked_config(args)
-    library = RecordLibrary(args.records)
-    library.ensure(config.corridor, [args.traffic_seed], progress=True)
+    library = Recording(records=args.records).library(config.corridor, [args.traffic_seed])
     record = library.get(config.corridor, args.traffic_seed)
-    target = choose_target(config, record, args.target, args.policy)
-    policy = make_policy(config, args.policy, target.worlds)
+    worlds = choose_target(config, record, args.target, args.policy)
+    policy = make_policy(config, args.policy, worlds)
     start = time.perf_counter()
-    runs = attack(
-        config, target.worlds, policy, args.runs, noise_factor=args.noise_factor, seed=args.seed
-    )
+    runs = attack(config, worlds, policy, args.runs, noise_factor=args.noise_factor, seed=args.seed)
     seconds = time.perf_counter() - start
     privacy, report = config.privacy, privacy_report(config)
     claim = f"({privacy.epsilon:g}, {privacy.delta:g})"
     return Finding(
         title=f"{args.env.rpartition('/')[2]}, preset {privacy.preset} at {claim}",
-        target=target.description,
+        target=worlds.description,
         policy=args.policy,
         n_runs=args.runs,
         noise_factor=args.noise_factor,

@@ -29,21 +29,13 @@ from dptse_env.model.prediction import (
 )
 from dptse_env.release.traffic_table import TrafficTable
 from dptse_env.traffic import Corridor, RecordLibrary, mean_dwell
-from scripts.cli import make_corridor, parse_keywords, run
+from scripts.cli import Road, make_corridor, parse_keywords, run
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(Road):
     """Fit the ARZ parameters."""
 
-    corridor: str | None = None
-    """Corridor: the name of a shipped one, or a JSON object of fields that replace those of the
-    environment's corridor; the environment's own if not given."""
-    env: str = "dptse_env:dptse/PaperHighway-v0"
-    """Environment id."""
-    keywords: str = "{}"
-    """Keywords of the environment as JSON; those about the corridor, its demand and its incident
-    matter."""
     train: str = "0:16"
     """Traffic seeds to fit, first:stop."""
     held_out: str = "1000:1008"
@@ -52,10 +44,6 @@ class Args:
     """Name of the fitted set."""
     max_evaluations: int = 400
     """Models to try at most."""
-    workers: int | None = None
-    """Processes that record missing traffic; all cores if not given."""
-    records: Path | None = None
-    """Folder of the record cache; the user's cache if not given."""
     output: Path = Path("results/calibration")
     """Folder for the fitted set and the errors."""
 
@@ -117,8 +105,7 @@ def main(args: Args) -> None:
     if shared:
         raise ValueError(f"held_out must not share seeds with train, both have {shared}")
     corridor = make_corridor(args.corridor, args.env, parse_keywords(args.keywords))
-    library = RecordLibrary(args.records)
-    library.ensure(corridor, (*train, *held_out), workers=args.workers, progress=True)
+    library = args.library(corridor, (*train, *held_out))
     dwell = mean_dwell((library.get(corridor, seed) for seed in train), corridor.n_mainline)
     fit = calibrate(
         corridor, load_series(corridor, train, library), args.name,

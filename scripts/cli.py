@@ -9,17 +9,54 @@ import logging
 import shlex
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import tyro
 
 from agents.evaluation.episodes import make_config
 from dptse_env.model.parameters import read_parameters
-from dptse_env.traffic import CORRIDORS, Corridor, NetworkError, RecordingError, SumoVersionError
+from dptse_env.traffic import (
+    CORRIDORS,
+    Corridor,
+    NetworkError,
+    RecordingError,
+    RecordLibrary,
+    SumoVersionError,
+)
 
-ArgsT = TypeVar("ArgsT")
+
+@dataclass(frozen=True)
+class Recording:
+    """Options for recording missing traffic."""
+
+    workers: int | None = None
+    """Processes that record missing traffic; all cores if not given."""
+    records: Path | None = None
+    """Folder of the record cache; the user's cache if not given."""
+
+    def library(self, corridor: Corridor, seeds: Sequence[int]) -> RecordLibrary:
+        """Return the library of records, after recording what is missing."""
+        library = RecordLibrary(self.records)
+        library.ensure(corridor, seeds, workers=self.workers, progress=True)
+        return library
+
+
+@dataclass(frozen=True)
+class Road(Recording):
+    """A road to record."""
+
+    corridor: str | None = None
+    """Corridor: the name of a shipped one, or a JSON object of fields that replace those of the
+    environment's corridor; the environment's own if not given."""
+    env: str = "dptse_env:dptse/PaperHighway-v0"
+    """Environment id."""
+    keywords: str = "{}"
+    """Keywords of the environment as JSON; those about the corridor, its demand and its incident
+    matter."""
+
 
 _NOT_RESULTS = ("workers", "records", "output")
 """Arguments that results do not depend on."""
@@ -83,10 +120,9 @@ def parse_keywords(text: str) -> dict[str, Any]:
     Raises:
         ValueError: The text is no JSON object.
     """
-    try:
+    keywords: Any = None
+    with contextlib.suppress(json.JSONDecodeError):
         keywords = json.loads(text)
-    except json.JSONDecodeError as problem:
-        raise ValueError(f"keywords must be a JSON object, got {text!r}") from problem
     if not isinstance(keywords, dict):
         raise ValueError(f"keywords must be a JSON object, got {text!r}")
     return keywords

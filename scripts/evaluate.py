@@ -28,24 +28,21 @@ from agents.evaluation.figures import (
     RoadMap,
     draw_maps,
     estimate_map,
-    query_map,
     save_figure,
-    truth_map,
 )
 from agents.evaluation.policies import PolicySource, SavedPolicy, find_policy, read_saved_policy
 from agents.evaluation.report import Report
 from dptse_env.config import EnvConfig, parse_seeds
 from dptse_env.policies import TRANSFERABLE
 from dptse_env.schedules import OBSERVATION_SCHEDULES
-from dptse_env.traffic import RecordLibrary
-from scripts.cli import parameters_argument, parse_keywords, records_argument, run
+from scripts.cli import Recording, parameters_argument, parse_keywords, records_argument, run
 
 ALL = "all"
 """The schedule that runs with a bandwidth that covers the road."""
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(Recording):
     """Evaluate query schedules and trained policies."""
 
     env: str = "dptse_env:dptse/PaperHighway-v0"
@@ -79,10 +76,6 @@ class Args:
     """Privacy parameter delta; the environment's own if not given."""
     noise_seed: int = 0
     """Seeds noise and estimators; one stream per traffic seed, the same for every schedule."""
-    workers: int | None = None
-    """Processes that record missing traffic; all cores if not given."""
-    records: Path | None = None
-    """Folder of the record cache; the user's cache if not given."""
     output: Path = Path("results/evaluation")
     """Folder for table, scores and figures."""
 
@@ -144,9 +137,7 @@ def evaluate(
         for name, source in sources.items():
             env = make_vector(args.env, len(seeds), make_keywords(args, estimator, source))
             cells[estimator, name] = env, load(args, source, env)
-    library = RecordLibrary(args.records)
-    corridor = reference_config(args).corridor
-    library.ensure(corridor, seeds, workers=args.workers, progress=True)
+    args.library(reference_config(args).corridor, seeds)
     scores: dict[tuple[str, str], list[EpisodeScore]] = {}
     with tqdm(
         total=len(cells) * len(seeds), desc="evaluating", unit="episode", mininterval=0.5
@@ -183,9 +174,9 @@ def draw_traffic(
         policy = load(args, sources[name], env)
         score, history = watch_episode(env, policy, traffic_seed=seed, seed=args.noise_seed + seed)
         maps += [
-            *([] if maps else [truth_map(history)]),
+            *([] if maps else [RoadMap("true density", history.truth, history)]),
             estimate_map(history, score, f"{name}: estimate"),
-            query_map(history, f"{name}: queried"),
+            RoadMap(f"{name}: queried", history.queried, history),
         ]
     title = f"Traffic seed {seed}, {estimator}, {noise}"
     save_figure(draw_maps([maps], width=8.4), args.output / "space_time.png", title)

@@ -11,30 +11,24 @@ need another folder.
 
 from __future__ import annotations
 
-import json
+import contextlib
 import subprocess
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import torch
 import tyro
 from tqdm import tqdm
 
 from agents.training.plan import TrainingPlan
-from agents.training.recipes import (
-    MaskablePPORecipe,
-    MaskRecipe,
-    PlackettLuceRecipe,
-    ScoresRecipe,
-)
+from agents.training.recipes import MaskablePPORecipe, MaskRecipe, PlackettLuceRecipe, ScoresRecipe
 from agents.training.run_files import Row
 from agents.training.tensorboard_writer import make_tensorboard_writer
 from agents.training.training import BEST, POLICY, Training
 from dptse_env.config import parse_seeds
-from dptse_env.traffic import RecordLibrary
 from dptse_env.utils.validation import integer
-from scripts.cli import resumable, run
+from scripts.cli import Recording, parse_keywords, records_argument, resumable, run
 
 AnyRecipe = (
     Annotated[PlackettLuceRecipe, tyro.conf.subcommand("plackett-luce")]
@@ -45,7 +39,7 @@ AnyRecipe = (
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(Recording):
     """Train a query policy."""
 
     env: str = "dptse_env:dptse/PrivateHighway-v0"
@@ -69,10 +63,6 @@ class Args:
     """Threads of torch; numbers depend on it in the last digits."""
     tensorboard: bool = True
     """Whether to also write the learning curve for TensorBoard, where that is installed."""
-    workers: int | None = None
-    """Processes that record missing traffic; all cores if not given."""
-    records: Path | None = None
-    """Folder of the record cache; the user's cache if not given."""
     output: Path = Path("results/training")
     """Folder of the training."""
     recipe: AnyRecipe = field(default_factory=PlackettLuceRecipe)
@@ -85,12 +75,6 @@ def make_plan(args: Args) -> TrainingPlan:
     Raises:
         ValueError: An argument is out of range, or ``keywords`` is no JSON object.
     """
-    try:
-        keywords = json.loads(args.keywords)
-    except json.JSONDecodeError as problem:
-        raise ValueError(f"keywords must be a JSON object, got {args.keywords!r}") from problem
-    if not isinstance(keywords, dict):
-        raise ValueError(f"keywords must be a JSON object, got {args.keywords!r}")
     return TrainingPlan(
         env=args.env,
         recipe=args.recipe,
@@ -98,7 +82,7 @@ def make_plan(args: Args) -> TrainingPlan:
         steps=args.recipe.default_steps if args.steps is None else args.steps,
         traffic_seeds=parse_seeds(args.traffic, "traffic"),
         validation_seeds=parse_seeds(args.validation, "validation"),
-        keywords=keywords,
+        keywords=parse_keywords(args.keywords),
         validate_every=args.validate_every,
         checkpoint_every=args.checkpoint_every,
     )
@@ -118,28 +102,25 @@ def commit() -> str | None:
 
 
 class Bar:
-    """A progress bar over decisions, with the latest errors beside it."""
+    """A progress bar over seconds of traffic, with the latest errors beside it."""
 
     def __init__(self, total: int) -> None:
         """Show an empty bar."""
-        self._bar = tqdm(total=total, unit="step", unit_scale=True, desc="training")
-        self._shown: dict[str, Any] = {}
+        self.bar = tqdm(total=total, unit="step", unit_scale=True, desc="training")
+        self._shown: dict[str, str] = {}
 
     def __call__(self, row: Row) -> None:
         """Advance the bar to a row."""
-        for name in ("error", "validation"):
-            if name in row:
-                self._shown[name] = f"{row[name]:.4f}"
-        self._bar.set_postfix(self._shown, refresh=False)
-        self._bar.update(int(row["steps"]) - self._bar.n)
+        errors: dict[str, str] = {
+            name: f"{row[name]:.4f}" for name in ("error", "validation") if name in row
+        }
+        self._shown |= errors
+        self.bar.set_postfix(self._shown, refresh=False)
+        self.bar.update(int(row["steps"]) - self.bar.n)
 
     def show(self, stage: str, fraction: float) -> None:
         """Show the fraction of a stage that is done; the bar stands still meanwhile."""
-        self._bar.set_postfix({stage: f"{fraction:.0%}", **self._shown})
-
-    def close(self) -> None:
-        """Leave the bar as it is."""
-        self._bar.close()
+        self.bar.set_postfix({stage: f"{fraction:.0%}", **self._shown})
 
 
 @resumable()
@@ -147,27 +128,20 @@ def main(args: Args) -> None:
     """Record missing traffic, train, and leave the policy."""
     plan = make_plan(args)
     torch.set_num_threads(integer("threads", args.threads, 1))
-    library = RecordLibrary(args.records)
-    seeds = (*plan.traffic_seeds, *plan.validation_seeds)
-    library.ensure(plan.config.corridor, seeds, workers=args.workers, progress=True)
-    records = None if args.records is None else str(args.records)
+    args.library(plan.config.corridor, (*plan.traffic_seeds, *plan.validation_seeds))
     bar = Bar(plan.steps_at(plan.n_updates))
     writer = make_tensorboard_writer(args.output / "tensorboard") if args.tensorboard else None
     watchers = (bar,) if writer is None else (bar, writer)
-    try:
+    with bar.bar, contextlib.closing(writer) if writer else contextlib.nullcontext():
         training = Training(
             plan,
             args.output,
-            records=records,
+            records=records_argument(args.records),
             commit=commit(),
             watchers=watchers,
             progress=bar.show,
         )
         training.run()
-    finally:
-        bar.close()
-        if writer is not None:
-            writer.close()
     last = training.rows[-1]
     print(
         f"error in validation {last['validation']:.4f} deterministic, "

@@ -28,9 +28,8 @@ from agents.search.tuning import TuningStudy, locked_study, scores_of
 from agents.search.tuning_task import TuningTask
 from dptse_env.model import ARZParameters
 from dptse_env.model.parameters import read_parameters
-from dptse_env.traffic import RecordLibrary
 from dptse_env.utils.validation import integer
-from scripts.cli import parse_keywords, records_argument, resumable, run
+from scripts.cli import Recording, parse_keywords, records_argument, resumable, run
 
 
 @dataclass(frozen=True)
@@ -150,8 +149,7 @@ def main(args: Args) -> None:
     """Record what is missing, tune every configuration, and leave the sets."""
     tasks = make_tasks(args)
     corridor = tasks[0].config().corridor
-    library = RecordLibrary(args.records)
-    library.ensure(corridor, tasks[0].traffic_seeds, workers=args.workers, progress=True)
+    Recording(args.workers, args.records).library(corridor, tasks[0].traffic_seeds)
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     errors = "density RMSE\n[veh/km]", "speed RMSE\n[km/h]"
     table = make_table("scores on the tuning traffic", "set", "settings", "reward", *errors, left=2)

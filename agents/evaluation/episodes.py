@@ -55,10 +55,6 @@ def unwrap(env: gym.Env[Any, Any]) -> SensorQueryEnv:
 def make_config(env: str, keywords: Mapping[str, Any]) -> EnvConfig:
     """Return the configuration of an environment.
 
-    Args:
-        env: Environment id.
-        keywords: Keywords of ``gym.make``.
-
     Raises:
         ValueError: A keyword is unknown or out of range.
     """
@@ -158,11 +154,6 @@ def run_episode(
 def make_vector(env: str, n_episodes: int, keywords: Mapping[str, Any]) -> SensorQueryVectorEnv:
     """Make a vector environment of whole episodes, as `run_episodes` takes it.
 
-    Args:
-        env: Environment id.
-        n_episodes: Episodes at once.
-        keywords: Of ``gym.make_vec``, but for ``autoreset_mode``.
-
     Raises:
         ValueError: A keyword is unknown or out of range.
     """
@@ -183,20 +174,12 @@ def run_episodes(
     deterministic: bool = True,
     on_second: Callable[[], None] | None = None,
 ) -> list[EpisodeScore]:
-    """Run a batch of episodes at once and pool the errors of each.
+    """Run a batch of episodes at once and pool the errors of each; see `run_episode`.
 
+    The environment is bare and made with ``autoreset_mode="Disabled"`` (`make_vector`). Its n
+    episodes are in the order of the n traffic seeds and the n seeds of noise and estimator.
     The scores are those of `run_episode` for each pair of seeds, but for policies that draw at
     random: they draw for the whole batch at once, so other numbers from the same distribution.
-
-    Args:
-        env: A bare vector environment, made with ``autoreset_mode="Disabled"`` (`make_vector`). Its
-            episodes are in the order of the seeds.
-        policy: Picks the queries.
-        traffic_seeds: Traffic of each episode, n of the environment's traffic seeds.
-        seeds: Seed of the noise and the estimator of each episode, n of them.
-        warm_up: Seconds that do not count.
-        deterministic: Handed to the policy.
-        on_second: Called after the reset and after every second.
 
     Raises:
         ValueError: Seeds are too many or too few, the environment is made otherwise, or episodes
@@ -233,9 +216,10 @@ def _play(
     deterministic: bool,
     on_second: Callable[[], None] | None,
 ) -> list[dict[str, Any]]:
-    """Play n episodes to their end; return `_SERIES`, reward and time of every second, (n,) each.
+    """Play n episodes to their end by a step from actions to observations and rewards.
 
-    ``step`` takes actions and returns observations and rewards.
+    Returns:
+        `_SERIES`, reward and time of every second, shape (n,) each.
     """
     n = process.n_episodes
     state: Any = None

@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from agents.evaluation.episodes import EpisodeScore
 from agents.evaluation.statistics import Interval
 from dptse_env.rendering import DENSITY_MAP, QUERY_COLOUR, History
+from dptse_env.utils.arrays import FloatArray
 
 COLOURS = ("#1b4f72", "#c1272d", "#5d8233", "#7d5ba6", "#b9770e")
 GRID_COLOUR = "#e3e6ea"
@@ -45,6 +47,21 @@ def add_frame(axis: Axes, lines: Literal["both", "x", "y"] = "both") -> None:
     axis.tick_params(labelsize=8)
 
 
+def finish_figure(
+    figure: Figure,
+    named: Iterable[Axes] | None = None,
+    columns: int = 5,
+    margin: float | None = None,
+) -> Figure:
+    """Frame all panels, and name the curves of some of them, by default of all, below them."""
+    for axis in figure.axes:
+        add_frame(axis)
+        if margin is not None:
+            axis.margins(x=margin)
+    add_legend(figure, figure.axes if named is None else named, columns)
+    return figure
+
+
 def add_legend(figure: Figure, axes: Iterable[Axes], columns: int = 5) -> None:
     """Name each label of some axes once below all panels."""
     named: dict[str, Any] = {}
@@ -62,11 +79,22 @@ def add_legend(figure: Figure, axes: Iterable[Axes], columns: int = 5) -> None:
         )
 
 
+def set_log_ticks(axis: Axis, ticks: Sequence[float]) -> None:
+    """Put plain numbers at some ticks of a logarithmic axis, and nothing between them."""
+    axis.set_major_locator(FixedLocator(list(ticks)))
+    axis.set_minor_locator(NullLocator())
+    axis.set_major_formatter("{x:g}")
+
+
+def spread(intervals: Sequence[Interval]) -> FloatArray:
+    """Return the lengths of error bars below and above the means, shape (2, n)."""
+    return np.array([[each.mean - each.low, each.high - each.mean] for each in intervals]).T
+
+
 def draw_dot(axis: Axes, interval: Interval, place: float, colour: str, label: str | None) -> None:
     """Draw a mean with its interval at a height, and its value beside it."""
-    spread = [[interval.mean - interval.low], [interval.high - interval.mean]]
     axis.errorbar(
-        [interval.mean], [place], xerr=spread, color=colour, label=label,
+        [interval.mean], [place], xerr=spread([interval]), color=colour, label=label,
         fmt="o", markersize=4, capsize=2.5, linewidth=1.2,
     )  # fmt: skip
     axis.annotate(
@@ -78,7 +106,7 @@ def draw_dot(axis: Axes, interval: Interval, place: float, colour: str, label: s
 def save_errors(
     path: Path,
     rows: Sequence[str],
-    series: Mapping[str, Mapping[str, tuple[Interval, Interval]]],
+    series: Mapping[str, Mapping[str, Mapping[str, Interval]]],
     title: str,
 ) -> None:
     """Save the errors of every policy as dots with 95 % intervals, density beside speed.
@@ -86,13 +114,14 @@ def save_errors(
     Args:
         path: Where to save the PNG.
         rows: Policies, from top to bottom.
-        series: By estimator, then by policy: (density [veh/km], speed [km/h]) intervals.
+        series: By estimator, policy and field of `EpisodeScore`: intervals.
         title: Title of the figure.
     """
     figure = make_figure(8.4, 1.6 + 0.42 * len(rows), dpi=150)
     axes = figure.subplots(1, 2, sharey=True)
     places = np.arange(len(rows))[::-1]
-    for metric, axis in enumerate(axes):
+    labels = {"rmse_density": "density RMSE [veh/km]", "rmse_speed": "speed RMSE [km/h]"}
+    for axis, (metric, axis_label) in zip(axes, labels.items(), strict=True):
         for k, (name, intervals) in enumerate(series.items()):
             shift = ((len(series) - 1) / 2 - k) * 0.3
             for place, row in zip(places, rows, strict=True):
@@ -100,11 +129,9 @@ def save_errors(
                 colour = COLOURS[k % len(COLOURS)]
                 draw_dot(axis, intervals[row][metric], place + shift, colour, label)
         axis.set_xscale("log")
-        axis.xaxis.set_major_locator(FixedLocator(ERROR_TICKS))
-        axis.xaxis.set_minor_locator(NullLocator())
-        axis.xaxis.set_major_formatter("{x:g}")
+        set_log_ticks(axis.xaxis, ERROR_TICKS)
         axis.margins(x=0.12)
-        axis.set_xlabel(("density RMSE [veh/km]", "speed RMSE [km/h]")[metric])
+        axis.set_xlabel(axis_label)
         add_frame(axis, "x")
     axes[0].set_yticks(places, rows)
     add_legend(figure, axes[:1])
@@ -116,35 +143,24 @@ class RoadMap:
     """A panel over space and time.
 
     Attributes:
-        title: Title of the panel.
-        values: Densities [veh/km] or flags of queried segments, shape (n_mainline, n_seconds).
+        seconds: Densities [veh/km] or flags of queried segments by second, (n_mainline,) each.
         history: The episode, for its scales.
     """
 
     title: str
-    values: NDArray[Any]
+    seconds: Sequence[NDArray[Any]]
     history: History
 
     @property
     def is_flags(self) -> bool:
         """True for a panel of queried segments."""
-        return self.values.dtype == bool
-
-
-def truth_map(history: History, title: str = "true density") -> RoadMap:
-    """Return the panel of the true density."""
-    return RoadMap(title, np.array(history.truth).T, history)
+        return self.seconds[0].dtype == bool
 
 
 def estimate_map(history: History, score: EpisodeScore, title: str) -> RoadMap:
     """Return the panel of the estimated density; its title ends with the RMSE of the score."""
     title = f"{title}, RMSE {score.rmse_density:.1f} veh/km"
-    return RoadMap(title, np.array(history.estimate).T, history)
-
-
-def query_map(history: History, title: str) -> RoadMap:
-    """Return the panel of the queried segments."""
-    return RoadMap(title, np.array(history.queried).T, history)
+    return RoadMap(title, history.estimate, history)
 
 
 def draw_maps(columns: Sequence[Sequence[RoadMap]], width: float) -> Figure:
@@ -177,14 +193,14 @@ def draw_maps(columns: Sequence[Sequence[RoadMap]], width: float) -> Figure:
 
 
 def _draw_map(axis: Axes, panel: RoadMap) -> AxesImage:
-    n, n_seconds = panel.values.shape
+    values = np.array(panel.seconds).T
     axis.set_title(panel.title, loc="left", fontsize=9, pad=3, color=QUERY_COLOUR)
     axis.tick_params(labelsize=8)
     return axis.imshow(
-        panel.values,
+        values,
         origin="lower",
         aspect="auto",
-        extent=(-0.5, n_seconds - 0.5, 0.0, n * panel.history.segment_length),
+        extent=(-0.5, values.shape[1] - 0.5, 0.0, len(values) * panel.history.segment_length),
         cmap="Greys" if panel.is_flags else DENSITY_MAP,
         vmin=0.0,
         vmax=1.0 if panel.is_flags else panel.history.density_scale,

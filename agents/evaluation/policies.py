@@ -18,11 +18,7 @@ from dptse_env.schedules import make_schedule
 
 @dataclass(frozen=True)
 class NamedSchedule:
-    """A query schedule by its name or the file of its plan.
-
-    Attributes:
-        source: The name, or the path of a plan.
-    """
+    """A query schedule by its name or the file of its plan."""
 
     source: str
 
@@ -52,8 +48,6 @@ class SavedPolicy:
 
     Attributes:
         source: The file, or the name of a policy that comes with the package.
-        sha256: Digest of the file.
-        card: Its card.
     """
 
     source: str

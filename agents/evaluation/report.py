@@ -26,8 +26,6 @@ class Row:
     """The scores of one policy with one estimator, summarised.
 
     Attributes:
-        estimator: Name of the estimator.
-        policy: Name of the policy.
         mean: By metric, the mean over episodes with its 95 % interval.
         difference: By metric, the mean paired difference to the reference policy.
         n_diverged: Seconds over all episodes in which the estimator had to start over.
@@ -46,18 +44,14 @@ class Report:
     def __init__(
         self, scores: Mapping[tuple[str, str], list[EpisodeScore]], reference: str, title: str
     ) -> None:
-        """Summarise scores.
-
-        Args:
-            scores: By (estimator, policy): one score per episode, in one order for all.
-            reference: Policy that the others are compared with; it is in ``scores``.
-            title: Environment, settings and episodes.
+        """Summarise scores by (estimator, policy), one per episode, in one order for all.
 
         Raises:
             ValueError: There are fewer than two episodes.
         """
         self.scores, self.reference, self.title = dict(scores), reference, title
-        self.rows = [self._row(*key) for key in self.scores]
+        self.estimators = list(dict.fromkeys(estimator for estimator, _ in self.scores))
+        self.rows = {key: self._row(*key) for key in self.scores}
 
     def _row(self, estimator: str, policy: str) -> Row:
         cell, reference = self.scores[estimator, policy], self.scores[estimator, self.reference]
@@ -65,26 +59,22 @@ class Report:
         def values(scores: list[EpisodeScore], metric: str) -> list[float]:
             return [getattr(score, metric) for score in scores]
 
-        return Row(
-            estimator,
-            policy,
-            {name: mean_interval(values(cell, name)) for name in METRICS},
-            {
-                name: paired_difference(values(cell, name), values(reference, name))
-                for name in METRICS
-            },
-            sum(score.n_diverged for score in cell),
-        )
+        means = {name: mean_interval(values(cell, name)) for name in METRICS}
+        differences = {
+            name: paired_difference(values(cell, name), values(reference, name)) for name in METRICS
+        }
+        n_diverged = sum(score.n_diverged for score in cell)
+        return Row(estimator, policy, means, differences, n_diverged)
 
     def ranked(self, estimator: str) -> list[str]:
         """Return the policies by mean density error, best first."""
-        rows = [row for row in self.rows if row.estimator == estimator]
-        return [row.policy for row in sorted(rows, key=lambda row: row.mean["rmse_density"].mean)]
+        names = [policy for name, policy in self.rows if name == estimator]
+        return sorted(names, key=lambda name: self.rows[estimator, name].mean["rmse_density"].mean)
 
     def print(self) -> None:
         """Print a table per estimator, best density error first."""
         print_text(f"{self.title}; mean ± half of the 95 % interval")
-        for estimator in dict.fromkeys(row.estimator for row in self.rows):
+        for estimator in self.estimators:
             print_table(self._table(estimator))
 
     def _table(self, estimator: str) -> Table:
@@ -92,11 +82,10 @@ class Report:
         metrics = {"rmse_density": "density RMSE\n[veh/km]", "rmse_speed": "speed RMSE\n[km/h]"}
         columns = [column for metric in metrics.values() for column in (metric, against)]
         table = make_table(f"estimator {estimator}", "policy", *columns)
-        rows = {row.policy: row for row in self.rows if row.estimator == estimator}
         for policy in self.ranked(estimator):
-            cells = []
+            cells, row = [], self.rows[estimator, policy]
             for metric in metrics:
-                mean, difference = rows[policy].mean[metric], rows[policy].difference[metric]
+                mean, difference = row.mean[metric], row.difference[metric]
                 cells.append(f"{mean.mean:.2f} ± {mean.half_width:.2f}")
                 compared = f"{difference.mean:+.2f} ± {difference.half_width:.2f}"
                 cells.append("-" if policy == self.reference else compared)
@@ -118,14 +107,15 @@ class Report:
             "reference": self.reference,
             "arguments": {key: str(value) for key, value in arguments.items()},
             "versions": {name: version(name) for name in packages},
-            "rows": [dataclasses.asdict(row) for row in self.rows],
+            "rows": [dataclasses.asdict(row) for row in self.rows.values()],
         }
         (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
 
     def draw(self, path: Path) -> None:
         """Save a figure of density and speed errors of all policies."""
-        series: dict[str, dict[str, tuple[Interval, Interval]]] = {}
-        for row in self.rows:
-            pair = row.mean["rmse_density"], row.mean["rmse_speed"]
-            series.setdefault(row.estimator, {})[row.policy] = pair
-        save_errors(path, self.ranked(self.rows[0].estimator), series, self.title)
+        ranked = self.ranked(self.estimators[0])
+        series = {
+            name: {policy: self.rows[name, policy].mean for policy in ranked}
+            for name in self.estimators
+        }
+        save_errors(path, ranked, series, self.title)

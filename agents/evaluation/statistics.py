@@ -14,12 +14,9 @@ from dptse_env.utils.arrays import FloatArray
 
 @dataclass(frozen=True)
 class Interval:
-    """A mean with its confidence interval.
+    """A mean with the ends of its confidence interval.
 
     Attributes:
-        mean: The mean.
-        low: Lower end.
-        high: Upper end.
         n: Number of values behind it.
     """
 
@@ -229,16 +226,6 @@ def holm(p_values: Mapping[str, float]) -> dict[str, float]:
         largest = max(largest, min(1.0, (len(p_values) - rank) * p_values[name]))
         adjusted[name] = largest
     return {name: adjusted[name] for name in p_values}
-
-
-def worst_row(table: ArrayLike) -> int:
-    """Return the index of the training seed with the largest mean error over the traffic seeds.
-
-    Raises:
-        ValueError: The table is too small or not finite.
-    """
-    (values,) = _paired_tables([table])
-    return int(np.argmax(values.mean(axis=1)))
 
 
 def _paired_tables(tables: Sequence[ArrayLike]) -> list[FloatArray]:

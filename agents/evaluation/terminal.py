@@ -11,13 +11,7 @@ _UNLIMITED = 100_000
 
 
 def make_table(title: str, *columns: str, left: int = 1) -> Table:
-    """Return an empty table.
-
-    Args:
-        title: Its title.
-        columns: Headers; lines may be separated by a newline.
-        left: Number of columns, from the first on, that are left-aligned; numbers go right.
-    """
+    """Return an empty table; the first ``left`` columns are left-aligned, numbers go right."""
     table = Table(box=box.SIMPLE_HEAD, title=title, title_justify="left")
     for place, header in enumerate(columns):
         table.add_column(header, justify="left" if place < left else "right")

@@ -114,7 +114,6 @@ class Results(Generic[DesignT, CellT]):
     """Scores by cell, in the order of the traffic seeds of a design.
 
     Attributes:
-        design: The design.
         scores: Score by cell and traffic seed.
     """
 

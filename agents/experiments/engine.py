@@ -50,11 +50,8 @@ class Engine(Protocol):
     ) -> Generator[tuple[TaskT, ResultT], None, None]:
         """Yield tasks with their results, in whatever order they end.
 
-        Closing the generator ends what still runs. An error of ``work`` is raised here.
-
-        Args:
-            work: A function of a module, so that workers can import it.
-            tasks: Its arguments; they can be pickled.
+        Closing the generator ends what still runs. An error of ``work`` is raised here; it is a
+        function of a module, so that workers can import it, and tasks can be pickled.
         """
 
 
@@ -113,12 +110,7 @@ def run_all(
 ) -> None:
     """Run tasks, add their records to a ledger as they end, and sort it.
 
-    Args:
-        tasks: The tasks.
-        ledger: Takes the records.
-        engine: Runs the tasks.
-        work: Runs a task and returns a record for each of its seeds.
-        progress: Whether to show a progress bar.
+    ``work`` runs a task and returns a record for each of its seeds.
     """
     total = sum(len(task.seeds) for task in tasks)
     bar = tqdm(total=total, desc="episodes", unit="episode", mininterval=0.5, disable=not progress)
@@ -139,13 +131,13 @@ def make_pool(workers: int) -> ProcessPoolExecutor:
 
 def follow_parent() -> None:
     """Leave interrupts to the parent process, and end when it ends."""
+
+    def end_with_parent() -> None:
+        parent = multiprocessing.parent_process()
+        assert parent is not None
+        wait([parent.sentinel])
+        # The parent was killed: no process takes results any more, and nothing is left to clean up.
+        os._exit(1)
+
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    wait([parent.sentinel])
-    # The parent was killed: no process takes results any more, and nothing is left to clean up.
-    os._exit(1)
+    threading.Thread(target=end_with_parent, daemon=True).start()

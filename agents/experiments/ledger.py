@@ -7,12 +7,12 @@ import dataclasses
 import io
 import os
 import typing
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
 from agents.experiments.cells import KeyT
-from agents.experiments.files import write_atomically
+from agents.experiments.files import write_csv
 
 
 class Scored(Protocol):
@@ -29,7 +29,7 @@ ScoredT = TypeVar("ScoredT", bound=Scored)
 
 
 class Ledger(Generic[KeyT, ScoredT]):
-    """One record for each key and traffic seed, on disk as soon as it is added.
+    """A record for each key and traffic seed, on disk as soon as it is added.
 
     A process that dies while it writes leaves a last line without its end. Such a line is dropped
     when the file is opened again, and its episode is run again.
@@ -40,12 +40,7 @@ class Ledger(Generic[KeyT, ScoredT]):
     """
 
     def __init__(self, path: Path, key_type: type[KeyT], record_type: type[ScoredT]) -> None:
-        """Read the file, if there is one.
-
-        Args:
-            path: The CSV file.
-            key_type: Type of the keys; its fields are the first columns.
-            record_type: Type of the records; its fields are the other columns.
+        """Read the file, if there is one; the fields of both types are its columns, in order.
 
         Raises:
             ValueError: A line other than a torn last one is not as this class writes it.
@@ -106,19 +101,10 @@ class Ledger(Generic[KeyT, ScoredT]):
 
     def sort(self) -> None:
         """Put the file in an order that does not depend on the course of the run."""
-        text = io.StringIO()
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(self.columns)
-        writer.writerows(self._sorted())
-        write_atomically(self.path, text.getvalue())
-
-    def _sorted(self) -> Iterator[list[Any]]:
-        def order(item: tuple[tuple[Any, int], ScoredT]) -> tuple[Any, ...]:
-            (key, seed), _ = item
-            return (*dataclasses.astuple(key), seed)
-
-        for (key, _), record in sorted(self.rows.items(), key=order):
-            yield _line(key, record)
+        rows = sorted(
+            self.rows.items(), key=lambda item: (*dataclasses.astuple(item[0][0]), item[0][1])
+        )
+        write_csv(self.path, self.columns, (_line(key, record) for (key, _), record in rows))
 
 
 def _line(key: Any, record: Any) -> list[Any]:

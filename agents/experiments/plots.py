@@ -7,10 +7,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
-from matplotlib.ticker import FixedLocator, NullLocator
 from numpy.typing import ArrayLike
 
+from agents.evaluation.figures import spread
 from agents.evaluation.statistics import Interval
 from dptse_env.utils.arrays import FloatArray
 
@@ -53,9 +52,8 @@ def draw_curve(
 ) -> None:
     """Draw means at their places with intervals as bars."""
     means = np.array([interval.mean for interval in intervals])
-    spread = np.array([[each.mean - each.low, each.high - each.mean] for each in intervals]).T
     axis.errorbar(
-        np.asarray(places), means, yerr=spread,
+        np.asarray(places), means, yerr=spread(intervals),
         color=look.colour, marker=look.marker, linestyle=look.line,
         markersize=4, linewidth=1.2, capsize=2, label=label,
     )  # fmt: skip
@@ -73,10 +71,3 @@ def shifted(places: Sequence[float], share: float, log: bool) -> FloatArray:
     first, last = float(array[0]), float(array[-1])
     moved: FloatArray = array * (last / first) ** share if log else array + share * (last - first)
     return moved
-
-
-def set_log_ticks(axis: Axis, ticks: Sequence[float]) -> None:
-    """Put plain numbers at some ticks of a logarithmic axis, and nothing between them."""
-    axis.set_major_locator(FixedLocator(list(ticks)))
-    axis.set_minor_locator(NullLocator())
-    axis.set_major_formatter("{x:g}")

@@ -62,14 +62,16 @@ def results_provenance(
         "made_with": {**made_with, "settings": settings},
         "tuned": sorted(settings.keys() & available_settings()),
         "sources": [source_digest()],
-        "machine": {
-            "python": platform.python_version(),
-            "platform": platform.platform(),
-            **{name: version(name) for name in ("gymnasium", "numba", "numpy", "scipy")},
-        },
+        "machine": machine(("gymnasium", "numba", "numpy", "scipy")),
     }
     plain: dict[str, Any] = json.loads(json.dumps(content))
     return plain
+
+
+def machine(packages: Sequence[str]) -> dict[str, str]:
+    """Return the versions of Python, the platform and packages."""
+    versions = {name: version(name) for name in packages}
+    return {"python": platform.python_version(), "platform": platform.platform(), **versions}
 
 
 def source_digest() -> str:

@@ -15,7 +15,13 @@ import jinja2
 
 from agents.evaluation.episodes import WARM_UP
 from agents.experiments.files import write_atomically
-from agents.experiments.tables import format_interval, format_number, format_range
+from agents.experiments.tables import (
+    format_interval,
+    format_number,
+    format_range,
+    settings_table,
+    versions_table,
+)
 
 TEMPLATE, REPORT = "report.md.j2", "REPORT.md"
 
@@ -38,13 +44,18 @@ def fill(folder: Path, content: Mapping[str, Any], name: str = TEMPLATE) -> str:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
+    environment.globals |= {
+        "WARM_UP": WARM_UP,
+        "versions_table": versions_table,
+        "settings_table": settings_table,
+    }
     environment.filters |= {
         "interval": format_interval,
         "number": format_number,
         "integers": format_range,
         "plain": "{:g}".format,
     }
-    return environment.get_template(name).render(WARM_UP=WARM_UP, **content)
+    return environment.get_template(name).render(content)
 
 
 def write_report(folder: Path, template_folder: Path, content: Mapping[str, Any]) -> None:

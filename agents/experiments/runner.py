@@ -22,8 +22,6 @@ class Workplace:
     """Folder and processes of a study.
 
     Attributes:
-        folder: Folder of ledgers, figures and report.
-        engine: Runs the episodes.
         records: Folder of the record cache; None for the user's cache.
         recorders: Processes that record missing traffic; None for all cores.
     """
@@ -44,10 +42,6 @@ class EpisodeTask(Generic[CellT]):
     """A cell on some traffic seeds.
 
     Attributes:
-        env: Environment id.
-        schedule: Query schedule.
-        cell: The cell.
-        seeds: Its traffic seeds.
         records: Folder of the record cache; None for the user's cache.
     """
 

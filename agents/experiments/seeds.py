@@ -21,17 +21,6 @@ STUDY_TEST = range(6_000_000, 7_000_000)
 TRAINING = range(10_000_000, 1_010_000_000)
 """Training episodes; see `training_seed`."""
 
-NOISE_SEEDS = {
-    "evaluation": EVALUATION,
-    "tuning": TUNING,
-    "plan search": PLAN_SEARCH,
-    "training validation": TRAINING_VALIDATION,
-    "study validation": STUDY_VALIDATION,
-    "study test": STUDY_TEST,
-    "training": TRAINING,
-}
-"""All ranges by name."""
-
 TRAININGS = 1_000
 """Training seeds are in 0..999; each has its separate stretch of `TRAINING`."""
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
-import io
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,12 +10,14 @@ from typing import Any
 from agents.evaluation.episodes import EpisodeScore
 from agents.evaluation.statistics import Interval
 from agents.experiments.cells import METRICS, Results
-from agents.experiments.files import write_atomically
+from agents.experiments.files import write_csv
 
 
-def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a Markdown table; the first column is left-aligned, the others centred."""
-    lines = [header, ["---", *[":-:"] * (len(header) - 1)], *rows]
+def markdown(
+    header: Sequence[str], rows: Iterable[Sequence[str]], first: str = "---", rest: str = ":-:"
+) -> str:
+    """Return a Markdown table, its first column and the rest with the given rules below them."""
+    lines = [header, [first, *[rest] * (len(header) - 1)], *rows]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
@@ -69,8 +69,11 @@ def health_table(
     return markdown([*header, *fields.values(), "episodes"], rows)
 
 
-def versions_table(versions: Mapping[str, Any], provenance: Mapping[str, Any]) -> str:
+def versions_table(provenance: Mapping[str, Any]) -> str:
     """Return the versions behind results: packages, states of the code, and the machine."""
+    made_with = provenance["made_with"]
+    # Results of several environments have the same versions under each of them.
+    versions = made_with.get("versions") or next(iter(made_with["cells"].values()))["versions"]
     sources = {"source of dptse_env": ", ".join(provenance["sources"])}
     rows = {**versions, **sources, **provenance["machine"]}
     return markdown(["version of", ""], [[name, str(value)] for name, value in rows.items()])
@@ -103,15 +106,6 @@ def _one_line(settings: Mapping[str, Any]) -> str:
         f"{key} ({_one_line(value)})" if isinstance(value, Mapping) else f"{key} {value}"
         for key, value in settings.items()
     )
-
-
-def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    """Write a CSV file in one piece."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows(rows)
-    write_atomically(path, text.getvalue())
 
 
 def interval_columns(interval: Interval) -> list[str]:

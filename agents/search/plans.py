@@ -127,17 +127,13 @@ class PlanScorer:
 
     def scores(self, plans: BoolArray, seeds: IntArray, noise: int) -> FloatArray:
         """Return mean rewards of plans (m, period, n) on traffic seeds (r,), shape (m, r)."""
-        each = self.n_episodes // len(seeds)
-        blocks = [plans[i : i + each] for i in range(0, len(plans), each)]
-        return np.concatenate([self.block(block, seeds, noise) for block in blocks])
-
-    def block(self, plans: BoolArray, seeds: IntArray, noise: int) -> FloatArray:
-        """Return the same for at most as many plans as one batch holds."""
         m, r = len(plans), len(seeds)
-        n_used = m * r
+        most = self.n_episodes // r
+        if m > most:
+            blocks = [plans[i : i + most] for i in range(0, m, most)]
+            return np.concatenate([self.scores(block, seeds, noise) for block in blocks])
         traffic = np.resize(np.tile(seeds, m), self.n_episodes).tolist()
         followed = np.resize(np.repeat(np.arange(m), r), self.n_episodes)
-        used = np.arange(self.n_episodes) < n_used
         env = self.env
         env.reset(seed=[noise + seed for seed in traffic], options={"traffic_seed": traffic})
         total, n_steps = np.zeros(self.n_episodes), env.config.horizon_steps
@@ -145,7 +141,7 @@ class PlanScorer:
             transition = env.advance(plans[followed, step % plans.shape[1]].astype(np.int8))
             if step >= WARM_UP:
                 total += transition.reward
-        mean: FloatArray = total[used] / (n_steps - WARM_UP)
+        mean: FloatArray = total[: m * r] / (n_steps - WARM_UP)
         return mean.reshape(m, r)
 
 
@@ -159,7 +155,6 @@ class PlanSearch:
 
     Attributes:
         best: The best plan so far, shape (period, n).
-        n_rounds: Finished rounds.
         n_adopted: Neighbours that replaced it.
     """
 

@@ -4,104 +4,74 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import reduce
 from typing import Any
 
-import optuna
+from optuna.distributions import CategoricalDistribution, FloatDistribution
 
 from dptse_env.estimators import EstimatorSettings
 
-
-@dataclass(frozen=True)
-class Range:
-    """A setting between two values.
-
-    Attributes:
-        low: Least value.
-        high: Greatest value.
-        log: Whether its logarithm is searched evenly.
-    """
-
-    low: float
-    high: float
-    log: bool = True
-
-    def suggest(self, trial: optuna.Trial, name: str) -> float:
-        """Return a trial's value of the setting, rounded to four digits."""
-        return float(f"{trial.suggest_float(name, self.low, self.high, log=self.log):.4g}")
-
-    def holds(self, value: Any) -> bool:
-        """Return true if the search can reach ``value``."""
-        return bool(self.low <= value <= self.high)
-
-    def at_bound(self, value: Any) -> bool:
-        """Return true if ``value`` lies within a fiftieth of the range of an end."""
-        scale = math.log if self.log else float
-        share = (scale(value) - scale(self.low)) / (scale(self.high) - scale(self.low))
-        return not 0.02 < share < 0.98
+Knob = FloatDistribution | CategoricalDistribution
+"""The values that the search can give a setting."""
 
 
-@dataclass(frozen=True)
-class Choice:
-    """A setting among a few values.
+def evenly(low: float, high: float) -> FloatDistribution:
+    """Return a range whose logarithm is searched evenly."""
+    return FloatDistribution(low, high, log=True)
 
-    Attributes:
-        options: The values.
-    """
 
-    options: tuple[Any, ...]
+def holds(knob: Knob, value: Any) -> bool:
+    """Return true if the search can reach ``value``."""
+    if isinstance(knob, CategoricalDistribution):
+        return value in knob.choices
+    return bool(knob.low <= value <= knob.high)
 
-    def suggest(self, trial: optuna.Trial, name: str) -> Any:
-        """Return a trial's value of the setting."""
-        return trial.suggest_categorical(name, self.options)
 
-    def holds(self, value: Any) -> bool:
-        """Return true if the search can reach ``value``."""
-        return value in self.options
-
-    def at_bound(self, value: Any) -> bool:
-        """Return false: options have no ends."""
+def at_bound(knob: Knob, value: Any) -> bool:
+    """Return true if ``value`` lies within a fiftieth of a range of one of its ends."""
+    if isinstance(knob, CategoricalDistribution):
         return False
+    scale = math.log if knob.log else float
+    share = (scale(value) - scale(knob.low)) / (scale(knob.high) - scale(knob.low))
+    return not 0.02 < share < 0.98
 
 
-Knob = Range | Choice
+def rounded(value: Any) -> Any:
+    """Return a suggested value, numbers rounded to four digits."""
+    return float(f"{value:.4g}") if isinstance(value, float) else value
+
 
 _PROCESS_NOISE: Mapping[str, Knob] = {
-    "process_noise.0": Range(1e-3, 5e-2),
-    "process_noise.1": Range(1e-3, 5e-2),
+    "process_noise.0": evenly(1e-3, 5e-2),
+    "process_noise.1": evenly(1e-3, 5e-2),
 }
 
 # Q and R times one factor leave the estimates of all but the UKF as they are, and there alpha does
 # what the factor would: R is known from the mechanism, so it stays and Q is searched.
-NOISE_SCALE = {"noise_scale": Range(0.5, 3.0)}
+NOISE_SCALE = {"noise_scale": evenly(0.5, 3.0)}
 
 SPACE: dict[str, Mapping[str, Knob]] = {
     "ekf": _PROCESS_NOISE,
-    "ukf": {**_PROCESS_NOISE, "ukf.alpha": Range(0.1, 1.0)},
+    "ukf": {**_PROCESS_NOISE, "ukf.alpha": evenly(0.1, 1.0)},
     "enkf": {
         **_PROCESS_NOISE,
-        "enkf.inflation": Range(1.0, 1.1, log=False),
-        "enkf.taper": Choice((None, 0.5, 1.0, 2.0)),
+        "enkf.inflation": FloatDistribution(1.0, 1.1),
+        "enkf.taper": CategoricalDistribution((None, 0.5, 1.0, 2.0)),
     },
     "mhe": {
         **_PROCESS_NOISE,
-        "mhe.arrival_noise.0": Range(3e-3, 0.2),
-        "mhe.arrival_noise.1": Range(3e-3, 0.2),
-        "mhe.linearisation": Choice(("paper", "trajectory")),
-        "mhe.bounds": Choice(("box", "cone")),
+        "mhe.arrival_noise.0": evenly(3e-3, 0.2),
+        "mhe.arrival_noise.1": evenly(3e-3, 0.2),
+        "mhe.linearisation": CategoricalDistribution(("paper", "trajectory")),
+        "mhe.bounds": CategoricalDistribution(("box", "cone")),
     },
-    "random_walk": {"walk_noise.0": Range(1e-3, 0.1), "walk_noise.1": Range(1e-3, 0.1)},
+    "random_walk": {"walk_noise.0": evenly(1e-3, 0.1), "walk_noise.1": evenly(1e-3, 0.1)},
 }
 """By estimator: paths into `EstimatorSettings` and where their values are searched."""
 
 
 def search_space(estimator: str, with_noise_scale: bool = False) -> dict[str, Knob]:
-    """Return the search space of an estimator.
-
-    Args:
-        estimator: Its name.
-        with_noise_scale: Whether to search the scale of R, too.
+    """Return the search space of an estimator, with or without the scale of R.
 
     Raises:
         ValueError: There is nothing to tune, or no such estimator.

@@ -25,7 +25,7 @@ from optuna.trial import FrozenTrial, TrialState
 
 from agents.evaluation.episodes import WARM_UP, EpisodeScore
 from agents.experiments.files import replacing
-from agents.search.space import nested, values_of
+from agents.search.space import at_bound, holds, nested, rounded, values_of
 from agents.search.tuning_task import TuningTask, score_episode
 from dptse_env.estimators import EstimatorSettings
 from dptse_env.estimators.tuned_settings import write_settings
@@ -104,7 +104,7 @@ class TuningStudy:
                 return
         if label == "shipped" and settings == EstimatorSettings():
             return
-        if not all(knob.holds(values[path]) for path, knob in self.space.items()):
+        if not all(holds(knob, values[path]) for path, knob in self.space.items()):
             logger.warning("the %s settings lie outside of the search: %s", label, values)
             return
         self.study.enqueue_trial(values, user_attrs={"label": label})
@@ -135,12 +135,7 @@ class TuningStudy:
         """Run trials until ``n_trials`` are finished, those of earlier runs included.
 
         With one trial at a time, a study that was interrupted comes out as one that was not.
-
-        Args:
-            n_trials: Total number of trials.
-            executor: Runs the episodes.
-            n_parallel: Trials under way at once.
-            on_trial: Called after every finished trial.
+        ``on_trial`` is called after every finished trial.
         """
         running: dict[Future[EpisodeScore], _Running] = {}
         try:
@@ -170,9 +165,8 @@ class TuningStudy:
         # A new sampler for each trial: resuming must not draw the first numbers again.
         seed = np.random.SeedSequence([self.seed, self._n_counted()]).generate_state(1)[0]
         self.study.sampler = optuna.samplers.TPESampler(seed=int(seed), multivariate=True)
-        trial = self.study.ask()
-        values = {path: knob.suggest(trial, path) for path, knob in self.space.items()}
-        settings = nested(values)
+        trial = self.study.ask({**self.space})
+        settings = nested({path: rounded(trial.params[path]) for path in self.space})
         trial.set_user_attr("settings", settings)
         return _Running(trial, from_mapping(EstimatorSettings, settings, "estimator_settings"))
 
@@ -241,7 +235,9 @@ class TuningStudy:
             "n_stopped_early": len(trials),
             **scores_of(best),
             "defaults": None if defaults is None else scores_of(defaults),
-            "at_bounds": [path for path, knob in self.space.items() if knob.at_bound(values[path])],
+            "at_bounds": [
+                path for path, knob in self.space.items() if at_bound(knob, values[path])
+            ],
             "date": date.today().isoformat(),
             "versions": {name: version(name) for name in packages},
         }
@@ -252,12 +248,6 @@ def locked_study(
     task: TuningTask, folder: Path, seed: int = 0, score: Score = score_episode
 ) -> Iterator[TuningStudy]:
     """Begin a study or go on with it, and keep other processes out of it meanwhile.
-
-    Args:
-        task: The task.
-        folder: Folder of the journal; made if missing.
-        seed: Seeds the sampler.
-        score: Scores settings on a traffic seed.
 
     Raises:
         ValueError: The journal is of a study with other arguments.

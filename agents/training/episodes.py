@@ -153,14 +153,7 @@ class TrainingEpisodes(VecEnvWrapper):
 def make_episodes(
     env: str, keywords: Mapping[str, Any], recipe: Recipe, seed: int, *, reward_scale: float = 1.0
 ) -> TrainingEpisodes:
-    """Make the episodes that a recipe trains on.
-
-    Args:
-        env: Environment id.
-        keywords: Of the environment.
-        recipe: Number of episodes, replicas and action encoding.
-        seed: Training seed.
-        reward_scale: Factor on rewards.
+    """Make the episodes that a recipe trains on with a training seed.
 
     Raises:
         ValueError: A keyword is unknown or out of range.

@@ -25,11 +25,7 @@ class Learner(Protocol):
         """Number of updates, or of rounds, that are done."""
 
     def train(self, record: Record) -> None:
-        """Train until the end of the plan.
-
-        Args:
-            record: Called after every update, and after what comes ahead of the first one.
-        """
+        """Train until the end of the plan; record every update, and what precedes the first."""
 
     def state(self) -> dict[str, Any]:
         """Return what `restore` needs, as tensors, numbers and strings."""

@@ -14,7 +14,7 @@ from agents.experiments.seeds import training_seed
 from agents.training.episodes import make_episodes
 from agents.training.learner import Record
 from agents.training.plan import TrainingPlan
-from agents.training.policy_iteration import swap_round
+from agents.training.policy_iteration import collect_swaps, raise_scores
 from agents.training.recipes import PlackettLuceRecipe
 from agents.training.regression import regress
 from dptse_env.parts import make_interface
@@ -31,14 +31,7 @@ class PlackettLuceLearner:
         keywords: Mapping[str, Any],
         progress: Callable[[str, float], None],
     ) -> None:
-        """Make an untrained policy.
-
-        Args:
-            plan: Of the training.
-            recipe: The plan's recipe.
-            keywords: Of the environments.
-            progress: Called with the name of a stage and the fraction of it that is done.
-        """
+        """Make an untrained policy; ``keywords`` are those of the environments."""
         self._plan, self._recipe, self._keywords = plan, recipe, keywords
         self._progress = progress
         self._rounds, self._is_begun = 0, False
@@ -61,10 +54,10 @@ class PlackettLuceLearner:
 
     def train(self, record: Record) -> None:
         """See `Learner`."""
+        start = time.perf_counter()
         if not self._is_begun:
-            began = time.perf_counter()
             self._regress()
-            record(time.perf_counter() - began, {})
+            record(time.perf_counter() - start, {})
         if self._rounds < self._recipe.swaps.rounds:
             self._swap(record)
 
@@ -91,7 +84,11 @@ class PlackettLuceLearner:
         keywords = {**self._keywords, "action": self._recipe.action}
         env = make_vector(plan.env, settings.episodes, keywords)
         while self._rounds < settings.rounds:
-            began = time.perf_counter()
-            error = swap_round(self.policy, env, settings, self._rounds, plan.seed, self._progress)
+            start = time.perf_counter()
+            swaps = collect_swaps(
+                self.policy, env, settings, self._rounds, plan.seed, self._progress
+            )
+            step, progress = settings.step_of(self._rounds), partial(self._progress, "fit")
+            raise_scores(self.policy, swaps, settings, step, progress)
             self._rounds += 1
-            record(time.perf_counter() - began, {"error": error})
+            record(time.perf_counter() - start, {"error": float(swaps.error.mean())})

@@ -4,21 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import platform
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from importlib.metadata import version
 from typing import Any
 
-import gymnasium as gym
-
-from agents.evaluation.episodes import WARM_UP
-from agents.experiments.provenance import source_digest
+from agents.evaluation.episodes import WARM_UP, make_config
+from agents.experiments.provenance import machine, source_digest
 from agents.experiments.seeds import TRAINING_VALIDATION, TRAININGS
 from agents.training.recipes import Recipe
 from dptse_env.config import TRAINING_SEEDS, VALIDATION_SEEDS, EnvConfig
-from dptse_env.env import SensorQueryEnv
 from dptse_env.parts import make_interface
 from dptse_env.utils.validation import integer
 
@@ -99,15 +95,8 @@ class TrainingPlan:
         Raises:
             ValueError: A keyword is unknown or out of range.
         """
-        made = gym.make(
-            self.env,
-            disable_env_checker=True,
-            action=self.recipe.action,
-            traffic_seeds=list(self.traffic_seeds),
-            **self.keywords,
-        )
-        assert isinstance(made.unwrapped, SensorQueryEnv)
-        return made.unwrapped.config
+        chosen = {"action": self.recipe.action, "traffic_seeds": list(self.traffic_seeds)}
+        return make_config(self.env, {**chosen, **self.keywords})
 
     def provenance(self, commit: str | None) -> dict[str, Any]:
         """Return what `take_folder` compares and keeps, as plain JSON."""
@@ -133,11 +122,7 @@ class TrainingPlan:
             "tuned": [],
             "sources": [source_digest()],
             "commit": commit,
-            "machine": {
-                "python": platform.python_version(),
-                "platform": platform.platform(),
-                **{name: version(name) for name in libraries},
-            },
+            "machine": machine(libraries),
         }
         plain: dict[str, Any] = json.loads(json.dumps(content))
         return plain

@@ -9,7 +9,6 @@ are measured anew, under the new policy.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 
 import numpy as np
 import torch
@@ -31,35 +30,6 @@ SEED_STRIDE = 10_000
 
 REPORT_INTERVAL = 50
 """Minibatches between two reports of progress."""
-
-
-def swap_round(
-    policy: PlackettLucePolicy,
-    env: SensorQueryVectorEnv,
-    settings: SwapRounds,
-    index: int,
-    seed: int,
-    progress: Callable[[str, float], None],
-) -> float:
-    """Try swaps under a policy, and improve it by them.
-
-    Args:
-        policy: Changed in place.
-        env: As `collect_swaps` takes it.
-        settings: Of rounds.
-        index: Number of the round, counted from 0.
-        seed: Training seed.
-        progress: Called with the name of a stage and the fraction of it that is done.
-
-    Returns:
-        The mean one-second error under the policy before the round.
-
-    Raises:
-        ValueError: There is nothing to swap, or the horizon is too short (`try_swaps`).
-    """
-    swaps = collect_swaps(policy, env, settings, index, seed, progress)
-    raise_scores(policy, swaps, settings, settings.step_of(index), partial(progress, "fit"))
-    return float(swaps.error.mean())
 
 
 def collect_swaps(
@@ -104,19 +74,12 @@ def raise_scores(
     step: float,
     progress: Callable[[float], None] | None = None,
 ) -> None:
-    """Raise the scores of ``policy`` by ``step`` times the expected gain of a query.
+    """Raise the scores of ``policy`` in place by ``step`` times the expected gain of a query.
 
     Gains are in units of the policy's mean one-second error, so that settings carry over to other
     environments. The price of contributions is subtracted from each: vehicles that have reached
     their cap are missing from the releases for the rest of an episode, long after the seconds in
     which a gain is measured.
-
-    Args:
-        policy: Changed in place.
-        swaps: Tried under this policy.
-        settings: Price, minibatches and learning rate.
-        step: Rise of a score for an expected gain of one mean one-second error.
-        progress: Called with the fraction that is done, every so often.
     """
     unit = swaps.error.mean()
     gains = np.clip(swaps.gain / unit, -LARGEST_GAIN, LARGEST_GAIN)

@@ -39,13 +39,7 @@ class PPOLearner:
     """
 
     def __init__(self, plan: TrainingPlan, recipe: PPORecipe, keywords: Mapping[str, Any]) -> None:
-        """Make the episodes and an untrained model.
-
-        Args:
-            plan: Of the training.
-            recipe: The plan's recipe.
-            keywords: Of the environment.
-        """
+        """Make the episodes and an untrained model; ``keywords`` are those of the environment."""
         self._plan, self._recipe, self._is_begun = plan, recipe, False
         self._episodes = make_episodes(
             plan.env, keywords, recipe, plan.seed, reward_scale=recipe.reward_scale

@@ -58,20 +58,13 @@ def regress(
     progress: Callable[[float], None] | None = None,
     targets: Callable[[QueryProcess], Observation] = squared_errors,
 ) -> None:
-    """Let ``policy`` act, and fit its scores to the squared errors that follow from it.
+    """Let ``policy`` act, and fit its scores in place to the squared errors that follow from it.
 
     With the expected squared error exp(z) of a segment, the loss y exp(-z) + z is that of normal
     errors with this variance; it is least where exp(z) is the mean of y. Scores are ``sharpness``
     times z plus a bonus for age, since querying segments that have not been observed for long gains
     more, up to a constant. Each round aggregates data collected by the current policy, as in
     DAgger.
-
-    Args:
-        policy: Changed in place.
-        episodes: Reset first, and left where they end.
-        settings: Rounds, seconds, minibatches and sharpness.
-        progress: Called with the fraction that is done, every so often.
-        targets: Returns the squared errors of all episodes, shape (n, n_mainline).
     """
     level = torch.tensor([LEVEL], requires_grad=True)
     optimizer = torch.optim.Adam([*policy.scorer.parameters(), level], lr=settings.rate)

@@ -5,43 +5,27 @@ from __future__ import annotations
 import csv
 import io
 import json
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from agents.experiments.files import write_atomically
+
 CHECKPOINT, PROGRESS = "checkpoint.pt", "progress.csv"
 
 FORMAT = 2
-"""Of checkpoints; raise it whenever their content changes its meaning."""
+"""Format of checkpoints; raise it whenever their content changes its meaning."""
 
 COLUMNS = (
     "update", "steps", "seconds", "error", "validation", "validation_drawn", "learning_rate",
     "kl", "clipped", "entropy", "explained_variance", "value_loss",
 )  # fmt: skip
-"""Of `PROGRESS`. Errors are minus the mean reward of a second: of the actions trained on, and on
-validation traffic with deterministic and with drawn actions."""
+"""Columns of `PROGRESS`. Errors are minus the mean reward of a second: of the actions trained on,
+and on validation traffic with deterministic and with drawn actions."""
 
 Row = dict[str, float]
-
-
-def write_atomic(path: Path, content: bytes) -> None:
-    """Write a file so that a kill or a full disk leaves either the old content or the new.
-
-    Raises:
-        OSError: It cannot be written; the old content stays.
-    """
-    temporary = path.with_suffix(".tmp")
-    try:
-        with temporary.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def write_progress(folder: Path, rows: Sequence[Row]) -> None:
@@ -50,7 +34,7 @@ def write_progress(folder: Path, rows: Sequence[Row]) -> None:
     writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
-    write_atomic(folder / PROGRESS, text.getvalue().encode())
+    write_atomically(folder / PROGRESS, text.getvalue())
 
 
 def read_progress(folder: Path) -> list[Row]:
@@ -66,7 +50,7 @@ def write_checkpoint(folder: Path, content: dict[str, Any]) -> None:
     """Write a checkpoint of tensors, numbers and strings."""
     buffer = io.BytesIO()
     torch.save({"format": FORMAT, **content}, buffer)
-    write_atomic(folder / CHECKPOINT, buffer.getvalue())
+    write_atomically(folder / CHECKPOINT, buffer.getvalue())
 
 
 def read_checkpoint(folder: Path) -> dict[str, Any] | None:
@@ -86,9 +70,8 @@ def read_checkpoint(folder: Path) -> dict[str, Any] | None:
     try:
         content: dict[str, Any] = torch.load(path, weights_only=True)
     except Exception as problem:
-        raise ValueError(f"{path} is damaged: {problem}; remove the folder to start over") from (
-            problem
-        )
+        message = f"{path} is damaged: {problem}; remove the folder to start over"
+        raise ValueError(message) from problem
     found = content.get("format", 1)
     if found != FORMAT:
         raise ValueError(

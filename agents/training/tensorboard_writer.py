@@ -1,4 +1,4 @@
-"""`TensorBoardWriter`: the learning curve for TensorBoard, where that is installed."""
+"""The learning curve for TensorBoard, where that is installed."""
 
 from __future__ import annotations
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 
@@ -28,15 +28,8 @@ from dptse_env.sb3.saved import ActingPolicy, save_policy
 POLICY, BEST = "policy.zip", "best.zip"
 
 
-class Watcher(Protocol):
-    """Receives every row of the learning curve as it comes."""
-
-    def __call__(self, row: Row) -> None:
-        """Take a row."""
-
-
-def _ignore(_stage: str, _fraction: float) -> None:
-    """Report nothing."""
+Watcher = Callable[[Row], None]
+"""Receives every row of the learning curve as it comes."""
 
 
 class Training:
@@ -61,13 +54,13 @@ class Training:
         records: str | None = None,
         commit: str | None = None,
         watchers: tuple[Watcher, ...] = (),
-        progress: Callable[[str, float], None] = _ignore,
+        progress: Callable[[str, float], None] = lambda stage, fraction: None,
     ) -> None:
         """Take the folder and restore its state.
 
         Args:
-            plan: What is trained.
-            folder: Where; made if it is missing.
+            plan: The plan.
+            folder: The folder; made if it is missing.
             records: Folder of the record cache; None for the user's cache.
             commit: State of the sources, for the record.
             watchers: Receive every row, those read from the folder first.
@@ -86,9 +79,8 @@ class Training:
         training = {**keywords, "traffic_seeds": list(plan.traffic_seeds)}
         self.learner = _make_learner(plan, training, progress)
         self._acting = ActingPolicy(self.learner.policy, make_interface(config))
-        self._validation = Validation(
-            plan.env, {**keywords, "action": plan.recipe.action}, plan.validation_seeds
-        )
+        validation = {**keywords, "action": plan.recipe.action}
+        self._validation = Validation(plan.env, validation, plan.validation_seeds)
         self.rows: list[Row] = []
         self._seconds, self._best = 0.0, float("inf")
         if checkpoint is not None:
@@ -101,7 +93,7 @@ class Training:
 
     @property
     def is_finished(self) -> bool:
-        """Whether all updates are done."""
+        """True if all updates are done."""
         return self.update >= self.plan.n_updates
 
     def run(self) -> None:
@@ -117,12 +109,8 @@ class Training:
         """Record a finished round or update."""
         update, plan = self.update, self.plan
         self._seconds += seconds
-        row: Row = {
-            "update": update,
-            "steps": plan.steps_at(update),
-            "seconds": round(self._seconds, 1),
-            **values,
-        }
+        row: Row = {"update": update, "steps": plan.steps_at(update)}
+        row |= {"seconds": round(self._seconds, 1), **values}
         if plan.is_due(update, plan.validate_every):
             self._validate(row)
         self.rows.append(row)
@@ -164,13 +152,9 @@ class Training:
     def _keep(self) -> None:
         """Write learning curve and checkpoint."""
         write_progress(self.folder, self.rows)
-        content = {
-            "update": self.update,
-            "best": self._best,
-            "torch": torch.get_rng_state(),
-            "learner": self.learner.state(),
-        }
-        write_checkpoint(self.folder, content)
+        learner, generator = self.learner.state(), torch.get_rng_state()
+        content = {"update": self.update, "best": self._best, "torch": generator}
+        write_checkpoint(self.folder, {**content, "learner": learner})
 
     def _resume(self, kept: Mapping[str, Any]) -> None:
         """Restore the state of a checkpoint and the learning curve up to it."""

@@ -1,11 +1,11 @@
-"""This package's environments at work: alone, vectorised natively, and by Gymnasium's own means."""
+"""This package's environments at work: alone, vectorised natively, and by Gymnasium's means."""
 
 from __future__ import annotations
 
 import copy
 import multiprocessing
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium as gym
@@ -13,8 +13,8 @@ import numpy as np
 
 from benchmarks.throughput.measure import Measured, queries, resident, take_turns, together
 from benchmarks.throughput.rows import HORIZON
+from dptse_env.config import EnvConfig
 from dptse_env.estimators import make_estimator
-from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.vector_env import SensorQueryVectorEnv
 
 TURN = 0.2  # [s] that a turn should take
@@ -26,8 +26,8 @@ def env_id(preset: str) -> str:
     return f"dptse_env:dptse/{preset}-v0"
 
 
-def batch(preset: str, n: int, threads: int, **more: Any) -> SensorQueryVectorEnv:
-    """Return n episodes in one process."""
+def make_batch(preset: str, n: int, threads: int, **more: Any) -> SensorQueryVectorEnv:
+    """Make n episodes in one process."""
     env = gym.make_vec(env_id(preset), num_envs=n, threads=threads, **more)
     assert isinstance(env, SensorQueryVectorEnv)
     return env
@@ -43,71 +43,59 @@ def libraries(preset: str, **more: Any) -> float | None:
 
 
 class Tap:
-    """Passes the calls of an estimator on and keeps what it was given."""
+    """Passes the calls of an estimator on and keeps those that change it.
 
-    def __init__(self, own: Any) -> None:
-        """Tap ``own``."""
-        self._own = own
-        self.resets: list[tuple[Any, ...]] = []
-        self.steps: list[tuple[Any, ...]] = []
+    Attributes:
+        calls: Name and arguments of each call.
+    """
+
+    def __init__(self, estimator: Any) -> None:
+        """Tap an estimator."""
+        self._estimator = estimator
+        self.calls: list[tuple[str, tuple[Any, ...]]] = []
 
     def __getattr__(self, name: str) -> Any:
-        """Show everything else as it is."""
-        return getattr(self._own, name)
+        """Return an attribute of the estimator, a method that changes it with a record of calls."""
+        method = getattr(self._estimator, name)
+        if name not in ("reset", "predict", "update"):
+            return method
 
-    def reset(
-        self, episodes: IntArray, states: FloatArray, generators: Sequence[np.random.Generator]
-    ) -> None:
-        """Keep the generators as they are now: the estimator draws from them."""
-        self.resets.append((episodes, states, copy.deepcopy(generators)))
-        self._own.reset(episodes, states, generators)
+        def call(*arguments: Any) -> None:
+            # The estimator draws from the generators of a reset.
+            kept = copy.deepcopy(arguments) if name == "reset" else arguments
+            self.calls.append((name, kept))
+            method(*arguments)
 
-    def predict(self, episodes: IntArray, inputs: FloatArray) -> None:
-        """Keep and pass on."""
-        self.steps.append((episodes, inputs))
-        self._own.predict(episodes, inputs)
-
-    def update(
-        self, episodes: IntArray, observed: BoolArray, values: FloatArray, sigma: FloatArray
-    ) -> None:
-        """Keep and pass on."""
-        self.steps[-1] += (observed, values, sigma)
-        self._own.update(episodes, observed, values, sigma)
+        return call
 
 
 class Kernel:
     """The estimator alone, given exactly what that of an environment was given."""
 
     def __init__(self, env: SensorQueryVectorEnv) -> None:
-        """Build another estimator like that of ``env``, and tap that one."""
-        config, process = env.config, env.process
-        self.own: Any = make_estimator(
-            config.estimator, config.backend, process.model, env.num_envs, config.settings()
+        """Make another estimator like that of ``env``, and tap that one."""
+        config, self._process = env.config, env.process
+        self._estimator: Any = make_estimator(
+            config.estimator, config.backend, env.process.model, env.num_envs, config.settings()
         )
-        self.tap = process.estimator = Tap(process.estimator)  # type: ignore[assignment]
-        self._process = process
-
-    def reset(self) -> None:
-        """Follow the environment's resets."""
-        for arguments in self.tap.resets:
-            self.own.reset(*arguments)
-        self.tap.resets.clear()
+        self._tap: Any = Tap(env.process.estimator)
+        self._process.estimator = self._tap
 
     def follow(self) -> int:
-        """Take the steps that the environment took; return how many episodes' steps."""
+        """Repeat the calls since the last time; return the number of steps, over all episodes."""
         done = 0
-        for episodes, inputs, observed, values, sigma in self.tap.steps:
-            self.own.predict(episodes, inputs)
-            self.own.update(episodes, observed, values, sigma)
-            self.own.estimate()
-            done += len(episodes)
-        self.tap.steps.clear()
+        for name, arguments in self._tap.calls:
+            getattr(self._estimator, name)(*arguments)
+            if name == "update":
+                self._estimator.estimate()
+                done += len(arguments[0])
+        self._tap.calls.clear()
         return done
 
     def check(self) -> None:
         """Stop unless the estimates agree: else the two have not done the same work."""
-        mine, its = self.own.estimate(), self._process.estimate
-        np.testing.assert_allclose(mine.density, its.density, rtol=1e-9, atol=1e-9)
+        estimate, expected = self._estimator.estimate(), self._process.estimate
+        np.testing.assert_allclose(estimate.density, expected.density, rtol=1e-9, atol=1e-9)
 
 
 class Driver:
@@ -124,33 +112,47 @@ class Driver:
         self.env.reset(seed=seed)
         self.left = HORIZON
 
+    def renew(self) -> None:
+        """Begin all episodes if less than a turn is left of them."""
+        if self.left < self.turn:
+            self.restart()
+
     def step(self, n_steps: int) -> int:
-        """Take steps in all episodes; return how many that makes."""
+        """Take steps in all episodes; return their number, over all episodes."""
         for _ in range(n_steps):
             self.env.step(self.masks[self.taken % len(self.masks)])
             self.taken += 1
         self.left -= n_steps
         return n_steps * self.n_episodes
 
+    def take(self) -> int:
+        """Take the steps of a turn; return their number, over all episodes."""
+        return self.step(self.turn)
+
     def settle(self, n_steps: int) -> None:
-        """Take first steps, then choose how many make a turn."""
+        """Take first steps, then choose the number of steps of a turn."""
         self.step(n_steps)
         start = time.perf_counter()
         self.step(1)
         elapsed = time.perf_counter() - start
         self.turn = int(np.clip(TURN / elapsed, 1, LONGEST_TURN))
 
-    def seconds_of_a_reset(self) -> float:
-        """Return what beginning all episodes takes [s], their records in memory already."""
-        start = time.perf_counter()
-        self.restart(0)
-        return time.perf_counter() - start
+    def measure(self, seconds: float, loaded: float | None) -> Measured:
+        """Measure turns, resets left out."""
+        arms = take_turns({"environment": self.take}, seconds, self.renew)
+        return Measured(arms, resident("VmHWM"), loaded)
 
 
-def first_steps(env_config: Any) -> int:
-    """Return after how many steps each step costs the same: the MHE's window is full."""
-    full = env_config.estimator == "mhe"
-    return env_config.settings().mhe.horizon + 1 if full else 2
+def make_driver(env: SensorQueryVectorEnv) -> Driver:
+    """Make the driver of a native vector environment."""
+    config, n = env.config, env.num_envs
+    masks = queries(LONGEST_TURN // 4, n, config.corridor.n_mainline, config.bandwidth)
+    return Driver(env, n, masks)
+
+
+def first_steps(config: EnvConfig) -> int:
+    """Return the number of steps after which all cost the same: the MHE's window is full."""
+    return config.settings().mhe.horizon + 1 if config.estimator == "mhe" else 2
 
 
 def scalar(seconds: float, preset: str, **more: Any) -> Measured:
@@ -161,42 +163,41 @@ def scalar(seconds: float, preset: str, **more: Any) -> Measured:
     masks = queries(LONGEST_TURN, 1, config.corridor.n_mainline, config.bandwidth)[:, 0]
     driver = Driver(env, 1, masks)
     driver.settle(first_steps(config))
-    return _measured(driver, {"environment": lambda: driver.step(driver.turn)}, seconds, loaded)
+    return driver.measure(seconds, loaded)
 
 
 def vector(seconds: float, preset: str, n: int, threads: int, **more: Any) -> Measured:
     """Measure n episodes on one thread, on ``threads``, and the bare estimator on the same."""
     loaded = libraries(preset, **more)
-    env = batch(preset, n, 1, **more)
-    config = env.config
-    masks = queries(LONGEST_TURN // 4, n, config.corridor.n_mainline, config.bandwidth)
-    driver = Driver(env, n, masks)
-    reset = driver.seconds_of_a_reset()
-    kernel = Kernel(env)
+    driver = make_driver(make_batch(preset, n, 1, **more))
+    start = time.perf_counter()
     driver.restart(0)
-    driver.settle(first_steps(config))
+    notes = {"reset_seconds": time.perf_counter() - start}
+    kernel = Kernel(driver.env)
+    driver.restart(0)
+    driver.settle(first_steps(driver.env.config))
     peak = resident("VmHWM")
-    kernel.reset()
     kernel.follow()
 
-    work: dict[str, Callable[[], int]] = {"one thread": lambda: driver.step(driver.turn)}
+    work: dict[str, Callable[[], int]] = {"one thread": driver.take}
     drivers = [driver]
     if threads > 1:
-        twin = Driver(batch(preset, n, threads, **more), n, masks)
-        twin.step(driver.taken)
-        drivers.append(twin)
-        work["threads"] = lambda: twin.step(driver.turn)
+        paired = make_driver(make_batch(preset, n, threads, **more))
+        paired.step(driver.taken)
+        paired.turn = driver.turn
+        drivers.append(paired)
+        work["threads"] = paired.take
     work["kernel"] = kernel.follow
 
     def prepare() -> None:
         if driver.left < driver.turn:
-            for one in drivers:
-                one.restart()
-            kernel.reset()
+            for each in drivers:
+                each.restart()
+            kernel.follow()
 
     arms = take_turns(work, seconds, prepare)
     kernel.check()
-    return Measured(arms, peak, loaded, {"reset_seconds": reset})
+    return Measured(arms, peak, loaded, notes)
 
 
 def gymnasium_vector(seconds: float, preset: str, n: int, mode: str, **more: Any) -> Measured:
@@ -207,23 +208,10 @@ def gymnasium_vector(seconds: float, preset: str, n: int, mode: str, **more: Any
         masks = queries(LONGEST_TURN, n, env.single_action_space.shape[0], more["bandwidth"])
         driver = Driver(env, n, masks)
         driver.settle(2)
-        measured = _measured(
-            driver, {"environment": lambda: driver.step(driver.turn)}, seconds, loaded
-        )
+        measured = driver.measure(seconds, loaded)
         workers = multiprocessing.active_children()
         if workers:
             measured.peak = together([worker.pid for worker in workers if worker.pid])
         return measured
     finally:
         env.close()
-
-
-def _measured(
-    driver: Driver, work: dict[str, Callable[[], int]], seconds: float, loaded: float | None
-) -> Measured:
-    def prepare() -> None:
-        if driver.left < driver.turn:
-            driver.restart()
-
-    arms = take_turns(work, seconds, prepare)
-    return Measured(arms, resident("VmHWM"), loaded)

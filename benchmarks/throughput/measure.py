@@ -1,4 +1,4 @@
-"""How work is timed: in turns, each turn a sample of its rate; and how memory is read."""
+"""Timing of work in turns, each turn a sample of its rate; and the memory of processes."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ import numpy as np
 
 @dataclass
 class Samples:
-    """What the turns of one kind of work gave.
+    """Samples of the rate of one kind of work.
 
     Attributes:
-        rates: Units a second, one per turn.
+        rates: Units a second in each turn.
         cores: CPU seconds a second of this process, over all turns; None if not measured.
     """
 
@@ -26,12 +26,12 @@ class Samples:
 
 @dataclass
 class Measured:
-    """What one child process reports.
+    """The report of one child process.
 
     Attributes:
         arms: Samples by the name of the work.
-        peak: Most memory that was resident [MiB]; None where the system does not tell.
-        libraries: What was resident once libraries were loaded and one step was taken [MiB].
+        peak: Largest resident memory [MiB]; None where the system does not tell.
+        libraries: Resident memory once libraries were loaded and one step was taken [MiB].
         notes: Further figures by name.
     """
 
@@ -42,24 +42,24 @@ class Measured:
 
     @classmethod
     def from_plain(cls, plain: Mapping[str, Any]) -> Measured:
-        """Read what `dataclasses.asdict` wrote."""
+        """Read the output of `dataclasses.asdict`."""
         arms = {name: Samples(**samples) for name, samples in plain["arms"].items()}
-        return cls(arms, plain["peak"], plain["libraries"], plain["notes"])
+        return cls(**{**plain, "arms": arms})
 
 
 def take_turns(
     work: Mapping[str, Callable[[], int]],
     seconds: float,
-    prepare: Callable[[], None] = lambda: None,
+    prepare: Callable[[], object] = lambda: None,
     least: int = 3,
 ) -> dict[str, Samples]:
     """Let each kind of work have its turn, again and again, so that all meet the same weather.
 
     Args:
-        work: What to call by name; it returns how many units it did.
-        seconds: Time to fill [s]; every kind has ``least`` turns all the same.
+        work: Functions to call by name; each returns the number of units that it did.
+        seconds: Time to fill [s].
         prepare: Called ahead of every round, off the clock.
-        least: Turns of each kind at least.
+        least: Least number of turns of each kind.
     """
     rates: dict[str, list[float]] = {name: [] for name in work}
     busy, passed = dict.fromkeys(work, 0.0), dict.fromkeys(work, 0.0)
@@ -78,25 +78,23 @@ def take_turns(
 
 
 def resident(field_name: str = "VmRSS") -> float | None:
-    """Return the memory of this process [MiB] as Linux tells it; ``VmHWM`` is its peak."""
-    status = Path("/proc/self/status")
-    if not status.exists():
-        return None
-    (line,) = [line for line in status.read_text().splitlines() if line.startswith(field_name)]
-    return int(line.split()[1]) / 1024
+    """Return the memory of this process [MiB] on Linux; ``VmHWM`` is its peak."""
+    return _mebibytes(Path("/proc/self/status"), field_name)
 
 
 def together(workers: list[int]) -> float | None:
-    """Return the memory of this process and what workers have beside it [MiB]."""
-    total = resident()
-    for pid in workers:
-        rollup = Path(f"/proc/{pid}/smaps_rollup")
-        if total is None or not rollup.exists():
-            return None
-        for line in rollup.read_text().splitlines():
-            if line.startswith("Private_"):
-                total += int(line.split()[1]) / 1024
-    return total
+    """Return the memory of this process and the private memory of its workers [MiB]."""
+    sizes = [_mebibytes(Path(f"/proc/{pid}/smaps_rollup"), "Private_") for pid in workers]
+    known = [size for size in (resident(), *sizes) if size is not None]
+    return sum(known) if len(known) == 1 + len(workers) else None
+
+
+def _mebibytes(path: Path, start: str) -> float | None:
+    """Return the sum of some lines of a file of Linux [MiB]; None if there is no such file."""
+    if not path.exists():
+        return None
+    lines = path.read_text().splitlines()
+    return sum(int(line.split()[1]) for line in lines if line.startswith(start)) / 1024
 
 
 def queries(n_steps: int, n_episodes: int, n_segments: int, n_queried: int) -> np.ndarray:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from benchmarks.peers import FilterPeer
 from benchmarks.replay import recorded
+from benchmarks.steps import Row, Steps, step_times
 from benchmarks.throughput.measure import Measured, Samples, resident
-from benchmarks.timing import Row, Steps, interleave
 
 BLOCK, BLOCKS = 25, 8
 
@@ -15,14 +13,10 @@ BLOCK, BLOCKS = 25, 8
 def plain_loop(_seconds: float, estimator: str, bandwidth: int) -> Measured:
     """Measure filterpy's filter, or for the MHE its program assembled and solved by piqp."""
     replay = recorded("w99-3lane", (0,), 1, bandwidth, BLOCK * BLOCKS)
-    loaded = resident()
-    row: Row
-    if estimator == "mhe":
-        row = Steps(estimator, "reference", "reference", replay)
-    else:
-        row = FilterPeer(estimator, replay, BLOCK)
+    loaded, is_mhe = resident(), estimator == "mhe"
+    row: Row = (
+        Steps(estimator, "reference", replay) if is_mhe else FilterPeer(estimator, replay, BLOCK)
+    )
     # The MHE's steps take some 30 ms each, and a filter takes three of each block.
-    interleave([row], replay.n_steps, BLOCK, 1 if estimator == "mhe" else 3)
-    blocks = np.array_split(np.array(row.microseconds), BLOCKS)
-    rates = [float(1e6 / block.mean()) for block in blocks]
-    return Measured({"estimator": Samples(rates)}, resident("VmHWM"), loaded)
+    times = step_times({"estimator": row}, BLOCK * BLOCKS, BLOCK, 1 if is_mhe else 3)["estimator"]
+    return Measured({"estimator": Samples((1e6 / times).tolist())}, resident("VmHWM"), loaded)

@@ -1,9 +1,10 @@
-"""What the repeats of a row gave, put together."""
+"""Results of the rows, the repeats of each put together."""
 
 from __future__ import annotations
 
+import math
 import statistics
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,12 +15,12 @@ from benchmarks.throughput.rows import Row
 
 @dataclass
 class Result:
-    """A row and what its child processes reported.
+    """A row and the reports of its child processes. A figure that was not measured is NaN.
 
     Attributes:
         row: The row.
-        repeats: One report per child that succeeded.
-        problem: Why there is none, or not as many as asked for.
+        repeats: A report for each child that succeeded.
+        problem: Reason why there is none, or not as many as requested.
     """
 
     row: Row
@@ -28,64 +29,52 @@ class Result:
 
     def rates(self, arm: str) -> list[float]:
         """Return the rate of every turn of every repeat."""
-        return [r for one in self.repeats if arm in one.arms for r in one.arms[arm].rates]
+        return [rate for each in self.repeats if arm in each.arms for rate in each.arms[arm].rates]
 
-    def rate(self, arm: str) -> float | None:
+    def rate(self, arm: str) -> float:
         """Return the median rate [1/s]."""
-        rates = self.rates(arm)
-        return statistics.median(rates) if rates else None
+        return _median(self.rates(arm))
 
-    def spread(self, arm: str) -> float | None:
+    def spread(self, arm: str) -> float:
         """Return half the distance of the 10th to the 90th percentile, as a share of the median."""
-        rates = self.rates(arm)
-        if not rates:
-            return None
-        low, high = np.percentile(rates, [10, 90])
-        return float((high - low) / 2.0 / statistics.median(rates))
+        low, high = np.percentile(self.rates(arm) or [math.nan], [10, 90])
+        return float((high - low) / 2.0 / self.rate(arm))
 
-    def share(self, arm: str, whole: str) -> float | None:
+    def share(self, arm: str, reference: str) -> float:
         """Return the median over turns of one rate divided by another of the same round."""
-        pairs = zip(self.rates(arm), self.rates(whole), strict=False)
-        ratios = [one / other for one, other in pairs]
-        return statistics.median(ratios) if ratios else None
+        pairs = zip(self.rates(arm), self.rates(reference), strict=False)
+        return _median([rate / other for rate, other in pairs])
 
     @property
-    def peak(self) -> float | None:
-        """Most memory of any repeat [MiB]."""
-        known = [one.peak for one in self.repeats if one.peak is not None]
-        return max(known) if known else None
+    def peak(self) -> float:
+        """Largest memory of any repeat [MiB]."""
+        return max((each.peak for each in self.repeats if each.peak is not None), default=math.nan)
 
     @property
-    def libraries(self) -> float | None:
-        """What libraries took of it [MiB]."""
-        known = [one.libraries for one in self.repeats if one.libraries is not None]
-        return statistics.median(known) if known else None
+    def libraries(self) -> float:
+        """Memory of the libraries [MiB]."""
+        return _median([each.libraries for each in self.repeats if each.libraries is not None])
 
-    def note(self, name: str) -> float | None:
+    def note(self, name: str) -> float:
         """Return the median of a further figure."""
-        known = [one.notes[name] for one in self.repeats if name in one.notes]
-        return statistics.median(known) if known else None
+        return _median([each.notes[name] for each in self.repeats if name in each.notes])
 
 
 Results = Mapping[str, Result]
 """Results by the name of the row."""
 
 
-def rate_of(results: Results, row: str, arm: str) -> float | None:
-    """Return a median rate, or None where the row was not measured."""
-    return results[row].rate(arm) if row in results else None
+def find(results: Results, name: str) -> Result:
+    """Return the result of a row; one without any figure where it was not measured."""
+    return results.get(name, Result(Row(name, "")))
 
 
-def ratio(one: float | None, other: float | None) -> float | None:
-    """Divide, where both are known."""
-    return None if one is None or other is None else one / other
+def best(results: Results, prefix: str) -> str | None:
+    """Return the name of the quickest row whose name starts so; None where none was measured."""
+    rates = {name: results[name].rate("environment") for name in results if name.startswith(prefix)}
+    measured = {name: rate for name, rate in rates.items() if not math.isnan(rate)}
+    return max(measured, key=lambda name: measured[name], default=None)
 
 
-def best(results: Results, prefix: str) -> tuple[str, float] | None:
-    """Return the quickest row whose name starts so, and its rate."""
-    rates = [
-        (name, rate)
-        for name, result in results.items()
-        if name.startswith(prefix) and (rate := result.rate("environment")) is not None
-    ]
-    return max(rates, key=lambda pair: pair[1]) if rates else None
+def _median(values: Sequence[float]) -> float:
+    return statistics.median(values) if values else math.nan

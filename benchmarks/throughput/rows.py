@@ -17,18 +17,17 @@ HORIZON = 300
 """Length of an episode [s]; it starts anywhere in a record, so that a batch sees all of it."""
 
 THREADS = 2
-"""What "two cores" means."""
+"""Threads of a measurement on "two cores"."""
 
-EXTRA = "pip install 'dptse-env[benchmark]'"
 LONGEST = 300.0  # [s] that a row may take, compiling its kernels included
 
 
 @dataclass(frozen=True)
 class Row:
-    """One child process.
+    """The job of one child process.
 
     Attributes:
-        name: What ``--rows`` calls it.
+        name: Name for ``--rows``.
         work: ``module:function`` of this package.
         options: Keywords of the function.
         needs: Modules that it imports and that need not be installed.
@@ -41,14 +40,15 @@ class Row:
 
     @property
     def missing(self) -> str | None:
-        """Say what is not installed and how to get it, if something is not."""
+        """Description of missing modules, and how to get them; None where all are installed."""
         absent = [name for name in self.needs if importlib.util.find_spec(name) is None]
-        return f"{' and '.join(absent)} not installed: {EXTRA}" if absent else None
+        install = "pip install 'dptse-env[benchmark]'"
+        return f"{' and '.join(absent)} not installed: {install}" if absent else None
 
 
 @dataclass(frozen=True)
 class Sizes:
-    """What a run spends.
+    """Traffic and bandwidths of a run.
 
     Attributes:
         traffic_seeds: Records behind the environments' rows.
@@ -88,13 +88,10 @@ def catalogue(sizes: Sizes) -> Iterator[Row]:
             **more,
         }
 
-    def sumo(seeds: str, **more: Any) -> dict[str, Any]:
-        return {"preset": "paper-highway", "traffic_seeds": seeds, **more}
-
-    yield Row("libsumo", "simulators:recording", sumo(sizes.recorded_seeds))
-    yield Row(
-        "recording-processes", "simulators:processes", sumo(sizes.pooled_seeds, workers=THREADS)
-    )
+    sumo = {"preset": "paper-highway", "traffic_seeds": sizes.recorded_seeds}
+    pooled = {**sumo, "traffic_seeds": sizes.pooled_seeds, "workers": THREADS}
+    yield Row("libsumo", "simulators:recording", sumo)
+    yield Row("recording-processes", "simulators:processes", pooled)
     yield Row("sumo-rl", "sumo_rl_peer:intersection", needs=("sumo_rl", "sumo"))
     for estimator in ESTIMATORS:
         yield Row(f"scalar-{estimator}", "environments:scalar", env(estimator))
@@ -104,33 +101,21 @@ def catalogue(sizes: Sizes) -> Iterator[Row]:
     for estimator in ("ekf", "ukf", "enkf", "mhe"):
         options = {"estimator": estimator, "bandwidth": FEW}
         yield Row(f"plain-{estimator}", "plain_loops:plain_loop", options)
-    for n in (8, 64):
-        yield _gymnasium("sync", n, env("ekf"))
-    for n in (2, 4, 8, 16):
-        yield _gymnasium("async", n, env("ekf"))
+    for mode, sizes_of_mode in (("sync", (8, 64)), ("async", (2, 4, 8, 16))):
+        for n in sizes_of_mode:
+            yield Row(f"{mode}-{n}", "environments:gymnasium_vector", env("ekf", n=n, mode=mode))
     for estimator in ESTIMATORS:
         for bandwidth in sizes.bandwidths:
             for n in SIZES:
                 # A single episode has nothing to share out.
                 options = env(estimator, bandwidth, n=n, threads=THREADS if n > 1 else 1)
                 yield Row(vector_name(estimator, bandwidth, n), "environments:vector", options)
-    private = {**env("ekf"), "preset": "PrivateHighway"}
-    yield Row("vector-private", "environments:vector", {**private, "n": 1024, "threads": THREADS})
-    for estimator in ("ekf", "ukf"):
-        yield Row(f"profile-{estimator}", "profiles:profile", env(estimator, n=1024))
-    learning = env("ekf", n=1024, threads=THREADS)
-    yield Row("ppo", "learning:ppo", learning, needs=("stable_baselines3", "torch"))
+    parallel = env("ekf", n=1024, threads=THREADS)
+    yield Row("vector-private", "environments:vector", {**parallel, "preset": "PrivateHighway"})
+    yield Row("ppo", "learning:ppo", parallel, needs=("stable_baselines3", "torch"))
     for name, preset in (("memory-paper", "PaperHighway"), ("memory-private", "PrivateHighway")):
-        options = {
-            **env("ekf", n=1024, n_episodes=10_000),
-            "preset": preset,
-            "traffic_seeds": sizes.kept_seeds,
-        }
-        yield Row(name, "memory:memory", options)
-
-
-def _gymnasium(mode: str, n: int, options: dict[str, Any]) -> Row:
-    return Row(f"{mode}-{n}", "environments:gymnasium_vector", {**options, "n": n, "mode": mode})
+        options = env("ekf", n=1024, n_episodes=10_000, traffic_seeds=sizes.kept_seeds)
+        yield Row(name, "memory:memory", {**options, "preset": preset})
 
 
 def chosen(rows: Sequence[Row], patterns: Sequence[str]) -> list[Row]:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import resource
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from itertools import count
 from pathlib import Path
 
@@ -15,17 +16,19 @@ from dptse_env.traffic.sumo import running
 from dptse_env.traffic.sumo import seconds as seconds_of
 
 
-def bare(corridor: Corridor, seed: int) -> int:
-    """Run the scenario that would be recorded, incident and all, and read nothing.
-
-    Returns:
-        Its seconds.
-    """
+def bare(corridor: Corridor, seed: int) -> None:
+    """Run the scenario that would be recorded, incident and all, and read nothing."""
     scenario = draw_scenario(corridor, seed)
     with running(corridor, scenario) as libsumo:
         for _ in seconds_of(libsumo, corridor, scenario):
             pass
-    return corridor.duration
+
+
+@contextmanager
+def empty_libraries() -> Iterator[Iterator[RecordLibrary]]:
+    """Yield any number of libraries without a record, in a temporary folder."""
+    with tempfile.TemporaryDirectory() as folder:
+        yield (RecordLibrary(Path(folder) / str(k)) for k in count())
 
 
 def recording(seconds: float, preset: str, traffic_seeds: str) -> Measured:
@@ -34,19 +37,14 @@ def recording(seconds: float, preset: str, traffic_seeds: str) -> Measured:
     corridor, seeds = config.corridor, config.traffic_seeds
     bare(corridor, seeds[0])
     loaded = resident()
-    with tempfile.TemporaryDirectory() as folder:
-        libraries = (RecordLibrary(Path(folder) / str(k)) for k in count())
 
-        def record() -> int:
-            library = next(libraries)
-            for seed in seeds:
-                library.get(corridor, seed)
-            return len(seeds) * corridor.duration
+    def each(run: Callable[[Corridor, int], object]) -> int:
+        for seed in seeds:
+            run(corridor, seed)
+        return len(seeds) * corridor.duration
 
-        work: dict[str, Callable[[], int]] = {
-            "bare": lambda: sum(bare(corridor, seed) for seed in seeds),
-            "recording": record,
-        }
+    with empty_libraries() as libraries:
+        work = {"bare": lambda: each(bare), "recording": lambda: each(next(libraries).get)}
         arms = take_turns(work, seconds)
     return Measured(arms, resident("VmHWM"), loaded)
 
@@ -55,8 +53,7 @@ def processes(seconds: float, preset: str, traffic_seeds: str, workers: int) -> 
     """Measure recording many scenarios in one child process and in several, start included."""
     config = resolve(preset, {"traffic_seeds": traffic_seeds})
     corridor, seeds = config.corridor, config.traffic_seeds
-    with tempfile.TemporaryDirectory() as folder:
-        libraries = (RecordLibrary(Path(folder) / str(k)) for k in count())
+    with empty_libraries() as libraries:
 
         def record(n: int) -> int:
             next(libraries).ensure(corridor, seeds, workers=n)

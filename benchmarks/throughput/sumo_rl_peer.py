@@ -1,4 +1,4 @@
-"""sumo-rl's single intersection on libsumo, as a peer of the same family."""
+"""sumo-rl's single intersection on libsumo, for comparison."""
 
 from __future__ import annotations
 
@@ -47,4 +47,4 @@ def intersection(seconds: float) -> Measured:
 
     arms = take_turns({"environment": episode}, seconds, reset)
     env.close()
-    return Measured(arms, resident("VmHWM"), loaded, {"simulated_seconds": float(DELTA_TIME)})
+    return Measured(arms, resident("VmHWM"), loaded)

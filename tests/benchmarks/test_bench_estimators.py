@@ -1,84 +1,64 @@
-"""Whether the benchmark runs and says something of every row; never how fast anything is."""
+"""Rows of the benchmark of the estimators, and their replay; never how fast anything is."""
 
 import math
-import re
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from benchmarks.bench_estimators import AIMS, has_reference
-from benchmarks.compile_time import first_step
+from benchmarks.bench_estimators import AIMS, Args, measure
 from benchmarks.replay import recorded
-from benchmarks.timing import Row
-
-ROOT = Path(__file__).parents[2]
-
-
-@pytest.fixture(scope="module")
-def lines():
-    """The printed lines by estimator and row: their numbers."""
-    done = subprocess.run(
-        [sys.executable, "benchmarks/bench_estimators.py", "--quick"],
-        cwd=ROOT, check=True, capture_output=True, text=True,
-    )  # fmt: skip
-    found = {}
-    for line in done.stdout.splitlines():
-        row = re.match(r"(ekf|ukf|enkf|mhe) +(\S.*?)  +(\S+ .*)$", line)
-        if row:
-            found[row[1], row[2]] = row[3].split()
-    return found
-
-
-def expected_rows():
-    for estimator in AIMS:
-        yield estimator, "compiled, one episode"
-        yield estimator, "compiled, batch of 2"
-        if has_reference(estimator):
-            yield estimator, "reference"
-        yield estimator, "qpsolvers, piqp" if estimator == "mhe" else "filterpy"
+from benchmarks.steps import step_times
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("row", list(expected_rows()))
-def test_every_row_is_there_and_finite(lines, row):
-    numbers = [float(word) for word in lines[row] if word not in ("met", "no")]
-    assert len(numbers) >= 3
-    assert all(math.isfinite(number) and number > 0.0 for number in numbers)
+def test_every_row_is_there_and_finite():
+    times = measure(Args(traffic_seeds="0:1", batch=2, steps=16, block=8, passes=1))
+    compiled = ["compiled, one episode", "compiled, batch of 2"]
+    assert {name: list(rows) for name, rows in times.items()} == {
+        "ekf": [*compiled, "reference", "filterpy"],
+        "ukf": [*compiled, "reference", "filterpy"],
+        "enkf": [*compiled, "filterpy"],
+        "mhe": [*compiled, "reference"],
+    }
+    assert times.keys() == AIMS.keys()
+    assert all(
+        math.isfinite(time) and time > 0.0 for rows in times.values() for time in rows.values()
+    )
 
 
-@pytest.mark.slow
-def test_a_first_step_is_timed_in_a_process_of_its_own(tmp_path):
-    assert math.isfinite(first_step("open_loop", str(tmp_path)))
-    assert list(tmp_path.rglob("*.nbi"))
+class Counter:
+    """Remembers the blocks that it took; a step takes as long as its index says [us]."""
+
+    def __init__(self, clock):
+        self.clock, self.taken, self.block = clock, [], range(0)
+
+    def begin(self, block):
+        self.block = block
+
+    def take(self):
+        self.taken.append(self.block)
+        self.clock.now += 1e-6 * sum(2 * (k + len(self.taken)) for k in self.block)
+        return 2 * len(self.block)
 
 
-class Counter(Row):
-    """Yields a time that is told beforehand, and remembers which steps it took."""
+class Clock:
+    """A clock that only rows advance."""
 
-    def __init__(self, seconds):
-        super().__init__("ekf", "told")
-        self.told, self.taken = iter(seconds), []
+    now = 0.0
 
-    def begin(self):
-        pass
-
-    def run(self, steps):
-        for k in steps:
-            self.taken.append(k)
-            yield k, next(self.told)
+    def __call__(self):
+        return self.now
 
 
-def test_a_step_is_the_median_of_its_passes_and_a_row_the_mean_of_its_steps():
-    row = Counter([1e-6, 4e-6, 2e-6, 5e-6, 9e-6, 6e-6])
-    row.n_episodes = 2
-    for _ in range(3):
-        row.measure(range(2))
-    assert row.taken == [0, 1, 0, 1, 0, 1]
-    np.testing.assert_allclose(row.microseconds, [1.0, 2.5])
-    assert row.mean == pytest.approx(1.75)
+def test_the_time_of_a_block_is_the_median_of_its_passes(monkeypatch):
+    clock = Clock()
+    monkeypatch.setattr("benchmarks.throughput.measure.time.perf_counter", clock)
+    row = Counter(clock)
+    times = step_times({"row": row}, 5, 2, 3)["row"]
+    blocks = [range(2), range(2, 4), range(4, 5)]
+    assert row.taken == [range(2), *blocks * 3]
+    # The second pass is in the middle: its blocks are taken as numbers 5 to 7.
+    np.testing.assert_allclose(times, [0.5 + 5, 2.5 + 6, 4 + 7])
 
 
 def test_a_replay_has_28_outputs_in_every_step_and_follows_the_schedule():

@@ -4,34 +4,25 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from dptse_env.config import resolve
 from dptse_env.traffic import SHORT_HIGHWAY, RecordLibrary, randomised
+from scripts.cli import run
 from scripts.record import Args, main
 
 ROOT = Path(__file__).parents[2]
 
 
-def run(*arguments):
-    return subprocess.run(
-        [sys.executable, str(ROOT / "scripts" / "record.py"), *arguments],
-        capture_output=True,
-        text=True,
-        check=False,
-        cwd=ROOT,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-    )
-
-
 def test_the_command_records_into_the_library_and_reports_the_dwell(tmp_path):
-    result = run(
-        "--corridor",
-        "short-highway",
-        "--seeds",
-        "3:5",
-        "--workers",
-        "1",
-        "--records",
-        str(tmp_path),
+    arguments = (
+        "--corridor", "short-highway", "--seeds", "3:5", "--workers", "1",
+        "--records", str(tmp_path),
+    )  # fmt: skip
+    script = [sys.executable, str(ROOT / "scripts" / "record.py"), *arguments]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    result = subprocess.run(
+        script, capture_output=True, text=True, check=False, cwd=ROOT, env=environment
     )
     assert result.returncode == 0, result.stderr
     assert f"short-highway: 2 record(s) in {tmp_path}" in result.stdout
@@ -42,7 +33,7 @@ def test_the_command_records_into_the_library_and_reports_the_dwell(tmp_path):
 
 
 def test_random_traffic_is_recorded_on_request(tmp_path, capsys):
-    main(Args("short-highway", seeds="0:1", random=True, workers=1, records=tmp_path))
+    main(Args(corridor="short-highway", seeds="0:1", random=True, workers=1, records=tmp_path))
     assert RecordLibrary(tmp_path).record_path(randomised(SHORT_HIGHWAY), 0).is_dir()
     assert "1 record(s)" in capsys.readouterr().out
 
@@ -60,16 +51,21 @@ def test_fields_of_a_corridor_and_keywords_are_recorded(tmp_path):
     assert RecordLibrary(tmp_path).record_path(full, 1).is_dir()
 
 
-def test_mistakes_end_in_one_line_on_stderr():
-    for arguments, message in (
-        (["--seeds", "x"], "error: seeds must be 'first:stop'"),
-        (["--corridor", "nowhere"], "error: corridor must be one of"),
-        (["--corridor", '{"length": 3}'], "error: corridor.length"),
-        (["--corridor", '{"duration": -3}'], "error: corridor.duration must be"),
-        (["--corridor", "3"], "error: corridor must be one of"),
-        (["--keywords", "3"], "error: keywords must be a JSON object"),
-    ):
-        result = run(*arguments)
-        assert result.returncode == 2
-        assert result.stderr.strip().splitlines()[-1].startswith(message)
-        assert "Traceback" not in result.stderr
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--seeds", "x"), "error: seeds must be 'first:stop'"),
+        (("--corridor", "nowhere"), "error: corridor must be one of"),
+        (("--corridor", '{"length": 3}'), "error: corridor.length"),
+        (("--corridor", '{"duration": -3}'), "error: corridor.duration must be"),
+        (("--corridor", "3"), "error: corridor must be one of"),
+        (("--keywords", "3"), "error: keywords must be a JSON object"),
+    ],
+)
+def test_mistakes_end_in_one_line_on_stderr(arguments, message, monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["record.py", *arguments])
+    with pytest.raises(SystemExit) as ended:
+        run(main, Args, None)
+    assert ended.value.code == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert line.startswith(message)

@@ -10,8 +10,18 @@ import pytest
 from agents.studies.paper.plan import PaperDesign
 from agents.studies.policies.plan import PolicyCell
 from agents.studies.privacy.plan import PrivacyDesign
-from scripts.cli import command
-from scripts.study import Freeze, Paper, Policies, Privacy, Run, freeze, main, policy_design
+from scripts.cli import command, run
+from scripts.study import (
+    Freeze,
+    Paper,
+    Policies,
+    Privacy,
+    Run,
+    Study,
+    freeze,
+    main,
+    policy_design,
+)
 from tests.agents.policies import SHORT, save
 
 ROOT = Path(__file__).parents[2]
@@ -30,20 +40,17 @@ CELLS = (
 )
 
 
-def study(*arguments):
-    return subprocess.run(
-        [sys.executable, str(ROOT / "scripts" / "study.py"), *map(str, arguments)],
-        capture_output=True, text=True, check=False, cwd=ROOT,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-    )  # fmt: skip
-
-
 def test_the_command_line_runs_a_study_and_reports_its_command(tmp_path):
     arguments = (
         "privacy", "--env", SHORT, "--seeds", "2000:2002", "--estimators", "random_walk",
         "--epsilons", "1.0", "--caps", "4", "--bandwidths", "1", "--bandwidth", "2",
+        "--workers", "1", "--output", str(tmp_path / "out"),
     )  # fmt: skip
-    result = study(*arguments, "--workers", 1, "--output", tmp_path / "out")
+    script = [sys.executable, str(ROOT / "scripts" / "study.py"), *arguments]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    result = subprocess.run(
+        script, capture_output=True, text=True, check=False, cwd=ROOT, env=environment
+    )
     assert result.returncode == 0, result.stderr
     with (tmp_path / "out" / "episodes.csv").open() as file:
         assert len(list(csv.DictReader(file))) == 2 * len(PRIVACY.cells())
@@ -63,10 +70,12 @@ def test_the_command_line_runs_a_study_and_reports_its_command(tmp_path):
         (("policies", "freeze", "--cells", "far"), "error: cells must be of primary, paper"),
     ],
 )
-def test_mistakes_end_in_one_line_on_stderr(arguments, message, tmp_path):
-    result = study(*arguments, "--output", tmp_path / "out")
-    assert result.returncode == 2
-    (line,) = result.stderr.strip().splitlines()
+def test_mistakes_end_in_one_line_on_stderr(arguments, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["study.py", *arguments, "--output", str(tmp_path / "out")])
+    with pytest.raises(SystemExit) as ended:
+        run(main, Study, None)
+    assert ended.value.code == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
     assert line.startswith(message)
     assert not (tmp_path / "out").exists()
 

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from tqdm import tqdm
 
-from agents.studies.audit.strategies import AdversaryPolicy
+from agents.studies.audit.strategies import FixedQueries
 from agents.studies.audit.worlds import AdjacentWorlds
 from dptse_env.config import EnvConfig
 from dptse_env.parts import make_parts, make_release
@@ -17,7 +16,6 @@ from dptse_env.process import QueryProcess
 from dptse_env.release import (
     GaussianMechanism,
     GaussianRelease,
-    Mechanism,
     ReleaseModel,
     ReleaseRequest,
     TrafficTable,
@@ -42,30 +40,18 @@ class Runs:
     distances: FloatArray
 
 
-class RecordingMechanism:
-    """A mechanism that keeps its last releases: the public transcript, one step at a time.
+class RecordingMechanism(GaussianMechanism):
+    """Gaussian noise that keeps its last releases: the public transcript, one step at a time.
 
     Attributes:
         released: The last releases, shape (k, n_columns, 2).
     """
 
-    def __init__(self, mechanism: Mechanism) -> None:
-        """Wrap a mechanism."""
-        self._mechanism = mechanism
-        self.released = np.empty((0, 0, 2))
-
-    @property
-    def sigma(self) -> FloatArray:
-        """See `Mechanism.sigma`."""
-        return self._mechanism.sigma
-
-    def reset(self, episodes: IntArray, generators: Sequence[np.random.Generator]) -> None:
-        """See `Mechanism.reset`."""
-        self._mechanism.reset(episodes, generators)
+    released: FloatArray
 
     def release(self, episodes: IntArray, values: FloatArray) -> FloatArray:
         """See `Mechanism.release`."""
-        self.released = self._mechanism.release(episodes, values)
+        self.released = super().release(episodes, values)
         return self.released
 
 
@@ -132,14 +118,7 @@ def gaussian(release: ReleaseModel) -> GaussianRelease:
 def planned_distance(
     config: EnvConfig, worlds: AdjacentWorlds, plan: BoolArray, sigma: FloatArray
 ) -> float:
-    """Return the distance between the worlds under fixed queries, in units of the noise.
-
-    Args:
-        config: The configuration.
-        worlds: The two worlds.
-        plan: Segments by step, shape (horizon, n_mainline).
-        sigma: Noise standard deviations, (2,).
-    """
+    """Return the distance between the worlds under a plan (horizon, n_mainline), in noise units."""
     adversary = Adversary(config, worlds, 1, sigma)
     adversary.reset(1)
     for step, queried in enumerate(plan):
@@ -150,7 +129,7 @@ def planned_distance(
 def attack(
     config: EnvConfig,
     worlds: AdjacentWorlds,
-    policy: AdversaryPolicy,
+    policy: FixedQueries,
     n_runs: int,
     *,
     noise_factor: float = 1.0,
@@ -181,9 +160,7 @@ def attack(
     process = QueryProcess(make_parts(config, 2 * size, worlds))
     release = gaussian(process.release)
     sigma, columns = noise_factor * release.sigma, release.setup.n_columns
-    mechanism = RecordingMechanism(
-        GaussianMechanism(sigma, n_episodes=2 * size, n_segments=columns)
-    )
+    mechanism = RecordingMechanism(sigma, n_episodes=2 * size, n_segments=columns)
     release.mechanism = mechanism
     adversary = Adversary(config, worlds, 2 * size, sigma)
     parts = []
@@ -192,32 +169,18 @@ def attack(
     ) as bar:
         for first in range(0, n_runs, size):
             runs = range(first, min(first + size, n_runs))
+            n = 2 * len(runs)
             for world in (0, 1):
-                _begin(process, world, runs, seed)
-            _play(process, mechanism, adversary, policy, 2 * len(runs))
+                # A run's noise stream does not depend on the batch.
+                streams = [np.random.default_rng((seed, world, run)) for run in runs]
+                options = {"traffic_seed": world, "start": 0}
+                process.reset(world * len(runs) + np.arange(len(runs)), streams, options)
+            adversary.reset(n)
+            for step in range(config.horizon_steps):
+                queries = policy.queries(step, adversary.score)
+                process.step(np.arange(n), queries.astype(np.int8))
+                adversary.update(step + 1, process.queried[:n], mechanism.released)
             parts.append([adversary.score.reshape(2, -1), np.sqrt(adversary.square).reshape(2, -1)])
-            bar.update(2 * len(runs))
+            bar.update(n)
     scores, distances = (np.concatenate(part, axis=1) for part in zip(*parts, strict=True))
     return Runs(scores, distances)
-
-
-def _begin(process: QueryProcess, world: int, runs: range, seed: int) -> None:
-    """Begin some runs of a world; a run's noise stream does not depend on the batch."""
-    episodes = np.arange(world * len(runs), (world + 1) * len(runs))
-    streams = [np.random.default_rng((seed, world, run)) for run in runs]
-    process.reset(episodes, streams, {"traffic_seed": world, "start": 0})
-
-
-def _play(
-    process: QueryProcess,
-    mechanism: RecordingMechanism,
-    adversary: Adversary,
-    policy: AdversaryPolicy,
-    n_runs: int,
-) -> None:
-    """Play runs to their end; their scores stay with the adversary."""
-    adversary.reset(n_runs)
-    for step in range(process.config.horizon_steps):
-        queries = policy.queries(step, adversary.score)
-        process.step(np.arange(n_runs), queries.astype(np.int8))
-        adversary.update(step + 1, process.queried[:n_runs], mechanism.released)

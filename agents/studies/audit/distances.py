@@ -1,4 +1,4 @@
-"""Distances by which one second of one vehicle moves the releases, in closed form."""
+"""Distances by which a second of a vehicle moves the releases, and the seconds that count."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from agents.studies.audit.worlds import Trajectory
 from dptse_env.config import EnvConfig
 from dptse_env.parts import flow_centre, make_release
-from dptse_env.release import SpeedRelease
+from dptse_env.release import CappedSettings, SpeedRelease
 from dptse_env.traffic import Record
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 
@@ -117,3 +117,22 @@ def plan_contributions(gains: FloatArray, always: BoolArray, cap: int) -> Contri
         reach = float(gains[fixed[:n]].sum() + free.sum())
         options.append(ContributionPlan(reach, cap - n, stop))
     return max(options)
+
+
+def replaces(config: EnvConfig) -> bool:
+    """Return whether adjacent records differ in a vehicle replaced by another, or in one more."""
+    privacy = config.privacy
+    return not isinstance(privacy, CappedSettings) or privacy.adjacency == "replace"
+
+
+def protects_seconds(config: EnvConfig) -> bool:
+    """Return whether a single second of a trip is protected, not the trip."""
+    privacy = config.privacy
+    return isinstance(privacy, CappedSettings) and privacy.unit == "event"
+
+
+def contribution_cap(config: EnvConfig) -> int:
+    """Return in how many queried steps of an episode a vehicle counts at most."""
+    privacy = config.privacy
+    cap = privacy.contribution_cap if isinstance(privacy, CappedSettings) else None
+    return cap or config.horizon_steps

@@ -26,16 +26,9 @@ class Finding:
     """The finding of one audit.
 
     Attributes:
-        title: The environment and the claim under attack.
         target: The difference of the two worlds in words.
-        policy: Name of the policy.
-        n_runs: Runs per world.
-        noise_factor: Factor of the declared noise.
         distance: Largest distance between the worlds' true sums, in units of the noise: the
             largest mu that this attack can show.
-        result: The test of the claim.
-        privacy: The configuration's privacy report.
-        seconds: Duration of the runs.
     """
 
     title: str

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import numpy as np
 
-from agents.studies.audit.distances import ReleaseDistances, plan_contributions
-from agents.studies.audit.protection import contribution_cap
+from agents.studies.audit.distances import (
+    ReleaseDistances,
+    contribution_cap,
+    plan_contributions,
+)
 from agents.studies.audit.worlds import AdjacentWorlds
 from dptse_env.config import EnvConfig
 from dptse_env.parts import make_interface, make_release
@@ -24,18 +25,6 @@ STRATEGIES = ("hunter", "adaptive", *PUBLIC_SCHEDULES)
 """Names of the policies."""
 
 
-class AdversaryPolicy(Protocol):
-    """Chooses queries from past releases and the adversary's knowledge."""
-
-    def queries(self, step: int, belief: FloatArray) -> BoolArray:
-        """Return the segments to query, shape (k, n_mainline).
-
-        Args:
-            step: Steps released so far.
-            belief: Log-likelihood ratio of world 1 of each run's transcript so far, shape (k,).
-        """
-
-
 class FixedQueries:
     """Queries by a plan, whatever is released.
 
@@ -48,7 +37,10 @@ class FixedQueries:
         self.plan = plan
 
     def queries(self, step: int, belief: FloatArray) -> BoolArray:
-        """See `AdversaryPolicy.queries`."""
+        """Return the segments to query, shape (k, n_mainline).
+
+        ``belief`` is the log-likelihood ratio of world 1 of each run's transcript so far, (k,).
+        """
         return np.tile(self.plan[step], (len(belief), 1))
 
 
@@ -56,7 +48,7 @@ class AdaptiveQueries(FixedQueries):
     """Follows its plan while it is undecided, and stops querying from then on."""
 
     def queries(self, step: int, belief: FloatArray) -> BoolArray:
-        """See `AdversaryPolicy.queries`."""
+        """See `FixedQueries.queries`."""
         undecided = np.abs(belief) < DECISION_THRESHOLD
         queries: BoolArray = self.plan[step] & undecided[:, None]
         return queries

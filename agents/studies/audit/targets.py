@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
 from agents.studies.audit.attack import planned_distance
-from agents.studies.audit.distances import ReleaseDistances, plan_contributions
-from agents.studies.audit.protection import contribution_cap, protects_seconds, replaces
+from agents.studies.audit.distances import (
+    ReleaseDistances,
+    contribution_cap,
+    plan_contributions,
+    protects_seconds,
+    replaces,
+)
 from agents.studies.audit.strategies import (
     PUBLIC_SCHEDULES,
     always_observed,
@@ -30,15 +34,7 @@ SHORTLIST = 12
 list grows sparser down the ranking instead of ending early."""
 
 
-@dataclass(frozen=True)
-class AuditTarget:
-    """Two worlds and a description of their difference."""
-
-    worlds: AdjacentWorlds
-    description: str
-
-
-def choose_target(config: EnvConfig, record: Record, kind: str, policy: str) -> AuditTarget:
+def choose_target(config: EnvConfig, record: Record, kind: str, policy: str) -> AdjacentWorlds:
     """Return the two worlds of a kind that a policy distinguishes best.
 
     Args:
@@ -68,16 +64,16 @@ def choose_target(config: EnvConfig, record: Record, kind: str, policy: str) -> 
     vehicle = Trajectory.from_record(record, first)
     if kind == "deleted":
         pair = _protected(config, record, seen, (vehicle, Trajectory.absent()))
-        worlds = AdjacentWorlds(record.without(first), pair)
-        return AuditTarget(worlds, f"vehicle {first} of the record, or none in its place")
-    pairs = {}
+        description = f"vehicle {first} of the record, or none in its place"
+        return AdjacentWorlds(record.without(first), pair, description)
+    candidates = []
     for other in np.unique(ranked[np.geomspace(1, len(ranked) - 1, SHORTLIST).astype(int)]):
         rest = record.without(first).without(other)
         partner = Trajectory.from_record(record, other)
         pair = _protected(config, rest, seen, (vehicle, partner))
-        pairs[int(other)] = AdjacentWorlds(rest, pair)
-    second = max(pairs, key=lambda other: _reached(config, pairs[other], policy))
-    return AuditTarget(pairs[second], f"vehicle {first} of the record, or vehicle {second} instead")
+        description = f"vehicle {first} of the record, or vehicle {other} instead"
+        candidates.append(AdjacentWorlds(rest, pair, description))
+    return max(candidates, key=lambda worlds: _reached(config, worlds, policy))
 
 
 def _observable(config: EnvConfig, record: Record, policy: str) -> BoolArray:
@@ -116,7 +112,7 @@ def _reached(config: EnvConfig, worlds: AdjacentWorlds, policy: str) -> float:
     return planned_distance(config, worlds, plan, ReleaseDistances.from_config(config).sigma)
 
 
-def _worst_case(config: EnvConfig, record: Record, policy: str) -> AuditTarget:
+def _worst_case(config: EnvConfig, record: Record, policy: str) -> AdjacentWorlds:
     """Return the two trajectories of the closed form that are furthest apart."""
     corridor, seconds = config.corridor, np.arange(1, config.horizon_steps + 1)
     load = record.counts[:, : corridor.n_mainline].sum(axis=0)
@@ -132,12 +128,14 @@ def _worst_case(config: EnvConfig, record: Record, policy: str) -> AuditTarget:
             f"there at {limit:g} km/h": Trajectory.constant(seconds, here, limit),
         }
     seen = _observable(config, record, policy)
-    worlds = {
-        name: AdjacentWorlds(record, _protected(config, record, seen, (stands, other)))
+    added = f"an added vehicle that stands on segment {here}"
+    candidates = [
+        AdjacentWorlds(
+            record, _protected(config, record, seen, (stands, other)), f"{added}, or {name}"
+        )
         for name, other in alternatives.items()
-    }
-    worst = max(worlds, key=lambda name: _reached(config, worlds[name], policy))
-    return AuditTarget(worlds[worst], f"an added vehicle that stands on segment {here}, or {worst}")
+    ]
+    return max(candidates, key=lambda worlds: _reached(config, worlds, policy))
 
 
 def _protected(

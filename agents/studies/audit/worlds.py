@@ -58,12 +58,15 @@ class AdjacentWorlds(RecordLibrary):
     Attributes:
         rest: The other vehicles.
         trajectories: The vehicle in either world.
+        description: The difference in words.
     """
 
-    def __init__(self, rest: Record, trajectories: tuple[Trajectory, Trajectory]) -> None:
+    def __init__(
+        self, rest: Record, trajectories: tuple[Trajectory, Trajectory], description: str = ""
+    ) -> None:
         """Add the vehicle to the rest."""
         super().__init__()
-        self.rest, self.trajectories = rest, trajectories
+        self.rest, self.trajectories, self.description = rest, trajectories, description
         self._records = tuple(_add(rest, each) for each in trajectories)
 
     def get(self, corridor: Corridor, seed: int) -> Record:

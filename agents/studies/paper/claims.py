@@ -17,12 +17,7 @@ Verdict = Literal["holds", "does not hold", "undecided", "not measured"]
 
 @dataclass(frozen=True)
 class ExpectedRange:
-    """An open range of values.
-
-    Attributes:
-        low: Lower end.
-        high: Upper end.
-    """
+    """An open range of values."""
 
     low: float = -math.inf
     high: float = math.inf
@@ -45,10 +40,6 @@ class Claim:
     """A statement that measurements can support or refute.
 
     Attributes:
-        key: Short name.
-        statement: The claim.
-        quantity: The quantity that is measured.
-        unit: Unit of the quantity.
         expected: ExpectedRange in which the quantity should lie.
         measure: Returns the interval of each part by its name.
     """
@@ -66,10 +57,7 @@ class Outcome:
     """Measurement and verdict of a claim under one setting.
 
     Attributes:
-        claim: The claim.
-        setting: The setting.
         parts: Interval and verdict by the name of the part; empty if not measured.
-        verdict: Verdict of the claim.
     """
 
     claim: Claim

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,24 +14,18 @@ from matplotlib.ticker import NullFormatter
 from agents.evaluation.episodes import EpisodeScore, watch_episode
 from agents.evaluation.figures import (
     ERROR_TICKS,
+    RoadMap,
     add_frame,
     add_legend,
     draw_maps,
     estimate_map,
     make_figure,
-    save_figure,
-    truth_map,
+    set_log_ticks,
+    spread,
 )
 from agents.evaluation.statistics import Interval, geometric_mean_interval, mean_interval
 from agents.experiments.cells import DENSITY, METRICS, SPEED
-from agents.experiments.plots import (
-    ESTIMATOR_LOOKS,
-    LABELS,
-    draw_curve,
-    draw_level,
-    set_log_ticks,
-    shifted,
-)
+from agents.experiments.plots import ESTIMATOR_LOOKS, LABELS, draw_curve, draw_level, shifted
 from agents.experiments.runner import make_env
 from agents.studies.paper.plan import PAPER_ESTIMATORS, SETTINGS, PaperCell, PaperDesign, Setting
 from agents.studies.paper.results import PaperResults
@@ -51,9 +43,7 @@ class SweepLayout:
     """Layout of a figure of a sweep.
 
     Attributes:
-        field: The sweep.
         metrics: One block of rows each.
-        columns: Panels side by side.
         log: Whether the vertical axis is logarithmic.
         log_places: Whether the horizontal axis is.
     """
@@ -138,12 +128,8 @@ def draw_open_loop(
         return
     axis.annotate(
         f"open loop {alone.mean:.1f} ± {alone.half_width:.1f} {unit}, off the scale ↑",
-        (0.98, 0.985),
-        xycoords="axes fraction",
-        ha="right",
-        va="top",
-        fontsize=7.5,
-    )
+        (0.98, 0.985), xycoords="axes fraction", ha="right", va="top", fontsize=7.5,
+    )  # fmt: skip
     low, high = axis.get_ylim()
     axis.set_ylim(low, high + 0.08 * (high - low))  # space for the text
 
@@ -182,28 +168,19 @@ def _time_panel(axis: Axes, results: PaperResults, places: Any, relative: bool) 
     shades = ("#0072b2", "#56b4e9", "#d55e00", "#e69f00")
     for k, setting in enumerate(SETTINGS):
         reference = results.seconds("ekf", setting) if relative else 1e-3
-        for place, name in zip(places, names, strict=True):
-            time = geometric_mean_interval(results.seconds(name, setting) / reference)
-            axis.errorbar(
-                [time.mean],
-                [place + 0.24 - 0.16 * k],
-                xerr=[[time.mean - time.low], [time.high - time.mean]],
-                fmt="o",
-                markersize=4,
-                capsize=2,
-                color=shades[k],
-                label=f"here, {setting}" if name == names[0] else None,
-            )
+        times = [
+            geometric_mean_interval(results.seconds(name, setting) / reference) for name in names
+        ]
+        axis.errorbar(
+            [time.mean for time in times], places + 0.24 - 0.16 * k, xerr=spread(times),
+            fmt="o", markersize=4, capsize=2, color=shades[k], label=f"here, {setting}",
+        )  # fmt: skip
     scale = PAPER_SECONDS["ekf"] if relative else 1e-3
     published = [k for k, name in enumerate(names) if name in PAPER_ESTIMATORS]
     axis.plot(
-        [PAPER_SECONDS[names[k]] / scale for k in published],
-        [places[k] for k in published],
-        linestyle="none",
-        marker="x",
-        color="#000000",
-        label="the paper",
-    )
+        [PAPER_SECONDS[names[k]] / scale for k in published], [places[k] for k in published],
+        linestyle="none", marker="x", color="#000000", label="the paper",
+    )  # fmt: skip
 
 
 Watched = dict[PaperCell, tuple[EpisodeScore, History]]
@@ -226,16 +203,8 @@ def draw_pictures(design: PaperDesign, watched: Watched) -> Figure:
     columns = []
     for setting in SETTINGS:
         episodes = [watched[design.picture(name, setting)] for name in design.all_estimators]
-        maps = [truth_map(episodes[0][1], f"{setting}\ntruth")]
+        maps = [RoadMap(f"{setting}\ntruth", episodes[0][1].truth, episodes[0][1])]
         for name, (score, history) in zip(design.all_estimators, episodes, strict=True):
             maps.append(estimate_map(history, score, LABELS[name]))
         columns.append(maps)
     return draw_maps(columns, width=14.0)
-
-
-def draw_figures(folder: Path, results: PaperResults, titles: Sequence[str]) -> None:
-    """Save the figures of results 1, 3, 4 and 5, with their titles in this order."""
-    figures = {name: draw_sweeps(results, layout) for name, layout in LAYOUTS.items()}
-    figures["fig5_run_time.png"] = draw_times(results)
-    for (name, figure), title in zip(figures.items(), titles, strict=True):
-        save_figure(figure, folder / name, title)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from itertools import combinations, pairwise
 
 import numpy as np
@@ -19,7 +19,8 @@ from agents.studies.paper.plan import PAPER_ESTIMATORS, Setting
 from agents.studies.paper.results import PaperResults, correlations, roughness, slopes
 from dptse_env.utils.arrays import FloatArray
 
-Measure = Callable[[PaperResults, Setting], Mapping[str, Interval]]
+Parts = Mapping[str, Interval]
+"""Intervals by the name of the part of a claim."""
 
 
 def percent(values: FloatArray, reference: FloatArray) -> Interval:
@@ -33,59 +34,56 @@ def _mean(m: PaperResults, field: str, name: str, setting: Setting, metric: str)
     return mean
 
 
-def falls(metric: str) -> Measure:
+def falls(m: PaperResults, setting: Setting, *, metric: str) -> Parts:
     """Measure the slope of the error over the number of CV segments."""
-
-    def measure(m: PaperResults, setting: Setting) -> Mapping[str, Interval]:
-        places = np.array(m.design.sweeps["bandwidth"])
-        curves = {name: m.curve("bandwidth", name, setting, metric) for name in PAPER_ESTIMATORS}
-        return {LABELS[name]: mean_interval(slopes(places, y)) for name, y in curves.items()}
-
-    return measure
+    places = np.array(m.design.sweeps["bandwidth"])
+    curves = {name: m.curve("bandwidth", name, setting, metric) for name in PAPER_ESTIMATORS}
+    return {LABELS[name]: mean_interval(slopes(places, y)) for name, y in curves.items()}
 
 
-def against_others(name: str, metric: str, *fields: str) -> Measure:
-    """Measure an estimator's mean error over a sweep minus that of each other estimator."""
-
-    def measure(m: PaperResults, setting: Setting) -> Mapping[str, Interval]:
-        parts = {}
-        for field in fields:
-            error = _mean(m, field, name, setting, metric)
-            for other in PAPER_ESTIMATORS:
-                if other != name:
-                    label = f"{LABELS[name]} − {LABELS[other]}"
-                    label += f", over {_AXES[field]}" if len(fields) > 1 else ""
-                    reference = _mean(m, field, other, setting, metric)
-                    parts[label] = paired_difference(error, reference)
-        return parts
-
-    return measure
+def against_rest(
+    m: PaperResults,
+    setting: Setting,
+    *,
+    name: str,
+    metric: str,
+    fields: tuple[str, ...] = ("bandwidth",),
+) -> Parts:
+    """Measure an estimator's mean error over sweeps minus that of each other estimator."""
+    parts = {}
+    for field in fields:
+        error = _mean(m, field, name, setting, metric)
+        for other in PAPER_ESTIMATORS:
+            if other != name:
+                label = f"{LABELS[name]} − {LABELS[other]}"
+                label += f", over {_AXES[field]}" if len(fields) > 1 else ""
+                reference = _mean(m, field, other, setting, metric)
+                parts[label] = paired_difference(error, reference)
+    return parts
 
 
 _AXES = {"bandwidth": "CV segments", "epsilon": "ε", "delta": "δ"}
 
 
-def percent_apart(*pairs: tuple[str, str, str]) -> Measure:
+def percent_apart(
+    m: PaperResults, setting: Setting, *, pairs: Sequence[tuple[str, str, str]]
+) -> Parts:
     """Measure differences of mean errors over CV segments, each (estimator, reference, metric)."""
-
-    def measure(m: PaperResults, setting: Setting) -> Mapping[str, Interval]:
-        return {
-            f"{LABELS[a]} to {LABELS[b]}, {METRICS[metric][0]}": percent(
-                _mean(m, "bandwidth", a, setting, metric), _mean(m, "bandwidth", b, setting, metric)
-            )
-            for a, b, metric in pairs
-        }
-
-    return measure
+    return {
+        f"{LABELS[a]} to {LABELS[b]}, {METRICS[metric][0]}": percent(
+            _mean(m, "bandwidth", a, setting, metric), _mean(m, "bandwidth", b, setting, metric)
+        )
+        for a, b, metric in pairs
+    }
 
 
-def mhe_behind_ekf(m: PaperResults, setting: Setting) -> Mapping[str, Interval]:
+def mhe_behind_ekf(m: PaperResults, setting: Setting) -> Parts:
     """Measure the MHE's speed error above the EKF's."""
     mhe, ekf = (_mean(m, "bandwidth", name, setting, SPEED) for name in ("mhe", "ekf"))
     return {"MHE − EKF": paired_difference(mhe, ekf)}
 
 
-def enkf_rougher(m: PaperResults, setting: Setting) -> Mapping[str, Interval]:
+def enkf_rougher(m: PaperResults, setting: Setting) -> Parts:
     """Measure the roughness of the EnKF's density curve minus that of each other estimator."""
     rough = {
         name: roughness(m.curve("bandwidth", name, setting, DENSITY)) for name in PAPER_ESTIMATORS
@@ -106,7 +104,7 @@ def _correlation(a: FloatArray, b: FloatArray) -> Interval:
     return Interval(mean, low, high, z.n)
 
 
-def alike_over_epsilon(m: PaperResults, setting: Setting) -> Mapping[str, Interval]:
+def alike_over_epsilon(m: PaperResults, setting: Setting) -> Parts:
     """Measure the correlation of two estimators' density curves over epsilon."""
     curves = {name: m.curve("epsilon", name, setting, DENSITY) for name in PAPER_ESTIMATORS}
     return {
@@ -115,7 +113,7 @@ def alike_over_epsilon(m: PaperResults, setting: Setting) -> Mapping[str, Interv
     }
 
 
-def speed_like_density(m: PaperResults, setting: Setting) -> Mapping[str, Interval]:
+def speed_like_density(m: PaperResults, setting: Setting) -> Parts:
     """Measure the correlation of an estimator's density and speed curves."""
     return {
         f"{LABELS[name]}, over {_AXES[field]}": _correlation(
@@ -126,7 +124,7 @@ def speed_like_density(m: PaperResults, setting: Setting) -> Mapping[str, Interv
     }
 
 
-def epsilon_matters_more(m: PaperResults, setting: Setting) -> Mapping[str, Interval]:
+def epsilon_matters_more(m: PaperResults, setting: Setting) -> Parts:
     """Measure the fall of the density error from end to end, over epsilon minus over delta."""
     parts = {}
     for name in PAPER_ESTIMATORS:
@@ -136,27 +134,27 @@ def epsilon_matters_more(m: PaperResults, setting: Setting) -> Mapping[str, Inte
     return parts
 
 
-def growth(field: str, low: float | None, high: float | None) -> Measure:
+def growth(
+    m: PaperResults,
+    setting: Setting,
+    *,
+    field: str,
+    low: float | None = None,
+    high: float | None = None,
+) -> Parts:
     """Measure the excess of the density error at one value of a sweep over a higher value [%].
 
-    Args:
-        field: The sweep.
-        low: The value of more privacy; None for the lowest.
-        high: The value of less privacy; None for the highest.
+    The values are the lowest and the highest of the sweep unless they are given.
     """
-
-    def measure(m: PaperResults, setting: Setting) -> Mapping[str, Interval]:
-        values = m.design.sweeps[field]
-        ends = values[0] if low is None else low, values[-1] if high is None else high
-        return {
-            LABELS[name]: percent(*(m.at(field, end, name, setting, DENSITY) for end in ends))
-            for name in PAPER_ESTIMATORS
-        }
-
-    return measure
+    values = m.design.sweeps[field]
+    ends = values[0] if low is None else low, values[-1] if high is None else high
+    return {
+        LABELS[name]: percent(*(m.at(field, end, name, setting, DENSITY) for end in ends))
+        for name in PAPER_ESTIMATORS
+    }
 
 
-def time_order(m: PaperResults, setting: Setting) -> Mapping[str, Interval]:
+def time_order(m: PaperResults, setting: Setting) -> Parts:
     """Measure the ratios of step times of neighbours in the paper's order."""
     order = ("ukf", "enkf", "mhe", "ekf")
     return {
@@ -167,16 +165,12 @@ def time_order(m: PaperResults, setting: Setting) -> Mapping[str, Interval]:
     }
 
 
-def below(reference: str, metric: str) -> Measure:
+def above_baseline(m: PaperResults, setting: Setting, *, baseline: str, metric: str) -> Parts:
     """Measure every estimator's error minus a baseline's at the base point."""
-
-    def measure(m: PaperResults, setting: Setting) -> Mapping[str, Interval]:
-        other = m.base(reference, setting, metric)
-        return {
-            f"{LABELS[name]} − {LABELS[reference]}": paired_difference(
-                m.base(name, setting, metric), other
-            )
-            for name in PAPER_ESTIMATORS
-        }
-
-    return measure
+    reference = m.base(baseline, setting, metric)
+    return {
+        f"{LABELS[name]} − {LABELS[baseline]}": paired_difference(
+            m.base(name, setting, metric), reference
+        )
+        for name in PAPER_ESTIMATORS
+    }

@@ -6,12 +6,16 @@ before the full run, after a look at three traffic seeds.
 
 from __future__ import annotations
 
-from agents.experiments.cells import DENSITY, SPEED
+from functools import partial
+from itertools import product
+
+from agents.experiments.cells import DENSITY, METRICS, SPEED
+from agents.experiments.plots import LABELS
 from agents.studies.paper.claims import ABOVE_ZERO, BELOW_ZERO, Claim, ExpectedRange
 from agents.studies.paper.measures import (
-    against_others,
+    above_baseline,
+    against_rest,
     alike_over_epsilon,
-    below,
     enkf_rougher,
     epsilon_matters_more,
     falls,
@@ -21,7 +25,7 @@ from agents.studies.paper.measures import (
     speed_like_density,
     time_order,
 )
-from agents.studies.paper.plan import EPSILON
+from agents.studies.paper.plan import BASELINE_ESTIMATORS, EPSILON
 
 CLOSE = 5.0
 """Two errors are close if they differ by less than this [%]."""
@@ -34,53 +38,44 @@ _OVER_CV = "mean over the numbers of CV segments"
 _APART = f"relative difference of the RMSE, {_OVER_CV}"
 
 CLAIMS = (
-    Claim(
-        "P1", "The density error of every technique falls with more CV segments.",
-        "least-squares slope of the density RMSE over the number of CV segments",
-        "veh/km a segment", BELOW_ZERO, falls(DENSITY),
+    *(
+        Claim(
+            f"P{k}", f"The {name} error of every technique falls with more CV segments.",
+            f"least-squares slope of the {name} RMSE over the number of CV segments",
+            f"{unit} a segment", BELOW_ZERO, partial(falls, metric=metric),
+        )
+        for k, (metric, (name, unit)) in enumerate(METRICS.items(), start=1)
     ),
-    Claim(
-        "P2", "The speed error of every technique falls with more CV segments.",
-        "least-squares slope of the speed RMSE over the number of CV segments",
-        "km/h a segment", BELOW_ZERO, falls(SPEED),
-    ),
-    Claim(
-        "P3", "UKF performs best in density.",
-        f"difference of density RMSE, {_OVER_CV}", "veh/km", BELOW_ZERO,
-        against_others("ukf", DENSITY, "bandwidth"),
-    ),
-    Claim(
-        "P4", "UKF performs best in speed.",
-        f"difference of speed RMSE, {_OVER_CV}", "km/h", BELOW_ZERO,
-        against_others("ukf", SPEED, "bandwidth"),
-    ),
-    Claim(
-        "P5", "EnKF performs worst in density.",
-        f"difference of density RMSE, {_OVER_CV}", "veh/km", ABOVE_ZERO,
-        against_others("enkf", DENSITY, "bandwidth"),
-    ),
-    Claim(
-        "P6", "EnKF performs worst in speed.",
-        f"difference of speed RMSE, {_OVER_CV}", "km/h", ABOVE_ZERO,
-        against_others("enkf", SPEED, "bandwidth"),
+    *(
+        Claim(
+            f"P{k}", f"{LABELS[estimator]} performs {rank} in {METRICS[metric][0]}.",
+            f"difference of {METRICS[metric][0]} RMSE, {_OVER_CV}", METRICS[metric][1], expected,
+            partial(against_rest, name=estimator, metric=metric),
+        )
+        for k, (estimator, rank, expected, metric) in enumerate(
+            (
+                ("ukf", "best", BELOW_ZERO, DENSITY), ("ukf", "best", BELOW_ZERO, SPEED),
+                ("enkf", "worst", ABOVE_ZERO, DENSITY), ("enkf", "worst", ABOVE_ZERO, SPEED),
+            ),
+            start=3,
+        )
     ),
     Claim(
         "P7", "In density, MHE and EKF follow UKF closely.",
         _APART, "%", ExpectedRange(-CLOSE, CLOSE),
-        percent_apart(("mhe", "ukf", DENSITY), ("ekf", "ukf", DENSITY)),
+        partial(percent_apart, pairs=(("mhe", "ukf", DENSITY), ("ekf", "ukf", DENSITY))),
     ),
     Claim(
-        "P8", "In speed, EKF follows UKF closely.",
-        _APART, "%", ExpectedRange(-CLOSE, CLOSE), percent_apart(("ekf", "ukf", SPEED)),
+        "P8", "In speed, EKF follows UKF closely.", _APART, "%", ExpectedRange(-CLOSE, CLOSE),
+        partial(percent_apart, pairs=(("ekf", "ukf", SPEED),)),
     ),
     Claim(
         "P9", "MHE falls behind EKF in speed.",
         f"difference of speed RMSE, {_OVER_CV}", "km/h", ABOVE_ZERO, mhe_behind_ekf,
     ),
     Claim(
-        "P10", "EKF and MHE perform comparably.",
-        _APART, "%", ExpectedRange(-CLOSE, CLOSE),
-        percent_apart(("mhe", "ekf", DENSITY), ("mhe", "ekf", SPEED)),
+        "P10", "EKF and MHE perform comparably.", _APART, "%", ExpectedRange(-CLOSE, CLOSE),
+        partial(percent_apart, pairs=(("mhe", "ekf", DENSITY), ("mhe", "ekf", SPEED))),
     ),
     Claim(
         "P11", "EnKF's error varies more from one number of CV segments to the next.",
@@ -90,12 +85,12 @@ CLAIMS = (
     Claim(
         "P12", "UKF performs best in density under other ε and δ, too.",
         "difference of density RMSE, mean over the values of ε and of δ", "veh/km", BELOW_ZERO,
-        against_others("ukf", DENSITY, "epsilon", "delta"),
+        partial(against_rest, name="ukf", metric=DENSITY, fields=("epsilon", "delta")),
     ),
     Claim(
         "P13", "EnKF performs worst in density under other ε and δ, too.",
         "difference of density RMSE, mean over the values of ε and of δ", "veh/km", ABOVE_ZERO,
-        against_others("enkf", DENSITY, "epsilon", "delta"),
+        partial(against_rest, name="enkf", metric=DENSITY, fields=("epsilon", "delta")),
     ),
     Claim(
         "P14", "All techniques vary similarly with privacy.",
@@ -115,17 +110,17 @@ CLAIMS = (
     Claim(
         "P17", "The variation is small over the full range of δ.",
         "excess of the density RMSE at the lowest δ over that at the highest", "%",
-        ExpectedRange(-SMALL, SMALL), growth("delta", None, None),
+        ExpectedRange(-SMALL, SMALL), partial(growth, field="delta"),
     ),
     Claim(
         "P18", "The variation is small for ε above 1.",
         "excess of the density RMSE at ε = 1 over that at the highest ε", "%",
-        ExpectedRange(-SMALL, SMALL), growth("epsilon", EPSILON, None),
+        ExpectedRange(-SMALL, SMALL), partial(growth, field="epsilon", low=EPSILON),
     ),
     Claim(
         "P19", "The error worsens quickly as ε goes from 1 towards 0.",
         "excess of the density RMSE at the lowest ε over that at ε = 1", "%",
-        ExpectedRange(low=SMALL), growth("epsilon", None, EPSILON),
+        ExpectedRange(low=SMALL), partial(growth, field="epsilon", high=EPSILON),
     ),
     Claim(
         "P20", "A step takes UKF the least time, then EnKF, MHE and EKF.",
@@ -134,26 +129,12 @@ CLAIMS = (
 )  # fmt: skip
 """Claims of the paper's section on results, in its order."""
 
-PROJECT_TARGETS = (
+PROJECT_TARGETS = tuple(
     Claim(
-        "T1", "Every estimator beats the random walk in density.",
-        "difference of density RMSE at the base point", "veh/km", BELOW_ZERO,
-        below("random_walk", DENSITY),
-    ),
-    Claim(
-        "T2", "Every estimator beats the random walk in speed.",
-        "difference of speed RMSE at the base point", "km/h", BELOW_ZERO,
-        below("random_walk", SPEED),
-    ),
-    Claim(
-        "T3", "Every estimator beats the open loop in density.",
-        "difference of density RMSE at the base point", "veh/km", BELOW_ZERO,
-        below("open_loop", DENSITY),
-    ),
-    Claim(
-        "T4", "Every estimator beats the open loop in speed.",
-        "difference of speed RMSE at the base point", "km/h", BELOW_ZERO,
-        below("open_loop", SPEED),
-    ),
+        f"T{k}", f"Every estimator beats the {LABELS[baseline]} in {METRICS[metric][0]}.",
+        f"difference of {METRICS[metric][0]} RMSE at the base point", METRICS[metric][1],
+        BELOW_ZERO, partial(above_baseline, baseline=baseline, metric=metric),
+    )
+    for k, (baseline, metric) in enumerate(product(BASELINE_ESTIMATORS, METRICS), start=1)
 )  # fmt: skip
 """Targets of this project for its estimators."""

@@ -19,12 +19,7 @@ EPSILON, DELTA = 1.0, 0.05
 
 
 class Setting(NamedTuple):
-    """A choice that the paper leaves open; each result is shown under all of them.
-
-    Attributes:
-        privacy: Privacy preset.
-        parameters: ARZ parameter set of the estimator's model.
-    """
+    """A choice that the paper leaves open; each result is shown under all of them."""
 
     privacy: str
     parameters: str
@@ -43,14 +38,9 @@ SETTINGS = tuple(
 
 @dataclass(frozen=True)
 class PaperCell:
-    """One configuration, run on every traffic seed.
+    """A configuration, run on every traffic seed.
 
     Attributes:
-        estimator: Name of the estimator.
-        parameters: Name of the ARZ parameter set.
-        privacy: Privacy preset.
-        epsilon: Privacy parameter.
-        delta: Privacy parameter.
         bandwidth: CV segments queried a second.
     """
 

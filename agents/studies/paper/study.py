@@ -8,26 +8,25 @@ from typing import Any
 
 from agents.evaluation.episodes import EpisodeScore
 from agents.evaluation.figures import save_figure
-from agents.experiments.cells import DENSITY, SPEED
 from agents.experiments.engine import run_all
 from agents.experiments.ledger import Ledger
 from agents.experiments.provenance import check_folder, design_provenance, take_folder
 from agents.experiments.reports import write_report
 from agents.experiments.runner import Workplace, missing_tasks, run_task
-from agents.experiments.tables import format_range, settings_table, versions_table, write_summary
+from agents.experiments.tables import format_range, write_summary
+from agents.studies.paper import paper_claims, plan, tables
 from agents.studies.paper.claims import judge_all
-from agents.studies.paper.figures import OFF_SCALE, draw_figures, draw_pictures, watch_pictures
-from agents.studies.paper.paper_claims import CLAIMS, CLOSE, PROJECT_TARGETS, SIMILAR, SMALL
+from agents.studies.paper.figures import (
+    LAYOUTS,
+    OFF_SCALE,
+    draw_pictures,
+    draw_sweeps,
+    draw_times,
+    watch_pictures,
+)
+from agents.studies.paper.paper_claims import CLAIMS, PROJECT_TARGETS
 from agents.studies.paper.plan import DELTA, EPSILON, PaperCell, PaperDesign
 from agents.studies.paper.results import PaperResults
-from agents.studies.paper.tables import (
-    base_table,
-    grid_table,
-    health_table,
-    parts_table,
-    time_table,
-    verdict_table,
-)
 from agents.studies.paper.timing import StepTime, time_all, untimed
 
 TEMPLATES = Path(__file__).parent
@@ -39,11 +38,6 @@ def run(design: PaperDesign, place: Workplace, command: str) -> None:
 
     Result 2 shows episodes, so its picture is drawn again only if it is missing or anything was
     run.
-
-    Args:
-        design: The plan.
-        place: Where it runs and leaves its results.
-        command: The command that makes this report.
 
     Raises:
         ValueError: A value of the design is out of range, or the folder has other results.
@@ -71,13 +65,15 @@ def draw(place: Workplace, results: PaperResults) -> None:
     design, point = results.design, f"(ε, δ) = ({EPSILON:g}, {DELTA:g})"
     seeds = f"traffic seeds {format_range(design.traffic_seeds)}, 95 % intervals"
     segments = f"{design.privacy_segments} CV segments"
-    titles = [
-        f"Error against the number of CV segments, {point}; {seeds}",
-        f"Density error against ε, δ = {DELTA:g}, {segments}; {seeds}",
-        f"Density error against δ, ε = {EPSILON:g}, {segments}; {seeds}",
-        f"Wall time of predict, update and estimate, one episode at a time, {point}, {segments}",
-    ]
-    draw_figures(place.folder, results, titles)
+    titles = {
+        "fig1_cv_segments.png": f"Error against the number of CV segments, {point}; {seeds}",
+        "fig3_epsilon.png": f"Density error against ε, δ = {DELTA:g}, {segments}; {seeds}",
+        "fig4_delta.png": f"Density error against δ, ε = {EPSILON:g}, {segments}; {seeds}",
+    }
+    for name, title in titles.items():
+        save_figure(draw_sweeps(results, LAYOUTS[name]), place.folder / name, title)
+    title = f"Wall time of predict, update and estimate, one episode at a time, {point}, {segments}"
+    save_figure(draw_times(results), place.folder / "fig5_run_time.png", title)
     if not (place.folder / PICTURE).exists():
         first, n_segments = design.traffic_seeds[0], design.picture_segments
         title = f"Density over space and time, traffic seed {first}, {n_segments} CV segments"
@@ -86,28 +82,16 @@ def draw(place: Workplace, results: PaperResults) -> None:
 
 
 def report(results: PaperResults, recorded: Mapping[str, Any], command: str) -> dict[str, Any]:
-    """Return the tables and numbers of the report."""
-    claims, targets = judge_all(CLAIMS, results), judge_all(PROJECT_TARGETS, results)
-    details = [(outcomes[0].claim, parts_table(outcomes)) for outcomes in (*claims, *targets)]
+    """Return the names in the template of the report."""
     return {
+        "results": results,
         "design": results.design,
-        "n_cells": len(results.design.cells()),
         "command": command,
-        "epsilon": EPSILON,
-        "delta": DELTA,
-        "close": CLOSE,
-        "small": SMALL,
-        "similar": SIMILAR,
-        "off_scale": OFF_SCALE,
-        "claims_table": verdict_table(claims),
-        "targets_table": verdict_table(targets),
-        "density_table": base_table(results, DENSITY),
-        "speed_table": base_table(results, SPEED),
-        "time_table": time_table(results),
-        "health_table": health_table(results),
-        "details": details,
-        "grid_table": grid_table(results),
-        "versions_table": versions_table(recorded["made_with"]["versions"], recorded),
-        "settings_table": settings_table(recorded),
         "provenance": recorded,
+        "claims": judge_all(CLAIMS, results),
+        "targets": judge_all(PROJECT_TARGETS, results),
+        "tables": tables,
+        "plan": plan,
+        "bounds": paper_claims,
+        "off_scale": OFF_SCALE,
     }

@@ -25,7 +25,6 @@ class StepTime:
     """Time of an estimator in one episode.
 
     Attributes:
-        traffic_seed: The traffic it followed.
         seconds: Wall time of predict, update and estimate, mean over the episode's steps [s].
     """
 
@@ -43,10 +42,10 @@ class Stopwatch:
             setattr(timed, name, self._timed(getattr(timed, name)))
 
     def _timed(self, method: Callable[..., Any]) -> Callable[..., Any]:
-        def call(*args: Any) -> Any:
+        def call(*args: Any, **keywords: Any) -> Any:
             start = time.perf_counter()
             try:
-                return method(*args)
+                return method(*args, **keywords)
             finally:
                 self.seconds += time.perf_counter() - start
 

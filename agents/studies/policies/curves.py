@@ -18,8 +18,6 @@ class Curve:
     """The error of a training on its validation traffic.
 
     Attributes:
-        recipe: Its recipe.
-        training_seed: Its seed.
         steps: Seconds of traffic simulated so far.
         errors: Normalised RMSE × 1000 with deterministic actions, at each of the steps.
     """
@@ -45,14 +43,12 @@ def read_curves(checkpoints: Iterable[Checkpoint], cell: str) -> list[Curve]:
 
 
 def _read(path: Path, checkpoint: Checkpoint) -> Curve:
-    points = []
-    with path.open(encoding="utf-8", newline="") as file:
-        try:
-            for row in csv.DictReader(file):
-                if row[_ERROR]:
-                    points.append((float(row["steps"]), 1000.0 * float(row[_ERROR])))
-        except (KeyError, ValueError) as problem:
-            raise ValueError(f"{path} is no learning curve: {problem!r}") from problem
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            rows = [row for row in csv.DictReader(file) if row[_ERROR]]
+        points = [(float(row["steps"]), 1000.0 * float(row[_ERROR])) for row in rows]
+    except (KeyError, ValueError) as problem:
+        raise ValueError(f"{path} is no learning curve: {problem!r}") from problem
     if not points:
         raise ValueError(f"{path} is no learning curve: it has no validation")
     steps, errors = zip(*points, strict=True)

@@ -7,7 +7,7 @@ from itertools import cycle
 import numpy as np
 from matplotlib.figure import Figure
 
-from agents.evaluation.figures import add_frame, add_legend, draw_dot, make_figure
+from agents.evaluation.figures import draw_dot, finish_figure, make_figure
 from agents.evaluation.statistics import mean
 from agents.studies.policies.plan import PRIMARY, REFERENCE, Entry
 from agents.studies.policies.queries import (
@@ -45,7 +45,7 @@ def draw_ranking(results: PolicyResults) -> Figure:
             draw_dot(axis, interval, place, KIND_COLOURS[rank.kind], rank.kind)
         axis.set_xlabel(f"{name} error [{unit}]")
     axes[0].set_yticks(places, [rank.label for rank in ranks])
-    return _finish(figure)
+    return finish_figure(figure, margin=0.12)
 
 
 def draw_cells(results: PolicyResults) -> Figure:
@@ -67,7 +67,7 @@ def draw_cells(results: PolicyResults) -> Figure:
     axis.axvline(0.0, color="#333333", linewidth=1.0)
     axis.set_yticks(places, [label for label, _, _ in rows])
     axis.set_xlabel("error below the reference [%]")
-    return _finish(figure)
+    return finish_figure(figure, margin=0.12)
 
 
 def draw_curves(results: PolicyResults) -> Figure:
@@ -93,7 +93,7 @@ def draw_curves(results: PolicyResults) -> Figure:
     axis.set_xscale("symlog", linthresh=LINEAR_UP_TO)
     axis.set_xlabel("seconds simulated in training")
     axis.set_ylabel("error on validation traffic × 1000")
-    return _finish(figure)
+    return finish_figure(figure, margin=0.12)
 
 
 def draw_queries(results: PolicyResults) -> Figure:
@@ -118,7 +118,7 @@ def draw_queries(results: PolicyResults) -> Figure:
     axes[0, 2].axis("off")
     for axis in (axes[0, 0], *axes[1]):
         axis.set_ylim(bottom=0.0)
-    return _finish(figure)
+    return finish_figure(figure, margin=0.12)
 
 
 def _drawn(results: PolicyResults) -> dict[str, list[QueryCounts]]:
@@ -137,12 +137,3 @@ def _drawn(results: PolicyResults) -> dict[str, list[QueryCounts]]:
         label: [results.queries[entry, seed] for entry in entries for seed in seeds]
         for label, entries in named.items()
     }
-
-
-def _finish(figure: Figure) -> Figure:
-    """Frame all panels, and name their colours once below them."""
-    for axis in figure.axes:
-        add_frame(axis)
-        axis.margins(x=0.12)
-    add_legend(figure, figure.axes)
-    return figure

@@ -83,20 +83,7 @@ def _check_tuned(design: PolicyDesign, manifest: Manifest) -> None:
             )
 
 
-def check_untouched(folder: Path) -> None:
-    """Refuse a folder in which test traffic was run.
-
-    Raises:
-        ValueError: It was.
-    """
-    if (folder / TEST).exists():
-        raise ValueError(
-            f"{folder / TEST} exists: test traffic has been run, nothing can be frozen any more. "
-            "Choose another --output"
-        )
-
-
-def begin(folder: Path, drafted: Manifest) -> Manifest:
+def write_draft(folder: Path, drafted: Manifest) -> Manifest:
     """Put a draft into a folder, or go on with the same draft there.
 
     Raises:
@@ -119,13 +106,7 @@ def begin(folder: Path, drafted: Manifest) -> Manifest:
 def choose(
     design: PolicyDesign, manifest: Manifest, ledger: Ledger[Entry, EpisodeScore]
 ) -> Manifest:
-    """Return the manifest with the choices of validation traffic, frozen.
-
-    Args:
-        design: The design.
-        manifest: The draft.
-        ledger: Scores on validation traffic of all its entries without bounds.
-    """
+    """Return a draft with the choices of validation traffic, by its scores in a ledger, frozen."""
     choices = {cell.name: _choice(cell, design, manifest, ledger) for cell in design.cells}
     time = datetime.now(UTC).isoformat(timespec="seconds")
     return dataclasses.replace(manifest, choices=choices, frozen=time)

@@ -26,10 +26,6 @@ class Checkpoint:
     Attributes:
         cell: Cell that it was trained for.
         recipe: Recipe that trained it, or the name that it was given.
-        training_seed: Seed of its training.
-        action: Its action encoding.
-        path: Its file.
-        sha256: Digest of that file.
     """
 
     cell: str
@@ -61,9 +57,6 @@ class Tuned:
 
     Attributes:
         policy: The schedule or recipe that uses them.
-        estimator: Estimator that they are for.
-        parameters: ARZ parameter set that they are for.
-        privacy: Privacy preset that they are for.
         settings: Fields of `EstimatorSettings`.
     """
 
@@ -91,7 +84,7 @@ class CellChoice:
 
 @dataclass(frozen=True)
 class Manifest:
-    """Everything that is fixed before test traffic is touched.
+    """The policies and choices that are fixed before test traffic is touched.
 
     Attributes:
         design: The design, as plain JSON.
@@ -196,21 +189,12 @@ class Manifest:
 
     def runs(self, learner: Learner) -> tuple[int, ...]:
         """Return the training seeds of a learner, ascending."""
-        return tuple(
-            sorted(
-                checkpoint.training_seed
-                for checkpoint in self.checkpoints
-                if (checkpoint.cell, checkpoint.recipe) == (learner.trained_in, learner.policy)
-            )
-        )
+        trained = (learner.trained_in, learner.policy)
+        found = (each for each in self.checkpoints if (each.cell, each.recipe) == trained)
+        return tuple(sorted(each.training_seed for each in found))
 
     def entries(self, design: PolicyDesign, bounds: bool = True) -> list[Entry]:
-        """Return all policies that are run, in every cell.
-
-        Args:
-            design: The design.
-            bounds: Whether oracles are among them.
-        """
+        """Return all policies that are run, in every cell, with or without oracles."""
         entries = []
         for cell in design.cells:
             entries += [Entry(cell.name, "baseline", name) for name in self.ladder[cell.name]]

@@ -28,10 +28,6 @@ class PolicyCell:
     """An environment in which policies are compared.
 
     Attributes:
-        name: Short name.
-        description: Description of the environment.
-        env: Environment id.
-        keywords: Keywords of ``gym.make`` that make it.
         transfers: Cells whose learned policies are run here, too, without training.
         bounds: Oracles that are run; they see the truth.
         without: Schedules that suit the cell but take too long.
@@ -173,12 +169,9 @@ class Entry:
     """A policy in a cell, run on every traffic seed: the key of the ledgers.
 
     Attributes:
-        cell: Name of the cell.
         kind: ``baseline``, ``bound`` or ``learned``.
-        policy: Name of the schedule or of the recipe.
         trained_in: Cell that a learned policy was trained for; empty for schedules.
         training_seed: Seed of its training; -1 for schedules.
-        mode: One of `MODES`; schedules have one only.
     """
 
     cell: str
@@ -195,9 +188,7 @@ class Learner:
 
     Attributes:
         cell: Cell in which it is run.
-        policy: Name of the recipe.
         trained_in: Cell that it was trained for.
-        mode: One of `MODES`.
     """
 
     cell: str

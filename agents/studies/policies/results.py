@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -16,7 +16,6 @@ from agents.evaluation.statistics import (
     holm,
     percent_below,
     percent_of_way,
-    worst_row,
 )
 from agents.experiments import cells
 from agents.studies.policies.curves import Curve
@@ -36,10 +35,8 @@ class Comparison:
     """A learned policy against the best baseline of its cell.
 
     Attributes:
-        learner: The policy.
         baseline: The baseline, chosen on validation traffic.
         below: How far its error lies below the baseline's [%], two-level bootstrap.
-        difference: Error of the baseline minus that of the policy, crossed t.
         p_value: Of a zero difference, crossed t.
         adjusted: The p-value after Holm over all secondary comparisons.
     """
@@ -64,8 +61,6 @@ class PolicyResults:
     """Scores, queries and learning curves of a design.
 
     Attributes:
-        design: The design.
-        manifest: The policies and choices that were frozen.
         scores: Score by entry and test seed.
         queries: Queries by entry of the primary cell and test seed.
         curves: Learning curves of the policies of the primary cell.
@@ -136,7 +131,7 @@ class PolicyResults:
 
     def worst(self, learner: Learner) -> int:
         """Return the place of the training seed of largest error on test traffic."""
-        return worst_row(self.learned(learner))
+        return int(self.learned(learner).mean(axis=1).argmax())
 
     def progress(self, learner: Learner) -> Interval | None:
         """Return how far a policy is from the best baseline to the error oracle [%]."""
@@ -152,32 +147,17 @@ class PolicyResults:
     @cached_property
     def comparisons(self) -> list[Comparison]:
         """Comparisons of all learned policies of the secondary cells with the best baseline."""
-        pairs = [
-            (learner, self.choice(cell.name).baseline)
-            for cell in self.design.cells[1:]
-            for learner in self.chosen(cell.name)
-        ]
-        tests = {}
-        for learner, name in pairs:
-            difference = self.schedule(learner.cell, name) - self.learned(learner)
-            tests[_key(learner)] = crossed_t(difference)
-        adjusted = holm({key: p_value for key, (_, p_value) in tests.items()})
-        return [
-            Comparison(
-                learner,
-                name,
-                self.below(self.learned(learner), self.schedule(learner.cell, name)),
-                *tests[_key(learner)],
-                adjusted[_key(learner)],
-            )
-            for learner, name in pairs
-        ]
+        learners = [each for cell in self.design.cells[1:] for each in self.chosen(cell.name)]
+        names = [self.choice(learner.cell).baseline for learner in learners]
+        found = []
+        for learner, name in zip(learners, names, strict=True):
+            errors, reference = self.learned(learner), self.schedule(learner.cell, name)
+            test = crossed_t(reference - errors)
+            found.append(Comparison(learner, name, self.below(errors, reference), *test, 1.0))
+        adjusted = holm({str(each.learner): each.p_value for each in found})
+        return [replace(each, adjusted=adjusted[str(each.learner)]) for each in found]
 
     @property
     def references(self) -> tuple[str, str]:
         """The best baseline of the primary cell, and the paper's schedule."""
         return self.choice(PRIMARY).baseline, REFERENCE
-
-
-def _key(learner: Learner) -> str:
-    return f"{learner.cell}, {learner.label}"

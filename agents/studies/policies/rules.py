@@ -17,7 +17,6 @@ class PolicyTarget:
     """A percentage that a policy must lie below a reference.
 
     Attributes:
-        description: The target in words.
         percent: Least percentage below the reference.
         baseline: The reference; empty for the best baseline of the validation traffic.
     """
@@ -38,11 +37,8 @@ class TargetVerdict:
     """Measurement and verdict of a target.
 
     Attributes:
-        target: The target.
-        reference: The schedule that it refers to.
         overall: Percent below, all training seeds together.
         worst: Percent below of the worst training seed.
-        worst_seed: The worst training seed.
         enough: Whether there were enough training seeds and test seeds.
     """
 

@@ -30,11 +30,6 @@ class EntryTask:
     """An entry on traffic seeds, with everything that a worker needs.
 
     Attributes:
-        cell: The entry.
-        policy: Its policy.
-        env: Environment id.
-        keywords: Keywords of ``gym.make_vec``.
-        seeds: Traffic seeds.
         noise: Noise is seeded with this plus the traffic seed.
         transferred: Whether the policy acts in a cell that it was not trained for.
         records: Folder of the record cache; None for the user's cache.

@@ -9,30 +9,30 @@ from typing import Any
 from agents.evaluation.episodes import EpisodeScore
 from agents.evaluation.figures import save_figure
 from agents.evaluation.statistics import crossed_t
+from agents.experiments import seeds as noise_seeds
 from agents.experiments.engine import run_all
 from agents.experiments.ledger import Ledger, ScoredT
 from agents.experiments.provenance import check_folder, take_folder
 from agents.experiments.reports import write_report
 from agents.experiments.runner import Workplace
-from agents.experiments.seeds import STUDY_TEST, STUDY_VALIDATION, TRAINING
-from agents.experiments.tables import versions_table
+from agents.experiments.seeds import STUDY_TEST, STUDY_VALIDATION
+from agents.studies.policies import rules, tables
 from agents.studies.policies.curves import read_curves
 from agents.studies.policies.figures import draw_cells, draw_curves, draw_queries, draw_ranking
 from agents.studies.policies.freezing import (
     QUERIES,
     TEST,
     VALIDATION,
-    begin,
-    check_untouched,
     choose,
     design_provenance,
     draft,
+    write_draft,
 )
 from agents.studies.policies.manifest import Checkpoint, Manifest, Tuned
 from agents.studies.policies.plan import DETERMINISTIC, MODES, PRIMARY, Entry, Learner, PolicyDesign
 from agents.studies.policies.queries import QueryCounts
 from agents.studies.policies.results import ERROR_ORACLE, PolicyResults
-from agents.studies.policies.rules import LEAST_RUNS, LEAST_TRAFFIC, POLICY_TARGETS, judge
+from agents.studies.policies.rules import POLICY_TARGETS, judge
 from agents.studies.policies.running import (
     EntryTask,
     cell_config,
@@ -40,17 +40,7 @@ from agents.studies.policies.running import (
     make_task,
     run_entry,
 )
-from agents.studies.policies.tables import (
-    checkpoint_table,
-    choice_table,
-    health_table,
-    ranking_table,
-    secondary_table,
-    seeds_table,
-    tuned_table,
-    verdict_table,
-    write_summary,
-)
+from agents.studies.policies.tables import write_summary
 
 TEMPLATES = Path(__file__).parent
 CURVES_FIGURE = "fig_curves.png"
@@ -66,23 +56,20 @@ def freeze(
 ) -> tuple[Manifest, bool]:
     """Fix policies and choices before test traffic is touched.
 
-    Args:
-        design: The plan.
-        place: Where it runs and leaves its results.
-        command: The command that freezes.
-        checkpoints: Learned policies.
-        tuned: Estimator settings tuned for single policies.
-
     Returns:
         The manifest, and whether it was frozen by this call.
 
     Raises:
         ValueError: Test traffic has been run, or the folder is of something else.
     """
-    check_untouched(place.folder)
+    if (place.folder / TEST).exists():
+        raise ValueError(
+            f"{place.folder / TEST} exists: test traffic has been run, nothing can be frozen any "
+            "more. Choose another --output"
+        )
     drafted = draft(design, checkpoints, tuned, command)
     take_folder(place.folder, design_provenance(design))
-    manifest = begin(place.folder, drafted)
+    manifest = write_draft(place.folder, drafted)
     if manifest.frozen:
         return manifest, False
     ledger = Ledger(place.folder / VALIDATION, Entry, EpisodeScore)
@@ -95,10 +82,6 @@ def freeze(
 
 def run(place: Workplace, n_resamples: int = 10_000) -> None:
     """Run the frozen policies and choices on test traffic, and report.
-
-    Args:
-        place: Where it runs and leaves its results.
-        n_resamples: Resamples of every bootstrap.
 
     Raises:
         FileNotFoundError: Nothing was frozen, or a frozen policy is gone that is still to be run.
@@ -179,42 +162,29 @@ def draw(folder: Path, results: PolicyResults) -> None:
 
 
 def report(folder: Path, results: PolicyResults, recorded: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the tables and numbers of the report."""
+    """Return the names in the template of the report."""
     design, manifest, learner = results.design, results.manifest, results.primary
     verdicts = [] if learner is None else [judge(results, learner, each) for each in POLICY_TARGETS]
     best, paper = (results.schedule(PRIMARY, name) for name in results.references)
     oracle = None
     if ERROR_ORACLE in manifest.bounds[PRIMARY]:
         oracle = results.below(results.schedule(PRIMARY, ERROR_ORACLE), best)
-    versions = next(iter(recorded["made_with"]["cells"].values()))["versions"]
     return {
         "design": design,
         "manifest": manifest,
         # Manifests that an earlier script froze name it.
         "freeze_command": manifest.command.replace("policy_study.py", "study.py policies"),
-        "n_entries": len(manifest.entries(design)),
-        "noise": {"validation": STUDY_VALIDATION, "test": STUDY_TEST, "training": TRAINING},
-        "least_runs": LEAST_RUNS,
-        "least_traffic": LEAST_TRAFFIC,
-        "primary_cell": design.cell(PRIMARY),
+        "results": results,
+        "tables": tables,
+        "rules": rules,
+        "seeds": noise_seeds,
         "best_baseline": results.references[0],
         "reference": results.references[1],
         "best_below_paper": results.below(best, paper),
         "oracle_below_best": oracle,
         "verdicts": verdicts,
-        "verdict_table": verdict_table(verdicts),
         "learned": None if learner is None else _learned(results, learner),
         "has_curves": (folder / CURVES_FIGURE).exists(),
-        "choice_table": choice_table(results),
-        "n_comparisons": len(results.comparisons),
-        "secondary_table": secondary_table(results),
-        "cells": [
-            (cell, ranking_table(results, cell.name), health_table(results, cell.name))
-            for cell in design.cells
-        ],
-        "checkpoint_table": checkpoint_table(results),
-        "tuned_table": tuned_table(results),
-        "versions_table": versions_table(versions, recorded),
         "provenance": recorded,
     }
 
@@ -227,10 +197,8 @@ def _learned(results: PolicyResults, learner: Learner) -> dict[str, Any]:
     counterpart = Learner(learner.cell, learner.policy, learner.trained_in, other)
     difference, p_value = crossed_t(best - errors)
     return {
-        "policy": learner.policy,
-        "mode": learner.mode,
-        "n_runs": len(results.manifest.runs(learner)),
-        "seeds_table": seeds_table(results, learner),
+        "learner": learner,
+        "n_runs": len(errors),
         "hindsight": hindsight,
         "below_hindsight": results.below(errors, results.schedule(PRIMARY, hindsight)),
         "progress": results.progress(learner),

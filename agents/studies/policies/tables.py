@@ -10,7 +10,8 @@ from typing import Any
 from agents.evaluation.episodes import EpisodeScore
 from agents.evaluation.statistics import iqm, mean
 from agents.experiments import tables
-from agents.experiments.tables import format_interval, interval_columns, markdown, write_csv
+from agents.experiments.files import write_csv
+from agents.experiments.tables import format_interval, interval_columns, markdown
 from agents.studies.policies.plan import REFERENCE, Learner
 from agents.studies.policies.results import ERROR, METRICS, PolicyResults
 from agents.studies.policies.rules import TargetVerdict
@@ -22,7 +23,6 @@ class Rank:
     """A policy of a cell with its errors.
 
     Attributes:
-        label: Its name.
         kind: ``baseline``, ``bound`` or ``learned``.
         n_runs: Training seeds behind it; 0 where nothing is trained.
         errors: By metric, errors on test traffic, shape (n_runs or 1, n_seeds).

@@ -43,16 +43,11 @@ class Account:
 
 
 def mu_met(config: EnvConfig, density_std: float, contributions: int) -> float:
-    """Return mu of the density releases alone for a vehicle that is met in some steps.
+    """Return mu of the density releases [veh/km] alone for a vehicle that is met in some steps.
 
     A lower bound on mu of the whole transcript, since releases of speeds only add to it. It is
     reached by two records in which one vehicle's trip is replaced by a trip elsewhere, each met
     `contributions` times.
-
-    Args:
-        config: Gives the segment length and the largest speed.
-        density_std: Noise of a density [veh/km].
-        contributions: Steps in which the vehicle is met.
     """
     sensitivity = contribution_sensitivity(
         contributions=contributions,
@@ -76,13 +71,7 @@ def mu_alone(
 
 
 def make_account(env: str, cell: PrivacyCell, contributions: Sequence[int]) -> Account:
-    """Return the guarantee behind the noise of a cell.
-
-    Args:
-        env: Environment id.
-        cell: The cell.
-        contributions: Steps in which a vehicle may be met.
-    """
+    """Return the guarantee behind a cell's noise, by numbers of steps in which a vehicle is met."""
     with without_void_warning():
         config = make_config(env, cell.keywords)
     report, privacy = privacy_report(config), config.privacy
@@ -116,11 +105,7 @@ def make_account(env: str, cell: PrivacyCell, contributions: Sequence[int]) -> A
 
 @dataclass(frozen=True)
 class Traffic:
-    """The traffic of a corridor, whatever the seed.
-
-    Attributes:
-        corridor: Digest of the corridor.
-    """
+    """The traffic of a corridor, whatever the seed."""
 
     corridor: str
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from agents.evaluation.figures import ERROR_TICKS, add_frame, add_legend, make_figure
+from agents.evaluation.figures import ERROR_TICKS, finish_figure, make_figure, set_log_ticks
 from agents.evaluation.statistics import Interval
 from agents.experiments.cells import DENSITY, METRICS, SPEED
 from agents.experiments.plots import (
@@ -19,7 +18,6 @@ from agents.experiments.plots import (
     Look,
     draw_curve,
     draw_level,
-    set_log_ticks,
     shifted,
 )
 from agents.studies.privacy.account import Account
@@ -56,7 +54,7 @@ def draw_epsilon(results: PrivacyResults) -> Figure:
         row[0].set_ylabel(_axis_label(metric))
     for axis in axes[-1]:
         axis.set_xlabel("ε")
-    return _finish(figure, axes.flat)
+    return finish_figure(figure, axes.flat, columns=6)
 
 
 def draw_modes(results: PrivacyResults) -> Figure:
@@ -85,21 +83,7 @@ def draw_modes(results: PrivacyResults) -> Figure:
             axis.set_ylim(bottom=0.0)
     axes[1, 0].set_xlabel("boundary inputs of the estimator")
     axes[1, 1].set_xlabel("segments queried a second")
-    return _finish(figure, axes[0])
-
-
-class Abscissa(NamedTuple):
-    """A kind of epsilon that errors are drawn over.
-
-    Attributes:
-        label: Label of the axis.
-        value: Returns it from an account.
-        is_claimed: Whether it is the epsilon that the configuration names.
-    """
-
-    label: str
-    value: Callable[[Account], float]
-    is_claimed: bool = False
+    return finish_figure(figure, axes[0], columns=6)
 
 
 def draw_claimed(results: PrivacyResults) -> Figure:
@@ -107,30 +91,33 @@ def draw_claimed(results: PrivacyResults) -> Figure:
     figure = make_figure(13.6, 7.8, dpi=130)
     axes = figure.subplots(2, 3)
     cap, _ = results.meetings
-    claimed = Abscissa("ε claimed", lambda account: account.claimed, is_claimed=True)
-    met = Abscissa(f"ε true of densities alone,\nmet {cap} times", lambda account: account.met[cap])
-    alone = Abscissa(
-        f"ε true of both releases,\nmet {cap} times, alone and standing",
-        lambda account: account.alone[cap],
-    )
     _true_epsilon(axes[0, 0], results)
-    _errors(axes[1, 0], results, DENSITY, met)
+    _errors(axes[1, 0], results, DENSITY, lambda account: account.met[cap])
+    axes[1, 0].set_xlabel(f"ε true of densities alone,\nmet {cap} times")
     for row, metric in zip(axes, (DENSITY, SPEED), strict=True):
-        _errors(row[1], results, metric, claimed)
-        _errors(row[2], results, metric, alone)
-    return _finish(figure, [*axes[:, 1], axes[0, 2]])
+        _errors(row[1], results, metric, lambda account: account.claimed, shift=0.008)
+        row[1].set_xlabel("ε claimed")
+        _errors(row[2], results, metric, lambda account: account.alone[cap])
+        row[2].set_xlabel(f"ε true of both releases,\nmet {cap} times, alone and standing")
+    return finish_figure(figure, [*axes[:, 1], axes[0, 2]], columns=6)
 
 
-def _errors(axis: Axes, results: PrivacyResults, metric: str, over: Abscissa) -> None:
+def _errors(
+    axis: Axes,
+    results: PrivacyResults,
+    metric: str,
+    epsilon: Callable[[Account], float],
+    shift: float = 0.0,
+) -> None:
     """Draw errors under the paper's noise and under a guarantee over one kind of epsilon."""
     design = results.design
     name = design.estimators[0]
     drawn: list[float] = []
     for k, protection in enumerate((*design.printed, design.base)):
-        places = [over.value(account) for account in results.accounts[protection]]
+        places = [epsilon(account) for account in results.accounts[protection]]
         drawn += places
         means = _means(results, design.along_epsilon(name, protection), metric)
-        moved = shifted(places, 0.008 * (k - 1) if over.is_claimed else 0.0, log=True)
+        moved = shifted(places, shift * (k - 1), log=True)
         label = str(protection).replace("`", "")
         draw_curve(axis, moved, means, _look(results, protection), label)
     for mode, line in (("nominal", ":"), ("true", "--")):
@@ -138,7 +125,6 @@ def _errors(axis: Axes, results: PrivacyResults, metric: str, over: Abscissa) ->
         draw_level(axis, alone, line, f"open loop, {mode} boundary")
     _set_log(axis, _ticks(drawn))
     axis.set_ylabel(f"{LABELS[name]}: {_axis_label(metric)}")
-    axis.set_xlabel(over.label)
 
 
 def _true_epsilon(axis: Axes, results: PrivacyResults) -> None:
@@ -203,12 +189,3 @@ def _set_log(axis: Axes, ticks: Sequence[float]) -> None:
 def _axis_label(metric: str) -> str:
     name, unit = METRICS[metric]
     return f"{name} RMSE [{unit}]"
-
-
-def _finish(figure: Figure, named: Iterable[Axes]) -> Figure:
-    """Frame all panels, and name the curves of some below them."""
-    named = list(named)
-    for axis in figure.axes:
-        add_frame(axis)
-    add_legend(figure, named, columns=6)
-    return figure

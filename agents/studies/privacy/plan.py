@@ -40,17 +40,12 @@ class Protection(NamedTuple):
 
 @dataclass(frozen=True)
 class PrivacyCell:
-    """One configuration, run on every traffic seed.
+    """A configuration, run on every traffic seed.
 
     Attributes:
-        estimator: Name of the estimator.
-        preset: Privacy preset.
         unit: Protected unit; `UNBOUNDED` where the preset bounds no contributions.
         cap: Queried steps in which a vehicle counts; 0 where none is set.
         boundary_inputs: ``true``, ``nominal`` or ``private``.
-        epsilon: Privacy parameter of the configuration.
-        delta: Privacy parameter of the configuration.
-        bandwidth: Segments queried a second.
     """
 
     estimator: str
@@ -126,7 +121,7 @@ class PrivacyDesign(Design[PrivacyCell]):
 
     @property
     def all_estimators(self) -> tuple[str, ...]:
-        """Every estimator that is run."""
+        """The estimators, then the open loop."""
         return (*self.estimators, OPEN_LOOP)
 
     @property

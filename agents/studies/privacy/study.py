@@ -18,20 +18,12 @@ from agents.experiments.plots import LABELS
 from agents.experiments.provenance import check_folder, design_provenance, take_folder
 from agents.experiments.reports import write_report
 from agents.experiments.runner import Workplace, missing_tasks, run_task
-from agents.experiments.tables import settings_table, versions_table, write_summary
+from agents.experiments.tables import write_summary
+from agents.studies.privacy import tables
 from agents.studies.privacy.account import Traffic, Trips, make_account, measure_trips
 from agents.studies.privacy.figures import draw_claimed, draw_epsilon, draw_modes
 from agents.studies.privacy.plan import OPEN_LOOP, PrivacyCell, PrivacyDesign
 from agents.studies.privacy.results import PrivacyResults
-from agents.studies.privacy.tables import (
-    bandwidth_table,
-    claimed_table,
-    cost_table,
-    epsilon_table,
-    health_table,
-    modes_table,
-    noise_table,
-)
 from dptse_env.traffic import RecordLibrary
 
 TEMPLATES = Path(__file__).parent
@@ -39,11 +31,6 @@ TEMPLATES = Path(__file__).parent
 
 def run(design: PrivacyDesign, place: Workplace, command: str) -> None:
     """Run the episodes that are missing, then draw and report.
-
-    Args:
-        design: The plan.
-        place: Where it runs and leaves its results.
-        command: The command that makes this report.
 
     Raises:
         ValueError: A value of the design is out of range, or the folder has other results.
@@ -131,6 +118,7 @@ def estimator_numbers(results: PrivacyResults, name: str) -> dict[str, Any]:
         ]
 
     return {
+        "name": name,
         "label": LABELS[name],
         "density": results.mean(base, DENSITY),
         "speed": results.mean(base, SPEED),
@@ -152,16 +140,11 @@ def estimator_numbers(results: PrivacyResults, name: str) -> dict[str, Any]:
         "bandwidth_change": measure_change(
             results, design.cell(name, bandwidth=many), design.cell(name, bandwidth=few)
         ),
-        "cost_table": cost_table(results, name),
-        "error_tables": [
-            (error, unit, epsilon_table(results, name, metric))
-            for metric, (error, unit) in METRICS.items()
-        ],
     }
 
 
 def report(results: PrivacyResults, recorded: Mapping[str, Any], command: str) -> dict[str, Any]:
-    """Return the tables and numbers of the report."""
+    """Return the names in the template of the report."""
     design = results.design
     nearest = min(range(len(design.epsilons)), key=lambda k: abs(np.log(design.epsilons[k])))
     cap, horizon = results.meetings
@@ -172,19 +155,14 @@ def report(results: PrivacyResults, recorded: Mapping[str, Any], command: str) -
     }
     return {
         "design": design,
-        "n_cells": len(design.cells()),
         "command": command,
+        "METRICS": METRICS,
         "estimators": [estimator_numbers(results, name) for name in design.estimators],
         "printed": [(kind, results.accounts[kind][nearest]) for kind in design.printed],
         "meetings": {"cap": cap, "longest": results.longest_trip, "horizon": horizon},
         "trips": {"median": median, "high": percentile_99, "n_vehicles": len(results.trips)},
         "open_loop": open_loop,
-        "claimed_table": claimed_table(results),
-        "noise_table": noise_table(results),
-        "modes_table": modes_table(results),
-        "bandwidth_table": bandwidth_table(results),
-        "health_table": health_table(results),
-        "versions_table": versions_table(recorded["made_with"]["versions"], recorded),
-        "settings_table": settings_table(recorded),
+        "results": results,
+        "tables": tables,
         "provenance": recorded,
     }

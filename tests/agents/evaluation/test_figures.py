@@ -5,12 +5,11 @@ from PIL import Image
 
 from agents.evaluation.episodes import watch_episode
 from agents.evaluation.figures import (
+    RoadMap,
     draw_maps,
     estimate_map,
-    query_map,
     save_errors,
     save_figure,
-    truth_map,
 )
 from agents.evaluation.statistics import Interval
 from dptse_env.schedules import make_schedule
@@ -39,7 +38,8 @@ def test_a_map_names_exactly_the_error_of_the_score(watched):
 def test_maps_stand_in_columns_with_one_bar(watched, tmp_path):
     score, history = watched
     column = [
-        truth_map(history), estimate_map(history, score, "estimate"), query_map(history, "queried"),
+        RoadMap("truth", history.truth, history), estimate_map(history, score, "estimate"),
+        RoadMap("queried", history.queried, history),
     ]  # fmt: skip
     figure = draw_maps([column, column], width=8.0)
     assert len(figure.axes) == 2 * 3 + 1
@@ -55,7 +55,9 @@ def test_maps_stand_in_columns_with_one_bar(watched, tmp_path):
 
 
 def test_errors_of_every_policy_are_drawn(tmp_path):
-    pair = Interval(10.0, 9.0, 11.0, 3), Interval(5.0, 4.0, 6.0, 3)
+    pair = {
+        "rmse_density": Interval(10.0, 9.0, 11.0, 3), "rmse_speed": Interval(5.0, 4.0, 6.0, 3),
+    }  # fmt: skip
     rows = ["paper", "round-robin"]
     series = {name: dict.fromkeys(rows, pair) for name in ("ekf", "ukf")}
     save_errors(tmp_path / "errors.png", rows, series, "title")

@@ -14,7 +14,6 @@ from agents.evaluation.statistics import (
     paired_difference,
     percent_below,
     percent_of_way,
-    worst_row,
 )
 
 
@@ -180,10 +179,6 @@ def test_holm_steps_down():
 def test_holm_takes_probabilities_only(value):
     with pytest.raises(ValueError, match=r"p-values must be in \[0, 1\], got .* for x"):
         holm({"x": value})
-
-
-def test_the_worst_run_errs_most_on_average():
-    assert worst_row([[1.0, 9.0], [6.0, 6.0], [11.0, 0.0]]) == 1
 
 
 @pytest.mark.parametrize(

@@ -2,11 +2,15 @@ from itertools import combinations
 
 import numpy as np
 
-from agents.experiments.seeds import NOISE_SEEDS, TRAINING, TRAININGS, training_seed
+from agents.experiments import seeds
+from agents.experiments.seeds import TRAINING, TRAININGS, training_seed
 from dptse_env.config import TEST_SEEDS
+
+NOISE_SEEDS = {name: value for name, value in vars(seeds).items() if isinstance(value, range)}
 
 
 def test_no_two_uses_share_a_seed():
+    assert len(NOISE_SEEDS) == 7
     for (first, a), (second, b) in combinations(NOISE_SEEDS.items(), 2):
         assert a.stop <= b.start or b.stop <= a.start, (first, second)
 

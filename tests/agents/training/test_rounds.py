@@ -10,7 +10,7 @@ import torch
 
 from agents.evaluation.episodes import make_vector
 from agents.experiments.seeds import training_seed
-from agents.training.policy_iteration import collect_swaps, swap_round
+from agents.training.policy_iteration import collect_swaps, raise_scores
 from agents.training.recipes import SwapRounds
 from agents.training.run_files import read_progress
 from agents.training.training import BEST, POLICY, Training
@@ -29,10 +29,8 @@ KEYWORDS = {"horizon": 80, "privacy": "capped", "action": "slots", "traffic_seed
 
 
 @pytest.mark.parametrize("stopped", [0, 1, 2])
-def test_a_training_killed_between_rounds_continues_alike(stopped, tmp_path):
-    plan = make_plan()
-    whole = Training(plan, tmp_path / "whole")
-    whole.run()
+def test_a_training_killed_between_rounds_continues_alike(stopped, trained, tmp_path):
+    plan, complete = make_plan(), trained()
     broken = Training(plan, tmp_path / "broken", watchers=(stop_at(stopped),))
     with pytest.raises(StopError):
         broken.run()
@@ -41,17 +39,14 @@ def test_a_training_killed_between_rounds_continues_alike(stopped, tmp_path):
     assert again.update == max(stopped - 1, 0)
     again.run()
     assert again.is_finished
-    assert without_time(again.rows) == without_time(whole.rows)
+    assert without_time(again.rows) == without_time(complete.rows)
     for name in (POLICY, BEST):
-        same = [(tmp_path / run / name).read_bytes() for run in ("whole", "broken")]
-        assert same[0] == same[1]
+        assert (again.folder / name).read_bytes() == (complete.folder / name).read_bytes()
 
 
-def test_the_curve_of_rounds(tmp_path):
-    reports = []
-    training = Training(make_plan(), tmp_path, progress=lambda *report: reports.append(report))
-    training.run()
-    rows = read_progress(tmp_path)
+def test_the_curve_of_rounds(trained):
+    training = trained()
+    reports, rows = training.reports, read_progress(training.folder)
     assert [row["update"] for row in rows] == [0, 1, 2]
     # Four episodes are simulated for nine seconds ahead of the rounds; in a round three of 80 s,
     # each with 1 + 2 forks under noise and its opposite.
@@ -81,7 +76,8 @@ def ignore(stage, fraction):
 
 def weights_after(settings, index):
     policy = make_policy()
-    swap_round(policy, make_batch(), settings, index, SEED, ignore)
+    swaps = collect_swaps(policy, make_batch(), settings, index, SEED, ignore)
+    raise_scores(policy, swaps, settings, settings.step_of(index))
     return torch.nn.utils.parameters_to_vector(policy.parameters()).detach().numpy()
 
 

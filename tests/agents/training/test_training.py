@@ -1,6 +1,7 @@
 import dataclasses
 import json
 import pathlib
+import shutil
 
 import numpy as np
 import pytest
@@ -9,8 +10,9 @@ pytest.importorskip("sb3_contrib")
 
 import torch
 
+from agents.experiments.files import write_atomically
 from agents.training.recipes import RECIPES, RegressionRounds
-from agents.training.run_files import CHECKPOINT, PROGRESS, read_progress, write_atomic
+from agents.training.run_files import CHECKPOINT, PROGRESS, read_progress
 from agents.training.training import BEST, POLICY, Training
 from dptse_env.sb3 import load_policy
 from tests.agents.training.plans import (
@@ -25,11 +27,9 @@ PPO_LEARNERS = [name for name in RECIPES if name != "plackett-luce"]
 
 
 @pytest.mark.parametrize("learner", PPO_LEARNERS)
-def test_a_killed_training_continues_to_the_same_curve(learner, tmp_path):
-    plan = make_plan(learner)
-    whole = Training(plan, tmp_path / "whole")
-    whole.run()
-    assert whole.is_finished
+def test_a_killed_training_continues_to_the_same_curve(learner, trained, tmp_path):
+    plan, complete = make_plan(learner), trained(learner)
+    assert complete.is_finished
     # Updates 0, 2, 4 are kept: the fifth is lost and done again. At the fourth, after 40 s, the
     # second group of episodes is just begun anew.
     broken = Training(plan, tmp_path / "broken", watchers=(stop_at(5),))
@@ -41,19 +41,17 @@ def test_a_killed_training_continues_to_the_same_curve(learner, tmp_path):
     again = Training(plan, tmp_path / "broken", watchers=(seen.append,))
     assert [row["update"] for row in again.rows] == [0, 1, 2, 3, 4]
     again.run()
-    assert without_time(again.rows) == without_time(whole.rows)
-    assert without_time(seen) == without_time(whole.rows)
+    assert without_time(again.rows) == without_time(complete.rows)
+    assert without_time(seen) == without_time(complete.rows)
     for name in (POLICY, BEST):
-        same = [(tmp_path / run / name).read_bytes() for run in ("whole", "broken")]
-        assert same[0] == same[1]
-    for name, value in whole.learner.policy.state_dict().items():
+        assert (again.folder / name).read_bytes() == (complete.folder / name).read_bytes()
+    for name, value in complete.learner.policy.state_dict().items():
         assert torch.equal(again.learner.policy.state_dict()[name], value), name
 
 
-def test_the_curve_of_ppo(tmp_path):
-    training = Training(make_plan("scores"), tmp_path)
-    training.run()
-    rows = read_progress(tmp_path)
+def test_the_curve_of_ppo(trained):
+    training = trained("scores")
+    rows = read_progress(training.folder)
     assert [row["update"] for row in rows] == list(range(7))
     assert [row["steps"] for row in rows] == [40 * u for u in range(7)]
     assert [row["update"] for row in rows if "validation" in row] == [0, 3, 6]
@@ -64,18 +62,15 @@ def test_the_curve_of_ppo(tmp_path):
     assert rates[-1] == pytest.approx(training.plan.recipe.final_learning_rate)
 
 
-def test_steps_are_decisions_whatever_the_encoding(tmp_path):
-    plan = make_plan("maskable")
-    training = Training(plan, tmp_path)
-    training.run()
-    assert plan.actions_per_step == 2
+def test_steps_are_decisions_whatever_the_encoding(trained):
+    training = trained("maskable")
+    assert training.plan.actions_per_step == 2
     assert training.rows[-1]["steps"] == 240
     assert training.learner.model.num_timesteps == 480
 
 
-def test_every_update_compares_replicas(tmp_path):
-    training = Training(make_plan("scores"), tmp_path)
-    training.run()
+def test_every_update_compares_replicas(trained):
+    training = trained("scores")
     # Episode by episode, as the minibatches are drawn from. Of two replicas each is compared with
     # the other, so that their advantages are opposite.
     advantages = training.learner.model.rollout_buffer.advantages.reshape(2, 2, 10)
@@ -83,20 +78,20 @@ def test_every_update_compares_replicas(tmp_path):
     assert np.abs(advantages).max() > 0.01
 
 
-def test_a_finished_training_is_left_alone(tmp_path):
-    Training(make_plan(), tmp_path).run()
-    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
-    again = Training(make_plan(), tmp_path)
+def test_a_finished_training_is_left_alone(trained, tmp_path):
+    folder = shutil.copytree(trained().folder, tmp_path / "run")
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    again = Training(make_plan(), folder, commit="abc")
     again.run()
-    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
 
 
-def test_the_folder_describes_the_training(tmp_path):
-    Training(make_plan(), tmp_path, commit="abc").run()
-    assert {path.name for path in tmp_path.iterdir()} == {
+def test_the_folder_describes_the_training(trained):
+    folder = trained().folder
+    assert {path.name for path in folder.iterdir()} == {
         "run.json", PROGRESS, CHECKPOINT, POLICY, BEST,
     }  # fmt: skip
-    record = json.loads((tmp_path / "run.json").read_text())
+    record = json.loads((folder / "run.json").read_text())
     assert record["commit"] == "abc"
     made_with = record["made_with"]
     assert made_with["seed"] == 1
@@ -104,7 +99,7 @@ def test_the_folder_describes_the_training(tmp_path):
     assert made_with["recipe"]["n_envs"] == 4
     assert made_with["learner"] == "plackett-luce"
     assert set(record["machine"]) >= {"torch", "stable-baselines3", "numpy", "python"}
-    policy = load_policy(tmp_path / POLICY, _env())
+    policy = load_policy(folder / POLICY, _env())
     assert policy.card["training"]["steps"] == 36 + 2 * 3 * 80 * 7
     assert policy.card["training"]["traffic seeds"] == "0..2"
 
@@ -140,15 +135,15 @@ def test_another_recipe_or_learner_is_refused(tmp_path):
         Training(make_plan("mask"), tmp_path)
 
 
-def test_a_missing_or_damaged_checkpoint_is_named(tmp_path):
-    Training(make_plan(), tmp_path).run()
-    path = tmp_path / CHECKPOINT
+def test_a_missing_or_damaged_checkpoint_is_named(trained, tmp_path):
+    folder = shutil.copytree(trained().folder, tmp_path / "run")
+    path = folder / CHECKPOINT
     path.write_bytes(path.read_bytes()[:1000])
     with pytest.raises(ValueError, match=r"checkpoint\.pt is damaged"):
-        Training(make_plan(), tmp_path)
+        Training(make_plan(), folder)
     path.unlink()
     with pytest.raises(ValueError, match=r"checkpoint\.pt is missing, although progress\.csv"):
-        Training(make_plan(), tmp_path)
+        Training(make_plan(), folder)
 
 
 def test_a_checkpoint_of_a_former_version_is_refused(tmp_path):
@@ -167,9 +162,8 @@ def test_a_folder_with_other_things_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize("name", [PROGRESS, CHECKPOINT])
-def test_a_full_disk_leaves_a_folder_to_continue_in(tmp_path, monkeypatch, name):
-    plan = make_plan("scores")
-    Training(plan, tmp_path / "whole").run()
+def test_a_full_disk_leaves_a_folder_to_continue_in(trained, tmp_path, monkeypatch, name):
+    plan, complete = make_plan("scores"), trained("scores")
     training = Training(plan, tmp_path / "full")
     replace, written = pathlib.Path.replace, []
 
@@ -186,8 +180,8 @@ def test_a_full_disk_leaves_a_folder_to_continue_in(tmp_path, monkeypatch, name)
     again = Training(plan, tmp_path / "full")
     assert again.update == 2
     again.run()
-    whole, resumed = (read_progress(tmp_path / run) for run in ("whole", "full"))
-    assert without_time(whole) == without_time(resumed)
+    expected, resumed = read_progress(complete.folder), read_progress(tmp_path / "full")
+    assert without_time(expected) == without_time(resumed)
 
 
 def test_nothing_half_written_stays(tmp_path, monkeypatch):
@@ -198,15 +192,14 @@ def test_nothing_half_written_stays(tmp_path, monkeypatch):
 
     monkeypatch.setattr("os.fsync", full)
     with pytest.raises(OSError, match="No space left"):
-        write_atomic(tmp_path / "file", b"new")
+        write_atomically(tmp_path / "file", b"new")
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == {"file": b"old"}
 
 
-def test_the_regression_moves_the_scorer_and_counts_as_no_update(tmp_path):
+def test_the_regression_moves_the_scorer_and_counts_as_no_update(trained, tmp_path):
     plan = make_plan()
-    first = Training(plan, tmp_path / "one")
-    before = {name: value.clone() for name, value in first.learner.policy.state_dict().items()}
-    first.run()
+    first = trained()
+    before = Training(plan, tmp_path / "one").learner.policy.state_dict()
     recipe = dataclasses.replace(plan.recipe, regression=RegressionRounds(rounds=0))
     second = Training(make_plan(recipe=recipe), tmp_path / "two")
     second.run()

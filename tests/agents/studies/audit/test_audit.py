@@ -128,7 +128,7 @@ def test_where_paths_meet_speeds_alone_tell(preset, record):
 @pytest.mark.parametrize("privacy", ALL_PRIVACY)
 def test_the_worst_case_is_the_whole_of_mu(privacy, policy, record):
     setting = config(**privacy)
-    worlds = choose_target(setting, record, "worst-case", policy).worlds
+    worlds = choose_target(setting, record, "worst-case", policy)
     mu = privacy_report(setting).mu
     distance = reached(setting, worlds, policy)
     assert distance <= mu * (1.0 + 1e-9)
@@ -146,7 +146,7 @@ def test_the_worst_case_is_the_whole_of_mu(privacy, policy, record):
 )
 def test_no_vehicle_of_the_record_exceeds_mu(privacy, kind, policy, record):
     setting = config(**privacy)
-    worlds = choose_target(setting, record, kind, policy).worlds
+    worlds = choose_target(setting, record, kind, policy)
     distance = reached(setting, worlds, policy)
     assert 0.0 < distance <= privacy_report(setting).mu * (1.0 + 1e-9)
 
@@ -155,7 +155,7 @@ def test_no_vehicle_of_the_record_exceeds_mu(privacy, kind, policy, record):
 @pytest.mark.parametrize("privacy", [{"preset": "corrected"}, {}, {"cap": 2}])
 def test_the_vehicle_that_is_deleted_tells_most(privacy, policy, record):
     setting = config(**privacy)
-    chosen = reached(setting, choose_target(setting, record, "deleted", policy).worlds, policy)
+    chosen = reached(setting, choose_target(setting, record, "deleted", policy), policy)
     everyone = [
         reached(
             setting,
@@ -174,7 +174,7 @@ def test_a_replaced_vehicle_tells_more_than_a_deleted_one(record):
     for preset in ("corrected", "capped"):
         setting = config(preset=preset)
         replaced, deleted = (
-            reached(setting, choose_target(setting, record, kind, "hunter").worlds)
+            reached(setting, choose_target(setting, record, kind, "hunter"))
             for kind in ("replaced", "deleted")
         )
         assert replaced > 1.2 * deleted
@@ -183,7 +183,7 @@ def test_a_replaced_vehicle_tells_more_than_a_deleted_one(record):
 def test_an_event_is_one_second(record):
     setting = config(unit="event")
     for kind in ("worst-case", "replaced", "deleted"):
-        paths = choose_target(setting, record, kind, "hunter").worlds.trajectories
+        paths = choose_target(setting, record, kind, "hunter").trajectories
         assert {len(path.step) for path in paths} <= {0, 1}
         assert len({int(step) for path in paths for step in path.step}) == 1
 
@@ -266,7 +266,7 @@ def test_the_adaptive_hunter_rests_where_it_is_decided():
 @pytest.mark.parametrize("preset", ["paper", "capped"])
 def test_the_score_is_the_log_likelihood_ratio_of_the_transcript(preset, record):
     setting = config(preset=preset)
-    worlds = choose_target(setting, record, "worst-case", "hunter").worlds
+    worlds = choose_target(setting, record, "worst-case", "hunter")
     # A schedule that mostly looks elsewhere: what it does not see must not count.
     plan = make_policy(setting, "paper", worlds).plan
     sigma = ReleaseDistances.from_config(setting).sigma
@@ -299,7 +299,7 @@ def test_the_score_is_the_log_likelihood_ratio_of_the_transcript(preset, record)
 
 def test_scores_have_the_law_of_their_distance(record):
     setting = config(epsilon=5.0)
-    worlds = choose_target(setting, record, "worst-case", "hunter").worlds
+    worlds = choose_target(setting, record, "worst-case", "hunter")
     policy = make_policy(setting, "hunter", worlds)
     runs = attack(setting, worlds, policy, 400, progress=False)
     mu = privacy_report(setting).mu
@@ -314,7 +314,7 @@ def test_scores_have_the_law_of_their_distance(record):
 
 def test_less_noise_puts_the_worlds_further_apart(record):
     setting = config()
-    worlds = choose_target(setting, record, "worst-case", "hunter").worlds
+    worlds = choose_target(setting, record, "worst-case", "hunter")
     policy = make_policy(setting, "hunter", worlds)
     runs = attack(setting, worlds, policy, 3, noise_factor=0.5, progress=False)
     np.testing.assert_allclose(runs.distances, 2.0 * privacy_report(setting).mu)
@@ -323,7 +323,7 @@ def test_less_noise_puts_the_worlds_further_apart(record):
 @pytest.mark.parametrize("privacy", [{}, {"preset": "paper"}, {"boundary_inputs": "private"}])
 def test_runs_do_not_depend_on_the_batch(privacy, record):
     setting = config(**privacy)
-    worlds = choose_target(setting, record, "replaced", "hunter").worlds
+    worlds = choose_target(setting, record, "replaced", "hunter")
     policy = make_policy(setting, "adaptive", worlds)
     together = attack(setting, worlds, policy, 5, seed=3, progress=False)
     parts = attack(setting, worlds, policy, 5, seed=3, batch=2, progress=False)
@@ -335,7 +335,7 @@ def test_runs_do_not_depend_on_the_batch(privacy, record):
 
 def test_adapting_stays_below_mu_and_stops_early(record):
     setting = config(epsilon=10.0)
-    worlds = choose_target(setting, record, "worst-case", "hunter").worlds
+    worlds = choose_target(setting, record, "worst-case", "hunter")
     runs = attack(setting, worlds, make_policy(setting, "adaptive", worlds), 100, progress=False)
     mu = privacy_report(setting).mu
     assert runs.distances.max() <= mu * (1.0 + 1e-9)
@@ -344,13 +344,13 @@ def test_adapting_stays_below_mu_and_stops_early(record):
 
 def test_a_road_needs_no_fixed_sensor(record):
     setting = dataclasses.replace(config(), corridor=dataclasses.replace(ROAD, fixed_sensors=()))
-    worlds = choose_target(setting, record, "worst-case", "hunter").worlds
+    worlds = choose_target(setting, record, "worst-case", "hunter")
     assert reached(setting, worlds) == pytest.approx(privacy_report(setting).mu)
 
 
 def test_a_short_horizon_is_kept(record):
     setting = config(horizon=10, unit="horizon")
-    worlds = choose_target(setting, record, "worst-case", "hunter").worlds
+    worlds = choose_target(setting, record, "worst-case", "hunter")
     runs = attack(setting, worlds, make_policy(setting, "hunter", worlds), 2, progress=False)
     np.testing.assert_allclose(runs.distances, privacy_report(setting).mu)
 
@@ -359,7 +359,7 @@ def test_an_audit_sees_a_cap_that_is_not_held(record, monkeypatch):
     setting = config(epsilon=5.0, cap=6)
     report = privacy_report(setting)
     claim = Claim(report.mu, epsilon_of(report.mu, 0.05), 0.05)
-    worlds = choose_target(setting, record, "worst-case", "static").worlds
+    worlds = choose_target(setting, record, "worst-case", "static")
     policy = make_policy(setting, "static", worlds)
     held = attack(setting, worlds, policy, 400, progress=False)
     assert audit(*held.scores, claim).verdict == "not rejected"

@@ -4,15 +4,17 @@ import dataclasses
 import pytest
 
 from agents.evaluation.statistics import mean_interval
+from agents.experiments.cells import METRICS
 from agents.experiments.provenance import design_provenance
 from agents.experiments.reports import fill
-from agents.experiments.tables import markdown, settings_table, write_summary
+from agents.experiments.tables import markdown, settings_table, versions_table, write_summary
 from agents.studies.paper import study
 from agents.studies.paper.claims import judge_all
 from agents.studies.paper.paper_claims import CLAIMS, PROJECT_TARGETS
 from agents.studies.paper.plan import SETTINGS
 from agents.studies.paper.tables import (
     base_table,
+    grid_table,
     health_table,
     parts_table,
     time_table,
@@ -47,14 +49,19 @@ def test_a_markdown_table():
 def test_the_report_holds_every_table_and_number(provenance, tmp_path):
     content = study.report(RESULTS, provenance, "the command")
     text = fill(study.TEMPLATES, content)
-    for name, value in content.items():
-        if name.endswith("_table"):
-            assert value in text, name
+    for metric in METRICS:
+        assert base_table(RESULTS, metric) in text
+    for table in (time_table, health_table, grid_table):
+        assert table(RESULTS) in text
+    for claims in (CLAIMS, PROJECT_TARGETS):
+        assert verdict_table(judge_all(claims, RESULTS)) in text
+    assert versions_table(provenance) in text
+    assert settings_table(provenance) in text
     for claim in (*CLAIMS, *PROJECT_TARGETS):
         assert claim.statement in text
         assert claim.quantity in text
-    for _, table in content["details"]:
-        assert table in text
+    for outcomes in judge_all((*CLAIMS, *PROJECT_TARGETS), RESULTS):
+        assert parts_table(outcomes) in text
     for number in ("the command", "2000 to 2005", f"{len(DESIGN.cells())} configurations"):
         assert number in text
     assert "nan" not in text

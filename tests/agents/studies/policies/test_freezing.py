@@ -5,7 +5,7 @@ import pytest
 from agents.evaluation.episodes import EpisodeScore
 from agents.experiments.ledger import Ledger
 from agents.experiments.seeds import STUDY_TEST
-from agents.studies.policies.freezing import begin, choose, draft
+from agents.studies.policies.freezing import choose, draft, write_draft
 from agents.studies.policies.manifest import (
     CellChoice,
     Manifest,
@@ -131,11 +131,11 @@ def test_validation_traffic_chooses(runs, tmp_path):
 
 def test_a_folder_keeps_to_one_manifest(runs, tmp_path):
     manifest = draft(SMALL, checkpoints(runs), (), "command")
-    begin(tmp_path, manifest)
-    assert begin(tmp_path, manifest).digest == manifest.digest
+    write_draft(tmp_path, manifest)
+    assert write_draft(tmp_path, manifest).digest == manifest.digest
     other = draft(SMALL, checkpoints(runs)[:1], (), "command")
     with pytest.raises(ValueError, match="manifest of other policies"):
-        begin(tmp_path, other)
+        write_draft(tmp_path, other)
     (tmp_path / "manifest.json").write_text("{}")
     with pytest.raises(ValueError, match="not as this program writes it"):
         Manifest.read(tmp_path)

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from agents.experiments.reports import fill
-from agents.studies.policies import study
+from agents.experiments.tables import versions_table
+from agents.studies.policies import study, tables
 from agents.studies.policies.curves import read_curves
 from agents.studies.policies.manifest import find_checkpoints
 from agents.studies.policies.queries import by_offset, by_segment, near_since_start
@@ -26,15 +27,17 @@ def test_the_report_holds_every_table_and_number(tmp_path):
     assert (best.is_met, paper.is_met, best.worst_seed) == (False, True, 2)
     assert (best.overall.mean, paper.overall.mean) == (pytest.approx(9.4), pytest.approx(24.5))
     assert content["learned"]["progress"].mean == pytest.approx(47.0)
-    assert content["n_comparisons"] == 2
+    assert len(results.comparisons) == 2
     text = fill(study.TEMPLATES, content)
-    for name, value in content.items():
-        if name.endswith("_table"):
-            assert value in text, name
-    for _, table, _ in content["cells"]:
-        assert table in text
+    assert tables.verdict_table(content["verdicts"]) in text
+    for name in ("choice", "secondary", "checkpoint", "tuned"):
+        assert getattr(tables, f"{name}_table")(results) in text, name
+    for cell in results.design.cells:
+        assert tables.ranking_table(results, cell.name) in text
+    assert versions_table(PROVENANCE) in text
     for words in (
-        content["learned"]["seeds_table"], f"{paper.overall.mean:.1f} % [{paper.overall.low:.1f}",
+        tables.seeds_table(results, results.primary),
+        f"{paper.overall.mean:.1f} % [{paper.overall.low:.1f}",
         "python scripts/study.py policies freeze", "no plan", "plackett-luce, from primary",
     ):  # fmt: skip
         assert words in text, words
@@ -77,7 +80,7 @@ def test_a_report_without_a_trained_policy_has_no_verdict(tmp_path):
     )  # fmt: skip
     study.draw(tmp_path, results)
     content = study.report(tmp_path, results, PROVENANCE)
-    assert (content["verdicts"], content["learned"], content["n_comparisons"]) == ([], None, 0)
+    assert (content["verdicts"], content["learned"], results.comparisons) == ([], None, [])
     text = fill(study.TEMPLATES, content)
     assert "plackett-luce" not in text
     # Without learning curves there is no figure, and none is named.
