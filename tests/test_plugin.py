@@ -4,6 +4,7 @@ import json
 import pickle
 import sys
 import warnings
+from importlib import import_module
 from pathlib import Path
 
 import gymnasium as gym
@@ -12,6 +13,7 @@ import pytest
 
 from dptse_env import register_part
 from dptse_env.estimators import Estimate
+from dptse_env.registration import REGISTRIES
 from dptse_env.release import Released
 from dptse_env.schedules import make_schedule
 
@@ -23,6 +25,15 @@ import dptse_plugin  # noqa: E402
 from dptse_plugin import parts  # noqa: E402
 
 KEYWORDS = [keyword for keyword in dptse_plugin.PARTS if keyword != "schedule"]
+
+
+@pytest.fixture(autouse=True)
+def registries(monkeypatch):
+    """Forget at the end of a test what it has registered."""
+    for path in REGISTRIES.values():
+        module, _, attribute = path.partition(":")
+        registry = getattr(import_module(module), attribute)
+        monkeypatch.setattr(registry, "_parts", dict(registry._parts))
 
 
 def by_module(keyword):
