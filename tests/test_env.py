@@ -44,8 +44,10 @@ def assert_same(first, second):
         np.testing.assert_array_equal(first, second)
 
 
-@pytest.mark.parametrize("action", ACTION_ENCODINGS)
-@pytest.mark.parametrize("env_id", IDS)
+CHECKED = [(env_id, "mask") for env_id in IDS] + [(SHORT, name) for name in ACTION_ENCODINGS]
+
+
+@pytest.mark.parametrize(("env_id", "action"), sorted(set(CHECKED)))
 def test_the_checkers_find_nothing(env_id, action):
     env = gym.make(env_id, action=action, render_mode="rgb_array", traffic_seeds="0:2")
     check_env(env.unwrapped)
@@ -245,7 +247,7 @@ def _first_observation(env_id):
     return env.reset(seed=0)[0]
 
 
-@pytest.mark.parametrize("method", ["forkserver", "spawn"])
+@pytest.mark.parametrize("method", [pytest.param("forkserver", marks=pytest.mark.slow), "spawn"])
 def test_ids_are_known_in_subprocesses(method):
     with multiprocessing.get_context(method).Pool(1) as pool:
         there = pool.apply(_first_observation, (SHORT,))

@@ -65,6 +65,7 @@ def linear_errors(backend, n_members, n_seeds):
     return (filters.states - x) / deviation, (covariances - p) / np.outer(deviation, deviation)
 
 
+@pytest.mark.slow
 @both_backends
 def test_approaches_the_kalman_filter_as_one_over_the_root_of_the_members(backend):
     spreads = {}

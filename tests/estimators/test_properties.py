@@ -33,8 +33,18 @@ WITH_COVARIANCE = [case for case in CASES if case[0] not in ("random_walk", "ope
 EXCHANGED = [*range(15), 16, 15, 17, 18]  # segments, the on-ramps exchanged
 SLOW = {("mhe", "reference"), ("enkf", "reference")}  # milliseconds a step
 
-every_case = pytest.mark.parametrize(("name", "backend", "release"), CASES)
-with_covariance = pytest.mark.parametrize(("name", "backend", "release"), WITH_COVARIANCE)
+
+def over(cases):
+    """Return the mark that runs a test over cases, the slowest among the slow tests."""
+    slowest = ("mhe", "reference")
+    marked = [
+        pytest.param(*case, marks=pytest.mark.slow) if case[:2] == slowest else case
+        for case in cases
+    ]
+    return pytest.mark.parametrize(("name", "backend", "release"), marked)
+
+
+every_case, with_covariance = over(CASES), over(WITH_COVARIANCE)
 both_bounds = pytest.mark.parametrize("bounds", ["cone", "box"])
 
 

@@ -40,6 +40,7 @@ CELLS = (
 )
 
 
+@pytest.mark.slow
 def test_the_command_line_runs_a_study_and_reports_its_command(tmp_path):
     arguments = (
         "privacy", "--env", SHORT, "--seeds", "2000:2002", "--estimators", "random_walk",

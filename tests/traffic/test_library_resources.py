@@ -28,6 +28,7 @@ def thousand(tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/dev/fd").is_dir(), reason="descriptors cannot be counted here")
 def test_descriptors_stay_bounded_over_a_thousand_records(thousand):
     records = RecordLibrary(thousand, n_open=N_OPEN)
@@ -42,6 +43,7 @@ def test_descriptors_stay_bounded_over_a_thousand_records(thousand):
     assert n_descriptors() == before
 
 
+@pytest.mark.slow
 def test_memory_stays_flat_over_many_records(thousand):
     records = RecordLibrary(thousand, n_open=N_OPEN)
 

@@ -176,8 +176,9 @@ class Learned:
         return (action[0] if np.ndim(observation) == 1 else action), state
 
 
+LOOKS_AHEAD = ("oracle-greedy", "oracle-brute-force")
 LADDER = [
-    name
+    pytest.param(name, marks=pytest.mark.slow) if name in LOOKS_AHEAD else name
     for name in (*OBSERVATION_SCHEDULES, *COVARIANCE_SCHEDULES, *ORACLES)
     if name not in ("random", "all")
 ]

@@ -23,7 +23,7 @@ from tests.agents.training.plans import (
     without_time,
 )
 
-PPO_LEARNERS = [name for name in RECIPES if name != "plackett-luce"]
+PPO_LEARNERS = ["scores", "mask", pytest.param("maskable", marks=pytest.mark.slow)]
 
 
 @pytest.mark.parametrize("learner", PPO_LEARNERS)

@@ -19,6 +19,9 @@ DESIGN = PaperDesign(
     picture_segments=3,
     privacy_segments=2,
 )
+# Figures of a whole study; those of the other studies are drawn in each run of the tests.
+pytestmark = pytest.mark.slow
+
 FIGURES = ("fig1_cv_segments", "fig2_space_time", "fig3_epsilon", "fig4_delta", "fig5_run_time")
 
 
