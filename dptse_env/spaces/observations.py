@@ -197,31 +197,8 @@ def default_blocks(setup: ObservationSetup) -> list[str]:
 class ObservationEncoding:
     """Encoding of public states as vectors, with the space and the position of every block.
 
-    Default blocks, in order, with S segments (mainline, on-ramps, off-ramps), n mainline segments
-    and F fixed sensors:
-
-    ========================= ==== ============================================ =========
-    block                     size value                                        bounds
-    ========================= ==== ============================================ =========
-    density                   S    estimated density / density scale            [0, 4]
-    speed                     S    estimated speed / speed scale                [0, 4]
-    density_log_std           S    log of (standard deviation / scale)          [-10, 5]
-    speed_log_std             S    the same for speed                           [-10, 5]
-    released_density          n    last released density / scale                [-5, 5]
-    released_speed            n    last released speed / scale, or, under its   [-5, 5]
-                                   name, ``released_flow``
-    density_innovation        n    normalised innovation, 0 if not observed     [-10, 10]
-    speed_innovation          n    the same for speed                           [-10, 10]
-    age                       n    steps since last observed / 60, at most 1    [0, 1]
-    queried                   n    the last query                               {0, 1}
-    fixed_density_innovation  F    normalised innovation of the fixed sensors   [-10, 10]
-    fixed_speed_innovation    F    the same for speed                           [-10, 10]
-    bandwidth                 1    queries a step / n                           [0, 1]
-    epsilon                   1    log10 of the privacy parameter               [-6, 6]
-    picked                    n    picks so far (sequential actions only)       {0, 1}
-    ========================= ==== ============================================ =========
-
-    Values beyond the bounds are clipped.
+    `dptse_env.env.SensorQueryEnv` has a table of the default blocks. Values beyond
+    the bounds are clipped.
 
     Attributes:
         setup: The public configuration.
