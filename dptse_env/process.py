@@ -167,14 +167,14 @@ class QueryProcess:
         decision = encoding.decode(episodes, actions, self.pending)
         if self._checks_decisions:
             check_decision(encoding, decision, len(episodes))
-        ready = decision.complete
+        ready, n_ready = decision.complete, np.count_nonzero(decision.complete)
         self.n_dropped[episodes] = decision.n_dropped
         reward = np.zeros(len(episodes))
-        if not ready.any():
+        if n_ready == 0:
             return self._outcome(episodes, self.estimate.at(episodes), reward)
         self._advance(episodes[ready], decision.queried[ready])
         estimate = self._estimated(episodes)
-        acted = estimate if ready.all() else self.estimate.at(episodes[ready])
+        acted = estimate if n_ready == len(episodes) else self.estimate.at(episodes[ready])
         reward[ready] = self._score(episodes[ready], acted)
         return self._outcome(episodes, estimate, reward)
 

@@ -4,6 +4,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -43,18 +44,19 @@ class ReleaseSetup:
         """The road."""
         return self.traffic.corridor
 
-    @property
+    @cached_property
     def n_columns(self) -> int:
         """Columns of a release: the S segments, then the boundary segments if they are released."""
         corridor = self.corridor
         private = self.settings.boundary == "private"
         return corridor.n_segments + (corridor.n_boundaries if private else 0)
 
-    @property
-    def always_observed(self) -> tuple[int, ...]:
+    @cached_property
+    def always_observed(self) -> IntArray:
         """Columns that are observed at every step without a query."""
         corridor = self.corridor
-        return (*corridor.fixed_sensors, *range(corridor.n_segments, self.n_columns))
+        boundaries = range(corridor.n_segments, self.n_columns)
+        return np.array([*corridor.fixed_sensors, *boundaries], dtype=np.int64)
 
     def observed(self, queried: BoolArray) -> BoolArray:
         """Return the observed columns (k, n_columns) of queried segments (k, n_mainline)."""

@@ -66,7 +66,8 @@ def public_plan(config: EnvConfig, name: str) -> BoolArray:
 
 def always_observed(config: EnvConfig) -> list[int]:
     """Return the record columns that are observed at every step without a query."""
-    return list(make_release(config).setup.always_observed)
+    columns: list[int] = make_release(config).setup.always_observed.tolist()
+    return columns
 
 
 def hunting_plan(config: EnvConfig, worlds: AdjacentWorlds) -> BoolArray:
