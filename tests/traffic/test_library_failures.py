@@ -47,7 +47,8 @@ RecordLibrary(sys.argv[1]).ensure(SHORT_HIGHWAY, range(400), workers=2)
 
 
 def everything_in(path):
-    return sorted(entry for entry in Path(path).rglob("*") if entry.is_file())
+    # Unlike Path.rglob, os.walk passes over folders that a writer removes meanwhile.
+    return sorted(Path(folder) / name for folder, _, names in os.walk(path) for name in names)
 
 
 def wait_for(condition, seconds=60.0):
