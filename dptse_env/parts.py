@@ -18,7 +18,6 @@ from dptse_env.release import (
     ReleaseModel,
     ReleaseSetup,
     TrafficTable,
-    make_boundary,
 )
 from dptse_env.release.report import in_order
 from dptse_env.spaces.actions import ACTION_ENCODINGS, ActionEncoding
@@ -223,7 +222,7 @@ def make_parts(
     traffic = traffic or make_traffic(config, library)
     release = release or make_release(config, n_episodes, traffic)
     model = model or make_model(config)
-    boundary = boundary or make_boundary(config.privacy.boundary, traffic, model, n_episodes)
+    boundary = boundary or BOUNDARIES[config.privacy.boundary](traffic, model, n_episodes)
     estimator = estimator or make_estimator(
         config.estimator, config.backend, model, n_episodes, config.settings()
     )

@@ -21,9 +21,8 @@ import numpy as np
 
 from agents.evaluation.episodes import WARM_UP, Policy
 from dptse_env.process import QueryProcess
-from dptse_env.release import Capped, GaussianRelease, Mechanism
+from dptse_env.release import Capped, Mechanism, require_gaussian
 from dptse_env.utils.arrays import Action, AnyArray, FloatArray, IntArray, Observation
-from dptse_env.utils.registry import name_of_class
 from dptse_env.vector_env import SensorQueryVectorEnv
 
 
@@ -183,12 +182,7 @@ def _replayed(
     reward, contributions = np.zeros((2, before.n_episodes))
     for sign in (1.0, -1.0):
         fork = before.fork()
-        release = fork.release
-        if not isinstance(release, GaussianRelease):
-            raise ValueError(
-                "swaps need a release model with Gaussian noise, got "
-                f"{name_of_class(type(release))}"
-            )
+        release = require_gaussian(fork.release, "a trial of swaps")
         release.mechanism = AntitheticNoise(release.mechanism, sign * noise)
         for action in actions:
             reward += 0.5 * fork.step(every, action).reward

@@ -1,9 +1,9 @@
 """Release of traffic data: true traffic, release models, and boundary inputs."""
 
 from dptse_env.release.base import Released, ReleaseModel, ReleaseRequest, ReleaseSetup
-from dptse_env.release.boundary import BOUNDARIES, BoundaryModel, make_boundary
+from dptse_env.release.boundary import BOUNDARIES, BoundaryModel
 from dptse_env.release.checks import check_released
-from dptse_env.release.gaussian import Capped, Corrected, GaussianRelease, Paper
+from dptse_env.release.gaussian import Capped, Corrected, GaussianRelease, Paper, require_gaussian
 from dptse_env.release.mechanism import GaussianMechanism, Mechanism
 from dptse_env.release.report import PrivacyReport, QuantityReport
 from dptse_env.release.settings import (
@@ -54,5 +54,5 @@ __all__ = [
     "TrafficTable",
     "Unit",
     "check_released",
-    "make_boundary",
+    "require_gaussian",
 ]

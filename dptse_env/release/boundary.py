@@ -136,10 +136,3 @@ BOUNDARIES: dict[BoundaryInputs, type[TrueBoundary | NominalBoundary]] = {
     "private": PrivateBoundary,
 }
 """Boundary models by the value of ``privacy.boundary_inputs``."""
-
-
-def make_boundary(
-    kind: BoundaryInputs, traffic: TrafficTable, model: ARZModel, n_episodes: int
-) -> BoundaryModel:
-    """Return the boundary model of a kind for a batch of n episodes."""
-    return BOUNDARIES[kind](traffic, model, n_episodes)

@@ -134,6 +134,19 @@ class GaussianRelease(ReleaseModel):
         )
 
 
+def require_gaussian(release: ReleaseModel, user: str) -> GaussianRelease:
+    """Return a release model with Gaussian noise; ``user`` names in errors what needs one.
+
+    Raises:
+        ValueError: It is another release model.
+    """
+    if not isinstance(release, GaussianRelease):
+        raise ValueError(
+            f"{user} needs a release model with Gaussian noise, got {release.setup.name!r}"
+        )
+    return release
+
+
 class Paper(GaussianRelease):
     """True density and mean speed of all vehicles, with the noise as printed in the paper."""
 

@@ -115,7 +115,7 @@ class Schedule(ABC):
         segments there 1.5 times as often. A mainline segment with a fixed sensor is observed
         without a query, so it comes last for any value.
         """
-        fixed = self.interface.observations.fixed_sensors
+        fixed = self.interface.observations.setup.fixed_sensors
         score = np.array(value, dtype=np.float64)
         score[:, fixed[fixed < self.n_mainline]] = -np.inf
         turn = (np.arange(self.n_mainline) - step[:, None]) % self.n_mainline

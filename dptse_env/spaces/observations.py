@@ -221,8 +221,6 @@ class ObservationEncoding:
             ValueError: There is no such block, it lacks a method, or two have the same name.
         """
         self.setup = setup
-        self.n_mainline = setup.corridor.n_mainline
-        self.fixed_sensors = setup.fixed_sensors
         names = [name for value in blocks for name in _expanded(value, setup)]
         self.blocks: tuple[ObservationBlock, ...] = tuple(map(_made, names))
         sizes = [_checked_size(block, setup) for block in self.blocks]
@@ -235,21 +233,20 @@ class ObservationEncoding:
         low = np.repeat([block.low for block in self.blocks], sizes).astype(np.float32)
         high = np.repeat([block.high for block in self.blocks], sizes).astype(np.float32)
         self.space = spaces.Box(low, high, dtype=np.float32)
-        self._low, self._high, self._size = low, high, len(low)
         places = self.slices.values()
         self._plan = tuple(zip(self.blocks, places, map(is_foreign, self.blocks), strict=True))
 
     def encode(self, state: PublicState) -> Observation:
         """Return the observations of k episodes, shape (k, size), always inside the space."""
         k = len(state.released)
-        flat = np.empty((k, self._size), dtype=np.float32)
+        flat = np.empty((k, self.space.shape[0]), dtype=np.float32)
         for block, place, checked in self._plan:
             values = block.values(state, self.setup)
             if checked:
                 _check_values(block, values, (k, place.stop - place.start))
             flat[:, place] = values
-        np.maximum(flat, self._low, out=flat)
-        return np.minimum(flat, self._high, out=flat)
+        np.maximum(flat, self.space.low, out=flat)
+        return np.minimum(flat, self.space.high, out=flat)
 
     def block(self, observation: Observation, name: str) -> Observation:
         """Return the block ``name`` of observations of shape (..., size).

@@ -8,7 +8,7 @@ from dptse_env.config import resolve
 from dptse_env.model import ARZModel, load_parameters
 from dptse_env.parts import make_parts
 from dptse_env.process import QueryProcess
-from dptse_env.release.boundary import NominalBoundary, PrivateBoundary, TrueBoundary, make_boundary
+from dptse_env.release.boundary import BOUNDARIES, NominalBoundary, PrivateBoundary, TrueBoundary
 from dptse_env.release.nominal import nominal_inputs
 from dptse_env.release.traffic_table import TrafficTable
 from dptse_env.traffic import SHORT_HIGHWAY, RecordLibrary
@@ -36,7 +36,7 @@ def at(boundary, time, index=0, episode=0):
     [("true", TrueBoundary), ("nominal", NominalBoundary), ("private", PrivateBoundary)],
 )
 def test_a_kind_by_its_name(traffic, kind, expected):
-    boundary = make_boundary(kind, traffic, model(), 1)
+    boundary = BOUNDARIES[kind](traffic, model(), 1)
     assert type(boundary) is expected
     assert boundary.void_reasons == (("boundary_inputs",) if kind == "true" else ())
 

@@ -15,10 +15,9 @@ from dptse_env.parts import make_parts, make_release
 from dptse_env.process import QueryProcess
 from dptse_env.release import (
     GaussianMechanism,
-    GaussianRelease,
-    ReleaseModel,
     ReleaseRequest,
     TrafficTable,
+    require_gaussian,
 )
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 
@@ -69,7 +68,7 @@ class Adversary:
         """Prepare for n_runs at once, under noise of standard deviation `sigma`, (2,)."""
         traffic = TrafficTable(config.corridor, (0, 1), worlds)
         # Sums of both worlds for every run, whichever world it is in.
-        self._release = gaussian(make_release(config, 2 * n_runs, traffic))
+        self._release = require_gaussian(make_release(config, 2 * n_runs, traffic), "the audit")
         for world, record in traffic.load([0, 1]):
             self._release.load(world, record)
         self._sigma = sigma
@@ -100,19 +99,6 @@ class Adversary:
         """Score one released step: the log-likelihood ratio of Gaussians of either mean."""
         midpoint, difference = self.expect(time, queried)
         self.score += np.sum((released / self._sigma - midpoint) * difference, axis=(1, 2))
-
-
-def gaussian(release: ReleaseModel) -> GaussianRelease:
-    """Return a release model with Gaussian noise, whose likelihoods the adversary knows.
-
-    Raises:
-        ValueError: It has other noise.
-    """
-    if not isinstance(release, GaussianRelease):
-        raise ValueError(
-            f"the audit needs a release model with Gaussian noise, got {release.setup.name!r}"
-        )
-    return release
 
 
 def planned_distance(
@@ -158,7 +144,7 @@ def attack(
     )  # fmt: skip
     size = min(batch, n_runs)
     process = QueryProcess(make_parts(config, 2 * size, worlds))
-    release = gaussian(process.release)
+    release = require_gaussian(process.release, "the audit")
     sigma, columns = noise_factor * release.sigma, release.setup.n_columns
     mechanism = RecordingMechanism(sigma, n_episodes=2 * size, n_segments=columns)
     release.mechanism = mechanism

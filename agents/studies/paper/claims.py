@@ -40,7 +40,7 @@ class Claim:
     """A statement that measurements can support or refute.
 
     Attributes:
-        expected: ExpectedRange in which the quantity should lie.
+        expected: Range in which the quantity should lie.
         measure: Returns the interval of each part by its name.
     """
 
