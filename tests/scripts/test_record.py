@@ -1,8 +1,4 @@
 import dataclasses
-import os
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 
@@ -10,8 +6,7 @@ from dptse_env.config import resolve
 from dptse_env.traffic import SHORT_HIGHWAY, RecordLibrary, randomised
 from scripts.cli import run
 from scripts.record import Args, main
-
-ROOT = Path(__file__).parents[2]
+from tests.scripts.commands import run_script
 
 
 def test_the_command_records_into_the_library_and_reports_the_dwell(tmp_path):
@@ -19,11 +14,7 @@ def test_the_command_records_into_the_library_and_reports_the_dwell(tmp_path):
         "--corridor", "short-highway", "--seeds", "3:5", "--workers", "1",
         "--records", str(tmp_path),
     )  # fmt: skip
-    script = [sys.executable, str(ROOT / "scripts" / "record.py"), *arguments]
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    result = subprocess.run(
-        script, capture_output=True, text=True, check=False, cwd=ROOT, env=environment
-    )
+    result = run_script("record.py", *arguments)
     assert result.returncode == 0, result.stderr
     assert f"short-highway: 2 record(s) in {tmp_path}" in result.stdout
     assert "T_avg" in result.stdout

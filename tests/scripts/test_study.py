@@ -1,9 +1,5 @@
 import csv
 import dataclasses
-import os
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 
@@ -23,8 +19,8 @@ from scripts.study import (
     policy_design,
 )
 from tests.agents.policies import SHORT, save
+from tests.scripts.commands import run_script
 
-ROOT = Path(__file__).parents[2]
 PAPER = PaperDesign(
     env=SHORT, seeds="2000:2002", estimators=("ekf",), cv_segments=(1, 2, 3), epsilons=(0.5, 2.0),
     deltas=(0.01,), picture_segments=3, privacy_segments=2,
@@ -47,11 +43,7 @@ def test_the_command_line_runs_a_study_and_reports_its_command(tmp_path):
         "--epsilons", "1.0", "--caps", "4", "--bandwidths", "1", "--bandwidth", "2",
         "--workers", "1", "--output", str(tmp_path / "out"),
     )  # fmt: skip
-    script = [sys.executable, str(ROOT / "scripts" / "study.py"), *arguments]
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    result = subprocess.run(
-        script, capture_output=True, text=True, check=False, cwd=ROOT, env=environment
-    )
+    result = run_script("study.py", *arguments)
     assert result.returncode == 0, result.stderr
     with (tmp_path / "out" / "episodes.csv").open() as file:
         assert len(list(csv.DictReader(file))) == 2 * len(PRIVACY.cells())

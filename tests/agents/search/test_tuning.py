@@ -10,18 +10,10 @@ from optuna.trial import TrialState
 
 from agents.evaluation.episodes import EpisodeScore
 from agents.search.tuning import journal_path, locked_study, scores_of
-from agents.search.tuning_task import TuningTask, score_episode
+from agents.search.tuning_task import score_episode
 from dptse_env.estimators import EstimatorSettings
 from dptse_env.estimators.tuned_settings import load_settings, read_settings
-
-TASK = TuningTask(
-    env="dptse_env:dptse/ShortHighway-v0",
-    estimator="ekf",
-    parameters="w99-3lane",
-    privacy="paper",
-    seeds="0:3",
-    keywords={"epsilon": 1.0, "delta": 0.05, "bandwidth": 2},
-)
+from tests.agents.search.tasks import TASK
 
 
 def made_up(task, settings, seed):

@@ -3,20 +3,12 @@ import dataclasses
 import pytest
 
 from agents.evaluation.episodes import run_episode
-from agents.search.tuning_task import TuningTask, score_episode
+from agents.search.tuning_task import score_episode
 from dptse_env.estimators import EstimatorSettings
 from dptse_env.model import ARZParameters
 from dptse_env.schedules import make_schedule
 from tests.agents.policies import save
-
-TASK = TuningTask(
-    env="dptse_env:dptse/ShortHighway-v0",
-    estimator="ekf",
-    parameters="w99-3lane",
-    privacy="paper",
-    seeds="0:3",
-    keywords={"epsilon": 1.0, "delta": 0.05, "bandwidth": 2},
-)
+from tests.agents.search.tasks import TASK
 
 
 def test_an_episode_is_what_an_evaluation_runs_with_another_noise_seed():
