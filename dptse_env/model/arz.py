@@ -4,10 +4,11 @@ from typing import Literal
 
 import numpy as np
 
-from dptse_env.model.dynamics import ARZDynamics, interleave
+from dptse_env.model.dynamics import ARZDynamics
 from dptse_env.model.jacobian import step_jacobian
 from dptse_env.model.layout import RoadNetwork
 from dptse_env.model.parameters import ARZParameters
+from dptse_env.model.rows import MeasurementRows
 from dptse_env.utils.arrays import FloatArray
 from dptse_env.utils.validation import non_negative
 
@@ -21,6 +22,8 @@ LEAST_W = 0.4
 # Share of the jam density below which a measurement treats the density as constant: dv/drho grows
 # as psi / rho^2, which makes filters diverge.
 MEASUREMENT_FLOOR = 0.01
+# Bounds on the factors of demand states.
+LEAST_FACTOR, LARGEST_FACTOR = 0.1, 3.0
 
 
 class ARZModel(ARZDynamics):
@@ -31,11 +34,15 @@ class ARZModel(ARZDynamics):
         parameters: Parameters of the model; each cell's jam density follows its lanes.
         time_step: T [s].
         reference_speed: v_0 [km/h], where sensors release the centred flow rho (v - v_0) [veh/h];
-            None where they release the speed.
+            None where they release the speed. A release may have a centre of its own for each
+            segment in its place.
+        rows: What a measurement may cover; None for single segments.
+        demand_states: Whether the state has a factor on the demand of each entry.
 
     Raises:
-        ValueError: The network is impossible, the time step violates the CFL condition, or the
-            reference speed is negative or not finite.
+        ValueError: The network is impossible, the time step violates the CFL condition, the
+            reference speed is negative or not finite, or rows cover several segments where mean
+            speeds are released, which have no sum.
     """
 
     def __init__(
@@ -44,9 +51,14 @@ class ARZModel(ARZDynamics):
         parameters: ARZParameters,
         time_step: float = 1.0,
         reference_speed: float | None = None,
+        rows: MeasurementRows | None = None,
+        demand_states: bool = False,
     ) -> None:
         """Prepare the dynamics and the scale of measurements."""
-        super().__init__(network, parameters, time_step)
+        super().__init__(network, parameters, time_step, demand_states)
+        self.rows = rows or MeasurementRows.single(self.n_segments)
+        if reference_speed is None and not (self.rows.span == 1).all():
+            raise ValueError("model.rows must be single segments where mean speeds are released")
         self.reference_speed: float | None = None
         second = 1.0
         if reference_speed is not None:
@@ -55,41 +67,61 @@ class ARZModel(ARZDynamics):
         self.measurement_scale = np.array([self.density_scale, second * self.speed_scale])
 
     def jacobian(self, states: FloatArray, inputs: FloatArray) -> FloatArray:
-        """Analytic derivative of `step` by the state, `(n, 2 S, 2 S)`."""
+        """Analytic derivative of `step` by the state, `(n, n_x, n_x)`."""
         return step_jacobian(self, states, inputs)
 
-    def measure(self, states: FloatArray) -> FloatArray:
-        """Density and speed of each segment `(n, S, 2)` (paper, eq. 3), density floored in v.
+    def measure(self, states: FloatArray, centre: FloatArray | None = None) -> FloatArray:
+        """Density and speed of each row `(n, M, 2)` (paper, eq. 3), density floored in v.
 
-        With a reference speed, density and centred flow psi - rho (p(rho) + v_0).
+        Where flows are released, density and centred flow psi - rho (p(rho) + v_0), averaged over
+        the segments of a row.
+
+        Args:
+            states: `(n, n_x)`.
+            centre: v_0 of each segment `(S,)` or `(n, S)` [km/h]; None for the reference speed.
         """
         if self.reference_speed is None:
-            return self.traffic(states)
-        rho, psi = states[..., 0::2], states[..., 1::2]
-        carried = self.relations.pressure(rho, self.jam_density) + self.reference_speed
-        return np.stack([rho, psi - rho * carried], axis=-1)
+            return self.traffic(states)[:, self.rows.first]
+        rho, psi = self.components(states)
+        v_0 = self.reference_speed if centre is None else centre
+        carried = self.relations.pressure(rho, self.jam_density) + v_0
+        return self.rows.averages(np.stack([rho, psi - rho * carried], axis=-1))
 
-    def measurement_jacobian(self, states: FloatArray) -> FloatArray:
-        """Derivative of `measure`, `(n, S, 2, 2)`, by the segment's (rho, psi)."""
+    def measurement_jacobian(
+        self, states: FloatArray, centre: FloatArray | None = None
+    ) -> FloatArray:
+        """Derivative, `(n, S, 2, 2)`, of a row of a single segment by the segment's (rho, psi)."""
         if self.reference_speed is None:
             return self.traffic_jacobian(states)
-        pressure = self.relations.pressure(states[..., 0::2], self.jam_density)
+        pressure = self.relations.pressure(self.components(states)[0], self.jam_density)
+        v_0 = self.reference_speed if centre is None else centre
         jacobian = np.zeros((*pressure.shape, 2, 2))
         jacobian[..., 0, 0] = 1.0
-        jacobian[..., 1, 0] = -(1.0 + self.parameters.gamma) * pressure - self.reference_speed
+        jacobian[..., 1, 0] = -(1.0 + self.parameters.gamma) * pressure - v_0
         jacobian[..., 1, 1] = 1.0
         return jacobian
 
+    def measurement_matrix(
+        self, states: FloatArray, centre: FloatArray | None = None
+    ) -> FloatArray:
+        """Derivative of `measure` by the state, `(n, M, 2, n_x)`."""
+        blocks = self.measurement_jacobian(states, centre)
+        n, S = blocks.shape[:2]
+        matrix = np.zeros((n, self.rows.n_rows, 2, self.n_states))
+        by_segment = np.einsum("ms,nsij->nmisj", self.rows.weights, blocks)
+        matrix[..., : 2 * S] = by_segment.reshape(n, -1, 2, 2 * S)
+        return matrix
+
     def traffic(self, states: FloatArray) -> FloatArray:
         """Density and speed of each segment `(n, S, 2)`, the density floored in the speed."""
-        rho, psi = states[..., 0::2], states[..., 1::2]
+        rho, psi = self.components(states)
         floored = np.maximum(rho, MEASUREMENT_FLOOR * self.jam_density)
         speed = psi / floored - self.relations.pressure(floored, self.jam_density)
         return np.stack([rho, speed], axis=-1)
 
     def traffic_jacobian(self, states: FloatArray) -> FloatArray:
         """Derivative of `traffic`, `(n, S, 2, 2)`, by the segment's (rho, psi)."""
-        rho, psi = states[..., 0::2], states[..., 1::2]
+        rho, psi = self.components(states)
         floor = MEASUREMENT_FLOOR * self.jam_density
         floored = np.maximum(rho, floor)
         pressure = self.relations.pressure(floored, self.jam_density)
@@ -105,15 +137,18 @@ class ARZModel(ARZDynamics):
 
         `cone`: rho in [1 veh/km, rho_m], v >= 0 and w in [0.4 v_f, 1.1 v_f].
         `box`: rho in [0, rho_m], psi in [0, rho_m v_f], the paper's, which leaves w unbounded.
+        Demand factors lie in [0.1, 3] in both.
         """
         v_f, jam = self.parameters.free_flow_speed, self.jam_density
+        density, psi = self.components(states)
         if bounds == "cone":
-            rho = np.clip(states[..., 0::2], LEAST_DENSITY, jam)
+            rho = np.clip(density, LEAST_DENSITY, jam)
             least_w = np.maximum(self.relations.pressure(rho, jam), LEAST_W * v_f)
             low, high = least_w * rho, self.largest_speed * rho
         elif bounds == "box":
-            rho = np.clip(states[..., 0::2], 0.0, jam)
+            rho = np.clip(density, 0.0, jam)
             low, high = np.zeros_like(rho), np.broadcast_to(jam * v_f, rho.shape)
         else:
             raise ValueError(f"bounds must be 'cone' or 'box', got {bounds!r}")
-        return interleave(rho, np.clip(states[..., 1::2], low, high))
+        factors = np.clip(self.demand_factors(states), LEAST_FACTOR, LARGEST_FACTOR)
+        return self.compose(rho, np.clip(psi, low, high), factors)

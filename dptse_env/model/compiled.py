@@ -20,7 +20,7 @@ class CompiledARZModel(ARZModel):
         return make_road_arrays(self)
 
     def step(self, states: FloatArray, inputs: FloatArray) -> FloatArray:
-        """States `(n, 2 S)` one time step later."""
+        """States `(n, n_x)` one time step later."""
         after = np.empty(states.shape)
         _step_batch(self.road, np.ascontiguousarray(states), np.ascontiguousarray(inputs), after)
         return after
@@ -58,3 +58,8 @@ def _jacobian_batch(
                 b = road.neighbours[c, slot]
                 for k in range(4):
                     jacobian[i, 2 * c + k // 2, 2 * b + k % 2] = blocks[c, slot, k]
+        for j in range(2 * road.jam.size, after.size):
+            e = j - 2 * road.jam.size
+            jacobian[i, j, j] = 1.0
+            for k in range(2):
+                jacobian[i, 2 * road.entries[e] + k, j] = scratch.by_factor[e, k]

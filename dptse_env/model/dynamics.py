@@ -4,6 +4,9 @@ State `x = [rho_0, psi_0, rho_1, psi_1, ...]` over the S segments, with density 
 relative flow psi = rho w [veh/h], where w = v + p(rho) [km/h] is what drivers carry with them.
 Inputs `u = [D_in, w_in, rho_out, D_on1, w_on1, ..., rho_off1, ...]`: demands at the entries [veh/h]
 with their w [km/h], and densities behind the exits [veh/km]. Arrays have a leading batch axis n.
+
+With demand states the state has a further component for each entry at its end: a factor on the
+demand that the inputs give there, which a step leaves as it is.
 """
 
 from typing import NamedTuple
@@ -41,13 +44,18 @@ class ARZDynamics:
         network: The road.
         parameters: Parameters of the model; each cell's jam density follows its lanes.
         time_step: T [s].
+        demand_states: Whether the state has a factor on the demand of each entry.
 
     Raises:
         ValueError: The network is impossible, or the time step violates the CFL condition.
     """
 
     def __init__(
-        self, network: RoadNetwork, parameters: ARZParameters, time_step: float = 1.0
+        self,
+        network: RoadNetwork,
+        parameters: ARZParameters,
+        time_step: float = 1.0,
+        demand_states: bool = False,
     ) -> None:
         """Derive the arrays that the equations need and check the time step."""
         self.network = network
@@ -56,7 +64,8 @@ class ARZDynamics:
         self.layout: Layout = make_layout(network)
         self.relations = Relations(parameters.free_flow_speed, parameters.gamma)
         self.n_segments = self.layout.n_segments
-        self.n_states = 2 * self.n_segments
+        self.n_demand_states = self.layout.entries.size if demand_states else 0
+        self.n_states = 2 * self.n_segments + self.n_demand_states
         self.n_inputs = self.layout.n_inputs
         self.n_boundaries = self.layout.n_boundaries
         per_lane = parameters.jam_density / parameters.lanes
@@ -74,13 +83,43 @@ class ARZDynamics:
     # States -------------------------------------------------------------------------------------
 
     def states(self, density: FloatArray, speed: FloatArray) -> FloatArray:
-        """State `(n, 2 S)` of densities [veh/km] and speeds [km/h] `(n, S)`; psi = rho (v + p)."""
+        """State `(n, n_x)` of densities [veh/km] and speeds [km/h] `(n, S)`; psi = rho (v + p).
+
+        Demand factors are 1.
+        """
         w = speed + self.relations.pressure(density, self.jam_density)
-        return interleave(density, density * w)
+        return self.compose(density, density * w)
+
+    def components(self, states: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Views of rho [veh/km] and psi [veh/h] `(n, S)` of states."""
+        end = 2 * self.n_segments
+        return states[..., 0:end:2], states[..., 1:end:2]
+
+    def demand_factors(self, states: FloatArray) -> FloatArray:
+        """View of the factors on the demands `(n, E)`, E = 0 without demand states."""
+        return states[..., 2 * self.n_segments :]
+
+    def compose(
+        self, density: FloatArray, psi: FloatArray, factors: FloatArray | None = None
+    ) -> FloatArray:
+        """State `(n, n_x)` of rho and psi `(n, S)` and demand factors `(n, E)`, 1 by default."""
+        pairs = np.stack([density, psi], axis=-1).reshape(*density.shape[:-1], -1)
+        if self.n_demand_states == 0:
+            return pairs
+        if factors is None:
+            factors = np.ones((*density.shape[:-1], self.n_demand_states))
+        return np.concatenate([pairs, factors], axis=-1)
+
+    @property
+    def state_scale(self) -> FloatArray:
+        """Units `(n_x,)` of normalised states: rho_m, rho_m v_f, and 1 for demand factors."""
+        rho_m = self.density_scale
+        pairs = np.tile([rho_m, rho_m * self.speed_scale], self.n_segments)
+        return np.concatenate([pairs, np.ones(self.n_demand_states)])
 
     def density(self, states: FloatArray) -> FloatArray:
         """Density `(n, S)` [veh/km]."""
-        return states[..., 0::2].copy()
+        return self.components(states)[0].copy()
 
     def speed(self, states: FloatArray) -> FloatArray:
         """Speed `(n, S)` [km/h], `max(w - p(rho), 0)`; the free speed v_f in a vacuum."""
@@ -88,8 +127,7 @@ class ARZDynamics:
 
     def cells(self, states: FloatArray) -> Cells:
         """Derive w, speed and demand of every cell."""
-        density = np.maximum(states[..., 0::2], 0.0)
-        psi = np.maximum(states[..., 1::2], 0.0)
+        density, psi = (np.maximum(part, 0.0) for part in self.components(states))
         empty = density <= VACUUM * self.jam_density
         w = np.where(empty, self.parameters.free_flow_speed, psi / np.where(empty, 1.0, density))
         speed = np.maximum(w - self.relations.pressure(density, self.jam_density), 0.0)
@@ -130,25 +168,31 @@ class ARZDynamics:
         entries = layout.entries  # demand that is not served vanishes
         w_in = inputs[:, layout.entry_inputs + 1]
         source = np.minimum(
-            inputs[:, layout.entry_inputs],
+            self.demands(states, inputs),
             self.relations.supply(w_in, speed[:, entries], jam[entries]),
         )
         return Fluxes(outflow, outflow * w, source, source * w_in)
 
+    def demands(self, states: FloatArray, inputs: FloatArray) -> FloatArray:
+        """Demands at the entries `(n, 1 + I)` [veh/h], by the states' factors if they have any."""
+        demands: FloatArray = inputs[:, self.layout.entry_inputs]
+        return demands * self.demand_factors(states) if self.n_demand_states else demands
+
     def step(self, states: FloatArray, inputs: FloatArray) -> FloatArray:
-        """States `(n, 2 S)` one time step later (paper, eq. 1a and 1b for a general T)."""
-        rho, psi = states[..., 0::2], states[..., 1::2]
+        """States `(n, n_x)` one time step later (paper, eq. 1a and 1b for a general T)."""
+        rho, psi = self.components(states)
         flux = self.fluxes(states, inputs)
         inflow = flux.outflow @ self.layout.routing.T
         relative_inflow = flux.relative_outflow @ self.layout.routing.T
         inflow[:, self.layout.entries] += flux.source
         relative_inflow[:, self.layout.entries] += flux.relative_source
         v_f = self.parameters.free_flow_speed
-        return interleave(
+        return self.compose(
             rho + self.step_ratio * (inflow - flux.outflow),
             psi
             + self.step_ratio * (relative_inflow - flux.relative_outflow)
             + self.relaxation * (v_f * rho - psi),
+            self.demand_factors(states),
         )
 
     def merged(self, cells: Cells) -> tuple[FloatArray, FloatArray]:
@@ -196,8 +240,3 @@ class ARZDynamics:
         inputs[:, layout.entry_inputs + 1] = w
         inputs[:, layout.exit_inputs] = density[:, layout.exit_boundaries]
         return inputs
-
-
-def interleave(density: FloatArray, psi: FloatArray) -> FloatArray:
-    """State `(..., 2 S)` of its two components `(..., S)`."""
-    return np.stack([density, psi], axis=-1).reshape(*density.shape[:-1], -1)

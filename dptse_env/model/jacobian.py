@@ -25,7 +25,7 @@ class Gradients(NamedTuple):
 
 
 def step_jacobian(model: ARZDynamics, states: FloatArray, inputs: FloatArray) -> FloatArray:
-    """Derivative `(n, 2 S, 2 S)` of `model.step`."""
+    """Derivative `(n, n_x, n_x)` of `model.step`."""
     layout = model.layout
     cells = model.cells(states)
     gradients = _gradients(model, states, cells)
@@ -35,7 +35,7 @@ def step_jacobian(model: ARZDynamics, states: FloatArray, inputs: FloatArray) ->
     _merges(model, cells, gradients, by)
     _diverges(model, cells, gradients, by)
     _exits(model, cells, gradients, inputs, by)
-    source_by = _source_gradient(model, cells, gradients, inputs)
+    source_by = _source_gradient(model, states, cells, gradients, inputs)
 
     each = np.arange(model.n_segments)
     relative_by = cells.w[:, :, None, None] * by
@@ -54,7 +54,27 @@ def step_jacobian(model: ARZDynamics, states: FloatArray, inputs: FloatArray) ->
     blocks[:, each, each, 0, 0] += 1.0
     blocks[:, each, each, 1, 0] += model.relaxation * model.parameters.free_flow_speed
     blocks[:, each, each, 1, 1] += 1.0 - model.relaxation
-    return blocks.transpose(0, 1, 3, 2, 4).reshape(-1, model.n_states, model.n_states)
+    n = 2 * model.n_segments
+    traffic = blocks.transpose(0, 1, 3, 2, 4).reshape(-1, n, n)
+    return _with_demand(model, states, inputs, traffic) if model.n_demand_states else traffic
+
+
+def _with_demand(
+    model: ARZDynamics, states: FloatArray, inputs: FloatArray, traffic: FloatArray
+) -> FloatArray:
+    """Add rows and columns of the demand factors, which enter the entries where these are free."""
+    layout, n = model.layout, traffic.shape[1]
+    entries, each = layout.entries, n + np.arange(layout.entries.size)
+    w_in, speed = inputs[:, layout.entry_inputs + 1], model.cells(states).speed[:, entries]
+    supply = model.relations.supply(w_in, speed, model.jam_density[entries])
+    free = model.demands(states, inputs) <= supply
+    by = np.where(free, model.step_ratio * inputs[:, layout.entry_inputs], 0.0)
+    whole = np.zeros((len(traffic), model.n_states, model.n_states))
+    whole[:, :n, :n] = traffic
+    whole[:, each, each] = 1.0
+    whole[:, 2 * entries, each] = by
+    whole[:, 2 * entries + 1, each] = by * w_in
+    return whole
 
 
 def _gradients(model: ARZDynamics, states: FloatArray, cells: Cells) -> Gradients:
@@ -62,7 +82,7 @@ def _gradients(model: ARZDynamics, states: FloatArray, cells: Cells) -> Gradient
     rho = cells.density
     empty = rho <= VACUUM * jam
     held = np.where(empty, 1.0, rho)
-    moving = ~empty & (states[..., 1::2] > 0.0)
+    moving = ~empty & (model.components(states)[1] > 0.0)
     w = np.stack([np.where(moving, -cells.w / held, 0.0), np.where(moving, 1.0 / held, 0.0)], -1)
 
     pressure = relations.pressure(rho, jam)
@@ -148,11 +168,15 @@ def _exits(
 
 
 def _source_gradient(
-    model: ARZDynamics, cells: Cells, gradients: Gradients, inputs: FloatArray
+    model: ARZDynamics,
+    states: FloatArray,
+    cells: Cells,
+    gradients: Gradients,
+    inputs: FloatArray,
 ) -> FloatArray:
     layout = model.layout
     entries, jam = layout.entries, model.jam_density[layout.entries]
-    demand, w_in = inputs[:, layout.entry_inputs], inputs[:, layout.entry_inputs + 1]
+    demand, w_in = model.demands(states, inputs), inputs[:, layout.entry_inputs + 1]
     speed = cells.speed[:, entries]
     _, by_speed = model.relations.supply_gradient(w_in, speed, jam)
     unlimited = demand <= model.relations.supply(w_in, speed, jam)

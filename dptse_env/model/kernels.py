@@ -32,13 +32,16 @@ class Scratch(NamedTuple):
     cells: FloatArray  # (S, 9) w, speed and demand of each cell and their derivatives
     outflow: FloatArray  # (S, 2) q and phi out of each cell
     gradient: FloatArray  # (S, 3, 4) derivatives of (q, phi) by each party's (rho, psi)
+    # (1 + I, 2) derivatives of each entry's next (rho, psi) by its demand factor
+    by_factor: FloatArray
 
 
 @njit(cache=True, error_model="numpy")
 def make_scratch(road: RoadArrays) -> Scratch:
     """Allocate the working space for a road."""
     n = road.jam.size
-    return Scratch(np.empty((n, 9)), np.empty((n, 2)), np.zeros((n, 3, 4)))
+    by_factor = np.zeros((road.entries.size, 2))
+    return Scratch(np.empty((n, 9)), np.empty((n, 2)), np.zeros((n, 3, 4)), by_factor)
 
 
 @njit(cache=True, error_model="numpy")
@@ -222,14 +225,23 @@ def _flows_out(
 
 @njit(cache=True, error_model="numpy")
 def _sources(
-    road: RoadArrays, cells: FloatArray, inputs: FloatArray, after: FloatArray, blocks: FloatArray
+    road: RoadArrays,
+    cells: FloatArray,
+    state: FloatArray,
+    inputs: FloatArray,
+    after: FloatArray,
+    blocks: FloatArray,
+    by_factor: FloatArray,
 ) -> None:
     """Add inflows from outside; demand that is not served is lost."""
-    for c in range(road.jam.size):
+    n = 2 * road.jam.size
+    for e in range(road.entries.size):
+        c = road.entries[e]
         column = road.entry[c]
-        if column < 0:
-            continue
         source, w_in = inputs[column], inputs[column + 1]
+        if state.size > n:
+            by_factor[e, 0] = road.step_ratio * source
+            source *= state[n + e]
         s, _, by_v = supply(w_in, cells[c, _V], road.jam[c], road.free_flow_speed, road.gamma)
         if source > s:
             source = s
@@ -238,6 +250,8 @@ def _sources(
             blocks[c, 0, 1] += slope * cells[c, _V_PSI]
             blocks[c, 0, 2] += slope * w_in * cells[c, _V_RHO]
             blocks[c, 0, 3] += slope * w_in * cells[c, _V_PSI]
+            by_factor[e, 0] = 0.0
+        by_factor[e, 1] = w_in * by_factor[e, 0]
         after[2 * c] += road.step_ratio * source
         after[2 * c + 1] += road.step_ratio * source * w_in
 
@@ -255,12 +269,12 @@ def advance(
 
     Args:
         road: The road.
-        state: `(2 S,)`.
+        state: `(n_x,)`, with a demand factor for each entry at its end or without.
         inputs: `(n_u,)`.
-        after: `(2 S,)` output, the next state; may be `state` itself.
+        after: `(n_x,)` output, the next state; may be `state` itself.
         blocks: `(S, K, 4)` output, the Jacobian: derivatives of a cell's next (rho, psi) by a
             neighbour's (rho, psi), row by row, in the order of `road.neighbours`.
-        scratch: From `make_scratch`.
+        scratch: From `make_scratch`; left with the derivatives by the demand factors.
     """
     cells, outflow, gradient = scratch.cells, scratch.outflow, scratch.gradient
     v_f, ratio, relaxation = road.free_flow_speed, road.step_ratio, road.relaxation
@@ -274,7 +288,9 @@ def advance(
         after[2 * c + 1] = psi - ratio * outflow[c, 1] + relaxation * (v_f * rho - psi)
         blocks[c, 0, 0] = 1.0
         blocks[c, 0, 2], blocks[c, 0, 3] = relaxation * v_f, 1.0 - relaxation
-    _sources(road, cells, inputs, after, blocks)
+    for i in range(2 * road.jam.size, state.size):
+        after[i] = state[i]
+    _sources(road, cells, state, inputs, after, blocks, scratch.by_factor)
 
     for e in range(road.edges.shape[0]):
         start, end, weight = road.edges[e, 0], road.edges[e, 1], ratio * road.edge_share[e]

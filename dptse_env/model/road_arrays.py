@@ -25,6 +25,7 @@ class RoadArrays(NamedTuple):
     parties: IntArray
     share: FloatArray  # (S,) exit share of a diverge
     entry: IntArray  # (S,) input column of the demand from outside, -1 for an inner cell
+    entries: IntArray  # (1 + I,) cells with inflow from outside
     exit: IntArray  # (S,) input column of the density outside, -1 for an inner cell
     edges: IntArray  # (E, 2) cells (from, to) between which vehicles pass
     edge_share: FloatArray  # (E,) share of the outflow that passes
@@ -33,9 +34,9 @@ class RoadArrays(NamedTuple):
     degree: IntArray  # (S,) how many neighbours there are
     terms: IntArray  # (M, 4) (row cell, slot of its neighbour, outflow's cell, its party)
     term_weight: FloatArray  # (M,) weight of the outflow's gradient in the Jacobian [h/km]
-    # v_0 [km/h] of the centred flow that sensors release; NaN where they release the speed
-    reference_speed: float
     second_scale: float  # unit of the second number that sensors release [km/h or veh/h]
+    row_first: IntArray  # (M,) first segment of each row of a measurement
+    row_span: IntArray  # (M,) segments of each row
 
 
 def make_road_arrays(model: ARZModel) -> RoadArrays:
@@ -77,6 +78,7 @@ def make_road_arrays(model: ARZModel) -> RoadArrays:
         parties=parties,
         share=share,
         entry=entry,
+        entries=layout.entries,
         exit=leave,
         edges=edges,
         edge_share=edge_share,
@@ -84,8 +86,9 @@ def make_road_arrays(model: ARZModel) -> RoadArrays:
         degree=degree,
         terms=terms,
         term_weight=model.step_ratio * weights,
-        reference_speed=np.nan if model.reference_speed is None else model.reference_speed,
         second_scale=float(model.measurement_scale[1]),
+        row_first=model.rows.first,
+        row_span=model.rows.span,
     )
 
 

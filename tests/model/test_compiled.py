@@ -87,7 +87,5 @@ def test_kernel_may_overwrite_its_state():
 def test_a_road_says_what_sensors_release():
     for model_type in (ARZModel, CompiledARZModel):
         speed, flow = model_type(HIGHWAY, W99), model_type(HIGHWAY, W99, reference_speed=40.0)
-        assert np.isnan(make_road_arrays(speed).reference_speed)
-        assert make_road_arrays(flow).reference_speed == 40.0
         assert make_road_arrays(speed).second_scale == W99.free_flow_speed
         assert make_road_arrays(flow).second_scale == W99.jam_density * W99.free_flow_speed
