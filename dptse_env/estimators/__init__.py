@@ -10,6 +10,7 @@ from dptse_env.estimators.registry import (
     settings_type,
 )
 from dptse_env.estimators.settings import (
+    DemandSettings,
     EnsembleSettings,
     EstimatorSettings,
     HorizonSettings,
@@ -19,6 +20,7 @@ from dptse_env.estimators.settings import (
 __all__ = [
     "BACKENDS",
     "ESTIMATORS",
+    "DemandSettings",
     "EnsembleSettings",
     "Estimate",
     "Estimator",

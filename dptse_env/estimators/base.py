@@ -51,7 +51,7 @@ class Estimator(Protocol):
         is_compiled: Whether `predict` and `update` release Python's global interpreter lock, so
             that blocks of episodes benefit from threads.
         n_episodes: Episodes n in the batch.
-        innovations: `(n, S, 2)` residuals of both releases before the last update, over their
+        innovations: `(n, M, 2)` residuals of both releases before the last update, over their
             predicted standard deviations; 0 where nothing was observed.
         diverged: `(n,)` whether the last update found the filter non-finite or indefinite and
             reset it to its prior.
@@ -72,7 +72,7 @@ class Estimator(Protocol):
 
         Args:
             episodes: `(k,)` distinct indices.
-            states: `(k, 2 S)` prior means.
+            states: `(k, 2 S)` prior means of the traffic; demand factors begin at 1.
             generators: A random stream per episode, for estimators that draw.
         """
 
@@ -80,16 +80,25 @@ class Estimator(Protocol):
         """Predict episodes `(k,)` one step ahead under the model's inputs `(k, n_u)`."""
 
     def update(
-        self, episodes: IntArray, observed: BoolArray, values: FloatArray, sigma: FloatArray
+        self,
+        episodes: IntArray,
+        observed: BoolArray,
+        values: FloatArray,
+        sigma: FloatArray,
+        centre: FloatArray | None = None,
     ) -> None:
-        """Update episodes by measurements.
+        """Update episodes by measurements, whose M rows are those of ``model.rows``.
 
         Args:
             episodes: `(k,)` distinct indices.
-            observed: `(k, S)` flags of the measured segments.
-            values: `(k, S, 2)` density [veh/km] and, depending on the model, speed [km/h] or
-                centred flow [veh/h]; ignored where not observed.
-            sigma: `(2,)` standard deviations of their noise, in the same units.
+            observed: `(k, M)` flags of the rows that are measured.
+            values: `(k, M, 2)` average density [veh/km] of a row's segments and, depending on the
+                model, their speed [km/h] or average centred flow [veh/h]; ignored where not
+                observed.
+            sigma: Standard deviations of their noise, in the same units, `(k, M, 2)` or of a shape
+                that broadcasts to it.
+            centre: Speeds v_0 [km/h] that the flows are centred on, `(k, S)` or of a shape that
+                broadcasts to it; None for the model's reference speed.
         """
 
     def estimate(self) -> Estimate:

@@ -1,8 +1,7 @@
 """Base class of estimators: batch size, flags, and checks of arguments."""
 
-import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -12,13 +11,29 @@ from dptse_env.model import ARZModel
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 
 
-class Measurements(NamedTuple):
-    """Checked arguments of `Estimator.update`."""
+class EpisodeMeasurements(NamedTuple):
+    """Measurements of one episode."""
 
-    episodes: IntArray
-    observed: BoolArray
-    values: FloatArray
-    sigma: FloatArray
+    observed: BoolArray  # (M,)
+    values: FloatArray  # (M, 2)
+    sigma: FloatArray  # (M, 2)
+    centre: FloatArray  # (S,)
+
+
+class Measurements(NamedTuple):
+    """Checked arguments of `Estimator.update`, all of full shape."""
+
+    episodes: IntArray  # (k,)
+    observed: BoolArray  # (k, M)
+    values: FloatArray  # (k, M, 2)
+    sigma: FloatArray  # (k, M, 2)
+    centre: FloatArray  # (k, S), NaN where speeds are released
+
+    def by_episode(self) -> Iterator[tuple[int, EpisodeMeasurements]]:
+        """Iterate over the k episodes and their measurements."""
+        rows = self.observed, self.values, self.sigma, self.centre
+        for episode, *arrays in zip(self.episodes.tolist(), *rows, strict=True):
+            yield episode, EpisodeMeasurements(*arrays)
 
 
 def checked_episodes(episodes: IntArray, n_episodes: int) -> IntArray:
@@ -41,26 +56,58 @@ def checked_rows(name: str, rows: FloatArray, shape: tuple[int, ...]) -> FloatAr
     return array
 
 
+def checked_deviations(sigma: FloatArray, shape: tuple[int, ...]) -> FloatArray:
+    """Return standard deviations of full shape; refuse one that is negative or not finite."""
+    given = np.asarray(sigma, dtype=np.float64)
+    if given.shape[-1:] != shape[-1:] or given.ndim > len(shape):
+        raise ValueError(f"sigma must have shape {shape} or broadcast to it, got {given.shape}")
+    if not (given >= 0.0).all() or not np.isfinite(given).all():
+        worst = given[~((given >= 0.0) & np.isfinite(given))].flat[0]
+        raise ValueError(f"sigma must be finite and >= 0, got {worst}")
+    try:
+        return np.ascontiguousarray(np.broadcast_to(given, shape))
+    except ValueError as problem:
+        message = f"sigma must have shape {shape} or broadcast to it, got {given.shape}"
+        raise ValueError(message) from problem
+
+
 def checked_measurements(
     n_episodes: int,
-    n_segments: int,
+    model: ARZModel,
     episodes: IntArray,
     observed: BoolArray,
     values: FloatArray,
     sigma: FloatArray,
+    centre: FloatArray | None,
 ) -> Measurements:
     """Return the arguments of `Estimator.update` as contiguous arrays; refuse malformed ones."""
     indices = checked_episodes(episodes, n_episodes)
+    shape = indices.size, model.rows.n_rows
     mask = np.ascontiguousarray(observed, dtype=np.bool_)
-    if mask.shape != (indices.size, n_segments):
-        raise ValueError(f"observed must have shape {(indices.size, n_segments)}, got {mask.shape}")
-    noise = checked_rows("sigma", sigma, (2,))
-    for i, value in enumerate(noise.tolist()):
-        if not 0.0 <= value < math.inf:
-            raise ValueError(f"sigma[{i}] must be finite and >= 0, got {value}")
+    if mask.shape != shape:
+        raise ValueError(f"observed must have shape {shape}, got {mask.shape}")
     return Measurements(
-        indices, mask, checked_rows("values", values, (indices.size, n_segments, 2)), noise
+        indices,
+        mask,
+        checked_rows("values", values, (*shape, 2)),
+        checked_deviations(sigma, (*shape, 2)),
+        checked_centres(centre, model, indices.size),
     )
+
+
+def checked_centres(centre: FloatArray | None, model: ARZModel, n_rows: int) -> FloatArray:
+    """Return the centres of flows (n_rows, S): NaN where the model measures speeds."""
+    shape = n_rows, model.n_segments
+    if model.reference_speed is None:
+        return np.full(shape, np.nan)
+    if centre is None:
+        return np.full(shape, model.reference_speed)
+    given = np.asarray(centre, dtype=np.float64)
+    if given.ndim > 2 or given.shape[-1:] != shape[1:] or given.shape[:-1] not in ((), shape[:1]):
+        raise ValueError(f"centre must have shape {shape} or broadcast to it, got {given.shape}")
+    if not np.isfinite(given).all():
+        raise ValueError(f"centre must be finite, got {given[~np.isfinite(given)].flat[0]}")
+    return np.ascontiguousarray(np.broadcast_to(given, shape))
 
 
 class BatchEstimator(ABC):
@@ -78,7 +125,7 @@ class BatchEstimator(ABC):
         self.n_episodes = n_episodes
         self.settings = settings
         self._noise_scale: float = getattr(settings, "noise_scale", 1.0)
-        self.innovations = np.zeros((n_episodes, model.n_segments, 2))
+        self.innovations = np.zeros((n_episodes, model.rows.n_rows, 2))
         self.diverged = np.zeros(n_episodes, dtype=np.bool_)
         self.fallback = np.zeros(n_episodes, dtype=np.bool_)
 
@@ -87,7 +134,11 @@ class BatchEstimator(ABC):
     ) -> None:
         """See `Estimator.reset`."""
         indices = checked_episodes(episodes, self.n_episodes)
-        states = checked_rows("states", states, (indices.size, self.model.n_states))
+        shape = (indices.size, 2 * self.model.n_segments)
+        states = checked_rows("states", states, shape)
+        if self.model.n_demand_states > 0:
+            factors = np.ones((indices.size, self.model.n_demand_states))
+            states = np.concatenate([states, factors], axis=1)
         self.innovations[indices] = 0.0
         self.diverged[indices] = False
         self.fallback[indices] = False
@@ -99,11 +150,17 @@ class BatchEstimator(ABC):
         self._predict(indices, checked_rows("inputs", inputs, (indices.size, self.model.n_inputs)))
 
     def update(
-        self, episodes: IntArray, observed: BoolArray, values: FloatArray, sigma: FloatArray
+        self,
+        episodes: IntArray,
+        observed: BoolArray,
+        values: FloatArray,
+        sigma: FloatArray,
+        centre: FloatArray | None = None,
     ) -> None:
         """See `Estimator.update`; observed values that are not finite make a filter diverge."""
-        sizes = self.n_episodes, self.model.n_segments
-        measured = checked_measurements(*sizes, episodes, observed, values, sigma)
+        measured = checked_measurements(
+            self.n_episodes, self.model, episodes, observed, values, sigma, centre
+        )
         self.fallback[measured.episodes] = False
         self._update(measured._replace(sigma=self._noise_scale * measured.sigma))
 

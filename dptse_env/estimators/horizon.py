@@ -1,8 +1,8 @@
 """Settings and quadratic program of the window, shared by both moving horizon estimators.
 
-All quantities here are normalised, rho by rho_m, psi and flows by rho_m v_f and speeds by v_f. A
-window holds L = T + 1 stages; z stacks their states. The program is the paper's, eq. 17:
-`minimise z' H z + q' z with lower <= z <= upper`.
+All quantities here are normalised, rho by rho_m, psi and flows by rho_m v_f and speeds by v_f; a
+demand factor is a number without a unit. A window holds L = T + 1 stages; z stacks their states.
+The program is the paper's, eq. 17: `minimise z' H z + q' z with lower <= z <= upper`.
 """
 
 import warnings
@@ -13,9 +13,10 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
+from dptse_env.estimators.noise import initial_variance
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel, Bounds
-from dptse_env.model.arz import LEAST_DENSITY, LEAST_W
+from dptse_env.model.arz import LARGEST_FACTOR, LEAST_DENSITY, LEAST_FACTOR, LEAST_W
 from dptse_env.model.parameters import LARGEST_W
 from dptse_env.utils.arrays import BoolArray, FloatArray
 from dptse_env.utils.validation import positive
@@ -33,11 +34,23 @@ POLISHES = 10
 LEAST_DEVIATION = 1e-3
 
 
-def process_variance(settings: EstimatorSettings) -> FloatArray:
-    """Return the variances `(2,)` behind w_2; a zero is refused."""
+def require_process_noise(settings: EstimatorSettings) -> None:
+    """Refuse a process noise of zero, whose weight w_2 would be infinite."""
     for i, value in enumerate(settings.process_noise):
         positive(f"estimator_settings.process_noise[{i}]", value)
-    return np.square(np.array(settings.process_noise, dtype=np.float64))
+
+
+def moving_variance(model: ARZModel, settings: EstimatorSettings) -> FloatArray:
+    """Return the arrival variances `(n_x,)` of a window that moves.
+
+    They are those of `arrival_noise`, and for demand factors those of the prior: a window of the
+    default length says less about a factor than its random walk takes away, and an arrival that is
+    too sure of itself keeps a wrong factor for many windows.
+    """
+    variance = initial_variance(model, settings)
+    n = 2 * model.n_segments
+    variance[:n] = np.tile(np.square(settings.mhe.arrival_noise), model.n_segments)
+    return variance
 
 
 def settings_of_mhe(settings: EstimatorSettings) -> EstimatorSettings:
@@ -60,46 +73,49 @@ def settings_of_mhe(settings: EstimatorSettings) -> EstimatorSettings:
 
 
 def normalised_bounds(model: ARZModel, bounds: Bounds) -> tuple[FloatArray, FloatArray]:
-    """Return the least and the largest normalised state `(2 S,)` of the program."""
+    """Return the least and the largest normalised state `(n_x,)` of the program."""
     share = model.jam_density / model.density_scale
-    lower, upper = np.zeros(model.n_states), np.repeat(share, 2)
+    lower, upper = np.zeros(2 * model.n_segments), np.repeat(share, 2)
     if bounds == "cone":
         lower = np.tile([1.0, LEAST_W], model.n_segments) * LEAST_DENSITY / model.density_scale
         upper[1::2] *= LARGEST_W
-    return lower, upper
+    factors = np.ones(model.n_demand_states)
+    return (
+        np.concatenate([lower, LEAST_FACTOR * factors]),
+        np.concatenate([upper, LARGEST_FACTOR * factors]),
+    )
 
 
 class Window(NamedTuple):
-    """A window's linearised problem: L stages, S segments, normalised."""
+    """A window's linearised problem: L stages of n_x components, M rows, normalised."""
 
-    arrival: FloatArray  # (2 S,) mean of the first state
-    arrival_variance: FloatArray  # (2,) its variances, of rho and of psi
-    transitions: FloatArray  # (L - 1, 2 S, 2 S) A of each step
-    offsets: FloatArray  # (L - 1, 2 S) B u + c_1 of each step
-    process_variance: FloatArray  # (2,)
-    observed: BoolArray  # (L, S)
-    # (L, S, 2) derivatives of the second release, speed or flow, by the segment's rho and psi
-    rows: FloatArray
-    targets: FloatArray  # (L, S, 2) density, and the other less the linearisation's constant c_2
-    noise: FloatArray  # (L, 2) variances of both
+    arrival: FloatArray  # (n_x,) mean of the first state
+    arrival_variance: FloatArray  # (n_x,) its variances
+    transitions: FloatArray  # (L - 1, n_x, n_x) A of each step
+    offsets: FloatArray  # (L - 1, n_x) B u + c_1 of each step
+    process_variance: FloatArray  # (L - 1, n_x) of each step
+    observed: BoolArray  # (L, M)
+    rows: FloatArray  # (L, M, 2, n_x) derivatives of both numbers of each row by the state
+    targets: FloatArray  # (L, M, 2) density, and the other less the linearisation's constant c_2
+    noise: FloatArray  # (L, M, 2) variances of both
 
 
 def assemble(window: Window) -> tuple[FloatArray, FloatArray]:
-    """Return H `(L 2 S, L 2 S)` and q `(L 2 S,)` of the paper's eq. 17."""
-    n_stages, n_segments = window.observed.shape
-    n = 2 * n_segments
+    """Return H `(L n_x, L n_x)` and q `(L n_x,)` of the paper's eq. 17."""
+    n_stages, n = len(window.observed), window.arrival.size
     H, q = np.zeros((n_stages * n, n_stages * n)), np.zeros(n_stages * n)
-    mu = np.tile(1.0 / window.arrival_variance, n_segments)
+    mu = 1.0 / window.arrival_variance
     H[:n, :n] += np.diag(mu)
     q[:n] -= 2.0 * mu * window.arrival
-    for i in range(n_stages):
+    for i, observed in enumerate(window.observed):
         here = slice(i * n, (i + 1) * n)
-        C = measurement_matrix(window.observed[i], window.rows[i])
-        w_1 = np.tile(1.0 / window.noise[i], len(C) // 2)
+        C = window.rows[i][observed].reshape(-1, n)
+        w_1 = 1.0 / window.noise[i][observed].ravel()
         H[here, here] += C.T @ (w_1[:, None] * C)
-        q[here] -= 2.0 * C.T @ (w_1 * window.targets[i][window.observed[i]].ravel())
-    w_2 = np.tile(1.0 / window.process_variance, n_segments)
-    for i, (A, c) in enumerate(zip(window.transitions, window.offsets, strict=True)):
+        q[here] -= 2.0 * C.T @ (w_1 * window.targets[i][observed].ravel())
+    steps = zip(window.transitions, window.offsets, window.process_variance, strict=True)
+    for i, (A, c, variance) in enumerate(steps):
+        w_2 = 1.0 / variance
         here, after = slice(i * n, (i + 1) * n), slice((i + 1) * n, (i + 2) * n)
         H[here, here] += A.T @ (w_2[:, None] * A)
         H[after, after] += np.diag(w_2)
@@ -108,16 +124,6 @@ def assemble(window: Window) -> tuple[FloatArray, FloatArray]:
         q[here] += 2.0 * A.T @ (w_2 * c)
         q[after] -= 2.0 * w_2 * c
     return H, q
-
-
-def measurement_matrix(observed: BoolArray, rows: FloatArray) -> FloatArray:
-    """Return C `(m, 2 S)` of a stage: both releases of each observed segment in turn."""
-    segments = np.flatnonzero(observed)
-    C = np.zeros((segments.size, 2, 2 * observed.size))
-    C[np.arange(segments.size), 0, 2 * segments] = 1.0
-    C[np.arange(segments.size), 1, 2 * segments] = rows[segments, 0]
-    C[np.arange(segments.size), 1, 2 * segments + 1] = rows[segments, 1]
-    return C.reshape(-1, 2 * observed.size)
 
 
 def natural_residual(

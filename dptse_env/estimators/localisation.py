@@ -1,7 +1,10 @@
 """Localisation: weights of sampled covariances by the distance along the road."""
 
+from typing import NamedTuple
+
 import numpy as np
 
+from dptse_env.model import ARZModel
 from dptse_env.model.layout import RoadNetwork
 from dptse_env.utils.arrays import FloatArray
 
@@ -39,3 +42,28 @@ def tapers(network: RoadNetwork, reach: float) -> FloatArray:
     """
     x = positions(network)
     return gaspari_cohn(np.abs(x[:, None] - x), reach)
+
+
+class RowTapers(NamedTuple):
+    """Weights of the covariances of M rows of a measurement."""
+
+    with_states: FloatArray  # (M, n_x) with the components of the state
+    among_rows: FloatArray  # (M, M)
+
+
+def row_tapers(model: ARZModel, reach: float) -> RowTapers:
+    """Return weights for the rows of a model's measurements, zero beyond a reach [km].
+
+    A row over several segments has the average weight of its segments, and a demand factor lies
+    where its entry does. With T the weights between segments, W those of the segments in the rows
+    and C the choice of a segment for each component, all weights are blocks of `[C; W] T [C; W]'`,
+    which is positive semidefinite as T is.
+    """
+    weights = model.rows.weights
+    by_segment = weights @ tapers(model.network, reach)
+    entries = model.layout.entries[: model.n_demand_states]
+    segments = np.concatenate([np.repeat(np.arange(model.n_segments), 2), entries])
+    return RowTapers(
+        with_states=np.ascontiguousarray(by_segment[:, segments]),
+        among_rows=by_segment @ weights.T,
+    )

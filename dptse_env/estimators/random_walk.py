@@ -69,11 +69,12 @@ class RandomWalk(BatchEstimator):
         self.variances[episodes] += self._process_variance
 
     def _update(self, measured: Measurements) -> None:
-        self._update_quantity(measured, slice(0, 1), measured.values[..., :1], measured.sigma[:1])
-        speeds, sigma = measured.values[..., 1:], measured.sigma[1:]
+        values, sigma = measured.values, measured.sigma
+        self._update_quantity(measured, slice(0, 1), values[..., :1], sigma[..., :1])
+        speeds, sigma = values[..., 1:], sigma[..., 1:]
         if self.model.reference_speed is not None:
             density = np.maximum(self.means[measured.episodes, :, :1], self._least_density)
-            speeds = self.model.reference_speed + speeds / density
+            speeds = measured.centre[..., None] + speeds / density
             sigma = sigma / density
         self._update_quantity(measured, slice(1, 2), speeds, sigma)
         finite = np.isfinite(measured.values).all(axis=2) | ~measured.observed

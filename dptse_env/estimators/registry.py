@@ -39,6 +39,7 @@ def _expected(part: Any) -> str | None:
 
 _WALK = "dptse_env.estimators.random_walk:RandomWalk"
 _OPEN = "dptse_env.estimators.open_loop:OpenLoop"
+_WITHOUT_DEMAND = (Backends(_WALK, _WALK), Backends(_OPEN, _OPEN))
 ESTIMATORS = Registry(
     "estimator",
     {
@@ -78,11 +79,17 @@ def make_estimator(
         raise ValueError(f"n_episodes must be >= 1, got {n_episodes}")
     check_estimator(estimator, backend)
     part = ESTIMATORS.find(estimator)
-    model_of_backend = _load(getattr(_MODELS, backend))(
-        model.network, model.parameters, model.time_step, model.reference_speed
-    )
-    factory = _load(getattr(part, backend)) if isinstance(part, Backends) else part
     settings = settings_type(estimator)() if settings is None else settings
+    has_demand = getattr(settings, "demand", None) is not None
+    if has_demand and part in _WITHOUT_DEMAND:
+        raise ValueError(
+            f"estimator_settings.demand needs a filter with a traffic model, {estimator!r} has none"
+        )
+    model_of_backend = _load(getattr(_MODELS, backend))(
+        model.network, model.parameters, model.time_step, model.reference_speed, model.rows,
+        has_demand,
+    )  # fmt: skip
+    factory = _load(getattr(part, backend)) if isinstance(part, Backends) else part
     made: Estimator = factory(model_of_backend, n_episodes, settings)
     if is_foreign(made):
         _check_attributes(made, model, n_episodes)
@@ -124,7 +131,7 @@ def _check_attributes(estimator: Estimator, model: ARZModel, n_episodes: int) ->
     if missing is not None:
         raise ValueError(f"estimator {name} must {missing}")
     shapes = {
-        "innovations": (n_episodes, model.n_segments, 2),
+        "innovations": (n_episodes, model.rows.n_rows, 2),
         "diverged": (n_episodes,),
         "fallback": (n_episodes,),
     }

@@ -105,13 +105,41 @@ class HorizonSettings:
 
 
 @dataclass(frozen=True)
+class DemandSettings:
+    """Settings of demand states: factors on the demands at the entries, estimated as well.
+
+    A factor begins at 1 and follows a random walk.
+
+    Attributes:
+        deviation: Standard deviation of the prior.
+        walk: Standard deviation of a step of the random walk.
+
+    Raises:
+        ValueError: A value is out of range.
+    """
+
+    deviation: Annotated[float, Interval(1e-3, 1)] = 0.2
+    walk: Annotated[float, Interval(1e-6, 1)] = 0.058
+
+    def __post_init__(self) -> None:
+        """Check values."""
+        checked_fields(self, f"{_PATH}.demand")
+
+
+@dataclass(frozen=True)
 class EstimatorSettings:
     """Tuning of the estimators, in units of the jam density rho_m and of v_f.
 
     Attributes:
         process_noise: Standard deviations of the process noise of one step: of rho over rho_m, of
             psi over rho_m v_f.
-        walk_noise: The same of the random walk: of rho over rho_m, of v over v_f.
+        density_growth: Standard deviation, over rho_m, of a further process noise of rho at jam
+            density; its variance is in proportion to rho.
+        count_noise: Variance of a measured density beside the mechanism's noise, as a share of
+            rho / l, the variance of a Poisson count: the model's densities are no counts.
+        demand: Settings of demand states; None for a filter that takes the demands as given.
+        walk_noise: Standard deviations of a step of the random walk: of rho over rho_m, of v over
+            v_f.
         noise_scale: Factor on the standard deviations of the mechanism's noise, for an R that also
             covers the difference of vehicle counts and densities.
         initial_variance: Variance of each normalised component of the prior.
@@ -126,6 +154,9 @@ class EstimatorSettings:
     """
 
     process_noise: tuple[Deviation, Deviation] = (0.01, 0.01)
+    density_growth: Deviation = 0.0
+    count_noise: Annotated[float, Interval(0, 100)] = 0.0
+    demand: DemandSettings | None = None
     walk_noise: tuple[Deviation, Deviation] = (0.025, 0.025)
     noise_scale: Annotated[float, Interval(1e-6, 1000)] = 1.0
     initial_variance: Annotated[float, Interval(0, 100, open_low=True)] = 1e-3

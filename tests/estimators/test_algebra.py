@@ -10,6 +10,7 @@ from dptse_env.estimators.compiled.algebra import (
     propagate,
     scratch_vectors,
     segment_update,
+    sum_update,
 )
 from dptse_env.model.compiled import CompiledARZModel
 from dptse_env.model.parameters import load_parameters
@@ -44,10 +45,54 @@ def test_propagation_is_f_p_f_transposed_plus_q():
     noise = np.array([0.3, 0.7])
     expected = dense @ covariance[:, :N] @ dense.T + np.diag(np.tile(noise, N // 2))
     scratch = np.zeros((2, *covariance.shape))
-    propagate(road, blocks, noise, covariance, *scratch)
+    no_factors = np.empty((0, 2))
+    propagate(road, blocks, no_factors, np.tile(noise, N // 2), covariance, *scratch)
     np.testing.assert_allclose(covariance[:, :N], expected, rtol=1e-12, atol=1e-12)
     np.testing.assert_array_equal(covariance[:, :N], covariance[:, :N].T)
     np.testing.assert_array_equal(covariance[:, N:], 0.0)
+
+
+def test_propagation_with_demand_states_adds_their_columns():
+    rng = np.random.default_rng(1)
+    road, n_factors = MODEL.road, MODEL.road.entries.size
+    n = N + n_factors
+    blocks = rng.normal(size=(*road.neighbours.shape, 4))
+    by_factor = rng.normal(size=(n_factors, 2))
+    dense = np.zeros((n, n))
+    for c in range(MODEL.n_segments):
+        for slot in range(road.degree[c]):
+            b = road.neighbours[c, slot]
+            dense[2 * c : 2 * c + 2, 2 * b : 2 * b + 2] = blocks[c, slot].reshape(2, 2)
+    for e, c in enumerate(road.entries):
+        dense[2 * c : 2 * c + 2, N + e] = by_factor[e]
+        dense[N + e, N + e] = 1.0
+    root = 0.1 * rng.normal(size=(n, n))
+    covariance = np.zeros((n, padded(n)))
+    covariance[:, :n] = root @ root.T + 1e-3 * np.eye(n)
+    noise = rng.uniform(0.1, 1.0, n)
+    expected = dense @ covariance[:, :n] @ dense.T + np.diag(noise)
+    propagate(road, blocks, by_factor, noise, covariance, *np.zeros((2, *covariance.shape)))
+    np.testing.assert_allclose(covariance[:, :n], expected, rtol=1e-12, atol=1e-12)
+    np.testing.assert_array_equal(covariance[:, n:], 0.0)
+
+
+@pytest.mark.parametrize(("first", "span"), [(3, 1), (3, 2), (0, 5), (17, 2)])
+def test_the_average_of_segments_is_two_scalar_updates(first, span):
+    rng = np.random.default_rng(2)
+    covariance, residuals = random_covariance(rng), rng.normal(size=2)
+    slopes, noise = rng.normal(size=(MODEL.n_segments, 2)), np.array([0.03, 0.2])
+    H = np.zeros((2, N))
+    for s in range(first, first + span):
+        H[0, 2 * s] = 1.0 / span
+        H[1, 2 * s : 2 * s + 2] = slopes[s] / span
+    P = covariance[:, :N].copy()
+    gain = P @ H.T @ np.linalg.inv(H @ P @ H.T + np.diag(noise))
+    shift = np.zeros(padded(N))
+    work = scratch_vectors(padded(N))
+    assert sum_update(covariance, first, span, residuals, slopes, noise, shift, work)
+    mirror(covariance)
+    np.testing.assert_allclose(shift[:N], gain @ residuals, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(covariance[:, :N], P - gain @ H @ P, rtol=1e-9, atol=1e-12)
 
 
 def updated(covariance, segments, rows, noise):

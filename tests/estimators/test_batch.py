@@ -3,6 +3,7 @@ import pytest
 
 from dptse_env.estimators import BACKENDS, ESTIMATORS
 from dptse_env.estimators.batch import checked_episodes, checked_measurements
+from tests.model.roads import Road, model_of
 
 from .episodes import random_streams, simulate, started
 
@@ -21,9 +22,15 @@ def test_episodes_out_of_range_are_refused():
     [
         ({"observed": np.zeros((2, 4), bool)}, r"observed must have shape \(2, 5\), got \(2, 4\)"),
         ({"values": np.zeros((2, 5))}, r"values must have shape \(2, 5, 2\), got \(2, 5\)"),
-        ({"sigma": np.ones(3)}, r"sigma must have shape \(2,\), got \(3,\)"),
-        ({"sigma": np.array([1.0, -1.0])}, r"sigma\[1\] must be finite and >= 0, got -1\.0"),
-        ({"sigma": np.array([np.inf, 1.0])}, r"sigma\[0\] must be finite and >= 0, got inf"),
+        (
+            {"sigma": np.ones(3)},
+            r"sigma must have shape \(2, 5, 2\) or broadcast to it, got \(3,\)",
+        ),
+        ({"sigma": np.ones((2, 4, 2))}, r"sigma must have shape .*, got \(2, 4, 2\)"),
+        ({"sigma": np.array([1.0, -1.0])}, r"sigma must be finite and >= 0, got -1\.0"),
+        ({"sigma": np.array([np.inf, 1.0])}, r"sigma must be finite and >= 0, got inf"),
+        ({"centre": np.ones((2, 4))}, r"centre must have shape \(2, 5\) or .*, got \(2, 4\)"),
+        ({"centre": np.full(5, np.nan)}, r"centre must be finite, got nan"),
     ],
 )
 def test_bad_measurements_are_named(changes, message):
@@ -32,9 +39,25 @@ def test_bad_measurements_are_named(changes, message):
         "observed": np.ones((2, 5), bool),
         "values": np.zeros((2, 5, 2)),
         "sigma": np.ones(2),
+        "centre": np.ones(5),
     }
+    model = model_of(Road(n_mainline=5), reference_speed=50.0)
     with pytest.raises(ValueError, match=message):
-        checked_measurements(2, 5, **{**good, **changes})
+        checked_measurements(2, model, **{**good, **changes})
+
+
+def test_what_measurements_leave_out_is_filled_in():
+    model = model_of(Road(n_mainline=5), reference_speed=50.0)
+    values = np.zeros((2, 5, 2))
+    sigma = np.array([3.0, 4.0])
+    given = checked_measurements(2, model, np.arange(2), np.ones((2, 5), bool), values, sigma, None)
+    np.testing.assert_array_equal(given.sigma, np.broadcast_to(sigma, (2, 5, 2)))
+    np.testing.assert_array_equal(given.centre, np.full((2, 5), 50.0))
+    speeds = model_of(Road(n_mainline=5))
+    given = checked_measurements(
+        2, speeds, np.arange(2), np.ones((2, 5), bool), values, sigma, np.full(5, 7.0)
+    )
+    assert np.isnan(given.centre).all()  # speeds have no centre
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

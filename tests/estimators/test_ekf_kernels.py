@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dptse_env.estimators import EstimatorSettings
-from dptse_env.estimators.compiled.ekf_kernels import released
+from dptse_env.estimators.compiled.ekf_rows import released
 from dptse_env.estimators.open_loop import estimated_traffic
 from dptse_env.model.relations import VACUUM
 from dptse_env.model.road_arrays import make_road_arrays
@@ -42,9 +42,10 @@ def test_a_release_and_its_derivatives_are_the_models(parameters, release):
     states = model.states(density, rng.uniform(0.0, 1.1, shape) * model.speed_scale)
     states -= 0.01 * scale_of(model) * (rng.random(states.shape) < 0.1)  # some negative
     road = make_road_arrays(model)
+    centre = np.nan if model.reference_speed is None else model.reference_speed
     found = np.array(
         [
-            [released(road, s, *pair) for s, pair in enumerate(state.reshape(-1, 2))]
+            [released(road, s, *pair, centre) for s, pair in enumerate(state.reshape(-1, 2))]
             for state in states
         ]
     )

@@ -1,7 +1,5 @@
 """Both backends of the ensemble Kalman filter, each against the other."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
@@ -11,8 +9,8 @@ from dptse_env.estimators import (
     EstimatorSettings,
     make_estimator,
 )
-from dptse_env.estimators.compiled.normals import fill, make_bits
 
+from .draws import draw_alike
 from .episodes import RELEASES, SIGMA, random_streams, run, scale_of, simulate, started
 
 both_sets = pytest.mark.parametrize("parameters", ["paper", "w99-3lane"])
@@ -20,18 +18,6 @@ both_bounds = pytest.mark.parametrize("bounds", ["cone", "box"])
 both_releases = pytest.mark.parametrize("release", RELEASES)
 
 FIELDS = ("density", "speed", "density_std", "speed_std")
-
-
-class Replay:
-    """Draws what a compiled stream is about to draw, a member a row."""
-
-    def __init__(self, stream):
-        self.stream = stream.copy()
-
-    def standard_normal(self, shape):
-        out = np.empty(shape[0] * shape[1], dtype=np.float32)
-        fill(self.stream, out, make_bits(out.size))
-        return out.reshape(shape[1], shape[0]).T.astype(float)
 
 
 @both_sets
@@ -46,9 +32,7 @@ def test_given_the_same_draws_backends_agree(parameters, bounds, release, option
     episodes = simulate(parameters, n_steps=60, release=release)
     settings = EstimatorSettings(bounds=bounds, enkf=EnsembleSettings(**options))
     compiled, reference = (started("enkf", kind, episodes, settings) for kind in BACKENDS)
-    reference.members[:] = compiled.members
-    process, measurement = (Replay(stream) for stream in compiled._ensembles.streams[0])
-    reference._streams[0] = SimpleNamespace(process=process, measurement=measurement)
+    draw_alike(compiled, reference)
     unit = scale_of(episodes.model)
 
     for k in range(60):

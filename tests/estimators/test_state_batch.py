@@ -107,6 +107,43 @@ def test_projects_as_the_model_does(corridor, parameters, bounds):
         np.testing.assert_allclose(swarm.T / unit(model), expected / unit(model), atol=1e-13)
 
 
+def with_factors(model, states, rng):
+    """The states and random factors on the demands, within their bounds and beyond."""
+    factors = rng.uniform(-0.5, 4.0, (len(states), model.n_demand_states))
+    return np.concatenate([states, factors], axis=1)
+
+
+@everywhere
+def test_demand_factors_scale_what_enters_and_stay(corridor, parameters):
+    plain = ARZModel(corridor, parameters)
+    model, rng = ARZModel(corridor, parameters, demand_states=True), np.random.default_rng(0)
+    for _ in range(50):
+        inputs = random_inputs(model, rng)
+        states = model.project(with_factors(model, random_states(plain, rng), rng))
+        expected = model.step(states, np.repeat(inputs[None], WIDTH, axis=0))
+        actual = advanced(model, states, inputs)
+        scale = model.state_scale
+        np.testing.assert_allclose(actual / scale, expected / scale, atol=1e-12)
+        np.testing.assert_array_equal(model.demand_factors(actual), model.demand_factors(states))
+    ones = model.compose(*model.components(states))
+    assert (np.abs(advanced(model, ones, inputs) - actual)[:, : 2 * model.n_segments] > 1e-3).any()
+
+
+@everywhere
+@pytest.mark.parametrize("bounds", ["cone", "box"])
+def test_projects_demand_factors_as_the_model_does(corridor, parameters, bounds):
+    plain = ARZModel(corridor, parameters)
+    model, rng = ARZModel(corridor, parameters, demand_states=True), np.random.default_rng(0)
+    states = with_factors(model, random_states(plain, rng), rng)
+    states[:, : 2 * model.n_segments] *= 1.0 + 0.5 * rng.normal(size=(WIDTH, plain.n_states))
+    swarm = states.T.copy()
+    project_states(make_road_arrays(model), swarm, bounds == "box")
+    expected = model.project(states, bounds)
+    scale = model.state_scale
+    np.testing.assert_allclose(swarm.T / scale, expected / scale, atol=1e-13)
+    assert (model.demand_factors(expected) != model.demand_factors(states)).any()
+
+
 @everywhere
 def test_measures_as_the_model_does(corridor, parameters):
     model, rng = ARZModel(corridor, parameters), np.random.default_rng(0)
@@ -125,14 +162,26 @@ def test_measures_as_the_model_does(corridor, parameters):
 def test_releases_what_the_model_measures(corridor, parameters, reference_speed):
     """States with negative components among them, as those of members ahead of a projection."""
     model = ARZModel(corridor, parameters, reference_speed=reference_speed)
+    v_0 = np.nan if reference_speed is None else reference_speed
+    assert_releases(model, np.full(model.n_segments, v_0), model.measure)
+
+
+@everywhere
+def test_releases_flows_centred_on_a_speed_of_each_segment(corridor, parameters):
+    model = ARZModel(corridor, parameters, reference_speed=51.0)
+    centre = np.random.default_rng(1).uniform(0.0, 100.0, model.n_segments)
+    assert_releases(model, centre, lambda states: model.measure(states, centre))
+
+
+def assert_releases(model, centre, measure):
     road, rng = make_road_arrays(model), np.random.default_rng(0)
     states = random_states(model, rng)
     states += 0.02 * unit(model) * rng.normal(size=states.shape)
-    expected = model.measure(states)[..., 1]
+    expected = measure(states)[..., 1]
     out = np.empty(WIDTH)
     for s in range(model.n_segments):
         rho, psi = (np.ascontiguousarray(states[:, 2 * s + i]) for i in range(2))
-        released_by_states(road, s, rho, psi, out)
+        released_by_states(road, s, rho, psi, centre[s], out)
         np.testing.assert_allclose(out, expected[:, s], rtol=0.0, atol=1e-9 * road.second_scale)
     assert (states[:, 0::2] < 0.0).any()
 

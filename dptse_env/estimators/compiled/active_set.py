@@ -12,7 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from dptse_env.estimators.compiled.window import Chain, WindowScratch, gradient, solve
+from dptse_env.estimators.compiled.chain import Chain, WindowScratch
+from dptse_env.estimators.compiled.window import gradient, solve
 from dptse_env.estimators.horizon import AT_BOUND
 from dptse_env.model.road_arrays import RoadArrays
 from dptse_env.utils.arrays import FloatArray, IntArray
@@ -60,7 +61,7 @@ def minimise(
 ) -> bool:
     """Replace `z` `(L, padded)`, a guess, by the minimiser; return whether it was found.
 
-    `lower` and `upper` `(2 S,)` bound every stage. A solution is accepted by its natural residual
+    `lower` and `upper` `(n_x,)` bound every stage. A solution is accepted by its natural residual
     |z - clip(z - g / diag H, lower, upper)|.
     """
     n, width = lower.size, z.shape[1]

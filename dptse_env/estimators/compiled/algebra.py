@@ -43,9 +43,26 @@ def _multiply(road: RoadArrays, blocks: FloatArray, right: FloatArray, out: Floa
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _multiply_factors(
+    road: RoadArrays, by_factor: FloatArray, right: FloatArray, out: FloatArray
+) -> None:
+    """Add to `out` = F right what demand factors, the last rows, contribute; they stay."""
+    n, width = 2 * road.jam.size, right.shape[1]
+    for e in range(right.shape[0] - n):
+        c, factor, kept = road.entries[e], right[n + e], out[n + e]
+        upper, lower = out[2 * c], out[2 * c + 1]
+        a, b = by_factor[e, 0], by_factor[e, 1]
+        for j in range(width):
+            upper[j] += a * factor[j]
+            lower[j] += b * factor[j]
+            kept[j] = factor[j]
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
 def propagate(
     road: RoadArrays,
     blocks: FloatArray,
+    by_factor: FloatArray,
     noise: FloatArray,
     covariance: FloatArray,
     product: FloatArray,
@@ -56,21 +73,28 @@ def propagate(
     Args:
         road: The road, for the cells of the blocks.
         blocks: `(S, K, 4)` blocks of F, as written by `dptse_env.model.kernels.advance`.
-        noise: `(2,)` variances that Q adds to every rho and every psi.
-        covariance: `(2 S, padded)`, replaced.
-        product: `(2 S, padded)` scratch.
-        transposed: `(2 S, padded)` scratch.
+        by_factor: `(1 + I, 2)` derivatives of the entries' cells by the demand factors, if the
+            states have them.
+        noise: `(n_x,)` variances that Q adds.
+        covariance: `(n_x, padded)`, replaced.
+        product: `(n_x, padded)` scratch.
+        transposed: `(n_x, padded)` scratch.
     """
     n = covariance.shape[0]
+    has_factors = n > 2 * road.jam.size
     _multiply(road, blocks, covariance, product)
+    if has_factors:
+        _multiply_factors(road, by_factor, covariance, product)
     for i in range(n):
         for j in range(n):
             transposed[i, j] = product[j, i]
         transposed[i, n:] = 0.0
     _multiply(road, blocks, transposed, covariance)
+    if has_factors:
+        _multiply_factors(road, by_factor, transposed, covariance)
     mirror(covariance)
     for i in range(n):
-        covariance[i, i] += noise[i % 2]
+        covariance[i, i] += noise[i]
 
 
 @njit(cache=True, error_model="numpy")
@@ -83,9 +107,9 @@ def mirror(covariance: FloatArray) -> None:
 
 @njit(cache=True, error_model="numpy")
 def scratch_vectors(width: int) -> tuple[FloatArray, ...]:
-    """Allocate the working space of `segment_update`."""
-    work = np.zeros((6, width))
-    return work[0], work[1], work[2], work[3], work[4], work[5]
+    """Allocate the working space of `segment_update` and `sum_update`."""
+    work = np.zeros((8, width))
+    return work[0], work[1], work[2], work[3], work[4], work[5], work[6], work[7]
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
@@ -111,14 +135,14 @@ def segment_update(
             second by the segment's two components.
         noise: `(2,)` variances of the measurements.
         shift: `(padded,)` change of the mean by earlier measurements; updated.
-        work: Six scratch vectors `(padded,)`, their padding zero.
+        work: Scratch vectors `(padded,)`, their padding zero.
 
     Returns:
         Whether both predicted variances are finite, positive and no less than the noise.
     """
-    n, width = covariance.shape
+    width = covariance.shape[1]
     first, second = 2 * segment, 2 * segment + 1
-    c1, k1, rest1, c2, k2, rest2 = work
+    c1, k1, rest1, c2, k2, rest2, _, _ = work
     _read_rows(covariance, first, c1, c2)
 
     total = c1[first] + noise[0]
@@ -143,12 +167,99 @@ def segment_update(
         rest2[j] = c2[j] - total * k2[j]
         shift[j] += k2[j] * step
 
-    for i in range(n):
+    _downdate(covariance, c1, k1, rest1, c2, k2, rest2)
+    return True
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def sum_update(
+    covariance: FloatArray,
+    first: int,
+    span: int,
+    residuals: FloatArray,
+    slopes: FloatArray,
+    noise: FloatArray,
+    shift: FloatArray,
+    work: tuple[FloatArray, ...],
+) -> bool:
+    """Update by the average density and flow of neighbouring segments, as `segment_update`.
+
+    Args:
+        covariance: `(n, padded)`, its lower half replaced.
+        first: The first segment.
+        span: The number of segments.
+        residuals: `(2,)` of both at the point of linearisation.
+        slopes: `(S, 2)` derivatives of each segment's flow by its two components.
+        noise: `(2,)` variances of the measurements.
+        shift: `(padded,)` change of the mean by earlier measurements; updated.
+        work: Scratch vectors `(padded,)`, their padding zero.
+
+    Returns:
+        Whether both predicted variances are finite, positive and no less than the noise.
+    """
+    n, width = covariance.shape
+    c1, k1, rest1, c2, k2, rest2, upper, lower = work
+    part = 1.0 / span
+    c1[:], c2[:] = 0.0, 0.0
+    for s in range(first, first + span):
+        _read_rows(covariance, 2 * s, upper, lower)
+        a, b = part * slopes[s, 0], part * slopes[s, 1]
+        for j in range(n):
+            c1[j] += part * upper[j]
+            c2[j] += a * upper[j] + b * lower[j]
+
+    total, step = noise[0], residuals[0]
+    for s in range(first, first + span):
+        total += part * c1[2 * s]
+        step -= part * shift[2 * s]
+    if not _is_variance(total, noise[0]):
+        return False
+    inverse = 1.0 / total
+    for j in range(width):
+        k1[j] = c1[j] * inverse
+        rest1[j] = c1[j] - total * k1[j]
+        shift[j] += k1[j] * step
+
+    c1_h, k1_h = 0.0, 0.0
+    for s in range(first, first + span):
+        a, b = part * slopes[s, 0], part * slopes[s, 1]
+        c1_h += a * c1[2 * s] + b * c1[2 * s + 1]
+        k1_h += a * k1[2 * s] + b * k1[2 * s + 1]
+    for j in range(width):
+        c2[j] -= c1_h * k1[j] + k1_h * rest1[j]
+    total, step = noise[1], residuals[1]
+    for s in range(first, first + span):
+        a, b = part * slopes[s, 0], part * slopes[s, 1]
+        total += a * c2[2 * s] + b * c2[2 * s + 1]
+        step -= a * shift[2 * s] + b * shift[2 * s + 1]
+    if not _is_variance(total, noise[1]):
+        return False
+    inverse = 1.0 / total
+    for j in range(width):
+        k2[j] = c2[j] * inverse
+        rest2[j] = c2[j] - total * k2[j]
+        shift[j] += k2[j] * step
+
+    _downdate(covariance, c1, k1, rest1, c2, k2, rest2)
+    return True
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _downdate(
+    covariance: FloatArray,
+    c1: FloatArray,
+    k1: FloatArray,
+    rest1: FloatArray,
+    c2: FloatArray,
+    k2: FloatArray,
+    rest2: FloatArray,
+) -> None:
+    """Subtract what two scalar updates in Joseph form take from the lower half of P."""
+    for i in range(covariance.shape[0]):
         x1, y1, x2, y2 = k1[i], rest1[i], k2[i], rest2[i]
         # Up to the diagonal, in full registers.
         for j in range((i // VECTOR_WIDTH + 1) * VECTOR_WIDTH):
             covariance[i, j] -= x1 * c1[j] + y1 * k1[j] + (x2 * c2[j] + y2 * k2[j])
-    return True
 
 
 @njit(cache=True, error_model="numpy")

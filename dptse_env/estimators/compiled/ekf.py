@@ -18,5 +18,5 @@ class CompiledEKF(CompiledFilter):
         kernels.predict(*self._packed, episodes, inputs)
 
     def _update(self, measured: Measurements) -> None:
-        observed, values, sigma = measured.observed, measured.values, measured.sigma
-        kernels.update(*self._packed, measured.episodes, observed, values, sigma)
+        episodes, observed, values, sigma, centre = measured
+        kernels.update(*self._packed, episodes, observed, values, sigma, centre)

@@ -16,7 +16,20 @@ from dptse_env.estimators.compiled.algebra import (
     scratch_vectors,
     segment_update,
 )
-from dptse_env.model.arz import LEAST_DENSITY, LEAST_W, MEASUREMENT_FLOOR
+from dptse_env.estimators.compiled.ekf_rows import (
+    innovate,
+    linearise,
+    make_rows,
+    measured,
+    update_wide,
+    variance_along,
+)
+from dptse_env.model.arz import (
+    LARGEST_FACTOR,
+    LEAST_DENSITY,
+    LEAST_FACTOR,
+    LEAST_W,
+)
 from dptse_env.model.kernels import advance, make_scratch, pressure
 from dptse_env.model.parameters import LARGEST_W
 from dptse_env.model.relations import VACUUM
@@ -31,13 +44,15 @@ Packed = tuple[Any, ...]
 class Filters(NamedTuple):
     """State of the filters of n episodes."""
 
-    means: FloatArray  # (n, 2 S) [veh/km, veh/h]
-    covariances: FloatArray  # (n, 2 S, padded) normalised, the padding zero
-    priors: FloatArray  # (n, 2 S) prior means
-    innovations: FloatArray  # (n, S, 2)
+    means: FloatArray  # (n, n_x) [veh/km, veh/h], then demand factors if there are any
+    covariances: FloatArray  # (n, n_x, padded) normalised, the padding zero
+    priors: FloatArray  # (n, n_x) prior means
+    innovations: FloatArray  # (n, M, 2)
     diverged: BoolArray  # (n,)
-    process_variance: FloatArray  # (2,) normalised
-    initial_variance: float  # normalised
+    process_variance: FloatArray  # (n_x,) normalised
+    growth_variance: float  # variance that rho / rho_m = 1 adds to the process noise of rho
+    count_variance: float  # variance of a density beside the noise, over rho, normalised
+    initial_variance: FloatArray  # (n_x,) normalised
     density_scale: float  # rho_m [veh/km]
     is_box: bool  # whether means are projected into the paper's box, not the cone
 
@@ -47,17 +62,41 @@ def predict(road_: Packed, filters_: Packed, episodes: IntArray, inputs: FloatAr
     """Predict one step ahead under inputs `(k, n_u)`: x = f(x, u), P = F P F' + Q."""
     road, filters = RoadArrays(*road_), Filters(*filters_)
     scratch = make_scratch(road)
-    blocks = np.empty((*road.neighbours.shape, 4))
+    blocks, by_factor = np.empty((*road.neighbours.shape, 4)), scratch.by_factor
     product, transposed = np.empty((2, *filters.covariances.shape[1:]))
-    v_f = road.free_flow_speed
+    noise = np.empty(filters.process_variance.size)
     for k in range(episodes.size):
         mean = filters.means[episodes[k]]
+        process_noise(road, filters, mean, noise)
         advance(road, mean, inputs[k], mean, blocks, scratch)
         project(road, mean, filters.is_box)
-        blocks[:, :, 1] *= v_f
-        blocks[:, :, 2] /= v_f
+        normalise(road, filters.density_scale, blocks, by_factor)
         covariance = filters.covariances[episodes[k]]
-        propagate(road, blocks, filters.process_variance, covariance, product, transposed)
+        propagate(road, blocks, by_factor, noise, covariance, product, transposed)
+
+
+@njit(cache=True, error_model="numpy")
+def process_noise(
+    road: RoadArrays, filters: Filters, mean: FloatArray, variance: FloatArray
+) -> None:
+    """Write the variances of the process noise of a step that leaves a mean `(n_x,)`."""
+    variance[:] = filters.process_variance
+    if filters.growth_variance == 0.0:
+        return
+    for s in range(road.jam.size):
+        variance[2 * s] += filters.growth_variance * mean[2 * s] / filters.density_scale
+
+
+@njit(cache=True, error_model="numpy")
+def normalise(
+    road: RoadArrays, density_scale: float, blocks: FloatArray, by_factor: FloatArray
+) -> None:
+    """Normalise a step's derivatives: rho by rho_m, psi by rho_m v_f."""
+    v_f = road.free_flow_speed
+    blocks[:, :, 1] *= v_f
+    blocks[:, :, 2] /= v_f
+    by_factor[:, 0] /= density_scale
+    by_factor[:, 1] /= density_scale * v_f
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -68,31 +107,49 @@ def update(
     observed: BoolArray,
     values: FloatArray,
     sigma: FloatArray,
+    centre: FloatArray,
 ) -> None:
     """Update by measurements; see `Estimator.update`."""
     road, filters = RoadArrays(*road_), Filters(*filters_)
     shift = np.empty(filters.covariances.shape[2])
     work = scratch_vectors(shift.size)
-    rows = np.empty((road.jam.size, 4))
-    noise = np.array([(sigma[0] / filters.density_scale) ** 2, (sigma[1] / road.second_scale) ** 2])
+    rows = make_rows(road)
     for k in range(episodes.size):
         e = episodes[k]
         mean, covariance = filters.means[e], filters.covariances[e]
-        innovations = filters.innovations[e]
-        _linearise(road, filters, mean, observed[k], values[k], rows)
-        _innovate(covariance, observed[k], rows, noise, innovations)
+        linearise(
+            road,
+            filters.density_scale,
+            filters.count_variance,
+            mean,
+            observed[k],
+            values[k],
+            sigma[k],
+            centre[k],
+            rows,
+        )
+        innovate(road, covariance, observed[k], rows, filters.innovations[e])
         shift[:] = 0.0
-        sound = True
-        for s in range(road.jam.size):
-            if not (observed[k, s] and sound):
+        sound, n_wide = True, 0
+        for m in range(road.row_first.size):
+            if not (observed[k, m] and sound):
+                continue
+            if road.row_span[m] > 1:
+                n_wide += 1
                 continue
             # All rows are linearised at the prediction, so their order is irrelevant.
-            sound = segment_update(covariance, s, rows[s], noise, shift, work)
+            sound = segment_update(
+                covariance, road.row_first[m], rows.single[m], rows.noise[m], shift, work
+            )
+        if n_wide > 0 and sound:
+            sound = update_wide(road, covariance, observed[k], rows, shift, work)
         if observed[k].any():
             mirror(covariance)
             for s in range(road.jam.size):
                 mean[2 * s] += shift[2 * s] * filters.density_scale
                 mean[2 * s + 1] += shift[2 * s + 1] * filters.density_scale * road.free_flow_speed
+            for i in range(2 * road.jam.size, mean.size):
+                mean[i] += shift[i]
             project(road, mean, filters.is_box)
         filters.diverged[e] = not (
             sound and np.isfinite(mean).all() and is_covariance(covariance, shift)
@@ -109,7 +166,7 @@ def restart(filters: Filters, episode: int) -> None:
     covariance = filters.covariances[episode]
     covariance[:] = 0.0
     for i in range(covariance.shape[0]):
-        covariance[i, i] = filters.initial_variance
+        covariance[i, i] = filters.initial_variance[i]
 
 
 @njit(cache=True, error_model="numpy")
@@ -126,75 +183,8 @@ def project(road: RoadArrays, mean: FloatArray, is_box: bool) -> None:
             least_w = max(pressure(rho, jam, v_f, road.gamma), LEAST_W * v_f)
             low, high = least_w * rho, LARGEST_W * v_f * rho
         mean[2 * c], mean[2 * c + 1] = rho, _clip(psi, low, high)
-
-
-@njit(cache=True, error_model="numpy")
-def measured(
-    rho: float, psi: float, jam: float, v_f: float, gamma: float
-) -> tuple[float, float, float]:
-    """Return the measured speed [km/h], density floored, and its derivatives by rho and psi."""
-    floor = MEASUREMENT_FLOOR * jam
-    floored = max(rho, floor)
-    p = pressure(floored, jam, v_f, gamma)
-    slope = -(psi / floored + gamma * p) / floored if rho > floor else 0.0
-    return psi / floored - p, slope, 1.0 / floored
-
-
-@njit(cache=True, error_model="numpy")
-def released(road: RoadArrays, s: int, rho: float, psi: float) -> tuple[float, float, float]:
-    """Return a segment's released speed or centred flow, and its derivatives by rho and psi."""
-    jam, v_f, gamma = road.jam[s], road.free_flow_speed, road.gamma
-    if np.isnan(road.reference_speed):
-        return measured(rho, psi, jam, v_f, gamma)
-    p = pressure(rho, jam, v_f, gamma)
-    flow = psi - rho * (p + road.reference_speed)
-    return flow, -(1.0 + gamma) * p - road.reference_speed, 1.0
-
-
-@njit(cache=True, error_model="numpy")
-def _linearise(
-    road: RoadArrays,
-    filters: Filters,
-    mean: FloatArray,
-    observed: BoolArray,
-    values: FloatArray,
-    rows: FloatArray,
-) -> None:
-    """Write the residuals of both releases and the second row of H, all normalised."""
-    scale, unit = filters.density_scale, road.second_scale
-    for s in range(road.jam.size):
-        if observed[s]:
-            rho, psi = mean[2 * s], mean[2 * s + 1]
-            second, by_rho, by_psi = released(road, s, rho, psi)
-            rows[s, 0] = (values[s, 0] - rho) / scale
-            rows[s, 1] = (values[s, 1] - second) / unit
-            rows[s, 2] = by_rho * scale / unit
-            rows[s, 3] = by_psi * scale * road.free_flow_speed / unit
-
-
-@njit(cache=True, error_model="numpy")
-def _innovate(
-    covariance: FloatArray,
-    observed: BoolArray,
-    rows: FloatArray,
-    noise: FloatArray,
-    innovations: FloatArray,
-) -> None:
-    """Write residuals over their predicted deviations, before the update."""
-    innovations[:] = 0.0
-    for s in range(observed.size):
-        if observed[s]:
-            variance = variance_along(covariance, s, rows[s, 2], rows[s, 3])
-            innovations[s, 0] = rows[s, 0] / np.sqrt(covariance[2 * s, 2 * s] + noise[0])
-            innovations[s, 1] = rows[s, 1] / np.sqrt(variance + noise[1])
-
-
-@njit(cache=True, error_model="numpy")
-def variance_along(covariance: FloatArray, s: int, by_rho: float, by_psi: float) -> float:
-    """Return the variance of a quantity with these derivatives by a segment's rho and psi."""
-    a, b = covariance[2 * s, 2 * s], covariance[2 * s, 2 * s + 1]
-    c = covariance[2 * s + 1, 2 * s + 1]
-    return float(by_rho * by_rho * a + 2.0 * by_rho * by_psi * b + by_psi * by_psi * c)
+    for i in range(2 * road.jam.size, mean.size):
+        mean[i] = _clip(mean[i], LEAST_FACTOR, LARGEST_FACTOR)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

@@ -10,7 +10,8 @@ from dptse_env.estimators.batch import BatchEstimator, Measurements
 from dptse_env.estimators.compiled import enkf_kernels as kernels
 from dptse_env.estimators.compiled.algebra import padded
 from dptse_env.estimators.compiled.normals import STREAM_WIDTH, make_stream
-from dptse_env.estimators.localisation import tapers
+from dptse_env.estimators.localisation import RowTapers, row_tapers
+from dptse_env.estimators.noise import count_variance, initial_variance, process_variance
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
 from dptse_env.model.road_arrays import make_road_arrays
@@ -29,6 +30,9 @@ class CompiledEnKF(BatchEstimator):
     before every update that has measurements, and projects them; `taper` weighs the sampled
     covariances by distance, those of outputs with states and those among outputs. An S with
     covariances that the gain neglects would give the measurements too little weight.
+
+    The noise that depends on the density (`EstimatorSettings.density_growth` and `count_noise`)
+    has the variance at the ensemble's mean for all members.
     """
 
     is_compiled: ClassVar[bool] = True
@@ -36,9 +40,10 @@ class CompiledEnKF(BatchEstimator):
     def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
         """See `make_estimator`."""
         super().__init__(model, n_episodes, settings)
-        unit = model.density_scale * np.array([1.0, model.speed_scale])
-        priors = model.project(np.zeros((n_episodes, model.n_states)), settings.bounds)
+        nothing = np.zeros((n_episodes, model.n_segments))
+        priors = model.project(model.compose(nothing, nothing), settings.bounds)
         taper, none = settings.enkf.taper, np.empty((0, 0))
+        weights = RowTapers(none, none) if taper is None else row_tapers(model, taper)
         self.n_members = settings.enkf.n_members
         self._road = tuple(make_road_arrays(model))
         self._ensembles = kernels.Ensembles(
@@ -48,11 +53,14 @@ class CompiledEnKF(BatchEstimator):
             streams=np.empty((n_episodes, 2, 4, STREAM_WIDTH), dtype=np.uint64),
             innovations=self.innovations,
             diverged=self.diverged,
-            process_deviation=np.array(settings.process_noise) * unit,
-            initial_deviation=float(np.sqrt(settings.initial_variance)) * unit,
+            process_deviation=np.sqrt(process_variance(model, settings)) * model.state_scale,
+            density_growth=float(settings.density_growth),
+            count_variance=count_variance(model, settings),
+            initial_deviation=np.sqrt(initial_variance(model, settings)) * model.state_scale,
             density_scale=model.density_scale,
             inflation=settings.enkf.inflation,
-            tapers=none if taper is None else tapers(model.network, taper),
+            tapers=weights.with_states,
+            row_tapers=weights.among_rows,
             is_box=settings.bounds == "box",
         )
         self._packed = tuple(self._ensembles)
@@ -60,26 +68,25 @@ class CompiledEnKF(BatchEstimator):
 
     @property
     def members(self) -> FloatArray:
-        """Members `(n, M, 2 S)` [veh/km, veh/h], a copy."""
+        """Members `(n, n_members, n_x)` [veh/km, veh/h], then demand factors if any; a copy."""
         return np.ascontiguousarray(self._inner.swapaxes(1, 2))
 
     @property
     def states(self) -> FloatArray:
-        """Means of the members `(n, 2 S)` [veh/km, veh/h]."""
+        """Means of the members `(n, n_x)` [veh/km, veh/h], then demand factors if any."""
         return np.asarray(self._inner.mean(axis=2))
 
     @property
     def covariances(self) -> FloatArray:
-        """Sample covariances `(n, 2 S, 2 S)`, rho normalised by rho_m and psi by rho_m v_f."""
-        scale = self.model.density_scale * np.array([1.0, self.model.speed_scale])
+        """Sample covariances `(n, n_x, n_x)`, rho normalised by rho_m and psi by rho_m v_f."""
         rest = self._inner - self.states[:, :, None]
-        rest /= np.tile(scale, self.model.n_segments)[:, None]
+        rest /= self.model.state_scale[:, None]
         product = rest @ rest.swapaxes(1, 2) / (self.n_members - 1)
         return np.asarray(0.5 * (product + product.swapaxes(1, 2)))
 
     @property
     def _inner(self) -> FloatArray:
-        """Members `(n, 2 S, M)` without padding."""
+        """Members `(n, n_x, n_members)` without padding."""
         return self._ensembles.members[:, :, : self.n_members]
 
     def _reset(
@@ -99,14 +106,7 @@ class CompiledEnKF(BatchEstimator):
         kernels.predict(self._road, self._packed, episodes, inputs)
 
     def _update(self, measured: Measurements) -> None:
-        kernels.update(
-            self._road,
-            self._packed,
-            measured.episodes,
-            measured.observed,
-            measured.values,
-            measured.sigma,
-        )
+        kernels.update(self._road, self._packed, *measured)
 
     def estimate(self) -> Estimate:
         """Current estimate of all episodes."""

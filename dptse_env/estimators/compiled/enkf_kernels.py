@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 
 from dptse_env.estimators.compiled.cholesky import solve
 from dptse_env.estimators.compiled.ekf_kernels import Packed
+from dptse_env.estimators.compiled.moments import centre_row, is_finite, mean_of, moments_of
 from dptse_env.estimators.compiled.normals import Bits, Draws, fill, make_bits
+from dptse_env.estimators.compiled.row_outputs import average_outputs
 from dptse_env.estimators.compiled.state_batch import (
     advance_states,
     make_batch_scratch,
@@ -30,20 +32,32 @@ from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 class Ensembles(NamedTuple):
     """Members of n episodes and the parameters of their updates."""
 
-    # (n, 2 S, width) a member per column [veh/km, veh/h]; columns beyond the members are padding
-    # with copies of the first one
+    # (n, n_x, width) a member per column [veh/km, veh/h], with demand factors if there are any;
+    # columns beyond the members are padding with copies of the first one
     members: FloatArray
-    n_members: int  # M
-    priors: FloatArray  # (n, 2 S) prior means
+    n_members: int
+    priors: FloatArray  # (n, n_x) prior means
     streams: NDArray[np.uint64]  # (n, 2, 4, STREAM_WIDTH) of process noise and of measurement noise
-    innovations: FloatArray  # (n, S, 2)
+    innovations: FloatArray  # (n, M, 2)
     diverged: BoolArray  # (n,)
-    process_deviation: FloatArray  # (2,) of rho and psi in a step [veh/km, veh/h]
-    initial_deviation: FloatArray  # (2,) of the members around a prior [veh/km, veh/h]
+    process_deviation: FloatArray  # (n_x,) of a step [veh/km, veh/h, 1]
+    density_growth: float  # deviation over rho_m that rho = rho_m adds to the noise of rho
+    count_variance: float  # variance of a density beside the noise, over rho, normalised
+    initial_deviation: FloatArray  # (n_x,) of the members around a prior [veh/km, veh/h, 1]
     density_scale: float  # rho_m [veh/km]
     inflation: float  # factor on distances from the mean before an update
-    tapers: FloatArray  # (S, S) weights of covariances between segments; (0, 0) for none
+    tapers: FloatArray  # (M, n_x) weights of covariances of rows with states; (0, 0) for none
+    row_tapers: FloatArray  # (M, M) weights of covariances among rows; (0, 0) for none
     is_box: bool  # whether members are projected into the paper's box, not the cone
+
+
+class Measured(NamedTuple):
+    """Measurements of an episode."""
+
+    rows: IntArray  # (m,) those that are observed
+    values: FloatArray  # (M, 2)
+    sigma: FloatArray  # (M, 2)
+    centre: FloatArray  # (S,)
 
 
 @njit(cache=True, error_model="numpy")
@@ -59,17 +73,23 @@ def _restart(road: RoadArrays, ensembles: Ensembles, e: int) -> None:
     members, n = ensembles.members[e], ensembles.n_members
     for i in range(members.shape[0]):
         members[i] = ensembles.priors[e, i]
-    draws = np.empty(members.shape[0] * n, dtype=np.float32)
+    draws = _make_draws(members.shape[0] * n)
     fill(ensembles.streams[e, 0], draws, make_bits(draws.size))
     _perturb(members, n, ensembles.initial_deviation, draws)
     project_states(road, members, ensembles.is_box)
 
 
 @njit(cache=True, error_model="numpy")
+def _make_draws(size: int) -> Draws:
+    """Allocate at least `size` numbers, an even number of them, as `fill` writes pairs."""
+    return np.empty(size + size % 2, dtype=np.float32)
+
+
+@njit(cache=True, error_model="numpy")
 def _perturb(members: FloatArray, n: int, deviation: FloatArray, draws: Draws) -> None:
     """Add noise to the first n columns; those beyond repeat the first."""
     for i in range(members.shape[0]):
-        row, draw, size = members[i], draws[i * n : (i + 1) * n], deviation[i % 2]
+        row, draw, size = members[i], draws[i * n : (i + 1) * n], deviation[i]
         for j in range(n):
             row[j] += size * draw[j]
         row[n:] = row[0]
@@ -82,39 +102,36 @@ def predict(road_: Packed, ensembles_: Packed, episodes: IntArray, inputs: Float
     n = ensembles.n_members
     size, width = ensembles.members.shape[1:]
     scratch = make_batch_scratch(road, width)
-    draws = np.empty(size * n, dtype=np.float32)
+    draws, deviation = _make_draws(size * n), np.empty(size)
     bits = make_bits(draws.size)
     for k in range(episodes.size):
         members = ensembles.members[episodes[k]]
+        _process_deviation(road, ensembles, members, deviation)
         advance_states(road, members, inputs[k], scratch)
         fill(ensembles.streams[episodes[k], 0], draws, bits)
-        _perturb(members, n, ensembles.process_deviation, draws)
+        _perturb(members, n, deviation, draws)
         project_states(road, members, ensembles.is_box)
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
-def _mean(row: FloatArray, n: int) -> float:
-    """Return the mean of the first n relative to the first, exact for equal numbers."""
-    first, total = row[0], 0.0
-    for j in range(n):
-        total += row[j] - first
-    return float(first + total / n)
-
-
 @njit(cache=True, error_model="numpy")
-def _centre(row: FloatArray, n: int, unit: float, out: FloatArray) -> float:
-    """Write distances from the mean, zero beyond n, and return the mean, both over `unit`."""
-    mean, inverse = _mean(row, n), 1.0 / unit
-    for j in range(n):
-        out[j] = (row[j] - mean) * inverse
-    out[n:] = 0.0
-    return mean * inverse
+def _process_deviation(
+    road: RoadArrays, ensembles: Ensembles, members: FloatArray, deviation: FloatArray
+) -> None:
+    """Write the deviations `(n_x,)` of the process noise of a step that leaves the members."""
+    deviation[:] = ensembles.process_deviation
+    if ensembles.density_growth == 0.0:
+        return
+    scale = ensembles.density_scale
+    for s in range(road.jam.size):
+        share = mean_of(members[2 * s], ensembles.n_members) / scale
+        grown = (ensembles.density_growth * scale) ** 2 * share
+        deviation[2 * s] = np.sqrt(deviation[2 * s] ** 2 + grown)
 
 
 @njit(cache=True, error_model="numpy")
 def _inflate(members: FloatArray, n: int, factor: float) -> None:
     for i in range(members.shape[0]):
-        row, mean = members[i], _mean(members[i], n)
+        row, mean = members[i], mean_of(members[i], n)
         for j in range(row.size):
             row[j] = mean + factor * (row[j] - mean)
 
@@ -127,40 +144,30 @@ def update(
     observed: BoolArray,
     values: FloatArray,
     sigma: FloatArray,
+    centre: FloatArray,
 ) -> None:
     """Update by measurements, perturbed for each member; see `Estimator.update`."""
     road, ensembles = RoadArrays(*road_), Ensembles(*ensembles_)
-    n_segments = road.jam.size
-    draws = np.empty(2 * n_segments * ensembles.n_members, dtype=np.float32)
+    n_rows = road.row_first.size
+    draws = np.empty(2 * n_rows * ensembles.n_members, dtype=np.float32)
     bits = make_bits(draws.size)
-    segments = np.empty(n_segments, dtype=np.int64)
+    rows = np.empty(n_rows, dtype=np.int64)
     for k in range(episodes.size):
         e, n_seen = episodes[k], 0
-        for s in range(n_segments):
-            if observed[k, s]:
-                segments[n_seen] = s
+        for m in range(n_rows):
+            if observed[k, m]:
+                rows[n_seen] = m
                 n_seen += 1
         ensembles.innovations[e] = 0.0
         members, sound = ensembles.members[e], True
         if n_seen > 0:
-            sound = _update_members(
-                road, ensembles, e, segments[:n_seen], values[k], sigma, draws, bits
-            )
+            measured = Measured(rows[:n_seen], values[k], sigma[k], centre[k])
+            sound = _update_members(road, ensembles, e, measured, draws, bits)
             project_states(road, members, ensembles.is_box)
-        ensembles.diverged[e] = not (sound and _is_finite(members))
+        ensembles.diverged[e] = not (sound and is_finite(members))
         if ensembles.diverged[e]:
             ensembles.innovations[e] = 0.0
             _restart(road, ensembles, e)
-
-
-@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
-def _is_finite(members: FloatArray) -> bool:
-    total = 0.0
-    for i in range(members.shape[0]):
-        row = members[i]
-        for j in range(row.size):
-            total += 0.0 * row[j]
-    return total == 0.0
 
 
 @njit(cache=True, error_model="numpy")
@@ -168,9 +175,7 @@ def _update_members(
     road: RoadArrays,
     ensembles: Ensembles,
     e: int,
-    segments: IntArray,
-    values: FloatArray,
-    sigma: FloatArray,
+    measured: Measured,
     draws: Draws,
     bits: Bits,
 ) -> bool:
@@ -184,29 +189,25 @@ def _update_members(
     if ensembles.inflation != 1.0:
         _inflate(members, n, ensembles.inflation)
         project_states(road, members, ensembles.is_box)
-    m, width = 2 * segments.size, members.shape[1]
-    used = draws[: m * n]
+    size, width = 2 * measured.rows.size, members.shape[1]
+    used = draws[: size * n]
     fill(ensembles.streams[e, 1], used, bits)
-    distances, residuals = np.empty((m, width)), np.empty((m, width))
-    units = np.array([ensembles.density_scale, road.second_scale])
-    noise = sigma / units
-    centres = _compare(
-        road, ensembles, e, segments, values, units, noise, used, distances, residuals
-    )
+    distances, residuals = np.empty((size, width)), np.empty((size, width))
+    differences, noise = _compare(road, ensembles, e, measured, used, distances, residuals)
     # Full vector registers for the solution; rows beyond the states are zero.
     states = np.zeros(((members.shape[0] + 7) // 8 * 8, width))
     for i in range(members.shape[0]):
-        _centre(members[i], n, 1.0, states[i])
+        centre_row(members[i], n, 1.0, states[i])
     joint, gain = np.dot(distances, distances.T), np.dot(distances, states.T)
     if ensembles.tapers.size > 0:
-        _taper(ensembles.tapers, segments, joint, gain)
+        _taper(ensembles, measured.rows, joint, gain)
     inverse = 1.0 / (n - 1)
-    for i in range(m):
+    for i in range(size):
         for j in range(i):
             joint[i, j] *= inverse
-        joint[i, i] = inverse * joint[i, i] + noise[i % 2] ** 2
+        joint[i, i] = inverse * joint[i, i] + noise[i] ** 2
         deviation = np.sqrt(joint[i, i])
-        ensembles.innovations[e, segments[i // 2], i % 2] = centres[i] / deviation
+        ensembles.innovations[e, measured.rows[i // 2], i % 2] = differences[i] / deviation
     if not solve(joint, gain):
         return False
     shift = np.dot(gain.T, residuals)
@@ -214,7 +215,7 @@ def _update_members(
         row, step = members[i], shift[i]
         for j in range(width):
             row[j] += inverse * step[j]
-    return _is_finite(members)
+    return is_finite(members)
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
@@ -222,42 +223,56 @@ def _compare(
     road: RoadArrays,
     ensembles: Ensembles,
     e: int,
-    segments: IntArray,
-    values: FloatArray,
-    units: FloatArray,
-    noise: FloatArray,
+    measured: Measured,
     draws: Draws,
     distances: FloatArray,
     residuals: FloatArray,
-) -> FloatArray:
-    """Write deviations of outputs and residuals of members; return the residuals of the mean."""
+) -> tuple[FloatArray, FloatArray]:
+    """Write deviations of outputs and residuals of members, normalised.
+
+    Returns:
+        The residuals of the mean, and the deviations of the noise, `(2 m,)` each.
+    """
     members, n = ensembles.members[e], ensembles.n_members
-    centres, second = np.empty(2 * segments.size), np.empty(members.shape[1])
-    for i in range(segments.size):
-        s = segments[i]
-        rho, psi = members[2 * s], members[2 * s + 1]
-        released_by_states(road, s, rho, psi, second)
+    units = np.array([ensembles.density_scale, road.second_scale])
+    differences, noise = np.empty(2 * measured.rows.size), np.empty(2 * measured.rows.size)
+    width = members.shape[1]
+    second, average, work = np.empty(width), np.empty(width), np.empty(width)
+    for i in range(measured.rows.size):
+        m = measured.rows[i]
+        first, span = road.row_first[m], road.row_span[m]
+        if span == 1:
+            density = members[2 * first]
+            v_0 = measured.centre[first]
+            released_by_states(road, first, density, members[2 * first + 1], v_0, second)
+        else:
+            density = average
+            average_outputs(road, members, first, span, measured.centre, density, second, work)
         for kind in range(2):
-            r, row = 2 * i + kind, rho if kind == 0 else second
+            r, row = 2 * i + kind, density if kind == 0 else second
             distance, residual, draw = distances[r], residuals[r], draws[r * n : (r + 1) * n]
-            centre = values[s, kind] / units[kind] - _centre(row, n, units[kind], distance)
-            size = noise[kind]
+            mean = centre_row(row, n, units[kind], distance)
+            size = measured.sigma[m, kind] / units[kind]
+            if kind == 0 and ensembles.count_variance > 0.0:
+                counted = ensembles.count_variance * mean * units[0] / span
+                size = np.sqrt(size**2 + counted)
+            difference = measured.values[m, kind] / units[kind] - mean
             for j in range(n):
-                residual[j] = centre + size * draw[j] - distance[j]
+                residual[j] = difference + size * draw[j] - distance[j]
             residual[n:] = 0.0
-            centres[r] = centre
-    return centres
+            differences[r], noise[r] = difference, size
+    return differences, noise
 
 
 @njit(cache=True, error_model="numpy")
-def _taper(tapers: FloatArray, segments: IntArray, joint: FloatArray, gain: FloatArray) -> None:
+def _taper(ensembles: Ensembles, rows: IntArray, joint: FloatArray, gain: FloatArray) -> None:
     """Weigh covariances among outputs, and those with the states, by distance."""
     for i in range(joint.shape[0]):
-        weights = tapers[segments[i // 2]]
+        among, weights = ensembles.row_tapers[rows[i // 2]], ensembles.tapers[rows[i // 2]]
         for j in range(joint.shape[1]):
-            joint[i, j] *= weights[segments[j // 2]]
-        for j in range(2 * weights.size):
-            gain[i, j] *= weights[j // 2]
+            joint[i, j] *= among[rows[j // 2]]
+        for j in range(weights.size):
+            gain[i, j] *= weights[j]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -269,19 +284,10 @@ def summarise(road_: Packed, members: FloatArray, n: int, out: FloatArray) -> No
     for e in range(members.shape[0]):
         for s in range(road.jam.size):
             rho, psi = members[e, 2 * s], members[e, 2 * s + 1]
-            mean[0, 0], out[2, e, s] = _moments(rho, n)
-            mean[1, 0] = _mean(psi, n)
+            mean[0, 0], out[2, e, s] = moments_of(rho, n)
+            mean[1, 0] = mean_of(psi, n)
             measured_speeds(mean[0], mean[1], road.jam[s], v_f, gamma, mean[2])
             measured_speeds(rho, psi, road.jam[s], v_f, gamma, speed)
-            _, out[3, e, s] = _moments(speed, n)
+            _, out[3, e, s] = moments_of(speed, n)
             out[0, e, s] = min(mean[0, 0], road.jam[s])
             out[1, e, s] = min(max(mean[2, 0], 0.0), LARGEST_W * v_f)
-
-
-@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
-def _moments(row: FloatArray, n: int) -> tuple[float, float]:
-    """Return mean and standard deviation of the first n."""
-    mean, total = _mean(row, n), 0.0
-    for j in range(n):
-        total += (row[j] - mean) ** 2
-    return mean, np.sqrt(total / (n - 1))

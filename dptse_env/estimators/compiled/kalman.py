@@ -9,6 +9,7 @@ from dptse_env.estimators.base import Estimate
 from dptse_env.estimators.batch import BatchEstimator
 from dptse_env.estimators.compiled import ekf_kernels as kernels
 from dptse_env.estimators.compiled.algebra import padded
+from dptse_env.estimators.noise import count_variance, initial_variance, process_variance
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
 from dptse_env.model.road_arrays import make_road_arrays
@@ -31,8 +32,10 @@ class CompiledFilter(BatchEstimator):
             priors=start.copy(),
             innovations=self.innovations,
             diverged=self.diverged,
-            process_variance=np.array(settings.process_noise, dtype=np.float64) ** 2,
-            initial_variance=float(settings.initial_variance),
+            process_variance=process_variance(model, settings),
+            growth_variance=float(settings.density_growth) ** 2,
+            count_variance=count_variance(model, settings),
+            initial_variance=initial_variance(model, settings),
             density_scale=float(model.density_scale),
             is_box=settings.bounds == "box",
         )
@@ -42,12 +45,12 @@ class CompiledFilter(BatchEstimator):
 
     @property
     def states(self) -> FloatArray:
-        """Means `(n, 2 S)` [veh/km, veh/h], a copy."""
+        """Means `(n, n_x)` [veh/km, veh/h], then demand factors if there are any; a copy."""
         return self._filters.means.copy()
 
     @property
     def covariances(self) -> FloatArray:
-        """Covariances `(n, 2 S, 2 S)`, rho normalised by rho_m and psi by rho_m v_f, a copy."""
+        """Covariances `(n, n_x, n_x)`, rho normalised by rho_m and psi by rho_m v_f, a copy."""
         return self._filters.covariances[:, :, : self.model.n_states].copy()
 
     def estimate(self) -> Estimate:

@@ -6,13 +6,14 @@ from dptse_env.estimators.batch import Measurements
 from dptse_env.estimators.compiled import mhe_kernels
 from dptse_env.estimators.compiled.algebra import padded
 from dptse_env.estimators.compiled.kalman import CompiledFilter
-from dptse_env.estimators.compiled.mhe_kernels import Windows
+from dptse_env.estimators.compiled.stages import Windows
 from dptse_env.estimators.horizon import (
     LEAST_DEVIATION,
     Window,
     assemble,
+    moving_variance,
     normalised_bounds,
-    process_variance,
+    require_process_noise,
     settings_of_mhe,
     solve,
 )
@@ -36,34 +37,11 @@ class CompiledMHE(CompiledFilter):
 
     def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
         """See `make_estimator`."""
-        process_variance(settings)  # check before allocation
+        require_process_noise(settings)
         super().__init__(model, n_episodes, settings_of_mhe(settings))
-        mhe = settings.mhe
         self.n_passed_on = 0
-        n, s, width = model.n_states, model.n_segments, padded(model.n_states)
         self._road: RoadArrays = make_road_arrays(model)
-        shape = (n_episodes, mhe.horizon + 1)
-        lower, upper = normalised_bounds(model, mhe.bounds)
-        self._windows = Windows(
-            length=np.ones(n_episodes, dtype=np.int64),
-            arrival_variance=np.ones((n_episodes, 2)),
-            predicted=np.zeros((*shape, n)),
-            inputs=np.zeros((*shape, model.n_inputs)),
-            observed=np.zeros((*shape, s), dtype=np.bool_),
-            values=np.zeros((*shape, s, 2)),
-            noise=np.ones((*shape, 2)),
-            blocks=np.zeros((*shape, *self._road.neighbours.shape, 4)),
-            offsets=np.zeros((*shape, n)),
-            rows=np.zeros((*shape, s, 2)),
-            constants=np.zeros((*shape, s)),
-            solution=np.zeros((*shape, width)),
-            side=np.zeros((*shape, width), dtype=np.int64),
-            unsolved=np.zeros(n_episodes, dtype=np.bool_),
-            moving_variance=np.square(np.array(mhe.arrival_noise, dtype=np.float64)),
-            lower=lower,
-            upper=upper,
-            along=mhe.linearisation == "trajectory",
-        )
+        self._windows = _allocate(model, n_episodes, settings, self._road)
         self._windows_packed = (*self._packed, tuple(self._windows))
         self._scales = model.measurement_scale
         self._restart(np.arange(n_episodes))
@@ -71,23 +49,35 @@ class CompiledMHE(CompiledFilter):
     def window(self, episode: int) -> Window:
         """Return the linearised problem of an episode, dense, for `assemble`."""
         windows, length = self._windows, int(self._windows.length[episode])
-        n, road = self.model.n_states, self._road
+        n, s, road = self.model.n_states, self.model.n_segments, self._road
         transitions = np.zeros((length - 1, n, n))
-        for c in range(self.model.n_segments):
+        for c in range(s):
             for slot in range(road.degree[c]):
                 b = road.neighbours[c, slot]
                 block = windows.blocks[episode, : length - 1, c, slot].reshape(-1, 2, 2)
                 transitions[:, 2 * c : 2 * c + 2, 2 * b : 2 * b + 2] = block
+        each = np.arange(2 * s, n)
+        transitions[:, each, each] = 1.0
+        for e, factor in enumerate(each):
+            for j in range(2):
+                by_factor = windows.by_factor[episode, : length - 1, e, j]
+                transitions[:, 2 * road.entries[e] + j, factor] = by_factor
+        weights = self.model.rows.weights
+        rows = np.zeros((length, *weights.shape[:1], 2, n))
+        rows[:, :, 0, 0 : 2 * s : 2] = weights
+        for j in range(2):
+            slopes = windows.slopes[episode, :length, None, :, j]
+            rows[:, :, 1, j : 2 * s : 2] = weights * slopes
         targets = windows.values[episode, :length].copy()
-        targets[..., 1] -= windows.constants[episode, :length]
+        targets[..., 1] -= windows.constants[episode, :length] @ weights.T
         return Window(
             arrival=windows.predicted[episode, 0],
             arrival_variance=windows.arrival_variance[episode],
             transitions=transitions,
             offsets=windows.offsets[episode, : length - 1],
-            process_variance=self._filters.process_variance,
+            process_variance=windows.process_variance[episode, : length - 1],
             observed=windows.observed[episode, :length],
-            rows=windows.rows[episode, :length],
+            rows=rows,
             targets=targets,
             noise=windows.noise[episode, :length],
         )
@@ -97,9 +87,8 @@ class CompiledMHE(CompiledFilter):
 
     def _update(self, measured: Measurements) -> None:
         sigma = np.maximum(measured.sigma, LEAST_DEVIATION * self._scales)
-        mhe_kernels.update(
-            *self._windows_packed, measured.episodes, measured.observed, measured.values, sigma
-        )
+        episodes, observed, values, _, centre = measured
+        mhe_kernels.update(*self._windows_packed, episodes, observed, values, sigma, centre)
         unsolved = measured.episodes[self._windows.unsolved[measured.episodes]]
         for episode in unsolved.tolist():
             self._pass_on(episode)
@@ -123,4 +112,38 @@ class CompiledMHE(CompiledFilter):
 
     def _restart(self, episodes: IntArray) -> None:
         for episode in episodes.tolist():
-            mhe_kernels.restart(*self._windows_packed, episode)
+            mhe_kernels.restart(*self._windows_packed[1:], episode)
+
+
+def _allocate(
+    model: ARZModel, n_episodes: int, settings: EstimatorSettings, road: RoadArrays
+) -> Windows:
+    """Return empty windows."""
+    n, s, n_rows = model.n_states, model.n_segments, model.rows.n_rows
+    width, shape = padded(n), (n_episodes, settings.mhe.horizon + 1)
+    lower, upper = normalised_bounds(model, settings.mhe.bounds)
+    return Windows(
+        length=np.ones(n_episodes, dtype=np.int64),
+        arrival_variance=np.ones((n_episodes, n)),
+        predicted=np.zeros((*shape, n)),
+        inputs=np.zeros((*shape, model.n_inputs)),
+        process_variance=np.ones((*shape, n)),
+        blocks=np.zeros((*shape, *road.neighbours.shape, 4)),
+        by_factor=np.zeros((*shape, model.n_demand_states, 2)),
+        offsets=np.zeros((*shape, n)),
+        observed=np.zeros((*shape, n_rows), dtype=np.bool_),
+        values=np.zeros((*shape, n_rows, 2)),
+        noise=np.ones((*shape, n_rows, 2)),
+        centre=np.zeros((*shape, s)),
+        slopes=np.zeros((*shape, s, 2)),
+        constants=np.zeros((*shape, s)),
+        point=np.zeros((n_episodes, width)),
+        solution=np.zeros((*shape, width)),
+        side=np.zeros((*shape, width), dtype=np.int64),
+        unsolved=np.zeros(n_episodes, dtype=np.bool_),
+        moving_variance=moving_variance(model, settings),
+        lower=lower,
+        upper=upper,
+        units=model.state_scale,
+        along=settings.mhe.linearisation == "trajectory",
+    )

@@ -18,26 +18,26 @@ from dptse_env.utils.arrays import BoolArray, FloatArray
 class Points(NamedTuple):
     """Sigma points of n episodes."""
 
-    # (n, 2 S, width) projected points after the last prediction [veh/km, veh/h]: that of the mean,
-    # then pairs; columns beyond 4 S + 1 repeat the first
+    # (n, n_x, width) projected points after the last prediction [veh/km, veh/h, demand factors]:
+    # that of the mean, then pairs; columns beyond 2 n_x + 1 repeat the first
     states: FloatArray
-    centres: FloatArray  # (n, 2 S) their weighted means, before any projection
+    centres: FloatArray  # (n, n_x) their weighted means, before any projection
+    noise: FloatArray  # (n, n_x) variances of P beyond the points': the last step's process noise
     moved: BoolArray  # (n,) whether they were predicted since their last update
+    scale: FloatArray  # (n_x,) units of the normalised components
     weight: float  # W of every point but the first
     surplus: float  # beta - alpha^2
     spread: float  # points are the mean plus and minus spread times columns of a root of P
 
 
 @njit(cache=True, error_model="numpy")
-def draw(
-    mean: FloatArray, root: FloatArray, spread: float, scale: FloatArray, states: FloatArray
-) -> None:
-    """Write the points of a mean and the upper root of its covariance."""
-    n = mean.size
+def draw(points: Points, e: int, mean: FloatArray, root: FloatArray) -> None:
+    """Write one episode's points of a mean and the upper root of its covariance."""
+    states, n = points.states[e], mean.size
     for i in range(n):
         row, centre = states[i], mean[i]
         row[:] = centre
-        step = spread * scale[i % 2]
+        step = points.spread * points.scale[i]
         for k in range(i + 1):
             shift = step * root[k, i]
             row[1 + k] += shift
@@ -58,7 +58,6 @@ def distances_from_first(row: FloatArray, scale: float, weight: float, out: Floa
 def gather(
     points: Points,
     e: int,
-    scale: FloatArray,
     distances: FloatArray,
     shift: FloatArray,
     covariance: FloatArray,
@@ -66,8 +65,8 @@ def gather(
     """Write mean and covariance of one episode's points."""
     states, n = points.states[e], shift.size
     for i in range(n):
-        shift[i] = distances_from_first(states[i], scale[i % 2], points.weight, distances[i])
-        points.centres[e, i] = states[i, 0] + shift[i] * scale[i % 2]
+        shift[i] = distances_from_first(states[i], points.scale[i], points.weight, distances[i])
+        points.centres[e, i] = states[i, 0] + shift[i] * points.scale[i]
     products(distances, n, distances, n, True, covariance)
     for i in range(n):
         for j in range(i + 1):

@@ -1,7 +1,7 @@
 """The ARZ model for a batch of states of a road: sigma points, or members of an ensemble.
 
 The equations are those of `dptse_env.model.kernels` without derivatives. States are stored by
-component, `(2 S, width)`, a column each, so that every inner loop runs over contiguous memory
+component, `(n_x, width)`, a column each, so that every inner loop runs over contiguous memory
 without a branch and compiles to vector instructions. Padding columns must also be states.
 """
 
@@ -11,7 +11,13 @@ import numpy as np
 from numba import njit
 
 from dptse_env.estimators.compiled.power import power
-from dptse_env.model.arz import LEAST_DENSITY, LEAST_W, MEASUREMENT_FLOOR
+from dptse_env.model.arz import (
+    LARGEST_FACTOR,
+    LEAST_DENSITY,
+    LEAST_FACTOR,
+    LEAST_W,
+    MEASUREMENT_FLOOR,
+)
 from dptse_env.model.parameters import LARGEST_W
 from dptse_env.model.relations import VACUUM
 from dptse_env.model.road_arrays import EXIT, LINK, MERGE, RoadArrays
@@ -144,18 +150,22 @@ def _flow_out(road: RoadArrays, scratch: BatchScratch, c: int, inputs: FloatArra
 
 @njit(cache=True, error_model="numpy")
 def _enter(
-    road: RoadArrays, scratch: BatchScratch, c: int, inputs: FloatArray, states: FloatArray
+    road: RoadArrays, scratch: BatchScratch, e: int, inputs: FloatArray, states: FloatArray
 ) -> None:
-    """Add inflow from outside; demand that is not served is lost."""
-    v_f, gamma = road.free_flow_speed, road.gamma
+    """Add the inflow of an entry from outside; demand that is not served is lost."""
+    v_f, gamma, n = road.free_flow_speed, road.gamma, 2 * road.jam.size
+    c = road.entries[e]
     source, w_in = inputs[road.entry[c]], inputs[road.entry[c] + 1]
     w, root, supply = scratch.row[0], scratch.row[1], scratch.row[2]
     w[:] = w_in
     root[:] = (w_in / ((1.0 + gamma) * v_f)) ** (1.0 / gamma)
     _supplies(w, root, scratch.speed[c], road.jam[c], v_f, gamma, supply)
-    rho, psi = states[2 * c], states[2 * c + 1]
+    rho, psi, demand = states[2 * c], states[2 * c + 1], scratch.row[3]
+    demand[:] = source
+    if states.shape[0] > n:
+        demand *= states[n + e]
     for j in range(supply.size):
-        entered = road.step_ratio * (supply[j] if source > supply[j] else source)
+        entered = road.step_ratio * (supply[j] if demand[j] > supply[j] else demand[j])
         rho[j] += entered
         psi[j] += entered * w_in
 
@@ -185,7 +195,7 @@ def _arrive(
 def advance_states(
     road: RoadArrays, states: FloatArray, inputs: FloatArray, scratch: BatchScratch
 ) -> None:
-    """Predict every column of `states` `(2 S, width)` one step ahead under inputs `(n_u,)`."""
+    """Predict every column of `states` `(n_x, width)` one step ahead under inputs `(n_u,)`."""
     v_f, gamma, ratio = road.free_flow_speed, road.gamma, road.step_ratio
     for c in range(road.jam.size):
         _tabulate(
@@ -197,8 +207,8 @@ def advance_states(
     for c in range(road.jam.size):
         rho, psi = states[2 * c], states[2 * c + 1]
         _leave(rho, psi, scratch.flow[c], scratch.w[c], ratio, road.relaxation, v_f)
-        if road.entry[c] >= 0:
-            _enter(road, scratch, c, inputs, states)
+    for e in range(road.entries.size):
+        _enter(road, scratch, e, inputs, states)
     for e in range(road.edges.shape[0]):
         start, end = road.edges[e, 0], road.edges[e, 1]
         part = ratio * road.edge_share[e]
@@ -238,6 +248,11 @@ def project_states(road: RoadArrays, states: FloatArray, is_box: bool) -> None:
             _into_box(psi, jam * v_f)
         else:
             _into_cone(rho, psi, jam, v_f, gamma)
+    for i in range(2 * road.jam.size, states.shape[0]):
+        row = states[i]
+        for j in range(row.size):
+            factor = LEAST_FACTOR if row[j] < LEAST_FACTOR else row[j]
+            row[j] = LARGEST_FACTOR if factor > LARGEST_FACTOR else factor
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
@@ -253,10 +268,18 @@ def measured_speeds(
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def released_by_states(
-    road: RoadArrays, s: int, rho_row: FloatArray, psi_row: FloatArray, out: FloatArray
+    road: RoadArrays,
+    s: int,
+    rho_row: FloatArray,
+    psi_row: FloatArray,
+    v_0: float,
+    out: FloatArray,
 ) -> None:
-    """Write the measured speeds [km/h] or centred flows [veh/h], as `ARZModel.measure`."""
-    jam, v_f, v_0 = road.jam[s], road.free_flow_speed, road.reference_speed
+    """Write the measured speeds [km/h] or centred flows [veh/h], as `ARZModel.measure`.
+
+    Flows are centred on v_0 [km/h]; it is NaN where speeds are measured.
+    """
+    jam, v_f = road.jam[s], road.free_flow_speed
     if np.isnan(v_0):
         measured_speeds(rho_row, psi_row, jam, v_f, road.gamma, out)
         return

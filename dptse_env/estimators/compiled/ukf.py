@@ -32,7 +32,9 @@ class CompiledUKF(CompiledFilter):
         self._points = Points(
             states=np.zeros((n_episodes, n_states, padded(2 * n_states + 1))),
             centres=np.zeros((n_episodes, n_states)),
+            noise=np.zeros((n_episodes, n_states)),
             moved=np.zeros(n_episodes, dtype=np.bool_),
+            scale=model.state_scale,
             weight=0.5 / spread,
             surplus=beta - alpha**2,
             spread=float(np.sqrt(spread)),
@@ -43,9 +45,14 @@ class CompiledUKF(CompiledFilter):
         ukf_kernels.predict(*self._packed, self._points_packed, episodes, inputs)
 
     def _update(self, measured: Measurements) -> None:
-        observed, values, sigma = measured.observed, measured.values, measured.sigma
         ukf_kernels.update(
-            *self._packed, self._points_packed, measured.episodes, observed, values, sigma
+            *self._packed,
+            self._points_packed,
+            measured.episodes,
+            measured.observed,
+            measured.values,
+            measured.sigma,
+            measured.centre,
         )
 
     def _restart(self, episodes: IntArray) -> None:

@@ -7,20 +7,30 @@ measurements would place it after the motion; on recorded traffic that filter is
 worse at small alpha.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 from numba import njit
 
 from dptse_env.estimators.compiled.algebra import is_covariance, mirror
-from dptse_env.estimators.compiled.dense import eliminate, products
-from dptse_env.estimators.compiled.ekf_kernels import Filters, Packed, project, restart
-from dptse_env.estimators.compiled.sigma_points import Points, distances_from_first, draw, gather
+from dptse_env.estimators.compiled.dense import eliminate
+from dptse_env.estimators.compiled.ekf_kernels import (
+    Filters,
+    Packed,
+    process_noise,
+    project,
+    restart,
+)
+from dptse_env.estimators.compiled.sigma_points import Points, draw, gather
 from dptse_env.estimators.compiled.state_batch import (
     advance_states,
     make_batch_scratch,
     project_states,
-    released_by_states,
+)
+from dptse_env.estimators.compiled.ukf_outputs import (
+    Outputs,
+    first_column,
+    make_outputs,
+    measure,
+    row_noise,
 )
 from dptse_env.model.road_arrays import RoadArrays
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
@@ -35,35 +45,22 @@ def predict(
     n, width = points.states.shape[1:]
     scratch, distances = make_batch_scratch(road, width), np.empty((n, width))
     root, shift = np.empty(filters.covariances.shape[1:]), np.empty(n)
-    scale = np.array([filters.density_scale, filters.density_scale * road.free_flow_speed])
     for k in range(episodes.size):
         e = episodes[k]
         mean, covariance, states = filters.means[e], filters.covariances[e], points.states[e]
         root[:] = covariance
         if not eliminate(root, n, filters.covariances.shape[2]):
             mean[:] = np.nan  # detected by the update, which resets the filter
-        draw(mean, root, points.spread, scale, states)
+        process_noise(road, filters, mean, points.noise[e])
+        draw(points, e, mean, root)
         advance_states(road, states, inputs[k], scratch)
         project_states(road, states, filters.is_box)
-        gather(points, e, scale, distances, shift, covariance)
+        gather(points, e, distances, shift, covariance)
         for i in range(n):
-            covariance[i, i] += filters.process_variance[i % 2]
+            covariance[i, i] += points.noise[e, i]
         mean[:] = points.centres[e]
         project(road, mean, filters.is_box)
         points.moved[e] = True
-
-
-class Outputs(NamedTuple):
-    """Scratch space of `update`, for m measured numbers, densities first."""
-
-    distances: FloatArray  # (2 S, width) of the points, normalised
-    outputs: FloatArray  # (S, width) distances of the speeds, or flows, measured
-    shift: FloatArray  # (2 S,) weighted sums of distances
-    output_shift: FloatArray  # (S,) weighted sums of outputs
-    cross: FloatArray  # (2 S, padded) covariance of outputs (rows) with states, then scratch
-    # (2 S, columns) rows of outputs: S, then their covariance with states, then the residual
-    # in the last column
-    joint: FloatArray
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -75,33 +72,29 @@ def update(
     observed: BoolArray,
     values: FloatArray,
     sigma: FloatArray,
+    centre: FloatArray,
 ) -> None:
     """Update by measurements; see `Estimator.update`."""
     road, filters, points = RoadArrays(*road_), Filters(*filters_), Points(*points_)
-    n, width = points.states.shape[1:]
-    padded = filters.covariances.shape[2]
-    segments, n_seen = np.empty(road.jam.size, dtype=np.int64), 0
-    work = Outputs(
-        np.empty((n, width)), np.empty((n // 2, width)), np.empty(n), np.empty(n // 2),
-        np.zeros((n, padded)), np.zeros((n, 2 * padded + 8)),
-    )  # fmt: skip
-    scale = np.array([filters.density_scale, filters.density_scale * road.free_flow_speed])
-    noise = np.array([(sigma[0] / filters.density_scale) ** 2, (sigma[1] / road.second_scale) ** 2])
-    variances = np.empty(padded)
+    n_rows = road.row_first.size
+    work = make_outputs(n_rows, *points.states.shape[1:])
+    rows, variances = np.empty(n_rows, dtype=np.int64), np.empty(filters.covariances.shape[2])
     for k in range(episodes.size):
         e = episodes[k]
         n_seen = 0
-        for s in range(road.jam.size):
-            if observed[k, s]:
-                segments[n_seen] = s
+        for r in range(n_rows):
+            if observed[k, r]:
+                rows[n_seen] = r
                 n_seen += 1
         filters.innovations[e] = 0.0
         sound = True
         if n_seen > 0:
+            seen = rows[:n_seen]
+            row_noise(road, filters, e, seen, sigma[k], work.noise)
             if not points.moved[e]:
-                sound = _stay(road, filters, points, e, scale, work)
+                sound = _stay(road, filters, points, e, work)
             sound = sound and _update_episode(
-                road, filters, points, e, segments[:n_seen], values[k], noise, scale, work
+                road, filters, points, e, seen, values[k], centre[k], work
             )
             points.moved[e] = False
         mean, covariance = filters.means[e], filters.covariances[e]
@@ -114,18 +107,16 @@ def update(
 
 
 @njit(cache=True, error_model="numpy")
-def _stay(
-    road: RoadArrays, filters: Filters, points: Points, e: int, scale: FloatArray, work: Outputs
-) -> bool:
+def _stay(road: RoadArrays, filters: Filters, points: Points, e: int, work: Outputs) -> bool:
     """Make points without a prediction, after another update in the same step."""
-    n = filters.means.shape[1]
-    covariance, root = filters.covariances[e], work.cross
-    root[:] = covariance
-    if not eliminate(root, n, filters.covariances.shape[2]):
+    covariance = filters.covariances[e]
+    root = covariance.copy()
+    if not eliminate(root, root.shape[0], root.shape[1]):
         return False
-    draw(filters.means[e], root, points.spread, scale, points.states[e])
+    draw(points, e, filters.means[e], root)
     project_states(road, points.states[e], filters.is_box)
-    gather(points, e, scale, work.distances, work.shift, covariance)
+    gather(points, e, work.distances, work.shift, covariance)
+    points.noise[e] = 0.0
     return True
 
 
@@ -135,24 +126,23 @@ def _update_episode(
     filters: Filters,
     points: Points,
     e: int,
-    segments: IntArray,
+    rows: IntArray,
     values: FloatArray,
-    noise: FloatArray,
-    scale: FloatArray,
+    centre: FloatArray,
     work: Outputs,
 ) -> bool:
-    n, m, width = filters.means.shape[1], segments.size, 2 * segments.size
+    n, m, width = filters.means.shape[1], rows.size, 2 * rows.size
     mean, covariance = filters.means[e], filters.covariances[e]
-    _measure(road, filters, points, e, segments, values, noise, scale, work)
-    joint = work.joint
-    start = (width + 7) // 8 * 8
+    measure(road, filters, points, e, rows, values, centre, work)
+    joint, noise = work.joint, work.noise
+    start = first_column(m)
     columns = start + n + 1
     padded = (columns + 7) // 8 * 8
     joint[:width, columns:padded] = 0.0
     for i in range(width):
-        segment = segments[i % m]
-        filters.innovations[e, segment, i // m] = joint[i, start + n] / np.sqrt(joint[i, i])
-        if not joint[i, i] >= noise[i // m] * (1.0 - 1e-9):
+        variance = joint[i, i]
+        filters.innovations[e, rows[i % m], i // m] = joint[i, start + n] / np.sqrt(variance)
+        if not variance >= noise[i % m, i // m] * (1.0 - 1e-9):
             return False
     # Elimination turns [S, C, y] into [U, V, z] with U' U = S, V' V = C' S^-1 C, V' z = K y.
     if not eliminate(joint, width, padded):
@@ -163,7 +153,7 @@ def _update_episode(
         total = 0.0
         for r in range(width):
             total += joint[r, start + i] * joint[r, start + n]
-        mean[i] = points.centres[e, i] + total * scale[i % 2]
+        mean[i] = points.centres[e, i] + total * points.scale[i]
     project(road, mean, filters.is_box)
     return True
 
@@ -179,60 +169,3 @@ def _reduce(joint: FloatArray, width: int, start: int, covariance: FloatArray) -
             row = covariance[i]
             for j in range(i + 1):
                 row[j] -= a * first[j] + b * second[j]
-
-
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _measure(
-    road: RoadArrays,
-    filters: Filters,
-    points: Points,
-    e: int,
-    segments: IntArray,
-    values: FloatArray,
-    noise: FloatArray,
-    scale: FloatArray,
-    work: Outputs,
-) -> None:
-    """Write the covariance S of outputs, theirs with the states, and the residuals to `joint`.
-
-    The densities' covariance in the points is P less the step's process noise.
-    """
-    n, m = filters.means.shape[1], segments.size
-    start = (2 * m + 7) // 8 * 8
-    unit, states, joint = road.second_scale, points.states[e], work.joint
-    for i in range(n):
-        work.shift[i] = distances_from_first(
-            states[i], scale[i % 2], points.weight, work.distances[i]
-        )
-    for i in range(m):
-        s = segments[i]
-        outputs = work.outputs[i]
-        released_by_states(road, s, states[2 * s], states[2 * s + 1], outputs)
-        joint[m + i, start + n] = outputs[0] / unit
-        work.output_shift[i] = distances_from_first(outputs, unit, points.weight, outputs)
-        joint[m + i, start + n] += work.output_shift[i]
-    products(work.outputs, m, work.distances, n, False, work.cross)
-    covariance = filters.covariances[e]
-    q0 = filters.process_variance[0] if points.moved[e] else 0.0
-    for i in range(m):
-        s = segments[i]
-        output_row, density_row = joint[m + i], joint[i]
-        for j in range(n):
-            density_row[start + j] = covariance[2 * s, j] - (q0 if j == 2 * s else 0.0)
-            output_row[start + j] = (
-                points.weight * work.cross[i, j]
-                + points.surplus * work.output_shift[i] * work.shift[j]
-            )
-        density_row[start + n] = (values[s, 0] - points.centres[e, 2 * s]) / scale[0]
-        output_row[start + n] = values[s, 1] / unit - output_row[start + n]
-    products(work.outputs, m, work.outputs, m, True, work.cross)
-    for i in range(m):
-        for j in range(i + 1):
-            spread = points.surplus * work.output_shift[i] * work.output_shift[j]
-            joint[m + j, m + i] = points.weight * work.cross[i, j] + spread
-        joint[m + i, m + i] += noise[1]
-    for i in range(m):
-        for j in range(m):
-            joint[i, j] = joint[i, start + 2 * segments[j]]
-            joint[i, m + j] = joint[m + j, start + 2 * segments[i]]
-        joint[i, i] += noise[0]

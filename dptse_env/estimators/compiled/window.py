@@ -6,56 +6,26 @@ them H d = r takes a forward and a backward sweep (the smoother of Bryson and Fr
 further inverses. All quantities are normalised; vectors and rows are padded as in `algebra`.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 from numba import njit
 
-from dptse_env.estimators.compiled.algebra import mirror, propagate, scratch_vectors, segment_update
+from dptse_env.estimators.compiled.algebra import (
+    mirror,
+    propagate,
+    scratch_vectors,
+    segment_update,
+    sum_update,
+)
+from dptse_env.estimators.compiled.chain import Chain, WindowScratch
+from dptse_env.estimators.compiled.window_rows import (
+    add_diagonal,
+    add_slope,
+    inform,
+    weigh,
+    weigh_wide,
+)
 from dptse_env.model.road_arrays import RoadArrays
-from dptse_env.utils.arrays import BoolArray, FloatArray
-
-
-class Chain(NamedTuple):
-    """A linearised window of L stages."""
-
-    arrival: FloatArray  # (2 S,) mean of the first state
-    arrival_variance: FloatArray  # (2,)
-    process_variance: FloatArray  # (2,)
-    blocks: FloatArray  # (>= L - 1, S, K, 4) of the transitions
-    offsets: FloatArray  # (>= L - 1, 2 S)
-    observed: BoolArray  # (>= L, S)
-    # (>= L, S, 2) derivatives of the second release, speed or flow, by the segment's rho and
-    # psi
-    rows: FloatArray
-    constants: FloatArray  # (>= L, S) constant of the linearised second release
-    values: FloatArray  # (>= L, S, 2) density, and speed or flow
-    noise: FloatArray  # (>= L, 2) variances
-
-
-class WindowScratch(NamedTuple):
-    """Scratch space for windows of up to L stages."""
-
-    factors: FloatArray  # (L, 2 S, padded) filtered covariances
-    before: FloatArray  # (2 S, padded) the last covariance before its stage's measurements
-    information: FloatArray  # (L, S, 3) C' C / R: rho rho, rho psi, psi psi
-    diagonal: FloatArray  # (L, padded) of H
-    product: FloatArray  # (2, 2 S, padded) scratch
-    sweep: FloatArray  # (4, padded) scratch
-
-
-@njit(cache=True, error_model="numpy")
-def make_window_scratch(n_stages: int, n_segments: int, width: int) -> WindowScratch:
-    """Allocate the scratch space."""
-    n = 2 * n_segments
-    return WindowScratch(
-        np.zeros((n_stages, n, width)),
-        np.zeros((n, width)),
-        np.zeros((n_stages, n_segments, 3)),
-        np.ones((n_stages, width)),
-        np.zeros((2, n, width)),
-        np.zeros((4, width)),
-    )
+from dptse_env.utils.arrays import FloatArray
 
 
 @njit(cache=True, error_model="numpy")
@@ -63,92 +33,127 @@ def factorise(road: RoadArrays, chain: Chain, n_stages: int, scratch: WindowScra
     """Filter covariances through the window; return whether all variances are sound."""
     n, width = scratch.before.shape
     row, shift, work = np.zeros(4), np.zeros(width), scratch_vectors(width)
+    inform(road, chain, n_stages, scratch)
     for t in range(n_stages):
         P = scratch.factors[t]
         if t == 0:
             P[:] = 0.0
             for i in range(n):
-                P[i, i] = chain.arrival_variance[i % 2]
+                P[i, i] = chain.arrival_variance[i]
         else:
             P[:] = scratch.factors[t - 1]
             propagate(
                 road,
                 chain.blocks[t - 1],
-                chain.process_variance,
+                chain.by_factor[t - 1],
+                chain.process_variance[t - 1],
                 P,
                 scratch.product[0],
                 scratch.product[1],
             )
         if t == n_stages - 1:
             scratch.before[:] = P
-        for s in range(n // 2):
-            if chain.observed[t, s]:
-                row[2], row[3] = chain.rows[t, s, 0], chain.rows[t, s, 1]
-                if not segment_update(P, s, row, chain.noise[t], shift, work):
+        for m in range(road.row_first.size):
+            if chain.observed[t, m] and road.row_span[m] == 1:
+                s = road.row_first[m]
+                row[2], row[3] = chain.slopes[t, s, 0], chain.slopes[t, s, 1]
+                if not segment_update(P, s, row, chain.noise[t, m], shift, work):
                     return False
+        if scratch.n_wide[t] > 0 and not _update_wide(road, chain, t, scratch, shift, work):
+            return False
         mirror(P)
-    _inform(road, chain, n_stages, scratch)
+    _write_diagonal(road, chain, n_stages, scratch)
     return True
 
 
 @njit(cache=True, error_model="numpy")
-def _inform(road: RoadArrays, chain: Chain, n_stages: int, scratch: WindowScratch) -> None:
-    """Write the blocks of H from measurements, and its diagonal."""
-    w = 1.0 / chain.process_variance
+def _update_wide(
+    road: RoadArrays,
+    chain: Chain,
+    t: int,
+    scratch: WindowScratch,
+    shift: FloatArray,
+    work: tuple[FloatArray, ...],
+) -> bool:
+    """Update a stage's covariance by its rows of several segments, as `segment_update`."""
+    # A call next to `segment_update` would slow down a window that has no such rows.
+    P, slopes, residuals = scratch.factors[t], chain.slopes[t], np.zeros(2)
+    for i in range(scratch.n_wide[t]):
+        m = scratch.wide[t, i]
+        first, span, noise = road.row_first[m], road.row_span[m], chain.noise[t, m]
+        if not sum_update(P, first, span, residuals, slopes, noise, shift, work):
+            return False
+    return True
+
+
+@njit(cache=True, error_model="numpy")
+def _write_diagonal(road: RoadArrays, chain: Chain, n_stages: int, scratch: WindowScratch) -> None:
+    """Write the diagonal of H."""
+    n = 2 * road.jam.size
     for t in range(n_stages):
-        diagonal = scratch.diagonal[t]
-        for s in range(road.jam.size):
-            by_rho, by_psi = chain.rows[t, s, 0], chain.rows[t, s, 1]
-            seen = 1.0 if chain.observed[t, s] else 0.0
-            w_density, w_second = seen / chain.noise[t, 0], seen / chain.noise[t, 1]
-            scratch.information[t, s, 0] = w_density + w_second * by_rho * by_rho
-            scratch.information[t, s, 1] = w_second * by_rho * by_psi
-            scratch.information[t, s, 2] = w_second * by_psi * by_psi
-            for i in range(2):
-                before = w[i] if t > 0 else 1.0 / chain.arrival_variance[i]
-                diagonal[2 * s + i] = before + scratch.information[t, s, 2 * i]
-        if t == n_stages - 1:
-            continue
+        for i in range(chain.arrival.size):
+            before = chain.arrival_variance[i] if t == 0 else chain.process_variance[t - 1, i]
+            scratch.diagonal[t, i] = 1.0 / before
+    add_diagonal(road, chain, n_stages, scratch)
+    for t in range(n_stages - 1):
+        diagonal, w = scratch.diagonal[t], 1.0 / chain.process_variance[t]
         for c in range(road.jam.size):
+            w_rho, w_psi = w[2 * c], w[2 * c + 1]
             for slot in range(road.degree[c]):
                 b, block = road.neighbours[c, slot], chain.blocks[t, c, slot]
-                diagonal[2 * b] += w[0] * block[0] ** 2 + w[1] * block[2] ** 2
-                diagonal[2 * b + 1] += w[0] * block[1] ** 2 + w[1] * block[3] ** 2
+                diagonal[2 * b] += w_rho * block[0] ** 2 + w_psi * block[2] ** 2
+                diagonal[2 * b + 1] += w_rho * block[1] ** 2 + w_psi * block[3] ** 2
+        for e in range(chain.by_factor.shape[1]):
+            c, (by_rho, by_psi) = road.entries[e], chain.by_factor[t, e]
+            diagonal[n + e] += w[2 * c] * by_rho**2 + w[2 * c + 1] * by_psi**2 + w[n + e]
 
 
 @njit(cache=True, error_model="numpy")
 def gradient(road: RoadArrays, chain: Chain, n_stages: int, z: FloatArray, out: FloatArray) -> None:
     """Write H z + q / 2, half the objective's gradient, `(L, padded)`."""
-    n_segments, K = road.jam.size, chain.process_variance
     out[:n_stages] = 0.0
-    for i in range(2 * n_segments):
-        out[0, i] = (z[0, i] - chain.arrival[i]) / chain.arrival_variance[i % 2]
-    for t in range(n_stages):
-        for s in range(n_segments):
-            if not chain.observed[t, s]:
-                continue
-            rho, psi = z[t, 2 * s], z[t, 2 * s + 1]
-            by_rho, by_psi = chain.rows[t, s, 0], chain.rows[t, s, 1]
-            excess = by_rho * rho + by_psi * psi + chain.constants[t, s] - chain.values[t, s, 1]
-            excess /= chain.noise[t, 1]
-            out[t, 2 * s] += (rho - chain.values[t, s, 0]) / chain.noise[t, 0] + by_rho * excess
-            out[t, 2 * s + 1] += by_psi * excess
+    for i in range(chain.arrival.size):
+        out[0, i] = (z[0, i] - chain.arrival[i]) / chain.arrival_variance[i]
+    add_slope(road, chain, n_stages, z, out)
+    _add_slope_of_steps(road, chain, n_stages, z, out)
+
+
+@njit(cache=True, error_model="numpy")
+def _add_slope_of_steps(
+    road: RoadArrays, chain: Chain, n_stages: int, z: FloatArray, out: FloatArray
+) -> None:
+    """Add half the gradient of the process noise's part of the objective."""
+    n, n_factors = 2 * road.jam.size, chain.by_factor.shape[1]
+    gap = np.empty(chain.arrival.size)
     for t in range(n_stages - 1):
-        for c in range(n_segments):
-            first = z[t + 1, 2 * c] - chain.offsets[t, 2 * c]
-            second = z[t + 1, 2 * c + 1] - chain.offsets[t, 2 * c + 1]
+        K = chain.process_variance[t]
+        for i in range(gap.size):
+            gap[i] = z[t + 1, i] - chain.offsets[t, i]
+        for e in range(n_factors):
+            c, (by_rho, by_psi), factor = road.entries[e], chain.by_factor[t, e], z[t, n + e]
+            gap[2 * c] -= by_rho * factor
+            gap[2 * c + 1] -= by_psi * factor
+            gap[n + e] -= factor
+        for c in range(road.jam.size):
+            first, second = gap[2 * c], gap[2 * c + 1]
             for slot in range(road.degree[c]):
                 b, block = road.neighbours[c, slot], chain.blocks[t, c, slot]
                 first -= block[0] * z[t, 2 * b] + block[1] * z[t, 2 * b + 1]
                 second -= block[2] * z[t, 2 * b] + block[3] * z[t, 2 * b + 1]
-            first /= K[0]
-            second /= K[1]
+            first /= K[2 * c]
+            second /= K[2 * c + 1]
             out[t + 1, 2 * c] += first
             out[t + 1, 2 * c + 1] += second
             for slot in range(road.degree[c]):
                 b, block = road.neighbours[c, slot], chain.blocks[t, c, slot]
                 out[t, 2 * b] -= block[0] * first + block[2] * second
                 out[t, 2 * b + 1] -= block[1] * first + block[3] * second
+            gap[2 * c], gap[2 * c + 1] = first, second
+        for e in range(n_factors):
+            c, (by_rho, by_psi) = road.entries[e], chain.by_factor[t, e]
+            weighed = gap[n + e] / K[n + e]
+            out[t + 1, n + e] += weighed
+            out[t, n + e] -= by_rho * gap[2 * c] + by_psi * gap[2 * c + 1] + weighed
 
 
 @njit(cache=True, error_model="numpy")
@@ -167,42 +172,44 @@ def solve(
     costate a = A' l of the next stage, d = m + P a and l = r - C'C/R d + a.
     """
     mean, change, costate, slope = scratch.sweep
-    width = mean.size
+    width, nothing = mean.size, np.zeros(mean.size)
+    has_factors = chain.by_factor.shape[1] > 0
     mean[:] = 0.0
     out[:first] = 0.0
     for t in range(first, n_stages):
         if t > first:
             _move(road, chain.blocks[t - 1], out[t - 1], mean)
-        _weigh(scratch.information[t], mean, right[t], change)
+            if has_factors:
+                _move_factors(road, chain.by_factor[t - 1], out[t - 1], mean)
+        weigh(scratch.information[t], mean, right[t], change)
+        if scratch.n_wide[t] > 0:
+            weigh_wide(road, chain, t, scratch, mean, change)
         out[t] = mean
         _add_product(scratch.factors[t], change, out[t])
-    last = n_stages - 1
-    _weigh(scratch.information[last], out[last], right[last], costate)
-    for t in range(last - 1, -1, -1):
-        _move_back(road, chain.blocks[t], costate, slope)
-        _add_product(scratch.factors[t], slope, out[t])
-        _weigh(scratch.information[t], out[t], right[t], costate)
-        if t < first:  # r is zero there, whatever `right` is
-            _weigh(scratch.information[t], out[t], np.zeros(width), costate)
+    slope[:] = 0.0
+    for t in range(n_stages - 1, -1, -1):
+        if t < n_stages - 1:
+            _move_back(road, chain.blocks[t], costate, slope)
+            if has_factors:
+                _move_factors_back(road, chain.by_factor[t], costate, slope)
+            _add_product(scratch.factors[t], slope, out[t])
+        # r is zero in the stages before `first`, whatever `right` is.
+        weigh(scratch.information[t], out[t], right[t] if t >= first else nothing, costate)
+        if scratch.n_wide[t] > 0:
+            weigh_wide(road, chain, t, scratch, out[t], costate)
         for i in range(width):
             costate[i] += slope[i]
-
-
-@njit(cache=True, error_model="numpy")
-def _weigh(information: FloatArray, x: FloatArray, right: FloatArray, out: FloatArray) -> None:
-    """Write right - C'C/R x."""
-    out[:] = right
-    for s in range(information.shape[0]):
-        a, b, c = information[s]
-        out[2 * s] -= a * x[2 * s] + b * x[2 * s + 1]
-        out[2 * s + 1] -= b * x[2 * s] + c * x[2 * s + 1]
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _add_product(P: FloatArray, x: FloatArray, out: FloatArray) -> None:
     """Add P x to `out`, P symmetric."""
-    width = out.size
-    for i in range(0, P.shape[0], 2):
+    n, width = P.shape
+    if n % 2 == 1:
+        a = x[n - 1]
+        for j in range(width):
+            out[j] += a * P[n - 1, j]
+    for i in range(0, n - 1, 2):
         a, b, upper, lower = x[i], x[i + 1], P[i], P[i + 1]
         if a == 0.0 and b == 0.0:
             continue
@@ -212,7 +219,7 @@ def _add_product(P: FloatArray, x: FloatArray, out: FloatArray) -> None:
 
 @njit(cache=True, error_model="numpy")
 def _move(road: RoadArrays, blocks: FloatArray, x: FloatArray, out: FloatArray) -> None:
-    """Write A x."""
+    """Write the traffic's part of A x, without what demand factors contribute."""
     for c in range(road.jam.size):
         first, second = 0.0, 0.0
         for slot in range(road.degree[c]):
@@ -223,8 +230,19 @@ def _move(road: RoadArrays, blocks: FloatArray, x: FloatArray, out: FloatArray) 
 
 
 @njit(cache=True, error_model="numpy")
+def _move_factors(road: RoadArrays, by_factor: FloatArray, x: FloatArray, out: FloatArray) -> None:
+    """Add to A x what demand factors contribute, and write their own part; they stay."""
+    n = 2 * road.jam.size
+    for e in range(by_factor.shape[0]):
+        c, (by_rho, by_psi), factor = road.entries[e], by_factor[e], x[n + e]
+        out[2 * c] += by_rho * factor
+        out[2 * c + 1] += by_psi * factor
+        out[n + e] = factor
+
+
+@njit(cache=True, error_model="numpy")
 def _move_back(road: RoadArrays, blocks: FloatArray, x: FloatArray, out: FloatArray) -> None:
-    """Write A' x."""
+    """Write the traffic's part of A' x, and zeros for demand factors."""
     out[:] = 0.0
     for c in range(road.jam.size):
         first, second = x[2 * c], x[2 * c + 1]
@@ -232,3 +250,14 @@ def _move_back(road: RoadArrays, blocks: FloatArray, x: FloatArray, out: FloatAr
             b, block = road.neighbours[c, slot], blocks[c, slot]
             out[2 * b] += block[0] * first + block[2] * second
             out[2 * b + 1] += block[1] * first + block[3] * second
+
+
+@njit(cache=True, error_model="numpy")
+def _move_factors_back(
+    road: RoadArrays, by_factor: FloatArray, x: FloatArray, out: FloatArray
+) -> None:
+    """Write the demand factors' part of A' x."""
+    n = 2 * road.jam.size
+    for e in range(by_factor.shape[0]):
+        c, (by_rho, by_psi) = road.entries[e], by_factor[e]
+        out[n + e] = x[n + e] + by_rho * x[2 * c] + by_psi * x[2 * c + 1]

@@ -3,27 +3,30 @@
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 
+from dptse_env.estimators.batch import EpisodeMeasurements
 from dptse_env.estimators.reference.kalman import (
     EpisodeFilter,
     ReferenceFilter,
     configure,
     linearise,
+    measurement_covariance,
+    process_covariance,
 )
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
-from dptse_env.utils.arrays import BoolArray, FloatArray
+from dptse_env.utils.arrays import FloatArray
 
 
 class _Filter(ExtendedKalmanFilter):  # type: ignore[misc]
     """Filter of an episode in normalised units: filterpy's equations with the ARZ model."""
 
     def __init__(self, model: ARZModel, settings: EstimatorSettings) -> None:
-        super().__init__(dim_x=model.n_states, dim_z=2 * model.n_segments)
+        super().__init__(dim_x=model.n_states, dim_z=2 * model.rows.n_rows)
         configure(self, model, settings)
 
     @property
     def state(self) -> FloatArray:
-        """Mean `(1, 2 S)` in physical units."""
+        """Mean `(1, n_x)` in physical units."""
         return np.asarray(self.x[None] * self.scale)
 
     @state.setter
@@ -37,6 +40,7 @@ class _Filter(ExtendedKalmanFilter):  # type: ignore[misc]
     def predict_x(self, u: FloatArray) -> None:
         """Predict by the ARZ model instead of a matrix."""
         before, inputs = self.state, u[None]
+        self.Q = process_covariance(self)
         jacobian = self.model.jacobian(before, inputs)[0]
         self.F = jacobian * self.scale[None] / self.scale[:, None]
         self.state = self.model.step(before, inputs)
@@ -44,15 +48,16 @@ class _Filter(ExtendedKalmanFilter):  # type: ignore[misc]
     def advance(self, u: FloatArray) -> None:
         self.predict(u)
 
-    def assimilate(self, observed: BoolArray, values: FloatArray, sigma: FloatArray) -> FloatArray:
+    def assimilate(self, measured: EpisodeMeasurements) -> FloatArray:
         """See `EpisodeFilter.assimilate`."""
+        observed = measured.observed
         if not observed.any():
             return np.zeros((0, 2))
-        predicted = self.model.measure(self.state)[0] / self.measurement_scale
-        jacobian = linearise(self.model, self, observed)
-        measured = (values[observed] / self.measurement_scale).ravel()
-        noise = np.diag(np.tile(np.square(sigma / self.measurement_scale), int(observed.sum())))
-        self.update(measured, lambda _: jacobian, lambda _: predicted[observed].ravel(), R=noise)
+        predicted = self.model.measure(self.state, measured.centre)[0] / self.measurement_scale
+        jacobian = linearise(self.model, self, measured)
+        values = (measured.values[observed] / self.measurement_scale).ravel()
+        noise = measurement_covariance(self, measured)
+        self.update(values, lambda _: jacobian, lambda _: predicted[observed].ravel(), R=noise)
         self.state = self.state
         return np.asarray((self.y / np.sqrt(np.diag(self.S))).reshape(-1, 2))
 

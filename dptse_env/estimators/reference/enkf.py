@@ -11,11 +11,17 @@ import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from dptse_env.estimators.base import Estimate
-from dptse_env.estimators.batch import BatchEstimator, Measurements
-from dptse_env.estimators.localisation import tapers
+from dptse_env.estimators.batch import BatchEstimator, EpisodeMeasurements, Measurements
+from dptse_env.estimators.localisation import RowTapers, row_tapers
+from dptse_env.estimators.noise import (
+    count_variance,
+    density_growth,
+    initial_variance,
+    process_variance,
+)
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
-from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+from dptse_env.utils.arrays import FloatArray, IntArray
 
 
 class _Streams(NamedTuple):
@@ -31,7 +37,7 @@ class ReferenceEnKF(BatchEstimator):
     Equal to `CompiledEnKF` in distribution; its random numbers differ.
 
     Attributes:
-        members: `(n, M, 2 S)` [veh/km, veh/h].
+        members: `(n, n_members, n_x)` [veh/km, veh/h], then demand factors if there are any.
     """
 
     def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
@@ -39,26 +45,25 @@ class ReferenceEnKF(BatchEstimator):
         super().__init__(model, n_episodes, settings)
         enkf = settings.enkf
         self.n_members, self._inflation = enkf.n_members, enkf.inflation
-        everywhere = np.ones((model.n_segments, model.n_segments))
-        self._tapers = everywhere if enkf.taper is None else tapers(model.network, enkf.taper)
-        rho_m, v_f = model.density_scale, model.speed_scale
-        self._state_unit = np.tile([rho_m, rho_m * v_f], model.n_segments)
-        self._output_unit = model.measurement_scale
-        process_noise = np.tile(settings.process_noise, model.n_segments)
-        self._process_deviation = process_noise * self._state_unit
-        self._initial_deviation = np.sqrt(settings.initial_variance) * self._state_unit
-        self._priors = model.project(np.zeros((n_episodes, model.n_states)), settings.bounds)
+        n_rows, nothing = model.rows.n_rows, np.zeros((n_episodes, model.n_segments))
+        self._tapers = RowTapers(np.ones((n_rows, model.n_states)), np.ones((n_rows, n_rows)))
+        if enkf.taper is not None:
+            self._tapers = row_tapers(model, enkf.taper)
+        self._state_unit, self._output_unit = model.state_scale, model.measurement_scale
+        self._process_variance = process_variance(model, settings)
+        self._initial_deviation = np.sqrt(initial_variance(model, settings)) * self._state_unit
+        self._priors = model.project(model.compose(nothing, nothing), settings.bounds)
         self.members = np.repeat(self._priors[:, None], self.n_members, axis=1)
         self._streams = [_make_streams(np.random.default_rng(0)) for _ in range(n_episodes)]
 
     @property
     def states(self) -> FloatArray:
-        """Means of the members `(n, 2 S)` [veh/km, veh/h]."""
+        """Means of the members `(n, n_x)` [veh/km, veh/h], then demand factors if any."""
         return np.asarray(self.members.mean(axis=1))
 
     @property
     def covariances(self) -> FloatArray:
-        """Sample covariances `(n, 2 S, 2 S)`, rho normalised by rho_m and psi by rho_m v_f."""
+        """Sample covariances `(n, n_x, n_x)`, rho normalised by rho_m and psi by rho_m v_f."""
         rest = (self.members - self.states[:, None]) / self._state_unit
         return np.asarray(rest.swapaxes(1, 2) @ rest / (self.n_members - 1))
 
@@ -93,29 +98,26 @@ class ReferenceEnKF(BatchEstimator):
     def _predict(self, episodes: IntArray, inputs: FloatArray) -> None:
         """Predict all members of all episodes at once, then add process noise."""
         with np.errstate(all="ignore"):  # the update detects overflows
+            density = self.model.density(self.members[episodes].mean(axis=1))
+            grown = density_growth(self.model, self.settings, density)
+            deviations = np.sqrt(self._process_variance + grown) * self._state_unit
             states = self.members[episodes].reshape(-1, self.model.n_states)
             moved = self.model.step(states, np.repeat(inputs, self.n_members, axis=0))
-            shape = (self.n_members, self.model.n_states)
-            for episode, members in zip(episodes.tolist(), moved.reshape(-1, *shape), strict=True):
-                self.members[episode] = self._perturbed(episode, members, self._process_deviation)
+            moved = moved.reshape(-1, self.n_members, self.model.n_states)
+            for episode, *parts in zip(episodes.tolist(), moved, deviations, strict=True):
+                self.members[episode] = self._perturbed(episode, *parts)
 
     def _update(self, measured: Measurements) -> None:
         with np.errstate(all="ignore"):
-            for episode, mask, row in zip(
-                measured.episodes.tolist(), measured.observed, measured.values, strict=True
-            ):
-                self._update_one(episode, mask, row, measured.sigma)
+            for episode, measured_there in measured.by_episode():
+                self._update_one(episode, measured_there)
 
-    def _update_one(
-        self, episode: int, observed: BoolArray, values: FloatArray, sigma: FloatArray
-    ) -> None:
+    def _update_one(self, episode: int, measured: EpisodeMeasurements) -> None:
         self.innovations[episode] = 0.0
         sound = True
-        if observed.any():
+        if measured.observed.any():
             try:
-                self.innovations[episode, observed] = self._assimilate(
-                    episode, observed, values[observed], sigma
-                )
+                self.innovations[episode, measured.observed] = self._assimilate(episode, measured)
             except LinAlgError:  # something is not finite, or S not definite
                 sound = False
         self.diverged[episode] = not (sound and np.isfinite(self.members[episode]).all())
@@ -123,32 +125,38 @@ class ReferenceEnKF(BatchEstimator):
             self.innovations[episode] = 0.0
             self._restart(episode)
 
-    def _assimilate(
-        self, episode: int, observed: BoolArray, values: FloatArray, sigma: FloatArray
-    ) -> FloatArray:
-        """Update members by measurements `(m, 2)`; return their normalised innovations."""
-        members = self.members[episode]
+    def _assimilate(self, episode: int, measured: EpisodeMeasurements) -> FloatArray:
+        """Update members by the m observed rows; return their normalised innovations `(m, 2)`."""
+        members, observed = self.members[episode], measured.observed
         if self._inflation != 1.0:
             mean = members.mean(axis=0)
             members = self._projected(mean + self._inflation * (members - mean))
-        outputs = self.model.measure(members)[:, observed] / self._output_unit
+        outputs = self.model.measure(members, measured.centre)[:, observed] / self._output_unit
         outputs = outputs.reshape(self.n_members, -1)
-        mean, noise = outputs.mean(axis=0), np.tile(sigma / self._output_unit, len(values))
+        mean, noise = outputs.mean(axis=0), np.sqrt(self._noise_variance(members, measured))
         states, rest = members - members.mean(axis=0), outputs - mean
-        segment = np.repeat(np.flatnonzero(observed), 2)
-        segments = np.repeat(np.arange(self.model.n_segments), 2)
-        cross = states.T @ rest / (self.n_members - 1) * self._tapers[np.ix_(segments, segment)]
-        joint = rest.T @ rest / (self.n_members - 1) * self._tapers[np.ix_(segment, segment)]
+        row = np.repeat(np.flatnonzero(observed), 2)
+        cross = states.T @ rest / (self.n_members - 1) * self._tapers.with_states[row].T
+        joint = rest.T @ rest / (self.n_members - 1) * self._tapers.among_rows[np.ix_(row, row)]
         joint += np.diag(noise**2)
+        values = measured.values[observed]
         if not (np.isfinite(joint).all() and np.isfinite(values).all()):
             raise LinAlgError("the update is not finite")  # a projection would hide it
-        measured = (values / self._output_unit).ravel()
+        values = (values / self._output_unit).ravel()
         draws = self._streams[episode].measurement.standard_normal(outputs.shape)
         factor = cho_factor(joint, check_finite=False)
         gain = cho_solve(factor, cross.T, check_finite=False).T
-        residuals = measured + noise * draws - outputs
+        residuals = values + noise * draws - outputs
         self.members[episode] = self._projected(members + residuals @ gain.T)
-        return np.asarray(((measured - mean) / np.sqrt(np.diag(joint))).reshape(-1, 2))
+        return np.asarray(((values - mean) / np.sqrt(np.diag(joint))).reshape(-1, 2))
+
+    def _noise_variance(self, members: FloatArray, measured: EpisodeMeasurements) -> FloatArray:
+        """Return the variances `(2 m,)` of the observed rows' noise, normalised."""
+        rows = self.model.rows
+        density = rows.weights @ self.model.density(members).mean(axis=0)
+        variance = np.square(measured.sigma / self._output_unit)
+        variance[:, 0] += count_variance(self.model, self.settings) * density / rows.span
+        return np.asarray(variance[measured.observed].ravel())
 
 
 def _make_streams(generator: np.random.Generator) -> _Streams:

@@ -9,11 +9,17 @@ import numpy as np
 from scipy.linalg import LinAlgError, LinAlgWarning
 
 from dptse_env.estimators.base import Estimate
-from dptse_env.estimators.batch import BatchEstimator, Measurements
+from dptse_env.estimators.batch import BatchEstimator, EpisodeMeasurements, Measurements
+from dptse_env.estimators.noise import (
+    count_variance,
+    density_growth,
+    initial_variance,
+    process_variance,
+)
 from dptse_env.estimators.open_loop import estimated_traffic
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
-from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+from dptse_env.utils.arrays import FloatArray, IntArray
 
 
 class EpisodeFilter(Protocol):
@@ -27,7 +33,7 @@ class EpisodeFilter(Protocol):
 
     @property
     def state(self) -> FloatArray:
-        """Mean `(1, 2 S)` in physical units."""
+        """Mean `(1, n_x)` in physical units."""
 
     def restart(self) -> None:
         """Reset to the prior."""
@@ -35,8 +41,8 @@ class EpisodeFilter(Protocol):
     def advance(self, u: FloatArray) -> None:
         """Predict one step under inputs `(n_u,)`."""
 
-    def assimilate(self, observed: BoolArray, values: FloatArray, sigma: FloatArray) -> FloatArray:
-        """Update by the observed segments; return their normalised innovations `(m, 2)`."""
+    def assimilate(self, measured: EpisodeMeasurements) -> FloatArray:
+        """Update by the observed rows; return their normalised innovations `(m, 2)`."""
 
 
 def is_sound(episode_filter: EpisodeFilter) -> bool:
@@ -48,14 +54,14 @@ def is_sound(episode_filter: EpisodeFilter) -> bool:
     return bool(np.all(variance >= 0.0) and np.all(allowed >= episode_filter.P**2))
 
 
-def linearise(model: ARZModel, episode_filter: EpisodeFilter, observed: BoolArray) -> FloatArray:
-    """Return the normalised Jacobian `(m, 2 S)` of the observed segments' measurements."""
-    blocks = model.measurement_jacobian(episode_filter.x[None] * episode_filter.scale)[0]
-    jacobian = np.zeros((model.n_segments, 2, model.n_states))
-    for s in range(model.n_segments):
-        jacobian[s, :, 2 * s : 2 * s + 2] = blocks[s]
-    jacobian *= episode_filter.scale / episode_filter.measurement_scale[:, None]
-    return np.asarray(jacobian[observed].reshape(-1, model.n_states))
+def linearise(
+    model: ARZModel, episode_filter: EpisodeFilter, measured: EpisodeMeasurements
+) -> FloatArray:
+    """Return the normalised Jacobian `(2 m, n_x)` of the observed rows' measurements."""
+    state = episode_filter.x[None] * episode_filter.scale
+    matrix = model.measurement_matrix(state, measured.centre)[0]
+    matrix *= episode_filter.scale / episode_filter.measurement_scale[:, None]
+    return np.asarray(matrix[measured.observed].reshape(-1, model.n_states))
 
 
 def traffic_variance(model: ARZModel, episode_filter: EpisodeFilter) -> FloatArray:
@@ -64,7 +70,8 @@ def traffic_variance(model: ARZModel, episode_filter: EpisodeFilter) -> FloatArr
         model.traffic_jacobian(episode_filter.x[None] * episode_filter.scale)[0]
         * episode_filter.scale[:2]
     )
-    joint = episode_filter.P.reshape(model.n_segments, 2, model.n_segments, 2)
+    n = 2 * model.n_segments
+    joint = episode_filter.P[:n, :n].reshape(model.n_segments, 2, model.n_segments, 2)
     blocks = joint[np.arange(model.n_segments), :, np.arange(model.n_segments)]
     variance = np.einsum("sij,sjk,sik->si", jacobian, blocks, jacobian)
     return np.asarray(np.maximum(variance, 0.0))
@@ -72,14 +79,30 @@ def traffic_variance(model: ARZModel, episode_filter: EpisodeFilter) -> FloatArr
 
 def configure(episode_filter: Any, model: ARZModel, settings: EstimatorSettings) -> None:
     """Set the scales, noise and prior of a filter of filterpy, and reset it to a prior of zero."""
-    rho_m, v_f = model.density_scale, model.speed_scale
-    episode_filter.model, episode_filter.bounds = model, settings.bounds
-    episode_filter.scale = np.tile([rho_m, rho_m * v_f], model.n_segments)
+    episode_filter.model, episode_filter.settings = model, settings
+    episode_filter.bounds = settings.bounds
+    episode_filter.scale = model.state_scale
     episode_filter.measurement_scale = model.measurement_scale
-    episode_filter.Q = np.diag(np.tile(np.square(settings.process_noise), model.n_segments))
     episode_filter.prior = np.zeros(model.n_states)
-    episode_filter.prior_covariance = settings.initial_variance * np.eye(model.n_states)
+    episode_filter.prior_covariance = np.diag(initial_variance(model, settings))
     episode_filter.restart()
+
+
+def process_covariance(episode_filter: Any) -> FloatArray:
+    """Return Q of a step that leaves the present mean of a filter that was configured."""
+    model, settings = episode_filter.model, episode_filter.settings
+    density = model.density(episode_filter.state)[0]
+    variance = process_variance(model, settings) + density_growth(model, settings, density)
+    return np.diag(variance)
+
+
+def measurement_covariance(episode_filter: Any, measured: EpisodeMeasurements) -> FloatArray:
+    """Return R `(2 m, 2 m)` of the observed rows, normalised, of a filter that was configured."""
+    model, settings = episode_filter.model, episode_filter.settings
+    variance = np.square(measured.sigma / model.measurement_scale)
+    density = model.rows.weights @ model.density(episode_filter.state)[0]
+    variance[:, 0] += count_variance(model, settings) * density / model.rows.span
+    return np.diag(variance[measured.observed].ravel())
 
 
 class ReferenceFilter(BatchEstimator):
@@ -96,12 +119,12 @@ class ReferenceFilter(BatchEstimator):
 
     @property
     def states(self) -> FloatArray:
-        """Means `(n, 2 S)` [veh/km, veh/h]."""
+        """Means `(n, n_x)` [veh/km, veh/h], then demand factors if there are any."""
         return np.concatenate([episode_filter.state for episode_filter in self._filters])
 
     @property
     def covariances(self) -> FloatArray:
-        """Covariances `(n, 2 S, 2 S)`, rho normalised by rho_m and psi by rho_m v_f."""
+        """Covariances `(n, n_x, n_x)`, rho normalised by rho_m and psi by rho_m v_f."""
         return np.stack([episode_filter.P for episode_filter in self._filters])
 
     def estimate(self) -> Estimate:
@@ -131,22 +154,17 @@ class ReferenceFilter(BatchEstimator):
     def _update(self, measured: Measurements) -> None:
         with np.errstate(all="ignore"), warnings.catch_warnings():
             warnings.simplefilter("error", LinAlgWarning)
-            for episode, mask, row in zip(
-                measured.episodes.tolist(), measured.observed, measured.values, strict=True
-            ):
-                self._update_one(episode, mask, row, measured.sigma)
+            for episode, measured_there in measured.by_episode():
+                self._update_one(episode, measured_there)
 
-    def _update_one(
-        self, episode: int, observed: BoolArray, values: FloatArray, sigma: FloatArray
-    ) -> None:
+    def _update_one(self, episode: int, measured: EpisodeMeasurements) -> None:
         episode_filter = self._filters[episode]
         self.innovations[episode] = 0.0
-        sound = is_sound(episode_filter) and bool(np.isfinite(values[observed]).all())
+        observed = measured.observed
+        sound = is_sound(episode_filter) and bool(np.isfinite(measured.values[observed]).all())
         if sound:
             try:
-                self.innovations[episode, observed] = episode_filter.assimilate(
-                    observed, values, sigma
-                )
+                self.innovations[episode, observed] = episode_filter.assimilate(measured)
                 sound = is_sound(episode_filter)
             except (LinAlgError, LinAlgWarning):  # no inverse, or an inaccurate one
                 sound = False

@@ -4,18 +4,23 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from dptse_env.estimators.batch import Measurements
+from dptse_env.estimators.batch import EpisodeMeasurements, Measurements
 from dptse_env.estimators.horizon import (
     LEAST_DEVIATION,
     Window,
     assemble,
-    measurement_matrix,
+    moving_variance,
     normalised_bounds,
-    process_variance,
+    require_process_noise,
     settings_of_mhe,
     solve,
 )
-from dptse_env.estimators.reference.kalman import EpisodeFilter, ReferenceFilter
+from dptse_env.estimators.noise import count_variance, initial_variance
+from dptse_env.estimators.reference.kalman import (
+    EpisodeFilter,
+    ReferenceFilter,
+    process_covariance,
+)
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
 from dptse_env.utils.arrays import BoolArray, FloatArray
@@ -25,17 +30,20 @@ from dptse_env.utils.arrays import BoolArray, FloatArray
 class _Stage:
     """Stage of the window, normalised, with the transition to the next one."""
 
-    predicted: FloatArray  # (2 S,)
-    solution: FloatArray  # (2 S,)
-    observed: BoolArray  # (S,)
-    values: FloatArray  # (S, 2)
-    noise: FloatArray  # (2,)
+    predicted: FloatArray  # (n_x,)
+    solution: FloatArray  # (n_x,)
+    point: FloatArray  # (n_x,) where "paper" linearises the measurement
+    observed: BoolArray  # (M,)
+    values: FloatArray  # (M, 2)
+    noise: FloatArray  # (M, 2)
+    centre: FloatArray | None  # (S,) v_0 [km/h]
+    C: FloatArray  # (M, 2, n_x)
+    c_2: FloatArray  # (M,)
     # Set when the stage is left, and when it is linearised.
     inputs: FloatArray = field(init=False)  # (n_u,)
+    process_variance: FloatArray = field(init=False)  # (n_x,)
     A: FloatArray = field(init=False)
     c_1: FloatArray = field(init=False)
-    rows: FloatArray = field(init=False)  # (S, 2)
-    c_2: FloatArray = field(init=False)  # (S,)
 
 
 class _EpisodeWindow:
@@ -46,10 +54,8 @@ class _EpisodeWindow:
 
     def __init__(self, model: ARZModel, settings: EstimatorSettings) -> None:
         self.model, self.settings, self.mhe = model, settings, settings.mhe
-        rho_m, v_f = model.density_scale, model.speed_scale
-        self.scale = np.tile([rho_m, rho_m * v_f], model.n_segments)
+        self.scale = model.state_scale
         self.measurement_scale = model.measurement_scale
-        self.process_variance = process_variance(settings)
         self.bounds = normalised_bounds(model, self.mhe.bounds)
         self.prior = np.zeros(model.n_states)
         self.restart()
@@ -58,7 +64,7 @@ class _EpisodeWindow:
 
     @property
     def state(self) -> FloatArray:
-        """Mean `(1, 2 S)` in physical units."""
+        """Mean `(1, n_x)` in physical units."""
         return np.asarray(self.x[None] * self.scale)
 
     @state.setter
@@ -68,32 +74,34 @@ class _EpisodeWindow:
     def restart(self) -> None:
         """Reset to a window of a single stage, the prior."""
         self.state, self.unsolved = self.prior[None], False
-        self.P = self.settings.initial_variance * np.eye(self.model.n_states)
-        self.arrival_variance = np.full(2, self.settings.initial_variance)
-        self.stages = [self._stage()]
-        self._linearise_measurement(self.stages[0], self.x)
+        self.arrival_variance = initial_variance(self.model, self.settings)
+        self.P = np.diag(self.arrival_variance)
+        self.stages = [self._stage(self.x)]
 
-    def advance(self, inputs: FloatArray) -> None:
+    def advance(self, u: FloatArray) -> None:
         """Append the model's prediction as a stage, and drop the oldest one of a full window."""
         mean = np.mean([stage.solution for stage in self.stages], axis=0)
         before = self.stages[-1]
-        before.inputs = inputs
-        self.state = self.model.step(self.model.project(self.state), inputs[None])
-        self.stages.append(self._stage())
+        before.inputs = u
+        before.process_variance = np.diag(process_covariance(self))
+        self.state = self.model.step(self.model.project(self.state), u[None])
+        self.stages.append(self._stage(mean))
         if self.mhe.linearisation == "paper":
             self._linearise_step(before, mean)
-            self._linearise_measurement(self.stages[-1], mean)
         if len(self.stages) > self.mhe.horizon + 1:
             self.stages.pop(0)
-            self.arrival_variance[:] = np.square(self.mhe.arrival_noise)
+            self.arrival_variance = moving_variance(self.model, self.settings)
 
-    def assimilate(self, observed: BoolArray, values: FloatArray, sigma: FloatArray) -> FloatArray:
+    def assimilate(self, measured: EpisodeMeasurements) -> FloatArray:
         """Update by measurements of the last stage; return their normalised innovations."""
         stage, self.unsolved = self.stages[-1], False
-        stage.observed = observed
-        stage.values = np.where(observed[:, None], values, 0.0) / self.measurement_scale
-        stage.noise = np.square(np.maximum(sigma / self.measurement_scale, LEAST_DEVIATION))
-        if self.mhe.linearisation == "trajectory":
+        observed = stage.observed = measured.observed.copy()  # callers may reuse their arrays
+        stage.values = np.where(observed[:, None], measured.values, 0.0) / self.measurement_scale
+        stage.noise = self._noise(measured.sigma)
+        stage.centre = measured.centre.copy()
+        if self.mhe.linearisation == "paper":
+            self._linearise_measurement(stage, stage.point)
+        else:
             for earlier in self.stages:
                 self._linearise_measurement(earlier, earlier.solution)
                 if earlier is not stage:
@@ -120,12 +128,12 @@ class _EpisodeWindow:
         targets[..., 1] -= np.stack([stage.c_2 for stage in stages])
         return Window(
             arrival=stages[0].predicted,
-            arrival_variance=self.arrival_variance,
+            arrival_variance=self.arrival_variance.copy(),
             transitions=np.array([stage.A for stage in stages[:-1]]).reshape(-1, n, n),
             offsets=np.array([stage.c_1 for stage in stages[:-1]]).reshape(-1, n),
-            process_variance=self.process_variance,
+            process_variance=np.array([one.process_variance for one in stages[:-1]]).reshape(-1, n),
             observed=np.stack([stage.observed for stage in stages]),
-            rows=np.stack([stage.rows for stage in stages]),
+            rows=np.stack([stage.C for stage in stages]),
             targets=targets,
             noise=np.stack([stage.noise for stage in stages]),
         )
@@ -133,17 +141,35 @@ class _EpisodeWindow:
     def _innovations(self) -> FloatArray:
         """Return residuals `(m, 2)` at the prediction over their predicted deviations."""
         stage = self.stages[-1]
-        C = measurement_matrix(stage.observed, stage.rows)
-        R = np.tile(stage.noise, len(C) // 2)
+        C = stage.C[stage.observed].reshape(-1, self.model.n_states)
+        R = stage.noise[stage.observed].ravel()
         before = np.linalg.inv(np.linalg.inv(self.P) - C.T @ (C / R[:, None]))
         spread = np.sqrt(np.diag(C @ before @ C.T) + R).reshape(-1, 2)
-        expected = self.model.measure(self.state)[0] / self.measurement_scale
+        expected = self.model.measure(self.state, stage.centre)[0] / self.measurement_scale
         return np.asarray((stage.values - expected)[stage.observed] / spread)
 
-    def _stage(self) -> _Stage:
-        n_segments = self.model.n_segments
-        nothing = np.zeros(n_segments, dtype=np.bool_)
-        return _Stage(self.x, self.x, nothing, np.zeros((n_segments, 2)), np.ones(2))
+    def _noise(self, sigma: FloatArray) -> FloatArray:
+        """Return the variances `(M, 2)` of measurements with deviations `(M, 2)`."""
+        rows = self.model.rows
+        noise: FloatArray = np.maximum(sigma / self.measurement_scale, LEAST_DEVIATION) ** 2
+        density = rows.weights @ self.model.density(self.state)[0]
+        noise[:, 0] += count_variance(self.model, self.settings) * density / rows.span
+        return noise
+
+    def _stage(self, point: FloatArray) -> _Stage:
+        """Return a stage at the present mean, without measurements."""
+        n_rows = self.model.rows.n_rows
+        return _Stage(
+            self.x,
+            self.x,
+            point,
+            observed=np.zeros(n_rows, dtype=np.bool_),
+            values=np.zeros((n_rows, 2)),
+            noise=np.ones((n_rows, 2)),
+            centre=None,
+            C=np.zeros((n_rows, 2, self.model.n_states)),
+            c_2=np.zeros(n_rows),
+        )
 
     def _linearise_step(self, stage: _Stage, point: FloatArray) -> None:
         """Set A and B u + c_1 at the physical state nearest to a point."""
@@ -154,13 +180,13 @@ class _EpisodeWindow:
         stage.c_1 = after - stage.A @ (state[0] / self.scale)
 
     def _linearise_measurement(self, stage: _Stage, point: FloatArray) -> None:
-        """Set the second output's rows of C and c_2 at the physical state nearest to a point."""
+        """Set C, and c_2 of the second number, at the physical state nearest to a point."""
         state = self.model.project((point * self.scale)[None])
-        unit = self.measurement_scale[1]
-        by_state = self.model.measurement_jacobian(state)[0, :, 1]
-        stage.rows = by_state * self.scale[:2] / unit
-        second = self.model.measure(state)[0, :, 1] / unit
-        stage.c_2 = second - np.sum(stage.rows * (state[0] / self.scale).reshape(-1, 2), axis=1)
+        unit = self.measurement_scale
+        matrix = self.model.measurement_matrix(state, stage.centre)[0]
+        stage.C = matrix * self.scale / unit[:, None]
+        second = self.model.measure(state, stage.centre)[0, :, 1] / unit[1]
+        stage.c_2 = second - np.sum(stage.C[:, 1] * (state[0] / self.scale), axis=1)
 
 
 class ReferenceMHE(ReferenceFilter):
@@ -173,6 +199,7 @@ class ReferenceMHE(ReferenceFilter):
 
     def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
         """See `make_estimator`."""
+        require_process_noise(settings)
         self._windows: list[_EpisodeWindow] = []
         super().__init__(model, n_episodes, settings_of_mhe(settings))
 

@@ -3,10 +3,17 @@
 import numpy as np
 from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter, unscented_transform
 
-from dptse_env.estimators.reference.kalman import EpisodeFilter, ReferenceFilter, configure
+from dptse_env.estimators.batch import EpisodeMeasurements
+from dptse_env.estimators.reference.kalman import (
+    EpisodeFilter,
+    ReferenceFilter,
+    configure,
+    measurement_covariance,
+    process_covariance,
+)
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
-from dptse_env.utils.arrays import BoolArray, FloatArray
+from dptse_env.utils.arrays import FloatArray
 
 
 class _Points(MerweScaledSigmaPoints):  # type: ignore[misc]
@@ -36,13 +43,13 @@ class _Filter(UnscentedKalmanFilter):  # type: ignore[misc]
     def __init__(self, model: ARZModel, settings: EstimatorSettings) -> None:
         ukf = settings.ukf
         points = _Points(model.n_states, alpha=ukf.alpha, beta=ukf.beta, kappa=ukf.kappa)
-        sizes = model.n_states, 2 * model.n_segments, model.time_step
+        sizes = model.n_states, 2 * model.rows.n_rows, model.time_step
         super().__init__(*sizes, None, None, points, x_mean_fn=_mean, z_mean_fn=_mean)
         configure(self, model, settings)
 
     @property
     def state(self) -> FloatArray:
-        """Mean `(1, 2 S)` in physical units, projected."""
+        """Mean `(1, n_x)` in physical units, projected."""
         return np.asarray(self.model.project(self.x[None] * self.scale, self.bounds))
 
     def restart(self) -> None:
@@ -69,22 +76,24 @@ class _Filter(UnscentedKalmanFilter):  # type: ignore[misc]
         return np.asarray((sigmas_f - x).T @ (self.Wc[:, None] * (sigmas_h - z)))
 
     def advance(self, inputs: FloatArray) -> None:
+        self.Q = process_covariance(self)
         self.predict(inputs=inputs)
         self.has_moved = True
 
-    def assimilate(self, observed: BoolArray, values: FloatArray, sigma: FloatArray) -> FloatArray:
+    def assimilate(self, measured: EpisodeMeasurements) -> FloatArray:
         """See `EpisodeFilter.assimilate`."""
+        observed = measured.observed
         if not observed.any():
             return np.zeros((0, 2))
+        noise = measurement_covariance(self, measured)
         if not self.has_moved:
             self.compute_process_sigmas(self._dt)
             self.points_fn.moved = None
             self.x, self.P = unscented_transform(self.sigmas_f, self.Wm, self.Wc, None, _mean)
-        noise = np.diag(np.tile(np.square(sigma / self.measurement_scale), int(observed.sum())))
-        outputs = self.model.measure(self.sigmas_f * self.scale) / self.measurement_scale
-        rows = iter(outputs[:, observed].reshape(len(outputs), -1))
-        measured = (values[observed] / self.measurement_scale).ravel()
-        self.update(measured, R=noise, hx=lambda _: next(rows))
+        outputs = self.model.measure(self.sigmas_f * self.scale, measured.centre)
+        rows = iter((outputs / self.measurement_scale)[:, observed].reshape(len(outputs), -1))
+        values = (measured.values[observed] / self.measurement_scale).ravel()
+        self.update(values, R=noise, hx=lambda _: next(rows))
         self.x = self.state[0] / self.scale
         self.has_moved = False
         return np.asarray((self.y / np.sqrt(np.diag(self.S))).reshape(-1, 2))

@@ -1,0 +1,123 @@
+"""Compiled windows of the moving horizon estimator: their stages, and how these are linearised."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from dptse_env.estimators.compiled.ekf_kernels import Filters, normalise, project
+from dptse_env.estimators.compiled.ekf_rows import released
+from dptse_env.model.kernels import advance, make_scratch
+from dptse_env.model.road_arrays import RoadArrays
+from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+
+
+class Windows(NamedTuple):
+    """Windows of n episodes, up to L = N + 1 stages each; normalised but for inputs and centres."""
+
+    length: IntArray  # (n,) stages in use
+    arrival_variance: FloatArray  # (n, n_x) in use
+    predicted: FloatArray  # (n, L, n_x) predictions of stages; the first is the arrival's mean
+    inputs: FloatArray  # (n, L, n_u) of the step that leaves each stage
+    process_variance: FloatArray  # (n, L, n_x) likewise
+    blocks: FloatArray  # (n, L, S, K, 4) likewise
+    by_factor: FloatArray  # (n, L, E, 2) likewise, of the demand factors; E = 0 without
+    offsets: FloatArray  # (n, L, n_x) likewise
+    observed: BoolArray  # (n, L, M)
+    values: FloatArray  # (n, L, M, 2)
+    noise: FloatArray  # (n, L, M, 2)
+    centre: FloatArray  # (n, L, S) v_0 [km/h] of each stage's flows, NaN where they are speeds
+    slopes: FloatArray  # (n, L, S, 2)
+    constants: FloatArray  # (n, L, S)
+    # (n, padded) where the last stage's measurement is linearised, unless along the solution
+    point: FloatArray
+    solution: FloatArray  # (n, L, padded)
+    side: IntArray  # (n, L, padded) bound at which each variable was last active
+    unsolved: BoolArray  # (n,) whether the active-set method found no optimum
+    moving_variance: FloatArray  # (n_x,) arrival variance of a window that moves
+    lower: FloatArray  # (n_x,)
+    upper: FloatArray  # (n_x,)
+    units: FloatArray  # (n_x,) of normalised states
+    along: bool  # whether to linearise along the last solution
+
+
+@njit(cache=True, error_model="numpy")
+def enter(filters: Filters, windows: Windows, e: int, t: int) -> None:
+    """Add the mean as a stage without measurements."""
+    for i in range(windows.units.size):
+        windows.predicted[e, t, i] = filters.means[e, i] / windows.units[i]
+        windows.solution[e, t, i] = windows.predicted[e, t, i]
+    windows.observed[e, t] = False
+    windows.side[e, t] = 0
+    windows.noise[e, t] = 1.0
+
+
+@njit(cache=True, error_model="numpy")
+def shift(windows: Windows, e: int) -> None:
+    """Drop the oldest stage."""
+    windows.arrival_variance[e] = windows.moving_variance
+    for t in range(windows.solution.shape[1] - 1):
+        windows.predicted[e, t] = windows.predicted[e, t + 1]
+        windows.inputs[e, t] = windows.inputs[e, t + 1]
+        windows.process_variance[e, t] = windows.process_variance[e, t + 1]
+        windows.blocks[e, t] = windows.blocks[e, t + 1]
+        windows.by_factor[e, t] = windows.by_factor[e, t + 1]
+        windows.offsets[e, t] = windows.offsets[e, t + 1]
+        windows.observed[e, t] = windows.observed[e, t + 1]
+        windows.values[e, t] = windows.values[e, t + 1]
+        windows.noise[e, t] = windows.noise[e, t + 1]
+        windows.centre[e, t] = windows.centre[e, t + 1]
+        windows.slopes[e, t] = windows.slopes[e, t + 1]
+        windows.constants[e, t] = windows.constants[e, t + 1]
+        windows.solution[e, t] = windows.solution[e, t + 1]
+        windows.side[e, t] = windows.side[e, t + 1]
+
+
+@njit(cache=True, error_model="numpy")
+def _physical(road: RoadArrays, windows: Windows, point: FloatArray) -> FloatArray:
+    """Return the state in the cone nearest to a normalised point."""
+    state = np.empty(windows.units.size)
+    for i in range(state.size):
+        state[i] = point[i] * windows.units[i]
+    project(road, state, False)
+    return state
+
+
+@njit(cache=True, error_model="numpy")
+def linearise_step(
+    road: RoadArrays, filters: Filters, windows: Windows, e: int, t: int, point: FloatArray
+) -> None:
+    """Linearise the step that leaves a stage, at the physical state nearest to a point."""
+    n, scale, v_f = 2 * road.jam.size, filters.density_scale, road.free_flow_speed
+    state, scratch = _physical(road, windows, point), make_scratch(road)
+    offsets, blocks, by_factor = windows.offsets[e, t], windows.blocks[e, t], scratch.by_factor
+    advance(road, state, windows.inputs[e, t], offsets, blocks, scratch)
+    for i in range(n, state.size):
+        c, slopes = road.entries[i - n], by_factor[i - n]
+        offsets[2 * c] -= slopes[0] * state[i]
+        offsets[2 * c + 1] -= slopes[1] * state[i]
+        offsets[i] = 0.0
+    for c in range(road.jam.size):
+        for slot in range(road.degree[c]):
+            b, block = road.neighbours[c, slot], blocks[c, slot]
+            offsets[2 * c] -= block[0] * state[2 * b] + block[1] * state[2 * b + 1]
+            offsets[2 * c + 1] -= block[2] * state[2 * b] + block[3] * state[2 * b + 1]
+        offsets[2 * c] /= scale
+        offsets[2 * c + 1] /= scale * v_f
+    normalise(road, scale, blocks, by_factor)
+    windows.by_factor[e, t] = by_factor[: state.size - n]
+
+
+@njit(cache=True, error_model="numpy")
+def linearise_measurement(
+    road: RoadArrays, filters: Filters, windows: Windows, e: int, t: int, point: FloatArray
+) -> None:
+    """Linearise the second number of every segment, at the physical state nearest to a point."""
+    scale, unit = filters.density_scale, road.second_scale
+    state = _physical(road, windows, point)
+    for s in range(road.jam.size):
+        rho, psi = state[2 * s], state[2 * s + 1]
+        second, by_rho, by_psi = released(road, s, rho, psi, windows.centre[e, t, s])
+        windows.slopes[e, t, s, 0] = by_rho * scale / unit
+        windows.slopes[e, t, s, 1] = by_psi * scale * road.free_flow_speed / unit
+        windows.constants[e, t, s] = (second - by_rho * rho - by_psi * psi) / unit

@@ -1,0 +1,34 @@
+"""Variances of a filter's noise and prior, normalised: rho by rho_m, psi by rho_m v_f."""
+
+import numpy as np
+
+from dptse_env.estimators.settings import EstimatorSettings
+from dptse_env.model import ARZModel
+from dptse_env.utils.arrays import FloatArray
+
+
+def process_variance(model: ARZModel, settings: EstimatorSettings) -> FloatArray:
+    """Return the variances, shape (n_x,), of a step's process noise at a density of zero."""
+    traffic = np.tile(settings.process_noise, model.n_segments)
+    walk = 0.0 if settings.demand is None else settings.demand.walk
+    return np.concatenate([traffic, np.full(model.n_demand_states, walk)]) ** 2
+
+
+def initial_variance(model: ARZModel, settings: EstimatorSettings) -> FloatArray:
+    """Return the variances, shape (n_x,), of the prior."""
+    traffic = np.full(2 * model.n_segments, settings.initial_variance)
+    deviation = 0.0 if settings.demand is None else settings.demand.deviation
+    return np.concatenate([traffic, np.full(model.n_demand_states, deviation**2)])
+
+
+def count_variance(model: ARZModel, settings: EstimatorSettings) -> float:
+    """Return the variance of a measured density beside the noise, over rho [km/veh]."""
+    return float(settings.count_noise / model.network.segment_length / model.density_scale**2)
+
+
+def density_growth(model: ARZModel, settings: EstimatorSettings, density: FloatArray) -> FloatArray:
+    """Return the variances, shape (..., n_x), that densities (..., S) [veh/km] add to a step's."""
+    growth = np.zeros((*density.shape[:-1], model.n_states))
+    grown = settings.density_growth**2 * density / model.density_scale
+    growth[..., 0 : 2 * model.n_segments : 2] = grown
+    return growth
