@@ -65,6 +65,10 @@ class Args:
     """Noise and estimators are seeded with this plus the traffic seed."""
     noise_scale: bool = False
     """Search the scale of R, too, although the mechanism's noise is known."""
+    demand: bool = False
+    """Search demand states, too, and the noise that goes with them."""
+    variant: str = ""
+    """Ending of the names of the sets; empty for default sets."""
     sampler_seed: int = 0
     """Seeds the search."""
     records: Path | None = None
@@ -101,6 +105,8 @@ def make_tasks(args: Args) -> list[TuningTask]:
             noise_seed=args.noise_seed,
             records=records_argument(args.records),
             with_noise_scale=args.noise_scale,
+            with_demand=args.demand,
+            variant=args.variant,
             keywords=keywords,
         )
         task.config()

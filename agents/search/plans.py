@@ -111,12 +111,17 @@ class PlanScorer:
         """Make the environment; nothing is recorded before `scores`.
 
         Raises:
-            ValueError: A value of the task is out of range.
+            ValueError: A value of the task is out of range, or queries are not of single segments.
         """
         task.check()
         self.env = task.make(n_episodes, seeds)
         self.n_episodes = n_episodes
         config = self.env.config
+        if not config.queries.are_plain:
+            raise ValueError(
+                f"plans are of single segments: they need query_spans (1,) and price_levels "
+                f"(1.0,), got {config.queries}"
+            )
         self.n_mainline, self.bandwidth = config.corridor.n_mainline, config.bandwidth
         self.free = np.setdiff1d(np.arange(self.n_mainline), config.corridor.fixed_sensors)
         if len(self.free) < self.bandwidth:

@@ -9,7 +9,7 @@ from typing import Any
 
 from optuna.distributions import CategoricalDistribution, FloatDistribution
 
-from dptse_env.estimators import EstimatorSettings
+from dptse_env.estimators import DemandSettings, EstimatorSettings
 
 Knob = FloatDistribution | CategoricalDistribution
 """The values that the search can give a setting."""
@@ -46,6 +46,27 @@ _PROCESS_NOISE: Mapping[str, Knob] = {
     "process_noise.1": evenly(1e-3, 5e-2),
 }
 
+# Demand states explain what constant process noise stands for otherwise, so that its best values
+# are smaller.
+DEMAND: Mapping[str, Knob] = {
+    "process_noise.0": evenly(3e-4, 5e-2),
+    "process_noise.1": evenly(1e-4, 5e-2),
+    "density_growth": evenly(1e-4, 0.1),
+    "count_noise": evenly(3e-3, 3.0),
+    "demand.deviation": evenly(0.02, 0.6),
+    "demand.walk": evenly(1e-3, 0.3),
+}
+"""Settings that are searched where demand states are."""
+
+DEMAND_START = EstimatorSettings(
+    process_noise=(0.0061, 0.001),
+    density_growth=0.0115,
+    count_noise=0.09,
+    noise_scale=1.2,
+    demand=DemandSettings(),
+)
+"""The settings with demand states from which a search begins."""
+
 # Q and R times one factor leave the estimates of all but the UKF as they are, and there alpha does
 # what the factor would: R is known from the mechanism, so it stays and Q is searched.
 NOISE_SCALE = {"noise_scale": evenly(0.5, 3.0)}
@@ -70,11 +91,18 @@ SPACE: dict[str, Mapping[str, Knob]] = {
 """By estimator: paths into `EstimatorSettings` and where their values are searched."""
 
 
-def search_space(estimator: str, with_noise_scale: bool = False) -> dict[str, Knob]:
-    """Return the search space of an estimator, with or without the scale of R.
+def search_space(
+    estimator: str, with_noise_scale: bool = False, with_demand: bool = False
+) -> dict[str, Knob]:
+    """Return the search space of an estimator.
+
+    Args:
+        estimator: Its name.
+        with_noise_scale: Whether to search the scale of R.
+        with_demand: Whether to search demand states and the noise that goes with them.
 
     Raises:
-        ValueError: There is nothing to tune, or no such estimator.
+        ValueError: There is nothing to tune, no such estimator, or it has no demand states.
     """
     if estimator == "open_loop":
         raise ValueError(
@@ -83,7 +111,10 @@ def search_space(estimator: str, with_noise_scale: bool = False) -> dict[str, Kn
         )
     if estimator not in SPACE:
         raise ValueError(f"estimator must be one of {', '.join(SPACE)}, got {estimator!r}")
-    return {**SPACE[estimator], **(NOISE_SCALE if with_noise_scale else {})}
+    if with_demand and estimator == "random_walk":
+        raise ValueError("demand must be left out for 'random_walk', which has no traffic model")
+    added = {**(NOISE_SCALE if with_noise_scale else {}), **(DEMAND if with_demand else {})}
+    return {**SPACE[estimator], **added}
 
 
 def nested(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -25,7 +25,7 @@ from optuna.trial import FrozenTrial, TrialState
 
 from agents.evaluation.episodes import WARM_UP, EpisodeScore
 from agents.experiments.files import replacing
-from agents.search.space import at_bound, holds, nested, rounded, values_of
+from agents.search.space import DEMAND_START, at_bound, holds, nested, rounded, values_of
 from agents.search.tuning_task import TuningTask, score_episode
 from dptse_env.estimators import EstimatorSettings
 from dptse_env.estimators.tuned_settings import write_settings
@@ -79,7 +79,7 @@ class TuningStudy:
         # No other process has the journal, so running trials belong to a run that was killed.
         for trial in self.study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
             self.study.tell(trial.number, state=TrialState.FAIL)
-        self._enqueue("defaults", EstimatorSettings())
+        self._enqueue("defaults", DEMAND_START if task.with_demand else EstimatorSettings())
         self._enqueue("shipped", task.config().settings())
 
     def _identify(self, identity: dict[str, Any]) -> None:
@@ -97,6 +97,8 @@ class TuningStudy:
 
     def _enqueue(self, label: str, settings: EstimatorSettings) -> None:
         """Queue a labelled trial, unless one with its label was run or waits."""
+        if self.task.with_demand and settings.demand is None:
+            return
         values = values_of(settings, self.space)
         states = (*_FINISHED, TrialState.WAITING)
         for trial in self.study.get_trials(deepcopy=False, states=states):
@@ -212,6 +214,7 @@ class TuningStudy:
                 privacy=self.task.privacy,
                 settings=best.user_attrs["settings"],
                 provenance=self._provenance(best, defaults),
+                variant=self.task.variant,
             )
 
     def _provenance(self, best: FrozenTrial, defaults: FrozenTrial | None) -> dict[str, Any]:

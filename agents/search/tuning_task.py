@@ -41,6 +41,9 @@ class TuningTask:
         noise_seed: Noise and estimators are seeded with this plus the traffic seed.
         records: Folder of the record cache; the user's cache if None.
         with_noise_scale: Whether to search the scale of the measurements' noise, too.
+        with_demand: Whether to search demand states and the noise that goes with them, too.
+        variant: Ending of the set's name; empty for the set that is the default of its privacy
+            preset.
 
     Raises:
         FileNotFoundError: There is no such saved policy.
@@ -58,6 +61,8 @@ class TuningTask:
     noise_seed: int = TUNING.start
     records: str | None = None
     with_noise_scale: bool = False
+    with_demand: bool = False
+    variant: str = ""
 
     def __post_init__(self) -> None:
         """Check what needs no environment."""
@@ -84,7 +89,7 @@ class TuningTask:
     @property
     def space(self) -> dict[str, Knob]:
         """The search space, by path into the settings."""
-        return search_space(self.estimator, self.with_noise_scale)
+        return search_space(self.estimator, self.with_noise_scale, self.with_demand)
 
     @property
     def traffic_seeds(self) -> tuple[int, ...]:
@@ -99,7 +104,8 @@ class TuningTask:
     @property
     def name(self) -> str:
         """Name of the set."""
-        return settings_name(self.estimator, self.parameters_name, self.privacy)
+        name = settings_name(self.estimator, self.parameters_name, self.privacy)
+        return f"{name}-{self.variant}" if self.variant else name
 
     def make(self, settings: EstimatorSettings | None = None) -> gym.Env[Any, Any]:
         """Make the environment; with its default settings if None."""

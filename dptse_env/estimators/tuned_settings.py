@@ -89,14 +89,18 @@ def write_settings(
     privacy: str,
     settings: Mapping[str, Any],
     provenance: Mapping[str, Any],
+    variant: str = "",
 ) -> None:
     """Write the tuned fields of `EstimatorSettings` and their provenance as JSON.
+
+    A variant is an ending of the set's name, beside the default set of a privacy preset.
 
     Raises:
         ValueError: A setting is unknown or out of range; nothing is written then.
     """
+    name = settings_name(estimator, parameters, privacy)
     content = {
-        "name": settings_name(estimator, parameters, privacy),
+        "name": f"{name}-{variant}" if variant else name,
         "estimator": estimator,
         "parameters": parameters,
         "privacy": privacy,
@@ -111,8 +115,10 @@ def write_settings(
 def _parse(text: str, path: str) -> EstimatorSettings:
     content = parse_object(text, path, _KEYS)
     name = settings_name(content["estimator"], content["parameters"], content["privacy"])
-    if content["name"] != name:
-        raise ValueError(f"{path}: name must be {name!r}, got {content['name']!r}")
+    if content["name"] != name and not content["name"].startswith(f"{name}-"):
+        raise ValueError(
+            f"{path}: name must be {name!r} or begin with '{name}-', got {content['name']!r}"
+        )
     try:
         return from_mapping(EstimatorSettings, content["settings"], _PATH)
     except ValueError as problem:

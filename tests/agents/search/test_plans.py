@@ -3,7 +3,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from agents.evaluation.episodes import WARM_UP
+from agents.evaluation.episodes import WARM_UP, make_vector
 from agents.search.plans import (
     PlanScorer,
     PlanSearch,
@@ -13,6 +13,7 @@ from agents.search.plans import (
     validation_scores,
 )
 from dptse_env.schedules.plans import PlanContext
+from tests.release.sums import SumRelease
 
 SHORT = "dptse_env:dptse/ShortHighway-v0"
 TASK = PlanTask(
@@ -160,3 +161,15 @@ def test_bad_tasks_are_named(changes, message):
 def test_a_bandwidth_without_a_choice_is_refused():
     with pytest.raises(ValueError, match="bandwidth 6 leaves nothing to choose among the 5"):
         PlanSearch(dataclasses.replace(TASK, bandwidth=6))
+
+
+def test_plans_are_of_single_segments():
+    class Sums(PlanTask):
+        def make(self, n_episodes, seeds):
+            keywords = {"privacy": SumRelease, "query_spans": (1, 2), "traffic_seeds": seeds}
+            return make_vector(self.env, n_episodes, keywords)
+
+    with pytest.raises(
+        ValueError, match=r"^plans are of single segments: .* got query_spans \(1, 2"
+    ):
+        PlanScorer(Sums(SHORT), (0, 1), 2)
