@@ -2,6 +2,7 @@
 
 import math
 import os
+from collections.abc import Iterable
 
 from dptse_env.utils.fields import POSITIVE, Interval, number
 
@@ -12,6 +13,13 @@ def require(condition: bool, path: str, allowed: str, value: object) -> None:
     """Raise ``ValueError`` "<path> must be <allowed>, got <value>" unless `condition` holds."""
     if not condition:
         raise ValueError(f"{path} must be {allowed}, got {value!r}")
+
+
+def require_name(path: str, name: object, known: Iterable[str]) -> None:
+    """Raise ``ValueError`` unless `name` is one of the `known` strings."""
+    names = list(known)
+    if not isinstance(name, str) or name not in names:
+        raise ValueError(f"{path} must be one of {', '.join(names)}, got {name!r}")
 
 
 def integer(path: str, value: object, low: int, high: float = math.inf) -> int:

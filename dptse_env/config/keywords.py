@@ -1,0 +1,192 @@
+"""Keywords of an environment: how they change the configuration of a preset."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+from dptse_env.config.env_config import MOST_SEEDS, PRESETS, EnvConfig
+from dptse_env.estimators import settings_type
+from dptse_env.release import RELEASE_MODELS, PrivacySettings
+from dptse_env.traffic import Corridor, find_corridor, randomised
+from dptse_env.utils.fields import field_hints, from_mapping
+from dptse_env.utils.validation import require_name
+
+GEOMETRY = (
+    "n_mainline", "on_ramps", "off_ramps", "exit_shares", "lanes", "ramp_lanes", "segment_length",
+    "speed_limit",
+)  # fmt: skip
+"""Fields of a corridor by which it is another road: what was fitted to one may not suit another."""
+
+
+class UnknownKeywordError(TypeError, ValueError):
+    """A keyword that an environment does not have.
+
+    A ``TypeError`` as for any function, since libraries that try keywords on environments look for
+    it, and a ``ValueError`` as for every other bad keyword.
+    """
+
+
+def resolve(preset: str, overrides: Mapping[str, Any]) -> EnvConfig:
+    """Return a preset with some of its fields replaced.
+
+    Args:
+        preset: A name in `PRESETS`.
+        overrides: Fields of `EnvConfig`. A mapping replaces the named fields of a nested
+            dataclass and keeps the others. Names stand for known values: a corridor, a release
+            model. Shortcuts: ``epsilon`` and ``delta`` of ``privacy``, ``incident`` of
+            ``corridor`` (``"preset"``, ``"none"``, ``"random"`` or a mapping) and ``demand`` of
+            ``corridor`` (the same without ``"none"``); random means drawn anew for every traffic
+            seed. ``traffic_seeds`` may be a string ``"first:stop"``. In a mapping
+            ``estimator_settings``, fields left out keep what None would have given: the tuned set
+            of the resolved estimator, parameters and privacy preset, or else the defaults.
+
+    Raises:
+        UnknownKeywordError: A key is no field and no shortcut.
+        ValueError: A value is out of range; the message starts with its path.
+
+    Warns:
+        UserWarning: The corridor is another road, and values measured or tuned on the preset's
+            road are used on it.
+    """
+    require_name("preset", preset, PRESETS)
+    base, values = PRESETS[preset], dict(overrides)
+    _check_keywords(values)
+    corridor = _corridor(base.corridor, values)
+    values["privacy"] = _privacy(base.privacy, values)
+    if isinstance(values.get("traffic_seeds"), str):
+        values["traffic_seeds"] = parse_seeds(values["traffic_seeds"], "traffic_seeds")
+    if isinstance(values.get("observation"), str):
+        values["observation"] = (values["observation"],)
+    settings = values.get("estimator_settings")
+    if isinstance(settings, Mapping):
+        del values["estimator_settings"]
+    config = from_mapping(EnvConfig, {**values, "corridor": corridor}, "", base)
+    if isinstance(settings, Mapping):
+        expected = settings_type(config.estimator)
+        given = from_mapping(expected, settings, "estimator_settings", config.settings())
+        config = replace(config, estimator_settings=given)
+    inherited = _inherited(corridor, config, overrides)
+    if inherited and not config.inherited:
+        config = replace(config, inherited=inherited)
+        warnings.warn(
+            f"{', '.join(inherited)}: values measured or tuned on {base.corridor.name} are used on "
+            "another road; give them to use others",
+            UserWarning,
+            stacklevel=3,
+        )
+    return config
+
+
+def parse_seeds(text: str, path: str = "seeds") -> tuple[int, ...]:
+    """Return the seeds that ``"first:stop"`` or ``"one"`` stands for, ``stop`` left out.
+
+    Raises:
+        ValueError: The text is neither, or the range is empty or too long.
+    """
+    first, colon, stop = text.partition(":")
+    if not (first.isdecimal() and (stop.isdecimal() or not colon)) or len(text) > 40:
+        raise ValueError(f"{path} must be 'first:stop' or one seed, got {text[:60]!r}")
+    seeds = range(int(first), int(stop) if colon else int(first) + 1)
+    if not seeds:
+        raise ValueError(f"{path} must not be empty, got {text!r}")
+    if seeds.stop - seeds.start > MOST_SEEDS:
+        raise ValueError(f"{path} must be at most {MOST_SEEDS} seeds, got {text!r}")
+    return tuple(seeds)
+
+
+_SHORTCUTS = ("epsilon", "delta", "incident", "demand")
+
+
+def _check_keywords(values: Mapping[str, Any]) -> None:
+    known = (*field_hints(EnvConfig), *_SHORTCUTS)
+    for key in values:
+        if key not in known:
+            raise UnknownKeywordError(
+                f"{key} is unknown; allowed: {', '.join(known)} (got an unexpected keyword "
+                f"argument {key!r})"
+            )
+
+
+def _corridor(base: Corridor, values: dict[str, Any]) -> Corridor:
+    """Take the keywords about the corridor out of ``values`` and apply them."""
+    corridor = values.pop("corridor", {})
+    if isinstance(corridor, Mapping):
+        base = from_mapping(Corridor, _with_scales(base, corridor), "corridor", base)
+    else:
+        base = find_corridor(corridor)
+    for key, names in (
+        ("demand", ("preset", "random")),
+        ("incident", ("preset", "random", "none")),
+    ):
+        if key not in values:
+            continue
+        value = values.pop(key)
+        if isinstance(value, str):
+            require_name(key, value, names)
+            source = randomised(base) if value == "random" else base
+            value = None if value == "none" else getattr(source, key)
+        base = from_mapping(Corridor, {key: value}, "corridor", base)
+    return base
+
+
+def _with_scales(base: Corridor, fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Return fields of a corridor with scales that follow a change of lanes and speed limit."""
+    whole = dict(fields)
+    for scale, cause in (("density_scale", "lanes"), ("speed_scale", "speed_limit")):
+        changed = whole.get(cause)
+        if (
+            scale not in whole
+            and isinstance(changed, int | float)
+            and not isinstance(changed, bool)
+        ):
+            whole[scale] = getattr(base, scale) * float(changed) / getattr(base, cause)
+    return whole
+
+
+def _inherited(
+    corridor: Corridor, config: EnvConfig, overrides: Mapping[str, Any]
+) -> tuple[str, ...]:
+    """Return the keywords that another road left as they are for the preset's."""
+    geometry = [getattr(corridor, name) for name in GEOMETRY]
+    shipped = [preset.corridor for preset in PRESETS.values()]
+    if any(geometry == [getattr(road, name) for name in GEOMETRY] for road in shipped):
+        return ()
+    found = []
+    given = overrides.get("corridor")
+    if isinstance(given, Mapping) and "average_dwell" not in given:
+        found.append("corridor.average_dwell")
+    if isinstance(config.parameters, str) and "parameters" not in overrides:
+        found.append("parameters")
+    if config.settings_name is not None and "estimator_settings" not in overrides:
+        found.append("estimator_settings")
+    return tuple(found)
+
+
+def _privacy(base: PrivacySettings, values: dict[str, Any]) -> PrivacySettings:
+    """Take the keywords about privacy out of ``values`` and apply them.
+
+    A change of the release model keeps epsilon and delta and takes the model's defaults otherwise.
+    """
+    given = values.pop("privacy", {})
+    if isinstance(given, PrivacySettings):
+        base, given = given, {}
+    elif isinstance(given, str | type):
+        given = {"preset": given}
+    elif not isinstance(given, Mapping):
+        raise ValueError(
+            f"privacy must be the name of a release model, a class or a mapping, got {given!r}"
+        )
+    given = dict(given)
+    preset = given.pop("preset", base.preset)
+    if not isinstance(preset, str | type):
+        raise ValueError(f"privacy.preset must be a name or a class, got {preset!r}")
+    if isinstance(preset, str):
+        preset = RELEASE_MODELS.name_of(preset)
+    if preset != base.preset:
+        model = RELEASE_MODELS.find(preset)
+        base = model.settings_type(preset=preset, epsilon=base.epsilon, delta=base.delta)
+    given |= {key: values.pop(key) for key in ("epsilon", "delta") if key in values}
+    return from_mapping(type(base), given, "privacy", base)
