@@ -11,6 +11,7 @@ from gymnasium.envs.registration import register, registry
 ENVIRONMENTS = {
     "dptse/PaperHighway-v0": "paper-highway",
     "dptse/PrivateHighway-v0": "private-highway",
+    "dptse/PrivateHighway-v1": "private-highway-v1",
     "dptse/ShortHighway-v0": "short-highway",
 }
 """Environment ids and the preset behind each."""
@@ -19,6 +20,7 @@ REGISTRIES = {
     "action": "dptse_env.spaces.actions:ACTION_ENCODINGS",
     "corridor": "dptse_env.traffic:CORRIDORS",
     "estimator": "dptse_env.estimators:ESTIMATORS",
+    "pacing": "dptse_env.release:PACINGS",
     "observation": "dptse_env.spaces.observations:BLOCKS",
     "privacy": "dptse_env.release:RELEASE_MODELS",
     "reward": "dptse_env.spaces.rewards:REWARDS",

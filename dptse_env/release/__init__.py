@@ -1,14 +1,25 @@
 """Release of traffic data: true traffic, release models, and boundary inputs."""
 
-from dptse_env.release.base import Released, ReleaseModel, ReleaseRequest, ReleaseSetup
+from dptse_env.release.base import (
+    MeasuredRows,
+    Released,
+    ReleaseModel,
+    ReleaseRequest,
+    ReleaseSetup,
+    split_release,
+)
 from dptse_env.release.boundary import BOUNDARIES, BoundaryModel
 from dptse_env.release.checks import check_released
 from dptse_env.release.gaussian import Capped, Corrected, GaussianRelease, Paper, require_gaussian
 from dptse_env.release.mechanism import GaussianMechanism, Mechanism
+from dptse_env.release.paced import Paced
+from dptse_env.release.pacing import PACINGS, Pacing, PacingSetup, PublicStep
+from dptse_env.release.queries import MOST_OPTIONS, BandwidthUnit, QueryOptions
 from dptse_env.release.report import PrivacyReport, QuantityReport
 from dptse_env.release.settings import (
     BoundaryInputs,
     CappedSettings,
+    PacedSettings,
     PrivacySettings,
     SpeedRelease,
     Unit,
@@ -19,7 +30,7 @@ from dptse_env.utils.registry import Registry
 
 RELEASE_MODELS = Registry(
     "privacy.preset",
-    {"paper": Paper, "corrected": Corrected, "capped": Capped},
+    {"paper": Paper, "corrected": Corrected, "capped": Capped, "paced": Paced},
     check=lambda part: (
         None
         if isinstance(part, type) and issubclass(part, ReleaseModel)
@@ -28,12 +39,16 @@ RELEASE_MODELS = Registry(
     aliases={"guaranteed": "capped"},
 )
 """Release models by name: with the noise as printed in the paper, with the noise that its cited
-theorem needs, and with capped contributions, which gives a guarantee for every query policy."""
+theorem needs, with capped contributions, and with paced ledgers; the last two give a guarantee for
+every query policy."""
 
 __all__ = [
     "BOUNDARIES",
+    "MOST_OPTIONS",
+    "PACINGS",
     "RELEASE_MODELS",
     "VOID_REASONS",
+    "BandwidthUnit",
     "BoundaryInputs",
     "BoundaryModel",
     "Capped",
@@ -41,11 +56,18 @@ __all__ = [
     "Corrected",
     "GaussianMechanism",
     "GaussianRelease",
+    "MeasuredRows",
     "Mechanism",
+    "Paced",
+    "PacedSettings",
+    "Pacing",
+    "PacingSetup",
     "Paper",
     "PrivacyReport",
     "PrivacySettings",
+    "PublicStep",
     "QuantityReport",
+    "QueryOptions",
     "ReleaseModel",
     "ReleaseRequest",
     "ReleaseSetup",
@@ -55,4 +77,5 @@ __all__ = [
     "Unit",
     "check_released",
     "require_gaussian",
+    "split_release",
 ]

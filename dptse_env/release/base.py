@@ -10,6 +10,8 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from dptse_env.estimators import Estimate
+from dptse_env.model import ARZModel, MeasurementRows
+from dptse_env.release.queries import NO_OPTIONS, QueryOptions
 from dptse_env.release.report import PrivacyReport
 from dptse_env.release.settings import PrivacySettings
 from dptse_env.release.traffic_table import TrafficTable
@@ -27,9 +29,10 @@ class ReleaseSetup:
         name: Name of the model, for reports.
         settings: The privacy settings.
         traffic: The true traffic, with its corridor.
-        bandwidth: Largest number of mainline segments queried in a step.
+        bandwidth: What the queries of a step may cost together, in the unit of ``queries``.
         horizon: Steps of an episode.
         n_episodes: Size n of the batch.
+        queries: The G options that can be queried; the mainline segments where they are not given.
     """
 
     name: str
@@ -38,6 +41,13 @@ class ReleaseSetup:
     bandwidth: int
     horizon: int
     n_episodes: int
+    queries: QueryOptions = NO_OPTIONS
+
+    def __post_init__(self) -> None:
+        """Fill in the options."""
+        if self.queries is NO_OPTIONS:
+            options = QueryOptions.make(self.corridor.n_mainline, self.bandwidth)
+            object.__setattr__(self, "queries", options)
 
     @property
     def corridor(self) -> Corridor:
@@ -45,25 +55,42 @@ class ReleaseSetup:
         return self.traffic.corridor
 
     @cached_property
+    def rows(self) -> MeasurementRows:
+        """The M rows that estimators may be given: the options and what is observed besides."""
+        return self.queries.rows(self.corridor)
+
+    @cached_property
     def n_columns(self) -> int:
-        """Columns of a release: the S segments, then the boundary segments if they are released."""
-        corridor = self.corridor
+        """Columns of a release: the M rows, then the boundary segments if they are released."""
         private = self.settings.boundary == "private"
-        return corridor.n_segments + (corridor.n_boundaries if private else 0)
+        return self.rows.n_rows + (self.corridor.n_boundaries if private else 0)
 
     @cached_property
     def always_observed(self) -> IntArray:
         """Columns that are observed at every step without a query."""
-        corridor = self.corridor
-        boundaries = range(corridor.n_segments, self.n_columns)
-        return np.array([*corridor.fixed_sensors, *boundaries], dtype=np.int64)
+        sensors = self.queries.sensor_rows(self.corridor)
+        boundaries = range(self.rows.n_rows, self.n_columns)
+        return np.array([*sensors, *boundaries], dtype=np.int64)
 
     def observed(self, queried: BoolArray) -> BoolArray:
-        """Return the observed columns (k, n_columns) of queried segments (k, n_mainline)."""
+        """Return the observed columns (k, n_columns) of queried options (k, G)."""
         observed = np.zeros((len(queried), self.n_columns), dtype=bool)
         observed[:, : queried.shape[1]] = queried
         observed[:, self.always_observed] = True
         return observed
+
+    def covered(self, observed: BoolArray) -> BoolArray:
+        """Return the mainline segments (k, n_mainline) of observed columns (k, n_columns)."""
+        n = self.corridor.n_mainline
+        if self.rows.are_single:
+            return observed[:, :n]
+        return observed[:, : self.rows.n_rows] @ self._covers
+
+    @cached_property
+    def _covers(self) -> BoolArray:
+        """Mainline segments in each row, shape (M, n_mainline)."""
+        covers: BoolArray = self.rows.weights[:, : self.corridor.n_mainline] > 0.0
+        return covers
 
 
 def _no_prediction() -> Estimate:
@@ -77,7 +104,8 @@ class ReleaseRequest(NamedTuple):
         episodes: Distinct rows of the batch, shape (k,).
         traffic: Index of each episode's traffic seed, shape (k,).
         times: Second of the record, shape (k,).
-        observed: Columns that were queried or are always observed, shape (k, n_columns).
+        observed: Columns that were queried or are always observed, shape (k, n_columns): those of
+            the options come first.
         prediction: Returns the estimator's prediction for this second, which is public: it depends
             on earlier releases and the configuration alone. Raises where there is no estimator.
     """
@@ -95,11 +123,48 @@ class Released(NamedTuple):
     Attributes:
         values: Density [veh/km] and mean speed [km/h] or centred flow [veh/h] of every column,
             shape (k, n_columns, 2), in a fresh array; those not observed are to be discarded.
-        sigma: Standard deviations of their noise, shape (2,), in the same units.
+        sigma: Standard deviations of their noise, in the same units, shape (k, n_columns, 2) or
+            (2,) where all columns have the same.
+        centre: Speeds [km/h] that the flows are centred on, of the segments and of the boundary
+            segments if they are released, shape (k, S) or (k, S + R); None for the `flow_centre`.
     """
 
     values: FloatArray
     sigma: FloatArray
+    centre: FloatArray | None = None
+
+
+class MeasuredRows(NamedTuple):
+    """What an estimator is given of a release, beside the rows that were observed.
+
+    Attributes:
+        values: Shape (k, M, 2).
+        sigma: Shape (k, M, 2).
+        centre: Shape (k, S), NaN where mean speeds are released.
+    """
+
+    values: FloatArray
+    sigma: FloatArray
+    centre: FloatArray
+
+
+def split_release(
+    released: Released, model: ARZModel
+) -> tuple[MeasuredRows, tuple[FloatArray, FloatArray | None]]:
+    """Return what a release says of the model's rows, and of the boundary segments.
+
+    The latter are values of shape (k, R, 2), or (k, 0, 2) if they are not released, and the speeds
+    that their flows are centred on, shape (k, R), or None for the model's reference speed.
+    """
+    values, n_rows, n_segments = released.values, model.rows.n_rows, model.n_segments
+    sigma = np.broadcast_to(released.sigma, values.shape)[:, :n_rows]
+    centre = released.centre
+    if centre is None:
+        v_0 = np.nan if model.reference_speed is None else model.reference_speed
+        own, at_boundary = np.full((len(values), n_segments), v_0), None
+    else:
+        own, at_boundary = centre[:, :n_segments], centre[:, n_segments:]
+    return MeasuredRows(values[:, :n_rows], sigma, own), (values[:, n_rows:], at_boundary)
 
 
 class ReleaseModel(ABC):
@@ -116,6 +181,10 @@ class ReleaseModel(ABC):
     """Dataclass of the settings under the keyword ``privacy``."""
     claims_guarantee: ClassVar[bool] = False
     """True where users expect a guarantee, so that a warning is due if it is void."""
+    releases_sums: ClassVar[bool] = False
+    """True where a release may cover several segments, at a price level that the query chooses."""
+    has_prices: ClassVar[bool] = False
+    """True where queries have prices, which `public_state` gives."""
 
     @classmethod
     def flow_centre(cls, corridor: Corridor, settings: Any) -> float | None:
@@ -132,7 +201,10 @@ class ReleaseModel(ABC):
     @property
     @abstractmethod
     def sigma(self) -> FloatArray:
-        """Standard deviations of the noise of both released quantities, shape (2,)."""
+        """Standard deviations of the noise of both released quantities, shape (2,).
+
+        Where they vary, those that are expected before an episode begins.
+        """
 
     @abstractmethod
     def reset(self, episodes: IntArray, generators: Sequence[np.random.Generator]) -> None:
@@ -159,8 +231,15 @@ class ReleaseModel(ABC):
         """Arrays that depend on traffic alone: a fork of the process shares them."""
         return ()
 
-    def spent(self, steps: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Return mu and epsilon of a vehicle after some steps, (k,) each; infinite if unknown."""
+    def spent(self, episodes: IntArray, steps: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Return upper bounds on a vehicle's privacy loss so far, mu and epsilon, shape (k,) each.
+
+        They are public, and infinite if unknown.
+
+        Args:
+            episodes: Distinct rows of the batch, shape (k,).
+            steps: Steps released so far in each of them, shape (k,).
+        """
         unknown = np.full(len(steps), math.inf)
         return unknown, unknown.copy()
 
@@ -178,6 +257,17 @@ class ReleaseModel(ABC):
             speed_release="flow" if flow else "mean",
             boundary_inputs=settings.boundary,
         )
+
+    def public_info(self, episodes: IntArray) -> Rows:
+        """Return further public entries of ``info``, rows of k episodes; by default none."""
+        return {}
+
+    def public_state(self, episodes: IntArray) -> tuple[FloatArray, FloatArray] | None:
+        """Return prices (k, G) and tracer (k, n_mainline) of ``episodes``, see `PublicState`.
+
+        None where queries have no prices.
+        """
+        return None
 
     def private_info(self, episodes: IntArray, traffic: IntArray) -> Rows:
         """Return private data for ``info["truth"]`` alone, rows of k episodes; by default none."""

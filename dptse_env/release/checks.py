@@ -12,7 +12,7 @@ def check_released(release: ReleaseModel, released: Any, request: ReleaseRequest
     """Refuse a release of a wrong shape, or one that is not finite where it was observed."""
     name = name_of_class(release)
     shape = (*request.observed.shape, 2)
-    values, sigma = (np.asarray(part) for part in released)
+    values, sigma = np.asarray(released.values), np.asarray(released.sigma)
     if values.shape != shape or values.dtype.kind != "f":
         raise ValueError(
             f"privacy.preset {name}.release() must return floats of shape {shape}, got "
@@ -22,8 +22,21 @@ def check_released(release: ReleaseModel, released: Any, request: ReleaseRequest
         raise ValueError(
             f"privacy.preset {name}.release() must return finite values of observed segments"
         )
-    if sigma.shape != (2,) or not (np.isfinite(sigma) & (sigma >= 0.0)).all():
+    if sigma.shape not in ((2,), shape) or not (np.isfinite(sigma) & (sigma >= 0.0)).all():
         raise ValueError(
-            f"privacy.preset {name}.release() must return two finite standard deviations >= 0, "
-            f"got {sigma}"
+            f"privacy.preset {name}.release() must return finite standard deviations >= 0, two or "
+            f"of shape {shape}, got {sigma if sigma.size == 2 else sigma.shape}"
         )
+    if released.centre is not None:
+        centre, n_segments = np.asarray(released.centre), release.setup.corridor.n_segments
+        finite = centre.dtype.kind == "f" and np.isfinite(centre).all()
+        if (
+            centre.ndim != 2
+            or len(centre) != shape[0]
+            or centre.shape[1] < n_segments
+            or not finite
+        ):
+            raise ValueError(
+                f"privacy.preset {name}.release() must return finite centres of shape "
+                f"{(shape[0], n_segments)} or more, got shape {centre.shape}"
+            )

@@ -5,24 +5,20 @@ it counts depends on its trajectory and on the queries, which are public, and ne
 vehicles: removing a vehicle from a record does not change the contributions of the others.
 """
 
-from typing import TypeVar
-
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from dptse_env.release.vehicle_table import VehicleTable, widened
 from dptse_env.traffic import Record
-from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray, IntArray
-
-NumberT = TypeVar("NumberT", bound=np.generic)
-
-GROWTH = 1.5  # factor on the size of full tables
+from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 
 
 class Contributions:
-    """Vehicle tables of a set of records, with the contributions of each vehicle in each episode.
+    """Contributions of the vehicles of a set of records, in each episode.
 
     Attributes:
+        vehicles: The vehicles by second.
         cap: C, steps in which a vehicle counts; None if it counts in all of them.
         exposures: Shape (n_episodes, n_vehicles), steps in which each vehicle has counted; as wide
             as the largest record loaded.
@@ -32,39 +28,15 @@ class Contributions:
         self, n_slots: int, n_steps: int, n_episodes: int, largest_speed: float, cap: int | None
     ) -> None:
         """Prepare for up to `n_slots` records; speeds are clipped to `largest_speed` [km/h]."""
-        self.cap, self.largest_speed = cap, largest_speed
+        self.cap = cap
         self._limit = n_steps if cap is None else cap
-        self._start = np.zeros((n_slots, n_steps + 1), dtype=np.int64)
-        self._n_vehicles = np.zeros(n_slots, dtype=np.int64)
-        self._rows = 0
-        self._vehicle: NDArray[np.int32] = np.empty(0, dtype=np.int32)
-        self._segment: NDArray[np.int16] = np.empty(0, dtype=np.int16)
-        self._speed: NDArray[np.float32] = np.empty(0, dtype=np.float32)
+        self.vehicles = VehicleTable(n_slots, n_steps, largest_speed)
         self.exposures: NDArray[np.int32] = np.zeros((n_episodes, 0), dtype=np.int32)
 
-    @property
-    def tables(self) -> tuple[AnyArray, ...]:
-        """Vehicle tables of all records, which no episode changes."""
-        return self._start, self._n_vehicles, self._vehicle, self._segment, self._speed
-
     def load(self, slot: int, record: Record) -> None:
-        """Append the vehicle table of a record."""
-        end = self._rows + record.n_rows
-        if end > len(self._vehicle):
-            size = max(end, int(GROWTH * len(self._vehicle)))
-            self._vehicle = _grown(self._vehicle, size)
-            self._segment = _grown(self._segment, size)
-            self._speed = _grown(self._speed, size)
-        if record.n_vehicles > self.exposures.shape[1]:
-            wider = np.zeros((len(self.exposures), record.n_vehicles), dtype=np.int32)
-            wider[:, : self.exposures.shape[1]] = self.exposures
-            self.exposures = wider
-        self._vehicle[self._rows : end] = record.vehicle
-        self._segment[self._rows : end] = record.segment
-        self._speed[self._rows : end] = np.clip(record.speed, 0.0, self.largest_speed)
-        self._start[slot] = self._rows + record.offsets
-        self._n_vehicles[slot] = record.n_vehicles
-        self._rows = end
+        """Read the vehicles of a record."""
+        self.vehicles.load(slot, record)
+        self.exposures = widened(self.exposures, record.n_vehicles)
 
     def reset(self, episodes: IntArray) -> None:
         """Begin new episodes, shape (k,): no vehicle has counted yet."""
@@ -75,7 +47,7 @@ class Contributions:
 
         Neither values nor length depend on the records of other episodes.
         """
-        return self.exposures[episode, : self._n_vehicles[slot]].copy()
+        return self.exposures[episode, : self.vehicles.n_vehicles[slot]].copy()
 
     def collect(
         self, episodes: IntArray, slots: IntArray, times: IntArray, observed: BoolArray
@@ -87,18 +59,12 @@ class Contributions:
         (k, n_columns) and zero in columns that are not observed.
         """
         counts, speeds = np.zeros((2, *observed.shape))
+        table = self.vehicles
         _collect(
-            self._start, self._vehicle, self._segment, self._speed, episodes, slots, times,
+            table.start, table.vehicle, table.segment, table.speed, episodes, slots, times,
             observed, self._limit, self.exposures, counts, speeds,
         )  # fmt: skip
         return counts, speeds
-
-
-def _grown(column: NDArray[NumberT], size: int) -> NDArray[NumberT]:
-    """Return a longer copy of a column; values beyond its end are undefined."""
-    longer = np.empty(size, dtype=column.dtype)
-    longer[: len(column)] = column
-    return longer
 
 
 @njit(cache=True, error_model="numpy")

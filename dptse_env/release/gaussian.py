@@ -92,7 +92,7 @@ class GaussianRelease(ReleaseModel):
         values = self.mechanism.release(request.episodes, self.true_values(request))
         return Released(values, self.sigma)
 
-    def spent(self, steps: IntArray) -> tuple[FloatArray, FloatArray]:
+    def spent(self, episodes: IntArray, steps: IntArray) -> tuple[FloatArray, FloatArray]:
         """See `ReleaseModel.spent`."""
         return self._account.spent(steps)
 
@@ -246,8 +246,8 @@ class Capped(GaussianRelease):
 
     @property
     def shared(self) -> tuple[AnyArray, ...]:
-        """The vehicle tables of all traffic."""
-        return self.contributions.tables
+        """The vehicles of all traffic."""
+        return self.contributions.vehicles.arrays
 
     def load(self, index: int, record: Record) -> None:
         """Read the vehicle table of a record."""
@@ -286,7 +286,7 @@ class Capped(GaussianRelease):
             for episode, index in zip(episodes, traffic, strict=True)
         ]
         # A vehicle that has counted k times has spent the budget of a cap of k.
-        spent = [self.spent(steps.astype(np.int64))[1].tolist() for steps in counted]
+        spent = [self._account.spent(steps.astype(np.int64))[1].tolist() for steps in counted]
         return {
             "exposures": object_array([steps.tolist() for steps in counted]),
             "individual_epsilon": object_array(spent),

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal
 
 from dptse_env.privacy import Adjacency
+from dptse_env.release.pacing import PACINGS
 from dptse_env.utils.fields import Interval, checked_fields
 
 Unit = Literal["trip", "horizon", "event"]
@@ -103,3 +104,56 @@ class CappedSettings(PrivacySettings):
             "horizon": f"one vehicle's whole trip, {change}",
             "event": f"one second of one vehicle's trip, {change}",
         }[self.unit]
+
+
+PacedUnit = Literal["trip", "event"]
+"""Unit of protection of the paced ledger: a complete trip, or a second of it."""
+
+
+@dataclass(frozen=True)
+class PacedSettings(PrivacySettings):
+    """Settings of `dptse_env.release.Paced`.
+
+    Attributes:
+        unit: Unit of protection: ``trip``, all of a vehicle's trip that an episode covers;
+            ``event``, one second of a trip.
+        adjacency: Difference of two adjacent records: ``replace`` or ``add_remove``.
+        pace: Part of the budget that the pacing tries to have spent at the end of a trip.
+        clip: Largest deviation D of a speed from its centre that is released [km/h]; larger ones
+            are clipped.
+        ratio: Ratio r of the charge for a deviation of D and the charge for being counted; noise
+            of flows has D / sqrt(r) times the deviation of that of counts. At most 1 for the
+            adjacency ``replace``.
+        pacing: What sets the prices: ``tracer``, a registered name, ``"package.module:Class"``, or
+            a class.
+
+    Raises:
+        ValueError: A field is out of range; the message names its path below ``privacy``.
+    """
+
+    default_boundary: ClassVar[BoundaryInputs] = "nominal"
+
+    preset: Any = "paced"
+    unit: PacedUnit = "trip"
+    adjacency: Adjacency = "replace"
+    pace: Annotated[float, Interval(0.05, 1)] = 0.85
+    clip: Annotated[float, Interval(1, 200)] = 25.0
+    ratio: Annotated[float, Interval(0.01, 100)] = 1.0
+    pacing: Any = "tracer"
+
+    def __post_init__(self) -> None:
+        """Check the fields, and that they are compatible."""
+        super().__post_init__()
+        PACINGS.find(self.pacing)
+        if self.ratio > 1.0 and self.adjacency == "replace":
+            raise ValueError(
+                "privacy.ratio must be at most 1 for privacy.adjacency 'replace', where two "
+                f"vehicles may deviate in opposite directions, got {self.ratio:g}"
+            )
+
+    @property
+    def protected(self) -> str:
+        """Description of the protected data and of the change that is protected."""
+        change = "replaced by another" if self.adjacency == "replace" else "added or removed"
+        part = "whole trip" if self.unit == "trip" else "second of a trip"
+        return f"one vehicle's {part}, {change}"

@@ -77,7 +77,7 @@ def test_the_numbers_of_a_report_follow_from_one_another(preset):
 @pytest.mark.parametrize("preset", ["paper", "corrected"])
 def test_the_whole_episode_is_charged_from_the_first_step(preset):
     release = make_release(config(preset))
-    mu, epsilon = release.spent(np.array([0, 1, 350, 700]))
+    mu, epsilon = release.spent(np.arange(4), np.array([0, 1, 350, 700]))
     assert mu.tolist() == [release.report().mu] * 4
     assert epsilon.tolist() == [release.report().epsilon] * 4
 
@@ -204,7 +204,7 @@ def test_reasons_that_void_a_guarantee_are_listed(settings, reasons):
 @pytest.mark.parametrize(("unit", "whole"), [("trip", 16), ("horizon", 100), ("event", 1)])
 def test_an_episode_is_charged_step_by_step_until_the_cap(unit, whole):
     release = make_release(capped(unit=unit))
-    mu, epsilon = release.spent(np.arange(101))
+    mu, epsilon = release.spent(np.arange(101), np.arange(101))
     counted = np.minimum(np.arange(101), whole)
     np.testing.assert_allclose(mu, release.report().mu * np.sqrt(counted / whole), rtol=1e-14)
     assert (mu[0], epsilon[0]) == (0.0, 0.0)
@@ -224,4 +224,4 @@ def test_the_report_describes_the_mechanism_in_force():
     assert (found.guarantee, found.void_reasons) == ("none", ("releases_not_composed",))
     assert [quantity.noise_std for quantity in found.releases] == weaker.tolist()
     assert found.epsilon > 5.0
-    assert release.spent(np.array([100]))[0][0] == pytest.approx(found.mu)
+    assert release.spent(np.array([0]), np.array([100]))[0][0] == pytest.approx(found.mu)

@@ -106,7 +106,7 @@ def test_no_policy_exceeds_mu(data):
     assert found <= mu**2 * SLACK
     # As many steps as were released: the account that a running episode shows.
     short = T // 2
-    spent, _ = release.spent(np.array([short]))
+    spent, _ = release.spent(np.array([0]), np.array([short]))
     found = squared_distance(release, policy, short, always)
     assert found <= spent[0] ** 2 * SLACK
 

@@ -5,7 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from dptse_env.release import CappedSettings, PrivacySettings
+from dptse_env.release import CappedSettings, PacedSettings, PrivacySettings
+from dptse_env.release.pacing import TracerPacing
 
 
 def test_settings_default_to_the_paper_and_survive_json():
@@ -64,6 +65,41 @@ def test_bad_settings_of_capped_contributions_are_named_with_their_path(field, v
         CappedSettings(**{field: value})
 
 
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"pace": 0.0}, r"^privacy\.pace must be a number in \[0\.05, 1\], got 0\.0$"),
+        ({"pace": 2}, r"^privacy\.pace must be a number in \[0\.05, 1\], got 2$"),
+        ({"clip": 0.0}, r"^privacy\.clip must be a number in \[1, 200\], got 0\.0$"),
+        ({"clip": math.inf}, r"^privacy\.clip must be a number in \[1, 200\], got inf$"),
+        ({"ratio": 0.0}, r"^privacy\.ratio must be a number in \[0\.01, 100\], got 0\.0$"),
+        ({"ratio": math.nan}, r"^privacy\.ratio must be a number in \[0\.01, 100\], got nan$"),
+        ({"ratio": 2.0}, r"^privacy\.ratio must be at most 1 for privacy\.adjacency 'replace'.* 2"),
+        ({"ratio": 1.0001}, r"^privacy\.ratio must be at most 1 for .*, got 1\.0001$"),
+        ({"unit": "horizon"}, r"^privacy\.unit must be one of 'trip', 'event', got 'horizon'$"),
+        ({"adjacency": "both"}, r"^privacy\.adjacency must be one of .*, got 'both'$"),
+        ({"pacing": "fast"}, r"^privacy\.pacing must be one of tracer, .*got 'fast'"),
+        ({"pacing": dict}, r"^privacy\.pacing .* must be a subclass of .*release\.Pacing"),
+        ({"pacing": "numpy:nothing"}, r"^privacy\.pacing"),
+    ],
+)  # fmt: skip
+def test_bad_settings_of_the_paced_ledger_are_named_with_their_path(fields, message):
+    with pytest.raises(ValueError, match=message):
+        PacedSettings(**fields)
+
+
+def test_a_ratio_above_one_is_fine_where_no_vehicle_takes_the_place_of_another():
+    assert PacedSettings(adjacency="add_remove", ratio=50).ratio == 50.0
+    assert PacedSettings(ratio=1).ratio == 1.0
+
+
+@pytest.mark.parametrize(
+    "pacing", ["tracer", TracerPacing, "dptse_env.release.pacing:TracerPacing"]
+)
+def test_a_pacing_is_a_name_a_path_or_a_class(pacing):
+    assert PacedSettings(pacing=pacing).pacing == pacing
+
+
 def test_mean_speeds_of_a_segment_have_no_neighbour_without_its_one_vehicle():
     with pytest.raises(ValueError, match=r"^privacy\.adjacency must be 'replace' where mean"):
         CappedSettings(adjacency="add_remove", speed_release="mean")
@@ -86,6 +122,7 @@ def test_a_unit_bounds_how_often_it_can_count(unit, contributions, cap):
         (PrivacySettings(boundary_inputs="private"), "private"),
         (CappedSettings(), "nominal"),
         (CappedSettings(boundary_inputs="true"), "true"),
+        (PacedSettings(), "nominal"),
     ],
 )
 def test_the_boundary_is_the_model_s_default_unless_given(settings, boundary):

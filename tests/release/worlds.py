@@ -39,13 +39,16 @@ class Worlds:
     def ensure(self, corridor, seeds):
         """All vehicles are present."""
 
-    def release(self, settings, counted=None, horizon=None):
-        """A release model of all record columns, with other contributions if any are given."""
+    def release(self, settings, counted=None, horizon=None, kind=None):
+        """A release model of all record columns, with other contributions if any are given.
+
+        It is of another class than that of the settings if one is given.
+        """
         n, duration = len(self.records), self.records[0].n_steps - 1
         traffic = TrafficTable(corridor(duration), tuple(range(n)), self)
         settings = dataclasses.replace(settings, boundary_inputs="private")
         setup = ReleaseSetup(settings.preset, settings, traffic, 2, horizon or duration, n)
-        release = RELEASE_MODELS[settings.preset](setup)
+        release = (kind or RELEASE_MODELS[settings.preset])(setup)
         if counted is not None:
             release.contributions = counted
         for index, loaded in traffic.load(np.arange(n)):
@@ -98,5 +101,5 @@ class Mutant(Contributions):
                     continue
                 self.spent[account] = self.spent.get(account, 0) + charged
                 counts[k, segment] += 1
-                speeds[k, segment] += min(whole.speed[row], self.largest_speed)
+                speeds[k, segment] += min(whole.speed[row], self.vehicles.largest_speed)
         return counts, speeds

@@ -1,0 +1,188 @@
+"""Query options: what a policy may ask for, and the rows of a release that answer it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+
+from dptse_env.model import MeasurementRows
+from dptse_env.traffic import Corridor
+from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+
+BandwidthUnit = Literal["segments", "sums"]
+"""What a query costs of the bandwidth: as much as it has segments, or one."""
+
+
+MOST_OPTIONS = 10_000
+"""Largest number of options."""
+
+
+@dataclass(frozen=True, eq=False)
+class QueryOptions:
+    """The G queries among which a policy chooses, each of neighbouring mainline segments.
+
+    Options are in the order of their spans, within these of their price levels, within these from
+    upstream to downstream. By default option s is segment s.
+
+    Attributes:
+        first: The first segment of each option, shape (G,).
+        span: Number of segments that each covers, shape (G,).
+        level: Factor on the release model's price, shape (G,).
+        cost: What each costs of the bandwidth, shape (G,).
+        n_mainline: Mainline segments n.
+        bandwidth: What the queries of a step may cost together.
+    """
+
+    first: IntArray
+    span: IntArray
+    level: FloatArray
+    cost: IntArray
+    n_mainline: int
+    bandwidth: int
+
+    @classmethod
+    def make(
+        cls,
+        n_mainline: int,
+        bandwidth: int,
+        spans: Sequence[int] = (1,),
+        levels: Sequence[float] = (1.0,),
+        unit: BandwidthUnit = "segments",
+    ) -> QueryOptions:
+        """Return all options of some spans and price levels.
+
+        Args:
+            n_mainline: Mainline segments.
+            bandwidth: What the queries of a step may cost together.
+            spans: The keyword ``query_spans``.
+            levels: The keyword ``price_levels``.
+            unit: The keyword ``bandwidth_unit``.
+
+        Raises:
+            ValueError: Spans or levels are none, repeated or out of order, there are too many
+                options, or the bandwidth pays for none of them.
+        """
+        _check(n_mainline, bandwidth, spans, levels, unit)
+        groups = [(span, level) for span in spans for level in levels]
+        sizes = [n_mainline - span + 1 for span, _ in groups]
+        span = np.repeat(np.array([span for span, _ in groups], dtype=np.int64), sizes)
+        return cls(
+            first=np.concatenate([np.arange(size) for size in sizes]),
+            span=span,
+            level=np.repeat(np.array([level for _, level in groups], dtype=np.float64), sizes),
+            cost=span if unit == "segments" else np.ones_like(span),
+            n_mainline=n_mainline,
+            bandwidth=bandwidth,
+        )
+
+    def __str__(self) -> str:
+        """Return the spans and price levels in words."""
+        spans, levels = (dict.fromkeys(part.tolist()) for part in (self.span, self.level))
+        return f"query_spans {tuple(spans)} and price_levels {tuple(levels)}"
+
+    @property
+    def n_options(self) -> int:
+        """Number of options G."""
+        return self.first.size
+
+    @cached_property
+    def covers(self) -> BoolArray:
+        """Which segments each option covers, shape (G, n_mainline)."""
+        place = np.arange(self.n_mainline) - self.first[:, None]
+        covers: BoolArray = (place >= 0) & (place < self.span[:, None])
+        return covers
+
+    @cached_property
+    def most_queries(self) -> int:
+        """Most distinct options that the bandwidth pays for in a step."""
+        return int(np.count_nonzero(np.cumsum(np.sort(self.cost)) <= self.bandwidth))
+
+    @cached_property
+    def costs_differ(self) -> bool:
+        """Whether some options cost more than others."""
+        return bool((self.cost != self.cost[0]).any())
+
+    @cached_property
+    def are_segments(self) -> bool:
+        """Whether option s is segment s, at whatever price level."""
+        return self.n_options == self.n_mainline and bool((self.span == 1).all())
+
+    @cached_property
+    def are_plain(self) -> bool:
+        """Whether option s is segment s, at the release model's price."""
+        return self.are_segments and bool((self.level == 1.0).all())
+
+    @cached_property
+    def standard_level(self) -> float:
+        """The price level nearest to 1 by ratio, the lower one of two."""
+        levels: list[float] = self.level.tolist()
+        return min(levels, key=lambda level: (abs(math.log(level)), level))
+
+    def covered(self, queried: BoolArray) -> BoolArray:
+        """Return the segments (k, n_mainline) that queried options (k, G) cover."""
+        return queried.copy() if self.are_segments else queried @ self.covers
+
+    def rows(self, corridor: Corridor) -> MeasurementRows:
+        """Return the rows of a release: options, then ramps, then sensors without an option.
+
+        The last are mainline segments with a fixed sensor that are no option of span 1 and price
+        level 1.
+        """
+        others = np.array(self._others(corridor), dtype=np.int64)
+        return MeasurementRows(
+            np.concatenate([self.first, others]),
+            np.concatenate([self.span, np.ones_like(others)]),
+            corridor.n_segments,
+        )
+
+    def sensor_rows(self, corridor: Corridor) -> tuple[int, ...]:
+        """Return the row of each of the corridor's fixed sensors."""
+        others = {s: self.n_options + k for k, s in enumerate(self._others(corridor))}
+        row = self._singles | others
+        return tuple(row[s] for s in corridor.fixed_sensors)
+
+    def _others(self, corridor: Corridor) -> list[int]:
+        """Return the segments of the rows that are no options."""
+        n = self.n_mainline
+        sensors = [s for s in corridor.fixed_sensors if s < n and s not in self._singles]
+        return [*range(n, corridor.n_segments), *sensors]
+
+    @cached_property
+    def _singles(self) -> dict[int, int]:
+        """The options of span 1 and price level 1, by their segment."""
+        single = np.flatnonzero((self.span == 1) & (self.level == 1.0))
+        return {int(self.first[option]): int(option) for option in single}
+
+
+_NONE = np.zeros(0, dtype=np.int64)
+
+NO_OPTIONS = QueryOptions(_NONE, _NONE, np.zeros(0), _NONE, 0, 0)
+"""In place of options that are not given."""
+
+
+def _check(
+    n: int, bandwidth: int, spans: Sequence[int], levels: Sequence[float], unit: BandwidthUnit
+) -> None:
+    if not spans or list(spans) != sorted(set(spans)) or not 1 <= spans[0] <= spans[-1] <= n:
+        raise ValueError(
+            f"query_spans must be ascending, distinct numbers of segments in 1..{n}, got {spans}"
+        )
+    if not levels or len(set(levels)) < len(levels):
+        raise ValueError(f"price_levels must be distinct factors, got {levels}")
+    n_options = len(levels) * sum(n - span + 1 for span in spans)
+    if n_options > MOST_OPTIONS:
+        raise ValueError(
+            f"query_spans and price_levels must leave at most {MOST_OPTIONS} queries to choose "
+            f"from, got {n_options}"
+        )
+    cheapest = spans[0] if unit == "segments" else 1
+    if bandwidth < cheapest:
+        raise ValueError(
+            f"bandwidth must be in {cheapest}..{n}, to pay for a query of {spans[0]} segments, got "
+            f"{bandwidth}"
+        )
