@@ -28,6 +28,13 @@ class SensorQueryEnv(gym.Env[Observation, Any]):
     error of that estimate. Queries never change the traffic: an episode replays a record of SUMO,
     made once for each traffic seed and cached on disk.
 
+    **Queries**: by default an option is a mainline segment, and there are G = n of them. With
+    ``query_spans`` an option is the average over one or several neighbouring segments, with
+    ``price_levels`` one of several prices for it; ``interface.queries`` is the table of all G. An
+    option costs as much of the ``bandwidth`` as it has segments, or one
+    (``bandwidth_unit="sums"``). Options that overlap may be queried together; each answer has noise
+    of its own.
+
     **Observation**: a flat float32 ``Box`` of named blocks, in this order; ``interface.observations
     .slices`` has the place of each. F is the number of fixed sensors, and the density and speed
     scales are constants of the corridor.
@@ -39,32 +46,38 @@ class SensorQueryEnv(gym.Env[Observation, Any]):
     speed                     S    estimated speed / speed scale                [0, 4]
     density_log_std           S    log of (standard deviation / scale)          [-10, 5]
     speed_log_std             S    the same for the speed                       [-10, 5]
-    released_density          n    last released density / scale                [-5, 5]
-    released_speed            n    last released speed / scale; where flows are [-5, 5]
+    released_density          G    last released density / scale                [-5, 5]
+    released_speed            G    last released speed / scale; where flows are [-5, 5]
                                    released, ``released_flow`` takes its place
-    density_innovation        n    normalised innovation, 0 if not observed     [-10, 10]
-    speed_innovation          n    the same for the second released quantity    [-10, 10]
+    density_innovation        G    normalised innovation, 0 if not observed     [-10, 10]
+    speed_innovation          G    the same for the second released quantity    [-10, 10]
     age                       n    seconds since last observed / 60, at most 1  [0, 1]
-    queried                   n    the last query                               {0, 1}
+    queried                   G    the last query                               {0, 1}
     fixed_density_innovation  F    normalised innovation of the fixed sensors   [-10, 10]
     fixed_speed_innovation    F    the same for the second released quantity    [-10, 10]
     bandwidth                 1    queries a step / n                           [0, 1]
     epsilon                   1    log10 of the privacy parameter               [-6, 6]
-    picked                    n    picks so far (``action="sequential"`` only)  {0, 1}
+    picked                    G    picks so far (``action="sequential"`` only)  {0, 1}
+    last_price                G    log10 of the last price / 2, 0 before the    [-5, 5]
+                                   first query (release models with prices)
+    tracer                    n    mean charge of a vehicle on the segment over [0, 1]
+                                   its budget (release models with prices)
     ========================= ==== ============================================ =========
 
     Values beyond the bounds are clipped. ``observation`` chooses other blocks.
 
-    **Action**: ``action`` chooses the encoding; a sampled action never raises.
+    **Action**: ``action`` chooses the encoding; a sampled action never raises. B is the largest
+    number of queries that the bandwidth pays for.
 
     ============== ============================ ============================================
     ``action``     space                        meaning
     ============== ============================ ============================================
-    ``mask``       ``MultiBinary(n)``           one flag per segment (default)
-    ``scores``     ``Box(-1, 1, (n,))``         the ``bandwidth`` segments of highest score
-    ``slots``      ``MultiDiscrete([n] * B)``   one segment for each of the B queries
-    ``sequential`` ``Discrete(n)``              one segment per action, B actions a second;
-                                                `action_masks` has the segments still free
+    ``mask``       ``MultiBinary(G)``           one flag per option (default)
+    ``scores``     ``Box(-1, 1, (G,))``         the options of highest score
+    ``slots``      ``MultiDiscrete([G] * B)``   one option for each of the B queries
+    ``sequential`` ``Discrete(G)``              one option per action, until the bandwidth pays
+                                                for no other; `action_masks` has those that may
+                                                be picked next
     ============== ============================ ============================================
 
     **Reward**: minus the root mean squared error over the mainline, density and speed each in
@@ -80,8 +93,8 @@ class SensorQueryEnv(gym.Env[Observation, Any]):
     ``rmse_density``  error of the estimated mainline densities [veh/km]; true traffic
     ``rmse_speed``    error of the speeds of occupied segments [km/h]; true traffic
     ``n_occupied``    mainline segments with a vehicle; true traffic
-    ``n_dropped``     requested segments that were cut, repeated or replaced
-    ``queried``       the segments that were queried, flags of shape (n,)
+    ``n_dropped``     requested options that were cut, repeated or replaced
+    ``queried``       the options that were queried, flags of shape (G,)
     ``diverged``      1 if the estimator diverged in this second and was started anew
     ``fallback``      1 if its update had no solution in this second, so that it only predicted
     ``mu``            privacy loss of a vehicle so far, at most: Gaussian DP parameter
@@ -199,7 +212,7 @@ class SensorQueryEnv(gym.Env[Observation, Any]):
         )
 
     def action_masks(self) -> NDArray[np.bool_]:
-        """Return which segments may be picked next, shape (n,), for ``action="sequential"``.
+        """Return which options may be picked next, shape (G,), for ``action="sequential"``.
 
         Raises:
             ValueError: A step takes one action only.
@@ -208,7 +221,8 @@ class SensorQueryEnv(gym.Env[Observation, Any]):
         self.interface.require_sequential()
         if self.process.over[0]:
             raise gym.error.ResetNeeded("no episode is running: call reset() first")
-        free: NDArray[np.bool_] = ~self.process.pending.picked[0]
+        picked = self.process.pending.picked[:1]
+        free: NDArray[np.bool_] = self.interface.actions.available(picked)[0]
         return free
 
     def privacy(self) -> dict[str, Any]:

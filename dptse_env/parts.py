@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import warnings
 from dataclasses import dataclass
 from typing import Any
@@ -15,6 +16,7 @@ from dptse_env.release import (
     VOID_REASONS,
     BoundaryModel,
     PrivacyReport,
+    QueryOptions,
     ReleaseModel,
     ReleaseSetup,
     TrafficTable,
@@ -32,26 +34,34 @@ class QueryInterface:
     """The interface of an environment to a policy; it holds no state of episodes.
 
     Attributes:
-        n_mainline: Segments that can be queried.
-        bandwidth: Most queries a step.
+        queries: The options that can be queried.
         actions: The action encoding, with its space.
         observations: The observation encoding, with its space and block names.
         reward: The reward, a function of a `dptse_env.spaces.rewards.ScoredSecond`; its attribute
             ``term`` says which errors greedy schedules weigh.
     """
 
-    n_mainline: int
-    bandwidth: int
+    queries: QueryOptions
     actions: ActionEncoding
     observations: ObservationEncoding
     reward: Any
 
+    @property
+    def n_mainline(self) -> int:
+        """Number of mainline segments."""
+        return self.queries.n_mainline
+
+    @property
+    def bandwidth(self) -> int:
+        """What the queries of a step may cost together."""
+        return self.queries.bandwidth
+
     def require_sequential(self) -> None:
-        """Raise ``ValueError`` unless an action picks one segment, as for ``"sequential"``."""
+        """Raise ``ValueError`` unless an action picks one option, as for ``"sequential"``."""
         if not self.actions.picks_one_by_one:
             raise ValueError(
                 "action_masks() needs action='sequential' or another encoding that picks one "
-                f"segment per action, got {name_of_class(self.actions)}"
+                f"option per action, got {name_of_class(self.actions)}"
             )
 
 
@@ -89,28 +99,55 @@ def make_interface(config: EnvConfig) -> QueryInterface:
     Raises:
         ValueError: A part of another package is not what is expected.
     """
-    corridor, n = config.corridor, config.corridor.n_mainline
-    encoding = ACTION_ENCODINGS.find(config.action)
-    actions = encoding(n, config.bandwidth)
+    corridor, queries = config.corridor, config.queries
+    actions = _make_actions(config)
+    setup = ObservationSetup(
+        corridor,
+        config.bandwidth,
+        config.privacy.epsilon,
+        n_options=queries.n_options,
+        sensor_rows=queries.sensor_rows(corridor),
+        releases_flow=flow_centre(config) is not None,
+        picks_one_by_one=actions.actions_per_step > 1,
+        has_prices=RELEASE_MODELS.find(config.privacy.preset).has_prices,
+    )
+    return QueryInterface(
+        queries=queries,
+        actions=actions,
+        observations=ObservationEncoding(setup, config.observation),
+        reward=make_reward(config.reward),
+    )
+
+
+def _make_actions(config: EnvConfig) -> ActionEncoding:
+    """Make the action encoding; it learns of costs where these differ, and else of their number.
+
+    Raises:
+        ValueError: It is no encoding, or costs differ and it cannot be made of them.
+    """
+    encoding, queries = ACTION_ENCODINGS.find(config.action), config.queries
+    if not queries.costs_differ:
+        actions = encoding(queries.n_options, queries.most_queries)
+    elif _takes(encoding, "costs"):
+        actions = encoding(queries.n_options, config.bandwidth, costs=queries.cost)
+    else:
+        raise ValueError(
+            f"action {name_of_class(encoding)} must take the argument costs where queries cost "
+            f"different amounts of the bandwidth, as they do with query_spans "
+            f"{config.query_spans} and bandwidth_unit {config.bandwidth_unit!r}"
+        )
     if not isinstance(actions, ActionEncoding):
         raise ValueError(
             f"action {name_of_class(encoding)} must be a subclass of "
             "dptse_env.spaces.actions.ActionEncoding"
         )
-    setup = ObservationSetup(
-        corridor,
-        config.bandwidth,
-        config.privacy.epsilon,
-        releases_flow=flow_centre(config) is not None,
-        picks_one_by_one=actions.actions_per_step > 1,
-    )
-    return QueryInterface(
-        n_mainline=n,
-        bandwidth=config.bandwidth,
-        actions=actions,
-        observations=ObservationEncoding(setup, config.observation),
-        reward=make_reward(config.reward),
-    )
+    return actions
+
+
+def _takes(function: Any, name: str) -> bool:
+    """Return whether a function or class can be called with an argument of a name."""
+    parameters = inspect.signature(function).parameters
+    return name in parameters or any(p.kind is p.VAR_KEYWORD for p in parameters.values())
 
 
 def flow_centre(config: EnvConfig) -> float | None:
@@ -123,7 +160,11 @@ def flow_centre(config: EnvConfig) -> float | None:
 def make_model(config: EnvConfig) -> ARZModel:
     """Make the traffic model of the estimator, with a time step of one second."""
     return ARZModel(
-        config.corridor, config.arz_parameters, TIME_STEP, reference_speed=flow_centre(config)
+        config.corridor,
+        config.arz_parameters,
+        TIME_STEP,
+        reference_speed=flow_centre(config),
+        rows=config.queries.rows(config.corridor),
     )
 
 
@@ -146,6 +187,7 @@ def make_release(
             bandwidth=config.bandwidth,
             horizon=config.horizon_steps,
             n_episodes=n_episodes,
+            queries=config.queries,
         )
     )
     return release

@@ -11,7 +11,7 @@ import numpy as np
 
 from dptse_env.estimators import Estimate, check_estimate
 from dptse_env.parts import Parts, complete_report
-from dptse_env.release import ReleaseRequest, check_released
+from dptse_env.release import ReleaseRequest, check_released, split_release
 from dptse_env.release.nominal import nominal_state
 from dptse_env.reset_options import ResetOptions
 from dptse_env.spaces.actions import PendingPicks, check_decision
@@ -59,7 +59,9 @@ class QueryProcess:
         n_episodes: Size of the batch.
         time: Second of the record that each episode stands at, shape (n,).
         traffic_index: Index into ``config.traffic_seeds`` of each episode's traffic, shape (n,).
-        queried: The last query of each episode, shape (n, n_mainline).
+        queried: The options of each episode's last query, shape (n, G).
+        age: Steps since each mainline segment was last observed, shape (n, n_mainline).
+        released: The last releases of the M rows, shape (n, M, 2).
         pending: State of the action encoding between actions.
         estimate: The present estimates, arrays of shape (n, S).
         error: Their error, arrays of shape (n,).
@@ -79,16 +81,16 @@ class QueryProcess:
         self._checks_estimates = is_foreign(self.estimator)
         self._checks_releases = is_foreign(self.release)
         self._checks_decisions = is_foreign(self.interface.actions)
-        corridor = self.config.corridor
         self.n_episodes = n = parts.n_episodes
-        self.pending = PendingPicks(n, corridor.n_mainline)
+        queries = self.interface.queries
+        self.pending = PendingPicks(n, queries.n_options)
         self.traffic_index = np.zeros(n, dtype=np.int64)
         self.time = np.zeros(n, dtype=np.int64)
         self.end = np.zeros(n, dtype=np.int64)
-        self.queried = np.zeros((n, corridor.n_mainline), dtype=bool)
+        self.queried = np.zeros((n, queries.n_options), dtype=bool)
         self.n_dropped = np.zeros(n, dtype=np.int64)
-        self.age = np.zeros((n, corridor.n_mainline), dtype=np.int64)
-        self.released = np.zeros((n, corridor.n_segments, 2))
+        self.age = np.zeros((n, queries.n_mainline), dtype=np.int64)
+        self.released = np.zeros((n, self.model.rows.n_rows, 2))
         self.estimate = self.estimator.estimate()
         self.error = EstimationError(np.zeros(n), np.zeros(n), np.zeros(n, dtype=np.int64))
         self._is_fork = False
@@ -101,7 +103,7 @@ class QueryProcess:
         """
         shared = (
             self.config, self.interface, self.model, self.traffic, self._threads,
-            *self.boundary.shared, *self.release.shared,
+            *self.boundary.shared, *self.release.shared, self.release.setup,
         )  # fmt: skip
         fork = copy.deepcopy(self, {id(item): item for item in shared})
         fork._is_fork = True
@@ -190,7 +192,7 @@ class QueryProcess:
 
     def _advance(self, episodes: IntArray, queried: BoolArray) -> None:
         """Advance one second: predict, release, update, and store the query."""
-        traffic, n_segments = self.traffic_index[episodes], self.model.n_segments
+        traffic, n_rows = self.traffic_index[episodes], self.model.rows.n_rows
         inputs = self.boundary.inputs(episodes, traffic, self.time[episodes])
         self._in_threads(episodes, self.estimator.predict, inputs)
         self.time[episodes] += 1
@@ -198,23 +200,23 @@ class QueryProcess:
         request = ReleaseRequest(
             episodes, traffic, self.time[episodes], observed, lambda: self._predicted(episodes)
         )
-        values, sigma = released = self.release.release(request)
+        released = self.release.release(request)
         if self._checks_releases:
             check_released(self.release, released, request)
-        self.boundary.update(episodes, values[:, n_segments:])
-        observed, values = observed[:, :n_segments], values[:, :n_segments]
-        self._in_threads(episodes, self.estimator.update, observed, values, shared=(sigma,))
+        measured, at_boundary = split_release(released, self.model)
+        self.boundary.update(episodes, *at_boundary)
+        observed, values = observed[:, :n_rows], measured.values
+        self._in_threads(episodes, self.estimator.update, observed, *measured)
         self.queried[episodes] = queried
         self.released[episodes] = np.where(observed[:, :, None], values, self.released[episodes])
-        self.age[episodes] = np.where(observed[:, : queried.shape[1]], 0, self.age[episodes] + 1)
+        covered = self.release.setup.covered(observed)
+        self.age[episodes] = np.where(covered, 0, self.age[episodes] + 1)
 
-    def _in_threads(
-        self, episodes: IntArray, work: Any, *rows: Any, shared: tuple[Any, ...] = ()
-    ) -> None:
+    def _in_threads(self, episodes: IntArray, work: Any, *rows: Any) -> None:
         """Call ``work`` on blocks of episodes and of their rows, in several threads."""
         self._threads.run(
             len(episodes),
-            lambda block: work(episodes[block], *(array[block] for array in rows), *shared),
+            lambda block: work(episodes[block], *(array[block] for array in rows)),
         )
 
     def _predicted(self, episodes: IntArray) -> Estimate:
@@ -258,6 +260,7 @@ class QueryProcess:
         return Outcome(self._encoded(episodes, estimate), reward, self.over[episodes])
 
     def _encoded(self, episodes: IntArray, estimate: Estimate) -> Observation:
+        prices, tracer = self.release.public_state(episodes) or (None, None)
         state = PublicState(
             estimate=estimate,
             released=self.released[episodes],
@@ -265,6 +268,8 @@ class QueryProcess:
             age=self.age[episodes],
             queried=self.queried[episodes],
             picked=self.pending.picked[episodes],
+            prices=prices,
+            tracer=tracer,
         )
         return self.interface.observations.encode(state)
 
@@ -290,7 +295,7 @@ class QueryProcess:
         The keys in `TRUTH_INFO` come from the true traffic. They serve training and evaluation, as
         the reward does, and are not covered by the guarantee. The others are public.
         """
-        mu, epsilon = self.release.spent(self.elapsed[episodes])
+        mu, epsilon = self.release.spent(episodes, self.elapsed[episodes])
         infos: Rows = {
             "rmse_density": self.error.density[episodes],
             "rmse_speed": self.error.speed[episodes],
@@ -301,6 +306,7 @@ class QueryProcess:
             "mu": mu,
             "epsilon": epsilon,
             "queried": self.queried[episodes],
+            **self.release.public_info(episodes),
         }
         if self.config.truth_in_info:
             infos["truth"] = self._truth_infos(episodes)

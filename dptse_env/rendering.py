@@ -31,7 +31,7 @@ class History:
         density_scale: Density at the end of the colour scale [veh/km].
         truth: True mainline densities [veh/km], an array (n_mainline,) per second.
         estimate: Estimated mainline densities [veh/km], an array (n_mainline,) per second.
-        queried: Queried segments, flags (n_mainline,) per second.
+        queried: Segments that a query covered, flags (n_mainline,) per second.
         rmse: Density error over the mainline [veh/km], a number per second.
     """
 
@@ -57,7 +57,7 @@ class History:
         second = int(process.elapsed[0])
         self.truth[second:] = [process.truth(np.zeros(1, dtype=np.int64))[0, :n, 0]]
         self.estimate[second:] = [process.estimate.density[0, :n].copy()]
-        self.queried[second:] = [process.queried[0].copy()]
+        self.queried[second:] = [process.interface.queries.covered(process.queried[:1])[0]]
         self.rmse[second:] = [float(process.error.density[0])]
 
 

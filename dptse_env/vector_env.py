@@ -237,16 +237,15 @@ class SensorQueryVectorEnv(VectorEnv[Observation, Action, Any]):
         return Transition(self._observation.copy(), reward, truncated, to_reset, final)
 
     def action_masks(self) -> BoolArray:
-        """Return which segments may be picked next, shape (n, n_mainline), for ``sequential``.
+        """Return which options may be picked next, shape (n, G), for ``sequential``.
 
         Raises:
-            ValueError: An action is not the pick of one segment.
+            ValueError: An action is not the pick of one option.
             gymnasium.error.ResetNeeded: An episode was never reset.
         """
         self.interface.require_sequential()
         self._require_reset()
-        free: BoolArray = ~self.process.pending.picked
-        return free
+        return self.interface.actions.available(self.process.pending.picked)
 
     def privacy(self) -> dict[str, Any]:
         """Return the guarantee of an episode, or what voids it, and the account behind it."""

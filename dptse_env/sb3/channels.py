@@ -22,6 +22,8 @@ CENTRES = {
     "queried": (0.0, 1.0),
     "fixed_density_innovation": (0.0, 1.5),
     "fixed_speed_innovation": (0.0, 1.5),
+    "last_price": (0.0, 1.0),
+    "tracer": (0.5, 0.3),
 }
 """Centre and scale of each block's values, chosen so that channels are of order one. They are
 constants rather than running statistics, which could be lost between training and use."""
@@ -30,6 +32,9 @@ MAINLINE_BLOCKS = (
     "density", "speed", "density_log_std", "speed_log_std", "density_innovation",
     "speed_innovation", "age", "queried",
 )  # fmt: skip
+PRICE_BLOCKS = ("last_price", "tracer")
+"""Blocks with channels where the observation has them."""
+
 RAMP_BLOCKS = ("density", "speed", "density_log_std", "speed_log_std")
 FIXED_SENSOR_BLOCKS = ("fixed_density_innovation", "fixed_speed_innovation")
 
@@ -75,17 +80,27 @@ class RoadChannels:
 
     @classmethod
     def from_config(cls, config: EnvConfig) -> RoadChannels:
-        """Return the layout of the observations of an environment of ``config``."""
+        """Return the layout of the observations of an environment of ``config``.
+
+        Raises:
+            ValueError: Queries are not of single segments at one price level.
+        """
+        if not config.queries.are_segments:
+            raise ValueError(
+                "a policy whose network is shared by all segments needs query_spans (1,) and one "
+                f"price level, got {config.queries}"
+            )
         corridor, n = config.corridor, config.corridor.n_mainline
         encoding = make_interface(config).observations
         starts = {name: place.start for name, place in encoding.slices.items()}
         released = [name for name in starts if name.startswith("released_")]
+        prices = [name for name in PRICE_BLOCKS if name in starts]
         joins = {n + k: face for k, face in enumerate(corridor.on_ramps)}
         first = n + len(corridor.on_ramps)
         leaves = {first + k: face - 1 for k, face in enumerate(corridor.off_ramps)}
         channels = [
             _channel(name, starts, {i: i for i in range(n)}, n, "mainline")
-            for name in (*MAINLINE_BLOCKS, *released)
+            for name in (*MAINLINE_BLOCKS, *released, *prices)
         ]
         fixed = {s: k for k, s in enumerate(corridor.fixed_sensors)}
         for kind, ramps in (("on-ramp", joins), ("off-ramp", leaves)):

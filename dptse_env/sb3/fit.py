@@ -19,6 +19,10 @@ POLICY_FORMAT = "dptse-policy-1"
 """Format of policy files; its number is raised when saved weights change their meaning."""
 
 
+PLAIN = "single segments"
+"""What can be queried where a card says nothing about it."""
+
+
 @dataclass(frozen=True)
 class TrainedOn:
     """The road that a policy was trained on.
@@ -86,6 +90,8 @@ def make_fit(config: EnvConfig, kind: Kind) -> dict[str, Any]:
         "corridor": config.corridor.digest,
         "bandwidth": config.bandwidth,
     }
+    if not config.queries.are_plain:
+        fit["queries"] = _queries(config)
     if kind.is_shared:
         fit["channels"] = [channel.name for channel in RoadChannels.from_config(config).channels]
     return fit
@@ -100,8 +106,9 @@ def check_fit(
         ValueError: A property outside `allow` differs; the message names the values of both.
     """
     there, here = card["fits"], make_fit(config, kind)
-    differing = [key for key in ("format", "action", "bandwidth") if there[key] != here[key]]
-    problems = {key: _difference(key, there[key], here[key]) for key in differing}
+    values = {key: (there[key], here[key]) for key in ("format", "action", "bandwidth")}
+    values["queries"] = there.get("queries", PLAIN), here.get("queries", PLAIN)
+    problems = {key: _difference(key, a, b) for key, (a, b) in values.items() if a != b}
     channels = _channel_difference(there, here) if kind.is_shared else ""
     if channels:
         problems["channels"] = channels
@@ -123,6 +130,11 @@ def check_fit(
         if all(key in TRANSFERABLE for key in refused):
             hint = f"; to transfer it on purpose, allow {' and '.join(sorted(refused))}"
         raise ValueError("; ".join(refused.values()) + hint)
+
+
+def _queries(config: EnvConfig) -> str:
+    """Return the options that can be queried, other than the mainline segments, in words."""
+    return f"{config.queries}, bandwidth_unit {config.bandwidth_unit!r}"
 
 
 def _difference(key: str, there: object, here: object) -> str:

@@ -20,7 +20,7 @@ from dptse_env.parts import QueryInterface, make_interface
 from dptse_env.policies import CARD, TRANSFERABLE, WEIGHTS, PolicyFile, parse_policy, read_policy
 from dptse_env.sb3.fit import TrainedOn, check_fit, make_fit
 from dptse_env.sb3.kinds import KINDS, Shapes
-from dptse_env.utils.arrays import Action, Observation
+from dptse_env.utils.arrays import Action, BoolArray, Observation
 
 CARD_TEXT = "CARD.md"
 """Entry of a policy file with the readable card."""
@@ -57,10 +57,17 @@ class ActingPolicy:
         """
         extra: dict[str, Any] = {}
         if self._takes_masks:
-            picked = self.interface.observations.block(np.asarray(observation), "picked")
-            extra["action_masks"] = picked == 0
+            extra["action_masks"] = self._masks(np.asarray(observation))
         action, _ = self._policy.predict(observation, deterministic=deterministic, **extra)
         return action, state
+
+    def _masks(self, observation: Observation) -> BoolArray:
+        """Return the options that may be picked next, (G,) or (k, G)."""
+        actions = self.interface.actions
+        picked = np.zeros((*observation.shape[:-1], actions.n_options), dtype=bool)
+        if actions.actions_per_step > 1:
+            picked = self.interface.observations.block(observation, "picked") > 0
+        return actions.available(np.atleast_2d(picked)).reshape(picked.shape)
 
 
 class SavedPolicy(ActingPolicy):
@@ -241,7 +248,7 @@ def _text(card: Mapping[str, Any]) -> str:
     lines = [
         f"# {card['policy']['class']} for {card['env'].rpartition(':')[2]}",
         "",
-        f"Chooses {fits['bandwidth']} segments a second on corridor {TrainedOn.from_card(card)} "
+        f"Chooses {_shown_bandwidth(fits)} a second on corridor {TrainedOn.from_card(card)} "
         f"(action encoding `{fits['action']}`), trained with estimator {card['estimator']} at "
         f"epsilon {card['epsilon']:g}.",
         "",
@@ -256,6 +263,12 @@ def _text(card: Mapping[str, Any]) -> str:
     rows |= {f"version: {name}": number for name, number in card["versions"].items()}
     lines += [f"| {name} | {_shown(value)} |" for name, value in rows.items()]
     return "\n".join(lines) + "\n"
+
+
+def _shown_bandwidth(fits: Mapping[str, Any]) -> str:
+    if "queries" not in fits:
+        return f"{fits['bandwidth']} segments"
+    return f"queries for a bandwidth of {fits['bandwidth']} ({fits['queries']})"
 
 
 def _shown(value: Any) -> str:

@@ -1,4 +1,4 @@
-"""Base classes of schedules, whose `predict` turns chosen segments into actions."""
+"""Base classes of schedules, whose `predict` turns chosen options into actions."""
 
 from abc import ABC, abstractmethod
 from typing import Any, ClassVar, NamedTuple
@@ -7,6 +7,8 @@ import numpy as np
 
 from dptse_env.parts import QueryInterface
 from dptse_env.process import QueryProcess
+from dptse_env.schedules.ranking import best_options
+from dptse_env.spaces.picks import affordable
 from dptse_env.utils.arrays import Action, BoolArray, FloatArray, IntArray, Observation
 
 
@@ -15,7 +17,7 @@ class ScheduleState(NamedTuple):
 
     Attributes:
         step: Decisions completed in the episode, shape (k,).
-        wanted: The segments of the decision in progress, shape (k, n_mainline).
+        wanted: The options of the decision in progress, shape (k, G).
     """
 
     step: IntArray
@@ -23,9 +25,15 @@ class ScheduleState(NamedTuple):
 
 
 class Schedule(ABC):
-    """A query policy that needs no training; subclasses choose segments in `select`.
+    """A query policy that needs no training; subclasses choose options in `select`.
+
+    Options are the mainline segments, unless the environment has other spans or price levels
+    (`dptse_env.release.QueryOptions`).
 
     Attributes:
+        queries: The G options.
+        n_mainline: Mainline segments.
+        bandwidth: What the queries of a step may cost together.
         uses_truth: Whether the choice depends on the true traffic. Such a schedule is a bound on
             policies, not a policy.
     """
@@ -35,13 +43,14 @@ class Schedule(ABC):
     def __init__(self, interface: QueryInterface, seed: int | None = None) -> None:
         """Bind the schedule to an environment's interface (``env.unwrapped.interface``)."""
         self.interface = interface
+        self.queries = interface.queries
         self.n_mainline = interface.n_mainline
         self.bandwidth = interface.bandwidth
         self.generator = np.random.default_rng(seed)
 
     @abstractmethod
     def select(self, step: IntArray, observation: Observation) -> BoolArray:
-        """Return the segments to query, shape (k, n_mainline).
+        """Return the options to query, shape (k, G).
 
         Args:
             step: Decisions completed so far in each episode, shape (k,).
@@ -72,7 +81,7 @@ class Schedule(ABC):
         if fresh.size:
             wanted[fresh] = self._choose(fresh, step[fresh], batch[fresh])
         action = self.interface.actions.encode(wanted, picked)
-        last_pick = picked.sum(axis=1) + 1 == self.interface.actions.actions_per_step
+        last_pick = self.interface.actions.completes(wanted, picked)
         new_state = ScheduleState(step + last_pick, wanted)
         return (action[0] if np.ndim(observation) == 1 else action), new_state
 
@@ -86,7 +95,7 @@ class Schedule(ABC):
     ) -> tuple[IntArray, BoolArray]:
         if state is None:
             step = np.zeros(k, dtype=np.int64)
-            wanted = np.zeros((k, self.n_mainline), dtype=bool)
+            wanted = np.zeros((k, self.queries.n_options), dtype=bool)
         else:
             step, wanted = np.array(state[0]), np.array(state[1])
         if episode_start is not None:
@@ -95,7 +104,7 @@ class Schedule(ABC):
 
     def _picked(self, batch: Observation) -> BoolArray:
         if "picked" not in self.interface.observations.slices:
-            return np.zeros((len(batch), self.n_mainline), dtype=bool)
+            return np.zeros((len(batch), self.queries.n_options), dtype=bool)
         return self.interface.observations.block(batch, "picked") > 0
 
     def block(self, observation: Observation, name: str) -> Observation:
@@ -103,23 +112,68 @@ class Schedule(ABC):
         return self.interface.observations.block(observation, name)
 
     def mask(self, chosen: IntArray) -> BoolArray:
-        """Return the mask of the chosen indices, (k, anything) to (k, n_mainline)."""
-        mask = np.zeros((len(chosen), self.n_mainline), dtype=bool)
+        """Return the mask of the chosen options, (k, anything) to (k, G)."""
+        mask = np.zeros((len(chosen), self.queries.n_options), dtype=bool)
         np.put_along_axis(mask, chosen, True, axis=1)
         return mask
 
+    def first_that_fit(self, order: IntArray) -> BoolArray:
+        """Return the mask of the first options of an order (k, G) that the bandwidth pays for.
+
+        An option that costs more than is left is passed over.
+        """
+        if not self.queries.costs_differ:
+            return self.mask(order[:, : self.queries.most_queries])
+        mask, limit = self.mask(order[:, :0]), np.full(len(order), self.bandwidth)
+        kept = affordable(np.ones_like(mask), self.queries.cost[order], limit)
+        np.put_along_axis(mask, order, kept, axis=1)
+        return mask
+
+    def completed(self, chosen: IntArray) -> BoolArray:
+        """Return the mask of chosen options (k, anything), and of others as far as they fit."""
+        mask = self.mask(chosen)
+        if chosen.shape[1] == self.queries.most_queries:
+            return mask
+        return self.first_that_fit(np.argsort(~mask, axis=1, kind="stable"))
+
     def highest(self, value: FloatArray | Observation, step: IntArray) -> BoolArray:
-        """Return the ``bandwidth`` segments of the highest value (k, n_mainline).
+        """Return the options of the highest value that the bandwidth pays for, shape (k, G).
 
         Ties rotate along the road with the step: breaking them from one end would query the
         segments there 1.5 times as often. A mainline segment with a fixed sensor is observed
         without a query, so it comes last for any value.
+
+        Options of several segments have the mean of their segments' values, per unit of cost where
+        costs differ; a segment with a fixed sensor counts as the least of the others. The price
+        level is the one nearest to 1, and options do not overlap. Where bandwidth is left that pays
+        for no such option, it is used for others.
+
+        Args:
+            value: Value of each mainline segment, shape (k, n_mainline); none below 0 where costs
+                differ.
+            step: Decisions completed so far, shape (k,).
         """
         fixed = self.interface.observations.setup.fixed_sensors
+        fixed = fixed[fixed < self.n_mainline]
         score = np.array(value, dtype=np.float64)
-        score[:, fixed[fixed < self.n_mainline]] = -np.inf
-        turn = (np.arange(self.n_mainline) - step[:, None]) % self.n_mainline
-        return self.mask(np.lexsort((turn, -score), axis=1)[:, : self.bandwidth])
+        if self.queries.are_segments:
+            score[:, fixed] = -np.inf
+            turn = (np.arange(self.n_mainline) - step[:, None]) % self.n_mainline
+            return self.first_that_fit(np.lexsort((turn, -score), axis=1))
+        return best_options(self.queries, score, fixed, step)
+
+
+def require_plain(interface: QueryInterface, name: str) -> None:
+    """Refuse options other than the mainline segments at the release model's price.
+
+    Raises:
+        ValueError: There are others; ``name`` is the schedule's.
+    """
+    if not interface.queries.are_plain:
+        raise ValueError(
+            f"schedule {name!r} queries single segments: it needs query_spans (1,) and "
+            f"price_levels (1.0,), got {interface.queries}"
+        )
 
 
 class ProcessSchedule(Schedule):

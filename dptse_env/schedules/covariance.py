@@ -10,7 +10,7 @@ from dptse_env.estimators.settings import Deviation
 from dptse_env.model.road_arrays import make_road_arrays
 from dptse_env.process import QueryProcess
 from dptse_env.schedules import greedy_kernels as kernels
-from dptse_env.schedules.base import ProcessSchedule
+from dptse_env.schedules.base import ProcessSchedule, require_plain
 from dptse_env.schedules.covariance_kernels import Problem
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray, Observation
 from dptse_env.utils.fields import POSITIVE, checked_fields
@@ -54,11 +54,11 @@ class HasCovariance(Protocol):
 
     @property
     def states(self) -> FloatArray:
-        """Means, shape (n, 2 S) [veh/km, veh/h]."""
+        """Means, shape (n, 2 S) [veh/km, veh/h], or with demand factors at their end."""
 
     @property
     def covariances(self) -> FloatArray:
-        """Shape (n, 2 S, 2 S), rho normalised by rho_m and psi by rho_m v_f."""
+        """Those of the means, rho normalised by rho_m and psi by rho_m v_f."""
 
 
 class CovarianceSchedule(ProcessSchedule):
@@ -82,9 +82,10 @@ class CovarianceSchedule(ProcessSchedule):
         """Bind the schedule to a process (``env.unwrapped.process``).
 
         Raises:
-            ValueError: The estimator has no covariance.
+            ValueError: The estimator has no covariance, or options are not the mainline segments.
         """
         super().__init__(process, seed)
+        require_plain(process.interface, self.name)
         if not hasattr(type(process.estimator), "covariances"):
             raise ValueError(
                 f"schedule {self.name!r} needs an estimator with a covariance, "
@@ -94,14 +95,15 @@ class CovarianceSchedule(ProcessSchedule):
         self._estimator = cast(HasCovariance, process.estimator)
         self._road = tuple(make_road_arrays(process.model))
         self._problem = tuple(_problem(process, inflation))
-        self._covariances: FloatArray = self._estimator.covariances
+        self._n_traffic = 2 * process.model.n_segments
+        self._covariances: FloatArray = self._traffic_covariances
         self._after = self._covariances.copy()
         self._second = np.full(process.n_episodes, -1)
 
     def _choose(self, rows: IntArray, step: IntArray, observation: Observation) -> BoolArray:
         process = self.process
         inputs = process.boundary.inputs(rows, process.traffic_index[rows], process.time[rows])
-        means, covariances = self._estimator.states[rows], self._present(rows)
+        means, covariances = self._estimator.states[rows, : self._n_traffic], self._present(rows)
         queried = np.empty((len(rows), self.n_mainline), dtype=bool)
         self._select(means, covariances, np.ascontiguousarray(inputs), queried)
         if self.inflation.process_noise is not None:
@@ -114,10 +116,16 @@ class CovarianceSchedule(ProcessSchedule):
     ) -> None:
         """Write the sets to ``queried`` (k, n_mainline), posterior ones to ``covariances``."""
 
+    @property
+    def _traffic_covariances(self) -> FloatArray:
+        """The estimator's covariances without demand states, shape (n, 2 S, 2 S)."""
+        n = self._n_traffic
+        return np.ascontiguousarray(self._estimator.covariances[:, :n, :n])
+
     def _present(self, rows: IntArray) -> FloatArray:
         """Return present covariances, shape (k, 2 S, 2 S): the estimator's, or inflated ones."""
         if self.inflation.process_noise is None:
-            covariances: FloatArray = self._estimator.covariances
+            covariances = self._traffic_covariances
             return covariances if len(rows) == len(covariances) else covariances[rows]
         # A repeated call in the same second starts from the same covariance; after a second
         # without a call, as after a reset, the estimator's is the start.
@@ -126,7 +134,7 @@ class CovarianceSchedule(ProcessSchedule):
         moved = second == self._second[rows] + 1
         self._covariances[rows[moved]] = self._after[rows[moved]]
         if missed.any():
-            self._covariances[rows[missed]] = self._estimator.covariances[rows[missed]]
+            self._covariances[rows[missed]] = self._traffic_covariances[rows[missed]]
         self._second[rows] = second
         inflated: FloatArray = self._covariances[rows]
         return inflated
@@ -209,7 +217,8 @@ def _problem(process: QueryProcess, inflation: CovarianceInflation) -> Problem:
         always=always,
         can_query=np.setdiff1d(np.arange(n), always),
         noise=sigma**2,
-        process_variance=np.square(inflation.process_noise or noise, dtype=np.float64),
+        centre=np.nan if model.reference_speed is None else model.reference_speed,
+        process_variance=np.tile(np.square(inflation.process_noise or noise), model.n_segments),
         is_walk=is_walk,
         is_box=settings.bounds == "box",
         density_scale=float(rho_m),

@@ -12,7 +12,8 @@ import numpy as np
 from numba import njit
 
 from dptse_env.estimators.compiled.algebra import propagate
-from dptse_env.estimators.compiled.ekf_kernels import measured, project, released
+from dptse_env.estimators.compiled.ekf_kernels import project
+from dptse_env.estimators.compiled.ekf_rows import measured, released
 from dptse_env.model.kernels import advance
 from dptse_env.model.road_arrays import RoadArrays
 from dptse_env.utils.arrays import FloatArray, IntArray
@@ -26,7 +27,8 @@ class Problem(NamedTuple):
     always: IntArray  # (F,) segments with a fixed sensor
     can_query: IntArray  # (A,) mainline segments without a fixed sensor
     noise: FloatArray  # (2,) variances of both releases, normalised
-    # (2,) of a step: of rho and psi, normalised, or for a random walk of rho / rho_m and v / v_f
+    centre: float  # v_0 of released flows [km/h], NaN where speeds are released
+    # (2 S,) of a step: of rho and psi, normalised, or for a random walk of rho / rho_m and v / v_f
     process_variance: FloatArray
     is_walk: bool  # whether the estimator is a random walk
     is_box: bool  # whether means are projected into the box, not the cone
@@ -103,7 +105,8 @@ def step(road: RoadArrays, problem: Problem, covariance: FloatArray, work: Work)
         drift(problem, covariance, work)
     else:
         noise = problem.process_variance
-        propagate(road, work.blocks, noise, covariance, work.product, work.transposed)
+        no_factors = np.empty((0, 2))
+        propagate(road, work.blocks, no_factors, noise, covariance, work.product, work.transposed)
 
 
 @njit(cache=True, error_model="numpy")
@@ -126,7 +129,7 @@ def _linearise(road: RoadArrays, problem: Problem, work: Work) -> None:
     d_unit, v_unit = problem.units
     for s in range(road.jam.size):
         rho, psi = work.mean[2 * s], work.mean[2 * s + 1]
-        _, by_rho, by_psi = released(road, s, rho, psi)
+        _, by_rho, by_psi = released(road, s, rho, psi, problem.centre)
         a, b = by_rho * scale / road.second_scale, by_psi * scale * v_f / road.second_scale
         work.rows[s, 0], work.rows[s, 1] = a, b
         _, by_rho, by_psi = measured(rho, psi, road.jam[s], v_f, road.gamma)

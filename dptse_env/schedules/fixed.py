@@ -16,6 +16,9 @@ class Shifting(Schedule):
     The set starts at floor(n i / B) for i = 0 .. B-1; segments beyond the downstream end continue
     upstream. ``period=4`` is the schedule of Vishnoi et al. (section IV-A), ``period=1`` a round
     robin, ``period=None`` a static set.
+
+    Among several spans and price levels it keeps to the smallest span and the level nearest to 1:
+    n is the number of these options, and B how many of them the bandwidth pays for.
     """
 
     def __init__(
@@ -26,21 +29,27 @@ class Shifting(Schedule):
         if period is not None and period < 1:
             raise ValueError(f"schedule.period must be None or >= 1, got {period}")
         self.period = period
-        self._start = np.arange(self.bandwidth) * self.n_mainline // self.bandwidth
+        queries = self.queries
+        own = (queries.span == queries.span.min()) & (queries.level == queries.standard_level)
+        self._options = np.flatnonzero(own)
+        n = self._options.size
+        size = min(self.bandwidth // int(queries.cost[own][0]), n)
+        self._start = np.arange(size) * n // size
 
     def select(self, step: IntArray, observation: Observation) -> BoolArray:
         """See `Schedule.select`."""
         shift = np.zeros_like(step) if self.period is None else step // self.period
-        return self.mask((self._start + shift[:, None]) % self.n_mainline)
+        place = (self._start + shift[:, None]) % self._options.size
+        return self.completed(self._options[place])
 
 
 class Random(Schedule):
-    """A random set of ``bandwidth`` segments at every step."""
+    """A random set of options at every step, as many as the bandwidth pays for."""
 
     def select(self, step: IntArray, observation: Observation) -> BoolArray:
         """See `Schedule.select`."""
-        keys = self.generator.random((len(step), self.n_mainline))
-        return self.mask(np.argsort(keys, axis=1)[:, : self.bandwidth])
+        keys = self.generator.random((len(step), self.queries.n_options))
+        return self.first_that_fit(np.argsort(keys, axis=1))
 
 
 class OldestFirst(Schedule):
@@ -120,7 +129,7 @@ class Nothing(Schedule):
 
     def select(self, step: IntArray, observation: Observation) -> BoolArray:
         """See `Schedule.select`."""
-        return np.zeros((len(step), self.n_mainline), dtype=bool)
+        return np.zeros((len(step), self.queries.n_options), dtype=bool)
 
 
 class Everything(Schedule):
@@ -134,9 +143,13 @@ class Everything(Schedule):
         """Bind the schedule.
 
         Raises:
-            ValueError: The bandwidth does not cover the road.
+            ValueError: The bandwidth does not cover the road, or single segments cannot be queried.
         """
         super().__init__(interface, seed)
+        queries = self.queries
+        self._all = (queries.span == 1) & (queries.level == queries.standard_level)
+        if not self._all.any():
+            raise ValueError(f"schedule 'all' needs query_spans with 1, got {queries}")
         if self.bandwidth < self.n_mainline:
             raise ValueError(
                 f"schedule 'all' needs bandwidth {self.n_mainline}, the environment has "
@@ -145,4 +158,4 @@ class Everything(Schedule):
 
     def select(self, step: IntArray, observation: Observation) -> BoolArray:
         """See `Schedule.select`."""
-        return np.ones((len(step), self.n_mainline), dtype=bool)
+        return np.tile(self._all, (len(step), 1))

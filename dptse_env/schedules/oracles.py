@@ -11,8 +11,8 @@ import numpy as np
 
 from dptse_env.estimators import Estimator
 from dptse_env.process import QueryProcess
-from dptse_env.release import ReleaseRequest
-from dptse_env.schedules.base import ProcessSchedule
+from dptse_env.release import MeasuredRows, ReleaseRequest, split_release
+from dptse_env.schedules.base import ProcessSchedule, require_plain
 from dptse_env.spaces.rewards import ScoredSecond, estimation_error
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray, Observation
 
@@ -50,7 +50,7 @@ class _NextSecond:
 
     episodes: IntArray
     truth: FloatArray
-    released: FloatArray
+    released: MeasuredRows
     estimator: Estimator
 
 
@@ -62,6 +62,15 @@ class _Realised(ProcessSchedule):
     """
 
     uses_truth: ClassVar[bool] = True
+
+    def __init__(self, process: QueryProcess, seed: int | None = None) -> None:
+        """Bind the schedule.
+
+        Raises:
+            ValueError: Options are not the mainline segments.
+        """
+        super().__init__(process, seed)
+        require_plain(process.interface, self.name)
 
     def _choose(self, rows: IntArray, step: IntArray, observation: Observation) -> BoolArray:
         chosen = np.zeros((len(rows), self.n_mainline), dtype=bool)
@@ -78,7 +87,6 @@ class _Realised(ProcessSchedule):
     def _look(self, episodes: IntArray) -> _NextSecond:
         ahead = self.process.fork()
         traffic, times = ahead.traffic_index[episodes], ahead.time[episodes]
-        n = ahead.config.corridor.n_segments
         ahead.estimator.predict(episodes, ahead.boundary.inputs(episodes, traffic, times))
         all_columns = np.ones((len(episodes), ahead.release.setup.n_columns), dtype=bool)
         request = ReleaseRequest(
@@ -88,9 +96,9 @@ class _Realised(ProcessSchedule):
             all_columns,
             lambda: ahead.estimator.estimate().at(episodes),
         )
-        released = ahead.release.release(request).values
+        released, _ = split_release(ahead.release.release(request), ahead.model)
         truth = ahead.traffic.aggregates(traffic, times + 1)
-        return _NextSecond(episodes, truth, released[:, :n], ahead.estimator)
+        return _NextSecond(episodes, truth, released, ahead.estimator)
 
     def _reward(self, coming: _NextSecond, queried: BoolArray) -> FloatArray:
         """Return the rewards (k,) of querying ``queried`` (k, n_mainline)."""
@@ -99,7 +107,7 @@ class _Realised(ProcessSchedule):
         observed[:, [*process.config.corridor.fixed_sensors]] = True
         observed[:, :n] |= queried
         estimator = _copied(coming.estimator)
-        estimator.update(episodes, observed, coming.released, process.release.sigma)
+        estimator.update(episodes, observed, *coming.released)
         estimate, truth = estimator.estimate().at(episodes), coming.truth[:, :n]
         density, speed = truth[..., 0], truth[..., 1]
         error = estimation_error(density, speed, estimate.density[:, :n], estimate.speed[:, :n])
@@ -146,7 +154,8 @@ class OracleBruteForce(_Realised):
         """Bind the schedule.
 
         Raises:
-            ValueError: There are more than `MOST_SETS` sets.
+            ValueError: There are more than `MOST_SETS` sets, or options are not the mainline
+                segments.
         """
         super().__init__(process, seed)
         n_sets = comb(self.n_mainline, self.bandwidth)

@@ -15,7 +15,7 @@ import numpy as np
 from dptse_env.config import EnvConfig
 from dptse_env.estimators import ESTIMATORS
 from dptse_env.process import QueryProcess
-from dptse_env.schedules.base import Schedule
+from dptse_env.schedules.base import Schedule, require_plain
 from dptse_env.utils.arrays import BoolArray, IntArray, Observation
 from dptse_env.utils.json_object import parse_object, shipped_texts
 
@@ -126,9 +126,11 @@ class Planned(Schedule):
         """Bind the schedule.
 
         Raises:
-            ValueError: The plan was made for another corridor or bandwidth.
+            ValueError: The plan was made for another corridor or bandwidth, or options are not the
+                mainline segments.
         """
         super().__init__(process.interface, seed)
+        require_plain(process.interface, plan.kind)
         made_for, context = plan.context, PlanContext.from_config(process.config)
         if (made_for.digest, made_for.bandwidth) != (context.digest, context.bandwidth):
             raise ValueError(

@@ -30,7 +30,8 @@ ROAD = Corridor(
 
 
 def encoding(blocks=("default",), epsilon=0.1, **changes):
-    return ObservationEncoding(ObservationSetup(ROAD, 2, epsilon, **changes), blocks)
+    setup = {"n_options": N, "sensor_rows": ROAD.fixed_sensors, **changes}
+    return ObservationEncoding(ObservationSetup(ROAD, 2, epsilon, **setup), blocks)
 
 
 def state(k=2, fill=1.0):

@@ -1,0 +1,216 @@
+"""Whole environments in which a query may cover several segments, at several price levels."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from agents.evaluation.episodes import make_vector
+from dptse_env.config import resolve
+from dptse_env.parts import make_parts
+from dptse_env.process import QueryProcess
+from dptse_env.rendering import History
+from dptse_env.spaces.actions import ACTION_ENCODINGS, ActionEncoding, MaskAction
+
+from .release.sums import PricedRelease, SumRelease
+from .vectors import EPISODES, SHORT, lock_step, short
+
+ONE = np.zeros(1, dtype=np.int64)
+CONFIGURATIONS = {
+    "spans": {"query_spans": (1, 2, 4), "bandwidth": 5},
+    "sums": {"query_spans": (2, 3), "bandwidth_unit": "sums"},
+    "levels": {"price_levels": (0.5, 2.0)},
+    "all of it": {
+        "query_spans": (2, 3), "price_levels": (1.0, 4.0), "bandwidth": 4,
+        "privacy": {"preset": PricedRelease, "boundary_inputs": "private"},
+    },
+    "one query": {"query_spans": (6,), "bandwidth_unit": "sums"},
+}  # fmt: skip
+
+
+def make_process(**keywords):
+    defaults = {"privacy": SumRelease, "traffic_seeds": "0:1", "horizon": 30, "bandwidth": 6}
+    keywords = {**defaults, **keywords}
+    process = QueryProcess(make_parts(resolve("short-highway", keywords)))
+    process.reset(ONE, [np.random.default_rng(4)], {"traffic_seed": 0})
+    return process
+
+
+def query(process, *options):
+    """Query options for a second, by mask; return the observation."""
+    flags = np.isin(np.arange(process.interface.queries.n_options), options)
+    return process.step(ONE, flags[None].astype(np.int8)).observation
+
+
+@pytest.mark.parametrize("action", ACTION_ENCODINGS)
+@pytest.mark.parametrize("keywords", CONFIGURATIONS.values(), ids=CONFIGURATIONS)
+def test_batches_are_episodes_and_sampled_actions_never_raise(keywords, action):
+    lock_step({"privacy": PricedRelease, "action": action, **keywords}, 20)
+
+
+@pytest.mark.parametrize("action", ACTION_ENCODINGS)
+@pytest.mark.parametrize("keywords", CONFIGURATIONS.values(), ids=CONFIGURATIONS)
+def test_queries_stay_within_the_bandwidth_and_observations_in_the_space(keywords, action):
+    env = gym.make(SHORT, action=action, **{"privacy": SumRelease, **EPISODES, **keywords})
+    options = env.unwrapped.config.queries
+    env.reset(seed=1)
+    env.action_space.seed(2)
+    truncated = False
+    while not truncated:
+        observation, _, _, truncated, info = env.step(env.action_space.sample())
+        assert info["queried"].shape == (options.n_options,)
+        assert info["queried"] @ options.cost <= options.bandwidth
+        assert env.observation_space.contains(observation)
+
+
+def test_spans_and_levels_size_actions_and_blocks():
+    env = gym.make(SHORT, privacy=PricedRelease, query_spans=(1, 2), price_levels=(1.0, 2.0))
+    assert env.action_space == gym.spaces.MultiBinary(22)
+    slices = env.unwrapped.interface.observations.slices
+    sizes = {name: place.stop - place.start for name, place in slices.items()}
+    of_options = ("released_density", "released_flow", "density_innovation", "queried")
+    assert {sizes[name] for name in (*of_options, "speed_innovation", "last_price")} == {22}
+    assert {sizes[name] for name in ("age", "tracer")} == {6}
+    without = gym.make(SHORT, privacy=SumRelease, query_spans=(1, 2))
+    assert not {"last_price", "tracer"} & set(without.unwrapped.interface.observations.slices)
+    chosen = gym.make(SHORT, privacy="capped", observation=["age", "last_price", "tracer"])
+    observation, _ = chosen.reset(seed=0)
+    assert (observation[6:] == 0.0).all()
+
+
+def test_slots_and_picks_number_the_queries_that_the_bandwidth_pays_for():
+    keywords = {"privacy": SumRelease, "query_spans": (2,), "bandwidth": 5}
+    slots = gym.make(SHORT, action="slots", **keywords)
+    assert slots.action_space == gym.spaces.MultiDiscrete([5, 5])
+    sequential = gym.make(SHORT, action="sequential", **keywords)
+    assert sequential.action_space == gym.spaces.Discrete(5)
+    assert sequential.unwrapped.interface.actions.actions_per_step == 2
+
+
+def test_a_query_releases_the_mean_over_its_segments():
+    process = make_process(query_spans=(1, 3))
+    released = []
+
+    def release(request, genuine=process.release.release):
+        assert np.flatnonzero(request.observed).tolist() == [2, 5, 6, 11]  # with both sensors
+        released.append(process.release.true_values(request)[0])
+        return genuine(request)
+
+    process.release.release = release
+    query(process, 2, 6)  # segment 2 by itself, and segments 0 to 2
+    density = process.truth(ONE)[0, :, 0]
+    assert released[0][2, 0] == pytest.approx(density[2])
+    assert released[0][6, 0] == pytest.approx(density[:3].mean())
+    assert np.flatnonzero(process.released[0].any(axis=1)).tolist() == [2, 5, 6, 11]
+
+
+def test_age_is_of_segments_and_counts_every_query_that_covers_them():
+    process = make_process(query_spans=(2, 3))
+    for _ in range(3):
+        query(process)
+    ages = []
+    for options in ((1,), (7,), ()):
+        query(process, *options)
+        ages.append(process.age[0].tolist())
+    assert ages == [[64, 0, 0, 64, 64, 0], [65, 1, 0, 0, 0, 0], [66, 2, 1, 1, 1, 0]]
+
+
+def test_a_sensor_without_an_option_has_a_row_of_its_own():
+    process = make_process(query_spans=(2,), bandwidth=2)
+    observation = query(process, 0)
+    block = process.interface.observations.block
+    assert process.interface.observations.setup.sensor_rows == (7, 6)  # segment 5, and a ramp
+    innovations = process.estimator.innovations[0]
+    assert np.flatnonzero(innovations.all(axis=1)).tolist() == [0, 6, 7]
+    fixed = block(observation, "fixed_density_innovation")[0]
+    np.testing.assert_allclose(fixed, innovations[[7, 6], 0], rtol=1e-6)
+    assert block(observation, "density_innovation")[0].tolist()[1:] == [0.0] * 4
+    assert block(observation, "density_innovation")[0, 0] != 0.0
+
+
+def test_queries_bring_the_estimate_nearer():
+    """Averages enter the estimator as what they are: more of them give a smaller error."""
+
+    def error(**keywords):
+        env = short(8, privacy=SumRelease, horizon=60, action="scores", **keywords)
+        env.reset(seed=3)
+        scores = np.zeros(env.action_space.shape, dtype=np.float32)
+        rewards = [env.step(scores)[1] for _ in range(59)]
+        return -np.mean(rewards)
+
+    spans = {"query_spans": (2,), "bandwidth_unit": "sums"}
+    assert error(bandwidth=5, **spans) < 0.7 * error(bandwidth=1, **spans)
+
+
+def test_prices_and_the_tracer_are_observed():
+    process = make_process(privacy=PricedRelease, query_spans=(2, 3), price_levels=(1.0, 4.0))
+    block = process.interface.observations.block
+    first = process.observe(ONE)
+    assert not block(first, "last_price").any()
+    assert not block(first, "tracer").any()
+    query(process, 1)
+    observation = query(process, 6)
+    prices = block(observation, "last_price")[0]
+    expected = {1: 0.5 * np.log10(0.01), 6: 0.5 * np.log10(0.04)}
+    assert np.flatnonzero(prices).tolist() == [1, 6]
+    np.testing.assert_allclose(prices[[1, 6]], [expected[1], expected[6]], rtol=1e-6)
+    np.testing.assert_allclose(block(observation, "tracer")[0], [0, 0.5, 0.5, 0, 0, 0.5])
+
+
+def test_masks_show_what_the_rest_of_the_bandwidth_pays_for():
+    keywords = {"query_spans": (1, 2, 3), "bandwidth": 3, "action": "sequential"}
+    env = gym.make(SHORT, **{"privacy": SumRelease, **EPISODES, **keywords})
+    env.reset(seed=0)
+    assert env.unwrapped.action_masks().all()
+    *_, info = env.step(6)  # segments 0 and 1
+    assert not info["queried"].any()
+    assert np.flatnonzero(env.unwrapped.action_masks()).tolist() == [0, 1, 2, 3, 4, 5]
+    *_, info = env.step(0)
+    assert np.flatnonzero(info["queried"]).tolist() == [0, 6]
+    batch = short(2, privacy=SumRelease, **keywords)
+    batch.reset(seed=0)
+    batch.step(np.array([0, 11]))
+    masks = batch.action_masks()
+    assert masks.sum(axis=1).tolist() == [5 + 5, 15]  # the second has begun the next second
+
+
+def test_a_picture_shows_the_segments_that_queries_cover():
+    process = make_process(query_spans=(2, 3))
+    history = History.from_process(process)
+    query(process, 0)
+    history.append(process)
+    assert [row.tolist() for row in history.queried] == [[False] * 6, [True] * 2 + [False] * 4]
+
+
+def test_a_fork_goes_on_alike():
+    process = make_process(query_spans=(2, 3), privacy=PricedRelease)
+    query(process, 3)
+    query(process.fork(), 1)
+    first, second = process.fork(), process.fork()
+    np.testing.assert_array_equal(query(first, 7, 2), query(second, 7, 2))
+    assert np.flatnonzero(process.release.prices[0]).tolist() == [3]
+
+
+class Naive(ActionEncoding):
+    """An encoding of another package that counts queries."""
+
+    def __init__(self, n_options, bandwidth):
+        super().__init__(gym.spaces.MultiBinary(n_options), n_options, bandwidth)
+
+    decode = MaskAction.decode
+    encode = MaskAction.encode
+
+
+def test_an_encoding_that_knows_no_costs_is_refused_where_they_differ():
+    keywords = {"privacy": SumRelease, "action": Naive, "bandwidth": 3}
+    with pytest.raises(ValueError, match=r"^action .*Naive must take the argument costs where .*"):
+        gym.make(SHORT, query_spans=(1, 2), **keywords)
+    counted = gym.make(SHORT, query_spans=(2, 3), bandwidth_unit="sums", **keywords)
+    assert counted.action_space == gym.spaces.MultiBinary(9)
+
+
+def test_a_batch_of_decisions_of_different_lengths_is_not_evaluated():
+    keywords = {"privacy": SumRelease, "query_spans": (1, 2), "action": "sequential", **EPISODES}
+    with pytest.raises(ValueError, match=r"action 'sequential' takes different numbers of actions"):
+        make_vector(SHORT, 2, keywords)
+    assert make_vector(SHORT, 1, keywords).num_envs == 1
+    assert make_vector(SHORT, 2, {**keywords, "query_spans": (2,)}).num_envs == 2
