@@ -152,7 +152,7 @@ def make_corridor(corridor: str | None, env: str, keywords: Mapping[str, Any]) -
                     f"fields, got {corridor!r}"
                 )
         # Traffic does not depend on queries, and a short road may have fewer segments.
-        given["bandwidth"] = 1
+        given |= {"bandwidth": 1, "query_spans": [1]}
     with warnings.catch_warnings():
         # They are about the guarantee and the estimator; only the corridor is wanted.
         warnings.simplefilter("ignore", UserWarning)

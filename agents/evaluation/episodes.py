@@ -155,12 +155,20 @@ def make_vector(env: str, n_episodes: int, keywords: Mapping[str, Any]) -> Senso
     """Make a vector environment of whole episodes, as `run_episodes` takes it.
 
     Raises:
-        ValueError: A keyword is unknown or out of range.
+        ValueError: A keyword is unknown or out of range, or the decisions of a second may take
+            different numbers of actions, so that episodes would not stay in step.
     """
     made = gym.make_vec(
         env, num_envs=n_episodes, **{**keywords, "autoreset_mode": AutoresetMode.DISABLED}
     )
     assert isinstance(made, SensorQueryVectorEnv)
+    actions = made.interface.actions
+    if n_episodes > 1 and actions.picks_one_by_one and actions.costs is not None:
+        raise ValueError(
+            f"action {made.config.action!r} takes different numbers of actions for a second where "
+            f"queries cost different amounts ({made.config.queries}): episodes cannot be run as a "
+            "batch; use another encoding, or one episode at a time"
+        )
     return made
 
 

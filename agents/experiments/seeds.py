@@ -7,7 +7,7 @@ training, plus the number of the episode. Choices and reports never share a rang
 from __future__ import annotations
 
 EVALUATION = range(1_000_000)
-"""``scripts/evaluate.py``, and the studies of estimators and of privacy."""
+"""``scripts/evaluate.py``, and the studies of estimators, of privacy and of ledgers."""
 TUNING = range(1_000_000, 2_000_000)
 """The search of estimator settings."""
 PLAN_SEARCH = range(3_000_000, 4_000_000)

@@ -58,6 +58,7 @@ class TrainingEpisodes(VecEnvWrapper):
         self.env, self.replicas, self.reward_scale = venv.env, replicas, reward_scale
         group = np.arange(venv.num_envs) // replicas
         self._episode_seeds = (first_seed + group).tolist()
+        # Where decisions take different numbers of actions, that of the longest episode.
         self._length = self.env.config.horizon_steps * self.env.interface.actions.actions_per_step
         n = self.num_envs
         self._breaks = group * replicas * self._length // n

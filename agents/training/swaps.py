@@ -34,8 +34,8 @@ class Swaps:
         observations: Of the states, shape (m, size).
         error: Mean one-second error, minus the reward, over the seconds after a state, shape (m,).
         state: Index of the state in which each swap was tried, shape (k,).
-        added: Segment that was queried, shape (k,).
-        dropped: Segment that was queried without the swap, shape (k,).
+        added: Option that was queried, shape (k,).
+        dropped: Option that was queried without the swap, shape (k,).
         gain: Decrease of the summed error over these seconds due to the swap, shape (k,).
         contributions: Increase of the number of vehicles' contributions in them, shape (k,); zero
             where contributions are not bounded.
@@ -115,12 +115,16 @@ def try_swaps(
         The swaps of n states, of the same second in all episodes.
 
     Raises:
-        ValueError: All segments are queried, so that there is nothing to swap, or episodes end
-            before a gain could be measured.
+        ValueError: All options are queried, so that there is nothing to swap, they cost different
+            amounts, or episodes end before a gain could be measured.
     """
-    horizon, n = env.config.horizon_steps, env.interface.n_mainline
-    if env.config.bandwidth >= n:
-        raise ValueError(f"swaps need a bandwidth below {n} segments, got {env.config.bandwidth}")
+    horizon, queries = env.config.horizon_steps, env.config.queries
+    if queries.most_queries >= queries.n_options:
+        raise ValueError(
+            f"swaps need a bandwidth below {queries.n_options} segments, got {queries.bandwidth}"
+        )
+    if queries.costs_differ:
+        raise ValueError(f"swaps need queries that cost the same, got {queries}")
     # The states of every round are at other seconds.
     first = min(WARM_UP, horizon // 4) + int(generator.integers(seconds))
     if first + seconds > horizon:
@@ -155,7 +159,7 @@ def _tried(
     columns = before.release.setup.n_columns
     noise = generator.choice([-1.0, 1.0], size=(n, columns, 2)) * before.release.sigma
     reward, contributions = _replayed(before, actions, noise)
-    queried = np.zeros((n, before.interface.n_mainline), dtype=bool)
+    queried = np.zeros((n, before.interface.queries.n_options), dtype=bool)
     np.put_along_axis(queried, actions[0], True, axis=1)
     parts = []
     for _ in range(trials):

@@ -49,7 +49,7 @@ class QueryCounts:
 
 
 class QueryCounter:
-    """Counts the queries of a batch of episodes; call it after the reset and every second."""
+    """Counts the segments that a batch queries; call it after the reset and every second."""
 
     def __init__(self, process: QueryProcess, traffic_seeds: Sequence[int]) -> None:
         """Look up the incidents: truth, for evaluation only.
@@ -80,10 +80,11 @@ class QueryCounter:
         process = self._process
         episodes, time = np.arange(process.n_episodes), process.time
         phase = (time > self._start).astype(np.int64) + (time > self._end)
-        self._counts[episodes, phase] += process.queried
+        queried = process.interface.queries.covered(process.queried)
+        self._counts[episodes, phase] += queried
         self._seconds[episodes, phase] += 1
         place = (process.elapsed - 1) // BIN
-        self._near_counts[episodes, place] += (process.queried & self._near).sum(axis=1)
+        self._near_counts[episodes, place] += (queried & self._near).sum(axis=1)
 
     def results(self) -> list[QueryCounts]:
         """Return the counts, one record for each episode."""

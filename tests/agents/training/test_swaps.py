@@ -6,6 +6,7 @@ pytest.importorskip("sb3_contrib")
 
 from agents.training.swaps import AntitheticNoise, Swaps, try_swaps
 from dptse_env.release import GaussianMechanism
+from tests.release.sums import SumRelease
 
 SHORT = "dptse_env:dptse/ShortHighway-v0"
 SEEDS = [5, 6, 7]
@@ -170,3 +171,10 @@ def test_environments_without_swaps_are_refused(keywords, message):
     env = gym.make_vec(SHORT, num_envs=3, action="slots", autoreset_mode="Disabled", **keywords)
     with pytest.raises(ValueError, match=message):
         tried(env, Wandering())
+
+
+def test_swaps_need_queries_of_equal_cost():
+    with pytest.raises(
+        ValueError, match=r"^swaps need queries that cost the same, got query_spans"
+    ):
+        tried(make(privacy=SumRelease, query_spans=(1, 2)), Wandering())
