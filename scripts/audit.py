@@ -1,8 +1,9 @@
 """Attack the privacy of an environment, and bound from below what its releases reveal.
 
-python scripts/audit.py --env dptse_env:dptse/PrivateHighway-v0 --runs 5000
+python scripts/audit.py --env dptse_env:dptse/PrivateHighway-v1 --runs 5000
 python scripts/audit.py --env dptse_env:dptse/PaperHighway-v0 --target replaced
 python scripts/audit.py --env dptse_env:dptse/PrivateHighway-v0 --noise-factor 0.709
+python scripts/audit.py --target pairs --traffic-seed 2000 --runs 2000
 """
 
 from __future__ import annotations
@@ -15,9 +16,15 @@ from typing import Any
 
 from agents.evaluation.episodes import make_config
 from agents.studies.audit.attack import attack
+from agents.studies.audit.pairs import PairsFinding, study_pairs
 from agents.studies.audit.report import Finding
-from agents.studies.audit.strategies import STRATEGIES, make_policy
-from agents.studies.audit.targets import TARGET_KINDS, choose_target
+from agents.studies.audit.strategies import PUBLIC_SCHEDULES, STRATEGIES
+from agents.studies.audit.targets import (
+    TARGET_KINDS,
+    choose_target,
+    make_planner,
+    make_policy,
+)
 from dptse_env.config import EnvConfig
 from dptse_env.parts import privacy_report
 from dptse_env.privacy import mu_of
@@ -26,25 +33,37 @@ from dptse_env.release import PrivacyReport
 from dptse_env.utils.validation import inside, integer, positive, require
 from scripts.cli import Recording, run
 
+PAIRS = "pairs"
+"""Target of a replay of many pairs of trips instead of an attack."""
+
 
 @dataclass(frozen=True)
 class Args:
     """Audit the privacy of an environment."""
 
-    env: str = "dptse_env:dptse/PrivateHighway-v0"
+    env: str = "dptse_env:dptse/PrivateHighway-v1"
     """Environment id."""
     target: str = "worst-case"
-    """Vehicle that differs: 'worst-case', an added one; 'replaced' or 'deleted', of the record."""
+    """Vehicle that differs: 'worst-case', an added one; 'replaced' or 'deleted', of the record;
+    for preset 'paced' also 'opposite', two added ones that deviate in opposite directions, and of
+    the record 'runs-out', which is refused most, 'jam', which stands longest, and 'late', which
+    enters in the second half. 'pairs' replays pairs of trips of several records instead."""
     policy: str = "hunter"
-    """Queries: 'hunter', 'adaptive', or a public schedule: 'paper', 'static', 'round-robin'."""
+    """Queries: 'hunter', 'adaptive', or a public schedule: 'paper', 'static', 'round-robin'. Pairs
+    take public schedules; others stand for 'round-robin' there."""
     runs: int = 5000
-    """Runs in each of the two worlds."""
+    """Runs in each of the two worlds, or pairs of each record."""
     noise_factor: float = 1.0
-    """Multiplies the declared noise; below 1 shows that the audit can reject."""
+    """Multiplies the real noise, not the declared one; below 1 shows that the audit can reject."""
     traffic_seed: int = 0
-    """Traffic seed of the record."""
+    """Traffic seed of the record, for pairs of the first one."""
+    n_records: int = 20
+    """Records whose pairs are replayed."""
+    estimator: str | None = None
+    """Estimator that the prices of 'paced' follow; the environment's own if not given, as all
+    below."""
     privacy: str | None = None
-    """Privacy preset; the environment's own if not given, as all below."""
+    """Privacy preset."""
     epsilon: float | None = None
     """Privacy parameter epsilon."""
     delta: float | None = None
@@ -52,7 +71,13 @@ class Args:
     unit: str | None = None
     """Protected unit: 'trip', 'horizon' or 'event'."""
     cap: int | None = None
-    """Queried steps in which a vehicle counts."""
+    """Queried steps in which a vehicle counts, for 'capped'."""
+    pace: float | None = None
+    """Part of the budget that should be spent at the end of a trip, for 'paced'."""
+    clip: float | None = None
+    """Largest deviation of a speed that is released [km/h], for 'paced'."""
+    ratio: float | None = None
+    """Ratio of the charges for the largest deviation and for being counted, for 'paced'."""
     adjacency: str | None = None
     """'replace' or 'add_remove'."""
     boundary_inputs: str | None = None
@@ -69,15 +94,21 @@ class Args:
     """Folder for the result, a JSON file."""
 
 
+PRIVACY = (
+    "epsilon", "delta", "unit", "cap", "pace", "clip", "ratio", "adjacency", "boundary_inputs",
+)  # fmt: skip
+"""Arguments that are settings of the release model."""
+
+
 def attacked_config(args: Args) -> EnvConfig:
     """Return the configuration of the environment under attack."""
-    names = ("epsilon", "delta", "unit", "cap", "adjacency", "boundary_inputs")
-    privacy = {name: getattr(args, name) for name in names} | {"preset": args.privacy}
+    privacy = {name: getattr(args, name) for name in PRIVACY} | {"preset": args.privacy}
     keywords: dict[str, Any] = {
         "privacy": {name: value for name, value in privacy.items() if value is not None}
     }
-    if args.bandwidth is not None:
-        keywords["bandwidth"] = args.bandwidth
+    for name in ("bandwidth", "estimator"):
+        if getattr(args, name) is not None:
+            keywords[name] = getattr(args, name)
     return make_config(args.env, keywords)
 
 
@@ -94,19 +125,29 @@ def check(args: Args) -> None:
     Raises:
         ValueError: An argument is out of range.
     """
-    require(args.target in TARGET_KINDS, "target", f"one of {list(TARGET_KINDS)}", args.target)
+    kinds = [*TARGET_KINDS, PAIRS]
+    require(args.target in kinds, "target", f"one of {kinds}", args.target)
     require(args.policy in STRATEGIES, "policy", f"one of {list(STRATEGIES)}", args.policy)
     integer("runs", args.runs, 2)
     integer("traffic_seed", args.traffic_seed, 0)
+    integer("n_records", args.n_records, 1)
     integer("seed", args.seed, 0)
     positive("noise_factor", args.noise_factor)
     inside("confidence", args.confidence, 0.0, 1.0)
+
+
+def make_title(args: Args, config: EnvConfig) -> str:
+    """Return the environment and its claim in words."""
+    privacy = config.privacy
+    claim = f"({privacy.epsilon:g}, {privacy.delta:g})"
+    return f"{args.env.rpartition('/')[2]}, preset {privacy.preset} at {claim}"
 
 
 def run_audit(args: Args) -> Finding:
     """Choose two worlds, play them, and test the claim."""
     check(args)
     config = attacked_config(args)
+    make_planner(config, args.policy).require_kind(args.target)
     library = Recording(records=args.records).library(config.corridor, [args.traffic_seed])
     record = library.get(config.corridor, args.traffic_seed)
     worlds = choose_target(config, record, args.target, args.policy)
@@ -114,10 +155,9 @@ def run_audit(args: Args) -> Finding:
     start = time.perf_counter()
     runs = attack(config, worlds, policy, args.runs, noise_factor=args.noise_factor, seed=args.seed)
     seconds = time.perf_counter() - start
-    privacy, report = config.privacy, privacy_report(config)
-    claim = f"({privacy.epsilon:g}, {privacy.delta:g})"
+    report = privacy_report(config)
     return Finding(
-        title=f"{args.env.rpartition('/')[2]}, preset {privacy.preset} at {claim}",
+        title=make_title(args, config),
         target=worlds.description,
         policy=args.policy,
         n_runs=args.runs,
@@ -129,13 +169,24 @@ def run_audit(args: Args) -> Finding:
     )
 
 
+def run_pairs(args: Args) -> PairsFinding:
+    """Replay pairs of trips of several records."""
+    check(args)
+    config = attacked_config(args)
+    seeds = range(args.traffic_seed, args.traffic_seed + args.n_records)
+    library = Recording(records=args.records).library(config.corridor, seeds)
+    records = [library.get(config.corridor, seed) for seed in seeds]
+    policy = args.policy if args.policy in PUBLIC_SCHEDULES else "round-robin"
+    title = make_title(args, config)
+    return study_pairs(config, records, args.runs, title=title, policy=policy, seed=args.seed)
+
+
 def main(args: Args) -> None:
-    """Attack, and leave table and file."""
-    finding = run_audit(args)
+    """Attack or replay, and leave table and file."""
+    finding = run_pairs(args) if args.target == PAIRS else run_audit(args)
     finding.print()
     noise = "" if args.noise_factor == 1.0 else f"-noise-{args.noise_factor:g}"
-    preset = finding.privacy.preset
-    path = args.output / f"{preset}-{args.target}-{args.policy}{noise}.json"
+    path = args.output / f"{finding.privacy.preset}-{args.target}-{finding.policy}{noise}.json"
     finding.write(path, dataclasses.asdict(args))
     print(f"the result is in {path}")
 

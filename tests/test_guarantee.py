@@ -110,3 +110,72 @@ def test_a_spec_with_every_privacy_keyword_survives_json():
     again = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
     assert again.unwrapped.config == env.unwrapped.config
     assert_same(play(env, 5), play(again, 5))
+
+
+# --- the paced ledger ---------------------------------------------------------------------------
+
+
+def paced(**keywords):
+    return short(**{"privacy": {"preset": "paced", "epsilon": 0.5}, **keywords})
+
+
+def test_the_account_of_paced_ledgers_grows_up_to_the_guarantee():
+    env = paced(horizon=80, random_start=True, truth_in_info=True)
+    (_, at_reset), *steps = play(env, 80)
+    account = at_reset["privacy"]
+    assert json.loads(json.dumps(account, allow_nan=False)) == account
+    # All but the truth, which is shown here, is in order.
+    assert account["void_reasons"] == ["truth_in_info"]
+    assert (account["preset"], account["unit"], account["adjacency"]) == (
+        "paced", "trip", "replace",
+    )  # fmt: skip
+    infos = [at_reset, *(step[4] for step in steps)]
+    mus, epsilons = ([info[key] for info in infos] for key in ("mu", "epsilon"))
+    assert mus == sorted(mus)
+    assert epsilons == sorted(epsilons)
+    assert (mus[0], epsilons[0]) == (0.0, 0.0)
+    assert mus[-1] == pytest.approx(account["mu"])
+    assert epsilons[-1] == pytest.approx(0.5)
+    for info in infos:
+        assert info["centre_fallback"] == 0.0
+        truth = info["truth"]
+        assert max(truth["ledgers"], default=0.0) <= 1.0
+        assert max(truth["individual_epsilon"], default=0.0) <= info["epsilon"] + 1e-9
+    assert not any(at_reset["truth"]["ledgers"])
+    assert max(infos[-1]["truth"]["ledgers"]) > 0.9
+    assert sum(info["truth"]["n_refused"] for info in infos) > 0
+
+
+def test_ledgers_are_shown_only_with_the_truth():
+    (_, at_reset), *steps = play(paced(), 5)
+    account = at_reset["privacy"]
+    assert account["guarantee"].startswith("(0.5, 0.05)-differential privacy of count and flow")
+    for info in (at_reset, steps[-1][4]):
+        assert not {"ledgers", "individual_epsilon", "n_refused", "truth"} & set(info)
+
+
+def test_vector_environments_of_gymnasium_take_ledgers():
+    made = [lambda s=s: paced(truth_in_info=True, traffic_seeds=[s]) for s in range(3)]
+    env = gym.vector.SyncVectorEnv(made)
+    env.reset(seed=0)
+    for _ in range(3):
+        *_, info = env.step(env.action_space.sample())
+    assert len({len(one) for one in info["truth"]["ledgers"]}) > 1
+    assert info["centre_fallback"].tolist() == [0.0] * 3
+    env.close()
+
+
+def test_a_spec_with_every_keyword_of_paced_ledgers_survives_json():
+    env = gym.make(
+        "dptse_env:dptse/PrivateHighway-v1",
+        privacy={
+            "epsilon": 2.0, "delta": 0.01, "unit": "event", "adjacency": "add_remove",
+            "pace": 0.6, "clip": 25.0, "ratio": 3.0, "pacing": "tracer",
+            "boundary_inputs": "private",
+        },
+        traffic_seeds="0:2",
+        horizon=20,
+    )  # fmt: skip
+    again = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
+    assert again.unwrapped.config == env.unwrapped.config
+    assert_same(play(env, 5), play(again, 5))

@@ -63,7 +63,12 @@ def public(env, info):
     estimate = {name: getattr(process.estimate, name).copy() for name in vars(process.estimate)}
     masks = {"released": process.released.copy(), "age": process.age.copy()}
     shown = {key: value for key, value in info.items() if key not in TRUTH_INFO}
-    return shown | estimate | masks
+    terms = {
+        name: getattr(process.release, name).copy()
+        for name in ("prices", "centres", "sigmas")
+        if hasattr(process.release, name)
+    }
+    return shown | estimate | masks | terms
 
 
 def same(first, second):
@@ -154,9 +159,9 @@ def test_an_emptiness_mask_would_show(monkeypatch):
     process = env.unwrapped.process
     update = process.estimator.update
 
-    def update_occupied(episodes, observed, values, sigma):
+    def update_occupied(episodes, observed, *released):
         truth = process.truth(episodes)
-        update(episodes, observed & (truth[..., 0] > 0), values, sigma)
+        update(episodes, observed & (truth[..., 0] > 0), *released)
 
     monkeypatch.setattr(process.estimator, "update", update_occupied)
     assert unlike(env)

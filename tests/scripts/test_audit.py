@@ -75,6 +75,40 @@ def test_every_argument_arrives(tmp_path):
     assert found["arguments"]["traffic_seed"] == "3"
 
 
+def test_the_paced_ledger_is_attacked_with_the_estimator_of_the_environment(tmp_path):
+    name, found = run(tmp_path, privacy="paced", cap=None)
+    assert name == "paced-worst-case-hunter.json"
+    mu = mu_of(5.0, 0.05)
+    assert found["verdict"] == "not rejected"
+    assert 0.95 * mu < found["distance"] <= mu
+    assert found["privacy"]["void_reasons"] == []
+    _, weak = run(tmp_path / "weak", privacy="paced", cap=None, noise_factor=0.4)
+    assert weak["verdict"] == "rejected"
+    assert weak["result"]["claim"] == found["result"]["claim"]
+
+
+def test_settings_of_the_paced_ledger_arrive(tmp_path):
+    name, found = run(
+        tmp_path, runs=5, privacy="paced", cap=None, pace=0.5, clip=25.0, ratio=0.7, target="late",
+        estimator="open_loop",
+    )  # fmt: skip
+    assert name == "paced-late-hunter.json"
+    privacy = found["privacy"]
+    assert (privacy["pace"], privacy["clip"], privacy["ratio"]) == (0.5, 25.0, 0.7)
+    assert attacked_config(Args(env=SHORT, estimator="open_loop")).estimator == "open_loop"
+    assert attacked_config(Args(env=SHORT)).estimator == "ekf"
+
+
+def test_pairs_of_trips_are_replayed(tmp_path, capsys):
+    name, found = run(
+        tmp_path, privacy="paced", cap=None, target="pairs", runs=40, n_records=2, traffic_seed=1,
+    )  # fmt: skip
+    assert name == "paced-pairs-round-robin.json"
+    assert (found["n_pairs"], found["n_records"]) == (80, 2)
+    assert 0.0 < found["quantiles"]["0.5"] < found["quantiles"]["1"] <= 1.0
+    assert f"{found['quantiles']['1']:.4f}" in capsys.readouterr().out
+
+
 def test_the_bandwidth_arrives():
     assert attacked_config(Args(env=SHORT, bandwidth=1)).bandwidth == 1
     assert attacked_config(Args(env=SHORT)).bandwidth == 2
@@ -98,9 +132,17 @@ def test_two_audits_agree(tmp_path):
         ({"confidence": 1.0}, r"confidence must be a number in \(0, 1\)"),
         ({"traffic_seed": -1}, "traffic_seed must be an integer >= 0"),
         ({"seed": -1}, "seed must be an integer >= 0"),
+        ({"n_records": 0}, "n_records must be an integer >= 1, got 0"),
+        ({"target": "jam"}, r"target must be one of \[.*\] for preset 'capped', got 'jam'"),
+        ({"cap": 9, "privacy": "paced"}, r"privacy\.cap is unknown"),
+        ({"pace": 0.5}, r"privacy\.pace is unknown"),
+        ({"estimator": "none"}, "estimator must be one of"),
         ({"privacy": "none"}, r"privacy\.preset must be one of"),
         ({"epsilon": -1.0}, r"privacy\.epsilon must be a number in "),
-        ({"target": "replaced", "adjacency": "add_remove"}, "target must be 'deleted'"),
+        (
+            {"target": "replaced", "adjacency": "add_remove"},
+            "target must be one of .*add_remove",
+        ),
     ],
 )
 def test_bad_arguments_are_named_and_nothing_is_written(changes, message, tmp_path):

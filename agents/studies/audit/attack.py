@@ -8,18 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from tqdm import tqdm
 
+from agents.studies.audit.releases import Overheard, Terms, attacked
 from agents.studies.audit.strategies import FixedQueries
 from agents.studies.audit.worlds import AdjacentWorlds
 from dptse_env.config import EnvConfig
 from dptse_env.parts import make_parts, make_release
 from dptse_env.process import QueryProcess
-from dptse_env.release import (
-    GaussianMechanism,
-    ReleaseRequest,
-    TrafficTable,
-    require_gaussian,
-)
-from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+from dptse_env.release import ReleaseRequest, TrafficTable
+from dptse_env.utils.arrays import BoolArray, FloatArray
 
 BATCH = 250
 """Default number of runs per world that are played at once."""
@@ -39,77 +35,47 @@ class Runs:
     distances: FloatArray
 
 
-class RecordingMechanism(GaussianMechanism):
-    """Gaussian noise that keeps its last releases: the public transcript, one step at a time.
-
-    Attributes:
-        released: The last releases, shape (k, n_columns, 2).
-    """
-
-    released: FloatArray
-
-    def release(self, episodes: IntArray, values: FloatArray) -> FloatArray:
-        """See `Mechanism.release`."""
-        self.released = super().release(episodes, values)
-        return self.released
-
-
 class Adversary:
-    """Knows both worlds and the queries, and works out the sums of either world.
+    """Knows both worlds and all that is public, and works out the sums of either world.
 
     Attributes:
         score: Log-likelihood ratio of world 1 of each run's transcript so far, shape (k,).
         square: Squared distance between the worlds' sums so far, in units of the noise, (k,).
     """
 
-    def __init__(
-        self, config: EnvConfig, worlds: AdjacentWorlds, n_runs: int, sigma: FloatArray
-    ) -> None:
-        """Prepare for n_runs at once, under noise of standard deviation `sigma`, (2,)."""
+    def __init__(self, config: EnvConfig, worlds: AdjacentWorlds, n_runs: int) -> None:
+        """Prepare for n_runs at once."""
         traffic = TrafficTable(config.corridor, (0, 1), worlds)
         # Sums of both worlds for every run, whichever world it is in.
-        self._release = require_gaussian(make_release(config, 2 * n_runs, traffic), "the audit")
+        self._attacked = attacked(make_release(config, 2 * n_runs, traffic))
         for world, record in traffic.load([0, 1]):
-            self._release.load(world, record)
-        self._sigma = sigma
+            self._attacked.model.load(world, record)
 
     def reset(self, n_runs: int) -> None:
         """Begin new runs."""
         self._episodes, self._worlds = np.arange(2 * n_runs), np.repeat([0, 1], n_runs)
         nothing = np.random.default_rng(0)
-        self._release.reset(self._episodes, [nothing] * len(self._episodes))
+        self._attacked.model.reset(self._episodes, [nothing] * len(self._episodes))
         self.score, self.square = np.zeros(n_runs), np.zeros(n_runs)
 
-    def expect(self, time: int, queried: BoolArray) -> tuple[FloatArray, FloatArray]:
+    def expect(self, time: int, queried: BoolArray, terms: Terms) -> tuple[FloatArray, FloatArray]:
         """Return midpoint and difference of both worlds' sums, (k, n_columns, 2), and add up.
 
         Both are in units of the noise; the difference is zero where nothing is observed.
         """
-        observed = self._release.setup.observed(queried)
+        observed = self._attacked.model.setup.observed(queried)
         times = np.full(len(self._episodes), time)
-        answers = self._release.true_values(
-            ReleaseRequest(self._episodes, self._worlds, times, np.tile(observed, (2, 1)))
-        )
-        zero, first = np.split(answers / self._sigma, 2)
+        request = ReleaseRequest(self._episodes, self._worlds, times, np.tile(observed, (2, 1)))
+        both = terms.repeated(2)
+        zero, first = np.split(self._attacked.sums(request, both) / both.sigma, 2)
         difference = np.where(observed[:, :, None], first - zero, 0.0)
         self.square += np.sum(difference**2, axis=(1, 2))
         return 0.5 * (zero + first), difference
 
-    def update(self, time: int, queried: BoolArray, released: FloatArray) -> None:
+    def update(self, time: int, queried: BoolArray, released: FloatArray, terms: Terms) -> None:
         """Score one released step: the log-likelihood ratio of Gaussians of either mean."""
-        midpoint, difference = self.expect(time, queried)
-        self.score += np.sum((released / self._sigma - midpoint) * difference, axis=(1, 2))
-
-
-def planned_distance(
-    config: EnvConfig, worlds: AdjacentWorlds, plan: BoolArray, sigma: FloatArray
-) -> float:
-    """Return the distance between the worlds under a plan (horizon, n_mainline), in noise units."""
-    adversary = Adversary(config, worlds, 1, sigma)
-    adversary.reset(1)
-    for step, queried in enumerate(plan):
-        adversary.expect(step + 1, queried[None])
-    return float(np.sqrt(adversary.square[0]))
+        midpoint, difference = self.expect(time, queried, terms)
+        self.score += np.sum((released / terms.sigma - midpoint) * difference, axis=(1, 2))
 
 
 def attack(
@@ -125,8 +91,9 @@ def attack(
 ) -> Runs:
     """Play both worlds and score every transcript.
 
-    Each run is an episode of the decision process from the first second of the record. Estimates
-    reveal nothing beyond the releases, so the cheapest estimator is used.
+    Each run is an episode of the decision process from the first second of the record. Where prices
+    follow estimates, the estimator is that of the configuration. Elsewhere estimates reveal nothing
+    beyond the releases, and the cheapest estimator is used.
 
     Args:
         config: The configuration under attack.
@@ -138,17 +105,14 @@ def attack(
         batch: Runs per world that are played at once; results do not depend on it.
         progress: Whether to show a progress bar.
     """
-    config = dataclasses.replace(
-        config, traffic_seeds=(0, 1), random_start=False, action="mask",
-        estimator="open_loop", backend="compiled", estimator_settings=None,
-    )  # fmt: skip
+    config = attacked_form(config)
     size = min(batch, n_runs)
-    process = QueryProcess(make_parts(config, 2 * size, worlds))
-    release = require_gaussian(process.release, "the audit")
-    sigma, columns = noise_factor * release.sigma, release.setup.n_columns
-    mechanism = RecordingMechanism(sigma, n_episodes=2 * size, n_segments=columns)
-    release.mechanism = mechanism
-    adversary = Adversary(config, worlds, 2 * size, sigma)
+    traffic = TrafficTable(config.corridor, (0, 1), worlds)
+    release = Overheard(make_release(config, 2 * size, traffic))
+    process = QueryProcess(make_parts(config, 2 * size, traffic=traffic, release=release))
+    played = attacked(release.model)
+    played.scale_noise(noise_factor)
+    adversary = Adversary(config, worlds, 2 * size)
     parts = []
     with tqdm(
         total=2 * n_runs, desc="attacking", unit="run", mininterval=0.5, disable=not progress
@@ -165,8 +129,19 @@ def attack(
             for step in range(config.horizon_steps):
                 queries = policy.queries(step, adversary.score)
                 process.step(np.arange(n), queries.astype(np.int8))
-                adversary.update(step + 1, process.queried[:n], mechanism.released)
+                terms = played.terms(release.last)
+                adversary.update(step + 1, process.queried[:n], release.last.values, terms)
             parts.append([adversary.score.reshape(2, -1), np.sqrt(adversary.square).reshape(2, -1)])
             bar.update(n)
     scores, distances = (np.concatenate(part, axis=1) for part in zip(*parts, strict=True))
     return Runs(scores, distances)
+
+
+def attacked_form(config: EnvConfig) -> EnvConfig:
+    """Return a configuration with the episodes and the estimator of the attack."""
+    config = dataclasses.replace(
+        config, traffic_seeds=(0, 1), random_start=False, action="mask", backend="compiled"
+    )
+    if attacked(make_release(config)).follows_estimates:
+        return config
+    return dataclasses.replace(config, estimator="open_loop", estimator_settings=None)

@@ -121,14 +121,12 @@ def plan_contributions(gains: FloatArray, always: BoolArray, cap: int) -> Contri
 
 def replaces(config: EnvConfig) -> bool:
     """Return whether adjacent records differ in a vehicle replaced by another, or in one more."""
-    privacy = config.privacy
-    return not isinstance(privacy, CappedSettings) or privacy.adjacency == "replace"
+    return getattr(config.privacy, "adjacency", "replace") == "replace"
 
 
 def protects_seconds(config: EnvConfig) -> bool:
     """Return whether a single second of a trip is protected, not the trip."""
-    privacy = config.privacy
-    return isinstance(privacy, CappedSettings) and privacy.unit == "event"
+    return getattr(config.privacy, "unit", "trip") == "event"
 
 
 def contribution_cap(config: EnvConfig) -> int:

@@ -2,36 +2,42 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import numpy as np
 
-from agents.studies.audit.attack import planned_distance
-from agents.studies.audit.distances import (
-    ReleaseDistances,
-    contribution_cap,
-    plan_contributions,
-    protects_seconds,
-    replaces,
-)
-from agents.studies.audit.strategies import (
-    PUBLIC_SCHEDULES,
-    always_observed,
-    make_policy,
-    public_plan,
-)
+from agents.studies.audit.distances import protects_seconds, replaces
+from agents.studies.audit.gaussian_planner import GaussianPlanner
+from agents.studies.audit.paced_planner import PacedPlanner
+from agents.studies.audit.planning import Pair, Planner
+from agents.studies.audit.releases import AttackedGaussian, AttackedPaced, attacked
+from agents.studies.audit.strategies import FixedQueries
 from agents.studies.audit.worlds import AdjacentWorlds, Trajectory
 from dptse_env.config import EnvConfig
+from dptse_env.parts import make_release
 from dptse_env.traffic import Record
-from dptse_env.utils.arrays import BoolArray, IntArray
 from dptse_env.utils.validation import require
 
-TARGET_KINDS = ("worst-case", "replaced", "deleted")
-"""Kinds of targets; the last two are vehicles of the record."""
+PLANNERS: dict[type, type[Planner]] = {
+    AttackedGaussian: GaussianPlanner,
+    AttackedPaced: PacedPlanner,
+}
+"""Planners by the way a release model is attacked."""
+
+TARGET_KINDS = PacedPlanner.kinds
+"""Kinds of targets; release models other than the paced ledger have some of them."""
 
 SHORTLIST = 12
 """Partners to try for the best vehicle. The best partners stand in one jam and are alike, so the
 list grows sparser down the ranking instead of ending early."""
+
+
+def make_planner(config: EnvConfig, policy: str) -> Planner:
+    """Return what plans an attack on a configuration by a policy."""
+    return PLANNERS[type(attacked(make_release(config)))](config, policy)
+
+
+def make_policy(config: EnvConfig, policy: str, worlds: AdjacentWorlds) -> FixedQueries:
+    """Return the policy of a name in `STRATEGIES` for two worlds."""
+    return make_planner(config, policy).queries(worlds)
 
 
 def choose_target(config: EnvConfig, record: Record, kind: str, policy: str) -> AdjacentWorlds:
@@ -43,110 +49,60 @@ def choose_target(config: EnvConfig, record: Record, kind: str, policy: str) -> 
         kind: ``deleted``, a vehicle of the record is there or not; ``replaced``, one of two
             vehicles of the record is there; ``worst-case``, a vehicle is added that stands still,
             and in the other world stands elsewhere, drives by or is absent, whichever is worst
-            under the adjacency.
+            under the adjacency. For the paced ledger also ``opposite``, the part of the worst case
+            with two added vehicles on one segment, as slow and as fast as can be; and, of the
+            record and replaced by another or by none, ``runs-out``, the vehicle to which its ledger
+            refuses most, ``jam``, the one that stands longest, and ``late``, the one that pays most
+            of those that enter in the second half.
         policy: Name of the policy.
 
     Raises:
-        ValueError: The kind does not go with the adjacency, or the record holds too few vehicles.
+        ValueError: The kind does not go with the release model or the adjacency, or the record
+            holds too few vehicles.
     """
-    require(kind in TARGET_KINDS, "target", f"one of {list(TARGET_KINDS)}", kind)
-    if kind == "worst-case":
-        return _worst_case(config, record, policy)
-    replace = replaces(config)
-    require(
-        replace or kind == "deleted", "target", "'deleted' or 'worst-case' with add_remove", kind
-    )
-    seen = _observable(config, record, policy)
-    ranked = _by_reach(config, record, seen, policy)
-    need = 2 if kind == "replaced" else 1
+    planner = make_planner(config, policy)
+    planner.require_kind(kind)
+    if kind in planner.made_up_kinds:
+        made_up = planner.made_up(record, kind).items()
+        candidates = [_worlds(planner, record, pair, name) for name, pair in made_up]
+    else:
+        candidates = _of_record(planner, record, kind)
+    return max(candidates, key=planner.reached) if len(candidates) > 1 else candidates[0]
+
+
+def _of_record(planner: Planner, record: Record, kind: str) -> list[AdjacentWorlds]:
+    """Return worlds in which the best vehicle of a kind is replaced by others, or by none."""
+    ranked = planner.rank(record, kind)
+    alone = kind == "deleted" or not replaces(planner.config)
+    need = 1 if alone else 2
     require(len(ranked) >= need, "traffic", f"a record of {need} observable vehicles", len(ranked))
     first = int(ranked[0])
-    vehicle = Trajectory.from_record(record, first)
-    if kind == "deleted":
-        pair = _protected(config, record, seen, (vehicle, Trajectory.absent()))
-        description = f"vehicle {first} of the record, or none in its place"
-        return AdjacentWorlds(record.without(first), pair, description)
-    candidates = []
-    for other in np.unique(ranked[np.geomspace(1, len(ranked) - 1, SHORTLIST).astype(int)]):
-        rest = record.without(first).without(other)
-        partner = Trajectory.from_record(record, other)
-        pair = _protected(config, rest, seen, (vehicle, partner))
-        description = f"vehicle {first} of the record, or vehicle {other} instead"
-        candidates.append(AdjacentWorlds(rest, pair, description))
-    return max(candidates, key=lambda worlds: _reached(config, worlds, policy))
-
-
-def _observable(config: EnvConfig, record: Record, policy: str) -> BoolArray:
-    """Return flags of record columns the policy may observe, (n_steps, n_columns)."""
-    corridor, horizon = config.corridor, config.horizon_steps
-    observed = np.zeros((record.n_steps, record.n_columns), dtype=bool)
-    queried = public_plan(config, policy) if policy in PUBLIC_SCHEDULES else True
-    observed[1 : horizon + 1, : corridor.n_mainline] = queried
-    observed[1 : horizon + 1, always_observed(config)] = True
-    return observed
-
-
-def _by_reach(config: EnvConfig, record: Record, seen: BoolArray, policy: str) -> IntArray:
-    """Return vehicles by the distance between presence and absence, the largest first."""
-    rows = np.flatnonzero(seen[record.step, record.segment])
-    rows = rows[np.lexsort((record.step[rows], record.vehicle[rows]))]
-    gains = ReleaseDistances.from_config(config).by_row(record)[rows]
-    always = np.isin(record.segment[rows], always_observed(config))
-    # A schedule meets a vehicle when it does; a hunter picks the seconds that reveal most.
-    always |= policy in PUBLIC_SCHEDULES
-    vehicles, starts = np.unique(record.vehicle[rows].astype(np.int64), return_index=True)
-    reach = np.zeros(len(vehicles))
-    for i, (start, stop) in enumerate(pairwise([*starts.tolist(), len(rows)])):
-        trip = slice(start, stop)
-        if protects_seconds(config):
-            reach[i] = gains[trip].max()
-        else:
-            cap = contribution_cap(config)
-            reach[i] = plan_contributions(gains[trip], always[trip], cap).reach
-    best: IntArray = vehicles[np.argsort(-reach, kind="stable")]
-    return best
-
-
-def _reached(config: EnvConfig, worlds: AdjacentWorlds, policy: str) -> float:
-    plan = make_policy(config, policy, worlds).plan
-    return planned_distance(config, worlds, plan, ReleaseDistances.from_config(config).sigma)
-
-
-def _worst_case(config: EnvConfig, record: Record, policy: str) -> AdjacentWorlds:
-    """Return the two trajectories of the closed form that are furthest apart."""
-    corridor, seconds = config.corridor, np.arange(1, config.horizon_steps + 1)
-    load = record.counts[:, : corridor.n_mainline].sum(axis=0)
-    fixed = np.isin(np.arange(corridor.n_mainline), corridor.fixed_sensors)
-    # Segments without a sensor and with few others, whose mean speed one vehicle moves most.
-    here, there = (int(segment) for segment in np.lexsort((load, fixed))[:2])
-    stands = Trajectory.constant(seconds, here, 0.0)
-    alternatives = {"none in its place": Trajectory.absent()}
-    if replaces(config):
-        limit = corridor.speed_limit
-        alternatives = {
-            f"on segment {there} instead": Trajectory.constant(seconds, there, 0.0),
-            f"there at {limit:g} km/h": Trajectory.constant(seconds, here, limit),
-        }
-    seen = _observable(config, record, policy)
-    added = f"an added vehicle that stands on segment {here}"
-    candidates = [
-        AdjacentWorlds(
-            record, _protected(config, record, seen, (stands, other)), f"{added}, or {name}"
+    vehicle, rest = Trajectory.from_record(record, first), record.without(first)
+    if alone:
+        name = f"vehicle {first} of the record, or none in its place"
+        return [_worlds(planner, rest, (vehicle, Trajectory.absent()), name)]
+    others = np.unique(ranked[np.geomspace(1, len(ranked) - 1, SHORTLIST).astype(int)]).tolist()
+    return [
+        _worlds(
+            planner,
+            rest.without(other),
+            (vehicle, Trajectory.from_record(record, other)),
+            f"vehicle {first} of the record, or vehicle {other} instead",
         )
-        for name, other in alternatives.items()
+        for other in others
     ]
-    return max(candidates, key=lambda worlds: _reached(config, worlds, policy))
 
 
-def _protected(
-    config: EnvConfig, rest: Record, seen: BoolArray, pair: tuple[Trajectory, Trajectory]
-) -> tuple[Trajectory, Trajectory]:
-    """Return what may differ of two trajectories: for unit `event`, their most telling second."""
-    if not protects_seconds(config):
-        return pair
-    distances, total = ReleaseDistances.from_config(config), np.zeros(rest.n_steps)
-    for vehicle in pair:
-        gains = distances.by_second(rest, vehicle) * seen[vehicle.step, vehicle.segment]
-        np.add.at(total, vehicle.step, gains)
-    best = int(np.argmax(total))
-    return pair[0].only(pair[0].step == best), pair[1].only(pair[1].step == best)
+def _worlds(planner: Planner, rest: Record, pair: Pair, description: str) -> AdjacentWorlds:
+    """Return two worlds that differ as far as is protected.
+
+    For the unit ``event`` that is the second of the two trajectories that tells most.
+    """
+    if protects_seconds(planner.config):
+        seen, total = planner.observable(rest), np.zeros(rest.n_steps)
+        for vehicle in pair:
+            told = planner.gains(rest, vehicle) * seen[vehicle.step, vehicle.segment]
+            np.add.at(total, vehicle.step, told)
+        best = int(np.argmax(total))
+        pair = pair[0].only(pair[0].step == best), pair[1].only(pair[1].step == best)
+    return AdjacentWorlds(rest, pair, description)

@@ -3,60 +3,28 @@ import dataclasses
 import numpy as np
 import pytest
 
-from agents.studies.audit.attack import Adversary, attack, planned_distance
+from agents.studies.audit.attack import Adversary, attack
 from agents.studies.audit.distances import ReleaseDistances, plan_contributions
+from agents.studies.audit.gaussian_planner import planned_distance
+from agents.studies.audit.releases import Terms
 from agents.studies.audit.strategies import (
     DECISION_THRESHOLD,
     AdaptiveQueries,
     FixedQueries,
-    hunting_plan,
-    make_policy,
     public_plan,
 )
-from agents.studies.audit.targets import choose_target
+from agents.studies.audit.targets import choose_target, make_policy
 from agents.studies.audit.worlds import AdjacentWorlds, Trajectory
-from dptse_env.config import EnvConfig
 from dptse_env.parts import privacy_report
 from dptse_env.privacy import epsilon_of
 from dptse_env.privacy.audit_statistics import Claim, audit
-from dptse_env.release import RELEASE_MODELS, CappedSettings
-from dptse_env.traffic import SHORT_HIGHWAY, Demand, Record
+from dptse_env.release import CappedSettings
 
-HORIZON = 40
-ROAD = dataclasses.replace(
-    SHORT_HIGHWAY, duration=HORIZON, demand=Demand(((0.0, 1000.0),), (100.0,)), incident=None
-)
-N_COLUMNS = ROAD.n_segments + ROAD.n_boundaries
-
-
-def config(bandwidth=2, horizon=None, **privacy):
-    privacy = {
-        "preset": "capped",
-        **({} if privacy.get("preset", "capped") != "capped" else {"cap": 6}),
-        **privacy,
-    }
-    settings = RELEASE_MODELS[privacy["preset"]].settings_type(**privacy)
-    return EnvConfig(ROAD, privacy=settings, bandwidth=bandwidth, horizon=horizon)
-
-
-@pytest.fixture(scope="module")
-def record():
-    """Vehicles that enter one by one and drive through at speeds that vary."""
-    generator, rows = np.random.default_rng(0), []
-    for vehicle in range(12):
-        place, speed = generator.uniform(0.0, 1.0), generator.uniform(10.0, 90.0)
-        for step in range(1 + 2 * vehicle, HORIZON + 1):
-            if place < ROAD.n_mainline:
-                rows.append((step, vehicle, int(place), speed))
-            place += speed / 100.0 * generator.uniform(0.1, 1.0)
-            speed = float(np.clip(speed + generator.normal(0.0, 10.0), 0.0, 120.0))
-    step, vehicle, segment, speed = (np.array(column) for column in zip(*sorted(rows), strict=True))
-    return Record(step, vehicle, segment, speed, n_steps=HORIZON + 1, n_columns=N_COLUMNS)
+from .small import HORIZON, ROAD, config
 
 
 def reached(setting, worlds, policy="hunter"):
-    plan = make_policy(setting, policy, worlds).plan
-    return planned_distance(setting, worlds, plan, ReleaseDistances.from_config(setting).sigma)
+    return planned_distance(setting, worlds, make_policy(setting, policy, worlds).plan)
 
 
 ALL_PRIVACY = [
@@ -105,7 +73,7 @@ def test_the_closed_form_is_the_distance_of_a_second(preset, record):
         worlds = AdjacentWorlds(rest, (moved, Trajectory.absent()))
         plan = np.zeros((HORIZON, ROAD.n_mainline), dtype=bool)
         plan[step - 1, segment] = True
-        distance = planned_distance(setting, worlds, plan, distances.sigma)
+        distance = planned_distance(setting, worlds, plan)
         assert distance**2 == pytest.approx(squares[row], rel=1e-9)
         assert distance**2 == pytest.approx(distances.by_second(rest, moved)[0], rel=1e-9)
 
@@ -118,7 +86,7 @@ def test_where_paths_meet_speeds_alone_tell(preset, record):
     worlds = AdjacentWorlds(record, paths)
     plan = np.zeros((HORIZON, ROAD.n_mainline), dtype=bool)
     plan[19, 2] = True
-    distance = planned_distance(setting, worlds, plan, distances.sigma)
+    distance = planned_distance(setting, worlds, plan)
     assert record.counts[20, 2] > 0
     assert distance**2 == pytest.approx(distances.where_equal(record, paths)[0], rel=1e-9)
     assert distance > 0.0
@@ -195,7 +163,7 @@ def test_the_hunter_keeps_to_bandwidth_and_cap(bandwidth, record):
     worlds = AdjacentWorlds(
         record, (Trajectory.constant(seconds, 0, 0.0), Trajectory.constant(seconds, 1, 0.0))
     )
-    plan = hunting_plan(setting, worlds)
+    plan = make_policy(setting, "hunter", worlds).plan
     assert plan.sum(axis=1).max() <= bandwidth
     assert plan.sum() == 14  # seven for each of the two paths
     assert reached(setting, worlds) == pytest.approx(privacy_report(setting).mu)
@@ -208,7 +176,7 @@ def test_the_hunter_queries_the_seconds_that_reveal_most(record):
     # The fixed sensor at the end of the road comes after them.
     free = path.only(path.segment < 5)
     best = free.step[np.argsort(-np.abs(np.clip(free.speed, 0, 102) - 51.0))[:3]]
-    plan = hunting_plan(setting, worlds)
+    plan = make_policy(setting, "hunter", worlds).plan
     assert set(np.flatnonzero(plan.any(axis=1)) + 1) == set(best.tolist())
     assert plan.sum() == 3
 
@@ -220,7 +188,7 @@ def test_the_hunter_queries_where_the_two_trajectories_part(record):
     together = np.where(seconds <= 10, 1, 2), np.where(seconds <= 10, 1, 3)
     speed = np.where(seconds <= 10, 0.0, 20.0)
     paths = tuple(Trajectory(seconds, segment, speed) for segment in together)
-    plan = hunting_plan(setting, AdjacentWorlds(record, paths))
+    plan = make_policy(setting, "hunter", AdjacentWorlds(record, paths)).plan
     assert plan[:10].sum() == 0
     assert plan[10:20, [2, 3]].sum() == plan.sum() == 8
 
@@ -270,16 +238,16 @@ def test_the_score_is_the_log_likelihood_ratio_of_the_transcript(preset, record)
     # A schedule that mostly looks elsewhere: what it does not see must not count.
     plan = make_policy(setting, "paper", worlds).plan
     sigma = ReleaseDistances.from_config(setting).sigma
-    square = planned_distance(setting, worlds, plan, sigma) ** 2
-    answers = Adversary(setting, worlds, 2, sigma)
-    adversary = Adversary(setting, worlds, 2, sigma)
+    terms = Terms(np.tile(sigma, (2, ROAD.n_segments, 1)), np.empty((2, 0)), np.empty((2, 0)))
+    square = planned_distance(setting, worlds, plan) ** 2
+    answers, adversary = (Adversary(setting, worlds, 2) for _ in range(2))
     answers.reset(2)
     adversary.reset(2)
     noise = np.random.default_rng(0).standard_normal((HORIZON, ROAD.n_segments, 2))
     expected = np.zeros(2)
     for step, queried in enumerate(plan):
         both = np.tile(queried, (2, 1))
-        midpoint, difference = answers.expect(step + 1, both)
+        midpoint, difference = answers.expect(step + 1, both, terms)
         zero, first = (midpoint - 0.5 * difference)[0], (midpoint + 0.5 * difference)[0]
         # The transcript of world 1 without noise, and one of world 0 with it.
         released = np.stack([first, zero + noise[step]])
@@ -292,7 +260,7 @@ def test_the_score_is_the_log_likelihood_ratio_of_the_transcript(preset, record)
         expected += logs[1] - logs[0]
         # What is not observed must not matter.
         released[:, ~watched] = 1e6
-        adversary.update(step + 1, both, released * sigma)
+        adversary.update(step + 1, both, released * sigma, terms)
     np.testing.assert_allclose(adversary.score, expected, rtol=1e-9)
     assert adversary.score[0] == pytest.approx(0.5 * square)
 
@@ -371,7 +339,12 @@ def test_an_audit_sees_a_cap_that_is_not_held(record, monkeypatch):
 @pytest.mark.parametrize(
     ("kind", "privacy", "message"),
     [
-        ("replaced", {"adjacency": "add_remove"}, "target must be 'deleted' or 'worst-case'"),
+        (
+            "replaced",
+            {"adjacency": "add_remove"},
+            r"target must be one of \['worst-case', 'deleted'\] with add_remove",
+        ),
+        ("jam", {}, r"target must be one of \[.*\] for preset 'capped', got 'jam'"),
         ("nobody", {}, "target must be one of"),
     ],
 )

@@ -1,0 +1,190 @@
+"""Nothing of the true traffic may reach prices or centres except through what was released before.
+
+No error would show it if it did: the proof of the paced ledger would be void. With a release model
+that publishes the same values whatever the traffic, two episodes over different traffic must look
+the same, bit by bit, in prices, centres and deviations as in observations, estimates and ``info``.
+"""
+
+import dataclasses
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from dptse_env.estimators import ESTIMATORS
+from dptse_env.release import Paced, Pacing
+from dptse_env.spaces.actions import ACTION_ENCODINGS
+
+from .test_non_interference import BLIND_SCHEDULES, SEEDS, STEPS, same, transcript, unlike
+
+CHECKED = sorted(ESTIMATORS)
+
+
+class Blind:
+    """Publishes values that depend on the second and the column alone.
+
+    Ledgers and everything else are as in the class that it is mixed into.
+
+    Attributes:
+        sigmas: The last deviations, shape (k, C, 2).
+    """
+
+    def __init__(self, setup):
+        super().__init__(setup)
+        self._seconds, self.sigmas = 0, np.empty(0)
+
+    def reset(self, episodes, generators):
+        super().reset(episodes, generators)
+        self._seconds, self.sigmas = 0, np.empty(0)
+
+    def release(self, request):
+        released = super().release(request)
+        self._seconds, self.sigmas = self._seconds + 1, released.sigma
+        answer = np.random.default_rng(self._seconds).uniform(-0.2, 1.0, released.values.shape)
+        return released._replace(values=answer * [60.0, 2000.0])
+
+
+def make(kind=Paced, **keywords):
+    """An environment whose release model is a blind one of this kind."""
+    blind = type(f"Blind{kind.__name__}", (Blind, kind), {})
+    privacy = {"preset": blind, **keywords.pop("privacy", {})}
+    keywords = {"horizon": STEPS, "random_start": True, **keywords}
+    return gym.make(
+        "dptse_env:dptse/PrivateHighway-v1", traffic_seeds=SEEDS, privacy=privacy, **keywords
+    )
+
+
+@pytest.mark.parametrize("boundary", ["nominal", "private"])
+@pytest.mark.parametrize("unit", ["trip", "event"])
+@pytest.mark.parametrize("estimator", CHECKED)
+def test_traffic_does_not_show(estimator, unit, boundary):
+    env = make(estimator=estimator, privacy={"unit": unit, "boundary_inputs": boundary})
+    first, second = transcript(env, 0), transcript(env, 1)
+    assert same(first, second)
+    # What is held equal is alive.
+    for name in ("observation", "centres", "prices", "queried"):
+        moving = unit == "trip" or name != "prices"
+        assert np.array_equal(first[1][name], first[-1][name]) != moving
+    assert first[-1]["sigmas"].shape == (1, *first[-1]["prices"].shape[1:], 2)
+
+
+@pytest.mark.parametrize("estimator", CHECKED)
+@pytest.mark.parametrize("action", ACTION_ENCODINGS)
+def test_traffic_does_not_show_through_an_action(estimator, action):
+    env = make(estimator=estimator, action=action)
+    assert same(transcript(env, 0), transcript(env, 1))
+
+
+@pytest.mark.parametrize("boundary", ["nominal", "private"])
+@pytest.mark.parametrize("schedule", BLIND_SCHEDULES)
+def test_traffic_does_not_show_through_a_schedule(schedule, boundary):
+    env = make(privacy={"boundary_inputs": boundary, "clip": 25.0})
+    assert same(transcript(env, 0, schedule), transcript(env, 1, schedule))
+
+
+def test_vehicles_do_pay_and_run_out_meanwhile():
+    """The ledgers of both traffics differ, and that is what must not show."""
+    env = make(truth_in_info=True, privacy={"epsilon": 0.5})
+    told = []
+    for seed in SEEDS:
+        transcript(env, seed)
+        process = env.unwrapped.process
+        told.append(process.infos(np.array([0]))["truth"])
+    ledgers = [np.array(truth["ledgers"][0]) for truth in told]
+    assert max(ledger.max() for ledger in ledgers) > 0.8
+    assert len(ledgers[0]) != len(ledgers[1]) or not np.array_equal(*ledgers)
+
+
+# --- mutations that must be caught --------------------------------------------------------------
+
+
+def truth_of(release, request):
+    """True density and speed of this second, shape (k, S) each."""
+    traffic = release.setup.traffic.aggregates(request.traffic, request.times)
+    return {"density": traffic[..., 0], "speed": traffic[..., 1]}
+
+
+class CentreOfTheTruth(Paced):
+    def release(self, request):
+        seen = dataclasses.replace(request.prediction(), speed=truth_of(self, request)["speed"])
+        return super().release(request._replace(prediction=lambda: seen))
+
+
+class PriceOfTrueCounts(Paced):
+    def release(self, request):
+        seen = dataclasses.replace(request.prediction(), density=truth_of(self, request)["density"])
+        return super().release(request._replace(prediction=lambda: seen))
+
+
+class CentreOfTheSameSecond(Paced):
+    """Centred on speeds that this second's own noisy sums have corrected."""
+
+    def release(self, request):
+        first, prediction = super().release(request), request.prediction()
+        values = first.values[:, : prediction.speed.shape[1]]
+        told = prediction.speed + values[..., 1] / np.maximum(values[..., 0], 10.0)
+        seen = request.observed[:, : prediction.speed.shape[1]]
+        updated = dataclasses.replace(prediction, speed=np.where(seen, told, prediction.speed))
+        return super().release(request._replace(prediction=lambda: updated))
+
+
+class PriceOfTrueLedgers(Paced):
+    """Prices by what the vehicles have really left."""
+
+    def __init__(self, setup):
+        super().__init__(setup)
+        ledgers = self.ledgers
+
+        class FromLedgers(Pacing):
+            def prices(self, step):
+                left = ledgers.budget - ledgers.paid[step.episodes].max(axis=1, initial=0.0)
+                price = np.maximum(0.05 * left, 1e-3)[:, None]
+                return np.broadcast_to(price, step.observed.shape).copy()
+
+        self.pacing = FromLedgers(self.pacing.setup)
+
+
+class AccountOfTrueLedgers(Paced):
+    def spent(self, episodes, steps):
+        most = self.ledgers.paid[episodes].max(axis=1, initial=0.0)
+        return np.sqrt(2.0 * most), np.sqrt(2.0 * most)
+
+
+class RefusalsInPublic(Paced):
+    def public_info(self, episodes):
+        refused = self.private_info(episodes, np.zeros_like(episodes))["n_refused"]
+        return super().public_info(episodes) | {"n_refused": refused}
+
+
+class FallsBackWhereNobodyIs(Paced):
+    """Takes a segment that is empty for one without a prediction."""
+
+    def release(self, request):
+        empty = truth_of(self, request)["density"] == 0.0
+        prediction = request.prediction()
+        holed = dataclasses.replace(prediction, speed=np.where(empty, np.nan, prediction.speed))
+        return super().release(request._replace(prediction=lambda: holed))
+
+
+MUTANTS = (
+    CentreOfTheTruth,
+    PriceOfTrueCounts,
+    CentreOfTheSameSecond,
+    PriceOfTrueLedgers,
+    AccountOfTrueLedgers,
+    RefusalsInPublic,
+    FallsBackWhereNobodyIs,
+)
+
+
+@pytest.mark.parametrize("kind", MUTANTS)
+def test_what_looks_at_the_truth_would_show(kind):
+    # Little privacy is left, so that some vehicles run out within the episode.
+    assert unlike(make(kind, privacy={"epsilon": 0.5, "pace": 1.0}))
+
+
+@pytest.mark.parametrize("estimator", CHECKED)
+def test_true_boundary_inputs_would_show(estimator):
+    with pytest.warns(UserWarning, match="boundary_inputs"):
+        env = make(estimator=estimator, privacy={"boundary_inputs": "true"})
+    assert unlike(env) == (estimator != "random_walk")
