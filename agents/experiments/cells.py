@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import typing
 from abc import ABC, abstractmethod
-from collections.abc import Hashable, Iterator, Mapping
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
@@ -109,6 +109,13 @@ class UnmeasuredError(Exception):
     """The cell was not run."""
 
 
+class Change(NamedTuple):
+    """Paired differences of both errors between two cells."""
+
+    density: Interval
+    speed: Interval
+
+
 @dataclass(frozen=True)
 class Results(Generic[DesignT, CellT]):
     """Scores by cell, in the order of the traffic seeds of a design.
@@ -135,9 +142,17 @@ class Results(Generic[DesignT, CellT]):
         """Return the mean of a field over the seeds with its interval."""
         return mean_interval(self.values(cell, metric))
 
+    def means(self, cells: Sequence[CellT], metric: str) -> list[Interval]:
+        """Return the means of a field for some cells, in their order."""
+        return [self.mean(cell, metric) for cell in cells]
+
     def difference(self, cell: CellT, reference: CellT, metric: str) -> Interval:
         """Return by how much a cell exceeds a reference, paired by traffic and noise."""
         return paired_difference(self.values(cell, metric), self.values(reference, metric))
+
+    def change(self, cell: CellT, reference: CellT) -> Change:
+        """Return by how much both errors of a cell exceed those of a reference, paired."""
+        return Change(*(self.difference(cell, reference, metric) for metric in METRICS))
 
     def episodes(self, *cells: CellT) -> list[EpisodeScore]:
         """Return the scores of all episodes of some cells, each cell once."""

@@ -9,8 +9,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import ArrayLike
 
-from agents.evaluation.figures import spread
+from agents.evaluation.figures import ERROR_TICKS, set_log_ticks, spread
 from agents.evaluation.statistics import Interval
+from agents.experiments.cells import METRICS
 from dptse_env.utils.arrays import FloatArray
 
 GREY = "#333333"
@@ -63,6 +64,20 @@ def draw_level(axis: Axes, interval: Interval, line: Any = ":", label: str | Non
     """Draw a mean that no place changes as a line with a band."""
     axis.axhline(interval.mean, color=GREY, linestyle=line, linewidth=1.3, label=label)
     axis.axhspan(interval.low, interval.high, color=GREY, alpha=0.11, linewidth=0)
+
+
+def error_label(metric: str) -> str:
+    """Return the label of an axis of an error, with its unit."""
+    name, unit = METRICS[metric]
+    return f"{name} RMSE [{unit}]"
+
+
+def set_log_axes(axis: Axes, ticks: Sequence[float]) -> None:
+    """Make both axes logarithmic with plain numbers, the upright one for errors."""
+    axis.set_xscale("log")
+    set_log_ticks(axis.xaxis, ticks)
+    axis.set_yscale("log")
+    set_log_ticks(axis.yaxis, ERROR_TICKS)
 
 
 def shifted(places: Sequence[float], share: float, log: bool) -> FloatArray:

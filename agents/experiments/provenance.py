@@ -54,10 +54,7 @@ def results_provenance(
     to it. ``tuned`` names the settings that come from a shipped set. ``sources`` (states of the
     package's code) and ``machine`` are for the record.
     """
-    settings = {
-        settings_name(config.estimator, str(config.parameters), config.privacy.preset):
-        dataclasses.asdict(config.settings()) for config in configs
-    }  # fmt: skip
+    settings = {_name_of_settings(each): dataclasses.asdict(each.settings()) for each in configs}
     content = {
         "made_with": {**made_with, "settings": settings},
         "tuned": sorted(settings.keys() & available_settings()),
@@ -66,6 +63,12 @@ def results_provenance(
     }
     plain: dict[str, Any] = json.loads(json.dumps(content))
     return plain
+
+
+def _name_of_settings(config: EnvConfig) -> str:
+    """Return the name of the shipped set in force, or else of the set that could be there."""
+    name = settings_name(config.estimator, str(config.parameters), config.privacy.preset)
+    return config.settings_name or name
 
 
 def machine(packages: Sequence[str]) -> dict[str, str]:

@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic
 
 import gymnasium as gym
 
-from agents.evaluation.episodes import EpisodeScore, run_episode, without_void_warning
+from agents.evaluation.episodes import (
+    EpisodeScore,
+    make_vector,
+    run_episode,
+    without_void_warning,
+)
 from agents.experiments.cells import Cell, CellT, Design
 from agents.experiments.engine import Engine
 from agents.experiments.ledger import Ledger
 from dptse_env.schedules import make_schedule
 from dptse_env.traffic import Corridor, RecordLibrary
+from dptse_env.vector_env import SensorQueryVectorEnv
 
 
 @dataclass(frozen=True)
@@ -61,6 +67,23 @@ def make_env(env: str, cell: Cell, seeds: Sequence[int], records: str | None) ->
     seeded: dict[str, Any] = {"traffic_seeds": list(seeds), "records": records}
     with without_void_warning():
         return gym.make(env, disable_env_checker=True, **seeded, **cell.keywords)
+
+
+def make_batch(
+    env: str,
+    keywords: Mapping[str, Any],
+    seeds: Sequence[int],
+    records: str | None = None,
+    threads: int | None = 1,
+) -> SensorQueryVectorEnv:
+    """Make a vector environment for `run_episodes`, one episode for each traffic seed.
+
+    Raises:
+        ValueError: A keyword is unknown or out of range.
+    """
+    more = {"traffic_seeds": list(seeds), "records": records, "threads": threads}
+    with without_void_warning():
+        return make_vector(env, len(seeds), {**keywords, **more})
 
 
 def run_task(task: EpisodeTask[Any]) -> list[EpisodeScore]:

@@ -9,7 +9,7 @@ from typing import Any
 
 from agents.evaluation.episodes import EpisodeScore
 from agents.evaluation.statistics import Interval
-from agents.experiments.cells import METRICS, Results
+from agents.experiments.cells import METRICS, CellT, DesignT, Results
 from agents.experiments.files import write_csv
 
 
@@ -42,6 +42,26 @@ def format_range(values: Sequence[int]) -> str:
     if list(values) == list(range(values[0], values[-1] + 1)):
         return f"{values[0]} to {values[-1]}"
     return ", ".join(map(str, values))
+
+
+def compared_header(reference: str) -> list[str]:
+    """Return the headers of the columns of `compared_errors`."""
+    columns = [(f"{name} RMSE [{unit}]", f"against {reference}") for name, unit in METRICS.values()]
+    return [column for pair in columns for column in pair]
+
+
+def compared_errors(
+    results: Results[DesignT, CellT], cell: CellT, reference: CellT | None
+) -> list[str]:
+    """Return both errors of a cell, each with its paired difference to a reference, if any."""
+    row = []
+    for metric in METRICS:
+        row.append(format_interval(results.mean(cell, metric)))
+        if reference is None or cell == reference:
+            row.append("-")
+        else:
+            row.append(format_interval(results.difference(cell, reference, metric)))
+    return row
 
 
 def health_table(
@@ -79,23 +99,27 @@ def versions_table(provenance: Mapping[str, Any]) -> str:
     return markdown(["version of", ""], [[name, str(value)] for name, value in rows.items()])
 
 
-_FILTER = ("process_noise", "noise_scale", "initial_variance", "bounds")
+_FILTER = (
+    "process_noise", "density_growth", "count_noise", "demand", "noise_scale", "initial_variance",
+    "bounds",
+)  # fmt: skip
 _READ_BY = {
     "ekf": _FILTER,
     "ukf": (*_FILTER, "ukf"),
     "enkf": (*_FILTER, "enkf"),
-    "mhe": ("process_noise", "noise_scale", "mhe"),
+    "mhe": ("process_noise", "density_growth", "count_noise", "demand", "noise_scale", "mhe"),
     "random_walk": ("walk_noise", "noise_scale", "initial_variance"),
     "open_loop": ("bounds",),
 }
-"""Fields of the settings that an estimator reads."""
+"""Fields of the settings that an estimator reads; those at zero or none are not shown."""
 
 
 def settings_table(provenance: Mapping[str, Any]) -> str:
     """Return the estimators' settings, as far as each estimator reads them."""
     rows = []
     for name, settings in provenance["made_with"]["settings"].items():
-        fields = {key: settings[key] for key in _READ_BY[name.partition("-")[0]]}
+        read = _READ_BY[name.partition("-")[0]]
+        fields = {key: settings[key] for key in read if settings.get(key)}
         tuned = "yes" if name in provenance["tuned"] else "no"
         rows.append([f"`{name}`", tuned, _one_line(fields)])
     return markdown(["settings", "tuned", "values"], rows)
@@ -113,18 +137,26 @@ def interval_columns(interval: Interval) -> list[str]:
     return [f"{value:.6g}" for value in (interval.mean, interval.low, interval.high)]
 
 
-def write_summary(path: Path, results: Results[Any, Any]) -> None:
-    """Write means with intervals as CSV, one row for each cell."""
+def write_summary(path: Path, results: Results[Any, Any], fields: Sequence[str] = ()) -> None:
+    """Write means with intervals as CSV, one row for each cell.
+
+    Args:
+        path: The CSV file.
+        results: The results.
+        fields: Further fields of the scores.
+    """
     cells = sorted(results.design.cells(), key=dataclasses.astuple)
     columns = [*(field.name for field in dataclasses.fields(cells[0])), "n_seeds"]
     for metric, unit in zip(METRICS, ("veh_km", "km_h"), strict=True):
         columns += [f"{metric}_{unit}", f"{metric}_low", f"{metric}_high"]
-    columns += ["reward", "reward_low", "reward_high", "n_diverged", "n_fallback"]
+    for name in ("reward", *fields):
+        columns += [name, f"{name}_low", f"{name}_high"]
+    columns += ["n_diverged", "n_fallback"]
 
     def rows() -> Iterator[list[Any]]:
         for cell in cells:
             row = [*dataclasses.astuple(cell), len(results.design.traffic_seeds)]
-            for metric in (*METRICS, "reward"):
+            for metric in (*METRICS, "reward", *fields):
                 row += interval_columns(results.mean(cell, metric))
             yield row + [
                 results.values(cell, f"n_{kind}").sum() for kind in ("diverged", "fallback")

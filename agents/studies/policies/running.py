@@ -6,14 +6,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from agents.evaluation.episodes import (
-    EpisodeScore,
-    Policy,
-    make_vector,
-    run_episodes,
-    without_void_warning,
-)
+from agents.evaluation.episodes import EpisodeScore, Policy, run_episodes
 from agents.evaluation.policies import NamedSchedule, PolicySource, SavedPolicy
+from agents.experiments.runner import make_batch
 from agents.studies.policies.manifest import Manifest
 from agents.studies.policies.plan import DETERMINISTIC, Entry, PolicyCell, PolicyDesign
 from agents.studies.policies.queries import QueryCounter, QueryCounts
@@ -57,23 +52,6 @@ class EntryTask:
         # be the same all the same.
         allow = TRANSFERABLE if self.transferred else ()
         return env, self.policy.load(env, allow=allow, seed=POLICY_SEED)
-
-
-def make_batch(
-    env: str,
-    keywords: Mapping[str, Any],
-    seeds: Sequence[int],
-    records: str | None = None,
-    threads: int | None = 1,
-) -> SensorQueryVectorEnv:
-    """Make a vector environment for `run_episodes`, one episode for each traffic seed.
-
-    Raises:
-        ValueError: A keyword is unknown or out of range.
-    """
-    more = {"traffic_seeds": list(seeds), "records": records, "threads": threads}
-    with without_void_warning():
-        return make_vector(env, len(seeds), {**keywords, **more})
 
 
 def cell_config(cell: PolicyCell, seeds: Sequence[int]) -> EnvConfig:

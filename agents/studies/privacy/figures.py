@@ -8,8 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from agents.evaluation.figures import ERROR_TICKS, finish_figure, make_figure, set_log_ticks
-from agents.evaluation.statistics import Interval
+from agents.evaluation.figures import finish_figure, make_figure, set_log_ticks
 from agents.experiments.cells import DENSITY, METRICS, SPEED
 from agents.experiments.plots import (
     ESTIMATOR_LOOKS,
@@ -18,10 +17,12 @@ from agents.experiments.plots import (
     Look,
     draw_curve,
     draw_level,
+    error_label,
+    set_log_axes,
     shifted,
 )
 from agents.studies.privacy.account import Account
-from agents.studies.privacy.plan import BOUNDARY_MODES, OPEN_LOOP, PrivacyCell, Protection
+from agents.studies.privacy.plan import BOUNDARY_MODES, OPEN_LOOP, Protection
 from agents.studies.privacy.results import PrivacyResults
 
 CAPS = ("#9ecae1", "#4292c6", "#2171b5", "#08519c", "#08306b")
@@ -44,14 +45,14 @@ def draw_epsilon(results: PrivacyResults) -> Figure:
     for row, metric in zip(axes, METRICS, strict=True):
         for axis, name in zip(row, design.estimators, strict=True):
             for k, protection in enumerate(design.guaranteed):
-                means = _means(results, design.along_epsilon(name, protection), metric)
+                means = results.means(design.along_epsilon(name, protection), metric)
                 places = shifted(design.epsilons, 0.008 * (k - 2), log=True)
                 draw_curve(axis, places, means, _look(results, protection), str(protection))
             alone = results.mean(design.cell(OPEN_LOOP), metric)
             draw_level(axis, alone, label="open loop, nominal boundary")
-            _set_log(axis, design.epsilons)
+            set_log_axes(axis, design.epsilons)
             axis.set_title(LABELS[name], fontsize=9, loc="left")
-        row[0].set_ylabel(_axis_label(metric))
+        row[0].set_ylabel(error_label(metric))
     for axis in axes[-1]:
         axis.set_xlabel("ε")
     return finish_figure(figure, axes.flat, columns=6)
@@ -68,17 +69,17 @@ def draw_modes(results: PrivacyResults) -> Figure:
             modes = [design.cell(name, boundary_inputs=mode) for mode in BOUNDARY_MODES]
             places = np.arange(len(modes)) + 0.12 * (k - (len(design.all_estimators) - 1) / 2)
             dots = Look(look.colour, look.marker or "x", "")
-            draw_curve(row[0], places, _means(results, modes, metric), dots, label)
+            draw_curve(row[0], places, results.means(modes, metric), dots, label)
             if name == OPEN_LOOP:
                 alone = results.mean(design.cell(name), metric)
                 draw_level(row[1], alone, label="open loop, nominal boundary")
                 continue
-            means = _means(results, design.along_bandwidth(name), metric)
+            means = results.means(design.along_bandwidth(name), metric)
             draw_curve(row[1], np.array(design.bandwidths) + 0.12 * (k - 0.5), means, look, label)
         row[0].set_xticks(range(len(BOUNDARY_MODES)), MODE_LABELS)
         row[0].set_xlim(-0.5, len(BOUNDARY_MODES) - 0.5)
         row[1].set_xticks(design.bandwidths)
-        row[0].set_ylabel(_axis_label(metric))
+        row[0].set_ylabel(error_label(metric))
         for axis in row:
             axis.set_ylim(bottom=0.0)
     axes[1, 0].set_xlabel("boundary inputs of the estimator")
@@ -116,15 +117,15 @@ def _errors(
     for k, protection in enumerate((*design.printed, design.base)):
         places = [epsilon(account) for account in results.accounts[protection]]
         drawn += places
-        means = _means(results, design.along_epsilon(name, protection), metric)
+        means = results.means(design.along_epsilon(name, protection), metric)
         moved = shifted(places, shift * (k - 1), log=True)
         label = str(protection).replace("`", "")
         draw_curve(axis, moved, means, _look(results, protection), label)
     for mode, line in (("nominal", ":"), ("true", "--")):
         alone = results.mean(design.cell(OPEN_LOOP, boundary_inputs=mode), metric)
         draw_level(axis, alone, line, f"open loop, {mode} boundary")
-    _set_log(axis, _ticks(drawn))
-    axis.set_ylabel(f"{LABELS[name]}: {_axis_label(metric)}")
+    set_log_axes(axis, _ticks(drawn))
+    axis.set_ylabel(f"{LABELS[name]}: {error_label(metric)}")
 
 
 def _true_epsilon(axis: Axes, results: PrivacyResults) -> None:
@@ -145,7 +146,7 @@ def _true_epsilon(axis: Axes, results: PrivacyResults) -> None:
             true = [value(account) for account in results.accounts[protection]]
             highest = max(highest, *true)
             axis.plot(claimed, true, line, color=colour, marker=marker, markersize=4, linewidth=1.2)
-    _set_log(axis, results.design.epsilons)
+    set_log_axes(axis, results.design.epsilons)
     set_log_ticks(axis.yaxis, _ticks([float(claimed[0]), highest]))
     axis.set_xlabel("ε claimed")
     axis.set_ylabel("ε true, boundary inputs left out")
@@ -172,20 +173,3 @@ def _look(results: PrivacyResults, protection: Protection) -> Look:
     return PROTECTION_LOOKS[
         protection.unit if protection.unit in PROTECTION_LOOKS else protection.preset
     ]
-
-
-def _means(results: PrivacyResults, cells: Sequence[PrivacyCell], metric: str) -> list[Interval]:
-    return [results.mean(cell, metric) for cell in cells]
-
-
-def _set_log(axis: Axes, ticks: Sequence[float]) -> None:
-    """Make both axes logarithmic, with plain numbers."""
-    axis.set_xscale("log")
-    set_log_ticks(axis.xaxis, ticks)
-    axis.set_yscale("log")
-    set_log_ticks(axis.yaxis, ERROR_TICKS)
-
-
-def _axis_label(metric: str) -> str:
-    name, unit = METRICS[metric]
-    return f"{name} RMSE [{unit}]"

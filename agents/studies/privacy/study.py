@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from agents.evaluation.episodes import EpisodeScore
 from agents.evaluation.figures import save_figure
-from agents.evaluation.statistics import Interval
 from agents.experiments.cells import DENSITY, METRICS, SPEED
 from agents.experiments.engine import run_all
 from agents.experiments.ledger import Ledger
@@ -91,18 +90,6 @@ def draw(folder: Path, results: PrivacyResults) -> None:
     save_figure(draw_claimed(results), folder / "fig_claimed.png", title)
 
 
-class Change(NamedTuple):
-    """Paired differences of both errors between two cells."""
-
-    density: Interval
-    speed: Interval
-
-
-def measure_change(results: PrivacyResults, cell: PrivacyCell, reference: PrivacyCell) -> Change:
-    """Return by how much the errors of a cell exceed those of a reference."""
-    return Change(*(results.difference(cell, reference, metric) for metric in METRICS))
-
-
 def estimator_numbers(results: PrivacyResults, name: str) -> dict[str, Any]:
     """Return the numbers of the report about one estimator."""
     design = results.design
@@ -123,22 +110,22 @@ def estimator_numbers(results: PrivacyResults, name: str) -> dict[str, Any]:
         "density": results.mean(base, DENSITY),
         "speed": results.mean(base, SPEED),
         "over_printed": [
-            (printed, measure_change(results, base, design.cell(name, printed)))
+            (printed, results.change(base, design.cell(name, printed)))
             for printed in design.printed
         ],
         "better_density": beats_open_loop(DENSITY),
         "better_speed": beats_open_loop(SPEED),
         "low_cap": low.cap,
         "high_cap": high.cap,
-        "cap_change": measure_change(results, design.cell(name, high), design.cell(name, low)),
+        "cap_change": results.change(design.cell(name, high), design.cell(name, low)),
         "mode_changes": [
-            (mode, measure_change(results, design.cell(name, boundary_inputs=mode), base))
+            (mode, results.change(design.cell(name, boundary_inputs=mode), base))
             for mode in ("private", "true")
         ],
         "few": few,
         "many": many,
-        "bandwidth_change": measure_change(
-            results, design.cell(name, bandwidth=many), design.cell(name, bandwidth=few)
+        "bandwidth_change": results.change(
+            design.cell(name, bandwidth=many), design.cell(name, bandwidth=few)
         ),
     }
 

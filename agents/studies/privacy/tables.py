@@ -5,8 +5,14 @@ from __future__ import annotations
 from agents.experiments import tables
 from agents.experiments.cells import METRICS
 from agents.experiments.plots import LABELS
-from agents.experiments.tables import format_interval, format_number, markdown
-from agents.studies.privacy.plan import BOUNDARY_MODES, PrivacyCell
+from agents.experiments.tables import (
+    compared_errors,
+    compared_header,
+    format_interval,
+    format_number,
+    markdown,
+)
+from agents.studies.privacy.plan import BOUNDARY_MODES
 from agents.studies.privacy.results import PrivacyResults
 
 
@@ -71,8 +77,8 @@ def modes_table(results: PrivacyResults) -> str:
         nominal = design.cell(name, boundary_inputs=BOUNDARY_MODES[0])
         for mode in BOUNDARY_MODES:
             cell = design.cell(name, boundary_inputs=mode)
-            rows.append([LABELS[name], mode, *_compared(results, cell, nominal)])
-    return markdown(["estimator", "boundary inputs", *_header("nominal")], rows)
+            rows.append([LABELS[name], mode, *compared_errors(results, cell, nominal)])
+    return markdown(["estimator", "boundary inputs", *compared_header("nominal")], rows)
 
 
 def bandwidth_table(results: PrivacyResults) -> str:
@@ -82,21 +88,9 @@ def bandwidth_table(results: PrivacyResults) -> str:
     for name in design.estimators:
         base = design.cell(name)
         for cell in design.along_bandwidth(name):
-            rows.append([LABELS[name], str(cell.bandwidth), *_compared(results, cell, base)])
-    return markdown(["estimator", "queried a second", *_header(str(design.bandwidth))], rows)
-
-
-def _header(reference: str) -> list[str]:
-    columns = [(f"{name} RMSE [{unit}]", f"against {reference}") for name, unit in METRICS.values()]
-    return [column for pair in columns for column in pair]
-
-
-def _compared(results: PrivacyResults, cell: PrivacyCell, reference: PrivacyCell) -> list[str]:
-    row = []
-    for metric in METRICS:
-        difference = format_interval(results.difference(cell, reference, metric))
-        row += [format_interval(results.mean(cell, metric)), difference]
-    return [row[0], "-", row[2], "-"] if cell == reference else row
+            rows.append([LABELS[name], str(cell.bandwidth), *compared_errors(results, cell, base)])
+    header = ["estimator", "queried a second", *compared_header(f"{design.bandwidth}")]
+    return markdown(header, rows)
 
 
 def health_table(results: PrivacyResults) -> str:

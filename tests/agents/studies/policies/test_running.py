@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from agents.evaluation.episodes import run_episodes
+from agents.experiments.runner import make_batch
 from agents.experiments.seeds import STUDY_TEST
 from agents.studies.policies.freezing import draft
 from agents.studies.policies.plan import (
@@ -13,7 +14,6 @@ from agents.studies.policies.plan import (
 from agents.studies.policies.queries import BIN, PHASES, QueryCounter
 from agents.studies.policies.running import (
     count_queries,
-    make_batch,
     make_task,
     run_entry,
     suitable,
@@ -22,6 +22,7 @@ from dptse_env.schedules import make_schedule
 from dptse_env.traffic.scenario import draw_scenario
 from tests.agents.policies import SHORT
 from tests.agents.studies.policies.worlds import SMALL, WALK, checkpoints
+from tests.release.sums import SumRelease
 
 
 def test_a_task_runs_the_episodes_of_its_seeds(runs):
@@ -86,6 +87,17 @@ def test_queries_are_counted_by_segment_and_time():
         bins = flags[:, k][:, near].sum(axis=1).reshape(-1, BIN).sum(axis=1)
         np.testing.assert_array_equal(counts.counts("near"), bins)
     assert {counts.incident for counts in counter.results()} != {-1}
+
+
+def test_a_segment_is_counted_once_for_all_queries_that_cover_it():
+    keywords = {"privacy": SumRelease, "query_spans": (1, 2), "bandwidth": 3, "horizon": 61}
+    env = make_batch(SHORT, keywords, (2000,))
+    counter = QueryCounter(env.process, (2000,))
+    env.reset(seed=0)
+    counter()
+    env.advance(np.isin(np.arange(11), (1, 6))[None].astype(np.int8))  # 1 by itself, and 0 with 1
+    counter()
+    assert counter.results()[0].counts("before").tolist() == [1, 1, 0, 0, 0, 0]
 
 
 def test_without_an_incident_all_of_an_episode_is_before_it(runs):

@@ -7,7 +7,7 @@ import pytest
 
 from agents.evaluation.episodes import EpisodeScore, make_config, without_void_warning
 from agents.evaluation.statistics import Interval
-from agents.experiments.cells import DENSITY, METRICS, SPEED
+from agents.experiments.cells import DENSITY, METRICS, SPEED, Change
 from agents.experiments.provenance import design_provenance
 from agents.experiments.reports import fill
 from agents.experiments.runner import EpisodeTask, run_task
@@ -288,7 +288,7 @@ def test_the_report_holds_every_table_and_number(results):
 def test_a_change_is_marked_where_zero_is_in_its_interval(interval, is_certain, results):
     provenance = design_provenance(DESIGN)
     content = study.report(results, provenance, "the command")
-    content["estimators"][0]["cap_change"] = study.Change(interval, interval)
+    content["estimators"][0]["cap_change"] = Change(interval, interval)
     lines = fill(study.TEMPLATES, content).splitlines()
     text = f"{interval.mean:+.2f} [{interval.low:+.2f}, {interval.high:+.2f}] km/h"
     (line,) = (line for line in lines if text in line)
