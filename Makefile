@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 
 export OMP_NUM_THREADS = 1
 
-.PHONY: help setup docs demo policy-study audit test test-slow lint format benchmark wheel-test clean clean-kernels reproduce privacy-study
+.PHONY: help setup docs demo policy-study audit test test-slow lint format benchmark wheel-test clean clean-kernels reproduce privacy-study ledger-study
 
 help:  ## Show this list.
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -34,6 +34,9 @@ reproduce: setup  ## Repeat the paper's results and judge its claims; results/pa
 privacy-study: setup  ## Measure the price of the guarantee; results/privacy.
 	$(BIN)/python scripts/study.py privacy
 
+ledger-study: setup  ## Put capped contributions and paced ledgers side by side; results/ledger.
+	$(BIN)/python scripts/study.py ledger
+
 policy-study: setup  ## Hold the trained policies of results/training against every baseline; results/policies.
 	$(BIN)/python scripts/study.py policies freeze --test-seeds 2064:2128 --policies \
 		primary=results/training/primary primary:regression=results/training/regression \
@@ -43,8 +46,12 @@ policy-study: setup  ## Hold the trained policies of results/training against ev
 audit: setup  ## Attack the privacy presets, 5,000 runs in each of two worlds; results/audit.
 	$(BIN)/python scripts/audit.py --env dptse_env:dptse/PaperHighway-v0 --target replaced
 	$(BIN)/python scripts/audit.py --env dptse_env:dptse/PaperHighway-v0 --privacy corrected --target replaced
+	$(BIN)/python scripts/audit.py --env dptse_env:dptse/PrivateHighway-v0 --noise-factor 0.709
+	$(BIN)/python scripts/audit.py --env dptse_env:dptse/PrivateHighway-v0
 	$(BIN)/python scripts/audit.py --noise-factor 0.709
 	$(BIN)/python scripts/audit.py
+	$(BIN)/python scripts/audit.py --target replaced
+	$(BIN)/python scripts/audit.py --target pairs --traffic-seed 2000 --runs 2000
 
 test: setup  ## Run the tests, without the slow ones.
 	$(BIN)/python -m pytest -m 'not slow' -n 2

@@ -2,6 +2,7 @@
 
 python scripts/study.py paper              # the paper's five results, some 8,000 episodes
 python scripts/study.py privacy --quick    # the price of a privacy guarantee, in minutes
+python scripts/study.py ledger             # capped contributions beside paced ledgers
 python scripts/study.py policies freeze --policies primary=results/training/primary
 python scripts/study.py policies run       # learned policies against every baseline
 
@@ -25,6 +26,8 @@ import tyro
 
 from agents.experiments.engine import LocalProcesses
 from agents.experiments.runner import Workplace
+from agents.studies.ledger import study as ledger_study
+from agents.studies.ledger.plan import LedgerDesign
 from agents.studies.paper import study as paper_study
 from agents.studies.paper.plan import PaperDesign
 from agents.studies.policies import study as policy_study
@@ -77,6 +80,16 @@ class Privacy(StudyOptions):
 
 
 @dataclass(frozen=True)
+class LedgerStudy(StudyOptions):
+    """Put capped contributions and paced ledgers side by side."""
+
+    quick: bool = False
+    """Three traffic seeds, fewer points of each curve, and fewer schedules."""
+    design: tyro.conf.OmitArgPrefixes[LedgerDesign] = field(default_factory=LedgerDesign)
+    """The plan."""
+
+
+@dataclass(frozen=True)
 class Freeze(StudyOptions):
     """Fix policies and choices before test traffic is touched."""
 
@@ -118,12 +131,13 @@ class Policies:
 Study = (
     Annotated[Paper, tyro.conf.subcommand("paper")]
     | Annotated[Privacy, tyro.conf.subcommand("privacy")]
+    | Annotated[LedgerStudy, tyro.conf.subcommand("ledger")]
     | Annotated[Policies, tyro.conf.subcommand("policies")]
 )
 
 
 @resumable()
-def main(args: Paper | Privacy | Policies) -> None:
+def main(args: Paper | Privacy | LedgerStudy | Policies) -> None:
     """Run a study."""
     if isinstance(args, Paper):
         design = args.design.quick() if args.quick else args.design
@@ -133,6 +147,10 @@ def main(args: Paper | Privacy | Policies) -> None:
         private = args.design.quick() if args.quick else args.design
         place = args.workplace("privacy-quick" if args.quick else "privacy")
         privacy_study.run(private, place, command("study.py privacy", args))
+    elif isinstance(args, LedgerStudy):
+        planned = args.design.quick() if args.quick else args.design
+        place = args.workplace("ledger-quick" if args.quick else "ledger")
+        ledger_study.run(planned, place, command("study.py ledger", args))
     elif isinstance(args.step, Freeze):
         freeze(args.step)
         return

@@ -3,12 +3,15 @@ import dataclasses
 
 import pytest
 
+from agents.studies.ledger.cell import FilterSets
+from agents.studies.ledger.plan import LedgerDesign
 from agents.studies.paper.plan import PaperDesign
 from agents.studies.policies.plan import PolicyCell
 from agents.studies.privacy.plan import PrivacyDesign
 from scripts.cli import command, run
 from scripts.study import (
     Freeze,
+    LedgerStudy,
     Paper,
     Policies,
     Privacy,
@@ -59,6 +62,7 @@ def test_the_command_line_runs_a_study_and_reports_its_command(tmp_path):
     [
         (("paper", "--seeds", "0:4"), "error: seeds must be test seeds"),
         (("privacy", "--caps", "64"), "error: caps must hold a value beside 64"),
+        (("ledger", "--paces", "0.8"), "error: paces must hold a value beside 0.8"),
         (("policies", "run", "--workers", "0"), "error: workers must be an integer >= 1, got 0"),
         (("policies", "freeze", "--cells", "far"), "error: cells must be of primary, paper"),
     ],
@@ -161,6 +165,10 @@ def test_a_command_holds_what_results_depend_on(tmp_path):
     args = Paper(quick=True, design=design, workers=7, output=tmp_path, records=tmp_path)
     assert command("study.py paper", args) == (
         "python scripts/study.py paper --quick --epsilons 0.5 2.0"
+    )
+    paced = LedgerDesign(single_only=True, sets=FilterSets(paced_demand="tried"))
+    assert command("study.py ledger", LedgerStudy(design=paced)) == (
+        "python scripts/study.py ledger --paced-demand tried --single-only"
     )
 
 
