@@ -361,7 +361,7 @@ def test_a_sequential_episode_renders_one_column_a_second():
         ({"observation": 3}, r"^observation must be a sequence, got 3"),
         ({"estimator": 3}, r"^estimator must be a class, or callable with .*, got 3"),
         ({"reward": 3}, r"^reward must be callable with a ScoredSecond, got 3"),
-        ({"action": 3}, r"^action must be a class, made of \(n_mainline, bandwidth\), got 3"),
+        ({"action": 3}, r"^action must be a class, made of \(n_options, bandwidth\), got 3"),
         (
             {"estimator": "mhe", "estimator_settings": {"initial_variance": 1e12}},
             r"^estimator_settings\.initial_variance must be a number in .*, got 10",

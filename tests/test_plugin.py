@@ -224,8 +224,8 @@ class WrongShape(parts.LaplaceRelease):
 
 class NanRelease(parts.LaplaceRelease):
     def release(self, request):
-        values, sigma = super().release(request)
-        return Released(values * np.nan, sigma)
+        released = super().release(request)
+        return released._replace(values=released.values * np.nan)
 
 
 class NoSize:
@@ -366,7 +366,7 @@ AT_STEP = {
     ),
     "too many queries": (
         {"action": TooMany},
-        rf"^action {HERE}:TooMany.decode\(\) must query at most 2 segments, got 6",
+        rf"^action {HERE}:TooMany.decode\(\) must query at most 2 options, got 6",
     ),
 }
 

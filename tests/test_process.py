@@ -34,12 +34,13 @@ def sampled(process, n_steps):
 
 
 COUNTED = {"preset": "capped", "cap": 5, "boundary_inputs": "private"}
+PAID = {"preset": "paced", "boundary_inputs": "private"}
 
 
 @pytest.mark.parametrize(
     ("estimator", "action", "privacy"),
     [(e, a, "paper") for e in ESTIMATORS for a in ACTION_ENCODINGS]
-    + [(e, "mask", COUNTED) for e in ESTIMATORS],
+    + [(e, "mask", privacy) for e in ESTIMATORS for privacy in (COUNTED, PAID)],
 )
 def test_a_batch_is_so_many_single_episodes(estimator, action, privacy):
     keywords = {"estimator": estimator, "action": action, "privacy": privacy}
@@ -61,7 +62,7 @@ def test_a_batch_is_so_many_single_episodes(estimator, action, privacy):
 
 
 @pytest.mark.parametrize("backend", ["compiled", "reference"])
-@pytest.mark.parametrize("privacy", ["paper", COUNTED])
+@pytest.mark.parametrize("privacy", ["paper", COUNTED, PAID])
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 def test_a_fork_goes_on_as_its_origin_would_have(estimator, privacy, backend):
     keywords = {"estimator": estimator, "privacy": privacy, "backend": backend}

@@ -137,7 +137,7 @@ def test_each_episode_is_charged_from_its_own_beginning():
     (env, actions), cap = staggered(privacy=COUNTED), COUNTED["cap"]
     for k in range(1, 5):
         infos = env.step(actions)[4]
-        mu, epsilon = env.process.release.spent(np.array([k, min(k + 2, cap), k]))
+        mu, epsilon = env.process.release.spent(np.arange(3), np.array([k, min(k + 2, cap), k]))
         np.testing.assert_array_equal(infos["mu"], mu)
         np.testing.assert_array_equal(infos["epsilon"], epsilon)
         assert infos["mu"][0] < infos["mu"][1] or k >= cap
