@@ -62,7 +62,7 @@ def test_the_command_line_runs_a_study_and_reports_its_command(tmp_path):
     [
         (("paper", "--seeds", "0:4"), "error: seeds must be test seeds"),
         (("privacy", "--caps", "64"), "error: caps must hold a value beside 64"),
-        (("ledger", "--paces", "0.8"), "error: paces must hold a value beside 0.8"),
+        (("ledger", "--paces", "0.85"), "error: paces must hold a value beside 0.85"),
         (("policies", "run", "--workers", "0"), "error: workers must be an integer >= 1, got 0"),
         (("policies", "freeze", "--cells", "far"), "error: cells must be of primary, paper"),
     ],
