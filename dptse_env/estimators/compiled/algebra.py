@@ -148,11 +148,7 @@ def segment_update(
     total = c1[first] + noise[0]
     if not _is_variance(total, noise[0]):
         return False
-    inverse, step = 1.0 / total, row[0] - shift[first]
-    for j in range(width):
-        k1[j] = c1[j] * inverse
-        rest1[j] = c1[j] - total * k1[j]
-        shift[j] += k1[j] * step
+    _gain(c1, total, row[0] - shift[first], k1, rest1, shift)
 
     a, b = row[2], row[3]
     c1_h, k1_h = a * c1[first] + b * c1[second], a * k1[first] + b * k1[second]
@@ -161,11 +157,8 @@ def segment_update(
     total = a * c2[first] + b * c2[second] + noise[1]
     if not _is_variance(total, noise[1]):
         return False
-    inverse, step = 1.0 / total, row[1] - (a * shift[first] + b * shift[second])
-    for j in range(width):
-        k2[j] = c2[j] * inverse
-        rest2[j] = c2[j] - total * k2[j]
-        shift[j] += k2[j] * step
+    step = row[1] - (a * shift[first] + b * shift[second])
+    _gain(c2, total, step, k2, rest2, shift)
 
     _downdate(covariance, c1, k1, rest1, c2, k2, rest2)
     return True
@@ -214,11 +207,7 @@ def sum_update(
         step -= part * shift[2 * s]
     if not _is_variance(total, noise[0]):
         return False
-    inverse = 1.0 / total
-    for j in range(width):
-        k1[j] = c1[j] * inverse
-        rest1[j] = c1[j] - total * k1[j]
-        shift[j] += k1[j] * step
+    _gain(c1, total, step, k1, rest1, shift)
 
     c1_h, k1_h = 0.0, 0.0
     for s in range(first, first + span):
@@ -234,14 +223,27 @@ def sum_update(
         step -= a * shift[2 * s] + b * shift[2 * s + 1]
     if not _is_variance(total, noise[1]):
         return False
-    inverse = 1.0 / total
-    for j in range(width):
-        k2[j] = c2[j] * inverse
-        rest2[j] = c2[j] - total * k2[j]
-        shift[j] += k2[j] * step
+    _gain(c2, total, step, k2, rest2, shift)
 
     _downdate(covariance, c1, k1, rest1, c2, k2, rest2)
     return True
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _gain(
+    c: FloatArray,
+    total: float,
+    step: float,
+    k: FloatArray,
+    rest: FloatArray,
+    shift: FloatArray,
+) -> None:
+    """Write the gain of a scalar update and its rounding error, and move the mean along it."""
+    inverse = 1.0 / total
+    for j in range(c.size):
+        k[j] = c[j] * inverse
+        rest[j] = c[j] - total * k[j]
+        shift[j] += k[j] * step
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
