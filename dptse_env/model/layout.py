@@ -93,6 +93,18 @@ class Layout:
         first = 1 + self.entries.size
         return np.array([1, *range(first, self.n_boundaries)], dtype=np.int64)
 
+    @property
+    def edges(self) -> IntArray:
+        """`(E, 2)` cells (from, to) between which vehicles pass."""
+        ends, starts = np.nonzero(self.routing)
+        return np.stack([starts, ends], axis=1).astype(np.int64)
+
+    @property
+    def edge_shares(self) -> FloatArray:
+        """`(E,)` share of the outflow that passes along each edge."""
+        shares: FloatArray = self.routing[self.edges[:, 1], self.edges[:, 0]]
+        return shares
+
     def sparsity(self) -> BoolArray:
         """`(S, S)` flags: the cell of a row after a step depends on that of a column before it."""
         # The outflow of a cell depends on every cell at its downstream face.

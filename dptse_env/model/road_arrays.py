@@ -62,9 +62,7 @@ def make_road_arrays(model: ARZModel) -> RoadArrays:
     outside_jam = np.zeros(n)
     outside_jam[layout.exits] = model.exit_jam_density
 
-    ends, starts = np.nonzero(layout.routing)
-    edges = np.stack([starts, ends], axis=1).astype(np.int64)
-    edge_share = layout.routing[ends, starts]
+    edges, edge_share = layout.edges, layout.edge_shares
     neighbours, degree = _neighbours(model)
     terms, weights = _terms(parties, edges, edge_share, neighbours)
     return RoadArrays(
