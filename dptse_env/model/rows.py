@@ -7,7 +7,17 @@ from functools import cached_property
 
 import numpy as np
 
-from dptse_env.utils.arrays import FloatArray, IntArray
+from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+
+
+def covered(first: IntArray, span: IntArray, n: int) -> BoolArray:
+    """Return which of n neighbours in a row are covered by `span` of them from `first` on.
+
+    Shape (M, n), for `first` and `span` of shape (M,).
+    """
+    place = np.arange(n) - first[:, None]
+    inside: BoolArray = (place >= 0) & (place < span[:, None])
+    return inside
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,16 +60,15 @@ class MeasurementRows:
 
     @cached_property
     def are_single(self) -> bool:
-        """Whether row s is segment s, for all segments."""
+        """True if row s is segment s, for all segments."""
         every = np.arange(self.n_segments)
         return bool((self.span == 1).all()) and np.array_equal(self.first, every)
 
     @cached_property
     def weights(self) -> FloatArray:
         """Weights of the segments in each row, shape (M, S): 1 / span of those it covers."""
-        place = np.arange(self.n_segments) - self.first[:, None]
-        covered = (place >= 0) & (place < self.span[:, None])
-        return np.where(covered, 1.0 / self.span[:, None], 0.0)
+        inside = covered(self.first, self.span, self.n_segments)
+        return np.where(inside, 1.0 / self.span[:, None], 0.0)
 
     def averages(self, values: FloatArray) -> FloatArray:
         """Return the rows' averages, shape (n, M, 2), of values of shape (n, S, 2)."""

@@ -12,13 +12,14 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from dptse_env.model.rows import covered
 from dptse_env.release.vehicle_table import VehicleTable, widened
 from dptse_env.traffic import Record
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 
 
 class Columns(NamedTuple):
-    """What each of the C columns of a release covers.
+    """Record columns that each of the C columns of a release covers.
 
     Attributes:
         first: The first record column of each, shape (C,).
@@ -76,8 +77,7 @@ class Ledgers:
         self.paid: FloatArray = np.zeros((n_episodes, 0))
         self._columns = columns
         self.n_places = columns.n_places
-        place = np.arange(columns.n_places) - columns.first[:, None]
-        self.covers = ((place >= 0) & (place < columns.span[:, None])).astype(np.float64)
+        self.covers = covered(columns.first, columns.span, columns.n_places).astype(np.float64)
         self.are_single = bool((self.covers.sum(axis=0) <= 1.0).all())
 
     def load(self, slot: int, record: Record) -> None:

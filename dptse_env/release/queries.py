@@ -11,6 +11,7 @@ from typing import Literal
 import numpy as np
 
 from dptse_env.model import MeasurementRows
+from dptse_env.model.rows import covered
 from dptse_env.traffic import Corridor
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 
@@ -92,10 +93,8 @@ class QueryOptions:
 
     @cached_property
     def covers(self) -> BoolArray:
-        """Which segments each option covers, shape (G, n_mainline)."""
-        place = np.arange(self.n_mainline) - self.first[:, None]
-        covers: BoolArray = (place >= 0) & (place < self.span[:, None])
-        return covers
+        """Mainline segments that each option covers, shape (G, n_mainline)."""
+        return covered(self.first, self.span, self.n_mainline)
 
     @cached_property
     def most_queries(self) -> int:
@@ -104,17 +103,17 @@ class QueryOptions:
 
     @cached_property
     def costs_differ(self) -> bool:
-        """Whether some options cost more than others."""
+        """True if some options cost more than others."""
         return bool((self.cost != self.cost[0]).any())
 
     @cached_property
     def are_segments(self) -> bool:
-        """Whether option s is segment s, at whatever price level."""
+        """True if option s is segment s, at whatever price level."""
         return self.n_options == self.n_mainline and bool((self.span == 1).all())
 
     @cached_property
     def are_plain(self) -> bool:
-        """Whether option s is segment s, at the release model's price."""
+        """True if option s is segment s, at the release model's price."""
         return self.are_segments and bool((self.level == 1.0).all())
 
     @cached_property
