@@ -126,12 +126,8 @@ class GaussianRelease(ReleaseModel):
         return {"adjacency": "replace"}
 
     def _guarantee(self) -> str:
-        settings = self.setup.settings
         quantities = " and ".join(release.quantity for release in self.sensitivity.releases)
-        return (
-            f"({settings.epsilon:g}, {settings.delta:g})-differential privacy of {quantities} "
-            f"together, for {self.protects}"
-        )
+        return self.setup.settings.guarantee(quantities, self.protects)
 
 
 def require_gaussian(release: ReleaseModel, user: str) -> GaussianRelease:

@@ -18,6 +18,13 @@ BoundaryInputs = Literal["true", "nominal", "private"]
 boundary segments' releases."""
 
 
+CHANGES: dict[Adjacency, str] = {
+    "replace": "replaced by another",
+    "add_remove": "added or removed",
+}
+"""Change of a vehicle's data between two adjacent records, in words."""
+
+
 @dataclass(frozen=True)
 class PrivacySettings:
     """Settings of every release model; subclasses add further ones.
@@ -49,6 +56,13 @@ class PrivacySettings:
     def boundary(self) -> BoundaryInputs:
         """Source of the estimator's inputs at the boundary."""
         return self.boundary_inputs or self.default_boundary
+
+    def guarantee(self, quantities: str, protected: str) -> str:
+        """Return the sentence that states (epsilon, delta) for quantities and what is protected."""
+        return (
+            f"({self.epsilon:g}, {self.delta:g})-differential privacy of {quantities} together, "
+            f"for {protected}"
+        )
 
 
 @dataclass(frozen=True)
@@ -98,7 +112,7 @@ class CappedSettings(PrivacySettings):
     @property
     def protected(self) -> str:
         """Description of the protected data and of the change that is protected."""
-        change = "replaced by another" if self.adjacency == "replace" else "added or removed"
+        change = CHANGES[self.adjacency]
         return {
             "trip": f"one vehicle's trip, {change}, which counts in {self.cap} queried steps",
             "horizon": f"one vehicle's whole trip, {change}",
@@ -154,6 +168,5 @@ class PacedSettings(PrivacySettings):
     @property
     def protected(self) -> str:
         """Description of the protected data and of the change that is protected."""
-        change = "replaced by another" if self.adjacency == "replace" else "added or removed"
         part = "whole trip" if self.unit == "trip" else "second of a trip"
-        return f"one vehicle's {part}, {change}"
+        return f"one vehicle's {part}, {CHANGES[self.adjacency]}"
