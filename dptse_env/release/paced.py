@@ -46,6 +46,7 @@ class Paced(ReleaseModel):
 
     Attributes:
         mu: Parameter of Gaussian differential privacy of all releases together.
+        budget: Budget of a vehicle, a part of which ledgers keep back for rounding.
         ledgers: What the vehicles have paid.
         pacing: What sets the prices.
         noise: Standard normal noise.
@@ -72,7 +73,7 @@ class Paced(ReleaseModel):
         corridor, n = setup.corridor, setup.n_episodes
         self.mu = mu_of(settings.epsilon, settings.delta)
         self._squares = 2.0 if settings.adjacency == "replace" else 1.0
-        budget = self.mu**2 / self._squares
+        self.budget = self.mu**2 / self._squares
         first, span, level = _columns(setup)
         places = int((first + span).max())
         self.ledgers = Ledgers(
@@ -81,12 +82,12 @@ class Paced(ReleaseModel):
                 len(setup.traffic.traffic_seeds), corridor.duration + 1, corridor.speed_limit
             ),
             n,
-            budget=(1.0 - ROUNDING) * budget,
+            budget=(1.0 - ROUNDING) * self.budget,
             clip=settings.clip,
             ratio=settings.ratio,
         )
         # A pacing that offers the whole budget at once stays below what ledgers hold back.
-        offered = (1.0 - 2.0 * ROUNDING) * budget
+        offered = (1.0 - 2.0 * ROUNDING) * self.budget
         made_for = PacingSetup(
             corridor, offered, settings.pace, settings.ratio, first, span, level,
             setup.always_observed, _coverage(setup.queries), places, n,
@@ -94,7 +95,6 @@ class Paced(ReleaseModel):
         pacing = EventPacing if settings.unit == "event" else PACINGS.find(settings.pacing)
         self.pacing = pacing(made_for)
         self.noise = NoiseStreams(n, setup.n_columns)
-        self._first, self._span = first, span
         self._lengths = corridor.segment_length * span
         self.prices = np.zeros((n, setup.n_columns))
         self.centres = np.zeros((n, places))
@@ -162,7 +162,7 @@ class Paced(ReleaseModel):
     def _centres(self, speed: FloatArray) -> FloatArray:
         """Return the centres of segments, and of boundary segments that are released: (k, places).
 
-        Those of a boundary segment is that of the road's segment next to it.
+        The centre of a boundary segment is that of the road's segment next to it.
         """
         corridor, S = self.setup.corridor, speed.shape[1]
         centre: FloatArray = np.clip(speed, 0.0, corridor.speed_limit)
@@ -237,16 +237,13 @@ class Paced(ReleaseModel):
         settings, mu = self._settings, self.mu
         return replace(
             super().report(),
-            guarantee=(
-                f"({settings.epsilon:g}, {settings.delta:g})-differential privacy of count and "
-                f"flow together, for {settings.protected}"
-            ),
+            guarantee=settings.guarantee("count and flow", settings.protected),
             void_reasons=(),
             protects=settings.protected,
             mu=mu,
             epsilon=epsilon_of(mu, settings.delta),
             epsilon_strict=epsilon_of(mu, STRICT_DELTA),
-            assumptions={"budget": mu**2 / self._squares},
+            assumptions={"budget": self.budget},
             details={
                 "unit": settings.unit,
                 "adjacency": settings.adjacency,
@@ -275,9 +272,8 @@ class Paced(ReleaseModel):
             self.ledgers.paid_by(episode, index)
             for episode, index in zip(episodes, traffic, strict=True)
         ]
-        budget = self.mu**2 / self._squares
         return {
-            "ledgers": object_array([(ledger / budget).tolist() for ledger in paid]),
+            "ledgers": object_array([(ledger / self.budget).tolist() for ledger in paid]),
             "individual_epsilon": object_array([self._losses(row)[1].tolist() for row in paid]),
             "n_refused": self._refused[episodes].copy(),
         }

@@ -58,7 +58,7 @@ class PacingSetup:
 
 @dataclass(frozen=True)
 class PublicStep:
-    """What a price may depend on: a second of k episodes, before its release.
+    """Public numbers that a price may depend on: a second of k episodes, before its release.
 
     Attributes:
         episodes: Distinct rows of the batch, shape (k,).
@@ -136,25 +136,25 @@ class TracerPacing(Pacing):
         corridor, n = setup.corridor, setup.n_episodes
         layout = make_layout(corridor)
         S = layout.n_segments
-        ends, starts = np.nonzero(layout.routing)
         boundary = [layout.entry_boundaries, layout.exit_boundaries]
         if setup.n_places > S:
             entry_places, exit_places = (S + places for places in boundary)
         else:
             entry_places, exit_places = (np.full_like(places, -1) for places in boundary)
-        self._road = kernels.PacedRoad(
+        road = kernels.PacedRoad(
             n_mainline=corridor.n_mainline,
             n_segments=S,
             length=corridor.segment_length,
-            edges=np.stack([starts, ends], axis=1).astype(np.int64),
-            edge_share=layout.routing[ends, starts],
+            edges=layout.edges,
+            edge_share=layout.edge_shares,
             entries=layout.entries,
             entry_places=entry_places,
             exits=layout.exits,
             exit_places=exit_places,
             on_ramps=np.array(corridor.on_ramps, dtype=np.int64),
         )
-        self._columns = kernels.PacedColumns(setup.first, setup.span, setup.level)
+        columns = kernels.PacedColumns(setup.first, setup.span, setup.level)
+        self._packed = tuple(road), tuple(columns)
         always = np.zeros(setup.n_places, dtype=bool)
         for column in setup.always:
             always[setup.first[column]] = True
@@ -174,14 +174,14 @@ class TracerPacing(Pacing):
         """See `Pacing.prices`."""
         prices = np.empty(step.observed.shape)
         kernels.pace(
-            tuple(self._road), tuple(self._columns), step.episodes, step.observed, step.density,
-            step.speed, *self._offer, 1.0 + MEAN_SQUARE * self.setup.ratio, self._rates,
+            *self._packed, step.episodes, step.observed, step.density, step.speed, *self._offer,
+            1.0 + MEAN_SQUARE * self.setup.ratio, self._rates,
             self._tracer, prices,
         )  # fmt: skip
         return prices
 
     def expected_price(self, speed: FloatArray) -> float:
-        """Return the price of half a trip's way, at these speeds, by the rates that begin."""
+        """Return the price at the upstream end, at these speeds and the rates of the beginning."""
         n, length = self.setup.corridor.n_mainline, self.setup.corridor.segment_length
         seconds = SECONDS_PER_HOUR * length / np.clip(speed[:n], kernels.SLOWEST, kernels.FASTEST)
         queried = float((self._first_rates[:n] * seconds).sum()) + kernels.MARGIN
@@ -199,18 +199,22 @@ class EventPacing(Pacing):
     Every vehicle can pay for all queries that cover it, at any deviation.
     """
 
+    def __init__(self, setup: PacingSetup) -> None:
+        """Work out the price of a query that has a second's budget to itself."""
+        super().__init__(setup)
+        self._whole = setup.budget / (1.0 + setup.ratio)
+        self._columns = tuple(kernels.PacedColumns(setup.first, setup.span, setup.level))
+
     def prices(self, step: PublicStep) -> FloatArray:
         """See `Pacing.prices`."""
-        setup = self.setup
         prices = np.empty(step.observed.shape)
-        columns = kernels.PacedColumns(setup.first, setup.span, setup.level)
-        whole = setup.budget / (1.0 + setup.ratio)
-        kernels.divide(tuple(columns), setup.n_places, step.observed, whole, prices)
+        places = self.setup.n_places
+        kernels.divide(self._columns, places, step.observed, self._whole, prices)
         return prices
 
     def expected_price(self, speed: FloatArray) -> float:
         """Return the price where queries do not overlap."""
-        return self.setup.budget / (1.0 + self.setup.ratio)
+        return self._whole
 
 
 PACINGS = Registry(
