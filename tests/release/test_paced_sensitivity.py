@@ -14,6 +14,7 @@ from hypothesis.extra.numpy import arrays
 from dptse_env.privacy import mu_of
 from dptse_env.release import PacedSettings
 
+from .adjacent import adjacent_trips
 from .paced_worlds import (
     COLUMNS,
     LIMIT,
@@ -51,27 +52,10 @@ def wishes(draw, **fixed):
 
 
 @st.composite
-def trips(draw, n_vehicles):
-    """Places and speeds (n_vehicles, T + 1); few segments, so that vehicles meet."""
-    shape = n_vehicles, T + 1
-    places = draw(arrays(np.int16, shape, elements=st.integers(AWAY, PLACES)))
-    speed = st.sampled_from([0.0, LIMIT / 2, LIMIT, 1.5 * LIMIT]) | st.floats(0.0, LIMIT, width=32)
-    return places, draw(arrays(np.float32, shape, elements=speed))
-
-
-@st.composite
 def pairs(draw, asked):
     """Two records that differ in vehicle 0 as `asked` protects."""
-    places, speeds = draw(trips(draw(st.integers(1, 3))))
-    other_places, other_speeds = places.copy(), speeds.copy()
-    at = np.arange(T + 1)
-    if asked.unit == "event":
-        at = at[[draw(st.integers(1, T))]]
-    new_places, new_speeds = draw(trips(1))
-    if asked.adjacency == "add_remove":
-        new_places = np.full_like(new_places, AWAY)
-    other_places[0, at], other_speeds[0, at] = new_places[0, at], new_speeds[0, at]
-    return record(places, speeds, COLUMNS), record(other_places, other_speeds, COLUMNS)
+    places, speeds, *others = draw(adjacent_trips(asked, 3, T, PLACES, LIMIT))
+    return record(places, speeds, COLUMNS), record(*others, COLUMNS)
 
 
 @st.composite

@@ -16,35 +16,12 @@ from hypothesis.extra.numpy import arrays
 from dptse_env.privacy import mu_of
 from dptse_env.release import CappedSettings, PrivacySettings
 
+from .adjacent import adjacent_trips
 from .worlds import AWAY, Mutant, Worlds, corridor, record, squared_distance
 
 T, COLUMNS, SEGMENTS = 10, 12, 8
 LIMIT = corridor(T).speed_limit
 SLACK = 1.0 + 1e-9
-
-
-@st.composite
-def trips(draw, n_vehicles):
-    """Places and speeds (n_vehicles, T + 1); few segments, so that vehicles meet."""
-    shape = n_vehicles, T + 1
-    places = draw(arrays(np.int16, shape, elements=st.integers(AWAY, 3)))
-    speed = st.sampled_from([0.0, LIMIT / 2, LIMIT, 1.5 * LIMIT]) | st.floats(0.0, LIMIT, width=32)
-    return places, draw(arrays(np.float32, shape, elements=speed))
-
-
-@st.composite
-def pairs(draw, asked):
-    """Two records that differ in vehicle 0 as `asked` protects, and where it is in each."""
-    places, speeds = draw(trips(draw(st.integers(1, 4))))
-    other_places, other_speeds = places.copy(), speeds.copy()
-    at = np.arange(T + 1)
-    if asked.unit == "event":
-        at = at[[draw(st.integers(1, T))]]
-    new_places, new_speeds = draw(trips(1))
-    if asked.adjacency == "add_remove":
-        new_places = np.full_like(new_places, AWAY)
-    other_places[0, at], other_speeds[0, at] = new_places[0, at], new_speeds[0, at]
-    return places, speeds, other_places, other_speeds
 
 
 @st.composite
@@ -95,7 +72,7 @@ def wishes(draw):
 @given(st.data())
 def test_no_policy_exceeds_mu(data):
     asked = data.draw(wishes())
-    places, speeds, other_places, other_speeds = data.draw(pairs(asked))
+    places, speeds, other_places, other_speeds = data.draw(adjacent_trips(asked, 4, T, 3, LIMIT))
     policy = data.draw(policies(places, other_places))
     always = data.draw(st.sampled_from([(), (1,), (0, 2)]))
     worlds = Worlds(record(places, speeds, COLUMNS), record(other_places, other_speeds, COLUMNS))

@@ -4,6 +4,8 @@ import dataclasses
 
 import numpy as np
 
+from agents.studies.audit.attack import attack
+from agents.studies.audit.targets import choose_target, make_policy
 from dptse_env.config import EnvConfig
 from dptse_env.estimators.open_loop import OpenLoop
 from dptse_env.release import RELEASE_MODELS
@@ -37,3 +39,15 @@ class HalfTheLimit(OpenLoop):
         estimate = super().estimate()
         speed = np.full_like(estimate.speed, 0.5 * ROAD.speed_limit)
         return dataclasses.replace(estimate, speed=speed)
+
+
+def assert_runs_do_not_depend_on_the_batch(setting, record):
+    """Runs are the same however many are played at once, and differ by their seed."""
+    worlds = choose_target(setting, record, "replaced", "hunter")
+    policy = make_policy(setting, "adaptive", worlds)
+    together = attack(setting, worlds, policy, 5, seed=3, progress=False)
+    parts = attack(setting, worlds, policy, 5, seed=3, batch=2, progress=False)
+    np.testing.assert_array_equal(together.scores, parts.scores)
+    np.testing.assert_array_equal(together.distances, parts.distances)
+    other = attack(setting, worlds, policy, 5, seed=4, progress=False)
+    assert not np.isin(other.scores, together.scores).any()

@@ -20,7 +20,7 @@ from dptse_env.privacy import epsilon_of
 from dptse_env.privacy.audit_statistics import Claim, audit
 from dptse_env.release import CappedSettings
 
-from .small import HORIZON, ROAD, config
+from .small import HORIZON, ROAD, assert_runs_do_not_depend_on_the_batch, config
 
 
 def reached(setting, worlds, policy="hunter"):
@@ -290,15 +290,7 @@ def test_less_noise_puts_the_worlds_further_apart(record):
 
 @pytest.mark.parametrize("privacy", [{}, {"preset": "paper"}, {"boundary_inputs": "private"}])
 def test_runs_do_not_depend_on_the_batch(privacy, record):
-    setting = config(**privacy)
-    worlds = choose_target(setting, record, "replaced", "hunter")
-    policy = make_policy(setting, "adaptive", worlds)
-    together = attack(setting, worlds, policy, 5, seed=3, progress=False)
-    parts = attack(setting, worlds, policy, 5, seed=3, batch=2, progress=False)
-    np.testing.assert_array_equal(together.scores, parts.scores)
-    np.testing.assert_array_equal(together.distances, parts.distances)
-    other = attack(setting, worlds, policy, 5, seed=4, progress=False)
-    assert not np.isin(other.scores, together.scores).any()
+    assert_runs_do_not_depend_on_the_batch(config(**privacy), record)
 
 
 def test_adapting_stays_below_mu_and_stops_early(record):

@@ -17,7 +17,15 @@ from dptse_env.parts import make_release, privacy_report
 from dptse_env.privacy.audit_statistics import Claim, audit
 from dptse_env.release import ReleaseModel, ReleaseRequest, TrafficTable
 
-from .small import HORIZON, N_COLUMNS, ROAD, HalfTheLimit, config, paced
+from .small import (
+    HORIZON,
+    N_COLUMNS,
+    ROAD,
+    HalfTheLimit,
+    assert_runs_do_not_depend_on_the_batch,
+    config,
+    paced,
+)
 
 SECONDS = np.arange(1, HORIZON + 1)
 
@@ -271,14 +279,7 @@ def sums_by_world(setting, worlds, series):
     "setting", [paced("ekf"), paced("random_walk", boundary_inputs="private", unit="event")]
 )
 def test_runs_do_not_depend_on_the_batch(setting, record):
-    worlds = choose_target(setting, record, "replaced", "hunter")
-    policy = make_policy(setting, "adaptive", worlds)
-    together = attack(setting, worlds, policy, 5, seed=3, progress=False)
-    parts = attack(setting, worlds, policy, 5, seed=3, batch=2, progress=False)
-    np.testing.assert_array_equal(together.scores, parts.scores)
-    np.testing.assert_array_equal(together.distances, parts.distances)
-    other = attack(setting, worlds, policy, 5, seed=4, progress=False)
-    assert not np.isin(other.scores, together.scores).any()
+    assert_runs_do_not_depend_on_the_batch(setting, record)
 
 
 def test_adapting_stays_below_mu_and_stops_early(record):
