@@ -53,7 +53,7 @@ class QueryInterface:
 
     @property
     def bandwidth(self) -> int:
-        """What the queries of a step may cost together."""
+        """Largest cost of a step's queries together."""
         return self.queries.bandwidth
 
     def require_sequential(self) -> None:

@@ -135,7 +135,7 @@ class Released(NamedTuple):
 
 
 class MeasuredRows(NamedTuple):
-    """What an estimator is given of a release, beside the rows that were observed.
+    """Part of a release that an estimator is given, beside the rows that were observed.
 
     Attributes:
         values: Shape (k, M, 2).

@@ -1,4 +1,4 @@
-"""What an adversary plans before an attack: vehicles that tell much, and seconds to query them."""
+"""Plans of an adversary before an attack: vehicles that tell much, and seconds to query them."""
 
 from __future__ import annotations
 

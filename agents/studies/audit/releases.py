@@ -1,4 +1,4 @@
-"""What the adversary needs of a release model: its public terms, and sums without noise."""
+"""Release models as the adversary needs them: public terms, and sums without noise."""
 
 from __future__ import annotations
 

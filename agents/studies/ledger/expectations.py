@@ -1,4 +1,4 @@
-"""What an earlier trial made expect of paced ledgers, and the verdicts."""
+"""Expectations of paced ledgers from an earlier trial, and the verdicts."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ EXPECTATIONS = (
 
 @dataclass(frozen=True)
 class Judgement:
-    """What was expected, and what was measured.
+    """An expectation and its measurement.
 
     Attributes:
         statement: What is measured.

@@ -1,4 +1,4 @@
-"""What vehicles have paid, seen from the true traffic: for evaluation only."""
+"""Payments of vehicles, seen from the true traffic: for evaluation only."""
 
 from __future__ import annotations
 

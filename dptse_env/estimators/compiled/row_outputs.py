@@ -1,4 +1,4 @@
-"""What measured averages over neighbouring segments are in each of many states, compiled."""
+"""Compiled outputs of many states: averages over neighbouring segments, as rows measure them."""
 
 from numba import njit
 

@@ -1,4 +1,4 @@
-"""What the rows of a window's measurements contribute to its H and its gradient.
+"""Contributions of the rows of a window's measurements to its H and its gradient.
 
 A row of one segment adds a 2 x 2 block to H, which is kept per segment. A row of several segments
 adds a block that couples all of them; it is applied as a product of vectors instead.
