@@ -111,7 +111,7 @@ def test_a_mapping_of_settings_keeps_what_would_have_been_chosen():
     assert resolve("paper-highway", keywords).settings() == EstimatorSettings(
         mhe=HorizonSettings(horizon=3)
     )
-    given = EstimatorSettings(noise_scale=2.0)
+    given = EstimatorSettings(noise_scale=(2.0, 2.0))
     keywords["estimator_settings"] = given
     assert resolve("paper-highway", keywords).settings() is given
     for bad, message in (

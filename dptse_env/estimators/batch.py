@@ -124,7 +124,7 @@ class BatchEstimator(ABC):
         self.model = model
         self.n_episodes = n_episodes
         self.settings = settings
-        self._noise_scale: float = getattr(settings, "noise_scale", 1.0)
+        self._noise_scale = np.array(getattr(settings, "noise_scale", (1.0, 1.0)))
         self.innovations = np.zeros((n_episodes, model.rows.n_rows, 2))
         self.diverged = np.zeros(n_episodes, dtype=np.bool_)
         self.fallback = np.zeros(n_episodes, dtype=np.bool_)

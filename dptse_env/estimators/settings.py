@@ -15,6 +15,8 @@ _PATH = "estimator_settings"
 
 Deviation = Annotated[float, Interval(0, 10)]
 """A standard deviation in units of rho_m or v_f."""
+NoiseScale = Annotated[float, Interval(1e-6, 1000)]
+"""A factor on a standard deviation of the mechanism's noise."""
 ArrivalDeviation = Annotated[float, Interval(1e-6, 10)]
 """A positive standard deviation in units of rho_m or v_f."""
 
@@ -140,8 +142,9 @@ class EstimatorSettings:
         demand: Settings of demand states; None for a filter that takes the demands as given.
         walk_noise: Standard deviations of a step of the random walk: of rho over rho_m, of v over
             v_f.
-        noise_scale: Factor on the standard deviations of the mechanism's noise, for an R that also
-            covers the difference of vehicle counts and densities.
+        noise_scale: Factors on the standard deviations of the mechanism's noise, of a measured
+            density and of a measured flow or speed, for an R that also covers what the model does
+            not describe.
         initial_variance: Variance of each normalised component of the prior.
         bounds: Set into which means are projected: the `cone` of physical states or the paper's
             `box`.
@@ -158,7 +161,7 @@ class EstimatorSettings:
     count_noise: Annotated[float, Interval(0, 100)] = 0.0
     demand: DemandSettings | None = None
     walk_noise: tuple[Deviation, Deviation] = (0.025, 0.025)
-    noise_scale: Annotated[float, Interval(1e-6, 1000)] = 1.0
+    noise_scale: tuple[NoiseScale, NoiseScale] = (1.0, 1.0)
     initial_variance: Annotated[float, Interval(0, 100, open_low=True)] = 1e-3
     bounds: Bounds = "cone"
     ukf: SigmaPointSettings = field(default_factory=SigmaPointSettings)

@@ -207,7 +207,7 @@ def _problem(process: QueryProcess, inflation: CovarianceInflation) -> Problem:
     config, model = process.config, process.model
     corridor, settings, term = config.corridor, config.settings(), process.interface.reward.term
     n, rho_m, v_f = corridor.n_mainline, model.density_scale, model.speed_scale
-    sigma = settings.noise_scale * process.release.sigma / model.measurement_scale
+    sigma = np.array(settings.noise_scale) * process.release.sigma / model.measurement_scale
     is_walk = config.estimator == "random_walk"
     noise = settings.walk_noise if is_walk else settings.process_noise
     always = np.array(sorted(corridor.fixed_sensors), dtype=np.int64)

@@ -52,7 +52,7 @@ class Plain:
             self.Q = np.diag(np.tile(np.square(q), model.n_segments))
             self.mean = model.project(model.step(mean, inputs), settings.bounds)
         self.H = self.whole(model.measurement_jacobian(self.mean)[0], model.measurement_scale)
-        sigma = settings.noise_scale * process.release.sigma / model.measurement_scale
+        sigma = np.array(settings.noise_scale) * process.release.sigma / model.measurement_scale
         self.R = np.tile(sigma**2, model.n_segments)
         units = [config.corridor.density_scale, config.corridor.speed_scale]
         self.T = self.whole(model.traffic_jacobian(self.mean)[0], units)[: 2 * self.n]

@@ -51,7 +51,7 @@ def test_paths_become_nested_settings():
     settings = EstimatorSettings(
         process_noise=(0.1, 0.2),
         walk_noise=(0.3, 0.4),
-        noise_scale=1.5,
+        noise_scale=(1.5, 2.5),
         ukf=SigmaPointSettings(alpha=1.0),
         enkf=EnsembleSettings(inflation=1.02, taper=0.5),
         mhe=HorizonSettings(arrival_noise=(0.5, 0.6), linearisation="trajectory", bounds="cone"),
@@ -63,7 +63,7 @@ def test_paths_become_nested_settings():
     assert nested(values) == {
         "process_noise": [0.1, 0.2],
         "walk_noise": [0.3, 0.4],
-        "noise_scale": 1.5,
+        "noise_scale": [1.5, 2.5],
         "ukf": {"alpha": 1.0},
         "enkf": {"inflation": 1.02, "taper": 0.5},
         "mhe": {"arrival_noise": [0.5, 0.6], "linearisation": "trajectory", "bounds": "cone"},
