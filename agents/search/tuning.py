@@ -9,7 +9,7 @@ import fcntl
 import json
 import logging
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -26,7 +26,7 @@ from optuna.trial import FrozenTrial, TrialState
 from agents.evaluation.episodes import WARM_UP, EpisodeScore
 from agents.experiments.files import replacing
 from agents.search.space import DEMAND_START, at_bound, holds, nested, rounded, values_of
-from agents.search.tuning_task import TuningTask, score_episode
+from agents.search.tuning_task import TuningTask, score_episodes
 from dptse_env.estimators import EstimatorSettings
 from dptse_env.estimators.tuned_settings import write_settings
 from dptse_env.utils.fields import from_mapping
@@ -36,8 +36,11 @@ _COUNTED = (*_FINISHED, TrialState.RUNNING)
 
 logger = logging.getLogger(__name__)
 
-Score = Callable[[TuningTask, EstimatorSettings, int], EpisodeScore]
-"""Scores settings on a traffic seed; a function of a module, so that workers can import it."""
+Score = Callable[[TuningTask, EstimatorSettings, Sequence[int]], list[EpisodeScore]]
+"""Scores settings on traffic seeds; a function of a module, so that workers can import it."""
+
+BATCH = 8
+"""Episodes that run at once; a trial may stop early after each batch."""
 
 
 @dataclass
@@ -61,7 +64,7 @@ class TuningStudy:
     """
 
     def __init__(
-        self, task: TuningTask, folder: Path, seed: int = 0, score: Score = score_episode
+        self, task: TuningTask, folder: Path, seed: int = 0, score: Score = score_episodes
     ) -> None:
         """Begin or go on; use `locked_study`, which keeps other processes out."""
         self.task, self.seed, self._score = task, seed, score
@@ -139,7 +142,7 @@ class TuningStudy:
         With one trial at a time, a study that was interrupted comes out as one that was not.
         ``on_trial`` is called after every finished trial.
         """
-        running: dict[Future[EpisodeScore], _Running] = {}
+        running: dict[Future[list[EpisodeScore]], _Running] = {}
         try:
             while True:
                 while len(running) < n_parallel and self._n_counted() < n_trials:
@@ -148,7 +151,7 @@ class TuningStudy:
                     return
                 for future in wait(running, return_when=FIRST_COMPLETED).done:
                     trial = running[future]
-                    trial.scores.append(future.result())
+                    trial.scores.extend(future.result())
                     finished = self._tell(trial)
                     del running[future]
                     if not finished:
@@ -173,17 +176,22 @@ class TuningStudy:
         return _Running(trial, from_mapping(EstimatorSettings, settings, "estimator_settings"))
 
     def _submit(
-        self, trial: _Running, executor: Executor, running: dict[Future[EpisodeScore], _Running]
+        self,
+        trial: _Running,
+        executor: Executor,
+        running: dict[Future[list[EpisodeScore]], _Running],
     ) -> None:
-        seed = self.task.traffic_seeds[len(trial.scores)]
-        running[executor.submit(self._score, self.task, trial.settings, seed)] = trial
+        done = len(trial.scores)
+        seeds = self.task.traffic_seeds[done : done + BATCH]
+        running[executor.submit(self._score, self.task, trial.settings, seeds)] = trial
 
     def _tell(self, running: _Running) -> bool:
-        """Report the latest episode; return whether the trial is finished."""
+        """Report the latest batch; return whether the trial is finished."""
         trial, scores = running.trial, running.scores
         reward = float(np.mean([score.reward for score in scores]))
         if not math.isfinite(reward):
-            trial.set_user_attr("not_finite", scores[-1].traffic_seed)
+            bad = [score.traffic_seed for score in scores if not math.isfinite(score.reward)]
+            trial.set_user_attr("not_finite", bad)
             self.study.tell(trial, state=TrialState.PRUNED)
             return True
         trial.report(reward, len(scores))
@@ -248,7 +256,7 @@ class TuningStudy:
 
 @contextmanager
 def locked_study(
-    task: TuningTask, folder: Path, seed: int = 0, score: Score = score_episode
+    task: TuningTask, folder: Path, seed: int = 0, score: Score = score_episodes
 ) -> Iterator[TuningStudy]:
     """Begin a study or go on with it, and keep other processes out of it meanwhile.
 

@@ -6,7 +6,7 @@ The score is the mean reward of a second after the warm-up, as the environment g
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from importlib.metadata import version
@@ -15,7 +15,7 @@ from typing import Any
 
 import gymnasium as gym
 
-from agents.evaluation.episodes import WARM_UP, EpisodeScore, run_episode, unwrap
+from agents.evaluation.episodes import WARM_UP, EpisodeScore, make_vector, run_episodes, unwrap
 from agents.evaluation.policies import PolicySource, find_policy
 from agents.experiments.seeds import TUNING
 from agents.search.space import Knob, search_space
@@ -107,8 +107,8 @@ class TuningTask:
         name = settings_name(self.estimator, self.parameters_name, self.privacy)
         return f"{name}-{self.variant}" if self.variant else name
 
-    def make(self, settings: EstimatorSettings | None = None) -> gym.Env[Any, Any]:
-        """Make the environment; with its default settings if None."""
+    def arguments(self, settings: EstimatorSettings | None = None) -> dict[str, Any]:
+        """Return keywords that make the environment; with its default settings if None."""
         keywords: dict[str, Any] = {
             **self.keywords,
             **self.source.keywords,
@@ -122,7 +122,11 @@ class TuningTask:
             keywords["parameters"] = dataclasses.asdict(self.parameters)
         if settings is not None:
             keywords["estimator_settings"] = dataclasses.asdict(settings)
-        return gym.make(self.env, **keywords)
+        return keywords
+
+    def make(self, settings: EstimatorSettings | None = None) -> gym.Env[Any, Any]:
+        """Make the environment; with its default settings if None."""
+        return gym.make(self.env, **self.arguments(settings))
 
     def config(self) -> EnvConfig:
         """Return the configuration of the environment, with its default settings.
@@ -154,8 +158,10 @@ class TuningTask:
         }
 
 
-def score_episode(task: TuningTask, settings: EstimatorSettings, traffic_seed: int) -> EpisodeScore:
-    """Run one episode of a task with given settings."""
-    env = task.make(settings)
-    policy, noise = task.source.load(env), task.noise_seed + traffic_seed
-    return run_episode(env, policy, traffic_seed=traffic_seed, seed=noise)
+def score_episodes(
+    task: TuningTask, settings: EstimatorSettings, traffic_seeds: Sequence[int]
+) -> list[EpisodeScore]:
+    """Run an episode of a task on each traffic seed with given settings, as one batch."""
+    env = make_vector(task.env, len(traffic_seeds), task.arguments(settings))
+    noise = [task.noise_seed + seed for seed in traffic_seeds]
+    return run_episodes(env, task.source.load(env), traffic_seeds=traffic_seeds, seeds=noise)

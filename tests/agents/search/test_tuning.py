@@ -9,21 +9,26 @@ import pytest
 from optuna.trial import TrialState
 
 from agents.evaluation.episodes import EpisodeScore
-from agents.search.tuning import journal_path, locked_study, scores_of
-from agents.search.tuning_task import score_episode
+from agents.search.tuning import BATCH, journal_path, locked_study, scores_of
+from agents.search.tuning_task import score_episodes
 from dptse_env.estimators import EstimatorSettings
 from dptse_env.estimators.tuned_settings import load_settings, read_settings
 from tests.agents.search.tasks import TASK
 
+MADE_UP = dataclasses.replace(TASK, seeds=f"0:{3 * BATCH}")
+BATCHES = [tuple(range(k * BATCH, (k + 1) * BATCH)) for k in range(3)]
 
-def made_up(task, settings, seed):
-    """Best at a process noise of (0.02, 0.005) and the noise's own scale."""
+
+def made_up(task, settings, seeds):
+    """Best at a process noise of (0.02, 0.005)."""
     distance = (
         math.log(settings.process_noise[0] / 0.02) ** 2
         + math.log(settings.process_noise[1] / 0.005) ** 2
-        + math.log(settings.noise_scale) ** 2
     )
-    return EpisodeScore(seed, 10 + distance, 5 + distance, -0.1 * distance - seed, 0.0, 1.0, 0.0)
+    return [
+        EpisodeScore(seed, 10 + distance, 5 + distance, -0.1 * distance - seed, 0.0, 1.0, 0.0)
+        for seed in seeds
+    ]
 
 
 class Fake:
@@ -32,9 +37,9 @@ class Fake:
     def __init__(self):
         self.calls = []
 
-    def __call__(self, task, settings, seed):
-        self.calls.append((settings, seed))
-        return made_up(task, settings, seed)
+    def __call__(self, task, settings, seeds):
+        self.calls.append((settings, seeds))
+        return made_up(task, settings, seeds)
 
 
 @pytest.fixture
@@ -48,7 +53,7 @@ def executor():
         yield threads
 
 
-def run(folder, executor, n_trials, task=TASK, score=score_episode, **keywords):
+def run(folder, executor, n_trials, task=TASK, score=score_episodes, **keywords):
     with locked_study(task, folder, score=score) as study:
         study.run(n_trials, executor, **keywords)
     return study
@@ -67,7 +72,7 @@ def test_it_beats_the_defaults_on_real_traffic(tmp_path, executor):
     assert study.n_finished() == 6
     assert best.value >= defaults.value
     settings = EstimatorSettings(**best.user_attrs["settings"])
-    scores = [score_episode(task, settings, seed) for seed in (0, 1)]
+    scores = score_episodes(task, settings, (0, 1))
     assert best.value == pytest.approx(np.mean([score.reward for score in scores]), rel=1e-12)
     for key in ("rmse_density", "rmse_speed"):
         expected = np.mean([getattr(score, key) for score in scores])
@@ -75,7 +80,7 @@ def test_it_beats_the_defaults_on_real_traffic(tmp_path, executor):
 
 
 def test_it_finds_the_best_settings(tmp_path, executor, fake):
-    study = run(tmp_path, executor, 60, score=fake)
+    study = run(tmp_path, executor, 60, MADE_UP, fake)
     path = tmp_path / "x.json"
     study.write(path)
     assert read_settings(path).process_noise == pytest.approx((0.02, 0.005), rel=0.5)
@@ -83,24 +88,24 @@ def test_it_finds_the_best_settings(tmp_path, executor, fake):
     assert provenance["score"] == study.study.best_value > provenance["defaults"]["score"]
     assert provenance["defaults"]["score"] == scores_of(study.labelled("defaults"))["score"]
     assert provenance["n_trials"] == 60 > provenance["n_stopped_early"] > 0
-    assert (provenance["seeds"], provenance["bandwidth"]) == ("0:3", 2)
-    assert provenance["n_diverged"] == 3.0
+    assert (provenance["seeds"], provenance["bandwidth"]) == (MADE_UP.seeds, 2)
+    assert provenance["n_diverged"] == 3.0 * BATCH
     assert provenance["at_bounds"] == []
     assert len({tuple(t.params.values()) for t in study.study.get_trials()}) == 60
     assert set(provenance["versions"]) >= {"dptse-env", "optuna", "libsumo"}
 
 
 def test_the_defaults_and_the_present_set_are_tried_first_and_to_the_end(tmp_path, executor, fake):
-    run(tmp_path, executor, 2, score=fake)
+    run(tmp_path, executor, 2, MADE_UP, fake)
     first = EstimatorSettings(), load_settings("ekf-w99-3lane-paper")
-    assert fake.calls == [(settings, seed) for settings in first for seed in range(3)]
+    assert fake.calls == [(settings, seeds) for settings in first for seeds in BATCHES]
     other = Fake()
-    run(tmp_path / "open", executor, 1, dataclasses.replace(TASK, privacy="corrected"), other)
-    assert other.calls == [(EstimatorSettings(), seed) for seed in range(3)]
+    run(tmp_path / "open", executor, 1, dataclasses.replace(MADE_UP, privacy="corrected"), other)
+    assert other.calls == [(EstimatorSettings(), seeds) for seeds in BATCHES]
 
 
 def test_bad_trials_stop_early_but_never_the_first_two(tmp_path, executor, fake):
-    study = run(tmp_path, executor, 30, score=fake)
+    study = run(tmp_path, executor, 30, MADE_UP, fake)
     pruned = [t for t in study.study.get_trials() if t.state == TrialState.PRUNED]
     assert pruned
     assert all(len(t.intermediate_values) < 3 for t in pruned)
@@ -108,15 +113,15 @@ def test_bad_trials_stop_early_but_never_the_first_two(tmp_path, executor, fake)
 
 
 def test_an_interrupted_study_comes_out_as_one_that_was_not(tmp_path, executor, fake):
-    complete = run(tmp_path / "complete", executor, 20, score=fake)
-    first = trials(run(tmp_path / "parts", executor, 13, score=fake))
+    complete = run(tmp_path / "complete", executor, 20, MADE_UP, fake)
+    first = trials(run(tmp_path / "parts", executor, 13, MADE_UP, fake))
     path = journal_path(TASK, tmp_path / "parts")
     lines = path.read_bytes().splitlines(keepends=True)
     # Cut inside trial 12, as a kill in the middle of a write does, the lock still there.
     started = max(i for i, line in enumerate(lines) if json.loads(line)["op_code"] == 4)
     path.write_bytes(b"".join(lines[: started + 2]) + b'{"op_co')
     (tmp_path / "parts" / f"{path.name}.lock").touch()
-    resumed = run(tmp_path / "parts", executor, 20, score=fake)
+    resumed = run(tmp_path / "parts", executor, 20, MADE_UP, fake)
     kept = [trial for trial in trials(resumed) if trial[0] != TrialState.FAIL]
     assert len(trials(resumed)) == 21
     assert first[:12] == kept[:12]
@@ -136,7 +141,7 @@ def test_a_finished_study_does_nothing_more(tmp_path, executor, fake):
 
 
 def test_a_stale_first_trial_is_run_again(tmp_path, executor):
-    def fail(task, settings, seed):
+    def fail(task, settings, seeds):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -160,18 +165,19 @@ def test_several_trials_at_once_make_the_number_wanted(tmp_path, fake):
 
 
 def test_a_score_that_is_not_finite_is_never_the_best(tmp_path, executor):
-    def score(task, settings, seed):
-        result = made_up(task, settings, seed)
+    def without_reward(task, settings, seeds):
+        first, *rest = made_up(task, settings, seeds)
+        return [dataclasses.replace(first, reward=math.nan), *rest]
+
+    def score(task, settings, seeds):
         bad = settings.process_noise[0] > EstimatorSettings().process_noise[0]
-        return dataclasses.replace(result, reward=math.nan) if bad else result
+        return (without_reward if bad else made_up)(task, settings, seeds)
 
     study = run(tmp_path, executor, 20, score=score)
-    assert any("not_finite" in trial.user_attrs for trial in study.study.get_trials())
+    refused = [trial.user_attrs.get("not_finite") for trial in study.study.get_trials()]
+    assert [0] in refused
     assert study.best().params["process_noise.0"] <= 0.01
-    study = run(
-        tmp_path / "nothing", executor, 3,
-        score=lambda *args: dataclasses.replace(made_up(*args), reward=math.nan),
-    )  # fmt: skip
+    study = run(tmp_path / "nothing", executor, 3, score=without_reward)
     with pytest.raises(ValueError, match="ekf-w99-3lane-paper: no trial ran to its end"):
         study.write(tmp_path / "x.json")
 

@@ -3,7 +3,7 @@ import dataclasses
 import pytest
 
 from agents.evaluation.episodes import run_episode
-from agents.search.tuning_task import score_episode
+from agents.search.tuning_task import score_episodes
 from dptse_env.estimators import EstimatorSettings
 from dptse_env.model import ARZParameters
 from dptse_env.schedules import make_schedule
@@ -11,14 +11,16 @@ from tests.agents.policies import save
 from tests.agents.search.tasks import TASK
 
 
-def test_an_episode_is_what_an_evaluation_runs_with_another_noise_seed():
+def test_episodes_are_what_an_evaluation_runs_with_other_noise_seeds():
     settings = EstimatorSettings(process_noise=(0.02, 0.03))
     env = TASK.make(settings)
     assert env.unwrapped.config.settings() == settings
     schedule = make_schedule("paper", env)
-    expected = run_episode(env, schedule, traffic_seed=1, seed=1_000_001)
-    assert score_episode(TASK, settings, 1) == expected
-    assert score_episode(TASK, EstimatorSettings(), 1) != expected
+    expected = [
+        run_episode(env, schedule, traffic_seed=seed, seed=1_000_000 + seed) for seed in (1, 0)
+    ]
+    assert score_episodes(TASK, settings, (1, 0)) == expected
+    assert score_episodes(TASK, EstimatorSettings(), (1, 0)) != expected
 
 
 @pytest.mark.parametrize(
@@ -69,8 +71,8 @@ def test_settings_can_be_tuned_for_a_saved_policy(tmp_path):
     env = task.make(settings)
     assert env.unwrapped.config.action == "slots"
     expected = run_episode(env, task.source.load(env), traffic_seed=1, seed=1_000_001)
-    assert score_episode(task, settings, 1) == expected
-    assert score_episode(TASK, settings, 1) != expected
+    assert score_episodes(task, settings, (1,)) == [expected]
+    assert score_episodes(TASK, settings, (1,)) != [expected]
     other = dataclasses.replace(TASK, schedule=str(save(tmp_path / "other.zip", seed=2)))
     assert task.identity()["schedule"] != other.identity()["schedule"]  # by content, not by name
     with pytest.raises(ValueError, match="bandwidth is 2 for the policy and 3"):
