@@ -56,14 +56,20 @@ def checked_rows(name: str, rows: FloatArray, shape: tuple[int, ...]) -> FloatAr
     return array
 
 
+def without_repeats(array: FloatArray) -> FloatArray:
+    """Return the part of a broadcast array that its other items repeat."""
+    return array[tuple(slice(1) if stride == 0 else slice(None) for stride in array.strides)]
+
+
 def checked_deviations(sigma: FloatArray, shape: tuple[int, ...]) -> FloatArray:
     """Return standard deviations of full shape; refuse one that is negative or not finite."""
     given = np.asarray(sigma, dtype=np.float64)
     if given.shape[-1:] != shape[-1:] or given.ndim > len(shape):
         raise ValueError(f"sigma must have shape {shape} or broadcast to it, got {given.shape}")
-    if not (given >= 0.0).all() or not np.isfinite(given).all():
-        worst = given[~((given >= 0.0) & np.isfinite(given))].flat[0]
-        raise ValueError(f"sigma must be finite and >= 0, got {worst}")
+    distinct = without_repeats(given)
+    sound = (distinct >= 0.0) & np.isfinite(distinct)
+    if not sound.all():
+        raise ValueError(f"sigma must be finite and >= 0, got {distinct[~sound].flat[0]}")
     try:
         return np.ascontiguousarray(np.broadcast_to(given, shape))
     except ValueError as problem:
@@ -105,8 +111,9 @@ def checked_centres(centre: FloatArray | None, model: ARZModel, n_rows: int) -> 
     given = np.asarray(centre, dtype=np.float64)
     if given.ndim > 2 or given.shape[-1:] != shape[1:] or given.shape[:-1] not in ((), shape[:1]):
         raise ValueError(f"centre must have shape {shape} or broadcast to it, got {given.shape}")
-    if not np.isfinite(given).all():
-        raise ValueError(f"centre must be finite, got {given[~np.isfinite(given)].flat[0]}")
+    distinct = without_repeats(given)
+    if not np.isfinite(distinct).all():
+        raise ValueError(f"centre must be finite, got {distinct[~np.isfinite(distinct)].flat[0]}")
     return np.ascontiguousarray(np.broadcast_to(given, shape))
 
 

@@ -161,7 +161,7 @@ def split_release(
     centre = released.centre
     if centre is None:
         v_0 = np.nan if model.reference_speed is None else model.reference_speed
-        own, at_boundary = np.full((len(values), n_segments), v_0), None
+        own, at_boundary = np.broadcast_to(np.float64(v_0), (len(values), n_segments)), None
     else:
         own, at_boundary = centre[:, :n_segments], centre[:, n_segments:]
     return MeasuredRows(values[:, :n_rows], sigma, own), (values[:, n_rows:], at_boundary)

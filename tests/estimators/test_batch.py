@@ -29,6 +29,15 @@ def test_episodes_out_of_range_are_refused():
         ({"sigma": np.ones((2, 4, 2))}, r"sigma must have shape .*, got \(2, 4, 2\)"),
         ({"sigma": np.array([1.0, -1.0])}, r"sigma must be finite and >= 0, got -1\.0"),
         ({"sigma": np.array([np.inf, 1.0])}, r"sigma must be finite and >= 0, got inf"),
+        (
+            {"sigma": np.broadcast_to([[[1.0, 1.0]], [[1.0, np.nan]]], (2, 5, 2))},
+            r"sigma must be finite and >= 0, got nan",
+        ),
+        (
+            {"sigma": np.broadcast_to(np.array([1.0, 1.0, 1.0, 1.0, -2.0])[:, None], (2, 5, 2))},
+            r"sigma must be finite and >= 0, got -2\.0",
+        ),
+        ({"centre": np.broadcast_to([[5.0], [np.inf]], (2, 5))}, r"centre must .*, got inf"),
         ({"centre": np.ones((2, 4))}, r"centre must have shape \(2, 5\) or .*, got \(2, 4\)"),
         ({"centre": np.full(5, np.nan)}, r"centre must be finite, got nan"),
     ],
