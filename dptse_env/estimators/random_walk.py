@@ -18,7 +18,8 @@ class RandomWalk(BatchEstimator):
 
     Means are clipped to [0, rho_m] and [0, 1.1 v_f]. A released flow rho (v - v_0) is converted to
     a speed by the density just estimated, which is treated as exact and at least a hundredth of
-    rho_m.
+    rho_m. A row of several segments corrects each of them by its share of the uncertainty; what it
+    says of their errors together, their covariance, is dropped.
     """
 
     def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
@@ -69,6 +70,15 @@ class RandomWalk(BatchEstimator):
         self.variances[episodes] += self._process_variance
 
     def _update(self, measured: Measurements) -> None:
+        if self.model.rows.are_single:
+            self._update_segments(measured)
+        else:
+            self._update_rows(measured)
+        finite = np.isfinite(measured.values).all(axis=2) | ~measured.observed
+        self._restart(measured.episodes, np.all(finite, axis=1))
+
+    def _update_segments(self, measured: Measurements) -> None:
+        """Update all segments at once, by rows of single segments in their order."""
         values, sigma = measured.values, measured.sigma
         self._update_quantity(measured, slice(0, 1), values[..., :1], sigma[..., :1])
         speeds, sigma = values[..., 1:], sigma[..., 1:]
@@ -77,8 +87,6 @@ class RandomWalk(BatchEstimator):
             speeds = measured.centre[..., None] + speeds / density
             sigma = sigma / density
         self._update_quantity(measured, slice(1, 2), speeds, sigma)
-        finite = np.isfinite(measured.values).all(axis=2) | ~measured.observed
-        self._restart(measured.episodes, np.all(finite, axis=1))
 
     def _update_quantity(
         self, measured: Measurements, which: slice, values: FloatArray, sigma: FloatArray
@@ -98,6 +106,64 @@ class RandomWalk(BatchEstimator):
         self.means[episodes, :, which] = np.clip(mean + gain * residual, 0.0, upper)
         # Joseph form: no difference of nearly equal numbers.
         self.variances[episodes, :, which] = (1.0 - gain) ** 2 * variance + gain**2 * noise
+
+    def _update_rows(self, measured: Measurements) -> None:
+        """Update the segments of one row after the other: by its density, then by its flow."""
+        rows = self.model.rows
+        self.innovations[measured.episodes] = 0.0
+        for m in range(rows.n_rows):
+            seen = measured.observed[:, m]
+            if not seen.any():
+                continue
+            covered = slice(rows.first[m], rows.first[m] + rows.span[m])
+            episodes = measured.episodes[seen]
+            values, noise = measured.values[seen, m], measured.sigma[seen, m] ** 2
+            centre = measured.centre[seen, covered]
+            share = np.full(centre.shape, 1.0 / rows.span[m])
+            self._update_average(episodes, m, covered, 0, share, values[:, 0], noise[:, 0])
+            density = np.maximum(self.means[episodes, covered, 0], self._least_density[covered, 0])
+            share = density * share
+            flow = values[:, 1] + np.sum(share * centre, axis=1)
+            self._update_average(episodes, m, covered, 1, share, flow, noise[:, 1])
+
+    def _update_average(
+        self,
+        episodes: IntArray,
+        row: int,
+        covered: slice,
+        quantity: int,
+        weights: FloatArray,
+        values: FloatArray,
+        noise: FloatArray,
+    ) -> None:
+        """Update densities (0) or speeds (1) of segments, of which a weighted sum is measured.
+
+        Args:
+            episodes: Shape (k,).
+            row: The row that measures it.
+            covered: The segments, c of them.
+            quantity: 0 or 1.
+            weights: Shape (k, c).
+            values: The measured sums, shape (k,).
+            noise: Variances of their noise, shape (k,).
+        """
+        mean = self.means[episodes, covered, quantity]
+        variance = self.variances[episodes, covered, quantity]
+        parts = weights**2 * variance
+        total = parts.sum(axis=1) + noise
+        informative = (total > 0.0) & np.isfinite(values)
+        held = np.where(informative, total, 1.0)
+        residual = np.where(informative, values - np.sum(weights * mean, axis=1), 0.0)
+        gain = np.where(informative, 1.0 / held, 0.0)[:, None] * weights * variance
+        self.innovations[episodes, row, quantity] = residual / np.sqrt(held)
+        upper = self._upper[covered, quantity]
+        moved = np.clip(mean + gain * residual[:, None], 0.0, upper)
+        self.means[episodes, covered, quantity] = moved
+        # Joseph form: what the row says of a segment is blurred by the noise and by the others.
+        blur = noise[:, None] + parts.sum(axis=1, keepdims=True) - parts
+        self.variances[episodes, covered, quantity] = (
+            1.0 - gain * weights
+        ) ** 2 * variance + gain**2 * blur
 
     def estimate(self) -> Estimate:
         """Current estimate of all episodes."""

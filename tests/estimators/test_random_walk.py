@@ -1,10 +1,12 @@
 import numpy as np
 import pytest
 
-from dptse_env.estimators import EstimatorSettings
+from dptse_env.estimators import EstimatorSettings, make_estimator
+from dptse_env.model.rows import MeasurementRows
 
 from . import episodes as shared
 from .episodes import REFERENCE_SPEED, RELEASES, run, simulate
+from .rows import averaged, update, with_rows
 
 SETTINGS = EstimatorSettings(walk_noise=(0.03, 0.02), initial_variance=2e-3)
 BOTH = np.array([333.0, 102.0])  # units of density and speed, the paper's
@@ -115,3 +117,63 @@ def test_no_infinity_is_clipped_into_bounds(release, bad, which):
         for field in ("density", "speed", "density_std", "speed_std"):
             np.testing.assert_array_equal(getattr(estimate, field)[1], getattr(prior, field)[1])
         np.testing.assert_array_equal(walk.innovations[1], 0.0)
+
+
+def test_a_row_of_one_segment_is_read_alike_wherever_it_stands():
+    """Rows that are the segments in another order take the other path of the code."""
+    plain = simulate(n_steps=40, release="flow")
+    n = plain.model.n_segments
+    order = np.random.default_rng(3).permutation(n)
+    turned = with_rows(plain.model, MeasurementRows(order, np.ones(n, dtype=np.int64), n))
+    assert not turned.rows.are_single
+    walk = started(plain)
+    other = make_estimator("random_walk", "compiled", turned, 1, SETTINGS)
+    other.reset(plain.everyone, plain.start, shared.random_streams(1))
+    for k in range(40):
+        for each, at in ((walk, np.arange(n)), (other, order)):
+            each.predict(plain.everyone, plain.inputs[k])
+            values, observed = plain.values[k][:, at], plain.observed[k][:, at]
+            each.update(plain.everyone, observed, values, plain.sigma)
+        np.testing.assert_allclose(other.means, walk.means, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(other.variances, walk.variances, rtol=1e-9)
+        np.testing.assert_allclose(other.innovations, walk.innovations[:, order], atol=1e-9)
+
+
+def test_rows_of_several_segments_are_kalman_updates_without_covariances():
+    episodes = averaged(12)
+    rows = episodes.model.rows
+    assert rows.span.max() == 3
+    walk = started(episodes)
+    n = episodes.model.n_segments
+    largest = np.stack([episodes.model.jam_density, np.full(n, LARGEST[1])], axis=1)
+    for k in range(12):
+        walk.predict(episodes.everyone, episodes.inputs[k])
+        means, variances = walk.means[0].copy(), walk.variances[0].copy()
+        for m in np.flatnonzero(episodes.observed[k, 0]):
+            H, centre = rows.weights[m].copy(), episodes.centre[k, 0]
+            for i in range(2):
+                if i == 1:
+                    H *= np.maximum(means[:, 0], 0.01 * episodes.model.jam_density)
+                noise = episodes.sigma[k, 0, m, i] ** 2
+                P = np.diag(variances[:, i])
+                total = H @ P @ H + noise
+                value = episodes.values[k, 0, m, i] + (H @ centre if i == 1 else 0.0)
+                residual = value - H @ means[:, i]
+                gain = P @ H / total
+                means[:, i] = np.clip(means[:, i] + gain * residual, 0.0, largest[:, i])
+                variances[:, i] = np.diag(P - np.outer(gain, H @ P))
+        update(walk, episodes, k)
+        np.testing.assert_allclose(walk.means[0], means, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(walk.variances[0], variances, rtol=1e-7)
+
+
+def test_a_sum_that_is_not_finite_resets_the_episode():
+    episodes = averaged(2)
+    walk = started(episodes)
+    values = episodes.values[0].copy()
+    values[0, -1, 1] = np.nan
+    args = episodes.sigma[0], episodes.centre[0]
+    walk.update(episodes.everyone, np.ones_like(episodes.observed[0]), values, *args)
+    assert walk.diverged[0]
+    np.testing.assert_array_equal(walk.means, walk._prior)
+    assert np.all(walk.innovations == 0.0)
