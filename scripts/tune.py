@@ -64,7 +64,7 @@ class Args:
     noise_seed: int = TUNING.start
     """Noise and estimators are seeded with this plus the traffic seed."""
     noise_scale: bool = False
-    """Search the scale of R, too, although the mechanism's noise is known."""
+    """Search the scale of the noise of flows or speeds, too, although the mechanism's is known."""
     demand: bool = False
     """Search demand states, too, and the noise that goes with them."""
     variant: str = ""

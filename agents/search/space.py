@@ -49,7 +49,7 @@ _PROCESS_NOISE: Mapping[str, Knob] = {
 # Demand states explain what constant process noise stands for otherwise, so that its best values
 # are smaller.
 DEMAND: Mapping[str, Knob] = {
-    "process_noise.0": evenly(3e-4, 5e-2),
+    "process_noise.0": evenly(1e-4, 5e-2),
     "process_noise.1": evenly(1e-5, 5e-2),
     "density_growth": evenly(1e-4, 0.1),
     "count_noise": evenly(3e-3, 3.0),
@@ -62,14 +62,18 @@ DEMAND_START = EstimatorSettings(
     process_noise=(0.0061, 0.001),
     density_growth=0.0115,
     count_noise=0.09,
-    noise_scale=(1.2, 1.2),
+    noise_scale=(1.0, 1.2),
     demand=DemandSettings(),
 )
 """The settings with demand states from which a search begins."""
 
 # Q and R times one factor leave the estimates of all but the UKF as they are, and there alpha does
-# what the factor would: R is known from the mechanism, so it stays and Q is searched.
-NOISE_SCALE = {"noise_scale.0": evenly(0.5, 5.0), "noise_scale.1": evenly(0.5, 5.0)}
+# what the factor would: R is known from the mechanism, so it stays and Q is searched. What may be
+# searched is the weight of flows or speeds beside densities.
+NOISE_SCALE: Mapping[str, Knob] = {
+    "noise_scale.0": CategoricalDistribution((1.0,)),
+    "noise_scale.1": evenly(0.5, 5.0),
+}
 
 SPACE: dict[str, Mapping[str, Knob]] = {
     "ekf": _PROCESS_NOISE,
@@ -98,7 +102,7 @@ def search_space(
 
     Args:
         estimator: Its name.
-        with_noise_scale: Whether to search the scale of R.
+        with_noise_scale: Whether to search the scale of the noise of flows or speeds.
         with_demand: Whether to search demand states and the noise that goes with them.
 
     Raises:

@@ -40,7 +40,7 @@ class TuningTask:
         schedule: Query schedule, or a saved policy: its ``.zip`` file or shipped name.
         noise_seed: Noise and estimators are seeded with this plus the traffic seed.
         records: Folder of the record cache; the user's cache if None.
-        with_noise_scale: Whether to search the scale of the measurements' noise, too.
+        with_noise_scale: Whether to search the scale of the noise of flows or speeds, too.
         with_demand: Whether to search demand states and the noise that goes with them, too.
         variant: Ending of the set's name; empty for the set that is the default of its privacy
             preset.
