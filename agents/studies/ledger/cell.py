@@ -9,9 +9,17 @@ from typing import Any
 CAPPED, PACED, EXACT = MECHANISMS = ("capped", "paced", "exact")
 """Release models; ``exact`` has no noise and no guarantee."""
 EXACT_PRESET = "agents.studies.ledger.exact:Exact"
-PLAIN, DEMAND, WALK = FILTERS = ("ekf", "ekf-demand", "random_walk")
-"""Filters: the EKF, the EKF with demand states, and the random walk."""
-FILTER_LABELS = {PLAIN: "EKF", DEMAND: "EKF with demand states", WALK: "random walk"}
+PLAIN, DEMAND, WALK = "ekf", "ekf-demand", "random_walk"
+FILTER_LABELS = {
+    PLAIN: "EKF",
+    DEMAND: "EKF with demand states",
+    "ukf-demand": "UKF with demand states",
+    "enkf-demand": "EnKF with demand states",
+    "mhe-demand": "MHE with demand states",
+    WALK: "random walk",
+}
+FILTERS = tuple(FILTER_LABELS)
+"""Filters: an estimator, with demand states or without."""
 TRACER, EQUAL_RATES = "tracer", "equal-rates"
 PACINGS = {TRACER: "tracer", EQUAL_RATES: "agents.studies.ledger.pacing:EqualRates"}
 """Pacings by their names in the cells: by the rates of the queries, or by equal rates."""
@@ -32,24 +40,39 @@ class FilterSets:
     Attributes:
         capped: The EKF under ``capped``.
         capped_demand: The EKF with demand states under ``capped``.
+        capped_walk: The random walk under ``capped``.
         paced: The EKF under ``paced`` and ``exact``.
         paced_demand: The EKF with demand states under ``paced`` and ``exact``.
-        walk: The random walk under every mechanism.
+        paced_ukf: The UKF with demand states under ``paced``.
+        paced_enkf: The EnKF with demand states under ``paced``.
+        paced_mhe: The MHE with demand states under ``paced``.
+        paced_walk: The random walk under ``paced``.
     """
 
     capped: str = "ekf-w99-3lane-capped"
     capped_demand: str = "ekf-w99-3lane-capped-demand"
+    capped_walk: str = "random_walk-w99-3lane-capped"
     paced: str = "ekf-w99-3lane-capped"
     paced_demand: str = "ekf-w99-3lane-paced"
-    walk: str = "random_walk-w99-3lane-capped"
+    paced_ukf: str = "ukf-w99-3lane-paced"
+    paced_enkf: str = "enkf-w99-3lane-paced"
+    paced_mhe: str = "mhe-w99-3lane-paced"
+    paced_walk: str = "random_walk-w99-3lane-paced"
 
     def find(self, mechanism: str, filter_name: str) -> str:
         """Return the name of a set."""
-        if filter_name == WALK:
-            return self.walk
         if mechanism == CAPPED:
-            return self.capped if filter_name == PLAIN else self.capped_demand
-        return self.paced if filter_name == PLAIN else self.paced_demand
+            names = {PLAIN: self.capped, DEMAND: self.capped_demand, WALK: self.capped_walk}
+        else:
+            names = {
+                PLAIN: self.paced,
+                DEMAND: self.paced_demand,
+                "ukf-demand": self.paced_ukf,
+                "enkf-demand": self.paced_enkf,
+                "mhe-demand": self.paced_mhe,
+                WALK: self.paced_walk,
+            }
+        return names[filter_name]
 
 
 @dataclass(frozen=True)

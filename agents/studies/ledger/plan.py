@@ -13,6 +13,8 @@ from agents.studies.ledger.cell import (
     DEMAND,
     EQUAL_RATES,
     EXACT,
+    FILTER_LABELS,
+    FILTERS,
     PACED,
     PLAIN,
     REFERENCE,
@@ -206,6 +208,12 @@ class LedgerDesign(Design[LedgerCell]):
             rungs.append(Rung(label, self.cell(span=SPAN, bandwidth=cost, **at), base))
         return rungs
 
+    @property
+    def filters(self) -> list[Named]:
+        """Filters that are compared under ``paced``, the base filter first."""
+        names = [DEMAND, *(name for name in FILTERS if name not in (PLAIN, DEMAND))]
+        return [Named(FILTER_LABELS[name], self.cell(PACED, name)) for name in names]
+
     def along_epsilon(self, mechanism: str, delta: float) -> list[LedgerCell]:
         """Return the cells of one curve over epsilon."""
         return [self.cell(mechanism, epsilon=value, delta=delta) for value in self.epsilons]
@@ -251,6 +259,7 @@ class LedgerDesign(Design[LedgerCell]):
         """Yield the cells of every table and figure."""
         for guarantee in self.guarantees:
             yield from (rung.cell for rung in self.ladder(*guarantee))
+        yield from (each.cell for each in self.filters)
         for mechanism in (CAPPED, PACED):
             for delta in self.deltas:
                 yield from self.along_epsilon(mechanism, delta)

@@ -58,6 +58,16 @@ def epsilon_table(results: LedgerResults, metric: str) -> str:
     return markdown(["mechanism", *(f"ε = {value:g}" for value in design.epsilons)], rows)
 
 
+def filter_table(results: LedgerResults) -> str:
+    """Return both errors of every filter under ``paced``, and the difference to the first."""
+    filters = results.design.filters
+    rows = [
+        [label, *compared_errors(results, cell, filters[0].cell), _percent(results, cell, REFUSED)]
+        for label, cell in filters
+    ]
+    return markdown(["filter", *compared_header("the first"), REFUSED_HEADER], rows)
+
+
 def variants_table(results: LedgerResults) -> str:
     """Return errors by what is protected, and the paired difference to the base."""
     rows = []

@@ -6,7 +6,7 @@ from agents.studies.ledger.results import LedgerResults
 from agents.studies.ledger.watching import LENGTHS, LedgerScore, TripSums
 
 SHORT = "dptse_env:dptse/ShortHighway-v0"
-DEFAULTS = FilterSets("", "", "", "", "")
+DEFAULTS = FilterSets(*([""] * 9))
 """The settings that the environment takes by default, for every filter."""
 DESIGN = LedgerDesign(
     env=SHORT,
