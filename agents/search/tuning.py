@@ -78,7 +78,7 @@ class TuningStudy:
             pruner=optuna.pruners.MedianPruner(n_startup_trials=8, n_warmup_steps=1),
             load_if_exists=True,
         )
-        self._identify({**task.identity(), "sampler_seed": seed})
+        self._identify({**task.identity(), "sampler_seed": seed, "batch": BATCH})
         # No other process has the journal, so running trials belong to a run that was killed.
         for trial in self.study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
             self.study.tell(trial.number, state=TrialState.FAIL)
