@@ -208,11 +208,20 @@ class LedgerDesign(Design[LedgerCell]):
             rungs.append(Rung(label, self.cell(span=SPAN, bandwidth=cost, **at), base))
         return rungs
 
-    @property
-    def filters(self) -> list[Named]:
-        """Filters that are compared under ``paced``, the base filter first."""
+    def filters(self, **changes: Any) -> list[Named]:
+        """Return the cells of all filters under ``paced``, the base filter first."""
         names = [DEMAND, *(name for name in FILTERS if name not in (PLAIN, DEMAND))]
-        return [Named(FILTER_LABELS[name], self.cell(PACED, name)) for name in names]
+        return [Named(FILTER_LABELS[name], self.cell(PACED, name, **changes)) for name in names]
+
+    @property
+    def filter_tables(self) -> dict[str, list[Named]]:
+        """Cells of all filters, by what is queried."""
+        n = self.bandwidth
+        tables = {f"{n} segments": self.filters()}
+        if not self.single_only:
+            name = f"{n} sums of {SPAN} neighbours"
+            tables[name] = self.filters(span=SPAN, bandwidth_unit="sums")
+        return tables
 
     def along_epsilon(self, mechanism: str, delta: float) -> list[LedgerCell]:
         """Return the cells of one curve over epsilon."""
@@ -259,7 +268,8 @@ class LedgerDesign(Design[LedgerCell]):
         """Yield the cells of every table and figure."""
         for guarantee in self.guarantees:
             yield from (rung.cell for rung in self.ladder(*guarantee))
-        yield from (each.cell for each in self.filters)
+        for named in self.filter_tables.values():
+            yield from (each.cell for each in named)
         for mechanism in (CAPPED, PACED):
             for delta in self.deltas:
                 yield from self.along_epsilon(mechanism, delta)

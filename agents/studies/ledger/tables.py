@@ -60,12 +60,13 @@ def epsilon_table(results: LedgerResults, metric: str) -> str:
 
 def filter_table(results: LedgerResults) -> str:
     """Return both errors of every filter under ``paced``, and the difference to the first."""
-    filters = results.design.filters
-    rows = [
-        [label, *compared_errors(results, cell, filters[0].cell), _percent(results, cell, REFUSED)]
-        for label, cell in filters
-    ]
-    return markdown(["filter", *compared_header("the first"), REFUSED_HEADER], rows)
+    rows = []
+    for queries, filters in results.design.filter_tables.items():
+        for label, cell in filters:
+            errors = compared_errors(results, cell, filters[0].cell)
+            rows.append([queries, label, *errors, _percent(results, cell, REFUSED)])
+    header = ["queries a second", "filter", *compared_header("the first"), REFUSED_HEADER]
+    return markdown(header, rows)
 
 
 def variants_table(results: LedgerResults) -> str:

@@ -43,6 +43,7 @@ def test_the_full_design_holds_what_the_study_is_about():
     assert FULL.cell(bandwidth=10) in cells
     for name in ("ukf-demand", "enkf-demand", "mhe-demand", "random_walk"):
         assert FULL.cell(PACED, name) in cells
+        assert FULL.cell(PACED, name, span=2, bandwidth_unit="sums") in cells
     assert FULL.cell(EXACT) in cells
     assert FULL.cell(EXACT, span=2, bandwidth_unit="sums") in cells
 
@@ -59,7 +60,7 @@ def test_every_mechanism_has_the_set_that_was_tuned_for_it():
     assert FULL.cell(CAPPED).settings == sets.capped_demand
     assert FULL.cell().settings == FULL.cell(EXACT).settings == sets.paced_demand
     assert FULL.cell(CAPPED, "random_walk").settings == sets.capped_walk
-    names = [cell.settings for _, cell in FULL.filters]
+    names = [cell.settings for _, cell in FULL.filters()]
     assert names[0] == sets.paced_demand
     assert len(set(names)) == len(names) == 5
     assert all(name.endswith("-w99-3lane-paced") for name in names)
