@@ -121,7 +121,8 @@ class BatchEstimator(ABC):
     """An estimator of a batch of episodes; subclasses get checked, contiguous arguments.
 
     Public methods are documented in `Estimator`. A subclass writes `innovations` and `diverged` of
-    the episodes that it updates, and `fallback` where its update can fail.
+    the episodes that it updates, and `fallback` where its update can fail. It has `_estimate`, or
+    `estimate` where its settings have no `speed_cap`.
     """
 
     is_compiled: ClassVar[bool] = False
@@ -132,6 +133,8 @@ class BatchEstimator(ABC):
         self.n_episodes = n_episodes
         self.settings = settings
         self._noise_scale = np.array(getattr(settings, "noise_scale", (1.0, 1.0)))
+        cap = getattr(settings, "speed_cap", None)
+        self._largest_speed = None if cap is None else cap * model.network.speed_limit
         self.innovations = np.zeros((n_episodes, model.rows.n_rows, 2))
         self.diverged = np.zeros(n_episodes, dtype=np.bool_)
         self.fallback = np.zeros(n_episodes, dtype=np.bool_)
@@ -171,9 +174,16 @@ class BatchEstimator(ABC):
         self.fallback[measured.episodes] = False
         self._update(measured._replace(sigma=self._noise_scale * measured.sigma))
 
-    @abstractmethod
     def estimate(self) -> Estimate:
-        """Current estimate of all episodes."""
+        """Current estimate of all episodes, its speeds held to the settings' ``speed_cap``."""
+        estimate = self._estimate()
+        if self._largest_speed is not None:
+            np.minimum(estimate.speed, self._largest_speed, out=estimate.speed)
+        return estimate
+
+    def _estimate(self) -> Estimate:
+        """Return the estimate of all episodes in fresh arrays."""
+        raise NotImplementedError(f"{type(self).__name__} must have a method '_estimate'")
 
     @abstractmethod
     def _reset(

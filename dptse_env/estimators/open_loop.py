@@ -40,8 +40,7 @@ class OpenLoop(BatchEstimator):
         lost = episodes[self.diverged[episodes]]
         self.states[lost] = self._prior[lost]
 
-    def estimate(self) -> Estimate:
-        """Current estimate of all episodes."""
+    def _estimate(self) -> Estimate:
         density, speed = estimated_traffic(self.model, self.states)
         return Estimate(density, speed, np.zeros_like(density), np.zeros_like(speed))
 

@@ -165,8 +165,7 @@ class RandomWalk(BatchEstimator):
             1.0 - gain * weights
         ) ** 2 * variance + gain**2 * blur
 
-    def estimate(self) -> Estimate:
-        """Current estimate of all episodes."""
+    def _estimate(self) -> Estimate:
         deviations = np.sqrt(self.variances)
         return Estimate(
             self.means[..., 0].copy(),

@@ -142,6 +142,9 @@ class EstimatorSettings:
         demand: Settings of demand states; None for a filter that takes the demands as given.
         walk_noise: Standard deviations of a step of the random walk: of rho over rho_m, of v over
             v_f.
+        speed_cap: Largest speed that is reported, over the speed limit of the road; None for the
+            model's own bound, 1.1 v_f. It applies to `Estimate.speed` alone: states and standard
+            deviations are those of the filter.
         noise_scale: Factors on the standard deviations of the mechanism's noise, of a measured
             density and of a measured flow or speed, for an R that also covers what the model does
             not describe.
@@ -161,6 +164,7 @@ class EstimatorSettings:
     count_noise: Annotated[float, Interval(0, 100)] = 0.0
     demand: DemandSettings | None = None
     walk_noise: tuple[Deviation, Deviation] = (0.025, 0.025)
+    speed_cap: Annotated[float, Interval(0, 10, open_low=True)] | None = None
     noise_scale: tuple[NoiseScale, NoiseScale] = (1.0, 1.0)
     initial_variance: Annotated[float, Interval(0, 100, open_low=True)] = 1e-3
     bounds: Bounds = "cone"

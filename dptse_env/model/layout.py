@@ -38,6 +38,10 @@ class RoadNetwork(Protocol):
         """Length of every segment [km]."""
 
     @property
+    def speed_limit(self) -> float:
+        """Speed limit [km/h]; the dynamics do without it."""
+
+    @property
     def segment_lanes(self) -> Sequence[int]:
         """Lanes of each of the S segments."""
 

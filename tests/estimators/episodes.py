@@ -36,6 +36,7 @@ class Road:
     off_ramps: tuple[int, ...] = ()
     exit_shares: tuple[float, ...] = ()
     segment_length: float = 0.1
+    speed_limit: float = 102.0
     segment_lanes: tuple[int, ...] = (3,)
     lanes: int = 3
     ramp_lanes: int = 1

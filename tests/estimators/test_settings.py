@@ -25,6 +25,8 @@ from dptse_env.estimators.settings import (
         ("noise_scale", 1.0, r"noise_scale must be a sequence, got 1\.0"),
         ("initial_variance", 0.0, r"initial_variance must be a number in \(0, 100\], got 0\.0"),
         ("initial_variance", True, r"initial_variance must be a number"),
+        ("speed_cap", 0.0, r"speed_cap must be .*, got 0\.0"),
+        ("speed_cap", float("nan"), r"speed_cap must be .*, got nan"),
         ("bounds", "ball", r"bounds must be one of 'cone', 'box', got 'ball'"),
         ("ukf", {"alpha": 2.0}, r"ukf\.alpha must be a number in \[0\.001, 1\], got 2\.0"),
         ("ukf", {"alpha": 0.0}, r"ukf\.alpha must be a number in \[0\.001, 1\], got 0\.0"),
@@ -69,6 +71,7 @@ def test_settings_survive_json():
     settings = EstimatorSettings(
         process_noise=(0.1, 0.2),
         walk_noise=(0.3, 0.4),
+        speed_cap=1.05,
         noise_scale=(1.5, 2.5),
         bounds="box",
         ukf=SigmaPointSettings(alpha=0.5),

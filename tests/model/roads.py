@@ -24,6 +24,7 @@ class Road:
     off_ramps: tuple[int, ...] = ()
     exit_shares: tuple[float, ...] = ()
     segment_length: float = 0.1
+    speed_limit: float = 102.0
     lanes: int = 3
     ramp_lanes: int = 1
 

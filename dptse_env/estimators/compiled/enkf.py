@@ -108,8 +108,7 @@ class CompiledEnKF(BatchEstimator):
     def _update(self, measured: Measurements) -> None:
         kernels.update(self._road, self._packed, *measured)
 
-    def estimate(self) -> Estimate:
-        """Current estimate of all episodes."""
+    def _estimate(self) -> Estimate:
         out = np.empty((4, self.n_episodes, self.model.n_segments))
         kernels.summarise(self._road, self._ensembles.members, self.n_members, out)
         return Estimate(*out)

@@ -53,8 +53,7 @@ class CompiledFilter(BatchEstimator):
         """Covariances `(n, n_x, n_x)`, rho normalised by rho_m and psi by rho_m v_f, a copy."""
         return self._filters.covariances[:, :, : self.model.n_states].copy()
 
-    def estimate(self) -> Estimate:
-        """Current estimate of all episodes."""
+    def _estimate(self) -> Estimate:
         out = np.empty((4, self.n_episodes, self.model.n_segments))
         kernels.summarise(*self._packed, out)
         return Estimate(*out)

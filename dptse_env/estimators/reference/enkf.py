@@ -67,8 +67,8 @@ class ReferenceEnKF(BatchEstimator):
         rest = (self.members - self.states[:, None]) / self._state_unit
         return np.asarray(rest.swapaxes(1, 2) @ rest / (self.n_members - 1))
 
-    def estimate(self) -> Estimate:
-        """Current estimate of all episodes: the mean, and the deviations of the members."""
+    def _estimate(self) -> Estimate:
+        """Return the mean, and the deviations of the members."""
         # Both sets of bounds are convex: the projection removes rounding errors of the mean.
         mean = self.model.traffic(self._projected(self.states))
         spread = self.model.traffic(self.members).std(axis=1, ddof=1)

@@ -127,8 +127,7 @@ class ReferenceFilter(BatchEstimator):
         """Covariances `(n, n_x, n_x)`, rho normalised by rho_m and psi by rho_m v_f."""
         return np.stack([episode_filter.P for episode_filter in self._filters])
 
-    def estimate(self) -> Estimate:
-        """Current estimate of all episodes."""
+    def _estimate(self) -> Estimate:
         density, speed = estimated_traffic(self.model, self.states)
         deviation = np.sqrt(
             [traffic_variance(self.model, episode_filter) for episode_filter in self._filters]
