@@ -100,18 +100,22 @@ def versions_table(provenance: Mapping[str, Any]) -> str:
 
 
 _FILTER = (
-    "process_noise", "density_growth", "count_noise", "demand", "noise_scale", "initial_variance",
-    "bounds",
+    "process_noise", "process_noise_in", "density_growth", "count_noise", "demand", "speed_cap",
+    "noise_scale", "initial_variance", "bounds",
 )  # fmt: skip
 _READ_BY = {
     "ekf": _FILTER,
     "ukf": (*_FILTER, "ukf"),
     "enkf": (*_FILTER, "enkf"),
-    "mhe": ("process_noise", "density_growth", "count_noise", "demand", "noise_scale", "mhe"),
-    "random_walk": ("walk_noise", "noise_scale", "initial_variance"),
-    "open_loop": ("bounds",),
-}
-"""Fields of the settings that an estimator reads; those at zero or none are not shown."""
+    "mhe": (
+        "process_noise", "density_growth", "count_noise", "demand", "speed_cap", "noise_scale",
+        "mhe",
+    ),
+    "random_walk": ("walk_noise", "speed_cap", "noise_scale", "initial_variance"),
+    "open_loop": ("speed_cap", "bounds"),
+}  # fmt: skip
+"""Fields of the settings that an estimator reads; those at zero, none or psi are not shown."""
+_UNSAID = (None, 0.0, "psi")
 
 
 def settings_table(provenance: Mapping[str, Any]) -> str:
@@ -119,7 +123,7 @@ def settings_table(provenance: Mapping[str, Any]) -> str:
     rows = []
     for name, settings in provenance["made_with"]["settings"].items():
         read = _READ_BY[name.partition("-")[0]]
-        fields = {key: settings[key] for key in read if settings.get(key)}
+        fields = {key: settings[key] for key in read if settings.get(key) not in _UNSAID}
         tuned = "yes" if name in provenance["tuned"] else "no"
         rows.append([f"`{name}`", tuned, _one_line(fields)])
     return markdown(["settings", "tuned", "values"], rows)

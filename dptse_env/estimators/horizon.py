@@ -19,7 +19,7 @@ from dptse_env.model import ARZModel, Bounds
 from dptse_env.model.arz import LARGEST_FACTOR, LEAST_DENSITY, LEAST_FACTOR, LEAST_W
 from dptse_env.model.parameters import LARGEST_W
 from dptse_env.utils.arrays import BoolArray, FloatArray
-from dptse_env.utils.validation import positive
+from dptse_env.utils.validation import positive, require
 
 # Largest natural residual of an optimum, in normalised states.
 RESIDUAL = 1e-8
@@ -35,7 +35,9 @@ LEAST_DEVIATION = 1e-3
 
 
 def require_process_noise(settings: EstimatorSettings) -> None:
-    """Refuse a process noise of zero, whose weight w_2 would be infinite."""
+    """Refuse a process noise of zero, whose weight w_2 would be infinite, and one in (rho, w)."""
+    given = settings.process_noise_in
+    require(given == "psi", "estimator_settings.process_noise_in", "'psi' for the MHE", given)
     for i, value in enumerate(settings.process_noise):
         positive(f"estimator_settings.process_noise[{i}]", value)
 

@@ -32,6 +32,7 @@ from dptse_env.estimators.settings import (
         ("ukf", {"alpha": 0.0}, r"ukf\.alpha must be a number in \[0\.001, 1\], got 0\.0"),
         ("ukf", {"beta": -1.0}, r"ukf\.beta must be a number in \[0, 100\], got -1\.0"),
         ("ukf", {"kappa": "a"}, r"ukf\.kappa must be a number in \[-10000, 10000\], got 'a'"),
+        ("process_noise_in", "v", r"process_noise_in must be one of 'psi', 'w', got 'v'"),
         ("enkf", {"n_members": 1}, r"enkf\.n_members must be an integer in 2\.\.10000, got 1"),
         ("enkf", {"inflation": 0.9}, r"enkf\.inflation must be a number in \[1, 10\], got 0\.9"),
         ("enkf", {"taper": 0.0}, r"enkf\.taper must be .*, got 0\.0"),
@@ -71,6 +72,7 @@ def test_settings_survive_json():
     settings = EstimatorSettings(
         process_noise=(0.1, 0.2),
         walk_noise=(0.3, 0.4),
+        process_noise_in="w",
         speed_cap=1.05,
         noise_scale=(1.5, 2.5),
         bounds="box",

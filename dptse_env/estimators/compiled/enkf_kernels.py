@@ -13,6 +13,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from dptse_env.estimators.compiled.cholesky import solve
+from dptse_env.estimators.compiled.driver_noise import couple_members
 from dptse_env.estimators.compiled.ekf_kernels import Packed
 from dptse_env.estimators.compiled.moments import centre_row, is_finite, mean_of, moments_of
 from dptse_env.estimators.compiled.normals import Bits, Draws, fill, make_bits
@@ -40,7 +41,8 @@ class Ensembles(NamedTuple):
     streams: NDArray[np.uint64]  # (n, 2, 4, STREAM_WIDTH) of process noise and of measurement noise
     innovations: FloatArray  # (n, M, 2)
     diverged: BoolArray  # (n,)
-    process_deviation: FloatArray  # (n_x,) of a step [veh/km, veh/h, 1]
+    process_deviation: FloatArray  # (n_x,) of a step [veh/km, veh/h, 1]; of psi, or of rho_m w
+    noise_in_w: bool  # whether it is of w
     density_growth: float  # deviation over rho_m that rho = rho_m adds to the noise of rho
     count_variance: float  # variance of a density beside the noise, over rho, normalised
     initial_deviation: FloatArray  # (n_x,) of the members around a prior [veh/km, veh/h, 1]
@@ -109,6 +111,8 @@ def predict(road_: Packed, ensembles_: Packed, episodes: IntArray, inputs: Float
         _process_deviation(road, ensembles, members, deviation)
         advance_states(road, members, inputs[k], scratch)
         fill(ensembles.streams[episodes[k], 0], draws, bits)
+        if ensembles.noise_in_w:
+            couple_members(road, ensembles.density_scale, members, n, deviation, draws)
         _perturb(members, n, deviation, draws)
         project_states(road, members, ensembles.is_box)
 

@@ -12,6 +12,7 @@ from numba import njit
 
 from dptse_env.estimators.compiled.algebra import is_covariance, mirror
 from dptse_env.estimators.compiled.dense import eliminate
+from dptse_env.estimators.compiled.driver_noise import add_coupling, couple
 from dptse_env.estimators.compiled.ekf_kernels import (
     Filters,
     Packed,
@@ -56,10 +57,13 @@ def predict(
         advance_states(road, states, inputs[k], scratch)
         project_states(road, states, filters.is_box)
         gather(points, e, distances, shift, covariance)
-        for i in range(n):
-            covariance[i, i] += points.noise[e, i]
         mean[:] = points.centres[e]
         project(road, mean, filters.is_box)
+        if filters.noise_in_w:
+            couple(road, filters.density_scale, mean, points.noise[e], points.coupling[e])
+            add_coupling(covariance, points.coupling[e])
+        for i in range(n):
+            covariance[i, i] += points.noise[e, i]
         points.moved[e] = True
 
 
@@ -116,7 +120,7 @@ def _stay(road: RoadArrays, filters: Filters, points: Points, e: int, work: Outp
     draw(points, e, filters.means[e], root)
     project_states(road, points.states[e], filters.is_box)
     gather(points, e, work.distances, work.shift, covariance)
-    points.noise[e] = 0.0
+    points.noise[e], points.coupling[e] = 0.0, 0.0
     return True
 
 

@@ -103,7 +103,7 @@ def measure(
     for i in range(m):
         first, span = road.row_first[rows[i]], road.row_span[rows[i]]
         output_row, density_row = joint[m + i], joint[i]
-        _density_row(covariance, points.noise, e, first, span, density_row[start:])
+        _density_row(points, covariance, e, first, span, density_row[start:])
         for j in range(n):
             output_row[start + j] = (
                 points.weight * work.cross[i, j]
@@ -164,22 +164,24 @@ def _add_flows(
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _density_row(
-    covariance: FloatArray, noise: FloatArray, e: int, first: int, span: int, out: FloatArray
+    points: Points, covariance: FloatArray, e: int, first: int, span: int, out: FloatArray
 ) -> None:
     """Write the covariance of a row's average density with the states `(n_x,)`, in the points.
 
     That is P less the step's process noise, which the points do not have.
     """
-    n = covariance.shape[0]
+    n, noise, coupling = covariance.shape[0], points.noise[e], points.coupling[e]
     for j in range(n):
         out[j] = covariance[2 * first, j]
-    out[2 * first] -= noise[e, 2 * first]
+    out[2 * first] -= noise[2 * first]
+    out[2 * first + 1] -= coupling[first]
     if span == 1:
         return
     for s in range(first + 1, first + span):
         for j in range(n):
             out[j] += covariance[2 * s, j]
-        out[2 * s] -= noise[e, 2 * s]
+        out[2 * s] -= noise[2 * s]
+        out[2 * s + 1] -= coupling[s]
     for j in range(n):
         out[j] /= span
 

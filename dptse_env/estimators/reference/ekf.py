@@ -11,6 +11,7 @@ from dptse_env.estimators.reference.kalman import (
     linearise,
     measurement_covariance,
     process_covariance,
+    step_variance,
 )
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
@@ -39,11 +40,11 @@ class _Filter(ExtendedKalmanFilter):  # type: ignore[misc]
 
     def predict_x(self, u: FloatArray) -> None:
         """Predict by the ARZ model instead of a matrix."""
-        before, inputs = self.state, u[None]
-        self.Q = process_covariance(self)
+        before, inputs, variance = self.state, u[None], step_variance(self)
         jacobian = self.model.jacobian(before, inputs)[0]
         self.F = jacobian * self.scale[None] / self.scale[:, None]
         self.state = self.model.step(before, inputs)
+        self.Q = process_covariance(self, variance)
 
     def advance(self, u: FloatArray) -> None:
         self.predict(u)

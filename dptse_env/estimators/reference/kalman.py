@@ -12,6 +12,7 @@ from dptse_env.estimators.base import Estimate
 from dptse_env.estimators.batch import BatchEstimator, EpisodeMeasurements, Measurements
 from dptse_env.estimators.noise import (
     count_variance,
+    coupled_covariance,
     density_growth,
     initial_variance,
     process_variance,
@@ -88,12 +89,18 @@ def configure(episode_filter: Any, model: ARZModel, settings: EstimatorSettings)
     episode_filter.restart()
 
 
-def process_covariance(episode_filter: Any) -> FloatArray:
-    """Return Q of a step that leaves the present mean of a filter that was configured."""
+def step_variance(episode_filter: Any) -> FloatArray:
+    """Return the variances `(n_x,)` of the noise of a step that leaves a filter's present mean."""
     model, settings = episode_filter.model, episode_filter.settings
     density = model.density(episode_filter.state)[0]
-    variance = process_variance(model, settings) + density_growth(model, settings, density)
-    return np.diag(variance)
+    return process_variance(model, settings) + density_growth(model, settings, density)
+
+
+def process_covariance(episode_filter: Any, variance: FloatArray) -> FloatArray:
+    """Return Q of a step that leads to a filter's present mean, of its `step_variance`."""
+    if episode_filter.settings.process_noise_in == "psi":
+        return np.diag(variance)
+    return coupled_covariance(episode_filter.model, variance, episode_filter.state[0])
 
 
 def measurement_covariance(episode_filter: Any, measured: EpisodeMeasurements) -> FloatArray:

@@ -19,7 +19,7 @@ from dptse_env.estimators.noise import count_variance, initial_variance
 from dptse_env.estimators.reference.kalman import (
     EpisodeFilter,
     ReferenceFilter,
-    process_covariance,
+    step_variance,
 )
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
@@ -83,7 +83,7 @@ class _EpisodeWindow:
         mean = np.mean([stage.solution for stage in self.stages], axis=0)
         before = self.stages[-1]
         before.inputs = u
-        before.process_variance = np.diag(process_covariance(self))
+        before.process_variance = step_variance(self)
         self.state = self.model.step(self.model.project(self.state), u[None])
         self.stages.append(self._stage(mean))
         if self.mhe.linearisation == "paper":

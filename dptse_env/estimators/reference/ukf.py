@@ -10,6 +10,7 @@ from dptse_env.estimators.reference.kalman import (
     configure,
     measurement_covariance,
     process_covariance,
+    step_variance,
 )
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
@@ -45,6 +46,7 @@ class _Filter(UnscentedKalmanFilter):  # type: ignore[misc]
         points = _Points(model.n_states, alpha=ukf.alpha, beta=ukf.beta, kappa=ukf.kappa)
         sizes = model.n_states, 2 * model.rows.n_rows, model.time_step
         super().__init__(*sizes, None, None, points, x_mean_fn=_mean, z_mean_fn=_mean)
+        self.Q = np.zeros((model.n_states, model.n_states))  # known once the mean is predicted
         configure(self, model, settings)
 
     @property
@@ -76,8 +78,9 @@ class _Filter(UnscentedKalmanFilter):  # type: ignore[misc]
         return np.asarray((sigmas_f - x).T @ (self.Wc[:, None] * (sigmas_h - z)))
 
     def advance(self, inputs: FloatArray) -> None:
-        self.Q = process_covariance(self)
+        variance = step_variance(self)
         self.predict(inputs=inputs)
+        self.P += process_covariance(self, variance)
         self.has_moved = True
 
     def assimilate(self, measured: EpisodeMeasurements) -> FloatArray:
