@@ -21,7 +21,12 @@ from typing import Annotated, Any
 from dptse_env.config import PRESETS, EnvConfig
 from dptse_env.env import SensorQueryEnv
 from dptse_env.estimators import EstimatorSettings
-from dptse_env.estimators.settings import EnsembleSettings, HorizonSettings, SigmaPointSettings
+from dptse_env.estimators.settings import (
+    BlendSettings,
+    EnsembleSettings,
+    HorizonSettings,
+    SigmaPointSettings,
+)
 from dptse_env.model import ARZParameters
 from dptse_env.registration import ENVIRONMENTS
 from dptse_env.release import CappedSettings, PrivacySettings
@@ -50,6 +55,7 @@ SECTIONS: Mapping[type, str] = {
     SigmaPointSettings: "`estimator_settings.ukf`",
     EnsembleSettings: "`estimator_settings.enkf`",
     HorizonSettings: "`estimator_settings.mhe`",
+    BlendSettings: "`estimator_settings.blend`",
 }
 """Nested dataclasses, with the headings of their tables."""
 

@@ -31,6 +31,7 @@ LABELS = {
     "enkf": "EnKF",
     "mhe": "MHE",
     "random_walk": "random walk",
+    "blend": "EKF and random walk",
     "open_loop": "open loop",
 }
 """Names of the estimators in figures and tables."""
@@ -40,6 +41,7 @@ ESTIMATOR_LOOKS = {
     "enkf": Look("#009e73", "^"),
     "mhe": Look("#cc79a7", "D"),
     "random_walk": Look("#666666", "v", "--"),
+    "blend": Look("#56b4e9", "P"),
     "open_loop": Look("#000000", "", ":"),
 }
 

@@ -112,6 +112,7 @@ _READ_BY = {
         "mhe",
     ),
     "random_walk": ("walk_noise", "speed_cap", "noise_scale", "initial_variance"),
+    "blend": (*_FILTER, "walk_noise", "blend"),
     "open_loop": ("speed_cap", "bounds"),
 }  # fmt: skip
 """Fields of the settings that an estimator reads; those at zero, none or psi are not shown."""

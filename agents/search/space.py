@@ -46,6 +46,11 @@ _PROCESS_NOISE: Mapping[str, Knob] = {
     "process_noise.1": evenly(1e-3, 5e-2),
 }
 
+_WALK_NOISE: Mapping[str, Knob] = {
+    "walk_noise.0": evenly(1e-3, 0.1),
+    "walk_noise.1": evenly(1e-3, 0.1),
+}
+
 # Demand states explain what constant process noise stands for otherwise, so that its best values
 # are smaller.
 DEMAND: Mapping[str, Knob] = {
@@ -90,7 +95,13 @@ SPACE: dict[str, Mapping[str, Knob]] = {
         "mhe.linearisation": CategoricalDistribution(("paper", "trajectory")),
         "mhe.bounds": CategoricalDistribution(("box", "cone")),
     },
-    "random_walk": {"walk_noise.0": evenly(1e-3, 0.1), "walk_noise.1": evenly(1e-3, 0.1)},
+    "random_walk": _WALK_NOISE,
+    "blend": {
+        **_PROCESS_NOISE,
+        **_WALK_NOISE,
+        "blend.density_weight": FloatDistribution(0.0, 1.0),
+        "blend.speed_weight": FloatDistribution(0.0, 1.0),
+    },
 }
 """By estimator: paths into `EstimatorSettings` and where their values are searched."""
 

@@ -10,6 +10,7 @@ from dptse_env.estimators.registry import (
     settings_type,
 )
 from dptse_env.estimators.settings import (
+    BlendSettings,
     DemandSettings,
     EnsembleSettings,
     EstimatorSettings,
@@ -20,6 +21,7 @@ from dptse_env.estimators.settings import (
 __all__ = [
     "BACKENDS",
     "ESTIMATORS",
+    "BlendSettings",
     "DemandSettings",
     "EnsembleSettings",
     "Estimate",

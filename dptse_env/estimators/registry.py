@@ -48,6 +48,7 @@ ESTIMATORS = Registry(
         "enkf": _filter("enkf", "EnKF"),
         "mhe": _filter("mhe", "MHE"),
         "random_walk": Backends(_WALK, _WALK),
+        "blend": _filter("blend", "Blend"),
         "open_loop": Backends(_OPEN, _OPEN),
     },
     check=_expected,
@@ -63,8 +64,9 @@ def make_estimator(
     """Build an estimator for a batch of episodes.
 
     Args:
-        estimator: `ekf`, `ukf`, `enkf`, `mhe`, `random_walk` (no traffic model), `open_loop` (no
-            measurements), a registered name, ``"package.module:Class"`` or a class.
+        estimator: `ekf`, `ukf`, `enkf`, `mhe`, `random_walk` (no traffic model), `blend` (a mean
+            of EKF and random walk), `open_loop` (no measurements), a registered name,
+            ``"package.module:Class"`` or a class.
         backend: `compiled` (numba) or `reference` (numpy, filterpy, qpsolvers); the random walk
             is plain numpy under both. For a class of another package it selects the model alone.
         model: The traffic model.

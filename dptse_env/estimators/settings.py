@@ -130,6 +130,26 @@ class DemandSettings:
 
 
 @dataclass(frozen=True)
+class BlendSettings:
+    """Settings of the blend of an EKF and a random walk beside `EstimatorSettings`.
+
+    Attributes:
+        density_weight: Weight of the EKF's density; the random walk's has the rest.
+        speed_weight: Weight of the EKF's speed; the random walk's has the rest.
+
+    Raises:
+        ValueError: A value is out of range.
+    """
+
+    density_weight: Annotated[float, Interval(0, 1)] = 0.6
+    speed_weight: Annotated[float, Interval(0, 1)] = 0.6
+
+    def __post_init__(self) -> None:
+        """Check values."""
+        checked_fields(self, f"{_PATH}.blend")
+
+
+@dataclass(frozen=True)
 class EstimatorSettings:
     """Tuning of the estimators, in units of the jam density rho_m and of v_f.
 
@@ -160,6 +180,7 @@ class EstimatorSettings:
         ukf: Further settings of the unscented Kalman filter.
         enkf: Further settings of the ensemble Kalman filter.
         mhe: Further settings of the moving horizon estimator, with separate bounds.
+        blend: Further settings of the blend, whose EKF and random walk share the others.
 
     Raises:
         ValueError: A value is out of range.
@@ -178,6 +199,7 @@ class EstimatorSettings:
     ukf: SigmaPointSettings = field(default_factory=SigmaPointSettings)
     enkf: EnsembleSettings = field(default_factory=EnsembleSettings)
     mhe: HorizonSettings = field(default_factory=HorizonSettings)
+    blend: BlendSettings = field(default_factory=BlendSettings)
 
     def __post_init__(self) -> None:
         """Check values; lists become tuples."""

@@ -183,6 +183,7 @@ BLIND = {
     "ukf": (WITHOUT_NOISE, 1e-4),
     "enkf": (WITHOUT_NOISE, 1e-4),
     "mhe": (EstimatorSettings(mhe=ALONG), 1e-8),
+    "blend": (EstimatorSettings(), 1e-9),
 }
 
 

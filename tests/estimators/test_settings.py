@@ -5,6 +5,7 @@ import pytest
 
 from dptse_env.estimators.settings import (
     REFUSED_SOLVERS,
+    BlendSettings,
     EnsembleSettings,
     EstimatorSettings,
     HorizonSettings,
@@ -33,6 +34,8 @@ from dptse_env.estimators.settings import (
         ("ukf", {"beta": -1.0}, r"ukf\.beta must be a number in \[0, 100\], got -1\.0"),
         ("ukf", {"kappa": "a"}, r"ukf\.kappa must be a number in \[-10000, 10000\], got 'a'"),
         ("process_noise_in", "v", r"process_noise_in must be one of 'psi', 'w', got 'v'"),
+        ("blend", {"density_weight": 1.1}, r"blend\.density_weight must be .*, got 1\.1"),
+        ("blend", {"speed_weight": -0.1}, r"blend\.speed_weight must be .*, got -0\.1"),
         ("enkf", {"n_members": 1}, r"enkf\.n_members must be an integer in 2\.\.10000, got 1"),
         ("enkf", {"inflation": 0.9}, r"enkf\.inflation must be a number in \[1, 10\], got 0\.9"),
         ("enkf", {"taper": 0.0}, r"enkf\.taper must be .*, got 0\.0"),
@@ -79,6 +82,7 @@ def test_settings_survive_json():
         ukf=SigmaPointSettings(alpha=0.5),
         enkf=EnsembleSettings(inflation=1.1),
         mhe=HorizonSettings(horizon=4, arrival_noise=(0.1, 0.2), solver="quadprog"),
+        blend=BlendSettings(density_weight=0.3, speed_weight=0.9),
     )
     again = EstimatorSettings(**json.loads(json.dumps(asdict(settings))))
     assert again == settings
