@@ -11,7 +11,6 @@ from dptse_env.estimators.random_walk import RandomWalk
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
 from dptse_env.utils.arrays import FloatArray, IntArray
-from dptse_env.utils.validation import require
 
 
 class Blend(BatchEstimator):
@@ -33,14 +32,8 @@ class Blend(BatchEstimator):
     _filter_type: ClassVar[type[Any]]
 
     def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
-        """See `make_estimator`.
-
-        Raises:
-            ValueError: A measurement may cover several segments, which the walk cannot take in.
-        """
+        """See `make_estimator`."""
         super().__init__(model, n_episodes, settings)
-        n_rows = model.rows.n_rows
-        require(n_rows == model.n_segments, "rows of a blend's model", "its segments", n_rows)
         self.ekf = self._filter_type(model, n_episodes, settings)
         self.walk = RandomWalk(model, n_episodes, settings)
         self._priors = np.zeros((n_episodes, 2 * model.n_segments))

@@ -9,7 +9,7 @@ import pytest
 from dptse_env.estimators import BACKENDS, BlendSettings, DemandSettings, EstimatorSettings
 
 from .episodes import RELEASES, assert_same, run, show, simulate, started
-from .rows import averaged
+from .rows import averaged, update
 
 FIELDS = ("density", "speed", "density_std", "speed_std")
 BASE = EstimatorSettings(process_noise=(0.01, 0.02), noise_scale=(1.3, 0.8))
@@ -99,6 +99,18 @@ def test_both_parts_are_reset_where_one_diverges(backend):
 
 
 @both_backends
-def test_measurements_of_several_segments_are_refused(backend):
-    with pytest.raises(ValueError, match=r"rows of a blend's model must be its segments, got "):
-        started("blend", backend, averaged(1))
+def test_both_parts_read_rows_of_several_segments(backend):
+    episodes = averaged(12)
+    settings = weighted(0.7, 0.2)
+    blend, ekf, walk = filters = [
+        started(name, backend, episodes, settings) for name in ("blend", "ekf", "random_walk")
+    ]
+    for k in range(12):
+        for one in filters:
+            one.predict(episodes.everyone, episodes.inputs[k])
+            update(one, episodes, k)
+    expected = 0.7 * ekf.estimate().density + 0.3 * walk.estimate().density
+    np.testing.assert_allclose(blend.estimate().density, expected, rtol=1e-12)
+    c = np.array([0.7, 0.2])
+    innovations = c * ekf.innovations + (1.0 - c) * walk.innovations
+    np.testing.assert_allclose(blend.innovations, innovations, rtol=1e-12)
