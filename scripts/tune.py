@@ -67,6 +67,8 @@ class Args:
     """Search the scale of the noise of flows or speeds, too, although the mechanism's is known."""
     demand: bool = False
     """Search demand states, too, and the noise that goes with them."""
+    repairs: bool = False
+    """Search the cap of reported speeds and whether process noise is of psi or of w, too."""
     variant: str = ""
     """Ending of the names of the sets; empty for default sets."""
     sampler_seed: int = 0
@@ -106,6 +108,7 @@ def make_tasks(args: Args) -> list[TuningTask]:
             records=records_argument(args.records),
             with_noise_scale=args.noise_scale,
             with_demand=args.demand,
+            with_repairs=args.repairs,
             variant=args.variant,
             keywords=keywords,
         )

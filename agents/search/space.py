@@ -80,6 +80,13 @@ NOISE_SCALE: Mapping[str, Knob] = {
     "noise_scale.1": evenly(0.5, 5.0),
 }
 
+SPEED_CAP: Mapping[str, Knob] = {"speed_cap": CategoricalDistribution((None, 0.95, 1.0, 1.05))}
+
+# A deviation of w over v_f is one of psi over rho v_f: ten times as large where the road is a tenth
+# full.
+NOISE_IN: Mapping[str, Knob] = {"process_noise_in": CategoricalDistribution(("psi", "w"))}
+LARGEST_W_NOISE = 0.5
+
 SPACE: dict[str, Mapping[str, Knob]] = {
     "ekf": _PROCESS_NOISE,
     "ukf": {**_PROCESS_NOISE, "ukf.alpha": evenly(0.1, 1.0)},
@@ -107,7 +114,10 @@ SPACE: dict[str, Mapping[str, Knob]] = {
 
 
 def search_space(
-    estimator: str, with_noise_scale: bool = False, with_demand: bool = False
+    estimator: str,
+    with_noise_scale: bool = False,
+    with_demand: bool = False,
+    with_repairs: bool = False,
 ) -> dict[str, Knob]:
     """Return the search space of an estimator.
 
@@ -115,6 +125,8 @@ def search_space(
         estimator: Its name.
         with_noise_scale: Whether to search the scale of the noise of flows or speeds.
         with_demand: Whether to search demand states and the noise that goes with them.
+        with_repairs: Whether to search the cap of reported speeds and, for the Kalman filters,
+            what the process noise is of.
 
     Raises:
         ValueError: There is nothing to tune, no such estimator, or it has no demand states.
@@ -129,7 +141,17 @@ def search_space(
     if with_demand and estimator == "random_walk":
         raise ValueError("demand must be left out for 'random_walk', which has no traffic model")
     added = {**(NOISE_SCALE if with_noise_scale else {}), **(DEMAND if with_demand else {})}
-    return {**SPACE[estimator], **added}
+    space = {**SPACE[estimator], **added}
+    return _with_repairs(estimator, space) if with_repairs else space
+
+
+def _with_repairs(estimator: str, space: dict[str, Knob]) -> dict[str, Knob]:
+    """Return a search space with the cap of speeds and, where there is one, noise in w."""
+    if estimator in ("random_walk", "mhe"):
+        return {**space, **SPEED_CAP}
+    of_psi = space["process_noise.1"]
+    wider = {"process_noise.1": evenly(of_psi.low, LARGEST_W_NOISE)}
+    return {**space, **wider, **NOISE_IN, **SPEED_CAP}
 
 
 def nested(values: Mapping[str, Any]) -> dict[str, Any]:

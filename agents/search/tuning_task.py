@@ -42,6 +42,8 @@ class TuningTask:
         records: Folder of the record cache; the user's cache if None.
         with_noise_scale: Whether to search the scale of the noise of flows or speeds, too.
         with_demand: Whether to search demand states and the noise that goes with them, too.
+        with_repairs: Whether to search the cap of reported speeds and what the process noise is of,
+            too.
         variant: Ending of the set's name; empty for the set that is the default of its privacy
             preset.
 
@@ -62,6 +64,7 @@ class TuningTask:
     records: str | None = None
     with_noise_scale: bool = False
     with_demand: bool = False
+    with_repairs: bool = False
     variant: str = ""
 
     def __post_init__(self) -> None:
@@ -89,7 +92,9 @@ class TuningTask:
     @property
     def space(self) -> dict[str, Knob]:
         """The search space, by path into the settings."""
-        return search_space(self.estimator, self.with_noise_scale, self.with_demand)
+        return search_space(
+            self.estimator, self.with_noise_scale, self.with_demand, self.with_repairs
+        )
 
     @property
     def traffic_seeds(self) -> tuple[int, ...]:

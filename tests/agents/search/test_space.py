@@ -3,6 +3,8 @@ import pytest
 from optuna.distributions import CategoricalDistribution, FloatDistribution
 
 from agents.search.space import (
+    DEMAND,
+    DEMAND_START,
     SPACE,
     at_bound,
     evenly,
@@ -14,6 +16,8 @@ from agents.search.space import (
 )
 from dptse_env.estimators import (
     ESTIMATORS,
+    BlendSettings,
+    DemandSettings,
     EnsembleSettings,
     EstimatorSettings,
     HorizonSettings,
@@ -47,6 +51,22 @@ def test_the_search_holds_the_defaults_and_the_shipped_sets(estimator):
         assert from_mapping(EstimatorSettings, nested(values), "settings") == settings
 
 
+def test_repairs_are_searched_where_they_are_asked_for():
+    space = search_space("ekf", with_demand=True, with_repairs=True)
+    assert space["process_noise.1"].low == DEMAND["process_noise.1"].low
+    settings = EstimatorSettings(
+        process_noise=(0.02, 0.3), process_noise_in="w", speed_cap=1.0, demand=DemandSettings(),
+        density_growth=0.01, count_noise=0.1,
+    )  # fmt: skip
+    for one in (settings, DEMAND_START):
+        values = values_of(one, space)
+        assert all(holds(knob, values[path]) for path, knob in space.items())
+    assert not any(path in search_space("ekf") for path in ("process_noise_in", "speed_cap"))
+    for name in ("mhe", "random_walk"):
+        added = {*search_space(name, with_repairs=True)} - {*search_space(name)}
+        assert added == {"speed_cap"}
+
+
 def test_paths_become_nested_settings():
     settings = EstimatorSettings(
         process_noise=(0.1, 0.2),
@@ -55,6 +75,7 @@ def test_paths_become_nested_settings():
         ukf=SigmaPointSettings(alpha=1.0),
         enkf=EnsembleSettings(inflation=1.02, taper=0.5),
         mhe=HorizonSettings(arrival_noise=(0.5, 0.6), linearisation="trajectory", bounds="cone"),
+        blend=BlendSettings(density_weight=0.3, speed_weight=0.9),
     )
     everything = {path: knob for name in SPACE for path, knob in search_space(name, True).items()}
     values = values_of(settings, everything)
@@ -67,6 +88,7 @@ def test_paths_become_nested_settings():
         "ukf": {"alpha": 1.0},
         "enkf": {"inflation": 1.02, "taper": 0.5},
         "mhe": {"arrival_noise": [0.5, 0.6], "linearisation": "trajectory", "bounds": "cone"},
+        "blend": {"density_weight": 0.3, "speed_weight": 0.9},
     }
 
 
