@@ -149,9 +149,10 @@ def _with_repairs(estimator: str, space: dict[str, Knob]) -> dict[str, Knob]:
     """Return a search space with the cap of speeds and, where there is one, noise in w."""
     if estimator in ("random_walk", "mhe"):
         return {**space, **SPEED_CAP}
-    of_psi = space["process_noise.1"]
-    wider = {"process_noise.1": evenly(of_psi.low, LARGEST_W_NOISE)}
-    return {**space, **wider, **NOISE_IN, **SPEED_CAP}
+    noise = space["process_noise.1"]
+    if isinstance(noise, FloatDistribution):
+        noise = evenly(noise.low, LARGEST_W_NOISE)
+    return {**space, "process_noise.1": noise, **NOISE_IN, **SPEED_CAP}
 
 
 def nested(values: Mapping[str, Any]) -> dict[str, Any]:

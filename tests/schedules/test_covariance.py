@@ -237,6 +237,14 @@ def test_bad_inflations_are_named():
     assert issubclass(InflatedTrace, CovarianceSchedule)
 
 
+def test_noise_in_w_is_refused_where_the_schedule_would_need_it():
+    env = make_batch(estimator_settings={"process_noise_in": "w"})
+    message = r"^estimator_settings\.process_noise_in must be 'psi' for a schedule .*, got 'w'$"
+    with pytest.raises(ValueError, match=message):
+        make_schedule("greedy-trace", env)
+    make_schedule("inflated-trace", env)  # which has a process noise of its own
+
+
 def test_a_random_walks_covariance_gives_its_own_variances():
     env = make_batch(estimator="random_walk")
     for _ in states(env, 4):

@@ -8,6 +8,7 @@ With `psi = rho w`, independent deviations of rho and w are to first order devia
 from numba import njit
 
 from dptse_env.estimators.compiled.moments import mean_of
+from dptse_env.estimators.compiled.normals import Draws
 from dptse_env.model.arz import LEAST_DENSITY
 from dptse_env.model.parameters import LARGEST_W
 from dptse_env.model.relations import VACUUM
@@ -58,7 +59,7 @@ def couple_members(
     members: FloatArray,
     n: int,
     deviation: FloatArray,
-    draws: FloatArray,
+    draws: Draws,
 ) -> None:
     """Move the members' psi along with the noise of rho, and turn deviations of w into psi's.
 
