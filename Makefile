@@ -51,6 +51,7 @@ audit: setup  ## Attack the privacy presets, 5,000 runs in each of two worlds; r
 	$(BIN)/python scripts/audit.py --noise-factor 0.709
 	$(BIN)/python scripts/audit.py
 	$(BIN)/python scripts/audit.py --target replaced
+	$(BIN)/python scripts/audit.py --target opposite
 	$(BIN)/python scripts/audit.py --target pairs --traffic-seed 2000 --runs 2000
 
 test: setup  ## Run the tests, without the slow ones.
