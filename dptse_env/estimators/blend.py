@@ -21,8 +21,8 @@ class Blend(BatchEstimator):
     perfectly correlated errors, the largest for errors of deviations s_1 and s_2. Both parts read
     the same releases, so that their errors are far from independent.
 
-    A ``speed_cap`` holds the speeds of each part. `innovations` are the weighted means of the parts' own. Where a part diverges, both are reset to
-    their prior.
+    A ``speed_cap`` holds the speeds of each part. `innovations` are the weighted means of the
+    parts' own. Where a part diverges, both are reset to their prior.
 
     Attributes:
         ekf: The EKF.
