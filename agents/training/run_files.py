@@ -28,10 +28,10 @@ and on validation traffic with deterministic and with drawn actions."""
 Row = dict[str, float]
 
 
-def write_progress(folder: Path, rows: Sequence[Row]) -> None:
+def write_progress(folder: Path, rows: Sequence[Row], columns: Sequence[str] = COLUMNS) -> None:
     """Write the learning curve; missing values stay empty."""
     text = io.StringIO()
-    writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
+    writer = csv.DictWriter(text, columns, lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
     write_atomically(folder / PROGRESS, text.getvalue())

@@ -15,6 +15,7 @@ from dptse_env.estimators.settings import (
     EnsembleSettings,
     EstimatorSettings,
     HorizonSettings,
+    RecurrentSettings,
     SigmaPointSettings,
 )
 
@@ -28,6 +29,7 @@ __all__ = [
     "Estimator",
     "EstimatorSettings",
     "HorizonSettings",
+    "RecurrentSettings",
     "SigmaPointSettings",
     "check_estimate",
     "check_estimator",

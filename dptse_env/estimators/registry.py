@@ -39,7 +39,9 @@ def _expected(part: Any) -> str | None:
 
 _WALK = "dptse_env.estimators.random_walk:RandomWalk"
 _OPEN = "dptse_env.estimators.open_loop:OpenLoop"
-_WITHOUT_DEMAND = (Backends(_WALK, _WALK), Backends(_OPEN, _OPEN))
+_LEARNED = "dptse_env.estimators.learned.recurrent"
+_RECURRENT = Backends(f"{_LEARNED}:CompiledRecurrent", f"{_LEARNED}:ReferenceRecurrent")
+_WITHOUT_DEMAND = (Backends(_WALK, _WALK), Backends(_OPEN, _OPEN), _RECURRENT)
 ESTIMATORS = Registry(
     "estimator",
     {
@@ -50,6 +52,7 @@ ESTIMATORS = Registry(
         "random_walk": Backends(_WALK, _WALK),
         "blend": _filter("blend", "Blend"),
         "open_loop": Backends(_OPEN, _OPEN),
+        "recurrent": _RECURRENT,
     },
     check=_expected,
 )

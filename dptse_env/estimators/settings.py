@@ -108,6 +108,27 @@ class HorizonSettings:
 
 
 @dataclass(frozen=True)
+class RecurrentSettings:
+    """Settings of the recurrent network.
+
+    Attributes:
+        weights: Name of a network that ships with the package
+            (`dptse_env.estimators.learned.weights`), or a file.
+        outside: Whether to take a network for roads and releases outside of the ranges on its card.
+
+    Raises:
+        ValueError: A value is out of range.
+    """
+
+    weights: str = "highway"
+    outside: bool = False
+
+    def __post_init__(self) -> None:
+        """Check values."""
+        checked_fields(self, f"{_PATH}.recurrent")
+
+
+@dataclass(frozen=True)
 class DemandSettings:
     """Settings of demand states: factors on the demands at the entries, estimated as well.
 
@@ -181,6 +202,7 @@ class EstimatorSettings:
         enkf: Further settings of the ensemble Kalman filter.
         mhe: Further settings of the moving horizon estimator, with separate bounds.
         blend: Further settings of the blend, whose EKF and random walk share the others.
+        recurrent: Settings of the recurrent network, which has no others but `initial_variance`.
 
     Raises:
         ValueError: A value is out of range.
@@ -200,6 +222,7 @@ class EstimatorSettings:
     enkf: EnsembleSettings = field(default_factory=EnsembleSettings)
     mhe: HorizonSettings = field(default_factory=HorizonSettings)
     blend: BlendSettings = field(default_factory=BlendSettings)
+    recurrent: RecurrentSettings = field(default_factory=RecurrentSettings)
 
     def __post_init__(self) -> None:
         """Check values; lists become tuples."""

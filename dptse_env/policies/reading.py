@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dptse_env.policies.archive import open_archive, read_entry
 from dptse_env.policies.tensors import read_tensors
+from dptse_env.utils.archive import open_archive, read_entry
 
 CARD, WEIGHTS = "card.json", "weights.pt"
 """Entries of a policy file: its card, plain JSON that describes the policy, and its weights."""

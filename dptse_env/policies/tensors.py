@@ -6,8 +6,8 @@ import zipfile
 import numpy as np
 from numpy.typing import NDArray
 
-from dptse_env.policies.archive import read_entry
 from dptse_env.policies.tensor_table import TensorEntry, read_table
+from dptse_env.utils.archive import read_entry
 
 MOST_TENSORS = 256
 """Largest number of tensors in a file."""

@@ -1,0 +1,1 @@
+"""Training of learned estimators on simulated traffic."""

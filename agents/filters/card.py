@@ -1,0 +1,43 @@
+"""Card of a trained network: what it was trained on, and where it holds."""
+
+from __future__ import annotations
+
+import json
+from importlib.metadata import version
+from typing import Any
+
+from agents.evaluation.episodes import make_config
+from agents.experiments.provenance import source_digest
+from agents.filters.plan import FilterPlan
+from dptse_env.estimators.learned.cells import CHANNELS
+from dptse_env.estimators.learned.weights import FORMAT
+
+
+def make_card(plan: FilterPlan, done: int, name: str) -> dict[str, Any]:
+    """Return the card of a network after `done` passes of a plan."""
+    roads = [make_config(env, {}).corridor for env in plan.ranges.envs]
+    lanes = [count for road in roads for count in road.segment_lanes]
+    found: dict[str, list[float]] = {
+        "n_mainline": [road.n_mainline for road in roads],
+        "segment_length": [road.segment_length for road in roads],
+        "speed_limit": [road.speed_limit for road in roads],
+        "lanes": [float(count) for count in lanes],
+        "span": [1.0, *(float(span) for spans in plan.ranges.spans for span in spans)],
+        "flows": [float(_releases_flows(each)) for each in plan.ranges.mechanisms],
+    }
+    return {
+        "name": name,
+        "format": FORMAT,
+        "channels": list(CHANNELS),
+        "ranges": {key: [min(values), max(values)] for key, values in found.items()},
+        "training": {
+            "plan": json.loads(json.dumps(plan.provenance())),
+            "passes": done,
+            "sources": source_digest(),
+            "versions": {each: version(each) for each in ("dptse-env", "torch", "numpy")},
+        },
+    }
+
+
+def _releases_flows(mechanism: str) -> int:
+    return int(mechanism in ("capped", "paced"))

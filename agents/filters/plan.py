@@ -1,0 +1,144 @@
+"""Plan of the training of a recurrent network: rounds of scenarios, and passes over them."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from agents.experiments.seeds import TUNING
+from agents.filters.scenarios import Scenario, ScenarioRanges
+from dptse_env.config import TRAINING_SEEDS, VALIDATION_SEEDS
+from dptse_env.utils.validation import inside, integer, positive
+
+
+@dataclass(frozen=True)
+class Round:
+    """Scenarios that are collected with one estimator, and passes over them.
+
+    Attributes:
+        estimator: The estimator that is played: a name, or `OWN` for the network itself, as it
+            stands when the round begins. Centres and prices of ``paced`` and the schedules on
+            deviations follow it.
+        scenarios: Number of scenarios; those of earlier rounds are dropped.
+        passes: Number of passes over all episodes of a scenario, each drawn at random.
+    """
+
+    estimator: str
+    scenarios: int
+    passes: int
+
+    def __post_init__(self) -> None:
+        """Check values."""
+        integer("rounds.scenarios", self.scenarios, 1, 10_000)
+        integer("rounds.passes", self.passes, 1, 1_000_000)
+
+
+OWN = "own"
+"""The network that is trained, as the estimator of a round."""
+
+
+@dataclass(frozen=True)
+class FilterPlan:
+    """Everything that decides the numbers of a training.
+
+    Attributes:
+        seed: Training seed: scenarios, first weights, order.
+        traffic_seeds: Traffic seeds to train on.
+        validation_seeds: Traffic seeds to validate on.
+        ranges: What scenarios are drawn from.
+        rounds: Rounds, one after the other.
+        width: Width of the hidden state.
+        episodes: Episodes of a scenario, run as a batch.
+        window: Seconds over which gradients are propagated.
+        learning_rate: Of Adam at the beginning; it falls along a cosine.
+        likelihood: Weight of the likelihood in the loss.
+        prediction: Weight of the loss of predictions.
+        clip_norm: Largest norm of a gradient.
+        checkpoint_every: Passes between checkpoints.
+
+    Raises:
+        ValueError: A value is out of range.
+    """
+
+    seed: int
+    traffic_seeds: tuple[int, ...]
+    validation_seeds: tuple[int, ...]
+    ranges: ScenarioRanges = field(default_factory=ScenarioRanges)
+    rounds: tuple[Round, ...] = (
+        Round("ekf", 48, 240),
+        Round(OWN, 48, 160),
+        Round(OWN, 48, 200),
+    )
+    width: int = 32
+    episodes: int = 32
+    window: int = 50
+    learning_rate: float = 4e-3
+    likelihood: float = 0.005
+    prediction: float = 0.3
+    clip_norm: float = 1.0
+    checkpoint_every: int = 20
+
+    def __post_init__(self) -> None:
+        """Check values."""
+        integer("seed", self.seed, 0, 2**31)
+        _within("traffic", self.traffic_seeds, TRAINING_SEEDS)
+        _within("validation", self.validation_seeds, VALIDATION_SEEDS)
+        integer("width", self.width, 1, 512)
+        integer("episodes", self.episodes, 1, len(self.traffic_seeds))
+        integer("window", self.window, 1, 10_000)
+        positive("learning_rate", self.learning_rate)
+        inside("likelihood", self.likelihood, 0.0, 1.0)
+        inside("prediction", self.prediction, 0.0, 10.0)
+        positive("clip_norm", self.clip_norm)
+        integer("checkpoint_every", self.checkpoint_every, 1)
+        if not self.rounds or self.rounds[0].estimator == OWN:
+            raise ValueError(
+                "rounds must begin with one of another estimator, since the network knows nothing "
+                "yet"
+            )
+
+    @property
+    def n_passes(self) -> int:
+        """Number of passes of all rounds."""
+        return sum(each.passes for each in self.rounds)
+
+    def round_of(self, done: int) -> int:
+        """Return the index of the round in which the pass after `done` passes lies."""
+        for index, each in enumerate(self.rounds):
+            if done < each.passes:
+                return index
+            done -= each.passes
+        raise ValueError(f"the plan has {self.n_passes} passes")
+
+    def scenarios(self, index: int) -> list[Scenario]:
+        """Return the scenarios of a round; the same ones whenever it is called."""
+        rng = np.random.default_rng([self.seed, index])
+        traffic, n = self.traffic_seeds, self.rounds[index].scenarios
+        drawn = [self.ranges.draw(rng, traffic, self.episodes) for _ in range(n)]
+        first = TUNING.start
+        return [
+            dataclasses.replace(scenario, noise_seed=first + 10_000 * (index * n + k))
+            for k, scenario in enumerate(drawn)
+        ]
+
+    def rate(self, done: int) -> float:
+        """Return the learning rate after `done` passes."""
+        return self.learning_rate * 0.5 * (1.0 + math.cos(math.pi * done / self.n_passes))
+
+    def provenance(self) -> dict[str, Any]:
+        """Return the plan as plain data."""
+        return dataclasses.asdict(self)
+
+
+def _within(path: str, seeds: Sequence[int], allowed: range) -> None:
+    outside = [seed for seed in seeds if seed not in allowed]
+    if outside or not seeds:
+        raise ValueError(
+            f"{path} must be traffic seeds in {allowed[0]}..{allowed[-1]}, got "
+            f"{outside[0] if outside else 'none'}"
+        )

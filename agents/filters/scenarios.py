@@ -1,0 +1,95 @@
+"""Scenarios to learn an estimator from: environments, query policies and seeds, drawn at random."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+MECHANISMS = ("capped", "paced", "paper", "corrected")
+"""Release models that scenarios draw from."""
+SCHEDULES = (
+    "round-robin", "paper", "random", "oldest-first", "static", "stale-variance",
+    "largest-variance",
+)  # fmt: skip
+"""Query policies that scenarios draw from; the last two follow the estimator's own deviations."""
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """One environment with a query policy, played on several traffic seeds.
+
+    Attributes:
+        env: Environment id.
+        keywords: Keywords of the environment, without estimator and traffic seeds.
+        schedule: Query schedule.
+        traffic_seeds: Traffic seeds.
+        noise_seed: Noise and estimators are seeded with this plus the traffic seed.
+    """
+
+    env: str
+    keywords: dict[str, Any] = field(hash=False)
+    schedule: str
+    traffic_seeds: tuple[int, ...]
+    noise_seed: int
+
+
+@dataclass(frozen=True)
+class ScenarioRanges:
+    """What scenarios are drawn from.
+
+    Attributes:
+        envs: Environment ids.
+        mechanisms: Release models, each as often as the others.
+        schedules: Query schedules.
+        epsilon: Range of epsilon, drawn evenly in its logarithm.
+        deltas: Values of delta.
+        caps: Range of the cap of ``capped``, drawn evenly in its logarithm.
+        clips: Range of the clip of ``paced`` [km/h].
+        paces: Range of the pace of ``paced``.
+        spans: Spans of queries under ``paced``.
+    """
+
+    envs: tuple[str, ...] = (
+        "dptse_env:dptse/PrivateHighway-v1",
+        "dptse_env:dptse/PaperHighway-v0",
+    )
+    mechanisms: tuple[str, ...] = MECHANISMS
+    schedules: tuple[str, ...] = SCHEDULES
+    epsilon: tuple[float, float] = (0.5, 20.0)
+    deltas: tuple[float, ...] = (0.05, 0.001)
+    caps: tuple[int, int] = (24, 128)
+    clips: tuple[float, float] = (18.0, 51.0)
+    paces: tuple[float, float] = (0.7, 0.95)
+    spans: tuple[tuple[int, ...], ...] = ((1,), (2,), (1, 2))
+
+    def draw(self, rng: np.random.Generator, traffic: Sequence[int], n_episodes: int) -> Scenario:
+        """Draw a scenario on `n_episodes` of the traffic seeds."""
+        mechanism = str(rng.choice(self.mechanisms))
+        low, high = np.log(self.epsilon)
+        privacy: dict[str, Any] = {
+            "preset": mechanism,
+            "epsilon": round(float(np.exp(rng.uniform(low, high))), 3),
+            "delta": float(rng.choice(self.deltas)),
+        }
+        keywords: dict[str, Any] = {"privacy": privacy, "bandwidth": int(rng.integers(1, 16))}
+        if mechanism == "capped":
+            low, high = np.log(self.caps)
+            privacy["cap"] = int(np.exp(rng.uniform(low, high)))
+        elif mechanism == "paced":
+            privacy["clip"] = round(float(rng.uniform(*self.clips)), 1)
+            privacy["pace"] = round(float(rng.uniform(*self.paces)), 3)
+            spans = self.spans[int(rng.integers(len(self.spans)))]
+            if spans != (1,):
+                keywords |= {"query_spans": list(spans), "bandwidth_unit": "sums"}
+                keywords["bandwidth"] = int(rng.integers(1, 10))
+        seeds = rng.choice(np.asarray(traffic), size=n_episodes, replace=False)
+        return Scenario(
+            env=str(rng.choice(self.envs)),
+            keywords=keywords,
+            schedule=str(rng.choice(self.schedules)),
+            traffic_seeds=tuple(int(seed) for seed in seeds),
+            noise_seed=int(rng.integers(10**6, 2 * 10**6)),
+        )

@@ -1,0 +1,144 @@
+"""The recurrent network in torch, and the loss that it is trained by."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from dptse_env.estimators.learned.cells import LONGEST_AGE, SPEED_RANGE, channels
+from dptse_env.estimators.learned.network import (
+    HIGHEST_SPREAD,
+    LOWEST_SPREAD,
+    Network,
+    shapes,
+)
+
+
+class Road(NamedTuple):
+    """The cells of a batch of episodes, as `channels` takes them, and their connections."""
+
+    unit: Tensor  # (S,)
+    limit: float
+    flows: Tensor  # (k, 1)
+    fixed: Tensor  # (k, S, N_FIXED)
+    upstream: Tensor  # (S, S) flags of the cells (columns) upstream of each
+    scales: tuple[float, float]
+    n_mainline: int
+
+
+class State(NamedTuple):
+    """What the network keeps between seconds, for k episodes."""
+
+    hidden: Tensor  # (k, S, H)
+    predicted: Tensor  # (k, S, 2), without gradients
+    age: Tensor  # (k, S)
+
+
+class RecurrentNetwork(nn.Module):
+    """The network of `dptse_env.estimators.learned.network`, with gradients."""
+
+    inputs: Tensor
+    inputs_bias: Tensor
+    hidden: Tensor
+    hidden_bias: Tensor
+    heads: Tensor
+    heads_bias: Tensor
+
+    def __init__(self, width: int) -> None:
+        """Draw orthogonal hidden weights, and inputs' weights by their number."""
+        super().__init__()
+        self.width = width
+        for name, shape in shapes(width).items():
+            weights = torch.zeros(shape)
+            if name == "inputs":
+                weights.uniform_(-1.0, 1.0).mul_(shape[0] ** -0.5)
+            elif name == "hidden":
+                for first in range(0, 3 * width, width):
+                    nn.init.orthogonal_(weights[:, first : first + width])
+            elif name == "heads":
+                weights.normal_(0.0, 0.1 * width**-0.5)
+            self.register_parameter(name, nn.Parameter(weights))
+        with torch.no_grad():
+            # Free flow, and deviations of a tenth of the units.
+            self.heads_bias.copy_(torch.tensor([-2.5, 1.5, -3.0, -2.3] * 2))
+            self.inputs_bias[:width] = 1.0
+
+    def begin(self, start: Tensor) -> State:
+        """Return the state before the first second, of a prior (k, S, 2)."""
+        k, S = start.shape[:2]
+        return State(torch.zeros(k, S, self.width), start, torch.full((k, S), LONGEST_AGE))
+
+    def forward(self, road: Road, measured: Tensor, outside: Tensor, state: State) -> State:
+        """Return the state after a second, of its measurements (k, S, 9) and inputs (k, S, 2)."""
+        x = channels(torch, road, measured, state.predicted, state.age, outside)
+        h, H = state.hidden, self.width
+        up, down = road.upstream @ h, road.upstream.T @ h
+        g = torch.cat([x, up, down], -1) @ self.inputs + self.inputs_bias
+        q = h @ self.hidden + self.hidden_bias
+        gates = torch.sigmoid(g[..., : 2 * H] + q[..., : 2 * H])
+        z, r = gates[..., :H], gates[..., H:]
+        n = torch.tanh(g[..., 2 * H :] + r * q[..., 2 * H :])
+        h = n + z * (h - n)
+        with torch.no_grad():
+            mean = torch.sigmoid(h @ self.heads[:, 4:6] + self.heads_bias[4:6])
+            density = road.unit * mean[..., 0]
+            predicted = torch.stack([density, SPEED_RANGE * road.limit * mean[..., 1]], -1)
+            age = (state.age + 1.0) * (1.0 - measured[..., 0])
+        return State(h, predicted, age)
+
+    def read(self, road: Road, h: Tensor) -> tuple[Tensor, Tensor]:
+        """Return what the heads say of hidden states (..., S, H): of this second, and the next.
+
+        Density [veh/km], speed [km/h] and their standard deviations, shape (..., S, 4) each.
+        """
+        raw = (h @ self.heads + self.heads_bias).reshape(*h.shape[:-1], 2, 4)
+        mean, spread = torch.sigmoid(raw[..., :2]), raw[..., 2:]
+        spread = torch.exp(torch.clip(spread, LOWEST_SPREAD, HIGHEST_SPREAD))
+        unit = road.unit[:, None].expand(-1, 2)
+        table = torch.stack(
+            [
+                unit * mean[..., 0], SPEED_RANGE * road.limit * mean[..., 1],
+                unit * spread[..., 0], road.limit * spread[..., 1],
+            ],
+            -1,
+        )  # fmt: skip
+        return table[..., 0, :], table[..., 1, :]
+
+    def weights(self) -> Network:
+        """Return the weights as arrays."""
+        arrays: dict[str, Any] = {
+            name: np.ascontiguousarray(parameter.detach().numpy().copy())
+            for name, parameter in self.named_parameters()
+        }
+        return Network(**arrays)
+
+
+def second_loss(road: Road, estimated: Tensor, truth: Tensor, likelihood: float) -> Tensor:
+    """Return the loss of a second, averaged over all leading dimensions.
+
+    The environment's error over the mainline, and `likelihood` times the negative log-likelihood
+    of all cells under independent normal distributions. Speeds of empty cells do not count.
+
+    Args:
+        road: The cells.
+        estimated: Shape (..., S, 4).
+        truth: Shape (..., S, 2).
+        likelihood: Weight of the likelihood.
+    """
+    error, spread = _scaled(road, estimated, truth)
+    occupied = (truth[..., 0] > 0.0).float()
+    counts = torch.stack([torch.ones_like(occupied), occupied], -1)
+    squares = error**2 * counts
+    n = road.n_mainline
+    total = squares[..., :n, :].sum((-1, -2)) / counts[..., :n, :].sum((-1, -2))
+    surprise = (torch.log(spread) + 0.5 * (error / spread) ** 2) * counts
+    return torch.sqrt(total + 1e-8).mean() + likelihood * surprise.sum() / counts.sum()
+
+
+def _scaled(road: Road, estimated: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
+    """Return errors and deviations in the units of the environment's error, shape (..., S, 2)."""
+    scales = torch.tensor(road.scales)
+    return (estimated[..., :2] - truth) / scales, estimated[..., 2:] / scales

@@ -1,0 +1,132 @@
+"""Train a recurrent network as an estimator, in a folder.
+
+python scripts/train_estimator.py --seed 0 --output results/filters/0
+
+The folder gets run.json (the plan), progress.csv (the learning curve), checkpoint.pt and
+network.npz, which ``estimator_settings={"recurrent": {"weights": "<folder>/network.npz"}}`` takes.
+After an interruption, or a kill, the same command continues from the last checkpoint to the same
+numbers; other arguments need another folder.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+from tqdm import tqdm
+
+from agents.evaluation.episodes import make_config
+from agents.filters.plan import FilterPlan, Round
+from agents.filters.scenarios import ScenarioRanges
+from agents.filters.training import FilterTraining
+from agents.training.run_files import Row
+from agents.training.tensorboard_writer import make_tensorboard_writer
+from dptse_env.config import parse_seeds
+from dptse_env.utils.validation import integer
+from scripts.cli import Recording, records_argument, resumable, run
+
+
+@dataclass(frozen=True)
+class Args(Recording):
+    """Train a recurrent network as an estimator."""
+
+    seed: int = 0
+    """Training seed."""
+    traffic: str = "0:128"
+    """Traffic seeds to train on, first:stop; training seeds only."""
+    validation: str = "1000:1016"
+    """Traffic seeds to validate on, first:stop; validation seeds only."""
+    width: int = 32
+    """Width of the hidden state of a cell."""
+    learning_rate: float = 4e-3
+    """Learning rate at the beginning."""
+    rounds: tuple[str, ...] = ("ekf:48:240", "own:48:160", "own:48:200")
+    """Rounds as estimator:scenarios:passes; 'own' is the network that is trained."""
+    ranges: ScenarioRanges = field(default_factory=ScenarioRanges)
+    """What scenarios are drawn from."""
+    checkpoint_every: int = 20
+    """Passes between two checkpoints, each with a validation."""
+    threads: int = 1
+    """Threads of torch; numbers depend on it in the last digits."""
+    tensorboard: bool = True
+    """Whether to also write the learning curve for TensorBoard, where that is installed."""
+    output: Path = Path("results/filters/0")
+    """Folder of the training."""
+
+
+def parse_round(text: str) -> Round:
+    """Return a round, given as estimator:scenarios:passes.
+
+    Raises:
+        ValueError: The text has another form, or a number is out of range.
+    """
+    parts = text.split(":")
+    if len(parts) != 3 or not all(part.isdecimal() for part in parts[1:]):
+        raise ValueError(f"rounds must be like 'ekf:48:240', got {text!r}")
+    return Round(parts[0], int(parts[1]), int(parts[2]))
+
+
+def make_plan(args: Args) -> FilterPlan:
+    """Return the plan that the arguments describe.
+
+    Raises:
+        ValueError: An argument is out of range.
+    """
+    return FilterPlan(
+        seed=args.seed,
+        traffic_seeds=parse_seeds(args.traffic, "traffic"),
+        validation_seeds=parse_seeds(args.validation, "validation"),
+        ranges=args.ranges,
+        rounds=tuple(parse_round(each) for each in args.rounds),
+        width=args.width,
+        learning_rate=args.learning_rate,
+        checkpoint_every=args.checkpoint_every,
+    )
+
+
+class Bar:
+    """A progress bar over passes, with the latest errors beside it."""
+
+    def __init__(self, total: int) -> None:
+        """Show an empty bar."""
+        self.bar = tqdm(total=total, unit="pass", desc="training")
+        self._shown: dict[str, str] = {}
+
+    def __call__(self, row: Row) -> None:
+        """Advance the bar to a row."""
+        shown = ("error", "validation", "chi2")
+        self._shown |= {name: f"{row[name]:.4f}" for name in shown if name in row}
+        self.bar.set_postfix(self._shown, refresh=False)
+        self.bar.update(int(row["update"]) - self.bar.n)
+
+    def show(self, stage: str, fraction: float) -> None:
+        """Show the fraction of a stage that is done; the bar stands still meanwhile."""
+        self.bar.set_postfix({stage: f"{fraction:.0%}", **self._shown})
+
+
+@resumable()
+def main(args: Args) -> None:
+    """Record missing traffic, train, and leave the network."""
+    plan = make_plan(args)
+    torch.set_num_threads(integer("threads", args.threads, 1))
+    for env in plan.ranges.envs:
+        args.library(make_config(env, {}).corridor, (*plan.traffic_seeds, *plan.validation_seeds))
+    bar = Bar(plan.n_passes)
+    writer = make_tensorboard_writer(args.output / "tensorboard") if args.tensorboard else None
+    watchers = (bar,) if writer is None else (bar, writer)
+    with bar.bar, contextlib.closing(writer) if writer else contextlib.nullcontext():
+        training = FilterTraining(
+            plan,
+            args.output,
+            records=records_argument(args.records),
+            watchers=watchers,
+            progress=bar.show,
+        )
+        training.run()
+    print(f"the network is in {args.output / 'network.npz'}")
+
+
+if __name__ == "__main__":
+    run(main, Args, __doc__)
