@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from importlib.metadata import version
 from typing import Any
 
@@ -31,7 +30,7 @@ def make_card(plan: FilterPlan, done: int, name: str) -> dict[str, Any]:
         "channels": list(CHANNELS),
         "ranges": {key: [min(values), max(values)] for key, values in found.items()},
         "training": {
-            "plan": json.loads(json.dumps(plan.provenance())),
+            "plan": plan.settings(),
             "passes": done,
             "sources": source_digest(),
             "versions": {each: version(each) for each in ("dptse-env", "torch", "numpy")},

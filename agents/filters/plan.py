@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from importlib.metadata import version
 from typing import Any
 
 import numpy as np
 
+from agents.experiments.provenance import machine, source_digest
 from agents.experiments.seeds import TUNING
 from agents.filters.scenarios import Scenario, ScenarioRanges
 from dptse_env.config import TRAINING_SEEDS, VALIDATION_SEEDS
@@ -130,9 +133,21 @@ class FilterPlan:
         """Return the learning rate after `done` passes."""
         return self.learning_rate * 0.5 * (1.0 + math.cos(math.pi * done / self.n_passes))
 
+    def settings(self) -> dict[str, Any]:
+        """Return the plan as plain JSON."""
+        plain: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(self)))
+        return plain
+
     def provenance(self) -> dict[str, Any]:
-        """Return the plan as plain data."""
-        return dataclasses.asdict(self)
+        """Return what `take_folder` compares and keeps, as plain JSON."""
+        libraries = ("gymnasium", "numba", "numpy", "torch")
+        versions = {name: version(name) for name in ("dptse-env", "libsumo")}
+        return {
+            "made_with": {"versions": versions, "plan": self.settings(), "settings": {}},
+            "tuned": [],
+            "sources": [source_digest()],
+            "machine": machine(libraries),
+        }
 
 
 def _within(path: str, seeds: Sequence[int], allowed: range) -> None:

@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from agents.evaluation.episodes import make_config
+
 MECHANISMS = ("capped", "paced", "paper", "corrected")
 """Release models that scenarios draw from."""
 SCHEDULES = (
@@ -66,7 +68,12 @@ class ScenarioRanges:
     spans: tuple[tuple[int, ...], ...] = ((1,), (2,), (1, 2))
 
     def draw(self, rng: np.random.Generator, traffic: Sequence[int], n_episodes: int) -> Scenario:
-        """Draw a scenario on `n_episodes` of the traffic seeds."""
+        """Draw a scenario on `n_episodes` of the traffic seeds.
+
+        The bandwidth is drawn from 1 to all segments.
+        """
+        env = str(rng.choice(self.envs))
+        most = make_config(env, {}).corridor.n_mainline
         mechanism = str(rng.choice(self.mechanisms))
         low, high = np.log(self.epsilon)
         privacy: dict[str, Any] = {
@@ -74,7 +81,7 @@ class ScenarioRanges:
             "epsilon": round(float(np.exp(rng.uniform(low, high))), 3),
             "delta": float(rng.choice(self.deltas)),
         }
-        keywords: dict[str, Any] = {"privacy": privacy, "bandwidth": int(rng.integers(1, 16))}
+        keywords: dict[str, Any] = {"privacy": privacy, "bandwidth": int(rng.integers(1, most + 1))}
         if mechanism == "capped":
             low, high = np.log(self.caps)
             privacy["cap"] = int(np.exp(rng.uniform(low, high)))
@@ -84,10 +91,10 @@ class ScenarioRanges:
             spans = self.spans[int(rng.integers(len(self.spans)))]
             if spans != (1,):
                 keywords |= {"query_spans": list(spans), "bandwidth_unit": "sums"}
-                keywords["bandwidth"] = int(rng.integers(1, 10))
+                keywords["bandwidth"] = int(rng.integers(1, 2 * most // 3))
         seeds = rng.choice(np.asarray(traffic), size=n_episodes, replace=False)
         return Scenario(
-            env=str(rng.choice(self.envs)),
+            env=env,
             keywords=keywords,
             schedule=str(rng.choice(self.schedules)),
             traffic_seeds=tuple(int(seed) for seed in seeds),

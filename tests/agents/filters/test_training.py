@@ -1,0 +1,155 @@
+"""Collecting, the network with gradients, and a training that is interrupted."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from agents.evaluation.episodes import make_vector, run_episodes  # noqa: E402
+from agents.filters import validation  # noqa: E402
+from agents.filters.batches import make_batch  # noqa: E402
+from agents.filters.collecting import collect  # noqa: E402
+from agents.filters.plan import OWN, Round  # noqa: E402
+from agents.filters.torch_network import RecurrentNetwork, second_loss  # noqa: E402
+from agents.filters.training import FilterTraining  # noqa: E402
+from agents.training.run_files import read_progress  # noqa: E402
+from dptse_env.estimators.learned.weights import read_network, write_network  # noqa: E402
+from dptse_env.schedules import make_schedule  # noqa: E402
+from tests.estimators.learned.networks import card  # noqa: E402
+
+from .plans import CELLS, PLAN, SHORT  # noqa: E402
+
+
+@pytest.fixture(autouse=True)
+def _small_cells(monkeypatch):
+    monkeypatch.setattr(validation, "CELLS", CELLS)
+    torch.set_num_threads(1)
+
+
+def test_the_network_with_gradients_is_the_estimator(tmp_path):
+    """What torch makes of collected releases is what the environment reported."""
+    torch.manual_seed(0)
+    network = RecurrentNetwork(5)
+    with torch.no_grad():
+        network.heads.normal_(0.0, 0.5)
+    path = tmp_path / "network.npz"
+    write_network(path, network.weights(), card())
+    recurrent = {"weights": str(path), "outside": True}
+    own = {"estimator": "recurrent", "estimator_settings": {"recurrent": recurrent}}
+    for scenario in PLAN.scenarios(0):
+        batch = make_batch(collect(scenario, own, None))
+        keywords = {**scenario.keywords, **own, "traffic_seeds": list(scenario.traffic_seeds)}
+        env = make_vector(SHORT, 2, {**keywords, "action": "scores"})
+        estimates = []
+        run_episodes(
+            env, make_schedule(scenario.schedule, env), traffic_seeds=scenario.traffic_seeds,
+            seeds=[scenario.noise_seed + seed for seed in scenario.traffic_seeds],
+            on_second=lambda env=env, kept=estimates: kept.append(env.process.estimate),
+        )  # fmt: skip
+        state = network.begin(batch.start)
+        for t, estimate in enumerate(estimates[1:]):
+            state = network(batch.road, batch.measured[t], batch.outside[t], state)
+            present = network.read(batch.road, state.hidden)[0].detach().numpy()
+            np.testing.assert_allclose(present[..., 0], estimate.density, rtol=2e-4, atol=2e-3)
+            np.testing.assert_allclose(present[..., 3], estimate.speed_std, rtol=2e-3)
+
+
+def test_collected_errors_and_truth_are_the_environments():
+    scenario = PLAN.scenarios(0)[0]
+    collected = collect(scenario, {"estimator": "ekf"}, None)
+    T, n, S = collected.measured.shape[:3]
+    assert collected.truth.shape == (T, n, S, 2)
+    assert (n, S) == (2, collected.cells.lanes.size)
+    keywords = {**scenario.keywords, "traffic_seeds": list(scenario.traffic_seeds)}
+    env = make_vector(SHORT, 2, {**keywords, "estimator": "ekf", "action": "scores"})
+    scores = run_episodes(
+        env, make_schedule(scenario.schedule, env), traffic_seeds=scenario.traffic_seeds,
+        seeds=[scenario.noise_seed + seed for seed in scenario.traffic_seeds], warm_up=0,
+    )  # fmt: skip
+    errors = [-score.reward for score in scores]
+    np.testing.assert_allclose(collected.errors.mean(axis=0), errors, rtol=1e-5)
+
+
+def test_the_loss_is_the_environments_error():
+    collected = collect(PLAN.scenarios(0)[1], {"estimator": "random_walk"}, None)
+    batch = make_batch(collected)
+    estimated = torch.cat([batch.truth, torch.ones_like(batch.truth)], -1)
+    assert float(second_loss(batch.road, estimated, batch.truth, 0.0)) == pytest.approx(1e-4)
+    off = estimated + torch.tensor([collected.scales[0] * 0.1, 0.0, 0.0, 0.0])
+    occupied = (batch.truth[:, :, : collected.n_mainline, 0] > 0).float()
+    share = collected.n_mainline / (collected.n_mainline + occupied.sum(-1))
+    expected = float((0.1 * share.sqrt()).mean())
+    assert float(second_loss(batch.road, off, batch.truth, 0.0)) == pytest.approx(expected, 1e-3)
+    honest = second_loss(batch.road, estimated, batch.truth, 1.0)
+    wide = estimated * torch.tensor([1.0, 1.0, 50.0, 50.0])
+    assert second_loss(batch.road, wide, batch.truth, 1.0) > honest
+
+
+class KilledError(Exception):
+    pass
+
+
+def rows_of(training):
+    timed = {"seconds"}
+    return [{k: v for k, v in row.items() if k not in timed} for row in training.rows]
+
+
+def test_a_training_that_was_killed_comes_out_as_one_that_was_not(tmp_path):
+    whole = FilterTraining(PLAN, tmp_path / "whole")
+    whole.run()
+    assert whole.done == 6
+    assert [row["round"] for row in whole.rows] == [1, 1, 1, 2, 2, 2]
+
+    def kill(row):
+        if row["update"] == 5:
+            raise KilledError
+
+    with pytest.raises(KilledError):
+        FilterTraining(PLAN, tmp_path / "parts", watchers=[kill]).run()
+    resumed = FilterTraining(PLAN, tmp_path / "parts")
+    assert resumed.done == 4
+    resumed.run()
+    assert rows_of(resumed) == rows_of(whole)
+    one, other = (read_network(str(tmp_path / name / "network.npz")) for name in ("whole", "parts"))
+    for name, array in one.network._asdict().items():
+        np.testing.assert_array_equal(array, getattr(other.network, name))
+    assert len(read_progress(tmp_path / "parts")) == 6
+    again = FilterTraining(PLAN, tmp_path / "parts")
+    again.run()
+    assert rows_of(again) == rows_of(whole)
+
+
+def test_the_card_says_what_it_was_trained_on(tmp_path):
+    training = FilterTraining(dataclasses.replace(PLAN, rounds=(Round("ekf", 1, 1),)), tmp_path)
+    training.run()
+    saved = read_network(str(tmp_path / "network.npz"))
+    assert saved.card["ranges"]["span"] == [1.0, 2.0]
+    assert saved.card["ranges"]["flows"] == [0.0, 1.0]
+    assert saved.card["ranges"]["n_mainline"] == [6, 6]
+    assert saved.card["training"]["plan"]["seed"] == 3
+    assert saved.card["training"]["passes"] == 1
+
+
+def test_a_folder_of_another_plan_is_refused(tmp_path):
+    FilterTraining(PLAN, tmp_path)
+    with pytest.raises(ValueError, match="seed"):
+        FilterTraining(dataclasses.replace(PLAN, seed=4), tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"traffic_seeds": (1000,)}, r"traffic must be traffic seeds in 0\.\.999, got 1000"),
+        ({"validation_seeds": (5,)}, r"validation must be traffic seeds in 1000\.\.1999, got 5"),
+        ({"rounds": (Round(OWN, 1, 1),)}, "rounds must begin with one of another estimator"),
+        ({"rounds": ()}, "rounds must begin"),
+        ({"episodes": 4}, r"episodes must be an integer in 1\.\.3, got 4"),
+        ({"width": 0}, "width must be"),
+        ({"likelihood": -1.0}, "likelihood must be"),
+    ],
+)
+def test_bad_plans_are_named(changes, message):
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(PLAN, **changes)
