@@ -19,6 +19,7 @@ from dptse_env.schedules.covariance import (
 )
 from dptse_env.schedules.fixed import (
     Everything,
+    LargestDeviation,
     LargestVariance,
     Nothing,
     OldestFirst,
@@ -52,6 +53,7 @@ __all__ = [
     "GreedyLogdet",
     "GreedyTrace",
     "InflatedTrace",
+    "LargestDeviation",
     "LargestVariance",
     "Nothing",
     "OldestFirst",
@@ -81,6 +83,7 @@ OBSERVATION_SCHEDULES: dict[str, Any] = {
     "largest-variance": LargestVariance,
     "largest-density-variance": partial(LargestVariance, term="density"),
     "stale-variance": StaleVariance,
+    "largest-deviation": LargestDeviation,
     "all": Everything,
 }
 """Schedules that use the observation alone, each made of (interface, seed); a step costs at most a

@@ -124,6 +124,17 @@ class StaleVariance(Schedule):
         return self.highest((AGE_CAP * age + 1.0) ** self.age_power * variance, step)
 
 
+class LargestDeviation(StaleVariance):
+    """The segments of the largest deviation times the square root of the time without measurement.
+
+    Scores are ``(age + 1) (s_rho^2 + s_v^2)``, as those of `StaleVariance`, for estimators whose
+    deviations are honest, such as `recurrent`.
+    """
+
+    age_power: ClassVar[float] = 1.0
+    speed_cap: ClassVar[float] = np.inf
+
+
 class Nothing(Schedule):
     """No query: a lower bound, from the fixed sensors alone (mask actions only)."""
 

@@ -85,7 +85,14 @@ def test_a_bound_schedule_refuses_another_batch(name):
 
 @pytest.mark.parametrize(
     "name",
-    ["oldest-first", "largest-variance", "stale-variance", "oracle-error", *COVARIANCE_SCHEDULES],
+    [
+        "oldest-first",
+        "largest-variance",
+        "stale-variance",
+        "largest-deviation",
+        "oracle-error",
+        *COVARIANCE_SCHEDULES,
+    ],
 )
 def test_a_segment_with_a_fixed_sensor_is_queried_last(name):
     queries, _ = play(make_batch(bandwidth=5), name, 6)

@@ -150,3 +150,26 @@ def test_bad_schedules_are_named():
         make_schedule("best", Bare())
     with pytest.raises(ValueError, match=r"schedule\.period must be None or >= 1, got 0"):
         Shifting(Bare().interface, period=0)
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [("stale-variance", [1, 2, 12]), ("largest-deviation", [1, 5, 12])],
+)
+def test_deviations_are_weighed_by_age(name, expected):
+    """Scores are (age + 1)^a (s_rho^2 + min(s_v, cap)^2), a = 2 with a cap of 0.1, or 1 without."""
+    env = Bare(bandwidth=3)
+    age = np.zeros(15)
+    density, speed = np.full(15, 0.01), np.full(15, 0.01)
+    age[1], density[1] = 8 / 60, 0.3  # far ahead under both
+    age[2], density[2] = 24 / 60, 0.05  # 1.6 with the square of the age, 0.06 with the age
+    density[12], speed[12] = 0.5, 0.1
+    speed[5] = 0.3  # held to 0.1 under a cap
+    blocks = {"age": age, "density_log_std": np.log(density), "speed_log_std": np.log(speed)}
+    observation = env.observation(1, **{
+        key: np.pad(value, (0, env.interface.observations.slices[key].stop
+                            - env.interface.observations.slices[key].start - 15))
+        for key, value in blocks.items()
+    })  # fmt: skip
+    action, _ = make_schedule(name, env).predict(observation[0])
+    assert np.flatnonzero(action).tolist() == expected
