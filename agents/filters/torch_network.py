@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from dptse_env.estimators.learned.cells import LONGEST_AGE, SPEED_RANGE, channels
+from dptse_env.estimators.learned.cells import DENSITY_RANGE, LONGEST_AGE, SPEED_RANGE, channels
 from dptse_env.estimators.learned.network import (
     HIGHEST_SPREAD,
     LOWEST_SPREAD,
@@ -62,9 +62,10 @@ class RecurrentNetwork(nn.Module):
                 weights.normal_(0.0, 0.1 * width**-0.5)
             self.register_parameter(name, nn.Parameter(weights))
         with torch.no_grad():
-            # Free flow, and deviations of a tenth of the units.
-            self.heads_bias.copy_(torch.tensor([-2.5, 1.5, -3.0, -2.3] * 2))
-            self.inputs_bias[:width] = 1.0
+            # Free flow, and deviations of some 20 veh/km and 10 km/h.
+            self.heads_bias.copy_(torch.tensor([-2.0, 1.5, -2.0, -2.3] * 2))
+            # Cells remember for a second, or for as long as a minute.
+            self.inputs_bias[:width] = torch.linspace(0.0, 4.0, width)
 
     def begin(self, start: Tensor) -> State:
         """Return the state before the first second, of a prior (k, S, 2)."""
@@ -84,7 +85,7 @@ class RecurrentNetwork(nn.Module):
         h = n + z * (h - n)
         with torch.no_grad():
             mean = torch.sigmoid(h @ self.heads[:, 4:6] + self.heads_bias[4:6])
-            density = road.unit * mean[..., 0]
+            density = DENSITY_RANGE * road.unit * mean[..., 0]
             predicted = torch.stack([density, SPEED_RANGE * road.limit * mean[..., 1]], -1)
             age = (state.age + 1.0) * (1.0 - measured[..., 0])
         return State(h, predicted, age)
@@ -100,7 +101,7 @@ class RecurrentNetwork(nn.Module):
         unit = road.unit[:, None].expand(-1, 2)
         table = torch.stack(
             [
-                unit * mean[..., 0], SPEED_RANGE * road.limit * mean[..., 1],
+                DENSITY_RANGE * unit * mean[..., 0], SPEED_RANGE * road.limit * mean[..., 1],
                 unit * spread[..., 0], road.limit * spread[..., 1],
             ],
             -1,

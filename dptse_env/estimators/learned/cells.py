@@ -15,11 +15,13 @@ from dptse_env.estimators.batch import Measurements
 from dptse_env.model import ARZModel
 from dptse_env.utils.arrays import FloatArray, IntArray
 
-DENSITY_UNIT = 160.0
-"""Unit of densities [veh/km] for each lane: vehicles that stand, 6.25 m each."""
+DENSITY_UNIT = 40.0
+"""Unit of densities [veh/km] for each lane, between free flow and a jam."""
+DENSITY_RANGE = 4.0
+"""Largest density that is estimated, in its unit: vehicles that stand, 6.25 m each."""
 SPEED_RANGE = 1.1
 """Largest speed that is estimated, in speed limits."""
-LEAST_DENSITY = 0.01
+LEAST_DENSITY = 0.04
 """Least density, in its unit, by which a flow is divided."""
 LONGEST_AGE = 300.0
 """Seconds since a measurement after which a cell counts as never measured."""
@@ -32,9 +34,9 @@ MEASURED = (
 
 CHANNELS = (
     "queried", "density", "log_density_sigma", "flow", "log_flow_sigma", "centre", "speed",
-    "log_speed_sigma", "flows", "log_span", "shared_upstream", "shared_downstream", "log_age",
-    "predicted_density", "predicted_speed", "inflow", "outside_density", "on_ramp", "off_ramp",
-    "entry", "exit", "lanes", "log_length", "log_limit",
+    "log_speed_sigma", "density_news", "speed_news", "flows", "log_span", "shared_upstream",
+    "shared_downstream", "log_age", "predicted_density", "predicted_speed", "inflow",
+    "outside_density", "on_ramp", "off_ramp", "entry", "exit", "lanes", "log_length", "log_limit",
 )  # fmt: skip
 """The inputs of the network for each cell."""
 
@@ -141,7 +143,7 @@ def channels(
     age: Any,
     outside: Any,
 ) -> Any:
-    """Return the network's inputs, shape (k, S, 24), in the order of `CHANNELS`.
+    """Return the network's inputs, shape (k, S, 26), in the order of `CHANNELS`.
 
     Args:
         xp: numpy or torch, of which the other arguments are arrays.
@@ -158,15 +160,19 @@ def channels(
     second, sigma = measured[..., 3] / limit, measured[..., 4] / limit
     flows, centre = cells.flows, measured[..., 5] / limit
     by_density = flows / carrier / unit + (1.0 - flows)
+    read_density = xp.clip(measured[..., 1] / unit, -8.0, 8.0)
+    read_speed = xp.clip(centre + second * by_density, -1.0, 2.0)
     parts = [
         queried,
-        xp.clip(queried * measured[..., 1] / unit, -2.0, 2.0),
+        queried * read_density,
         queried * _log(xp, measured[..., 2] / unit),
-        xp.clip(flows * queried * second / unit, -2.0, 2.0),
+        xp.clip(flows * queried * second / unit, -4.0, 4.0),
         flows * queried * _log(xp, sigma / unit),
         centre,
-        xp.clip(queried * (centre + second * by_density), -1.0, 2.0),
+        queried * read_speed,
         queried * _log(xp, sigma * by_density),
+        queried * (read_density - density),
+        queried * (read_speed - predicted[..., 1] / limit),
         queried * 0.0 + flows,
         measured[..., 6],
         measured[..., 7],

@@ -5,6 +5,7 @@ from numba import njit
 
 from dptse_env.estimators.learned.cells import (
     CHANNELS,
+    DENSITY_RANGE,
     LEAST_DENSITY,
     LONGEST_AGE,
     N_FIXED,
@@ -84,11 +85,11 @@ def read(
         for s in range(S):
             row = x[i, s]
             _write(cells, s, weight[s], total[s], centre[i, s], prior[s], row)
-            row[9], row[10], row[11] = shares[s, 0], shares[s, 1], shares[s, 2]
-            row[12] = 0.25 * np.log(1.0 + min(age[episode, s], LONGEST_AGE))
-            row[15], row[16] = outside[s, 0], outside[s, 1]
+            row[11], row[12], row[13] = shares[s, 0], shares[s, 1], shares[s, 2]
+            row[14] = 0.25 * np.log(1.0 + min(age[episode, s], LONGEST_AGE))
+            row[17], row[18] = outside[s, 0], outside[s, 1]
             for j in range(N_FIXED):
-                row[17 + j] = cells.fixed[s, j]
+                row[19 + j] = cells.fixed[s, j]
             age[episode, s] = 0.0 if weight[s, 0] > 0.0 else age[episode, s] + 1.0
 
 
@@ -105,24 +106,25 @@ def _write(
     """Write the channels that a measurement of a cell gives."""
     unit, limit = cells.unit[s], cells.limit
     density = prior[0] / unit
-    row[0:8] = 0.0
-    row[8] = 1.0 if cells.flows else 0.0
-    row[13], row[14] = density, prior[1] / limit
+    row[0:10] = 0.0
+    row[10] = 1.0 if cells.flows else 0.0
+    row[15], row[16] = density, prior[1] / limit
     if cells.flows:
         row[5] = centre / limit
     if not weight[0] > 0.0:
         return
     row[0] = 1.0
-    row[1] = _held(total[0] / weight[0] / unit, -2.0, 2.0)
+    row[1] = _held(total[0] / weight[0] / unit, -8.0, 8.0)
     row[2] = _log(1.0 / np.sqrt(weight[0]) / unit)
     second, deviation = total[1] / weight[1] / limit, 1.0 / np.sqrt(weight[1]) / limit
     if cells.flows:
         carrier = max(density, LEAST_DENSITY)
-        row[3], row[4] = _held(second / unit, -2.0, 2.0), _log(deviation / unit)
+        row[3], row[4] = _held(second / unit, -4.0, 4.0), _log(deviation / unit)
         row[6] = _held(centre / limit + second / unit / carrier, -1.0, 2.0)
         row[7] = _log(deviation / unit / carrier)
     else:
         row[6], row[7] = _held(second, -1.0, 2.0), _log(deviation)
+    row[8], row[9] = row[1] - density, row[6] - prior[1] / limit
 
 
 @njit(cache=True, error_model="numpy")
@@ -236,7 +238,7 @@ def _read_heads(
     raw: Float32Array, bias: Float32Array, unit: float, limit: float, out: FloatArray
 ) -> None:
     """Write density, speed and their deviations."""
-    out[0] = unit * (0.5 + 0.5 * np.tanh(0.5 * float(raw[0] + bias[0])))
+    out[0] = DENSITY_RANGE * unit * (0.5 + 0.5 * np.tanh(0.5 * float(raw[0] + bias[0])))
     out[1] = SPEED_RANGE * limit * (0.5 + 0.5 * np.tanh(0.5 * float(raw[1] + bias[1])))
     out[2] = unit * np.exp(_held(float(raw[2] + bias[2]), LOWEST_SPREAD, HIGHEST_SPREAD))
     out[3] = limit * np.exp(_held(float(raw[3] + bias[3]), LOWEST_SPREAD, HIGHEST_SPREAD))

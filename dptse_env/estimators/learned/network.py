@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dptse_env.estimators.learned.cells import CHANNELS, SPEED_RANGE
+from dptse_env.estimators.learned.cells import CHANNELS, DENSITY_RANGE, SPEED_RANGE
 
 Float32Array = NDArray[np.float32]
 
@@ -96,7 +96,7 @@ def outputs(
     raw = h @ network.heads + network.heads_bias
     table = np.empty_like(raw)
     for first in (0, 4):
-        table[..., first] = unit * _sigmoid(raw[..., first])
+        table[..., first] = DENSITY_RANGE * unit * _sigmoid(raw[..., first])
         table[..., first + 1] = SPEED_RANGE * limit * _sigmoid(raw[..., first + 1])
         spread = np.exp(np.clip(raw[..., first + 2 : first + 4], LOWEST_SPREAD, HIGHEST_SPREAD))
         table[..., first + 2] = unit * spread[..., 0]

@@ -72,7 +72,7 @@ class Recurrent(BatchEstimator):
     def _reset(
         self, episodes: IntArray, states: FloatArray, generators: Sequence[np.random.Generator]
     ) -> None:
-        density, speed = estimated_traffic(self.model, states)
+        density, speed = estimated_traffic(self.model, states[:, : 2 * self.model.n_segments])
         self._prior[episodes, :, 0], self._prior[episodes, :, 1] = density, speed
         self._restart(episodes)
 
@@ -107,8 +107,7 @@ class Recurrent(BatchEstimator):
             self._restart(lost)
             self.innovations[lost] = 0.0
 
-    def estimate(self) -> Estimate:
-        """Current estimate of all episodes."""
+    def _estimate(self) -> Estimate:
         return Estimate(*(self._present[..., j].copy() for j in range(4)))
 
 

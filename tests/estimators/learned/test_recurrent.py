@@ -189,7 +189,7 @@ def test_deviations_and_estimates_stay_in_their_range(tmp_path):
     estimator = started("compiled", episodes, settings(tmp_path, network))
     run(estimator, episodes, range(30))
     estimate, unit = estimator.estimate(), estimator.cells.unit
-    np.testing.assert_allclose(estimate.density[0], unit)
+    np.testing.assert_allclose(estimate.density[0], 4.0 * unit)
     np.testing.assert_allclose(estimate.speed, 1.1 * episodes.model.network.speed_limit)
     np.testing.assert_allclose(estimate.density_std[0], unit * np.exp(LOWEST_SPREAD))
 
