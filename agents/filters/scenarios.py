@@ -57,6 +57,7 @@ class ScenarioRanges:
     envs: tuple[str, ...] = (
         "dptse_env:dptse/PrivateHighway-v1",
         "dptse_env:dptse/PaperHighway-v0",
+        "dptse_env:dptse/ShortHighway-v0",
     )
     mechanisms: tuple[str, ...] = MECHANISMS
     schedules: tuple[str, ...] = SCHEDULES

@@ -176,27 +176,25 @@ def advance(
         present: Estimates and deviations of this second, shape (n, S, 4), updated.
         ahead: Those of the next second before its release, shape (n, S, 4), updated.
     """
-    k, S, H = episodes.size, cells.lanes.size, network.hidden.shape[0]
-    before = np.empty((k, S, H), dtype=np.float32)
-    for i in range(k):
+    S, H = cells.lanes.size, network.hidden.shape[0]
+    g, q = np.empty((S, 3 * H), dtype=np.float32), np.empty((S, 3 * H), dtype=np.float32)
+    raw = np.empty((S, network.heads.shape[1]), dtype=np.float32)
+    # One product for each episode: its bits then do not depend on the batch that it is in.
+    for i in range(episodes.size):
         h = hidden[episodes[i]]
-        before[i] = h
         x[i, :, N_CHANNELS:] = 0.0
         for e in range(cells.edges.shape[0]):
             start, end = cells.edges[e, 0], cells.edges[e, 1]
             for j in range(H):
                 x[i, end, N_CHANNELS + j] += h[start, j]
                 x[i, start, N_CHANNELS + H + j] += h[end, j]
-    flat = before.reshape(k * S, H)
-    g = np.dot(x.reshape(k * S, x.shape[2]), network.inputs)
-    q = np.dot(flat, network.hidden)
-    for row in range(k * S):
-        _gate(g[row], q[row], network.inputs_bias, network.hidden_bias, flat[row])
-    raw = np.dot(flat, network.heads)
-    for i in range(k):
-        hidden[episodes[i]] = before[i]
+        np.dot(x[i], network.inputs, g)
+        np.dot(h, network.hidden, q)
         for s in range(S):
-            row = raw[i * S + s]
+            _gate(g[s], q[s], network.inputs_bias, network.hidden_bias, h[s])
+        np.dot(h, network.heads, raw)
+        for s in range(S):
+            row = raw[s]
             unit, limit = cells.unit[s], cells.limit
             _read_heads(row[0:4], network.heads_bias[0:4], unit, limit, present[episodes[i], s])
             _read_heads(row[4:8], network.heads_bias[4:8], unit, limit, ahead[episodes[i], s])

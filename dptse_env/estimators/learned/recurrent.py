@@ -69,6 +69,11 @@ class Recurrent(BatchEstimator):
         spread = deviation * np.array([model.density_scale, model.speed_scale])
         self._present[..., 2:] = self._prior[..., 2:] = spread
 
+    @property
+    def means(self) -> FloatArray:
+        """Densities [veh/km] and speeds [km/h], shape (n, S, 2)."""
+        return self._present[..., :2]
+
     def _reset(
         self, episodes: IntArray, states: FloatArray, generators: Sequence[np.random.Generator]
     ) -> None:
