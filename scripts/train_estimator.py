@@ -38,8 +38,12 @@ class Args(Recording):
     """Traffic seeds to train on, first:stop; training seeds only."""
     validation: str = "1000:1016"
     """Traffic seeds to validate on, first:stop; validation seeds only."""
+    validation_envs: tuple[str, ...] = FilterPlan.validation_envs
+    """Environments to validate in, with a round robin."""
     width: int = 32
     """Width of the hidden state of a cell."""
+    episodes: int = 32
+    """Episodes of a scenario."""
     learning_rate: float = 4e-3
     """Learning rate at the beginning."""
     rounds: tuple[str, ...] = ("ekf:48:240", "own:48:160", "own:48:200")
@@ -78,9 +82,11 @@ def make_plan(args: Args) -> FilterPlan:
         seed=args.seed,
         traffic_seeds=parse_seeds(args.traffic, "traffic"),
         validation_seeds=parse_seeds(args.validation, "validation"),
+        validation_envs=args.validation_envs,
         ranges=args.ranges,
         rounds=tuple(parse_round(each) for each in args.rounds),
         width=args.width,
+        episodes=args.episodes,
         learning_rate=args.learning_rate,
         checkpoint_every=args.checkpoint_every,
     )
@@ -112,7 +118,9 @@ def main(args: Args) -> None:
     plan = make_plan(args)
     torch.set_num_threads(integer("threads", args.threads, 1))
     for env in plan.ranges.envs:
-        args.library(make_config(env, {}).corridor, (*plan.traffic_seeds, *plan.validation_seeds))
+        args.library(make_config(env, {}).corridor, plan.traffic_seeds)
+    for env in plan.validation_envs:
+        args.library(make_config(env, {}).corridor, plan.validation_seeds)
     bar = Bar(plan.n_passes)
     writer = make_tensorboard_writer(args.output / "tensorboard") if args.tensorboard else None
     watchers = (bar,) if writer is None else (bar, writer)

@@ -53,6 +53,7 @@ class FilterPlan:
         seed: Training seed: scenarios, first weights, order.
         traffic_seeds: Traffic seeds to train on.
         validation_seeds: Traffic seeds to validate on.
+        validation_envs: Environments to validate in, with their default keywords.
         ranges: What scenarios are drawn from.
         rounds: Rounds, one after the other.
         width: Width of the hidden state.
@@ -71,6 +72,11 @@ class FilterPlan:
     seed: int
     traffic_seeds: tuple[int, ...]
     validation_seeds: tuple[int, ...]
+    validation_envs: tuple[str, ...] = (
+        "dptse_env:dptse/PrivateHighway-v0",
+        "dptse_env:dptse/PrivateHighway-v1",
+        "dptse_env:dptse/PaperHighway-v0",
+    )
     ranges: ScenarioRanges = field(default_factory=ScenarioRanges)
     rounds: tuple[Round, ...] = (
         Round("ekf", 48, 240),

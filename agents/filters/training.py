@@ -166,7 +166,8 @@ class FilterTraining:
 
     def _validate(self) -> Row:
         self._save(WEIGHTS)
-        scores = validate(str(self.folder / WEIGHTS), self.plan.validation_seeds, self._records)
+        plan, weights = self.plan, str(self.folder / WEIGHTS)
+        scores = validate(weights, plan.validation_envs, plan.validation_seeds, self._records)
         return {
             "validation": float(np.mean([each.error for each in scores.values()])),
             "chi2": float(np.mean([each.chi2_density for each in scores.values()])),

@@ -12,12 +12,6 @@ from agents.experiments.seeds import TUNING
 from dptse_env.process import QueryProcess
 from dptse_env.schedules import make_schedule
 
-CELLS: dict[str, tuple[str, dict[str, Any]]] = {
-    "capped": ("dptse_env:dptse/PrivateHighway-v0", {}),
-    "paced": ("dptse_env:dptse/PrivateHighway-v1", {}),
-    "paper": ("dptse_env:dptse/PaperHighway-v0", {}),
-}
-"""Environments by name, with keywords."""
 SCHEDULE = "round-robin"
 
 
@@ -92,11 +86,10 @@ def score(
     )
 
 
-def validate(weights: str, seeds: Sequence[int], records: str | None = None) -> dict[str, Score]:
-    """Return the scores of a network, given by name or file, in `CELLS`."""
+def validate(
+    weights: str, envs: Sequence[str], seeds: Sequence[int], records: str | None = None
+) -> dict[str, Score]:
+    """Return the scores of a network, given by name or file, in some environments."""
     settings = {"recurrent": {"weights": weights, "outside": True}}
     own = {"estimator": "recurrent", "estimator_settings": settings}
-    return {
-        name: score(env, {**keywords, **own}, SCHEDULE, seeds, records)
-        for name, (env, keywords) in CELLS.items()
-    }
+    return {env: score(env, own, SCHEDULE, seeds, records) for env in envs}

@@ -29,7 +29,9 @@ from .episodes import (
 # Flows are for the compiled ones: each is compared with its reference in a module of its own.
 CASES = [(name, backend, "speed") for name in ESTIMATORS for backend in BACKENDS]
 CASES += [(name, "compiled", "flow") for name in ESTIMATORS if name != "open_loop"]
-WITH_COVARIANCE = [case for case in CASES if case[0] not in ("random_walk", "open_loop", "recurrent")]
+WITH_COVARIANCE = [
+    case for case in CASES if case[0] not in ("random_walk", "open_loop", "recurrent")
+]
 EXCHANGED = [*range(15), 16, 15, 17, 18]  # segments, the on-ramps exchanged
 SLOW = {("mhe", "reference"), ("enkf", "reference")}  # milliseconds a step
 

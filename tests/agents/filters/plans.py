@@ -9,11 +9,10 @@ PLAN = FilterPlan(
     seed=3,
     traffic_seeds=(0, 1, 2),
     validation_seeds=(1000, 1001),
+    validation_envs=(SHORT,),
     ranges=RANGES,
     rounds=(Round("ekf", 2, 3), Round(OWN, 2, 3)),
     width=4,
     episodes=2,
     checkpoint_every=2,
 )
-CELLS = {"short": (SHORT, {"privacy": "paced", "horizon": 80})}
-"""A cell for validation that takes no time."""

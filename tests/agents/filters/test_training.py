@@ -8,7 +8,6 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from agents.evaluation.episodes import make_vector, run_episodes  # noqa: E402
-from agents.filters import validation  # noqa: E402
 from agents.filters.batches import make_batch  # noqa: E402
 from agents.filters.collecting import collect  # noqa: E402
 from agents.filters.plan import OWN, Round  # noqa: E402
@@ -19,12 +18,11 @@ from dptse_env.estimators.learned.weights import read_network, write_network  # 
 from dptse_env.schedules import make_schedule  # noqa: E402
 from tests.estimators.learned.networks import card  # noqa: E402
 
-from .plans import CELLS, PLAN, SHORT  # noqa: E402
+from .plans import PLAN, SHORT  # noqa: E402
 
 
 @pytest.fixture(autouse=True)
-def _small_cells(monkeypatch):
-    monkeypatch.setattr(validation, "CELLS", CELLS)
+def _one_thread():
     torch.set_num_threads(1)
 
 
