@@ -25,6 +25,7 @@ from dptse_env.estimators.settings import (
     BlendSettings,
     EnsembleSettings,
     HorizonSettings,
+    RecurrentSettings,
     SigmaPointSettings,
 )
 from dptse_env.model import ARZParameters
@@ -56,6 +57,7 @@ SECTIONS: Mapping[type, str] = {
     EnsembleSettings: "`estimator_settings.enkf`",
     HorizonSettings: "`estimator_settings.mhe`",
     BlendSettings: "`estimator_settings.blend`",
+    RecurrentSettings: "`estimator_settings.recurrent`",
 }
 """Nested dataclasses, with the headings of their tables."""
 

@@ -68,8 +68,8 @@ def make_estimator(
 
     Args:
         estimator: `ekf`, `ukf`, `enkf`, `mhe`, `random_walk` (no traffic model), `blend` (a mean
-            of EKF and random walk), `open_loop` (no measurements), a registered name,
-            ``"package.module:Class"`` or a class.
+            of EKF and random walk), `open_loop` (no measurements), `recurrent` (a network), a
+            registered name, ``"package.module:Class"`` or a class.
         backend: `compiled` (numba) or `reference` (numpy, filterpy, qpsolvers); the random walk
             is plain numpy under both. For a class of another package it selects the model alone.
         model: The traffic model.

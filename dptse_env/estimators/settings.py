@@ -202,7 +202,8 @@ class EstimatorSettings:
         enkf: Further settings of the ensemble Kalman filter.
         mhe: Further settings of the moving horizon estimator, with separate bounds.
         blend: Further settings of the blend, whose EKF and random walk share the others.
-        recurrent: Settings of the recurrent network, which has no others but `initial_variance`.
+        recurrent: Settings of the recurrent network; of the others it has `initial_variance`,
+            `noise_scale` and `speed_cap`.
 
     Raises:
         ValueError: A value is out of range.

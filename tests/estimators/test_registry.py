@@ -48,7 +48,7 @@ def test_every_estimator_measures_as_its_model_does(name, backend, reference_spe
 def test_unknown_names_say_what_is_allowed():
     with pytest.raises(
         ValueError,
-        match=r"estimator must be one of ekf, .*, open_loop, or 'package\.module:Name', got 'kf'",
+        match=r"estimator must be one of ekf, .*, recurrent, or 'package\.module:Name', got 'kf'",
     ):
         make_estimator("kf", "compiled", MODEL, 1)
     with pytest.raises(ValueError, match="backend must be one of compiled, reference, got 'torch'"):
