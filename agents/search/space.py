@@ -113,6 +113,13 @@ SPACE: dict[str, Mapping[str, Knob]] = {
 """By estimator: paths into `EstimatorSettings` and where their values are searched."""
 
 
+NOT_TUNED = {
+    "open_loop": "it takes no measurements and follows the model alone",
+    "recurrent": "its weights are trained by scripts/train_estimator.py",
+}
+"""Estimators that have nothing to tune, with the reason."""
+
+
 def search_space(
     estimator: str,
     with_noise_scale: bool = False,
@@ -131,10 +138,10 @@ def search_space(
     Raises:
         ValueError: There is nothing to tune, no such estimator, or it has no demand states.
     """
-    if estimator == "open_loop":
+    if estimator in NOT_TUNED:
         raise ValueError(
-            f"estimator 'open_loop' has nothing to tune: it takes no measurements and follows the "
-            f"model alone; tunable are {', '.join(SPACE)}"
+            f"estimator {estimator!r} has nothing to tune: {NOT_TUNED[estimator]}; tunable are "
+            f"{', '.join(SPACE)}"
         )
     if estimator not in SPACE:
         raise ValueError(f"estimator must be one of {', '.join(SPACE)}, got {estimator!r}")

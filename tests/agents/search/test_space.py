@@ -27,8 +27,10 @@ from dptse_env.estimators.tuned_settings import available_settings, load_setting
 from dptse_env.utils.fields import from_mapping
 
 
-def test_every_estimator_but_the_open_loop_can_be_tuned():
-    assert {*SPACE, "open_loop"} == set(ESTIMATORS)
+def test_every_estimator_that_has_settings_can_be_tuned():
+    assert {*SPACE, "open_loop", "recurrent"} == set(ESTIMATORS)
+    with pytest.raises(ValueError, match=r"'recurrent' has nothing to tune: .*train_estimator"):
+        search_space("recurrent")
     with pytest.raises(ValueError, match=r"'open_loop' has nothing to tune.*tunable are ekf, ukf"):
         search_space("open_loop")
     with pytest.raises(ValueError, match=r"estimator must be one of ekf, .*, got 'kf'"):
