@@ -11,7 +11,6 @@ need another folder.
 
 from __future__ import annotations
 
-import contextlib
 import subprocess
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,16 +18,14 @@ from typing import Annotated
 
 import torch
 import tyro
-from tqdm import tqdm
 
 from agents.training.plan import TrainingPlan
 from agents.training.recipes import MaskablePPORecipe, MaskRecipe, PlackettLuceRecipe, ScoresRecipe
-from agents.training.run_files import Row
-from agents.training.tensorboard_writer import make_tensorboard_writer
 from agents.training.training import BEST, POLICY, Training
 from dptse_env.config import parse_seeds
 from dptse_env.utils.validation import integer
 from scripts.cli import Recording, parse_keywords, records_argument, resumable, run
+from scripts.training_bar import Bar, watched
 
 AnyRecipe = (
     Annotated[PlackettLuceRecipe, tyro.conf.subcommand("plackett-luce")]
@@ -62,7 +59,7 @@ class Args(Recording):
     threads: int = 1
     """Threads of torch; numbers depend on it in the last digits."""
     tensorboard: bool = True
-    """Whether to also write the learning curve for TensorBoard, where that is installed."""
+    """Write the learning curve for TensorBoard, too, where that is installed."""
     output: Path = Path("results/training")
     """Folder of the training."""
     recipe: AnyRecipe = field(default_factory=PlackettLuceRecipe)
@@ -101,38 +98,20 @@ def commit() -> str | None:
     return head.stdout.strip() or None
 
 
-class Bar:
-    """A progress bar over seconds of traffic, with the latest errors beside it."""
-
-    def __init__(self, total: int) -> None:
-        """Show an empty bar."""
-        self.bar = tqdm(total=total, unit="step", unit_scale=True, desc="training")
-        self._shown: dict[str, str] = {}
-
-    def __call__(self, row: Row) -> None:
-        """Advance the bar to a row."""
-        errors: dict[str, str] = {
-            name: f"{row[name]:.4f}" for name in ("error", "validation") if name in row
-        }
-        self._shown |= errors
-        self.bar.set_postfix(self._shown, refresh=False)
-        self.bar.update(int(row["steps"]) - self.bar.n)
-
-    def show(self, stage: str, fraction: float) -> None:
-        """Show the fraction of a stage that is done; the bar stands still meanwhile."""
-        self.bar.set_postfix({stage: f"{fraction:.0%}", **self._shown})
-
-
 @resumable()
 def main(args: Args) -> None:
     """Record missing traffic, train, and leave the policy."""
     plan = make_plan(args)
     torch.set_num_threads(integer("threads", args.threads, 1))
     args.library(plan.config.corridor, (*plan.traffic_seeds, *plan.validation_seeds))
-    bar = Bar(plan.steps_at(plan.n_updates))
-    writer = make_tensorboard_writer(args.output / "tensorboard") if args.tensorboard else None
-    watchers = (bar,) if writer is None else (bar, writer)
-    with bar.bar, contextlib.closing(writer) if writer else contextlib.nullcontext():
+    bar = Bar(
+        "steps",
+        ("error", "validation"),
+        plan.steps_at(plan.n_updates),
+        unit="step",
+        unit_scale=True,
+    )
+    with watched(bar, args.output, args.tensorboard) as watchers:
         training = Training(
             plan,
             args.output,

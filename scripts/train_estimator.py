@@ -10,22 +10,19 @@ numbers; other arguments need another folder.
 
 from __future__ import annotations
 
-import contextlib
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
-from tqdm import tqdm
 
 from agents.evaluation.episodes import make_config
 from agents.filters.plan import FilterPlan, Round
 from agents.filters.scenarios import ScenarioRanges
 from agents.filters.training import FilterTraining
-from agents.training.run_files import Row
-from agents.training.tensorboard_writer import make_tensorboard_writer
 from dptse_env.config import parse_seeds
 from dptse_env.utils.validation import integer
 from scripts.cli import Recording, records_argument, resumable, run
+from scripts.training_bar import Bar, watched
 
 
 @dataclass(frozen=True)
@@ -49,13 +46,13 @@ class Args(Recording):
     rounds: tuple[str, ...] = ("ekf:48:240", "own:48:160", "own:48:200")
     """Rounds as estimator:scenarios:passes; 'own' is the network that is trained."""
     ranges: ScenarioRanges = field(default_factory=ScenarioRanges)
-    """What scenarios are drawn from."""
+    """Ranges that scenarios are drawn from."""
     checkpoint_every: int = 20
     """Passes between two checkpoints, each with a validation."""
     threads: int = 1
     """Threads of torch; numbers depend on it in the last digits."""
     tensorboard: bool = True
-    """Whether to also write the learning curve for TensorBoard, where that is installed."""
+    """Write the learning curve for TensorBoard, too, where that is installed."""
     output: Path = Path("results/filters/0")
     """Folder of the training."""
 
@@ -92,26 +89,6 @@ def make_plan(args: Args) -> FilterPlan:
     )
 
 
-class Bar:
-    """A progress bar over passes, with the latest errors beside it."""
-
-    def __init__(self, total: int) -> None:
-        """Show an empty bar."""
-        self.bar = tqdm(total=total, unit="pass", desc="training")
-        self._shown: dict[str, str] = {}
-
-    def __call__(self, row: Row) -> None:
-        """Advance the bar to a row."""
-        shown = ("error", "validation", "chi2")
-        self._shown |= {name: f"{row[name]:.4f}" for name in shown if name in row}
-        self.bar.set_postfix(self._shown, refresh=False)
-        self.bar.update(int(row["update"]) - self.bar.n)
-
-    def show(self, stage: str, fraction: float) -> None:
-        """Show the fraction of a stage that is done; the bar stands still meanwhile."""
-        self.bar.set_postfix({stage: f"{fraction:.0%}", **self._shown})
-
-
 @resumable()
 def main(args: Args) -> None:
     """Record missing traffic, train, and leave the network."""
@@ -121,10 +98,8 @@ def main(args: Args) -> None:
         args.library(make_config(env, {}).corridor, plan.traffic_seeds)
     for env in plan.validation_envs:
         args.library(make_config(env, {}).corridor, plan.validation_seeds)
-    bar = Bar(plan.n_passes)
-    writer = make_tensorboard_writer(args.output / "tensorboard") if args.tensorboard else None
-    watchers = (bar,) if writer is None else (bar, writer)
-    with bar.bar, contextlib.closing(writer) if writer else contextlib.nullcontext():
+    bar = Bar("update", ("error", "validation", "chi2"), plan.n_passes, unit="pass")
+    with watched(bar, args.output, args.tensorboard) as watchers:
         training = FilterTraining(
             plan,
             args.output,
