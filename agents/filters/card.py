@@ -10,11 +10,13 @@ from agents.experiments.provenance import source_digest
 from agents.filters.plan import FilterPlan
 from dptse_env.estimators.learned.cells import CHANNELS
 from dptse_env.estimators.learned.weights import FORMAT
+from dptse_env.release import RELEASE_MODELS
 
 
 def make_card(plan: FilterPlan, done: int, name: str) -> dict[str, Any]:
     """Return the card of a network after `done` passes of a plan."""
-    roads = [make_config(env, {}).corridor for env in plan.ranges.envs]
+    envs, mechanisms = plan.ranges.envs, plan.ranges.mechanisms
+    roads = [make_config(env, {}).corridor for env in envs]
     lanes = [count for road in roads for count in road.segment_lanes]
     found: dict[str, list[float]] = {
         "n_mainline": [road.n_mainline for road in roads],
@@ -22,7 +24,7 @@ def make_card(plan: FilterPlan, done: int, name: str) -> dict[str, Any]:
         "speed_limit": [road.speed_limit for road in roads],
         "lanes": [float(count) for count in lanes],
         "span": [1.0, *(float(span) for spans in plan.ranges.spans for span in spans)],
-        "flows": [float(_releases_flows(each)) for each in plan.ranges.mechanisms],
+        "flows": [_releases_flows(env, each) for env in envs for each in mechanisms],
     }
     return {
         "name": name,
@@ -38,5 +40,7 @@ def make_card(plan: FilterPlan, done: int, name: str) -> dict[str, Any]:
     }
 
 
-def _releases_flows(mechanism: str) -> int:
-    return int(mechanism in ("capped", "paced"))
+def _releases_flows(env: str, mechanism: str) -> float:
+    config = make_config(env, {"privacy": mechanism})
+    release = RELEASE_MODELS.find(config.privacy.preset)
+    return float(release.flow_centre(config.corridor, config.privacy) is not None)
