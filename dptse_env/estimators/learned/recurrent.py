@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -23,15 +24,6 @@ from dptse_env.estimators.open_loop import estimated_traffic
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
-
-
-class _Road(NamedTuple):
-    """The parts of `Cells` that `channels` needs."""
-
-    unit: FloatArray
-    limit: float
-    flows: float
-    fixed: FloatArray
 
 
 class Recurrent(BatchEstimator):
@@ -100,8 +92,9 @@ class Recurrent(BatchEstimator):
             self._advance(kept)
         self._check(episodes, sound)
 
+    @abstractmethod
     def _advance(self, measured: Measurements) -> None:
-        raise NotImplementedError
+        """Advance the network by measurements that are finite."""
 
     def _check(self, episodes: IntArray, sound: BoolArray) -> None:
         """Reset episodes with releases, inputs or a hidden state that are not finite."""
@@ -140,9 +133,7 @@ class ReferenceRecurrent(Recurrent):
     def _advance(self, measured: Measurements) -> None:
         episodes, cells = measured.episodes, self.cells
         shape = episodes.size, *cells.fixed.shape
-        road = _Road(
-            cells.unit, cells.limit, float(cells.flows), np.broadcast_to(cells.fixed, shape)
-        )
+        road = cells._replace(fixed=np.broadcast_to(cells.fixed, shape))
         seen = cell_measurements(cells, measured)
         self.innovations[episodes] = self._residuals(measured)
         x = channels(
