@@ -85,6 +85,20 @@ def check_test_seeds(seeds: Sequence[int], path: str = "seeds") -> None:
         )
 
 
+def require_seeds(path: str, seeds: Sequence[int], allowed: range) -> None:
+    """Refuse traffic seeds out of a range, and none at all.
+
+    Raises:
+        ValueError: A seed is outside, or there is none.
+    """
+    outside = [seed for seed in seeds if seed not in allowed]
+    if outside or not seeds:
+        raise ValueError(
+            f"{path} must be traffic seeds in {allowed[0]}..{allowed[-1]}, got "
+            f"{outside[0] if outside else 'none'}"
+        )
+
+
 def seed_kind(seeds: Sequence[int]) -> str:
     """Return which range traffic seeds belong to: training, validation, test, or mixed."""
     ranges = {"training": TRAINING_SEEDS, "validation": VALIDATION_SEEDS, "test": TEST_SEEDS}

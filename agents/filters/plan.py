@@ -5,13 +5,13 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from typing import Any
 
 import numpy as np
 
+from agents.evaluation.episodes import require_seeds
 from agents.experiments.provenance import machine, source_digest
 from agents.experiments.seeds import TUNING
 from agents.filters.scenarios import Scenario, ScenarioRanges
@@ -54,7 +54,7 @@ class FilterPlan:
         traffic_seeds: Traffic seeds to train on.
         validation_seeds: Traffic seeds to validate on.
         validation_envs: Environments to validate in, with their default keywords.
-        ranges: What scenarios are drawn from.
+        ranges: Ranges that scenarios are drawn from.
         rounds: Rounds, one after the other.
         width: Width of the hidden state.
         episodes: Episodes of a scenario, run as a batch.
@@ -95,8 +95,8 @@ class FilterPlan:
     def __post_init__(self) -> None:
         """Check values."""
         integer("seed", self.seed, 0, 2**31)
-        _within("traffic", self.traffic_seeds, TRAINING_SEEDS)
-        _within("validation", self.validation_seeds, VALIDATION_SEEDS)
+        require_seeds("traffic", self.traffic_seeds, TRAINING_SEEDS)
+        require_seeds("validation", self.validation_seeds, VALIDATION_SEEDS)
         integer("width", self.width, 1, 512)
         integer("episodes", self.episodes, 1, len(self.traffic_seeds))
         integer("window", self.window, 1, 10_000)
@@ -154,12 +154,3 @@ class FilterPlan:
             "sources": [source_digest()],
             "machine": machine(libraries),
         }
-
-
-def _within(path: str, seeds: Sequence[int], allowed: range) -> None:
-    outside = [seed for seed in seeds if seed not in allowed]
-    if outside or not seeds:
-        raise ValueError(
-            f"{path} must be traffic seeds in {allowed[0]}..{allowed[-1]}, got "
-            f"{outside[0] if outside else 'none'}"
-        )

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from agents.evaluation.episodes import Policy, make_vector, run_episodes
+from agents.evaluation.episodes import Policy, make_vector, require_seeds, run_episodes
 from agents.experiments.seeds import TRAINING_VALIDATION
 from dptse_env.config import VALIDATION_SEEDS
 from dptse_env.utils.arrays import FloatArray
@@ -23,12 +23,7 @@ class Validation:
         Raises:
             ValueError: A seed is not in `VALIDATION_SEEDS`, or a keyword is out of range.
         """
-        outside = [seed for seed in seeds if seed not in VALIDATION_SEEDS]
-        if outside or not seeds:
-            raise ValueError(
-                f"validation must be traffic seeds in {VALIDATION_SEEDS[0]}.."
-                f"{VALIDATION_SEEDS[-1]}, got {outside[0] if outside else 'none'}"
-            )
+        require_seeds("validation", seeds, VALIDATION_SEEDS)
         self.seeds = list(seeds)
         keywords = {**keywords, "traffic_seeds": self.seeds}
         self.env = make_vector(env, len(self.seeds), keywords)
