@@ -54,7 +54,7 @@ class _Recorder:
 
     def __init__(self, process: QueryProcess) -> None:
         self._estimator, self._process = process.estimator, process
-        self._cells = make_cells(process.model)
+        self.cells = make_cells(process.model)
         self.measured: list[Float32Array] = []
         self.outside: list[Float32Array] = []
 
@@ -63,14 +63,14 @@ class _Recorder:
 
     def predict(self, episodes: Any, inputs: Any) -> None:
         """Write down the inputs, and predict."""
-        self.outside.append(input_channels(self._cells, inputs).astype(np.float32))
+        self.outside.append(input_channels(self.cells, inputs).astype(np.float32))
         self._estimator.predict(episodes, inputs)
 
     def update(self, *arguments: Any) -> None:
         """Write down the measurements, and update."""
         n, model = self._process.n_episodes, self._process.model
         measured = checked_measurements(n, model, *arguments)
-        self.measured.append(cell_measurements(self._cells, measured).astype(np.float32))
+        self.measured.append(cell_measurements(self.cells, measured).astype(np.float32))
         self._estimator.update(*arguments)
 
 
@@ -112,7 +112,7 @@ def collect(scenario: Scenario, estimator: Mapping[str, Any], records: str | Non
     run_episodes(env, policy, traffic_seeds=seeds, seeds=noise, on_second=on_second)
     env.close()
     return Collected(
-        cells=make_cells(process.model),
+        cells=recorder.cells,
         scales=(corridor.density_scale, corridor.speed_scale),
         n_mainline=corridor.n_mainline,
         start=starts[0],
