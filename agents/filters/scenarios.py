@@ -40,7 +40,7 @@ class Scenario:
 
 @dataclass(frozen=True)
 class ScenarioRanges:
-    """What scenarios are drawn from.
+    """Ranges that scenarios are drawn from.
 
     Attributes:
         envs: Environment ids.

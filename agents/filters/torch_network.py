@@ -30,7 +30,7 @@ class Road(NamedTuple):
 
 
 class State(NamedTuple):
-    """What the network keeps between seconds, for k episodes."""
+    """State of the network between seconds, for k episodes."""
 
     hidden: Tensor  # (k, S, H)
     predicted: Tensor  # (k, S, 2), without gradients

@@ -16,7 +16,7 @@ from dptse_env.traffic import Corridor
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 
 BandwidthUnit = Literal["segments", "sums"]
-"""What a query costs of the bandwidth: as much as it has segments, or one."""
+"""Cost of a query in the bandwidth: as much as it has segments, or one."""
 
 
 MOST_OPTIONS = 10_000

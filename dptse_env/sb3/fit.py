@@ -20,7 +20,7 @@ POLICY_FORMAT = "dptse-policy-1"
 
 
 PLAIN = "single segments"
-"""What can be queried where a card says nothing about it."""
+"""Queries that are allowed where a card says nothing about them."""
 
 
 @dataclass(frozen=True)

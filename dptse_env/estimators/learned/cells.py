@@ -30,7 +30,7 @@ MEASURED = (
     "queried", "density", "density_sigma", "second", "second_sigma", "centre", "log_span",
     "shared_upstream", "shared_downstream",
 )  # fmt: skip
-"""What `cell_measurements` gives of each cell."""
+"""Numbers that `cell_measurements` gives of each cell."""
 
 CHANNELS = (
     "queried", "density", "log_density_sigma", "flow", "log_flow_sigma", "centre", "speed",

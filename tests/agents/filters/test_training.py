@@ -27,7 +27,7 @@ def _one_thread():
 
 
 def test_the_network_with_gradients_is_the_estimator(tmp_path):
-    """What torch makes of collected releases is what the environment reported."""
+    """Torch makes of collected releases the estimates that the environment reported."""
     torch.manual_seed(0)
     network = RecurrentNetwork(5)
     with torch.no_grad():

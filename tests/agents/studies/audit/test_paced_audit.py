@@ -47,7 +47,7 @@ def test_the_worst_case_is_nearly_the_whole_of_mu(estimator, clip, record):
 
 
 def test_opposite_deviations_on_one_segment_are_a_worst_case(record):
-    """Where the centre leaves room for the clip on both sides: two vehicles, one query."""
+    """Two vehicles and one query, where the centre leaves room for the clip on both sides."""
     setting = paced(HalfTheLimit, clip=51.0)
     worlds = choose_target(setting, record, "opposite", "hunter")
     slow, fast = worlds.trajectories

@@ -72,7 +72,7 @@ def pacings():
 
 
 def test_equal_rates_do_not_follow_the_queries(pacings):
-    """Where nothing moves, the last segment's price depends on its rate of querying alone."""
+    """The last segment's price depends on its rate of querying alone, where nothing moves."""
     n = pacings[0].setup.n_places
     observed = np.zeros((2, n), dtype=bool)
     observed[0, 0], observed[1, N_MAINLINE - 1] = True, False
