@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from agents.evaluation.episodes import parse_keywords
 from agents.evaluation.terminal import make_table, print_table
 from agents.experiments.files import replacing
 from dptse_env.config import parse_seeds
@@ -29,7 +30,7 @@ from dptse_env.model.prediction import (
 )
 from dptse_env.release.traffic_table import TrafficTable
 from dptse_env.traffic import Corridor, RecordLibrary, mean_dwell
-from scripts.cli import Road, make_corridor, parse_keywords, run
+from scripts.cli import Road, make_corridor, run
 
 
 @dataclass(frozen=True)

@@ -114,20 +114,6 @@ def _words(args: Any) -> Iterator[str]:
                 yield from (shlex.quote(str(each)) for each in values)
 
 
-def parse_keywords(text: str) -> dict[str, Any]:
-    """Return keywords of an environment that are given as a JSON object.
-
-    Raises:
-        ValueError: The text is no JSON object.
-    """
-    keywords: Any = None
-    with contextlib.suppress(json.JSONDecodeError):
-        keywords = json.loads(text)
-    if not isinstance(keywords, dict):
-        raise ValueError(f"keywords must be a JSON object, got {text!r}")
-    return keywords
-
-
 def make_corridor(corridor: str | None, env: str, keywords: Mapping[str, Any]) -> Corridor:
     """Return the corridor of an environment.
 

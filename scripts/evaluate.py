@@ -20,6 +20,7 @@ from agents.evaluation.episodes import (
     Policy,
     make_config,
     make_vector,
+    parse_keywords,
     run_episodes,
     seed_kind,
     watch_episode,
@@ -35,7 +36,7 @@ from agents.evaluation.report import Report
 from dptse_env.config import EnvConfig, parse_seeds
 from dptse_env.policies import TRANSFERABLE
 from dptse_env.schedules import OBSERVATION_SCHEDULES
-from scripts.cli import Recording, parameters_argument, parse_keywords, records_argument, run
+from scripts.cli import Recording, parameters_argument, records_argument, run
 
 ALL = "all"
 """The schedule that runs with a bandwidth that covers the road."""

@@ -9,9 +9,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from agents.evaluation.episodes import parse_keywords
 from dptse_env.config import parse_seeds
 from dptse_env.traffic import mean_dwell
-from scripts.cli import Road, make_corridor, parse_keywords, run
+from scripts.cli import Road, make_corridor, run
 
 
 @dataclass(frozen=True)

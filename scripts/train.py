@@ -19,12 +19,13 @@ from typing import Annotated
 import torch
 import tyro
 
+from agents.evaluation.episodes import parse_keywords
 from agents.training.plan import TrainingPlan
 from agents.training.recipes import MaskablePPORecipe, MaskRecipe, PlackettLuceRecipe, ScoresRecipe
 from agents.training.training import BEST, POLICY, Training
 from dptse_env.config import parse_seeds
 from dptse_env.utils.validation import integer
-from scripts.cli import Recording, parse_keywords, records_argument, resumable, run
+from scripts.cli import Recording, records_argument, resumable, run
 from scripts.training_bar import Bar, watched
 
 AnyRecipe = (

@@ -17,7 +17,7 @@ import torch
 
 from agents.evaluation.episodes import make_config
 from agents.filters.plan import FilterPlan, Round
-from agents.filters.scenarios import ScenarioRanges
+from agents.filters.scenarios import ScenarioRanges, parse_env
 from agents.filters.training import FilterTraining
 from dptse_env.config import parse_seeds
 from dptse_env.utils.validation import integer
@@ -31,19 +31,21 @@ class Args(Recording):
 
     seed: int = 0
     """Training seed."""
-    traffic: str = "0:128"
+    traffic: str = "0:96"
     """Traffic seeds to train on, first:stop; training seeds only."""
     validation: str = "1000:1016"
     """Traffic seeds to validate on, first:stop; validation seeds only."""
     validation_envs: tuple[str, ...] = FilterPlan.validation_envs
     """Environments to validate in, with a round robin."""
-    width: int = 32
+    width: int = FilterPlan.width
     """Width of the hidden state of a cell."""
     episodes: int = 32
-    """Episodes of a scenario."""
-    learning_rate: float = 4e-3
+    """Episodes of a scenario, and of a batch."""
+    learning_rate: float = FilterPlan.learning_rate
     """Learning rate at the beginning."""
-    rounds: tuple[str, ...] = ("ekf:48:240", "own:48:160", "own:48:200")
+    likelihood: float = FilterPlan.likelihood
+    """Weight of the likelihood in the loss."""
+    rounds: tuple[str, ...] = ("ekf:64:150", "own:64:200", "own:64:250")
     """Rounds as estimator:scenarios:passes; 'own' is the network that is trained."""
     ranges: ScenarioRanges = field(default_factory=ScenarioRanges)
     """Ranges that scenarios are drawn from."""
@@ -65,7 +67,7 @@ def parse_round(text: str) -> Round:
     """
     parts = text.split(":")
     if len(parts) != 3 or not all(part.isdecimal() for part in parts[1:]):
-        raise ValueError(f"rounds must be like 'ekf:48:240', got {text!r}")
+        raise ValueError(f"rounds must be like 'ekf:64:150', got {text!r}")
     return Round(parts[0], int(parts[1]), int(parts[2]))
 
 
@@ -85,6 +87,7 @@ def make_plan(args: Args) -> FilterPlan:
         width=args.width,
         episodes=args.episodes,
         learning_rate=args.learning_rate,
+        likelihood=args.likelihood,
         checkpoint_every=args.checkpoint_every,
     )
 
@@ -94,10 +97,11 @@ def main(args: Args) -> None:
     """Record missing traffic, train, and leave the network."""
     plan = make_plan(args)
     torch.set_num_threads(integer("threads", args.threads, 1))
-    for env in plan.ranges.envs:
-        args.library(make_config(env, {}).corridor, plan.traffic_seeds)
-    for env in plan.validation_envs:
-        args.library(make_config(env, {}).corridor, plan.validation_seeds)
+    for envs, seeds in (
+        (plan.ranges.envs, plan.traffic_seeds), (plan.validation_envs, plan.validation_seeds)
+    ):  # fmt: skip
+        for env in envs:
+            args.library(make_config(*parse_env(env)).corridor, seeds)
     bar = Bar("update", ("error", "validation", "chi2"), plan.n_passes, unit="pass")
     with watched(bar, args.output, args.tensorboard) as watchers:
         training = FilterTraining(

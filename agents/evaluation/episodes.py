@@ -7,6 +7,7 @@ and the same traffic seed, and the mechanism draws noise for all segments whiche
 from __future__ import annotations
 
 import contextlib
+import json
 import math
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -50,6 +51,20 @@ def unwrap(env: gym.Env[Any, Any]) -> SensorQueryEnv:
     if not isinstance(bare, SensorQueryEnv):
         raise TypeError(f"env must be an environment of dptse_env, got {type(bare).__name__}")
     return bare
+
+
+def parse_keywords(text: str) -> dict[str, Any]:
+    """Return keywords of an environment that are given as a JSON object.
+
+    Raises:
+        ValueError: The text is no JSON object.
+    """
+    keywords: Any = None
+    with contextlib.suppress(json.JSONDecodeError):
+        keywords = json.loads(text)
+    if not isinstance(keywords, dict):
+        raise ValueError(f"keywords must be a JSON object, got {text!r}")
+    return keywords
 
 
 def make_config(env: str, keywords: Mapping[str, Any]) -> EnvConfig:

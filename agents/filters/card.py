@@ -8,23 +8,30 @@ from typing import Any
 from agents.evaluation.episodes import make_config
 from agents.experiments.provenance import source_digest
 from agents.filters.plan import FilterPlan
-from dptse_env.estimators.learned.cells import CHANNELS
+from agents.filters.scenarios import parse_env
+from dptse_env.config import EnvConfig
+from dptse_env.estimators.learned.channels import CHANNELS
 from dptse_env.estimators.learned.weights import FORMAT
 from dptse_env.release import RELEASE_MODELS
 
 
 def make_card(plan: FilterPlan, done: int, name: str) -> dict[str, Any]:
     """Return the card of a network after `done` passes of a plan."""
-    envs, mechanisms = plan.ranges.envs, plan.ranges.mechanisms
-    roads = [make_config(env, {}).corridor for env in envs]
+    ranges = plan.ranges
+    configs = [
+        make_config(env, {**keywords, "privacy": mechanism})
+        for env, keywords in map(parse_env, ranges.envs)
+        for mechanism in ranges.mechanisms
+    ]
+    roads = [config.corridor for config in configs]
     lanes = [count for road in roads for count in road.segment_lanes]
     found: dict[str, list[float]] = {
         "n_mainline": [road.n_mainline for road in roads],
         "segment_length": [road.segment_length for road in roads],
         "speed_limit": [road.speed_limit for road in roads],
         "lanes": [float(count) for count in lanes],
-        "span": [1.0, *(float(span) for spans in plan.ranges.spans for span in spans)],
-        "flows": [_releases_flows(env, each) for env in envs for each in mechanisms],
+        "span": [1.0, *(float(span) for spans in ranges.spans for span in spans)],
+        "flows": [_releases_flows(config) for config in configs],
     }
     return {
         "name": name,
@@ -40,7 +47,6 @@ def make_card(plan: FilterPlan, done: int, name: str) -> dict[str, Any]:
     }
 
 
-def _releases_flows(env: str, mechanism: str) -> float:
-    config = make_config(env, {"privacy": mechanism})
+def _releases_flows(config: EnvConfig) -> float:
     release = RELEASE_MODELS.find(config.privacy.preset)
     return float(release.flow_centre(config.corridor, config.privacy) is not None)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -12,14 +13,11 @@ from numpy.typing import NDArray
 from agents.evaluation.episodes import make_vector, run_episodes
 from agents.filters.scenarios import Scenario
 from dptse_env.estimators.batch import checked_measurements
-from dptse_env.estimators.learned.cells import (
-    Cells,
-    cell_measurements,
-    input_channels,
-    make_cells,
-)
+from dptse_env.estimators.learned.cells import Cells, input_channels, make_cells
+from dptse_env.estimators.learned.channels import Released, Rows, make_rows, released
 from dptse_env.process import QueryProcess
 from dptse_env.schedules import make_schedule
+from dptse_env.traffic import Corridor
 
 Float32Array = NDArray[np.float32]
 
@@ -29,21 +27,22 @@ class Collected:
     """The seconds 1 to T of n episodes, S cells each.
 
     Attributes:
-        cells: The road.
-        scales: Units of density [veh/km] and of speed [km/h] in the environment's error.
-        n_mainline: Number of mainline segments.
-        start: Density [veh/km] and speed [km/h] of the prior, shape (n, S, 2).
-        measured: `cell_measurements`, shape (T, n, S, 9).
+        corridor: The road.
+        cells: The same as the network sees it.
+        rows: The rows of the measurements.
+        start: Density [veh/km] and speed [km/h] of the prior and their deviations, shape
+            (n, S, 4).
+        released: The measurements, each array with a leading axis of T.
         outside: `input_channels`, shape (T, n, S, 2).
         truth: Density [veh/km] and speed [km/h], shape (T, n, S, 2).
         errors: The environment's error of the estimator that was played, shape (T, n).
     """
 
+    corridor: Corridor
     cells: Cells
-    scales: tuple[float, float]
-    n_mainline: int
+    rows: Rows
     start: Float32Array
-    measured: Float32Array
+    released: Released
     outside: Float32Array
     truth: Float32Array
     errors: Float32Array
@@ -55,7 +54,7 @@ class _Recorder:
     def __init__(self, process: QueryProcess) -> None:
         self._estimator, self._process = process.estimator, process
         self.cells = make_cells(process.model)
-        self.measured: list[Float32Array] = []
+        self.released: list[Released] = []
         self.outside: list[Float32Array] = []
 
     def __getattr__(self, name: str) -> Any:
@@ -63,14 +62,14 @@ class _Recorder:
 
     def predict(self, episodes: Any, inputs: Any) -> None:
         """Write down the inputs, and predict."""
-        self.outside.append(input_channels(self.cells, inputs).astype(np.float32))
+        self.outside.append(_single(input_channels(self.cells, inputs)))
         self._estimator.predict(episodes, inputs)
 
     def update(self, *arguments: Any) -> None:
         """Write down the measurements, and update."""
         n, model = self._process.n_episodes, self._process.model
         measured = checked_measurements(n, model, *arguments)
-        self.measured.append(cell_measurements(self.cells, measured).astype(np.float32))
+        self.released.append(Released(*(_single(array) for array in released(measured))))
         self._estimator.update(*arguments)
 
 
@@ -98,26 +97,32 @@ def collect(scenario: Scenario, estimator: Mapping[str, Any], records: str | Non
     def on_second() -> None:
         if not starts:
             estimate = process.estimate
-            starts.append(np.stack([estimate.density, estimate.speed], -1).astype(np.float32))
+            table = [getattr(estimate, field.name) for field in dataclasses.fields(estimate)]
+            starts.append(_single(np.stack(table, -1)))
             return
-        truths.append(process.truth(np.arange(n)).astype(np.float32))
+        truths.append(_single(process.truth(np.arange(n))))
         density = process.error.density / corridor.density_scale
         speed = process.error.speed / corridor.speed_scale
         occupied, segments = process.error.n_occupied, corridor.n_mainline
         squares = segments * density**2 + occupied * speed**2
-        errors.append(np.sqrt(squares / (segments + occupied)).astype(np.float32))
+        errors.append(_single(np.sqrt(squares / (segments + occupied))))
 
     policy = make_schedule(scenario.schedule, env)
     noise = [scenario.noise_seed + seed for seed in seeds]
     run_episodes(env, policy, traffic_seeds=seeds, seeds=noise, on_second=on_second)
     env.close()
     return Collected(
+        corridor=corridor,
         cells=recorder.cells,
-        scales=(corridor.density_scale, corridor.speed_scale),
-        n_mainline=corridor.n_mainline,
+        rows=make_rows(process.model.rows),
         start=starts[0],
-        measured=np.stack(recorder.measured),
+        released=Released(*(np.stack(arrays) for arrays in zip(*recorder.released, strict=True))),
         outside=np.stack(recorder.outside),
         truth=np.stack(truths),
         errors=np.stack(errors),
     )
+
+
+def _single(array: Any) -> Float32Array:
+    rounded: Float32Array = np.asarray(array, dtype=np.float32)
+    return rounded

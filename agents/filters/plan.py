@@ -28,7 +28,7 @@ class Round:
             stands when the round begins. Centres and prices of ``paced`` and the schedules on
             deviations follow it.
         scenarios: Number of scenarios; those of earlier rounds are dropped.
-        passes: Number of passes over all episodes of a scenario, each drawn at random.
+        passes: Number of passes over a batch of episodes, each drawn at random.
     """
 
     estimator: str
@@ -57,7 +57,7 @@ class FilterPlan:
         ranges: Ranges that scenarios are drawn from.
         rounds: Rounds, one after the other.
         width: Width of the hidden state.
-        episodes: Episodes of a scenario, run as a batch.
+        episodes: Episodes of a scenario, and of a batch, which mixes the scenarios of a road.
         window: Seconds over which gradients are propagated.
         learning_rate: Of Adam at the beginning; it falls along a cosine.
         likelihood: Weight of the likelihood in the loss.
@@ -79,15 +79,15 @@ class FilterPlan:
     )
     ranges: ScenarioRanges = field(default_factory=ScenarioRanges)
     rounds: tuple[Round, ...] = (
-        Round("ekf", 48, 240),
-        Round(OWN, 48, 160),
-        Round(OWN, 48, 200),
+        Round("ekf", 64, 150),
+        Round(OWN, 64, 200),
+        Round(OWN, 64, 250),
     )
-    width: int = 32
+    width: int = 48
     episodes: int = 32
     window: int = 50
     learning_rate: float = 4e-3
-    likelihood: float = 0.005
+    likelihood: float = 0.02
     prediction: float = 0.3
     clip_norm: float = 1.0
     checkpoint_every: int = 20

@@ -8,15 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from agents.evaluation.episodes import make_config
+from agents.evaluation.episodes import make_config, parse_keywords
+from agents.filters.roads import ROADS
 
 MECHANISMS = ("capped", "paced", "paper", "corrected")
 """Release models that scenarios draw from."""
 SCHEDULES = (
     "round-robin", "paper", "random", "oldest-first", "static", "stale-variance",
-    "largest-variance",
+    "largest-variance", "largest-deviation",
 )  # fmt: skip
-"""Query policies that scenarios draw from; the last two follow the estimator's own deviations."""
+"""Query policies that scenarios draw from; the last three follow the estimator's own deviations."""
 
 
 @dataclass(frozen=True)
@@ -38,12 +39,22 @@ class Scenario:
     noise_seed: int
 
 
+def parse_env(text: str) -> tuple[str, dict[str, Any]]:
+    """Return the id and the keywords of an environment given as ``id`` or ``id {JSON}``.
+
+    Raises:
+        ValueError: What follows the id is no JSON object.
+    """
+    env, _, rest = text.partition(" ")
+    return env, parse_keywords(rest) if rest.strip() else {}
+
+
 @dataclass(frozen=True)
 class ScenarioRanges:
     """Ranges that scenarios are drawn from.
 
     Attributes:
-        envs: Environment ids.
+        envs: Environments, each an id or an id, a space and keywords as JSON (`parse_env`).
         mechanisms: Release models, each as often as the others.
         schedules: Query schedules.
         epsilon: Range of epsilon, drawn evenly in its logarithm.
@@ -54,11 +65,7 @@ class ScenarioRanges:
         spans: Spans of queries under ``paced``.
     """
 
-    envs: tuple[str, ...] = (
-        "dptse_env:dptse/PrivateHighway-v1",
-        "dptse_env:dptse/PaperHighway-v0",
-        "dptse_env:dptse/ShortHighway-v0",
-    )
+    envs: tuple[str, ...] = ROADS
     mechanisms: tuple[str, ...] = MECHANISMS
     schedules: tuple[str, ...] = SCHEDULES
     epsilon: tuple[float, float] = (0.5, 20.0)
@@ -73,8 +80,8 @@ class ScenarioRanges:
 
         The bandwidth is drawn from 1 to all segments.
         """
-        env = str(rng.choice(self.envs))
-        most = make_config(env, {}).corridor.n_mainline
+        env, keywords = parse_env(str(rng.choice(self.envs)))
+        most = make_config(env, keywords).corridor.n_mainline
         mechanism = str(rng.choice(self.mechanisms))
         low, high = np.log(self.epsilon)
         privacy: dict[str, Any] = {
@@ -82,7 +89,7 @@ class ScenarioRanges:
             "epsilon": round(float(np.exp(rng.uniform(low, high))), 3),
             "delta": float(rng.choice(self.deltas)),
         }
-        keywords: dict[str, Any] = {"privacy": privacy, "bandwidth": int(rng.integers(1, most + 1))}
+        keywords |= {"privacy": privacy, "bandwidth": int(rng.integers(1, most + 1))}
         if mechanism == "capped":
             low, high = np.log(self.caps)
             privacy["cap"] = int(np.exp(rng.uniform(low, high)))

@@ -8,7 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from dptse_env.estimators.learned.cells import DENSITY_RANGE, LONGEST_AGE, SPEED_RANGE, channels
+from dptse_env.estimators.learned.cells import DENSITY_RANGE, SPEED_RANGE
+from dptse_env.estimators.learned.channels import LONGEST_AGE, Released, Rows, read_rows
 from dptse_env.estimators.learned.network import (
     HIGHEST_SPREAD,
     LOWEST_SPREAD,
@@ -18,12 +19,13 @@ from dptse_env.estimators.learned.network import (
 
 
 class Road(NamedTuple):
-    """The cells of a batch of episodes, as `channels` takes them, and their connections."""
+    """The cells of a batch of episodes, as `read_rows` takes them, and their connections."""
 
     unit: Tensor  # (S,)
     limit: float
     flows: Tensor  # (k, 1)
     fixed: Tensor  # (k, S, N_FIXED)
+    rows: Rows  # with a leading axis of k
     upstream: Tensor  # (S, S) flags of the cells (columns) upstream of each
     scales: tuple[float, float]
     n_mainline: int
@@ -33,7 +35,7 @@ class State(NamedTuple):
     """State of the network between seconds, for k episodes."""
 
     hidden: Tensor  # (k, S, H)
-    predicted: Tensor  # (k, S, 2), without gradients
+    predicted: Tensor  # (k, S, 4), without gradients
     age: Tensor  # (k, S)
 
 
@@ -68,13 +70,16 @@ class RecurrentNetwork(nn.Module):
             self.inputs_bias[:width] = torch.linspace(0.0, 4.0, width)
 
     def begin(self, start: Tensor) -> State:
-        """Return the state before the first second, of a prior (k, S, 2)."""
+        """Return the state before the first second, of a prior (k, S, 4)."""
         k, S = start.shape[:2]
         return State(torch.zeros(k, S, self.width), start, torch.full((k, S), LONGEST_AGE))
 
-    def forward(self, road: Road, measured: Tensor, outside: Tensor, state: State) -> State:
-        """Return the state after a second, of its measurements (k, S, 9) and inputs (k, S, 2)."""
-        x = channels(torch, road, measured, state.predicted, state.age, outside)
+    def forward(self, road: Road, released: Released, outside: Tensor, state: State) -> State:
+        """Return the state after a second, of its measurements and the inputs (k, S, 2)."""
+        with torch.no_grad():
+            x, _ = read_rows(torch, road, road.rows, released, state.predicted, state.age)
+            age = (state.age + 1.0) * (1.0 - x[..., 0])
+            x = torch.cat([x, outside, road.fixed], -1)
         h, H = state.hidden, self.width
         up, down = road.upstream @ h, road.upstream.T @ h
         g = torch.cat([x, up, down], -1) @ self.inputs + self.inputs_bias
@@ -84,10 +89,7 @@ class RecurrentNetwork(nn.Module):
         n = torch.tanh(g[..., 2 * H :] + r * q[..., 2 * H :])
         h = n + z * (h - n)
         with torch.no_grad():
-            mean = torch.sigmoid(h @ self.heads[:, 4:6] + self.heads_bias[4:6])
-            density = DENSITY_RANGE * road.unit * mean[..., 0]
-            predicted = torch.stack([density, SPEED_RANGE * road.limit * mean[..., 1]], -1)
-            age = (state.age + 1.0) * (1.0 - measured[..., 0])
+            predicted = self._outputs(road, h @ self.heads[:, 4:] + self.heads_bias[4:])
         return State(h, predicted, age)
 
     def read(self, road: Road, h: Tensor) -> tuple[Tensor, Tensor]:
@@ -95,18 +97,17 @@ class RecurrentNetwork(nn.Module):
 
         Density [veh/km], speed [km/h] and their standard deviations, shape (..., S, 4) each.
         """
-        raw = (h @ self.heads + self.heads_bias).reshape(*h.shape[:-1], 2, 4)
-        mean, spread = torch.sigmoid(raw[..., :2]), raw[..., 2:]
-        spread = torch.exp(torch.clip(spread, LOWEST_SPREAD, HIGHEST_SPREAD))
-        unit = road.unit[:, None].expand(-1, 2)
-        table = torch.stack(
-            [
-                DENSITY_RANGE * unit * mean[..., 0], SPEED_RANGE * road.limit * mean[..., 1],
-                unit * spread[..., 0], road.limit * spread[..., 1],
-            ],
-            -1,
-        )  # fmt: skip
-        return table[..., 0, :], table[..., 1, :]
+        raw = h @ self.heads + self.heads_bias
+        return self._outputs(road, raw[..., :4]), self._outputs(road, raw[..., 4:])
+
+    def _outputs(self, road: Road, raw: Tensor) -> Tensor:
+        mean = torch.sigmoid(raw[..., :2])
+        spread = torch.exp(torch.clip(raw[..., 2:], LOWEST_SPREAD, HIGHEST_SPREAD))
+        parts = [
+            DENSITY_RANGE * road.unit * mean[..., 0], SPEED_RANGE * road.limit * mean[..., 1],
+            road.unit * spread[..., 0], road.limit * spread[..., 1],
+        ]  # fmt: skip
+        return torch.stack(parts, -1)
 
     def weights(self) -> Network:
         """Return the weights as arrays."""

@@ -12,7 +12,7 @@ import torch
 
 from agents.experiments.files import replacing
 from agents.experiments.provenance import take_folder
-from agents.filters.batches import Batch, make_batch
+from agents.filters.batches import Batch, draw_batch
 from agents.filters.card import make_card
 from agents.filters.collecting import Collected, collect
 from agents.filters.plan import OWN, FilterPlan
@@ -94,12 +94,12 @@ class FilterTraining:
             first = sum(each.passes for each in self.plan.rounds[:index])
             if self.done == first:
                 self._save(PLAYED)
-            batches = self._collect(index)
+            collected = self._collect(index)
             while self.done < first + self.plan.rounds[index].passes:
-                self._pass(index, batches)
+                self._pass(index, collected)
         self._save(WEIGHTS)
 
-    def _collect(self, index: int) -> list[Batch]:
+    def _collect(self, index: int) -> list[Collected]:
         estimator: dict[str, Any] = {"estimator": self.plan.rounds[index].estimator}
         if estimator["estimator"] == OWN:
             weights = {"weights": str(self.folder / PLAYED), "outside": True}
@@ -111,26 +111,26 @@ class FilterTraining:
         for k, scenario in enumerate(scenarios):
             self._progress(f"round {index + 1}, collecting", k / len(scenarios))
             collected.append(collect(scenario, estimator, self._records))
-        return [make_batch(each) for each in collected]
+        return collected
 
-    def _pass(self, index: int, batches: Sequence[Batch]) -> None:
-        """Pass over the episodes of a scenario."""
+    def _pass(self, index: int, collected: Sequence[Collected]) -> None:
+        """Pass over some episodes, drawn from all scenarios on a road."""
         started = time.perf_counter()
         plan, rate = self.plan, self.plan.rate(self.done)
         for group in self._optimiser.param_groups:
             group["lr"] = rate
         rng = np.random.default_rng([plan.seed, 2**31, self.done])
-        batch = batches[int(rng.integers(len(batches)))]
+        batch = draw_batch(rng, collected, plan.episodes)
         state = self.network.begin(batch.start)
         losses, errors = [], []
-        for first in range(0, len(batch.measured), plan.window):
+        for first in range(0, len(batch.truth), plan.window):
             state, loss, error = self._window(batch, first, state)
             losses.append(loss)
             errors.append(error)
         self.done += 1
         self._seconds += time.perf_counter() - started
         row: Row = {
-            "update": self.done, "steps": self.done * len(batch.measured) * len(batch.start),
+            "update": self.done, "steps": self.done * len(batch.truth) * len(batch.start),
             "seconds": round(self._seconds, 1), "round": index + 1, "rate": rate,
             "loss": float(np.mean(losses)), "error": float(np.mean(errors[1:] or errors)),
         }  # fmt: skip
@@ -144,11 +144,11 @@ class FilterTraining:
 
     def _window(self, batch: Batch, first: int, state: State) -> tuple[State, float, float]:
         """Update the weights by some seconds; return the state after them, loss and error."""
-        plan, road, last = self.plan, batch.road, len(batch.measured)
+        plan, road, last = self.plan, batch.road, len(batch.truth)
         seconds = range(first, min(first + plan.window, last))
         kept = []
         for t in seconds:
-            state = self.network(road, batch.measured[t], batch.outside[t], state)
+            state = self.network(road, batch.second(t), batch.outside[t], state)
             kept.append(state.hidden)
         present, ahead = self.network.read(road, torch.stack(kept))
         truth, after = (batch.truth[seconds.start + k : seconds.stop + k] for k in (0, 1))

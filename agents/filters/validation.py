@@ -9,6 +9,7 @@ import numpy as np
 
 from agents.evaluation.episodes import WARM_UP, make_vector, run_episodes
 from agents.experiments.seeds import TUNING
+from agents.filters.scenarios import parse_env
 from dptse_env.process import QueryProcess
 from dptse_env.schedules import make_schedule
 
@@ -92,4 +93,8 @@ def validate(
     """Return the scores of a network, given by name or file, in some environments."""
     settings = {"recurrent": {"weights": weights, "outside": True}}
     own = {"estimator": "recurrent", "estimator_settings": settings}
-    return {env: score(env, own, SCHEDULE, seeds, records) for env in envs}
+    cells = {text: parse_env(text) for text in envs}
+    return {
+        text: score(env, {**keywords, **own}, SCHEDULE, seeds, records)
+        for text, (env, keywords) in cells.items()
+    }

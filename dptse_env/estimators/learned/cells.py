@@ -1,17 +1,15 @@
-"""A road and its measurements as a recurrent network sees them: cell by cell, in its own units.
+"""The cells of a road as a recurrent network sees them, each in its own units.
 
-The network has no parameters of a road. Each cell (a mainline segment or a ramp) gets the same
-`CHANNELS`, so that one network serves any road and any release model.
+The network has no parameters of a road. Each cell (a mainline segment or a ramp) is described by
+the same numbers, so that one network serves any road.
 """
 
 from __future__ import annotations
 
-from types import ModuleType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from dptse_env.estimators.batch import Measurements
 from dptse_env.model import ARZModel
 from dptse_env.utils.arrays import FloatArray, IntArray
 
@@ -21,27 +19,9 @@ DENSITY_RANGE = 4.0
 """Largest density that is estimated, in its unit: vehicles that stand, 6.25 m each."""
 SPEED_RANGE = 1.1
 """Largest speed that is estimated, in speed limits."""
-LEAST_DENSITY = 0.04
-"""Least density, in its unit, by which a flow is divided."""
-LONGEST_AGE = 300.0
-"""Seconds since a measurement after which a cell counts as never measured."""
-
-MEASURED = (
-    "queried", "density", "density_sigma", "second", "second_sigma", "centre", "log_span",
-    "shared_upstream", "shared_downstream",
-)  # fmt: skip
-"""Numbers that `cell_measurements` gives of each cell."""
-
-CHANNELS = (
-    "queried", "density", "log_density_sigma", "flow", "log_flow_sigma", "centre", "speed",
-    "log_speed_sigma", "density_news", "speed_news", "flows", "log_span", "shared_upstream",
-    "shared_downstream", "log_age", "predicted_density", "predicted_speed", "inflow",
-    "outside_density", "on_ramp", "off_ramp", "entry", "exit", "lanes", "log_length", "log_limit",
-)  # fmt: skip
-"""The inputs of the network for each cell."""
 
 N_FIXED = 7
-"""Channels at the end that never change."""
+"""Numbers of a cell that never change."""
 
 
 class Cells(NamedTuple):
@@ -59,7 +39,7 @@ class Cells(NamedTuple):
     flows: bool  # whether flows are released, otherwise speeds
     row_first: IntArray  # (M,) first cell of each row of a measurement
     row_span: IntArray  # (M,) number of cells of each row
-    fixed: FloatArray  # (S, N_FIXED) channels that never change
+    fixed: FloatArray  # (S, N_FIXED) numbers that never change
 
 
 def make_cells(model: ARZModel) -> Cells:
@@ -90,42 +70,6 @@ def make_cells(model: ARZModel) -> Cells:
     )
 
 
-def cell_measurements(cells: Cells, measured: Measurements) -> FloatArray:
-    """Return `MEASURED` of every cell, shape (k, S, 9), in the units of the release.
-
-    Rows that overlap are averaged with the inverses of their variances; the span is that of the row
-    with the least.
-    """
-    k, S = len(measured.episodes), cells.lanes.size
-    table = np.zeros((k, S, len(MEASURED)))
-    weight = np.zeros((k, S, 2))
-    total = np.zeros((k, S, 2))
-    best = np.zeros((k, S))
-    for m in range(cells.row_first.size):
-        seen = measured.observed[:, m]
-        if not seen.any():
-            continue
-        first, span = cells.row_first[m], cells.row_span[m]
-        own = 1.0 / np.maximum(measured.sigma[seen, m], 1e-12) ** 2
-        for s in range(first, first + span):
-            weight[seen, s] += own
-            total[seen, s] += own * measured.values[seen, m]
-            better = seen.copy()
-            better[seen] = own[:, 0] > best[seen, s]
-            best[better, s] = own[better[seen], 0]
-            table[better, s, 6] = np.log(span)
-            table[better, s, 7] = float(s > first)
-            table[better, s, 8] = float(s < first + span - 1)
-    queried = weight[..., 0] > 0.0
-    safe = np.where(queried[..., None], weight, 1.0)
-    table[..., 0] = queried
-    table[..., 1:4:2] = total / safe
-    table[..., 2:5:2] = np.where(queried[..., None], 1.0 / np.sqrt(safe), 0.0)
-    if cells.flows:
-        table[..., 5] = measured.centre
-    return table
-
-
 def input_channels(cells: Cells, inputs: FloatArray) -> FloatArray:
     """Return inflow and density outside, shape (k, S, 2), of the model's inputs (k, n_u)."""
     table = np.zeros((len(inputs), cells.lanes.size, 2))
@@ -133,57 +77,3 @@ def input_channels(cells: Cells, inputs: FloatArray) -> FloatArray:
     table[:, cells.entries, 0] = inputs[:, cells.entry_inputs] / (2000.0 * lanes)
     table[:, cells.exits, 1] = inputs[:, cells.exit_inputs] / cells.exit_units
     return table
-
-
-def channels(
-    xp: ModuleType,
-    cells: Any,
-    measured: Any,
-    predicted: Any,
-    age: Any,
-    outside: Any,
-) -> Any:
-    """Return the network's inputs, shape (k, S, 26), in the order of `CHANNELS`.
-
-    Args:
-        xp: numpy or torch, of which the other arguments are arrays.
-        cells: Has ``unit`` (S,), ``limit``, ``flows`` (1 or 0, or (k, 1) of them) and ``fixed``
-            (k, S, N_FIXED).
-        measured: Shape (k, S, 9), from `cell_measurements`.
-        predicted: Predicted density [veh/km] and speed [km/h], shape (k, S, 2).
-        age: Seconds since the last measurement before this one, shape (k, S).
-        outside: Shape (k, S, 2), from `input_channels`.
-    """
-    queried, unit, limit = measured[..., 0], cells.unit, cells.limit
-    density = predicted[..., 0] / unit
-    carrier = xp.clip(density, LEAST_DENSITY, None)
-    second, sigma = measured[..., 3] / limit, measured[..., 4] / limit
-    flows, centre = cells.flows, measured[..., 5] / limit
-    by_density = flows / carrier / unit + (1.0 - flows)
-    read_density = xp.clip(measured[..., 1] / unit, -8.0, 8.0)
-    read_speed = xp.clip(centre + second * by_density, -1.0, 2.0)
-    parts = [
-        queried,
-        queried * read_density,
-        queried * _log(xp, measured[..., 2] / unit),
-        xp.clip(flows * queried * second / unit, -4.0, 4.0),
-        flows * queried * _log(xp, sigma / unit),
-        centre,
-        queried * read_speed,
-        queried * _log(xp, sigma * by_density),
-        queried * (read_density - density),
-        queried * (read_speed - predicted[..., 1] / limit),
-        queried * 0.0 + flows,
-        measured[..., 6],
-        measured[..., 7],
-        measured[..., 8],
-        0.25 * xp.log(1.0 + xp.clip(age, 0.0, LONGEST_AGE)),
-        density,
-        predicted[..., 1] / limit,
-    ]
-    return xp.concatenate([xp.stack(parts, -1), outside, cells.fixed], -1)
-
-
-def _log(xp: ModuleType, deviation: Any) -> Any:
-    """Return half the logarithm of a deviation, held to what training has seen."""
-    return 0.5 * xp.log(xp.clip(deviation, 1e-3, 20.0))

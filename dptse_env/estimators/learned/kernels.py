@@ -3,14 +3,15 @@
 import numpy as np
 from numba import njit
 
-from dptse_env.estimators.learned.cells import (
+from dptse_env.estimators.learned.cells import DENSITY_RANGE, N_FIXED, SPEED_RANGE, Cells
+from dptse_env.estimators.learned.channels import (
     CHANNELS,
-    DENSITY_RANGE,
-    LEAST_DENSITY,
+    LARGEST_CORRECTION,
+    LARGEST_INNOVATION,
+    LARGEST_SIGMA,
+    LEAST_SIGMA,
+    LEAST_VARIANCE,
     LONGEST_AGE,
-    N_FIXED,
-    SPEED_RANGE,
-    Cells,
 )
 from dptse_env.estimators.learned.network import (
     HIGHEST_SPREAD,
@@ -54,29 +55,23 @@ def read(
         x: Output, shape (k, S, C or more).
     """
     S = cells.lanes.size
-    weight, total = np.empty((S, 2)), np.empty((S, 2))
-    best, shares = np.empty(S), np.empty((S, 3))
+    sums, second = np.empty((S, 10)), np.empty((S, 4))
     outside = np.empty((S, 2))
     for i in range(episodes.size):
         episode = episodes[i]
         prior = present[episode]
-        weight[:], total[:], best[:], shares[:], outside[:] = 0.0, 0.0, 0.0, 0.0, 0.0
+        sums[:], outside[:] = 0.0, 0.0
         innovations[episode] = 0.0
+        for s in range(S):
+            _predict_second(cells.flows, centre[i, s], prior[s], second[s])
         for m in range(cells.row_first.size):
-            if not observed[i, m]:
-                continue
-            _innovation(cells, m, values[i, m], sigma[i, m], centre[i], prior, innovations[episode])
-            first, span = cells.row_first[m], cells.row_span[m]
-            for s in range(first, first + span):
-                for j in range(2):
-                    own = 1.0 / max(sigma[i, m, j], 1e-12) ** 2
-                    weight[s, j] += own
-                    total[s, j] += own * values[i, m, j]
-                    if j == 0 and own > best[s]:
-                        best[s] = own
-                        shares[s, 0] = np.log(span)
-                        shares[s, 1] = 1.0 if s > first else 0.0
-                        shares[s, 2] = 1.0 if s < first + span - 1 else 0.0
+            if observed[i, m]:
+                first, span = cells.row_first[m], cells.row_span[m]
+                covered = slice(first, first + span)
+                _read_row(
+                    values[i, m], sigma[i, m], prior[covered], second[covered], sums[covered],
+                    innovations[episode, m],
+                )  # fmt: skip
         for e in range(cells.entries.size):
             s = cells.entries[e]
             outside[s, 0] = inputs[episode, cells.entry_inputs[e]] / (2000.0 * cells.lanes[s])
@@ -84,75 +79,90 @@ def read(
             outside[cells.exits[e], 1] = inputs[episode, cells.exit_inputs[e]] / cells.exit_units[e]
         for s in range(S):
             row = x[i, s]
-            _write(cells, s, weight[s], total[s], centre[i, s], prior[s], row)
-            row[11], row[12], row[13] = shares[s, 0], shares[s, 1], shares[s, 2]
-            row[14] = 0.25 * np.log(1.0 + min(age[episode, s], LONGEST_AGE))
-            row[17], row[18] = outside[s, 0], outside[s, 1]
+            _write(cells, s, prior[s], second[s], sums[s], age[episode, s], row)
+            row[18], row[19] = outside[s, 0], outside[s, 1]
             for j in range(N_FIXED):
-                row[19 + j] = cells.fixed[s, j]
-            age[episode, s] = 0.0 if weight[s, 0] > 0.0 else age[episode, s] + 1.0
+                row[20 + j] = cells.fixed[s, j]
+            age[episode, s] = 0.0 if sums[s, 0] > 0.0 else age[episode, s] + 1.0
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", inline="always")
+def _predict_second(flows: bool, centre: float, prior: FloatArray, second: FloatArray) -> None:
+    """Write the second number of a cell, its variance, and its derivatives by speed and density."""
+    rho, v = prior[0], prior[1]
+    by_speed, slip = (rho, v - centre) if flows else (1.0, 0.0)
+    second[0] = rho * slip if flows else v
+    second[1] = (by_speed * prior[3]) ** 2 + (slip * prior[2]) ** 2
+    second[2], second[3] = by_speed, slip
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _read_row(
+    values: FloatArray,
+    sigma: FloatArray,
+    prior: FloatArray,
+    second: FloatArray,
+    sums: FloatArray,
+    innovation: FloatArray,
+) -> None:
+    """Write the innovation of a row, and add what it says to the sums of the cells it covers."""
+    span = len(prior)
+    share = 1.0 / span
+    for j in range(2):
+        mean, variance = 0.0, 0.0
+        for s in range(span):
+            mean += prior[s, 0] if j == 0 else second[s, 0]
+            variance += prior[s, 2] ** 2 if j == 0 else second[s, 1]
+        variance = max(variance * share**2 + sigma[j] ** 2, LEAST_VARIANCE)
+        error = values[j] - mean * share
+        innovation[j] = error / np.sqrt(variance)
+        for s in range(span):
+            sums[s, 2 + j] += np.log(_held(sigma[j], LEAST_SIGMA, LARGEST_SIGMA))
+            sums[s, 4 + j] += innovation[j]
+            sums[s, 6 + j] += share / variance * error
+            sums[s, 8 + j] += share**2 / variance
+    for s in range(span):
+        sums[s, 0] += 1.0
+        sums[s, 1] += share
+
+
+@njit(cache=True, error_model="numpy", inline="always")
 def _write(
     cells: Cells,
     s: int,
-    weight: FloatArray,
-    total: FloatArray,
-    centre: float,
     prior: FloatArray,
+    second: FloatArray,
+    sums: FloatArray,
+    age: float,
     row: Float32Array,
 ) -> None:
-    """Write the channels that a measurement of a cell gives."""
-    unit, limit = cells.unit[s], cells.limit
-    density = prior[0] / unit
-    row[0:10] = 0.0
-    row[10] = 1.0 if cells.flows else 0.0
-    row[15], row[16] = density, prior[1] / limit
-    if cells.flows:
-        row[5] = centre / limit
-    if not weight[0] > 0.0:
-        return
-    row[0] = 1.0
-    row[1] = _held(total[0] / weight[0] / unit, -8.0, 8.0)
-    row[2] = _log(1.0 / np.sqrt(weight[0]) / unit)
-    second, deviation = total[1] / weight[1] / limit, 1.0 / np.sqrt(weight[1]) / limit
-    if cells.flows:
-        carrier = max(density, LEAST_DENSITY)
-        row[3], row[4] = _held(second / unit, -4.0, 4.0), _log(deviation / unit)
-        row[6] = _held(centre / limit + second / unit / carrier, -1.0, 2.0)
-        row[7] = _log(deviation / unit / carrier)
-    else:
-        row[6], row[7] = _held(second, -1.0, 2.0), _log(deviation)
-    row[8], row[9] = row[1] - density, row[6] - prior[1] / limit
+    """Write the channels of a cell that `channels.read_rows` gives."""
+    unit, limit, flows = cells.unit[s], cells.limit, 1.0 if cells.flows else 0.0
+    by_speed, slip = second[2], second[3]
+    density_variance, speed_variance = prior[2] ** 2, prior[3] ** 2
+    count = sums[0]
+    queried, each = min(count, 1.0), 1.0 / max(count, 1.0)
+    log_unit = np.log(unit)
+    row[0], row[1] = queried, sums[1]
+    row[2] = 0.2 * (sums[2] * each - queried * log_unit)
+    row[3] = 0.2 * (sums[3] * each - queried * (flows * log_unit + np.log(limit)))
+    row[4], row[5] = prior[0] / unit, prior[1] / limit
+    row[6], row[7] = 0.25 * np.log(prior[2] / unit), 0.25 * np.log(prior[3] / limit)
+    for j in range(2):
+        row[8 + j] = 0.5 * _held(sums[4 + j], -LARGEST_INNOVATION, LARGEST_INNOVATION)
+    row[10] = 4.0 * _correction(density_variance * sums[6] / unit)
+    row[11] = 4.0 * _correction(slip * density_variance * sums[7] / unit)
+    row[12] = 4.0 * _correction(by_speed * speed_variance * sums[7] / limit)
+    row[13] = min(density_variance * sums[8], 1.0)
+    row[14] = min(by_speed**2 * speed_variance * sums[9], 1.0)
+    row[15], row[16] = slip / limit, flows
+    row[17] = 0.25 * np.log(1.0 + min(age, LONGEST_AGE))
 
 
-@njit(cache=True, error_model="numpy")
-def _innovation(
-    cells: Cells,
-    m: int,
-    values: FloatArray,
-    sigma: FloatArray,
-    centre: FloatArray,
-    prior: FloatArray,
-    innovations: FloatArray,
-) -> None:
-    """Write the residuals of a row over their predicted deviations, errors taken as independent."""
-    first, span = cells.row_first[m], cells.row_span[m]
-    density, second = 0.0, 0.0
-    variance, second_variance = sigma[0] ** 2, sigma[1] ** 2
-    for s in range(first, first + span):
-        rho, v, rho_std, v_std = prior[s, 0], prior[s, 1], prior[s, 2], prior[s, 3]
-        density += rho / span
-        variance += (rho_std / span) ** 2
-        if cells.flows:
-            second += rho * (v - centre[s]) / span
-            second_variance += ((rho * v_std) ** 2 + ((v - centre[s]) * rho_std) ** 2) / span**2
-        else:
-            second += v / span
-            second_variance += (v_std / span) ** 2
-    innovations[m, 0] = (values[0] - density) / np.sqrt(max(variance, 1e-12))
-    innovations[m, 1] = (values[1] - second) / np.sqrt(max(second_variance, 1e-12))
+@njit(cache=True, error_model="numpy", inline="always")
+def _correction(value: float) -> float:
+    held: float = _held(value, -LARGEST_CORRECTION, LARGEST_CORRECTION)
+    return held
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -246,9 +256,3 @@ def _read_heads(
 def _held(x: float, low: float, high: float) -> float:
     held: float = min(max(x, low), high)
     return held
-
-
-@njit(cache=True, error_model="numpy", inline="always")
-def _log(deviation: float) -> float:
-    half: float = 0.5 * np.log(_held(deviation, 1e-3, 20.0))
-    return half

@@ -19,7 +19,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dptse_env.estimators.learned.cells import CHANNELS, DENSITY_RANGE, SPEED_RANGE
+from dptse_env.estimators.learned.cells import DENSITY_RANGE, SPEED_RANGE
+from dptse_env.estimators.learned.channels import CHANNELS
 
 Float32Array = NDArray[np.float32]
 

@@ -11,13 +11,13 @@ import numpy as np
 from dptse_env.estimators.base import Estimate
 from dptse_env.estimators.batch import BatchEstimator, Measurements
 from dptse_env.estimators.learned import kernels, network
-from dptse_env.estimators.learned.cells import (
+from dptse_env.estimators.learned.cells import input_channels, make_cells
+from dptse_env.estimators.learned.channels import (
     CHANNELS,
     LONGEST_AGE,
-    cell_measurements,
-    channels,
-    input_channels,
-    make_cells,
+    make_rows,
+    read_rows,
+    released,
 )
 from dptse_env.estimators.learned.weights import SavedNetwork, read_network
 from dptse_env.estimators.open_loop import estimated_traffic
@@ -130,39 +130,25 @@ class CompiledRecurrent(Recurrent):
 class ReferenceRecurrent(Recurrent):
     """The recurrent network in numpy."""
 
+    def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
+        """See `make_estimator`."""
+        super().__init__(model, n_episodes, settings)
+        self._rows = make_rows(model.rows)
+
     def _advance(self, measured: Measurements) -> None:
         episodes, cells = measured.episodes, self.cells
-        shape = episodes.size, *cells.fixed.shape
-        road = cells._replace(fixed=np.broadcast_to(cells.fixed, shape))
-        seen = cell_measurements(cells, measured)
-        self.innovations[episodes] = self._residuals(measured)
-        x = channels(
-            np, road, seen, self._present[episodes, :, :2], self._age[episodes],
-            input_channels(cells, self._inputs[episodes]),
-        )  # fmt: skip
-        h = network.advance(
-            self.saved.network, cells.edges, x.astype(np.float32), self.hidden[episodes]
+        x, self.innovations[episodes] = read_rows(
+            np, cells, self._rows, released(measured), self._present[episodes], self._age[episodes]
         )
+        outside = input_channels(cells, self._inputs[episodes])
+        fixed = np.broadcast_to(cells.fixed, (*x.shape[:2], cells.fixed.shape[1]))
+        x = np.concatenate([x, outside, fixed], axis=-1).astype(np.float32)
+        h = network.advance(self.saved.network, cells.edges, x, self.hidden[episodes])
         self.hidden[episodes] = h
         present, ahead = network.outputs(self.saved.network, cells.unit, cells.limit, h)
         self._present[episodes], self._ahead[episodes] = present, ahead
-        self._age[episodes] = np.where(seen[..., 0] > 0.0, 0.0, self._age[episodes] + 1.0)
-
-    def _residuals(self, measured: Measurements) -> FloatArray:
-        """Return the residuals of all rows over their predicted deviations, shape (k, M, 2)."""
-        weights = self.model.rows.weights
-        rho, v, rho_std, v_std = np.moveaxis(self._present[measured.episodes], -1, 0)
-        if self.cells.flows:
-            slip = v - measured.centre
-            second, variance = rho * slip, (rho * v_std) ** 2 + (slip * rho_std) ** 2
-        else:
-            second, variance = v, v_std**2
-        means = np.stack([rho, second], axis=-1)
-        variances = np.stack([rho_std**2, variance], axis=-1)
-        residual = measured.values - np.einsum("ms,ksj->kmj", weights, means)
-        total = np.einsum("ms,ksj->kmj", weights**2, variances) + measured.sigma**2
-        residuals = residual / np.sqrt(np.maximum(total, 1e-12))
-        return np.where(measured.observed[..., None], residuals, 0.0)
+        queried = x[..., 0] > 0.0
+        self._age[episodes] = np.where(queried, 0.0, self._age[episodes] + 1.0)
 
 
 def check_ranges(saved: SavedNetwork, model: ARZModel) -> None:

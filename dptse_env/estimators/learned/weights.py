@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from dptse_env.estimators.learned.cells import CHANNELS
+from dptse_env.estimators.learned.channels import CHANNELS
 from dptse_env.estimators.learned.network import Network, shapes
 from dptse_env.utils.archive import open_archive, read_entry
 from dptse_env.utils.json_object import parse_object
@@ -32,7 +32,7 @@ LARGEST_FILE = 2**24
 """Largest size of a file and of its arrays together [bytes]; a network of width 32 has 60 kB."""
 
 LARGEST_WIDTH = 512
-FORMAT = "recurrent-1"
+FORMAT = "recurrent-2"
 """Name of the channels' order and meaning; another one is refused."""
 
 _CARD = {

@@ -8,7 +8,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from agents.evaluation.episodes import make_vector, run_episodes  # noqa: E402
-from agents.filters.batches import make_batch  # noqa: E402
+from agents.filters.batches import draw_batch, make_batch  # noqa: E402
 from agents.filters.collecting import collect  # noqa: E402
 from agents.filters.plan import OWN, Round  # noqa: E402
 from agents.filters.torch_network import RecurrentNetwork, second_loss  # noqa: E402
@@ -37,7 +37,7 @@ def test_the_network_with_gradients_is_the_estimator(tmp_path):
     recurrent = {"weights": str(path), "outside": True}
     own = {"estimator": "recurrent", "estimator_settings": {"recurrent": recurrent}}
     for scenario in PLAN.scenarios(0):
-        batch = make_batch(collect(scenario, own, None))
+        batch = make_batch([(collect(scenario, own, None), np.arange(2))])
         keywords = {**scenario.keywords, **own, "traffic_seeds": list(scenario.traffic_seeds)}
         env = make_vector(SHORT, 2, {**keywords, "action": "scores"})
         estimates = []
@@ -48,7 +48,7 @@ def test_the_network_with_gradients_is_the_estimator(tmp_path):
         )  # fmt: skip
         state = network.begin(batch.start)
         for t, estimate in enumerate(estimates[1:]):
-            state = network(batch.road, batch.measured[t], batch.outside[t], state)
+            state = network(batch.road, batch.second(t), batch.outside[t], state)
             present = network.read(batch.road, state.hidden)[0].detach().numpy()
             np.testing.assert_allclose(present[..., 0], estimate.density, rtol=2e-4, atol=2e-3)
             np.testing.assert_allclose(present[..., 3], estimate.speed_std, rtol=2e-3)
@@ -57,9 +57,9 @@ def test_the_network_with_gradients_is_the_estimator(tmp_path):
 def test_collected_errors_and_truth_are_the_environments():
     scenario = PLAN.scenarios(0)[0]
     collected = collect(scenario, {"estimator": "ekf"}, None)
-    T, n, S = collected.measured.shape[:3]
-    assert collected.truth.shape == (T, n, S, 2)
-    assert (n, S) == (2, collected.cells.lanes.size)
+    corridor = collected.corridor
+    expected = corridor.duration, 2, corridor.n_segments, 2
+    assert collected.truth.shape == collected.outside.shape == expected
     keywords = {**scenario.keywords, "traffic_seeds": list(scenario.traffic_seeds)}
     env = make_vector(SHORT, 2, {**keywords, "estimator": "ekf", "action": "scores"})
     scores = run_episodes(
@@ -72,17 +72,59 @@ def test_collected_errors_and_truth_are_the_environments():
 
 def test_the_loss_is_the_environments_error():
     collected = collect(PLAN.scenarios(0)[1], {"estimator": "random_walk"}, None)
-    batch = make_batch(collected)
+    batch = make_batch([(collected, np.arange(2))])
+    corridor = collected.corridor
     estimated = torch.cat([batch.truth, torch.ones_like(batch.truth)], -1)
     assert float(second_loss(batch.road, estimated, batch.truth, 0.0)) == pytest.approx(1e-4)
-    off = estimated + torch.tensor([collected.scales[0] * 0.1, 0.0, 0.0, 0.0])
-    occupied = (batch.truth[:, :, : collected.n_mainline, 0] > 0).float()
-    share = collected.n_mainline / (collected.n_mainline + occupied.sum(-1))
+    off = estimated + torch.tensor([corridor.density_scale * 0.1, 0.0, 0.0, 0.0])
+    occupied = (batch.truth[:, :, : corridor.n_mainline, 0] > 0).float()
+    share = corridor.n_mainline / (corridor.n_mainline + occupied.sum(-1))
     expected = float((0.1 * share.sqrt()).mean())
     assert float(second_loss(batch.road, off, batch.truth, 0.0)) == pytest.approx(expected, 1e-3)
     honest = second_loss(batch.road, estimated, batch.truth, 1.0)
     wide = estimated * torch.tensor([1.0, 1.0, 50.0, 50.0])
     assert second_loss(batch.road, wide, batch.truth, 1.0) > honest
+
+
+def test_a_batch_mixes_the_scenarios_of_a_road():
+    """Its episodes are those of the scenarios, with rows of sums padded where there are none."""
+    singles, sums = (
+        collect(scenario, {"estimator": "random_walk"}, None)
+        for scenario in (mixed(("paper",), 0), mixed(("paced",), 1))
+    )
+    assert singles.rows.share.size < sums.rows.share.size
+    batch = make_batch([(singles, np.array([1])), (sums, np.array([0, 1]))])
+    assert batch.road.flows[:, 0].tolist() == [0.0, 1.0, 1.0]
+    np.testing.assert_array_equal(batch.truth[:, 0], singles.truth[:, 1])
+    np.testing.assert_array_equal(batch.released.values[:, 2], sums.released.values[:, 1])
+    network = RecurrentNetwork(4)
+    together = network.begin(batch.start)
+    alone = [network.begin(make_batch([(each, np.arange(2))]).start) for each in (singles, sums)]
+    for t in range(20):
+        together = network(batch.road, batch.second(t), batch.outside[t], together)
+        for k, each in enumerate((singles, sums)):
+            part = make_batch([(each, np.arange(2))])
+            alone[k] = network(part.road, part.second(t), part.outside[t], alone[k])
+    hidden = torch.stack([alone[0].hidden[1], *alone[1].hidden])
+    np.testing.assert_allclose(together.hidden.detach(), hidden.detach(), atol=1e-5)
+
+
+def mixed(mechanisms, index):
+    ranges = dataclasses.replace(PLAN.ranges, mechanisms=mechanisms, spans=((1, 2),))
+    return dataclasses.replace(PLAN, ranges=ranges).scenarios(0)[index]
+
+
+def test_batches_are_drawn_from_all_scenarios_of_a_road():
+    collected = [collect(each, {"estimator": "random_walk"}, None) for each in PLAN.scenarios(0)]
+    rng, seen = np.random.default_rng(0), set()
+    starts = np.concatenate([each.truth.sum(axis=(0, 2, 3)) for each in collected])
+    for _ in range(30):
+        batch = draw_batch(rng, collected, 2)
+        assert len(batch.start) == 2
+        seen |= {
+            int(np.argmin(np.abs(starts - float(each)))) for each in batch.truth.sum((0, 2, 3))
+        }
+    assert len(seen) > 2
 
 
 class KilledError(Exception):

@@ -3,7 +3,7 @@
 import numpy as np
 
 from dptse_env.estimators import EstimatorSettings, RecurrentSettings
-from dptse_env.estimators.learned.cells import CHANNELS
+from dptse_env.estimators.learned.channels import CHANNELS
 from dptse_env.estimators.learned.network import Network, shapes
 from dptse_env.estimators.learned.weights import FORMAT, write_network
 
