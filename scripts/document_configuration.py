@@ -35,6 +35,7 @@ from dptse_env.traffic import (
     Corridor,
     Demand,
     DemandDistribution,
+    Drivers,
     Incident,
     IncidentDistribution,
 )
@@ -49,6 +50,7 @@ SECTIONS: Mapping[type, str] = {
     Corridor: "`corridor`",
     Demand: "`demand`, fixed",
     DemandDistribution: "`demand`, drawn for each traffic seed",
+    Drivers: "`corridor.drivers`",
     Incident: "`incident`, fixed",
     IncidentDistribution: "`incident`, drawn for each traffic seed",
     ARZParameters: "`parameters`",

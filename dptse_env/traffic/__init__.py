@@ -5,6 +5,7 @@ Importing this package does not import libsumo; only making a record does.
 
 from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.demand import Demand, DemandDistribution
+from dptse_env.traffic.drivers import Drivers
 from dptse_env.traffic.incident import Incident, IncidentDistribution
 from dptse_env.traffic.library import RecordLibrary
 from dptse_env.traffic.presets import (
@@ -28,6 +29,7 @@ __all__ = [
     "Corridor",
     "Demand",
     "DemandDistribution",
+    "Drivers",
     "Incident",
     "IncidentDistribution",
     "InvalidRecordError",

@@ -10,11 +10,12 @@ import dataclasses
 import hashlib
 import json
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Annotated
 
 from dptse_env.traffic.demand import Demand, DemandDistribution
+from dptse_env.traffic.drivers import Drivers
 from dptse_env.traffic.incident import Incident, IncidentDistribution
 from dptse_env.utils.fields import Interval, checked_fields
 from dptse_env.utils.validation import integer, require
@@ -52,6 +53,7 @@ class Corridor:
         speed_scale: constant that scales speeds in rewards and observations [km/h].
         average_dwell: T_avg of the paper's eq. (6): average time of a vehicle on a mainline
             segment [s], measured from records (`dptse_env.traffic.record.mean_dwell`).
+        drivers: the car-following model of all vehicles.
 
     Raises:
         ValueError: The geometry is impossible, or demand, incident or sensors do not fit it.
@@ -74,6 +76,7 @@ class Corridor:
     density_scale: Annotated[float, Interval(1, 100_000)] = 333.0
     speed_scale: Annotated[float, Interval(1, 1000)] = 102.0
     average_dwell: Annotated[float, Interval(0.01, 1e6)] = 8.0
+    drivers: Drivers = field(default_factory=Drivers)
 
     def __post_init__(self) -> None:
         """Check the fields and bring them to their declared types."""
@@ -95,12 +98,12 @@ class Corridor:
         self._check_incident()
 
     def _check_ramps(self) -> None:
-        for field in ("on_ramps", "off_ramps"):
-            faces = getattr(self, field)
+        for name in ("on_ramps", "off_ramps"):
+            faces = getattr(self, name)
             for i, face in enumerate(faces):
-                integer(f"corridor.{field}[{i}]", face, 1, self.n_mainline - 1)
+                integer(f"corridor.{name}[{i}]", face, 1, self.n_mainline - 1)
             increasing = list(faces) == sorted(set(faces))
-            require(increasing, f"corridor.{field}", "increasing", faces)
+            require(increasing, f"corridor.{name}", "increasing", faces)
         allowed = f"at other faces than the on-ramps {self.on_ramps}"
         disjoint = not set(self.on_ramps) & set(self.off_ramps)
         require(disjoint, "corridor.off_ramps", allowed, self.off_ramps)
@@ -163,8 +166,10 @@ class Corridor:
         records.
         """
         content = dataclasses.asdict(self)
-        for field in NOT_TRAFFIC:
-            del content[field]
+        for name in NOT_TRAFFIC:
+            del content[name]
+        if self.drivers == Drivers():
+            del content["drivers"]  # as in digests from before drivers could be chosen
         content["kinds"] = [type(self.demand).__name__, type(self.incident).__name__]
         text = json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)
         return hashlib.sha256(text.encode()).hexdigest()

@@ -217,7 +217,7 @@ def _command(folder: Path, network: str, corridor: Corridor, scenario: Scenario)
 def _routes(corridor: Corridor, scenario: Scenario) -> ElementTree.Element:
     """Describe the vehicles and their routes in SUMO's XML."""
     root = ElementTree.Element("routes")
-    ElementTree.SubElement(root, "vType", id="car", carFollowModel="W99")
+    ElementTree.SubElement(root, "vType", {"id": "car", **corridor.drivers.attributes()})
     for origin in range(MAINLINE, corridor.n_on_ramps):
         for end in range(MAINLINE, corridor.n_off_ramps):
             first = 0 if origin == MAINLINE else corridor.on_ramps[origin]

@@ -6,7 +6,15 @@ import sys
 
 import pytest
 
-from dptse_env.traffic import PAPER_HIGHWAY, SHORT_HIGHWAY, Demand, Incident, IncidentDistribution
+from agents.evaluation.episodes import make_config
+from dptse_env.traffic import (
+    PAPER_HIGHWAY,
+    SHORT_HIGHWAY,
+    Demand,
+    Drivers,
+    Incident,
+    IncidentDistribution,
+)
 
 
 def changed(**fields):
@@ -93,6 +101,7 @@ def test_the_digest_covers_what_shapes_the_traffic_and_nothing_else():
         "ramp_lanes": 2,
         "segment_length": 0.2,
         "speed_limit": 100.0,
+        "drivers": Drivers("IDM"),
     }
     observed = {
         "name": "other",
@@ -120,3 +129,19 @@ def test_the_digest_is_the_same_in_another_process():
     )
     assert result.stdout.strip() == SHORT_HIGHWAY.digest
     assert pickle.loads(pickle.dumps(SHORT_HIGHWAY)).digest == SHORT_HIGHWAY.digest
+
+
+def test_records_from_before_drivers_could_be_chosen_keep_their_digests():
+    assert PAPER_HIGHWAY.digest.startswith("2324ff6dffb73fb3")
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"model": "Gipps"}, r"corridor\.drivers\.model must be"),
+        ({"headway": 0.0}, r"corridor\.drivers\.headway must be"),
+    ],
+)
+def test_bad_drivers_are_named(fields, message):
+    with pytest.raises(ValueError, match=message):
+        make_config("dptse_env:dptse/PaperHighway-v0", {"corridor": {"drivers": fields}})

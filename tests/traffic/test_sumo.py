@@ -1,3 +1,4 @@
+import dataclasses
 import os
 import subprocess
 import sys
@@ -10,11 +11,13 @@ from dptse_env.traffic import (
     MAINLINE,
     PAPER_HIGHWAY,
     SHORT_HIGHWAY,
+    Drivers,
     RecordingError,
     SumoVersionError,
     draw_scenario,
     mean_dwell,
     simulate,
+    simulate_in_child,
     sumo,
 )
 from dptse_env.traffic.record import COLUMNS
@@ -232,3 +235,17 @@ def test_importing_the_room_does_not_import_libsumo():
     code = "import sys, dptse_env.traffic.library; sys.exit('libsumo' in sys.modules)"
     environment = {name: value for name, value in os.environ.items() if name != "SUMO_HOME"}
     subprocess.run([sys.executable, "-c", code], check=True, env=environment)
+
+
+@pytest.mark.parametrize(
+    "drivers",
+    [Drivers("Krauss", headway=1.5), Drivers("IDM"), Drivers(headway=2.0, speed_deviation=0.2)],
+    ids=str,
+)
+def test_drivers_shape_the_traffic(drivers, short_record):
+    """The same departures, driven otherwise."""
+    corridor = dataclasses.replace(SHORT_HIGHWAY, drivers=drivers)
+    record = simulate_in_child(corridor, 0)
+    assert record.n_steps == short_record.n_steps
+    assert len(record.speed) > 0
+    assert not np.array_equal(record.speed_sums, short_record.speed_sums)
