@@ -3,6 +3,7 @@
 python scripts/study.py paper              # the paper's five results, some 8,000 episodes
 python scripts/study.py privacy --quick    # the price of a privacy guarantee, in minutes
 python scripts/study.py ledger             # capped contributions beside paced ledgers
+python scripts/study.py estimators         # every estimator under every release model
 python scripts/study.py policies freeze --policies primary=results/training/primary
 python scripts/study.py policies run       # learned policies against every baseline
 
@@ -26,6 +27,8 @@ import tyro
 
 from agents.experiments.engine import LocalProcesses
 from agents.experiments.runner import Workplace
+from agents.studies.estimators import study as estimator_study
+from agents.studies.estimators.plan import EstimatorDesign
 from agents.studies.ledger import study as ledger_study
 from agents.studies.ledger.plan import LedgerDesign
 from agents.studies.paper import study as paper_study
@@ -90,6 +93,16 @@ class LedgerStudy(StudyOptions):
 
 
 @dataclass(frozen=True)
+class EstimatorStudy(StudyOptions):
+    """Put all estimators side by side, with the honesty of their deviations."""
+
+    quick: bool = False
+    """Three traffic seeds, and fewer estimators and schedules."""
+    design: tyro.conf.OmitArgPrefixes[EstimatorDesign] = field(default_factory=EstimatorDesign)
+    """The plan."""
+
+
+@dataclass(frozen=True)
 class Freeze(StudyOptions):
     """Fix policies and choices before test traffic is touched."""
 
@@ -132,12 +145,13 @@ Study = (
     Annotated[Paper, tyro.conf.subcommand("paper")]
     | Annotated[Privacy, tyro.conf.subcommand("privacy")]
     | Annotated[LedgerStudy, tyro.conf.subcommand("ledger")]
+    | Annotated[EstimatorStudy, tyro.conf.subcommand("estimators")]
     | Annotated[Policies, tyro.conf.subcommand("policies")]
 )
 
 
 @resumable()
-def main(args: Paper | Privacy | LedgerStudy | Policies) -> None:
+def main(args: Paper | Privacy | LedgerStudy | EstimatorStudy | Policies) -> None:
     """Run a study."""
     if isinstance(args, Paper):
         design = args.design.quick() if args.quick else args.design
@@ -151,6 +165,10 @@ def main(args: Paper | Privacy | LedgerStudy | Policies) -> None:
         planned = args.design.quick() if args.quick else args.design
         place = args.workplace("ledger-quick" if args.quick else "ledger")
         ledger_study.run(planned, place, command("study.py ledger", args))
+    elif isinstance(args, EstimatorStudy):
+        chosen = args.design.quick() if args.quick else args.design
+        place = args.workplace("estimators-quick" if args.quick else "estimators")
+        estimator_study.run(chosen, place, command("study.py estimators", args))
     elif isinstance(args.step, Freeze):
         freeze(args.step)
         return

@@ -32,6 +32,7 @@ LABELS = {
     "mhe": "MHE",
     "random_walk": "random walk",
     "blend": "EKF and random walk",
+    "recurrent": "recurrent",
     "open_loop": "open loop",
 }
 """Names of the estimators in figures and tables."""

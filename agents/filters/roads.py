@@ -26,6 +26,13 @@ ROADS = (
     ),
     _road(
         corridor={
+            "drivers": {"model": "IDM", "headway": 1.3, "speed_deviation": 0.1},
+            "average_dwell": 10.25,
+        }
+    ),
+    _road(corridor={"drivers": {"headway": 0.9, "speed_deviation": 0.15}, "average_dwell": 10.25}),
+    _road(
+        corridor={
             "n_mainline": 10,
             "lanes": 2,
             "on_ramps": (2,),
@@ -60,5 +67,5 @@ ROADS = (
         }
     ),
 )
-"""The three roads of the package, the paper's with a demand of another shape and random incidents,
-a road of 1 km with two lanes, and one of 2 km with four."""
+"""The three roads of the package; the paper's with random incidents and a demand of another shape, or
+other drivers; a road of 1 km with two lanes, and one of 2 km with four."""

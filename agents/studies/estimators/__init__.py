@@ -1,0 +1,1 @@
+"""Estimators side by side: errors, honesty of deviations, and what holds off the training."""

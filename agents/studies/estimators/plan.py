@@ -1,0 +1,129 @@
+"""Plan of the study of estimators: its cells, and the traffic of each world."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+from agents.evaluation.episodes import make_config, without_void_warning
+from agents.experiments.cells import Design
+from agents.studies.estimators.cell import DEFAULT_WEIGHTS, LEARNED, LINEAR, EstimatorCell
+from agents.studies.estimators.worlds import ELSEWHERE, GUARANTEES, MAIN, WORLDS
+from dptse_env.config import EnvConfig, parse_seeds
+from dptse_env.estimators.learned.weights import read_network
+
+OWN = "largest-deviation"
+"""The schedule on the deviations that the estimator reports."""
+WITH_POLICY = ("capped",)
+"""Worlds whose observations the shipped query policy knows."""
+
+
+@dataclass(frozen=True)
+class EstimatorDesign(Design[EstimatorCell]):
+    """The cells of the study.
+
+    Attributes:
+        seeds: Test traffic seeds of `MAIN` and `GUARANTEES`, first:stop.
+        elsewhere_seeds: Those of `ELSEWHERE`.
+        schedule: Base schedule.
+        schedules: Schedules that quick estimators meet in `MAIN`.
+        policy: Query policy that ships with the package.
+        quick_estimators: Estimators that meet every schedule.
+        slow_estimators: Estimators that meet the base schedule and the first of `schedules` only.
+        moved_estimators: Estimators that are run in `ELSEWHERE`.
+        weights: Network that counts as the estimator.
+        networks: Networks of other training seeds.
+        fit_seeds: Training traffic seeds on which linear stacks are fitted.
+    """
+
+    seeds: str = "2000:2064"
+    elsewhere_seeds: str = "2000:2024"
+    schedule: str = "round-robin"
+    schedules: tuple[str, ...] = ("paper", "round-robin", "oldest-first", "stale-variance", OWN)
+    policy: str = "private-highway"
+    quick_estimators: tuple[str, ...] = ("ekf", "random_walk", "blend", LINEAR, LEARNED)
+    slow_estimators: tuple[str, ...] = ("ukf", "enkf", "mhe")
+    moved_estimators: tuple[str, ...] = ("ekf", "random_walk", LEARNED)
+    weights: str = DEFAULT_WEIGHTS
+    networks: tuple[str, ...] = ()
+    fit_seeds: str = "0:32"
+
+    def quick(self) -> EstimatorDesign:
+        """Return a design of few cells on few seeds."""
+        return dataclasses.replace(
+            self,
+            seeds=self.first_seeds(3),
+            elsewhere_seeds=self.first_seeds(2),
+            schedules=("paper", "round-robin", OWN),
+            quick_estimators=("ekf", "random_walk", LINEAR, LEARNED),
+            slow_estimators=("ukf",),
+            fit_seeds="0:2",
+        )
+
+    def seeds_of(self, cell: EstimatorCell) -> tuple[int, ...]:
+        """Return the traffic seeds of a cell."""
+        return parse_seeds(self.elsewhere_seeds if cell.world in ELSEWHERE else self.seeds)
+
+    def cell(
+        self, world: str, estimator: str = LEARNED, schedule: str = "", weights: str = ""
+    ) -> EstimatorCell:
+        """Return a cell; the base schedule and the base network unless others are given."""
+        own = (weights or self.weights) if estimator == LEARNED else ""
+        return EstimatorCell(world, estimator, schedule or self.schedule, own)
+
+    def schedules_of(self, world: str) -> tuple[str, ...]:
+        """Return the schedules of a main world."""
+        return (*self.schedules, *((self.policy,) if world in WITH_POLICY else ()))
+
+    def all_cells(self) -> Iterator[EstimatorCell]:
+        """See `Design.all_cells`."""
+        for world in MAIN:
+            for pair in itertools.product(self.quick_estimators, self.schedules_of(world)):
+                yield self.cell(world, *pair)
+            for estimator in self.slow_estimators:
+                for schedule in dict.fromkeys((self.schedules[0], self.schedule)):
+                    yield self.cell(world, estimator, schedule)
+        for world in GUARANTEES:
+            for estimator in (*self.quick_estimators, *self.slow_estimators):
+                yield self.cell(world, estimator)
+        for world in (*MAIN, *GUARANTEES):
+            for network in self.networks:
+                yield self.cell(world, weights=network)
+        for network in self.networks:
+            yield self.cell("capped", schedule=OWN, weights=network)
+        for world, estimator in itertools.product(ELSEWHERE, self.moved_estimators):
+            yield self.cell(world, estimator)
+
+    @cached_property
+    def configs(self) -> list[EnvConfig]:
+        """See `Design.configs`."""
+        self.check()
+        for weights in self.all_networks:
+            read_network(weights)
+        with without_void_warning():
+            return [self.config(cell) for cell in self.cells()]
+
+    def config(self, cell: EstimatorCell) -> EnvConfig:
+        """Return the configuration of a cell.
+
+        Raises:
+            ValueError: A value is out of range.
+        """
+        seeds = {"traffic_seeds": list(self.seeds_of(cell))}
+        return make_config(cell.place.env, {**cell.keywords, **seeds})
+
+    @property
+    def all_networks(self) -> Sequence[str]:
+        """The base network, and those of other training seeds."""
+        return (self.weights, *self.networks)
+
+    @property
+    def fitted_worlds(self) -> list[str]:
+        """Worlds with a linear stack."""
+        return [
+            world for world in WORLDS
+            if any((each.world, each.estimator) == (world, LINEAR) for each in self.cells())
+        ]  # fmt: skip
