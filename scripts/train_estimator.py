@@ -45,7 +45,7 @@ class Args(Recording):
     """Learning rate at the beginning."""
     likelihood: float = FilterPlan.likelihood
     """Weight of the likelihood in the loss."""
-    rounds: tuple[str, ...] = ("ekf:80:250", "own:80:350", "own:80:400")
+    rounds: tuple[str, ...] = ("ekf:72:200", "own:72:300", "own:72:400")
     """Rounds as estimator:scenarios:passes; 'own' is the network that is trained."""
     ranges: ScenarioRanges = field(default_factory=ScenarioRanges)
     """Ranges that scenarios are drawn from."""
@@ -70,7 +70,7 @@ def parse_round(text: str) -> Round:
     """
     parts = text.split(":")
     if len(parts) != 3 or not all(part.isdecimal() for part in parts[1:]):
-        raise ValueError(f"rounds must be like 'ekf:80:250', got {text!r}")
+        raise ValueError(f"rounds must be like 'ekf:72:200', got {text!r}")
     return Round(parts[0], int(parts[1]), int(parts[2]))
 
 

@@ -79,15 +79,15 @@ class FilterPlan:
     )
     ranges: ScenarioRanges = field(default_factory=ScenarioRanges)
     rounds: tuple[Round, ...] = (
-        Round("ekf", 80, 250),
-        Round(OWN, 80, 350),
-        Round(OWN, 80, 400),
+        Round("ekf", 72, 200),
+        Round(OWN, 72, 300),
+        Round(OWN, 72, 400),
     )
-    width: int = 48
+    width: int = 64
     episodes: int = 32
     window: int = 50
     learning_rate: float = 4e-3
-    likelihood: float = 0.04
+    likelihood: float = 0.03
     prediction: float = 0.3
     clip_norm: float = 1.0
     checkpoint_every: int = 20

@@ -67,5 +67,5 @@ ROADS = (
         }
     ),
 )
-"""The three roads of the package; the paper's with random incidents and a demand of another shape, or
+"""The three roads of the package; the paper's with random incidents and another demand or
 other drivers; a road of 1 km with two lanes, and one of 2 km with four."""

@@ -14,6 +14,7 @@ from dptse_env.estimators.learned.network import (
     HIGHEST_SPREAD,
     LOWEST_SPREAD,
     Network,
+    message_width,
     shapes,
 )
 
@@ -81,7 +82,8 @@ class RecurrentNetwork(nn.Module):
             age = (state.age + 1.0) * (1.0 - x[..., 0])
             x = torch.cat([x, outside, road.fixed], -1)
         h, H = state.hidden, self.width
-        up, down = road.upstream @ h, road.upstream.T @ h
+        messages = h[..., : message_width(H)]
+        up, down = road.upstream @ messages, road.upstream.T @ messages
         g = torch.cat([x, up, down], -1) @ self.inputs + self.inputs_bias
         q = h @ self.hidden + self.hidden_bias
         gates = torch.sigmoid(g[..., : 2 * H] + q[..., : 2 * H])

@@ -112,8 +112,9 @@ class RecurrentSettings:
     """Settings of the recurrent network.
 
     Attributes:
-        weights: Name of a network that ships with the package
-            (`dptse_env.estimators.learned.weights`), or a file.
+        weights: Name of a network that ships with the package, or a file. A pair of networks, one
+            for releases of flows and one for releases of speeds, goes by the name that they share:
+            ``highway`` stands for ``highway-flows`` or ``highway-speeds``.
         outside: Whether to take a network for roads and releases outside of the ranges on its card.
 
     Raises:

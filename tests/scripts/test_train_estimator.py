@@ -42,7 +42,7 @@ def test_it_trains_a_network_that_an_environment_takes(tmp_path, capsys):
 def test_rounds_are_read_from_text():
     assert parse_round("own:3:40") == Round(OWN, 3, 40)
     for text in ("own", "own:3", "own:a:4", "own:3:4:5", "own:-1:4"):
-        with pytest.raises(ValueError, match=rf"rounds must be like 'ekf:80:250', got '{text}'"):
+        with pytest.raises(ValueError, match=rf"rounds must be like 'ekf:72:200', got '{text}'"):
             parse_round(text)
     with pytest.raises(ValueError, match=r"rounds\.scenarios must be an integer in 1\.\."):
         parse_round("own:0:4")

@@ -9,7 +9,6 @@ from agents.evaluation.figures import add_frame, draw_dot, finish_figure, make_f
 from agents.studies.estimators.cell import ESTIMATOR_LABELS, LEARNED, LINEAR
 from agents.studies.estimators.results import ERROR, EstimatorResults
 from agents.studies.estimators.watching import LEVELS
-from agents.studies.estimators.worlds import ELSEWHERE, MAIN
 
 COLOURS = {
     "ekf": "#0072b2", "ukf": "#d55e00", "enkf": "#009e73", "mhe": "#cc79a7",
@@ -22,18 +21,18 @@ def draw_worlds(results: EstimatorResults) -> Figure:
     design = results.design
     names = (*design.quick_estimators, *design.slow_estimators)
     figure = make_figure(11.0, 3.6)
-    axes = figure.subplots(1, len(MAIN), sharey=True)
-    for axis, (world, each) in zip(axes, MAIN.items(), strict=True):
+    axes = figure.subplots(1, len(design.main), sharey=True, squeeze=False)[0]
+    for axis, (world, each) in zip(axes, design.main.items(), strict=True):
         for k, name in enumerate(names):
             interval = results.mean(design.cell(world, name), ERROR)
             draw_dot(axis, interval, float(k), COLOURS[name], None)
         axis.set_title(each.label.replace("`", "").replace(", ", ",\n"), fontsize=9)
         axis.set_xlabel("error x 1000", fontsize=8)
         axis.set_yticks(range(len(names)), [ESTIMATOR_LABELS[name] for name in names])
-        axis.invert_yaxis()
         axis.margins(x=0.25)
         add_frame(axis, "x")
         axis.set_xlim(left=0.0)
+    axes[0].invert_yaxis()  # shared by all
     return figure
 
 
@@ -42,10 +41,11 @@ def draw_elsewhere(results: EstimatorResults) -> Figure:
     design = results.design
     figure = make_figure(7.4, 5.6)
     axis = figure.subplots()
-    for k, world in enumerate(ELSEWHERE):
+    for k, world in enumerate(design.elsewhere):
         below = results.below(design.cell(world), design.cell(world, "ekf"))
         draw_dot(axis, below, float(k), COLOURS[LEARNED] if below.low > 0.0 else "#d55e00", None)
-    axis.set_yticks(range(len(ELSEWHERE)), [each.label for each in ELSEWHERE.values()])
+    labels = [each.label.replace("`", "") for each in design.elsewhere.values()]
+    axis.set_yticks(range(len(labels)), labels)
     axis.axvline(0.0, color="#333333", linewidth=1.0)
     axis.invert_yaxis()
     axis.margins(x=0.12)
@@ -58,8 +58,8 @@ def draw_coverage(results: EstimatorResults) -> Figure:
     """Draw the coverage of reported intervals against what it should be, in each main world."""
     design = results.design
     figure = make_figure(11.0, 3.4)
-    axes = figure.subplots(1, len(MAIN), sharey=True)
-    for axis, (world, each) in zip(axes, MAIN.items(), strict=True):
+    axes = figure.subplots(1, len(design.main), sharey=True, squeeze=False)[0]
+    for axis, (world, each) in zip(axes, design.main.items(), strict=True):
         axis.plot([0, 100], [0, 100], color="#999999", linewidth=1.0, linestyle=":")
         for name in design.moved_estimators:
             cell = design.cell(world, name)

@@ -33,7 +33,8 @@ LAGS = ((0, 0), (0, -1), (0, 1), (5, 0), (5, -1), (5, 1), (20, 0))
 """Ages [s] and offsets of segments of the estimates that enter."""
 N_FEATURES = 4 * len(LAGS) + 1
 _LONGEST = 21
-RIDGE = 1e-3
+RIDGE = 1e-5
+"""Weight of the squared coefficients beside the mean squared error."""
 EVERY = 5
 """Seconds between those that a fit uses."""
 
@@ -171,7 +172,7 @@ def fit_stack(
     for j in range(2):
         counts = truth[:, 0] > 0.0 if j else np.ones(len(truth), dtype=bool)
         X, y = table[counts], truth[counts, j]
-        own = np.linalg.solve(X.T @ X + RIDGE * len(X) * np.eye(N_FEATURES) * 1e-3, X.T @ y)
+        own = np.linalg.solve(X.T @ X + RIDGE * len(X) * np.eye(N_FEATURES), X.T @ y)
         residual = (X @ own - y) * units[j] / spread[counts, j]
         coefficients.append(own.tolist())
         factors.append(float(np.sqrt(np.mean(residual**2))))

@@ -11,9 +11,11 @@ from functools import cached_property
 from agents.evaluation.episodes import make_config, without_void_warning
 from agents.experiments.cells import Design
 from agents.studies.estimators.cell import DEFAULT_WEIGHTS, LEARNED, LINEAR, EstimatorCell
-from agents.studies.estimators.worlds import ELSEWHERE, GUARANTEES, MAIN, WORLDS
+from agents.studies.estimators.worlds import ELSEWHERE, GUARANTEES, MAIN, WORLDS, World
 from dptse_env.config import EnvConfig, parse_seeds
-from dptse_env.estimators.learned.weights import read_network
+from dptse_env.estimators.learned.weights import SavedNetwork, member_for, read_network
+from dptse_env.schedules import OBSERVATION_SCHEDULES
+from dptse_env.utils.validation import require_name
 
 OWN = "largest-deviation"
 """The schedule on the deviations that the estimator reports."""
@@ -37,6 +39,7 @@ class EstimatorDesign(Design[EstimatorCell]):
         weights: Network that counts as the estimator.
         networks: Networks of other training seeds.
         fit_seeds: Training traffic seeds on which linear stacks are fitted.
+        worlds: Names of the worlds that are run.
     """
 
     seeds: str = "2000:2064"
@@ -50,6 +53,30 @@ class EstimatorDesign(Design[EstimatorCell]):
     weights: str = DEFAULT_WEIGHTS
     networks: tuple[str, ...] = ()
     fit_seeds: str = "0:32"
+    worlds: tuple[str, ...] = tuple(WORLDS)
+
+    def check(self) -> None:
+        """See `Design.check`; unknown worlds and schedules are refused as well."""
+        super().check()
+        for world in self.worlds:
+            require_name("worlds", world, WORLDS)
+        for schedule in self.schedules:
+            require_name("schedules", schedule, OBSERVATION_SCHEDULES)
+
+    @property
+    def main(self) -> dict[str, World]:
+        """The worlds in which every estimator meets every schedule."""
+        return {name: MAIN[name] for name in MAIN if name in self.worlds}
+
+    @property
+    def guarantees(self) -> dict[str, World]:
+        """Worlds of other actions and guarantees under ``paced``."""
+        return {name: GUARANTEES[name] for name in GUARANTEES if name in self.worlds}
+
+    @property
+    def elsewhere(self) -> dict[str, World]:
+        """Worlds that differ from `PrivateHighway-v1` in one thing."""
+        return {name: ELSEWHERE[name] for name in ELSEWHERE if name in self.worlds}
 
     def quick(self) -> EstimatorDesign:
         """Return a design of few cells on few seeds."""
@@ -80,29 +107,29 @@ class EstimatorDesign(Design[EstimatorCell]):
 
     def all_cells(self) -> Iterator[EstimatorCell]:
         """See `Design.all_cells`."""
-        for world in MAIN:
+        for world in self.main:
             for pair in itertools.product(self.quick_estimators, self.schedules_of(world)):
                 yield self.cell(world, *pair)
             for estimator in self.slow_estimators:
                 for schedule in dict.fromkeys((self.schedules[0], self.schedule)):
                     yield self.cell(world, estimator, schedule)
-        for world in GUARANTEES:
+        for world in self.guarantees:
             for estimator in (*self.quick_estimators, *self.slow_estimators):
                 yield self.cell(world, estimator)
-        for world in (*MAIN, *GUARANTEES):
+        for world in (*self.main, *self.guarantees):
             for network in self.networks:
                 yield self.cell(world, weights=network)
-        for network in self.networks:
-            yield self.cell("capped", schedule=OWN, weights=network)
-        for world, estimator in itertools.product(ELSEWHERE, self.moved_estimators):
+        if "capped" in self.worlds:
+            for network in self.networks:
+                yield self.cell("capped", schedule=OWN, weights=network)
+        for world, estimator in itertools.product(self.elsewhere, self.moved_estimators):
             yield self.cell(world, estimator)
 
     @cached_property
     def configs(self) -> list[EnvConfig]:
         """See `Design.configs`."""
         self.check()
-        for weights in self.all_networks:
-            read_network(weights)
+        self.saved_networks()
         with without_void_warning():
             return [self.config(cell) for cell in self.cells()]
 
@@ -119,6 +146,15 @@ class EstimatorDesign(Design[EstimatorCell]):
     def all_networks(self) -> Sequence[str]:
         """The base network, and those of other training seeds."""
         return (self.weights, *self.networks)
+
+    def saved_networks(self) -> dict[str, SavedNetwork]:
+        """Return the networks by name or file, both members of a pair.
+
+        Raises:
+            ValueError: There is no such network.
+        """
+        members = (member_for(each, flows) for each in self.all_networks for flows in (True, False))
+        return {name: read_network(name) for name in members}
 
     @property
     def fitted_worlds(self) -> list[str]:

@@ -28,10 +28,11 @@ from agents.studies.estimators.results import EstimatorResults
 from agents.studies.estimators.running import run_missing, worlds_of
 from agents.studies.estimators.timing import StepTime, measure
 from agents.studies.estimators.watching import JUMP, LEVELS, SLOW, EstimatorScore
-from agents.studies.estimators.worlds import ELSEWHERE, GUARANTEES, MAIN
-from dptse_env.estimators.learned.weights import read_network
+from dptse_env.config import parse_seeds
 
 TEMPLATES = Path(__file__).parent
+TIMED = "capped"
+"""World in which steps are timed, where it is among those that are run."""
 MEASURED_ONCE = "times.json"
 """Times of steps, and floors; measured again where the file is gone."""
 
@@ -67,7 +68,7 @@ def design_provenance(design: EstimatorDesign) -> dict[str, Any]:
         for world in worlds_of(cells)
         for each in [next(cell for cell in cells if cell.world == world)]
     }  # fmt: skip
-    networks = {name: read_network(name).sha256 for name in design.all_networks}
+    networks = {name: each.sha256 for name, each in design.saved_networks().items()}
     settings = [config for cell, config in cells.items() if not cell.weights]
     made_with = {"cells": worlds, "networks": networks, "fit_seeds": design.fit_seeds}
     return results_provenance(made_with, settings)
@@ -78,8 +79,17 @@ def _measured_once(
 ) -> tuple[list[StepTime], dict[str, list[Floor]]]:
     path = place.folder / MEASURED_ONCE
     if not path.exists():
-        found = {world: floors(design, world, place.records) for world in ("printed", "capped")}
-        times = [dataclasses.asdict(each) for each in measure(design, place.records)]
+        by_traffic = {
+            design.config(design.cell(world, "ekf")).corridor: world
+            for world in reversed(design.main)
+        }
+        found = {
+            world: floors(design, world, place.records)
+            for world in design.main
+            if world in by_traffic.values()
+        }
+        timed = TIMED if TIMED in design.main else next(iter(design.main))
+        times = [dataclasses.asdict(each) for each in measure(design, timed, place.records)]
         write_json(path, {"times": times, "floors": found})
     content = json.loads(path.read_text(encoding="utf-8"))
     kept = {world: [Floor(*each) for each in rows] for world, rows in content["floors"].items()}
@@ -106,14 +116,15 @@ def report(results: EstimatorResults, recorded: Mapping[str, Any], command: str)
         "tables": tables,
         "command": command,
         "provenance": recorded,
-        "MAIN": MAIN,
-        "GUARANTEES": GUARANTEES,
-        "ELSEWHERE": ELSEWHERE,
         "LEVELS": LEVELS,
         "JUMP": JUMP,
         "SLOW": SLOW,
         "OWN": OWN,
         "missed": [each for each in targets.judge(results) if not each.is_met],
-        "n_elsewhere": len(design.seeds_of(design.cell(next(iter(ELSEWHERE))))),
-        "card": read_network(design.weights).card,
+        "n_elsewhere": len(parse_seeds(design.elsewhere_seeds)),
+        "cards": {
+            name: each.card["training"]
+            for name, each in design.saved_networks().items()
+            if name.startswith(design.weights)
+        },
     }

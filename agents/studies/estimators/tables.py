@@ -10,7 +10,7 @@ from agents.studies.estimators.results import ERROR, EstimatorResults
 from agents.studies.estimators.targets import judge, networks
 from agents.studies.estimators.timing import StepTime
 from agents.studies.estimators.watching import LEVELS, REGIMES
-from agents.studies.estimators.worlds import ELSEWHERE, GUARANTEES, MAIN, WORLDS
+from agents.studies.estimators.worlds import WORLDS
 
 _ERRORS = ("error x 1000", "below EKF [%]", "density [veh/km]", "speed [km/h]", "χ²", "covered [%]")
 
@@ -70,13 +70,13 @@ def schedule_table(results: EstimatorResults, world: str) -> str:
 def regime_table(results: EstimatorResults) -> str:
     """Return RMSE of density and speed by regime of traffic, in each main world."""
     rows = []
-    for world in MAIN:
+    for world, each in results.design.main.items():
         for estimator in results.design.quick_estimators:
             cell = results.design.cell(world, estimator)
             parts = [results.regime(cell, regime) for regime in REGIMES]
             row = [f"{density:.1f} / {speed:.1f}" for _, density, speed in parts]
             share = " / ".join(f"{part[0]:.0f}" for part in parts)
-            rows.append([MAIN[world].label, ESTIMATOR_LABELS[estimator], *row, share])
+            rows.append([each.label, ESTIMATOR_LABELS[estimator], *row, share])
     header = ["world", "estimator", "jam", "front", "free flow", "share of segments [%]"]
     return markdown(header, rows)
 
@@ -84,7 +84,7 @@ def regime_table(results: EstimatorResults) -> str:
 def seed_table(results: EstimatorResults) -> str:
     """Return the error x 1000 of every training seed in the worlds of the targets."""
     design, rows = results.design, []
-    for world in (*MAIN, *GUARANTEES):
+    for world in (*design.main, *design.guarantees):
         cells = networks(design, world)
         errors = [f"{results.mean(cell, ERROR).mean:.1f}" for cell in cells]
         chi2 = [
@@ -101,7 +101,7 @@ def seed_table(results: EstimatorResults) -> str:
 def elsewhere_table(results: EstimatorResults) -> str:
     """Return errors away from the base world, and by how much the network's are smaller."""
     design, rows = results.design, []
-    for world in ELSEWHERE:
+    for world, each in design.elsewhere.items():
         cells = {name: design.cell(world, name) for name in design.moved_estimators}
         errors = [_tenths(results.mean(cell, ERROR)) for cell in cells.values()]
         below = format_interval(results.below(cells[LEARNED], cells["ekf"]))
@@ -109,7 +109,7 @@ def elsewhere_table(results: EstimatorResults) -> str:
             f"{results.mean(cells[LEARNED], f'chi2_{name}').mean:.2f}"
             for name in ("density", "speed")
         ]
-        rows.append([ELSEWHERE[world].label, *errors, below, ", ".join(chi2)])
+        rows.append([each.label, *errors, below, ", ".join(chi2)])
     names = [ESTIMATOR_LABELS[name] for name in design.moved_estimators]
     return markdown(
         ["`PrivateHighway-v1` but for", *names, "recurrent below EKF [%]", "χ² of recurrent"], rows

@@ -9,7 +9,6 @@ from agents.experiments.cells import DENSITY, SPEED
 from agents.studies.estimators.cell import LEARNED, EstimatorCell
 from agents.studies.estimators.plan import OWN, EstimatorDesign
 from agents.studies.estimators.results import ERROR, EstimatorResults
-from agents.studies.estimators.worlds import ELSEWHERE, GUARANTEES, MAIN
 
 CHI2 = (0.8, 1.25)
 """Range of chi-square in which deviations count as honest."""
@@ -19,6 +18,18 @@ BELOW_WALK = 25.0
 """Least percentage of the speed error below the random walk's."""
 MADE_BAD = ("other-traffic",)
 """Worlds in which an estimator ought to fail."""
+
+
+ERRORS = (
+    ("capped", "", ERROR, "`PrivateHighway-v0`, error x 1000", 70.0),
+    ("capped", OWN, ERROR, f"`PrivateHighway-v0`, `{OWN}`, error x 1000", 65.0),
+    ("printed", "", DENSITY, "`PaperHighway-v0`, density [veh/km]", 11.3),
+    ("printed", "", SPEED, "`PaperHighway-v0`, speed [km/h]", 5.2),
+    ("paced", "", ERROR, "`PrivateHighway-v1`, error x 1000", 60.0),
+    ("paced-sums", "", ERROR, "`PrivateHighway-v1`, five sums, error x 1000", 55.0),
+    ("paced-low-sums", "", ERROR, "`PrivateHighway-v1`, five sums, ε = 1, error x 1000", 70.0),
+)
+"""World, schedule (the base one if empty), metric, statement and largest mean."""
 
 
 class Verdict(NamedTuple):
@@ -34,15 +45,11 @@ def judge(results: EstimatorResults) -> list[Verdict]:
     """Return the verdicts on all targets; the worst training seed counts."""
     design = results.design
     found = [
-        _error(results, "capped", "", "`PrivateHighway-v0`", 70.0),
-        _error(results, "capped", OWN, f"`PrivateHighway-v0`, `{OWN}`", 65.0),
-        _metric(results, "printed", DENSITY, "`PaperHighway-v0`, density", 11.3),
-        _metric(results, "printed", SPEED, "`PaperHighway-v0`, speed", 5.2),
-        _error(results, "paced", "", "`PrivateHighway-v1`", 60.0),
-        _error(results, "paced-sums", "", "`PrivateHighway-v1`, five sums", 55.0),
-        _error(results, "paced-low-sums", "", "`PrivateHighway-v1`, five sums, ε = 1", 70.0),
+        _judged(results, networks(design, world, schedule), metric, statement, limit)
+        for world, schedule, metric, statement, limit in ERRORS
+        if world in design.worlds
     ]
-    worlds = (*MAIN, *GUARANTEES)
+    worlds = (*design.main, *design.guarantees)
     cells = [cell for world in worlds for cell in networks(design, world)]
     for name in ("density", "speed"):
         values = [results.mean(cell, f"chi2_{name}").mean for cell in cells]
@@ -55,7 +62,7 @@ def judge(results: EstimatorResults) -> list[Verdict]:
         )  # fmt: skip
     moved = [
         results.below(design.cell(world), design.cell(world, "ekf")).mean
-        for world in ELSEWHERE
+        for world in design.elsewhere
         if world not in MADE_BAD
     ]
     found.append(
@@ -79,19 +86,6 @@ def judge(results: EstimatorResults) -> list[Verdict]:
 def networks(design: EstimatorDesign, world: str, schedule: str = "") -> list[EstimatorCell]:
     """Return the cells of all training seeds in a world."""
     return [design.cell(world, LEARNED, schedule, weights) for weights in design.all_networks]
-
-
-def _error(
-    results: EstimatorResults, world: str, schedule: str, statement: str, limit: float
-) -> Verdict:
-    cells = networks(results.design, world, schedule)
-    return _judged(results, cells, ERROR, f"{statement}, error x 1000", limit)
-
-
-def _metric(
-    results: EstimatorResults, world: str, metric: str, statement: str, limit: float
-) -> Verdict:
-    return _judged(results, networks(results.design, world), metric, statement, limit)
 
 
 def _judged(

@@ -11,7 +11,6 @@ from agents.evaluation.episodes import make_vector
 from agents.evaluation.statistics import geometric_mean_interval
 from agents.studies.estimators.plan import EstimatorDesign
 
-WORLD = "capped"
 N_EPISODES, TURNS, STEPS = 1024, 15, 5
 
 
@@ -32,12 +31,16 @@ class StepTime:
 
 
 def measure(
-    design: EstimatorDesign, records: str | None, n_episodes: int = N_EPISODES, turns: int = TURNS
+    design: EstimatorDesign,
+    world: str,
+    records: str | None,
+    n_episodes: int = N_EPISODES,
+    turns: int = TURNS,
 ) -> list[StepTime]:
     """Measure the quick estimators in turns, so that all meet the same state of the machine."""
     envs = {}
     for estimator in design.quick_estimators:
-        cell = design.cell(WORLD, estimator)
+        cell = design.cell(world, estimator)
         keywords = {**cell.keywords, "action": "scores", "threads": 1, "records": records}
         keywords["traffic_seeds"] = list(design.traffic_seeds[:32])
         env = envs[estimator] = make_vector(cell.place.env, n_episodes, keywords)

@@ -181,12 +181,13 @@ def advance(
         cells: The road.
         network: The weights.
         episodes: Shape (k,).
-        x: Shape (k, S, C + 2 H): the channels, and space for sums of hidden states.
+        x: Shape (k, S, C + 2 M): the channels, and space for sums of messages.
         hidden: Hidden states, shape (n, S, H), updated.
         present: Estimates and deviations of this second, shape (n, S, 4), updated.
         ahead: Those of the next second before its release, shape (n, S, 4), updated.
     """
     S, H = cells.lanes.size, network.hidden.shape[0]
+    M = (network.inputs.shape[0] - N_CHANNELS) // 2
     g, q = np.empty((S, 3 * H), dtype=np.float32), np.empty((S, 3 * H), dtype=np.float32)
     raw = np.empty((S, network.heads.shape[1]), dtype=np.float32)
     # One product for each episode: its bits then do not depend on the batch that it is in.
@@ -195,9 +196,9 @@ def advance(
         x[i, :, N_CHANNELS:] = 0.0
         for e in range(cells.edges.shape[0]):
             start, end = cells.edges[e, 0], cells.edges[e, 1]
-            for j in range(H):
+            for j in range(M):
                 x[i, end, N_CHANNELS + j] += h[start, j]
-                x[i, start, N_CHANNELS + H + j] += h[end, j]
+                x[i, start, N_CHANNELS + M + j] += h[end, j]
         np.dot(x[i], network.inputs, g)
         np.dot(h, network.hidden, q)
         for s in range(S):

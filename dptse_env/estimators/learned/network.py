@@ -1,7 +1,8 @@
 """The weights of a recurrent network, and one step of it in numpy.
 
 A gated recurrent unit (Cho et al., 2014) in every cell of a road, with the same weights, reads the
-cell's channels x and the sums u and d of the hidden states of the cells upstream and downstream:
+cell's channels x and the sums u and d of the messages of the cells upstream and downstream: the
+first 16 numbers of their hidden states.
 
     z = sigma(W_z [x, u, d] + b_z + V_z h + c_z)
     r = sigma(W_r [x, u, d] + b_r + V_r h + c_r)
@@ -25,14 +26,16 @@ from dptse_env.estimators.learned.channels import CHANNELS
 Float32Array = NDArray[np.float32]
 
 N_HEADS = 8
+MESSAGE = 16
+"""Numbers of a hidden state that the cells next to it read, or all where there are fewer."""
 LOWEST_SPREAD, HIGHEST_SPREAD = -7.0, 0.5
 """Range of the logarithms of reported deviations, in units of density and of the speed limit."""
 
 
 class Network(NamedTuple):
-    """Weights of a network of width H with C channels, float32."""
+    """Weights of a network of width H with C channels and messages of M numbers, float32."""
 
-    inputs: Float32Array  # W, (C + 2 H, 3 H)
+    inputs: Float32Array  # W, (C + 2 M, 3 H)
     inputs_bias: Float32Array  # b, (3 H,)
     hidden: Float32Array  # V, (H, 3 H)
     hidden_bias: Float32Array  # c, (3 H,)
@@ -45,9 +48,14 @@ class Network(NamedTuple):
         return len(self.hidden)
 
 
+def message_width(width: int) -> int:
+    """Return the numbers M of a message in a network of some width."""
+    return min(width, MESSAGE)
+
+
 def shapes(width: int) -> dict[str, tuple[int, ...]]:
     """Return the shapes of the weights of a network by name."""
-    n_inputs = len(CHANNELS) + 2 * width
+    n_inputs = len(CHANNELS) + 2 * message_width(width)
     return {
         "inputs": (n_inputs, 3 * width),
         "inputs_bias": (3 * width,),
@@ -68,10 +76,11 @@ def advance(network: Network, edges: Any, x: Float32Array, h: Float32Array) -> F
         h: Hidden states before, shape (k, S, H).
     """
     H = network.width
-    upstream, downstream = np.zeros_like(h), np.zeros_like(h)
+    messages = h[..., : message_width(H)]
+    upstream, downstream = np.zeros_like(messages), np.zeros_like(messages)
     for start, end in edges:
-        upstream[:, end] += h[:, start]
-        downstream[:, start] += h[:, end]
+        upstream[:, end] += messages[:, start]
+        downstream[:, start] += messages[:, end]
     read = np.concatenate([x, upstream, downstream], axis=-1)
     g = read @ network.inputs + network.inputs_bias
     q = h @ network.hidden + network.hidden_bias

@@ -13,13 +13,12 @@ from dptse_env.estimators.batch import BatchEstimator, Measurements
 from dptse_env.estimators.learned import kernels, network
 from dptse_env.estimators.learned.cells import input_channels, make_cells
 from dptse_env.estimators.learned.channels import (
-    CHANNELS,
     LONGEST_AGE,
     make_rows,
     read_rows,
     released,
 )
-from dptse_env.estimators.learned.weights import SavedNetwork, read_network
+from dptse_env.estimators.learned.weights import SavedNetwork, member_for, read_network
 from dptse_env.estimators.open_loop import estimated_traffic
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
@@ -46,7 +45,8 @@ class Recurrent(BatchEstimator):
     def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
         """See `make_estimator`."""
         super().__init__(model, n_episodes, settings)
-        self.saved = read_network(settings.recurrent.weights)
+        flows = model.reference_speed is not None
+        self.saved = read_network(member_for(settings.recurrent.weights, flows))
         if not settings.recurrent.outside:
             check_ranges(self.saved, model)
         self.cells = make_cells(model)
@@ -116,7 +116,7 @@ class CompiledRecurrent(Recurrent):
 
     def _advance(self, measured: Measurements) -> None:
         episodes, S = measured.episodes, self.model.n_segments
-        n_inputs = len(CHANNELS) + 2 * self.saved.network.width
+        n_inputs = len(self.saved.network.inputs)
         x = np.empty((episodes.size, S, n_inputs), dtype=np.float32)
         kernels.read(
             self.cells, episodes, measured.observed, measured.values, measured.sigma,

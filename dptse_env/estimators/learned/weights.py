@@ -69,6 +69,18 @@ def shipped_networks() -> tuple[str, ...]:
     return tuple(sorted(name.removesuffix(".npz") for name in names if name.endswith(".npz")))
 
 
+def member_for(source: str, flows: bool) -> str:
+    """Return the network of a pair that suits releases of flows, or of speeds.
+
+    A pair is two networks whose names, or files, are ``<source>-flows`` and ``<source>-speeds``. A
+    name or file of a single network is returned as it is.
+    """
+    member = f"{source}-{'flows' if flows else 'speeds'}"
+    if member in shipped_networks():
+        return member
+    return f"{member}.npz" if Path(f"{member}.npz").is_file() else source
+
+
 def read_network(source: str) -> SavedNetwork:
     """Read a network, given by name or as a file.
 
@@ -78,9 +90,10 @@ def read_network(source: str) -> SavedNetwork:
     if source in shipped_networks():
         return _shipped(source)
     if not Path(source).is_file():
+        names = {name.removesuffix("-flows") for name in shipped_networks()}
+        known = ", ".join(sorted(names.union(shipped_networks())))
         raise ValueError(
-            f"estimator_settings.recurrent.weights must be a file or one of "
-            f"{', '.join(shipped_networks()) or 'none'}, got {source!r}"
+            f"estimator_settings.recurrent.weights must be a file or one of {known}, got {source!r}"
         )
     with Path(source).open("rb") as file:
         return parse_network(file.read(LARGEST_FILE + 1), source)
