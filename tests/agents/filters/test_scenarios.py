@@ -1,8 +1,11 @@
+import dataclasses
+
 import numpy as np
 import pytest
 
 from agents.evaluation.episodes import make_config
-from agents.filters.scenarios import MECHANISMS, SCHEDULES, ScenarioRanges
+from agents.filters.roads import ROADS
+from agents.filters.scenarios import MECHANISMS, SCHEDULES, ScenarioRanges, parse_env
 
 from .plans import RANGES
 
@@ -41,3 +44,22 @@ def test_the_same_generator_draws_the_same_scenarios():
 def test_mechanisms_can_be_left_out():
     scenarios = drawn(ScenarioRanges(envs=RANGES.envs, mechanisms=("capped",)), n=5)
     assert {each.keywords["privacy"]["preset"] for each in scenarios} == {"capped"}
+
+
+def test_environments_are_ids_with_keywords():
+    assert parse_env("a:b/C-v0") == ("a:b/C-v0", {})
+    assert parse_env('a:b/C-v0 {"bandwidth": 3}') == ("a:b/C-v0", {"bandwidth": 3})
+    with pytest.raises(ValueError, match=r"keywords must be a JSON object, got '\[3\]'"):
+        parse_env("a:b/C-v0 [3]")
+
+
+@pytest.mark.filterwarnings("ignore:.*values measured or tuned on")
+@pytest.mark.parametrize("env", ROADS)
+def test_every_road_of_a_training_is_an_environment(env):
+    """With scenarios of its own; none has the incident or the demand of another."""
+    ranges = dataclasses.replace(RANGES, envs=(env,))
+    for scenario in drawn(ranges, n=4):
+        config = make_config(scenario.env, scenario.keywords)
+        assert config.bandwidth <= config.corridor.n_mainline
+    digests = {make_config(*parse_env(each)).corridor.digest for each in ROADS}
+    assert len(digests) == len(ROADS)

@@ -33,10 +33,12 @@ def assert_agree(compiled, reference, tolerance=5e-6):
     np.testing.assert_allclose(compiled.innovations, reference.innovations, atol=1e-4)
 
 
+@pytest.mark.parametrize("width", [8, 20])
 @pytest.mark.parametrize("release", RELEASES)
-def test_backends_agree(release, tmp_path):
+def test_backends_agree(release, width, tmp_path):
+    """Networks whose messages are all of the hidden state, or a part of it."""
     episodes = simulate(n=3, n_steps=80, release=release)
-    given = settings(tmp_path)
+    given = settings(tmp_path, random_network(width))
     pair = [started(backend, episodes, given) for backend in BACKENDS]
     for k in range(80):
         for estimator in pair:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from dptse_env.estimators.learned.weights import (
+    member_for,
     parse_network,
     read_network,
     shipped_networks,
@@ -70,6 +71,19 @@ def test_an_unknown_name_lists_those_that_ship():
         read_network("none")
     for name in shipped_networks():
         assert read_network(name).card["training"]
+
+
+def test_a_pair_is_found_by_the_name_it_shares(tmp_path):
+    source = str(tmp_path / "pair")
+    write_network(f"{source}-flows.npz", random_network(), card())
+    assert member_for(source, flows=True) == f"{source}-flows.npz"
+    assert member_for(source, flows=False) == source  # refused by the one who reads it
+    single = f"{source}-flows.npz"
+    assert member_for(single, flows=True) == single
+    assert member_for("highway", flows=True) == "highway-flows"
+    assert member_for("highway", flows=False) == "highway-speeds"
+    with pytest.raises(ValueError, match="or one of highway, highway-flows, highway-speeds, got"):
+        read_network("nowhere")
 
 
 @pytest.mark.parametrize(
