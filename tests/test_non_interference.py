@@ -14,12 +14,20 @@ from dptse_env.estimators import ESTIMATORS
 from dptse_env.parts import flow_centre
 from dptse_env.process import TRUTH_INFO
 from dptse_env.release.boundary import NominalBoundary
-from dptse_env.schedules import COVARIANCE_SCHEDULES, OBSERVATION_SCHEDULES, ORACLES, make_schedule
+from dptse_env.schedules import (
+    COVARIANCE_SCHEDULES,
+    DEVIATION_SCHEDULES,
+    OBSERVATION_SCHEDULES,
+    ORACLES,
+    make_schedule,
+)
 from dptse_env.spaces.actions import ACTION_ENCODINGS
 
 SEEDS = (0, 1)
 START, STEPS = 250, 30
-BLIND_SCHEDULES = sorted({*OBSERVATION_SCHEDULES, *COVARIANCE_SCHEDULES} - {"all"})
+BLIND_SCHEDULES = sorted(
+    {*OBSERVATION_SCHEDULES, *DEVIATION_SCHEDULES, *COVARIANCE_SCHEDULES} - {"all"}
+)
 
 
 class ConstantMechanism:

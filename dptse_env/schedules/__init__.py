@@ -37,11 +37,13 @@ from dptse_env.schedules.plans import (
     find_plan,
     read_plan,
 )
+from dptse_env.schedules.reduction import ExpectedReduction
 from dptse_env.schedules.rollout import Rollout
 from dptse_env.utils.registry import Registry, name_of_class
 
 __all__ = [
     "COVARIANCE_SCHEDULES",
+    "DEVIATION_SCHEDULES",
     "OBSERVATION_SCHEDULES",
     "ORACLES",
     "PLANS",
@@ -49,6 +51,7 @@ __all__ = [
     "CovarianceInflation",
     "CovarianceSchedule",
     "Everything",
+    "ExpectedReduction",
     "Greedy",
     "GreedyLogdet",
     "GreedyTrace",
@@ -89,6 +92,10 @@ OBSERVATION_SCHEDULES: dict[str, Any] = {
 """Schedules that use the observation alone, each made of (interface, seed); a step costs at most a
 sort."""
 
+DEVIATION_SCHEDULES: dict[str, type[ProcessSchedule]] = {"expected-reduction": ExpectedReduction}
+"""Schedules that use the estimator's deviations and the release model's noise, each made of
+(process, seed); a step costs a sort."""
+
 COVARIANCE_SCHEDULES: dict[str, type[ProcessSchedule]] = {
     "greedy-trace": GreedyTrace,
     "greedy-logdet": GreedyLogdet,
@@ -116,7 +123,13 @@ def _expected(part: Any) -> str | None:
 
 SCHEDULES = Registry(
     "schedule",
-    {**OBSERVATION_SCHEDULES, **COVARIANCE_SCHEDULES, **dict.fromkeys(PLANS), **ORACLES},
+    {
+        **OBSERVATION_SCHEDULES,
+        **DEVIATION_SCHEDULES,
+        **COVARIANCE_SCHEDULES,
+        **dict.fromkeys(PLANS),
+        **ORACLES,
+    },
     check=_expected,
     aliases={"wary-trace": "inflated-trace", **PLAN_ALIASES},
 )

@@ -5,6 +5,7 @@ import pytest
 
 from dptse_env.schedules import (
     COVARIANCE_SCHEDULES,
+    DEVIATION_SCHEDULES,
     OBSERVATION_SCHEDULES,
     ORACLES,
     PLANS,
@@ -15,8 +16,8 @@ from dptse_env.spaces.actions import ACTION_ENCODINGS
 
 from .playing import begin, make_batch, make_single, play
 
-NAMES = [*sorted(set(OBSERVATION_SCHEDULES) - {"none", "all"}), *COVARIANCE_SCHEDULES, *ORACLES]
-BOUND = [*COVARIANCE_SCHEDULES, *ORACLES]
+BOUND = [*DEVIATION_SCHEDULES, *COVARIANCE_SCHEDULES, *ORACLES]
+NAMES = [*sorted(set(OBSERVATION_SCHEDULES) - {"none", "all"}), *BOUND]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -91,6 +92,7 @@ def test_a_bound_schedule_refuses_another_batch(name):
         "stale-variance",
         "largest-deviation",
         "oracle-error",
+        *DEVIATION_SCHEDULES,
         *COVARIANCE_SCHEDULES,
     ],
 )
@@ -102,7 +104,7 @@ def test_a_segment_with_a_fixed_sensor_is_queried_last(name):
 
 def test_only_oracles_use_the_truth():
     env = make_batch()
-    names = [*sorted(set(OBSERVATION_SCHEDULES) - {"all"}), *COVARIANCE_SCHEDULES]
+    names = [*sorted(set(OBSERVATION_SCHEDULES) - {"all"}), *BOUND[: -len(ORACLES)]]
     assert not any(make_schedule(name, env).uses_truth for name in names)
     assert all(make_schedule(name, env).uses_truth for name in ORACLES)
     assert not set(ORACLES) & {*OBSERVATION_SCHEDULES, *COVARIANCE_SCHEDULES, *PLANS}

@@ -13,7 +13,13 @@ from agents.evaluation.episodes import (
     unwrap,
     watch_episode,
 )
-from dptse_env.schedules import COVARIANCE_SCHEDULES, OBSERVATION_SCHEDULES, ORACLES, make_schedule
+from dptse_env.schedules import (
+    COVARIANCE_SCHEDULES,
+    DEVIATION_SCHEDULES,
+    OBSERVATION_SCHEDULES,
+    ORACLES,
+    make_schedule,
+)
 from dptse_env.spaces.actions import ACTION_ENCODINGS
 
 
@@ -179,7 +185,12 @@ class Learned:
 LOOKS_AHEAD = ("oracle-greedy", "oracle-brute-force")
 LADDER = [
     pytest.param(name, marks=pytest.mark.slow) if name in LOOKS_AHEAD else name
-    for name in (*OBSERVATION_SCHEDULES, *COVARIANCE_SCHEDULES, *ORACLES)
+    for name in (
+        *OBSERVATION_SCHEDULES,
+        *DEVIATION_SCHEDULES,
+        *COVARIANCE_SCHEDULES,
+        *ORACLES,
+    )
     if name not in ("random", "all")
 ]
 

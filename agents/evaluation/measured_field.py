@@ -1,0 +1,213 @@
+"""Replay of a measured field of density and speed as the truth, for estimators alone.
+
+A field has no vehicles. What a release would say is the field itself plus the noise of the preset
+``corrected``, whose deviation needs the road alone; the segments at both ends are the boundary.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from agents.evaluation.episodes import WARM_UP
+from dptse_env.estimators import make_estimator
+from dptse_env.model import ARZModel, ARZParameters
+from dptse_env.privacy import paper_sensitivity, single_noise_std
+from dptse_env.traffic import Corridor, Demand
+from dptse_env.utils.arrays import FloatArray
+
+FEET, MILES = 0.0003048, 1.609344
+"""Kilometres."""
+UNITS = {"veh/km": 1.0, "veh/mi": 1.0 / MILES, "veh/ft": 1.0 / FEET}
+SPEED_UNITS = {"km/h": 1.0, "mi/h": MILES, "m/s": 3.6, "ft/s": 3600.0 * FEET}
+"""Factors to veh/km and km/h."""
+
+
+class Field(NamedTuple):
+    """Density [veh/km] and speed [km/h] of T seconds of N + 2 segments, from upstream on."""
+
+    density: FloatArray  # (T, N + 2)
+    speed: FloatArray  # (T, N + 2)
+    segment_length: float  # [km]
+
+
+class FieldScore(NamedTuple):
+    """Errors of an estimator over all windows of a field, from second 61 on.
+
+    Attributes:
+        error: Mean error of a second as an environment scores it, x 1000.
+        density: Density RMSE [veh/km].
+        speed: Speed RMSE [km/h].
+        chi2_density: Mean square of density errors over their reported deviations.
+        chi2_speed: The same for speeds.
+    """
+
+    error: float
+    density: float
+    speed: float
+    chi2_density: float
+    chi2_speed: float
+
+
+@dataclass(frozen=True)
+class FieldSource:
+    """A field in two text files with a row for each cell and a column for each interval.
+
+    Attributes:
+        density: File of densities.
+        speed: File of speeds.
+        cell: Length of a cell [km].
+        interval: Length of an interval [s].
+        segments: Segments N that are estimated; two more are the boundary.
+        density_unit: One of `UNITS`.
+        speed_unit: One of `SPEED_UNITS`.
+        transposed: Whether rows are intervals.
+        reversed: Whether the first cell is the last downstream.
+    """
+
+    density: Path
+    speed: Path
+    cell: float
+    interval: float
+    segments: int
+    density_unit: str = "veh/km"
+    speed_unit: str = "km/h"
+    transposed: bool = False
+    reversed: bool = False
+
+    def read(self) -> Field:
+        """Read and average over segments, and interpolate to seconds.
+
+        Raises:
+            ValueError: A file is no table of numbers, they do not fit one another, or there are
+                fewer cells than segments.
+            OSError: A file cannot be read.
+        """
+        density, speed = self._table(self.density), self._table(self.speed)
+        if density.shape != speed.shape:
+            raise ValueError(
+                f"density and speed must have one shape, got {density.shape} and {speed.shape}"
+            )
+        n = self.segments + 2
+        each = len(density) // n
+        if each < 1:
+            raise ValueError(f"segments must be at most {len(density) - 2}, got {self.segments}")
+        density = density[: n * each] * UNITS[self.density_unit]
+        flow = density * speed[: n * each] * SPEED_UNITS[self.speed_unit]
+        density, flow = (table.reshape(n, each, -1).mean(axis=1).T for table in (density, flow))
+        speed = flow / np.maximum(density, 1e-9)
+        middles = (np.arange(len(density)) + 0.5) * self.interval
+        seconds = np.arange(0.0, len(density) * self.interval)
+        both = [
+            np.column_stack([np.interp(seconds, middles, column) for column in table.T])
+            for table in (density, speed)
+        ]
+        return Field(both[0], both[1], each * self.cell)
+
+    def _table(self, path: Path) -> FloatArray:
+        try:
+            table: FloatArray = np.loadtxt(path, ndmin=2)
+        except ValueError as problem:
+            raise ValueError(f"{path} must be a table of numbers: {problem}") from problem
+        if not np.isfinite(table).all() or (table < 0.0).any():
+            raise ValueError(f"{path} must have finite numbers of at least 0")
+        table = table.T if self.transposed else table
+        return table[::-1] if self.reversed else table
+
+
+def field_corridor(field: Field, lanes: int, speed_limit: float) -> Corridor:
+    """Return a straight road for a field; scales grow with lanes and limit as on other roads."""
+    n = field.density.shape[1] - 2
+    dwell = 3600.0 * field.segment_length / float(field.speed[:, 1:-1].mean())
+    return Corridor(
+        name="measured-field",
+        n_mainline=n,
+        on_ramps=(),
+        off_ramps=(),
+        exit_shares=(),
+        demand=Demand(mainline=((0.0, float((field.density * field.speed)[:, 0].mean())),)),
+        incident=None,
+        fixed_sensors=(),
+        duration=len(field.density),
+        lanes=lanes,
+        segment_length=field.segment_length,
+        speed_limit=speed_limit,
+        density_scale=111.0 * lanes,
+        speed_scale=speed_limit,
+        average_dwell=dwell,
+    )
+
+
+@dataclass(frozen=True)
+class Replay:
+    """A field that estimators are given noisy queries of, by round robin.
+
+    The truth is cut into windows, and each is replayed with several draws of the noise. Every
+    window begins with an estimate of 25 veh/km a lane at half the speed limit.
+
+    Attributes:
+        field: The field.
+        corridor: Its road.
+        parameters: Parameters of the filters' model.
+        bandwidth: Segments a second.
+        epsilon: Of the preset ``corrected``.
+        delta: The same.
+        window: Seconds of a window.
+        n_repeats: Draws of the noise.
+    """
+
+    field: Field
+    corridor: Corridor
+    parameters: ARZParameters
+    bandwidth: int
+    epsilon: float = 1.0
+    delta: float = 0.05
+    window: int = 450
+    n_repeats: int = 8
+
+    @property
+    def sigma(self) -> FloatArray:
+        """Deviations of the noise of densities [veh/km] and speeds [km/h]."""
+        corridor = self.corridor
+        sensitivity = paper_sensitivity(
+            n_sensors=self.bandwidth,
+            average_dwell=corridor.average_dwell,
+            segment_length=corridor.segment_length,
+            free_flow_speed=corridor.speed_scale,
+            jam_density=corridor.density_scale,
+        )
+        return np.array(single_noise_std(sensitivity, self.epsilon, self.delta))
+
+    def run(self, estimator: str, settings: Any) -> FieldScore:
+        """Return the errors of an estimator; the noise is the same for all."""
+        field, corridor, rng = self.field, self.corridor, np.random.default_rng(0)
+        starts = np.arange(0, len(field.density) - self.window, self.window)
+        starts = np.repeat(starts, self.n_repeats)
+        times = starts[:, None] + np.arange(self.window + 1)
+        truth = np.stack([field.density, field.speed], axis=-1)[times]
+        k, n, everyone = len(starts), corridor.n_mainline, np.arange(len(starts))
+        model = ARZModel(corridor, self.parameters)
+        made = make_estimator(estimator, "compiled", model, k, settings)
+        start = np.full((k, n), 25.0 * corridor.lanes), np.full((k, n), 0.5 * corridor.speed_limit)
+        made.reset(everyone, model.states(*start), rng.spawn(k))
+        sigma, squares, ratios = self.sigma, [], []
+        for t in range(1, self.window + 1):
+            ends = truth[:, t - 1, [0, -1]]
+            made.predict(everyone, model.boundary_inputs(ends[..., 0], ends[..., 1]))
+            observed = np.zeros((k, n), dtype=bool)
+            observed[:, (t * self.bandwidth + np.arange(self.bandwidth)) % n] = True
+            now = truth[:, t, 1:-1]
+            made.update(everyone, observed, now + sigma * rng.normal(size=now.shape), sigma)
+            if t > WARM_UP:
+                said = made.estimate()
+                error = np.stack([said.density, said.speed], -1) - now
+                squares.append(error**2)
+                ratios.append((error / np.stack([said.density_std, said.speed_std], -1)) ** 2)
+        squared, chi2 = np.array(squares), np.mean(ratios, axis=(0, 1, 2))
+        scales = np.array([corridor.density_scale, corridor.speed_scale])
+        error = np.sqrt((squared / scales**2).mean(axis=(-2, -1))).mean()
+        density, speed = np.sqrt(squared.mean(axis=(0, 1, 2)))
+        return FieldScore(1000.0 * float(error), *map(float, (density, speed, *chi2)))

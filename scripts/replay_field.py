@@ -1,0 +1,81 @@
+"""Replay a measured field of density and speed, and print what the estimators make of it.
+
+python scripts/replay_field.py --source.density density.txt --source.speed speed.txt
+--source.cell 0.1 --source.interval 5 --source.segments 6
+
+The field is the truth. Some of its segments are queried every second, by round robin, and released
+with the noise of the preset `corrected`; the segments at both ends are known without noise. Filters
+have the settings that were tuned for that preset.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from agents.evaluation.episodes import make_config
+from agents.evaluation.measured_field import FieldSource, Replay, field_corridor
+from agents.evaluation.terminal import make_table, print_table
+from agents.experiments.plots import LABELS
+from dptse_env.utils.validation import integer
+from scripts.cli import run
+
+PAPER = "dptse_env:dptse/PaperHighway-v0"
+
+
+@dataclass(frozen=True)
+class Args:
+    """Replay a measured field of density and speed."""
+
+    source: FieldSource
+    """Files and their units."""
+    lanes: int = 5
+    """Lanes of the road."""
+    speed_limit: float = 105.0
+    """Speed limit [km/h]."""
+    bandwidth: int = 2
+    """Segments that are queried every second."""
+    epsilon: float = 1.0
+    """Epsilon of the preset `corrected`."""
+    delta: float = 0.05
+    """Its delta."""
+    window: int = 450
+    """Seconds of each of the windows that the field is cut into."""
+    repeats: int = 8
+    """Draws of the noise."""
+    estimators: tuple[str, ...] = ("ekf", "ukf", "random_walk", "blend", "recurrent")
+    """Estimators."""
+    weights: str = "highway"
+    """Network of the estimator `recurrent`, by name or file."""
+
+
+def main(args: Args) -> None:
+    """Print the errors of every estimator."""
+    measured = args.source.read()
+    corridor = field_corridor(measured, args.lanes, args.speed_limit)
+    integer("bandwidth", args.bandwidth, 1, corridor.n_mainline)
+    integer("window", args.window, 61, len(measured.density) - 1)
+    integer("repeats", args.repeats, 1, 1000)
+    base = make_config(PAPER, {"privacy": "corrected"})
+    replay = Replay(
+        measured, corridor, base.arz_parameters, args.bandwidth, args.epsilon, args.delta,
+        args.window, args.repeats,
+    )  # fmt: skip
+    density, speed = replay.sigma
+    table = make_table(
+        f"noise: {density:.1f} veh/km, {speed:.1f} km/h",
+        "estimator", "error x 1000", "density [veh/km]", "speed [km/h]", "chi2 density",
+        "chi2 speed",
+    )  # fmt: skip
+    for name in args.estimators:
+        keywords: dict[str, Any] = {"privacy": "corrected", "estimator": name}
+        if name == "recurrent":
+            recurrent = {"weights": args.weights, "outside": True}
+            keywords["estimator_settings"] = {"recurrent": recurrent}
+        score = replay.run(name, make_config(PAPER, keywords).settings())
+        table.add_row(LABELS[name], *(f"{value:.2f}" for value in score))
+    print_table(table)
+
+
+if __name__ == "__main__":
+    run(main, Args, __doc__)

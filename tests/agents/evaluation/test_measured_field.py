@@ -1,0 +1,93 @@
+import numpy as np
+import pytest
+
+pytest.importorskip("tyro")
+
+from agents.evaluation.episodes import make_config
+from agents.evaluation.measured_field import Field, FieldSource, Replay, field_corridor
+from scripts import replay_field
+
+PAPER = "dptse_env:dptse/PaperHighway-v0"
+
+
+def write(folder, rows, columns, density=0.01, speed=20.0):
+    """Fields that grow from cell to cell, and from interval to interval."""
+    cells, times = np.arange(rows)[:, None], np.arange(columns)[None]
+    np.savetxt(folder / "density.txt", density * (1.0 + 0.1 * cells + 0.01 * times))
+    np.savetxt(folder / "speed.txt", speed * (1.0 + 0.05 * cells + 0.0 * times))
+    return folder / "density.txt", folder / "speed.txt"
+
+
+def source(folder, **changes):
+    fields = {
+        "density": folder / "density.txt", "speed": folder / "speed.txt", "cell": 0.05,
+        "interval": 5.0, "segments": 3, "density_unit": "veh/ft", "speed_unit": "ft/s",
+    }  # fmt: skip
+    return FieldSource(**{**fields, **changes})
+
+
+def test_cells_become_segments_and_intervals_seconds(tmp_path):
+    write(tmp_path, 10, 20)
+    field = source(tmp_path).read()
+    assert field.density.shape == field.speed.shape == (100, 5)
+    assert field.segment_length == pytest.approx(0.1)
+    # At 2.5 s, the middle of the first interval, the mean of the first two cells.
+    expected = 0.01 / 0.0003048 * (1.0 + 1.1) / 2
+    middle = (field.density[2, 0] + field.density[3, 0]) / 2
+    assert middle == pytest.approx(expected, rel=1e-3)
+    # The mean speed of vehicles: flow over density.
+    flow = (1.0 * 1.0 + 1.1 * 1.05) / (1.0 + 1.1)
+    assert field.speed[0, 0] == pytest.approx(20.0 * 1.09728 * flow)
+    turned = source(tmp_path, reversed=True).read()
+    np.testing.assert_allclose(turned.density, field.density[:, ::-1])
+
+
+def test_bad_fields_are_named(tmp_path):
+    write(tmp_path, 10, 20)
+    with pytest.raises(ValueError, match="segments must be at most 8, got 9"):
+        source(tmp_path, segments=9).read()
+    np.savetxt(tmp_path / "other.txt", np.ones((3, 4)))
+    with pytest.raises(ValueError, match="density and speed must have one shape"):
+        source(tmp_path, speed=tmp_path / "other.txt").read()
+    (tmp_path / "words.txt").write_text("fast slow\n")
+    with pytest.raises(ValueError, match=r"words\.txt must be a table of numbers"):
+        source(tmp_path, speed=tmp_path / "words.txt").read()
+    np.savetxt(tmp_path / "other.txt", -np.ones((10, 20)))
+    with pytest.raises(ValueError, match="finite numbers of at least 0"):
+        source(tmp_path, speed=tmp_path / "other.txt").read()
+
+
+def steady(seconds=200):
+    density, speed = np.full((seconds, 5), 75.0), np.full((seconds, 5), 90.0)
+    density[:, 2] = 90.0
+    return Field(density, speed, 0.1)
+
+
+def test_more_noise_and_fewer_queries_cost():
+    field = steady()
+    corridor = field_corridor(field, 3, 102.0)
+    assert corridor.density_scale == 333.0
+    assert corridor.average_dwell == pytest.approx(4.0)
+    config = make_config(PAPER, {"privacy": "corrected", "estimator": "random_walk"})
+    runs = {
+        epsilon: Replay(
+            field, corridor, config.arz_parameters, 1, epsilon, window=150, n_repeats=3
+        ).run("random_walk", config.settings())
+        for epsilon in (1.0, 1e6)
+    }
+    assert runs[1e6].error < 0.5 * runs[1.0].error
+    assert runs[1e6].density < 5.0
+    assert all(value > 0.0 for score in runs.values() for value in score)
+
+
+def test_the_script_prints_a_row_for_each_estimator(tmp_path, capsys):
+    write(tmp_path, 10, 60)
+    args = replay_field.Args(
+        source(tmp_path), bandwidth=1, window=100, repeats=1, estimators=("ekf", "recurrent")
+    )
+    replay_field.main(args)
+    text = capsys.readouterr().out
+    assert "EKF" in text
+    assert "recurrent" in text
+    with pytest.raises(ValueError, match=r"bandwidth must be an integer in 1\.\.3, got 4"):
+        replay_field.main(replay_field.Args(source(tmp_path), bandwidth=4))
