@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -35,7 +34,6 @@ class Collected:
         released: The measurements, each array with a leading axis of T.
         outside: `input_channels`, shape (T, n, S, 2).
         truth: Density [veh/km] and speed [km/h], shape (T, n, S, 2).
-        errors: The environment's error of the estimator that was played, shape (T, n).
     """
 
     corridor: Corridor
@@ -45,7 +43,6 @@ class Collected:
     released: Released
     outside: Float32Array
     truth: Float32Array
-    errors: Float32Array
 
 
 class _Recorder:
@@ -90,22 +87,16 @@ def collect(scenario: Scenario, estimator: Mapping[str, Any], records: str | Non
     recorder = _Recorder(process)
     process.estimator = recorder  # type: ignore[assignment]
     truths: list[Float32Array] = []
-    errors: list[Float32Array] = []
     starts: list[Float32Array] = []
     corridor = process.config.corridor
 
     def on_second() -> None:
         if not starts:
-            estimate = process.estimate
-            table = [getattr(estimate, field.name) for field in dataclasses.fields(estimate)]
+            said = process.estimate
+            table = said.density, said.speed, said.density_std, said.speed_std
             starts.append(_single(np.stack(table, -1)))
             return
         truths.append(_single(process.truth(np.arange(n))))
-        density = process.error.density / corridor.density_scale
-        speed = process.error.speed / corridor.speed_scale
-        occupied, segments = process.error.n_occupied, corridor.n_mainline
-        squares = segments * density**2 + occupied * speed**2
-        errors.append(_single(np.sqrt(squares / (segments + occupied))))
 
     policy = make_schedule(scenario.schedule, env)
     noise = [scenario.noise_seed + seed for seed in seeds]
@@ -119,7 +110,6 @@ def collect(scenario: Scenario, estimator: Mapping[str, Any], records: str | Non
         released=Released(*(np.stack(arrays) for arrays in zip(*recorder.released, strict=True))),
         outside=np.stack(recorder.outside),
         truth=np.stack(truths),
-        errors=np.stack(errors),
     )
 
 
