@@ -13,7 +13,7 @@ from agents.evaluation.episodes import make_vector, run_episodes
 from agents.filters.scenarios import Scenario
 from dptse_env.estimators.batch import checked_measurements
 from dptse_env.estimators.learned.cells import Cells, input_channels, make_cells
-from dptse_env.estimators.learned.channels import Released, Rows, make_rows, released
+from dptse_env.estimators.learned.channels import Released, Rows, make_released, make_rows
 from dptse_env.process import QueryProcess
 from dptse_env.schedules import make_schedule
 from dptse_env.traffic import Corridor
@@ -66,7 +66,7 @@ class _Recorder:
         """Write down the measurements, and update."""
         n, model = self._process.n_episodes, self._process.model
         measured = checked_measurements(n, model, *arguments)
-        self.released.append(Released(*(_single(array) for array in released(measured))))
+        self.released.append(Released(*(_single(array) for array in make_released(measured))))
         self._estimator.update(*arguments)
 
 

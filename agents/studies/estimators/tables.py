@@ -16,12 +16,14 @@ _ERRORS = ("error x 1000", "below EKF [%]", "density [veh/km]", "speed [km/h]", 
 
 
 def target_table(results: EstimatorResults) -> str:
-    """Return the targets with the worst training seed, and the verdicts."""
+    """Return the targets, what the worst training seed reaches, and the verdicts."""
     rows = [
         [each.statement, each.asked, each.reached, "**met**" if each.is_met else "**missed**"]
         for each in judge(results)
     ]
-    return markdown(["the worst training seed", "asked", "reached", ""], rows)
+    n = len(results.design.all_networks)
+    who = f"the worst of {n} training seeds" if n > 1 else "one training seed"
+    return markdown([who, "asked", "reached", ""], rows)
 
 
 def world_table(results: EstimatorResults, world: str) -> str:

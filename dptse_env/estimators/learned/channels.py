@@ -66,7 +66,7 @@ def make_rows(rows: MeasurementRows) -> Rows:
     return Rows((rows.weights > 0.0).astype(float), 1.0 / rows.span)
 
 
-def released(measured: Measurements) -> Released:
+def make_released(measured: Measurements) -> Released:
     """Return measurements as `read_rows` takes them."""
     seen = measured.observed[..., None]
     return Released(

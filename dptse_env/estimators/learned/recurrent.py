@@ -14,9 +14,9 @@ from dptse_env.estimators.learned import kernels, network
 from dptse_env.estimators.learned.cells import input_channels, make_cells
 from dptse_env.estimators.learned.channels import (
     LONGEST_AGE,
+    make_released,
     make_rows,
     read_rows,
-    released,
 )
 from dptse_env.estimators.learned.weights import SavedNetwork, member_for, read_network
 from dptse_env.estimators.open_loop import estimated_traffic
@@ -138,7 +138,12 @@ class ReferenceRecurrent(Recurrent):
     def _advance(self, measured: Measurements) -> None:
         episodes, cells = measured.episodes, self.cells
         x, self.innovations[episodes] = read_rows(
-            np, cells, self._rows, released(measured), self._present[episodes], self._age[episodes]
+            np,
+            cells,
+            self._rows,
+            make_released(measured),
+            self._present[episodes],
+            self._age[episodes],
         )
         outside = input_channels(cells, self._inputs[episodes])
         fixed = np.broadcast_to(cells.fixed, (*x.shape[:2], cells.fixed.shape[1]))
