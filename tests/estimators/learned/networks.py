@@ -19,8 +19,8 @@ RANGES = {
 
 def random_network(width=8, seed=0):
     """Weights of the size that training gives, so that gates work and outputs move."""
-    rng = np.random.default_rng(seed)
-    arrays = {name: rng.normal(0.0, 0.4, shape) for name, shape in shapes(width).items()}
+    rng, size = np.random.default_rng(seed), 0.4 * (8 / width) ** 0.5
+    arrays = {name: rng.normal(0.0, size, shape) for name, shape in shapes(width).items()}
     return Network(**{name: array.astype(np.float32) for name, array in arrays.items()})
 
 
