@@ -114,6 +114,7 @@ _READ_BY = {
     "random_walk": ("walk_noise", "speed_cap", "noise_scale", "initial_variance"),
     "blend": (*_FILTER, "walk_noise", "blend"),
     "open_loop": ("speed_cap", "bounds"),
+    "recurrent": ("speed_cap", "noise_scale", "initial_variance", "recurrent"),
 }  # fmt: skip
 """Fields of the settings that an estimator reads; those at zero, none or psi are not shown."""
 _UNSAID = (None, 0.0, "psi")
