@@ -93,27 +93,13 @@ def read_rows(
     flows, unit, limit = cells.flows, cells.unit, cells.limit
     density, speed = predicted[..., 0], predicted[..., 1]
     density_variance, speed_variance = predicted[..., 2] ** 2, predicted[..., 3] ** 2
-    slip = flows * (speed - released.centre)
+    slip = flows * (speed - released.centre)  # derivative of y by the density
     by_speed = flows * density + (1.0 - flows)  # derivative of y by the speed
     second = flows * density * slip + (1.0 - flows) * speed
     second_variance = by_speed**2 * speed_variance + slip**2 * density_variance
-    observed, share = released.observed, rows.share
-    means = _sums(xp, rows.covers, [density, second]) * share[..., None]
-    variances = _sums(xp, rows.covers, [density_variance, second_variance]) * share[..., None] ** 2
-    variances = xp.clip(variances + released.sigma**2, LEAST_VARIANCE, None)
-    errors = observed[..., None] * (released.values - means)
-    innovations = errors / xp.sqrt(variances)
-    weights = (observed * share)[..., None] / variances
-    sigma = observed[..., None] * xp.log(xp.clip(released.sigma, LEAST_SIGMA, LARGEST_SIGMA))
-    sums = _sums(
-        xp,
-        xp.swapaxes(rows.covers, -1, -2),
-        [
-            observed, observed * share, sigma[..., 0], sigma[..., 1], innovations[..., 0],
-            innovations[..., 1], (weights * errors)[..., 0], (weights * errors)[..., 1],
-            (share[..., None] * weights)[..., 0], (share[..., None] * weights)[..., 1],
-        ],
-    )  # fmt: skip
+    innovations, sums = _weigh(
+        xp, rows, released, [density, second], [density_variance, second_variance]
+    )
     count = sums[..., 0]
     queried, each = xp.clip(count, None, 1.0), 1.0 / xp.clip(count, 1.0, None)
     log_unit = xp.log(unit)
@@ -138,6 +124,29 @@ def read_rows(
         0.25 * xp.log(1.0 + xp.clip(age, 0.0, LONGEST_AGE)),
     ]
     return xp.stack(table, -1), innovations
+
+
+def _weigh(
+    xp: ModuleType, rows: Rows, released: Released, values: Any, variances: Any
+) -> tuple[Any, Any]:
+    """Return innovations over their deviations (k, M, 2), and sums over rows for each cell.
+
+    The sums (k, S, 10) are over the rows that cover a cell: their number, their shares, logarithms
+    of sigma, innovations, then e_m / (span_m V_m) and 1 / (span_m^2 V_m); the last four have a
+    column for densities and one for the second number.
+    """
+    observed, share = released.observed, rows.share
+    means = _sums(xp, rows.covers, values) * share[..., None]
+    total = _sums(xp, rows.covers, variances) * share[..., None] ** 2 + released.sigma**2
+    total = xp.clip(total, LEAST_VARIANCE, None)
+    errors = observed[..., None] * (released.values - means)
+    innovations = errors / xp.sqrt(total)
+    weights = (observed * share)[..., None] / total
+    sigma = observed[..., None] * xp.log(xp.clip(released.sigma, LEAST_SIGMA, LARGEST_SIGMA))
+    tables = [sigma, innovations, weights * errors, share[..., None] * weights]
+    columns = [table[..., j] for table in tables for j in range(2)]
+    back = xp.swapaxes(rows.covers, -1, -2)
+    return innovations, _sums(xp, back, [observed, observed * share, *columns])
 
 
 def _sums(xp: ModuleType, weights: Any, columns: Any) -> Any:
