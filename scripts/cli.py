@@ -17,7 +17,6 @@ from typing import Any
 import tyro
 
 from agents.evaluation.episodes import make_config
-from dptse_env.model.parameters import read_parameters
 from dptse_env.traffic import (
     CORRIDORS,
     Corridor,
@@ -25,6 +24,7 @@ from dptse_env.traffic import (
     RecordingError,
     RecordLibrary,
     SumoVersionError,
+    is_road_file,
 )
 
 
@@ -49,8 +49,8 @@ class Road(Recording):
     """A road to record."""
 
     corridor: str | None = None
-    """Corridor: the name of a shipped one, or a JSON object of fields that replace those of the
-    environment's corridor; the environment's own if not given."""
+    """Corridor: the name of a shipped one, a road file that ends in .toml, or a JSON object of
+    fields that replace those of the environment's corridor; the environment's own if not given."""
     env: str = "dptse_env:dptse/PaperHighway-v0"
     """Environment id."""
     keywords: str = "{}"
@@ -118,8 +118,8 @@ def make_corridor(corridor: str | None, env: str, keywords: Mapping[str, Any]) -
     """Return the corridor of an environment.
 
     Args:
-        corridor: Name of a shipped corridor, or a JSON object of corridor fields that replace
-            those of the environment's; None for the environment's corridor.
+        corridor: Name of a shipped corridor, a road file, or a JSON object of corridor fields that
+            replace those of the environment's; None for the environment's corridor.
         env: Environment id.
         keywords: Keywords of the environment.
 
@@ -129,13 +129,13 @@ def make_corridor(corridor: str | None, env: str, keywords: Mapping[str, Any]) -
     given: dict[str, Any] = {}
     if corridor is not None:
         given["corridor"] = corridor
-        if corridor not in CORRIDORS:
+        if corridor not in CORRIDORS and not is_road_file(corridor):
             with contextlib.suppress(json.JSONDecodeError):
                 given["corridor"] = json.loads(corridor)
             if not isinstance(given["corridor"], dict):
                 raise ValueError(
-                    f"corridor must be one of {', '.join(CORRIDORS)} or a JSON object of corridor "
-                    f"fields, got {corridor!r}"
+                    f"corridor must be one of {', '.join(CORRIDORS)}, a road file that ends in "
+                    f".toml, or a JSON object of corridor fields, got {corridor!r}"
                 )
         # Traffic does not depend on queries, and a short road may have fewer segments.
         given |= {"bandwidth": 1, "query_spans": [1]}
@@ -143,15 +143,6 @@ def make_corridor(corridor: str | None, env: str, keywords: Mapping[str, Any]) -
         # They are about the guarantee and the estimator; only the corridor is wanted.
         warnings.simplefilter("ignore", UserWarning)
         return make_config(env, {**given, **keywords}).corridor
-
-
-def parameters_argument(source: str) -> str | dict[str, Any]:
-    """Return ARZ parameters as a keyword: the name of a set, or the content of a JSON file.
-
-    Raises:
-        ValueError: The file is no set of parameters.
-    """
-    return dataclasses.asdict(read_parameters(source)) if source.endswith(".json") else source
 
 
 def records_argument(records: Path | None) -> str | None:

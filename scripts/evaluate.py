@@ -36,7 +36,8 @@ from agents.evaluation.report import Report
 from dptse_env.config import EnvConfig, parse_seeds
 from dptse_env.policies import TRANSFERABLE
 from dptse_env.schedules import OBSERVATION_SCHEDULES
-from scripts.cli import Recording, parameters_argument, records_argument, run
+from dptse_env.traffic import is_road_file
+from scripts.cli import Recording, records_argument, run
 
 ALL = "all"
 """The schedule that runs with a bandwidth that covers the road."""
@@ -67,8 +68,9 @@ class Args(Recording):
     """Schedule that the others are compared with; added if not among them."""
     bandwidth: int | None = None
     """Most segments to query a second; the environment's own if not given."""
-    parameters: str = "w99-3lane"
-    """ARZ parameters: the name of a set, or a JSON file as scripts/calibrate.py writes it."""
+    parameters: str | None = None
+    """ARZ parameters: the name of a set, or a JSON file as scripts/calibrate.py writes it; if not
+    given those of the keywords or of the road file, and else w99-3lane."""
     privacy: str | None = None
     """Privacy preset; the environment's own if not given."""
     epsilon: float | None = None
@@ -91,13 +93,14 @@ def make_keywords(args: Args, estimator: str, source: PolicySource) -> dict[str,
         **parse_keywords(args.keywords),
         **source.keywords,
         "estimator": estimator,
-        "parameters": parameters_argument(args.parameters),
         "traffic_seeds": args.seeds,
         "records": records_argument(args.records),
     }
-    for key in ("privacy", "epsilon", "delta", "bandwidth"):
+    for key in ("privacy", "epsilon", "delta", "bandwidth", "parameters"):
         if getattr(args, key) is not None:
             keywords[key] = getattr(args, key)
+    if not is_road_file(keywords.get("corridor")):
+        keywords.setdefault("parameters", "w99-3lane")
     if source.source == ALL:
         keywords["bandwidth"] = make_config(args.env, keywords).corridor.n_mainline
     return keywords
@@ -187,10 +190,11 @@ def main(args: Args) -> None:
     """Record what is missing, evaluate, and leave table, scores and figures."""
     sources = find_sources(args)
     scores = evaluate(args, sources)
-    seeds, privacy = parse_seeds(args.seeds), reference_config(args).privacy
+    seeds, config = parse_seeds(args.seeds), reference_config(args)
+    privacy, parameters = config.privacy, config.arz_parameters.name
     noise = f"{privacy.preset} noise at ({privacy.epsilon:g}, {privacy.delta:g})"
     traffic = f"{len(seeds)} episodes on {seed_kind(seeds)} traffic"
-    title = f"{args.env.rpartition('/')[2]}, {args.parameters}, {noise}, {traffic}"
+    title = f"{args.env.rpartition('/')[2]}, {parameters}, {noise}, {traffic}"
     report = Report(scores, args.reference, title)
     report.print()
     report.write(args.output, dataclasses.asdict(args))

@@ -9,8 +9,17 @@ from typing import Any
 
 from dptse_env.config.env_config import MOST_SEEDS, PRESETS, EnvConfig
 from dptse_env.estimators import settings_type
+from dptse_env.estimators.tuned_settings import read_settings
+from dptse_env.model.parameters import read_parameters
 from dptse_env.release import RELEASE_MODELS, PrivacySettings
-from dptse_env.traffic import Corridor, find_corridor, randomised
+from dptse_env.traffic import (
+    Corridor,
+    RoadFile,
+    find_corridor,
+    is_road_file,
+    randomised,
+    read_road,
+)
 from dptse_env.utils.fields import field_hints, from_mapping
 from dptse_env.utils.validation import require_name
 
@@ -36,24 +45,32 @@ def resolve(preset: str, overrides: Mapping[str, Any]) -> EnvConfig:
         preset: A name in `PRESETS`.
         overrides: Fields of `EnvConfig`. A mapping replaces the named fields of a nested
             dataclass and keeps the others. Names stand for known values: a corridor, a release
-            model. Shortcuts: ``epsilon`` and ``delta`` of ``privacy``, ``incident`` of
-            ``corridor`` (``"preset"``, ``"none"``, ``"random"`` or a mapping) and ``demand`` of
-            ``corridor`` (the same without ``"none"``); random means drawn anew for every traffic
-            seed. ``traffic_seeds`` may be a string ``"first:stop"``. In a mapping
-            ``estimator_settings``, fields left out keep what None would have given: the tuned set
-            of the resolved estimator, parameters and privacy preset, or else the defaults.
+            model. A corridor that ends in ``.toml`` is a road file, whose table ``environment``
+            gives keywords that are not among ``overrides``; ``parameters`` and
+            ``estimator_settings`` may be JSON files. Shortcuts: ``epsilon`` and ``delta``
+            of ``privacy``, ``incident`` of ``corridor`` (``"preset"``, ``"none"``, ``"random"`` or
+            a mapping) and ``demand`` of ``corridor`` (the same without ``"none"``); random means
+            drawn anew for every traffic seed. ``traffic_seeds`` may be a string ``"first:stop"``.
+            In a mapping ``estimator_settings``, fields left out keep what None would have given:
+            the tuned set of the resolved estimator, parameters and privacy preset, or else the
+            defaults.
 
     Raises:
         UnknownKeywordError: A key is no field and no shortcut.
         ValueError: A value is out of range; the message starts with its path.
 
     Warns:
-        UserWarning: The corridor is another road, and values measured or tuned on the preset's
-            road are used on it.
+        UserWarning: The corridor is another road, and values that were measured or tuned on the
+            preset's road, or assumed, are used on it.
     """
     require_name("preset", preset, PRESETS)
-    base, values = PRESETS[preset], dict(overrides)
+    road = _road_file(overrides)
+    base, values = PRESETS[preset], {**road.environment, **overrides} if road else dict(overrides)
+    overrides = dict(values)
     _check_keywords(values)
+    if road:
+        values["corridor"] = road.corridor
+    _read_files(values)
     corridor = _corridor(base.corridor, values)
     values["privacy"] = _privacy(base.privacy, values)
     if isinstance(values.get("traffic_seeds"), str):
@@ -68,16 +85,38 @@ def resolve(preset: str, overrides: Mapping[str, Any]) -> EnvConfig:
         expected = settings_type(config.estimator)
         given = from_mapping(expected, settings, "estimator_settings", config.settings())
         config = replace(config, estimator_settings=given)
-    inherited = _inherited(corridor, config, overrides)
+    inherited = _inherited(corridor, config, overrides, road.assumed if road else ())
     if inherited and not config.inherited:
         config = replace(config, inherited=inherited)
         warnings.warn(
-            f"{', '.join(inherited)}: values measured or tuned on {base.corridor.name} are used on "
-            "another road; give them to use others",
+            f"{', '.join(inherited)}: not of this road, but measured or tuned on "
+            f"{base.corridor.name}, or assumed; give them to use others",
             UserWarning,
             stacklevel=3,
         )
     return config
+
+
+def _road_file(overrides: Mapping[str, Any]) -> RoadFile | None:
+    """Return the road file that the keyword ``corridor`` names; None for another corridor."""
+    corridor = overrides.get("corridor")
+    return read_road(corridor) if is_road_file(corridor) else None
+
+
+def _read_files(values: dict[str, Any]) -> None:
+    """Replace names of JSON files of parameters and estimator settings by their content.
+
+    Raises:
+        ValueError: A file cannot be read, or has another format.
+    """
+    readers = {"parameters": read_parameters, "estimator_settings": read_settings}
+    for key, read in readers.items():
+        value = values.get(key)
+        if isinstance(value, str) and value.endswith(".json"):
+            try:
+                values[key] = read(value)
+            except OSError as problem:
+                raise ValueError(f"{key}: {value} cannot be read: {problem.strerror}") from problem
 
 
 def parse_seeds(text: str, path: str = "seeds") -> tuple[int, ...]:
@@ -147,14 +186,14 @@ def _with_scales(base: Corridor, fields: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _inherited(
-    corridor: Corridor, config: EnvConfig, overrides: Mapping[str, Any]
+    corridor: Corridor, config: EnvConfig, overrides: Mapping[str, Any], assumed: tuple[str, ...]
 ) -> tuple[str, ...]:
-    """Return the keywords that another road left as they are for the preset's."""
+    """Return the keywords that another road left as they are for the preset's, or assumed."""
     geometry = [getattr(corridor, name) for name in GEOMETRY]
     shipped = [preset.corridor for preset in PRESETS.values()]
     if any(geometry == [getattr(road, name) for name in GEOMETRY] for road in shipped):
         return ()
-    found = []
+    found = [f"corridor.{name}" for name in assumed]
     given = overrides.get("corridor")
     if isinstance(given, Mapping) and "average_dwell" not in given:
         found.append("corridor.average_dwell")

@@ -16,6 +16,13 @@ from dptse_env.traffic.presets import (
     randomised,
 )
 from dptse_env.traffic.record import InvalidRecordError, Record, mean_dwell
+from dptse_env.traffic.road_files import (
+    RoadFile,
+    is_road_file,
+    read_corridor,
+    read_road,
+    write_corridor,
+)
 from dptse_env.traffic.scenario import MAINLINE, Scenario, draw_scenario
 from dptse_env.traffic.sumo import RecordingError, SumoVersionError, simulate
 from dptse_env.traffic.sumo_network import NetworkError
@@ -37,12 +44,17 @@ __all__ = [
     "Record",
     "RecordLibrary",
     "RecordingError",
+    "RoadFile",
     "Scenario",
     "SumoVersionError",
     "draw_scenario",
     "find_corridor",
+    "is_road_file",
     "mean_dwell",
     "randomised",
+    "read_corridor",
+    "read_road",
     "simulate",
     "simulate_in_child",
+    "write_corridor",
 ]

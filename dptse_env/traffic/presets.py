@@ -10,6 +10,7 @@ from typing import Any
 from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.demand import Demand, DemandDistribution
 from dptse_env.traffic.incident import Incident, IncidentDistribution
+from dptse_env.traffic.road_files import is_road_file, read_corridor
 from dptse_env.utils.registry import Registry
 
 PAPER_HIGHWAY = Corridor(
@@ -61,11 +62,16 @@ CORRIDORS = Registry(
 
 
 def find_corridor(value: Any) -> Corridor:
-    """Return a corridor by name or ``"package.module:NAME"``, a `Corridor`, or that of a function.
+    """Return a corridor by name, of a road file, by ``"package.module:NAME"``, or as it is.
+
+    A string that ends in ``.toml`` is a road file (`dptse_env.traffic.road_files`); a function
+    returns the corridor.
 
     Raises:
         ValueError: There is none, or it is no `Corridor`.
     """
+    if is_road_file(value):
+        return read_corridor(value)
     corridor = CORRIDORS.find(value)
     if not isinstance(corridor, Corridor) and callable(corridor):
         corridor = corridor()

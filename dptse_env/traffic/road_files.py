@@ -1,0 +1,166 @@
+"""Roads as TOML files: a corridor, and the keywords of an environment that suit it.
+
+A file has the fields of `Corridor`, with tables for ``demand``, ``incident`` and ``drivers``, and a
+table ``environment`` of keywords of ``gym.make`` that hold on this road unless the caller gives
+them. ``docs/own_road.md`` has the format and an example.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import re
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeGuard
+
+import tomli_w
+
+from dptse_env.traffic.corridor import Corridor
+from dptse_env.utils.fields import from_mapping
+
+SUFFIX = ".toml"
+"""Ending of the name of a road file."""
+
+LARGEST_FILE = 10_000_000
+"""Bytes of a road file at most."""
+
+ASSUMED_PACE = 3.0
+"""Assumed ratio of the average dwell to the time of a crossing at the speed limit, where a file
+does not give the dwell. Records of the shipped roads, with their jams, have 2.8 to 2.9."""
+
+DENSITY_SCALE = 111.0
+"""Scale of densities for each lane [veh/km], which the shipped roads have, too."""
+
+_OPTIONAL: dict[str, Any] = {
+    "on_ramps": (),
+    "off_ramps": (),
+    "exit_shares": (),
+    "incident": None,
+    "fixed_sensors": (),
+}
+_ENVIRONMENT = "environment"
+_FILE_ENDINGS = (".json", ".npz")
+
+
+@dataclass(frozen=True)
+class RoadFile:
+    """The content of a road file.
+
+    Attributes:
+        corridor: The road.
+        environment: Keywords of an environment that suit the road. Names of files in it, strings
+            that end in ``.json`` or ``.npz``, are absolute.
+        assumed: Fields of the corridor that neither the file nor a record of the road gives.
+    """
+
+    corridor: Corridor
+    environment: Mapping[str, Any] = field(default_factory=dict)
+    assumed: tuple[str, ...] = ()
+
+
+def is_road_file(value: object) -> TypeGuard[str | os.PathLike[str]]:
+    """Return whether a value names a road file, by the ending of its name."""
+    return isinstance(value, str | os.PathLike) and os.fspath(value).endswith(SUFFIX)
+
+
+def read_road(path: str | os.PathLike[str]) -> RoadFile:
+    """Read a road file.
+
+    Fields that may be left out: ``name`` is then the file's, there are no ramps, incidents or fixed
+    sensors, and the scales follow lanes and speed limit. The average dwell is then assumed to be
+    `ASSUMED_PACE` times the time of a crossing at the speed limit, and named in ``assumed``.
+
+    Raises:
+        ValueError: There is no such file, it is no TOML, or a field is unknown, missing or out of
+            range; the message starts with the file's path and the field.
+    """
+    path = Path(path)
+    content = _content(path)
+    environment = content.pop(_ENVIRONMENT, {})
+    if not isinstance(environment, Mapping):
+        raise ValueError(f"{path}: {_ENVIRONMENT} must be a table, got {environment!r}")
+    if "corridor" in environment:
+        raise ValueError(f"{path}: {_ENVIRONMENT}.corridor must be left out: this file is one")
+    try:
+        corridor, assumed = _corridor(content, path)
+    except ValueError as problem:
+        raise ValueError(f"{path}: {problem}") from problem
+    keywords = {key: _absolute(value, path.parent) for key, value in environment.items()}
+    return RoadFile(corridor, keywords, assumed)
+
+
+def read_corridor(path: str | os.PathLike[str]) -> Corridor:
+    """Return the corridor of a road file; errors are those of `read_road`."""
+    return read_road(path).corridor
+
+
+def write_corridor(
+    path: str | os.PathLike[str],
+    corridor: Corridor,
+    environment: Mapping[str, Any] | None = None,
+    comment: str = "",
+) -> None:
+    """Write a road file that `read_road` reads as the same corridor.
+
+    Args:
+        path: The file; its folder exists.
+        corridor: The road.
+        environment: Keywords of an environment for the table ``environment``.
+        comment: Text for the head of the file.
+    """
+    content = _plain(dataclasses.asdict(corridor))
+    if environment:
+        content[_ENVIRONMENT] = _plain(dict(environment))
+    head = "".join(f"# {line}\n" for line in comment.splitlines())
+    Path(path).write_text(head + tomli_w.dumps(content), encoding="utf-8")
+
+
+def _content(path: Path) -> dict[str, Any]:
+    try:
+        if path.stat().st_size > LARGEST_FILE:
+            raise ValueError(f"{path}: a road file must have at most {LARGEST_FILE} bytes")
+        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except OSError as problem:
+        raise ValueError(f"{path}: the road file cannot be read: {problem.strerror}") from problem
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as problem:
+        raise ValueError(f"{path}: a road file must be TOML: {problem}") from problem
+
+
+def _corridor(content: Mapping[str, Any], path: Path) -> tuple[Corridor, tuple[str, ...]]:
+    """Return the corridor of a file's fields, and the names of those that were assumed."""
+    fields = {**_OPTIONAL, **content}
+    if "name" not in fields:
+        fields["name"] = re.sub(r"[^a-z0-9]+", "-", path.stem.lower()).strip("-")
+    corridor = from_mapping(Corridor, fields, "corridor")
+    crossing = 3600.0 * corridor.segment_length / corridor.speed_limit
+    derived = {
+        "density_scale": DENSITY_SCALE * corridor.lanes,
+        "speed_scale": corridor.speed_limit,
+        "average_dwell": ASSUMED_PACE * crossing,
+    }
+    fields |= {name: value for name, value in derived.items() if name not in content}
+    assumed = () if "average_dwell" in content else ("average_dwell",)
+    return from_mapping(Corridor, fields, "corridor"), assumed
+
+
+def _absolute(value: Any, folder: Path) -> Any:
+    """Return a value in which names of files start at a folder."""
+    if isinstance(value, Mapping):
+        return {key: _absolute(each, folder) for key, each in value.items()}
+    if isinstance(value, list):
+        return [_absolute(each, folder) for each in value]
+    if isinstance(value, str) and value.endswith(_FILE_ENDINGS):
+        return str((folder / value).absolute())
+    return value
+
+
+def _plain(value: Any) -> Any:
+    """Return a value as TOML has it: without None, and with lists for tuples."""
+    if isinstance(value, Mapping):
+        return {key: _plain(each) for key, each in value.items() if each is not None}
+    if isinstance(value, tuple | list):
+        return [_plain(each) for each in value]
+    return value

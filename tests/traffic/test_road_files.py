@@ -1,0 +1,188 @@
+"""Roads as TOML files."""
+
+import dataclasses
+
+import pytest
+
+from dptse_env.config import resolve
+from dptse_env.traffic import (
+    PAPER_HIGHWAY,
+    SHORT_HIGHWAY,
+    Corridor,
+    find_corridor,
+    randomised,
+    read_corridor,
+    read_road,
+    write_corridor,
+)
+
+ROAD = """
+n_mainline = 8
+lanes = 2
+segment_length = 0.2
+speed_limit = 90
+duration = 300
+on_ramps = [3]
+
+[demand]
+mainline = [[0, 1800], [100, 3000]]
+on_ramps = [300]
+
+[drivers]
+model = "IDM"
+
+[environment]
+bandwidth = 3
+parameters = "arz.json"
+"""
+
+
+@pytest.fixture
+def road(tmp_path):
+    path = tmp_path / "My road.toml"
+    path.write_text(ROAD)
+    return path
+
+
+@pytest.mark.parametrize(
+    "corridor", [PAPER_HIGHWAY, SHORT_HIGHWAY, randomised(PAPER_HIGHWAY)], ids=lambda c: c.name
+)
+def test_a_corridor_survives_a_file(corridor, tmp_path):
+    write_corridor(tmp_path / "road.toml", corridor, comment="a road\nin two lines")
+    assert read_corridor(tmp_path / "road.toml") == corridor
+    assert find_corridor(str(tmp_path / "road.toml")).digest == corridor.digest
+
+
+def test_what_a_file_leaves_out_is_derived_from_the_road(road):
+    read = read_road(road)
+    corridor = read.corridor
+    assert corridor.name == "my-road"
+    assert corridor.drivers.model == "IDM"
+    assert corridor.incident is None
+    assert corridor.fixed_sensors == ()
+    assert corridor.density_scale == 222.0
+    assert corridor.speed_scale == 90.0
+    assert corridor.average_dwell == pytest.approx(3 * 3600 * 0.2 / 90)
+    assert read.assumed == ("average_dwell",)
+
+
+def test_paths_in_a_file_start_at_its_folder(road):
+    assert read_road(road).environment["parameters"] == str(road.parent / "arz.json")
+
+
+def test_a_measured_dwell_is_not_assumed(road):
+    road.write_text("average_dwell = 9.5\n" + ROAD)
+    read = read_road(road)
+    assert read.corridor.average_dwell == 9.5
+    assert read.assumed == ()
+
+
+def test_a_byte_order_mark_is_accepted(road):
+    road.write_text("\ufeff" + ROAD, encoding="utf-8")
+    assert read_corridor(road).lanes == 2
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("lanes = 2", "lanes = 0", r"My road\.toml: corridor\.lanes must be .*1\.\.16, got 0"),
+        ("lanes = 2", "lane = 2", r"My road\.toml: corridor\.lane is unknown; allowed: name"),
+        ("n_mainline = 8", "", r"My road\.toml: corridor\.n_mainline is missing"),
+        ("on_ramps = [3]", "on_ramps = [9]", r"My road\.toml: corridor\.on_ramps\[0\]"),
+        ("1800", '"many"', r"My road\.toml: corridor\.demand\.mainline\[0\]\[1\]"),
+        ("lanes = 2", "lanes = ", r"My road\.toml: a road file must be TOML: .*line 3"),
+        ("lanes = 2", "lanes = 2\nlanes = 3", r"must be TOML: .*line 4"),
+        ("bandwidth = 3", 'corridor = "x"', r"environment\.corridor must be left out"),
+        ("[environment]", "[[environment]]", r"environment must be a table"),
+        ("lanes = 2", "speed_scale = nan", r"corridor\.speed_scale must be .*nan"),
+    ],
+)
+def test_bad_files_are_refused_by_file_and_field(road, old, new, message):
+    road.write_text(ROAD.replace(old, new, 1))
+    with pytest.raises(ValueError, match=message):
+        read_road(road)
+
+
+def test_files_that_cannot_be_read(tmp_path):
+    with pytest.raises(ValueError, match=r"none\.toml: the road file cannot be read"):
+        read_road(tmp_path / "none.toml")
+    (tmp_path / "folder.toml").mkdir()
+    with pytest.raises(ValueError, match=r"folder\.toml: the road file cannot be read"):
+        read_road(tmp_path / "folder.toml")
+    (tmp_path / "binary.toml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(ValueError, match="must be TOML"):
+        read_road(tmp_path / "binary.toml")
+    (tmp_path / "deep.toml").write_text("a = " + "[" * 100_000)
+    with pytest.raises(ValueError, match="must be TOML"):
+        read_road(tmp_path / "deep.toml")
+
+
+def test_the_keywords_of_a_file_come_after_the_callers(road):
+    road.write_text(ROAD.replace('"arz.json"', '"w99-3lane"'))
+    with pytest.warns(UserWarning, match=r"corridor\.average_dwell"):
+        config = resolve("private-highway-v1", {"corridor": str(road)})
+    assert config.bandwidth == 3
+    assert config.parameters == "w99-3lane"
+    assert "parameters" not in config.inherited
+    assert "corridor.average_dwell" in config.inherited
+    with pytest.warns(UserWarning, match=r"corridor\.average_dwell"):
+        config = resolve("private-highway-v1", {"corridor": str(road), "bandwidth": 1})
+    assert config.bandwidth == 1
+
+
+def test_parameters_and_settings_that_are_not_the_roads_own_are_named(road):
+    road.write_text(ROAD.partition("[environment]")[0])
+    with pytest.warns(UserWarning, match="not of this road"):
+        config = resolve("paper-highway", {"corridor": str(road)})
+    assert {"parameters", "estimator_settings", "corridor.average_dwell"} == set(config.inherited)
+
+
+def test_a_complete_file_warns_of_nothing(road):
+    from dptse_env.estimators.tuned_settings import load_settings, write_settings
+    from dptse_env.model import load_parameters
+    from dptse_env.model.parameters import write_parameters
+
+    arz = dataclasses.replace(load_parameters("w99-3lane"), name="mine")
+    write_parameters(road.parent / "arz.json", arz, {})
+    tuned = dataclasses.asdict(load_settings("ekf-w99-3lane-paced"))
+    write_settings(
+        road.parent / "ekf.json",
+        estimator="ekf",
+        parameters="mine",
+        privacy="paced",
+        settings=tuned,
+        provenance={},
+    )
+    text = "average_dwell = 9.5\n" + ROAD + 'estimator_settings = "ekf.json"\n'
+    road.write_text(text)
+    config = resolve("private-highway-v1", {"corridor": str(road)})
+    assert config.inherited == ()
+    assert config.arz_parameters == arz
+    assert config.settings() == load_settings("ekf-w99-3lane-paced")
+
+
+def test_files_of_parameters_that_are_missing_or_damaged(road):
+    with pytest.raises(ValueError, match=r"parameters: .*arz\.json cannot be read"):
+        resolve("private-highway-v1", {"corridor": str(road)})
+    (road.parent / "arz.json").write_text("{}")
+    with pytest.raises(ValueError, match=r"arz\.json"):
+        resolve("private-highway-v1", {"corridor": str(road)})
+
+
+def test_a_corridor_of_any_kind_is_written_and_read_alike(tmp_path):
+    corridor = Corridor(
+        name="plain",
+        n_mainline=4,
+        on_ramps=(),
+        off_ramps=(2,),
+        exit_shares=(0.2,),
+        demand=SHORT_HIGHWAY.demand.__class__(mainline=((0.0, 1000.0),)),
+        incident=None,
+        fixed_sensors=(3,),
+        duration=100,
+        drivers=dataclasses.replace(SHORT_HIGHWAY.drivers, headway=1.2),
+    )
+    write_corridor(tmp_path / "plain.toml", corridor, {"bandwidth": 2})
+    read = read_road(tmp_path / "plain.toml")
+    assert read.corridor == corridor
+    assert read.environment == {"bandwidth": 2}
