@@ -88,9 +88,7 @@ def randomised(corridor: Corridor) -> Corridor:
     the record's duration. The demand of `corridor` is the base of the distribution; its incident is
     dropped. Other fields are unchanged, also `average_dwell`, which should be measured again.
     """
-    demand = corridor.demand
-    base = demand.base if isinstance(demand, DemandDistribution) else demand
-    total = corridor.duration
+    base, total = corridor.published_demand, corridor.duration
     incident = IncidentDistribution(
         segments=tuple(range(corridor.n_mainline - 1)),
         start=(0.1 * total, 0.65 * total),
