@@ -16,6 +16,7 @@ from dptse_env.traffic.presets import (
     randomised,
 )
 from dptse_env.traffic.record import InvalidRecordError, Record, mean_dwell
+from dptse_env.traffic.recordings import Recordings, ranges
 from dptse_env.traffic.road_files import (
     RoadFile,
     is_road_file,
@@ -44,6 +45,7 @@ __all__ = [
     "Record",
     "RecordLibrary",
     "RecordingError",
+    "Recordings",
     "RoadFile",
     "Scenario",
     "SumoVersionError",
@@ -52,6 +54,7 @@ __all__ = [
     "is_road_file",
     "mean_dwell",
     "randomised",
+    "ranges",
     "read_corridor",
     "read_road",
     "simulate",

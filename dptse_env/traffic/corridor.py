@@ -12,11 +12,12 @@ import json
 import re
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Annotated
+from typing import Annotated, Any
 
 from dptse_env.traffic.demand import Demand, DemandDistribution
 from dptse_env.traffic.drivers import Drivers
 from dptse_env.traffic.incident import Incident, IncidentDistribution
+from dptse_env.traffic.recordings import Recordings
 from dptse_env.utils.fields import Interval, checked_fields
 from dptse_env.utils.validation import integer, require
 
@@ -54,6 +55,8 @@ class Corridor:
         average_dwell: T_avg of the paper's eq. (6): average time of a vehicle on a mainline
             segment [s], measured from records (`dptse_env.traffic.record.mean_dwell`).
         drivers: the car-following model of all vehicles.
+        recordings: imported traffic that episodes replay; None where SUMO simulates the traffic.
+            With recordings the demand is a description of them, and there is no incident.
 
     Raises:
         ValueError: The geometry is impossible, or demand, incident or sensors do not fit it.
@@ -77,6 +80,7 @@ class Corridor:
     speed_scale: Annotated[float, Interval(1, 1000)] = 102.0
     average_dwell: Annotated[float, Interval(0.01, 1e6)] = 8.0
     drivers: Drivers = field(default_factory=Drivers)
+    recordings: Recordings | None = None
 
     def __post_init__(self) -> None:
         """Check the fields and bring them to their declared types."""
@@ -96,6 +100,12 @@ class Corridor:
         fits = len(demand.on_ramps) == self.n_on_ramps
         require(fits, "corridor.demand.on_ramps", allowed, demand.on_ramps)
         self._check_incident()
+        if self.recordings is not None:
+            fixed, free = isinstance(self.demand, Demand), self.incident is None
+            allowed = "None where traffic is recorded"
+            require(free, "corridor.incident", allowed, self.incident)
+            allowed = "fixed where traffic is recorded"
+            require(fixed, "corridor.demand", allowed, self.demand)
 
     def _check_ramps(self) -> None:
         for name in ("on_ramps", "off_ramps"):
@@ -158,6 +168,17 @@ class Corridor:
             *(f"off-ramp {i + 1}" for i in range(self.n_off_ramps)),
         )
 
+    @property
+    def record_layout(self) -> dict[str, Any]:
+        """What the columns and the length of a record depend on, as plain JSON."""
+        return {
+            "n_mainline": self.n_mainline,
+            "on_ramps": list(self.on_ramps),
+            "off_ramps": list(self.off_ramps),
+            "segment_lengths": [self.segment_length] * self.n_segments,
+            "duration": self.duration,
+        }
+
     @cached_property
     def digest(self) -> str:
         """SHA-256 (hex) of the fields that determine the traffic, stable across processes.
@@ -170,6 +191,10 @@ class Corridor:
             del content[name]
         if self.drivers == Drivers():
             del content["drivers"]  # as in digests from before drivers could be chosen
+        if self.recordings is None:
+            del content["recordings"]  # likewise
+        else:
+            content["recordings"] = self.recordings.digest  # not the folder, which may be moved
         content["kinds"] = [type(self.demand).__name__, type(self.incident).__name__]
         text = json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)
         return hashlib.sha256(text.encode()).hexdigest()
