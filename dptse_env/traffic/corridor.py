@@ -15,11 +15,12 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Annotated, TypeVar
+from typing import Annotated, Any, TypeVar
 
 from dptse_env.traffic.demand import Demand, DemandDistribution, Share
 from dptse_env.traffic.drivers import Drivers
 from dptse_env.traffic.incident import Incident, IncidentDistribution
+from dptse_env.traffic.recordings import Recordings
 from dptse_env.utils.fields import Interval, checked_fields
 from dptse_env.utils.validation import integer, require
 
@@ -77,6 +78,8 @@ class Corridor:
         average_dwell: T_avg of the paper's eq. (6): average time of a vehicle on a mainline
             segment [s], measured from records (`dptse_env.traffic.record.mean_dwell`).
         drivers: the car-following model of all vehicles.
+        recordings: imported traffic that episodes replay; None where SUMO simulates the traffic.
+            With recordings the demand is a description of them, and there is no incident.
 
     Raises:
         ValueError: The geometry is impossible, or demand, incident or sensors do not fit it.
@@ -102,6 +105,7 @@ class Corridor:
     ramp_segments: RampSegments | tuple[RampSegments, ...] = 1
     ramp_length: Length | tuple[Length, ...] | None = None
     ramp_speed_limit: SpeedLimit | tuple[SpeedLimit, ...] | None = None
+    recordings: Recordings | None = None
 
     def __post_init__(self) -> None:
         """Check the fields and bring them to their declared types."""
@@ -127,6 +131,12 @@ class Corridor:
             object.__setattr__(self, "incident", self.incident[0] if self.incident else None)
         for incident in self.incidents:
             self._check_incident(incident)
+        if self.recordings is not None:
+            fixed, free = isinstance(self.demand, Demand), self.incident is None
+            allowed = "None where traffic is recorded"
+            require(free, "corridor.incident", allowed, self.incident)
+            allowed = "fixed where traffic is recorded"
+            require(fixed, "corridor.demand", allowed, self.demand)
 
     def _check_ramps(self) -> None:
         for name in ("on_ramps", "off_ramps"):
@@ -298,6 +308,18 @@ class Corridor:
                 names += [f"{kind} {i + 1}{part}" for part in parts]
         return tuple(names)
 
+    @property
+    def record_layout(self) -> dict[str, Any]:
+        """What the columns and the length of a record depend on, as plain JSON."""
+        return {
+            "n_mainline": self.n_mainline,
+            "on_ramps": list(self.on_ramps),
+            "off_ramps": list(self.off_ramps),
+            "ramp_segments": [len(segments) for segments in self._ramp_segments],
+            "segment_lengths": list(self.segment_lengths),
+            "duration": self.duration,
+        }
+
     @cached_property
     def digest(self) -> str:
         """SHA-256 (hex) of the fields that determine the traffic, stable across processes.
@@ -316,6 +338,10 @@ class Corridor:
         demand = content["demand"].get("base", content["demand"])
         if demand["exit_shares"] is None:
             del demand["exit_shares"]  # as before shares could vary
+        if self.recordings is None:
+            del content["recordings"]  # likewise
+        else:
+            content["recordings"] = self.recordings.digest  # not the folder, which may be moved
         kinds = [type(each).__name__ for each in self.incidents] or ["NoneType"]
         content["kinds"] = [type(self.demand).__name__, *kinds]
         text = json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)

@@ -1,8 +1,9 @@
 """Roads as TOML files: a corridor, and the keywords of an environment that suit it.
 
-A file has the fields of `Corridor`, with tables for ``demand``, ``incident`` and ``drivers``, and a
-table ``environment`` of keywords of ``gym.make`` that hold on this road unless the caller gives
-them. ``docs/own_road.md`` has the format and an example.
+A file has the fields of `Corridor`, with tables for ``demand``, ``incident``, ``drivers`` and
+``recordings``, whose folder may be relative to the file, and a table ``environment`` of keywords
+of ``gym.make`` that hold on this road unless the caller gives them. ``docs/own_road.md`` has the
+format and an example.
 """
 
 from __future__ import annotations
@@ -112,6 +113,10 @@ def write_corridor(
         comment: Text for the head of the file.
     """
     content = _plain(dataclasses.asdict(corridor))
+    if corridor.recordings is not None:
+        folder, home = Path(corridor.recordings.folder).absolute(), Path(path).absolute().parent
+        if folder.is_relative_to(home):  # so that the folder can be moved with the file in it
+            content["recordings"]["folder"] = str(folder.relative_to(home))
     if environment:
         content[_ENVIRONMENT] = _plain(dict(environment))
     head = "".join(f"# {line}\n" for line in comment.splitlines())
@@ -132,6 +137,10 @@ def _content(path: Path) -> dict[str, Any]:
 def _corridor(content: Mapping[str, Any], path: Path) -> tuple[Corridor, tuple[str, ...]]:
     """Return the corridor of a file's fields, and the names of those that were assumed."""
     fields = {**_OPTIONAL, **content}
+    recordings = fields.get("recordings")
+    if isinstance(recordings, Mapping) and isinstance(recordings.get("folder"), str):
+        folder = str((path.parent / recordings["folder"]).absolute())
+        fields["recordings"] = {**recordings, "folder": folder}
     if "name" not in fields:
         fields["name"] = re.sub(r"[^a-z0-9]+", "-", path.stem.lower()).strip("-")
     corridor = from_mapping(Corridor, fields, "corridor")
