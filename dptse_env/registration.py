@@ -12,6 +12,7 @@ ENVIRONMENTS = {
     "dptse/PaperHighway-v0": "paper-highway",
     "dptse/PrivateHighway-v0": "private-highway",
     "dptse/PrivateHighway-v1": "private-highway-v1",
+    "dptse/LongHighway-v0": "long-highway",
     "dptse/ShortHighway-v0": "short-highway",
 }
 """Environment ids and the preset behind each."""

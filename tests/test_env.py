@@ -14,6 +14,8 @@ from dptse_env.process import TRUTH_INFO
 from dptse_env.registration import ENVIRONMENTS, register_environments
 from dptse_env.spaces.actions import ACTION_ENCODINGS
 
+from .vectors import briefly
+
 SHORT = "dptse_env:dptse/ShortHighway-v0"
 IDS = [f"dptse_env:{env_id}" for env_id in ENVIRONMENTS]
 
@@ -49,7 +51,8 @@ CHECKED = [(env_id, "mask") for env_id in IDS] + [(SHORT, name) for name in ACTI
 
 @pytest.mark.parametrize(("env_id", "action"), sorted(set(CHECKED)))
 def test_the_checkers_find_nothing(env_id, action):
-    env = gym.make(env_id, action=action, render_mode="rgb_array", traffic_seeds="0:2")
+    keywords = {"render_mode": "rgb_array", "traffic_seeds": "0:2", **briefly(env_id)}
+    env = gym.make(env_id, action=action, **keywords)
     check_env(env.unwrapped)
     sb3_check_env(env.unwrapped)
     env.close()

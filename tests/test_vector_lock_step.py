@@ -11,7 +11,7 @@ from dptse_env.registration import ENVIRONMENTS
 from dptse_env.spaces.actions import ACTION_ENCODINGS
 from dptse_env.utils.threads import SMALLEST_BLOCK
 
-from .vectors import COUNTED, assert_same, lock_step, short
+from .vectors import COUNTED, assert_same, briefly, lock_step, short
 
 
 @pytest.mark.parametrize(
@@ -26,7 +26,7 @@ def test_a_batch_is_so_many_scalar_environments(estimator, action, privacy):
 
 @pytest.mark.parametrize("env_id", ENVIRONMENTS)
 def test_every_id_is_so_many_scalar_environments(env_id):
-    lock_step({"traffic_seeds": "0:2"}, n_steps=8, env_id=f"dptse_env:{env_id}")
+    lock_step({"traffic_seeds": "0:2", **briefly(env_id)}, n_steps=8, env_id=f"dptse_env:{env_id}")
 
 
 @pytest.mark.parametrize("truth_in_info", [False, True])

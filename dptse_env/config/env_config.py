@@ -241,6 +241,12 @@ PRESETS = {
         parameters="w99-3lane",
         privacy=PacedSettings(epsilon=5.0),
     ),
+    "long-highway": EnvConfig(
+        corridor=CORRIDORS["long-highway"],
+        parameters="w99-3lane",
+        bandwidth=8,
+        privacy=PacedSettings(epsilon=5.0),
+    ),
     "short-highway": EnvConfig(corridor=CORRIDORS["short-highway"], bandwidth=2),
 }
 """Configurations by name."""

@@ -66,7 +66,7 @@ LONG_HIGHWAY = Corridor(
     ),
     fixed_sensors=(119, 124, 125, 126, 127),
     duration=1200,
-    average_dwell=4.9,
+    average_dwell=4.52,
 )
 """A 12 km stretch with four interchanges; demand level and two incidents vary with the seed."""
 

@@ -34,7 +34,9 @@ def test_mainline_blocks_stand_at_their_segments(preset):
     config = PRESETS[preset]
     road, n = RoadChannels.from_config(config), config.corridor.n_mainline
     observation, starts = numbered(config)
-    released = "released_flow" if preset.startswith("private-highway") else "released_speed"
+    released = (
+        "released_flow" if preset.startswith(("private-highway", "long")) else "released_speed"
+    )
     for name in ("density", "speed_log_std", "released_density", released, "age", "queried"):
         expected = starts[name] + np.arange(n)
         np.testing.assert_allclose(raw(road, f"mainline {name}", observation), expected, rtol=1e-5)
