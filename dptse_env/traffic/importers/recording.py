@@ -241,7 +241,7 @@ class Recording:
         self._numbered: dict[tuple[int, int], int] = {}
         for number, (start, code, name) in enumerate(sorted(found)):
             self._numbered[code, int((start - first[code]) // stride)] = number
-            self.windows.append(Window(number, name, start + (self.base or 0.0)))
+            self.windows.append(Window(number, name, float(start) + (self.base or 0.0)))
         if not found:
             raise TrajectoryError(
                 f"{self.path}: it must last {self.corridor.duration + 1} s or more, the corridor's "
