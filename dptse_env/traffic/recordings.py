@@ -12,7 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dptse_env.traffic.record import MANIFEST, InvalidRecordError, Record
+from dptse_env.traffic.record import Record
+from dptse_env.traffic.stored_arrays import MANIFEST, InvalidRecordError
 from dptse_env.utils.fields import checked_fields
 from dptse_env.utils.json_object import parse_object
 from dptse_env.utils.validation import integer
@@ -63,7 +64,7 @@ class Recordings:
 
     def record_path(self, seed: int) -> Path:
         """Return the folder of a record, whether it exists or not."""
-        return Path(self.folder) / RECORDS / f"{seed:08d}"
+        return record_path(Path(self.folder), seed)
 
     def load(self, seed: int, road: Mapping[str, Any]) -> Record:
         """Open the record of a traffic seed.
@@ -94,6 +95,11 @@ class Recordings:
         return record
 
 
+def record_path(folder: Path, seed: int) -> Path:
+    """Return the folder of a record in a folder of recordings, whether it exists or not."""
+    return folder / RECORDS / f"{seed:08d}"
+
+
 def record_source(seed: int, road: Mapping[str, Any]) -> dict[str, object]:
     """Return the description that is saved with an imported record; see `Record.save`."""
     return {"recorded": True, "seed": seed, "road": dict(road)}
@@ -110,7 +116,7 @@ def write_manifest(
         seeds: Their traffic seeds.
         sources: JSON descriptions of the windows that they were cut from, for the reader.
     """
-    paths = {seed: Recordings(str(folder), "").record_path(seed) / MANIFEST for seed in seeds}
+    paths = {seed: record_path(folder, seed) / MANIFEST for seed in seeds}
     checksums = {
         str(seed): json.loads(path.read_text(encoding="utf-8"))["sha256"]
         for seed, path in paths.items()

@@ -29,7 +29,7 @@ def counts(imported, seed=0):
 
 
 def ngsim(points, shift=300.0):
-    """Return the 18 columns of a stream, whose times are `shift` ms later than `EPOCH` and theirs."""
+    """Return the 18 columns of a stream, `shift` ms later than `EPOCH` and its times."""
     vehicle, time, x, speed = points.T
     n = len(points)
     values = (
