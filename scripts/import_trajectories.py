@@ -68,8 +68,7 @@ class Args:
 def main(args: Args) -> None:
     """Import, and print which traffic seeds there are."""
     environment = read_road(args.corridor).environment if is_road_file(args.corridor) else {}
-    keywords = given_keywords("{}", args.corridor)
-    corridor = make_corridor("dptse_env:dptse/PaperHighway-v0", keywords)
+    corridor = make_corridor("dptse_env:dptse/PaperHighway-v0", given_keywords("{}", args.corridor))
     parts = zip(
         ("training", "validation", "test"),
         args.shares,

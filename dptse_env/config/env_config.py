@@ -139,6 +139,13 @@ class EnvConfig:
             raise ValueError(f"traffic_seeds must be distinct, got {seeds}")
         if self.corridor.recordings is not None:
             self.corridor.recordings.require(seeds)
+            needs = RELEASE_MODELS.find(self.privacy.preset).needs_vehicles
+            if needs and not self.corridor.recordings.has_vehicles:
+                raise ValueError(
+                    "privacy.preset must be a release model that needs no vehicles, such as "
+                    "'paper' or 'corrected', on a road of measured fields, got "
+                    f"{RELEASE_MODELS.name_of(self.privacy.preset)!r}"
+                )
         if isinstance(self.parameters, str):
             require_name("parameters", self.parameters, available_parameters())
         self.arz_parameters.require_time_step(TIME_STEP, min(self.corridor.segment_lengths))

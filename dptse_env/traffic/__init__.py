@@ -6,6 +6,8 @@ Importing this package does not import libsumo; only making a record does.
 from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.demand import Demand, DemandDistribution
 from dptse_env.traffic.drivers import Drivers
+from dptse_env.traffic.dwell import average_dwell
+from dptse_env.traffic.field_record import AnyRecord, FieldRecord, with_vehicles
 from dptse_env.traffic.incident import Incident, IncidentDistribution
 from dptse_env.traffic.library import RecordLibrary
 from dptse_env.traffic.presets import (
@@ -35,10 +37,12 @@ __all__ = [
     "MAINLINE",
     "PAPER_HIGHWAY",
     "SHORT_HIGHWAY",
+    "AnyRecord",
     "Corridor",
     "Demand",
     "DemandDistribution",
     "Drivers",
+    "FieldRecord",
     "Incident",
     "IncidentDistribution",
     "InvalidRecordError",
@@ -50,6 +54,7 @@ __all__ = [
     "RoadFile",
     "Scenario",
     "SumoVersionError",
+    "average_dwell",
     "draw_scenario",
     "find_corridor",
     "is_road_file",
@@ -60,5 +65,6 @@ __all__ = [
     "read_road",
     "simulate",
     "simulate_in_child",
+    "with_vehicles",
     "write_corridor",
 ]

@@ -27,6 +27,7 @@ import platformdirs
 from tqdm import tqdm
 
 from dptse_env.traffic.corridor import Corridor
+from dptse_env.traffic.field_record import AnyRecord
 from dptse_env.traffic.record import RECORD_VERSION, Record
 from dptse_env.traffic.stored_arrays import InvalidRecordError
 from dptse_env.traffic.sumo import (
@@ -73,14 +74,14 @@ class RecordLibrary:
         """Store the path; nothing is read or written yet."""
         self.path = default_path() if path is None else Path(path).expanduser()
         self.n_open = integer("library.n_open", n_open, 1)
-        self._open: OrderedDict[tuple[str, int], Record] = OrderedDict()
+        self._open: OrderedDict[tuple[str, int], AnyRecord] = OrderedDict()
         self._lock = threading.Lock()
 
     def __reduce__(self) -> tuple[type["RecordLibrary"], tuple[Path, int]]:
         """Pickle as the path alone: each process opens the records itself."""
         return type(self), (self.path, self.n_open)
 
-    def get(self, corridor: Corridor, seed: int) -> Record:
+    def get(self, corridor: Corridor, seed: int) -> AnyRecord:
         """Return the record of a traffic seed, which is made now if it is missing or damaged.
 
         Raises:
@@ -153,7 +154,7 @@ class RecordLibrary:
         folder = f"records-v{RECORD_VERSION}-sumo-{sumo_version()}"
         return self.path / folder / corridor.digest[:32] / f"{seed:08d}"
 
-    def _load_or_record(self, corridor: Corridor, seed: int) -> Record:
+    def _load_or_record(self, corridor: Corridor, seed: int) -> AnyRecord:
         if corridor.recordings is not None:
             return corridor.recordings.load(seed, corridor.record_layout)
         path, source = self.record_path(corridor, seed), _source(corridor, seed)

@@ -10,9 +10,9 @@ import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from dptse_env.traffic.record import Record
+from dptse_env.traffic.field_record import AnyRecord, load_record
 from dptse_env.traffic.stored_arrays import MANIFEST, InvalidRecordError
 from dptse_env.utils.fields import checked_fields
 from dptse_env.utils.json_object import parse_object
@@ -23,7 +23,10 @@ RECORDINGS_VERSION = 1
 RECORDS = "records"
 """Folder of the records in a folder of recordings."""
 
-_KEYS = {"format": str, "version": int, "road": dict, "records": dict, "sources": list}
+Kind = Literal["vehicles", "fields"]
+"""Kind of the records of a folder."""
+
+_KEYS = {"format": str, "version": int, "kind": str, "road": dict, "records": dict, "sources": list}
 
 
 @dataclass(frozen=True)
@@ -52,6 +55,11 @@ class Recordings:
         """
         return tuple(sorted(map(int, _manifest(self)["records"])))
 
+    @property
+    def has_vehicles(self) -> bool:
+        """Whether the records have vehicles; measured fields have none."""
+        return bool(_manifest(self)["kind"] == "vehicles")
+
     def require(self, seeds: Iterable[int]) -> None:
         """Raise ``ValueError`` unless there is a record of each of `seeds`."""
         known = self.seeds
@@ -66,7 +74,7 @@ class Recordings:
         """Return the folder of a record, whether it exists or not."""
         return record_path(Path(self.folder), seed)
 
-    def load(self, seed: int, road: Mapping[str, Any]) -> Record:
+    def load(self, seed: int, road: Mapping[str, Any]) -> AnyRecord:
         """Open the record of a traffic seed.
 
         Args:
@@ -86,7 +94,7 @@ class Recordings:
                 f"corridor's: import the trajectories again for this corridor"
             )
         try:
-            record = Record.load(path, record_source(seed, road))
+            record = load_record(path, record_source(seed, road))
             found = json.loads((path / MANIFEST).read_text(encoding="utf-8"))["sha256"]
         except FileNotFoundError as problem:
             raise InvalidRecordError(f"{path}: the record is missing") from problem
@@ -106,7 +114,11 @@ def record_source(seed: int, road: Mapping[str, Any]) -> dict[str, object]:
 
 
 def write_manifest(
-    folder: Path, road: Mapping[str, Any], seeds: Iterable[int], sources: list[dict[str, Any]]
+    folder: Path,
+    road: Mapping[str, Any],
+    seeds: Iterable[int],
+    sources: list[dict[str, Any]],
+    kind: Kind = "vehicles",
 ) -> str:
     """Write the manifest of a folder whose records are complete; return its digest.
 
@@ -115,6 +127,7 @@ def write_manifest(
         road: `Corridor.record_layout` of the road that they are made for.
         seeds: Their traffic seeds.
         sources: JSON descriptions of the windows that they were cut from, for the reader.
+        kind: Whether the records have vehicles or are measured fields.
     """
     paths = {seed: record_path(folder, seed) / MANIFEST for seed in seeds}
     checksums = {
@@ -124,6 +137,7 @@ def write_manifest(
     manifest = {
         "format": RECORDINGS_FORMAT,
         "version": RECORDINGS_VERSION,
+        "kind": kind,
         "road": dict(road),
         "records": checksums,
         "sources": sources,
@@ -167,5 +181,5 @@ def _manifest(recordings: Recordings) -> dict[str, Any]:
 
 
 def _digest(manifest: Mapping[str, Any]) -> str:
-    content = {key: manifest[key] for key in ("format", "version", "road", "records")}
+    content = {key: manifest[key] for key in ("format", "version", "kind", "road", "records")}
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()

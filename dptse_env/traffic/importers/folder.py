@@ -106,7 +106,7 @@ def import_trajectories(
     require_name("source.format", source.format, FORMATS)
     require(len(files) > 0, "files", "one or more", len(files))
     require(not output.exists(), "output", "a folder that does not exist yet", str(output))
-    _check_splits(splits)
+    check_splits(splits)
     bare = dataclasses.replace(
         corridor, incident=None, recordings=None, demand=corridor.published_demand
     )
@@ -117,7 +117,7 @@ def import_trajectories(
     try:
         recordings = _read(files, source, bare, work, options)
         windows = [(each, window) for each in recordings for window in each.windows]
-        seeds = _assign([split.share for split in splits], splits, len(windows))
+        seeds = assign_seeds(splits, len(windows))
         flat = [seed for split in splits for seed in seeds[split.name]]
         sources = []
         for seed, (recording, window) in zip(flat, windows, strict=True):
@@ -185,16 +185,21 @@ def _read(
     return recordings
 
 
-def _check_splits(splits: Sequence[Split]) -> None:
+def check_splits(splits: Sequence[Split]) -> None:
+    """Raise ``ValueError`` unless the shares add up."""
     shares = [split.share for split in splits]
     fits = min(shares) >= 0.0 and shares[0] > 0.0 and abs(sum(shares) - 1.0) < 1e-9
     require(fits, "shares", "at least 0, the first above 0, with the sum 1", shares)
 
 
-def _assign(
-    shares: Sequence[float], splits: Sequence[Split], n_windows: int
-) -> dict[str, tuple[int, ...]]:
-    """Return the traffic seeds of each split: as many as its share says, at least one if it can."""
+def assign_seeds(splits: Sequence[Split], n_windows: int) -> dict[str, tuple[int, ...]]:
+    """Return the traffic seeds of each split: as many as its share says, at least one if it can.
+
+    Raises:
+        ValueError: The shares do not add up, or a split has fewer seeds than windows.
+    """
+    check_splits(splits)
+    shares = [split.share for split in splits]
     counts = [0] * len(shares)
     for _ in range(n_windows):
         # The split that is furthest behind its share, those without a window first.
