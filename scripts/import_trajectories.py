@@ -12,6 +12,7 @@ The folder has the road (road.toml, to be given as the corridor), its records, a
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -74,15 +75,21 @@ def main(args: Args) -> None:
         (TRAINING_SEEDS, VALIDATION_SEEDS, TEST_SEEDS),
         strict=True,
     )
-    imported = import_trajectories(
-        args.files,
-        source(args),
-        corridor,
-        args.output,
-        [Split(*part) for part in parts],
-        Options(args.longest_gap, args.skip_start, args.skip_end, args.pause),
-        {key: value for key, value in environment.items() if key != "traffic_seeds"},
-    )
+    try:
+        imported = import_trajectories(
+            args.files,
+            source(args),
+            corridor,
+            args.output,
+            [Split(*part) for part in parts],
+            Options(args.longest_gap, args.skip_start, args.skip_end, args.pause),
+            {key: value for key, value in environment.items() if key != "traffic_seeds"},
+        )
+    except ImportError as missing:
+        raise ValueError(str(missing)) from missing
+    except KeyboardInterrupt:
+        print("interrupted: nothing was written", file=sys.stderr)
+        raise SystemExit(130) from None
     for name, seeds in imported.seeds.items():
         print(f"{name}: {len(seeds)} window(s), traffic seeds {ranges(seeds)}")
     print(f"road: {args.output / ROAD}\nreport: {args.output / REPORT}")

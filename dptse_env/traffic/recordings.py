@@ -72,7 +72,7 @@ class Recordings:
 
     def record_path(self, seed: int) -> Path:
         """Return the folder of a record, whether it exists or not."""
-        return Path(self.folder) / RECORDS / f"{seed:08d}"
+        return record_path(Path(self.folder), seed)
 
     def load(self, seed: int, road: Mapping[str, Any]) -> AnyRecord:
         """Open the record of a traffic seed.
@@ -103,6 +103,11 @@ class Recordings:
         return record
 
 
+def record_path(folder: Path, seed: int) -> Path:
+    """Return the folder of a record in a folder of recordings, whether it exists or not."""
+    return folder / RECORDS / f"{seed:08d}"
+
+
 def record_source(seed: int, road: Mapping[str, Any]) -> dict[str, object]:
     """Return the description that is saved with an imported record; see `Record.save`."""
     return {"recorded": True, "seed": seed, "road": dict(road)}
@@ -124,7 +129,7 @@ def write_manifest(
         sources: JSON descriptions of the windows that they were cut from, for the reader.
         kind: Whether the records have vehicles or are measured fields.
     """
-    paths = {seed: Recordings(str(folder), "").record_path(seed) / MANIFEST for seed in seeds}
+    paths = {seed: record_path(folder, seed) / MANIFEST for seed in seeds}
     checksums = {
         str(seed): json.loads(path.read_text(encoding="utf-8"))["sha256"]
         for seed, path in paths.items()

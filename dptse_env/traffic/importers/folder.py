@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import shutil
 import uuid
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,7 +23,7 @@ from dptse_env.traffic.importers.recording import Options, Recording, Window
 from dptse_env.traffic.importers.report import write_report
 from dptse_env.traffic.importers.source import Source
 from dptse_env.traffic.record import Record, mean_dwell
-from dptse_env.traffic.recordings import Recordings, record_source, write_manifest
+from dptse_env.traffic.recordings import Recordings, record_path, record_source, write_manifest
 from dptse_env.traffic.road_files import write_corridor
 from dptse_env.utils.validation import require, require_name
 
@@ -107,7 +107,9 @@ def import_trajectories(
     require(len(files) > 0, "files", "one or more", len(files))
     require(not output.exists(), "output", "a folder that does not exist yet", str(output))
     check_splits(splits)
-    bare = dataclasses.replace(corridor, incident=None, recordings=None, demand=_fixed(corridor))
+    bare = dataclasses.replace(
+        corridor, incident=None, recordings=None, demand=corridor.published_demand
+    )
     output.parent.mkdir(parents=True, exist_ok=True)
     work = output.parent / f".{output.name}-{uuid.uuid4().hex}"
     folder = work / "result"
@@ -117,21 +119,22 @@ def import_trajectories(
         windows = [(each, window) for each in recordings for window in each.windows]
         seeds = assign_seeds(splits, len(windows))
         flat = [seed for split in splits for seed in seeds[split.name]]
-        first_name = splits[0].name
-        training, sources = [], []
+        sources = []
         for seed, (recording, window) in zip(flat, windows, strict=True):
             record = recording.record(window)
-            path = Recordings(str(folder), "").record_path(seed)
-            record.save(path, record_source(seed, bare.record_layout))
+            record.save(record_path(folder, seed), record_source(seed, bare.record_layout))
             sources.append(_describe(seed, recording, window, record))
-            if seed in seeds[first_name]:
-                training.append(Record.load(path, record_source(seed, bare.record_layout)))
-        measured = measure(bare, training)
+
+        def load(seed: int) -> Record:
+            return Record.load(record_path(folder, seed), record_source(seed, bare.record_layout))
+
+        # One at a time, since an open record holds four file descriptors.
+        measured = measure(bare, lambda: map(load, seeds[splits[0].name]))
         digest = write_manifest(folder, bare.record_layout, flat, sources)
         written = dataclasses.replace(measured, recordings=Recordings(str(folder), digest))
         comment = "Recorded traffic. Demand, exit shares and average dwell are measured."
         write_corridor(folder / ROAD, written, environment, comment)
-        report = write_report(folder, written, recordings, seeds, sources, training[0])
+        report = write_report(folder, written, recordings, seeds, sources, load(flat[0]))
         folder.rename(output)
     finally:
         shutil.rmtree(work, ignore_errors=True)
@@ -139,37 +142,33 @@ def import_trajectories(
     return Imported(final, seeds, report)
 
 
-def measure(corridor: Corridor, records: Sequence[Record]) -> Corridor:
+def measure(corridor: Corridor, records: Callable[[], Iterable[Record]]) -> Corridor:
     """Return a corridor with the demand, exit shares and average dwell of records.
 
+    The records are read twice, one after another.
+
     Flows are Edie's: the mean over time of the sum of speeds over the length of a segment. That of
-    the mainline is taken in its first segment.
+    the mainline is taken in its first segment, those of ramps in the segment at their face.
 
     Raises:
         ValueError: No vehicle is on the mainline.
     """
-    sums = np.mean([record.speed_sums.mean(axis=0) for record in records], axis=0)
-    lengths = np.array(corridor.record_layout["segment_lengths"])
-    flow = sums[: corridor.n_segments] / lengths
-    n = corridor.n_mainline
-    passing = [flow[face - 1] for face in corridor.off_ramps]
+    sums = np.mean([record.speed_sums.mean(axis=0) for record in records()], axis=0)
+    flow = sums[: corridor.n_segments] / np.array(corridor.segment_lengths)
     shares = [
-        leaving / max(before, 1e-9)
-        for leaving, before in zip(
-            (flow[segments[0]] for segments in corridor.off_ramp_segments), passing, strict=True
-        )
+        flow[segments[0]] / max(flow[face - 1], 1e-9)
+        for face, segments in zip(corridor.off_ramps, corridor.off_ramp_segments, strict=True)
     ]
+    entering = [flow[segments[-1]] for segments in corridor.on_ramp_segments]
     held = np.clip(shares, SMALLEST_SHARE, 1.0 - SMALLEST_SHARE)
     return dataclasses.replace(
         corridor,
         demand=Demand(
             mainline=((0.0, round(float(flow[0]), 1)),),
-            on_ramps=tuple(
-                round(float(flow[segments[-1]]), 1) for segments in corridor.on_ramp_segments
-            ),
+            on_ramps=tuple(round(float(each), 1) for each in entering),
         ),
         exit_shares=tuple(round(float(each), 4) for each in held),
-        average_dwell=round(mean_dwell(records, n), 3),
+        average_dwell=round(mean_dwell(records(), corridor.n_mainline), 3),
     )
 
 
@@ -215,11 +214,6 @@ def assign_seeds(splits: Sequence[Split], n_windows: int) -> dict[str, tuple[int
     return {
         split.name: tuple(split.seeds[:count]) for split, count in zip(splits, counts, strict=True)
     }
-
-
-def _fixed(corridor: Corridor) -> Demand:
-    demand = corridor.demand
-    return demand if isinstance(demand, Demand) else demand.base
 
 
 def _describe(seed: int, recording: Recording, window: Window, record: Record) -> dict[str, Any]:

@@ -40,34 +40,32 @@ class Placed(NamedTuple):
 
 
 class Road:
-    """The record columns of a corridor by branch and position.
-
-    The boundary segments are as long as the segments that they adjoin.
-    """
+    """The record columns of a corridor by branch and position."""
 
     def __init__(self, corridor: Corridor) -> None:
         """Lay the columns along the road."""
         self.corridor = corridor
-        n, n_on, n_off = corridor.n_mainline, corridor.n_on_ramps, corridor.n_off_ramps
-        lengths = np.array(corridor.record_layout["segment_lengths"])
+        n, first = corridor.n_mainline, corridor.n_segments
+        lengths = np.array(corridor.with_boundaries(corridor.segment_lengths))
         self.faces = np.concatenate([[0.0], np.cumsum(lengths[:n])])
-        first = corridor.n_segments
+        start, end = -lengths[first], self.faces[-1] + lengths[first + 1]
         self.starts: list[FloatArray] = []
         """Start of each column of a branch, ascending, and the end of the last."""
         self.columns: list[IntArray] = []
         """Columns of each branch."""
-        ends = self.faces[-1] + lengths[n - 1]
-        self._add([-lengths[0], *self.faces, ends], [first, *range(n), first + 1])
-        for i, face in enumerate(corridor.on_ramps):
-            length, joined = lengths[n + i], self.faces[face]
-            before = [joined - 2.0 * length, joined - length, *self.faces[face:], ends]
-            self._add(before, [first + 2 + i, n + i, *range(face, n), first + 1])
-        for i, face in enumerate(corridor.off_ramps):
-            ramp = n + n_on + i
-            length, left = lengths[ramp], self.faces[face]
-            after = [-lengths[0], *self.faces[: face + 1], left + length, left + 2.0 * length]
-            self._add(after, [first, *range(face), ramp, first + 2 + n_on + i])
-        self.n_branches = 1 + n_on + n_off
+        self._add([start, *self.faces, end], [first, *range(n), first + 1])
+        boundary = itertools.count(first + 2)
+        for face, segments in zip(corridor.on_ramps, corridor.on_ramp_segments, strict=True):
+            ramp = [next(boundary), *segments]
+            before = self.faces[face] - np.cumsum(lengths[ramp][::-1])[::-1]
+            starts = [*before, *self.faces[face:], end]
+            self._add(starts, [*ramp, *range(face, n), first + 1])
+        for face, segments in zip(corridor.off_ramps, corridor.off_ramp_segments, strict=True):
+            ramp = [*segments, next(boundary)]
+            after = self.faces[face] + np.cumsum(lengths[ramp])
+            starts = [start, *self.faces[: face + 1], *after]
+            self._add(starts, [first, *range(face), *ramp])
+        self.n_branches = 1 + corridor.n_ramps
 
     def _add(self, starts: list[float], columns: list[int]) -> None:
         self.starts.append(np.array(starts))

@@ -92,6 +92,7 @@ class Recording:
     _vehicles: dict[tuple[int, str], int] = field(default_factory=dict)
     _coverage: list[list[float]] = field(default_factory=list)
     _off_names: set[str] = field(default_factory=set)
+    _stride: int = 1
 
     def read(self, folder: Path) -> None:
         """Read the file and keep its windows in `folder`.
@@ -113,7 +114,6 @@ class Recording:
         last = np.floor(coverage[:, 1] - self.options.skip_end)
         self._cut(first, last)
         self._seconds = Spill(folder / "seconds", SECOND)
-        kept: list[Rows] = []
         for bucket in range(n_buckets):
             found, rows = resample(
                 spill.take(bucket), self.placer.road, self.options.longest_gap, coverage,
@@ -122,8 +122,7 @@ class Recording:
             number = self._window_of(found, first)
             inside = number >= 0
             self._seconds.append(number[inside], found[inside])
-            kept.append(self._of_first_window(rows, first))
-        self.points = np.concatenate(kept)
+            self._keep_for_picture(rows, first)
         self._ids = np.array([_whole(name) for _, name in self._vehicles], dtype=np.int64)
         self.checks.require_forward(self.path)
         self.speed_ratio = self.checks.speed_ratio(self.path, self._unit)
@@ -241,7 +240,7 @@ class Recording:
         self._numbered: dict[tuple[int, int], int] = {}
         for number, (start, code, name) in enumerate(sorted(found)):
             self._numbered[code, int((start - first[code]) // stride)] = number
-            self.windows.append(Window(number, name, start + (self.base or 0.0)))
+            self.windows.append(Window(number, name, float(start) + (self.base or 0.0)))
         if not found:
             raise TrajectoryError(
                 f"{self.path}: it must last {self.corridor.duration + 1} s or more, the corridor's "
@@ -260,12 +259,15 @@ class Recording:
         number: IntArray = table[found["group"], place.astype(np.int64)]
         return np.where(step <= self.corridor.duration, number, -1)
 
-    def _of_first_window(self, rows: Rows, first: FloatArray) -> Rows:
+    def _keep_for_picture(self, rows: Rows, first: FloatArray) -> None:
         code = self.groups[self.windows[0].group]
         start = self.windows[0].start - (self.base or 0.0)
         here = (rows["group"] == code) & (rows["branch"] == 0) & (rows["time"] >= start)
-        rows = rows[here & (rows["time"] <= start + self.corridor.duration)]
-        return rows[:: 1 + len(rows) // PICTURE_POINTS]
+        here &= (rows["time"] <= start + self.corridor.duration) & (rows["row"] % self._stride == 0)
+        self.points = np.concatenate([self.points, rows[here]])
+        while len(self.points) > PICTURE_POINTS:  # fewer, and evenly so
+            self._stride *= 2
+            self.points = self.points[self.points["row"] % self._stride == 0]
 
     def _unit(self, quantity: str) -> str:
         return str(self.source.units.get(quantity, self.reader.units[quantity]))

@@ -143,7 +143,7 @@ def _draw(path: Path, corridor: Corridor, recording: Recording, record: Record) 
     from matplotlib.figure import Figure  # noqa: PLC0415  (slow to import)
 
     n = corridor.n_mainline
-    lengths = np.array(corridor.record_layout["segment_lengths"])[:n]
+    lengths = np.array(corridor.segment_lengths[:n])
     faces = np.concatenate([[0.0], np.cumsum(lengths)])
     times = np.arange(record.n_steps + 1) - 0.5
     counts = record.counts[:, :n]
@@ -153,7 +153,7 @@ def _draw(path: Path, corridor: Corridor, recording: Recording, record: Record) 
     axes = figure.subplots(3, 1, sharex=True, sharey=True)
     start = recording.windows[0].start - (recording.base or 0.0)
     points = recording.points
-    colours: dict[str, Any] = {"cmap": "RdYlGn", "vmin": 0.0, "vmax": corridor.speed_limit}
+    colours: dict[str, Any] = {"cmap": "RdYlGn", "vmin": 0.0, "vmax": corridor.largest_speed_limit}
     if np.isnan(points["speed"]).any():
         axes[0].plot(points["time"] - start, points["position"], ".", markersize=0.5, color="0.3")
     else:

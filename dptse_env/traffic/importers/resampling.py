@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -191,7 +192,8 @@ def _count_ends(
     corridor = road.corridor
     n, first = corridor.n_mainline, corridor.n_segments
     n_on, n_off = corridor.n_on_ramps, corridor.n_off_ramps
-    on, off = range(n, n + n_on), range(n + n_on, first)
+    on = itertools.chain(*corridor.on_ramp_segments)
+    off = itertools.chain(*corridor.off_ramp_segments)
     before, after = (
         range(first + 2, first + 2 + n_on),
         range(first + 2 + n_on, first + 2 + n_on + n_off),

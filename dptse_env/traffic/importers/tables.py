@@ -116,8 +116,7 @@ def read_table(
         place = re.search(r"Row #(\d+)", message)
         where = f", row {place[1]}" if place else f", after row {first - 1}"
         column = re.search(r"column #(\d+)", message)
-        fields = list(dict.fromkeys([*numbers.values(), *labels.values()]))
-        field = f": {fields[int(column[1])]}" if column else ""
+        field = f": {column_names(path, text_columns)[int(column[1])]}" if column else ""
         raise TrajectoryError(f"{path}{where}{field}: {message}") from problem
 
 

@@ -1,5 +1,6 @@
 """SUMO's floating-car data of a shipped corridor give the very records of the recorder."""
 
+import dataclasses
 import gzip
 import re
 
@@ -17,6 +18,7 @@ from dptse_env.traffic.importers import (
     import_trajectories,
 )
 from dptse_env.traffic.record import COLUMNS
+from dptse_env.traffic.sumo_network import edge_ids
 
 TRAINING = [Split("training", 1.0, range(1000))]
 
@@ -137,3 +139,28 @@ def test_edges_that_the_road_does_not_have_are_named(folder, recorded, tmp_path)
         run(folder, "fcd.csv", tmp_path, source)
     with pytest.raises(ValueError, match=r"layout\.edges\.A0 must be one of main_0"):
         run(folder, "fcd.csv", tmp_path, Source("fcd", layout=Layout(edges={"A0": "main_9"})))
+
+
+def test_an_uneven_road_with_long_ramps_is_imported_number_for_number(tmp_path, monkeypatch):
+    lengths = (0.1, 0.15, 0.08, 0.1, 0.12, 0.1)
+    road = dataclasses.replace(
+        SHORT_HIGHWAY, segment_length=lengths, ramp_segments=(2, 3), duration=90
+    )
+    output = "--fcd-output", str(tmp_path / "fcd.csv"), "--precision", "17"
+    monkeypatch.setattr(sumo, "OPTIONS", (*sumo.OPTIONS, *output))
+    recorded = simulate(road, 0)
+    imported = import_trajectories(
+        [tmp_path / "fcd.csv"], Source("fcd"), road, tmp_path / "new", TRAINING
+    )
+    record = RecordLibrary(tmp_path).get(imported.corridor, 0)
+    for name in COLUMNS:
+        np.testing.assert_array_equal(getattr(record, name), getattr(recorded, name))
+    # By position: edges of the mainline start at kilometres.
+    edges = {name: name for name in edge_ids(road)}
+    edges |= {f"main_{i}": float(sum(lengths[:i])) for i in range(6)}
+    source = Source("fcd", layout=Layout(edges=edges))
+    imported = import_trajectories(
+        [tmp_path / "fcd.csv"], source, road, tmp_path / "other", TRAINING
+    )
+    record = RecordLibrary(tmp_path).get(imported.corridor, 0)
+    assert (record.counts != recorded.counts).mean() < 0.005

@@ -60,6 +60,17 @@ def test_points_become_vehicles_at_whole_seconds(tmp_path):
     assert (np.diff(record.step[first]) == 1).all()
 
 
+def test_positions_and_speeds_are_interpolated_in_time(tmp_path):
+    time = 0.3 + 0.7 * np.arange(40)
+    x, speed = 5.0 * time + 0.25 * time**2, 5.0 + 0.5 * time
+    points = np.column_stack([np.zeros(40), time, x, speed])
+    record = record_of(run(plain(tmp_path / "a.csv", points)))
+    second = record.step + 1  # the first whole second is 1
+    np.testing.assert_allclose(record.speed, 3.6 * (5.0 + 0.5 * second), rtol=1e-5)
+    place = 5.0 * second + 0.25 * second**2 + 0.03  # a chord is 0.03 m at most above the arc
+    np.testing.assert_array_equal(record.segment, place // 100.0)
+
+
 def test_speeds_are_derived_where_none_are_given(tmp_path):
     source = dataclasses.replace(PLAIN, columns={"time": "t", "vehicle": "id", "x": "s"})
     noisy = stream()
