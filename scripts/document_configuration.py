@@ -38,6 +38,7 @@ from dptse_env.traffic import (
     Drivers,
     Incident,
     IncidentDistribution,
+    SumoScenario,
 )
 from dptse_env.utils.fields import Interval, allowed_numbers, field_hints
 from dptse_env.vector_env import SensorQueryVectorEnv
@@ -51,6 +52,7 @@ SECTIONS: Mapping[type, str] = {
     Demand: "`demand`, fixed",
     DemandDistribution: "`demand`, drawn for each traffic seed",
     Drivers: "`corridor.drivers`",
+    SumoScenario: "`corridor.network`",
     Incident: "`incident`, fixed",
     IncidentDistribution: "`incident`, drawn for each traffic seed",
     ARZParameters: "`parameters`",

@@ -26,6 +26,7 @@ from dptse_env.traffic.road_files import (
 from dptse_env.traffic.scenario import MAINLINE, Scenario, draw_scenario
 from dptse_env.traffic.sumo import RecordingError, SumoVersionError, simulate
 from dptse_env.traffic.sumo_network import NetworkError
+from dptse_env.traffic.sumo_scenario import SumoScenario
 from dptse_env.traffic.worker import simulate_in_child
 
 __all__ = [
@@ -46,6 +47,7 @@ __all__ = [
     "RecordingError",
     "RoadFile",
     "Scenario",
+    "SumoScenario",
     "SumoVersionError",
     "draw_scenario",
     "find_corridor",

@@ -17,6 +17,7 @@ from typing import Annotated
 from dptse_env.traffic.demand import Demand, DemandDistribution
 from dptse_env.traffic.drivers import Drivers
 from dptse_env.traffic.incident import Incident, IncidentDistribution
+from dptse_env.traffic.sumo_scenario import SumoScenario
 from dptse_env.utils.fields import Interval, checked_fields
 from dptse_env.utils.validation import integer, require
 
@@ -54,6 +55,11 @@ class Corridor:
         average_dwell: T_avg of the paper's eq. (6): average time of a vehicle on a mainline
             segment [s], measured from records (`dptse_env.traffic.record.mean_dwell`).
         drivers: the car-following model of all vehicles.
+        network: SUMO files of one's own, from which the road is recorded; None for a network made
+            of the fields above. With files, the vehicles are those of the files: the rates of
+            `demand` are what is published of them, the range of a `DemandDistribution` scales them
+            (SUMO's ``--scale``), `exit_shares` are published too, an incident limits the vehicles
+            on its segment, and `drivers` must be left at its default.
 
     Raises:
         ValueError: The geometry is impossible, or demand, incident or sensors do not fit it.
@@ -77,6 +83,7 @@ class Corridor:
     speed_scale: Annotated[float, Interval(1, 1000)] = 102.0
     average_dwell: Annotated[float, Interval(0.01, 1e6)] = 8.0
     drivers: Drivers = field(default_factory=Drivers)
+    network: SumoScenario | None = None
 
     def __post_init__(self) -> None:
         """Check the fields and bring them to their declared types."""
@@ -96,6 +103,7 @@ class Corridor:
         fits = len(demand.on_ramps) == self.n_on_ramps
         require(fits, "corridor.demand.on_ramps", allowed, demand.on_ramps)
         self._check_incident()
+        self._check_network()
 
     def _check_ramps(self) -> None:
         for name in ("on_ramps", "off_ramps"):
@@ -122,6 +130,16 @@ class Corridor:
         for segment in segments:
             integer("corridor.incident.segment", segment, 0, self.n_mainline - 1)
         require(start < self.duration, "corridor.incident.start", f"< {self.duration} s", start)
+
+    def _check_network(self) -> None:
+        if self.network is None:
+            return
+        n_columns = self.n_segments + self.n_boundaries
+        allowed = f"one for each of the {n_columns} record columns of this geometry"
+        fits = len(self.network.columns) == n_columns
+        require(fits, "corridor.network.columns", allowed, len(self.network.columns))
+        allowed = "left out on a road with a network of its own"
+        require(self.drivers == Drivers(), "corridor.drivers", allowed, self.drivers)
 
     @property
     def n_on_ramps(self) -> int:
@@ -163,13 +181,23 @@ class Corridor:
         """SHA-256 (hex) of the fields that determine the traffic, stable across processes.
 
         The fields of `NOT_TRAFFIC` are left out: corridors that differ in these alone share their
-        records.
+        records. With a `network`, its files, the demand's scale, the incident and the duration
+        determine the traffic.
         """
         content = dataclasses.asdict(self)
         for name in NOT_TRAFFIC:
             del content[name]
         if self.drivers == Drivers():
             del content["drivers"]  # as in digests from before drivers could be chosen
+        del content["network"]  # as in digests from before there were any
+        if self.network is not None:
+            scale = self.demand.scale if isinstance(self.demand, DemandDistribution) else None
+            content = {
+                "network": self.network.traffic,
+                "scale": scale,
+                "incident": content["incident"],
+                "duration": self.duration,
+            }
         content["kinds"] = [type(self.demand).__name__, type(self.incident).__name__]
         text = json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)
         return hashlib.sha256(text.encode()).hexdigest()

@@ -112,6 +112,9 @@ def write_corridor(
         comment: Text for the head of the file.
     """
     content = _plain(dataclasses.asdict(corridor))
+    if corridor.network is not None:
+        folder = Path(corridor.network.folder).absolute()
+        content["network"]["folder"] = os.path.relpath(folder, Path(path).absolute().parent)
     if environment:
         content[_ENVIRONMENT] = _plain(dict(environment))
     head = "".join(f"# {line}\n" for line in comment.splitlines())
@@ -134,6 +137,10 @@ def _corridor(content: Mapping[str, Any], path: Path) -> tuple[Corridor, tuple[s
     fields = {**_OPTIONAL, **content}
     if "name" not in fields:
         fields["name"] = re.sub(r"[^a-z0-9]+", "-", path.stem.lower()).strip("-")
+    network = fields.get("network")
+    if isinstance(network, Mapping) and isinstance(network.get("folder", "."), str):
+        folder = path.absolute().parent / network.get("folder", ".")
+        fields["network"] = {**network, "folder": os.path.normpath(folder)}
     corridor = from_mapping(Corridor, fields, "corridor")
     crossing = 3600.0 * corridor.segment_length / corridor.speed_limit
     derived = {

@@ -14,6 +14,7 @@ from dptse_env.traffic import (
     Drivers,
     Incident,
     IncidentDistribution,
+    SumoScenario,
 )
 
 
@@ -102,6 +103,12 @@ def test_the_digest_covers_what_shapes_the_traffic_and_nothing_else():
         "segment_length": 0.2,
         "speed_limit": 100.0,
         "drivers": Drivers("IDM"),
+        "network": SumoScenario(
+            net="a.net.xml",
+            routes=("a.rou.xml",),
+            sha256=("0", "1"),
+            columns=tuple(((f"edge {i}", 0.0, 100.0),) for i in range(25)),
+        ),
     }
     observed = {
         "name": "other",
