@@ -43,6 +43,10 @@ class Args:
     """First edge, instead of a path."""
     last: str | None = None
     """Last edge: the road is the shortest path between the two."""
+    first_position: float = 0.0
+    """Position on the first edge at which the road begins [m]."""
+    last_position: float | None = None
+    """Position on the last edge at which the road ends [m]; its end if not given."""
     leave_out: tuple[str, ...] = ()
     """Edges that join or leave the path and are to be no ramps."""
     segment_length: float = 100.0
@@ -70,7 +74,8 @@ def main(args: Args) -> None:
         raise ValueError(f"output must be a .toml file, got {args.output}")
     files = _files(args)
     path, between = _path(args)
-    layout = find_layout(files, path, args.segment_length, between, args.leave_out)
+    ends = (args.first_position, args.last_position)
+    layout = find_layout(files, path, args.segment_length, between, args.leave_out, ends)
     road = import_road(
         files,
         layout,

@@ -13,6 +13,7 @@ from dptse_env.traffic.sumo_import.chain import Chain
 from dptse_env.traffic.sumo_import.net import Net
 from dptse_env.traffic.sumo_import.ramps import Ramp, find_ramps, left_out_of
 from dptse_env.traffic.sumo_scenario import Stretch
+from dptse_env.utils.validation import require
 
 SHORTEST = 40.0
 """Shortest segment [m]."""
@@ -51,7 +52,11 @@ class Layout:
 
 
 def lay_out(
-    net: Net, path: list[Any], segment_length: float, left_out: Collection[str] = ()
+    net: Net,
+    path: list[Any],
+    segment_length: float,
+    left_out: Collection[str] = (),
+    ends: tuple[float, float | None] = (0.0, None),
 ) -> Layout:
     """Cut a path into segments, and find its ramps.
 
@@ -67,22 +72,26 @@ def lay_out(
         path: connected edges.
         segment_length: wanted length of a segment [m].
         left_out: edges at the path that are no ramps; their vehicles appear and vanish.
+        ends: positions [m] on the first edge, where the road begins, and on the last edge, where it
+            ends; None for the end of that edge.
 
     Raises:
-        ValueError: The path is too short, or ramps are too near to one another or to its ends.
+        ValueError: A position is not on its edge, the path is too short, or ramps are too near to
+            one another or to its ends.
     """
     chain = Chain(net, path)
+    limits = _limits(chain, ends)
     ramps = find_ramps(net, path, left_out, 2.0 * segment_length)
     ramps, merged = _merged(ramps, chain)
-    cuts = _cuts(chain, ramps, segment_length)
+    cuts = _cuts(chain, limits, ramps, segment_length)
     faces = {ramp.junction: _face(cuts, chain.ends[ramp.junction]) for ramp in ramps}
     ordered = [ramp for joins in (True, False) for ramp in ramps if ramp.joins is joins]
     lengths = [_ramp_length(ramp, segment_length) for ramp in ordered]
-    ends = list(pairwise(cuts[1:-1]))
+    parts = list(pairwise(cuts[1:-1]))
     return Layout(
-        lengths=tuple(end - start for start, end in ends),
-        lanes=tuple(chain.lanes(start, end) for start, end in ends),
-        limits=tuple(chain.limit(start, end) for start, end in ends),
+        lengths=tuple(end - start for start, end in parts),
+        lanes=tuple(chain.lanes(start, end) for start, end in parts),
+        limits=tuple(chain.limit(start, end) for start, end in parts),
         on_ramps=tuple(faces[ramp.junction] for ramp in ordered if ramp.joins),
         off_ramps=tuple(faces[ramp.junction] for ramp in ordered if not ramp.joins),
         ramp_lengths=tuple(lengths),
@@ -132,11 +141,29 @@ def _shortest(chain: Chain, index: int) -> float:
     return max(SHORTEST, SECONDS_ON_SEGMENT * limit / 3.6)
 
 
-def _cuts(chain: Chain, ramps: list[Ramp], wanted: float) -> list[float]:
-    """Return the distances of all faces along a path, its ends included [m]."""
+def _limits(chain: Chain, ends: tuple[float, float | None]) -> tuple[float, float]:
+    """Return the distances at which a road begins and ends along a path [m]."""
+    first, last = chain.edges[0], chain.edges[-1]
+    start, end = _on_edge("first_position", ends[0], first), last.getLength()
+    if ends[1] is not None:
+        end = _on_edge("last_position", ends[1], last)
+    return start, chain.length - last.getLength() + end
+
+
+def _on_edge(where: str, position: float, edge: Any) -> float:
+    """Return a position on an edge [m], or raise ``ValueError``."""
+    allowed = f"in [0, {edge.getLength():.1f}] m, the length of {edge.getID()!r}"
+    require(0.0 <= position <= edge.getLength(), where, allowed, position)
+    return float(position)
+
+
+def _cuts(
+    chain: Chain, limits: tuple[float, float], ramps: list[Ramp], wanted: float
+) -> list[float]:
+    """Return the distances of all faces along a path, the road's ends included [m]."""
     junctions = sorted({ramp.junction for ramp in ramps})
-    places = [0.0, *(chain.ends[junction] for junction in junctions), chain.length]
-    cuts = [0.0]
+    places = [limits[0], *(chain.ends[junction] for junction in junctions), limits[1]]
+    cuts = [limits[0]]
     for i, (start, end) in enumerate(pairwise(places)):
         # The first and the last stretch also have a boundary segment; a road has two segments.
         least = 1 + (i == 0) + (i == len(places) - 2) + (len(places) == 2)
@@ -148,7 +175,7 @@ def _cuts(chain: Chain, ramps: list[Ramp], wanted: float) -> list[float]:
             if most < least:
                 raise ValueError(_too_short(chain, ramps, start, end, least * shortest))
             n_parts = most
-        cuts += list(np.linspace(start, end, n_parts + 1)[1:])
+        cuts += np.linspace(start, end, n_parts + 1)[1:].tolist()
     return cuts
 
 
@@ -156,7 +183,7 @@ def _too_short(chain: Chain, ramps: list[Ramp], start: float, end: float, least:
     def place(distance: float) -> str:
         here = [ramp for ramp in ramps if chain.ends[ramp.junction] == distance]
         names = " and ".join(f"{ramp.kind} {'+'.join(ramp.names)}" for ramp in here)
-        return names or ("its start" if distance == 0.0 else "its end")
+        return names or ("its start" if distance == start else "its end")
 
     return (
         f"path: must have {least:.0f} m from {place(start)} to {place(end)} for its segments at "

@@ -48,6 +48,7 @@ def find_layout(
     segment_length: float,
     between: bool = False,
     left_out: Collection[str] = (),
+    ends: tuple[float, float | None] = (0.0, None),
 ) -> Layout:
     """Return the segments of a path in a network.
 
@@ -57,6 +58,8 @@ def find_layout(
         segment_length: wanted length of a segment [m].
         between: take the shortest path between the two edges of `path`.
         left_out: edges at the path that are no ramps.
+        ends: positions [m] on the first and the last edge at which the road begins and ends; None
+            for the end of the last.
 
     Raises:
         ValueError: The network or the path is of no use; the message names the file or the field.
@@ -66,7 +69,7 @@ def find_layout(
     require(len(path) >= 1, "path", "at least one edge", list(path))
     net = Net(files.net, files.internal_links)
     edges = net.path_between(path[0], path[-1]) if between else net.path_along(path)
-    return lay_out(net, edges, segment_length, left_out)
+    return lay_out(net, edges, segment_length, left_out, ends)
 
 
 def import_road(
