@@ -31,6 +31,11 @@ FORCED = frozenset([
 ])  # fmt: skip
 """Options of SUMO that a recording sets itself."""
 
+WRITES = re.compile(
+    r"output|statistic|(^|[.-])log([.-]|$)|^save-state|^(summary|tripinfo|vehroutes?|netstate|ndump)$"
+)
+"""Options of SUMO that write files, which a recording does not."""
+
 TOLERANCE = 0.01
 """Precision of lengths in network files [m]."""
 
@@ -90,8 +95,7 @@ class SumoScenario:
             match = re.fullmatch(r"--([a-z][\w.-]*)(=.*)?", option)
             require(match is not None, "network.options", "--name=value each", option)
             assert match is not None
-            name = match[1]
-            free = name not in FORCED and not re.search(r"output|(^|[.-])log$|error-log", name)
+            free = match[1] not in FORCED and not WRITES.search(match[1])
             require(free, "network.options", "free of outputs and of what a recording sets", option)
 
     def _check_columns(self) -> None:

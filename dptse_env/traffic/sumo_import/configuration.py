@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 
 from dptse_env.traffic.sumo_files import READ_BY
 from dptse_env.traffic.sumo_import.net import open_xml, root_of
-from dptse_env.traffic.sumo_scenario import FORCED
+from dptse_env.traffic.sumo_scenario import FORCED, WRITES
 
 SHORT = {
     "n": "net-file", "net": "net-file",
@@ -27,11 +27,12 @@ REFUSED = {
 }
 """Options that cannot be kept, and what they stand for."""
 
-DROPPED = re.compile(
-    r"output|log|verbose|gui|report|print-options|statistic|summary|tripinfo|xml-validation|seed"
-    r"|random$|remote-port|num-clients|threads|start$|quit-on-end|delay|window|breakpoints|registry"
+SHOWN = re.compile(
+    r"^(verbose|v|p|help|version|print-options|aggregate-warnings|step-log\..*|xml-validation.*"
+    r"|gui.*|window.*|delay|start|quit-on-end|breakpoints|game.*|registry.*"
+    r"|remote-port|num-clients|threads)$"
 )
-"""Options that are left out: what would be written or shown, and what a recording sets itself."""
+"""Options about what is shown, which are left out."""
 
 
 @dataclass(frozen=True)
@@ -150,7 +151,9 @@ def _options(values: dict[str, str]) -> tuple[str, ...]:
     kept = {
         name: value
         for name, value in values.items()
-        if name not in FORCED | REFUSED.keys() and not DROPPED.search(name)
+        if name not in FORCED | REFUSED.keys()
+        and not WRITES.search(name)
+        and not SHOWN.search(name)
     }
     return tuple(f"--{name}={value}" for name, value in kept.items())
 

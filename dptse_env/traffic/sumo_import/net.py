@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import gzip
 import xml.sax
+import zlib
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -27,7 +28,15 @@ class SumolibMissingError(NetworkError, ImportError):
     """sumolib, which reads networks, is not installed."""
 
 
-_UNREADABLE = (SyntaxError, xml.sax.SAXException, LookupError, ValueError, EOFError, OSError)
+_UNREADABLE = (
+    SyntaxError,
+    xml.sax.SAXException,
+    LookupError,
+    ValueError,
+    EOFError,
+    OSError,
+    zlib.error,
+)
 
 
 class Net:
@@ -187,14 +196,13 @@ def root_of(path: Path, where: str) -> ElementTree.Element:
         with open_xml(path) as file:
             root: ElementTree.Element = next(ElementTree.iterparse(file, events=("start",)))[1]
             return root
-    except OSError as error:
-        reason = error.strerror or error
-        raise ValueError(f"{where}: {path} cannot be read: {reason}") from error
-    except (ElementTree.ParseError, EOFError, UnicodeDecodeError) as error:
+    except (ElementTree.ParseError, gzip.BadGzipFile, zlib.error, EOFError) as error:
         raise ValueError(
             f"{where}: {path} must be XML, got something else (binary, encrypted or damaged): "
             f"{error}"
         ) from error
+    except OSError as error:
+        raise ValueError(f"{where}: {path} cannot be read: {error.strerror}") from error
 
 
 def _check_head(path: Path) -> None:

@@ -14,6 +14,7 @@ from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.demand import Demand
 from dptse_env.traffic.record import Record, mean_dwell
 from dptse_env.traffic.road_files import DENSITY_SCALE
+from dptse_env.traffic.sumo import RecordingError
 from dptse_env.traffic.sumo_import.configuration import Files
 from dptse_env.traffic.sumo_import.counts import counted_demand, counted_shares
 from dptse_env.traffic.sumo_import.layout import Layout, lay_out
@@ -96,13 +97,18 @@ def import_road(
         seed: traffic seed of the run that is counted.
 
     Raises:
-        ValueError: Files or fields are of no use, or no vehicle uses the path.
-        RecordingError: SUMO fails.
+        ValueError: Files or fields are of no use, SUMO refuses the files, or no vehicle uses the
+            path.
     """
     files.check()
+    allowed = "whole seconds"
+    require(begin is not None or files.begin.is_integer(), "begin", allowed, files.begin)
     start = int(files.begin) + warm_up if begin is None else begin
     draft = _draft(files, layout, name, duration, start, warm_up, speed_limit)
-    record = simulate_in_child(draft, seed)
+    try:
+        record = simulate_in_child(draft, seed)
+    except RecordingError as error:
+        raise ValueError(f"SUMO refuses these files: {' '.join(str(error).split())}") from error
     in_road = record.segment < draft.n_mainline
     if not in_road.any():
         seen = f"{record.n_vehicles} on its ramps or ends" if record.n_rows else "none"
