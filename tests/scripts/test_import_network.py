@@ -46,16 +46,11 @@ def test_an_imported_road_is_a_corridor_of_any_environment(folder):
 
 def test_path_and_files_may_be_given_one_by_one(folder, monkeypatch):
     output = folder / "given.toml"
-    main(
-        Args(
-            output=output,
-            net=folder / "road.net.xml",
-            routes=(folder / "road.rou.xml",),
-            path=PATH,
-            step_length=0.5,
-            duration=120,
-        )  # fmt: skip
-    )
+    args = Args(
+        output=output, net=folder / "road.net.xml", routes=(folder / "road.rou.xml",),
+        path=PATH, step_length=0.5, duration=120,
+    )  # fmt: skip
+    main(args)
     given, named = read_corridor(output), read_corridor(folder / "My own.toml")
     assert given.digest == named.digest
     assert (given.name, named.name) == ("given", "my-own")

@@ -33,7 +33,9 @@ class Layout:
         on_ramps: face of each on-ramp.
         off_ramps: face of each off-ramp.
         ramp_lengths: length of each ramp [m], on-ramps first; its boundary segment is as long.
-        ramp_lanes: lanes of each ramp, on-ramps first.
+        ramp_lanes: lanes of each ramp, on-ramps first, at most those of the segment that it joins
+            or leaves.
+        ramp_limits: speed limit of each ramp [km/h], on-ramps first.
         columns: stretches of each record column.
         names: what each ramp is in the network, on-ramps first.
         remarks: what was unusual, for people.
@@ -46,6 +48,7 @@ class Layout:
     off_ramps: tuple[int, ...]
     ramp_lengths: tuple[float, ...]
     ramp_lanes: tuple[int, ...]
+    ramp_limits: tuple[float, ...]
     columns: tuple[tuple[Stretch, ...], ...]
     names: tuple[str, ...]
     remarks: tuple[str, ...]
@@ -88,16 +91,21 @@ def lay_out(
     ordered = [ramp for joins in (True, False) for ramp in ramps if ramp.joins is joins]
     lengths = [_ramp_length(ramp, segment_length) for ramp in ordered]
     parts = list(pairwise(cuts[1:-1]))
+    lanes = tuple(chain.lanes(start, end) for start, end in parts)
+    beside = [lanes[faces[ramp.junction] - (not ramp.joins)] for ramp in ordered]
     return Layout(
         lengths=tuple(end - start for start, end in parts),
-        lanes=tuple(chain.lanes(start, end) for start, end in parts),
+        lanes=lanes,
         limits=tuple(chain.limit(start, end) for start, end in parts),
         on_ramps=tuple(faces[ramp.junction] for ramp in ordered if ramp.joins),
         off_ramps=tuple(faces[ramp.junction] for ramp in ordered if not ramp.joins),
         ramp_lengths=tuple(lengths),
         ramp_lanes=tuple(
-            sum(branch.lanes(length) for branch in ramp.branches)
-            for ramp, length in zip(ordered, lengths, strict=True)
+            min(ramp.lanes(length), most)
+            for ramp, length, most in zip(ordered, lengths, beside, strict=True)
+        ),
+        ramp_limits=tuple(
+            ramp.limit(length) for ramp, length in zip(ordered, lengths, strict=True)
         ),
         columns=_columns(chain, cuts, ordered, lengths, faces),
         names=tuple(" + ".join(ramp.names) for ramp in ordered),

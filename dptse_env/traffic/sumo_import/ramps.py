@@ -35,9 +35,15 @@ class Branch:
 
     def lanes(self, far: float) -> int:
         """Return the number of lanes from the path to a distance from it [m]."""
-        if self.joins:
-            return self.chain.lanes(self.chain.length - far, self.chain.length)
-        return self.chain.lanes(0.0, far)
+        return self.chain.lanes(*self._range(far))
+
+    def limit(self, far: float) -> float:
+        """Return the speed limit from the path to a distance from it [m], in km/h."""
+        return self.chain.limit(*self._range(far))
+
+    def _range(self, far: float) -> tuple[float, float]:
+        length = self.chain.length
+        return (length - far, length) if self.joins else (0.0, far)
 
 
 @dataclass
@@ -62,6 +68,14 @@ class Ramp:
     def kind(self) -> str:
         """Name of its kind."""
         return "on-ramp" if self.joins else "off-ramp"
+
+    def lanes(self, length: float) -> int:
+        """Return the number of lanes of all branches together, over a length from the path [m]."""
+        return sum(branch.lanes(length) for branch in self.branches)
+
+    def limit(self, length: float) -> float:
+        """Return the highest speed limit of the branches, over a length from the path, in km/h."""
+        return max(branch.limit(length) for branch in self.branches)
 
     @property
     def usable(self) -> float:

@@ -49,9 +49,9 @@ FLOWS = """
     <route id="through" edges="in merge narrow bend out"/>
     <route id="leaving" edges="in merge narrow bend exit-a exit-b"/>
     <route id="joining" edges="ramp-a ramp-b merge narrow bend out"/>
-    <flow id="t" type="car" route="through" begin="0" end="600" vehsPerHour="1500" departLane="best"/>
-    <flow id="l" type="car" route="leaving" begin="0" end="600" vehsPerHour="300" departLane="best"/>
-    <flow id="j" type="car" route="joining" begin="0" end="600" vehsPerHour="400"/>
+    <flow id="t" type="car" route="through" end="600" vehsPerHour="1500" departLane="best"/>
+    <flow id="l" type="car" route="leaving" end="600" vehsPerHour="300" departLane="best"/>
+    <flow id="j" type="car" route="joining" end="600" vehsPerHour="400"/>
 </routes>"""
 
 

@@ -1,6 +1,7 @@
 """What is read, and what is refused in one line that names the file."""
 
 import gzip
+import re
 from dataclasses import replace
 
 import pytest
@@ -62,10 +63,9 @@ def test_a_configuration_gives_files_and_options_of_the_traffic(tmp_path):
 def test_configurations_of_no_use_are_refused(tmp_path, change, message):
     path = tmp_path / "town.sumocfg"
     path.write_text(CONFIGURATION.replace(*change))
-    with pytest.raises(ValueError) as refused:
+    expected = rf"^configuration: {re.escape(str(path))}.*{re.escape(message)}"
+    with pytest.raises(ValueError, match=expected):
         read_configuration(path)
-    assert str(refused.value).startswith(f"configuration: {path}")
-    assert message in str(refused.value)
 
 
 @pytest.mark.parametrize(
@@ -97,10 +97,9 @@ def test_gzipped_networks_are_read(files, tmp_path):
 def test_networks_of_no_use_are_refused(tmp_path, content, message):
     path = tmp_path / "road.net.xml"
     path.write_bytes(content)
-    with pytest.raises(ValueError) as refused:
+    expected = rf"^net: {re.escape(str(path))}.*{re.escape(message)}"
+    with pytest.raises(ValueError, match=expected) as refused:
         find_layout(Files(path, ()), PATH, 100.0)
-    assert str(refused.value).startswith(f"net: {path}")
-    assert message in str(refused.value)
     assert "\n" not in str(refused.value)
 
 
@@ -129,9 +128,8 @@ def test_routes_of_no_use_are_refused(files, tmp_path, content, message):
     path = tmp_path / "own.rou.xml"
     path.write_text(content)
     layout = find_layout(files, PATH, 100.0)
-    with pytest.raises(ValueError) as refused:
+    with pytest.raises(ValueError, match=re.escape(message.format(path=path))) as refused:
         import_road(replace(files, routes=(path,)), layout, "road", 60)
-    assert message.format(path=path) in str(refused.value)
     assert "\n" not in str(refused.value)
 
 
