@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dptse_env.utils.arrays import BoolArray, FloatArray
+from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 
 if TYPE_CHECKING:
     from dptse_env.process import QueryProcess
@@ -27,7 +28,7 @@ class History:
 
     Attributes:
         horizon: Length of a full episode [s].
-        segment_length: [km].
+        lengths: Lengths of the mainline segments [km].
         density_scale: Density at the end of the colour scale [veh/km].
         truth: True mainline densities [veh/km], an array (n_mainline,) per second.
         estimate: Estimated mainline densities [veh/km], an array (n_mainline,) per second.
@@ -36,7 +37,7 @@ class History:
     """
 
     horizon: int
-    segment_length: float
+    lengths: tuple[float, ...]
     density_scale: float
     truth: list[FloatArray] = field(default_factory=list)
     estimate: list[FloatArray] = field(default_factory=list)
@@ -47,9 +48,22 @@ class History:
     def from_process(cls, process: QueryProcess) -> History:
         """Start a history with the present state of ``process``."""
         corridor = process.config.corridor
-        history = cls(process.config.horizon_steps, corridor.segment_length, corridor.density_scale)
+        lengths = corridor.segment_lengths[: corridor.n_mainline]
+        history = cls(process.config.horizon_steps, lengths, corridor.density_scale)
         history.append(process)
         return history
+
+    @property
+    def road_length(self) -> float:
+        """Length of the mainline [km]."""
+        return sum(self.lengths)
+
+    @cached_property
+    def rows(self) -> IntArray:
+        """Segment of each row of a picture, whose rows have one height: the shortest segment's."""
+        n_rows = round(self.road_length / min(self.lengths))
+        middles = (np.arange(n_rows) + 0.5) * self.road_length / n_rows
+        return np.searchsorted(np.cumsum(self.lengths), middles).astype(np.int64)
 
     def append(self, process: QueryProcess) -> None:
         """Add the present second, or replace it where a decision took several actions."""
@@ -74,8 +88,8 @@ class Picture:
         figure = Figure(figsize=(7.2, 6.4), dpi=100, layout="constrained")
         self._canvas: Any = FigureCanvasAgg(figure)
         axes = figure.subplots(4, 1, sharex=True, gridspec_kw={"height_ratios": [3, 3, 3, 1.3]})
-        self._shape = (len(history.truth[0]), history.horizon + 1)
-        extent = (-0.5, history.horizon + 0.5, 0.0, self._shape[0] * history.segment_length)
+        self._shape = (len(history.rows), history.horizon + 1)
+        extent = (-0.5, history.horizon + 0.5, 0.0, history.road_length)
         shades = {"cmap": DENSITY_MAP, "vmin": 0.0, "vmax": history.density_scale}
         flags = {"cmap": ListedColormap([NO_QUERY_COLOUR, QUERY_COLOUR]), "vmin": 0, "vmax": 1}
         # More seconds than pixels would leave an arbitrary choice of the queries; smooth those.
@@ -109,7 +123,7 @@ class Picture:
         panels: tuple[list[Any], ...] = (history.truth, history.estimate, history.queried)
         for image, series in zip(self._maps, panels, strict=True):
             values = np.full(self._shape, np.nan)
-            values[:, : len(series)] = np.transpose(series)
+            values[:, : len(series)] = np.transpose(series)[history.rows]
             image.set_data(values)
         self._error.set_data(range(len(history.rmse)), history.rmse)
         self._error.axes.set_ylim(0.0, 1.05 * max(*history.rmse, 1.0))

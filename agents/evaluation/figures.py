@@ -193,14 +193,14 @@ def draw_maps(columns: Sequence[Sequence[RoadMap]], width: float) -> Figure:
 
 
 def _draw_map(axis: Axes, panel: RoadMap) -> AxesImage:
-    values = np.array(panel.seconds).T
+    values = np.array(panel.seconds).T[panel.history.rows]
     axis.set_title(panel.title, loc="left", fontsize=9, pad=3, color=QUERY_COLOUR)
     axis.tick_params(labelsize=8)
     return axis.imshow(
         values,
         origin="lower",
         aspect="auto",
-        extent=(-0.5, values.shape[1] - 0.5, 0.0, len(values) * panel.history.segment_length),
+        extent=(-0.5, values.shape[1] - 0.5, 0.0, panel.history.road_length),
         cmap="Greys" if panel.is_flags else DENSITY_MAP,
         vmin=0.0,
         vmax=1.0 if panel.is_flags else panel.history.density_scale,

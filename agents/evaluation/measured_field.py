@@ -175,7 +175,7 @@ class Replay:
         sensitivity = paper_sensitivity(
             n_sensors=self.bandwidth,
             average_dwell=corridor.average_dwell,
-            segment_length=corridor.segment_length,
+            segment_length=self.field.segment_length,
             free_flow_speed=corridor.speed_scale,
             jam_density=corridor.density_scale,
         )
@@ -191,7 +191,8 @@ class Replay:
         k, n, everyone = len(starts), corridor.n_mainline, np.arange(len(starts))
         model = ARZModel(corridor, self.parameters)
         made = make_estimator(estimator, "compiled", model, k, settings)
-        start = np.full((k, n), 25.0 * corridor.lanes), np.full((k, n), 0.5 * corridor.speed_limit)
+        lanes, limits = (np.array(of) for of in (corridor.segment_lanes, corridor.speed_limits))
+        start = np.tile(25.0 * lanes, (k, 1)), np.tile(0.5 * limits, (k, 1))
         made.reset(everyone, model.states(*start), rng.spawn(k))
         sigma, squares, ratios = self.sigma, [], []
         for t in range(1, self.window + 1):

@@ -27,8 +27,8 @@ def make_card(plan: FilterPlan, done: int, name: str) -> dict[str, Any]:
     lanes = [count for road in roads for count in road.segment_lanes]
     found: dict[str, list[float]] = {
         "n_mainline": [road.n_mainline for road in roads],
-        "segment_length": [road.segment_length for road in roads],
-        "speed_limit": [road.speed_limit for road in roads],
+        "segment_length": [length for road in roads for length in road.segment_lengths],
+        "speed_limit": [limit for road in roads for limit in road.speed_limits],
         "lanes": [float(count) for count in lanes],
         "span": [1.0, *(float(span) for spans in ranges.spans for span in spans)],
         "flows": [_releases_flows(config) for config in configs],

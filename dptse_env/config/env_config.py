@@ -138,7 +138,7 @@ class EnvConfig:
             raise ValueError(f"traffic_seeds must be distinct, got {seeds}")
         if isinstance(self.parameters, str):
             require_name("parameters", self.parameters, available_parameters())
-        self.arz_parameters.require_time_step(TIME_STEP, self.corridor.segment_length)
+        self.arz_parameters.require_time_step(TIME_STEP, min(self.corridor.segment_lengths))
         self._check_settings()
 
     def _check_queries(self) -> None:
@@ -152,6 +152,11 @@ class EnvConfig:
                     f"{RELEASE_MODELS.name_of(model)!r}, which releases no sums, got "
                     f"{getattr(self, key)}"
                 )
+        lengths = self.corridor.segment_lengths[: self.corridor.n_mainline]
+        if max(spans) > 1 and len(set(lengths)) > 1:
+            raise ValueError(
+                f"query_spans must be (1,) where mainline segments differ in length, got {spans}"
+            )
         if max(spans) > 1 and model.flow_centre(self.corridor, self.privacy) is None:
             raise ValueError(
                 f"query_spans must be (1,) where mean speeds are released, got {spans}"

@@ -25,7 +25,7 @@ from dptse_env.utils.validation import require_name
 
 GEOMETRY = (
     "n_mainline", "on_ramps", "off_ramps", "exit_shares", "lanes", "ramp_lanes", "segment_length",
-    "speed_limit",
+    "speed_limit", "ramp_segments", "ramp_length", "ramp_speed_limit",
 )  # fmt: skip
 """Fields of a corridor by which it is another road: what was fitted to one may not suit another."""
 
@@ -173,16 +173,16 @@ def _corridor(base: Corridor, values: dict[str, Any]) -> Corridor:
 
 def _with_scales(base: Corridor, fields: Mapping[str, Any]) -> dict[str, Any]:
     """Return fields of a corridor with scales that follow a change of lanes and speed limit."""
-    whole = dict(fields)
-    for scale, cause in (("density_scale", "lanes"), ("speed_scale", "speed_limit")):
-        changed = whole.get(cause)
-        if (
-            scale not in whole
-            and isinstance(changed, int | float)
-            and not isinstance(changed, bool)
-        ):
-            whole[scale] = getattr(base, scale) * float(changed) / getattr(base, cause)
-    return whole
+    scales = {"density_scale": "lanes", "speed_scale": "speed_limit"}
+    changed = {scale for scale, cause in scales.items() if cause in fields and scale not in fields}
+    if not changed:
+        return dict(fields)
+    road = from_mapping(Corridor, fields, "corridor", base)
+    factors = {
+        "density_scale": road.most_lanes / base.most_lanes,
+        "speed_scale": road.largest_speed_limit / base.largest_speed_limit,
+    }
+    return {**fields, **{scale: getattr(base, scale) * factors[scale] for scale in changed}}
 
 
 def _inherited(

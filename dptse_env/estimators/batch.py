@@ -134,7 +134,7 @@ class BatchEstimator(ABC):
         self.settings = settings
         self._noise_scale = np.array(getattr(settings, "noise_scale", (1.0, 1.0)))
         cap = getattr(settings, "speed_cap", None)
-        self._largest_speed = None if cap is None else cap * model.network.speed_limit
+        self._largest_speed = None if cap is None else cap * np.array(model.network.speed_limits)
         self.innovations = np.zeros((n_episodes, model.rows.n_rows, 2))
         self.diverged = np.zeros(n_episodes, dtype=np.bool_)
         self.fallback = np.zeros(n_episodes, dtype=np.bool_)

@@ -14,9 +14,18 @@ def positions(network: RoadNetwork) -> FloatArray:
 
     Mainline segments lie at their centres, ramps at the face where they join or leave.
     """
-    faces = [*network.on_ramps, *network.off_ramps]
-    centres = np.arange(network.n_mainline) + 0.5
-    return network.segment_length * np.concatenate([centres, np.asarray(faces, dtype=np.float64)])
+    lengths = np.array(network.segment_lengths[: network.n_mainline])
+    faces = np.concatenate([[0.0], np.cumsum(lengths)])
+    along = np.empty(len(network.segment_lengths))
+    along[: network.n_mainline] = faces[:-1] + 0.5 * lengths
+    ramps = zip(
+        (*network.on_ramps, *network.off_ramps),
+        (*network.on_ramp_segments, *network.off_ramp_segments),
+        strict=True,
+    )
+    for face, segments in ramps:
+        along[list(segments)] = faces[face]
+    return along
 
 
 def gaspari_cohn(distance: FloatArray, reach: float) -> FloatArray:

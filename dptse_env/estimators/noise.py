@@ -26,8 +26,12 @@ def initial_variance(model: ARZModel, settings: EstimatorSettings) -> FloatArray
 
 
 def count_variance(model: ARZModel, settings: EstimatorSettings) -> float:
-    """Return the variance of a measured density beside the noise, over rho [km/veh]."""
-    return float(settings.count_noise / model.network.segment_length / model.density_scale**2)
+    """Return the variance of a measured density beside the noise, over rho [km/veh].
+
+    It is that of the shortest segment.
+    """
+    shortest = min(model.network.segment_lengths)
+    return float(settings.count_noise / shortest / model.density_scale**2)
 
 
 def density_growth(model: ARZModel, settings: EstimatorSettings, density: FloatArray) -> FloatArray:

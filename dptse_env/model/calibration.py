@@ -88,7 +88,7 @@ def starting_parameters(
     start = np.clip([1.1 * mean_speed.max(), 1.2, 1.0], _LOWEST[:3], _HIGHEST[:3])
     fit = optimize.least_squares(residual, start, bounds=(_LOWEST[:3], _HIGHEST[:3]))
     v_f, scale, gamma = (float(value) for value in fit.x)
-    return ARZParameters(name, v_f, scale * least_jam, gamma, 60.0, network.lanes)
+    return ARZParameters(name, v_f, scale * least_jam, gamma, 60.0, _most_lanes(network))
 
 
 def calibrate(
@@ -121,7 +121,7 @@ def calibrate(
 
     def parameters_at(values: FloatArray) -> ARZParameters:
         v_f, scale, gamma, tau = np.clip(np.exp(values), _LOWEST, _HIGHEST).tolist()
-        return ARZParameters(name, v_f, scale * least_jam, gamma, tau, network.lanes)
+        return ARZParameters(name, v_f, scale * least_jam, gamma, tau, _most_lanes(network))
 
     def loss(values: FloatArray) -> float:
         try:
@@ -130,7 +130,7 @@ def calibrate(
             return _REFUSED
         return _relative(prediction_error(model, data, horizons, stride), persistence)
 
-    jam = start.jam_density / start.lanes * network.lanes
+    jam = start.jam_density / start.lanes * _most_lanes(network)
     first = [start.free_flow_speed, jam / least_jam, start.gamma, start.relaxation_time]
     simplex = _simplex(np.log(first))
     found = optimize.minimize(
@@ -169,11 +169,16 @@ def _simplex(start: FloatArray) -> FloatArray:
     return np.vstack([first, first + _WIDTH * np.eye(first.size)])
 
 
+def _most_lanes(network: RoadNetwork) -> int:
+    """Return the largest number of lanes of the mainline, to which a jam density applies."""
+    return max(network.segment_lanes[: network.n_mainline])
+
+
 def _least_jam_density(network: RoadNetwork, data: Sequence[TrafficSeries]) -> float:
-    """Return just above the largest density per lane, for a road of `network.lanes` lanes."""
+    """Return just above the largest density per lane, for the lanes of `_most_lanes`."""
     lanes = np.asarray(network.segment_lanes, dtype=np.float64)
     largest = max(float(np.max(series.density / lanes)) for series in data)
-    return 1.01 * largest * network.lanes
+    return 1.01 * largest * _most_lanes(network)
 
 
 def _relative(error: PredictionError, reference: PredictionError) -> float:

@@ -73,11 +73,12 @@ class ARZDynamics:
         self.entry_jam_density = per_lane * self.layout.entry_lanes
         self.exit_jam_density = per_lane * self.layout.exit_lanes
         # The scale of the mainline for all cells, so that equal numbers have an equal meaning.
-        self.density_scale = per_lane * network.lanes
+        self.density_scale = per_lane * max(network.segment_lanes[: network.n_mainline])
         self.speed_scale = parameters.free_flow_speed
         self.largest_speed = LARGEST_W * parameters.free_flow_speed
-        parameters.require_time_step(time_step, network.segment_length)
-        self.step_ratio = time_step / SECONDS_PER_HOUR / network.segment_length  # T / l [h/km]
+        parameters.require_time_step(time_step, min(network.segment_lengths))
+        # T / l [h/km] of each segment
+        self.step_ratio: FloatArray = time_step / SECONDS_PER_HOUR / self.layout.lengths
         self.relaxation = time_step / parameters.relaxation_time  # T / tau
 
     # States -------------------------------------------------------------------------------------

@@ -41,15 +41,15 @@ def step_jacobian(model: ARZDynamics, states: FloatArray, inputs: FloatArray) ->
     relative_by = cells.w[:, :, None, None] * by
     relative_by[:, each, each] += flux.outflow[:, :, None] * gradients.w
 
-    balance = model.step_ratio * (layout.routing - np.eye(model.n_segments))
+    balance = model.step_ratio[:, None] * (layout.routing - np.eye(model.n_segments))
     blocks = np.empty((*by.shape[:3], 2, 2))  # n, row's cell, column's cell, row, column
     blocks[..., 0, :] = np.einsum("cd,ndek->ncek", balance, by)
     blocks[..., 1, :] = np.einsum("cd,ndek->ncek", balance, relative_by)
 
     entries = layout.entries
     w_in = inputs[:, layout.entry_inputs + 1, None]
-    blocks[:, entries, entries, 0] += model.step_ratio * source_by
-    blocks[:, entries, entries, 1] += model.step_ratio * w_in * source_by
+    blocks[:, entries, entries, 0] += model.step_ratio[entries, None] * source_by
+    blocks[:, entries, entries, 1] += model.step_ratio[entries, None] * w_in * source_by
 
     blocks[:, each, each, 0, 0] += 1.0
     blocks[:, each, each, 1, 0] += model.relaxation * model.parameters.free_flow_speed
@@ -68,7 +68,7 @@ def _with_demand(
     w_in, speed = inputs[:, layout.entry_inputs + 1], model.cells(states).speed[:, entries]
     supply = model.relations.supply(w_in, speed, model.jam_density[entries])
     free = model.demands(states, inputs) <= supply
-    by = np.where(free, model.step_ratio * inputs[:, layout.entry_inputs], 0.0)
+    by = np.where(free, model.step_ratio[entries] * inputs[:, layout.entry_inputs], 0.0)
     whole = np.zeros((len(traffic), model.n_states, model.n_states))
     whole[:, :n, :n] = traffic
     whole[:, each, each] = 1.0

@@ -240,20 +240,20 @@ def _sources(
         column = road.entry[c]
         source, w_in = inputs[column], inputs[column + 1]
         if state.size > n:
-            by_factor[e, 0] = road.step_ratio * source
+            by_factor[e, 0] = road.step_ratio[c] * source
             source *= state[n + e]
         s, _, by_v = supply(w_in, cells[c, _V], road.jam[c], road.free_flow_speed, road.gamma)
         if source > s:
             source = s
-            slope = road.step_ratio * by_v
+            slope = road.step_ratio[c] * by_v
             blocks[c, 0, 0] += slope * cells[c, _V_RHO]
             blocks[c, 0, 1] += slope * cells[c, _V_PSI]
             blocks[c, 0, 2] += slope * w_in * cells[c, _V_RHO]
             blocks[c, 0, 3] += slope * w_in * cells[c, _V_PSI]
             by_factor[e, 0] = 0.0
         by_factor[e, 1] = w_in * by_factor[e, 0]
-        after[2 * c] += road.step_ratio * source
-        after[2 * c + 1] += road.step_ratio * source * w_in
+        after[2 * c] += road.step_ratio[c] * source
+        after[2 * c + 1] += road.step_ratio[c] * source * w_in
 
 
 @njit(cache=True, error_model="numpy")
@@ -284,8 +284,8 @@ def advance(
     blocks[:] = 0.0
     for c in range(road.jam.size):
         rho, psi = state[2 * c], state[2 * c + 1]
-        after[2 * c] = rho - ratio * outflow[c, 0]
-        after[2 * c + 1] = psi - ratio * outflow[c, 1] + relaxation * (v_f * rho - psi)
+        after[2 * c] = rho - ratio[c] * outflow[c, 0]
+        after[2 * c + 1] = psi - ratio[c] * outflow[c, 1] + relaxation * (v_f * rho - psi)
         blocks[c, 0, 0] = 1.0
         blocks[c, 0, 2], blocks[c, 0, 3] = relaxation * v_f, 1.0 - relaxation
     for i in range(2 * road.jam.size, state.size):
@@ -293,7 +293,8 @@ def advance(
     _sources(road, cells, state, inputs, after, blocks, scratch.by_factor)
 
     for e in range(road.edges.shape[0]):
-        start, end, weight = road.edges[e, 0], road.edges[e, 1], ratio * road.edge_share[e]
+        start, end = road.edges[e, 0], road.edges[e, 1]
+        weight = ratio[end] * road.edge_share[e]
         after[2 * end] += weight * outflow[start, 0]
         after[2 * end + 1] += weight * outflow[start, 1]
     for m in range(road.terms.shape[0]):

@@ -1,5 +1,6 @@
 """Layout of a road in the model: connections of cells, and the lanes of each cell."""
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -12,9 +13,10 @@ from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 class RoadNetwork(Protocol):
     """The properties of a corridor that the model needs.
 
-    Segments are ordered: mainline 0..N-1, then on-ramps, then off-ramps (S in all). On-ramp
-    `on_ramps[i] = j` joins at the face between mainline segments j-1 and j; off-ramp
-    `off_ramps[o] = j` leaves at the face between j-1 and j and takes `exit_shares[o]` of the flow.
+    Segments are ordered: mainline 0..N-1, then on-ramps, then off-ramps (S in all), each in the
+    direction of travel. On-ramp `on_ramps[i] = j` joins at the face between mainline segments j-1
+    and j; off-ramp `off_ramps[o] = j` leaves at the face between j-1 and j and takes
+    `exit_shares[o]` of the flow.
     """
 
     @property
@@ -34,24 +36,28 @@ class RoadNetwork(Protocol):
         """For each off-ramp the share of the flow that takes it."""
 
     @property
-    def segment_length(self) -> float:
-        """Length of every segment [km]."""
+    def on_ramp_segments(self) -> Sequence[Sequence[int]]:
+        """Segments of each on-ramp, in the direction of travel."""
 
     @property
-    def speed_limit(self) -> float:
-        """Speed limit [km/h]; the dynamics do without it."""
+    def off_ramp_segments(self) -> Sequence[Sequence[int]]:
+        """Segments of each off-ramp, in the direction of travel."""
+
+    @property
+    def segment_lengths(self) -> Sequence[float]:
+        """Length of each of the S segments [km]."""
+
+    @property
+    def speed_limits(self) -> Sequence[float]:
+        """Speed limit of each of the S segments [km/h]; the dynamics do without it."""
 
     @property
     def segment_lanes(self) -> Sequence[int]:
         """Lanes of each of the S segments."""
 
     @property
-    def lanes(self) -> int:
-        """Lanes of the boundary cells at both ends of the mainline."""
-
-    @property
-    def ramp_lanes(self) -> int:
-        """Lanes of the boundary cells at the outer ends of the ramps."""
+    def boundary_lanes(self) -> Sequence[int]:
+        """Lanes of each of the R boundary cells: both ends of the mainline, then the ramps'."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +74,7 @@ class Layout:
     exit_inputs: IntArray  # (1 + O,) input column of each exit's downstream density
     routing: FloatArray  # (S, S) share of the outflow of a column's cell into a row's cell
     lanes: FloatArray  # (S,) lanes of the segments
+    lengths: FloatArray  # (S,) lengths of the segments [km]
     entry_lanes: FloatArray  # (1 + I,) lanes of the boundary cells before the entries
     exit_lanes: FloatArray  # (1 + O,) lanes of the boundary cells after the exits
 
@@ -129,35 +136,42 @@ def make_layout(network: RoadNetwork) -> Layout:
     """
     _check(network)
     n, n_on, n_off = network.n_mainline, len(network.on_ramps), len(network.off_ramps)
-    on_cells = {face: n + i for i, face in enumerate(network.on_ramps)}
-    off_cells = {face: n + n_on + o for o, face in enumerate(network.off_ramps)}
+    on, off = network.on_ramp_segments, network.off_ramp_segments
     shares = np.asarray(network.exit_shares, dtype=np.float64)
+    lanes = np.asarray(network.segment_lanes, dtype=np.float64)
+    boundary_lanes = np.asarray(network.boundary_lanes, dtype=np.float64)
 
-    merges = [(face - 1, cell, face) for face, cell in on_cells.items()]
-    diverges = [(face - 1, face, cell) for face, cell in off_cells.items()]
-    links = [(j - 1, j) for j in range(1, n) if j not in on_cells and j not in off_cells]
+    merges = [(face - 1, ramp[-1], face) for face, ramp in zip(network.on_ramps, on, strict=True)]
+    diverges = [
+        (face - 1, face, ramp[0]) for face, ramp in zip(network.off_ramps, off, strict=True)
+    ]
+    junctions = {*network.on_ramps, *network.off_ramps}
+    links = [(j - 1, j) for j in range(1, n) if j not in junctions]
+    for ramp in (*on, *off):
+        links += itertools.pairwise(ramp)
 
-    routing = np.zeros((n + n_on + n_off,) * 2)
+    routing = np.zeros((lanes.size,) * 2)
     for up, down in links:
         routing[down, up] = 1.0
-    for main, ramp, down in merges:
-        routing[down, [main, ramp]] = 1.0
-    for (up, main, off), share in zip(diverges, shares, strict=True):
-        routing[[main, off], up] = 1.0 - share, share
+    for main, joining, down in merges:
+        routing[down, [main, joining]] = 1.0
+    for (up, main, leaving), share in zip(diverges, shares, strict=True):
+        routing[[main, leaving], up] = 1.0 - share, share
 
     return Layout(
         links=_columns(links, 2),
         merges=_columns(merges, 3),
         diverges=_columns(diverges, 3),
         exit_shares=shares,
-        entries=np.array([0, *on_cells.values()], dtype=np.int64),
+        entries=np.array([0, *(ramp[0] for ramp in on)], dtype=np.int64),
         entry_inputs=np.array([0, *range(3, 3 + 2 * n_on, 2)], dtype=np.int64),
-        exits=np.array([n - 1, *off_cells.values()], dtype=np.int64),
+        exits=np.array([n - 1, *(ramp[-1] for ramp in off)], dtype=np.int64),
         exit_inputs=np.array([2, *range(3 + 2 * n_on, 3 + 2 * n_on + n_off)], dtype=np.int64),
         routing=routing,
-        lanes=np.asarray(network.segment_lanes, dtype=np.float64),
-        entry_lanes=np.array([network.lanes, *[network.ramp_lanes] * n_on], dtype=np.float64),
-        exit_lanes=np.array([network.lanes, *[network.ramp_lanes] * n_off], dtype=np.float64),
+        lanes=lanes,
+        lengths=np.asarray(network.segment_lengths, dtype=np.float64),
+        entry_lanes=boundary_lanes[[0, *range(2, 2 + n_on)]],
+        exit_lanes=boundary_lanes[[1, *range(2 + n_on, 2 + n_on + n_off)]],
     )
 
 
@@ -186,15 +200,16 @@ def _check(network: RoadNetwork) -> None:
     for i, share in enumerate(network.exit_shares):
         if not 0.0 <= share < 1.0:
             raise ValueError(f"network.exit_shares[{i}] must be in [0, 1), got {share}")
-    if not (np.isfinite(network.segment_length) and network.segment_length > 0.0):
-        raise ValueError(f"network.segment_length must be > 0 km, got {network.segment_length}")
-    n_segments = n + len(network.on_ramps) + len(network.off_ramps)
-    if len(network.segment_lanes) != n_segments:
-        raise ValueError(
-            f"network.segment_lanes must have {n_segments} entries, "
-            f"got {len(network.segment_lanes)}"
-        )
-    lanes = {f"segment_lanes[{i}]": count for i, count in enumerate(network.segment_lanes)}
-    for field, count in {**lanes, "lanes": network.lanes, "ramp_lanes": network.ramp_lanes}.items():
-        if count < 1:
-            raise ValueError(f"network.{field} must be >= 1, got {count}")
+    n_segments = n + sum(map(len, (*network.on_ramp_segments, *network.off_ramp_segments)))
+    n_boundaries = 2 + len(network.on_ramps) + len(network.off_ramps)
+    for field, size in (
+        ("segment_lengths", n_segments),
+        ("segment_lanes", n_segments),
+        ("boundary_lanes", n_boundaries),
+    ):
+        values = getattr(network, field)
+        if len(values) != size:
+            raise ValueError(f"network.{field} must have {size} entries, got {len(values)}")
+        for i, value in enumerate(values):
+            if not (np.isfinite(value) and value > 0.0):
+                raise ValueError(f"network.{field}[{i}] must be finite and > 0, got {value}")

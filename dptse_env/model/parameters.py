@@ -61,14 +61,14 @@ class ARZParameters:
         return min(forwards, crossing / self.gamma)
 
     def require_time_step(self, time_step: float, segment_length: float) -> None:
-        """Refuse a time step [s] that violates the CFL condition."""
+        """Refuse a time step [s] that violates the CFL condition on a segment [km]."""
         largest = self.largest_time_step(segment_length)
         if not 0.0 < time_step <= largest:
             # Rounded down, so that the number in the message is admissible.
             named = math.floor(100.0 * largest) / 100.0
             raise ValueError(
                 f"model.time_step must be > 0 and at most {named:.2f} s (CFL condition of "
-                f"parameters {self.name!r}), got {time_step}"
+                f"parameters {self.name!r} on a segment of {segment_length:g} km), got {time_step}"
             )
 
 

@@ -15,7 +15,7 @@ class RoadArrays(NamedTuple):
 
     free_flow_speed: float  # v_f [km/h]
     gamma: float  # Exponent of the pressure
-    step_ratio: float  # T / l [h/km]
+    step_ratio: FloatArray  # (S,) T / l [h/km]
     relaxation: float  # T / tau
     jam: FloatArray  # (S,) jam densities [veh/km]
     outside_jam: FloatArray  # (S,) jam density behind an exit [veh/km]; unused elsewhere
@@ -68,7 +68,7 @@ def make_road_arrays(model: ARZModel) -> RoadArrays:
     return RoadArrays(
         free_flow_speed=float(model.parameters.free_flow_speed),
         gamma=float(model.parameters.gamma),
-        step_ratio=float(model.step_ratio),
+        step_ratio=model.step_ratio,
         relaxation=float(model.relaxation),
         jam=model.jam_density,
         outside_jam=outside_jam,
@@ -83,7 +83,7 @@ def make_road_arrays(model: ARZModel) -> RoadArrays:
         neighbours=neighbours,
         degree=degree,
         terms=terms,
-        term_weight=model.step_ratio * weights,
+        term_weight=model.step_ratio[terms[:, 0]] * weights,
         second_scale=float(model.measurement_scale[1]),
         row_first=model.rows.first,
         row_span=model.rows.span,

@@ -66,6 +66,15 @@ class ReleaseSetup:
         return self.rows.n_rows + (self.corridor.n_boundaries if private else 0)
 
     @cached_property
+    def lengths(self) -> FloatArray:
+        """Length of each column of a release [km], shape (n_columns,)."""
+        corridor, rows = self.corridor, self.rows
+        every = np.array(corridor.with_boundaries(corridor.segment_lengths))
+        # Sums over several segments are released where all lengths on the mainline are equal.
+        boundaries = every[corridor.n_segments :][: self.n_columns - rows.n_rows]
+        return np.concatenate([every[rows.first] * rows.span, boundaries])
+
+    @cached_property
     def always_observed(self) -> IntArray:
         """Columns that are observed at every step without a query."""
         sensors = self.queries.sensor_rows(self.corridor)

@@ -105,7 +105,9 @@ class PrivateBoundary(NominalBoundary):
     def __init__(self, traffic: TrafficTable, model: ARZModel, n_episodes: int) -> None:
         """Prepare for episodes without any release yet."""
         super().__init__(traffic, model, n_episodes)
-        self._model, self._least_density = model, 1.0 / traffic.corridor.segment_length
+        self._model, corridor = model, traffic.corridor
+        lengths = [corridor.segment_lengths[s] for s in corridor.boundary_neighbours]
+        self._least_density = 1.0 / np.array(lengths)
         layout = model.layout
         self._jam_density = np.empty(model.n_boundaries)
         self._jam_density[layout.entry_boundaries] = model.entry_jam_density

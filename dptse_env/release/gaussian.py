@@ -30,6 +30,10 @@ from dptse_env.utils.vector_info import Rows, object_array
 class GaussianRelease(ReleaseModel):
     """Release of true values plus Gaussian noise; subclasses define values and sensitivity.
 
+    Sensitivity and noise are those of the shortest segment. One vehicle changes the sums of a
+    longer one by less, in proportion to its length, and its noise is smaller by as much: a vehicle
+    counts alike on every segment, in units of the noise.
+
     Attributes:
         sensitivity: L2 sensitivities of both released quantities over an episode.
     """
@@ -38,6 +42,8 @@ class GaussianRelease(ReleaseModel):
         """Compute sensitivity and noise; nothing is loaded."""
         super().__init__(setup)
         self.sensitivity = self._sensitivity()
+        stretch = setup.lengths / min(setup.corridor.segment_lengths)
+        self._stretch = None if (stretch == 1.0).all() else stretch[:, None]
         self.mechanism = GaussianMechanism(
             self._noise_std(), n_episodes=setup.n_episodes, n_segments=setup.n_columns
         )
@@ -89,8 +95,11 @@ class GaussianRelease(ReleaseModel):
 
     def release(self, request: ReleaseRequest) -> Released:
         """See `ReleaseModel.release`."""
-        values = self.mechanism.release(request.episodes, self.true_values(request))
-        return Released(values, self.sigma)
+        values = self.true_values(request)
+        if self._stretch is None:
+            return Released(self.mechanism.release(request.episodes, values), self.sigma)
+        values = self.mechanism.release(request.episodes, values * self._stretch) / self._stretch
+        return Released(values, self.sigma / self._stretch)
 
     def spent(self, episodes: IntArray, steps: IntArray) -> tuple[FloatArray, FloatArray]:
         """See `ReleaseModel.spent`."""
@@ -151,7 +160,7 @@ class Paper(GaussianRelease):
         return paper_sensitivity(
             n_sensors=setup.bandwidth + len(setup.always_observed),
             average_dwell=corridor.average_dwell,
-            segment_length=corridor.segment_length,
+            segment_length=min(corridor.segment_lengths),
             # Constants of the corridor, so that the noise does not depend on the estimator.
             free_flow_speed=corridor.speed_scale,
             jam_density=corridor.density_scale,
@@ -194,8 +203,8 @@ class Capped(GaussianRelease):
 
     @classmethod
     def flow_centre(cls, corridor: Corridor, settings: CappedSettings) -> float | None:
-        """Return half of the speed limit, the centre of the speeds that are clipped to it."""
-        return 0.5 * corridor.speed_limit if settings.speed_release == "flow" else None
+        """Return half of the largest speed limit, the centre of the speeds clipped to it."""
+        return 0.5 * corridor.largest_speed_limit if settings.speed_release == "flow" else None
 
     def __init__(self, setup: ReleaseSetup) -> None:
         """See `GaussianRelease`; the vehicle tables are empty until `load`."""
@@ -207,7 +216,7 @@ class Capped(GaussianRelease):
             len(traffic.traffic_seeds),
             corridor.duration + 1,
             setup.n_episodes,
-            corridor.speed_limit,
+            corridor.largest_speed_limit,
             setup.settings.contribution_cap,
         )
 
@@ -217,8 +226,8 @@ class Capped(GaussianRelease):
         return contribution_sensitivity(
             contributions=settings.contributions(self.setup.horizon),
             adjacency=settings.adjacency,
-            segment_length=corridor.segment_length,
-            largest_speed=corridor.speed_limit,
+            segment_length=min(corridor.segment_lengths),
+            largest_speed=corridor.largest_speed_limit,
             mean_speed_slope=slope if settings.speed_release == "mean" else None,
         )
 
@@ -256,19 +265,18 @@ class Capped(GaussianRelease):
 
     def true_values(self, request: ReleaseRequest) -> FloatArray:
         """See `GaussianRelease.true_values`; unobserved columns hold zeros."""
-        corridor = self.setup.corridor
-        length, limit = corridor.segment_length, corridor.speed_limit
+        setup, corridor = self.setup, self.setup.corridor
         counts, speeds = self.contributions.collect(
             request.episodes, request.traffic, request.times, request.observed
         )
         values = np.empty((*counts.shape, 2))
-        np.divide(counts, length, out=values[..., 0])
+        np.divide(counts, setup.lengths, out=values[..., 0])
         if self._settings.speed_release == "flow":
-            speeds -= 0.5 * limit * counts
-            np.divide(speeds, length, out=values[..., 1])
+            speeds -= 0.5 * corridor.largest_speed_limit * counts
+            np.divide(speeds, setup.lengths, out=values[..., 1])
         else:
-            empty = counts == 0.0
-            values[..., 1] = np.where(empty, limit, speeds / np.where(empty, 1.0, counts))
+            empty, limits = counts == 0.0, setup.traffic.limits[: setup.n_columns]
+            values[..., 1] = np.where(empty, limits, speeds / np.where(empty, 1.0, counts))
         return values
 
     def private_info(self, episodes: IntArray, traffic: IntArray) -> Rows:

@@ -20,15 +20,21 @@ def nominal_flows(corridor: Corridor, times: npt.ArrayLike) -> FloatArray:
     flow = rates[np.searchsorted(starts, times, side="right") - 1]
     on = dict(zip(corridor.on_ramps, demand.on_ramps, strict=True))
     off = dict(zip(corridor.off_ramps, corridor.exit_shares, strict=True))
-    entries = [np.full_like(flow, rate) for rate in demand.on_ramps]
-    mainline, exits = [], []
+    entering = [np.full_like(flow, rate) for rate in demand.on_ramps]
+    mainline, leaving = [], []
     for segment in range(corridor.n_mainline):
         if segment in off:
-            exits.append(off[segment] * flow)
-            flow = flow - exits[-1]
+            leaving.append(off[segment] * flow)
+            flow = flow - leaving[-1]
         flow = flow + on.get(segment, 0.0)
         mainline.append(flow)
-    return np.stack([*mainline, *entries, *exits], axis=-1)
+    ramps = zip(
+        (*corridor.on_ramp_segments, *corridor.off_ramp_segments),
+        (*entering, *leaving),
+        strict=True,
+    )
+    of_ramps = [of_ramp for segments, of_ramp in ramps for _ in segments]
+    return np.stack([*mainline, *of_ramps], axis=-1)
 
 
 def free_flow_density(
@@ -54,14 +60,13 @@ def nominal_inputs(corridor: Corridor, model: ARZModel) -> FloatArray:
     that reaches them. Incidents are not considered.
     """
     layout, v_f = model.layout, model.parameters.free_flow_speed
-    n, n_on = corridor.n_mainline, len(corridor.on_ramps)
     demand = _published(corridor)
     flows = nominal_flows(corridor, np.arange(corridor.duration + 1))
     inputs = np.empty((len(flows), model.n_inputs))
     inputs[:, layout.entry_inputs[0]] = flows[:, 0]  # no ramp lies ahead of the first segment
     inputs[:, layout.entry_inputs[1:]] = demand.on_ramps
     inputs[:, layout.entry_inputs + 1] = v_f
-    leaving = flows[:, [n - 1, *range(n + n_on, corridor.n_segments)]]
+    leaving = flows[:, layout.exits]
     inputs[:, layout.exit_inputs] = free_flow_density(model, leaving, model.exit_jam_density)
     return inputs
 

@@ -62,8 +62,8 @@ class Paced(ReleaseModel):
 
     @classmethod
     def flow_centre(cls, corridor: Corridor, settings: PacedSettings) -> float | None:
-        """Return half of the speed limit; a release has a centre of its own for each segment."""
-        return 0.5 * corridor.speed_limit
+        """Return half of the largest speed limit; a release has a centre for each segment."""
+        return 0.5 * corridor.largest_speed_limit
 
     def __init__(self, setup: ReleaseSetup) -> None:
         """Compute the budget; nothing is loaded."""
@@ -79,7 +79,9 @@ class Paced(ReleaseModel):
         self.ledgers = Ledgers(
             Columns(first, span, places),
             VehicleTable(
-                len(setup.traffic.traffic_seeds), corridor.duration + 1, corridor.speed_limit
+                len(setup.traffic.traffic_seeds),
+                corridor.duration + 1,
+                corridor.largest_speed_limit,
             ),
             n,
             budget=(1.0 - ROUNDING) * self.budget,
@@ -95,7 +97,6 @@ class Paced(ReleaseModel):
         pacing = EventPacing if settings.unit == "event" else PACINGS.find(settings.pacing)
         self.pacing = pacing(made_for)
         self.noise = NoiseStreams(n, setup.n_columns)
-        self._lengths = corridor.segment_length * span
         self.prices = np.zeros((n, setup.n_columns))
         self.centres = np.zeros((n, places))
         self._charged = np.zeros(n)  # largest payments that a vehicle can have made
@@ -104,11 +105,11 @@ class Paced(ReleaseModel):
 
     @cached_property
     def sigma(self) -> FloatArray:
-        """Deviations of a single segment's noise at the published demand, shape (2,)."""
+        """Deviations of the shortest segment's noise at the published demand, shape (2,)."""
         corridor = self.setup.corridor
-        free = np.full(corridor.n_segments, corridor.speed_limit)
-        price = self.pacing.expected_price(free)
-        sigma: FloatArray = self._deviations(np.array([[price]]))[0, 0] / corridor.segment_length
+        price = self.pacing.expected_price(np.array(corridor.speed_limits))
+        shortest = min(corridor.segment_lengths)
+        sigma: FloatArray = self._deviations(np.array([[price]]))[0, 0] / shortest
         return sigma
 
     def _deviations(self, prices: FloatArray) -> FloatArray:
@@ -156,7 +157,7 @@ class Paced(ReleaseModel):
         self._fallback[request.episodes] = ~finite.all(axis=1)
         if finite.all():
             return density, speed
-        nominal = self.setup.corridor.speed_limit
+        nominal = np.array(self.setup.corridor.speed_limits)
         return np.where(finite, density, 0.0), np.where(finite, speed, nominal)
 
     def _centres(self, speed: FloatArray) -> FloatArray:
@@ -165,12 +166,10 @@ class Paced(ReleaseModel):
         The centre of a boundary segment is that of the road's segment next to it.
         """
         corridor, S = self.setup.corridor, speed.shape[1]
-        centre: FloatArray = np.clip(speed, 0.0, corridor.speed_limit)
+        centre: FloatArray = np.clip(speed, 0.0, corridor.largest_speed_limit)
         if self.ledgers.n_places == S:
             return centre
-        n, n_on = corridor.n_mainline, len(corridor.on_ramps)
-        beside = [0, n - 1, *range(n, n + n_on), *range(n + n_on, S)]
-        return np.concatenate([centre, centre[:, beside]], axis=1)
+        return np.concatenate([centre, centre[:, corridor.boundary_neighbours]], axis=1)
 
     def _charge(self, episodes: IntArray, observed: BoolArray, prices: FloatArray) -> None:
         """Add the largest payment that a vehicle can make in this second."""
@@ -208,8 +207,9 @@ class Paced(ReleaseModel):
         values /= grid
         np.rint(values, out=values)
         values *= grid
-        values /= self._lengths[:, None]
-        return Released(values, deviations / self._lengths[:, None], centre)
+        lengths = self.setup.lengths[:, None]
+        values /= lengths
+        return Released(values, deviations / lengths, centre)
 
     @cached_property
     def _epsilons(self) -> FloatArray:

@@ -11,7 +11,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from dptse_env.model.layout import make_layout
+from dptse_env.model.layout import Layout, make_layout
 from dptse_env.model.parameters import SECONDS_PER_HOUR
 from dptse_env.release import pacing_kernels as kernels
 from dptse_env.traffic import Corridor
@@ -144,14 +144,14 @@ class TracerPacing(Pacing):
         road = kernels.PacedRoad(
             n_mainline=corridor.n_mainline,
             n_segments=S,
-            length=corridor.segment_length,
+            length=layout.lengths,
             edges=layout.edges,
             edge_share=layout.edge_shares,
             entries=layout.entries,
             entry_places=entry_places,
             exits=layout.exits,
             exit_places=exit_places,
-            on_ramps=np.array(corridor.on_ramps, dtype=np.int64),
+            next_segment=_next_segments(layout),
         )
         columns = kernels.PacedColumns(setup.first, setup.span, setup.level)
         self._packed = tuple(road), tuple(columns)
@@ -182,7 +182,8 @@ class TracerPacing(Pacing):
 
     def expected_price(self, speed: FloatArray) -> float:
         """Return the price at the upstream end, at these speeds and the rates of the beginning."""
-        n, length = self.setup.corridor.n_mainline, self.setup.corridor.segment_length
+        corridor = self.setup.corridor
+        n, length = corridor.n_mainline, np.array(corridor.segment_lengths[: corridor.n_mainline])
         seconds = SECONDS_PER_HOUR * length / np.clip(speed[:n], kernels.SLOWEST, kernels.FASTEST)
         queried = float((self._first_rates[:n] * seconds).sum()) + kernels.MARGIN
         return self._offer[0] / queried
@@ -191,6 +192,15 @@ class TracerPacing(Pacing):
         """See `Pacing.tracer`."""
         tracer = self._tracer[episodes, : self.setup.corridor.n_mainline]
         return np.minimum(tracer / self.setup.budget, 1.0)
+
+
+def _next_segments(layout: Layout) -> IntArray:
+    """Return the segment that each one leads to, (S,): the mainline at a diverge, -1 at an exit."""
+    following = np.full(layout.n_segments, -1, dtype=np.int64)
+    for start, end in layout.edges:
+        if following[start] < 0 or end < following[start]:
+            following[start] = end
+    return following
 
 
 class EventPacing(Pacing):

@@ -25,14 +25,14 @@ class PacedRoad(NamedTuple):
 
     n_mainline: int  # n
     n_segments: int  # S
-    length: float  # l of every segment [km]
+    length: FloatArray  # (S,) l of the segments [km]
     edges: IntArray  # (E, 2) segments (from, to) between which vehicles pass
     edge_share: FloatArray  # (E,) share of the outflow that passes
     entries: IntArray  # (1 + I,) segments with inflow from outside: the first, then the on-ramps
     entry_places: IntArray  # (1 + I,) boundary segments before them; negative if not released
     exits: IntArray  # (1 + O,) segments with outflow: the last of the mainline, the off-ramps
     exit_places: IntArray  # (1 + O,) boundary segments after them; negative if not released
-    on_ramps: IntArray  # (I,) mainline segments that the on-ramps feed
+    next_segment: IntArray  # (S,) segment that each leads to, ahead on the mainline; -1 at exits
 
 
 class PacedColumns(NamedTuple):
@@ -123,54 +123,51 @@ def _carry(
         flow[s] += arriving
         if place >= 0:
             mass[s] += arriving * before[place]
-            after[place] *= 1.0 - _moved(road, speed[s])
+            after[place] *= 1.0 - _moved(road.length[s], speed[s])
     for s in range(road.n_segments):
         if flow[s] > 0.0:
-            arrived = flow[s] / (SECONDS_PER_HOUR * road.length * max(density[s], 1e-9))
+            arrived = flow[s] / (SECONDS_PER_HOUR * road.length[s] * max(density[s], 1e-9))
             share = min(arrived, 1.0)
             after[s] = (1.0 - share) * before[s] + share * mass[s] / flow[s]
     for e in range(road.exits.size):
         s, place = road.exits[e], road.exit_places[e]
         if place >= 0:
-            share = _moved(road, speed[s])
+            share = _moved(road.length[s], speed[s])
             after[place] = (1.0 - share) * before[place] + share * before[s]
 
 
 @njit(cache=True, error_model="numpy")
-def _moved(road: PacedRoad, speed: float) -> float:
-    """Return the share of a segment's vehicles that leave it in a second."""
-    return float(min(speed / (SECONDS_PER_HOUR * road.length), 1.0))
+def _moved(length: float, speed: float) -> float:
+    """Return the share of the vehicles on a length [km] that leave it in a second."""
+    return float(min(speed / (SECONDS_PER_HOUR * length), 1.0))
 
 
 @njit(cache=True, error_model="numpy")
 def _remaining(road: PacedRoad, speed: FloatArray, rate: FloatArray, rest: FloatArray) -> None:
     """Write the queried seconds that a vehicle on each record column has still to come."""
-    n, ahead = road.n_mainline, MARGIN
+    n, S = road.n_mainline, road.n_segments
+    rest[:S] = 0.0
     for e in range(road.exits.size):
         s, place = road.exits[e], road.exit_places[e]
-        outside = MARGIN
+        rest[s] = MARGIN
         if place >= 0:
-            outside += _seconds(road, speed[s]) * rate[place]
-            rest[place] = outside
-        if s < n:
-            ahead = outside
-        else:
-            rest[s] = outside + _seconds(road, speed[s]) * rate[s]
-    for s in range(n - 1, -1, -1):
-        ahead += _seconds(road, speed[s]) * rate[s]
-        rest[s] = ahead
+            rest[s] += _seconds(road.length[s], speed[s]) * rate[place]
+            rest[place] = rest[s]
+    # Against the traffic: the segment that each one leads to comes first.
+    for first, last in ((n, -1), (S, n - 1)):
+        for s in range(first - 1, last, -1):
+            ahead = rest[road.next_segment[s]] if road.next_segment[s] >= 0 else rest[s]
+            rest[s] = ahead + _seconds(road.length[s], speed[s]) * rate[s]
     for e in range(road.entries.size):
         s, place = road.entries[e], road.entry_places[e]
-        if s >= n:
-            rest[s] = rest[road.on_ramps[e - 1]] + _seconds(road, speed[s]) * rate[s]
         if place >= 0:
-            rest[place] = rest[s] + _seconds(road, speed[s]) * rate[place]
+            rest[place] = rest[s] + _seconds(road.length[s], speed[s]) * rate[place]
 
 
 @njit(cache=True, error_model="numpy")
-def _seconds(road: PacedRoad, speed: float) -> float:
-    """Return the time [s] on a segment at a speed."""
-    return float(SECONDS_PER_HOUR * road.length / min(max(speed, SLOWEST), FASTEST))
+def _seconds(length: float, speed: float) -> float:
+    """Return the time [s] on a length [km] at a speed [km/h]."""
+    return float(SECONDS_PER_HOUR * length / min(max(speed, SLOWEST), FASTEST))
 
 
 @njit(cache=True, error_model="numpy")

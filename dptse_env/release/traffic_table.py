@@ -11,8 +11,8 @@ class TrafficTable:
     """The true traffic of a set of traffic seeds, in memory.
 
     Aggregates are computed once per record and stored in one table, so that a batch of episodes
-    reads its traffic with a single index. A mean speed is over vehicles; an empty segment has the
-    road's speed limit, so that no gap reveals that it is empty.
+    reads its traffic with a single index. A mean speed is over vehicles; an empty segment has its
+    speed limit, so that no gap reveals that it is empty.
     """
 
     def __init__(
@@ -24,6 +24,8 @@ class TrafficTable:
         # np.empty takes address space, not memory, until a record is written.
         self._table = np.empty((len(traffic_seeds), corridor.duration + 1, columns, 2))
         self._loaded = np.zeros(len(traffic_seeds), dtype=bool)
+        self._lengths = np.array(corridor.with_boundaries(corridor.segment_lengths))
+        self.limits = np.array(corridor.with_boundaries(corridor.speed_limits))
 
     def load(self, indices: npt.ArrayLike) -> list[tuple[int, Record]]:
         """Load the records of some traffic seeds; return those that were not in memory before.
@@ -38,9 +40,9 @@ class TrafficTable:
         for index in new:
             record = self.record(index)
             counts = record.counts
-            self._table[index, ..., 0] = counts / self.corridor.segment_length
+            self._table[index, ..., 0] = counts / self._lengths
             mean = record.speed_sums / np.maximum(counts, 1)
-            self._table[index, ..., 1] = np.where(counts > 0, mean, self.corridor.speed_limit)
+            self._table[index, ..., 1] = np.where(counts > 0, mean, self.limits)
             self._loaded[index] = True
             records.append((index, record))
         return records

@@ -95,9 +95,11 @@ class RoadChannels:
         starts = {name: place.start for name, place in encoding.slices.items()}
         released = [name for name in starts if name.startswith("released_")]
         prices = [name for name in PRICE_BLOCKS if name in starts]
-        joins = {n + k: face for k, face in enumerate(corridor.on_ramps)}
-        first = n + len(corridor.on_ramps)
-        leaves = {first + k: face - 1 for k, face in enumerate(corridor.off_ramps)}
+        # Of a ramp with several segments, the one that touches the mainline.
+        on_ramps = zip(corridor.on_ramp_segments, corridor.on_ramps, strict=True)
+        off_ramps = zip(corridor.off_ramp_segments, corridor.off_ramps, strict=True)
+        joins = {segments[-1]: face for segments, face in on_ramps}
+        leaves = {segments[0]: face - 1 for segments, face in off_ramps}
         channels = [
             _channel(name, starts, {i: i for i in range(n)}, n, "mainline")
             for name in (*MAINLINE_BLOCKS, *released, *prices)

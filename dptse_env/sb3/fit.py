@@ -30,8 +30,8 @@ class TrainedOn:
     Attributes:
         corridor: Name of the corridor.
         n_mainline: Number of mainline segments.
-        lanes: Lanes of the mainline; None where an old card does not have them.
-        segment_length: Length of a segment [km]; None where an old card does not have it.
+        lanes: Lanes of the mainline, at its widest; None where an old card does not have them.
+        segment_length: Length of the shortest segment [km]; None where an old card has none.
     """
 
     corridor: str
@@ -42,7 +42,8 @@ class TrainedOn:
     @classmethod
     def from_corridor(cls, corridor: Corridor) -> TrainedOn:
         """Describe a corridor."""
-        return cls(corridor.name, corridor.n_mainline, corridor.lanes, corridor.segment_length)
+        shortest = min(corridor.segment_lengths[: corridor.n_mainline])
+        return cls(corridor.name, corridor.n_mainline, corridor.most_lanes, shortest)
 
     @classmethod
     def from_card(cls, card: Mapping[str, Any]) -> TrainedOn:

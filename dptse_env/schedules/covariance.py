@@ -230,6 +230,6 @@ def _problem(process: QueryProcess, inflation: CovarianceInflation) -> Problem:
         density_scale=float(rho_m),
         units=np.array([corridor.density_scale / rho_m, corridor.speed_scale / v_f]),
         term_weights=np.array([term != "speed", term != "density"], dtype=np.float64),
-        length=corridor.segment_length if inflation.occupied else 0.0,
+        lengths=np.array(corridor.segment_lengths[:n]) if inflation.occupied else np.zeros(0),
         speed_cap=np.inf if inflation.speed_cap is None else inflation.speed_cap,
     )

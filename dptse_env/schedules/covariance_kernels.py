@@ -35,8 +35,8 @@ class Problem(NamedTuple):
     density_scale: float  # rho_m [veh/km]
     units: FloatArray  # (2,) scales of the reward over rho_m and v_f
     term_weights: FloatArray  # (2,) weights of density and speed in the reward
-    # length of a segment [km] where speeds are weighted by the probability of a vehicle, else 0
-    length: float
+    # (n_mainline,) lengths [km] if speeds are weighted by the probability of a vehicle, else (0,)
+    lengths: FloatArray
     speed_cap: float  # largest deviation of a speed that counts, in the reward's units
 
 
@@ -140,7 +140,8 @@ def _linearise(road: RoadArrays, problem: Problem, work: Work) -> None:
             work.traffic_rows[s, 0] = d_unit
             work.traffic_rows[s, 1] = (a - b * p / q) * d_unit
             work.traffic_rows[s, 2] = b / q
-            occupied = 1.0 if problem.length == 0.0 else 1.0 - np.exp(-problem.length * rho)
+            weighed = problem.lengths.size > 0
+            occupied = 1.0 - np.exp(-problem.lengths[s] * rho) if weighed else 1.0
             work.weights[s] = problem.term_weights[0]
             work.weights[n + s] = problem.term_weights[1] * occupied
 

@@ -1,18 +1,21 @@
 """Corridors: geometry, demand and incident of a road.
 
-Segments are numbered from 0: the mainline first, then the on-ramps, then the off-ramps. A ramp at
-face j sits between the mainline segments j-1 and j. Around these S segments lie boundary segments
-that are recorded but not estimated: one upstream and one downstream of the mainline, one before
-every on-ramp and one after every off-ramp.
+Segments are numbered from 0: the mainline first, then the on-ramps, then the off-ramps, each in the
+direction of travel. A ramp at face j sits between the mainline segments j-1 and j. Around these S
+segments lie boundary segments that are recorded but not estimated: one upstream and one downstream
+of the mainline, one before every on-ramp and one after every off-ramp. A boundary segment has
+length, lanes and limit of the segment that it lies next to.
 """
 
 import dataclasses
 import hashlib
+import itertools
 import json
 import re
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 from dptse_env.traffic.demand import Demand, DemandDistribution
 from dptse_env.traffic.drivers import Drivers
@@ -20,6 +23,8 @@ from dptse_env.traffic.incident import Incident, IncidentDistribution
 from dptse_env.traffic.sumo_scenario import SumoScenario
 from dptse_env.utils.fields import Interval, checked_fields
 from dptse_env.utils.validation import integer, require
+
+T = TypeVar("T")
 
 NOT_TRAFFIC = ("name", "fixed_sensors", "density_scale", "speed_scale", "average_dwell")
 """Fields that describe the observation of the traffic and do not change the traffic itself."""
@@ -30,11 +35,25 @@ Share = Annotated[float, Interval(0, 1, open_low=True, open_high=True)]
 """Share of the vehicles that pass an off-ramp."""
 Lanes = Annotated[int, Interval(1, 16)]
 """Number of lanes."""
+# SUMO cannot drive an edge shorter than about a vehicle and its gap.
+Length = Annotated[float, Interval(0.04, 10)]
+"""Length of a segment [km]."""
+SpeedLimit = Annotated[float, Interval(1, 1000)]
+"""A speed limit [km/h]."""
+RampSegments = Annotated[int, Interval(1, 100)]
+"""Number of segments of a ramp."""
+
+UNIFORM = {"ramp_length": None, "ramp_speed_limit": None, "ramp_segments": 1}
+"""Fields of ramps that do not enter a digest where they have these values."""
 
 
 @dataclass(frozen=True)
 class Corridor:
     """A stretch of highway with ramps, its demand and its incident.
+
+    Lengths, lanes and speed limits are one value for all mainline segments or a sequence with one
+    for each; those of ramps one value for all ramps or a sequence with one for each, on-ramps
+    first. A sequence of equal values is the same as the value.
 
     Attributes:
         name: lower-case letters, digits and hyphens.
@@ -46,10 +65,15 @@ class Corridor:
         incident: a temporary speed limit, fixed or drawn per traffic seed; None for free traffic.
         fixed_sensors: indices of the segments measured at every step.
         duration: length of a record [s].
-        lanes: number of lanes of the mainline.
-        ramp_lanes: number of lanes of every ramp, at most `lanes`.
-        segment_length: length of a segment [km].
-        speed_limit: speed limit outside incidents [km/h].
+        lanes: lanes of the mainline; where they get fewer, the leftmost ones end.
+        ramp_lanes: lanes of the ramps, at most those of the mainline segment that they join or
+            leave.
+        segment_length: length of the mainline's segments [km].
+        speed_limit: speed limit of the mainline outside incidents [km/h].
+        ramp_segments: number of segments of the ramps.
+        ramp_length: length of a ramp's segments [km]; None for that of the mainline segment that
+            it joins or leaves.
+        ramp_speed_limit: speed limit of the ramps [km/h]; None for that of the same segment.
         density_scale: constant that scales densities in rewards and observations [veh/km].
         speed_scale: constant that scales speeds in rewards and observations [km/h].
         average_dwell: T_avg of the paper's eq. (6): average time of a vehicle on a mainline
@@ -74,15 +98,17 @@ class Corridor:
     incident: Incident | IncidentDistribution | None
     fixed_sensors: tuple[Annotated[int, Interval(0, 2997)], ...]
     duration: Annotated[int, Interval(1, 100_000)]
-    lanes: Lanes = 3
-    ramp_lanes: Lanes = 1
-    # SUMO cannot drive an edge shorter than about a vehicle and its gap.
-    segment_length: Annotated[float, Interval(0.04, 10)] = 0.1
-    speed_limit: Annotated[float, Interval(1, 1000)] = 102.0
+    lanes: Lanes | tuple[Lanes, ...] = 3
+    ramp_lanes: Lanes | tuple[Lanes, ...] = 1
+    segment_length: Length | tuple[Length, ...] = 0.1
+    speed_limit: SpeedLimit | tuple[SpeedLimit, ...] = 102.0
     density_scale: Annotated[float, Interval(1, 100_000)] = 333.0
     speed_scale: Annotated[float, Interval(1, 1000)] = 102.0
     average_dwell: Annotated[float, Interval(0.01, 1e6)] = 8.0
     drivers: Drivers = field(default_factory=Drivers)
+    ramp_segments: RampSegments | tuple[RampSegments, ...] = 1
+    ramp_length: Length | tuple[Length, ...] | None = None
+    ramp_speed_limit: SpeedLimit | tuple[SpeedLimit, ...] | None = None
     network: SumoScenario | None = None
 
     def __post_init__(self) -> None:
@@ -90,9 +116,8 @@ class Corridor:
         checked_fields(self, "corridor")
         is_name = bool(re.fullmatch(r"[a-z0-9][a-z0-9-]*", self.name))
         require(is_name, "corridor.name", "lower-case letters, digits and hyphens", self.name)
-        allowed = f"<= {self.lanes} lanes"
-        require(self.ramp_lanes <= self.lanes, "corridor.ramp_lanes", allowed, self.ramp_lanes)
         self._check_ramps()
+        self._check_profiles()
         sensors = self.fixed_sensors
         for i, sensor in enumerate(sensors):
             integer(f"corridor.fixed_sensors[{i}]", sensor, 0, self.n_segments - 1)
@@ -118,6 +143,25 @@ class Corridor:
         allowed = f"one share for each of the {self.n_off_ramps} off-ramps"
         fits = len(self.exit_shares) == self.n_off_ramps
         require(fits, "corridor.exit_shares", allowed, self.exit_shares)
+
+    def _check_profiles(self) -> None:
+        """Check what varies along the road, and collapse sequences of equal values."""
+        counts = dict.fromkeys(("lanes", "segment_length", "speed_limit"), self.n_mainline)
+        counts |= dict.fromkeys(("ramp_lanes", *UNIFORM), self.n_ramps)
+        for name, count in counts.items():
+            values = getattr(self, name)
+            if not isinstance(values, tuple):
+                continue
+            each = "mainline segment" if count == self.n_mainline else "ramp"
+            allowed = f"one value, or {count}, one for each {each}"
+            require(len(values) == count, f"corridor.{name}", allowed, values)
+            if len(set(values)) == 1:
+                object.__setattr__(self, name, values[0])
+        lanes = self.segment_lanes
+        for face, beside, segments in self._ramps():
+            allowed = f"<= {lanes[beside]} lanes at face {face}"
+            most = lanes[segments[0]]
+            require(most <= lanes[beside], "corridor.ramp_lanes", allowed, most)
 
     def _check_incident(self) -> None:
         incident = self.incident
@@ -153,28 +197,108 @@ class Corridor:
 
     @property
     def n_segments(self) -> int:
-        """Number S = N + I + O of segments that are estimated."""
-        return self.n_mainline + self.n_on_ramps + self.n_off_ramps
+        """Number S of segments that are estimated: those of the mainline and of all ramps."""
+        return self.n_mainline + sum(self._per_ramp(self.ramp_segments))
+
+    @property
+    def n_ramps(self) -> int:
+        """Number I + O of ramps."""
+        return self.n_on_ramps + self.n_off_ramps
 
     @property
     def n_boundaries(self) -> int:
         """Number R = 2 + I + O of boundary segments around them."""
-        return 2 + self.n_on_ramps + self.n_off_ramps
+        return 2 + self.n_ramps
 
-    @property
+    @cached_property
+    def on_ramp_segments(self) -> tuple[tuple[int, ...], ...]:
+        """Segments of each on-ramp, in the direction of travel."""
+        return self._ramp_segments[: self.n_on_ramps]
+
+    @cached_property
+    def off_ramp_segments(self) -> tuple[tuple[int, ...], ...]:
+        """Segments of each off-ramp, in the direction of travel."""
+        return self._ramp_segments[self.n_on_ramps :]
+
+    @cached_property
+    def _ramp_segments(self) -> tuple[tuple[int, ...], ...]:
+        counts = self._per_ramp(self.ramp_segments)
+        firsts = itertools.accumulate(counts, initial=self.n_mainline)
+        return tuple(
+            tuple(range(first, first + count)) for first, count in zip(firsts, counts, strict=False)
+        )
+
+    @cached_property
+    def segment_lengths(self) -> tuple[float, ...]:
+        """Length [km] of each of the S segments."""
+        return self._along(self.segment_length, self.ramp_length)
+
+    @cached_property
     def segment_lanes(self) -> tuple[int, ...]:
         """Lanes of each of the S segments."""
-        n_ramps = self.n_on_ramps + self.n_off_ramps
-        return (self.lanes,) * self.n_mainline + (self.ramp_lanes,) * n_ramps
+        return self._along(self.lanes, self.ramp_lanes)
+
+    @cached_property
+    def speed_limits(self) -> tuple[float, ...]:
+        """Speed limit [km/h] of each of the S segments, outside incidents."""
+        return self._along(self.speed_limit, self.ramp_speed_limit)
+
+    @cached_property
+    def boundary_neighbours(self) -> tuple[int, ...]:
+        """Segment next to each of the R boundary segments."""
+        before = [segments[0] for segments in self.on_ramp_segments]
+        after = [segments[-1] for segments in self.off_ramp_segments]
+        return (0, self.n_mainline - 1, *before, *after)
+
+    @property
+    def boundary_lanes(self) -> tuple[int, ...]:
+        """Lanes of each of the R boundary segments."""
+        return tuple(self.segment_lanes[s] for s in self.boundary_neighbours)
+
+    def with_boundaries(self, values: Sequence[T]) -> tuple[T, ...]:
+        """Return values of the S segments, followed by those of the R boundary segments."""
+        return (*values, *(values[s] for s in self.boundary_neighbours))
+
+    @property
+    def most_lanes(self) -> int:
+        """Largest number of lanes of the mainline."""
+        return max(self.segment_lanes[: self.n_mainline])
+
+    @property
+    def largest_speed_limit(self) -> float:
+        """Largest speed limit of the road [km/h]."""
+        return max(self.speed_limits)
+
+    def _ramps(self) -> Iterator[tuple[int, int, tuple[int, ...]]]:
+        """Yield each ramp's face, the mainline segment that it joins or leaves, its segments."""
+        faces = [*self.on_ramps, *self.off_ramps]
+        beside = [*self.on_ramps, *(face - 1 for face in self.off_ramps)]
+        yield from zip(faces, beside, self._ramp_segments, strict=True)
+
+    def _per_ramp(self, values: T | tuple[T, ...]) -> tuple[T, ...]:
+        return values if isinstance(values, tuple) else (values,) * self.n_ramps
+
+    def _along(
+        self, values: T | tuple[T, ...], of_ramps: T | tuple[T, ...] | None
+    ) -> tuple[T, ...]:
+        """Return values of the S segments, given those of the mainline and of ramps."""
+        n = self.n_mainline
+        mainline = values if isinstance(values, tuple) else (values,) * n
+        if of_ramps is None:
+            of_ramps = tuple(mainline[beside] for _, beside, _ in self._ramps())
+        ramps = zip(self._per_ramp(of_ramps), self._ramp_segments, strict=True)
+        return (*mainline, *(value for value, segments in ramps for _ in segments))
 
     @property
     def segment_names(self) -> tuple[str, ...]:
         """Names of the S segments, counted from 1 as in the paper."""
-        return (
-            *(f"mainline {i + 1}" for i in range(self.n_mainline)),
-            *(f"on-ramp {i + 1}" for i in range(self.n_on_ramps)),
-            *(f"off-ramp {i + 1}" for i in range(self.n_off_ramps)),
-        )
+        names = [f"mainline {i + 1}" for i in range(self.n_mainline)]
+        kinds = (("on-ramp", self.on_ramp_segments), ("off-ramp", self.off_ramp_segments))
+        for kind, ramps in kinds:
+            for i, segments in enumerate(ramps):
+                parts = [f".{k + 1}" for k in range(len(segments))] if len(segments) > 1 else [""]
+                names += [f"{kind} {i + 1}{part}" for part in parts]
+        return tuple(names)
 
     @cached_property
     def digest(self) -> str:
@@ -189,6 +313,9 @@ class Corridor:
             del content[name]
         if self.drivers == Drivers():
             del content["drivers"]  # as in digests from before drivers could be chosen
+        for name, value in UNIFORM.items():
+            if content[name] == value:
+                del content[name]  # as before ramps could differ
         del content["network"]  # as in digests from before there were any
         if self.network is not None:
             scale = self.demand.scale if isinstance(self.demand, DemandDistribution) else None

@@ -142,11 +142,15 @@ def _corridor(content: Mapping[str, Any], path: Path) -> tuple[Corridor, tuple[s
         folder = path.absolute().parent / network.get("folder", ".")
         fields["network"] = {**network, "folder": os.path.normpath(folder)}
     corridor = from_mapping(Corridor, fields, "corridor")
-    crossing = 3600.0 * corridor.segment_length / corridor.speed_limit
+    n = corridor.n_mainline
+    crossings = [
+        3600.0 * length / limit
+        for length, limit in zip(corridor.segment_lengths, corridor.speed_limits, strict=True)
+    ]
     derived = {
-        "density_scale": DENSITY_SCALE * corridor.lanes,
-        "speed_scale": corridor.speed_limit,
-        "average_dwell": ASSUMED_PACE * crossing,
+        "density_scale": DENSITY_SCALE * corridor.most_lanes,
+        "speed_scale": corridor.largest_speed_limit,
+        "average_dwell": ASSUMED_PACE * sum(crossings[:n]) / n,
     }
     fields |= {name: value for name, value in derived.items() if name not in content}
     assumed = () if "average_dwell" in content else ("average_dwell",)

@@ -29,7 +29,7 @@ from dptse_env.traffic import sumo_files
 from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.record import Record
 from dptse_env.traffic.scenario import MAINLINE, Scenario, draw_scenario
-from dptse_env.traffic.sumo_network import edge_ids, network_xml
+from dptse_env.traffic.sumo_network import edge_ids, network_xml, ramp_edges
 
 SUPPORTED_SUMO = "1.28"
 """Release series that records are made with: others simulate the same scenario differently."""
@@ -151,7 +151,8 @@ def seconds(libsumo: ModuleType, corridor: Corridor, scenario: Scenario) -> Iter
     changes: list[tuple[float, float]] = []
     blocked_edge = ""
     if scenario.incident is not None:
-        changes = scenario.incident.limit_changes(corridor.speed_limit)
+        limit = corridor.speed_limits[scenario.incident.segment]
+        changes = scenario.incident.limit_changes(limit)
         blocked_edge = f"main_{scenario.incident.segment}"
     yield 0
     for second in range(corridor.duration):
@@ -227,9 +228,9 @@ def _routes(corridor: Corridor, scenario: Scenario) -> ElementTree.Element:
             if first >= last:
                 continue
             edges = (
-                *(["upstream"] if origin == MAINLINE else [f"before_on_{origin}", f"on_{origin}"]),
+                *_entry_edges(corridor, origin),
                 *(f"main_{i}" for i in range(first, last)),
-                *(["downstream"] if end == MAINLINE else [f"off_{end}", f"after_off_{end}"]),
+                *_exit_edges(corridor, end),
             )
             ElementTree.SubElement(root, "route", id=f"{origin}:{end}", edges=" ".join(edges))
     for vehicle, (departure, origin, end) in enumerate(
@@ -250,6 +251,20 @@ def _routes(corridor: Corridor, scenario: Scenario) -> ElementTree.Element:
             departLane="best",
         )
     return root
+
+
+def _entry_edges(corridor: Corridor, origin: int) -> list[str]:
+    if origin == MAINLINE:
+        return ["upstream"]
+    name = f"on_{origin}"
+    return [f"before_{name}", *ramp_edges(name, corridor.on_ramp_segments[origin])]
+
+
+def _exit_edges(corridor: Corridor, end: int) -> list[str]:
+    if end == MAINLINE:
+        return ["downstream"]
+    name = f"off_{end}"
+    return [*ramp_edges(name, corridor.off_ramp_segments[end]), f"after_{name}"]
 
 
 def _observe(libsumo: ModuleType, corridor: Corridor, scenario: Scenario) -> Record:

@@ -3,8 +3,8 @@
 The networks of the presets come with the package; any other geometry is compiled on demand, which
 needs `eclipse-sumo` (extra ``corridors``).
 
-Every edge declares the nominal segment length, and the recording runs with SUMO's internal links
-switched off: every vehicle is then on exactly one segment, and all segments are equally long.
+Every edge declares the nominal length of its segment, and the recording runs with SUMO's internal
+links switched off: every vehicle is then on exactly one segment.
 """
 
 import importlib.util
@@ -14,6 +14,7 @@ import os
 import re
 import subprocess
 import tempfile
+from collections.abc import Sequence
 from functools import lru_cache
 from importlib import resources
 from pathlib import Path
@@ -35,6 +36,10 @@ NETCONVERT_OPTIONS = (
 )
 
 
+Point = tuple[float, float]
+"""Coordinates [m]."""
+
+
 class NetworkError(RuntimeError):
     """A network cannot be compiled: netconvert is missing or refused it."""
 
@@ -45,10 +50,11 @@ class Geometry(NamedTuple):
     n_mainline: int
     on_ramps: tuple[int, ...]
     off_ramps: tuple[int, ...]
-    lanes: int
-    ramp_lanes: int
-    segment_length: float
-    speed_limit: float
+    on_ramp_segments: tuple[tuple[int, ...], ...]
+    off_ramp_segments: tuple[tuple[int, ...], ...]
+    segment_lengths: tuple[float, ...]
+    segment_lanes: tuple[int, ...]
+    speed_limits: tuple[float, ...]
 
     @classmethod
     def from_corridor(cls, corridor: Corridor) -> "Geometry":
@@ -58,16 +64,22 @@ class Geometry(NamedTuple):
 
 def edge_ids(corridor: Corridor) -> tuple[str, ...]:
     """Return the SUMO edge of each record column: the S segments, then the R boundary segments."""
-    on_ramps, off_ramps = range(corridor.n_on_ramps), range(corridor.n_off_ramps)
+    on_ramps, off_ramps = corridor.on_ramp_segments, corridor.off_ramp_segments
     return (
         *(f"main_{i}" for i in range(corridor.n_mainline)),
-        *(f"on_{i}" for i in on_ramps),
-        *(f"off_{i}" for i in off_ramps),
+        *(edge for i, ramp in enumerate(on_ramps) for edge in ramp_edges(f"on_{i}", ramp)),
+        *(edge for i, ramp in enumerate(off_ramps) for edge in ramp_edges(f"off_{i}", ramp)),
         "upstream",
         "downstream",
-        *(f"before_on_{i}" for i in on_ramps),
-        *(f"after_off_{i}" for i in off_ramps),
+        *(f"before_on_{i}" for i in range(len(on_ramps))),
+        *(f"after_off_{i}" for i in range(len(off_ramps))),
     )
+
+
+def ramp_edges(name: str, segments: Sequence[int]) -> tuple[str, ...]:
+    """Return the SUMO edges of a ramp's segments, in the direction of travel."""
+    several = len(segments) > 1
+    return tuple(f"{name}_{k}" for k in range(len(segments))) if several else (name,)
 
 
 def network_xml(corridor: Corridor) -> str:
@@ -134,66 +146,116 @@ def _netconvert() -> Path:
 
 def _plain_xml(geometry: Geometry) -> list[str]:
     """Describe nodes, edges and connections in netconvert's plain XML."""
-    nodes, edges, connections = (
-        ElementTree.Element(tag) for tag in ("nodes", "edges", "connections")
-    )
-    length_m = 1000.0 * geometry.segment_length
-
-    def node(name: str, x: float, y: float = 0.0, kind: str = "priority") -> None:
-        ElementTree.SubElement(nodes, "node", id=name, x=f"{x:.2f}", y=f"{y:.2f}", type=kind)
-
-    def edge(name: str, start: str, end: str, lanes: int, shape: str | None = None) -> None:
-        element = ElementTree.SubElement(
-            edges,
-            "edge",
-            {"id": name, "from": start, "to": end, "numLanes": str(lanes), "spreadType": "center"},
-            speed=f"{geometry.speed_limit / 3.6:.4f}",
-            length=f"{length_m:.2f}",
-        )
-        if shape is not None:
-            element.set("shape", shape)
-
-    def connect(start: str, end: str, lanes: int) -> None:
-        for lane in map(str, range(lanes)):
-            attributes = {"from": start, "to": end, "fromLane": lane, "toLane": lane}
-            ElementTree.SubElement(connections, "connection", attributes)
-
-    mainline = ["upstream", *(f"main_{i}" for i in range(geometry.n_mainline)), "downstream"]
-    for face in range(-1, geometry.n_mainline + 2):
+    xml = _PlainXML(geometry)
+    n, lanes, lengths = geometry.n_mainline, geometry.segment_lanes, xml.lengths_m
+    ends = [0.0, *itertools.accumulate(lengths[:n])]
+    x = [-lengths[0], *ends, ends[-1] + lengths[n - 1]]
+    for face in range(-1, n + 2):
         # Plain priority junctions would starve the ramps; a zipper lets both branches flow.
         kind = "zipper" if face in geometry.on_ramps else "priority"
-        node(f"face_{face}", face * length_m, kind=kind)
-    for face, name in enumerate(mainline, start=-1):
-        edge(name, f"face_{face}", f"face_{face + 1}", geometry.lanes)
-    for start, end in itertools.pairwise(mainline):
-        connect(start, end, geometry.lanes)
+        xml.node(f"face_{face}", x[face + 1], kind=kind)
+    names = ["upstream", *(f"main_{i}" for i in range(n)), "downstream"]
+    segments = [0, *range(n), n - 1]
+    for face, (name, segment) in enumerate(zip(names, segments, strict=True), start=-1):
+        xml.edge(name, segment, f"face_{face}", f"face_{face + 1}")
+    for (start, up), (end, down) in itertools.pairwise(zip(names, segments, strict=True)):
+        xml.connect(start, end, min(lanes[up], lanes[down]))
+    for i, (face, ramp) in enumerate(
+        zip(geometry.on_ramps, geometry.on_ramp_segments, strict=True)
+    ):
+        _on_ramp(xml, f"on_{i}", face, ends[face], ramp)
+    for i, (face, ramp) in enumerate(
+        zip(geometry.off_ramps, geometry.off_ramp_segments, strict=True)
+    ):
+        _off_ramp(xml, f"off_{i}", face, ends[face], ramp)
+    return xml.texts()
 
-    # Ramps start and end on the axis of the mainline's rightmost lanes, not of its middle.
-    axis_y = -0.5 * LANE_WIDTH_M * (geometry.lanes - geometry.ramp_lanes)
 
-    def ramp_point(face: int, n_segments: int) -> tuple[float, float]:
-        """Return the point `n_segments` along a ramp: on-ramps count backwards, from the face."""
-        along = n_segments * length_m
+def _on_ramp(xml: "_PlainXML", name: str, face: int, x: float, segments: tuple[int, ...]) -> None:
+    """Add an on-ramp that joins the mainline at a face."""
+    inner = [f"{edge}_start" for edge in ramp_edges(name, segments)]
+    nodes, edges = [f"{name}_entry", *inner], [f"before_{name}", *ramp_edges(name, segments)]
+    cells = (segments[0], *segments)
+    # On-ramps are laid out backwards, from the face.
+    along = [-sum(xml.lengths_m[cell] for cell in cells[k:]) for k in range(len(cells) + 1)]
+    points = [xml.ramp_point(face, x, segments[0], distance) for distance in along]
+    for node, point in zip(nodes, points, strict=False):
+        xml.node(node, *point)
+    targets = [*nodes[1:], f"face_{face}"]
+    for k, (edge, cell) in enumerate(zip(edges, cells, strict=True)):
+        at_face = k == len(edges) - 1
+        xml.edge(edge, cell, nodes[k], targets[k], points[k : k + 2] if at_face else None)
+    for start, end in itertools.pairwise([*edges, f"main_{face}"]):
+        xml.connect(start, end, xml.geometry.segment_lanes[segments[0]])
+
+
+def _off_ramp(xml: "_PlainXML", name: str, face: int, x: float, segments: tuple[int, ...]) -> None:
+    """Add an off-ramp that leaves the mainline at a face."""
+    inner = [f"{edge}_end" for edge in ramp_edges(name, segments)]
+    nodes, edges = [*inner, f"{name}_exit"], [*ramp_edges(name, segments), f"after_{name}"]
+    cells = (*segments, segments[-1])
+    along = [sum(xml.lengths_m[cell] for cell in cells[:k]) for k in range(len(cells) + 1)]
+    points = [xml.ramp_point(face - 1, x, segments[0], distance) for distance in along]
+    for node, point in zip(nodes, points[1:], strict=True):
+        xml.node(node, *point)
+    sources = [f"face_{face}", *nodes[:-1]]
+    for k, (edge, cell) in enumerate(zip(edges, cells, strict=True)):
+        xml.edge(edge, cell, sources[k], nodes[k], points[:2] if k == 0 else None)
+    for start, end in itertools.pairwise([f"main_{face - 1}", *edges]):
+        xml.connect(start, end, xml.geometry.segment_lanes[segments[0]])
+
+
+class _PlainXML:
+    """Nodes, edges and connections of a network, as netconvert reads them."""
+
+    def __init__(self, geometry: Geometry) -> None:
+        self.geometry = geometry
+        self.lengths_m = [1000.0 * length for length in geometry.segment_lengths]
+        self._nodes, self._edges, self._connections = (
+            ElementTree.Element(tag) for tag in ("nodes", "edges", "connections")
+        )
+
+    def node(self, name: str, x: float, y: float = 0.0, kind: str = "priority") -> None:
+        """Add a node [m]."""
+        place = {"x": f"{x:.2f}", "y": f"{y:.2f}"}
+        ElementTree.SubElement(self._nodes, "node", {"id": name, **place, "type": kind})
+
+    def edge(
+        self, name: str, segment: int, start: str, end: str, shape: Sequence[Point] | None = None
+    ) -> None:
+        """Add an edge with length, lanes and limit of a segment."""
+        geometry = self.geometry
+        lanes = str(geometry.segment_lanes[segment])
+        element = ElementTree.SubElement(
+            self._edges,
+            "edge",
+            {"id": name, "from": start, "to": end, "numLanes": lanes, "spreadType": "center"},
+            speed=f"{geometry.speed_limits[segment] / 3.6:.4f}",
+            length=f"{self.lengths_m[segment]:.2f}",
+        )
+        if shape is not None:
+            element.set("shape", " ".join("{:.2f},{:.2f}".format(*point) for point in shape))
+
+    def connect(self, start: str, end: str, lanes: int) -> None:
+        """Connect the rightmost lanes of two edges."""
+        for lane in map(str, range(lanes)):
+            attributes = {"from": start, "to": end, "fromLane": lane, "toLane": lane}
+            ElementTree.SubElement(self._connections, "connection", attributes)
+
+    def ramp_point(self, beside: int, x: float, ramp: int, along: float) -> Point:
+        """Return the point at a distance along a ramp [m] from the face at x [m].
+
+        Ramps start and end on the axis of the mainline's rightmost lanes, not of its middle;
+        `beside` is the mainline segment that the ramp joins or leaves.
+        """
+        lanes = self.geometry.segment_lanes
+        axis_y = -0.5 * LANE_WIDTH_M * (lanes[beside] - lanes[ramp])
         return (
-            face * length_m + along * math.cos(RAMP_ANGLE),
+            x + along * math.cos(RAMP_ANGLE),
             axis_y - abs(along) * math.sin(RAMP_ANGLE),
         )
 
-    def shape(face: int, *points: int) -> str:
-        return " ".join("{:.2f},{:.2f}".format(*ramp_point(face, point)) for point in points)
-
-    for i, face in enumerate(geometry.on_ramps):
-        node(f"on_{i}_entry", *ramp_point(face, -2))
-        node(f"on_{i}_start", *ramp_point(face, -1))
-        edge(f"before_on_{i}", f"on_{i}_entry", f"on_{i}_start", geometry.ramp_lanes)
-        edge(f"on_{i}", f"on_{i}_start", f"face_{face}", geometry.ramp_lanes, shape(face, -1, 0))
-        connect(f"before_on_{i}", f"on_{i}", geometry.ramp_lanes)
-        connect(f"on_{i}", f"main_{face}", geometry.ramp_lanes)
-    for i, face in enumerate(geometry.off_ramps):
-        node(f"off_{i}_end", *ramp_point(face, 1))
-        node(f"off_{i}_exit", *ramp_point(face, 2))
-        edge(f"off_{i}", f"face_{face}", f"off_{i}_end", geometry.ramp_lanes, shape(face, 0, 1))
-        edge(f"after_off_{i}", f"off_{i}_end", f"off_{i}_exit", geometry.ramp_lanes)
-        connect(f"main_{face - 1}", f"off_{i}", geometry.ramp_lanes)
-        connect(f"off_{i}", f"after_off_{i}", geometry.ramp_lanes)
-    return [ElementTree.tostring(root, encoding="unicode") for root in (nodes, edges, connections)]
+    def texts(self) -> list[str]:
+        """Return the three files."""
+        roots = (self._nodes, self._edges, self._connections)
+        return [ElementTree.tostring(root, encoding="unicode") for root in roots]

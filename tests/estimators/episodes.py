@@ -28,21 +28,6 @@ FIXED_SENSORS = (14, 17, 18)
 
 
 @dataclass(frozen=True)
-class Road:
-    """A road as the model asks for it; the paper's lanes and lengths."""
-
-    n_mainline: int = 1
-    on_ramps: tuple[int, ...] = ()
-    off_ramps: tuple[int, ...] = ()
-    exit_shares: tuple[float, ...] = ()
-    segment_length: float = 0.1
-    speed_limit: float = 102.0
-    segment_lanes: tuple[int, ...] = (3,)
-    lanes: int = 3
-    ramp_lanes: int = 1
-
-
-@dataclass(frozen=True)
 class Episodes:
     """n episodes of K steps: what drives a filter and what it should find."""
 

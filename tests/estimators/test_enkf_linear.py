@@ -11,8 +11,9 @@ from dptse_env.estimators import EnsembleSettings, EstimatorSettings
 from dptse_env.estimators.compiled.enkf import CompiledEnKF
 from dptse_env.estimators.reference.enkf import ReferenceEnKF
 from dptse_env.model import ARZModel, load_parameters
+from tests.model.roads import Road
 
-from .episodes import Road, random_streams
+from .episodes import random_streams
 
 both_backends = pytest.mark.parametrize("backend", [CompiledEnKF, ReferenceEnKF])
 
@@ -40,7 +41,7 @@ def linear_system(n_steps=20):
 
 def run_linear(system, backend, n_members, n_seeds):
     settings = replace(system.settings, enkf=EnsembleSettings(n_members=n_members))
-    model = ARZModel(Road(), load_parameters("paper"))
+    model = ARZModel(Road(n_mainline=1), load_parameters("paper"))
     filters, everyone = backend(model, n_seeds, settings), np.arange(n_seeds)
     filters.reset(everyone, np.tile(system.x, (n_seeds, 1)), random_streams(n_seeds))
     for z in system.z:

@@ -14,8 +14,9 @@ from dptse_env.estimators import (
     make_estimator,
 )
 from dptse_env.model import ARZModel, load_parameters
+from tests.model.roads import Road
 
-from .episodes import Road, random_streams
+from .episodes import random_streams
 
 # One segment that nobody enters or leaves has linear dynamics.
 V_F, RHO_M, TAU, V_0 = 102.0, 333.0, 60.0, 51.0
@@ -41,13 +42,13 @@ NO_PRESSURE = replace(PAPER, name="no pressure", gamma=10.0)
 SENSORS = {
     # Below the density that a measurement takes at least, the speed is linear in psi.
     "speed": Sensor(
-        ARZModel(Road(), PAPER),
+        ARZModel(Road(n_mainline=1), PAPER),
         np.array([[1.0, 0.0], [0.0, 1.0 / FLOOR]]),
         np.array([0.0, -V_F * 0.01**2]),
         np.array([0.4, 6.0]),
     ),
     "flow": Sensor(
-        ARZModel(Road(segment_length=1.0), NO_PRESSURE, reference_speed=V_0),
+        ARZModel(Road(n_mainline=1, segment_length=1.0), NO_PRESSURE, reference_speed=V_0),
         np.array([[1.0, 0.0], [-V_0, 1.0]]),
         np.zeros(2),
         np.array([0.4, 40.0]),

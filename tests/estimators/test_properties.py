@@ -13,9 +13,9 @@ from dptse_env.estimators import (
     make_estimator,
 )
 from dptse_env.model import ARZModel, Bounds
+from tests.model.roads import Road
 
 from .episodes import (
-    Road,
     Snapshot,
     assert_same,
     random_streams,

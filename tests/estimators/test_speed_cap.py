@@ -7,8 +7,9 @@ import pytest
 
 from dptse_env.estimators import BACKENDS, ESTIMATORS, EstimatorSettings
 from dptse_env.traffic import PAPER_HIGHWAY
+from tests.model.roads import Road
 
-from .episodes import Road, assert_same, model_of, run, show, simulate, started
+from .episodes import assert_same, model_of, run, show, simulate, started
 
 CAP = 0.7
 
@@ -39,7 +40,7 @@ def test_a_cap_holds_the_reported_speeds_and_nothing_else(name, backend):
 
 def test_the_cap_is_over_the_limit_of_the_road():
     slow = simulate(n_steps=1)
-    road = replace(Road(), n_mainline=1, speed_limit=50.0)
+    road = Road(n_mainline=1, speed_limit=50.0)
     model = type(slow.model)(road, model_of("paper", "speed").parameters)
     start = model.states(np.full((1, 1), 20.0), np.full((1, 1), 80.0))
     episodes = replace(slow, model=model, start=start)

@@ -15,6 +15,7 @@ from dptse_env.estimators.compiled.state_batch import (
 from dptse_env.model import ARZModel, load_parameters
 from dptse_env.model.road_arrays import make_road_arrays
 from dptse_env.traffic import PAPER_HIGHWAY, SHORT_HIGHWAY
+from tests.model.roads import UNEVEN
 
 WIDTH = 104
 
@@ -22,7 +23,7 @@ everywhere = pytest.mark.parametrize(
     ("corridor", "parameters"),
     [
         (corridor, load_parameters(name))
-        for corridor in (PAPER_HIGHWAY, SHORT_HIGHWAY)
+        for corridor in (PAPER_HIGHWAY, SHORT_HIGHWAY, UNEVEN)
         for name in ("paper", "w99-3lane")
     ],
     ids=lambda value: value.name,
@@ -55,7 +56,7 @@ def random_states(model, rng):
 
 
 def random_inputs(model, rng):
-    lanes = np.array([3.0, 3.0, *[1.0] * (model.n_boundaries - 2)]) / 3.0
+    lanes = np.array(model.network.boundary_lanes) / max(model.network.boundary_lanes)
     density = rng.uniform(0.0, 1.2, (1, model.n_boundaries)) * lanes * model.density_scale
     density[rng.random(density.shape) < 0.1] = 0.0
     speed = rng.uniform(0.0, 1.0, density.shape) * model.speed_scale

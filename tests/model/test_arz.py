@@ -14,6 +14,7 @@ from .roads import (
     NO_RELAXATION,
     PAPER,
     STRAIGHT,
+    UNEVEN,
     W99,
     Road,
     model_of,
@@ -23,6 +24,8 @@ from .roads import (
 
 seeds = st.integers(0, 2**32 - 1)
 both_sets = pytest.mark.parametrize("parameters", [PAPER, W99], ids=lambda p: p.name)
+
+both_roads = pytest.mark.parametrize("road", [HIGHWAY, UNEVEN], ids=["highway", "uneven"])
 
 
 def uniform(model: ARZModel, density: float, w: float):
@@ -93,33 +96,36 @@ def test_equilibrium_drivers_obey_the_first_order_godunov_scheme():
 
 
 @both_sets
+@both_roads
 @given(seed=seeds)
-def test_vehicles_are_balanced(parameters, seed):
-    model = model_of(HIGHWAY, parameters)
+def test_vehicles_are_balanced(road, parameters, seed):
+    model = model_of(road, parameters)
     rng = np.random.default_rng(seed)
     states, inputs = random_states(model, 4, rng), random_inputs(model, 4, rng)
     flux = model.fluxes(states, inputs)
-    change = (model.step(states, inputs) - states)[:, 0::2].sum(axis=1)
+    change = (model.step(states, inputs) - states)[:, 0::2] @ model.layout.lengths
     through = flux.source.sum(axis=1) - flux.outflow[:, model.layout.exits].sum(axis=1)
-    np.testing.assert_allclose(change, model.step_ratio * through, atol=1e-9)
+    np.testing.assert_allclose(change, through / 3600.0, atol=1e-9)
 
 
+@both_roads
 @given(seed=seeds)
-def test_relative_flow_is_balanced_without_relaxation(seed):
-    model = model_of(HIGHWAY, NO_RELAXATION)
+def test_relative_flow_is_balanced_without_relaxation(road, seed):
+    model = model_of(road, NO_RELAXATION)
     rng = np.random.default_rng(seed)
     states, inputs = random_states(model, 4, rng), random_inputs(model, 4, rng)
     flux = model.fluxes(states, inputs)
-    change = (model.step(states, inputs) - states)[:, 1::2].sum(axis=1)
+    change = (model.step(states, inputs) - states)[:, 1::2] @ model.layout.lengths
     leaving = flux.relative_outflow[:, model.layout.exits].sum(axis=1)
-    through = model.step_ratio * (flux.relative_source.sum(axis=1) - leaving)
-    np.testing.assert_allclose(change, through, rtol=1e-12, atol=1e-9 * PAPER.free_flow_speed)
+    through = (flux.relative_source.sum(axis=1) - leaving) / 3600.0
+    np.testing.assert_allclose(change, through, rtol=1e-11, atol=1e-9 * PAPER.free_flow_speed)
 
 
 @both_sets
+@both_roads
 @given(seed=seeds)
-def test_density_stays_positive_and_w_within_its_bounds(parameters, seed):
-    model = model_of(HIGHWAY, parameters)
+def test_density_stays_positive_and_w_within_its_bounds(road, parameters, seed):
+    model = model_of(road, parameters)
 
     def w_of(states):  # the plain quotient, in what counts as a vacuum too
         rho, psi = states[:, 0::2], states[:, 1::2]

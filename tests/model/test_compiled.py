@@ -8,11 +8,22 @@ from dptse_env.model.compiled import CompiledARZModel
 from dptse_env.model.kernels import advance, make_scratch
 from dptse_env.model.road_arrays import make_road_arrays
 
-from .roads import HIGHWAY, NO_RELAXATION, PAPER, STRAIGHT, W99, Road, random_inputs, random_states
+from .roads import (
+    HIGHWAY,
+    NO_RELAXATION,
+    PAPER,
+    STRAIGHT,
+    UNEVEN,
+    W99,
+    Road,
+    random_inputs,
+    random_states,
+)
 
 ROADS = {
     "highway": HIGHWAY,
     "straight": STRAIGHT,
+    "uneven": UNEVEN,
     "one cell": Road(n_mainline=1),
     "ramps side by side": Road(on_ramps=(3, 5), off_ramps=(4,), exit_shares=(0.0,)),
 }

@@ -3,11 +3,22 @@ import pytest
 
 from dptse_env.model.compiled import CompiledARZModel
 
-from .roads import HIGHWAY, PAPER, STRAIGHT, W99, Road, model_of, random_inputs, random_states
+from .roads import (
+    HIGHWAY,
+    PAPER,
+    STRAIGHT,
+    UNEVEN,
+    W99,
+    Road,
+    model_of,
+    random_inputs,
+    random_states,
+)
 
 ROADS = {
     "highway": HIGHWAY,
     "straight": STRAIGHT,
+    "uneven": UNEVEN,
     "ramps side by side": Road(on_ramps=(3, 5), off_ramps=(4,), exit_shares=(0.2,)),
     "wide ramps": Road(
         n_mainline=6, on_ramps=(2,), off_ramps=(4,), exit_shares=(0.5,), ramp_lanes=3

@@ -44,8 +44,8 @@ def test_a_row_depends_on_four_cells_at_most_on_the_paper_highway():
         ({"off_ramps": (9, 12)}, r"off_ramps\[0\] must be a face without another ramp, got 9"),
         ({"exit_shares": (0.1,)}, r"network.exit_shares must have 2 entries"),
         ({"exit_shares": (0.1, 1.0)}, r"network.exit_shares\[1\] must be in \[0, 1\), got 1.0"),
-        ({"segment_length": 0.0}, r"network.segment_length must be > 0 km, got 0.0"),
-        ({"ramp_lanes": 0}, r"network.segment_lanes\[15\] must be >= 1, got 0"),
+        ({"segment_length": 0.0}, r"network.segment_lengths\[0\] must be finite and > 0, got 0.0"),
+        ({"ramp_lanes": 0}, r"network.segment_lanes\[15\] must be finite and > 0, got 0"),
     ],
 )
 def test_impossible_geometry_is_named(changes, message):

@@ -43,7 +43,7 @@ def test_paper_highway_has_the_papers_dimensions():
         ({"n_mainline": 15.0}, r"corridor\.n_mainline must be an integer"),
         ({"duration": 0}, r"corridor\.duration must be an integer in 1\.\.100000, got 0"),
         ({"lanes": True}, r"corridor\.lanes must be an integer"),
-        ({"ramp_lanes": 4}, r"corridor\.ramp_lanes must be <= 3 lanes, got 4"),
+        ({"ramp_lanes": 4}, r"corridor\.ramp_lanes must be <= 3 lanes at face 3, got 4"),
         ({"segment_length": 0.01}, r"corridor\.segment_length must be .*, got 0\.01"),
         ({"speed_limit": float("nan")}, r"corridor\.speed_limit must be .*, got nan"),
         ({"average_dwell": 0.0}, r"corridor\.average_dwell must be .*, got 0\.0"),
@@ -103,6 +103,9 @@ def test_the_digest_covers_what_shapes_the_traffic_and_nothing_else():
         "segment_length": 0.2,
         "speed_limit": 100.0,
         "drivers": Drivers("IDM"),
+        "ramp_segments": 2,
+        "ramp_length": 0.2,
+        "ramp_speed_limit": 60.0,
         "network": SumoScenario(
             net="a.net.xml",
             routes=("a.rou.xml",),

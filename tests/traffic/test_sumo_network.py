@@ -78,7 +78,7 @@ def test_a_geometry_of_ones_own_is_compiled_and_drives():
 
 @needs_netconvert
 def test_netconverts_own_words_are_in_the_error():
-    geometry = Geometry.from_corridor(PAPER_HIGHWAY)._replace(ramp_lanes=0)
+    geometry = Geometry.from_corridor(PAPER_HIGHWAY)._replace(segment_lanes=(0,) * 19)
     with pytest.raises(NetworkError, match=r"netconvert refused.*\n.*Error"):
         compile_network(geometry)
 

@@ -12,7 +12,7 @@ from dptse_env.config import EnvConfig
 from dptse_env.parts import flow_centre, make_release
 from dptse_env.release import CappedSettings, SpeedRelease
 from dptse_env.traffic import Record
-from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True)
@@ -20,14 +20,18 @@ class ReleaseDistances:
     """Squared distances between sums with and without a vehicle, in units of the noise.
 
     Attributes:
-        length: Length of a segment [km].
-        largest_speed: The speed limit, which an empty segment has and flows clip to [km/h].
+        length: Length of the shortest segment [km], to which the noise belongs.
+        largest_speed: Largest speed limit, which flows clip to [km/h].
+        limits: Speed limit of each record column [km/h], which an empty segment has.
+        stretch: Length of each record column over the shortest one's, by which its noise is less.
         speed_release: Kind of the release of speeds.
         sigma: Noise of density and of speed or flow, (2,).
     """
 
     length: float
     largest_speed: float
+    limits: FloatArray
+    stretch: FloatArray
     speed_release: SpeedRelease
     sigma: FloatArray
 
@@ -37,18 +41,28 @@ class ReleaseDistances:
         corridor = config.corridor
         speed: SpeedRelease = "mean" if flow_centre(config) is None else "flow"
         sigma = make_release(config).sigma
-        return cls(corridor.segment_length, corridor.speed_limit, speed, sigma)
+        shortest = min(corridor.segment_lengths)
+        return cls(
+            length=shortest,
+            largest_speed=corridor.largest_speed_limit,
+            limits=np.array(corridor.with_boundaries(corridor.speed_limits)),
+            stretch=np.array(corridor.with_boundaries(corridor.segment_lengths)) / shortest,
+            speed_release=speed,
+            sigma=sigma,
+        )
 
     def by_second(self, rest: Record, added: Trajectory) -> FloatArray:
         """Return squares for the seconds of a trajectory that is added to a record, shape (m,)."""
         count = rest.counts[added.step, added.segment]
-        return self._squares(count, rest.speed_sums[added.step, added.segment], added.speed)
+        speed_sum = rest.speed_sums[added.step, added.segment]
+        return self._squares(added.segment, count, speed_sum, added.speed)
 
     def by_row(self, record: Record) -> FloatArray:
         """Return squares for the rows of a record, with and without each, shape (rows,)."""
         speed = record.speed.astype(np.float64)
         count = record.counts[record.step, record.segment] - 1
-        return self._squares(count, record.speed_sums[record.step, record.segment] - speed, speed)
+        others = record.speed_sums[record.step, record.segment] - speed
+        return self._squares(record.segment, count, others, speed)
 
     def where_equal(self, rest: Record, pair: tuple[Trajectory, Trajectory]) -> FloatArray:
         """Return squares between two trajectories on the same segments at the same seconds.
@@ -66,18 +80,20 @@ class ReleaseDistances:
             clipped = np.clip(first, 0.0, self.largest_speed)
             change = (clipped - np.clip(second, 0.0, self.largest_speed)) / self.length
         else:
-            change = (first - second) / (rest.counts[step, segment] + 1)
+            change = (first - second) / (rest.counts[step, segment] + 1) * self.stretch[segment]
         squares: FloatArray = (change / self.sigma[1]) ** 2
         return squares
 
-    def _squares(self, count: IntArray, speed_sum: FloatArray, speed: FloatArray) -> FloatArray:
+    def _squares(
+        self, segment: AnyArray, count: IntArray, speed_sum: FloatArray, speed: FloatArray
+    ) -> FloatArray:
         if self.speed_release == "flow":
             clipped = np.clip(speed, 0.0, self.largest_speed)
             second = (clipped - 0.5 * self.largest_speed) / self.length
         else:
             # An empty segment has the limit.
-            without = np.where(count > 0, speed_sum / np.maximum(count, 1), self.largest_speed)
-            second = (speed_sum + speed) / (count + 1) - without
+            without = np.where(count > 0, speed_sum / np.maximum(count, 1), self.limits[segment])
+            second = ((speed_sum + speed) / (count + 1) - without) * self.stretch[segment]
         first = 1.0 / (self.length * self.sigma[0])
         squares: FloatArray = first**2 + (second / self.sigma[1]) ** 2
         return squares

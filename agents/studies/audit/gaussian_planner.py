@@ -72,7 +72,7 @@ class GaussianPlanner(Planner):
         added = f"an added vehicle that stands on segment {here}"
         if not replaces(self.config):
             return {f"{added}, or none in its place": (stands, Trajectory.absent())}
-        limit = corridor.speed_limit
+        limit = corridor.largest_speed_limit
         elsewhere = Trajectory.constant(seconds, there, 0.0)
         passing = Trajectory.constant(seconds, here, limit)
         return {

@@ -129,7 +129,9 @@ class PacedPlanner(Planner):
         """
         corridor, clip = self.config.corridor, self._release.ledgers.clip
         centres = self._typical(record).terms.centres[seconds - 1, : corridor.n_mainline]
-        products = np.minimum(corridor.speed_limit - centres, clip) * np.minimum(centres, clip)
+        products = np.minimum(corridor.largest_speed_limit - centres, clip) * np.minimum(
+            centres, clip
+        )
         seen = self.observable(record)[seconds, : corridor.n_mainline]
         products = np.where(seen, products, -1.0)
         best = products.max(axis=1)
@@ -138,7 +140,7 @@ class PacedPlanner(Planner):
         still = np.zeros(len(seconds))
         return (
             Trajectory(seconds, segments, still),
-            Trajectory(seconds, segments, still + corridor.speed_limit),
+            Trajectory(seconds, segments, still + corridor.largest_speed_limit),
         )
 
     def reached(self, worlds: AdjacentWorlds) -> float:

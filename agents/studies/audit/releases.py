@@ -103,8 +103,7 @@ class AttackedPaced:
     def __init__(self, model: Paced) -> None:
         """Attack this model."""
         self.model, self._factor = model, 1.0
-        segment_length = model.setup.corridor.segment_length
-        self._lengths = segment_length * model.ledgers.covers.sum(axis=1)
+        self._lengths = model.setup.lengths
 
     def scale_noise(self, factor: float) -> None:
         """See `AttackedRelease.scale_noise`."""

@@ -126,7 +126,7 @@ class LinearStack(CompiledBlend):
     def _estimate(self) -> Estimate:
         features, blend = self.features(), super()._estimate()
         density, speed = (features @ each for each in self._coefficients)
-        limit = 1.1 * self.model.network.speed_limit
+        limit = 1.1 * max(self.model.network.speed_limits)
         return Estimate(
             np.clip(density * self._units[0], 0.0, self._units[0]),
             np.clip(speed * self._units[1], 0.0, limit),

@@ -52,8 +52,8 @@ def mu_met(config: EnvConfig, density_std: float, contributions: int) -> float:
     sensitivity = contribution_sensitivity(
         contributions=contributions,
         adjacency="replace",
-        segment_length=config.corridor.segment_length,
-        largest_speed=config.corridor.speed_limit,
+        segment_length=min(config.corridor.segment_lengths),
+        largest_speed=config.corridor.largest_speed_limit,
     )
     return sensitivity.releases[0].bound / density_std
 
@@ -66,7 +66,7 @@ def mu_alone(
     The vehicle stands, and an empty segment releases the speed limit, so the mean speed moves by
     the limit. In either record `contributions` segments differ.
     """
-    speed = math.sqrt(2.0 * contributions) * config.corridor.speed_limit / mean_speed_std
+    speed = math.sqrt(2.0 * contributions) * config.corridor.largest_speed_limit / mean_speed_std
     return math.hypot(mu_met(config, density_std, contributions), speed)
 
 

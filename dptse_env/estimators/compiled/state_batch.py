@@ -165,7 +165,7 @@ def _enter(
     if states.shape[0] > n:
         demand *= states[n + e]
     for j in range(supply.size):
-        entered = road.step_ratio * (supply[j] if demand[j] > supply[j] else demand[j])
+        entered = road.step_ratio[c] * (supply[j] if demand[j] > supply[j] else demand[j])
         rho[j] += entered
         psi[j] += entered * w_in
 
@@ -206,12 +206,12 @@ def advance_states(
         _flow_out(road, scratch, c, inputs)
     for c in range(road.jam.size):
         rho, psi = states[2 * c], states[2 * c + 1]
-        _leave(rho, psi, scratch.flow[c], scratch.w[c], ratio, road.relaxation, v_f)
+        _leave(rho, psi, scratch.flow[c], scratch.w[c], ratio[c], road.relaxation, v_f)
     for e in range(road.entries.size):
         _enter(road, scratch, e, inputs, states)
     for e in range(road.edges.shape[0]):
         start, end = road.edges[e, 0], road.edges[e, 1]
-        part = ratio * road.edge_share[e]
+        part = ratio[end] * road.edge_share[e]
         _arrive(states[2 * end], states[2 * end + 1], scratch.flow[start], scratch.w[start], part)
 
 

@@ -35,7 +35,7 @@ class Cells(NamedTuple):
     exit_units: FloatArray  # (1 + O,) unit of that density [veh/km]
     lanes: FloatArray  # (S,)
     unit: FloatArray  # (S,) unit of densities [veh/km]
-    limit: float  # speed limit [km/h]
+    limit: float  # largest speed limit [km/h], the unit of speeds
     flows: bool  # whether flows are released, otherwise speeds
     row_first: IntArray  # (M,) first cell of each row of a measurement
     row_span: IntArray  # (M,) number of cells of each row
@@ -45,14 +45,14 @@ class Cells(NamedTuple):
 def make_cells(model: ARZModel) -> Cells:
     """Return the cells of a model's road, and of the measurements that it may get."""
     network, layout = model.network, model.layout
-    n, n_on, S = network.n_mainline, len(network.on_ramps), layout.n_segments
-    marks = np.zeros((S, 4))
-    marks[n : n + n_on, 0] = 1.0
-    marks[n + n_on :, 1] = 1.0
+    marks = np.zeros((layout.n_segments, 4))
+    for kind, ramps in enumerate((network.on_ramp_segments, network.off_ramp_segments)):
+        for segments in ramps:
+            marks[list(segments), kind] = 1.0
     marks[layout.entries, 2] = 1.0
     marks[layout.exits, 3] = 1.0
-    length, limit = network.segment_length, network.speed_limit
-    scales = np.broadcast_to([np.log(length / 0.1), np.log(limit / 100.0)], (S, 2))
+    limits = np.array(network.speed_limits)
+    scales = np.stack([np.log(layout.lengths / 0.1), np.log(limits / 100.0)], axis=1)
     return Cells(
         edges=layout.edges,
         entries=layout.entries,
@@ -62,7 +62,7 @@ def make_cells(model: ARZModel) -> Cells:
         exit_units=DENSITY_UNIT * layout.exit_lanes,
         lanes=layout.lanes,
         unit=DENSITY_UNIT * layout.lanes,
-        limit=float(limit),
+        limit=float(limits.max()),
         flows=model.reference_speed is not None,
         row_first=model.rows.first,
         row_span=model.rows.span,

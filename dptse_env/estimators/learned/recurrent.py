@@ -165,8 +165,8 @@ def check_ranges(saved: SavedNetwork, model: ARZModel) -> None:
     network = model.network
     found = {
         "n_mainline": (network.n_mainline, network.n_mainline),
-        "segment_length": (network.segment_length, network.segment_length),
-        "speed_limit": (network.speed_limit, network.speed_limit),
+        "segment_length": (min(network.segment_lengths), max(network.segment_lengths)),
+        "speed_limit": (min(network.speed_limits), max(network.speed_limits)),
         "lanes": (min(network.segment_lanes), max(network.segment_lanes)),
         "span": (int(model.rows.span.min()), int(model.rows.span.max())),
         "flows": (int(model.reference_speed is not None),) * 2,

@@ -6,7 +6,6 @@ import dataclasses
 import os
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 
@@ -22,8 +21,6 @@ from dptse_env.traffic.sumo_import.net import Net
 from dptse_env.traffic.sumo_scenario import SumoScenario, sha256
 from dptse_env.traffic.worker import simulate_in_child
 from dptse_env.utils.validation import require
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -154,8 +151,12 @@ def _draft(
         options=files.options,
     )
     N, n_on, n_off = len(layout.lengths), len(layout.on_ramps), len(layout.off_ramps)
-    limits = layout.limits if speed_limit is None else (speed_limit,) * N
-    limits = tuple(round(limit, 1) for limit in limits)
+    limits, ramp_limits = layout.limits, layout.ramp_limits
+    if speed_limit is not None:
+        limits, ramp_limits = (speed_limit,) * N, (speed_limit,) * (n_on + n_off)
+    limits, ramp_limits = (
+        tuple(round(limit, 1) for limit in each) for each in (limits, ramp_limits)
+    )
     return Corridor(
         name=name,
         n_mainline=N,
@@ -166,10 +167,12 @@ def _draft(
         incident=None,
         fixed_sensors=(N - 1, *(N + n_on + i for i in range(n_off))),
         duration=duration,
-        lanes=_one(layout.lanes),  # type: ignore[arg-type]
-        ramp_lanes=_one(layout.ramp_lanes or (1,)),  # type: ignore[arg-type]
-        segment_length=_one(_kilometres(layout.lengths)),  # type: ignore[arg-type]
-        speed_limit=_one(limits),  # type: ignore[arg-type]
+        lanes=layout.lanes,
+        ramp_lanes=layout.ramp_lanes or 1,
+        segment_length=_kilometres(layout.lengths),
+        speed_limit=limits,
+        ramp_length=_kilometres(layout.ramp_lengths) or None,
+        ramp_speed_limit=ramp_limits or None,
         density_scale=DENSITY_SCALE * max(layout.lanes),
         speed_scale=max(limits),
         network=network,
@@ -178,11 +181,6 @@ def _draft(
 
 def _kilometres(lengths: Sequence[float]) -> tuple[float, ...]:
     return tuple(round(length / 1000.0, 4) for length in lengths)
-
-
-def _one(values: tuple[T, ...]) -> T | tuple[T, ...]:
-    """Return the one value of all, or the values."""
-    return values[0] if len(set(values)) == 1 else values
 
 
 def _appearing(corridor: Corridor, record: Record) -> tuple[str, ...]:

@@ -1,0 +1,134 @@
+"""An environment on a road of one's own, from a road file."""
+
+import dataclasses
+import json
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from dptse_env.estimators import ESTIMATORS
+from dptse_env.release import RELEASE_MODELS
+from dptse_env.schedules import make_schedule
+from dptse_env.traffic import write_corridor
+from tests.model.roads import UNEVEN
+
+ID = "dptse_env:dptse/PrivateHighway-v1"
+ROAD = dataclasses.replace(UNEVEN, duration=120)
+
+
+@pytest.fixture(scope="module")
+def road_file(tmp_path_factory):
+    path = tmp_path_factory.mktemp("road") / "uneven.toml"
+    write_corridor(path, ROAD, {"parameters": "w99-3lane", "bandwidth": 3, "horizon": 40})
+    return str(path)
+
+
+def make(road_file, **keywords):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        return gym.make(ID, corridor=road_file, traffic_seeds=[0], **keywords)
+
+
+def play(env, steps=40):
+    observation, info = env.reset(seed=0)
+    rewards = []
+    for _ in range(steps):
+        assert env.observation_space.contains(observation)
+        observation, reward, _, truncated, info = env.step(env.action_space.sample())
+        rewards.append(reward)
+    assert truncated
+    return np.array(rewards), info
+
+
+@pytest.mark.parametrize("estimator", sorted(set(ESTIMATORS) - {"recurrent"}))
+def test_every_estimator_runs_on_an_uneven_road(road_file, estimator):
+    env = make(road_file, estimator=estimator)
+    rewards, info = play(env)
+    assert np.isfinite(rewards).all()
+    assert info["rmse_density"] < 100.0
+
+
+@pytest.mark.parametrize("estimator", ["ekf", "ukf", "mhe"])
+def test_both_backends_agree_on_an_uneven_road(road_file, estimator):
+    found = []
+    for backend in ("compiled", "reference"):
+        env = make(road_file, estimator=estimator, backend=backend)
+        env.action_space.seed(0)
+        found.append(play(env)[0])
+    np.testing.assert_allclose(found[0], found[1], rtol=1e-4)
+
+
+@pytest.mark.parametrize("preset", RELEASE_MODELS)
+def test_every_release_model_runs_on_an_uneven_road(road_file, preset):
+    rewards, _ = play(make(road_file, privacy=preset))
+    assert np.isfinite(rewards).all()
+
+
+def test_a_recurrent_network_is_refused_outside_its_ranges_and_runs_if_told_so(road_file):
+    env = make(road_file, estimator="recurrent")
+    with pytest.raises(ValueError, match="were trained on"):
+        env.reset(seed=0)
+    settings = {"recurrent": {"outside": True}}
+    rewards, _ = play(make(road_file, estimator="recurrent", estimator_settings=settings))
+    assert np.isfinite(rewards).all()
+
+
+def test_the_road_survives_the_spec_and_a_vector_environment(road_file):
+    env = make(road_file)
+    again = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
+    assert again.unwrapped.config.corridor == env.unwrapped.config.corridor == ROAD
+    with pytest.warns(UserWarning, match="estimator_settings: not of this road"):
+        vector = gym.make_vec(ID, num_envs=2, corridor=road_file, traffic_seeds=[0])
+    vector.reset(seed=0)
+    _, reward, *_ = vector.step(vector.action_space.sample())
+    assert np.isfinite(reward).all()
+
+
+@pytest.mark.parametrize("name", ["round-robin", "largest-deviation", "stale-variance"])
+def test_schedules_run_on_an_uneven_road(road_file, name):
+    env = make(road_file)
+    policy = make_schedule(name, env)
+    observation, _ = env.reset(seed=0)
+    state, start = None, np.ones(1, dtype=bool)
+    for _ in range(20):
+        action, state = policy.predict(observation, state, start, True)
+        observation, reward, *_ = env.step(action)
+        start = np.zeros(1, dtype=bool)
+    assert np.isfinite(reward)
+
+
+def test_sums_need_segments_of_one_length(road_file):
+    with pytest.raises(ValueError, match=r"query_spans must be \(1,\) where mainline segments"):
+        make(road_file, query_spans=[1, 2])
+
+
+def test_the_time_step_must_suit_the_shortest_segment(tmp_path):
+    lengths = (0.1,) * 7 + (0.04,)
+    write_corridor(tmp_path / "short.toml", dataclasses.replace(ROAD, segment_length=lengths))
+    with pytest.raises(
+        ValueError, match=r"CFL condition of parameters .* on a segment of 0\.04 km"
+    ):
+        make(str(tmp_path / "short.toml"), parameters="w99-3lane")
+
+
+def test_a_reset_names_what_is_not_of_the_road(tmp_path):
+    path = tmp_path / "plain.toml"
+    path.write_text("n_mainline = 5\nduration = 60\nlanes = 2\n[demand]\nmainline = [[0, 1500]]\n")
+    with pytest.warns(UserWarning, match="not of this road"):
+        env = gym.make(ID, corridor=str(path), traffic_seeds=[0], bandwidth=2)
+    _, info = env.reset(seed=0)
+    assert set(info["inherited"]) == {
+        "corridor.average_dwell", "parameters", "estimator_settings",
+    }  # fmt: skip
+    assert json.dumps(info["inherited"])
+
+
+def test_pictures_show_segments_to_scale(road_file):
+    env = make(road_file, render_mode="rgb_array")
+    env.reset(seed=0)
+    env.step(env.action_space.sample())
+    picture = env.render()
+    assert picture.ndim == 3
+    assert picture.std() > 0.0

@@ -1,0 +1,133 @@
+"""Roads whose segments differ, driven in SUMO."""
+
+import dataclasses
+import itertools
+import re
+
+import numpy as np
+import pytest
+
+from dptse_env.traffic import PAPER_HIGHWAY, Demand, Incident, simulate
+from dptse_env.traffic.sumo_network import edge_ids, network_xml
+from tests.model.roads import UNEVEN
+
+ROAD = dataclasses.replace(
+    UNEVEN, duration=240, incident=Incident(5, ((60.0, 120.0, 10.0), (120.0, 140.0, 40.0)))
+)
+
+
+@pytest.fixture(scope="module")
+def uneven():
+    return simulate(ROAD, 0)
+
+
+def successors(corridor):
+    """Columns into which a vehicle may pass from each column."""
+    n, s = corridor.n_mainline, corridor.n_segments
+    following = {i: {i + 1} for i in range(n - 1)} | {n - 1: {s + 1}, s: {0}}
+    boundary = s + 2
+    for face, segments in zip(corridor.on_ramps, corridor.on_ramp_segments, strict=True):
+        chain = [boundary, *segments, face]
+        following |= {a: {b} for a, b in itertools.pairwise(chain)}
+        boundary += 1
+    for face, segments in zip(corridor.off_ramps, corridor.off_ramp_segments, strict=True):
+        chain = [*segments, boundary]
+        following |= {a: {b} for a, b in itertools.pairwise(chain)}
+        following[face - 1].add(segments[0])
+        boundary += 1
+    return following
+
+
+def test_vehicles_pass_from_segment_to_segment_along_the_road(uneven):
+    following = successors(ROAD)
+    passed = set()
+    for vehicle in range(uneven.n_vehicles):
+        mine = uneven.vehicle == vehicle
+        places, steps = uneven.segment[mine].tolist(), uneven.step[mine]
+        assert np.all(np.diff(steps) == 1), "a vehicle vanished for a while"
+        for a, b in itertools.pairwise(places):
+            if a != b:
+                # A second may take a fast vehicle over the whole of a short segment.
+                reached, two = following[a], set()
+                for between in reached:
+                    two |= following.get(between, set())
+                assert b in reached | two, (a, b)
+                passed.add((a, b))
+    for a, reached in following.items():
+        assert any((a, b) in passed for b in reached), f"nobody ever left column {a}"
+
+
+def test_the_network_has_the_lengths_lanes_and_limits_of_the_corridor():
+    text = network_xml(ROAD)
+    lengths = ROAD.with_boundaries(ROAD.segment_lengths)
+    lanes = ROAD.with_boundaries(ROAD.segment_lanes)
+    limits = ROAD.with_boundaries(ROAD.speed_limits)
+    for edge, length, count, limit in zip(edge_ids(ROAD), lengths, lanes, limits, strict=True):
+        found = re.findall(
+            rf'<lane id="{edge}_\d+" index="\d+" .*?speed="([\d.]+)" length="([\d.]+)"', text
+        )
+        assert len(found) == count, edge
+        assert {float(speed) for speed, _ in found} == {round(limit / 3.6, 2)}
+        assert {float(each) for _, each in found} == {round(1000.0 * length, 2)}
+
+
+def test_the_limit_after_an_incident_is_that_of_its_segment(uneven):
+    slow, after = slice(80, 120), slice(180, 240)
+    speeds = uneven.speed_sums[:, 5] / np.maximum(uneven.counts[:, 5], 1)
+    seen = uneven.counts[:, 5] > 0
+    assert speeds[slow][seen[slow]].mean() < 20.0
+    assert 40.0 < speeds[after][seen[after]].mean() <= 1.2 * 80.0
+
+
+def test_a_lane_drop_lets_two_lanes_of_traffic_through():
+    demand = Demand(mainline=((0.0, 5500.0),))
+    road = dataclasses.replace(
+        PAPER_HIGHWAY, on_ramps=(), off_ramps=(), exit_shares=(), incident=None, demand=demand,
+        lanes=(3,) * 10 + (2,) * 5, fixed_sensors=(), duration=400,
+    )  # fmt: skip
+    record = simulate(road, 0)
+    gone = np.unique(record.vehicle[(record.segment == 14) & (record.step >= 200)])
+    flow = 3600.0 * len(gone) / 200.0
+    assert 2800.0 < flow < 4500.0
+    queue = record.counts[300:, 7:10].mean() / 0.1
+    assert queue > 60.0, "traffic queues ahead of the drop"
+
+
+def test_equal_values_are_the_same_road_as_one_value():
+    same = dataclasses.replace(
+        PAPER_HIGHWAY,
+        lanes=(3,) * 15,
+        segment_length=(0.1,) * 15,
+        speed_limit=(102.0,) * 15,
+        ramp_lanes=(1,) * 4,
+        ramp_segments=(1,) * 4,
+    )
+    assert same == PAPER_HIGHWAY
+    assert same.digest == PAPER_HIGHWAY.digest
+
+
+def test_names_of_ramp_segments():
+    names = ROAD.segment_names
+    assert names[8:] == (
+        "on-ramp 1", "on-ramp 2.1", "on-ramp 2.2", "on-ramp 2.3",
+        "off-ramp 1.1", "off-ramp 1.2", "off-ramp 2",
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"lanes": (3, 3)}, r"corridor\.lanes must be one value, or 8, one for each mainline"),
+        (
+            {"ramp_lanes": (1, 1)},
+            r"corridor\.ramp_lanes must be one value, or 4, one for each ramp",
+        ),
+        ({"segment_length": (0.1,) * 7 + (0.01,)}, r"corridor\.segment_length\[7\] must be"),
+        ({"ramp_segments": 0}, r"corridor\.ramp_segments must be an integer in 1\.\.100, got 0"),
+        ({"ramp_lanes": (1, 2, 2, 4)}, r"corridor\.ramp_lanes must be <= 3 lanes at face 6, got 4"),
+        ({"fixed_sensors": (15,)}, r"corridor\.fixed_sensors\[0\] must be .* 0\.\.14, got 15"),
+    ],
+)
+def test_impossible_geometry_is_refused_by_path(fields, message):
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(ROAD, **fields)
