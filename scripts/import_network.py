@@ -2,7 +2,7 @@
 
 python scripts/import_network.py --configuration town.sumocfg --first e12 --last e40 --begin 25200 \
     --duration 900 --output a8.toml
-python scripts/import_network.py --net a8.net.xml --routes a8.rou.xml --path e1 e2 e3
+python scripts/import_network.py --net a8.net.xml --routes a8.rou.xml --path "e1 e2 e3"
 """
 
 from __future__ import annotations
@@ -37,18 +37,19 @@ class Args:
     """Route files; those of the configuration if not given."""
     additional: tuple[Path, ...] = ()
     """Additional files; those of the configuration if not given."""
-    path: tuple[str, ...] = ()
-    """Edges of the road, in the direction of travel; its ends become the boundary segments."""
+    path: str = ""
+    """Edges of the road in the direction of travel, with blanks between them, as in
+    --path="e1 -e2"; its ends become the boundary segments."""
     first: str | None = None
-    """First edge, instead of a path."""
+    """First edge, instead of a path; --first=-e1 where its name begins with a hyphen."""
     last: str | None = None
     """Last edge: the road is the shortest path between the two."""
     first_position: float = 0.0
     """Position on the first edge at which the road begins [m]."""
     last_position: float | None = None
     """Position on the last edge at which the road ends [m]; its end if not given."""
-    leave_out: tuple[str, ...] = ()
-    """Edges that join or leave the path and are to be no ramps."""
+    leave_out: str = ""
+    """Edges that join or leave the path and are to be no ramps, with blanks between them."""
     segment_length: float = 100.0
     """Wanted length of a segment [m]."""
     begin: int | None = None
@@ -62,8 +63,8 @@ class Args:
     """Speed limit of all segments [km/h]; that of the edges if not given."""
     step_length: float | None = None
     """SUMO's time step [s]; that of the configuration, or else 1, if not given."""
-    options: tuple[str, ...] = ()
-    """Further options of SUMO, for instance --options=--time-to-teleport=-1."""
+    options: str = ""
+    """Further options of SUMO, as in --options="--time-to-teleport=-1 --eager-insert=true"."""
     seed: int = 0
     """Traffic seed of the run that demand and exit shares are counted in."""
 
@@ -75,7 +76,7 @@ def main(args: Args) -> None:
     files = _files(args)
     path, between = _path(args)
     ends = (args.first_position, args.last_position)
-    layout = find_layout(files, path, args.segment_length, between, args.leave_out, ends)
+    layout = find_layout(files, path, args.segment_length, between, args.leave_out.split(), ends)
     road = import_road(
         files,
         layout,
@@ -105,7 +106,7 @@ def _files(args: Args) -> Files:
         routes=args.routes or files.routes,
         additional=args.additional or files.additional,
         step_length=args.step_length or files.step_length,
-        options=(*files.options, *args.options),
+        options=(*files.options, *args.options.split()),
     )
 
 
@@ -114,7 +115,7 @@ def _path(args: Args) -> tuple[tuple[str, ...], bool]:
     if args.path:
         if args.first or args.last:
             raise ValueError("path must be given alone, or first and last without it")
-        return args.path, False
+        return tuple(args.path.split()), False
     if args.first is None or args.last is None:
         raise ValueError("path must be given, or first and last")
     return (args.first, args.last), True

@@ -48,7 +48,7 @@ def test_path_and_files_may_be_given_one_by_one(folder, monkeypatch):
     output = folder / "given.toml"
     args = Args(
         output=output, net=folder / "road.net.xml", routes=(folder / "road.rou.xml",),
-        path=PATH, step_length=0.5, duration=120,
+        path=" ".join(PATH), step_length=0.5, duration=120,
     )  # fmt: skip
     main(args)
     given, named = read_corridor(output), read_corridor(folder / "My own.toml")

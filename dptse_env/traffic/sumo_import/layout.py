@@ -11,7 +11,7 @@ import numpy as np
 
 from dptse_env.traffic.sumo_import.chain import Chain
 from dptse_env.traffic.sumo_import.net import Net
-from dptse_env.traffic.sumo_import.ramps import Ramp, find_ramps, left_out_of
+from dptse_env.traffic.sumo_import.ramps import Ramp, find_ramps
 from dptse_env.traffic.sumo_scenario import Stretch
 from dptse_env.utils.validation import require
 
@@ -89,7 +89,7 @@ def lay_out(
     cuts = _cuts(chain, limits, ramps, segment_length)
     faces = {ramp.junction: _face(cuts, chain.ends[ramp.junction]) for ramp in ramps}
     ordered = [ramp for joins in (True, False) for ramp in ramps if ramp.joins is joins]
-    lengths = [_ramp_length(ramp, segment_length) for ramp in ordered]
+    lengths = [min(segment_length, 0.5 * ramp.usable) for ramp in ordered]
     parts = list(pairwise(cuts[1:-1]))
     lanes = tuple(chain.lanes(start, end) for start, end in parts)
     beside = [lanes[faces[ramp.junction] - (not ramp.joins)] for ramp in ordered]
@@ -117,27 +117,38 @@ def _merged(ramps: list[Ramp], chain: Chain) -> tuple[list[Ramp], list[str]]:
     """Make one ramp of those of a kind that are too near for a segment between them.
 
     Raises:
-        ValueError: An on-ramp and an off-ramp are too near.
+        ValueError: An on-ramp and an off-ramp are too near, or a ramp is too short; the message
+            names all of them.
     """
     kept: list[Ramp] = []
     remarks: list[str] = []
+    problems: list[str] = []
+    dropped: list[Ramp] = []
     for ramp in ramps:
         last = kept[-1] if kept else None
         apart = chain.ends[ramp.junction] - chain.ends[last.junction] if last else np.inf
-        if last is None or apart >= _shortest(chain, ramp.junction):
-            kept.append(ramp)
-            continue
-        if last.joins is not ramp.joins:
-            raise ValueError(
-                f"path: {last.kind} {'+'.join(last.names)} and {ramp.kind} {'+'.join(ramp.names)} "
-                f"are {apart:.0f} m apart, without room for a segment between them: leave one of "
-                f"them out, with {left_out_of([last])} or {left_out_of([ramp])}"
+        if ramp.usable < 2 * SHORTEST:
+            problems.append(
+                f"{ramp} has {ramp.usable:.0f} m of the {2 * SHORTEST:.0f} m for a segment and a "
+                "boundary segment"
             )
-        last.names += ramp.names
-        last.branches += ramp.branches
-        last.exits += ramp.exits
-        remarks.append(
-            f"{ramp.kind}s {', '.join(last.names)} are one ramp: they are {apart:.0f} m apart"
+            dropped.append(ramp)
+        elif last is None or apart >= _shortest(chain, ramp.junction):
+            kept.append(ramp)
+        elif last.joins is not ramp.joins:
+            problems.append(f"{last} and {ramp} are {apart:.0f} m apart")
+            dropped.append(ramp)
+        else:
+            last.names += ramp.names
+            last.branches += ramp.branches
+            last.exits += ramp.exits
+            remarks.append(f"one ramp: {last}, {apart:.0f} m apart")
+    if problems:
+        names = " ".join(name for ramp in dropped for name in ramp.names)
+        raise ValueError(
+            f"path: must have room for every ramp and for a segment between an on-ramp and an "
+            f"off-ramp, got: {'; '.join(problems)}; leave out some of them, for instance "
+            f'--leave-out="{names}"'
         )
     return kept, remarks
 
@@ -190,12 +201,12 @@ def _cuts(
 def _too_short(chain: Chain, ramps: list[Ramp], start: float, end: float, least: float) -> str:
     def place(distance: float) -> str:
         here = [ramp for ramp in ramps if chain.ends[ramp.junction] == distance]
-        names = " and ".join(f"{ramp.kind} {'+'.join(ramp.names)}" for ramp in here)
+        names = " and ".join(map(str, here))
         return names or ("its start" if distance == start else "its end")
 
     return (
-        f"path: must have {least:.0f} m from {place(start)} to {place(end)} for its segments at "
-        f"this speed limit, got {end - start:.0f} m: lengthen the path, or leave a ramp out "
+        f"path: must have {least:.1f} m from {place(start)} to {place(end)} for its segments at "
+        f"this speed limit, got {end - start:.1f} m: lengthen the path, or leave a ramp out "
         "(--leave-out)"
     )
 
@@ -203,21 +214,6 @@ def _too_short(chain: Chain, ramps: list[Ramp], start: float, end: float, least:
 def _face(cuts: list[float], place: float) -> int:
     """Return the number of the face at a distance; face 0 ends the upstream boundary segment."""
     return int(np.argmin(np.abs(np.array(cuts) - place))) - 1
-
-
-def _ramp_length(ramp: Ramp, wanted: float) -> float:
-    """Return the length of a ramp [m].
-
-    Raises:
-        ValueError: Its road is too short for a segment and a boundary segment.
-    """
-    length = min(wanted, 0.5 * ramp.usable)
-    if length < SHORTEST:
-        raise ValueError(
-            f"path: {ramp.kind} {'+'.join(ramp.names)} must be {2 * SHORTEST:.0f} m long for a "
-            f"segment and a boundary segment, got {ramp.usable:.0f} m: {left_out_of([ramp])}"
-        )
-    return length
 
 
 def _columns(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
@@ -64,10 +64,9 @@ class Ramp:
     branches: list[Branch] = field(default_factory=list)
     exits: list[str] = field(default_factory=list)
 
-    @property
-    def kind(self) -> str:
-        """Name of its kind."""
-        return "on-ramp" if self.joins else "off-ramp"
+    def __str__(self) -> str:
+        """Return its kind and its edges."""
+        return f"{'on' if self.joins else 'off'}-ramp {'+'.join(self.names)}"
 
     def lanes(self, length: float) -> int:
         """Return the number of lanes of all branches together, over a length from the path [m]."""
@@ -148,8 +147,3 @@ def _walk(edge: Any, joins: bool, taken: Collection[Any], wanted: float) -> list
 def _width(edge: Any, neighbour: Any, joins: bool) -> int:
     """Return the number of lane connections between an edge of a branch and the next one."""
     return len(connections(edge, neighbour) if joins else connections(neighbour, edge))
-
-
-def left_out_of(ramps: Iterable[Ramp]) -> str:
-    """Return the option that leaves ramps out."""
-    return "--leave-out " + " ".join(name for ramp in ramps for name in ramp.names)
