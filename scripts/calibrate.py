@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 
-from agents.evaluation.episodes import parse_keywords
 from agents.evaluation.terminal import make_table, print_table
 from agents.experiments.files import replacing
 from dptse_env.config import parse_seeds
@@ -105,7 +104,7 @@ def main(args: Args) -> None:
     shared = sorted(set(train) & set(held_out))
     if shared:
         raise ValueError(f"held_out must not share seeds with train, both have {shared}")
-    corridor = make_corridor(args.corridor, args.env, parse_keywords(args.keywords))
+    corridor = make_corridor(args.env, args.given_keywords())
     library = args.library(corridor, (*train, *held_out))
     dwell = mean_dwell((library.get(corridor, seed) for seed in train), corridor.n_mainline)
     fit = calibrate(

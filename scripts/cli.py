@@ -16,7 +16,7 @@ from typing import Any
 
 import tyro
 
-from agents.evaluation.episodes import make_config
+from agents.evaluation.episodes import make_config, parse_keywords
 from dptse_env.traffic import (
     CORRIDORS,
     Corridor,
@@ -46,7 +46,7 @@ class Recording:
 
 @dataclass(frozen=True)
 class Road(Recording):
-    """A road to record."""
+    """An environment and its road."""
 
     corridor: str | None = None
     """Corridor: the name of a shipped one, a road file that ends in .toml, or a JSON object of
@@ -54,8 +54,11 @@ class Road(Recording):
     env: str = "dptse_env:dptse/PaperHighway-v0"
     """Environment id."""
     keywords: str = "{}"
-    """Keywords of the environment as JSON; those about the corridor, its demand and its incident
-    matter."""
+    """Keywords of the environment as JSON, such as '{"incident": "random"}'."""
+
+    def given_keywords(self) -> dict[str, Any]:
+        """Return the keywords of the environment, with the corridor if one is given."""
+        return given_keywords(self.keywords, self.corridor)
 
 
 _NOT_RESULTS = ("workers", "records", "output")
@@ -114,35 +117,46 @@ def _words(args: Any) -> Iterator[str]:
                 yield from (shlex.quote(str(each)) for each in values)
 
 
-def make_corridor(corridor: str | None, env: str, keywords: Mapping[str, Any]) -> Corridor:
-    """Return the corridor of an environment.
+def given_keywords(keywords: str, corridor: str | None) -> dict[str, Any]:
+    """Return the keywords of an environment that a command line gives.
 
     Args:
-        corridor: Name of a shipped corridor, a road file, or a JSON object of corridor fields that
-            replace those of the environment's; None for the environment's corridor.
-        env: Environment id.
-        keywords: Keywords of the environment.
+        keywords: A JSON object.
+        corridor: Name of a shipped corridor, a road file, or a JSON object of corridor fields;
+            None for the corridor of the keywords or the environment.
 
     Raises:
-        ValueError: A name is unknown, or a field or keyword is unknown or out of range.
+        ValueError: The keywords are no JSON object, the corridor is unknown, or both name one.
     """
-    given: dict[str, Any] = {}
-    if corridor is not None:
-        given["corridor"] = corridor
-        if corridor not in CORRIDORS and not is_road_file(corridor):
-            with contextlib.suppress(json.JSONDecodeError):
-                given["corridor"] = json.loads(corridor)
-            if not isinstance(given["corridor"], dict):
-                raise ValueError(
-                    f"corridor must be one of {', '.join(CORRIDORS)}, a road file that ends in "
-                    f".toml, or a JSON object of corridor fields, got {corridor!r}"
-                )
-        # Traffic does not depend on queries, and a short road may have fewer segments.
-        given |= {"bandwidth": 1, "query_spans": [1]}
+    given = parse_keywords(keywords)
+    if corridor is None:
+        return given
+    if "corridor" in given:
+        raise ValueError("corridor must be given once, as an argument or among the keywords")
+    value: Any = corridor
+    if corridor not in CORRIDORS and not is_road_file(corridor):
+        with contextlib.suppress(json.JSONDecodeError):
+            value = json.loads(corridor)
+        if not isinstance(value, dict):
+            raise ValueError(
+                f"corridor must be one of {', '.join(CORRIDORS)}, a road file that ends in "
+                f".toml, or a JSON object of corridor fields, got {corridor!r}"
+            )
+    return {"corridor": value, **given}
+
+
+def make_corridor(env: str, keywords: Mapping[str, Any]) -> Corridor:
+    """Return the corridor of an environment with some keywords.
+
+    Raises:
+        ValueError: A field or keyword is unknown or out of range.
+    """
+    # Traffic does not depend on queries, and a short road may have fewer segments.
+    queries = {"bandwidth": 1, "query_spans": [1]} if "corridor" in keywords else {}
     with warnings.catch_warnings():
         # They are about the guarantee and the estimator; only the corridor is wanted.
         warnings.simplefilter("ignore", UserWarning)
-        return make_config(env, {**given, **keywords}).corridor
+        return make_config(env, {**queries, **keywords}).corridor
 
 
 def records_argument(records: Path | None) -> str | None:

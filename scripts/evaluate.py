@@ -20,7 +20,6 @@ from agents.evaluation.episodes import (
     Policy,
     make_config,
     make_vector,
-    parse_keywords,
     run_episodes,
     seed_kind,
     watch_episode,
@@ -37,21 +36,16 @@ from dptse_env.config import EnvConfig, parse_seeds
 from dptse_env.policies import TRANSFERABLE
 from dptse_env.schedules import OBSERVATION_SCHEDULES
 from dptse_env.traffic import is_road_file
-from scripts.cli import Recording, records_argument, run
+from scripts.cli import Road, records_argument, run
 
 ALL = "all"
 """The schedule that runs with a bandwidth that covers the road."""
 
 
 @dataclass(frozen=True)
-class Args(Recording):
+class Args(Road):
     """Evaluate query schedules and trained policies."""
 
-    env: str = "dptse_env:dptse/PaperHighway-v0"
-    """Environment id."""
-    keywords: str = "{}"
-    """Keywords of the environment as JSON, such as '{"reward": "speed"}'; arguments below come
-    before them."""
     schedules: tuple[str, ...] = tuple(OBSERVATION_SCHEDULES)
     """Query schedules and oracles; 'all' runs with a bandwidth that covers the road."""
     policies: tuple[str, ...] = ()
@@ -90,7 +84,7 @@ def make_keywords(args: Args, estimator: str, source: PolicySource) -> dict[str,
         ValueError: An argument is no JSON object or no file of parameters.
     """
     keywords: dict[str, Any] = {
-        **parse_keywords(args.keywords),
+        **args.given_keywords(),
         **source.keywords,
         "estimator": estimator,
         "traffic_seeds": args.seeds,

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import dataclasses
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from dptse_env.traffic import Demand, write_corridor
+from dptse_env.traffic import write_corridor
 from dptse_env.traffic.sumo_import import (
     Files,
     ImportedRoad,
@@ -134,16 +135,19 @@ def _comment(road: ImportedRoad) -> str:
         f"{min(layout.lanes)} to {max(layout.lanes)} lanes, "
         f"{min(layout.limits):.0f} to {max(layout.limits):.0f} km/h",
     ]
-    demand = corridor.demand
-    assert isinstance(demand, Demand)
-    rates = [rate for _, rate in demand.mainline]
-    lines.append(f"mainline: {min(rates):.0f} to {max(rates):.0f} veh/h")
-    for face, name, rate in zip(corridor.on_ramps, on, demand.on_ramps, strict=True):
-        lines.append(f"on-ramp at face {face}: {name}, {rate:.0f} veh/h")
+    demand = corridor.published_demand
+    lines.append(f"mainline: {_range(demand.mainline)}")
+    for face, name, rates in zip(corridor.on_ramps, on, demand.ramp_profiles, strict=True):
+        lines.append(f"on-ramp at face {face}: {name}, {_range(rates)}")
     for face, name, share in zip(corridor.off_ramps, off, corridor.exit_shares, strict=True):
         lines.append(f"off-ramp at face {face}: {name}, {100 * share:.1f} % leave")
     lines += [f"note: {remark}" for remark in road.remarks]
     return "\n".join(lines)
+
+
+def _range(profile: Sequence[tuple[float, float]]) -> str:
+    rates = [rate for _, rate in profile]
+    return f"{min(rates):.0f} to {max(rates):.0f} veh/h"
 
 
 if __name__ == "__main__":

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from agents.evaluation.episodes import parse_keywords
 from dptse_env.config import parse_seeds
 from dptse_env.traffic import mean_dwell
 from scripts.cli import Road, make_corridor, run
@@ -27,10 +26,10 @@ class Args(Road):
 
 def main(args: Args) -> None:
     """Record, and print the number of records and their mean dwell."""
-    keywords = parse_keywords(args.keywords)
+    keywords = args.given_keywords()
     if args.random:
         keywords |= {"demand": "random", "incident": "random"}
-    corridor, seeds = make_corridor(args.corridor, args.env, keywords), parse_seeds(args.seeds)
+    corridor, seeds = make_corridor(args.env, keywords), parse_seeds(args.seeds)
     library = args.library(corridor, seeds)
     dwell = mean_dwell((library.get(corridor, seed) for seed in seeds), corridor.n_mainline)
     print(f"{corridor.name}: {len(seeds)} record(s) in {library.path}")

@@ -19,13 +19,12 @@ from typing import Annotated
 import torch
 import tyro
 
-from agents.evaluation.episodes import parse_keywords
 from agents.training.plan import TrainingPlan
 from agents.training.recipes import MaskablePPORecipe, MaskRecipe, PlackettLuceRecipe, ScoresRecipe
 from agents.training.training import BEST, POLICY, Training
 from dptse_env.config import parse_seeds
 from dptse_env.utils.validation import integer
-from scripts.cli import Recording, records_argument, resumable, run
+from scripts.cli import Road, records_argument, resumable, run
 from scripts.training_bar import Bar, watched
 
 AnyRecipe = (
@@ -37,13 +36,11 @@ AnyRecipe = (
 
 
 @dataclass(frozen=True)
-class Args(Recording):
+class Args(Road):
     """Train a query policy."""
 
     env: str = "dptse_env:dptse/PrivateHighway-v0"
     """Environment id."""
-    keywords: str = "{}"
-    """Keywords of the environment as JSON, such as '{"estimator": "ukf", "bandwidth": 3}'."""
     seed: int = 0
     """Training seed."""
     steps: int | None = None
@@ -80,7 +77,7 @@ def make_plan(args: Args) -> TrainingPlan:
         steps=args.recipe.default_steps if args.steps is None else args.steps,
         traffic_seeds=parse_seeds(args.traffic, "traffic"),
         validation_seeds=parse_seeds(args.validation, "validation"),
-        keywords=parse_keywords(args.keywords),
+        keywords=args.given_keywords(),
         validate_every=args.validate_every,
         checkpoint_every=args.checkpoint_every,
     )

@@ -20,7 +20,6 @@ import optuna
 from rich.table import Table
 from tqdm import tqdm
 
-from agents.evaluation.episodes import parse_keywords
 from agents.evaluation.terminal import make_table, print_table
 from agents.experiments.engine import make_pool
 from agents.experiments.seeds import TUNING
@@ -30,7 +29,7 @@ from agents.search.tuning_task import TuningTask
 from dptse_env.model import ARZParameters
 from dptse_env.model.parameters import read_parameters
 from dptse_env.utils.validation import integer
-from scripts.cli import Recording, records_argument, resumable, run
+from scripts.cli import Recording, given_keywords, records_argument, resumable, run
 
 
 @dataclass(frozen=True)
@@ -39,6 +38,9 @@ class Args:
 
     env: str = "dptse_env:dptse/PaperHighway-v0"
     """Environment id."""
+    corridor: str | None = None
+    """Corridor: the name of a shipped one, a road file that ends in .toml, or a JSON object of
+    fields; the environment's own if not given."""
     keywords: str = "{}"
     """Keywords of the environment as JSON, such as '{"privacy": {"cap": 16}}'; arguments below come
     before them."""
@@ -86,7 +88,11 @@ def make_tasks(args: Args) -> list[TuningTask]:
     Raises:
         ValueError: An argument is out of range.
     """
-    keywords = {**parse_keywords(args.keywords), "epsilon": args.epsilon, "delta": args.delta}
+    keywords = {
+        **given_keywords(args.keywords, args.corridor),
+        "epsilon": args.epsilon,
+        "delta": args.delta,
+    }
     if args.bandwidth is not None:
         keywords["bandwidth"] = args.bandwidth
     integer("trials", args.trials, 1)

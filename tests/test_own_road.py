@@ -77,7 +77,8 @@ def test_a_recurrent_network_is_refused_outside_its_ranges_and_runs_if_told_so(r
 
 def test_the_road_survives_the_spec_and_a_vector_environment(road_file):
     env = make(road_file)
-    again = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
+    with pytest.warns(UserWarning, match="estimator_settings: not of this road"):
+        again = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
     assert again.unwrapped.config.corridor == env.unwrapped.config.corridor == ROAD
     with pytest.warns(UserWarning, match="estimator_settings: not of this road"):
         vector = gym.make_vec(ID, num_envs=2, corridor=road_file, traffic_seeds=[0])

@@ -4,23 +4,23 @@ import numpy as np
 import numpy.typing as npt
 
 from dptse_env.model import ARZModel
-from dptse_env.traffic import Corridor, Demand, DemandDistribution
+from dptse_env.traffic import Corridor
+from dptse_env.traffic.demand import value_at
 from dptse_env.utils.arrays import FloatArray
-
-
-def _published(corridor: Corridor) -> Demand:
-    demand = corridor.demand
-    return demand.base if isinstance(demand, DemandDistribution) else demand
 
 
 def nominal_flows(corridor: Corridor, times: npt.ArrayLike) -> FloatArray:
     """Return the flows [veh/h] at the published demand, (..., S), at times [s] of shape (...)."""
-    demand = _published(corridor)
-    starts, rates = np.array(demand.mainline).T
-    flow = rates[np.searchsorted(starts, times, side="right") - 1]
-    on = dict(zip(corridor.on_ramps, demand.on_ramps, strict=True))
-    off = dict(zip(corridor.off_ramps, corridor.exit_shares, strict=True))
-    entering = [np.full_like(flow, rate) for rate in demand.on_ramps]
+    demand = corridor.published_demand
+    flow = value_at(demand.mainline, times)
+    entering = [value_at(steps, times) for steps in demand.ramp_profiles]
+    on = dict(zip(corridor.on_ramps, entering, strict=True))
+    shares: list[FloatArray] = (
+        [np.full_like(flow, share) for share in corridor.exit_shares]
+        if demand.exit_shares is None
+        else [value_at(steps, times) for steps in demand.exit_shares]
+    )
+    off = dict(zip(corridor.off_ramps, shares, strict=True))
     mainline, leaving = [], []
     for segment in range(corridor.n_mainline):
         if segment in off:
@@ -60,11 +60,10 @@ def nominal_inputs(corridor: Corridor, model: ARZModel) -> FloatArray:
     that reaches them. Incidents are not considered.
     """
     layout, v_f = model.layout, model.parameters.free_flow_speed
-    demand = _published(corridor)
     flows = nominal_flows(corridor, np.arange(corridor.duration + 1))
     inputs = np.empty((len(flows), model.n_inputs))
     inputs[:, layout.entry_inputs[0]] = flows[:, 0]  # no ramp lies ahead of the first segment
-    inputs[:, layout.entry_inputs[1:]] = demand.on_ramps
+    inputs[:, layout.entry_inputs[1:]] = flows[:, layout.entries[1:]]
     inputs[:, layout.entry_inputs + 1] = v_f
     leaving = flows[:, layout.exits]
     inputs[:, layout.exit_inputs] = free_flow_density(model, leaving, model.exit_jam_density)

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Annotated, TypeVar
 
-from dptse_env.traffic.demand import Demand, DemandDistribution
+from dptse_env.traffic.demand import Demand, DemandDistribution, Share
 from dptse_env.traffic.drivers import Drivers
 from dptse_env.traffic.incident import Incident, IncidentDistribution
 from dptse_env.traffic.sumo_scenario import SumoScenario
@@ -31,8 +31,6 @@ NOT_TRAFFIC = ("name", "fixed_sensors", "density_scale", "speed_scale", "average
 
 Face = Annotated[int, Interval(1, 999)]
 """Number of a face between two mainline segments."""
-Share = Annotated[float, Interval(0, 1, open_low=True, open_high=True)]
-"""Share of the vehicles that pass an off-ramp."""
 Lanes = Annotated[int, Interval(1, 16)]
 """Number of lanes."""
 # SUMO cannot drive an edge shorter than about a vehicle and its gap.
@@ -62,7 +60,8 @@ class Corridor:
         off_ramps: face of each off-ramp, in 1..N-1, increasing, none shared with an on-ramp.
         exit_shares: share in (0, 1) of the vehicles passing each off-ramp that take it.
         demand: arrival rates, fixed or drawn per traffic seed.
-        incident: a temporary speed limit, fixed or drawn per traffic seed; None for free traffic.
+        incident: a temporary speed limit, fixed or drawn per traffic seed, or several of them; None
+            for free traffic.
         fixed_sensors: indices of the segments measured at every step.
         duration: length of a record [s].
         lanes: lanes of the mainline; where they get fewer, the leftmost ones end.
@@ -95,7 +94,7 @@ class Corridor:
     off_ramps: tuple[Face, ...]
     exit_shares: tuple[Share, ...]
     demand: Demand | DemandDistribution
-    incident: Incident | IncidentDistribution | None
+    incident: Incident | IncidentDistribution | tuple[Incident | IncidentDistribution, ...] | None
     fixed_sensors: tuple[Annotated[int, Interval(0, 2997)], ...]
     duration: Annotated[int, Interval(1, 100_000)]
     lanes: Lanes | tuple[Lanes, ...] = 3
@@ -123,11 +122,18 @@ class Corridor:
             integer(f"corridor.fixed_sensors[{i}]", sensor, 0, self.n_segments - 1)
         unique = len(set(sensors)) == len(sensors)
         require(unique, "corridor.fixed_sensors", "free of duplicates", sensors)
-        demand = self.demand.base if isinstance(self.demand, DemandDistribution) else self.demand
+        demand = self.published_demand
         allowed = f"one rate for each of the {self.n_on_ramps} on-ramps"
         fits = len(demand.on_ramps) == self.n_on_ramps
         require(fits, "corridor.demand.on_ramps", allowed, demand.on_ramps)
-        self._check_incident()
+        allowed = f"steps for each of the {self.n_off_ramps} off-ramps"
+        fits = demand.exit_shares is None or len(demand.exit_shares) == self.n_off_ramps
+        require(fits, "corridor.demand.exit_shares", allowed, demand.exit_shares)
+        if isinstance(self.incident, tuple) and len(self.incident) < 2:
+            # One incident in a sequence is the incident, and an empty sequence is none.
+            object.__setattr__(self, "incident", self.incident[0] if self.incident else None)
+        for incident in self.incidents:
+            self._check_incident(incident)
         self._check_network()
 
     def _check_ramps(self) -> None:
@@ -163,10 +169,7 @@ class Corridor:
             most = lanes[segments[0]]
             require(most <= lanes[beside], "corridor.ramp_lanes", allowed, most)
 
-    def _check_incident(self) -> None:
-        incident = self.incident
-        if incident is None:
-            return
+    def _check_incident(self, incident: Incident | IncidentDistribution) -> None:
         if isinstance(incident, Incident):
             segments, start = [incident.segment], incident.start
         else:
@@ -184,6 +187,19 @@ class Corridor:
         require(fits, "corridor.network.columns", allowed, len(self.network.columns))
         allowed = "left out on a road with a network of its own"
         require(self.drivers == Drivers(), "corridor.drivers", allowed, self.drivers)
+
+    @property
+    def published_demand(self) -> Demand:
+        """The demand, or that which random levels are about."""
+        demand = self.demand
+        return demand.base if isinstance(demand, DemandDistribution) else demand
+
+    @property
+    def incidents(self) -> tuple[Incident | IncidentDistribution, ...]:
+        """The incidents, of any number."""
+        if self.incident is None:
+            return ()
+        return self.incident if isinstance(self.incident, tuple) else (self.incident,)
 
     @property
     def n_on_ramps(self) -> int:
@@ -316,7 +332,10 @@ class Corridor:
         for name, value in UNIFORM.items():
             if content[name] == value:
                 del content[name]  # as before ramps could differ
-        del content["network"]  # as in digests from before there were any
+        demand = content["demand"].get("base", content["demand"])
+        if demand["exit_shares"] is None:
+            del demand["exit_shares"]  # as before shares could vary
+        del content["network"]  # as before there were any
         if self.network is not None:
             scale = self.demand.scale if isinstance(self.demand, DemandDistribution) else None
             content = {
@@ -325,6 +344,7 @@ class Corridor:
                 "incident": content["incident"],
                 "duration": self.duration,
             }
-        content["kinds"] = [type(self.demand).__name__, type(self.incident).__name__]
+        kinds = [type(each).__name__ for each in self.incidents] or ["NoneType"]
+        content["kinds"] = [type(self.demand).__name__, *kinds]
         text = json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)
         return hashlib.sha256(text.encode()).hexdigest()

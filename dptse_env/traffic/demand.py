@@ -1,9 +1,12 @@
 """Demand: arrival rates of vehicles, fixed or drawn for every traffic seed."""
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
+import numpy.typing as npt
+from numpy.typing import NDArray
 
 from dptse_env.utils.fields import Interval, checked_fields
 from dptse_env.utils.validation import require
@@ -12,6 +15,12 @@ Rate = Annotated[float, Interval(0, 100_000)]
 """Vehicles an hour."""
 Second = Annotated[float, Interval(0, 1e6)]
 """Seconds of simulated time."""
+Profile = tuple[tuple[Second, Rate], ...]
+"""Steps (time [s], rate [veh/h]): each rate holds until the next time, the last one to the end."""
+Share = Annotated[float, Interval(0, 1, open_low=True, open_high=True)]
+"""Share of the vehicles that pass an off-ramp."""
+ShareProfile = tuple[tuple[Second, Share], ...]
+"""Steps (time [s], share), as in a `Profile`."""
 Factor = Annotated[float, Interval(0, 100, open_low=True)]
 """Factor on every rate."""
 
@@ -23,29 +32,63 @@ class Demand:
     Attributes:
         mainline: steps (time [s], rate [veh/h]); each rate holds until the next time, the first
             time is 0 and the last rate holds until the end.
-        on_ramps: one constant rate [veh/h] per on-ramp.
+        on_ramps: for each on-ramp a constant rate [veh/h], or steps as for the mainline.
+        exit_shares: for each off-ramp steps (time [s], share), by the time at which vehicles
+            enter the road; None for the corridor's constant shares. Estimators know these alone.
 
     Raises:
-        ValueError: A rate is negative, or the times do not start at 0 and increase.
+        ValueError: A rate is negative, a share leaves (0, 1), or the times of steps do not start
+            at 0 and increase.
     """
 
-    mainline: tuple[tuple[Second, Rate], ...]
-    on_ramps: tuple[Rate, ...] = ()
+    mainline: Profile
+    on_ramps: tuple[Rate | Profile, ...] = ()
+    exit_shares: tuple[ShareProfile, ...] | None = None
 
     def __post_init__(self) -> None:
         """Check the fields and bring them to their declared types."""
         checked_fields(self, "demand")
-        times = np.array([time for time, _ in self.mainline])
-        increasing = len(times) > 0 and times[0] == 0.0 and bool(np.all(np.diff(times) > 0))
-        allowed = "steps (time, rate) whose times start at 0 and increase"
-        require(increasing, "demand.mainline", allowed, self.mainline)
+        _check_steps("demand.mainline", self.mainline, "rate")
+        for i, rates in enumerate(self.on_ramps):
+            if isinstance(rates, tuple):
+                _check_steps(f"demand.on_ramps[{i}]", rates, "rate")
+        for i, shares in enumerate(self.exit_shares or ()):
+            _check_steps(f"demand.exit_shares[{i}]", shares, "share")
+
+    @property
+    def ramp_profiles(self) -> tuple[Profile, ...]:
+        """Steps (time [s], rate [veh/h]) of each on-ramp."""
+        return tuple(
+            rates if isinstance(rates, tuple) else ((0.0, rates),) for rates in self.on_ramps
+        )
 
     def scaled(self, factor: float) -> "Demand":
         """Return this demand with every rate multiplied by `factor` [-]."""
-        return Demand(
-            mainline=tuple((time, rate * factor) for time, rate in self.mainline),
-            on_ramps=tuple(rate * factor for rate in self.on_ramps),
+        return dataclasses.replace(
+            self,
+            mainline=_scaled(self.mainline, factor),
+            on_ramps=tuple(
+                _scaled(rates, factor) if isinstance(rates, tuple) else rates * factor
+                for rates in self.on_ramps
+            ),
         )
+
+
+def value_at(steps: Profile, times: npt.ArrayLike) -> NDArray[np.float64]:
+    """Return the value of steps at times [s] of any shape."""
+    starts, values = np.array(steps).T
+    found: NDArray[np.float64] = values[np.searchsorted(starts, times, side="right") - 1]
+    return found
+
+
+def _scaled(steps: Profile, factor: float) -> Profile:
+    return tuple((time, rate * factor) for time, rate in steps)
+
+
+def _check_steps(path: str, steps: Profile, of: str) -> None:
+    times = np.array([time for time, _ in steps])
+    increasing = len(times) > 0 and times[0] == 0.0 and bool(np.all(np.diff(times) > 0))
+    require(increasing, path, f"steps (time, {of}) whose times start at 0 and increase", steps)
 
 
 @dataclass(frozen=True)

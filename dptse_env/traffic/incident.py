@@ -1,5 +1,6 @@
 """Incidents: temporary speed limits, fixed or drawn for every traffic seed."""
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -48,18 +49,6 @@ class Incident:
     def start(self) -> float:
         """Start of the first phase [s]."""
         return self.phases[0][0]
-
-    def limit_changes(self, speed_limit: float) -> list[tuple[float, float]]:
-        """Return the changes of the segment's limit as pairs (time [s], new limit [km/h]).
-
-        `speed_limit` is the limit outside the phases [km/h].
-        """
-        changes: list[tuple[float, float]] = []
-        for start, end, limit in self.phases:
-            if changes and changes[-1][0] == start:
-                changes.pop()  # the next phase follows directly, without the usual limit in between
-            changes += [(start, limit), (end, speed_limit)]
-        return changes
 
 
 @dataclass(frozen=True)
@@ -116,3 +105,25 @@ class IncidentDistribution:
                 (blocked_until, recovered_at, recovery_limit),
             ),
         )
+
+
+def limit_changes(
+    incidents: Iterable[Incident], speed_limits: Sequence[float]
+) -> list[tuple[float, int, float]]:
+    """Return the changes of limits in order, each as (time [s], segment, new limit [km/h]).
+
+    Where several incidents act on a segment at once, the lowest of their limits holds.
+
+    Args:
+        incidents: The incidents.
+        speed_limits: Limit of each segment outside incidents [km/h].
+    """
+    by_segment: dict[int, list[tuple[float, float, float]]] = {}
+    for incident in incidents:
+        by_segment.setdefault(incident.segment, []).extend(incident.phases)
+    changes = []
+    for segment, phases in by_segment.items():
+        for time in sorted({time for start, end, _ in phases for time in (start, end)}):
+            active = [limit for start, end, limit in phases if start <= time < end]
+            changes.append((time, segment, min(active, default=speed_limits[segment])))
+    return sorted(changes)

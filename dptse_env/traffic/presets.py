@@ -48,7 +48,29 @@ SHORT_HIGHWAY = Corridor(
 )
 """A 0.6 km stretch with one ramp of each kind and a jam, for tests and first trials."""
 
-SHIPPED_CORRIDORS = (PAPER_HIGHWAY, SHORT_HIGHWAY)
+LONG_HIGHWAY = Corridor(
+    name="long-highway",
+    n_mainline=120,
+    on_ramps=(24, 52, 80, 108),
+    off_ramps=(20, 48, 76, 104),
+    exit_shares=(0.1, 0.1, 0.1, 0.1),
+    demand=DemandDistribution(
+        Demand(
+            mainline=((0.0, 3000.0), (300.0, 5000.0), (750.0, 3000.0)),
+            on_ramps=(400.0, 400.0, 400.0, 400.0),
+        )
+    ),
+    incident=(
+        IncidentDistribution(tuple(range(10, 60)), start=(300.0, 700.0)),
+        IncidentDistribution(tuple(range(60, 119)), start=(400.0, 800.0)),
+    ),
+    fixed_sensors=(119, 124, 125, 126, 127),
+    duration=1200,
+    average_dwell=4.9,
+)
+"""A 12 km stretch with four interchanges; demand level and two incidents vary with the seed."""
+
+SHIPPED_CORRIDORS = (PAPER_HIGHWAY, SHORT_HIGHWAY, LONG_HIGHWAY)
 """Corridors whose compiled networks come with the package."""
 
 CORRIDORS = Registry(
@@ -88,9 +110,7 @@ def randomised(corridor: Corridor) -> Corridor:
     the record's duration. The demand of `corridor` is the base of the distribution; its incident is
     dropped. Other fields are unchanged, also `average_dwell`, which should be measured again.
     """
-    demand = corridor.demand
-    base = demand.base if isinstance(demand, DemandDistribution) else demand
-    total = corridor.duration
+    base, total = corridor.published_demand, corridor.duration
     incident = IncidentDistribution(
         segments=tuple(range(corridor.n_mainline - 1)),
         start=(0.1 * total, 0.65 * total),

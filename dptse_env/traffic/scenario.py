@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dptse_env.traffic.corridor import Corridor
-from dptse_env.traffic.demand import Demand, DemandDistribution
+from dptse_env.traffic.demand import Demand, DemandDistribution, value_at
 from dptse_env.traffic.incident import Incident, IncidentDistribution
 from dptse_env.utils.validation import integer
 
@@ -25,7 +25,7 @@ class Scenario:
     Attributes:
         seed: the traffic seed.
         demand: the realised mean rates.
-        incident: the realised incident, or None.
+        incidents: the realised incidents.
         departures: (V,) desired departure times [s], non-decreasing; a vehicle's index is its id.
         origins: (V,) index of the on-ramp, or `MAINLINE`.
         exits: (V,) index of the off-ramp, or `MAINLINE`.
@@ -38,7 +38,7 @@ class Scenario:
 
     seed: int
     demand: Demand
-    incident: Incident | None
+    incidents: tuple[Incident, ...]
     departures: NDArray[np.float64]
     origins: NDArray[np.int64]
     exits: NDArray[np.int64]
@@ -62,22 +62,25 @@ def draw_scenario(corridor: Corridor, seed: int) -> Scenario:
     """
     integer("traffic seed", seed, 0)
     demand_seed, incident_seed, arrival_seed, sumo_seed = np.random.SeedSequence(seed).spawn(4)
-    demand, incident, scale = corridor.demand, corridor.incident, 1.0
+    demand, scale = corridor.demand, 1.0
     if isinstance(demand, DemandDistribution):
         scale = demand.draw_scale(np.random.default_rng(demand_seed))
         demand = demand.base.scaled(scale)
-    if isinstance(incident, IncidentDistribution):
-        incident = incident.draw(np.random.default_rng(incident_seed))
+    generator = np.random.default_rng(incident_seed)
+    incidents = tuple(
+        each.draw(generator) if isinstance(each, IncidentDistribution) else each
+        for each in corridor.incidents
+    )
     generator = np.random.default_rng(arrival_seed)
     duration = corridor.duration if corridor.network is None else 0
     departures, origins = _arrivals(demand, duration, generator)
     return Scenario(
         seed=seed,
         demand=demand,
-        incident=incident,
+        incidents=incidents,
         departures=departures,
         origins=origins,
-        exits=_exits(corridor, origins, generator),
+        exits=_exits(corridor, demand, departures, origins, generator),
         sumo_seed=int(np.random.default_rng(sumo_seed).integers(2**31 - 1)),
         scale=scale,
     )
@@ -88,7 +91,7 @@ def _arrivals(
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Poisson arrivals of every entry, merged in order of time."""
     profiles = [(MAINLINE, demand.mainline)]
-    profiles += [(ramp, ((0.0, rate),)) for ramp, rate in enumerate(demand.on_ramps)]
+    profiles += enumerate(demand.ramp_profiles)
     times, origins = [np.empty(0)], [np.empty(0, dtype=np.int64)]
     for origin, profile in profiles:
         ends = [*(time for time, _ in profile[1:]), duration]
@@ -104,14 +107,17 @@ def _arrivals(
 
 
 def _exits(
-    corridor: Corridor, origins: NDArray[np.int64], generator: np.random.Generator
+    corridor: Corridor,
+    demand: Demand,
+    departures: NDArray[np.float64],
+    origins: NDArray[np.int64],
+    generator: np.random.Generator,
 ) -> NDArray[np.int64]:
     """Let each vehicle choose at each diverge that it passes, until it has left."""
     entry_face = np.array([*corridor.on_ramps, 0], dtype=np.int64)[origins]
     exits = np.full(len(origins), MAINLINE, dtype=np.int64)
-    for ramp, (face, share) in enumerate(
-        zip(corridor.off_ramps, corridor.exit_shares, strict=True)
-    ):
-        leaves = generator.random(len(origins)) < share
+    profiles = demand.exit_shares or tuple(((0.0, share),) for share in corridor.exit_shares)
+    for ramp, (face, profile) in enumerate(zip(corridor.off_ramps, profiles, strict=True)):
+        leaves = generator.random(len(origins)) < value_at(profile, departures)
         exits[leaves & (exits == MAINLINE) & (entry_face < face)] = ramp
     return exits

@@ -27,6 +27,7 @@ import numpy as np
 
 from dptse_env.traffic import sumo_files
 from dptse_env.traffic.corridor import Corridor
+from dptse_env.traffic.incident import limit_changes
 from dptse_env.traffic.record import Record
 from dptse_env.traffic.scenario import MAINLINE, Scenario, draw_scenario
 from dptse_env.traffic.sumo_network import edge_ids, network_xml, ramp_edges
@@ -140,7 +141,7 @@ def running(corridor: Corridor, scenario: Scenario) -> Iterator[ModuleType]:
 
 
 def seconds(libsumo: ModuleType, corridor: Corridor, scenario: Scenario) -> Iterator[int]:
-    """Advance a loaded simulation second by second, with the scenario's incident.
+    """Advance a loaded simulation second by second, with the scenario's incidents.
 
     Yields:
         0, 1, ..., `corridor.duration`: the second [s] whose state libsumo holds.
@@ -148,18 +149,13 @@ def seconds(libsumo: ModuleType, corridor: Corridor, scenario: Scenario) -> Iter
     if corridor.network is not None:
         yield from sumo_files.seconds(libsumo, corridor.network, corridor.duration)
         return
-    changes: list[tuple[float, float]] = []
-    blocked_edge = ""
-    if scenario.incident is not None:
-        limit = corridor.speed_limits[scenario.incident.segment]
-        changes = scenario.incident.limit_changes(limit)
-        blocked_edge = f"main_{scenario.incident.segment}"
+    changes = limit_changes(scenario.incidents, corridor.speed_limits)
     yield 0
     for second in range(corridor.duration):
         for substep in range(SUBSTEPS):
             while changes and changes[0][0] <= second + substep * STEP_LENGTH:
-                _, limit = changes.pop(0)
-                libsumo.edge.setMaxSpeed(blocked_edge, limit / KMH)
+                _, segment, limit = changes.pop(0)
+                libsumo.edge.setMaxSpeed(f"main_{segment}", limit / KMH)
             libsumo.simulationStep()
         yield second + 1
 

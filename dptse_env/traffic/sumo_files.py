@@ -6,7 +6,7 @@ nothing is written: output options are refused, and what additional files would 
 """
 
 import gzip
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
 from xml.etree import ElementTree
@@ -92,14 +92,14 @@ def observe(libsumo: ModuleType, corridor: Corridor, scenario: Scenario) -> Reco
     places = Places(network.columns)
     vehicles_on = libsumo.edge.getLastStepVehicleIDs
     position_of, speed_of = libsumo.vehicle.getLanePosition, libsumo.vehicle.getSpeed
-    limit = SegmentLimit(libsumo, scenario.incident)
+    limits = VehicleLimits(libsumo, scenario.incidents)
     numbers: dict[str, int] = {}
     steps: list[int] = []
     vehicles: list[int] = []
     columns: list[int] = []
     speeds: list[float] = []
     for second in seconds(libsumo, network, corridor.duration):
-        limited: list[str] = []
+        affected: dict[str, int] = {}
         for edge in places:
             for name in vehicles_on(edge):
                 column = places.column(edge, position_of(name))
@@ -109,9 +109,9 @@ def observe(libsumo: ModuleType, corridor: Corridor, scenario: Scenario) -> Reco
                 vehicles.append(numbers.setdefault(name, len(numbers)))
                 columns.append(column)
                 speeds.append(speed_of(name))
-                if column == limit.segment:
-                    limited.append(name)
-        limit.update(second, limited)
+                if column in limits.segments:
+                    affected[name] = column
+        limits.update(second, affected)
     order = np.lexsort((columns, steps))
     return Record(
         step=np.array(steps, dtype=np.int32)[order],
@@ -123,39 +123,56 @@ def observe(libsumo: ModuleType, corridor: Corridor, scenario: Scenario) -> Reco
     )
 
 
-class SegmentLimit:
-    """The incident's limit, for the vehicles on its segment.
+class VehicleLimits:
+    """Limits of incidents, for the vehicles on their segments.
 
-    Edges of one's own network may be much longer than a segment, so the limit is not set on them:
-    a vehicle has it from the first second at which it is on the segment to the first at which it is
+    Edges of one's own network may be much longer than a segment, so limits are not set on them: a
+    vehicle has one from the first second at which it is on the segment to the first at which it is
     not.
 
     Args:
         libsumo: the module, with a simulation.
-        incident: the incident; None for free traffic.
+        incidents: the incidents.
+
+    Attributes:
+        segments: the segments with an incident.
     """
 
-    def __init__(self, libsumo: ModuleType, incident: Incident | None) -> None:
+    def __init__(self, libsumo: ModuleType, incidents: Sequence[Incident]) -> None:
         """Start without limited vehicles."""
-        self.segment = -1 if incident is None else incident.segment
-        self._phases = () if incident is None else incident.phases
+        self.segments = frozenset(incident.segment for incident in incidents)
         self._libsumo = libsumo
+        self._incidents = incidents
         self._usual: dict[str, float] = {}
 
-    def update(self, second: int, vehicles: list[str]) -> None:
-        """Limit the `vehicles` on the segment at a second of the record, and free all others."""
-        limits = [limit for start, end, limit in self._phases if start <= second < end]
+    def update(self, second: int, vehicles: Mapping[str, int]) -> None:
+        """Limit vehicles by name on their segments at a second of the record; free all others."""
         vehicle = self._libsumo.vehicle
-        for name in vehicles if limits else ():
-            self._usual.setdefault(name, vehicle.getMaxSpeed(name))
-            vehicle.setMaxSpeed(name, min(limits[0] / KMH, self._usual[name]))
-        gone = self._usual.keys() - set(vehicles if limits else ())
-        if gone:
-            present = set(vehicle.getIDList())
-            for name in sorted(gone):
-                usual = self._usual.pop(name)
-                if name in present:
-                    vehicle.setMaxSpeed(name, usual)
+        limited = {
+            name: limit
+            for name, segment in vehicles.items()
+            if (limit := self._limit(second, segment)) is not None
+        }
+        for name, limit in limited.items():
+            usual = self._usual.setdefault(name, vehicle.getMaxSpeed(name))
+            vehicle.setMaxSpeed(name, min(limit / KMH, usual))
+        free = self._usual.keys() - limited.keys()
+        present = set(vehicle.getIDList()) if free else set()
+        for name in sorted(free):
+            usual = self._usual.pop(name)
+            if name in present:
+                vehicle.setMaxSpeed(name, usual)
+
+    def _limit(self, second: int, segment: int) -> float | None:
+        """Return the lowest limit of incidents on a segment at a second [km/h], if there is one."""
+        limits = [
+            limit
+            for incident in self._incidents
+            if incident.segment == segment
+            for start, end, limit in incident.phases
+            if start <= second < end
+        ]
+        return min(limits, default=None)
 
 
 def _without_outputs(path: Path, copy: Path) -> Path:

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from dptse_env.traffic import Incident, IncidentDistribution
+from dptse_env.traffic.incident import limit_changes
 
 
 @pytest.mark.parametrize(
@@ -23,8 +24,18 @@ def test_bad_incidents_are_refused_by_path(segment, phases, message):
 def test_limits_return_to_normal_between_phases_only_where_there_is_a_gap():
     touching = Incident(0, ((10, 20, 5), (20, 30, 50)))
     apart = Incident(0, ((10, 20, 5), (25, 30, 50)))
-    assert touching.limit_changes(100.0) == [(10, 5), (20, 50), (30, 100)]
-    assert apart.limit_changes(100.0) == [(10, 5), (20, 100), (25, 50), (30, 100)]
+    assert limit_changes([touching], [100.0]) == [(10, 0, 5), (20, 0, 50), (30, 0, 100)]
+    assert limit_changes([apart], [100.0]) == [
+        (10, 0, 5), (20, 0, 100), (25, 0, 50), (30, 0, 100),
+    ]  # fmt: skip
+
+
+def test_the_lowest_limit_holds_where_incidents_overlap():
+    first, second = Incident(1, ((10, 40, 20),)), Incident(1, ((20, 30, 5), (30, 50, 60)))
+    elsewhere = Incident(0, ((15, 25, 8),))
+    assert limit_changes([first, second, elsewhere], [100.0, 80.0]) == [
+        (10, 1, 20), (15, 0, 8), (20, 1, 5), (25, 0, 100), (30, 1, 20), (40, 1, 60), (50, 1, 80),
+    ]  # fmt: skip
 
 
 def test_drawn_incidents_stay_in_the_declared_ranges_and_fill_them():

@@ -4,7 +4,7 @@ from dptse_env.traffic import CORRIDORS, PAPER_HIGHWAY, DemandDistribution, rand
 
 
 def test_presets_are_found_by_their_names():
-    for name in ("paper-highway", "short-highway"):
+    for name in ("paper-highway", "short-highway", "long-highway"):
         assert CORRIDORS[name].name == name
 
 
@@ -18,7 +18,7 @@ def test_the_papers_demand_and_incident():
 @pytest.mark.parametrize("corridor", CORRIDORS.values(), ids=CORRIDORS)
 def test_randomised_traffic_keeps_the_road_and_the_base_demand(corridor):
     random = randomised(corridor)
-    assert random.demand == DemandDistribution(corridor.demand)
+    assert random.demand == DemandDistribution(corridor.published_demand)
     assert random.digest != corridor.digest
     assert random.on_ramps == corridor.on_ramps
     assert randomised(random) == random

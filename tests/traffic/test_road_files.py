@@ -53,6 +53,29 @@ def test_a_corridor_survives_a_file(corridor, tmp_path):
     assert find_corridor(str(tmp_path / "road.toml")).digest == corridor.digest
 
 
+def test_several_incidents_and_rates_that_vary(road):
+    text = ROAD.replace("on_ramps = [300]", "on_ramps = [[[0, 100], [60, 900]]]")
+    road.write_text(
+        text
+        + """
+[[incident]]
+segment = 2
+phases = [[50, 90, 20]]
+
+[[incident]]
+segments = [4, 5]
+start = [100, 120]
+"""
+    )
+    corridor = read_corridor(road)
+    assert corridor.demand.ramp_profiles == (((0.0, 100.0), (60.0, 900.0)),)
+    assert [type(each).__name__ for each in corridor.incidents] == [
+        "Incident", "IncidentDistribution",
+    ]  # fmt: skip
+    write_corridor(road, corridor)
+    assert read_corridor(road) == corridor
+
+
 def test_what_a_file_leaves_out_is_derived_from_the_road(road):
     read = read_road(road)
     corridor = read.corridor

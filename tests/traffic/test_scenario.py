@@ -5,7 +5,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dptse_env.traffic import MAINLINE, PAPER_HIGHWAY, Demand, Incident, draw_scenario, randomised
+from dptse_env.traffic import (
+    MAINLINE,
+    PAPER_HIGHWAY,
+    Demand,
+    Incident,
+    IncidentDistribution,
+    draw_scenario,
+    randomised,
+)
 
 SEEDS = range(200)
 
@@ -73,14 +81,14 @@ def test_the_streams_are_independent_of_one_another():
     corridor = randomised(PAPER_HIGHWAY)
     fixed = dataclasses.replace(corridor, incident=Incident(2, ((10, 20, 10),)))
     random_scenario, fixed_scenario = draw_scenario(corridor, 5), draw_scenario(fixed, 5)
-    assert random_scenario.incident != fixed_scenario.incident
+    assert random_scenario.incidents != fixed_scenario.incidents
     assert random_scenario.demand == fixed_scenario.demand
     np.testing.assert_array_equal(random_scenario.departures, fixed_scenario.departures)
 
 
 def test_random_traffic_differs_between_seeds():
     scenarios = [draw_scenario(randomised(PAPER_HIGHWAY), seed) for seed in range(30)]
-    assert len({scenario.incident for scenario in scenarios}) == 30
+    assert len({scenario.incidents for scenario in scenarios}) == 30
     assert len({scenario.demand for scenario in scenarios}) == 30
 
 
@@ -88,3 +96,48 @@ def test_random_traffic_differs_between_seeds():
 def test_a_bad_seed_is_refused(seed):
     with pytest.raises(ValueError, match=r"traffic seed must be an integer >= 0"):
         draw_scenario(PAPER_HIGHWAY, seed)
+
+
+def test_rates_of_a_ramp_and_shares_of_an_exit_follow_their_steps():
+    demand = Demand(
+        mainline=((0.0, 20_000.0),),
+        on_ramps=(((0.0, 0.0), (300.0, 20_000.0)), 0.0),
+        exit_shares=(((0.0, 0.9), (350.0, 0.1)), ((0.0, 0.5),)),
+    )
+    corridor = dataclasses.replace(PAPER_HIGHWAY, demand=demand, incident=None)
+    scenario = draw_scenario(corridor, 0)
+    ramp = scenario.departures[scenario.origins == 0]
+    assert ramp.min() > 300.0
+    assert len(ramp) == pytest.approx(400 * 20_000 / 3600, rel=0.1)
+    through = scenario.origins == MAINLINE
+    early = scenario.departures < 350.0
+    for when, share in ((early, 0.9), (~early, 0.1)):
+        taken = scenario.exits[through & when] == 0
+        assert taken.mean() == pytest.approx(share, abs=0.05)
+
+
+def test_incidents_are_drawn_one_by_one():
+    drawn = IncidentDistribution(tuple(range(5)))
+    fixed = Incident(7, ((10, 20, 10),))
+    both = dataclasses.replace(PAPER_HIGHWAY, incident=(drawn, fixed, drawn))
+    alone = dataclasses.replace(PAPER_HIGHWAY, incident=drawn)
+    first, second, third = draw_scenario(both, 3).incidents
+    assert first == draw_scenario(alone, 3).incidents[0]
+    assert second == fixed
+    assert third != first
+    assert dataclasses.replace(both, incident=(drawn,)) == alone
+    assert dataclasses.replace(both, incident=()).incident is None
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"on_ramps": (((5.0, 1.0),), 0.0)}, r"demand\.on_ramps\[0\] must be steps \(time, rate\)"),
+        ({"exit_shares": (((0.0, 0.1),),)}, r"demand\.exit_shares must be steps for each of the 2"),
+        ({"exit_shares": (((0.0, 1.5),),) * 2}, r"demand\.exit_shares\[0\]\[0\]\[1\] must be"),
+    ],
+)
+def test_impossible_steps_are_refused_by_path(fields, message):
+    fields = {"mainline": ((0.0, 1.0),), "on_ramps": (0.0, 0.0), **fields}
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(PAPER_HIGHWAY, demand=Demand(**fields))

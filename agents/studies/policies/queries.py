@@ -52,7 +52,7 @@ class QueryCounter:
     """Counts the segments that a batch queries; call it after the reset and every second."""
 
     def __init__(self, process: QueryProcess, traffic_seeds: Sequence[int]) -> None:
-        """Look up the incidents: truth, for evaluation only.
+        """Look up the first incident of each: truth, for evaluation only.
 
         Args:
             process: The episodes.
@@ -61,7 +61,8 @@ class QueryCounter:
         n, n_mainline = process.n_episodes, process.interface.n_mainline
         corridor = process.config.corridor
         self._process, self._seeds = process, tuple(traffic_seeds)
-        incidents = [draw_scenario(corridor, seed).incident for seed in traffic_seeds]
+        scenarios = [draw_scenario(corridor, seed) for seed in traffic_seeds]
+        incidents = [next(iter(scenario.incidents), None) for scenario in scenarios]
         self._segment = np.array([-1 if each is None else each.segment for each in incidents])
         self._start, self._end = np.array([_span(each) for each in incidents]).T
         distance = np.abs(np.arange(n_mainline) - self._segment[:, None])

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dptse_env.traffic.corridor import Corridor
-from dptse_env.traffic.demand import Demand
+from dptse_env.traffic.demand import Demand, Profile
 from dptse_env.traffic.record import Record
 
 NEVER = np.iinfo(np.int64).max
@@ -22,33 +22,29 @@ def counted_demand(corridor: Corridor, record: Record, period: int) -> Demand:
     Args:
         corridor: the road.
         record: one record of it.
-        period: length of the steps of the mainline's rate [s].
+        period: length of the steps of the rates [s].
 
     Returns:
-        The rate of vehicles that come over the upstream boundary segment, in steps, and the mean
-        rates of those on the on-ramps. Vehicles that are there at second 0 have entered before.
+        The rates of vehicles that come over the upstream boundary segment, and of those on the
+        on-ramps. Vehicles that are there at second 0 have entered before.
     """
     first = _first_steps(record)
-    S, n_on = corridor.n_segments, corridor.n_on_ramps
-    on_columns = range(corridor.n_mainline, corridor.n_mainline + n_on)
-    before = [S + 2 + i for i in range(n_on)]
-    upstream = first[:, S]
-    came = upstream[(upstream > 0) & (upstream < NEVER)]
-    duration = corridor.duration
-    edges = np.append(np.arange(0, duration, period), duration)
+    N, S, n_on = corridor.n_mainline, corridor.n_segments, corridor.n_on_ramps
+    edges = np.append(np.arange(0, corridor.duration, period), corridor.duration)
     if len(edges) > 2 and edges[-1] - edges[-2] < period:
         edges = np.delete(edges, -2)  # a last step that is shorter joins the one before
-    counts, _ = np.histogram(came, edges)
+    entrances = [first[:, S]]
+    entrances += [np.minimum(first[:, N + i], first[:, S + 2 + i]) for i in range(n_on)]
+    mainline, *ramps = (_rates(steps, edges) for steps in entrances)
+    return Demand(mainline=mainline, on_ramps=tuple(ramps))
+
+
+def _rates(steps: NDArray[np.int64], edges: NDArray[np.int64]) -> Profile:
+    """Return the rate of entering between times [s], of vehicles that enter at some steps."""
+    counts, _ = np.histogram(steps[(steps > 0) & (steps < NEVER)], edges)
     rates = 3600.0 * counts / np.diff(edges)
-    ramps = []
-    for column, boundary in zip(on_columns, before, strict=True):
-        entered = np.minimum(first[:, column], first[:, boundary])
-        ramps.append(3600.0 * int(np.sum((entered > 0) & (entered < NEVER))) / duration)
-    return Demand(
-        mainline=tuple(
-            (float(time), round(float(rate), 1)) for time, rate in zip(edges, rates, strict=False)
-        ),
-        on_ramps=tuple(round(rate, 1) for rate in ramps),
+    return tuple(
+        (float(time), round(float(rate), 1)) for time, rate in zip(edges[:-1], rates, strict=True)
     )
 
 

@@ -127,7 +127,8 @@ def test_demand_exit_shares_and_dwell_are_counted(road):
     corridor = road.corridor
     rates = [rate for _, rate in corridor.demand.mainline]
     assert np.mean(rates) == pytest.approx(1800.0, rel=0.1)  # those who leave come along, too
-    assert corridor.demand.on_ramps[0] == pytest.approx(400.0, rel=0.1)
+    on_ramp = [rate for _, rate in corridor.demand.on_ramps[0]]
+    assert np.mean(on_ramp) == pytest.approx(400.0, rel=0.1)
     # At the off-ramp: 300 of 1500 + 300 + 400 an hour.
     assert corridor.exit_shares[0] == pytest.approx(300 / 2200, rel=0.3)
     assert 3.0 < corridor.average_dwell < 6.0

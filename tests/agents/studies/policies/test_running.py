@@ -79,7 +79,7 @@ def test_queries_are_counted_by_segment_and_time():
         np.testing.assert_array_equal(counts.counts("before"), flags[before, k].sum(axis=0))
         assert counts.counts("seconds").sum() == 240
         assert counts.counts("seconds")[0] == before.sum()
-        incident = draw_scenario(env.config.corridor, counts.traffic_seed).incident
+        incident = draw_scenario(env.config.corridor, counts.traffic_seed).incidents[0]
         after = seconds > incident.phases[-1][1]
         np.testing.assert_array_equal(counts.counts("after"), flags[after, k].sum(axis=0))
         assert after.any()
