@@ -39,10 +39,7 @@ class TrafficTable:
         records = []
         for index in new:
             record = self.record(index)
-            counts = record.counts
-            self._table[index, ..., 0] = counts / self._lengths
-            mean = record.speed_sums / np.maximum(counts, 1)
-            self._table[index, ..., 1] = np.where(counts > 0, mean, self.limits)
+            self._table[index] = record.traffic(self._lengths, self.limits)
             self._loaded[index] = True
             records.append((index, record))
         return records

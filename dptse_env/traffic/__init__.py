@@ -15,7 +15,7 @@ from dptse_env.traffic.presets import (
     find_corridor,
     randomised,
 )
-from dptse_env.traffic.record import InvalidRecordError, Record, mean_dwell
+from dptse_env.traffic.record import Record, mean_dwell
 from dptse_env.traffic.road_files import (
     RoadFile,
     is_road_file,
@@ -24,6 +24,7 @@ from dptse_env.traffic.road_files import (
     write_corridor,
 )
 from dptse_env.traffic.scenario import MAINLINE, Scenario, draw_scenario
+from dptse_env.traffic.stored_arrays import InvalidRecordError
 from dptse_env.traffic.sumo import RecordingError, SumoVersionError, simulate
 from dptse_env.traffic.sumo_network import NetworkError
 from dptse_env.traffic.sumo_scenario import SumoScenario

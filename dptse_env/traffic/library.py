@@ -25,7 +25,8 @@ import platformdirs
 from tqdm import tqdm
 
 from dptse_env.traffic.corridor import Corridor
-from dptse_env.traffic.record import RECORD_VERSION, InvalidRecordError, Record
+from dptse_env.traffic.record import RECORD_VERSION, Record
+from dptse_env.traffic.stored_arrays import InvalidRecordError
 from dptse_env.traffic.sumo import (
     RecordingError,
     SumoVersionError,

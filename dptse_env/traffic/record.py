@@ -1,11 +1,5 @@
 """Records: segment and speed of each vehicle at every second."""
 
-import errno
-import hashlib
-import json
-import os
-import shutil
-import uuid
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dptse_env.traffic.stored_arrays import InvalidRecordError, load_arrays, save_arrays
 from dptse_env.utils.validation import integer, require
 
 RECORD_FORMAT = "dptse-record"
@@ -28,12 +23,6 @@ COLUMNS: dict[str, np.dtype[Any]] = {
     "speed": np.dtype("<f4"),
 }
 """Columns of the vehicle table and how they are stored."""
-
-MANIFEST = "manifest.json"
-
-
-class InvalidRecordError(ValueError):
-    """A stored record is damaged, incomplete, or not the requested one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,29 +155,14 @@ class Record:
         Raises:
             OSError: It cannot be written; `path` is then unchanged.
         """
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.parent / f".{path.name}-{uuid.uuid4().hex}"
-        temporary.mkdir()
-        try:
-            for name in COLUMNS:
-                with _column_path(temporary, name).open("wb") as file:
-                    np.save(file, getattr(self, name), allow_pickle=False)
-                    os.fsync(file.fileno())
-            header = {
-                "format": RECORD_FORMAT,
-                "version": RECORD_VERSION,
-                "n_steps": self.n_steps,
-                "n_columns": self.n_columns,
-                "source": dict(source),
-            }
-            manifest = header | {"sha256": _checksum(temporary, header)}
-            with (temporary / MANIFEST).open("w", encoding="utf-8") as text:
-                json.dump(manifest, text, indent=2)
-                text.flush()
-                os.fsync(text.fileno())
-            _publish(temporary, path)
-        finally:
-            shutil.rmtree(temporary, ignore_errors=True)
+        header = {
+            "format": RECORD_FORMAT,
+            "version": RECORD_VERSION,
+            "n_steps": self.n_steps,
+            "n_columns": self.n_columns,
+            "source": dict(source),
+        }
+        save_arrays(path, {name: getattr(self, name) for name in COLUMNS}, header)
 
     @classmethod
     def load(cls, path: Path, source: Mapping[str, object]) -> "Record":
@@ -203,31 +177,25 @@ class Record:
             InvalidRecordError: The record is damaged, incomplete, of another format version, or of
                 another source.
         """
-        if not path.is_dir():
-            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path))
+        wanted = {"format": RECORD_FORMAT, "version": RECORD_VERSION, "source": dict(source)}
+        columns, header = load_arrays(path, list(COLUMNS), wanted)
         try:
-            manifest = json.loads((path / MANIFEST).read_text(encoding="utf-8"))
-            checksum = manifest.pop("sha256")
-            wanted = {"format": RECORD_FORMAT, "version": RECORD_VERSION, "source": dict(source)}
-            for key, expected in wanted.items():
-                if manifest[key] != expected:
-                    found = manifest[key]
-                    raise InvalidRecordError(f"{path}: {key} is {found!r}, not {expected!r}")
-            if _checksum(path, manifest) != checksum:
-                raise InvalidRecordError(f"{path}: the checksum does not match")
-            columns = {name: np.load(_column_path(path, name), mmap_mode="r") for name in COLUMNS}
-            return cls(**columns, n_steps=manifest["n_steps"], n_columns=manifest["n_columns"])
-        except InvalidRecordError:
-            raise
-        except (
-            OSError,
-            ValueError,
-            LookupError,
-            TypeError,
-            AttributeError,
-            RecursionError,
-        ) as error:
+            return cls(**columns, n_steps=header["n_steps"], n_columns=header["n_columns"])
+        except (ValueError, LookupError, TypeError) as error:
             raise InvalidRecordError(f"{path}: {error!r}") from error
+
+    def traffic(
+        self, lengths: NDArray[np.float64], limits: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return density [veh/km] and mean speed over vehicles [km/h], (n_steps, n_columns, 2).
+
+        Args:
+            lengths: (n_columns,) lengths of the record columns [km].
+            limits: (n_columns,) their speed limits [km/h], the speed of an empty one.
+        """
+        counts = self.counts
+        mean = self.speed_sums / np.maximum(counts, 1)
+        return np.stack([counts / lengths, np.where(counts > 0, mean, limits)], axis=-1)
 
 
 def mean_dwell(records: Iterable[Record], n_mainline: int) -> float:
@@ -254,32 +222,3 @@ def mean_dwell(records: Iterable[Record], n_mainline: int) -> float:
         n_passages += len(step) - int(np.sum(same_vehicle & same_segment & next_step))
     require(n_passages > 0, "records", "records with a vehicle on the mainline", n_passages)
     return n_rows / n_passages
-
-
-def _column_path(directory: Path, name: str) -> Path:
-    return directory / f"{name}.npy"
-
-
-def _checksum(directory: Path, header: Mapping[str, object]) -> str:
-    """SHA-256 (hex) over the manifest's other entries and the column files."""
-    digest = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
-    for name in COLUMNS:
-        with _column_path(directory, name).open("rb") as file:
-            digest.update(hashlib.file_digest(file, "sha256").digest())
-    return digest.hexdigest()
-
-
-def _publish(temporary: Path, path: Path) -> None:
-    """Rename the finished directory, unless another process has published the record."""
-    try:
-        temporary.rename(path)
-    except OSError as error:
-        if error.errno not in (errno.EEXIST, errno.ENOTEMPTY):
-            raise
-        return
-    if os.name == "posix":
-        parent = os.open(path.parent, os.O_RDONLY)
-        try:
-            os.fsync(parent)
-        finally:
-            os.close(parent)

@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dptse_env.traffic import InvalidRecordError, Record, mean_dwell
-from dptse_env.traffic.record import COLUMNS, _checksum
+from dptse_env.traffic.record import COLUMNS
+from dptse_env.traffic.stored_arrays import _checksum
 
 SOURCE = {"corridor": "abc", "seed": 3, "sumo": "1.28.0"}
 
@@ -196,7 +197,7 @@ def double_a_vehicle(path):
     np.save(path / "vehicle.npy", vehicle)
     manifest = json.loads((path / "manifest.json").read_text())
     del manifest["sha256"]
-    edit_manifest(path, sha256=_checksum(path, manifest))
+    edit_manifest(path, sha256=_checksum(path, list(COLUMNS), manifest))
 
 
 def edit_manifest(path, **changes):
