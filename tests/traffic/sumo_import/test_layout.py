@@ -52,6 +52,8 @@ def test_acceleration_lanes_count_as_lanes_of_the_mainline(files):
     assert layout.lanes[:on] == (2,) * on
     assert layout.lanes[on : on + 2] == (3, 3)  # 250 m: two segments, and less than half of one
     assert set(layout.lanes[on + 3 :]) == {2}
+    longer = find_layout(files, PATH, 150.0)
+    assert longer.lanes[longer.on_ramps[0] + 1] == 3  # two thirds of it
     assert layout.limits[0] == pytest.approx(108.0)
     assert layout.limits[-1] == pytest.approx(90.0)
 
@@ -134,6 +136,14 @@ def test_traffic_lights_are_said(tmp_path):
     )
     layout = find_layout(Files(netconvert(tmp_path, nodes), ()), PATH, 100.0)
     assert layout.remarks == ("traffic light at junction 'n2', after 'merge'",)
+
+
+def test_roundabouts_are_said(files, tmp_path):
+    network = tmp_path / "round.net.xml"
+    roundabout = '<roundabout nodes="n1 n2" edges="merge elsewhere"/>'
+    network.write_text(files.net.read_text().replace("</net>", f"{roundabout}</net>"))
+    layout = find_layout(replace(files, net=network), PATH, 100.0)
+    assert layout.remarks == ("roundabout: edge(s) merge",)
 
 
 @pytest.mark.parametrize(

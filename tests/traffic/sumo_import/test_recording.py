@@ -216,7 +216,7 @@ def test_additional_files_write_nothing(tmp_path, monkeypatch):
     detectors = tmp_path / "detectors.add.xml"
     detectors.write_text(
         '<additional><inductionLoop id="d" lane="out_0" pos="10" period="60" file="counts.xml"/>'
-        '<edgeData id="e" file="edges.xml"/></additional>'
+        f'<edgeData id="e" file="{tmp_path}/edges.xml"/></additional>'
     )
     monkeypatch.chdir(tmp_path)
     before = sorted(path.name for path in tmp_path.iterdir())
