@@ -30,6 +30,7 @@ from dptse_env.parts import privacy_report
 from dptse_env.privacy import mu_of
 from dptse_env.privacy.audit_statistics import Claim, audit
 from dptse_env.release import PrivacyReport
+from dptse_env.traffic import with_vehicles
 from dptse_env.utils.validation import inside, integer, positive, require
 from scripts.cli import Recording, run
 
@@ -149,7 +150,7 @@ def run_audit(args: Args) -> Finding:
     config = attacked_config(args)
     make_planner(config, args.policy).require_kind(args.target)
     library = Recording(records=args.records).library(config.corridor, [args.traffic_seed])
-    record = library.get(config.corridor, args.traffic_seed)
+    record = with_vehicles(library.get(config.corridor, args.traffic_seed), "an audit")
     worlds = choose_target(config, record, args.target, args.policy)
     policy = make_policy(config, args.policy, worlds)
     start = time.perf_counter()
@@ -175,7 +176,7 @@ def run_pairs(args: Args) -> PairsFinding:
     config = attacked_config(args)
     seeds = range(args.traffic_seed, args.traffic_seed + args.n_records)
     library = Recording(records=args.records).library(config.corridor, seeds)
-    records = [library.get(config.corridor, seed) for seed in seeds]
+    records = [with_vehicles(library.get(config.corridor, seed), "an audit") for seed in seeds]
     policy = args.policy if args.policy in PUBLIC_SCHEDULES else "round-robin"
     title = make_title(args, config)
     return study_pairs(config, records, args.runs, title=title, policy=policy, seed=args.seed)

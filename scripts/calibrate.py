@@ -28,7 +28,7 @@ from dptse_env.model.prediction import (
     prediction_error,
 )
 from dptse_env.release.traffic_table import TrafficTable
-from dptse_env.traffic import Corridor, RecordLibrary, mean_dwell
+from dptse_env.traffic import Corridor, RecordLibrary, average_dwell
 from scripts.cli import Road, make_corridor, run
 
 
@@ -106,7 +106,7 @@ def main(args: Args) -> None:
         raise ValueError(f"held_out must not share seeds with train, both have {shared}")
     corridor = make_corridor(args.env, args.given_keywords())
     library = args.library(corridor, (*train, *held_out))
-    dwell = mean_dwell((library.get(corridor, seed) for seed in train), corridor.n_mainline)
+    dwell = average_dwell(corridor, (library.get(corridor, seed) for seed in train))
     fit = calibrate(
         corridor, load_series(corridor, train, library), args.name,
         max_evaluations=args.max_evaluations,

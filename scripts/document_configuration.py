@@ -38,6 +38,7 @@ from dptse_env.traffic import (
     Drivers,
     Incident,
     IncidentDistribution,
+    Recordings,
     SumoScenario,
 )
 from dptse_env.utils.fields import Interval, allowed_numbers, field_hints
@@ -53,6 +54,7 @@ SECTIONS: Mapping[type, str] = {
     DemandDistribution: "`demand`, drawn for each traffic seed",
     Drivers: "`corridor.drivers`",
     SumoScenario: "`corridor.network`",
+    Recordings: "`corridor.recordings`",
     Incident: "`incident`, fixed",
     IncidentDistribution: "`incident`, drawn for each traffic seed",
     ARZParameters: "`parameters`",

@@ -36,6 +36,7 @@ from dptse_env.config import EnvConfig, parse_seeds
 from dptse_env.policies import TRANSFERABLE
 from dptse_env.schedules import OBSERVATION_SCHEDULES
 from dptse_env.traffic import is_road_file
+from dptse_env.utils.validation import require
 from scripts.cli import Road, records_argument, run
 
 ALL = "all"
@@ -183,6 +184,7 @@ def draw_traffic(
 def main(args: Args) -> None:
     """Record what is missing, evaluate, and leave table, scores and figures."""
     sources = find_sources(args)
+    require(len(parse_seeds(args.seeds)) >= 2, "seeds", "at least two, for an interval", args.seeds)
     scores = evaluate(args, sources)
     seeds, config = parse_seeds(args.seeds), reference_config(args)
     privacy, parameters = config.privacy, config.arz_parameters.name

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from dptse_env.config import parse_seeds
-from dptse_env.traffic import mean_dwell
+from dptse_env.traffic import average_dwell
 from scripts.cli import Road, make_corridor, run
 
 
@@ -31,7 +31,7 @@ def main(args: Args) -> None:
         keywords |= {"demand": "random", "incident": "random"}
     corridor, seeds = make_corridor(args.env, keywords), parse_seeds(args.seeds)
     library = args.library(corridor, seeds)
-    dwell = mean_dwell((library.get(corridor, seed) for seed in seeds), corridor.n_mainline)
+    dwell = average_dwell(corridor, (library.get(corridor, seed) for seed in seeds))
     print(f"{corridor.name}: {len(seeds)} record(s) in {library.path}")
     print(f"mean dwell on a mainline segment (T_avg): {dwell:.2f} s")
 

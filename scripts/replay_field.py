@@ -1,7 +1,7 @@
 """Replay a measured field of density and speed, and print what the estimators make of it.
 
 python scripts/replay_field.py --source.density density.txt --source.speed speed.txt
---source.cell 0.1 --source.interval 5 --source.segments 6
+--source.cell 0.1 --source.interval 5 --segments 6
 
 The field is the truth. Some of its segments are queried every second, by round robin, and released
 with the noise of the preset `corrected`; the segments at both ends are known without noise. Filters
@@ -14,9 +14,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from agents.evaluation.episodes import make_config
-from agents.evaluation.measured_field import FieldSource, Replay, field_corridor
+from agents.evaluation.measured_field import Replay, field_corridor, read_field
 from agents.evaluation.terminal import make_table, print_table
 from agents.experiments.plots import LABELS
+from dptse_env.traffic.importers.fields import FieldSource
 from dptse_env.utils.validation import integer
 from scripts.cli import run
 
@@ -29,6 +30,8 @@ class Args:
 
     source: FieldSource
     """Files and their units."""
+    segments: int
+    """Segments that are estimated; two more are the boundary."""
     lanes: int = 5
     """Lanes of the road."""
     speed_limit: float = 105.0
@@ -51,7 +54,7 @@ class Args:
 
 def main(args: Args) -> None:
     """Print the errors of every estimator."""
-    measured = args.source.read()
+    measured = read_field(args.source, args.segments)
     corridor = field_corridor(measured, args.lanes, args.speed_limit)
     integer("bandwidth", args.bandwidth, 1, corridor.n_mainline)
     integer("window", args.window, 61, len(measured.density) - 1)

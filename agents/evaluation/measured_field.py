@@ -7,7 +7,6 @@ A field has no vehicles. What a release would say is the field itself plus the n
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,13 +16,8 @@ from dptse_env.estimators import make_estimator
 from dptse_env.model import ARZModel, ARZParameters
 from dptse_env.privacy import paper_sensitivity, single_noise_std
 from dptse_env.traffic import Corridor, Demand
+from dptse_env.traffic.importers.fields import FieldSource, by_second
 from dptse_env.utils.arrays import FloatArray
-
-FEET, MILES = 0.0003048, 1.609344
-"""Kilometres."""
-UNITS = {"veh/km": 1.0, "veh/mi": 1.0 / MILES, "veh/ft": 1.0 / FEET}
-SPEED_UNITS = {"km/h": 1.0, "mi/h": MILES, "m/s": 3.6, "ft/s": 3600.0 * FEET}
-"""Factors to veh/km and km/h."""
 
 
 class Field(NamedTuple):
@@ -52,70 +46,18 @@ class FieldScore(NamedTuple):
     chi2_speed: float
 
 
-@dataclass(frozen=True)
-class FieldSource:
-    """A field in two text files with a row for each cell and a column for each interval.
+def read_field(source: FieldSource, segments: int) -> Field:
+    """Read a field, averaged over `segments` + 2 segments and interpolated to seconds.
 
-    Attributes:
-        density: File of densities.
-        speed: File of speeds.
-        cell: Length of a cell [km].
-        interval: Length of an interval [s].
-        segments: Segments N that are estimated; two more are the boundary.
-        density_unit: One of `UNITS`.
-        speed_unit: One of `SPEED_UNITS`.
-        transposed: Whether rows are intervals.
-        reversed: Whether the first cell is the last downstream.
+    Raises:
+        ValueError: A file is malformed, or there are fewer cells than segments.
+        OSError: A file cannot be read.
     """
-
-    density: Path
-    speed: Path
-    cell: float
-    interval: float
-    segments: int
-    density_unit: str = "veh/km"
-    speed_unit: str = "km/h"
-    transposed: bool = False
-    reversed: bool = False
-
-    def read(self) -> Field:
-        """Read and average over segments, and interpolate to seconds.
-
-        Raises:
-            ValueError: A file is no table of numbers, they do not fit one another, or there are
-                fewer cells than segments.
-            OSError: A file cannot be read.
-        """
-        density, speed = self._table(self.density), self._table(self.speed)
-        if density.shape != speed.shape:
-            raise ValueError(
-                f"density and speed must have one shape, got {density.shape} and {speed.shape}"
-            )
-        n = self.segments + 2
-        each = len(density) // n
-        if each < 1:
-            raise ValueError(f"segments must be at most {len(density) - 2}, got {self.segments}")
-        density = density[: n * each] * UNITS[self.density_unit]
-        flow = density * speed[: n * each] * SPEED_UNITS[self.speed_unit]
-        density, flow = (table.reshape(n, each, -1).mean(axis=1).T for table in (density, flow))
-        speed = flow / np.maximum(density, 1e-9)
-        middles = (np.arange(len(density)) + 0.5) * self.interval
-        seconds = np.arange(0.0, len(density) * self.interval)
-        both = [
-            np.column_stack([np.interp(seconds, middles, column) for column in table.T])
-            for table in (density, speed)
-        ]
-        return Field(both[0], both[1], each * self.cell)
-
-    def _table(self, path: Path) -> FloatArray:
-        try:
-            table: FloatArray = np.loadtxt(path, ndmin=2)
-        except ValueError as problem:
-            raise ValueError(f"{path} must be a table of numbers: {problem}") from problem
-        if not np.isfinite(table).all() or (table < 0.0).any():
-            raise ValueError(f"{path} must have finite numbers of at least 0")
-        table = table.T if self.transposed else table
-        return table[::-1] if self.reversed else table
+    density, flow = source.read()
+    each = len(density) // (segments + 2)
+    if each < 1:
+        raise ValueError(f"segments must be at most {len(density) - 2}, got {segments}")
+    return Field(*by_second(density, flow, segments + 2, source.interval), each * source.cell)
 
 
 def field_corridor(field: Field, lanes: int, speed_limit: float) -> Corridor:

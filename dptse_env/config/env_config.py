@@ -83,7 +83,8 @@ class EnvConfig:
             ``"package.module:function"``, or a function of a `ScoredSecond`.
         horizon: Length of an episode [s]; None for the whole record.
         random_start: Whether an episode starts at a random second of the record.
-        traffic_seeds: Traffic seeds to draw episodes from.
+        traffic_seeds: Traffic seeds to draw episodes from; on a road with recordings `resolve` puts
+            the recorded training seeds in place of this default.
         truth_in_info: Whether ``info`` shows the true traffic.
         inherited: Keywords whose values were measured or tuned on another road than this one, and
             that nobody gave; filled in by `resolve`.
@@ -136,6 +137,15 @@ class EnvConfig:
             raise ValueError(f"traffic_seeds must be 1 to {MOST_SEEDS} seeds, got {len(seeds)}")
         if len(set(seeds)) < len(seeds):
             raise ValueError(f"traffic_seeds must be distinct, got {seeds}")
+        if self.corridor.recordings is not None:
+            self.corridor.recordings.require(seeds)
+            needs = RELEASE_MODELS.find(self.privacy.preset).needs_vehicles
+            if needs and not self.corridor.recordings.has_vehicles:
+                raise ValueError(
+                    "privacy.preset must be a release model that needs no vehicles, such as "
+                    "'paper' or 'corrected', on a road of measured fields, got "
+                    f"{RELEASE_MODELS.name_of(self.privacy.preset)!r}"
+                )
         if isinstance(self.parameters, str):
             require_name("parameters", self.parameters, available_parameters())
         self.arz_parameters.require_time_step(TIME_STEP, min(self.corridor.segment_lengths))

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from dptse_env.config.env_config import MOST_SEEDS, PRESETS, EnvConfig
+from dptse_env.config.env_config import MOST_SEEDS, PRESETS, TRAINING_SEEDS, EnvConfig
 from dptse_env.estimators import settings_type
 from dptse_env.estimators.tuned_settings import read_settings
 from dptse_env.model.parameters import read_parameters
@@ -50,7 +50,8 @@ def resolve(preset: str, overrides: Mapping[str, Any]) -> EnvConfig:
             ``estimator_settings`` may be JSON files. Shortcuts: ``epsilon`` and ``delta``
             of ``privacy``, ``incident`` of ``corridor`` (``"preset"``, ``"none"``, ``"random"`` or
             a mapping) and ``demand`` of ``corridor`` (the same without ``"none"``); random means
-            drawn anew for every traffic seed. ``traffic_seeds`` may be a string ``"first:stop"``.
+            drawn anew for every traffic seed. ``traffic_seeds`` may be a string ``"first:stop"``;
+            on a road with recordings they are by default all recorded training seeds.
             In a mapping ``estimator_settings``, fields left out keep what None would have given:
             the tuned set of the resolved estimator, parameters and privacy preset, or else the
             defaults.
@@ -73,6 +74,9 @@ def resolve(preset: str, overrides: Mapping[str, Any]) -> EnvConfig:
     _read_files(values)
     corridor = _corridor(base.corridor, values)
     values["privacy"] = _privacy(base.privacy, values)
+    if "traffic_seeds" not in values and corridor.recordings is not None:
+        recorded = corridor.recordings.seeds
+        values["traffic_seeds"] = tuple(seed for seed in recorded if seed in TRAINING_SEEDS)
     if isinstance(values.get("traffic_seeds"), str):
         values["traffic_seeds"] = parse_seeds(values["traffic_seeds"], "traffic_seeds")
     if isinstance(values.get("observation"), str):

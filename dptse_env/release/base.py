@@ -15,7 +15,7 @@ from dptse_env.release.queries import NO_OPTIONS, QueryOptions
 from dptse_env.release.report import PrivacyReport
 from dptse_env.release.settings import PrivacySettings
 from dptse_env.release.traffic_table import TrafficTable
-from dptse_env.traffic import Corridor, Record
+from dptse_env.traffic import AnyRecord, Corridor
 from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from dptse_env.utils.registry import name_of_class
 from dptse_env.utils.vector_info import Rows
@@ -192,6 +192,8 @@ class ReleaseModel(ABC):
     """True where users expect a guarantee, so that a warning is due if it is void."""
     releases_sums: ClassVar[bool] = False
     """True where a release may cover several segments, at a price level that the query chooses."""
+    needs_vehicles: ClassVar[bool] = False
+    """True where the model reads the vehicles of a record, which measured fields have not."""
     has_prices: ClassVar[bool] = False
     """True where queries have prices, which `public_state` gives."""
 
@@ -232,7 +234,7 @@ class ReleaseModel(ABC):
         same seed have common random numbers.
         """
 
-    def load(self, index: int, record: Record) -> None:  # noqa: B027 (nothing by default)
+    def load(self, index: int, record: AnyRecord) -> None:  # noqa: B027 (nothing by default)
         """Prepare for the traffic of an index into the traffic seeds; called once for each."""
 
     @property

@@ -22,7 +22,7 @@ from dptse_env.release.contributions import Contributions
 from dptse_env.release.mechanism import GaussianMechanism, Mechanism
 from dptse_env.release.report import STRICT_DELTA, PrivacyReport, QuantityReport, in_order
 from dptse_env.release.settings import CappedSettings, PrivacySettings
-from dptse_env.traffic import Corridor, Record
+from dptse_env.traffic import AnyRecord, Corridor, with_vehicles
 from dptse_env.utils.arrays import AnyArray, FloatArray, IntArray
 from dptse_env.utils.vector_info import Rows, object_array
 
@@ -200,6 +200,7 @@ class Capped(GaussianRelease):
 
     settings_type: ClassVar[type[PrivacySettings]] = CappedSettings
     claims_guarantee: ClassVar[bool] = True
+    needs_vehicles: ClassVar[bool] = True
 
     @classmethod
     def flow_centre(cls, corridor: Corridor, settings: CappedSettings) -> float | None:
@@ -254,9 +255,10 @@ class Capped(GaussianRelease):
         """The vehicles of all traffic."""
         return self.contributions.vehicles.arrays
 
-    def load(self, index: int, record: Record) -> None:
+    def load(self, index: int, record: AnyRecord) -> None:
         """Read the vehicle table of a record."""
-        self.contributions.load(index, record)
+        user = f"the release model {self.setup.name!r}"
+        self.contributions.load(index, with_vehicles(record, user))
 
     def reset(self, episodes: IntArray, generators: Sequence[np.random.Generator]) -> None:
         """See `ReleaseModel.reset`; no vehicle has counted yet."""

@@ -6,6 +6,8 @@ Importing this package does not import libsumo; only making a record does.
 from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.demand import Demand, DemandDistribution
 from dptse_env.traffic.drivers import Drivers
+from dptse_env.traffic.dwell import average_dwell
+from dptse_env.traffic.field_record import AnyRecord, FieldRecord, with_vehicles
 from dptse_env.traffic.incident import Incident, IncidentDistribution
 from dptse_env.traffic.library import RecordLibrary
 from dptse_env.traffic.presets import (
@@ -16,6 +18,7 @@ from dptse_env.traffic.presets import (
     randomised,
 )
 from dptse_env.traffic.record import Record, mean_dwell
+from dptse_env.traffic.recordings import Recordings, ranges
 from dptse_env.traffic.road_files import (
     RoadFile,
     is_road_file,
@@ -35,10 +38,12 @@ __all__ = [
     "MAINLINE",
     "PAPER_HIGHWAY",
     "SHORT_HIGHWAY",
+    "AnyRecord",
     "Corridor",
     "Demand",
     "DemandDistribution",
     "Drivers",
+    "FieldRecord",
     "Incident",
     "IncidentDistribution",
     "InvalidRecordError",
@@ -46,18 +51,22 @@ __all__ = [
     "Record",
     "RecordLibrary",
     "RecordingError",
+    "Recordings",
     "RoadFile",
     "Scenario",
     "SumoScenario",
     "SumoVersionError",
+    "average_dwell",
     "draw_scenario",
     "find_corridor",
     "is_road_file",
     "mean_dwell",
     "randomised",
+    "ranges",
     "read_corridor",
     "read_road",
     "simulate",
     "simulate_in_child",
+    "with_vehicles",
     "write_corridor",
 ]

@@ -9,22 +9,20 @@ length, lanes and limit of the segment that it lies next to.
 
 import dataclasses
 import hashlib
-import itertools
 import json
 import re
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Annotated, TypeVar
+from typing import Annotated, Any
 
 from dptse_env.traffic.demand import Demand, DemandDistribution, Share
 from dptse_env.traffic.drivers import Drivers
 from dptse_env.traffic.incident import Incident, IncidentDistribution
+from dptse_env.traffic.recordings import Recordings
+from dptse_env.traffic.road_segments import RoadSegments
 from dptse_env.traffic.sumo_scenario import SumoScenario
 from dptse_env.utils.fields import Interval, checked_fields
 from dptse_env.utils.validation import integer, require
-
-T = TypeVar("T")
 
 NOT_TRAFFIC = ("name", "fixed_sensors", "density_scale", "speed_scale", "average_dwell")
 """Fields that describe the observation of the traffic and do not change the traffic itself."""
@@ -46,7 +44,7 @@ UNIFORM = {"ramp_length": None, "ramp_speed_limit": None, "ramp_segments": 1}
 
 
 @dataclass(frozen=True)
-class Corridor:
+class Corridor(RoadSegments):
     """A stretch of highway with ramps, its demand and its incident.
 
     Lengths, lanes and speed limits are one value for all mainline segments or a sequence with one
@@ -83,6 +81,8 @@ class Corridor:
             `demand` are what is published of them, the range of a `DemandDistribution` scales them
             (SUMO's ``--scale``), `exit_shares` are published too, an incident limits the vehicles
             on its segment, and `drivers` must be left at its default.
+        recordings: imported traffic that episodes replay; None where SUMO simulates the traffic.
+            With recordings the demand is a description of them, and there is no incident.
 
     Raises:
         ValueError: The geometry is impossible, or demand, incident or sensors do not fit it.
@@ -109,6 +109,7 @@ class Corridor:
     ramp_length: Length | tuple[Length, ...] | None = None
     ramp_speed_limit: SpeedLimit | tuple[SpeedLimit, ...] | None = None
     network: SumoScenario | None = None
+    recordings: Recordings | None = None
 
     def __post_init__(self) -> None:
         """Check the fields and bring them to their declared types."""
@@ -134,6 +135,12 @@ class Corridor:
             object.__setattr__(self, "incident", self.incident[0] if self.incident else None)
         for incident in self.incidents:
             self._check_incident(incident)
+        if self.recordings is not None:
+            fixed, free = isinstance(self.demand, Demand), self.incident is None
+            allowed = "None where traffic is recorded"
+            require(free, "corridor.incident", allowed, self.incident)
+            allowed = "fixed where traffic is recorded"
+            require(fixed, "corridor.demand", allowed, self.demand)
         self._check_network()
 
     def _check_ramps(self) -> None:
@@ -164,7 +171,7 @@ class Corridor:
             if len(set(values)) == 1:
                 object.__setattr__(self, name, values[0])
         lanes = self.segment_lanes
-        for face, beside, segments in self._ramps():
+        for face, beside, segments in self.ramps():
             allowed = f"<= {lanes[beside]} lanes at face {face}"
             most = lanes[segments[0]]
             require(most <= lanes[beside], "corridor.ramp_lanes", allowed, most)
@@ -185,6 +192,8 @@ class Corridor:
         allowed = f"one for each of the {n_columns} record columns of this geometry"
         fits = len(self.network.columns) == n_columns
         require(fits, "corridor.network.columns", allowed, len(self.network.columns))
+        without = "None on a road with a network of its own"
+        require(self.recordings is None, "corridor.recordings", without, self.recordings)
         allowed = "left out on a road with a network of its own"
         require(self.drivers == Drivers(), "corridor.drivers", allowed, self.drivers)
 
@@ -202,119 +211,16 @@ class Corridor:
         return self.incident if isinstance(self.incident, tuple) else (self.incident,)
 
     @property
-    def n_on_ramps(self) -> int:
-        """Number I of on-ramps."""
-        return len(self.on_ramps)
-
-    @property
-    def n_off_ramps(self) -> int:
-        """Number O of off-ramps."""
-        return len(self.off_ramps)
-
-    @property
-    def n_segments(self) -> int:
-        """Number S of segments that are estimated: those of the mainline and of all ramps."""
-        return self.n_mainline + sum(self._per_ramp(self.ramp_segments))
-
-    @property
-    def n_ramps(self) -> int:
-        """Number I + O of ramps."""
-        return self.n_on_ramps + self.n_off_ramps
-
-    @property
-    def n_boundaries(self) -> int:
-        """Number R = 2 + I + O of boundary segments around them."""
-        return 2 + self.n_ramps
-
-    @cached_property
-    def on_ramp_segments(self) -> tuple[tuple[int, ...], ...]:
-        """Segments of each on-ramp, in the direction of travel."""
-        return self._ramp_segments[: self.n_on_ramps]
-
-    @cached_property
-    def off_ramp_segments(self) -> tuple[tuple[int, ...], ...]:
-        """Segments of each off-ramp, in the direction of travel."""
-        return self._ramp_segments[self.n_on_ramps :]
-
-    @cached_property
-    def _ramp_segments(self) -> tuple[tuple[int, ...], ...]:
-        counts = self._per_ramp(self.ramp_segments)
-        firsts = itertools.accumulate(counts, initial=self.n_mainline)
-        return tuple(
-            tuple(range(first, first + count)) for first, count in zip(firsts, counts, strict=False)
-        )
-
-    @cached_property
-    def segment_lengths(self) -> tuple[float, ...]:
-        """Length [km] of each of the S segments."""
-        return self._along(self.segment_length, self.ramp_length)
-
-    @cached_property
-    def segment_lanes(self) -> tuple[int, ...]:
-        """Lanes of each of the S segments."""
-        return self._along(self.lanes, self.ramp_lanes)
-
-    @cached_property
-    def speed_limits(self) -> tuple[float, ...]:
-        """Speed limit [km/h] of each of the S segments, outside incidents."""
-        return self._along(self.speed_limit, self.ramp_speed_limit)
-
-    @cached_property
-    def boundary_neighbours(self) -> tuple[int, ...]:
-        """Segment next to each of the R boundary segments."""
-        before = [segments[0] for segments in self.on_ramp_segments]
-        after = [segments[-1] for segments in self.off_ramp_segments]
-        return (0, self.n_mainline - 1, *before, *after)
-
-    @property
-    def boundary_lanes(self) -> tuple[int, ...]:
-        """Lanes of each of the R boundary segments."""
-        return tuple(self.segment_lanes[s] for s in self.boundary_neighbours)
-
-    def with_boundaries(self, values: Sequence[T]) -> tuple[T, ...]:
-        """Return values of the S segments, followed by those of the R boundary segments."""
-        return (*values, *(values[s] for s in self.boundary_neighbours))
-
-    @property
-    def most_lanes(self) -> int:
-        """Largest number of lanes of the mainline."""
-        return max(self.segment_lanes[: self.n_mainline])
-
-    @property
-    def largest_speed_limit(self) -> float:
-        """Largest speed limit of the road [km/h]."""
-        return max(self.speed_limits)
-
-    def _ramps(self) -> Iterator[tuple[int, int, tuple[int, ...]]]:
-        """Yield each ramp's face, the mainline segment that it joins or leaves, its segments."""
-        faces = [*self.on_ramps, *self.off_ramps]
-        beside = [*self.on_ramps, *(face - 1 for face in self.off_ramps)]
-        yield from zip(faces, beside, self._ramp_segments, strict=True)
-
-    def _per_ramp(self, values: T | tuple[T, ...]) -> tuple[T, ...]:
-        return values if isinstance(values, tuple) else (values,) * self.n_ramps
-
-    def _along(
-        self, values: T | tuple[T, ...], of_ramps: T | tuple[T, ...] | None
-    ) -> tuple[T, ...]:
-        """Return values of the S segments, given those of the mainline and of ramps."""
-        n = self.n_mainline
-        mainline = values if isinstance(values, tuple) else (values,) * n
-        if of_ramps is None:
-            of_ramps = tuple(mainline[beside] for _, beside, _ in self._ramps())
-        ramps = zip(self._per_ramp(of_ramps), self._ramp_segments, strict=True)
-        return (*mainline, *(value for value, segments in ramps for _ in segments))
-
-    @property
-    def segment_names(self) -> tuple[str, ...]:
-        """Names of the S segments, counted from 1 as in the paper."""
-        names = [f"mainline {i + 1}" for i in range(self.n_mainline)]
-        kinds = (("on-ramp", self.on_ramp_segments), ("off-ramp", self.off_ramp_segments))
-        for kind, ramps in kinds:
-            for i, segments in enumerate(ramps):
-                parts = [f".{k + 1}" for k in range(len(segments))] if len(segments) > 1 else [""]
-                names += [f"{kind} {i + 1}{part}" for part in parts]
-        return tuple(names)
+    def record_layout(self) -> dict[str, Any]:
+        """What the columns and the length of a record depend on, as plain JSON."""
+        return {
+            "n_mainline": self.n_mainline,
+            "on_ramps": list(self.on_ramps),
+            "off_ramps": list(self.off_ramps),
+            "ramp_segments": [len(segments) for segments in self._ramp_segments],
+            "segment_lengths": list(self.segment_lengths),
+            "duration": self.duration,
+        }
 
     @cached_property
     def digest(self) -> str:
@@ -336,6 +242,10 @@ class Corridor:
         if demand["exit_shares"] is None:
             del demand["exit_shares"]  # as before shares could vary
         del content["network"]  # as before there were any
+        if self.recordings is None:
+            del content["recordings"]  # likewise
+        else:
+            content["recordings"] = self.recordings.digest  # not the folder, which may be moved
         if self.network is not None:
             scale = self.demand.scale if isinstance(self.demand, DemandDistribution) else None
             content = {

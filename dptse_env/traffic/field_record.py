@@ -89,7 +89,11 @@ class FieldRecord:
             raise InvalidRecordError(f"{path}: {error!r}") from error
 
 
-def load_record(path: Path, source: Mapping[str, object]) -> Record | FieldRecord:
+AnyRecord = Record | FieldRecord
+"""A record of either kind."""
+
+
+def load_record(path: Path, source: Mapping[str, object]) -> AnyRecord:
     """Open a stored record of either kind; arguments and errors are those of `Record.load`."""
     try:
         is_field = json.loads((path / MANIFEST).read_text(encoding="utf-8")).get("format")
@@ -100,7 +104,7 @@ def load_record(path: Path, source: Mapping[str, object]) -> Record | FieldRecor
     return Record.load(path, source)
 
 
-def with_vehicles(record: Record | FieldRecord, user: str) -> Record:
+def with_vehicles(record: AnyRecord, user: str) -> Record:
     """Return a record that has vehicles; `user` names in the error what needs them.
 
     Raises:

@@ -3,6 +3,8 @@
 A record is found by the corridor's digest, the traffic seed, SUMO's version and the record format;
 when any of them changes, another record is made. Several processes may use a library at once.
 
+The records of a corridor with recordings come from their folder instead, and are never made.
+
 A record appears under its name when it is complete, so a writer that is killed leaves a hidden
 folder at most. Its writer may still run, perhaps on another machine, so such a folder is removed
 when it has reached a certain age.
@@ -25,6 +27,7 @@ import platformdirs
 from tqdm import tqdm
 
 from dptse_env.traffic.corridor import Corridor
+from dptse_env.traffic.field_record import AnyRecord
 from dptse_env.traffic.record import RECORD_VERSION, Record
 from dptse_env.traffic.stored_arrays import InvalidRecordError
 from dptse_env.traffic.sumo import (
@@ -71,18 +74,19 @@ class RecordLibrary:
         """Store the path; nothing is read or written yet."""
         self.path = default_path() if path is None else Path(path).expanduser()
         self.n_open = integer("library.n_open", n_open, 1)
-        self._open: OrderedDict[tuple[str, int], Record] = OrderedDict()
+        self._open: OrderedDict[tuple[str, int], AnyRecord] = OrderedDict()
         self._lock = threading.Lock()
 
     def __reduce__(self) -> tuple[type["RecordLibrary"], tuple[Path, int]]:
         """Pickle as the path alone: each process opens the records itself."""
         return type(self), (self.path, self.n_open)
 
-    def get(self, corridor: Corridor, seed: int) -> Record:
+    def get(self, corridor: Corridor, seed: int) -> AnyRecord:
         """Return the record of a traffic seed, which is made now if it is missing or damaged.
 
         Raises:
-            ValueError: The seed is negative or no integer.
+            ValueError: The seed is negative or no integer, or was not recorded.
+            InvalidRecordError: A record of the corridor's recordings is damaged or exchanged.
             RecordingError: The record cannot be made; the message names the library and the seed.
             NetworkError: The corridor has to be compiled and cannot be.
             SumoVersionError: libsumo is missing, broken or of another release series.
@@ -106,10 +110,12 @@ class RecordLibrary:
         Nothing is opened: a damaged record counts as present, and `get` makes it again.
 
         Raises:
-            ValueError: A seed is negative or no integer.
+            ValueError: A seed is negative or no integer, or was not recorded.
             SumoVersionError: libsumo is missing or of another release series.
         """
         wanted = dict.fromkeys(integer("traffic seed", seed, 0) for seed in seeds)
+        if corridor.recordings is not None:
+            corridor.recordings.require(wanted)
         return [seed for seed in wanted if not self.record_path(corridor, seed).is_dir()]
 
     def ensure(
@@ -128,7 +134,7 @@ class RecordLibrary:
         The default number of `workers` is that of usable cores; `progress` shows a progress bar.
 
         Raises:
-            ValueError: A seed or the number of workers is out of range.
+            ValueError: A seed or the number of workers is out of range, or a seed was not recorded.
             RecordingError: A recording fails; the message names its seed and the number of records
                 in the library. Recordings in progress are finished and kept, no other is started.
             NetworkError: The corridor has to be compiled and cannot be.
@@ -143,10 +149,14 @@ class RecordLibrary:
 
     def record_path(self, corridor: Corridor, seed: int) -> Path:
         """Return the directory of a record, whether it exists or not."""
+        if corridor.recordings is not None:
+            return corridor.recordings.record_path(seed)
         folder = f"records-v{RECORD_VERSION}-sumo-{sumo_version()}"
         return self.path / folder / corridor.digest[:32] / f"{seed:08d}"
 
-    def _load_or_record(self, corridor: Corridor, seed: int) -> Record:
+    def _load_or_record(self, corridor: Corridor, seed: int) -> AnyRecord:
+        if corridor.recordings is not None:
+            return corridor.recordings.load(seed, corridor.record_layout)
         path, source = self.record_path(corridor, seed), _source(corridor, seed)
         try:
             return Record.load(path, source)

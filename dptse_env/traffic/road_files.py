@@ -1,8 +1,9 @@
 """Roads as TOML files: a corridor, and the keywords of an environment that suit it.
 
-A file has the fields of `Corridor`, with tables for ``demand``, ``incident`` and ``drivers``, and a
-table ``environment`` of keywords of ``gym.make`` that hold on this road unless the caller gives
-them. ``docs/own_road.md`` has the format and an example.
+A file has the fields of `Corridor`, with tables for ``demand``, ``incident``, ``drivers`` and
+``recordings``, whose folder may be relative to the file, and a table ``environment`` of keywords
+of ``gym.make`` that hold on this road unless the caller gives them. ``docs/own_road.md`` has the
+format and an example.
 """
 
 from __future__ import annotations
@@ -42,6 +43,7 @@ _OPTIONAL: dict[str, Any] = {
     "fixed_sensors": (),
 }
 _ENVIRONMENT = "environment"
+_WITH_FOLDER = ("recordings", "network")
 _FILE_ENDINGS = (".json", ".npz")
 
 
@@ -112,9 +114,13 @@ def write_corridor(
         comment: Text for the head of the file.
     """
     content = _plain(dataclasses.asdict(corridor))
-    if corridor.network is not None:
-        folder = Path(corridor.network.folder).absolute()
-        content["network"]["folder"] = os.path.relpath(folder, Path(path).absolute().parent)
+    for name in _WITH_FOLDER:
+        given = getattr(corridor, name)
+        if given is None:
+            continue
+        folder, home = Path(given.folder).absolute(), Path(path).absolute().parent
+        if folder.is_relative_to(home):  # so that the folder can be moved with the file in it
+            content[name]["folder"] = str(folder.relative_to(home))
     if environment:
         content[_ENVIRONMENT] = _plain(dict(environment))
     head = "".join(f"# {line}\n" for line in comment.splitlines())
@@ -135,12 +141,13 @@ def _content(path: Path) -> dict[str, Any]:
 def _corridor(content: Mapping[str, Any], path: Path) -> tuple[Corridor, tuple[str, ...]]:
     """Return the corridor of a file's fields, and the names of those that were assumed."""
     fields = {**_OPTIONAL, **content}
+    for name in _WITH_FOLDER:
+        given = fields.get(name)
+        if isinstance(given, Mapping) and isinstance(given.get("folder"), str):
+            folder = str((path.parent / given["folder"]).absolute())
+            fields[name] = {**given, "folder": folder}
     if "name" not in fields:
         fields["name"] = re.sub(r"[^a-z0-9]+", "-", path.stem.lower()).strip("-")
-    network = fields.get("network")
-    if isinstance(network, Mapping) and isinstance(network.get("folder", "."), str):
-        folder = path.absolute().parent / network.get("folder", ".")
-        fields["network"] = {**network, "folder": os.path.normpath(folder)}
     corridor = from_mapping(Corridor, fields, "corridor")
     n = corridor.n_mainline
     crossings = [

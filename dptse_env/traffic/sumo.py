@@ -116,6 +116,9 @@ def running(corridor: Corridor, scenario: Scenario) -> Iterator[ModuleType]:
     Yields:
         The module libsumo; `seconds` advances its simulation.
     """
+    if corridor.recordings is not None:
+        cause = "its traffic is recorded, not simulated"
+        raise RecordingError.from_cause(corridor, scenario.seed, cause)
     network = network_xml(corridor) if corridor.network is None else ""
     with _one_at_a_time, tempfile.TemporaryDirectory(prefix="dptse-sumo-") as directory:
         if simulation_is_loaded():

@@ -54,9 +54,9 @@ class SumoScenario:
         columns: for each record column (the S segments, then the R boundary segments) the stretches
             of edges that belong to it. A vehicle counts where its front bumper is.
         sha256: SHA-256 (hex) of each file: the network, the route files, the additional files.
+        folder: folder of the files; in a road file it may be relative to that file. Their names are
+            relative to it.
         additional: additional files, in SUMO's order. What they would write is not written.
-        folder: folder of the files; their names are relative to it. In a road file it is relative
-            to the folder of that file.
         begin: second of SUMO's clock at which a record starts.
         warm_up: seconds simulated before that, which are not recorded.
         step_length: SUMO's time step [s]; it divides a second.
@@ -70,8 +70,8 @@ class SumoScenario:
     routes: tuple[str, ...]
     columns: tuple[tuple[Stretch, ...], ...]
     sha256: tuple[str, ...]
+    folder: str
     additional: tuple[str, ...] = ()
-    folder: str = "."
     begin: Clock = 0
     warm_up: Clock = 0
     step_length: StepLength = 1.0

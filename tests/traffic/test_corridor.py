@@ -111,6 +111,7 @@ def test_the_digest_covers_what_shapes_the_traffic_and_nothing_else():
             routes=("a.rou.xml",),
             sha256=("0", "1"),
             columns=tuple(((f"edge {i}", 0.0, 100.0),) for i in range(25)),
+            folder=".",
         ),
     }
     observed = {
@@ -121,7 +122,9 @@ def test_the_digest_covers_what_shapes_the_traffic_and_nothing_else():
         "average_dwell": 1.0,
     }
     names = {field.name for field in dataclasses.fields(PAPER_HIGHWAY)}
-    assert names == set(changes) | set(observed), "say here whether a new field shapes the traffic"
+    assert names == {"recordings", *changes, *observed}, (
+        "say here whether a new field shapes the traffic"
+    )
     digests = [changed(**{field: value}).digest for field, value in changes.items()]
     assert len({PAPER_HIGHWAY.digest, *digests}) == 1 + len(changes)
     for field, value in observed.items():

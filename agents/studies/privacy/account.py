@@ -14,7 +14,7 @@ from dptse_env.config import EnvConfig
 from dptse_env.parts import privacy_report
 from dptse_env.privacy import contribution_sensitivity, epsilon_of
 from dptse_env.release import CappedSettings
-from dptse_env.traffic import Corridor, RecordLibrary
+from dptse_env.traffic import Corridor, RecordLibrary, with_vehicles
 from dptse_env.utils.arrays import IntArray
 
 
@@ -132,7 +132,7 @@ class Trips:
 
 def measure_trips(corridor: Corridor, seed: int, library: RecordLibrary) -> Trips:
     """Return the lengths of the trips of a record; truth, for evaluation only."""
-    record = library.get(corridor, seed)
+    record = with_vehicles(library.get(corridor, seed), "the account")
     mainline = record.segment < corridor.n_mainline
     seconds = np.bincount(record.vehicle[mainline], minlength=record.n_vehicles)
     return Trips(seed, " ".join(map(str, seconds[seconds > 0].tolist())))
