@@ -39,6 +39,7 @@ from dptse_env.traffic import (
     Incident,
     IncidentDistribution,
     Recordings,
+    SumoScenario,
 )
 from dptse_env.utils.fields import Interval, allowed_numbers, field_hints
 from dptse_env.vector_env import SensorQueryVectorEnv
@@ -52,6 +53,7 @@ SECTIONS: Mapping[type, str] = {
     Demand: "`demand`, fixed",
     DemandDistribution: "`demand`, drawn for each traffic seed",
     Drivers: "`corridor.drivers`",
+    SumoScenario: "`corridor.network`",
     Recordings: "`corridor.recordings`",
     Incident: "`incident`, fixed",
     IncidentDistribution: "`incident`, drawn for each traffic seed",

@@ -30,6 +30,7 @@ from dptse_env.traffic.scenario import MAINLINE, Scenario, draw_scenario
 from dptse_env.traffic.stored_arrays import InvalidRecordError
 from dptse_env.traffic.sumo import RecordingError, SumoVersionError, simulate
 from dptse_env.traffic.sumo_network import NetworkError
+from dptse_env.traffic.sumo_scenario import SumoScenario
 from dptse_env.traffic.worker import simulate_in_child
 
 __all__ = [
@@ -53,6 +54,7 @@ __all__ = [
     "Recordings",
     "RoadFile",
     "Scenario",
+    "SumoScenario",
     "SumoVersionError",
     "average_dwell",
     "draw_scenario",

@@ -20,6 +20,7 @@ from dptse_env.traffic.drivers import Drivers
 from dptse_env.traffic.incident import Incident, IncidentDistribution
 from dptse_env.traffic.recordings import Recordings
 from dptse_env.traffic.road_segments import RoadSegments
+from dptse_env.traffic.sumo_scenario import SumoScenario
 from dptse_env.utils.fields import Interval, checked_fields
 from dptse_env.utils.validation import integer, require
 
@@ -75,6 +76,11 @@ class Corridor(RoadSegments):
         average_dwell: T_avg of the paper's eq. (6): average time of a vehicle on a mainline
             segment [s], measured from records (`dptse_env.traffic.record.mean_dwell`).
         drivers: the car-following model of all vehicles.
+        network: SUMO files of one's own, from which the road is recorded; None for a network made
+            of the fields above. With files, the vehicles are those of the files: the rates of
+            `demand` are what is published of them, the range of a `DemandDistribution` scales them
+            (SUMO's ``--scale``), `exit_shares` are published too, an incident limits the vehicles
+            on its segment, and `drivers` must be left at its default.
         recordings: imported traffic that episodes replay; None where SUMO simulates the traffic.
             With recordings the demand is a description of them, and there is no incident.
 
@@ -102,6 +108,7 @@ class Corridor(RoadSegments):
     ramp_segments: RampSegments | tuple[RampSegments, ...] = 1
     ramp_length: Length | tuple[Length, ...] | None = None
     ramp_speed_limit: SpeedLimit | tuple[SpeedLimit, ...] | None = None
+    network: SumoScenario | None = None
     recordings: Recordings | None = None
 
     def __post_init__(self) -> None:
@@ -134,6 +141,7 @@ class Corridor(RoadSegments):
             require(free, "corridor.incident", allowed, self.incident)
             allowed = "fixed where traffic is recorded"
             require(fixed, "corridor.demand", allowed, self.demand)
+        self._check_network()
 
     def _check_ramps(self) -> None:
         for name in ("on_ramps", "off_ramps"):
@@ -177,6 +185,18 @@ class Corridor(RoadSegments):
             integer("corridor.incident.segment", segment, 0, self.n_mainline - 1)
         require(start < self.duration, "corridor.incident.start", f"< {self.duration} s", start)
 
+    def _check_network(self) -> None:
+        if self.network is None:
+            return
+        n_columns = self.n_segments + self.n_boundaries
+        allowed = f"one for each of the {n_columns} record columns of this geometry"
+        fits = len(self.network.columns) == n_columns
+        require(fits, "corridor.network.columns", allowed, len(self.network.columns))
+        without = "None on a road with a network of its own"
+        require(self.recordings is None, "corridor.recordings", without, self.recordings)
+        allowed = "left out on a road with a network of its own"
+        require(self.drivers == Drivers(), "corridor.drivers", allowed, self.drivers)
+
     @property
     def published_demand(self) -> Demand:
         """The demand, or that which random levels are about."""
@@ -207,7 +227,8 @@ class Corridor(RoadSegments):
         """SHA-256 (hex) of the fields that determine the traffic, stable across processes.
 
         The fields of `NOT_TRAFFIC` are left out: corridors that differ in these alone share their
-        records.
+        records. With a `network`, its files, the demand's scale, the incident and the duration
+        determine the traffic.
         """
         content = dataclasses.asdict(self)
         for name in NOT_TRAFFIC:
@@ -220,10 +241,19 @@ class Corridor(RoadSegments):
         demand = content["demand"].get("base", content["demand"])
         if demand["exit_shares"] is None:
             del demand["exit_shares"]  # as before shares could vary
+        del content["network"]  # as before there were any
         if self.recordings is None:
             del content["recordings"]  # likewise
         else:
             content["recordings"] = self.recordings.digest  # not the folder, which may be moved
+        if self.network is not None:
+            scale = self.demand.scale if isinstance(self.demand, DemandDistribution) else None
+            content = {
+                "network": self.network.traffic,
+                "scale": scale,
+                "incident": content["incident"],
+                "duration": self.duration,
+            }
         kinds = [type(each).__name__ for each in self.incidents] or ["NoneType"]
         content["kinds"] = [type(self.demand).__name__, *kinds]
         text = json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)

@@ -113,4 +113,8 @@ class DemandDistribution:
 
     def draw(self, generator: np.random.Generator) -> Demand:
         """Draw one demand."""
-        return self.base.scaled(float(generator.uniform(*self.scale)))
+        return self.base.scaled(self.draw_scale(generator))
+
+    def draw_scale(self, generator: np.random.Generator) -> float:
+        """Draw the factor on every rate [-]."""
+        return float(generator.uniform(*self.scale))

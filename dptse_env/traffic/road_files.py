@@ -43,6 +43,7 @@ _OPTIONAL: dict[str, Any] = {
     "fixed_sensors": (),
 }
 _ENVIRONMENT = "environment"
+_WITH_FOLDER = ("recordings", "network")
 _FILE_ENDINGS = (".json", ".npz")
 
 
@@ -113,10 +114,13 @@ def write_corridor(
         comment: Text for the head of the file.
     """
     content = _plain(dataclasses.asdict(corridor))
-    if corridor.recordings is not None:
-        folder, home = Path(corridor.recordings.folder).absolute(), Path(path).absolute().parent
+    for name in _WITH_FOLDER:
+        given = getattr(corridor, name)
+        if given is None:
+            continue
+        folder, home = Path(given.folder).absolute(), Path(path).absolute().parent
         if folder.is_relative_to(home):  # so that the folder can be moved with the file in it
-            content["recordings"]["folder"] = str(folder.relative_to(home))
+            content[name]["folder"] = str(folder.relative_to(home))
     if environment:
         content[_ENVIRONMENT] = _plain(dict(environment))
     head = "".join(f"# {line}\n" for line in comment.splitlines())
@@ -137,10 +141,11 @@ def _content(path: Path) -> dict[str, Any]:
 def _corridor(content: Mapping[str, Any], path: Path) -> tuple[Corridor, tuple[str, ...]]:
     """Return the corridor of a file's fields, and the names of those that were assumed."""
     fields = {**_OPTIONAL, **content}
-    recordings = fields.get("recordings")
-    if isinstance(recordings, Mapping) and isinstance(recordings.get("folder"), str):
-        folder = str((path.parent / recordings["folder"]).absolute())
-        fields["recordings"] = {**recordings, "folder": folder}
+    for name in _WITH_FOLDER:
+        given = fields.get(name)
+        if isinstance(given, Mapping) and isinstance(given.get("folder"), str):
+            folder = str((path.parent / given["folder"]).absolute())
+            fields[name] = {**given, "folder": folder}
     if "name" not in fields:
         fields["name"] = re.sub(r"[^a-z0-9]+", "-", path.stem.lower()).strip("-")
     corridor = from_mapping(Corridor, fields, "corridor")

@@ -30,6 +30,10 @@ class Scenario:
         origins: (V,) index of the on-ramp, or `MAINLINE`.
         exits: (V,) index of the off-ramp, or `MAINLINE`.
         sumo_seed: seed of SUMO's random desired speeds.
+        scale: factor on the corridor's demand [-].
+
+    On a road that is recorded from SUMO files of its own (`Corridor.network`), the vehicles are
+    those of the files, and departures, origins and exits are empty.
     """
 
     seed: int
@@ -39,6 +43,7 @@ class Scenario:
     origins: NDArray[np.int64]
     exits: NDArray[np.int64]
     sumo_seed: int
+    scale: float = 1.0
 
     @property
     def n_vehicles(self) -> int:
@@ -57,16 +62,18 @@ def draw_scenario(corridor: Corridor, seed: int) -> Scenario:
     """
     integer("traffic seed", seed, 0)
     demand_seed, incident_seed, arrival_seed, sumo_seed = np.random.SeedSequence(seed).spawn(4)
-    demand = corridor.demand
+    demand, scale = corridor.demand, 1.0
     if isinstance(demand, DemandDistribution):
-        demand = demand.draw(np.random.default_rng(demand_seed))
+        scale = demand.draw_scale(np.random.default_rng(demand_seed))
+        demand = demand.base.scaled(scale)
     generator = np.random.default_rng(incident_seed)
     incidents = tuple(
         each.draw(generator) if isinstance(each, IncidentDistribution) else each
         for each in corridor.incidents
     )
     generator = np.random.default_rng(arrival_seed)
-    departures, origins = _arrivals(demand, corridor.duration, generator)
+    duration = corridor.duration if corridor.network is None else 0
+    departures, origins = _arrivals(demand, duration, generator)
     return Scenario(
         seed=seed,
         demand=demand,
@@ -75,6 +82,7 @@ def draw_scenario(corridor: Corridor, seed: int) -> Scenario:
         origins=origins,
         exits=_exits(corridor, demand, departures, origins, generator),
         sumo_seed=int(np.random.default_rng(sumo_seed).integers(2**31 - 1)),
+        scale=scale,
     )
 
 

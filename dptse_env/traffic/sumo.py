@@ -25,6 +25,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from dptse_env.traffic import sumo_files
 from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.incident import limit_changes
 from dptse_env.traffic.record import Record
@@ -39,8 +40,7 @@ STEP_LENGTH = 0.5
 per run of 730 vehicles on the paper's corridor) and overlaps twice as often."""
 
 SUBSTEPS = round(1.0 / STEP_LENGTH)
-KMH = 3.6
-"""Factor from m/s to km/h."""
+KMH = sumo_files.KMH
 
 OPTIONS = (
     f"--step-length={STEP_LENGTH}",
@@ -48,13 +48,7 @@ OPTIONS = (
     "--collision.action=none",
     # Vehicles that stand still in a jam are not removed.
     "--time-to-teleport=-1",
-    "--no-step-log",
-    "--duration-log.disable",
-    "--no-warnings",
-    # Validation would look for schemas under SUMO_HOME, which is not needed otherwise.
-    "--xml-validation=never",
-    "--xml-validation.net=never",
-    "--xml-validation.routes=never",
+    *sumo_files.QUIET,
 )
 
 _one_at_a_time = threading.Lock()
@@ -101,14 +95,16 @@ def simulate(corridor: Corridor, seed: int) -> Record:
     The same corridor and seed give the same record, bit for bit, in any process.
 
     Raises:
-        RecordingError: SUMO fails, or libsumo already holds a simulation in this process, which
-            is left unchanged (see `dptse_env.traffic.worker`).
+        RecordingError: SUMO fails, the corridor's own files are missing or changed, or libsumo
+            already holds a simulation in this process, which is left unchanged (see
+            `dptse_env.traffic.worker`).
         NetworkError: The corridor has to be compiled and cannot be.
         SumoVersionError: libsumo is missing, broken or of another release series.
     """
     scenario = draw_scenario(corridor, seed)
     with running(corridor, scenario) as libsumo:
-        return _observe(libsumo, corridor, scenario)
+        observe = _observe if corridor.network is None else sumo_files.observe
+        return observe(libsumo, corridor, scenario)
 
 
 @contextlib.contextmanager
@@ -123,7 +119,7 @@ def running(corridor: Corridor, scenario: Scenario) -> Iterator[ModuleType]:
     if corridor.recordings is not None:
         cause = "its traffic is recorded, not simulated"
         raise RecordingError.from_cause(corridor, scenario.seed, cause)
-    network = network_xml(corridor)
+    network = network_xml(corridor) if corridor.network is None else ""
     with _one_at_a_time, tempfile.TemporaryDirectory(prefix="dptse-sumo-") as directory:
         if simulation_is_loaded():
             cause = "libsumo holds another simulation in this process"
@@ -133,7 +129,10 @@ def running(corridor: Corridor, scenario: Scenario) -> Iterator[ModuleType]:
         messages = folder / "messages.txt"
         try:
             with _stderr_to(messages):
-                libsumo.start(_command(folder, network, corridor, scenario))
+                if corridor.network is None:
+                    libsumo.start(_command(folder, network, corridor, scenario))
+                else:
+                    libsumo.start(sumo_files.command(folder, corridor.network, scenario))
             yield libsumo
         except Exception as error:
             output = messages.read_text(encoding="utf-8", errors="replace").strip()
@@ -150,6 +149,9 @@ def seconds(libsumo: ModuleType, corridor: Corridor, scenario: Scenario) -> Iter
     Yields:
         0, 1, ..., `corridor.duration`: the second [s] whose state libsumo holds.
     """
+    if corridor.network is not None:
+        yield from sumo_files.seconds(libsumo, corridor.network, corridor.duration)
+        return
     changes = limit_changes(scenario.incidents, corridor.speed_limits)
     yield 0
     for second in range(corridor.duration):

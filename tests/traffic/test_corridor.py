@@ -14,6 +14,7 @@ from dptse_env.traffic import (
     Drivers,
     Incident,
     IncidentDistribution,
+    SumoScenario,
 )
 
 
@@ -105,6 +106,13 @@ def test_the_digest_covers_what_shapes_the_traffic_and_nothing_else():
         "ramp_segments": 2,
         "ramp_length": 0.2,
         "ramp_speed_limit": 60.0,
+        "network": SumoScenario(
+            net="a.net.xml",
+            routes=("a.rou.xml",),
+            sha256=("0", "1"),
+            columns=tuple(((f"edge {i}", 0.0, 100.0),) for i in range(25)),
+            folder=".",
+        ),
     }
     observed = {
         "name": "other",
