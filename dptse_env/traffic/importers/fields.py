@@ -16,7 +16,7 @@ from dptse_env.traffic.dwell import average_dwell
 from dptse_env.traffic.field_record import FieldRecord
 from dptse_env.traffic.importers.folder import ROAD, Split, assign_seeds
 from dptse_env.traffic.importers.new_folder import new_folder
-from dptse_env.traffic.recordings import Recordings, record_source, write_manifest
+from dptse_env.traffic.recordings import Recordings, record_path, record_source, write_manifest
 from dptse_env.traffic.road_files import DENSITY_SCALE, write_corridor
 from dptse_env.utils.validation import integer, positive, require
 
@@ -181,8 +181,7 @@ def import_field(
         for seed, start in zip(flat, starts, strict=True):
             window = slice(start, start + duration + 1)
             record = FieldRecord(field[0][window][:, order], field[1][window][:, order])
-            path = Recordings(str(folder), "").record_path(seed)
-            record.save(path, record_source(seed, bare.record_layout))
+            record.save(record_path(folder, seed), record_source(seed, bare.record_layout))
             sources.append({"seed": seed, "file": source.density.name, "start": start})
             if seed in seeds[splits[0].name]:
                 training.append(record)

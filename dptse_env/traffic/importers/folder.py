@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import shutil
-import uuid
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +15,7 @@ from dptse_env.traffic.demand import Demand
 from dptse_env.traffic.importers.fcd import FCD
 from dptse_env.traffic.importers.formats import EXID, HIGHD, NGSIM, TABLE, TGSIM
 from dptse_env.traffic.importers.i24 import I24
+from dptse_env.traffic.importers.new_folder import new_folder
 from dptse_env.traffic.importers.placing import Placer
 from dptse_env.traffic.importers.points import Format
 from dptse_env.traffic.importers.recording import Options, Recording, Window
@@ -105,17 +104,12 @@ def import_trajectories(
     """
     require_name("source.format", source.format, FORMATS)
     require(len(files) > 0, "files", "one or more", len(files))
-    require(not output.exists(), "output", "a folder that does not exist yet", str(output))
     check_splits(splits)
     bare = dataclasses.replace(
         corridor, incident=None, recordings=None, demand=corridor.published_demand
     )
-    output.parent.mkdir(parents=True, exist_ok=True)
-    work = output.parent / f".{output.name}-{uuid.uuid4().hex}"
-    folder = work / "result"
-    folder.mkdir(parents=True)
-    try:
-        recordings = _read(files, source, bare, work, options)
+    with new_folder(output) as folder:
+        recordings = _read(files, source, bare, folder.parent, options)
         windows = [(each, window) for each in recordings for window in each.windows]
         seeds = assign_seeds(splits, len(windows))
         flat = [seed for split in splits for seed in seeds[split.name]]
@@ -135,9 +129,6 @@ def import_trajectories(
         comment = "Recorded traffic. Demand, exit shares and average dwell are measured."
         write_corridor(folder / ROAD, written, environment, comment)
         report = write_report(folder, written, recordings, seeds, sources, load(flat[0]))
-        folder.rename(output)
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
     final = dataclasses.replace(written, recordings=Recordings(str(output.absolute()), digest))
     return Imported(final, seeds, report)
 

@@ -13,7 +13,7 @@ from dptse_env.utils.validation import require
 def new_folder(output: Path) -> Iterator[Path]:
     """Yield an empty folder that becomes `output` when the body ends, and vanishes if it fails.
 
-    Beside it, in its parent, the body may leave what is thrown away.
+    Its parent is a folder for this alone, in which the body may leave what is thrown away.
 
     Raises:
         ValueError: There is something at `output`.
