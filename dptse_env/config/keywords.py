@@ -74,21 +74,10 @@ def resolve(preset: str, overrides: Mapping[str, Any]) -> EnvConfig:
     _read_files(values)
     corridor = _corridor(base.corridor, values)
     values["privacy"] = _privacy(base.privacy, values)
-    if "traffic_seeds" not in values and corridor.recordings is not None:
-        recorded = corridor.recordings.seeds
-        values["traffic_seeds"] = tuple(seed for seed in recorded if seed in TRAINING_SEEDS)
-    if isinstance(values.get("traffic_seeds"), str):
-        values["traffic_seeds"] = parse_seeds(values["traffic_seeds"], "traffic_seeds")
+    _read_seeds(values, corridor)
     if isinstance(values.get("observation"), str):
         values["observation"] = (values["observation"],)
-    settings = values.get("estimator_settings")
-    if isinstance(settings, Mapping):
-        del values["estimator_settings"]
-    config = from_mapping(EnvConfig, {**values, "corridor": corridor}, "", base)
-    if isinstance(settings, Mapping):
-        expected = settings_type(config.estimator)
-        given = from_mapping(expected, settings, "estimator_settings", config.settings())
-        config = replace(config, estimator_settings=given)
+    config = _config(base, values, corridor)
     inherited = _inherited(corridor, config, overrides, road.assumed if road else ())
     if inherited and not config.inherited:
         config = replace(config, inherited=inherited)
@@ -99,6 +88,27 @@ def resolve(preset: str, overrides: Mapping[str, Any]) -> EnvConfig:
             stacklevel=3,
         )
     return config
+
+
+def _config(base: EnvConfig, values: dict[str, Any], corridor: Corridor) -> EnvConfig:
+    """Return the configuration; a mapping of settings changes those that are otherwise in force."""
+    settings = values.get("estimator_settings")
+    if not isinstance(settings, Mapping):
+        return from_mapping(EnvConfig, {**values, "corridor": corridor}, "", base)
+    del values["estimator_settings"]
+    config = from_mapping(EnvConfig, {**values, "corridor": corridor}, "", base)
+    expected = settings_type(config.estimator)
+    given = from_mapping(expected, settings, "estimator_settings", config.settings())
+    return replace(config, estimator_settings=given)
+
+
+def _read_seeds(values: dict[str, Any], corridor: Corridor) -> None:
+    """Replace a range of traffic seeds by these, and put recorded ones where none are given."""
+    if "traffic_seeds" not in values and corridor.recordings is not None:
+        recorded = corridor.recordings.seeds
+        values["traffic_seeds"] = tuple(seed for seed in recorded if seed in TRAINING_SEEDS)
+    if isinstance(values.get("traffic_seeds"), str):
+        values["traffic_seeds"] = parse_seeds(values["traffic_seeds"], "traffic_seeds")
 
 
 def _road_file(overrides: Mapping[str, Any]) -> RoadFile | None:
