@@ -155,7 +155,7 @@ def test_the_keywords_of_a_file_come_after_the_callers(road):
 
 def test_parameters_and_settings_that_are_not_the_roads_own_are_named(road):
     road.write_text(ROAD.partition("[environment]")[0])
-    with pytest.warns(UserWarning, match="not of this road"):
+    with pytest.warns(UserWarning, match="on another road"):
         config = resolve("paper-highway", {"corridor": str(road)})
     assert {"parameters", "estimator_settings", "corridor.average_dwell"} == set(config.inherited)
 

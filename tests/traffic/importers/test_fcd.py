@@ -56,7 +56,7 @@ def test_imported_fcd_is_the_record_number_for_number(suffix, folder, recorded, 
     assert (record.n_steps, record.n_columns) == (recorded.n_steps, recorded.n_columns)
 
 
-@pytest.mark.filterwarnings("ignore:.*not of this road")
+@pytest.mark.filterwarnings("ignore:.*values measured or tuned on")
 def test_an_environment_replays_the_imported_traffic(folder, recorded, tmp_path):
     run(folder, "fcd.csv", tmp_path)
     road = str(tmp_path / "new" / "road.toml")

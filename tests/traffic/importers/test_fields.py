@@ -68,7 +68,7 @@ def test_flows_give_the_same_field_as_speeds(tmp_path):
 def test_environments_play_a_field_and_refuse_what_needs_vehicles(tmp_path):
     import_field(write(tmp_path), ROAD, tmp_path / "road", SPLITS, 100)
     path = str(tmp_path / "road" / "road.toml")
-    with pytest.warns(UserWarning, match="not of this road"):
+    with pytest.warns(UserWarning, match="on another road"):
         env = gym.make("dptse_env:dptse/PaperHighway-v0", corridor=path, bandwidth=2)
     assert env.unwrapped.config.traffic_seeds == (0, 1)
     env.reset(seed=0)
