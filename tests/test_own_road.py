@@ -8,7 +8,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from dptse_env.estimators import ESTIMATORS
+from dptse_env.estimators import ESTIMATORS, EstimatorSettings
+from dptse_env.estimators.noise import count_variance
+from dptse_env.model import ARZModel, load_parameters
 from dptse_env.release import RELEASE_MODELS
 from dptse_env.schedules import make_schedule
 from dptse_env.traffic import write_corridor
@@ -54,10 +56,19 @@ def test_every_estimator_runs_on_an_uneven_road(road_file, estimator):
 def test_both_backends_agree_on_an_uneven_road(road_file, estimator):
     found = []
     for backend in ("compiled", "reference"):
-        env = make(road_file, estimator=estimator, backend=backend)
+        settings = {"count_noise": 2.0}
+        env = make(road_file, estimator=estimator, backend=backend, estimator_settings=settings)
         env.action_space.seed(0)
         found.append(play(env)[0])
     np.testing.assert_allclose(found[0], found[1], rtol=1e-4)
+
+
+def test_a_count_scatters_less_in_density_on_a_longer_segment():
+    model = ARZModel(ROAD, load_parameters("w99-3lane"))
+    variance = count_variance(model, EstimatorSettings(count_noise=2.0))
+    np.testing.assert_allclose(
+        variance * ROAD.segment_lengths, 2.0 / model.density_scale**2, rtol=1e-12
+    )
 
 
 @pytest.mark.parametrize("preset", RELEASE_MODELS)

@@ -82,8 +82,8 @@ def resolve(preset: str, overrides: Mapping[str, Any]) -> EnvConfig:
     if inherited and not config.inherited:
         config = replace(config, inherited=inherited)
         warnings.warn(
-            f"{', '.join(inherited)}: values measured or tuned on {base.corridor.name}, or assumed, "
-            "are used on another road; give them to use others",
+            f"{', '.join(inherited)}: values measured or tuned on {base.corridor.name}, or "
+            "assumed, are used on another road; give them to use others",
             UserWarning,
             stacklevel=3,
         )

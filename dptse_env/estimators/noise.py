@@ -25,13 +25,14 @@ def initial_variance(model: ARZModel, settings: EstimatorSettings) -> FloatArray
     return np.concatenate([traffic, np.full(model.n_demand_states, deviation**2)])
 
 
-def count_variance(model: ARZModel, settings: EstimatorSettings) -> float:
-    """Return the variance of a measured density beside the noise, over rho [km/veh].
+def count_variance(model: ARZModel, settings: EstimatorSettings) -> FloatArray:
+    """Return the variances of measured densities beside the noise, over rho [km/veh], shape (M,).
 
-    It is that of the shortest segment.
+    They are those of a row's first segment; a row of several segments has so many times less.
     """
-    shortest = min(model.network.segment_lengths)
-    return float(settings.count_noise / shortest / model.density_scale**2)
+    lengths = model.layout.lengths[model.rows.first]
+    variance: FloatArray = settings.count_noise / lengths / model.density_scale**2
+    return variance
 
 
 def density_growth(model: ARZModel, settings: EstimatorSettings, density: FloatArray) -> FloatArray:

@@ -53,7 +53,7 @@ class Filters(NamedTuple):
     process_variance: FloatArray  # (n_x,) normalised; of psi, or of w
     noise_in_w: bool  # whether it is of w
     growth_variance: float  # variance that rho / rho_m = 1 adds to the process noise of rho
-    count_variance: float  # variance of a density beside the noise, over rho, normalised
+    count_variance: FloatArray  # (M,) variance of densities beside the noise, over rho, normalised
     initial_variance: FloatArray  # (n_x,) normalised
     density_scale: float  # rho_m [veh/km]
     is_box: bool  # whether means are projected into the paper's box, not the cone

@@ -64,7 +64,7 @@ def released(
 def linearise(
     road: RoadArrays,
     density_scale: float,
-    count_variance: float,
+    count_variance: FloatArray,
     mean: FloatArray,
     observed: BoolArray,
     values: FloatArray,
@@ -91,7 +91,7 @@ def linearise(
         rows.single[m, 0] = (values[m, 0] - density) / scale
         rows.single[m, 1] = (values[m, 1] - second) / unit
         rows.single[m, 2], rows.single[m, 3] = rows.slopes[first, 0], rows.slopes[first, 1]
-        rows.noise[m, 0] = (sigma[m, 0] / scale) ** 2 + count_variance * density / span
+        rows.noise[m, 0] = (sigma[m, 0] / scale) ** 2 + count_variance[m] * density / span
         rows.noise[m, 1] = (sigma[m, 1] / unit) ** 2
 
 

@@ -44,7 +44,7 @@ class Ensembles(NamedTuple):
     process_deviation: FloatArray  # (n_x,) of a step [veh/km, veh/h, 1]; of psi, or of rho_m w
     noise_in_w: bool  # whether it is of w
     density_growth: float  # deviation over rho_m that rho = rho_m adds to the noise of rho
-    count_variance: float  # variance of a density beside the noise, over rho, normalised
+    count_variance: FloatArray  # (M,) variance of densities beside the noise, over rho, normalised
     initial_deviation: FloatArray  # (n_x,) of the members around a prior [veh/km, veh/h, 1]
     density_scale: float  # rho_m [veh/km]
     inflation: float  # factor on distances from the mean before an update
@@ -257,8 +257,8 @@ def _compare(
             distance, residual, draw = distances[r], residuals[r], draws[r * n : (r + 1) * n]
             mean = centre_row(row, n, units[kind], distance)
             size = measured.sigma[m, kind] / units[kind]
-            if kind == 0 and ensembles.count_variance > 0.0:
-                counted = ensembles.count_variance * mean * units[0] / span
+            if kind == 0 and ensembles.count_variance[m] > 0.0:
+                counted = ensembles.count_variance[m] * mean * units[0] / span
                 size = np.sqrt(size**2 + counted)
             difference = measured.values[m, kind] / units[kind] - mean
             for j in range(n):

@@ -143,7 +143,7 @@ def _measure(
         density = 0.0
         for s in range(first, first + span):
             density += mean[2 * s]
-        windows.noise[e, last, m, 0] += filters.count_variance * density / span**2
+        windows.noise[e, last, m, 0] += filters.count_variance[m] * density / span**2
     return sound
 
 

@@ -64,9 +64,9 @@ def row_noise(
     for i in range(rows.size):
         r = rows[i]
         noise[i, 0], noise[i, 1] = (sigma[r, 0] / scale) ** 2, (sigma[r, 1] / unit) ** 2
-        if filters.count_variance > 0.0:
+        if filters.count_variance[r] > 0.0:
             density = _average(filters.means, e, 2 * road.row_first[r], road.row_span[r])
-            noise[i, 0] += filters.count_variance * density / road.row_span[r]
+            noise[i, 0] += filters.count_variance[r] * density / road.row_span[r]
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
