@@ -40,7 +40,7 @@ def test_a_corridor_of_other_fields_is_calibrated(tmp_path):
     ("changes", "message"),
     [
         ({"held_out": "1:3"}, r"held_out must not share seeds with train, both have \[1\]"),
-        ({"corridor": "long"}, "corridor must be one of paper-highway, short-highway or a JSON"),
+        ({"corridor": "long"}, "corridor must be one of paper-highway, .*, a road file"),
         ({"keywords": '{"corridor": {"length": 1}}'}, r"corridor\.length"),
         ({"train": "x"}, "train must be 'first:stop' or one seed, got 'x'"),
     ],
