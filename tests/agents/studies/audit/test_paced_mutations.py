@@ -105,7 +105,8 @@ SUBTLE = {
     "a ratio of two": (
         RatioOfTwo, (staying(1), staying(1, ROAD.speed_limit)), {"pace": 0.4}, 1.13
     ),
-    "noise divided by 1.41": (Paced, (staying(1), staying(3)), {}, 1.38),
+    # A vehicle spends 95 % of its budget in an episode: 1.41 times the root of that.
+    "noise divided by 1.41": (Paced, (staying(1), staying(3)), {}, 1.36),
 }  # fmt: skip
 
 
