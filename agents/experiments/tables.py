@@ -104,15 +104,15 @@ _FILTER = (
     "noise_scale", "initial_variance", "bounds",
 )  # fmt: skip
 _READ_BY = {
-    "ekf": _FILTER,
-    "ukf": (*_FILTER, "ukf"),
+    "ekf": (*_FILTER, "band"),
+    "ukf": (*_FILTER, "band", "ukf"),
     "enkf": (*_FILTER, "enkf"),
     "mhe": (
         "process_noise", "density_growth", "count_noise", "demand", "speed_cap", "noise_scale",
         "mhe",
     ),
     "random_walk": ("walk_noise", "speed_cap", "noise_scale", "initial_variance"),
-    "blend": (*_FILTER, "walk_noise", "blend"),
+    "blend": (*_FILTER, "band", "walk_noise", "blend"),
     "open_loop": ("speed_cap", "bounds"),
     "recurrent": ("speed_cap", "noise_scale", "initial_variance", "recurrent"),
 }  # fmt: skip

@@ -200,20 +200,32 @@ def project(road: RoadArrays, mean: FloatArray, is_box: bool) -> None:
 def summarise(road_: Packed, filters_: Packed, out: FloatArray) -> None:
     """Write density, speed and their standard deviations to `out` `(4, n, S)`, physical units."""
     road, filters = RoadArrays(*road_), Filters(*filters_)
-    v_f, scale = road.free_flow_speed, filters.density_scale
-    largest = LARGEST_W * v_f
     for e in range(filters.means.shape[0]):
-        mean, covariance = filters.means[e], filters.covariances[e]
         for s in range(road.jam.size):
-            rho, psi, jam = mean[2 * s], mean[2 * s + 1], road.jam[s]
-            p = pressure(rho, jam, v_f, road.gamma)
-            w = psi / rho if rho > VACUUM * jam else v_f
-            _, by_rho, by_psi = measured(rho, psi, jam, v_f, road.gamma)
-            variance = variance_along(covariance, s, by_rho * scale, by_psi * scale * v_f)
-            out[0, e, s] = rho
-            out[1, e, s] = _clip(w - p, 0.0, largest)
-            out[2, e, s] = scale * np.sqrt(max(covariance[2 * s, 2 * s], 0.0))
-            out[3, e, s] = np.sqrt(max(variance, 0.0))
+            summarise_segment(road, filters, e, s, filters.covariances[e], s, out)
+
+
+@njit(cache=True, error_model="numpy")
+def summarise_segment(
+    road: RoadArrays,
+    filters: Filters,
+    e: int,
+    s: int,
+    covariance: FloatArray,
+    at: int,
+    out: FloatArray,
+) -> None:
+    """Write what `summarise` does of a segment, whose covariance is block `at` of a matrix."""
+    v_f, scale = road.free_flow_speed, filters.density_scale
+    rho, psi, jam = filters.means[e, 2 * s], filters.means[e, 2 * s + 1], road.jam[s]
+    p = pressure(rho, jam, v_f, road.gamma)
+    w = psi / rho if rho > VACUUM * jam else v_f
+    _, by_rho, by_psi = measured(rho, psi, jam, v_f, road.gamma)
+    variance = variance_along(covariance, at, by_rho * scale, by_psi * scale * v_f)
+    out[0, e, s] = rho
+    out[1, e, s] = _clip(w - p, 0.0, LARGEST_W * v_f)
+    out[2, e, s] = scale * np.sqrt(max(covariance[2 * at, 2 * at], 0.0))
+    out[3, e, s] = np.sqrt(max(variance, 0.0))
 
 
 @njit(cache=True, error_model="numpy")
