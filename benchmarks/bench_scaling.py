@@ -1,0 +1,106 @@
+"""Time of an estimator's step on roads of growing length.
+
+python benchmarks/bench_scaling.py
+
+A step is `predict` and `update` of one episode on one core, a third of the mainline segments
+queried. All roads and estimators are measured in turns in one run. The exponent is the slope of a
+line fitted to the logarithms of time and length: 1 where a road twice as long costs twice as much.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from agents.evaluation.terminal import make_table, print_table
+from agents.experiments.plots import LABELS
+from benchmarks.long_roads import long_road
+from benchmarks.replay import replay_of
+from benchmarks.steps import Row, Steps, step_times
+from dptse_env.config import EnvConfig
+from dptse_env.traffic import RecordLibrary
+from dptse_env.utils.arrays import FloatArray
+from scripts.cli import run
+
+WARM_UP = 300  # [s] of the record, while the road fills
+EXPONENTS = {"ekf": 1.15, "ukf": 1.3, "enkf": 1.15, "mhe": 1.3, "recurrent": 1.15}
+"""Largest exponent that is aimed at, of estimators whose covariances reach a band."""
+
+
+@dataclass(frozen=True)
+class Args:
+    """Time a step of each estimator on roads of several lengths."""
+
+    estimators: tuple[str, ...] = tuple(EXPONENTS)
+    """Estimators to measure."""
+    lengths: tuple[int, ...] = (30, 60, 120, 200)
+    """Mainline segments of the roads, ascending."""
+    band: int | None = 10
+    """Band of the covariances [segments]; "None" for all of the road."""
+    taper: float | None = 1.0
+    """Reach of the EnKF's taper [km]; "None" for all of the road."""
+    parameters: str = "w99-3lane"
+    """ARZ parameter set."""
+    steps: int = 100
+    """Steps of an episode."""
+    block: int = 10
+    """Steps of one row before the next one has its turn."""
+    passes: int = 3
+    """Times that all rows go through the steps."""
+    quick: bool = False
+    """Smallest sizes: whether it runs, not how fast."""
+
+
+def measure(args: Args) -> dict[str, FloatArray]:
+    """Return the time of a step [us] by estimator, on each road."""
+    rows: dict[str, Row] = {}
+    for n in args.lengths:
+        corridor = long_road(n)
+        RecordLibrary().ensure(corridor, (0,))
+        config = EnvConfig(
+            corridor=corridor, parameters=args.parameters, bandwidth=n // 3, traffic_seeds=(0,)
+        )
+        replay = replay_of(config, 1, args.steps, WARM_UP)
+        settings = replace(
+            replay.settings,
+            band=args.band,
+            enkf=replace(replay.settings.enkf, taper=args.taper),
+            recurrent=replace(replay.settings.recurrent, outside=True),
+        )
+        for name in args.estimators:
+            rows[f"{name} {n}"] = Steps(name, "compiled", replace(replay, settings=settings))
+    times = step_times(rows, args.steps, args.block, args.passes)
+    return {
+        name: np.array([np.median(times[f"{name} {n}"]) for n in args.lengths])
+        for name in args.estimators
+    }
+
+
+def exponent(lengths: tuple[int, ...], times: FloatArray) -> float:
+    """Return the slope of a line fitted to the logarithms of times and lengths."""
+    return float(np.polyfit(np.log(lengths), np.log(times), 1)[0])
+
+
+def main(args: Args) -> None:
+    """Measure and print."""
+    if args.quick:
+        args = replace(args, lengths=(12, 18), band=4, steps=6, block=3, passes=1)
+    columns = [f"S = {n}" for n in args.lengths]
+    columns = [f"us/step, {columns[0]}", *columns[1:], "exponent", "target", ""]
+    title = f"time of a step as a ratio to S = {args.lengths[0]}, band {args.band}"
+    table = make_table(title, "estimator", *columns, left=1)
+    for name, times in measure(args).items():
+        found, aim = exponent(args.lengths, times), EXPONENTS.get(name)
+        ratios = [f"{ratio:.2f}" for ratio in times[1:] / times[0]]
+        judged = ["", ""] if aim is None else [f"{aim:g}", "met" if found <= aim else "no"]
+        table.add_row(LABELS[name], f"{times[0]:.0f}", *ratios, f"{found:.2f}", *judged)
+    print_table(table)
+
+
+if __name__ == "__main__":
+    run(main, Args, __doc__)
