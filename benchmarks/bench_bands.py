@@ -67,8 +67,9 @@ def measure(args: Args, estimator: str, band: int | None, last: int) -> np.ndarr
     errors, spent, n_steps = [], 0.0, 0
     for seed in range(len(seeds)):
         observation, _ = env.reset(seed=seed, options={"traffic_seed": seeds[seed]})
+        state = None
         for second in range(last):
-            action, _ = schedule.predict(observation)
+            action, state = schedule.predict(observation, state)
             begun = time.perf_counter()
             observation, _, _, _, info = env.step(action)
             spent += time.perf_counter() - begun if second > 0 else 0.0
