@@ -93,10 +93,12 @@ class TrainingPlan:
         """The configuration of the environment.
 
         Raises:
-            ValueError: A keyword is unknown or out of range.
+            ValueError: A keyword is unknown or out of range, or the recipe cannot train there.
         """
         chosen = {"action": self.recipe.action, "traffic_seeds": list(self.traffic_seeds)}
-        return make_config(self.env, {**chosen, **self.keywords})
+        config = make_config(self.env, {**chosen, **self.keywords})
+        self.recipe.check_environment(config)
+        return config
 
     def provenance(self, commit: str | None) -> dict[str, Any]:
         """Return what `take_folder` compares and keeps, as plain JSON."""

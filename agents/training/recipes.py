@@ -9,6 +9,8 @@ from typing import Annotated, ClassVar
 
 import tyro
 
+from dptse_env.config import EnvConfig
+from dptse_env.release import RELEASE_MODELS, GaussianRelease
 from dptse_env.sb3.policy import RULE
 from dptse_env.utils.validation import inside, integer, non_negative, positive, require
 
@@ -141,6 +143,14 @@ class Recipe(ABC):
         """
 
     @abstractmethod
+    def check_environment(self, config: EnvConfig) -> None:
+        """Refuse an environment that the recipe cannot train in.
+
+        Raises:
+            ValueError: It cannot; the message names the setting.
+        """
+
+    @abstractmethod
     def n_updates(self, steps: int, actions_per_step: int) -> int:
         """Return the number of updates, or of rounds, in ``steps`` seconds of traffic."""
 
@@ -181,6 +191,16 @@ class PlackettLuceRecipe(Recipe):
         """See `Recipe.check_steps`."""
         no_steps = steps == 0
         require(no_steps, "steps", f"0 for {self.learner}, which is trained in rounds", steps)
+
+    def check_environment(self, config: EnvConfig) -> None:
+        """See `Recipe.check_environment`; swaps choose the noise of a release, a Gaussian one."""
+        preset = config.privacy.preset
+        if self.swaps.rounds and not issubclass(RELEASE_MODELS.find(preset), GaussianRelease):
+            raise ValueError(
+                f"recipe.swaps.rounds must be 0 under {RELEASE_MODELS.name_of(preset)!r}, whose "
+                f"noise swaps cannot choose, got {self.swaps.rounds}; recipe:maskable trains under "
+                "any release model"
+            )
 
     def n_updates(self, steps: int, actions_per_step: int) -> int:
         """Return the number of rounds of swaps."""
@@ -248,6 +268,9 @@ class PPORecipe(Recipe):
     def check_steps(self, steps: int) -> None:
         """See `Recipe.check_steps`."""
         integer("steps", steps, 1)
+
+    def check_environment(self, config: EnvConfig) -> None:
+        """See `Recipe.check_environment`; PPO trains in all of them."""
 
     def n_updates(self, steps: int, actions_per_step: int) -> int:
         """See `Recipe.n_updates`; the last update is a whole one."""

@@ -228,6 +228,14 @@ def test_plans_that_are_refused(changes, message):
         make_plan(**changes)
 
 
+def test_swaps_under_a_release_without_gaussian_noise_are_refused_at_once(tmp_path):
+    plan = make_plan(keywords={"horizon": 80, "privacy": "paced"})
+    message = r"^recipe.swaps.rounds must be 0 under 'paced', .*, got 2; recipe:maskable"
+    with pytest.raises(ValueError, match=message):
+        Training(plan, tmp_path / "x")
+    assert not (tmp_path / "x").exists()
+
+
 def test_a_bad_keyword_is_refused_before_anything_is_written(tmp_path):
     with pytest.raises(ValueError, match="estimatr is unknown"):
         Training(make_plan(keywords={"estimatr": "ukf"}), tmp_path / "run")
