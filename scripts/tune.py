@@ -2,8 +2,8 @@
 
 python scripts/tune.py --estimators ekf ukf --privacy paper corrected --seeds 0:8 --workers 2
 
-Each set is left in <output>/<estimator>-<ARZ parameters>-<privacy preset>.json. To ship one, copy
-it to dptse_env/estimators/tuned/: environments of that configuration then take it by default.
+Each set is left in <output>/<estimator>-<ARZ parameters>-<privacy preset>.json, a file that
+estimator_settings takes, as a keyword or in the table environment of a road file.
 
 Trials are kept in a journal beside it. After an interruption, or a kill, the same command goes on
 where it stopped, and with more --trials it searches on; other arguments need another folder.
@@ -72,6 +72,8 @@ class Args:
     """Search demand states, too, and the noise that goes with them."""
     repairs: bool = False
     """Search the cap of reported speeds and whether process noise is of psi or of w, too."""
+    band: int | None = None
+    """Band of the covariances of EKF, UKF and blend [segments]; "None" for the whole road."""
     variant: str = ""
     """Ending of the names of the sets; empty for default sets."""
     sampler_seed: int = 0
@@ -116,6 +118,7 @@ def make_tasks(args: Args) -> list[TuningTask]:
             with_noise_scale=args.noise_scale,
             with_demand=args.demand,
             with_repairs=args.repairs,
+            band=args.band,
             variant=args.variant,
             keywords=keywords,
         )
@@ -176,7 +179,10 @@ def main(args: Args) -> None:
                 study.write(args.output / f"{task.name}.json")
                 add_rows(table, study)
     print_table(table)
-    print(f"tuned sets are in {args.output}/; copy to dptse_env/estimators/tuned/ to ship one")
+    print(
+        f"tuned sets are in {args.output}/: take one as estimator_settings, or name it in the "
+        "table environment of a road file"
+    )
 
 
 if __name__ == "__main__":

@@ -90,6 +90,20 @@ def test_tuned_settings_are_found_by_estimator_parameters_and_privacy():
     assert resolve("paper-highway", {"parameters": own}).settings() == EstimatorSettings()
 
 
+def test_a_set_for_the_corridor_comes_before_that_for_any():
+    config = resolve("long-highway", {})
+    assert config.settings_name == "ekf-w99-3lane-paced-long-highway"
+    assert config.settings().band is not None
+    assert resolve("long-highway", {"estimator": "mhe"}).settings_name == "mhe-w99-3lane-paced"
+    assert resolve("private-highway-v1", {}).settings_name == "ekf-w99-3lane-paced"
+
+
+def test_a_road_of_ones_own_takes_no_set_for_an_ending_of_its_name():
+    """`ekf-w99-3lane-capped-demand` is a variant, not a set for a road that is called demand."""
+    keywords = {"parameters": "w99-3lane", "privacy": "capped", "corridor": {"name": "demand"}}
+    assert resolve("paper-highway", keywords).settings_name == "ekf-w99-3lane-capped"
+
+
 def test_a_tuned_set_by_name_serves_any_estimator():
     keywords = {"estimator": "ukf", "estimator_settings": "ekf-w99-3lane-paper"}
     config = resolve("paper-highway", keywords)

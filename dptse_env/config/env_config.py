@@ -63,8 +63,8 @@ class EnvConfig:
         parameters: ARZ parameters, or the name of a set.
         estimator_settings: Tuning of the estimator, or the name of a shipped set
             (`dptse_env.estimators.tuned_settings`), whichever estimator it was tuned for. None for
-            the set ``<estimator>-<ARZ parameters>-<privacy preset>`` if one ships, else the
-            estimator's defaults.
+            the set ``<estimator>-<ARZ parameters>-<privacy preset>-<corridor>``, or that without
+            the corridor's name, if one ships, else the estimator's defaults.
         bandwidth: Most mainline segments to query a step; what the queries of a step may cost
             together, in ``bandwidth_unit``.
         query_spans: Numbers of neighbouring mainline segments that one query may cover, ascending.
@@ -218,6 +218,9 @@ class EnvConfig:
         if not isinstance(self.estimator, str) or not isinstance(self.privacy.preset, str):
             return None
         name = settings_name(self.estimator, self.arz_parameters.name, self.privacy.preset)
+        for_road = f"{name}-{self.corridor.name}"
+        if self.corridor.name in CORRIDORS and for_road in available_settings():
+            return for_road
         return name if name in available_settings() else None
 
     def settings(self) -> Any:
