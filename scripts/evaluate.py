@@ -120,7 +120,9 @@ def find_sources(args: Args) -> dict[str, PolicySource]:
         # Files of runs have one name; their folders differ.
         name = f"{path.parent.name}/{path.stem}" if path.suffix == ".zip" else source
         if name in sources:
-            raise ValueError(f"policies must have different names, {name!r} is there twice")
+            raise ValueError(
+                f"schedules and policies must have different names, {name!r} is there twice"
+            )
         sources[name] = read_saved_policy(source)
     return sources
 

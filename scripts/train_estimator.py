@@ -39,8 +39,9 @@ class Args(Recording):
     """Environments to validate in, with a round robin."""
     width: int = FilterPlan.width
     """Width of the hidden state of a cell."""
-    episodes: int = 32
-    """Episodes of a scenario, and of a batch."""
+    episodes: int | None = None
+    """Episodes of a scenario, each on another traffic seed, and of a batch; 32, or as many as there
+    are traffic seeds to train on, if not given."""
     learning_rate: float = FilterPlan.learning_rate
     """Learning rate at the beginning."""
     likelihood: float = FilterPlan.likelihood
@@ -80,15 +81,16 @@ def make_plan(args: Args) -> FilterPlan:
     Raises:
         ValueError: An argument is out of range.
     """
+    traffic = parse_seeds(args.traffic, "traffic")
     return FilterPlan(
         seed=args.seed,
-        traffic_seeds=parse_seeds(args.traffic, "traffic"),
+        traffic_seeds=traffic,
         validation_seeds=parse_seeds(args.validation, "validation"),
         validation_envs=args.validation_envs,
         ranges=args.ranges,
         rounds=tuple(parse_round(each) for each in args.rounds),
         width=args.width,
-        episodes=args.episodes,
+        episodes=min(FilterPlan.episodes, len(traffic)) if args.episodes is None else args.episodes,
         learning_rate=args.learning_rate,
         likelihood=args.likelihood,
         checkpoint_every=args.checkpoint_every,

@@ -90,6 +90,15 @@ def test_tuned_settings_are_found_by_estimator_parameters_and_privacy():
     assert resolve("paper-highway", {"parameters": own}).settings() == EstimatorSettings()
 
 
+@pytest.mark.parametrize("estimator", ["random_walk", "open_loop", "recurrent"])
+def test_demand_states_without_a_traffic_model_are_refused_by_the_configuration(estimator):
+    keywords = {"estimator": estimator, "estimator_settings": "ekf-w99-3lane-paced"}
+    with pytest.raises(
+        ValueError, match=rf"^estimator_settings.demand must be None for '{estimator}'"
+    ):
+        resolve("paper-highway", keywords)
+
+
 def test_a_set_for_the_corridor_comes_before_that_for_any():
     config = resolve("long-highway", {})
     assert config.settings_name == "ekf-w99-3lane-paced-long-highway"

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Annotated, Any
 
-from dptse_env.estimators import check_estimator, settings_type
+from dptse_env.estimators import check_demand, check_estimator, settings_type
 from dptse_env.estimators.tuned_settings import (
     available_settings,
     known_settings,
@@ -181,6 +181,7 @@ class EnvConfig:
                 f"estimator_settings must be a mapping, the name of a set, or a "
                 f"{expected.__name__}, got {settings!r}"
             )
+        check_demand(self.estimator, self.settings())
 
     @cached_property
     def queries(self) -> QueryOptions:

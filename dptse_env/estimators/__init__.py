@@ -4,6 +4,7 @@ from dptse_env.estimators.base import Estimate, Estimator
 from dptse_env.estimators.registry import (
     BACKENDS,
     ESTIMATORS,
+    check_demand,
     check_estimate,
     check_estimator,
     make_estimator,
@@ -31,6 +32,7 @@ __all__ = [
     "HorizonSettings",
     "RecurrentSettings",
     "SigmaPointSettings",
+    "check_demand",
     "check_estimate",
     "check_estimator",
     "make_estimator",

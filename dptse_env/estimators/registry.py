@@ -61,6 +61,20 @@ settings); their attribute ``settings_type`` may be a dataclass of other setting
 BACKENDS = get_args(Backend)
 
 
+def check_demand(estimator: Any, settings: Any) -> None:
+    """Check that an estimator has the demand states that its settings ask for.
+
+    Raises:
+        ValueError: It has no traffic model.
+    """
+    if getattr(settings, "demand", None) is None:
+        return
+    if ESTIMATORS.find(estimator) in _WITHOUT_DEMAND:
+        raise ValueError(
+            f"estimator_settings.demand must be None for {estimator!r}, which has no traffic model"
+        )
+
+
 def make_estimator(
     estimator: Any, backend: str, model: ARZModel, n_episodes: int, settings: Any = None
 ) -> Estimator:
@@ -85,11 +99,8 @@ def make_estimator(
     check_estimator(estimator, backend)
     part = ESTIMATORS.find(estimator)
     settings = settings_type(estimator)() if settings is None else settings
+    check_demand(estimator, settings)
     has_demand = getattr(settings, "demand", None) is not None
-    if has_demand and part in _WITHOUT_DEMAND:
-        raise ValueError(
-            f"estimator_settings.demand needs a filter with a traffic model, {estimator!r} has none"
-        )
     model_of_backend = _load(getattr(_MODELS, backend))(
         model.network, model.parameters, model.time_step, model.reference_speed, model.rows,
         has_demand,
