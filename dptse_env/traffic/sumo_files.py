@@ -33,7 +33,7 @@ KMH = 3.6
 """Factor from m/s to km/h."""
 
 READ_BY = frozenset(["rerouter", "variableSpeedSign", "vss", "include"])
-"""Elements of additional files whose ``file`` is read; of all others it is written."""
+"""Elements of routes and additional files whose ``file`` is read; of all others it is written."""
 
 _WRITTEN = ("file", "output", "dest")
 

@@ -71,8 +71,9 @@ class Files:
         for path in self.routes:
             if _is_empty(path):
                 raise ValueError(f"routes: {path} must have vehicles, got an empty file")
-        for path in self.additional:
-            _check_references(path)
+        for where, paths in (("routes", self.routes), ("additional", self.additional)):
+            for path in paths:
+                _check_references(path, where)
 
     @property
     def internal_links(self) -> bool:
@@ -182,13 +183,13 @@ def _is_empty(path: Path) -> bool:
     return seen <= 1
 
 
-def _check_references(path: Path) -> None:
-    """Check that an additional file reads no other file, which no digest would cover."""
+def _check_references(path: Path, where: str) -> None:
+    """Check that a file reads no other file, which no digest would cover."""
 
     def check(element: ElementTree.Element) -> bool:
         if element.tag in READ_BY and ("file" in element.attrib or "href" in element.attrib):
             raise ValueError(
-                f"additional: {path}: <{element.tag}> must not read another file, got "
+                f"{where}: {path}: <{element.tag}> must not read another file, got "
                 f"{element.get('file', element.get('href'))!r}: put its content in its place"
             )
         return False

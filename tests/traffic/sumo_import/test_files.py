@@ -144,6 +144,10 @@ def test_a_simulation_needs_vehicles_and_reads_no_files_behind_its_back(files, t
     layout = find_layout(files, PATH, 100.0)
     with pytest.raises(ValueError, match="routes: must have at least one file"):
         import_road(replace(files, routes=()), layout, "road", 60)
+    path = tmp_path / "all.rou.xml"
+    path.write_text('<routes><include href="more.rou.xml"/></routes>')
+    with pytest.raises(ValueError, match=r"^routes: .*<include> must not read another file"):
+        import_road(replace(files, routes=(path,)), layout, "road", 60)
     path = tmp_path / "signs.add.xml"
     path.write_text(
         '<additional><variableSpeedSign id="s" lanes="in_0" file="s.xml"/></additional>'
