@@ -12,7 +12,6 @@ import dataclasses
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from agents.evaluation.episodes import make_config
 from agents.studies.audit.attack import attack
@@ -32,14 +31,14 @@ from dptse_env.privacy.audit_statistics import Claim, audit
 from dptse_env.release import PrivacyReport
 from dptse_env.traffic import with_vehicles
 from dptse_env.utils.validation import inside, integer, positive, require
-from scripts.cli import Recording, run
+from scripts.cli import Road, run
 
 PAIRS = "pairs"
 """Target of a replay of many pairs of trips instead of an attack."""
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(Road):
     """Audit the privacy of an environment."""
 
     env: str = "dptse_env:dptse/PrivateHighway-v1"
@@ -89,8 +88,6 @@ class Args:
     """Confidence of the lower bounds."""
     seed: int = 0
     """Seeds the noise."""
-    records: Path | None = None
-    """Folder of the record cache; the user's cache if not given."""
     output: Path = Path("results/audit")
     """Folder for the result, a JSON file."""
 
@@ -102,11 +99,21 @@ PRIVACY = (
 
 
 def attacked_config(args: Args) -> EnvConfig:
-    """Return the configuration of the environment under attack."""
+    """Return the configuration of the environment under attack.
+
+    Raises:
+        ValueError: A setting of the release model is given twice, or another value is bad.
+    """
+    keywords = args.given_keywords()
     privacy = {name: getattr(args, name) for name in PRIVACY} | {"preset": args.privacy}
-    keywords: dict[str, Any] = {
-        "privacy": {name: value for name, value in privacy.items() if value is not None}
-    }
+    privacy = {name: value for name, value in privacy.items() if value is not None}
+    if privacy:
+        if "privacy" in keywords:
+            raise ValueError(
+                f"privacy must be given once, as arguments or among the keywords, got {privacy} "
+                "as well"
+            )
+        keywords["privacy"] = privacy
     for name in ("bandwidth", "estimator"):
         if getattr(args, name) is not None:
             keywords[name] = getattr(args, name)
@@ -149,7 +156,7 @@ def run_audit(args: Args) -> Finding:
     check(args)
     config = attacked_config(args)
     make_planner(config, args.policy).require_kind(args.target)
-    library = Recording(records=args.records).library(config.corridor, [args.traffic_seed])
+    library = args.library(config.corridor, [args.traffic_seed])
     record = with_vehicles(library.get(config.corridor, args.traffic_seed), "an audit")
     worlds = choose_target(config, record, args.target, args.policy)
     policy = make_policy(config, args.policy, worlds)
@@ -175,7 +182,7 @@ def run_pairs(args: Args) -> PairsFinding:
     check(args)
     config = attacked_config(args)
     seeds = range(args.traffic_seed, args.traffic_seed + args.n_records)
-    library = Recording(records=args.records).library(config.corridor, seeds)
+    library = args.library(config.corridor, seeds)
     records = [with_vehicles(library.get(config.corridor, seed), "an audit") for seed in seeds]
     policy = args.policy if args.policy in PUBLIC_SCHEDULES else "round-robin"
     title = make_title(args, config)
