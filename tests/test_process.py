@@ -5,12 +5,11 @@ from scipy import stats
 
 from dptse_env.config import resolve
 from dptse_env.estimators import ESTIMATORS
-from dptse_env.estimators.compiled import mhe_kernels
 from dptse_env.parts import make_parts
 from dptse_env.process import QueryProcess
 from dptse_env.spaces.actions import ACTION_ENCODINGS
 
-from .estimators.solvers import lying, missing, silent, unsolved
+from .estimators.solvers import lying, missing, silent, stop_compiled_solvers
 
 SEEDS = (11, 12, 13)
 ALL = np.arange(3)
@@ -233,7 +232,7 @@ def test_a_step_that_is_not_solved_for_keeps_the_prediction_and_says_so(
         process.step(ALL[:2], nobody)
     assert [process.info(e)["fallback"] for e in range(2)] == [0.0, 0.0]
     monkeypatch.setattr(qpsolvers, "solve_problem", solver)
-    monkeypatch.setattr(mhe_kernels, "update", unsolved)  # the active set gives up
+    stop_compiled_solvers(monkeypatch)
     predicted, update = {}, process.estimator.update
 
     def spy(*given):

@@ -1,10 +1,12 @@
-"""Solvers that fail, to stand in for `qpsolvers.solve_problem` and for the active set."""
+"""Solvers that fail, to stand in for `qpsolvers.solve_problem` and for the compiled ones."""
 
 import numpy as np
 import qpsolvers
 
+from dptse_env.estimators.compiled import mhe_kernels, road_kernels
 from dptse_env.estimators.compiled.ekf_kernels import Filters
-from dptse_env.estimators.compiled.mhe_kernels import Windows, update
+from dptse_env.estimators.compiled.mhe_kernels import update
+from dptse_env.estimators.compiled.stages import UNSOLVED, Windows
 
 
 def lying(problem, **_):
@@ -31,4 +33,10 @@ def unsolved(road, filters, windows, *given):
     update(road, filters, windows, *given)
     for array, before in kept:
         array[:] = before
-    mine.unsolved[:] = True
+    mine.rounds[:] = UNSOLVED
+
+
+def stop_compiled_solvers(monkeypatch):
+    """Let neither compiled method solve a program of a short road."""
+    monkeypatch.setattr(mhe_kernels, "update", unsolved)
+    monkeypatch.setattr(road_kernels, "solve", lambda *_: None)

@@ -23,6 +23,13 @@ def mhe_of(backend, episodes, start=None, **horizon):
 # Against the oracles ------------------------------------------------------------------------------
 
 
+def n_held(compiled, episode=0):
+    """Number of components of the solution that a bound holds."""
+    windows = compiled._windows
+    z = windows.solution[episode, : windows.length[episode], : compiled.model.n_states]
+    return int(((z == windows.lower) | (z == windows.upper)).sum())
+
+
 def agree(episodes, steps, tolerance=1e-9, **horizon):
     """Run both backends, compare every step; returns bounds held and programs passed on."""
     compiled = mhe_of("compiled", episodes, **horizon)
@@ -40,7 +47,7 @@ def agree(episodes, steps, tolerance=1e-9, **horizon):
             compiled.innovations, reference.innovations, rtol=0, atol=1e3 * tolerance
         )
         assert not np.any(compiled.fallback | reference.fallback)
-        held.append(int((compiled._windows.side != 0).sum()))
+        held.append(n_held(compiled))
     a, b = compiled.estimate(), reference.estimate()
     for field in ("density", "speed", "density_std", "speed_std"):
         np.testing.assert_allclose(getattr(a, field), getattr(b, field), rtol=1e-5, atol=1e-5)
@@ -86,7 +93,7 @@ def test_the_minimum_is_another_solvers(release):
     mhe = bounded_window(release=release, horizon=4)
     H, q = assemble(mhe.window(0))
     lower, upper = (np.tile(b, 5) for b in normalised_bounds(mhe.model, "box"))
-    z = mhe._windows.solution[0, :, :38].ravel()
+    z = mhe._windows.solution[0, :5, :38].ravel()
     factor = np.linalg.cholesky(H).T
     other = lsq_linear(factor, np.linalg.solve(factor.T, -q / 2), (lower, upper + 1e-15), "bvls")
     np.testing.assert_allclose(z, other.x, atol=1e-9)

@@ -10,7 +10,7 @@ from dptse_env.estimators.compiled import mhe_kernels
 from dptse_env.estimators.horizon import natural_residual, solve
 
 from .episodes import SIGMA, run, simulate, started
-from .solvers import lying, mad, missing, silent, unsolved
+from .solvers import lying, mad, missing, silent, stop_compiled_solvers, unsolved
 
 both_backends = pytest.mark.parametrize("backend", ["compiled", "reference"])
 
@@ -23,7 +23,7 @@ def test_what_is_not_solved_leaves_the_prediction_and_a_flag(backend, solver, mo
     run(mhe, episodes, range(8))
     assert not mhe.fallback.any()
     monkeypatch.setattr(qpsolvers, "solve_problem", solver)
-    monkeypatch.setattr(mhe_kernels, "update", unsolved)
+    stop_compiled_solvers(monkeypatch)
     mhe.predict(episodes.everyone, episodes.inputs[8])
     predicted = mhe.states
     mhe.update(episodes.everyone, episodes.observed[8], episodes.values[8], SIGMA)
@@ -40,7 +40,7 @@ def test_a_reset_takes_the_flag_away(backend, monkeypatch):
     episodes = simulate(n=2, n_steps=1)
     mhe = started("mhe", backend, episodes)
     monkeypatch.setattr(qpsolvers, "solve_problem", silent)
-    monkeypatch.setattr(mhe_kernels, "update", unsolved)
+    stop_compiled_solvers(monkeypatch)
     run(mhe, episodes, [0])
     assert mhe.fallback.tolist() == [True, True]
     mhe.reset(np.array([1]), episodes.start[[1]], [np.random.default_rng(0)])
@@ -60,17 +60,24 @@ def test_a_solver_that_is_not_installed_is_named_when_the_estimator_is_made(back
     assert mhe.fallback.any() == (backend == "reference")
 
 
-def test_what_the_active_set_leaves_goes_to_the_other_solver(monkeypatch):
+@pytest.mark.parametrize("helper", ["projected Newton", "library"])
+def test_what_one_solver_leaves_goes_to_the_next(helper, monkeypatch):
     episodes = simulate(n_steps=12, noise=3.0)
     alone, helped = started("mhe", "compiled", episodes), started("mhe", "compiled", episodes)
     run(alone, episodes, range(12))
     run(helped, episodes, range(11))
-    monkeypatch.setattr(mhe_kernels, "update", unsolved)
+    if helper == "library":
+        stop_compiled_solvers(monkeypatch)
+    else:
+        monkeypatch.setattr(mhe_kernels, "update", unsolved)
+    predicted = helped.states.copy()
     run(helped, episodes, [11])
-    assert helped.n_passed_on == 1
+    assert helped.n_passed_on == (helper == "library")
     assert not helped.fallback.any()
+    assert np.abs(helped.states - predicted).max() > 1e-3
     np.testing.assert_allclose(helped.states, alone.states, rtol=1e-9, atol=1e-6)
     np.testing.assert_array_equal(helped._windows.side, alone._windows.side)
+    assert (alone._windows.side != 0).any()
 
 
 def random_program(n=30):

@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 
 from dptse_env.estimators.compiled.chain import Chain, WindowScratch
-from dptse_env.estimators.compiled.window import gradient, solve
+from dptse_env.estimators.compiled.window import gradient, natural_residual, solve
 from dptse_env.estimators.horizon import AT_BOUND
 from dptse_env.model.road_arrays import RoadArrays
 from dptse_env.utils.arrays import FloatArray, IntArray
@@ -95,7 +95,7 @@ def minimise(
         _fix(active, m, lower, upper, z)
         _set_near_bounds(n_stages, lower, upper, z)
         gradient(road, chain, n_stages, z, slope)
-        residual = _natural_residual(n_stages, scratch, lower, upper, slope, z)
+        residual = natural_residual(n_stages, scratch.diagonal, lower, upper, slope, z)
         if residual <= REFINED or trial == 5:
             return bool(residual <= ACCEPTED)
         solve(road, chain, n_stages, 0, scratch, slope, step)
@@ -234,22 +234,3 @@ def _fix(active: ActiveSet, m: int, lower: FloatArray, upper: FloatArray, z: Flo
     for a in range(m):
         t, i = active.members[a]
         z[t, i] = lower[i] if active.side[t, i] < 0 else upper[i]
-
-
-@njit(cache=True, error_model="numpy")
-def _natural_residual(
-    n_stages: int,
-    scratch: WindowScratch,
-    lower: FloatArray,
-    upper: FloatArray,
-    slope: FloatArray,
-    z: FloatArray,
-) -> float:
-    largest = 0.0
-    for t in range(n_stages):
-        for i in range(lower.size):
-            target = z[t, i] - slope[t, i] / scratch.diagonal[t, i]
-            gap = abs(z[t, i] - min(max(target, lower[i]), upper[i]))
-            if not gap <= largest:  # also true for a NaN
-                largest = gap
-    return largest

@@ -5,11 +5,13 @@ from numba import njit
 
 from dptse_env.estimators.compiled import ekf_kernels as kernels
 from dptse_env.estimators.compiled.active_set import make_active_set, minimise
-from dptse_env.estimators.compiled.chain import Chain, make_window_scratch
+from dptse_env.estimators.compiled.chain import make_window_scratch
 from dptse_env.estimators.compiled.ekf_kernels import Filters, Packed, process_noise, project
 from dptse_env.estimators.compiled.ekf_rows import released, row_variances
 from dptse_env.estimators.compiled.stages import (
+    UNSOLVED,
     Windows,
+    chain_of,
     enter,
     linearise_measurement,
     linearise_step,
@@ -26,11 +28,11 @@ def restart(filters_: Packed, windows_: Packed, episode: int) -> None:
     """Reset an episode to a window of a single stage, its prior."""
     filters, windows = Filters(*filters_), Windows(*windows_)
     kernels.restart(filters, episode)
-    windows.length[episode] = 1
+    windows.length[episode], windows.updated[episode] = 1, 0
     windows.arrival_variance[episode] = filters.initial_variance
     enter(filters, windows, episode, 0)
     windows.point[episode] = windows.solution[episode, 0]
-    windows.unsolved[episode] = False
+    windows.rounds[episode] = 0
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -42,9 +44,10 @@ def predict(
     scratch = make_scratch(road)
     blocks = np.empty((*road.neighbours.shape, 4))
     state = np.empty(filters.means.shape[1])
-    capacity = windows.solution.shape[1]
     for k in range(episodes.size):
         e = episodes[k]
+        if windows.length[e] == windows.solution.shape[1]:  # there was no update
+            shift(windows, e)
         length, point = windows.length[e], windows.point[e]
         point[:] = 0.0
         for t in range(length):
@@ -59,11 +62,17 @@ def predict(
         windows.inputs[e, length - 1] = inputs[k]
         if not windows.along:
             linearise_step(road, filters, windows, e, length - 1, point)
-        if length == capacity:
-            shift(windows, e)
-            length -= 1
         windows.length[e] = length + 1
         enter(filters, windows, e, length)
+
+
+@njit(cache=True, error_model="numpy")
+def write_sides(windows: Windows, e: int, z: FloatArray) -> None:
+    """Write at which bound each variable of a solution `(L, padded)` is."""
+    for t in range(windows.length[e]):
+        for i in range(windows.units.size):
+            at_lower, at_upper = z[t, i] <= windows.lower[i], z[t, i] >= windows.upper[i]
+            windows.side[e, t, i] = int(at_upper) - int(at_lower)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -80,37 +89,26 @@ def update(
     """Update by measurements, `sigma` no less than allowed; see `Estimator.update`."""
     road, filters, windows = RoadArrays(*road_), Filters(*filters_), Windows(*windows_)
     capacity, width = windows.solution.shape[1:]
-    scratch = make_window_scratch(road, capacity, windows.units.size, width)
-    active = make_active_set(capacity, width)
+    scratch = make_window_scratch(road, capacity - 1, windows.units.size, width)
+    active = make_active_set(capacity - 1, width)
     for k in range(episodes.size):
         e = episodes[k]
-        length = windows.length[e]
-        last = length - 1
-        windows.observed[e, last] = observed[k]
-        windows.centre[e, last] = centre[k]
-        sound = _measure(road, filters, windows, e, values[k], sigma[k])
-        if windows.along:
-            for t in range(length):
-                point = windows.solution[e, t]
-                linearise_measurement(road, filters, windows, e, t, point)
-                if t < last:
-                    linearise_step(road, filters, windows, e, t, point)
-        else:
-            linearise_measurement(road, filters, windows, e, last, windows.point[e])
-        chain = _chain(windows, e)
-        windows.unsolved[e] = False
+        sound = enter_measurements(
+            road, filters, windows, e, observed[k], values[k], sigma[k], centre[k]
+        )
+        length, chain = windows.length[e], chain_of(windows, e)
         if sound and factorise(road, chain, length, scratch):
-            filters.covariances[e] = scratch.factors[last]
-            _innovate(road, filters, windows, e, scratch.before)
+            filters.covariances[e] = scratch.factors[length - 1]
+            innovate(road, filters, windows, e, scratch.before)
             if observed[k].any():
-                active.side[:] = windows.side[e]
+                side = windows.side[e, : capacity - 1]
+                active.side[:] = side
                 z = windows.solution[e].copy()
-                windows.unsolved[e] = not minimise(
-                    road, chain, length, scratch, windows.lower, windows.upper, active, z
-                )
-                if not windows.unsolved[e]:
-                    windows.side[e] = active.side
+                if minimise(road, chain, length, scratch, windows.lower, windows.upper, active, z):
+                    side[:] = active.side
                     accept(road, filters, windows, e, z)
+                else:
+                    windows.rounds[e] = UNSOLVED
             # An optimum that is not finite has no residual and counts as unsolved.
             sound = bool(np.isfinite(filters.covariances[e]).all())
         else:
@@ -118,6 +116,43 @@ def update(
         filters.diverged[e] = not sound
         if not sound:
             restart(filters_, windows_, e)
+
+
+@njit(cache=True, error_model="numpy")
+def enter_measurements(
+    road: RoadArrays,
+    filters: Filters,
+    windows: Windows,
+    e: int,
+    observed: BoolArray,
+    values: FloatArray,
+    sigma: FloatArray,
+    centre: FloatArray,
+) -> bool:
+    """Add measurements to the last stage, and linearise; return whether all is finite."""
+    if windows.length[e] == windows.solution.shape[1]:
+        shift(windows, e)
+    last = windows.length[e] - 1
+    windows.observed[e, last] = observed
+    windows.centre[e, last] = centre
+    windows.rounds[e] = 0
+    sound = _measure(road, filters, windows, e, values, sigma)
+    _linearise(road, filters, windows, e)
+    return sound
+
+
+@njit(cache=True, error_model="numpy")
+def _linearise(road: RoadArrays, filters: Filters, windows: Windows, e: int) -> None:
+    """Linearise the last stage, or all stages where that is along the solution."""
+    last = windows.length[e] - 1
+    if not windows.along:
+        linearise_measurement(road, filters, windows, e, last, windows.point[e])
+        return
+    for t in range(last + 1):
+        point = windows.solution[e, t]
+        linearise_measurement(road, filters, windows, e, t, point)
+        if t < last:
+            linearise_step(road, filters, windows, e, t, point)
 
 
 @njit(cache=True, error_model="numpy")
@@ -148,23 +183,6 @@ def _measure(
 
 
 @njit(cache=True, error_model="numpy")
-def _chain(windows: Windows, e: int) -> Chain:
-    return Chain(
-        windows.predicted[e, 0],
-        windows.arrival_variance[e],
-        windows.process_variance[e],
-        windows.blocks[e],
-        windows.by_factor[e],
-        windows.offsets[e],
-        windows.observed[e],
-        windows.slopes[e],
-        windows.constants[e],
-        windows.values[e],
-        windows.noise[e],
-    )
-
-
-@njit(cache=True, error_model="numpy")
 def accept(road: RoadArrays, filters: Filters, windows: Windows, e: int, z: FloatArray) -> None:
     """Accept a solution `(L, padded)`, whose last state is the estimate."""
     windows.solution[e] = z
@@ -175,10 +193,13 @@ def accept(road: RoadArrays, filters: Filters, windows: Windows, e: int, z: Floa
 
 
 @njit(cache=True, error_model="numpy")
-def _innovate(
+def innovate(
     road: RoadArrays, filters: Filters, windows: Windows, e: int, before: FloatArray
 ) -> None:
-    """Write residuals at the prediction over the deviations that the window expects."""
+    """Write residuals at the prediction over the deviations that the window expects.
+
+    `before` has the covariances, before the measurements, of each row's segments.
+    """
     last = windows.length[e] - 1
     scale, unit = filters.density_scale, road.second_scale
     innovations, slopes = filters.innovations[e], windows.slopes[e, last]

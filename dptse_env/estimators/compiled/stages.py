@@ -5,17 +5,25 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from dptse_env.estimators.compiled.chain import Chain
 from dptse_env.estimators.compiled.ekf_kernels import Filters, normalise, project
 from dptse_env.estimators.compiled.ekf_rows import released
 from dptse_env.model.kernels import advance, make_scratch
 from dptse_env.model.road_arrays import RoadArrays
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 
+UNSOLVED = -1  # instead of a number of rounds
+
 
 class Windows(NamedTuple):
-    """Windows of n episodes, up to L = N + 1 stages each; normalised but for inputs and centres."""
+    """Windows of n episodes, up to L = N + 2 stages each; normalised but for inputs and centres.
+
+    A prediction makes a full window one stage longer, until the update drops the oldest one.
+    """
 
     length: IntArray  # (n,) stages in use
+    # (n,) stages at the last update, for its covariance; 0 once that is written, or without one
+    updated: IntArray
     arrival_variance: FloatArray  # (n, n_x) in use
     predicted: FloatArray  # (n, L, n_x) predictions of stages; the first is the arrival's mean
     inputs: FloatArray  # (n, L, n_u) of the step that leaves each stage
@@ -32,8 +40,8 @@ class Windows(NamedTuple):
     # (n, padded) where the last stage's measurement is linearised, unless along the solution
     point: FloatArray
     solution: FloatArray  # (n, L, padded)
-    side: IntArray  # (n, L, padded) bound at which each variable was last active
-    unsolved: BoolArray  # (n,) whether the active-set method found no optimum
+    side: IntArray  # (n, L, padded) bound at which each variable was last, for the active set
+    rounds: IntArray  # (n,) rounds that the last program took, or UNSOLVED
     moving_variance: FloatArray  # (n_x,) arrival variance of a window that moves
     lower: FloatArray  # (n_x,)
     upper: FloatArray  # (n_x,)
@@ -55,6 +63,7 @@ def enter(filters: Filters, windows: Windows, e: int, t: int) -> None:
 @njit(cache=True, error_model="numpy")
 def shift(windows: Windows, e: int) -> None:
     """Drop the oldest stage."""
+    windows.length[e] -= 1
     windows.arrival_variance[e] = windows.moving_variance
     for t in range(windows.solution.shape[1] - 1):
         windows.predicted[e, t] = windows.predicted[e, t + 1]
@@ -121,3 +130,21 @@ def linearise_measurement(
         windows.slopes[e, t, s, 0] = by_rho * scale / unit
         windows.slopes[e, t, s, 1] = by_psi * scale * road.free_flow_speed / unit
         windows.constants[e, t, s] = (second - by_rho * rho - by_psi * psi) / unit
+
+
+@njit(cache=True, error_model="numpy")
+def chain_of(windows: Windows, e: int) -> Chain:
+    """Return the linearised window of an episode; its arrays are views."""
+    return Chain(
+        windows.predicted[e, 0],
+        windows.arrival_variance[e],
+        windows.process_variance[e],
+        windows.blocks[e],
+        windows.by_factor[e],
+        windows.offsets[e],
+        windows.observed[e],
+        windows.slopes[e],
+        windows.constants[e],
+        windows.values[e],
+        windows.noise[e],
+    )

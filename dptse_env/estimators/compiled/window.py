@@ -157,6 +157,26 @@ def _add_slope_of_steps(
 
 
 @njit(cache=True, error_model="numpy")
+def natural_residual(
+    n_stages: int,
+    diagonal: FloatArray,
+    lower: FloatArray,
+    upper: FloatArray,
+    slope: FloatArray,
+    z: FloatArray,
+) -> float:
+    """Return the largest |z - clip(z - g / diag H, lower, upper)|, the diagonal `(L, >= n_x)`."""
+    largest = 0.0
+    for t in range(n_stages):
+        for i in range(lower.size):
+            target = z[t, i] - slope[t, i] / diagonal[t, i]
+            gap = abs(z[t, i] - min(max(target, lower[i]), upper[i]))
+            if not gap <= largest:  # also true for a NaN
+                largest = gap
+    return largest
+
+
+@njit(cache=True, error_model="numpy")
 def solve(
     road: RoadArrays,
     chain: Chain,
