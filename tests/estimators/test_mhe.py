@@ -54,6 +54,7 @@ def agree(episodes, steps, tolerance=1e-9, **horizon):
     return np.array(held), compiled.n_passed_on
 
 
+@pytest.mark.usefixtures("order")
 @both_bounds
 @both_linearisations
 @both_releases
@@ -66,6 +67,7 @@ def test_backends_agree(bounds, linearisation, release):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("order")
 @pytest.mark.parametrize(
     ("release", "linearisation", "tolerance"),
     [("speed", "paper", 1e-9), ("speed", "trajectory", 5e-9), ("flow", "paper", 1e-9)],
@@ -87,6 +89,7 @@ def bounded_window(seed=0, release="speed", horizon=10):
     return mhe
 
 
+@pytest.mark.usefixtures("order")
 @both_releases
 def test_the_minimum_is_another_solvers(release):
     # The other solver takes minutes for the default horizon.

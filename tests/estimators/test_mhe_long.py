@@ -14,7 +14,8 @@ from dptse_env.estimators.horizon import assemble, natural_residual, normalised_
 from dptse_env.model.compiled import CompiledARZModel
 from dptse_env.model.parameters import load_parameters
 
-from .episodes import REFERENCE_SPEEDS, SIGMAS, Road, random_streams, run, simulate, started
+from ..model.roads import UNEVEN, Road
+from .episodes import REFERENCE_SPEEDS, SIGMAS, random_streams, run, simulate, started
 
 ONE = np.array([0])
 # A model that is trusted almost entirely ties the whole window together: a bound that binds in one
@@ -23,15 +24,8 @@ TRUSTED = {"process_noise": (1e-4, 2e-4), "density_growth": 0.015}
 
 
 def long_road(n_mainline):
-    faces = range(8, n_mainline - 4, 16)
-    off = range(15, n_mainline - 4, 16)
-    return Road(
-        n_mainline,
-        tuple(faces),
-        tuple(off),
-        (0.1,) * len(off),
-        segment_lanes=(3,) * n_mainline + (1,) * (len(faces) + len(off)),
-    )
+    on, off = range(8, n_mainline - 4, 16), range(15, n_mainline - 4, 16)
+    return Road(n_mainline, tuple(on), tuple(off), (0.1,) * len(off))
 
 
 def hostile(n_mainline, release, wildness, n_steps, seed=0, **settings):
@@ -104,6 +98,7 @@ def test_no_program_is_far_from_its_solution(linearisation):
     assert np.median(rounds) >= 3  # they are hard
 
 
+@pytest.mark.usefixtures("along_the_road")
 def test_covariances_are_those_of_the_last_update_whenever_they_are_asked_for():
     """The window moves on before they are computed; three episodes in different states."""
     episodes = simulate(n=3, n_steps=12)
@@ -122,6 +117,7 @@ def test_covariances_are_those_of_the_last_update_whenever_they_are_asked_for():
     np.testing.assert_allclose(mhe.covariances[2], expected[2], rtol=0, atol=1e-10)
 
 
+@pytest.mark.usefixtures("along_the_road")
 def test_two_predictions_without_an_update_move_a_full_window_twice():
     episodes = simulate(n_steps=12)
     settings = EstimatorSettings(mhe=HorizonSettings(horizon=4))
@@ -133,3 +129,27 @@ def test_two_predictions_without_an_update_move_a_full_window_twice():
         run(mhe, episodes, [10, 11])
     np.testing.assert_allclose(compiled.states, reference.states, rtol=1e-8, atol=1e-8)
     np.testing.assert_allclose(compiled.covariances, reference.covariances, rtol=0, atol=1e-10)
+
+
+@pytest.mark.usefixtures("order")
+def test_a_road_of_segments_of_many_kinds_is_estimated_alike():
+    """Lengths, lanes and limits vary, ramps have several segments."""
+    model = CompiledARZModel(UNEVEN, load_parameters("w99-3lane"))
+    rng, s, v_f = np.random.default_rng(0), model.n_segments, model.speed_scale
+    start = model.states(0.2 * model.jam_density[None], np.full((1, s), 0.5 * v_f))
+    settings = EstimatorSettings(mhe=HorizonSettings(horizon=4))
+    both = [make_estimator("mhe", kind, model, 1, settings) for kind in BACKENDS]
+    boundary = np.full((1, 2 + len(UNEVEN.on_ramps) + len(UNEVEN.off_ramps)), 10.0)
+    inputs = model.boundary_inputs(boundary, np.full_like(boundary, 0.6 * v_f))
+    for mhe in both:
+        mhe.reset(ONE, start, random_streams(1))
+    truth = model.measure(start)
+    for _ in range(10):
+        observed, noise = rng.random((1, s)) < 0.4, rng.normal(size=(1, s, 2))
+        values = truth + 3.0 * SIGMAS["speed"] * noise
+        for mhe in both:
+            mhe.predict(ONE, inputs)
+            mhe.update(ONE, observed, values, SIGMAS["speed"])
+        np.testing.assert_allclose(both[0].states, both[1].states, rtol=1e-7, atol=1e-5)
+        np.testing.assert_allclose(both[0].covariances, both[1].covariances, atol=1e-9)
+        np.testing.assert_allclose(both[0].innovations, both[1].innovations, atol=1e-6)

@@ -15,6 +15,7 @@ N_STEPS = 14
 both_linearisations = pytest.mark.parametrize("linearisation", ["paper", "trajectory"])
 
 
+@pytest.mark.usefixtures("order")
 @both_linearisations
 @pytest.mark.parametrize("bounds", ["box", "cone"])
 @pytest.mark.parametrize("settings", [PLAIN, RICH], ids=["plain", "rich"])
