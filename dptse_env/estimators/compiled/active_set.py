@@ -13,6 +13,7 @@ import numpy as np
 from numba import njit
 
 from dptse_env.estimators.compiled.chain import Chain, WindowScratch
+from dptse_env.estimators.compiled.stages import UNSOLVED
 from dptse_env.estimators.compiled.window import gradient, natural_residual, solve
 from dptse_env.estimators.horizon import AT_BOUND
 from dptse_env.model.road_arrays import RoadArrays
@@ -58,11 +59,11 @@ def minimise(
     upper: FloatArray,
     active: ActiveSet,
     z: FloatArray,
-) -> bool:
-    """Replace `z` `(L, padded)`, a guess, by the minimiser; return whether it was found.
+) -> int:
+    """Replace `z` `(L, padded)`, a guess, by the minimiser; return the number of rounds it took.
 
     `lower` and `upper` `(n_x,)` bound every stage. A solution is accepted by its natural residual
-    |z - clip(z - g / diag H, lower, upper)|.
+    |z - clip(z - g / diag H, lower, upper)|; without one `UNSOLVED` is returned.
     """
     n, width = lower.size, z.shape[1]
     slope, step, free = np.zeros((3, n_stages, width))
@@ -74,10 +75,10 @@ def minimise(
     for turn in range(ROUNDS):
         m = _members(n_stages, n, active)
         if m < 0:
-            return False
+            return UNSOLVED
         n_columns = _columns(road, chain, n_stages, scratch, active, m, n_columns, step)
         if n_columns < 0:
-            return False
+            return UNSOLVED
         excess = np.empty(m)
         for a in range(m):
             t, i = active.members[a]
@@ -90,14 +91,14 @@ def minimise(
             settled = True
             break
     if not settled:
-        return False
+        return UNSOLVED
     for trial in range(6):
         _fix(active, m, lower, upper, z)
         _set_near_bounds(n_stages, lower, upper, z)
         gradient(road, chain, n_stages, z, slope)
         residual = natural_residual(n_stages, scratch.diagonal, lower, upper, slope, z)
         if residual <= REFINED or trial == 5:
-            return bool(residual <= ACCEPTED)
+            return turn + 1 if residual <= ACCEPTED else UNSOLVED
         solve(road, chain, n_stages, 0, scratch, slope, step)
         for a in range(m):
             excess[a] = -step[active.members[a, 0], active.members[a, 1]]
@@ -105,7 +106,7 @@ def minimise(
         _subtract(1.0, step, z, n_stages)
         for a in range(m):
             _subtract(multipliers[a], _column(active, a), z, n_stages)
-    return False
+    return UNSOLVED
 
 
 @njit(cache=True, error_model="numpy")

@@ -25,7 +25,7 @@ from dptse_env.utils.arrays import FloatArray, IntArray
 
 # Variables of the longest window up to which it is factorised in the order of time: that is faster
 # on short roads, and slower on long ones.
-MOST_IN_TIME = 700
+MOST_IN_TIME = 1500
 
 
 class CompiledMHE(CompiledFilter):

@@ -104,11 +104,13 @@ def update(
                 side = windows.side[e, : capacity - 1]
                 active.side[:] = side
                 z = windows.solution[e].copy()
-                if minimise(road, chain, length, scratch, windows.lower, windows.upper, active, z):
+                rounds = minimise(
+                    road, chain, length, scratch, windows.lower, windows.upper, active, z
+                )
+                windows.rounds[e] = rounds
+                if rounds != UNSOLVED:
                     side[:] = active.side
                     accept(road, filters, windows, e, z)
-                else:
-                    windows.rounds[e] = UNSOLVED
             # An optimum that is not finite has no residual and counts as unsolved.
             sound = bool(np.isfinite(filters.covariances[e]).all())
         else:
