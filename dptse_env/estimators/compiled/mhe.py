@@ -6,7 +6,7 @@ from dptse_env.estimators.batch import Measurements
 from dptse_env.estimators.compiled import mhe_kernels, road_kernels
 from dptse_env.estimators.compiled.algebra import padded
 from dptse_env.estimators.compiled.kalman import CompiledFilter
-from dptse_env.estimators.compiled.road_order import make_order
+from dptse_env.estimators.compiled.road_order import Spaces, make_order
 from dptse_env.estimators.compiled.stages import UNSOLVED, Windows
 from dptse_env.estimators.horizon import (
     LEAST_DEVIATION,
@@ -54,6 +54,7 @@ class CompiledMHE(CompiledFilter):
         self._windows = _allocate(model, n_episodes, settings, self._road)
         self._in_time = (settings.mhe.horizon + 1) * model.n_states <= MOST_IN_TIME
         order = make_order(model, self._road, settings.mhe.horizon + 1)
+        self._spaces = Spaces(order, settings.mhe.horizon + 1)
         self._windows_packed = (*self._packed, tuple(self._windows))
         self._all_packed = (*self._windows_packed, tuple(order))
         self._scales = model.measurement_scale
@@ -110,8 +111,9 @@ class CompiledMHE(CompiledFilter):
         mhe_kernels.predict(*self._windows_packed, episodes, inputs)
 
     def _write_covariances(self, episodes: IntArray) -> None:
-        for episode in episodes.tolist():
-            road_kernels.write_covariance(*self._all_packed, episode)
+        with self._spaces.lend() as space:
+            for episode in episodes.tolist():
+                road_kernels.write_covariance(*self._all_packed, space, episode)
 
     def _update(self, measured: Measurements) -> None:
         sigma = np.maximum(measured.sigma, LEAST_DEVIATION * self._scales)
@@ -121,9 +123,13 @@ class CompiledMHE(CompiledFilter):
             mhe_kernels.update(*self._windows_packed, episodes, observed, values, sigma, centre)
             unsolved = episodes[rounds[episodes] == UNSOLVED]
             if unsolved.size:
-                road_kernels.solve(*self._all_packed, unsolved)
+                with self._spaces.lend() as space:
+                    road_kernels.solve(*self._all_packed, space, unsolved)
         else:
-            road_kernels.update(*self._all_packed, episodes, observed, values, sigma, centre)
+            with self._spaces.lend() as space:
+                road_kernels.update(
+                    *self._all_packed, space, episodes, observed, values, sigma, centre
+                )
         for episode in episodes[rounds[episodes] == UNSOLVED].tolist():
             self._pass_on(episode)
 

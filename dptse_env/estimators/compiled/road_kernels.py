@@ -19,7 +19,7 @@ from dptse_env.estimators.compiled.mhe_kernels import (
     write_sides,
 )
 from dptse_env.estimators.compiled.road_matrix import add_rows, assemble
-from dptse_env.estimators.compiled.road_order import Order, Space, make_space, place
+from dptse_env.estimators.compiled.road_order import Order, Space, place
 from dptse_env.estimators.compiled.road_program import minimise
 from dptse_env.estimators.compiled.stages import UNSOLVED, Windows, chain_of
 from dptse_env.model.road_arrays import RoadArrays
@@ -32,6 +32,7 @@ def update(
     filters_: Packed,
     windows_: Packed,
     order_: Packed,
+    space_: Packed,
     episodes: IntArray,
     observed: BoolArray,
     values: FloatArray,
@@ -40,8 +41,7 @@ def update(
 ) -> None:
     """Update by measurements, `sigma` no less than allowed; see `Estimator.update`."""
     road, filters, windows = RoadArrays(*road_), Filters(*filters_), Windows(*windows_)
-    order = Order(*order_)
-    space = make_space(order, windows.solution.shape[1] - 1)
+    order, space = Order(*order_), Space(*space_)
     for k in range(episodes.size):
         e = episodes[k]
         sound = enter_measurements(
@@ -58,12 +58,16 @@ def update(
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def solve(
-    road_: Packed, filters_: Packed, windows_: Packed, order_: Packed, episodes: IntArray
+    road_: Packed,
+    filters_: Packed,
+    windows_: Packed,
+    order_: Packed,
+    space_: Packed,
+    episodes: IntArray,
 ) -> None:
     """Solve the programs of episodes whose windows have been linearised."""
     road, filters, windows = RoadArrays(*road_), Filters(*filters_), Windows(*windows_)
-    order = Order(*order_)
-    space = make_space(order, windows.solution.shape[1] - 1)
+    order, space = Order(*order_), Space(*space_)
     for k in range(episodes.size):
         e = episodes[k]
         chain = chain_of(windows, e)
@@ -152,7 +156,7 @@ def _copy_block(
 
 @njit(cache=True, error_model="numpy")
 def write_covariance(
-    road_: Packed, filters_: Packed, windows_: Packed, order_: Packed, e: int
+    road_: Packed, filters_: Packed, windows_: Packed, order_: Packed, space_: Packed, e: int
 ) -> None:
     """Write the covariance of the last state given the window of the last update, without bounds.
 
@@ -160,11 +164,10 @@ def write_covariance(
     """
     road, filters, windows = RoadArrays(*road_), Filters(*filters_), Windows(*windows_)
     order, chain, length = Order(*order_), chain_of(windows, e), windows.updated[e]
-    n, n_variables = windows.units.size, length * windows.units.size
-    space = make_space(order, length)
+    n, n_variables, space = windows.units.size, length * windows.units.size, Space(*space_)
     windows.updated[e] = 0
     if not _assemble(road, chain, length, order, space):
-        return
+        return  # not after an update that was sound
     columns, covariance = np.zeros((n_variables, n)), filters.covariances[e]
     for i in range(n):
         columns[place(order, length, length - 1, i), i] = 1.0

@@ -5,6 +5,10 @@ covariance has no zeros. Along the road, with a segment's states of all stages s
 entries near its diagonal only.
 """
 
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +18,7 @@ from dptse_env.estimators.compiled.envelope import SPARE
 from dptse_env.estimators.localisation import positions
 from dptse_env.model import ARZModel
 from dptse_env.model.road_arrays import RoadArrays
-from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray, IntArray
 
 
 class Order(NamedTuple):
@@ -88,6 +92,35 @@ def make_space(order: Order, n_stages: int) -> Space:
         np.zeros(n),
         np.zeros(order.width),
     )
+
+
+class Spaces:
+    """Working spaces that are kept from step to step, one for each thread that is in one.
+
+    For a new one the operating system has to clear memory, which took a third of a step on 120
+    segments.
+    """
+
+    def __init__(self, order: Order, n_stages: int) -> None:
+        """Take the order, and the stages of the longest window."""
+        self._order, self._n_stages = order, n_stages
+        self._idle: list[tuple[AnyArray, ...]] = []
+
+    def __reduce__(self) -> tuple[type[Spaces], tuple[Order, int]]:
+        """Copy and pickle without the spaces."""
+        return type(self), (self._order, self._n_stages)
+
+    @contextmanager
+    def lend(self) -> Iterator[tuple[AnyArray, ...]]:
+        """Lend a space, a `Space` as a tuple for kernels."""
+        try:
+            space = self._idle.pop()
+        except IndexError:  # all are lent to other threads
+            space = tuple(make_space(self._order, self._n_stages))
+        try:
+            yield space
+        finally:
+            self._idle.append(space)
 
 
 @njit(cache=True, error_model="numpy")
