@@ -1,5 +1,7 @@
 """The compiled moving horizon estimator on long roads, and on programs that are hard to solve."""
 
+import copy
+
 import numpy as np
 import pytest
 
@@ -55,6 +57,24 @@ def hostile(n_mainline, release, wildness, n_steps, seed=0, **settings):
         values = truth + wildness * sigma * rng.normal(size=(1, s, 2))
         mhe.update(ONE, observed, values, sigma)
         yield mhe
+
+
+def test_a_copy_goes_on_alike_and_every_thread_has_its_space():
+    """A copy leaves the working spaces behind."""
+    mhe = next(iter(hostile(80, "speed", 1.0, 1)))
+    twin = copy.deepcopy(mhe)
+    observed = np.ones((1, mhe.model.n_segments), dtype=bool)
+    for each in (mhe, twin):
+        each.predict(ONE, mhe.model.boundary_inputs(*np.full((2, 1, mhe.model.n_boundaries), 30.0)))
+        values = each.model.measure(each.states)
+        each.update(ONE, observed, values, SIGMAS["speed"])
+    np.testing.assert_array_equal(mhe.states, twin.states)
+    np.testing.assert_array_equal(mhe.covariances, twin.covariances)
+    spaces = mhe._spaces
+    with spaces.lend() as one, spaces.lend() as other:
+        assert not np.shares_memory(one[0], other[0])
+    with spaces.lend() as again:
+        assert np.shares_memory(again[0], one[0]) or np.shares_memory(again[0], other[0])
 
 
 def program(mhe):
