@@ -45,6 +45,8 @@ class Args:
     """Segments queried a second."""
     privacy: str = "paper"
     """Release model."""
+    parameters: str = "w99-3lane"
+    """ARZ parameter set."""
     traffic_seeds: str = "0:3"
     """Traffic seeds, first:stop."""
     quick: bool = False
@@ -57,6 +59,7 @@ def measure(args: Args, estimator: str, band: int | None, last: int) -> np.ndarr
     env: Any = gym.make(
         ID,
         corridor=long_road(args.length),
+        parameters=args.parameters,
         bandwidth=args.queried,
         privacy=args.privacy,
         estimator=estimator,
