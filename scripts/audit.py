@@ -13,7 +13,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from agents.evaluation.episodes import make_config
+from agents.evaluation.environments import make_config
 from agents.studies.audit.attack import attack
 from agents.studies.audit.pairs import PairsFinding, study_pairs
 from agents.studies.audit.report import Finding

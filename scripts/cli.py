@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import json
 import logging
 import shlex
 import sys
@@ -16,15 +15,13 @@ from typing import Any
 
 import tyro
 
-from agents.evaluation.episodes import make_config, parse_keywords
+from agents.evaluation.environments import given_keywords, make_config
 from dptse_env.traffic import (
-    CORRIDORS,
     Corridor,
     NetworkError,
     RecordingError,
     RecordLibrary,
     SumoVersionError,
-    is_road_file,
 )
 
 
@@ -115,34 +112,6 @@ def _words(args: Any) -> Iterator[str]:
             if value is not True:
                 values = value if isinstance(value, tuple) else (value,)
                 yield from (shlex.quote(str(each)) for each in values)
-
-
-def given_keywords(keywords: str, corridor: str | None) -> dict[str, Any]:
-    """Return the keywords of an environment that a command line gives.
-
-    Args:
-        keywords: A JSON object.
-        corridor: Name of a shipped corridor, a road file, or a JSON object of corridor fields;
-            None for the corridor of the keywords or the environment.
-
-    Raises:
-        ValueError: The keywords are no JSON object, the corridor is unknown, or both name one.
-    """
-    given = parse_keywords(keywords)
-    if corridor is None:
-        return given
-    if "corridor" in given:
-        raise ValueError("corridor must be given once, as an argument or among the keywords")
-    value: Any = corridor
-    if corridor not in CORRIDORS and not is_road_file(corridor):
-        with contextlib.suppress(json.JSONDecodeError):
-            value = json.loads(corridor)
-        if not isinstance(value, dict):
-            raise ValueError(
-                f"corridor must be one of {', '.join(CORRIDORS)}, a road file that ends in "
-                f".toml, or a JSON object of corridor fields, got {corridor!r}"
-            )
-    return {"corridor": value, **given}
 
 
 def make_corridor(env: str, keywords: Mapping[str, Any]) -> Corridor:

@@ -15,15 +15,8 @@ from typing import Any
 import gymnasium as gym
 from tqdm import tqdm
 
-from agents.evaluation.episodes import (
-    EpisodeScore,
-    Policy,
-    make_config,
-    make_vector,
-    run_episodes,
-    seed_kind,
-    watch_episode,
-)
+from agents.evaluation.environments import make_config, make_vector
+from agents.evaluation.episodes import EpisodeScore, Policy, run_episodes, seed_kind, watch_episode
 from agents.evaluation.figures import (
     RoadMap,
     draw_maps,

@@ -17,6 +17,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from agents.evaluation.environments import given_keywords
 from dptse_env.config import TEST_SEEDS, TRAINING_SEEDS, VALIDATION_SEEDS
 from dptse_env.traffic import is_road_file, ranges, read_road
 from dptse_env.traffic.importers import (
@@ -28,7 +29,7 @@ from dptse_env.traffic.importers import (
 )
 from dptse_env.traffic.importers.folder import ROAD
 from dptse_env.traffic.importers.report import REPORT
-from scripts.cli import given_keywords, make_corridor, run
+from scripts.cli import make_corridor, run
 
 
 @dataclass(frozen=True)

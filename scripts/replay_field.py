@@ -13,7 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from agents.evaluation.episodes import make_config
+from agents.evaluation.environments import make_config
 from agents.evaluation.measured_field import Replay, field_corridor, read_field
 from agents.evaluation.terminal import make_table, print_table
 from agents.experiments.plots import LABELS

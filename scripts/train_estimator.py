@@ -15,7 +15,7 @@ from pathlib import Path
 
 import torch
 
-from agents.evaluation.episodes import make_config
+from agents.evaluation.environments import make_config
 from agents.filters.plan import FilterPlan, Round
 from agents.filters.scenarios import ScenarioRanges, parse_env
 from agents.filters.training import FilterTraining

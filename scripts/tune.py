@@ -20,6 +20,7 @@ import optuna
 from rich.table import Table
 from tqdm import tqdm
 
+from agents.evaluation.environments import given_keywords
 from agents.evaluation.terminal import make_table, print_table
 from agents.experiments.engine import make_pool
 from agents.experiments.seeds import TUNING
@@ -29,7 +30,7 @@ from agents.search.tuning_task import TuningTask
 from dptse_env.model import ARZParameters
 from dptse_env.model.parameters import read_parameters
 from dptse_env.utils.validation import integer
-from scripts.cli import Recording, given_keywords, records_argument, resumable, run
+from scripts.cli import Recording, records_argument, resumable, run
 
 
 @dataclass(frozen=True)

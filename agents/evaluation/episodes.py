@@ -6,11 +6,8 @@ and the same traffic seed, and the mechanism draws noise for all segments whiche
 
 from __future__ import annotations
 
-import contextlib
-import json
 import math
-import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -18,8 +15,8 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from dptse_env.config import TEST_SEEDS, TRAINING_SEEDS, VALIDATION_SEEDS, EnvConfig
-from dptse_env.env import SensorQueryEnv
+from agents.evaluation.environments import unwrap
+from dptse_env.config import TEST_SEEDS, TRAINING_SEEDS, VALIDATION_SEEDS
 from dptse_env.process import QueryProcess
 from dptse_env.rendering import History
 from dptse_env.vector_env import SensorQueryVectorEnv
@@ -39,49 +36,6 @@ class Policy(Protocol):
         deterministic: bool = False,
     ) -> tuple[Any, Any]:
         """Return an action and the policy's next state."""
-
-
-def unwrap(env: gym.Env[Any, Any]) -> SensorQueryEnv:
-    """Return the environment of this package under its wrappers.
-
-    Raises:
-        TypeError: It is none of this package.
-    """
-    bare = env.unwrapped
-    if not isinstance(bare, SensorQueryEnv):
-        raise TypeError(f"env must be an environment of dptse_env, got {type(bare).__name__}")
-    return bare
-
-
-def parse_keywords(text: str) -> dict[str, Any]:
-    """Return keywords of an environment that are given as a JSON object.
-
-    Raises:
-        ValueError: The text is no JSON object.
-    """
-    keywords: Any = None
-    with contextlib.suppress(json.JSONDecodeError):
-        keywords = json.loads(text)
-    if not isinstance(keywords, dict):
-        raise ValueError(f"keywords must be a JSON object, got {text!r}")
-    return keywords
-
-
-def make_config(env: str, keywords: Mapping[str, Any]) -> EnvConfig:
-    """Return the configuration of an environment.
-
-    Raises:
-        ValueError: A keyword is unknown or out of range.
-    """
-    return unwrap(gym.make(env, disable_env_checker=True, **keywords)).config
-
-
-@contextlib.contextmanager
-def without_void_warning() -> Iterator[None]:
-    """Suppress the void-guarantee warning; the study reports it itself."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message=r"privacy\.preset is .* yet no privacy")
-        yield
 
 
 def check_test_seeds(seeds: Sequence[int], path: str = "seeds") -> None:
@@ -178,27 +132,6 @@ def run_episode(
     process = unwrap(env).process
     seconds = _play(process, policy, observation, step, deterministic, on_second)
     return _pool(seconds, [traffic_seed], warm_up)[0]
-
-
-def make_vector(env: str, n_episodes: int, keywords: Mapping[str, Any]) -> SensorQueryVectorEnv:
-    """Make a vector environment of whole episodes, as `run_episodes` takes it.
-
-    Raises:
-        ValueError: A keyword is unknown or out of range, or the decisions of a second may take
-            different numbers of actions, so that episodes would not stay in step.
-    """
-    made = gym.make_vec(
-        env, num_envs=n_episodes, **{**keywords, "autoreset_mode": AutoresetMode.DISABLED}
-    )
-    assert isinstance(made, SensorQueryVectorEnv)
-    actions = made.interface.actions
-    if n_episodes > 1 and actions.picks_one_by_one and actions.costs is not None:
-        raise ValueError(
-            f"action {made.config.action!r} takes different numbers of actions for a second where "
-            f"queries cost different amounts ({made.config.queries}): episodes cannot be run as a "
-            "batch; use another encoding, or one episode at a time"
-        )
-    return made
 
 
 def run_episodes(

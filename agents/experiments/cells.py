@@ -11,12 +11,8 @@ from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
-from agents.evaluation.episodes import (
-    EpisodeScore,
-    check_test_seeds,
-    make_config,
-    without_void_warning,
-)
+from agents.evaluation.environments import make_config, without_void_warning
+from agents.evaluation.episodes import EpisodeScore, check_test_seeds
 from agents.evaluation.statistics import Interval, mean_interval, paired_difference
 from dptse_env.config import TEST_SEEDS, EnvConfig, parse_seeds
 from dptse_env.schedules import OBSERVATION_SCHEDULES

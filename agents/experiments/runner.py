@@ -9,12 +9,8 @@ from typing import Any, Generic
 
 import gymnasium as gym
 
-from agents.evaluation.episodes import (
-    EpisodeScore,
-    make_vector,
-    run_episode,
-    without_void_warning,
-)
+from agents.evaluation.environments import make_vector, without_void_warning
+from agents.evaluation.episodes import EpisodeScore, run_episode
 from agents.experiments.cells import Cell, CellT, Design
 from agents.experiments.engine import Engine
 from agents.experiments.ledger import Ledger

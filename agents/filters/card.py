@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib.metadata import version
 from typing import Any
 
-from agents.evaluation.episodes import make_config
+from agents.evaluation.environments import make_config
 from agents.experiments.provenance import source_digest
 from agents.filters.plan import FilterPlan
 from agents.filters.scenarios import parse_env

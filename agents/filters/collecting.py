@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.evaluation.episodes import make_vector, run_episodes
+from agents.evaluation.environments import make_vector
+from agents.evaluation.episodes import run_episodes
 from agents.filters.scenarios import Scenario
 from dptse_env.estimators.batch import checked_measurements
 from dptse_env.estimators.learned.cells import Cells, input_channels, make_cells

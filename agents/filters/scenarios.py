@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from agents.evaluation.episodes import make_config, parse_keywords
+from agents.evaluation.environments import make_config, parse_keywords
 from agents.filters.roads import ROADS
 
 MECHANISMS = ("capped", "paced", "paper", "corrected")

@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from agents.evaluation.episodes import WARM_UP, make_vector, run_episodes
+from agents.evaluation.environments import make_vector
+from agents.evaluation.episodes import WARM_UP, run_episodes
 from agents.experiments.seeds import TUNING
 from agents.filters.scenarios import parse_env
 from dptse_env.process import QueryProcess

@@ -16,7 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from agents.evaluation.episodes import WARM_UP, make_vector
+from agents.evaluation.environments import make_vector
+from agents.evaluation.episodes import WARM_UP
 from agents.experiments.seeds import PLAN_SEARCH
 from dptse_env.config import TRAINING_SEEDS, VALIDATION_SEEDS, parse_seeds
 from dptse_env.schedules import PLANS, Shifting

@@ -15,7 +15,8 @@ from typing import Any
 
 import gymnasium as gym
 
-from agents.evaluation.episodes import WARM_UP, EpisodeScore, make_vector, run_episodes, unwrap
+from agents.evaluation.environments import make_vector, unwrap
+from agents.evaluation.episodes import WARM_UP, EpisodeScore, run_episodes
 from agents.evaluation.policies import PolicySource, find_policy
 from agents.experiments.seeds import TUNING
 from agents.search.space import Knob, search_space

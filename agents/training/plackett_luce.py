@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from agents.evaluation.episodes import make_vector
+from agents.evaluation.environments import make_vector
 from agents.experiments.seeds import training_seed
 from agents.training.episodes import make_episodes
 from agents.training.learner import Record

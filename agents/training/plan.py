@@ -10,7 +10,8 @@ from functools import cached_property
 from importlib.metadata import version
 from typing import Any
 
-from agents.evaluation.episodes import WARM_UP, make_config
+from agents.evaluation.environments import make_config
+from agents.evaluation.episodes import WARM_UP
 from agents.experiments.provenance import machine, source_digest
 from agents.experiments.seeds import TRAINING_VALIDATION, TRAININGS
 from agents.training.recipes import Recipe

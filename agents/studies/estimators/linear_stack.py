@@ -16,7 +16,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from agents.evaluation.episodes import WARM_UP, make_config, run_episodes
+from agents.evaluation.environments import make_config
+from agents.evaluation.episodes import WARM_UP, run_episodes
 from agents.experiments.files import write_json
 from agents.experiments.runner import make_batch
 from agents.experiments.seeds import TUNING

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-from agents.evaluation.episodes import make_config, without_void_warning
+from agents.evaluation.environments import make_config, without_void_warning
 from agents.experiments.cells import Design
 from agents.studies.estimators.cell import DEFAULT_WEIGHTS, LEARNED, LINEAR, EstimatorCell
 from agents.studies.estimators.worlds import ELSEWHERE, GUARANTEES, MAIN, WORLDS, World

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from agents.evaluation.episodes import make_vector
+from agents.evaluation.environments import make_vector
 from agents.evaluation.statistics import geometric_mean_interval
 from agents.studies.estimators.plan import EstimatorDesign
 

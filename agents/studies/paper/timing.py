@@ -10,7 +10,8 @@ from typing import Any
 import gymnasium as gym
 from tqdm import tqdm
 
-from agents.evaluation.episodes import run_episode, unwrap
+from agents.evaluation.environments import unwrap
+from agents.evaluation.episodes import run_episode
 from agents.experiments.ledger import Ledger
 from agents.experiments.runner import make_env
 from agents.studies.paper.plan import PaperCell, PaperDesign

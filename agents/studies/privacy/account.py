@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from agents.evaluation.episodes import make_config, without_void_warning
+from agents.evaluation.environments import make_config, without_void_warning
 from agents.studies.privacy.plan import PrivacyCell
 from dptse_env.config import EnvConfig
 from dptse_env.parts import privacy_report

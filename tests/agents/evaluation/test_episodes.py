@@ -4,13 +4,12 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from agents.evaluation.environments import make_config, unwrap
 from agents.evaluation.episodes import (
     check_test_seeds,
-    make_config,
     run_episode,
     run_episodes,
     seed_kind,
-    unwrap,
     watch_episode,
 )
 from dptse_env.schedules import (

@@ -3,7 +3,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from agents.evaluation.episodes import make_config
+from agents.evaluation.environments import make_config
 from agents.filters.roads import ROADS
 from agents.filters.scenarios import MECHANISMS, SCHEDULES, ScenarioRanges, parse_env
 

@@ -7,7 +7,8 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from agents.evaluation.episodes import make_vector, run_episodes  # noqa: E402
+from agents.evaluation.environments import make_vector  # noqa: E402
+from agents.evaluation.episodes import run_episodes  # noqa: E402
 from agents.filters.batches import draw_batch, make_batch  # noqa: E402
 from agents.filters.collecting import collect  # noqa: E402
 from agents.filters.plan import OWN, Round  # noqa: E402

@@ -3,7 +3,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from agents.evaluation.episodes import WARM_UP, make_vector
+from agents.evaluation.environments import make_vector
+from agents.evaluation.episodes import WARM_UP
 from agents.search.plans import (
     PlanScorer,
     PlanSearch,

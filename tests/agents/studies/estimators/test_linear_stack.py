@@ -3,7 +3,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from agents.evaluation.episodes import make_vector, run_episodes
+from agents.evaluation.environments import make_vector
+from agents.evaluation.episodes import run_episodes
 from agents.studies.estimators.linear_stack import (
     EQUAL,
     LAGS,

@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from agents.evaluation.episodes import make_vector, run_episodes
+from agents.evaluation.environments import make_vector
+from agents.evaluation.episodes import run_episodes
 from agents.studies.estimators import tampering
 from agents.studies.estimators.tampering import tamper
 from dptse_env.schedules import make_schedule

@@ -2,7 +2,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from agents.evaluation.episodes import make_config, run_episode, run_episodes
+from agents.evaluation.environments import make_config
+from agents.evaluation.episodes import run_episode, run_episodes
 from agents.experiments.runner import make_batch
 from agents.studies.ledger.watching import (
     LENGTHS,

@@ -5,7 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from agents.evaluation.episodes import EpisodeScore, make_config, without_void_warning
+from agents.evaluation.environments import make_config, without_void_warning
+from agents.evaluation.episodes import EpisodeScore
 from agents.evaluation.statistics import Interval
 from agents.experiments.cells import DENSITY, METRICS, SPEED, Change
 from agents.experiments.provenance import design_provenance

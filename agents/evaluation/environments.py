@@ -1,0 +1,109 @@
+"""Environments by id and keywords, scalar and vectorised, and keywords from command lines."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import warnings
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import gymnasium as gym
+from gymnasium.vector import AutoresetMode
+
+from dptse_env.config import EnvConfig
+from dptse_env.env import SensorQueryEnv
+from dptse_env.traffic import CORRIDORS, is_road_file
+from dptse_env.vector_env import SensorQueryVectorEnv
+
+
+def unwrap(env: gym.Env[Any, Any]) -> SensorQueryEnv:
+    """Return the environment of this package under its wrappers.
+
+    Raises:
+        TypeError: It is none of this package.
+    """
+    bare = env.unwrapped
+    if not isinstance(bare, SensorQueryEnv):
+        raise TypeError(f"env must be an environment of dptse_env, got {type(bare).__name__}")
+    return bare
+
+
+def parse_keywords(text: str) -> dict[str, Any]:
+    """Return keywords of an environment that are given as a JSON object.
+
+    Raises:
+        ValueError: The text is no JSON object.
+    """
+    keywords: Any = None
+    with contextlib.suppress(json.JSONDecodeError):
+        keywords = json.loads(text)
+    if not isinstance(keywords, dict):
+        raise ValueError(f"keywords must be a JSON object, got {text!r}")
+    return keywords
+
+
+def given_keywords(keywords: str, corridor: str | None) -> dict[str, Any]:
+    """Return the keywords of an environment that a command line gives.
+
+    Args:
+        keywords: A JSON object.
+        corridor: Name of a shipped corridor, a road file, or a JSON object of corridor fields;
+            None for the corridor of the keywords or the environment.
+
+    Raises:
+        ValueError: The keywords are no JSON object, the corridor is unknown, or both name one.
+    """
+    given = parse_keywords(keywords)
+    if corridor is None:
+        return given
+    if "corridor" in given:
+        raise ValueError("corridor must be given once, as an argument or among the keywords")
+    value: Any = corridor
+    if corridor not in CORRIDORS and not is_road_file(corridor):
+        with contextlib.suppress(json.JSONDecodeError):
+            value = json.loads(corridor)
+        if not isinstance(value, dict):
+            raise ValueError(
+                f"corridor must be one of {', '.join(CORRIDORS)}, a road file that ends in "
+                f".toml, or a JSON object of corridor fields, got {corridor!r}"
+            )
+    return {"corridor": value, **given}
+
+
+def make_config(env: str, keywords: Mapping[str, Any]) -> EnvConfig:
+    """Return the configuration of an environment.
+
+    Raises:
+        ValueError: A keyword is unknown or out of range.
+    """
+    return unwrap(gym.make(env, disable_env_checker=True, **keywords)).config
+
+
+def make_vector(env: str, n_episodes: int, keywords: Mapping[str, Any]) -> SensorQueryVectorEnv:
+    """Make a vector environment of whole episodes, as `run_episodes` takes it.
+
+    Raises:
+        ValueError: A keyword is unknown or out of range, or the decisions of a second may take
+            different numbers of actions, so that episodes would not stay in step.
+    """
+    made = gym.make_vec(
+        env, num_envs=n_episodes, **{**keywords, "autoreset_mode": AutoresetMode.DISABLED}
+    )
+    assert isinstance(made, SensorQueryVectorEnv)
+    actions = made.interface.actions
+    if n_episodes > 1 and actions.picks_one_by_one and actions.costs is not None:
+        raise ValueError(
+            f"action {made.config.action!r} takes different numbers of actions for a second where "
+            f"queries cost different amounts ({made.config.queries}): episodes cannot be run as a "
+            "batch; use another encoding, or one episode at a time"
+        )
+    return made
+
+
+@contextlib.contextmanager
+def without_void_warning() -> Iterator[None]:
+    """Suppress the void-guarantee warning; the study reports it itself."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=r"privacy\.preset is .* yet no privacy")
+        yield
