@@ -6,6 +6,7 @@ python scripts/study.py ledger             # capped contributions beside paced l
 python scripts/study.py estimators         # every estimator under every release model
 python scripts/study.py policies freeze --policies primary=results/training/primary
 python scripts/study.py policies run       # learned policies against every baseline
+python scripts/study.py privacy --corridor my-road.toml    # the same on a road of your own
 
 `freeze` fixes the digests of the policies, and lets validation traffic choose the best baseline and
 the best recipe; `run` takes these and no others to test traffic, once. After an interruption the
@@ -19,12 +20,15 @@ import os
 # Read when numpy loads, here and in the workers: one thread each.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
+from agents.evaluation.environments import given_keywords
+from agents.experiments.cells import Design
 from agents.experiments.engine import LocalProcesses
 from agents.experiments.runner import Workplace
 from agents.studies.estimators import study as estimator_study
@@ -55,9 +59,9 @@ class StudyOptions:
     output: Path | None = None
     """Folder for everything; a folder in results/ if not given."""
 
-    def workplace(self, default: str) -> Workplace:
-        """Return the workplace; the default names a folder in results/."""
-        folder = self.output or RESULTS / default
+    def workplace(self, *default: str) -> Workplace:
+        """Return the workplace; the default gives the parts of the name of a folder in results/."""
+        folder = self.output or RESULTS / "-".join(default)
         engine = LocalProcesses(self.workers)
         return Workplace(folder, engine, records_argument(self.records), self.workers)
 
@@ -123,6 +127,9 @@ class Freeze(StudyOptions):
     """Test traffic seeds, first:stop, within 2000:3000."""
     quick: bool = False
     """The primary cell alone, on eight seeds."""
+    corridor: str | None = None
+    """Road in place of the cells' own: the name of a shipped corridor, a road file that ends in
+    .toml, or a JSON object of corridor fields."""
 
 
 @dataclass(frozen=True)
@@ -155,19 +162,19 @@ def main(args: Paper | Privacy | LedgerStudy | EstimatorStudy | Policies) -> Non
     """Run a study."""
     if isinstance(args, Paper):
         design = args.design.quick() if args.quick else args.design
-        place = args.workplace("paper-quick" if args.quick else "paper")
+        place = args.workplace("paper", *which(design, args.quick))
         paper_study.run(design, place, command("study.py paper", args))
     elif isinstance(args, Privacy):
         private = args.design.quick() if args.quick else args.design
-        place = args.workplace("privacy-quick" if args.quick else "privacy")
+        place = args.workplace("privacy", *which(private, args.quick))
         privacy_study.run(private, place, command("study.py privacy", args))
     elif isinstance(args, LedgerStudy):
         planned = args.design.quick() if args.quick else args.design
-        place = args.workplace("ledger-quick" if args.quick else "ledger")
+        place = args.workplace("ledger", *which(planned, args.quick))
         ledger_study.run(planned, place, command("study.py ledger", args))
     elif isinstance(args, EstimatorStudy):
         chosen = args.design.quick() if args.quick else args.design
-        place = args.workplace("estimators-quick" if args.quick else "estimators")
+        place = args.workplace("estimators", *which(chosen, args.quick))
         estimator_study.run(chosen, place, command("study.py estimators", args))
     elif isinstance(args.step, Freeze):
         freeze(args.step)
@@ -178,13 +185,22 @@ def main(args: Paper | Privacy | LedgerStudy | EstimatorStudy | Policies) -> Non
     print(f"report, figures and scores are in {place.folder}/")
 
 
+def which(design: Design[Any], quick: bool) -> list[str]:
+    """Return what tells results from those of the whole study on the environment's own road."""
+    road = [] if design.corridor is None else [design.configs[0].corridor.name]
+    return (["quick"] if quick else []) + road
+
+
 def policy_design(args: Freeze, cells: tuple[PolicyCell, ...] = CELLS) -> PolicyDesign:
     """Return the design of the study of policies.
 
     Raises:
         ValueError: An argument is out of range.
     """
-    known = {cell.name: cell for cell in cells}
+    road = given_keywords("{}", args.corridor)
+    known = {
+        cell.name: dataclasses.replace(cell, keywords={**cell.keywords, **road}) for cell in cells
+    }
     unknown = [name for name in args.cells if name not in known]
     if unknown:
         raise ValueError(f"cells must be of {', '.join(known)}, got {unknown[0]!r}")

@@ -11,7 +11,7 @@ from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
-from agents.evaluation.environments import make_config, without_void_warning
+from agents.evaluation.environments import given_keywords, make_config, without_void_warning
 from agents.evaluation.episodes import EpisodeScore, check_test_seeds
 from agents.evaluation.statistics import Interval, mean_interval, paired_difference
 from dptse_env.config import TEST_SEEDS, EnvConfig, parse_seeds
@@ -49,11 +49,14 @@ class Design(ABC, Generic[CellT]):
         seeds: Test traffic seeds, first:stop; each is the seed of the noise, too.
         schedule: Query schedule of every episode.
         env: Environment id.
+        corridor: Road in place of the environment's: the name of a shipped corridor, a road file
+            that ends in .toml, or a JSON object of corridor fields.
     """
 
     seeds: str = f"{TEST_SEEDS.start}:{TEST_SEEDS.start + 20}"
     schedule: str = "paper"
     env: str = "dptse_env:dptse/PaperHighway-v0"
+    corridor: str | None = None
 
     def check(self) -> None:
         """Check the values that no environment checks.
@@ -86,6 +89,19 @@ class Design(ABC, Generic[CellT]):
         return list(dict.fromkeys(self.all_cells()))
 
     @cached_property
+    def road(self) -> dict[str, Any]:
+        """Keyword of ``gym.make`` that puts the road of ``corridor`` into every environment.
+
+        Raises:
+            ValueError: There is no such road.
+        """
+        return given_keywords("{}", self.corridor)
+
+    def keywords(self, cell: CellT) -> dict[str, Any]:
+        """Return the keywords of ``gym.make`` that make a cell on the road of the design."""
+        return {**self.road, **cell.keywords}
+
+    @cached_property
     def configs(self) -> list[EnvConfig]:
         """The configurations of all cells, after a check of the design.
 
@@ -95,7 +111,9 @@ class Design(ABC, Generic[CellT]):
         self.check()
         seeds = {"traffic_seeds": list(self.traffic_seeds)}
         with without_void_warning():
-            return [make_config(self.env, {**cell.keywords, **seeds}) for cell in self.cells()]
+            return [
+                make_config(self.env, {**self.keywords(each), **seeds}) for each in self.cells()
+            ]
 
 
 DesignT = TypeVar("DesignT", bound=Design[Any])

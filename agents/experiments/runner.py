@@ -11,7 +11,7 @@ import gymnasium as gym
 
 from agents.evaluation.environments import make_vector, without_void_warning
 from agents.evaluation.episodes import EpisodeScore, run_episode
-from agents.experiments.cells import Cell, CellT, Design
+from agents.experiments.cells import CellT, Design
 from agents.experiments.engine import Engine
 from agents.experiments.ledger import Ledger
 from dptse_env.schedules import make_schedule
@@ -44,25 +44,29 @@ class EpisodeTask(Generic[CellT]):
     """A cell on some traffic seeds.
 
     Attributes:
+        keywords: Keywords of ``gym.make`` that make it.
         records: Folder of the record cache; None for the user's cache.
     """
 
     env: str
     schedule: str
     cell: CellT
+    keywords: Mapping[str, Any]
     seeds: tuple[int, ...]
     records: str | None
 
 
-def make_env(env: str, cell: Cell, seeds: Sequence[int], records: str | None) -> gym.Env[Any, Any]:
-    """Make the environment of a cell.
+def make_env(
+    env: str, keywords: Mapping[str, Any], seeds: Sequence[int], records: str | None
+) -> gym.Env[Any, Any]:
+    """Make an environment for `run_episode`.
 
     Raises:
-        ValueError: A value of the cell is out of range.
+        ValueError: A keyword is unknown or out of range.
     """
     seeded: dict[str, Any] = {"traffic_seeds": list(seeds), "records": records}
     with without_void_warning():
-        return gym.make(env, disable_env_checker=True, **seeded, **cell.keywords)
+        return gym.make(env, disable_env_checker=True, **seeded, **keywords)
 
 
 def make_batch(
@@ -84,7 +88,7 @@ def make_batch(
 
 def run_task(task: EpisodeTask[Any]) -> list[EpisodeScore]:
     """Run a cell on its seeds; a seed gives the traffic and the noise, so cells are paired."""
-    env = make_env(task.env, task.cell, task.seeds, task.records)
+    env = make_env(task.env, task.keywords, task.seeds, task.records)
     schedule = make_schedule(task.schedule, env)
     return [run_episode(env, schedule, traffic_seed=seed, seed=seed) for seed in task.seeds]
 
@@ -95,7 +99,7 @@ def missing_tasks(
     """Return the episodes that a ledger lacks, one task a cell."""
     lacking = {cell: ledger.lacking(cell, design.traffic_seeds) for cell in design.cells()}
     return [
-        EpisodeTask(design.env, design.schedule, cell, seeds, records)
+        EpisodeTask(design.env, design.schedule, cell, design.keywords(cell), seeds, records)
         for cell, seeds in lacking.items()
         if seeds
     ]

@@ -12,11 +12,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import date
 from importlib.metadata import version
-from typing import Any
 
 import numpy as np
 
-from agents.evaluation.environments import make_vector
+from agents.evaluation.environments import given_keywords, make_vector
 from agents.evaluation.episodes import WARM_UP
 from agents.experiments.seeds import PLAN_SEARCH
 from dptse_env.config import TRAINING_SEEDS, VALIDATION_SEEDS, parse_seeds
@@ -50,6 +49,8 @@ class PlanTask:
             begin the search, and four times as many episodes run at once.
         seed: Seeds the search.
         records: Folder of the record cache; the user's cache if not given.
+        corridor: Road in place of the environment's: the name of a shipped corridor, a road file
+            that ends in .toml, or a JSON object of corridor fields.
     """
 
     env: str = "dptse_env:dptse/PrivateHighway-v0"
@@ -62,6 +63,7 @@ class PlanTask:
     neighbours: int = 31
     seed: int = 0
     records: str | None = None
+    corridor: str | None = None
 
     def check(self) -> None:
         """Check what needs no environment.
@@ -92,7 +94,8 @@ class PlanTask:
 
     def make(self, n_episodes: int, seeds: tuple[int, ...]) -> SensorQueryVectorEnv:
         """Make the environment for a number of episodes on some traffic seeds."""
-        keywords: dict[str, Any] = {"estimator": self.estimator, "records": self.records}
+        keywords = given_keywords("{}", self.corridor)
+        keywords |= {"estimator": self.estimator, "records": self.records}
         for name in ("parameters", "bandwidth"):
             if getattr(self, name) is not None:
                 keywords[name] = getattr(self, name)

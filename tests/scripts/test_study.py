@@ -1,15 +1,23 @@
 import csv
 import dataclasses
+import json
+from dataclasses import replace
 
 import pytest
 
+from agents.studies.estimators.cell import LINEAR
+from agents.studies.estimators.plan import EstimatorDesign
+from agents.studies.estimators.worlds import GUARANTEES, MAIN
 from agents.studies.ledger.cell import FilterSets
 from agents.studies.ledger.plan import LedgerDesign
 from agents.studies.paper.plan import PaperDesign
 from agents.studies.policies.plan import PolicyCell
+from agents.studies.policies.running import cell_config
 from agents.studies.privacy.plan import PrivacyDesign
+from dptse_env.traffic import SHORT_HIGHWAY, read_corridor, write_corridor
 from scripts.cli import command, run
 from scripts.study import (
+    EstimatorStudy,
     Freeze,
     LedgerStudy,
     Paper,
@@ -65,6 +73,8 @@ def test_the_command_line_runs_a_study_and_reports_its_command(tmp_path):
         (("ledger", "--paces", "0.85"), "error: paces must hold a value beside 0.85"),
         (("policies", "run", "--workers", "0"), "error: workers must be an integer >= 1, got 0"),
         (("policies", "freeze", "--cells", "far"), "error: cells must be of primary, paper"),
+        (("ledger", "--corridor", "moon"), "error: corridor must be one of paper-highway, "),
+        (("estimators", "--corridor", "no.toml"), "error: "),
     ],
 )
 def test_mistakes_end_in_one_line_on_stderr(arguments, message, tmp_path, monkeypatch, capsys):
@@ -110,6 +120,51 @@ def test_bad_arguments_of_the_study_of_privacy_are_named(changes, message, tmp_p
     with pytest.raises(ValueError, match=message):
         main(Privacy(design=design, workers=1, output=tmp_path / "out"))
     assert not (tmp_path / "out").exists()
+
+
+@pytest.fixture
+def road(tmp_path):
+    """The file of a short road with a lane more than the shipped one."""
+    path = tmp_path / "my-road.toml"
+    write_corridor(path, replace(SHORT_HIGHWAY, name="my-road", lanes=3))
+    return str(path)
+
+
+ESTIMATORS = EstimatorDesign(
+    seeds="2000:2002", schedules=("round-robin",), slow_estimators=(), fit_seeds="0:1",
+    quick_estimators=("ekf", "random_walk", LINEAR, "recurrent"), worlds=("printed", "paced"),
+)  # fmt: skip
+
+
+@pytest.mark.filterwarnings("ignore:.*values measured or tuned on")
+@pytest.mark.parametrize(
+    ("arguments", "design"), [(Privacy, PRIVACY), (EstimatorStudy, ESTIMATORS)]
+)
+def test_a_study_is_made_of_a_road_of_one_s_own(arguments, design, road, tmp_path, monkeypatch):
+    monkeypatch.setattr("agents.studies.estimators.study.measure", lambda *_: [])
+    monkeypatch.chdir(tmp_path)
+    main(arguments(design=replace(design, corridor=road), quick=False, workers=1))
+    (folder,) = (tmp_path / "results").iterdir()
+    assert folder.name.endswith("-my-road")
+    assert "on the road `my-road` in place of" in (folder / "REPORT.md").read_text()
+    made_with = json.loads((folder / "run.json").read_text())["made_with"]
+    digests = {made_with["corridor"]} if "corridor" in made_with else {
+        each["corridor"] for each in made_with["cells"].values()
+    }  # fmt: skip
+    assert digests == {read_corridor(road).digest}
+
+
+def test_worlds_that_are_other_roads_are_refused_on_a_road_of_one_s_own(road):
+    assert set(EstimatorDesign(corridor=road).worlds) == {*MAIN, *GUARANTEES}
+    with pytest.raises(ValueError, match=r"worlds must be of printed, .* got 'krauss'"):
+        EstimatorDesign(corridor=road, worlds=("krauss",)).check()
+
+
+@pytest.mark.filterwarnings("ignore:.*values measured or tuned on")
+def test_policies_are_frozen_on_a_road_of_one_s_own(road):
+    design = policy_design(Freeze(corridor=road, cells=("primary",)))
+    assert design.cells[0].keywords["corridor"] == road
+    assert cell_config(design.cells[0], (2000,)).corridor.name == "my-road"
 
 
 def arguments(folder, **changes):

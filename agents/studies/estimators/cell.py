@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -40,15 +41,16 @@ class EstimatorCell:
     @property
     def keywords(self) -> dict[str, Any]:
         """Keywords of ``gym.make`` that make it, where no stack is fitted yet."""
-        return self.with_fit("")
+        return self.on({})
 
-    def with_fit(self, fit: str) -> dict[str, Any]:
-        """Return the keywords with a file of fitted stacks."""
-        keywords = {**self.place.keywords, "estimator": self.estimator}
+    def on(self, road: Mapping[str, Any], fit: str = "") -> dict[str, Any]:
+        """Return the keywords on a road, given as a keyword, with a file of fitted stacks."""
+        place = self.place.on(road)
+        keywords = {**place.keywords, "estimator": self.estimator}
         keywords |= find_policy(self.schedule).keywords
         if self.estimator == LINEAR:
             keywords["estimator"] = STACK
-            keywords["estimator_settings"] = stack_settings(self.place, fit, self.world)
+            keywords["estimator_settings"] = stack_settings(place, fit, self.world)
         if self.estimator == LEARNED:
             recurrent = {"weights": self.weights, "outside": True}
             keywords["estimator_settings"] = {"recurrent": recurrent}

@@ -26,7 +26,7 @@ class Floor(NamedTuple):
 def floors(design: EstimatorDesign, world: str, records: str | None) -> list[Floor]:
     """Return the error of the truth a second ago, and of its moving average."""
     cell, seeds = design.cell(world, "random_walk"), design.traffic_seeds[:16]
-    env = make_batch(cell.place.env, cell.keywords, seeds, records)
+    env = make_batch(cell.place.env, design.keywords(cell), seeds, records)
     process, kept = env.process, []
 
     def on_second() -> None:

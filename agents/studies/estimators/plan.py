@@ -7,6 +7,7 @@ import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 from agents.evaluation.environments import make_config, without_void_warning
 from agents.experiments.cells import Design
@@ -39,7 +40,8 @@ class EstimatorDesign(Design[EstimatorCell]):
         weights: Network that counts as the estimator.
         networks: Networks of other training seeds.
         fit_seeds: Training traffic seeds on which linear stacks are fitted.
-        worlds: Names of the worlds that are run.
+        worlds: Names of the worlds that are run; all by default, and with ``corridor`` those that
+            are no roads of their own.
     """
 
     seeds: str = "2000:2064"
@@ -53,15 +55,30 @@ class EstimatorDesign(Design[EstimatorCell]):
     weights: str = DEFAULT_WEIGHTS
     networks: tuple[str, ...] = ()
     fit_seeds: str = "0:32"
-    worlds: tuple[str, ...] = tuple(WORLDS)
+    worlds: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Put the default in place of no worlds."""
+        if not self.worlds:
+            names = WORLDS if self.corridor is None else {**MAIN, **GUARANTEES}
+            object.__setattr__(self, "worlds", tuple(names))
 
     def check(self) -> None:
         """See `Design.check`; unknown worlds and schedules are refused as well."""
         super().check()
         for world in self.worlds:
             require_name("worlds", world, WORLDS)
+            if self.corridor is not None and world in ELSEWHERE:
+                raise ValueError(
+                    f"worlds must be of {', '.join({**MAIN, **GUARANTEES})} where a corridor is "
+                    f"given, got {world!r}"
+                )
         for schedule in self.schedules:
             require_name("schedules", schedule, OBSERVATION_SCHEDULES)
+        if self.schedule not in self.schedules:
+            raise ValueError(
+                f"schedules must hold the base schedule {self.schedule!r}, got {self.schedules}"
+            )
 
     @property
     def main(self) -> dict[str, World]:
@@ -103,7 +120,8 @@ class EstimatorDesign(Design[EstimatorCell]):
 
     def schedules_of(self, world: str) -> tuple[str, ...]:
         """Return the schedules of a main world."""
-        return (*self.schedules, *((self.policy,) if world in WITH_POLICY else ()))
+        knows = world in WITH_POLICY and self.corridor is None
+        return (*self.schedules, *((self.policy,) if knows else ()))
 
     def all_cells(self) -> Iterator[EstimatorCell]:
         """See `Design.all_cells`."""
@@ -133,6 +151,10 @@ class EstimatorDesign(Design[EstimatorCell]):
         with without_void_warning():
             return [self.config(cell) for cell in self.cells()]
 
+    def keywords(self, cell: EstimatorCell, fit: str = "") -> dict[str, Any]:
+        """See `Design.keywords`; with a file of fitted stacks."""
+        return cell.on(self.road, fit)
+
     def config(self, cell: EstimatorCell) -> EnvConfig:
         """Return the configuration of a cell.
 
@@ -140,7 +162,7 @@ class EstimatorDesign(Design[EstimatorCell]):
             ValueError: A value is out of range.
         """
         seeds = {"traffic_seeds": list(self.seeds_of(cell))}
-        return make_config(cell.place.env, {**cell.keywords, **seeds})
+        return make_config(cell.place.env, {**self.keywords(cell), **seeds})
 
     @property
     def all_networks(self) -> Sequence[str]:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from agents.evaluation.episodes import run_episodes
 from agents.evaluation.policies import find_policy
@@ -34,14 +35,14 @@ class EstimatorTask:
     """A cell on traffic seeds, with everything that a worker needs.
 
     Attributes:
-        fit: File of the fitted stacks.
+        keywords: Keywords of ``gym.make`` that make it.
         records: Folder of the record cache; None for the user's cache.
         threads: Threads that estimate; None for one per core.
     """
 
     cell: EstimatorCell
+    keywords: Mapping[str, Any]
     seeds: tuple[int, ...]
-    fit: str
     records: str | None
     threads: int | None
 
@@ -57,8 +58,11 @@ def run_missing(
         place.record(corridor, seeds)
     fit_missing(design, place)
     threads = 1 if place.engine.is_parallel else None
+    fit = str(place.folder / FITS)
     tasks = [
-        EstimatorTask(cell, design.seeds_of(cell), str(place.folder / FITS), place.records, threads)
+        EstimatorTask(
+            cell, design.keywords(cell, fit), design.seeds_of(cell), place.records, threads
+        )
         for cell in lacking
     ]
     run_all(tasks, ledger, place.engine, run_cell)
@@ -72,7 +76,7 @@ def fit_missing(design: EstimatorDesign, place: Workplace) -> None:
     for corridor in {design.config(design.cell(name)).corridor for name in worlds}:
         place.record(corridor, seeds)
     for name in worlds:
-        fits[name] = fit_stack(WORLDS[name], seeds, FIT_SCHEDULES, place.records)
+        fits[name] = fit_stack(WORLDS[name].on(design.road), seeds, FIT_SCHEDULES, place.records)
         write_fits(Path(path), fits)
 
 
@@ -82,9 +86,7 @@ def run_cell(task: EstimatorTask) -> list[EstimatorScore]:
     with warnings.catch_warnings():
         # Roads and drivers off the training are the point here.
         warnings.filterwarnings("ignore", message=".*values measured or tuned on")
-        env = make_batch(
-            cell.place.env, cell.with_fit(task.fit), task.seeds, task.records, task.threads
-        )
+        env = make_batch(cell.place.env, task.keywords, task.seeds, task.records, task.threads)
     policy = find_policy(cell.schedule).load(
         env, allow=TRANSFERABLE if cell.is_learned_policy else (), seed=POLICY_SEED
     )

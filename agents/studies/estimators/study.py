@@ -88,12 +88,18 @@ def _measured_once(
             for world in design.main
             if world in by_traffic.values()
         }
-        timed = TIMED if TIMED in design.main else next(iter(design.main))
-        times = [dataclasses.asdict(each) for each in measure(design, timed, place.records)]
+        times = [
+            dataclasses.asdict(each) for each in measure(design, _timed(design), place.records)
+        ]
         write_json(path, {"times": times, "floors": found})
     content = json.loads(path.read_text(encoding="utf-8"))
     kept = {world: [Floor(*each) for each in rows] for world, rows in content["floors"].items()}
     return [StepTime(**each) for each in content["times"]], kept
+
+
+def _timed(design: EstimatorDesign) -> str:
+    """Return the world in which steps are timed."""
+    return TIMED if TIMED in design.main else next(iter(design.main))
 
 
 def draw(folder: Path, results: EstimatorResults) -> None:
@@ -103,8 +109,9 @@ def draw(folder: Path, results: EstimatorResults) -> None:
     title = f"Error under the schedule {design.schedule}; {seeds}"
     save_figure(draw_worlds(results), folder / "fig_estimators.png", title)
     save_figure(draw_coverage(results), folder / "fig_coverage.png", "Coverage of intervals")
-    title = "The recurrent network where things differ from PrivateHighway-v1"
-    save_figure(draw_elsewhere(results), folder / "fig_elsewhere.png", title)
+    if design.elsewhere:
+        title = "The recurrent network where things differ from PrivateHighway-v1"
+        save_figure(draw_elsewhere(results), folder / "fig_elsewhere.png", title)
 
 
 def report(results: EstimatorResults, recorded: Mapping[str, Any], command: str) -> dict[str, Any]:
@@ -120,7 +127,11 @@ def report(results: EstimatorResults, recorded: Mapping[str, Any], command: str)
         "JUMP": JUMP,
         "SLOW": SLOW,
         "OWN": OWN,
-        "missed": [each for each in targets.judge(results) if not each.is_met],
+        "road": design.configs[0].corridor.name,
+        "timed": design.main[_timed(design)].label,
+        "missed": []
+        if design.corridor
+        else [each for each in targets.judge(results) if not each.is_met],
         "n_elsewhere": len(parse_seeds(design.elsewhere_seeds)),
         "cards": {
             name: each.card["training"]

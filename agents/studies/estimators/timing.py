@@ -41,7 +41,7 @@ def measure(
     envs = {}
     for estimator in design.quick_estimators:
         cell = design.cell(world, estimator)
-        keywords = {**cell.keywords, "action": "scores", "threads": 1, "records": records}
+        keywords = {**design.keywords(cell), "action": "scores", "threads": 1, "records": records}
         keywords["traffic_seeds"] = list(design.traffic_seeds[:32])
         env = envs[estimator] = make_vector(cell.place.env, n_episodes, keywords)
         env.reset(seed=0)

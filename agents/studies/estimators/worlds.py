@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -25,6 +27,10 @@ class World:
     env: str
     keywords: dict[str, Any] = field(default_factory=dict, hash=False)
     tampering: str = ""
+
+    def on(self, road: Mapping[str, Any]) -> World:
+        """Return this world with the keywords of a road in place of its own."""
+        return dataclasses.replace(self, keywords={**self.keywords, **road})
 
 
 MAIN = {

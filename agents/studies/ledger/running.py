@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,12 +23,14 @@ class LedgerTask:
     """A cell on traffic seeds, with everything that a worker needs.
 
     Attributes:
+        keywords: Keywords of ``gym.make`` that make it.
         records: Folder of the record cache; None for the user's cache.
         threads: Threads that estimate; None for one per core.
     """
 
     env: str
     cell: LedgerCell
+    keywords: Mapping[str, Any]
     seeds: tuple[int, ...]
     records: str | None
     threads: int | None
@@ -44,7 +46,7 @@ def lacking_tasks(
     seeds = design.traffic_seeds
     threads = 1 if place.engine.is_parallel else None
     return [
-        LedgerTask(design.env, cell, seeds, place.records, threads)
+        LedgerTask(design.env, cell, design.keywords(cell), seeds, place.records, threads)
         for cell in dict.fromkeys(cells)
         if ledger.lacking(cell, seeds)
     ]
@@ -63,7 +65,7 @@ def watch_cell(task: LedgerTask) -> list[TripSums]:
 
 
 def _run(task: LedgerTask) -> tuple[LedgerWatcher, list[EpisodeScore]]:
-    env = make_batch(task.env, task.cell.keywords, task.seeds, task.records, task.threads)
+    env = make_batch(task.env, task.keywords, task.seeds, task.records, task.threads)
     schedule = make_schedule(task.cell.schedule, env, POLICY_SEED)
     watcher = LedgerWatcher(env.process, task.seeds)
     scores = run_episodes(

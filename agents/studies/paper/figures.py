@@ -192,7 +192,7 @@ def watch_pictures(design: PaperDesign, records: str | None) -> Watched:
     names = design.all_estimators
     cells = [design.picture(name, setting) for setting in SETTINGS for name in names]
     for cell in dict.fromkeys(cells):
-        env = make_env(design.env, cell, design.traffic_seeds, records)
+        env = make_env(design.env, design.keywords(cell), design.traffic_seeds, records)
         schedule = make_schedule(design.schedule, env)
         watched[cell] = watch_episode(env, schedule, traffic_seed=seed, seed=seed)
     return watched

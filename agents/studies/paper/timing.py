@@ -89,7 +89,7 @@ def time_all(
     )  # fmt: skip
     for cell, seed in bar:
         if cell not in envs:
-            envs[cell] = make_env(design.env, cell, design.traffic_seeds, records)
+            envs[cell] = make_env(design.env, design.keywords(cell), design.traffic_seeds, records)
             # Kernels load and traffic is read before anything counts.
             step_time(envs[cell], design.schedule, seed)
         ledger.append(cell, [step_time(envs[cell], design.schedule, seed)])

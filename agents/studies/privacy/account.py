@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from agents.evaluation.environments import make_config, without_void_warning
-from agents.studies.privacy.plan import PrivacyCell
+from agents.studies.privacy.plan import PrivacyCell, PrivacyDesign
 from dptse_env.config import EnvConfig
 from dptse_env.parts import privacy_report
 from dptse_env.privacy import contribution_sensitivity, epsilon_of
@@ -70,10 +70,10 @@ def mu_alone(
     return math.hypot(mu_met(config, density_std, contributions), speed)
 
 
-def make_account(env: str, cell: PrivacyCell, contributions: Sequence[int]) -> Account:
+def make_account(design: PrivacyDesign, cell: PrivacyCell, contributions: Sequence[int]) -> Account:
     """Return the guarantee behind a cell's noise, by numbers of steps in which a vehicle is met."""
     with without_void_warning():
-        config = make_config(env, cell.keywords)
+        config = make_config(design.env, design.keywords(cell))
     report, privacy = privacy_report(config), config.privacy
     density_std, second_std = (release.noise_std for release in report.releases)
     # Where contributions are bounded, no vehicle counts more often, and the bound is met exactly.

@@ -69,7 +69,7 @@ def read_results(
     meetings = (min(design.cap, horizon), int(lengths.max()), horizon)
     accounts = {
         protection: [
-            make_account(design.env, cell, meetings)
+            make_account(design, cell, meetings)
             for cell in design.along_epsilon(design.estimators[0], protection)
         ]
         for protection in (*design.guaranteed, *design.printed)

@@ -20,7 +20,13 @@ SHORT = "dptse_env:dptse/ShortHighway-v0"
 SEEDS = (2000, 2001)
 EKF = PaperCell("ekf", "w99-3lane", "paper", 1.0, 0.05, 2)
 WALK = dataclasses.replace(EKF, estimator="random_walk")
-TASKS = [EpisodeTask(SHORT, "paper", cell, SEEDS, None) for cell in (EKF, WALK)]
+
+
+def task_of(cell):
+    return EpisodeTask(SHORT, "paper", cell, cell.keywords, SEEDS, None)
+
+
+TASKS = [task_of(EKF), task_of(WALK)]
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -37,7 +43,7 @@ def test_a_task_is_a_cell_on_its_seeds():
     scores = run_task(TASKS[0])
     assert [score.traffic_seed for score in scores] == list(SEEDS)
     assert scores[0].rmse_density != scores[1].rmse_density
-    env = make_env(SHORT, EKF, SEEDS, None)
+    env = make_env(SHORT, EKF.keywords, SEEDS, None)
     schedule = make_schedule("paper", env)
     assert scores == [run_episode(env, schedule, traffic_seed=k, seed=k) for k in SEEDS]
     assert scores[1] != run_episode(env, schedule, traffic_seed=2001, seed=2000)
@@ -45,7 +51,7 @@ def test_a_task_is_a_cell_on_its_seeds():
 
 
 def test_noise_alone_moves_what_differs_in_noise_alone():
-    other = dataclasses.replace(TASKS[0], cell=dataclasses.replace(EKF, privacy="corrected"))
+    other = task_of(dataclasses.replace(EKF, privacy="corrected"))
     for less, more in zip(run_task(TASKS[0]), run_task(other), strict=True):
         assert less.rmse_density < more.rmse_density
 
@@ -53,7 +59,7 @@ def test_noise_alone_moves_what_differs_in_noise_alone():
 def test_the_open_loop_does_not_depend_on_what_its_canonical_cell_leaves_out():
     first = PaperCell("open_loop", "paper", "paper", 1.0, 0.05, 1)
     second = PaperCell("open_loop", "paper", "corrected", 0.1, 0.01, 3)
-    scores = [run_task(dataclasses.replace(TASKS[0], cell=cell)) for cell in (first, second)]
+    scores = [run_task(task_of(cell)) for cell in (first, second)]
     assert scores[0] == scores[1]
 
 
@@ -84,7 +90,7 @@ def test_any_engine_fills_a_ledger(ledger, tmp_path):
 
 
 def test_a_failure_in_a_worker_is_raised_and_leaves_no_process(ledger):
-    bad = dataclasses.replace(TASKS[0], cell=dataclasses.replace(EKF, bandwidth=99))
+    bad = task_of(dataclasses.replace(EKF, bandwidth=99))
     with pytest.raises(ValueError, match="bandwidth must be in"):
         run_all([bad, *TASKS], ledger, LocalProcesses(2), run_task, progress=False)
     assert multiprocessing.active_children() == []

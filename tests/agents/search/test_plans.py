@@ -164,6 +164,14 @@ def test_a_bandwidth_without_a_choice_is_refused():
         PlanSearch(dataclasses.replace(TASK, bandwidth=6))
 
 
+@pytest.mark.filterwarnings("ignore:.*values measured or tuned on")
+def test_a_plan_is_searched_on_a_road_of_one_s_own():
+    task = dataclasses.replace(TASK, corridor='{"name": "wide", "lanes": 4}')
+    plan = PlanSearch(task).plan()
+    assert plan.context.corridor == "wide"
+    assert plan.provenance["task"]["corridor"] == task.corridor
+
+
 def test_plans_are_of_single_segments():
     class Sums(PlanTask):
         def make(self, n_episodes, seeds):

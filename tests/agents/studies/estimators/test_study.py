@@ -80,6 +80,7 @@ def test_a_complete_folder_is_rendered_without_an_episode_and_without_records(fo
         ),
         ({"worlds": ("tiny", "moon")}, "worlds must be one of .*, got 'moon'"),
         ({"seeds": "0:3"}, "must be test seeds"),
+        ({"schedules": ("paper",)}, "schedules must hold the base schedule 'round-robin'"),
         ({"schedules": ("dice",)}, "schedules must be one of .*, got 'dice'"),
     ],
 )

@@ -72,7 +72,7 @@ def test_the_picture_shows_the_episodes_that_were_scored():
     watched = watch_pictures(design, None)
     cell = design.picture("ekf", SETTINGS[1])
     score, history = watched[cell]
-    env = make_env(design.env, cell, (2000,), None)
+    env = make_env(design.env, cell.keywords, (2000,), None)
     assert score == run_episode(env, make_schedule("paper", env), traffic_seed=2000, seed=2000)
     assert history.queried[-1].sum() == 3
     figure = draw_pictures(design, watched)

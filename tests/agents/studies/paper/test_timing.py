@@ -35,7 +35,7 @@ def test_a_stopwatch_adds_up_the_time_in_the_methods():
 def test_a_step_is_timed_and_the_estimator_left_as_it_was(monkeypatch):
     RecordLibrary().ensure(resolve("short-highway", {}).corridor, (2000,))
     cell = PaperCell("random_walk", "w99-3lane", "paper", 1.0, 0.05, 2)
-    env = make_env(SHORT, cell, (2000,), None)
+    env = make_env(SHORT, cell.keywords, (2000,), None)
     estimator = env.unwrapped.process.estimator
     update = type(estimator).update
 

@@ -92,7 +92,8 @@ def test_the_open_loop_does_not_depend_on_what_its_shared_cell_leaves_out():
         shared = DESIGN.cell("open_loop", boundary_inputs=other.boundary_inputs)
         assert shared in DESIGN.cells()
         scores = [
-            run_task(EpisodeTask(SHORT, "paper", cell, (2000,), None)) for cell in (other, shared)
+            run_task(EpisodeTask(SHORT, "paper", cell, cell.keywords, (2000,), None))
+            for cell in (other, shared)
         ]
         assert scores[0] == scores[1]
 
@@ -143,7 +144,7 @@ def test_a_vehicle_met_as_often_as_the_cap_has_the_guarantee_s_own_share_of_mu()
 
 
 def test_a_guarantee_is_worth_what_it_claims_and_no_vehicle_counts_beyond_the_cap():
-    account = make_account(SHORT, DESIGN.cell("ekf"), (4, 64, 500))
+    account = make_account(DESIGN, DESIGN.cell("ekf"), (4, 64, 500))
     assert account.claimed == account.composed == pytest.approx(5.0)
     assert account.alone[64] == account.alone[500] == pytest.approx(5.0)
     assert account.alone[4] < 2.0
@@ -154,7 +155,7 @@ def test_a_guarantee_is_worth_what_it_claims_and_no_vehicle_counts_beyond_the_ca
 @pytest.mark.parametrize("preset", ["paper", "corrected"])
 def test_the_paper_s_noise_is_worth_less_the_more_often_a_vehicle_is_met(preset):
     cell = DESIGN.cell("ekf", Protection(preset), epsilon=1.0)
-    account = make_account(SHORT, cell, (4, 64, 300))
+    account = make_account(DESIGN, cell, (4, 64, 300))
     report = privacy_report(config_of(cell))
     assert account.composed == report.epsilon
     assert (account.density_std, account.second_std) == tuple(r.noise_std for r in report.releases)
@@ -217,7 +218,7 @@ def made_up(density=lambda cell: 10.0):
             scores[cell, seed] = score(seed, density(cell) + 5.0 * k + 0.01 * k**2, 4.0 + k)
     accounts = {
         protection: [
-            make_account(SHORT, cell, (64, 90, 400))
+            make_account(DESIGN, cell, (64, 90, 400))
             for cell in DESIGN.along_epsilon("ekf", protection)
         ]
         for protection in (*DESIGN.guaranteed, *DESIGN.printed)
