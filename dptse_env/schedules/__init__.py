@@ -27,6 +27,7 @@ from dptse_env.schedules.fixed import (
     Shifting,
     StaleVariance,
 )
+from dptse_env.schedules.front import SpeedFront
 from dptse_env.schedules.oracles import OracleBruteForce, OracleError, OracleGreedy
 from dptse_env.schedules.plans import (
     PLAN_ALIASES,
@@ -72,6 +73,7 @@ __all__ = [
     "Schedule",
     "ScheduleState",
     "Shifting",
+    "SpeedFront",
     "StaleVariance",
     "make_schedule",
 ]
@@ -87,6 +89,7 @@ OBSERVATION_SCHEDULES: dict[str, Any] = {
     "largest-density-variance": partial(LargestVariance, term="density"),
     "stale-variance": StaleVariance,
     "largest-deviation": LargestDeviation,
+    "speed-front": SpeedFront,
     "all": Everything,
 }
 """Schedules that use the observation alone, each made of (interface, seed); a step costs at most a

@@ -51,8 +51,11 @@ def test_a_schedule_begins_anew_with_the_episode(name):
     env = make_batch()
     schedule = make_schedule(name, env)
     first, _ = play(env, schedule, 8)
+    observation, state = begin(env), None
+    for _ in range(3):
+        action, state = schedule.predict(observation, state)
+        observation = env.step(action)[0]
     observation = begin(env)
-    state = (np.full(3, 7), np.zeros((3, env.unwrapped.interface.n_mainline), dtype=bool))
     actions = []
     for step in range(8):
         action, state = schedule.predict(observation, state, np.full(3, step == 0))

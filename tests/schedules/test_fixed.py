@@ -173,3 +173,33 @@ def test_deviations_are_weighed_by_age(name, expected):
     })  # fmt: skip
     action, _ = make_schedule(name, env).predict(observation[0])
     assert np.flatnonzero(action).tolist() == expected
+
+
+def test_fronts_are_queried_where_answers_surprised():
+    """Scores are (age + 1)^1.5 (|v_before - v_after| + 0.02) q (v + 0.3) (2 - x)."""
+    env = Bare(bandwidth=2)
+    speed = np.full(15, 1.0)
+    speed[8:] = 0.4  # a front at 7 and 8, faster and upstream at 7
+    blocks = {"speed": speed, "age": np.full(15, 0.1)}
+
+    def observed(**more):
+        padded = {
+            key: np.pad(value, (0, env.interface.observations.slices[key].stop
+                                - env.interface.observations.slices[key].start - 15))
+            for key, value in {**blocks, **more}.items()
+        }  # fmt: skip
+        return env.observation(1, **padded)[0]
+
+    schedule = make_schedule("speed-front", env)
+    action, state = schedule.predict(observed())
+    assert np.flatnonzero(action).tolist() == [7, 8]
+    flags, surprise = np.zeros(15), np.zeros(15)
+    flags[[2, 8]], surprise[2] = 1.0, 10.0
+    answers = {"queried": flags, "density_innovation": surprise, "speed_innovation": surprise}
+    for _ in range(3):  # surprised by 2, not by 8, of which no more is expected
+        action, state = schedule.predict(observed(**answers), state)
+    np.testing.assert_allclose(state.surprise[0, [2, 7, 8]], [0.512 + 48.8, 1.0, 0.512])
+    assert np.flatnonzero(action).tolist() == [2, 7]
+    action, state = schedule.predict(observed(), state, episode_start=[True])
+    assert (state.surprise == 1.0).all()
+    assert np.flatnonzero(action).tolist() == [7, 8]
