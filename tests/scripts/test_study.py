@@ -155,7 +155,7 @@ def test_a_study_is_made_of_a_road_of_one_s_own(arguments, design, road, tmp_pat
 
 
 def test_worlds_that_are_other_roads_are_refused_on_a_road_of_one_s_own(road):
-    assert set(EstimatorDesign(corridor=road).worlds) == {*MAIN, *GUARANTEES}
+    assert set(EstimatorDesign(corridor=road).run_worlds) == {*MAIN, *GUARANTEES}
     with pytest.raises(ValueError, match=r"worlds must be of printed, .* got 'krauss'"):
         EstimatorDesign(corridor=road, worlds=("krauss",)).check()
 

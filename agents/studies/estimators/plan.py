@@ -40,8 +40,8 @@ class EstimatorDesign(Design[EstimatorCell]):
         weights: Network that counts as the estimator.
         networks: Networks of other training seeds.
         fit_seeds: Training traffic seeds on which linear stacks are fitted.
-        worlds: Names of the worlds that are run; all by default, and with ``corridor`` those that
-            are no roads of their own.
+        worlds: Names of the worlds that are run; none stands for all of them, or with ``corridor``
+            for those that are no roads of their own.
     """
 
     seeds: str = "2000:2064"
@@ -57,16 +57,10 @@ class EstimatorDesign(Design[EstimatorCell]):
     fit_seeds: str = "0:32"
     worlds: tuple[str, ...] = ()
 
-    def __post_init__(self) -> None:
-        """Put the default in place of no worlds."""
-        if not self.worlds:
-            names = WORLDS if self.corridor is None else {**MAIN, **GUARANTEES}
-            object.__setattr__(self, "worlds", tuple(names))
-
     def check(self) -> None:
         """See `Design.check`; unknown worlds and schedules are refused as well."""
         super().check()
-        for world in self.worlds:
+        for world in self.run_worlds:
             require_name("worlds", world, WORLDS)
             if self.corridor is not None and world in ELSEWHERE:
                 raise ValueError(
@@ -81,19 +75,24 @@ class EstimatorDesign(Design[EstimatorCell]):
             )
 
     @property
+    def run_worlds(self) -> tuple[str, ...]:
+        """Names of the worlds that are run."""
+        return self.worlds or tuple(WORLDS if self.corridor is None else {**MAIN, **GUARANTEES})
+
+    @property
     def main(self) -> dict[str, World]:
         """The worlds in which every estimator meets every schedule."""
-        return {name: MAIN[name] for name in MAIN if name in self.worlds}
+        return {name: MAIN[name] for name in MAIN if name in self.run_worlds}
 
     @property
     def guarantees(self) -> dict[str, World]:
         """Worlds of other actions and guarantees under ``paced``."""
-        return {name: GUARANTEES[name] for name in GUARANTEES if name in self.worlds}
+        return {name: GUARANTEES[name] for name in GUARANTEES if name in self.run_worlds}
 
     @property
     def elsewhere(self) -> dict[str, World]:
         """Worlds that differ from `PrivateHighway-v1` in one thing."""
-        return {name: ELSEWHERE[name] for name in ELSEWHERE if name in self.worlds}
+        return {name: ELSEWHERE[name] for name in ELSEWHERE if name in self.run_worlds}
 
     def quick(self) -> EstimatorDesign:
         """Return a design of few cells on few seeds."""
@@ -137,7 +136,7 @@ class EstimatorDesign(Design[EstimatorCell]):
         for world in (*self.main, *self.guarantees):
             for network in self.networks:
                 yield self.cell(world, weights=network)
-        if "capped" in self.worlds:
+        if "capped" in self.run_worlds:
             for network in self.networks:
                 yield self.cell("capped", schedule=OWN, weights=network)
         for world, estimator in itertools.product(self.elsewhere, self.moved_estimators):

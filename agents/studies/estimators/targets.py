@@ -47,7 +47,7 @@ def judge(results: EstimatorResults) -> list[Verdict]:
     found = [
         _judged(results, networks(design, world, schedule), metric, statement, limit)
         for world, schedule, metric, statement, limit in ERRORS
-        if world in design.worlds
+        if world in design.run_worlds
     ]
     worlds = (*design.main, *design.guarantees)
     cells = [cell for world in worlds for cell in networks(design, world)]
@@ -96,4 +96,4 @@ def _judged(
     limit: float,
 ) -> Verdict:
     worst = results.mean(results.worst(cells, metric), metric).mean
-    return Verdict(statement, f"<= {limit:g}", f"{worst:.1f}", worst <= limit)
+    return Verdict(statement, f"<= {limit:g}", f"{worst:.2f}", worst <= limit)
