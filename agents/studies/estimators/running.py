@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from agents.evaluation.episodes import run_episodes
+from agents.evaluation.honesty import EstimateWatcher, EstimatorScore
 from agents.evaluation.policies import find_policy
 from agents.experiments.engine import run_all
 from agents.experiments.ledger import Ledger
@@ -18,7 +19,6 @@ from agents.studies.estimators.cell import EstimatorCell
 from agents.studies.estimators.linear_stack import fit_stack, write_fits
 from agents.studies.estimators.plan import EstimatorDesign
 from agents.studies.estimators.tampering import tamper
-from agents.studies.estimators.watching import EstimateWatcher, EstimatorScore
 from agents.studies.estimators.worlds import WORLDS
 from dptse_env.config import parse_seeds
 from dptse_env.policies import TRANSFERABLE

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from agents.evaluation.figures import save_figure
+from agents.evaluation.honesty import JUMP, LEVELS, SLOW, EstimatorScore
 from agents.experiments.files import write_json
 from agents.experiments.ledger import Ledger
 from agents.experiments.provenance import (
@@ -27,7 +28,6 @@ from agents.studies.estimators.plan import OWN, EstimatorDesign
 from agents.studies.estimators.results import EstimatorResults
 from agents.studies.estimators.running import run_missing, worlds_of
 from agents.studies.estimators.timing import StepTime, measure
-from agents.studies.estimators.watching import JUMP, LEVELS, SLOW, EstimatorScore
 from dptse_env.config import parse_seeds
 
 TEMPLATES = Path(__file__).parent

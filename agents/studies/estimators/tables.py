@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from agents.evaluation.honesty import LEVELS, REGIMES
 from agents.evaluation.statistics import Interval
 from agents.experiments.cells import DENSITY, SPEED, UnmeasuredError
 from agents.experiments.tables import format_interval, markdown
@@ -9,7 +10,6 @@ from agents.studies.estimators.cell import ESTIMATOR_LABELS, LEARNED, EstimatorC
 from agents.studies.estimators.results import ERROR, EstimatorResults
 from agents.studies.estimators.targets import judge, networks
 from agents.studies.estimators.timing import StepTime
-from agents.studies.estimators.watching import LEVELS, REGIMES
 from agents.studies.estimators.worlds import WORLDS
 
 _ERRORS = ("error x 1000", "below EKF [%]", "density [veh/km]", "speed [km/h]", "χ²", "covered [%]")

@@ -6,12 +6,12 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from agents.evaluation.contributions import LedgerScore, LedgerWatcher, TripSums
 from agents.evaluation.episodes import EpisodeScore, run_episodes
 from agents.experiments.ledger import Ledger
 from agents.experiments.runner import Workplace, make_batch
 from agents.studies.ledger.cell import LedgerCell
 from agents.studies.ledger.plan import LedgerDesign
-from agents.studies.ledger.watching import LedgerScore, LedgerWatcher, TripSums
 from dptse_env.schedules import make_schedule
 
 POLICY_SEED = 0

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from agents.evaluation.contributions import LedgerScore, TripSums
 from agents.evaluation.figures import save_figure
 from agents.experiments.cells import METRICS
 from agents.experiments.engine import run_all
@@ -20,7 +21,6 @@ from agents.studies.ledger.figures import draw_epsilon, draw_ladder, draw_ledger
 from agents.studies.ledger.plan import LedgerDesign, Named
 from agents.studies.ledger.results import EXHAUSTED, REFUSED, LedgerResults
 from agents.studies.ledger.running import lacking_tasks, score_cell, watch_cell
-from agents.studies.ledger.watching import LedgerScore, TripSums
 
 TEMPLATES = Path(__file__).parent
 STARING = "largest-variance"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 
+from agents.evaluation.contributions import LENGTHS, QUANTILES
 from agents.evaluation.episodes import EpisodeScore
 from agents.evaluation.statistics import Interval
 from agents.experiments import tables
@@ -13,7 +14,6 @@ from agents.studies.ledger.cell import CAPPED, FILTER_LABELS, FILTERS, MECHANISM
 from agents.studies.ledger.expectations import judge_all
 from agents.studies.ledger.plan import Named
 from agents.studies.ledger.results import EXHAUSTED, REFUSED, LedgerResults
-from agents.studies.ledger.watching import LENGTHS, QUANTILES
 
 REFUSED_HEADER = "refused [%]"
 

@@ -1,9 +1,9 @@
 """A small design, and made-up results of it: errors and payments as a test wants them."""
 
+from agents.evaluation.contributions import LENGTHS, LedgerScore, TripSums
 from agents.studies.ledger.cell import FilterSets
 from agents.studies.ledger.plan import LedgerDesign
 from agents.studies.ledger.results import LedgerResults
-from agents.studies.ledger.watching import LENGTHS, LedgerScore, TripSums
 
 SHORT = "dptse_env:dptse/ShortHighway-v0"
 DEFAULTS = FilterSets(*([""] * 9))

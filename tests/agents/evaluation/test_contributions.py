@@ -2,16 +2,16 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from agents.evaluation.environments import make_config
-from agents.evaluation.episodes import run_episode, run_episodes
-from agents.experiments.runner import make_batch
-from agents.studies.ledger.watching import (
+from agents.evaluation.contributions import (
     LENGTHS,
     NEARLY_SPENT,
     QUANTILES,
     LedgerWatcher,
     vehicle_table,
 )
+from agents.evaluation.environments import make_config
+from agents.evaluation.episodes import run_episode, run_episodes
+from agents.experiments.runner import make_batch
 from dptse_env.parts import make_release
 from dptse_env.schedules import make_schedule
 from dptse_env.traffic import RecordLibrary

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from agents.evaluation.episodes import EpisodeScore
-from agents.studies.estimators.watching import EstimateWatcher, regimes
+from agents.evaluation.honesty import EstimateWatcher, regimes
 from dptse_env.estimators import Estimate
 
 
