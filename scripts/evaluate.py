@@ -2,6 +2,8 @@
 
 python scripts/evaluate.py --schedules paper round-robin --seeds 2000:2020
 python scripts/evaluate.py --policies results/training/primary/pl-0/best.zip
+python scripts/evaluate.py --suite query-suite-v1 --policies round-robin my_package:MySchedule
+python scripts/evaluate.py --suite query-suite-v1 --verify results/suites/query-suite-v1/mine.json
 """
 
 from __future__ import annotations
@@ -23,7 +25,7 @@ from agents.evaluation.figures import (
     estimate_map,
     save_figure,
 )
-from agents.evaluation.policies import PolicySource, SavedPolicy, find_policy, read_saved_policy
+from agents.evaluation.policies import NamedSchedule, PolicySource, find_policy
 from agents.evaluation.report import Report
 from dptse_env.config import EnvConfig, parse_seeds
 from dptse_env.policies import TRANSFERABLE
@@ -31,6 +33,7 @@ from dptse_env.schedules import OBSERVATION_SCHEDULES
 from dptse_env.traffic import is_road_file
 from dptse_env.utils.validation import require
 from scripts.cli import Road, records_argument, run
+from scripts.evaluate_suite import evaluate_suite
 
 ALL = "all"
 """The schedule that runs with a bandwidth that covers the road."""
@@ -43,7 +46,14 @@ class Args(Road):
     schedules: tuple[str, ...] = tuple(OBSERVATION_SCHEDULES)
     """Query schedules and oracles; 'all' runs with a bandwidth that covers the road."""
     policies: tuple[str, ...] = ()
-    """Trained policies: files, or names of those that come with the package."""
+    """Policies: files of saved ones, names of those that come with the package, schedules as
+    "module:Class", and models of stable-baselines3 as "module:Class=file.zip", which are unpickled:
+    load those that you trust."""
+    suite: str | None = None
+    """Score the policies in the cells of a suite, such as query-suite-v1, which say everything but
+    workers, records and output."""
+    verify: Path | None = None
+    """Card of a suite of which a drawn cell is run again, to see whether its errors are right."""
     stochastic: bool = False
     """Let trained policies draw their actions instead of taking the likeliest."""
     transfer: bool = False
@@ -116,7 +126,7 @@ def find_sources(args: Args) -> dict[str, PolicySource]:
             raise ValueError(
                 f"schedules and policies must have different names, {name!r} is there twice"
             )
-        sources[name] = read_saved_policy(source)
+        sources[name] = find_policy(source)
     return sources
 
 
@@ -160,7 +170,7 @@ def draw_traffic(
     """Draw the first traffic with the reference, the best schedule and the best policy."""
     estimator, seed = args.estimators[0], parse_seeds(args.seeds)[0]
     ranked = [name for name in report.ranked(estimator) if name not in (args.reference, ALL)]
-    learned = [name for name in ranked if isinstance(sources[name], SavedPolicy)]
+    learned = [name for name in ranked if not isinstance(sources[name], NamedSchedule)]
     schedules = [name for name in ranked if name not in learned]
     maps: list[RoadMap] = []
     for name in (args.reference, *schedules[:1], *learned[:1]):
@@ -176,8 +186,32 @@ def draw_traffic(
     save_figure(draw_maps([maps], width=8.4), args.output / "space_time.png", title)
 
 
+def suite_options(args: Args) -> tuple[str, Path]:
+    """Return the suite, and the folder of its cards.
+
+    Raises:
+        ValueError: There is an argument that the suite says, or a card to verify and no suite.
+    """
+    if args.suite is None:
+        raise ValueError("verify needs the suite of the card, such as --suite query-suite-v1")
+    own = ("suite", "policies", "verify", "workers", "records", "output")
+    given = [
+        each.name
+        for each in dataclasses.fields(args)
+        if each.name not in own and getattr(args, each.name) != each.default
+    ]
+    if given:
+        raise ValueError(f"{given[0]} is what the cells of a suite say: leave it out")
+    is_default = args.output == Args.output
+    return args.suite, Path("results/suites") / args.suite if is_default else args.output
+
+
 def main(args: Args) -> None:
     """Record what is missing, evaluate, and leave table, scores and figures."""
+    if args.suite is not None or args.verify is not None:
+        suite, folder = suite_options(args)
+        evaluate_suite(suite, args.policies, args.verify, folder, args)
+        return
     sources = find_sources(args)
     require(len(parse_seeds(args.seeds)) >= 2, "seeds", "at least two, for an interval", args.seeds)
     scores = evaluate(args, sources)

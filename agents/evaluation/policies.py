@@ -1,4 +1,4 @@
-"""Query policies by name: schedules, and saved policies with their cards.
+"""Query policies by name: schedules, saved policies with their cards, and saved models.
 
 torch and stable-baselines3 are imported when a saved policy is loaded, so that schedules and cards
 need neither.
@@ -6,10 +6,16 @@ need neither.
 
 from __future__ import annotations
 
+import hashlib
+import importlib
+import inspect
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
+
+from gymnasium import spaces
 
 from agents.evaluation.episodes import Policy
 from dptse_env.policies import read_policy, shipped_policies
@@ -29,8 +35,13 @@ class NamedSchedule:
 
     @property
     def identity(self) -> str:
-        """The name."""
-        return self.source
+        """The name; of a plan the digest of its file, of a class that of its module, too."""
+        if self.source.endswith(".json"):
+            return _digest_of(Path(self.source))
+        if ":" not in self.source:
+            return self.source
+        file = importlib.import_module(self.source.partition(":")[0]).__file__
+        return self.source if file is None else f"{self.source} {_digest_of(Path(file))}"
 
     def load(self, env: Any, *, allow: Collection[str] = (), seed: int | None = None) -> Policy:
         """Bind the schedule to an environment, see `dptse_env.schedules.make_schedule`.
@@ -40,6 +51,10 @@ class NamedSchedule:
         """
         policy: Policy = make_schedule(self.source, env, seed)
         return policy
+
+
+def _digest_of(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 @dataclass(frozen=True)
@@ -94,7 +109,114 @@ class SavedPolicy:
         return policy
 
 
-PolicySource = NamedSchedule | SavedPolicy
+@dataclass(frozen=True)
+class SavedModel:
+    """A model as stable-baselines3 and sb3-contrib save it.
+
+    Loading one unpickles it, which can run any code: load files that you trust.
+
+    Attributes:
+        source: ``"module:Class=file.zip"``, such as ``"stable_baselines3:PPO=ppo.zip"``.
+    """
+
+    source: str
+
+    @property
+    def path(self) -> str:
+        """The file."""
+        return self.source.partition("=")[2]
+
+    @cached_property
+    def model(self) -> Any:
+        """The model.
+
+        Raises:
+            FileNotFoundError: There is no such file.
+            ValueError: There is no such class, or it cannot load the file.
+        """
+        if not Path(self.path).is_file():
+            raise FileNotFoundError(f"there is no saved model {self.path!r}")
+        module, _, name = self.source.partition("=")[0].partition(":")
+        try:
+            return getattr(importlib.import_module(module), name).load(self.path, device="cpu")
+        except Exception as problem:
+            raise ValueError(
+                f"{self.source!r} cannot be loaded: {type(problem).__name__}: {problem}"
+            ) from problem
+
+    @property
+    def keywords(self) -> dict[str, Any]:
+        """Keywords that an environment needs for it: the encoding of its action space.
+
+        Raises:
+            ValueError: It cannot be loaded, or no encoding has such a space.
+        """
+        kind = type(self.model.action_space)
+        if kind not in _ENCODINGS:
+            raise ValueError(
+                f"{self.source!r} has actions of {kind.__name__}, which no encoding has"
+            )
+        return {"action": _ENCODINGS[kind]}
+
+    @property
+    def identity(self) -> str:
+        """Digest of the file."""
+        return _digest_of(Path(self.path))
+
+    def load(self, env: Any, *, allow: Collection[str] = (), seed: int | None = None) -> Policy:
+        """Bind the model to an environment.
+
+        Raises:
+            ValueError: Its spaces are not those of the environment.
+        """
+        del allow, seed  # spaces must be equal, whatever may differ; models hold their own seed
+        bare, model = env.unwrapped, self.model
+        for name in ("observation_space", "action_space"):
+            given, own = getattr(bare, f"single_{name}", getattr(bare, name)), getattr(model, name)
+            if given.shape != own.shape or given.dtype != own.dtype or _size(given) != _size(own):
+                raise ValueError(
+                    f"{self.source!r} has the {name} {own}, the environment has {given}"
+                )
+        return _Masked(model, bare) if self.keywords["action"] == "sequential" else model
+
+
+_ENCODINGS = {
+    spaces.MultiBinary: "mask",
+    spaces.Box: "scores",
+    spaces.MultiDiscrete: "slots",
+    spaces.Discrete: "sequential",
+}
+"""Action encoding by the type of its space."""
+
+
+def _size(space: Any) -> Any:
+    """Return the number of choices of a discrete space."""
+    return getattr(space, "n", None) if not hasattr(space, "nvec") else space.nvec.tolist()
+
+
+class _Masked:
+    """A model that picks one option at a time, among those that may be picked."""
+
+    def __init__(self, model: Any, env: Any) -> None:
+        self._model, self._env = model, env
+        self._takes_masks = "action_masks" in inspect.signature(model.predict).parameters
+
+    def predict(
+        self,
+        observation: Any,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = False,
+    ) -> tuple[Any, Any]:
+        """See `Policy.predict`."""
+        masks = {"action_masks": self._env.action_masks()} if self._takes_masks else {}
+        found: tuple[Any, Any] = self._model.predict(
+            observation, state, episode_start, deterministic, **masks
+        )
+        return found
+
+
+PolicySource = NamedSchedule | SavedPolicy | SavedModel
 """A query policy before it is bound to an environment."""
 
 
@@ -102,14 +224,17 @@ def find_policy(source: str) -> PolicySource:
     """Return the policy that a name or a file stands for.
 
     Args:
-        source: The ``.zip`` file of a saved policy, the name of one that comes with the package, or
-            else a schedule: its name or the ``.json`` file of a plan. Whether a schedule exists and
-            suits an environment is checked when it is loaded.
+        source: The ``.zip`` file of a saved policy, the name of one that comes with the package, a
+            model of stable-baselines3 as ``"module:Class=file.zip"``, or else a schedule: its name,
+            the ``.json`` file of a plan, or ``"module:Class"``. Whether a schedule or a model
+            exists and suits an environment is checked when it is loaded.
 
     Raises:
         FileNotFoundError: There is no such saved policy.
         ValueError: The file is not a saved policy.
     """
+    if ":" in source.partition("=")[0] and "=" in source:
+        return SavedModel(source)
     if source.endswith(".zip") or source in shipped_policies():
         return read_saved_policy(source)
     return NamedSchedule(source)
