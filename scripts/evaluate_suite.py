@@ -32,7 +32,8 @@ def evaluate_suite(
         return
     if not policies:
         raise ValueError(f"policies must be one or more, to be scored in {suite.name}")
-    engine = LocalProcesses(options.workers or os.cpu_count() or 1)
+    workers = os.cpu_count() or 1 if options.workers is None else options.workers
+    engine = LocalProcesses(workers)
     place = Workplace(folder, engine, records_argument(options.records), options.workers)
     cards = run_suite(suite, policies, place)
     _print(suite, cards, {**{each.name: each for each in cards}, **shipped_cards(suite)})

@@ -13,6 +13,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from gymnasium import spaces
@@ -35,12 +36,17 @@ class NamedSchedule:
 
     @property
     def identity(self) -> str:
-        """The name; of a plan the digest of its file, of a class that of its module, too."""
+        """The name; of a plan the digest of its file, of a class that of its module, too.
+
+        Raises:
+            FileNotFoundError: There is no such plan.
+            ValueError: The module cannot be imported.
+        """
         if self.source.endswith(".json"):
             return _digest_of(Path(self.source))
         if ":" not in self.source:
             return self.source
-        file = importlib.import_module(self.source.partition(":")[0]).__file__
+        file = _imported(self.source).__file__
         return self.source if file is None else f"{self.source} {_digest_of(Path(file))}"
 
     def load(self, env: Any, *, allow: Collection[str] = (), seed: int | None = None) -> Policy:
@@ -51,6 +57,16 @@ class NamedSchedule:
         """
         policy: Policy = make_schedule(self.source, env, seed)
         return policy
+
+
+def _imported(source: str) -> ModuleType:
+    """Return the module of ``"module:Name"``; whatever it raises is a `ValueError`."""
+    try:
+        return importlib.import_module(source.partition(":")[0])
+    except Exception as problem:
+        raise ValueError(
+            f"{source!r} cannot be imported: {type(problem).__name__}: {problem}"
+        ) from problem
 
 
 def _digest_of(path: Path) -> str:
@@ -136,9 +152,10 @@ class SavedModel:
         """
         if not Path(self.path).is_file():
             raise FileNotFoundError(f"there is no saved model {self.path!r}")
-        module, _, name = self.source.partition("=")[0].partition(":")
+        name = self.source.partition("=")[0].partition(":")[2]
+        module = _imported(self.source)
         try:
-            return getattr(importlib.import_module(module), name).load(self.path, device="cpu")
+            return getattr(module, name).load(self.path, device="cpu")
         except Exception as problem:
             raise ValueError(
                 f"{self.source!r} cannot be loaded: {type(problem).__name__}: {problem}"

@@ -44,8 +44,8 @@ def run_suite(
 
     Raises:
         FileNotFoundError: There is no such saved policy.
-        ValueError: A file is no saved policy, a card in the folder is of another policy or version,
-            or two policies would have one card.
+        ValueError: A file is no saved policy, a card in the folder is of another policy or suite or
+            was begun with other versions, or two policies would have one card.
     """
     policies = [find_policy(source) for source in sources]
     names = [card_name(source) for source in sources]
@@ -91,7 +91,13 @@ def _started(suite: Suite, name: str, policy: PolicySource, folder: Path) -> Car
             f"{path} is the card of another policy of this name, {found.source!r}: choose another "
             "--output, or remove the card"
         )
-    return dataclasses.replace(found, made_with=made_with)
+    begun = {key: value for key, value in found.made_with.items() if made_with.get(key) != value}
+    if begun and not all(_is_done(found, cell) for cell in suite.cells):
+        raise ValueError(
+            f"{path} was begun with other versions ({', '.join(begun)}): choose another --output, "
+            "or remove the card"
+        )
+    return found
 
 
 def _is_done(card: Card, cell: SuiteCell) -> bool:

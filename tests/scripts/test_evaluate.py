@@ -8,10 +8,13 @@ import pytest
 from PIL import Image
 
 from agents.evaluation.episodes import run_episode
+from agents.suite.card import Card
+from agents.suite.cells import SUITES
 from dptse_env.sb3 import load_policy
 from dptse_env.schedules import make_schedule
 from scripts.evaluate import Args, main, reference_config
 from tests.agents.policies import SHORT, save
+from tests.agents.suite.small import SMALL
 
 
 def test_it_leaves_table_scores_and_figures(tmp_path, capsys):
@@ -152,6 +155,69 @@ def test_policies_that_do_not_fit_or_share_a_name_are_refused(tmp_path):
         main(arguments)
     with pytest.raises(ValueError, match="'run/best' is there twice"):
         main(dataclasses.replace(arguments, policies=(path, path)))
-    with pytest.raises(FileNotFoundError, match="no saved policy 'nobody'"):
+    with pytest.raises(FileNotFoundError, match=r"no saved policy 'nobody\.zip'"):
+        main(dataclasses.replace(arguments, policies=("nobody.zip",)))
+    with pytest.raises(ValueError, match=r"schedule must be one of .*, got 'nobody'"):
         main(dataclasses.replace(arguments, policies=("nobody",)))
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.fixture
+def _small_suite(monkeypatch):
+    """Make the small suite known, without cards that ship."""
+    monkeypatch.setitem(SUITES, "small-v1", SMALL)
+
+
+@pytest.mark.usefixtures("_small_suite")
+def test_policies_are_scored_in_a_suite(tmp_path, capsys):
+    args = Args(
+        suite="small-v1", policies=("paper", "oracle-error", "tests.agents.suite.small:Raising"),
+        workers=1, output=tmp_path / "cards",
+    )  # fmt: skip
+    main(args)
+    printed = capsys.readouterr().out
+    assert "| `oracle-error` | 1.00 |" in printed
+    assert "tests.agents.suite.small-Raising failed in wide: raised KeyError" in printed
+    assert {path.name for path in (tmp_path / "cards").iterdir()} == {
+        "paper.json", "oracle-error.json", "tests.agents.suite.small-Raising.json",
+    }  # fmt: skip
+
+
+@pytest.mark.usefixtures("_small_suite")
+def test_a_card_is_verified(tmp_path, capsys):
+    args = Args(suite="small-v1", policies=("paper",), workers=1, output=tmp_path / "cards")
+    main(args)
+    path = tmp_path / "cards" / "paper.json"
+    main(Args(suite="small-v1", verify=path))
+    assert ": errors agree, mean error x 1000 " in capsys.readouterr().out
+    card = Card.read(path)
+    better = {
+        name: dataclasses.replace(each, error=tuple(0.5 * value for value in each.error))
+        for name, each in card.results.items()
+    }
+    dataclasses.replace(card, results=better).write(path)
+    with pytest.raises(ValueError, match=r"the mean error x 1000 is .* on the card and .* now"):
+        main(Args(suite="small-v1", verify=path))
+    with pytest.raises(ValueError, match="policies must be one, that of the card"):
+        main(Args(suite="small-v1", verify=path, policies=("paper", "static")))
+    with pytest.raises(ValueError, match="'static' is not the policy of the card"):
+        main(Args(suite="small-v1", verify=path, policies=("static",)))
+
+
+@pytest.mark.usefixtures("_small_suite")
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"suite": "v9"}, "suite must be one of query-suite-v1, small-v1, got 'v9'"),
+        ({"seeds": "2000:2004"}, "seeds is what the cells of a suite say: leave it out"),
+        ({"env": SHORT}, "env is what the cells of a suite say"),
+        ({"policies": ()}, "policies must be one or more, to be scored in small-v1"),
+        ({"suite": None, "verify": Path("card.json")}, "verify needs the suite of the card"),
+        ({"workers": 0}, "workers must be"),
+    ],
+)
+def test_bad_arguments_of_a_suite_are_named(changes, message, tmp_path):
+    given = {"suite": "small-v1", "policies": ("paper",), "output": tmp_path / "out", **changes}
+    with pytest.raises(ValueError, match=message):
+        main(Args(**given))
     assert not (tmp_path / "out").exists()

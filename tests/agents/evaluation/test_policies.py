@@ -8,6 +8,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from agents.evaluation.environments import make_vector
+from agents.evaluation.episodes import run_episodes
 from agents.evaluation.policies import find_policy, read_saved_policy
 from dptse_env import sb3
 from dptse_env.policies import TRANSFERABLE
@@ -109,3 +111,53 @@ def test_a_card_is_read_without_torch(tmp_path):
         f"assert find_policy({str(path)!r}).action == 'slots'; assert 'torch' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.fixture(scope="module")
+def models(tmp_path_factory):
+    """Untrained models of stable-baselines3 and sb3-contrib for each action encoding."""
+    sb3, contrib = pytest.importorskip("stable_baselines3"), pytest.importorskip("sb3_contrib")
+    folder, found = tmp_path_factory.mktemp("models"), {}
+    for action in ("mask", "scores", "slots", "sequential"):
+        kind = contrib.MaskablePPO if action == "sequential" else sb3.PPO
+        model = kind("MlpPolicy", gym.make(SHORT, action=action), n_steps=8, batch_size=8, seed=0)
+        model.save(folder / f"{action}.zip")
+        found[action] = f"{kind.__module__.split('.')[0]}:{kind.__name__}={folder}/{action}.zip"
+    return found
+
+
+@pytest.mark.parametrize("action", ["mask", "scores", "slots", "sequential"])
+def test_a_saved_model_acts_in_the_encoding_of_its_action_space(action, models):
+    policy = find_policy(models[action])
+    assert policy.keywords == {"action": action}
+    env = make_vector(SHORT, 2, {"action": action, "horizon": 70})
+    scores = run_episodes(env, policy.load(env), traffic_seeds=(0, 1), seeds=(0, 1))
+    assert all(-1.0 < score.reward < 0.0 for score in scores)
+    assert all(score.n_dropped == 0 for score in scores if action == "sequential")
+    other = make_vector(SHORT, 2, {"action": action, "corridor": "paper-highway"})
+    with pytest.raises(ValueError, match="has the observation_space"):
+        policy.load(other)
+
+
+def test_a_bad_model_is_named(models, tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"there is no saved model 'none\.zip'"):
+        find_policy("stable_baselines3:PPO=none.zip").keywords  # noqa: B018
+    path = tmp_path / "text.zip"
+    path.write_text("no archive")
+    for kind in ("stable_baselines3:PPO", "stable_baselines3:Nobody", "no_such_module:PPO"):
+        with pytest.raises(ValueError, match=r"text\.zip' cannot be (loaded|imported): "):
+            find_policy(f"{kind}={path}").keywords  # noqa: B018
+    one, other = (find_policy(models[name]).identity for name in ("mask", "scores"))
+    assert len(one) == 64
+    assert one != other
+
+
+def test_a_schedule_of_a_module_is_told_apart_by_its_code(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "mine_a.py").write_text("from dptse_env.schedules import OldestFirst as Mine\n")
+    (tmp_path / "mine_b.py").write_text("from dptse_env.schedules import Random as Mine\n")
+    one, other = (find_policy(f"mine_{letter}:Mine").identity for letter in "ab")
+    assert one.split()[0] == "mine_a:Mine"
+    assert one.split()[1] != other.split()[1]
+    with pytest.raises(ValueError, match="'mine_c:Mine' cannot be imported: ModuleNotFoundError"):
+        find_policy("mine_c:Mine").identity  # noqa: B018

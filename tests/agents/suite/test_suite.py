@@ -96,6 +96,17 @@ def test_cards_of_other_policies_are_not_mixed(tmp_path):
         run_suite(SMALL, [str(path)], place, progress=False)
 
 
+def test_cells_of_other_versions_are_not_mixed(tmp_path):
+    place = Workplace(tmp_path, Noting(interrupt_after=1))
+    with pytest.raises(KeyboardInterrupt):
+        run_suite(SMALL, ["paper"], place, progress=False)
+    path = tmp_path / "paper.json"
+    card = Card.read(path)
+    dataclasses.replace(card, made_with={**card.made_with, "numpy": "1.0"}).write(path)
+    with pytest.raises(ValueError, match=r"paper\.json was begun with other versions \(numpy\)"):
+        run_suite(SMALL, ["paper"], Workplace(tmp_path, Noting()), progress=False)
+
+
 def test_a_policy_that_is_not_there_ends_before_anything_runs(tmp_path):
     place = Workplace(tmp_path / "out", Noting())
     with pytest.raises(FileNotFoundError, match=r"none\.zip"):
