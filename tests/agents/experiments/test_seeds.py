@@ -10,7 +10,7 @@ NOISE_SEEDS = {name: value for name, value in vars(seeds).items() if isinstance(
 
 
 def test_no_two_uses_share_a_seed():
-    assert len(NOISE_SEEDS) == 7
+    assert len(NOISE_SEEDS) == 8
     for (first, a), (second, b) in combinations(NOISE_SEEDS.items(), 2):
         assert a.stop <= b.start or b.stop <= a.start, (first, second)
 
