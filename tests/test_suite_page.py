@@ -1,5 +1,6 @@
 """The page of the suite against the cards that ship."""
 
+import random
 from pathlib import Path
 
 import pytest
@@ -26,7 +27,7 @@ def test_the_tables_of_the_page_are_those_of_the_cards():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(SUITES))
-def test_a_drawn_cell_of_each_shipped_card_is_right(name):
+def test_a_drawn_cell_of_three_drawn_cards_is_right(name):
     suite = find_suite(name)
-    for card in shipped_cards(suite).values():
+    for card in random.sample(list(shipped_cards(suite).values()), 3):
         assert verify(card, suite, find_policy(card.source), None).is_same
