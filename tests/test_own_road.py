@@ -10,6 +10,7 @@ import pytest
 
 from dptse_env.estimators import ESTIMATORS, EstimatorSettings
 from dptse_env.estimators.noise import count_variance
+from dptse_env.estimators.tuned_settings import write_settings
 from dptse_env.model import ARZModel, load_parameters
 from dptse_env.release import RELEASE_MODELS
 from dptse_env.schedules import make_schedule
@@ -144,3 +145,28 @@ def test_pictures_show_segments_to_scale(road_file):
     picture = env.render()
     assert picture.ndim == 3
     assert picture.std() > 0.0
+
+
+def test_settings_of_a_road_hold_for_the_estimator_that_they_were_tuned_for(tmp_path):
+    tuned = {"demand": {}, "count_noise": 0.1}
+    write_settings(
+        tmp_path / "ekf.json", estimator="ekf", parameters="w99-3lane", privacy="paced",
+        settings=tuned, provenance={},
+    )  # fmt: skip
+    road = tmp_path / "tuned.toml"
+    table = {"estimator_settings": "ekf.json", "parameters": "w99-3lane", "bandwidth": 2}
+    write_corridor(road, ROAD, table)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        config = gym.make(ID, corridor=str(road)).unwrapped.config
+    assert config.settings().demand is not None
+    with pytest.warns(UserWarning, match="^estimator_settings: values measured or tuned on"):
+        walk = gym.make(ID, corridor=str(road), estimator="random_walk").unwrapped.config
+    assert walk.settings_name == "random_walk-w99-3lane-paced"
+    config = gym.make(ID, corridor=str(road), estimator="open_loop").unwrapped.config
+    assert config.settings().demand is None
+    with pytest.raises(ValueError, match="demand must be None for 'random_walk'"):
+        gym.make(
+            ID, corridor=str(road), estimator="random_walk",
+            estimator_settings=str(tmp_path / "ekf.json"),
+        )  # fmt: skip

@@ -17,7 +17,6 @@ from agents.experiments.cells import Design
 from agents.experiments.files import write_json
 from dptse_env.config import EnvConfig
 from dptse_env.estimators.tuned_settings import available_settings, settings_name
-from dptse_env.model import load_parameters
 
 PROVENANCE_FILE = "run.json"
 
@@ -34,14 +33,14 @@ def design_provenance(design: Design[Any]) -> dict[str, Any]:
 
 def environment_provenance(env: str, schedule: str, configs: Sequence[EnvConfig]) -> dict[str, Any]:
     """Return versions, traffic and models behind results of one environment, as plain JSON."""
-    names = dict.fromkeys(str(config.parameters) for config in configs)
+    parameters = {each.name: each for each in (config.arz_parameters for config in configs)}
     return {
         "versions": {name: version(name) for name in ("dptse-env", "libsumo")},
         "env": env,
         "corridor": configs[0].corridor.digest,
         "schedule": schedule,
         "warm_up": WARM_UP,
-        "parameters": {name: dataclasses.asdict(load_parameters(name)) for name in names},
+        "parameters": {name: dataclasses.asdict(each) for name, each in parameters.items()},
     }
 
 
@@ -67,7 +66,7 @@ def results_provenance(
 
 def _name_of_settings(config: EnvConfig) -> str:
     """Return the name of the shipped set in force, or else of the set that could be there."""
-    name = settings_name(config.estimator, str(config.parameters), config.privacy.preset)
+    name = settings_name(config.estimator, config.arz_parameters.name, config.privacy.preset)
     return config.settings_name or name
 
 

@@ -15,7 +15,6 @@ from agents.evaluation.episodes import WARM_UP
 from agents.experiments.seeds import SUITE
 from dptse_env.config import EnvConfig, parse_seeds
 from dptse_env.estimators.learned.weights import member_for, read_network
-from dptse_env.model import load_parameters
 
 PAPER, PRIVATE = "dptse_env:dptse/PaperHighway-v0", "dptse_env:dptse/PrivateHighway-v0"
 PACED, SHORT = "dptse_env:dptse/PrivateHighway-v1", "dptse_env:dptse/ShortHighway-v0"
@@ -74,7 +73,7 @@ class SuiteCell:
             "privacy": dataclasses.asdict(config.privacy),
             "settings": dataclasses.asdict(config.settings()),
             "networks": _network_digests(config),
-            "parameters": dataclasses.asdict(load_parameters(str(config.parameters))),
+            "parameters": dataclasses.asdict(config.arz_parameters),
             "warm_up": WARM_UP,
         }
         plain = json.dumps(content, sort_keys=True, default=str)

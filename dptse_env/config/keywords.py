@@ -8,8 +8,8 @@ from dataclasses import replace
 from typing import Any
 
 from dptse_env.config.env_config import MOST_SEEDS, PRESETS, TRAINING_SEEDS, EnvConfig
-from dptse_env.estimators import settings_type
-from dptse_env.estimators.tuned_settings import read_settings
+from dptse_env.estimators import ESTIMATORS, settings_type
+from dptse_env.estimators.tuned_settings import read_settings, tuned_estimator
 from dptse_env.model.parameters import read_parameters
 from dptse_env.release import RELEASE_MODELS, PrivacySettings
 from dptse_env.traffic import (
@@ -46,8 +46,9 @@ def resolve(preset: str, overrides: Mapping[str, Any]) -> EnvConfig:
         overrides: Fields of `EnvConfig`. A mapping replaces the named fields of a nested
             dataclass and keeps the others. Names stand for known values: a corridor, a release
             model. A corridor that ends in ``.toml`` is a road file, whose table ``environment``
-            gives keywords that are not among ``overrides``; ``parameters`` and
-            ``estimator_settings`` may be JSON files. Shortcuts: ``epsilon`` and ``delta``
+            gives keywords that are not among ``overrides``, but for settings in a file that were
+            tuned for another estimator; ``parameters`` and ``estimator_settings`` may be JSON
+            files. Shortcuts: ``epsilon`` and ``delta``
             of ``privacy``, ``incident`` of ``corridor`` (``"preset"``, ``"none"``, ``"random"`` or
             a mapping) and ``demand`` of ``corridor`` (the same without ``"none"``); random means
             drawn anew for every traffic seed. ``traffic_seeds`` may be a string ``"first:stop"``;
@@ -67,11 +68,13 @@ def resolve(preset: str, overrides: Mapping[str, Any]) -> EnvConfig:
     require_name("preset", preset, PRESETS)
     road = _road_file(overrides)
     base, values = PRESETS[preset], {**road.environment, **overrides} if road else dict(overrides)
-    overrides = dict(values)
     _check_keywords(values)
+    _read_files(values)
+    if road and _is_tuned_for_another(road, overrides, values.get("estimator", base.estimator)):
+        del values["estimator_settings"]
+    overrides = dict(values)
     if road:
         values["corridor"] = road.corridor
-    _read_files(values)
     corridor = _corridor(base.corridor, values)
     values["privacy"] = _privacy(base.privacy, values)
     _read_seeds(values, corridor)
@@ -131,6 +134,14 @@ def _read_files(values: dict[str, Any]) -> None:
                 values[key] = read(value)
             except OSError as problem:
                 raise ValueError(f"{key}: {value} cannot be read: {problem.strerror}") from problem
+
+
+def _is_tuned_for_another(road: RoadFile, overrides: Mapping[str, Any], estimator: Any) -> bool:
+    """Return whether settings come from a road's table and were tuned for another estimator."""
+    settings = road.environment.get("estimator_settings")
+    if "estimator_settings" in overrides or not str(settings).endswith(".json"):
+        return False
+    return tuned_estimator(str(settings)) != ESTIMATORS.name_of(estimator)
 
 
 def parse_seeds(text: str, path: str = "seeds") -> tuple[int, ...]:

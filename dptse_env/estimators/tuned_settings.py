@@ -81,6 +81,15 @@ def read_settings(path: str | Path) -> EstimatorSettings:
     return _parse(Path(path).read_text(encoding="utf-8"), str(path))
 
 
+def tuned_estimator(path: str | Path) -> str:
+    """Return the estimator that the set in a JSON file was tuned for.
+
+    Raises:
+        ValueError: The file has another format.
+    """
+    return str(parse_object(Path(path).read_text(encoding="utf-8"), str(path), _KEYS)["estimator"])
+
+
 def write_settings(
     path: str | Path,
     *,

@@ -14,6 +14,9 @@ from agents.studies.paper.plan import PaperDesign
 from agents.studies.policies.plan import PolicyCell
 from agents.studies.policies.running import cell_config
 from agents.studies.privacy.plan import PrivacyDesign
+from dptse_env.estimators.tuned_settings import write_settings
+from dptse_env.model import load_parameters
+from dptse_env.model.parameters import write_parameters
 from dptse_env.traffic import SHORT_HIGHWAY, read_corridor, write_corridor
 from scripts.cli import command, run
 from scripts.study import (
@@ -124,9 +127,16 @@ def test_bad_arguments_of_the_study_of_privacy_are_named(changes, message, tmp_p
 
 @pytest.fixture
 def road(tmp_path):
-    """The file of a short road with a lane more than the shipped one."""
+    """The file of a short road with a lane more than the shipped one, with a fit and settings."""
     path = tmp_path / "my-road.toml"
-    write_corridor(path, replace(SHORT_HIGHWAY, name="my-road", lanes=3))
+    fit = replace(load_parameters("w99-3lane"), name="my-road")
+    write_parameters(tmp_path / "fit.json", fit, {})
+    write_settings(
+        tmp_path / "ekf.json", estimator="ekf", parameters="my-road", privacy="paced",
+        settings={"demand": {}}, provenance={},
+    )  # fmt: skip
+    table = {"parameters": "fit.json", "estimator_settings": "ekf.json"}
+    write_corridor(path, replace(SHORT_HIGHWAY, name="my-road", lanes=3), table)
     return str(path)
 
 
