@@ -6,7 +6,6 @@ need neither.
 
 from __future__ import annotations
 
-import hashlib
 import importlib
 import inspect
 from collections.abc import Collection, Mapping
@@ -21,6 +20,7 @@ from gymnasium import spaces
 from agents.evaluation.episodes import Policy
 from dptse_env.policies import read_policy, shipped_policies
 from dptse_env.schedules import make_schedule
+from dptse_env.utils.digests import file_digest
 
 
 @dataclass(frozen=True)
@@ -43,11 +43,11 @@ class NamedSchedule:
             ValueError: The module cannot be imported.
         """
         if self.source.endswith(".json"):
-            return _digest_of(Path(self.source))
+            return file_digest(self.source)
         if ":" not in self.source:
             return self.source
         file = _imported(self.source).__file__
-        return self.source if file is None else f"{self.source} {_digest_of(Path(file))}"
+        return self.source if file is None else f"{self.source} {file_digest(file)}"
 
     def load(self, env: Any, *, allow: Collection[str] = (), seed: int | None = None) -> Policy:
         """Bind the schedule to an environment, see `dptse_env.schedules.make_schedule`.
@@ -67,10 +67,6 @@ def _imported(source: str) -> ModuleType:
         raise ValueError(
             f"{source!r} cannot be imported: {type(problem).__name__}: {problem}"
         ) from problem
-
-
-def _digest_of(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 @dataclass(frozen=True)
@@ -178,7 +174,7 @@ class SavedModel:
     @property
     def identity(self) -> str:
         """Digest of the file."""
-        return _digest_of(Path(self.path))
+        return file_digest(self.path)
 
     def load(self, env: Any, *, allow: Collection[str] = (), seed: int | None = None) -> Policy:
         """Bind the model to an environment.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import json
 import math
 import typing
@@ -14,13 +13,14 @@ from typing import Any
 
 from agents.experiments.files import write_json
 from agents.suite.cells import Suite
+from dptse_env.utils.digests import json_digest
 
 DONE, FAILED = "done", "failed"
 
 
 @dataclass(frozen=True)
 class CellResult:
-    """What a policy did in a cell; a failed one has a reason and no numbers.
+    """Result of a policy in a cell; a failed one has a reason and no numbers.
 
     Attributes:
         cell: Name of the cell.
@@ -128,8 +128,7 @@ class Card:
     @property
     def digest(self) -> str:
         """Digest of the content."""
-        text = json.dumps(self.content, sort_keys=True)
-        return hashlib.sha256(text.encode()).hexdigest()[:16]
+        return json_digest(self.content)[:16]
 
     def write(self, path: Path) -> None:
         """Write the card in one piece."""

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -15,6 +13,8 @@ from agents.evaluation.episodes import WARM_UP
 from agents.experiments.seeds import SUITE
 from dptse_env.config import EnvConfig, parse_seeds
 from dptse_env.estimators.learned.weights import member_for, read_network
+from dptse_env.utils.digests import json_digest
+from dptse_env.utils.validation import require_name
 
 PAPER, PRIVATE = "dptse_env:dptse/PaperHighway-v0", "dptse_env:dptse/PrivateHighway-v0"
 PACED, SHORT = "dptse_env:dptse/PrivateHighway-v1", "dptse_env:dptse/ShortHighway-v0"
@@ -76,8 +76,7 @@ class SuiteCell:
             "parameters": dataclasses.asdict(config.arz_parameters),
             "warm_up": WARM_UP,
         }
-        plain = json.dumps(content, sort_keys=True, default=str)
-        return hashlib.sha256(plain.encode()).hexdigest()[:16]
+        return json_digest(content)[:16]
 
 
 def _network_digests(config: EnvConfig) -> list[str]:
@@ -101,11 +100,9 @@ class Suite:
         Raises:
             ValueError: There is none.
         """
-        for cell in self.cells:
-            if cell.name == name:
-                return cell
-        known = ", ".join(cell.name for cell in self.cells)
-        raise ValueError(f"cell must be one of {known}, got {name!r}")
+        cells = {cell.name: cell for cell in self.cells}
+        require_name("cell", name, cells)
+        return cells[name]
 
 
 ROAD_SEEDS, LONG_SEEDS = "2500:2548", "2500:2516"
@@ -187,6 +184,5 @@ def find_suite(name: str) -> Suite:
     Raises:
         ValueError: There is none.
     """
-    if name not in SUITES:
-        raise ValueError(f"suite must be one of {', '.join(SUITES)}, got {name!r}")
+    require_name("suite", name, SUITES)
     return SUITES[name]

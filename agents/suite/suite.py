@@ -17,9 +17,6 @@ from agents.suite.card import DONE, Card, CellResult
 from agents.suite.cells import Suite, SuiteCell
 from agents.suite.running import SuiteTask, run_cell
 
-LONG_FIRST = ("long",)
-"""Beginnings of the names of cells that take longest, which are run first."""
-
 
 def card_name(source: str) -> str:
     """Return the name of a policy in tables, and of its card's file without the suffix.
@@ -62,14 +59,13 @@ def run_suite(
         for cell in suite.cells
         if not _is_done(cards[name], cell)
     ]
-    tasks.sort(key=lambda task: not task.cell.name.startswith(LONG_FIRST))
+    tasks.sort(key=lambda task: _size(task.cell), reverse=True)  # no worker ends with a long one
     _record(tasks, place)
     place.folder.mkdir(parents=True, exist_ok=True)
-    name_of = dict(zip((policy.source for policy in policies), names, strict=True))
     bar = tqdm(total=len(tasks), desc=suite.name, unit="cell", disable=not progress)
     with bar, contextlib.closing(place.engine.run(run_cell, tasks)) as finished:
         for task, result in finished:
-            name = name_of[task.policy.source]
+            name = card_name(task.policy.source)
             cards[name] = _with(cards[name], result, suite)
             cards[name].write(place.folder / f"{name}.json")
             bar.update()
@@ -98,6 +94,12 @@ def _started(suite: Suite, name: str, policy: PolicySource, folder: Path) -> Car
             "or remove the card"
         )
     return found
+
+
+def _size(cell: SuiteCell) -> int:
+    """Return the segments that a policy estimates in a cell, all seconds and episodes together."""
+    config = cell.config
+    return config.corridor.n_mainline * config.horizon_steps * len(cell.traffic_seeds)
 
 
 def _is_done(card: Card, cell: SuiteCell) -> bool:

@@ -17,7 +17,7 @@ TOLERANCE = 1e-6
 
 
 class Verification(NamedTuple):
-    """What a re-run of a cell found.
+    """Result of running a cell of a card again.
 
     Attributes:
         cell: The cell that was drawn.

@@ -5,7 +5,6 @@ exchanged is an error. `dptse_env.traffic.importers` writes the folder.
 """
 
 import functools
-import hashlib
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ from typing import Any, Literal
 
 from dptse_env.traffic.field_record import AnyRecord, load_record
 from dptse_env.traffic.stored_arrays import MANIFEST, InvalidRecordError
+from dptse_env.utils.digests import json_digest
 from dptse_env.utils.fields import checked_fields
 from dptse_env.utils.json_object import parse_object
 from dptse_env.utils.validation import integer
@@ -182,4 +182,4 @@ def _manifest(recordings: Recordings) -> dict[str, Any]:
 
 def _digest(manifest: Mapping[str, Any]) -> str:
     content = {key: manifest[key] for key in ("format", "version", "kind", "road", "records")}
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+    return json_digest(content)

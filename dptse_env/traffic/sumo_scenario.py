@@ -1,7 +1,5 @@
 """SUMO files of one's own: what a road is recorded from in place of a generated network."""
 
-import hashlib
-import os
 import re
 from bisect import bisect_right
 from collections.abc import Iterator
@@ -11,6 +9,7 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Annotated
 
+from dptse_env.utils.digests import file_digest
 from dptse_env.utils.fields import Interval, checked_fields
 from dptse_env.utils.validation import require
 
@@ -150,7 +149,7 @@ class SumoScenario:
         for name, expected in zip(self.files, self.sha256, strict=True):
             path = self.path(name)
             try:
-                found = sha256(path)
+                found = file_digest(path)
             except OSError as error:
                 raise ChangedFilesError(f"{path}: cannot be read: {error.strerror}") from error
             if found != expected:
@@ -158,12 +157,6 @@ class SumoScenario:
                     f"{path}: is not the file that the road was made from (its SHA-256 is {found}, "
                     f"not {expected}); import the road again"
                 )
-
-
-def sha256(path: str | os.PathLike[str]) -> str:
-    """Return the SHA-256 (hex) of a file's content."""
-    with Path(path).open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 class Places:

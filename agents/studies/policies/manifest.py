@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from agents.experiments.files import write_json
 from agents.studies.policies.plan import MODES, Entry, Learner, PolicyCell, PolicyDesign
 from dptse_env.config import EnvConfig
 from dptse_env.estimators.tuned_settings import read_settings
+from dptse_env.utils.digests import json_digest
 
 MANIFEST_FILE = "manifest.json"
 
@@ -149,8 +149,7 @@ class Manifest:
     @property
     def digest(self) -> str:
         """Digest of the manifest."""
-        plain = json.dumps(dataclasses.asdict(self), sort_keys=True)
-        return hashlib.sha256(plain.encode()).hexdigest()[:12]
+        return json_digest(dataclasses.asdict(self))[:12]
 
     def checkpoint(self, entry: Entry) -> Checkpoint:
         """Return the policy behind an entry of kind ``learned``.

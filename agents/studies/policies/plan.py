@@ -13,6 +13,7 @@ from dptse_env.config import TEST_SEEDS, VALIDATION_SEEDS
 from dptse_env.schedules import COVARIANCE_SCHEDULES, OBSERVATION_SCHEDULES, ORACLES, PLANS
 from dptse_env.traffic import CORRIDORS
 from dptse_env.traffic.incident import Incident
+from dptse_env.utils.validation import require_name
 
 PRIVATE = "dptse_env:dptse/PrivateHighway-v0"
 PAPER = "dptse_env:dptse/PaperHighway-v0"
@@ -124,11 +125,9 @@ class PolicyDesign:
         Raises:
             ValueError: There is none.
         """
-        for cell in self.cells:
-            if cell.name == name:
-                return cell
-        known = ", ".join(cell.name for cell in self.cells)
-        raise ValueError(f"cell must be one of {known}, got {name!r}")
+        cells = {cell.name: cell for cell in self.cells}
+        require_name("cell", name, cells)
+        return cells[name]
 
     def quick(self) -> PolicyDesign:
         """Return a design of the primary cell alone, on few seeds."""

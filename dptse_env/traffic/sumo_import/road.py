@@ -18,8 +18,9 @@ from dptse_env.traffic.sumo_import.configuration import Files
 from dptse_env.traffic.sumo_import.counts import counted_demand, counted_shares
 from dptse_env.traffic.sumo_import.layout import Layout, lay_out
 from dptse_env.traffic.sumo_import.net import Net
-from dptse_env.traffic.sumo_scenario import SumoScenario, sha256
+from dptse_env.traffic.sumo_scenario import SumoScenario
 from dptse_env.traffic.worker import simulate_in_child
+from dptse_env.utils.digests import file_digest
 from dptse_env.utils.validation import require
 
 
@@ -142,7 +143,7 @@ def _draft(
         net=names[0],
         routes=names[1 : 1 + n_routes],
         additional=names[1 + n_routes :],
-        sha256=tuple(sha256(path) for path in paths),
+        sha256=tuple(file_digest(path) for path in paths),
         columns=layout.columns,
         folder=str(folder),
         begin=begin,
