@@ -77,13 +77,13 @@ def raise_scores(
     """Raise the scores of ``policy`` in place by ``step`` times the expected gain of a query.
 
     Gains are in units of the policy's mean one-second error, so that settings carry over to other
-    environments. The price of contributions is subtracted from each: vehicles that have reached
-    their cap are missing from the releases for the rest of an episode, long after the seconds in
-    which a gain is measured.
+    environments. The price of the budgets that vehicles spend is subtracted from each: a vehicle
+    without budget is missing from the releases for the rest of an episode, long after the seconds
+    in which a gain is measured.
     """
     unit = swaps.error.mean()
     gains = np.clip(swaps.gain / unit, -LARGEST_GAIN, LARGEST_GAIN)
-    gains -= settings.price * swaps.contributions
+    gains -= settings.price * swaps.spent
     seen = torch.from_numpy(swaps.observations)
     targets = torch.from_numpy(gains.astype(np.float32))
     state, added, dropped = map(torch.from_numpy, (swaps.state, swaps.added, swaps.dropped))

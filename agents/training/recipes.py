@@ -10,7 +10,7 @@ from typing import Annotated, ClassVar
 import tyro
 
 from dptse_env.config import EnvConfig
-from dptse_env.release import RELEASE_MODELS, GaussianRelease
+from dptse_env.release import RELEASE_MODELS
 from dptse_env.sb3.policy import RULE
 from dptse_env.utils.validation import inside, integer, non_negative, positive, require
 
@@ -77,8 +77,8 @@ class SwapRounds:
     """Rise of a score, in the first round, for an expected gain of one mean one-second error."""
     final_step: float = 5.0
     """The same in the last round; it falls linearly, so that errors of the rounds average out."""
-    price: float = 0.002
-    """Penalty per contribution, in units of the mean one-second error."""
+    price: float = 0.128
+    """Penalty for the whole budget of a vehicle, in units of the mean one-second error."""
     batches: int = 600
     """Minibatches of a round's fit."""
     batch_size: int = 1024
@@ -193,9 +193,9 @@ class PlackettLuceRecipe(Recipe):
         require(no_steps, "steps", f"0 for {self.learner}, which is trained in rounds", steps)
 
     def check_environment(self, config: EnvConfig) -> None:
-        """See `Recipe.check_environment`; swaps choose the noise of a release, a Gaussian one."""
+        """See `Recipe.check_environment`; swaps choose the noise of a release."""
         preset = config.privacy.preset
-        if self.swaps.rounds and not issubclass(RELEASE_MODELS.find(preset), GaussianRelease):
+        if self.swaps.rounds and not RELEASE_MODELS.find(preset).takes_noise:
             raise ValueError(
                 f"recipe.swaps.rounds must be 0 under {RELEASE_MODELS.name_of(preset)!r}, whose "
                 f"noise swaps cannot choose, got {self.swaps.rounds}; recipe:maskable trains under "

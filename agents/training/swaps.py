@@ -21,7 +21,6 @@ import numpy as np
 
 from agents.evaluation.episodes import WARM_UP, Policy
 from dptse_env.process import QueryProcess
-from dptse_env.release import Capped, Mechanism, require_gaussian
 from dptse_env.utils.arrays import Action, AnyArray, FloatArray, IntArray, Observation
 from dptse_env.vector_env import SensorQueryVectorEnv
 
@@ -37,8 +36,8 @@ class Swaps:
         added: Option that was queried, shape (k,).
         dropped: Option that was queried without the swap, shape (k,).
         gain: Decrease of the summed error over these seconds due to the swap, shape (k,).
-        contributions: Increase of the number of vehicles' contributions in them, shape (k,); zero
-            where contributions are not bounded.
+        spent: Increase of the budgets that vehicles spend in them, shape (k,); zero where they
+            have none.
     """
 
     observations: Observation
@@ -47,7 +46,7 @@ class Swaps:
     added: IntArray
     dropped: IntArray
     gain: FloatArray
-    contributions: FloatArray
+    spent: FloatArray
 
     @classmethod
     def from_parts(cls, parts: Sequence[Swaps]) -> Swaps:
@@ -61,35 +60,8 @@ class Swaps:
             joined("observations"),
             joined("error"),
             np.concatenate([n + part.state for n, part in zip(first, parts, strict=True)]),
-            *(joined(name) for name in ("added", "dropped", "gain", "contributions")),
+            *(joined(name) for name in ("added", "dropped", "gain", "spent")),
         )
-
-
-class AntitheticNoise:
-    """A mechanism whose next release has given noise; later ones have that of another mechanism."""
-
-    def __init__(self, mechanism: Mechanism, noise: FloatArray) -> None:
-        """Take over from ``mechanism``; ``noise`` has the shape of a release."""
-        self._mechanism, self._noise = mechanism, noise
-        self._is_first = True
-
-    @property
-    def sigma(self) -> FloatArray:
-        """See `Mechanism`."""
-        return self._mechanism.sigma
-
-    def reset(self, episodes: IntArray, generators: Sequence[np.random.Generator]) -> None:
-        """See `Mechanism`; new episodes have the noise of the other mechanism only."""
-        self._is_first = False
-        self._mechanism.reset(episodes, generators)
-
-    def release(self, episodes: IntArray, values: FloatArray) -> FloatArray:
-        """See `Mechanism`."""
-        released = self._mechanism.release(episodes, values)  # advances its streams in any case
-        if not self._is_first:
-            return released
-        self._is_first = False
-        return values + self._noise
 
 
 def try_swaps(
@@ -157,8 +129,8 @@ def _tried(
     """Try swaps in the first of ``actions``, in every episode of ``before``."""
     n, every = len(shown), np.arange(len(shown))
     columns = before.release.setup.n_columns
-    noise = generator.choice([-1.0, 1.0], size=(n, columns, 2)) * before.release.sigma
-    reward, contributions = _replayed(before, actions, noise)
+    noise = generator.choice([-1.0, 1.0], size=(n, columns, 2))
+    reward, spent = _replayed(before, actions, noise)
     queried = np.zeros((n, before.interface.queries.n_options), dtype=bool)
     np.put_along_axis(queried, actions[0], True, axis=1)
     parts = []
@@ -167,9 +139,9 @@ def _tried(
         place = generator.integers(actions[0].shape[1], size=n)
         query = actions[0].copy()
         query[every, place] = added
-        swapped_reward, swapped_contributions = _replayed(before, [query, *actions[1:]], noise)
+        swapped_reward, swapped_spent = _replayed(before, [query, *actions[1:]], noise)
         dropped = actions[0][every, place]
-        gain, increase = swapped_reward - reward, swapped_contributions - contributions
+        gain, increase = swapped_reward - reward, swapped_spent - spent
         parts.append((every, added, dropped, gain, increase))
     state, *columns_of_swaps = (np.concatenate(column) for column in zip(*parts, strict=True))
     return Swaps(shown, -reward / len(actions), state, *columns_of_swaps)
@@ -178,18 +150,16 @@ def _tried(
 def _replayed(
     before: QueryProcess, actions: Sequence[Action], noise: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the summed reward of each episode and its vehicles' number of contributions by then.
+    """Return the summed reward of each episode and the budgets that its vehicles have spent then.
 
     Both are means over the noise and its opposite, shape (n,).
     """
     every = np.arange(before.n_episodes)
-    reward, contributions = np.zeros((2, before.n_episodes))
+    reward, spent = np.zeros((2, before.n_episodes))
     for sign in (1.0, -1.0):
         fork = before.fork()
-        release = require_gaussian(fork.release, "a trial of swaps")
-        release.mechanism = AntitheticNoise(release.mechanism, sign * noise)
+        fork.release.give_noise(sign * noise)
         for action in actions:
             reward += 0.5 * fork.step(every, action).reward
-        if isinstance(release, Capped):
-            contributions += 0.5 * release.contributions.exposures.sum(axis=1)
-    return reward, contributions
+        spent += 0.5 * fork.release.budgets_spent(every)
+    return reward, spent

@@ -196,6 +196,8 @@ class ReleaseModel(ABC):
     """True where the model reads the vehicles of a record, which measured fields have not."""
     has_prices: ClassVar[bool] = False
     """True where queries have prices, which `public_state` gives."""
+    takes_noise: ClassVar[bool] = False
+    """True where `give_noise` works, which trainings by swaps need."""
 
     @classmethod
     def flow_centre(cls, corridor: Corridor, settings: Any) -> float | None:
@@ -279,6 +281,24 @@ class ReleaseModel(ABC):
         None where queries have no prices.
         """
         return None
+
+    def give_noise(self, noise: FloatArray) -> None:
+        """Set the noise of the next release of all episodes, as what-if trials in forks need it.
+
+        Args:
+            noise: In standard deviations, shape (n_episodes, n_columns, 2).
+
+        Raises:
+            ValueError: Noise of this model cannot be set, or ``noise`` has another shape.
+        """
+        raise ValueError(f"noise of the release model {self.setup.name!r} cannot be set")
+
+    def budgets_spent(self, episodes: IntArray) -> FloatArray:
+        """Return the budgets that vehicles have spent so far, parts of them added up, shape (k,).
+
+        Private; zeros where vehicles have no budget for their trip.
+        """
+        return np.zeros(len(episodes))
 
     def private_info(self, episodes: IntArray, traffic: IntArray) -> Rows:
         """Return private data for ``info["truth"]`` alone, rows of k episodes; by default none."""

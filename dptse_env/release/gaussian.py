@@ -20,10 +20,12 @@ from dptse_env.privacy import (
 from dptse_env.release.base import Released, ReleaseModel, ReleaseRequest, ReleaseSetup
 from dptse_env.release.contributions import Contributions
 from dptse_env.release.mechanism import GaussianMechanism, Mechanism
+from dptse_env.release.noise import NoiseStreams
 from dptse_env.release.report import STRICT_DELTA, PrivacyReport, QuantityReport, in_order
 from dptse_env.release.settings import CappedSettings, PrivacySettings
 from dptse_env.traffic import AnyRecord, Corridor, with_vehicles
 from dptse_env.utils.arrays import AnyArray, FloatArray, IntArray
+from dptse_env.utils.registry import name_of_class
 from dptse_env.utils.vector_info import Rows, object_array
 
 
@@ -37,6 +39,8 @@ class GaussianRelease(ReleaseModel):
     Attributes:
         sensitivity: L2 sensitivities of both released quantities over an episode.
     """
+
+    takes_noise: ClassVar[bool] = True
 
     def __init__(self, setup: ReleaseSetup) -> None:
         """Compute sensitivity and noise; nothing is loaded."""
@@ -59,6 +63,12 @@ class GaussianRelease(ReleaseModel):
         mu = self.sensitivity.joint_mu(mechanism.sigma.tolist())
         contributions = self.sensitivity.contributions
         self._account = ReleaseAccount(mu, self.setup.settings.delta, contributions)
+
+    def give_noise(self, noise: FloatArray) -> None:
+        """See `ReleaseModel.give_noise`."""
+        if not isinstance(self.mechanism, NoiseStreams):
+            raise ValueError(f"noise of {name_of_class(type(self.mechanism))} cannot be set")
+        self.mechanism.give(noise)
 
     @abstractmethod
     def _sensitivity(self) -> Sensitivity:
@@ -280,6 +290,11 @@ class Capped(GaussianRelease):
             empty, limits = counts == 0.0, setup.traffic.limits[: setup.n_columns]
             values[..., 1] = np.where(empty, limits, speeds / np.where(empty, 1.0, counts))
         return values
+
+    def budgets_spent(self, episodes: IntArray) -> FloatArray:
+        """See `ReleaseModel.budgets_spent`: contributions over their cap."""
+        spent: FloatArray = self.contributions.exposures[episodes].sum(axis=1, dtype=np.float64)
+        return spent / self.contributions.cap if self.contributions.cap else np.zeros_like(spent)
 
     def private_info(self, episodes: IntArray, traffic: IntArray) -> Rows:
         """Return each vehicle's contributions and the epsilon that it has spent.

@@ -56,6 +56,7 @@ class NoiseStreams:
         self._next = np.full(n_episodes, block)
         # Steps for which every block certainly has noise: saves a look at `_next` at each step.
         self._sure = 0
+        self._given: FloatArray | None = None
 
     @property
     def n_episodes(self) -> int:
@@ -68,7 +69,7 @@ class NoiseStreams:
         Raises:
             ValueError: There is not exactly one stream for each episode.
         """
-        rows = episodes.tolist()
+        rows, self._given = episodes.tolist(), None
         if len(generators) != len(rows):
             raise ValueError(
                 f"generators must be one for each of {len(rows)} episodes, got {len(generators)}"
@@ -77,6 +78,20 @@ class NoiseStreams:
             self._generators[row] = generator
             self._draw(row, generator)
         self._sure = self._block - int(self._next.max())
+
+    def give(self, noise: FloatArray) -> None:
+        """Set the next step's noise of all episodes, shape (n, C, 2) in standard deviations.
+
+        The noise drawn for that step is skipped. It serves what-if trials in forks, which have no
+        guarantee.
+
+        Raises:
+            ValueError: ``noise`` has another shape.
+        """
+        shape = (self.n_episodes, *self._noise.shape[2:])
+        if noise.shape != shape:
+            raise ValueError(f"noise must have shape {shape}, got {noise.shape}")
+        self._given = noise * self._scale
 
     def next(self, episodes: IntArray) -> FloatArray:
         """Return the noise of the next step of some episodes, shape (k, C, 2), a fresh array.
@@ -91,6 +106,8 @@ class NoiseStreams:
         step += 1
         self._next[episodes] = step
         self._sure -= 1
+        if self._given is not None:
+            noise, self._given = self._given[episodes], None
         return noise
 
     def _refill(self, episodes: IntArray) -> None:

@@ -60,6 +60,7 @@ class Paced(ReleaseModel):
     needs_vehicles: ClassVar[bool] = True
     releases_sums: ClassVar[bool] = True
     has_prices: ClassVar[bool] = True
+    takes_noise: ClassVar[bool] = True
 
     @classmethod
     def flow_centre(cls, corridor: Corridor, settings: PacedSettings) -> float | None:
@@ -263,6 +264,17 @@ class Paced(ReleaseModel):
     def public_info(self, episodes: IntArray) -> Rows:
         """Return whether centres fell back to nominal speeds, since no prediction was finite."""
         return {"centre_fallback": self._fallback[episodes].copy()}
+
+    def give_noise(self, noise: FloatArray) -> None:
+        """See `ReleaseModel.give_noise`."""
+        self.noise.give(noise)
+
+    def budgets_spent(self, episodes: IntArray) -> FloatArray:
+        """See `ReleaseModel.budgets_spent`: payments over the budget."""
+        if self._settings.unit == "event":
+            return np.zeros(len(episodes))
+        paid: FloatArray = self.ledgers.paid[episodes].sum(axis=1)
+        return paid / self.budget
 
     def private_info(self, episodes: IntArray, traffic: IntArray) -> Rows:
         """Return what each vehicle has paid, the epsilon that it has spent, and refusals.

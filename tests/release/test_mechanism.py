@@ -331,3 +331,27 @@ def test_a_bad_sigma_is_refused(sigma):
 def test_a_bad_size_is_named(size):
     with pytest.raises(ValueError, match=rf"^{size} must be an integer >= 1, got 0$"):
         make(**{size: 0})
+
+
+# --- noise that is given ---------------------------------------------------------------------
+
+
+def test_given_noise_is_that_of_the_next_release_alone():
+    plain, given = started(1, 2), started(1, 2)
+    deviations = np.random.default_rng(3).choice([-1.0, 1.0], size=(2, S, 2))
+    given.give(deviations)
+    plain_noise, given_noise = noise(plain, 3), noise(given, 3)
+    np.testing.assert_array_equal(given_noise[0], on_grid(deviations * SIGMA))
+    np.testing.assert_array_equal(given_noise[1:], plain_noise[1:])
+
+
+def test_given_noise_does_not_outlast_a_reset():
+    given = started(1)
+    given.give(np.ones((1, S, 2)))
+    given.reset(np.array([0]), streams(1))
+    np.testing.assert_array_equal(noise(given, 2), noise(started(1), 2))
+
+
+def test_given_noise_must_have_the_shape_of_a_release():
+    with pytest.raises(ValueError, match=r"^noise must have shape \(1, 19, 2\), got \(19, 2\)"):
+        started(1).give(np.ones((S, 2)))

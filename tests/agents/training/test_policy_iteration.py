@@ -31,7 +31,7 @@ def policy():
     )
 
 
-def planted(policy, gain, contributions=None, n_states=300, trials=20):
+def planted(policy, gain, spent=None, n_states=300, trials=20):
     """Swaps whose gain is that of their segments, ``gain(channels)`` of shape (m, N), and noise."""
     generator = np.random.default_rng(0)
     size = policy.observation_space.shape[0]
@@ -49,7 +49,7 @@ def planted(policy, gain, contributions=None, n_states=300, trials=20):
     noise = generator.normal(0.0, 0.02, len(state))
     error = np.full(n_states, 0.1)
     gains = 0.1 * (difference(gain) + noise)
-    return Swaps(seen, error, state, added, dropped, gains, difference(contributions))
+    return Swaps(seen, error, state, added, dropped, gains, difference(spent))
 
 
 def moved(policy, swaps, settings=SETTINGS):
@@ -81,15 +81,13 @@ def test_scores_move_by_a_step_of_the_expected_gain(policy):
     assert (change - expected).std() < 0.2 * expected.std()
 
 
-def test_contributions_have_their_price(policy):
-    def contributions(channels):
+def test_budgets_have_their_price(policy):
+    def spent(channels):
         return 8.0 * (channels[:, 0] > 0.0)
 
-    swaps = planted(policy, None, contributions)
+    swaps = planted(policy, None, spent)
     change = moved(policy, swaps) / STEP
-    expected = -0.01 * centred(
-        contributions(policy.features(torch.from_numpy(swaps.observations)).numpy())
-    )
+    expected = -0.01 * centred(spent(policy.features(torch.from_numpy(swaps.observations)).numpy()))
     assert np.corrcoef(change.ravel(), expected.ravel())[0, 1] > 0.9
 
 

@@ -4,13 +4,13 @@ import pytest
 
 pytest.importorskip("sb3_contrib")
 
-from agents.training.swaps import AntitheticNoise, Swaps, try_swaps
-from dptse_env.release import GaussianMechanism
+from agents.training.swaps import Swaps, try_swaps
 from tests.release.sums import SumRelease
 
 SHORT = "dptse_env:dptse/ShortHighway-v0"
 SEEDS = [5, 6, 7]
 COUNTED = {"preset": "capped", "cap": 20, "boundary_inputs": "private"}
+PRIVACIES = [COUNTED, {"preset": "paced", "boundary_inputs": "private"}]
 SECONDS, TRIALS, HORIZON = 6, 2, 40
 
 
@@ -40,20 +40,25 @@ def tried(env, policy, seed=0):
     return list(try_swaps(env, policy, SEEDS, generator, seconds=SECONDS, trials=TRIALS))
 
 
+@pytest.fixture(scope="module", params=PRIVACIES, ids=lambda privacy: privacy["preset"])
+def privacy(request):
+    return request.param
+
+
 @pytest.fixture(scope="module")
-def pass_of_swaps():
+def pass_of_swaps(privacy):
     policy = Wandering()
-    return policy, tried(make(), policy)
+    return policy, tried(make(privacy=privacy), policy)
 
 
-def test_swaps_are_tried_all_along_and_the_episodes_go_on_as_without(pass_of_swaps):
+def test_swaps_are_tried_all_along_and_the_episodes_go_on_as_without(pass_of_swaps, privacy):
     policy, parts = pass_of_swaps
     first = next(k for k, seen in enumerate(policy.seen) if (seen == parts[0].observations).all())
     assert HORIZON // 4 <= first < HORIZON // 4 + SECONDS
     assert len(parts) == (HORIZON - first) // SECONDS
     for k, part in enumerate(parts):
         np.testing.assert_array_equal(part.observations, policy.seen[first + k * SECONDS])
-    env = make()
+    env = make(privacy=privacy)
     observation, _ = env.reset(seed=SEEDS)
     for seen, action in zip(policy.seen, policy.queried, strict=True):
         np.testing.assert_array_equal(seen, observation)
@@ -73,35 +78,32 @@ def test_a_swap_replaces_a_queried_segment_by_one_that_was_not(pass_of_swaps):
     assert set(joined.added) == set(joined.dropped) == set(range(6))
 
 
-def noises(env):
+def signs(env):
     """Signs as the first state's, drawn like the swaps: they come after the choice of seconds."""
     generator = np.random.default_rng(0)
     generator.integers(SECONDS)
-    release = env.process.release
-    signs = generator.choice([-1.0, 1.0], size=(3, release.setup.n_columns, 2))
-    return signs * release.sigma
+    return generator.choice([-1.0, 1.0], size=(3, env.process.release.setup.n_columns, 2))
 
 
-def test_gains_are_those_of_episodes_run_apart(pass_of_swaps):
+def test_gains_are_those_of_episodes_run_apart(pass_of_swaps, privacy):
     policy, parts = pass_of_swaps
     part = parts[0]
     first = next(k for k, seen in enumerate(policy.seen) if (seen == part.observations).all())
 
     def run(swapped, sign):
-        """Return rewards and exposures of an episode from its reset on; no forks."""
-        env = make()
+        """Return rewards and spent budgets of an episode from its reset on; no forks."""
+        env = make(privacy=privacy)
         env.reset(seed=SEEDS)
         for action in policy.queried[:first]:
             env.step(action)
-        release = env.process.release
-        release.mechanism = AntitheticNoise(release.mechanism, sign * noises(env))
+        env.process.release.give_noise(sign * signs(env))
         query = policy.queried[first].copy()
         for episode, added, dropped in swapped:
             query[episode][query[episode] == dropped] = added
         total = np.zeros(3)
         for action in [query, *policy.queried[first + 1 : first + SECONDS]]:
             total += env.step(action)[1]
-        return np.array([total, release.contributions.exposures.sum(axis=1)])
+        return np.array([total, env.process.release.budgets_spent(np.arange(3))])
 
     def mean(swapped):
         return (run(swapped, 1.0) + run(swapped, -1.0)) / 2.0
@@ -113,14 +115,14 @@ def test_gains_are_those_of_episodes_run_apart(pass_of_swaps):
         swapped = zip(part.state[rows], part.added[rows], part.dropped[rows], strict=True)
         expected = mean(list(swapped)) - plain
         np.testing.assert_allclose(part.gain[rows], expected[0], atol=1e-12)
-        np.testing.assert_array_equal(part.contributions[rows], expected[1])
+        np.testing.assert_allclose(part.spent[rows], expected[1], atol=1e-12)
     assert np.abs(part.gain).min() > 1e-6
-    assert np.abs(part.contributions).max() > 0
+    assert np.abs(part.spent).max() > 0
 
 
-def test_other_draws_try_other_swaps(pass_of_swaps):
-    again = Swaps.from_parts(tried(make(), Wandering()))
-    other = Swaps.from_parts(tried(make(), Wandering(), seed=1))
+def test_other_draws_try_other_swaps(pass_of_swaps, privacy):
+    again = Swaps.from_parts(tried(make(privacy=privacy), Wandering()))
+    other = Swaps.from_parts(tried(make(privacy=privacy), Wandering(), seed=1))
     joined = Swaps.from_parts(pass_of_swaps[1])
     np.testing.assert_array_equal(joined.gain, again.gain)
     assert not np.array_equal(joined.added[:50], other.added[:50])
@@ -134,29 +136,10 @@ def test_states_of_later_parts_are_counted_on():
     np.testing.assert_array_equal(joined.gain, np.tile(part.gain, 2))
 
 
-def test_without_a_cap_nothing_is_counted():
+def test_without_budgets_nothing_is_spent():
     joined = Swaps.from_parts(tried(make(privacy="paper"), Wandering()))
-    assert not joined.contributions.any()
+    assert not joined.spent.any()
     assert joined.gain.any()
-
-
-def test_only_the_next_release_has_the_noise_that_is_given():
-    def mechanism():
-        made = GaussianMechanism((2.0, 3.0), n_episodes=1, n_segments=4)
-        made.reset(np.array([0]), [np.random.default_rng(1)])
-        return made
-
-    episodes, values, noise = np.array([0]), np.ones((1, 4, 2)), np.full((1, 4, 2), 0.25)
-    plain, given = mechanism(), AntitheticNoise(mechanism(), noise)
-    np.testing.assert_array_equal(given.sigma, plain.sigma)
-    plain.release(episodes, values)
-    np.testing.assert_array_equal(given.release(episodes, values), values + noise)
-    np.testing.assert_array_equal(given.release(episodes, values), plain.release(episodes, values))
-    given = AntitheticNoise(mechanism(), noise)
-    given.reset(episodes, [np.random.default_rng(1)])
-    np.testing.assert_array_equal(
-        given.release(episodes, values), mechanism().release(episodes, values)
-    )
 
 
 @pytest.mark.parametrize(
@@ -178,3 +161,8 @@ def test_swaps_need_queries_of_equal_cost():
         ValueError, match=r"^swaps need queries that cost the same, got query_spans"
     ):
         tried(make(privacy=SumRelease, query_spans=(1, 2)), Wandering())
+
+
+def test_swaps_need_a_release_model_whose_noise_can_be_set():
+    with pytest.raises(ValueError, match=r"^noise of the release model '.*SumRelease' cannot be"):
+        tried(make(privacy=SumRelease), Wandering())

@@ -228,9 +228,9 @@ def test_plans_that_are_refused(changes, message):
         make_plan(**changes)
 
 
-def test_swaps_under_a_release_without_gaussian_noise_are_refused_at_once(tmp_path):
-    plan = make_plan(keywords={"horizon": 80, "privacy": "paced"})
-    message = r"^recipe.swaps.rounds must be 0 under 'paced', .*, got 2; recipe:maskable"
+def test_swaps_under_a_release_whose_noise_cannot_be_set_are_refused_at_once(tmp_path):
+    plan = make_plan(keywords={"horizon": 80, "privacy": "tests.release.sums:SumRelease"})
+    message = r"^recipe.swaps.rounds must be 0 under '.*SumRelease', .*, got 2; recipe:maskable"
     with pytest.raises(ValueError, match=message):
         Training(plan, tmp_path / "x")
     assert not (tmp_path / "x").exists()
