@@ -50,6 +50,10 @@ class Args(Road):
     """Traffic seeds to train on, first:stop; training seeds only."""
     validation: str = "1000:1024"
     """Traffic seeds to validate on, first:stop; validation seeds only."""
+    also: tuple[str, ...] = ()
+    """Further environments to train one network in, on the same traffic seeds, each an id or an id,
+    a space and keywords as JSON: 'dptse_env:dptse/LongHighway-v0 {"bandwidth": 4}'. For
+    plackett-luce."""
     validate_every: int = 25
     """Updates of PPO between two validations."""
     checkpoint_every: int = 10
@@ -78,6 +82,7 @@ def make_plan(args: Args) -> TrainingPlan:
         traffic_seeds=parse_seeds(args.traffic, "traffic"),
         validation_seeds=parse_seeds(args.validation, "validation"),
         keywords=args.given_keywords(),
+        also=args.also,
         validate_every=args.validate_every,
         checkpoint_every=args.checkpoint_every,
     )
@@ -101,7 +106,8 @@ def main(args: Args) -> None:
     """Record missing traffic, train, and leave the policy."""
     plan = make_plan(args)
     torch.set_num_threads(integer("threads", args.threads, 1))
-    args.library(plan.config.corridor, (*plan.traffic_seeds, *plan.validation_seeds))
+    for world in plan.worlds:
+        args.library(world.config.corridor, (*plan.traffic_seeds, *plan.validation_seeds))
     bar = Bar(
         "steps",
         ("error", "validation"),

@@ -15,11 +15,12 @@ from pathlib import Path
 
 import torch
 
-from agents.evaluation.environments import make_config
+from agents.evaluation.environments import make_config, parse_env
 from agents.filters.plan import FilterPlan, Round
-from agents.filters.scenarios import ScenarioRanges, parse_env
+from agents.filters.scenarios import ScenarioRanges
 from agents.filters.training import FilterTraining
 from dptse_env.config import parse_seeds
+from dptse_env.estimators.learned.weights import read_network
 from dptse_env.utils.validation import integer
 from scripts.cli import Recording, records_argument, resumable, run
 from scripts.training_bar import Bar, watched
@@ -37,8 +38,11 @@ class Args(Recording):
     """Traffic seeds to validate on, first:stop; validation seeds only."""
     validation_envs: tuple[str, ...] = FilterPlan.validation_envs
     """Environments to validate in, with a round robin."""
-    width: int = FilterPlan.width
-    """Width of the hidden state of a cell."""
+    width: int | None = None
+    """Width of the hidden state of a cell; that of the initial network, or 64, if not given."""
+    initial: str | None = None
+    """Network to begin with in place of random weights: the name of one that ships, such as
+    highway-flows, or a file. Rounds may then begin with 'own'."""
     episodes: int | None = None
     """Episodes of a scenario, each on another traffic seed, and of a batch; 32, or as many as there
     are traffic seeds to train on, if not given."""
@@ -81,7 +85,10 @@ def make_plan(args: Args) -> FilterPlan:
     Raises:
         ValueError: An argument is out of range.
     """
-    traffic = parse_seeds(args.traffic, "traffic")
+    traffic, width = parse_seeds(args.traffic, "traffic"), args.width
+    if width is None:
+        network = read_network(args.initial).network if args.initial else None
+        width = FilterPlan.width if network is None else network.hidden.shape[0]
     return FilterPlan(
         seed=args.seed,
         traffic_seeds=traffic,
@@ -89,7 +96,8 @@ def make_plan(args: Args) -> FilterPlan:
         validation_envs=args.validation_envs,
         ranges=args.ranges,
         rounds=tuple(parse_round(each) for each in args.rounds),
-        width=args.width,
+        width=width,
+        initial=args.initial,
         episodes=min(FilterPlan.episodes, len(traffic)) if args.episodes is None else args.episodes,
         learning_rate=args.learning_rate,
         likelihood=args.likelihood,

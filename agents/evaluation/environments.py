@@ -43,6 +43,16 @@ def parse_keywords(text: str) -> dict[str, Any]:
     return keywords
 
 
+def parse_env(text: str) -> tuple[str, dict[str, Any]]:
+    """Return the id and the keywords of an environment given as ``id`` or ``id {JSON}``.
+
+    Raises:
+        ValueError: What follows the id is no JSON object.
+    """
+    env, _, rest = text.partition(" ")
+    return env, parse_keywords(rest) if rest.strip() else {}
+
+
 def given_keywords(keywords: str, corridor: str | None) -> dict[str, Any]:
     """Return the keywords of an environment that a command line gives.
 

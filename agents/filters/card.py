@@ -5,10 +5,9 @@ from __future__ import annotations
 from importlib.metadata import version
 from typing import Any
 
-from agents.evaluation.environments import make_config
+from agents.evaluation.environments import make_config, parse_env
 from agents.experiments.provenance import source_digest
 from agents.filters.plan import FilterPlan
-from agents.filters.scenarios import parse_env
 from dptse_env.config import EnvConfig
 from dptse_env.estimators.learned.channels import CHANNELS
 from dptse_env.estimators.learned.weights import FORMAT

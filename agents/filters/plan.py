@@ -16,7 +16,8 @@ from agents.experiments.provenance import machine, source_digest
 from agents.experiments.seeds import TUNING
 from agents.filters.scenarios import Scenario, ScenarioRanges
 from dptse_env.config import TRAINING_SEEDS, VALIDATION_SEEDS
-from dptse_env.utils.validation import inside, integer, positive
+from dptse_env.estimators.learned.weights import read_network
+from dptse_env.utils.validation import inside, integer, positive, require
 
 
 @dataclass(frozen=True)
@@ -64,6 +65,8 @@ class FilterPlan:
         prediction: Weight of the loss of predictions.
         clip_norm: Largest norm of a gradient.
         checkpoint_every: Passes between checkpoints.
+        initial: Network whose weights the training begins with, a name or a file; None for weights
+            drawn at random.
 
     Raises:
         ValueError: A value is out of range.
@@ -91,6 +94,7 @@ class FilterPlan:
     prediction: float = 0.3
     clip_norm: float = 1.0
     checkpoint_every: int = 20
+    initial: str | None = None
 
     def __post_init__(self) -> None:
         """Check values."""
@@ -105,10 +109,15 @@ class FilterPlan:
         inside("prediction", self.prediction, 0.0, 10.0)
         positive("clip_norm", self.clip_norm)
         integer("checkpoint_every", self.checkpoint_every, 1)
-        if not self.rounds or self.rounds[0].estimator == OWN:
+        if not self.rounds or (self.initial is None and self.rounds[0].estimator == OWN):
             raise ValueError(
-                "rounds must begin with one of another estimator, since the network knows nothing "
-                "yet"
+                "rounds must begin with one of another estimator where no initial network is "
+                "given, since the network knows nothing yet"
+            )
+        if self.initial is not None:
+            width = read_network(self.initial).network.hidden.shape[0]
+            require(
+                self.width == width, "width", f"that of the initial network, {width}", self.width
             )
 
     @property
@@ -142,6 +151,8 @@ class FilterPlan:
     def settings(self) -> dict[str, Any]:
         """Return the plan as plain JSON."""
         plain: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(self)))
+        if self.initial is not None:
+            plain["initial_sha256"] = read_network(self.initial).sha256
         return plain
 
     def provenance(self) -> dict[str, Any]:

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from agents.evaluation.environments import make_config, parse_keywords
+from agents.evaluation.environments import make_config, parse_env
 from agents.filters.roads import ROADS
+from dptse_env.utils.validation import require
 
 MECHANISMS = ("capped", "paced", "paper", "corrected")
 """Release models that scenarios draw from."""
@@ -39,16 +40,6 @@ class Scenario:
     noise_seed: int
 
 
-def parse_env(text: str) -> tuple[str, dict[str, Any]]:
-    """Return the id and the keywords of an environment given as ``id`` or ``id {JSON}``.
-
-    Raises:
-        ValueError: What follows the id is no JSON object.
-    """
-    env, _, rest = text.partition(" ")
-    return env, parse_keywords(rest) if rest.strip() else {}
-
-
 @dataclass(frozen=True)
 class ScenarioRanges:
     """Ranges that scenarios are drawn from.
@@ -63,6 +54,10 @@ class ScenarioRanges:
         clips: Range of the clip of ``paced`` [km/h].
         paces: Range of the pace of ``paced``.
         spans: Spans of queries under ``paced``.
+        largest_share: Largest bandwidth as a share of the segments.
+
+    Raises:
+        ValueError: The share is not in (0, 1].
     """
 
     envs: tuple[str, ...] = ROADS
@@ -74,14 +69,21 @@ class ScenarioRanges:
     clips: tuple[float, float] = (18.0, 51.0)
     paces: tuple[float, float] = (0.7, 0.95)
     spans: tuple[tuple[int, ...], ...] = ((1,), (2,), (1, 2))
+    largest_share: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Check values."""
+        within = 0.0 < self.largest_share <= 1.0
+        require(within, "ranges.largest_share", "in (0, 1]", self.largest_share)
 
     def draw(self, rng: np.random.Generator, traffic: Sequence[int], n_episodes: int) -> Scenario:
         """Draw a scenario on `n_episodes` of the traffic seeds.
 
-        The bandwidth is drawn from 1 to all segments.
+        The bandwidth is drawn from 1 to all segments, or to a share of them.
         """
         env, keywords = parse_env(str(rng.choice(self.envs)))
-        most = make_config(env, keywords).corridor.n_mainline
+        n_mainline = make_config(env, keywords).corridor.n_mainline
+        most = max(int(self.largest_share * n_mainline), 1)
         mechanism = str(rng.choice(self.mechanisms))
         low, high = np.log(self.epsilon)
         privacy: dict[str, Any] = {
@@ -99,7 +101,7 @@ class ScenarioRanges:
             spans = self.spans[int(rng.integers(len(self.spans)))]
             if spans != (1,):
                 keywords |= {"query_spans": list(spans), "bandwidth_unit": "sums"}
-                keywords["bandwidth"] = int(rng.integers(1, 2 * most // 3))
+                keywords["bandwidth"] = int(rng.integers(1, max(2 * most // 3, 2)))
         seeds = rng.choice(np.asarray(traffic), size=n_episodes, replace=False)
         return Scenario(
             env=env,

@@ -111,6 +111,12 @@ class RecurrentNetwork(nn.Module):
         ]  # fmt: skip
         return torch.stack(parts, -1)
 
+    def take(self, weights: Network) -> None:
+        """Take weights of the same width."""
+        with torch.no_grad():
+            for name, parameter in self.named_parameters():
+                parameter.copy_(torch.from_numpy(getattr(weights, name).copy()))
+
     def weights(self) -> Network:
         """Return the weights as arrays."""
         arrays: dict[str, Any] = {

@@ -25,7 +25,7 @@ from agents.training.run_files import (
     write_checkpoint,
     write_progress,
 )
-from dptse_env.estimators.learned.weights import write_network
+from dptse_env.estimators.learned.weights import read_network, write_network
 
 WEIGHTS, PLAYED = "network.npz", "played.npz"
 """The trained network, and the network that the scenarios of a round are collected with."""
@@ -79,6 +79,8 @@ class FilterTraining:
         take_folder(folder, plan.provenance())
         torch.manual_seed(plan.seed)
         self.network = RecurrentNetwork(plan.width)
+        if plan.initial is not None:
+            self.network.take(read_network(plan.initial).network)
         self._step = torch.compile(self.network) if compiled else self.network
         self._optimiser = torch.optim.Adam(self.network.parameters(), plan.learning_rate)
         self.done, self._seconds = 0, 0.0

@@ -152,15 +152,23 @@ class TrainingEpisodes(VecEnvWrapper):
 
 
 def make_episodes(
-    env: str, keywords: Mapping[str, Any], recipe: Recipe, seed: int, *, reward_scale: float = 1.0
+    env: str,
+    keywords: Mapping[str, Any],
+    recipe: Recipe,
+    seed: int,
+    *,
+    n_envs: int | None = None,
+    reward_scale: float = 1.0,
 ) -> TrainingEpisodes:
     """Make the episodes that a recipe trains on with a training seed.
+
+    ``n_envs`` is their number, that of the recipe if not given.
 
     Raises:
         ValueError: A keyword is unknown or out of range.
     """
     chosen = {"autoreset_mode": "SameStep", "action": recipe.action}
-    made = gym.make_vec(env, num_envs=recipe.n_envs, **{**keywords, **chosen})
+    made = gym.make_vec(env, num_envs=n_envs or recipe.n_envs, **{**keywords, **chosen})
     return TrainingEpisodes(
         SB3VecEnv(made), training_seed(seed), replicas=recipe.replicas, reward_scale=reward_scale
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol, TypeAlias
 
 from stable_baselines3.common.policies import BasePolicy
@@ -19,6 +19,10 @@ class Learner(Protocol):
     @property
     def policy(self) -> BasePolicy:
         """The policy, changed in place by the training."""
+
+    @property
+    def policies(self) -> Sequence[BasePolicy]:
+        """The policy of each environment of the plan; they have their weights in common."""
 
     @property
     def update(self) -> int:

@@ -16,7 +16,8 @@ from agents.training.learner import Record
 from agents.training.plan import TrainingPlan
 from agents.training.policy_iteration import collect_swaps, raise_scores
 from agents.training.recipes import PlackettLuceRecipe
-from agents.training.regression import regress
+from agents.training.regression import Practice, regress
+from agents.training.worlds import World
 from dptse_env.parts import make_interface
 from dptse_env.sb3 import PlackettLucePolicy, RoadChannels
 
@@ -31,19 +32,14 @@ class PlackettLuceLearner:
         keywords: Mapping[str, Any],
         progress: Callable[[str, float], None],
     ) -> None:
-        """Make an untrained policy; ``keywords`` are those of the environments."""
+        """Make an untrained policy; ``keywords`` are further ones of all environments."""
         self._plan, self._recipe, self._keywords = plan, recipe, keywords
         self._progress = progress
         self._rounds, self._is_begun = 0, False
-        interface = make_interface(plan.config)
         torch.manual_seed(plan.seed)
-        self.policy = PlackettLucePolicy(
-            interface.observations.space,
-            interface.actions.space,
-            road=RoadChannels.from_config(plan.config),
-            width=recipe.width,
-            rule=recipe.rule,
-        )
+        self.policy = _untrained(plan.worlds[0], recipe)
+        others = [_sharing(self.policy, world) for world in plan.worlds[1:]]
+        self.policies = (self.policy, *others)
         # Draws of the training must not depend on how many weights were drawn before them.
         torch.manual_seed(training_seed(plan.seed))
 
@@ -72,23 +68,62 @@ class PlackettLuceLearner:
 
     def _regress(self) -> None:
         """Do the rounds of regression, in episodes whose memory is freed afterwards."""
-        plan, recipe = self._plan, self._recipe
-        if recipe.regression.rounds:
-            episodes = make_episodes(plan.env, self._keywords, recipe, plan.seed)
-            progress = partial(self._progress, "regression")
-            regress(self.policy, episodes, recipe.regression, progress)
+        recipe, seed = self._recipe, self._plan.seed
+        if not recipe.regression.rounds:
+            return
+        practice = []
+        for world, policy in zip(self._plan.worlds, self.policies, strict=True):
+            keywords = {**world.keywords, **self._keywords}
+            n_envs = world.part(recipe.n_envs, recipe.replicas)
+            episodes = make_episodes(world.env, keywords, recipe, seed, n_envs=n_envs)
+            batch_size = world.part(recipe.regression.batch_size)
+            practice.append(Practice(policy, episodes, batch_size))
+        regress(practice, recipe.regression, partial(self._progress, "regression"))
 
     def _swap(self, record: Record) -> None:
         """Do the rounds of swaps that are left, in episodes whose memory is freed afterwards."""
         plan, settings = self._plan, self._recipe.swaps
-        keywords = {**self._keywords, "action": self._recipe.action}
-        env = make_vector(plan.env, settings.episodes, keywords)
+        environments = [
+            make_vector(
+                world.env,
+                world.part(settings.episodes),
+                {**world.keywords, **self._keywords, "action": self._recipe.action},
+            )
+            for world in plan.worlds
+        ]
         while self._rounds < settings.rounds:
             start = time.perf_counter()
-            swaps = collect_swaps(
-                self.policy, env, settings, self._rounds, plan.seed, self._progress
-            )
+            tried = [
+                collect_swaps(policy, env, settings, self._rounds, plan.seed, self._progress)
+                for policy, env in zip(self.policies, environments, strict=True)
+            ]
             step, progress = settings.step_of(self._rounds), partial(self._progress, "fit")
-            raise_scores(self.policy, swaps, settings, step, progress)
+            raise_scores(self.policies, tried, settings, step, progress)
             self._rounds += 1
-            record(time.perf_counter() - start, {"error": float(swaps.error.mean())})
+            error = sum(float(swaps.error.mean()) for swaps in tried) / len(tried)
+            record(time.perf_counter() - start, {"error": error})
+
+
+def _untrained(world: World, recipe: PlackettLuceRecipe) -> PlackettLucePolicy:
+    interface = make_interface(world.config)
+    return PlackettLucePolicy(
+        interface.observations.space,
+        interface.actions.space,
+        road=RoadChannels.from_config(world.config),
+        width=recipe.width,
+        rule=recipe.rule,
+    )
+
+
+def _sharing(policy: PlackettLucePolicy, world: World) -> PlackettLucePolicy:
+    """Return a policy for a world with the weights of another one.
+
+    Raises:
+        ValueError: The world's observations have other channels.
+    """
+    interface = make_interface(world.config)
+    spaces = interface.observations.space, interface.actions.space
+    try:
+        return policy.sharing(*spaces, RoadChannels.from_config(world.config))
+    except ValueError as problem:
+        raise ValueError(f"also: {world}: {problem}") from problem

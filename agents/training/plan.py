@@ -10,11 +10,12 @@ from functools import cached_property
 from importlib.metadata import version
 from typing import Any
 
-from agents.evaluation.environments import make_config
+from agents.evaluation.environments import make_config, parse_env
 from agents.evaluation.episodes import WARM_UP
 from agents.experiments.provenance import machine, source_digest
 from agents.experiments.seeds import TRAINING_VALIDATION, TRAININGS
 from agents.training.recipes import Recipe
+from agents.training.worlds import World
 from dptse_env.config import TRAINING_SEEDS, VALIDATION_SEEDS, EnvConfig
 from dptse_env.parts import make_interface
 from dptse_env.utils.validation import integer
@@ -33,6 +34,8 @@ class TrainingPlan:
         traffic_seeds: Traffic to train on.
         validation_seeds: Traffic to validate on.
         keywords: Of the environment, plain JSON; the recipe chooses the action encoding.
+        also: Further environments to train and validate in, on the same traffic seeds, each an id
+            or an id, a space and keywords as JSON. One network learns from all of them.
         validate_every: Updates of PPO between two validations; all rounds of swaps are validated.
         checkpoint_every: Updates of PPO between two checkpoints; every round leaves one.
 
@@ -47,6 +50,7 @@ class TrainingPlan:
     traffic_seeds: tuple[int, ...]
     validation_seeds: tuple[int, ...]
     keywords: Mapping[str, Any] = field(default_factory=dict)
+    also: tuple[str, ...] = ()
     validate_every: int = 25
     checkpoint_every: int = 10
 
@@ -66,9 +70,19 @@ class TrainingPlan:
                 raise ValueError(
                     f"{path} must hold seeds in {allowed[0]}..{allowed[-1]}, got {outside[0]}"
                 )
-        for key in ("action", "traffic_seeds", "autoreset_mode"):
-            if key in self.keywords:
-                raise ValueError(f"keywords.{key} is chosen by the training, leave it out")
+        for _, keywords in self._environments:
+            for key in ("action", "traffic_seeds", "autoreset_mode"):
+                if key in keywords:
+                    raise ValueError(f"keywords.{key} is chosen by the training, leave it out")
+        if self.also and not self.recipe.takes_many:
+            raise ValueError(
+                f"also must be empty for {self.recipe.learner}, whose network is tied to one "
+                f"environment, got {self.also[0]!r}"
+            )
+
+    @property
+    def _environments(self) -> list[tuple[str, Mapping[str, Any]]]:
+        return [(self.env, self.keywords), *map(parse_env, self.also)]
 
     @property
     def n_updates(self) -> int:
@@ -77,7 +91,8 @@ class TrainingPlan:
 
     def steps_at(self, update: int) -> int:
         """Return the seconds of traffic simulated by the end of an update, all of them counted."""
-        return self.recipe.steps_at(update, self.config.horizon_steps, self.actions_per_step)
+        per_step = self.actions_per_step
+        return sum(self.recipe.steps_at(update, world, per_step) for world in self.worlds)
 
     def is_due(self, update: int, every: int) -> bool:
         """Return whether a task that is due ``every`` so many updates is due after this one."""
@@ -91,26 +106,40 @@ class TrainingPlan:
 
     @cached_property
     def config(self) -> EnvConfig:
-        """The configuration of the environment.
+        """The configuration of the first environment, which the policy is saved for.
+
+        Raises:
+            ValueError: As `worlds`.
+        """
+        return self.worlds[0].config
+
+    @cached_property
+    def worlds(self) -> tuple[World, ...]:
+        """The environments to train in, that of the plan first.
 
         Raises:
             ValueError: A keyword is unknown or out of range, or the recipe cannot train there.
         """
         chosen = {"action": self.recipe.action, "traffic_seeds": list(self.traffic_seeds)}
-        config = make_config(self.env, {**chosen, **self.keywords})
-        self.recipe.check_environment(config)
-        return config
+        worlds: list[World] = []
+        for env, keywords in self._environments:
+            config = make_config(env, {**chosen, **keywords})
+            self.recipe.check_environment(config)
+            first = worlds[0].config if worlds else config
+            share = first.corridor.n_mainline / config.corridor.n_mainline
+            worlds.append(World(env, keywords, config, share))
+        return tuple(worlds)
 
     def provenance(self, commit: str | None) -> dict[str, Any]:
         """Return what `take_folder` compares and keeps, as plain JSON."""
-        config = self.config
         libraries = ("gymnasium", "numba", "numpy", "stable-baselines3", "torch")
         content = {
             "made_with": {
                 "versions": {name: version(name) for name in ("dptse-env", "libsumo")},
                 "env": self.env,
                 "keywords": dict(self.keywords),
-                "corridor": config.corridor.digest,
+                "also": self.also,
+                "corridor": [world.config.corridor.digest for world in self.worlds],
                 "learner": self.recipe.learner,
                 "recipe": dataclasses.asdict(self.recipe),
                 "seed": self.seed,
@@ -120,7 +149,9 @@ class TrainingPlan:
                 "validation_noise": TRAINING_VALIDATION.start,
                 "validate_every": self.validate_every,
                 "warm_up": WARM_UP,
-                "settings": {config.estimator: dataclasses.asdict(config.settings())},
+                "settings": {
+                    str(world): dataclasses.asdict(world.config.settings()) for world in self.worlds
+                },
             },
             "tuned": [],
             "sources": [source_digest()],

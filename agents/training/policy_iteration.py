@@ -8,10 +8,11 @@ are measured anew, under the new policy.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from agents.experiments.seeds import training_seed
 from agents.training.recipes import SwapRounds
@@ -44,7 +45,7 @@ def collect_swaps(
 
     Args:
         policy: Acts by drawing.
-        env: An environment as `try_swaps` takes it, of ``settings.episodes`` episodes.
+        env: An environment as `try_swaps` takes it.
         settings: Of rounds.
         index: Number of the round, counted from 0.
         seed: Training seed. Draws depend on it and on ``index`` alone, but for those of torch.
@@ -57,7 +58,7 @@ def collect_swaps(
     for part in try_swaps(
         env,
         policy,
-        list(range(first, first + settings.episodes)),
+        list(range(first, first + env.num_envs)),
         np.random.default_rng([seed, index]),
         seconds=settings.seconds,
         trials=settings.trials,
@@ -67,41 +68,71 @@ def collect_swaps(
     return Swaps.from_parts(parts)
 
 
-def raise_scores(
-    policy: PlackettLucePolicy,
-    swaps: Swaps,
-    settings: SwapRounds,
-    step: float,
-    progress: Callable[[float], None] | None = None,
-) -> None:
-    """Raise the scores of ``policy`` in place by ``step`` times the expected gain of a query.
+class _Gains:
+    """Swaps of an environment as targets of the fit.
 
     Gains are in units of the policy's mean one-second error, so that settings carry over to other
     environments. The price of the budgets that vehicles spend is subtracted from each: a vehicle
     without budget is missing from the releases for the rest of an episode, long after the seconds
     in which a gain is measured.
     """
-    unit = swaps.error.mean()
-    gains = np.clip(swaps.gain / unit, -LARGEST_GAIN, LARGEST_GAIN)
-    gains -= settings.price * swaps.spent
-    seen = torch.from_numpy(swaps.observations)
-    targets = torch.from_numpy(gains.astype(np.float32))
-    state, added, dropped = map(torch.from_numpy, (swaps.state, swaps.added, swaps.dropped))
-    with torch.no_grad():
-        parts = [policy.scores(seen[i : i + PART]) for i in range(0, len(seen), PART)]
-        before = torch.cat(parts)
-    optimizer = torch.optim.Adam(policy.scorer.parameters(), lr=settings.rate)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, settings.batches)
-    for batch in range(settings.batches):
-        rows = torch.randint(len(targets), (settings.batch_size,))
-        shown, row = torch.unique(state[rows], return_inverse=True)
-        moved = policy.scores(seen[shown]) - before[shown]
-        expected = (moved[row, added[rows]] - moved[row, dropped[rows]]) / step
-        loss = torch.square(expected - targets[rows]).mean()
+
+    def __init__(
+        self, policy: PlackettLucePolicy, swaps: Swaps, settings: SwapRounds, batch_size: int
+    ) -> None:
+        unit = swaps.error.mean()
+        gains = np.clip(swaps.gain / unit, -LARGEST_GAIN, LARGEST_GAIN)
+        gains -= settings.price * swaps.spent
+        self._policy, self._batch_size = policy, batch_size
+        self._seen = torch.from_numpy(swaps.observations)
+        self._targets = torch.from_numpy(gains.astype(np.float32))
+        self._swapped = tuple(map(torch.from_numpy, (swaps.state, swaps.added, swaps.dropped)))
+        with torch.no_grad():
+            seen = self._seen
+            parts = [policy.scores(seen[i : i + PART]) for i in range(0, len(seen), PART)]
+            self._before = torch.cat(parts)
+
+    def loss(self, step: float) -> Tensor:
+        """Return the squared error of a random minibatch of expected gains."""
+        rows = torch.randint(len(self._targets), (self._batch_size,))
+        state, added, dropped = (each[rows] for each in self._swapped)
+        shown, row = torch.unique(state, return_inverse=True)
+        moved = self._policy.scores(self._seen[shown]) - self._before[shown]
+        expected = (moved[row, added] - moved[row, dropped]) / step
+        return torch.square(expected - self._targets[rows]).mean()
+
+
+def raise_scores(
+    policies: Sequence[PlackettLucePolicy],
+    swaps: Sequence[Swaps],
+    settings: SwapRounds,
+    step: float,
+    progress: Callable[[float], None] | None = None,
+) -> None:
+    """Raise the scores of policies in place by ``step`` times the expected gain of a query.
+
+    Args:
+        policies: Policies that share a scorer, each of an environment of its own.
+        swaps: Those tried under each of them.
+        settings: Of rounds.
+        step: Rise of a score for an expected gain of one mean one-second error.
+        progress: Called with the fraction of the fit that is done.
+    """
+    scorer = policies[0].scorer
+    n = policies[0].road.n_mainline
+    gains = [
+        _Gains(policy, each, settings, max(settings.batch_size * n // policy.road.n_mainline, 1))
+        for policy, each in zip(policies, swaps, strict=True)
+    ]
+    batches = settings.batches * len(gains)
+    optimizer = torch.optim.Adam(scorer.parameters(), lr=settings.rate)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, batches)
+    for batch in range(batches):
+        loss = gains[batch % len(gains)].loss(step)
         optimizer.zero_grad()
         torch.autograd.backward(loss)
         optimizer.step()
         schedule.step()
         if progress is not None and batch % REPORT_INTERVAL == 0:
-            progress(batch / settings.batches)
-    policy.scorer.zero_grad()
+            progress(batch / batches)
+    scorer.zero_grad()

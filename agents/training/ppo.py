@@ -39,10 +39,17 @@ class PPOLearner:
     """
 
     def __init__(self, plan: TrainingPlan, recipe: PPORecipe, keywords: Mapping[str, Any]) -> None:
-        """Make the episodes and an untrained model; ``keywords`` are those of the environment."""
+        """Make the episodes and an untrained model.
+
+        ``keywords`` are further ones of the environment.
+        """
         self._plan, self._recipe, self._is_begun = plan, recipe, False
         self._episodes = make_episodes(
-            plan.env, keywords, recipe, plan.seed, reward_scale=recipe.reward_scale
+            plan.env,
+            {**plan.keywords, **keywords},
+            recipe,
+            plan.seed,
+            reward_scale=recipe.reward_scale,
         )
         self.model = _make_model(recipe, self._episodes, plan.seed)
 
@@ -51,6 +58,11 @@ class PPOLearner:
         """The policy of the model."""
         policy: BasePolicy = self.model.policy
         return policy
+
+    @property
+    def policies(self) -> tuple[BasePolicy, ...]:
+        """The policy alone: a perceptron is tied to its environment."""
+        return (self.policy,)
 
     @property
     def update(self) -> int:

@@ -9,6 +9,7 @@ from typing import Annotated, ClassVar
 
 import tyro
 
+from agents.training.worlds import World
 from dptse_env.config import EnvConfig
 from dptse_env.release import RELEASE_MODELS
 from dptse_env.sb3.policy import RULE
@@ -102,9 +103,10 @@ class SwapRounds:
         fraction = index / max(self.rounds - 1, 1)
         return self.step + (self.final_step - self.step) * fraction
 
-    def steps(self, horizon: int) -> int:
+    def steps(self, world: World) -> int:
         """Return the seconds that a round simulates, in all episodes and their forks together."""
-        return self.episodes * horizon * (1 + 2 * (1 + self.trials))
+        seconds = world.part(self.episodes) * world.config.horizon_steps
+        return seconds * (1 + 2 * (1 + self.trials))
 
 
 @dataclass(frozen=True)
@@ -121,6 +123,8 @@ class Recipe(ABC):
     """Seconds of traffic to train for where the number is not given."""
     has_long_updates: ClassVar[bool]
     """Whether each update takes long enough to be validated and kept."""
+    takes_many: ClassVar[bool] = False
+    """Whether one network can learn from several environments."""
 
     n_envs: int = 128
     """Episodes simulated at once."""
@@ -155,8 +159,8 @@ class Recipe(ABC):
         """Return the number of updates, or of rounds, in ``steps`` seconds of traffic."""
 
     @abstractmethod
-    def steps_at(self, update: int, horizon: int, actions_per_step: int) -> int:
-        """Return the seconds of traffic simulated by the end of an update."""
+    def steps_at(self, update: int, world: World, actions_per_step: int) -> int:
+        """Return the seconds of traffic simulated in a world by the end of an update."""
 
 
 @dataclass(frozen=True)
@@ -167,6 +171,7 @@ class PlackettLuceRecipe(Recipe):
     action: ClassVar[str] = "slots"
     default_steps: ClassVar[int] = 0
     has_long_updates: ClassVar[bool] = True
+    takes_many: ClassVar[bool] = True
 
     width: int = 48
     """Features per segment of the scorer."""
@@ -206,10 +211,11 @@ class PlackettLuceRecipe(Recipe):
         """Return the number of rounds of swaps."""
         return self.swaps.rounds
 
-    def steps_at(self, update: int, horizon: int, actions_per_step: int) -> int:
+    def steps_at(self, update: int, world: World, actions_per_step: int) -> int:
         """See `Recipe.steps_at`; the regression comes ahead of update 0."""
-        regression = self.regression.rounds * self.regression.seconds * self.n_envs
-        return regression + update * self.swaps.steps(horizon)
+        episodes = world.part(self.n_envs, self.replicas)
+        regression = self.regression.rounds * self.regression.seconds * episodes
+        return regression + update * self.swaps.steps(world)
 
 
 @dataclass(frozen=True)
@@ -276,7 +282,7 @@ class PPORecipe(Recipe):
         """See `Recipe.n_updates`; the last update is a whole one."""
         return -(-steps * actions_per_step // self.steps_per_update)
 
-    def steps_at(self, update: int, horizon: int, actions_per_step: int) -> int:
+    def steps_at(self, update: int, world: World, actions_per_step: int) -> int:
         """See `Recipe.steps_at`."""
         return update * self.steps_per_update // actions_per_step
 

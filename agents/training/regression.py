@@ -9,7 +9,7 @@ sample. Querying the segments where it is largest comes close to querying by the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import torch
@@ -51,46 +51,79 @@ def squared_errors(process: QueryProcess) -> Observation:
     return squared.astype(np.float32)
 
 
+class Practice:
+    """Episodes in which a policy acts, and the samples that they leave.
+
+    Attributes:
+        policy: The policy.
+        batch_size: Samples in a minibatch.
+    """
+
+    def __init__(
+        self, policy: PlackettLucePolicy, episodes: TrainingEpisodes, batch_size: int
+    ) -> None:
+        """Begin the episodes."""
+        self.policy, self.batch_size = policy, batch_size
+        self._episodes, self._observation = episodes, episodes.reset()
+        self._seen: list[Tensor] = []
+        self._errors: list[Tensor] = []
+
+    def collect(
+        self, settings: RegressionRounds, targets: Callable[[QueryProcess], Observation]
+    ) -> None:
+        """Act for a round, and keep what is seen and the targets."""
+        for second in range(settings.seconds):
+            if second % settings.interval == 0:
+                self._seen.append(torch.from_numpy(self._observation.copy()))
+                self._errors.append(torch.from_numpy(targets(self._episodes.env.process)))
+            actions, _ = self.policy.predict(self._observation, deterministic=False)
+            stepped, *_ = self._episodes.step(actions)
+            assert isinstance(stepped, np.ndarray)
+            self._observation = stepped
+
+    def samples(self) -> tuple[Tensor, Tensor]:
+        """Return all observations (k, size) and targets (k, n) so far."""
+        return torch.cat(self._seen), torch.cat(self._errors)
+
+
 def regress(
-    policy: PlackettLucePolicy,
-    episodes: TrainingEpisodes,
+    practice: Sequence[Practice],
     settings: RegressionRounds,
     progress: Callable[[float], None] | None = None,
     targets: Callable[[QueryProcess], Observation] = squared_errors,
 ) -> None:
-    """Let ``policy`` act, and fit its scores in place to the squared errors that follow from it.
+    """Let policies act, and fit their common scores in place to the squared errors that follow.
 
     With the expected squared error exp(z) of a segment, the loss y exp(-z) + z is that of normal
     errors with this variance; it is least where exp(z) is the mean of y. Scores are ``sharpness``
     times z plus a bonus for age, since querying segments that have not been observed for long gains
     more, up to a constant. Each round aggregates data collected by the current policy, as in
-    DAgger.
+    DAgger. Minibatches are of one environment after the other.
+
+    Args:
+        practice: Policies that share a scorer, each in an environment of its own.
+        settings: Of the regression.
+        progress: Called with the fraction of the fits that is done.
+        targets: Squared errors of a process.
     """
-    level = torch.tensor([LEVEL], requires_grad=True)
-    optimizer = torch.optim.Adam([*policy.scorer.parameters(), level], lr=settings.rate)
-    bonus = {"age": settings.age_bonus}
-    observation = episodes.reset()
-    seen: list[Tensor] = []
-    errors: list[Tensor] = []
+    policy, bonus = practice[0].policy, {"age": settings.age_bonus}
+    levels = torch.full((len(practice),), LEVEL, requires_grad=True)
+    optimizer = torch.optim.Adam([*policy.scorer.parameters(), levels], lr=settings.rate)
     for index in range(settings.rounds):
-        for second in range(settings.seconds):
-            if second % settings.interval == 0:
-                seen.append(torch.from_numpy(observation.copy()))
-                errors.append(torch.from_numpy(targets(episodes.env.process)))
-            actions, _ = policy.predict(observation, deterministic=False)
-            stepped, *_ = episodes.step(actions)
-            assert isinstance(stepped, np.ndarray)
-            observation = stepped
+        for each in practice:
+            each.collect(settings, targets)
         if index:
             _add(policy, bonus, -settings.sharpness)
         else:
             _add(policy, policy.rule, -1.0)
             _add(policy, VARIANCE, settings.sharpness)
-        samples = torch.cat(seen), torch.cat(errors)
-        for batch in range(settings.batches):
-            done = (index + batch / settings.batches) / settings.rounds
+        samples = [each.samples() for each in practice]
+        batches = settings.batches * len(practice)
+        for batch in range(batches):
+            done = (index + batch / batches) / settings.rounds
             optimizer.param_groups[0]["lr"] = settings.rate * (1.0 - DECAY * done)
-            _fit(policy, level, optimizer, settings, *samples)
+            k = batch % len(practice)
+            _fit(practice[k], levels[k], optimizer, settings, *samples[k])
             if progress is not None and batch % REPORT_INTERVAL == 0:
                 progress(done)
         _add(policy, bonus, settings.sharpness)
@@ -105,7 +138,7 @@ def _add(policy: PlackettLucePolicy, weights: Mapping[str, float], factor: float
 
 
 def _fit(
-    policy: PlackettLucePolicy,
+    practice: Practice,
     level: Tensor,
     optimizer: torch.optim.Optimizer,
     settings: RegressionRounds,
@@ -113,7 +146,8 @@ def _fit(
     errors: Tensor,
 ) -> None:
     """Take a step of the optimizer on a random minibatch."""
-    rows = torch.randint(len(seen), (settings.batch_size,))
+    policy = practice.policy
+    rows = torch.randint(len(seen), (practice.batch_size,))
     logs = policy.scores(seen[rows]) / settings.sharpness + level
     loss = ((errors[rows] + FLOOR) * torch.exp(-logs) + logs).mean()
     optimizer.zero_grad()

@@ -15,7 +15,7 @@ from agents.experiments.files import write_atomically
 
 CHECKPOINT, PROGRESS = "checkpoint.pt", "progress.csv"
 
-FORMAT = 2
+FORMAT = 3
 """Format of checkpoints; raise it whenever their content changes its meaning."""
 
 COLUMNS = (

@@ -72,17 +72,22 @@ class Training:
             OSError: The folder cannot be written.
         """
         self.plan, self.folder, self._watchers = plan, folder, watchers
-        config = plan.config
         checkpoint = read_checkpoint(folder)  # may refuse the folder, which then stays as it is
         take_folder(folder, plan.provenance(commit))
-        keywords = {**plan.keywords, "records": records}
-        training = {**keywords, "traffic_seeds": list(plan.traffic_seeds)}
+        training = {"records": records, "traffic_seeds": list(plan.traffic_seeds)}
         self.learner = _make_learner(plan, training, progress)
-        self._acting = ActingPolicy(self.learner.policy, make_interface(config))
-        validation = {**keywords, "action": plan.recipe.action}
-        self._validation = Validation(plan.env, validation, plan.validation_seeds)
+        chosen = {"records": records, "action": plan.recipe.action}
+        self._validations = [
+            (
+                str(world),
+                ActingPolicy(policy, make_interface(world.config)),
+                Validation(world.env, {**world.keywords, **chosen}, plan.validation_seeds),
+            )
+            for world, policy in zip(plan.worlds, self.learner.policies, strict=True)
+        ]
         self.rows: list[Row] = []
         self._seconds, self._best = 0.0, float("inf")
+        self._errors: dict[str, dict[str, float]] = {}
         if checkpoint is not None:
             self._resume(checkpoint)
 
@@ -121,18 +126,23 @@ class Training:
 
     def _validate(self, row: Row) -> None:
         for name, deterministic in (("validation", True), ("validation_drawn", False)):
-            errors = self._validation.errors(self._acting, deterministic=deterministic)
-            row[name] = float(errors.mean())
+            self._errors[name] = {
+                world: float(validation.errors(acting, deterministic=deterministic).mean())
+                for world, acting, validation in self._validations
+            }
+            row[name] = sum(self._errors[name].values()) / len(self._errors[name])
         if row["validation"] < self._best:
             self._best = row["validation"]
             self._save(BEST, row)
 
     def _save(self, name: str, row: Row) -> None:
-        plan = self.plan
-        figures = {
-            f"error on {len(plan.validation_seeds)} validation episodes, {kind}": row[key]
-            for key, kind in (("validation", "deterministic"), ("validation_drawn", "drawn"))
-        }
+        plan, n = self.plan, len(self.plan.validation_seeds)
+        figures: dict[str, float] = {}
+        for key, kind in (("validation", "deterministic"), ("validation_drawn", "drawn")):
+            figures[f"error on {n} validation episodes, {kind}"] = row[key]
+            if plan.also:
+                for world, error in self._errors.get(key, {}).items():
+                    figures[f"error in {world}, {kind}"] = error
         save_policy(
             self.folder / name,
             self.learner.policy,
@@ -142,6 +152,7 @@ class Training:
             training={
                 "learner": plan.recipe.learner,
                 "seed": plan.seed,
+                **({"also": list(plan.also)} if plan.also else {}),
                 "steps": int(row["steps"]),
                 "traffic seeds": _range(plan.traffic_seeds),
                 "validation seeds": _range(plan.validation_seeds),
@@ -153,13 +164,16 @@ class Training:
         """Write learning curve and checkpoint."""
         write_progress(self.folder, self.rows)
         learner, generator = self.learner.state(), torch.get_rng_state()
-        content = {"update": self.update, "best": self._best, "torch": generator}
+        content = {
+            "update": self.update, "best": self._best, "torch": generator, "errors": self._errors
+        }  # fmt: skip
         write_checkpoint(self.folder, {**content, "learner": learner})
 
     def _resume(self, kept: Mapping[str, Any]) -> None:
         """Restore the state of a checkpoint and the learning curve up to it."""
         self.rows = [row for row in read_progress(self.folder) if row["update"] <= kept["update"]]
         self._best, self._seconds = kept["best"], self.rows[-1]["seconds"]
+        self._errors = kept["errors"]
         self.learner.restore(kept["learner"])
         torch.set_rng_state(kept["torch"])
         for row in self.rows:
@@ -170,7 +184,7 @@ class Training:
 def _make_learner(
     plan: TrainingPlan, keywords: Mapping[str, Any], progress: Callable[[str, float], None]
 ) -> Learner:
-    """Make the learner of the plan's recipe; ``keywords`` are those of its environments."""
+    """Make the learner of the plan's recipe; ``keywords`` are further ones of its environments."""
     recipe = plan.recipe
     if isinstance(recipe, PlackettLuceRecipe):
         return PlackettLuceLearner(plan, recipe, keywords, progress)

@@ -68,6 +68,33 @@ class PlackettLucePolicy(BasePolicy):
         self.features = RoadFeatures(road)
         self.scorer = Scorer(road, width, rule)
 
+    def sharing(
+        self,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Space[Any],
+        road: RoadChannels,
+    ) -> "PlackettLucePolicy":
+        """Return a policy for another environment that has the very same weights.
+
+        A training that moves them moves both policies.
+
+        Raises:
+            ValueError: A space does not fit ``road``, or its channels differ from those of this
+                policy.
+        """
+        names, own = ([channel.name for channel in each.channels] for each in (road, self.road))
+        if names != own:
+            missing, more = sorted(set(own) - set(names)), sorted(set(names) - set(own))
+            raise ValueError(
+                f"environments must have the same channels to share a network; one lacks "
+                f"{missing} and has {more} besides"
+            )
+        twin = PlackettLucePolicy(
+            observation_space, action_space, road=road, width=self.width, rule=self.rule
+        )
+        twin.scorer = self.scorer
+        return twin
+
     def scores(self, observation: Tensor) -> Tensor:
         """Return the scores (k, n) of observations (k, size)."""
         scores: Tensor = self.scorer(self.features(observation))

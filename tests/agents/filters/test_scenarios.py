@@ -3,9 +3,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from agents.evaluation.environments import make_config
+from agents.evaluation.environments import make_config, parse_env
 from agents.filters.roads import ROADS
-from agents.filters.scenarios import MECHANISMS, SCHEDULES, ScenarioRanges, parse_env
+from agents.filters.scenarios import MECHANISMS, SCHEDULES, ScenarioRanges
 
 from .plans import RANGES
 
@@ -39,6 +39,14 @@ def test_every_scenario_is_an_environment(scenario):
 
 def test_the_same_generator_draws_the_same_scenarios():
     assert drawn(n=5) == drawn(n=5) != drawn(n=5, seed=1)
+
+
+def test_bandwidths_can_be_held_to_a_share_of_the_road():
+    few = dataclasses.replace(RANGES, largest_share=0.35)
+    assert {scenario.keywords["bandwidth"] for scenario in drawn(few)} == {1, 2}
+    for share in (0.0, 1.1):
+        with pytest.raises(ValueError, match=r"ranges\.largest_share must be in \(0, 1\], got"):
+            dataclasses.replace(RANGES, largest_share=share)
 
 
 def test_mechanisms_can_be_left_out():

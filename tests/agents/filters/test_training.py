@@ -177,6 +177,22 @@ def test_a_folder_of_another_plan_is_refused(tmp_path):
         FilterTraining(dataclasses.replace(PLAN, seed=4), tmp_path)
 
 
+def test_a_training_may_begin_with_another_network(tmp_path):
+    first = FilterTraining(dataclasses.replace(PLAN, rounds=(Round("ekf", 1, 1),)), tmp_path / "a")
+    first.run()
+    initial = str(tmp_path / "a" / "network.npz")
+    plan = dataclasses.replace(PLAN, initial=initial, rounds=(Round(OWN, 1, 1),), seed=5)
+    second = FilterTraining(plan, tmp_path / "b")
+    for taken, given in zip(second.network.weights(), first.network.weights(), strict=True):
+        np.testing.assert_array_equal(taken, given)
+    second.run()
+    assert not np.array_equal(second.network.weights().hidden, first.network.weights().hidden)
+    card = read_network(str(tmp_path / "b" / "network.npz")).card
+    assert card["training"]["plan"]["initial_sha256"] == read_network(initial).sha256
+    with pytest.raises(ValueError, match="width must be that of the initial network, 4, got 8"):
+        dataclasses.replace(plan, width=8)
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -186,6 +202,7 @@ def test_a_folder_of_another_plan_is_refused(tmp_path):
         ({"rounds": ()}, "rounds must begin"),
         ({"episodes": 4}, r"episodes must be an integer in 1\.\.3, got 4"),
         ({"width": 0}, "width must be"),
+        ({"initial": "nowhere"}, r"weights must be a file or one of highway, .*, got 'nowhere'"),
         ({"likelihood": -1.0}, "likelihood must be"),
     ],
 )

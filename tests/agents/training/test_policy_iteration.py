@@ -61,7 +61,7 @@ def moved(policy, swaps, settings=SETTINGS):
             return policy.scores(seen).numpy()
 
     before = scores()
-    raise_scores(policy, swaps, settings, STEP)
+    raise_scores([policy], [swaps], settings, STEP)
     change = scores() - before
     return change - change.mean(axis=1, keepdims=True)
 
@@ -107,6 +107,6 @@ def test_no_gain_moves_nothing_but_noise(policy):
 def test_it_reports_its_progress_and_leaves_no_gradients(policy):
     shares = []
     few = SwapRounds(batches=100, batch_size=8)
-    raise_scores(policy, planted(policy, None, n_states=10), few, STEP, shares.append)
+    raise_scores([policy], [planted(policy, None, n_states=10)], few, STEP, shares.append)
     assert shares == [0.0, 0.5]
     assert all(p.grad is None for p in policy.scorer.parameters())

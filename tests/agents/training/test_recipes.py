@@ -12,7 +12,10 @@ from agents.training.recipes import (
     ScoresRecipe,
     SwapRounds,
 )
+from agents.training.worlds import World
+from dptse_env.config import EnvConfig
 from dptse_env.spaces.actions import ACTION_ENCODINGS
+from dptse_env.traffic import CORRIDORS
 
 
 @pytest.mark.parametrize("recipe", RECIPES.values())
@@ -86,4 +89,7 @@ def test_a_recipe_without_any_round_is_refused():
 
 def test_seconds_of_a_round_include_those_of_its_forks():
     # The episodes themselves, and one unswapped and three swapped forks under either noise.
-    assert SwapRounds(episodes=10, trials=3).steps(700) == 10 * 700 * 9
+    world = World("x", {}, EnvConfig(CORRIDORS["paper-highway"]))
+    assert SwapRounds(episodes=10, trials=3).steps(world) == 10 * 700 * 9
+    longer = dataclasses.replace(world, share=0.3)
+    assert SwapRounds(episodes=10, trials=3).steps(longer) == 3 * 700 * 9

@@ -8,7 +8,7 @@ import torch
 
 from agents.training.episodes import make_episodes
 from agents.training.recipes import PlackettLuceRecipe, RegressionRounds
-from agents.training.regression import regress, squared_errors
+from agents.training.regression import Practice, regress, squared_errors
 from dptse_env.sb3 import PlackettLucePolicy, RoadChannels
 
 SHORT = "dptse_env:dptse/ShortHighway-v0"
@@ -43,7 +43,7 @@ def test_scores_become_the_logarithms_of_expected_squared_errors():
         variance = queried_variance(process)
         return (variance * generator.exponential(size=variance.shape)).astype(np.float32)
 
-    regress(policy, episodes, settings, targets=planted)
+    regress([Practice(policy, episodes, settings.batch_size)], settings, targets=planted)
     seen = episodes.reset()
     for _ in range(60):
         seen = episodes.step(policy.predict(seen)[0])[0]
@@ -62,7 +62,7 @@ def test_the_bonus_for_age_is_added_once_after_any_number_of_rounds():
         settings, episodes, policy = make(
             rounds=rounds, age_bonus=bonus, seconds=2, batches=1, rate=1e-9
         )
-        regress(policy, episodes, settings)
+        regress([Practice(policy, episodes, settings.batch_size)], settings)
         weights.append(dict(zip(policy.rule, policy.scorer.rule.tolist(), strict=True)))
     assert weights[0]["age"] - weights[1]["age"] == pytest.approx(0.5 * 4.0, rel=1e-4)
     assert weights[0]["speed_log_std"] == pytest.approx(0.5 * 4.0, rel=1e-4)
@@ -71,7 +71,7 @@ def test_the_bonus_for_age_is_added_once_after_any_number_of_rounds():
 def test_it_reports_its_progress_and_leaves_no_gradients():
     fractions = []
     settings, episodes, policy = make(rounds=2, seconds=3, batches=100)
-    regress(policy, episodes, settings, fractions.append)
+    regress([Practice(policy, episodes, settings.batch_size)], settings, fractions.append)
     assert fractions == [0.0, 0.25, 0.5, 0.75]
     assert all(p.grad is None for p in policy.scorer.parameters())
 

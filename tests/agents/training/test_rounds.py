@@ -77,7 +77,7 @@ def ignore(stage, fraction):
 def weights_after(settings, index):
     policy = make_policy()
     swaps = collect_swaps(policy, make_batch(), settings, index, SEED, ignore)
-    raise_scores(policy, swaps, settings, settings.step_of(index))
+    raise_scores([policy], [swaps], settings, settings.step_of(index))
     return torch.nn.utils.parameters_to_vector(policy.parameters()).detach().numpy()
 
 
