@@ -4,6 +4,7 @@ python scripts/study.py paper              # the paper's five results, some 8,00
 python scripts/study.py privacy --quick    # the price of a privacy guarantee, in minutes
 python scripts/study.py ledger             # capped contributions beside paced ledgers
 python scripts/study.py estimators         # every estimator under every release model
+python scripts/study.py choices            # where a choice of queries pays, and what it saves
 python scripts/study.py policies freeze --policies primary=results/training/primary
 python scripts/study.py policies run       # learned policies against every baseline
 python scripts/study.py privacy --corridor my-road.toml    # the same on a road of your own
@@ -31,6 +32,8 @@ from agents.evaluation.environments import given_keywords
 from agents.experiments.cells import Design
 from agents.experiments.engine import LocalProcesses
 from agents.experiments.runner import Workplace
+from agents.studies.choices import study as choice_study
+from agents.studies.choices.plan import ChoiceDesign
 from agents.studies.estimators import study as estimator_study
 from agents.studies.estimators.plan import EstimatorDesign
 from agents.studies.ledger import study as ledger_study
@@ -107,6 +110,16 @@ class EstimatorStudy(StudyOptions):
 
 
 @dataclass(frozen=True)
+class ChoiceStudy(StudyOptions):
+    """Map where a choice of queries pays, and what bandwidth it saves."""
+
+    quick: bool = False
+    """Three traffic seeds, and fewer bandwidths and policies."""
+    design: tyro.conf.OmitArgPrefixes[ChoiceDesign] = field(default_factory=ChoiceDesign)
+    """The plan."""
+
+
+@dataclass(frozen=True)
 class Freeze(StudyOptions):
     """Fix policies and choices before test traffic is touched."""
 
@@ -153,12 +166,13 @@ Study = (
     | Annotated[Privacy, tyro.conf.subcommand("privacy")]
     | Annotated[LedgerStudy, tyro.conf.subcommand("ledger")]
     | Annotated[EstimatorStudy, tyro.conf.subcommand("estimators")]
+    | Annotated[ChoiceStudy, tyro.conf.subcommand("choices")]
     | Annotated[Policies, tyro.conf.subcommand("policies")]
 )
 
 
 @resumable()
-def main(args: Paper | Privacy | LedgerStudy | EstimatorStudy | Policies) -> None:
+def main(args: Paper | Privacy | LedgerStudy | EstimatorStudy | ChoiceStudy | Policies) -> None:
     """Run a study."""
     if isinstance(args, Paper):
         design = args.design.quick() if args.quick else args.design
@@ -176,6 +190,10 @@ def main(args: Paper | Privacy | LedgerStudy | EstimatorStudy | Policies) -> Non
         chosen = args.design.quick() if args.quick else args.design
         place = args.workplace("estimators", *which(chosen, args.quick))
         estimator_study.run(chosen, place, command("study.py estimators", args))
+    elif isinstance(args, ChoiceStudy):
+        mapped = args.design.quick() if args.quick else args.design
+        place = args.workplace("choices", *(["quick"] if args.quick else []))
+        choice_study.run(mapped, place, command("study.py choices", args))
     elif isinstance(args.step, Freeze):
         freeze(args.step)
         return

@@ -21,6 +21,8 @@ from dptse_env.utils.arrays import FloatArray
 DENSITY, SPEED = "rmse_density", "rmse_speed"
 METRICS = {DENSITY: ("density", "veh/km"), SPEED: ("speed", "km/h")}
 """Name and unit of each error of an estimate."""
+ERROR = "error"
+"""Name of the environment's error x 1000 among the metrics: minus the mean reward."""
 
 
 class Key(Hashable, Protocol):
@@ -74,6 +76,10 @@ class Design(ABC, Generic[CellT]):
     def traffic_seeds(self) -> tuple[int, ...]:
         """The traffic seeds."""
         return parse_seeds(self.seeds)
+
+    def seeds_of(self, cell: CellT) -> tuple[int, ...]:
+        """Return the traffic seeds of a cell."""
+        return self.traffic_seeds
 
     def first_seeds(self, n: int) -> str:
         """Return the first n traffic seeds, or all where there are fewer, as first:stop."""
@@ -142,15 +148,17 @@ class Results(Generic[DesignT, CellT]):
     scores: Mapping[tuple[CellT, int], EpisodeScore]
 
     def values(self, cell: CellT, metric: str) -> FloatArray:
-        """Return a field of `EpisodeScore` for each seed, shape (n_seeds,).
+        """Return a field of the scores, or `ERROR`, for each seed of the cell, shape (n_seeds,).
 
         Raises:
             UnmeasuredError: The cell was not run.
         """
-        seeds = self.design.traffic_seeds
+        seeds = self.design.seeds_of(cell)
         if (cell, seeds[0]) not in self.scores:
             raise UnmeasuredError(cell)
-        return np.array([getattr(self.scores[cell, seed], metric) for seed in seeds])
+        name = "reward" if metric == ERROR else metric
+        values = np.array([getattr(self.scores[cell, seed], name) for seed in seeds])
+        return -1000.0 * values if metric == ERROR else values
 
     def mean(self, cell: CellT, metric: str) -> Interval:
         """Return the mean of a field over the seeds with its interval."""
@@ -163,6 +171,15 @@ class Results(Generic[DesignT, CellT]):
     def difference(self, cell: CellT, reference: CellT, metric: str) -> Interval:
         """Return by how much a cell exceeds a reference, paired by traffic and noise."""
         return paired_difference(self.values(cell, metric), self.values(reference, metric))
+
+    def below(self, cell: CellT, reference: CellT, metric: str = ERROR) -> Interval:
+        """Return by how much the mean of a cell lies below that of a reference [%], paired.
+
+        The interval is that of the difference over the mean of the reference.
+        """
+        scale = 100.0 / float(self.values(reference, metric).mean())
+        found = mean_interval(self.values(reference, metric) - self.values(cell, metric))
+        return Interval(scale * found.mean, scale * found.low, scale * found.high, found.n)
 
     def change(self, cell: CellT, reference: CellT) -> Change:
         """Return by how much both errors of a cell exceed those of a reference, paired."""

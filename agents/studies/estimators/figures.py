@@ -7,8 +7,9 @@ from matplotlib.figure import Figure
 
 from agents.evaluation.figures import add_frame, draw_dot, finish_figure, make_figure
 from agents.evaluation.honesty import LEVELS
+from agents.experiments.cells import ERROR
 from agents.studies.estimators.cell import ESTIMATOR_LABELS, LEARNED, LINEAR
-from agents.studies.estimators.results import ERROR, EstimatorResults
+from agents.studies.estimators.results import EstimatorResults
 
 COLOURS = {
     "ekf": "#0072b2", "ukf": "#d55e00", "enkf": "#009e73", "mhe": "#cc79a7",

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from agents.experiments.cells import DENSITY, SPEED
+from agents.experiments.cells import DENSITY, ERROR, SPEED
 from agents.studies.estimators.cell import LEARNED, EstimatorCell
 from agents.studies.estimators.plan import OWN, EstimatorDesign
-from agents.studies.estimators.results import ERROR, EstimatorResults
+from agents.studies.estimators.results import EstimatorResults
 
 CHI2 = (0.8, 1.25)
 """Range of chi-square in which deviations count as honest."""

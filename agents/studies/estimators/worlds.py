@@ -56,12 +56,13 @@ _LONG_DEMAND = {
         "on_ramps": [300.0, 300.0, 300.0],
     }
 }
-_TWO_PEAKS = {
+TWO_PEAKS = {
     "base": {
         "mainline": [[0.0, 5000.0], [120.0, 2000.0], [300.0, 5600.0], [420.0, 3000.0]],
         "on_ramps": [150.0, 600.0],
     }
 }
+"""Another shape of demand on the road of the paper."""
 _LONG_ROAD = {
     "n_mainline": 60,
     "on_ramps": [9, 29, 49],
@@ -93,7 +94,7 @@ ELSEWHERE = {
     "incident": _paced("the paper's incident", incident={
         "segment": 10, "phases": [[200.0, 400.0, 10.08], [400.0, 500.0, 50.95]],
     }),
-    "two-peaks": _paced("demand with two peaks", demand=_TWO_PEAKS),
+    "two-peaks": _paced("demand with two peaks", demand=TWO_PEAKS),
     "long": _paced("a road of 6 km, B = 20", corridor=_LONG_ROAD, bandwidth=20),
     "short": World("`ShortHighway-v0`", SHORT),
     **{f"epsilon-{e:g}": _paced(f"ε = {e:g}", epsilon=e) for e in (0.5, 2.0, 10.0, 20.0)},
