@@ -107,6 +107,14 @@ def test_a_set_for_the_corridor_comes_before_that_for_any():
     assert resolve("private-highway-v1", {}).settings_name == "ekf-w99-3lane-paced"
 
 
+@pytest.mark.parametrize("privacy", ["capped", "paced"])
+def test_the_long_road_has_a_network_of_its_own(privacy):
+    config = resolve("long-highway", {"estimator": "recurrent", "privacy": privacy})
+    assert config.settings().recurrent.weights == "long-highway"
+    short = resolve("private-highway-v1", {"estimator": "recurrent", "privacy": privacy})
+    assert short.settings().recurrent.weights == "highway"
+
+
 def test_a_road_of_ones_own_takes_no_set_for_an_ending_of_its_name():
     """`ekf-w99-3lane-capped-demand` is a variant, not a set for a road that is called demand."""
     keywords = {"parameters": "w99-3lane", "privacy": "capped", "corridor": {"name": "demand"}}

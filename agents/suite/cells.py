@@ -123,7 +123,7 @@ def _cell(
 
 
 def _long(name: str, description: str, **keywords: Any) -> SuiteCell:
-    return _cell(name, description, LONG, LONG_SEEDS, estimator="ekf", **keywords)
+    return _cell(name, description, LONG, LONG_SEEDS, **keywords)
 
 
 _CAPPED = {"preset": "capped", "epsilon": 5.0, "cap": 64}
@@ -167,11 +167,18 @@ SUITES = {
                 parameters="w99-3lane",
             ),
             _long(
-                "long-capped-8", "LongHighway-v0, capped, EKF, B = 8", bandwidth=8, privacy=_CAPPED
+                "long-capped-recurrent-8", "LongHighway-v0, capped, recurrent, B = 8",
+                estimator="recurrent", bandwidth=8, privacy=_CAPPED,
             ),
-            _long("long-paced-8", "LongHighway-v0, EKF, B = 8", bandwidth=8),
-            _long("long-paced-4", "LongHighway-v0, EKF, B = 4", bandwidth=4),
-            _long("long-paced-2", "LongHighway-v0, EKF, B = 2", bandwidth=2),
+            _long(
+                "long-recurrent-8", "LongHighway-v0, recurrent, B = 8",
+                estimator="recurrent", bandwidth=8,
+            ),
+            _long("long-ekf-4", "LongHighway-v0, EKF, B = 4", estimator="ekf", bandwidth=4),
+            _long(
+                "long-recurrent-2", "LongHighway-v0, recurrent, B = 2",
+                estimator="recurrent", bandwidth=2,
+            ),
         ),
     )
 }  # fmt: skip

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from agents.evaluation.policies import find_policy
-from agents.studies.estimators.worlds import TWO_PEAKS
+from agents.experiments.demand import TWO_PEAKS
 
 HIGHWAY, LONG = "highway", "long"
 CAPPED, PACED = "capped", "paced"
@@ -61,7 +61,8 @@ class ChoiceCell:
         release: ``capped`` or ``paced``.
         estimator: ``ekf`` or ``recurrent``.
         epsilon: Of the guarantee.
-        bandwidth: Segments queried a second.
+        span: Neighbouring segments that a query sums over.
+        bandwidth: Queries a second.
         policy: A schedule, or a saved policy.
     """
 
@@ -70,6 +71,7 @@ class ChoiceCell:
     release: str
     estimator: str
     epsilon: float
+    span: int
     bandwidth: int
     policy: str
 
@@ -95,4 +97,6 @@ class ChoiceCell:
         }
         if self.road == LONG:
             keywords["privacy"] = self.release
+        if self.span > 1:
+            keywords |= {"query_spans": [self.span], "bandwidth_unit": "sums"}
         return keywords

@@ -40,6 +40,7 @@ class World(NamedTuple):
     estimator: str
     traffic: str = OWN_TRAFFIC
     epsilon: float = EPSILON
+    span: int = 1
 
     @property
     def label(self) -> str:
@@ -63,6 +64,8 @@ class ChoiceDesign(Design[ChoiceCell]):
         long_bandwidths: Of the long road; none to leave it out.
         base_bandwidth: Bandwidth of the short road at which epsilon and traffic are varied.
         epsilons: Values of epsilon on the short road, the base value among them.
+        joint_bandwidth: Bandwidth of the cells of everything taken together.
+        joint_epsilons: Values of epsilon there, with sums over two neighbours.
     """
 
     seeds: str = "2600:2632"
@@ -76,6 +79,8 @@ class ChoiceDesign(Design[ChoiceCell]):
     long_bandwidths: tuple[int, ...] = (2, 4, 8, 24)
     base_bandwidth: int = 2
     epsilons: tuple[float, ...] = (0.5, 1.0, EPSILON, 20.0)
+    joint_bandwidth: int = 5
+    joint_epsilons: tuple[float, ...] = (EPSILON, 1.0, 0.25)
 
     def check(self) -> None:
         """See `Design.check`."""
@@ -123,6 +128,13 @@ class ChoiceDesign(Design[ChoiceCell]):
             world._replace(traffic=OTHER_TRAFFIC),
         ]
 
+    @property
+    def together(self) -> list[World]:
+        """Worlds in which release, estimator and queries are taken together, on the short road."""
+        base = World(HIGHWAY, PACED, RECURRENT)
+        sums = [base._replace(epsilon=each, span=2) for each in self.joint_epsilons]
+        return [World(HIGHWAY, CAPPED, EKF), base, *sums]
+
     def learned(self, world: World) -> tuple[str, ...]:
         """Return the learned policies of a world."""
         return self.capped if world.release == CAPPED else self.paced
@@ -138,8 +150,8 @@ class ChoiceDesign(Design[ChoiceCell]):
 
     def cell(self, world: World, bandwidth: int, policy: str) -> ChoiceCell:
         """Return a cell."""
-        road, release, estimator, traffic, epsilon = world
-        return ChoiceCell(road, traffic, release, estimator, epsilon, bandwidth, policy)
+        road, release, estimator, traffic, epsilon, span = world
+        return ChoiceCell(road, traffic, release, estimator, epsilon, span, bandwidth, policy)
 
     def all_cells(self) -> Iterator[ChoiceCell]:
         """See `Design.all_cells`."""
@@ -150,6 +162,9 @@ class ChoiceDesign(Design[ChoiceCell]):
             for place, bandwidth in places:
                 for policy in self.policies(world):
                     yield self.cell(place, bandwidth, policy)
+        for world in self.together:
+            for policy in (REFERENCE, self.schedule, self.rule(world)):
+                yield self.cell(world, self.joint_bandwidth, policy)
 
     def seeds_of(self, cell: ChoiceCell) -> tuple[int, ...]:
         """See `Design.seeds_of`."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from agents.evaluation.statistics import Interval
-from agents.experiments.cells import ERROR
+from agents.experiments.cells import DENSITY, ERROR, SPEED
 from agents.experiments.tables import markdown
 from agents.studies.choices.cell import OTHER_TRAFFIC
 from agents.studies.choices.plan import ORACLE, REFERENCE, World
@@ -48,6 +48,22 @@ def saved_table(results: ChoiceResults, world: World) -> str:
         for bandwidth in design.bandwidths_of(world)
     ]
     return markdown(["B", *_choosers(results, world)], rows)
+
+
+def joint_table(results: ChoiceResults) -> str:
+    """Return errors of everything taken together, by policy."""
+    design = results.design
+    rows = []
+    for world in design.together:
+        sums = ", sums over two neighbours" if world.span > 1 else ""
+        row = [f"{world.label}, ε = {world.epsilon:g}{sums}"]
+        for policy in (REFERENCE, design.schedule, design.rule(world)):
+            cell = design.cell(world, design.joint_bandwidth, policy)
+            density, speed = (results.mean(cell, metric).mean for metric in (DENSITY, SPEED))
+            error = results.mean(cell, ERROR)
+            row.append(f"{error.mean:.1f} ± {error.half_width:.1f} ({density:.1f}, {speed:.1f})")
+        rows.append(row)
+    return markdown(["", f"`{REFERENCE}`", f"`{design.schedule}`", "rule"], rows)
 
 
 def paying(results: ChoiceResults) -> list[tuple[World, int, str, Interval]]:

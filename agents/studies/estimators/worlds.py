@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from agents.experiments.demand import TWO_PEAKS
+
 PAPER, PRIVATE = "dptse_env:dptse/PaperHighway-v0", "dptse_env:dptse/PrivateHighway-v0"
 PACED, SHORT = "dptse_env:dptse/PrivateHighway-v1", "dptse_env:dptse/ShortHighway-v0"
 SUMS = {"query_spans": [2], "bandwidth_unit": "sums"}
@@ -56,13 +58,6 @@ _LONG_DEMAND = {
         "on_ramps": [300.0, 300.0, 300.0],
     }
 }
-TWO_PEAKS = {
-    "base": {
-        "mainline": [[0.0, 5000.0], [120.0, 2000.0], [300.0, 5600.0], [420.0, 3000.0]],
-        "on_ramps": [150.0, 600.0],
-    }
-}
-"""Another shape of demand on the road of the paper."""
 _LONG_ROAD = {
     "n_mainline": 60,
     "on_ramps": [9, 29, 49],

@@ -22,6 +22,7 @@ DESIGN = ChoiceDesign(
     bandwidths=(2, 5),
     long_bandwidths=(),
     epsilons=(5.0,),
+    joint_epsilons=(1.0,),
     capped=("private-highway",),
 )
 ON_CAPPED = World(HIGHWAY, CAPPED, "ekf")
@@ -75,6 +76,7 @@ def test_the_report_shows_the_map(finished):
     assert text.count("| 2 (13 %) |") == 4
     assert "`private-highway`, training seed" in text
     assert "drivers by Krauss" in text
+    assert "| `paced`, recurrent, ε = 1, sums over two neighbours |" in text
     assert (place.folder / "fig_gains.png").stat().st_size > 10_000
     places = len(tables.paying(results)) + len(tables.not_paying(results))
     assert places == 4 * 2
