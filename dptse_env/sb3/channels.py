@@ -124,6 +124,11 @@ class RoadChannels:
         )
 
     @property
+    def sensor_mark(self) -> tuple[float, ...]:
+        """Marks of 0 or 1 per segment: whether it has a fixed sensor."""
+        return self.marks[-1]
+
+    @property
     def n_channels(self) -> int:
         """Channels per segment, marks included."""
         return len(self.channels) + len(self.marks)

@@ -61,11 +61,16 @@ class _PlackettLuce(Kind):
 
     def describe(self, policy: BasePolicy) -> dict[str, Any]:
         assert isinstance(policy, PlackettLucePolicy)
-        return {"width": policy.width, "rule": policy.rule}
+        return {
+            "width": policy.width, "rule": policy.rule, "skips_sensors": policy.skips_sensors,
+        }  # fmt: skip
 
     def shapes(self, config: EnvConfig, arguments: Mapping[str, Any]) -> Shapes:
-        _check_names(arguments, {"width", "rule"})
+        _check_names({"skips_sensors": False, **arguments}, {"width", "rule", "skips_sensors"})
         _check_action(config, "slots")
+        skips = arguments.get("skips_sensors", False)
+        if not isinstance(skips, bool):
+            raise ValueError(f"policy.arguments.skips_sensors must be a bool, got {skips!r:.80}")
         width, rule = _size("width", arguments["width"]), arguments["rule"]
         if not isinstance(rule, dict) or not rule:
             raise ValueError(f"policy.arguments.rule must be a mapping of blocks, got {rule!r:.80}")
@@ -90,7 +95,9 @@ class _PlackettLuce(Kind):
 
     def make(self, config: EnvConfig, arguments: Mapping[str, Any]) -> BasePolicy:
         road = RoadChannels.from_config(config)
-        return PlackettLucePolicy(*_spaces(config), road=road, **arguments)
+        # Policies of version 0.1 query every segment.
+        known = {"skips_sensors": False, **arguments}
+        return PlackettLucePolicy(*_spaces(config), road=road, **known)
 
 
 class _Perceptron(Kind):

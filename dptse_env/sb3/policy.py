@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
+import torch
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs
@@ -15,6 +16,10 @@ from dptse_env.sb3.torch_modules import RoadFeatures, Scorer
 RULE = {"density_log_std": 2.8, "speed_log_std": 1.2, "age": 7.2}
 """Initial weights of the scores: an untrained policy queries segments whose estimate is uncertain
 or that have not been observed for long."""
+
+
+LAST_PLACE = 1e4
+"""Subtracted from the scores of segments that are queried only when there are no others."""
 
 
 class PlackettLucePolicy(BasePolicy):
@@ -36,9 +41,13 @@ class PlackettLucePolicy(BasePolicy):
         road: Layout of the observations.
         width: Features per segment.
         rule: Initial weights of the rule by observation block.
+        skips_sensors: Whether it leaves segments with a fixed sensor to that sensor, which tells
+            every second what a query would, as long as there are others to query.
         features: Module that arranges observations along the road.
         scorer: Module that scores segments; it has all learned weights.
     """
+
+    handicap: Tensor
 
     def __init__(
         self,
@@ -48,6 +57,7 @@ class PlackettLucePolicy(BasePolicy):
         road: RoadChannels,
         width: int = 48,
         rule: Mapping[str, float] = RULE,
+        skips_sensors: bool = True,
     ) -> None:
         """Make the network.
 
@@ -58,6 +68,7 @@ class PlackettLucePolicy(BasePolicy):
                 configuration.
             width: Features per segment.
             rule: Initial weights of observation blocks in the scores.
+            skips_sensors: Whether segments with a fixed sensor come last.
 
         Raises:
             ValueError: A space does not fit ``road``, or the rule has an unknown block.
@@ -65,6 +76,9 @@ class PlackettLucePolicy(BasePolicy):
         self.bandwidth = _bandwidth(observation_space, action_space, road)
         super().__init__(observation_space, action_space)
         self.road, self.width, self.rule = road, width, dict(rule)
+        self.skips_sensors = skips_sensors
+        last = LAST_PLACE * torch.tensor(road.sensor_mark) if skips_sensors else torch.zeros(())
+        self.register_buffer("handicap", last, persistent=False)
         self.features = RoadFeatures(road)
         self.scorer = Scorer(road, width, rule)
 
@@ -90,7 +104,12 @@ class PlackettLucePolicy(BasePolicy):
                 f"{missing} and has {more} besides"
             )
         twin = PlackettLucePolicy(
-            observation_space, action_space, road=road, width=self.width, rule=self.rule
+            observation_space,
+            action_space,
+            road=road,
+            width=self.width,
+            rule=self.rule,
+            skips_sensors=self.skips_sensors,
         )
         twin.scorer = self.scorer
         return twin
@@ -102,7 +121,7 @@ class PlackettLucePolicy(BasePolicy):
 
     def get_distribution(self, observation: Tensor) -> PlackettLuce:
         """Return the distribution over ordered sets for observations (k, size)."""
-        return PlackettLuce(self.scores(observation), self.bandwidth)
+        return PlackettLuce(self.scores(observation) - self.handicap, self.bandwidth)
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> Tensor:
         assert isinstance(observation, Tensor)
@@ -116,6 +135,7 @@ class PlackettLucePolicy(BasePolicy):
             "road": self.road,
             "width": self.width,
             "rule": self.rule,
+            "skips_sensors": self.skips_sensors,
         }
 
 

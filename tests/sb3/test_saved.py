@@ -295,7 +295,7 @@ def test_weights_other_than_those_of_the_network_are_refused(tmp_path, action, c
         ("slots", lambda c: _arguments(c).update(width=10**30), r"width must be .* in 1\.\.100000"),
         ("slots", lambda c: _arguments(c).update(width=-1), r"width must be an integer in 1\.\."),
         ("slots", lambda c: _arguments(c).update(width=8.0), r"width must be an integer in 1\.\."),
-        ("slots", lambda c: _arguments(c).update(depth=3), "arguments must be rule, width"),
+        ("slots", lambda c: _arguments(c).update(depth=3), "arguments must be rule, skips_sensors, width"),
         ("slots", lambda c: _arguments(c).update(rule=[1]), "rule must be a mapping"),
         ("slots", lambda c: _arguments(c).update(rule={"colour": 1}), "must be one of .*'colour'"),
         ("slots", lambda c: _arguments(c).update(rule={"age": 10**400}), "must be a number up to"),
