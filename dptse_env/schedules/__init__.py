@@ -28,7 +28,7 @@ from dptse_env.schedules.fixed import (
     StaleVariance,
 )
 from dptse_env.schedules.front import SpeedFront
-from dptse_env.schedules.oracles import OracleBruteForce, OracleError, OracleGreedy
+from dptse_env.schedules.oracles import OracleBruteForce, OracleError, OracleGain, OracleGreedy
 from dptse_env.schedules.plans import (
     PLAN_ALIASES,
     PLANS,
@@ -63,6 +63,7 @@ __all__ = [
     "OldestFirst",
     "OracleBruteForce",
     "OracleError",
+    "OracleGain",
     "OracleGreedy",
     "Plan",
     "PlanContext",
@@ -110,6 +111,7 @@ two steps of the EKF, of ``rollout`` some hundred."""
 
 ORACLES: dict[str, type[ProcessSchedule]] = {
     "oracle-error": OracleError,
+    "oracle-gain": OracleGain,
     "oracle-greedy": OracleGreedy,
     "oracle-brute-force": OracleBruteForce,
 }

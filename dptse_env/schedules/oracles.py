@@ -62,15 +62,23 @@ class _Realised(ProcessSchedule):
     """
 
     uses_truth: ClassVar[bool] = True
+    without_noise: ClassVar[bool] = False
+    """True where releases are tried without their noise, which no policy can know."""
 
     def __init__(self, process: QueryProcess, seed: int | None = None) -> None:
         """Bind the schedule.
 
         Raises:
-            ValueError: Options are not the mainline segments.
+            ValueError: Options are not the mainline segments, or the schedule needs to set the
+                noise of a release model that does not let it.
         """
         super().__init__(process, seed)
         require_plain(process.interface, self.name)
+        if self.without_noise and not process.release.takes_noise:
+            raise ValueError(
+                f"schedule {self.name!r} needs a release model whose noise can be set, got "
+                f"{process.release.setup.name!r}"
+            )
 
     def _choose(self, rows: IntArray, step: IntArray, observation: Observation) -> BoolArray:
         chosen = np.zeros((len(rows), self.n_mainline), dtype=bool)
@@ -89,6 +97,8 @@ class _Realised(ProcessSchedule):
         traffic, times = ahead.traffic_index[episodes], ahead.time[episodes]
         ahead.estimator.predict(episodes, ahead.boundary.inputs(episodes, traffic, times))
         all_columns = np.ones((len(episodes), ahead.release.setup.n_columns), dtype=bool)
+        if self.without_noise:
+            ahead.release.give_noise(np.zeros((ahead.n_episodes, all_columns.shape[1], 2)))
         request = ReleaseRequest(
             episodes,
             traffic,
@@ -115,6 +125,27 @@ class _Realised(ProcessSchedule):
             ScoredSecond(error, density, speed, estimate, queried, process.config.corridor)
         )
         return rewards
+
+
+class OracleGain(_Realised):
+    """The segments whose query alone would increase the reward most if it had no noise.
+
+    The reward is that of the coming second, with the truth, and each segment is tried by itself. It
+    knows what a query is worth but not what its noise will do, as the best policy would. That
+    takes n updates of the estimator per step.
+    """
+
+    name: ClassVar[str] = "oracle-gain"
+    without_noise: ClassVar[bool] = True
+
+    def _best(self, coming: _NextSecond) -> BoolArray:
+        every = np.arange(self.n_mainline)
+        rewards = [
+            self._reward(coming, np.tile(every == segment, (len(coming.episodes), 1)))
+            for segment in every
+        ]
+        order = np.argsort(-np.stack(rewards, axis=1), axis=1, kind="stable")
+        return self.mask(order[:, : self.bandwidth])
 
 
 class OracleGreedy(_Realised):

@@ -12,7 +12,7 @@ from dptse_env.parts import make_interface
 from dptse_env.sb3 import PlackettLucePolicy, RoadChannels
 
 
-def make_policy(preset="private-highway", **keywords):
+def make_policy(preset="private-highway", *, skips_sensors=True, **keywords):
     config = resolve(preset, {"action": "slots", **keywords})
     interface = make_interface(config)
     torch.manual_seed(0)
@@ -20,6 +20,7 @@ def make_policy(preset="private-highway", **keywords):
         interface.observations.space,
         interface.actions.space,
         road=RoadChannels.from_config(config),
+        skips_sensors=skips_sensors,
     )
 
 
@@ -45,13 +46,30 @@ def test_actions_are_distinct_and_follow_the_distribution(bandwidth):
 def test_deterministic_actions_are_the_highest_scores():
     policy = make_policy()
     seen = observations(policy)
-    best = policy.scores(seen).argsort(dim=1, descending=True)[:, :5]
+    scores = policy.scores(seen).detach()
+    scores[:, 14] = -torch.inf  # the last segment has a fixed sensor
+    best = scores.argsort(dim=1, descending=True)[:, :5]
     actions, state = policy.predict(seen.numpy(), deterministic=True)
     np.testing.assert_array_equal(actions, best.numpy())
     assert state is None
     np.testing.assert_array_equal(policy.predict(seen[0].numpy(), deterministic=True)[0], best[0])
     drawn = [policy.predict(seen.numpy())[0] for _ in range(2)]
     assert (drawn[0] != drawn[1]).any()
+
+
+def test_a_segment_with_a_fixed_sensor_is_queried_when_there_is_no_other():
+    seen = observations(make_policy())
+    for deterministic in (True, False):
+        some, _ = make_policy(bandwidth=14).predict(seen.numpy(), deterministic=deterministic)
+        assert not (some == 14).any()
+        every, _ = make_policy(bandwidth=15).predict(seen.numpy(), deterministic=deterministic)
+        assert (every[:, -1] == 14).all()
+
+
+def test_a_policy_may_be_told_to_query_segments_with_sensors():
+    policy = make_policy(skips_sensors=False)
+    actions, _ = policy.predict(observations(policy, 500).numpy())
+    assert (actions == 14).any()
 
 
 def test_untrained_it_stands_near_its_rule():

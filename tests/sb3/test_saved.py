@@ -295,7 +295,8 @@ def test_weights_other_than_those_of_the_network_are_refused(tmp_path, action, c
         ("slots", lambda c: _arguments(c).update(width=10**30), r"width must be .* in 1\.\.100000"),
         ("slots", lambda c: _arguments(c).update(width=-1), r"width must be an integer in 1\.\."),
         ("slots", lambda c: _arguments(c).update(width=8.0), r"width must be an integer in 1\.\."),
-        ("slots", lambda c: _arguments(c).update(depth=3), "arguments must be rule, skips_sensors, width"),
+        ("slots", lambda c: _arguments(c).update(skips_sensors=1), "skips_sensors must be a bool"),
+        ("slots", lambda c: _arguments(c).update(depth=3), "arguments must be rule, skips_"),
         ("slots", lambda c: _arguments(c).update(rule=[1]), "rule must be a mapping"),
         ("slots", lambda c: _arguments(c).update(rule={"colour": 1}), "must be one of .*'colour'"),
         ("slots", lambda c: _arguments(c).update(rule={"age": 10**400}), "must be a number up to"),
@@ -415,6 +416,16 @@ def test_shipped_policies_act_where_they_were_trained(name):
         observation, *_, infos = env.step(actions)
         assert (infos["queried"].sum(axis=1) == env.config.bandwidth).all()
         assert not infos["n_dropped"].any()
+
+
+def test_policies_of_version_0_1_query_segments_with_sensors(tmp_path):
+    policy, config = make_policy("slots")
+    path = tmp_path / "one.zip"
+    save_policy(path, policy, config, **ABOUT)
+    env = make_env()
+    assert load_policy(path, env)._policy.skips_sensors
+    edit_card(path, lambda card: _arguments(card).pop("skips_sensors"))
+    assert not load_policy(path, env)._policy.skips_sensors
 
 
 def test_a_policy_comes_with_the_package():

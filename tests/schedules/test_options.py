@@ -151,7 +151,9 @@ def test_all_queries_every_segment_by_itself():
 
 
 @pytest.mark.parametrize("road", ["spans", "levels"])
-@pytest.mark.parametrize("name", [*COVARIANCE_SCHEDULES, "oracle-greedy", "oracle-brute-force"])
+@pytest.mark.parametrize(
+    "name", [*COVARIANCE_SCHEDULES, "oracle-gain", "oracle-greedy", "oracle-brute-force"]
+)
 def test_schedules_of_single_segments_say_so(name, road):
     message = rf"schedule '{name}' queries single segments: it needs query_spans \(1,\) and price"
     with pytest.raises(ValueError, match=message):

@@ -7,6 +7,7 @@ import pytest
 
 from dptse_env.schedules import make_schedule
 from dptse_env.schedules.oracles import _Realised
+from tests.release.sums import SumRelease
 
 from .playing import begin, make_batch, make_single, play
 
@@ -81,7 +82,46 @@ def test_the_greedy_oracle_adds_the_best_segment_each_time():
         before.append(queried)
 
 
-@pytest.mark.parametrize("name", ["oracle-error", "oracle-greedy", "oracle-brute-force"])
+@pytest.mark.parametrize("privacy", ["paper", BOUNDED, {"preset": "paced"}], ids=str)
+def test_the_oracle_of_gains_tries_every_segment_without_noise(privacy):
+    keywords = {"bandwidth": 2, "privacy": privacy}
+    queries, _ = play(make_single(**keywords), "oracle-gain", 4)
+    before = []
+    for query in queries[:, 0]:
+        # Every segment is observed in the trials, so their rewards are told apart by the updates.
+        env = make_single(**keywords)
+        begin(env)
+        for queried in before:
+            mask = np.zeros(6, dtype=np.int8)
+            mask[queried] = 1
+            env.step(mask)
+        process = env.unwrapped.process
+        coming = make_schedule("oracle-gain", env)._look(np.array([0]))
+        length = process.config.corridor.segment_length
+        counts = coming.released.values[0, :6, 0]
+        if privacy == "paper":
+            np.testing.assert_allclose(counts, coming.truth[0, :6, 0], atol=0.02)
+        else:
+            # What counts is a whole number of vehicles, up to the grid of the release.
+            np.testing.assert_allclose(counts * length, np.rint(counts * length), atol=0.01)
+        gains = [
+            make_schedule("oracle-gain", env)._reward(coming, (np.arange(6) == s)[None])[0]
+            for s in range(6)
+        ]
+        assert set(np.flatnonzero(query)) == set(np.argsort(gains)[-2:])
+        before.append(np.flatnonzero(query))
+
+
+def test_the_oracle_of_gains_needs_noise_that_can_be_set():
+    with pytest.raises(
+        ValueError, match=r"^schedule 'oracle-gain' needs a release model whose noi"
+    ):
+        make_schedule("oracle-gain", make_single(privacy=SumRelease))
+
+
+@pytest.mark.parametrize(
+    "name", ["oracle-error", "oracle-gain", "oracle-greedy", "oracle-brute-force"]
+)
 @pytest.mark.parametrize("keywords", [{"privacy": BOUNDED}, {"estimator": "enkf"}], ids=str)
 def test_an_oracle_leaves_the_process_as_it_is(name, keywords):
     """Whoever follows an oracle's queries without calling it meets the same numbers."""

@@ -181,7 +181,7 @@ class Learned:
         return (action[0] if np.ndim(observation) == 1 else action), state
 
 
-LOOKS_AHEAD = ("oracle-greedy", "oracle-brute-force")
+LOOKS_AHEAD = ("oracle-gain", "oracle-greedy", "oracle-brute-force")
 LADDER = [
     pytest.param(name, marks=pytest.mark.slow) if name in LOOKS_AHEAD else name
     for name in (
