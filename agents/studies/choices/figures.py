@@ -6,12 +6,11 @@ from matplotlib.figure import Figure
 
 from agents.evaluation.figures import finish_figure, make_figure, set_log_ticks
 from agents.experiments.plots import GREY, Look, draw_curve, shifted
-from agents.studies.choices.plan import ORACLE
+from agents.studies.choices.plan import GAIN, ORACLE
 from agents.studies.choices.results import ChoiceResults
 
-RULE, LEARNED, BOUND = (
-    Look("#0072b2", "o"), Look("#d55e00", "s"), Look("#666666", "^", ":"),
-)  # fmt: skip
+RULE, LEARNED = Look("#0072b2", "o"), Look("#d55e00", "s")
+BOUNDS = {ORACLE: Look("#666666", "^", ":"), GAIN: Look("#333333", "v", "--")}
 
 
 def draw_gains(results: ChoiceResults) -> Figure:
@@ -23,7 +22,8 @@ def draw_gains(results: ChoiceResults) -> Figure:
     for axis, world in zip(axes, design.worlds, strict=False):
         bandwidths = design.bandwidths_of(world)
         shares = [100.0 * design.cell(world, each, "").share for each in bandwidths]
-        curves = [("rule", [design.rule(world)], RULE), (ORACLE, [ORACLE], BOUND)]
+        curves = [("rule", [design.rule(world)], RULE)]
+        curves += [(bound, [bound], BOUNDS[bound]) for bound in design.bounds(world)]
         if design.learned(world):
             curves.append(("learned", list(design.learned(world)), LEARNED))
         for k, (label, policies, look) in enumerate(curves):
@@ -39,4 +39,4 @@ def draw_gains(results: ChoiceResults) -> Figure:
         axis.remove()
     for axis in axes[::columns]:
         axis.set_ylabel(f"error below {design.schedule} [%]", fontsize=8)
-    return finish_figure(figure, columns=3)
+    return finish_figure(figure, columns=4)

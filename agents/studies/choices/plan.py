@@ -27,7 +27,7 @@ from agents.studies.choices.cell import (
 )
 from dptse_env.config import EnvConfig, parse_seeds
 
-ORACLE = "oracle-error"
+ORACLE, GAIN = "oracle-error", "oracle-gain"
 REFERENCE = "paper"
 EPSILON = 5.0
 
@@ -143,9 +143,13 @@ class ChoiceDesign(Design[ChoiceCell]):
         """Return the rule of a world."""
         return self.rule_ekf if world.estimator == EKF else self.rule_recurrent
 
+    def bounds(self, world: World) -> tuple[str, ...]:
+        """Return the oracles of a world; trying every segment takes too long on the long road."""
+        return (ORACLE, GAIN) if world.road == HIGHWAY else (ORACLE,)
+
     def policies(self, world: World) -> list[str]:
         """Return all policies of a world."""
-        rules = [self.schedule, REFERENCE, self.rule(world), ORACLE]
+        rules = [self.schedule, REFERENCE, self.rule(world), *self.bounds(world)]
         return list(dict.fromkeys([*rules, *self.learned(world)]))
 
     def cell(self, world: World, bandwidth: int, policy: str) -> ChoiceCell:

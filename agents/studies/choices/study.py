@@ -20,7 +20,7 @@ from agents.experiments.runner import Workplace
 from agents.studies.choices import tables
 from agents.studies.choices.cell import HIGHWAY, ROADS, ChoiceCell
 from agents.studies.choices.figures import draw_gains
-from agents.studies.choices.plan import EPSILON, ORACLE, REFERENCE, ChoiceDesign
+from agents.studies.choices.plan import EPSILON, GAIN, ORACLE, REFERENCE, ChoiceDesign
 from agents.studies.choices.results import ChoiceResults
 from agents.studies.choices.running import run_missing
 from dptse_env.config import parse_seeds
@@ -72,6 +72,7 @@ def report(results: ChoiceResults, recorded: Mapping[str, Any], command: str) ->
         "command": command,
         "provenance": recorded,
         "ORACLE": ORACLE,
+        "GAIN": GAIN,
         "REFERENCE": REFERENCE,
         "EPSILON": EPSILON,
         "HIGHWAY": HIGHWAY,

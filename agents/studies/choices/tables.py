@@ -8,7 +8,7 @@ from agents.evaluation.statistics import Interval
 from agents.experiments.cells import DENSITY, ERROR, SPEED
 from agents.experiments.tables import markdown
 from agents.studies.choices.cell import OTHER_TRAFFIC
-from agents.studies.choices.plan import ORACLE, REFERENCE, World
+from agents.studies.choices.plan import REFERENCE, World
 from agents.studies.choices.results import ChoiceResults
 
 
@@ -104,7 +104,7 @@ def _header(results: ChoiceResults, world: World, first: str) -> list[str]:
     worst = ["worst training seed"] if len(design.learned(world)) > 1 else []
     return [
         first, f"`{REFERENCE}`", f"`{design.schedule}`", *_choosers(results, world), *worst,
-        f"`{ORACLE}`",
+        *(f"`{bound}`" for bound in design.bounds(world)),
     ]  # fmt: skip
 
 
@@ -117,7 +117,8 @@ def _gains(results: ChoiceResults, world: World, bandwidth: int) -> list[str]:
     groups = _choosers(results, world)
     gains = [_percent(results.gain(world, bandwidth, group)) for group in groups.values()]
     worst = [f"{results.worst_gain(world, bandwidth, learned):.1f}"] if len(learned) > 1 else []
-    return [*errors, *gains, *worst, _percent(results.gain(world, bandwidth, [ORACLE]))]
+    bounds = [_percent(results.gain(world, bandwidth, [each])) for each in design.bounds(world)]
+    return [*errors, *gains, *worst, *bounds]
 
 
 def _percent(interval: Interval) -> str:
