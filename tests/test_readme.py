@@ -21,4 +21,4 @@ def test_its_examples_run_one_after_the_other(capsys):
         exec(block, names)
     assert len(blocks) == 3
     assert "mean error 0." in capsys.readouterr().out
-    assert names["schedule"].predict(names["env"].reset(seed=0)[0])[0].shape == (5,)
+    assert names["schedule"].predict(names["env"].reset(seed=0)[0])[0].shape == (2,)
