@@ -113,7 +113,11 @@ def make_vector(env: str, n_episodes: int, keywords: Mapping[str, Any]) -> Senso
 
 @contextlib.contextmanager
 def without_void_warning() -> Iterator[None]:
-    """Suppress the void-guarantee warning; the study reports it itself."""
+    """Suppress warnings of a void guarantee, and of an id with a newer version.
+
+    A study reports the guarantee itself, and names the version that it is about.
+    """
     with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=r".*is out of date\. You should consider")
         warnings.filterwarnings("ignore", message=r"privacy\.preset is .* yet no privacy")
         yield

@@ -35,7 +35,10 @@ def varied_table(results: ChoiceResults, world: World) -> str:
 
 
 def saved_table(results: ChoiceResults, world: World) -> str:
-    """Return the bandwidth that the rule and the learned policies save, by bandwidth."""
+    """Return the bandwidth that the rule and the learned policies save, by bandwidth.
+
+    The largest bandwidth is left out: nothing larger was run that could be saved.
+    """
     design = results.design
     rows = [
         [
@@ -45,7 +48,7 @@ def saved_table(results: ChoiceResults, world: World) -> str:
                 for policies in _choosers(results, world).values()
             ),
         ]
-        for bandwidth in design.bandwidths_of(world)
+        for bandwidth in design.bandwidths_of(world)[:-1]
     ]
     return markdown(["B", *_choosers(results, world)], rows)
 
