@@ -8,10 +8,9 @@ from typing import Any
 from agents.evaluation.environments import make_config, parse_env
 from agents.experiments.provenance import source_digest
 from agents.filters.plan import FilterPlan
-from dptse_env.config import EnvConfig
 from dptse_env.estimators.learned.channels import CHANNELS
 from dptse_env.estimators.learned.weights import FORMAT
-from dptse_env.release import RELEASE_MODELS
+from dptse_env.parts import flow_centre
 
 
 def make_card(plan: FilterPlan, done: int, name: str) -> dict[str, Any]:
@@ -30,7 +29,7 @@ def make_card(plan: FilterPlan, done: int, name: str) -> dict[str, Any]:
         "speed_limit": [limit for road in roads for limit in road.speed_limits],
         "lanes": [float(count) for count in lanes],
         "span": [1.0, *(float(span) for spans in ranges.spans for span in spans)],
-        "flows": [_releases_flows(config) for config in configs],
+        "flows": [float(flow_centre(config) is not None) for config in configs],
     }
     return {
         "name": name,
@@ -44,8 +43,3 @@ def make_card(plan: FilterPlan, done: int, name: str) -> dict[str, Any]:
             "versions": {each: version(each) for each in ("dptse-env", "torch", "numpy")},
         },
     }
-
-
-def _releases_flows(config: EnvConfig) -> float:
-    release = RELEASE_MODELS.find(config.privacy.preset)
-    return float(release.flow_centre(config.corridor, config.privacy) is not None)

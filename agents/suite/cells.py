@@ -13,7 +13,7 @@ from agents.evaluation.episodes import WARM_UP
 from agents.experiments.seeds import SUITE
 from dptse_env.config import EnvConfig, parse_seeds
 from dptse_env.estimators.learned.weights import member_for, read_network
-from dptse_env.release import RELEASE_MODELS
+from dptse_env.parts import flow_centre
 from dptse_env.utils.digests import json_digest
 from dptse_env.utils.validation import require_name
 
@@ -84,8 +84,7 @@ def _network_digests(config: EnvConfig) -> list[str]:
     """Return the digest of the network that a learned estimator reads, if it is one."""
     if config.estimator != "recurrent":
         return []
-    release = RELEASE_MODELS.find(config.privacy.preset)
-    flows = release.flow_centre(config.corridor, config.privacy) is not None
+    flows = flow_centre(config) is not None
     return [read_network(member_for(config.settings().recurrent.weights, flows)).sha256]
 
 
