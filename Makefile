@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 
 export OMP_NUM_THREADS = 1
 
-.PHONY: help setup docs demo policy-study audit test test-slow lint format benchmark wheel-test clean clean-kernels reproduce privacy-study ledger-study
+.PHONY: help setup docs demo policy-study audit test test-slow lint format benchmark wheel-test clean clean-kernels reproduce privacy-study ledger-study choice-study
 
 help:  ## Show this list.
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -42,6 +42,11 @@ policy-study: setup  ## Hold the trained policies of results/training against ev
 		primary=results/training/primary primary:regression=results/training/regression \
 		$(foreach cell,paper bandwidth-3 bandwidth-7 epsilon-1 epsilon-10,$(cell)=results/training/$(cell))
 	$(BIN)/python scripts/study.py policies run
+
+choice-study: setup  ## Map where a choice of queries pays, with the policies of results/training; results/choices.
+	$(BIN)/python scripts/study.py choices \
+		--capped $(wildcard results/training/capped-roads/*/best.zip) \
+		--paced $(wildcard results/training/paced-roads/*/best.zip)
 
 audit: setup  ## Attack the privacy presets, 5,000 runs in each of two worlds; results/audit.
 	$(BIN)/python scripts/audit.py --env dptse_env:dptse/PaperHighway-v0 --target replaced

@@ -6,6 +6,7 @@ from matplotlib.figure import Figure
 
 from agents.evaluation.figures import finish_figure, make_figure, set_log_ticks
 from agents.experiments.plots import GREY, Look, draw_curve, shifted
+from agents.studies.choices.cell import ROADS
 from agents.studies.choices.plan import GAIN, ORACLE
 from agents.studies.choices.results import ChoiceResults
 
@@ -32,7 +33,7 @@ def draw_gains(results: ChoiceResults) -> Figure:
         axis.axhline(0.0, color=GREY, linewidth=0.8)
         axis.set_xscale("log")
         set_log_ticks(axis.xaxis, [round(share, 1) for share in shares])
-        road = design.label_of(world.road).partition(",")[0]
+        road = ROADS[world.road].label.partition(",")[0]
         axis.set_title(f"{road}, {world.label.replace('`', '')}", fontsize=9)
         axis.set_xlabel("segments queried a second [%]", fontsize=8)
     for axis in axes[len(design.worlds) :]:

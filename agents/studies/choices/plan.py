@@ -22,7 +22,6 @@ from agents.studies.choices.cell import (
     OWN_TRAFFIC,
     PACED,
     RECURRENT,
-    ROADS,
     ChoiceCell,
 )
 from dptse_env.config import EnvConfig, parse_seeds
@@ -197,7 +196,3 @@ class ChoiceDesign(Design[ChoiceCell]):
             ValueError: A file is not a saved policy.
         """
         return [read_saved_policy(each) for each in (*self.capped, *self.paced)]
-
-    def label_of(self, road: str) -> str:
-        """Return the name of a road in tables."""
-        return ROADS[road].label
