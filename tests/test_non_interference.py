@@ -14,6 +14,7 @@ from dptse_env.estimators import ESTIMATORS
 from dptse_env.parts import flow_centre
 from dptse_env.process import TRUTH_INFO
 from dptse_env.release.boundary import NominalBoundary
+from dptse_env.release.noise import NoiseStreams
 from dptse_env.schedules import (
     COVARIANCE_SCHEDULES,
     DEVIATION_SCHEDULES,
@@ -30,7 +31,7 @@ BLIND_SCHEDULES = sorted(
 )
 
 
-class ConstantMechanism:
+class ConstantMechanism(NoiseStreams):
     """Releases the same values whatever the traffic: others for every second and segment."""
 
     def __init__(self, mechanism, releases_flow):
@@ -39,6 +40,9 @@ class ConstantMechanism:
 
     def reset(self, episodes, generators):
         self._step = 0
+
+    def give(self, noise):
+        pass  # its answers have no noise
 
     def release(self, episodes, values):
         self._step += 1

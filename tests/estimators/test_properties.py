@@ -269,9 +269,11 @@ def test_the_numbering_of_segments_and_rows_changes_nothing(name, backend, relea
     run(a, episodes, range(n_steps))
     run(b, other, range(n_steps))
     first, second = show(a), show(b)
+    # The network sums in single precision, in another order; densities are of the order of 100.
+    atol = 1e-4 if name == "recurrent" else 1e-7
     for field in ("density", "speed", "density_std", "speed_std", "innovations"):
         mine, its = getattr(first, field), getattr(second, field)[:, EXCHANGED]
-        np.testing.assert_allclose(mine, its, rtol=1e-6, atol=1e-7, err_msg=field)
+        np.testing.assert_allclose(mine, its, rtol=1e-6, atol=atol, err_msg=field)
 
 
 # Batches ------------------------------------------------------------------------------------------
