@@ -12,9 +12,9 @@ from dptse_env.config import resolve
 from dptse_env.parts import make_interface, make_parts, warn_where_void
 from dptse_env.process import QueryProcess
 from dptse_env.rendering import History, Picture
-from dptse_env.traffic import RecordLibrary
+from dptse_env.traffic import Records, open_library
 from dptse_env.utils.arrays import Observation
-from dptse_env.utils.validation import integer, path_or_none
+from dptse_env.utils.validation import integer
 
 _ONLY = np.zeros(1, dtype=np.int64)
 
@@ -122,7 +122,7 @@ class SensorQueryEnv(gym.Env[Observation, Any]):
         *,
         render_mode: str | None = None,
         render_every: int = 1,
-        records: str | None = None,
+        records: Records = None,
         **overrides: Any,
     ) -> None:
         """Describe the environment; nothing is recorded or compiled before `reset`.
@@ -132,7 +132,8 @@ class SensorQueryEnv(gym.Env[Observation, Any]):
             render_mode: None or ``"rgb_array"``.
             render_every: Simulated time between two drawings [s]; in between, `render` returns the
                 last one.
-            records: Folder of the record cache; None for the user's cache.
+            records: Folder of the record cache, or a library of records; None for the user's
+                cache.
             **overrides: Fields of `dptse_env.config.EnvConfig`, or the shortcuts ``epsilon``,
                 ``delta``, ``incident`` and ``demand``. Values may be plain JSON.
 
@@ -155,7 +156,7 @@ class SensorQueryEnv(gym.Env[Observation, Any]):
         self.interface = make_interface(self.config)
         self.action_space = self.interface.actions.space
         self.observation_space = self.interface.observations.space
-        self._records = path_or_none("records", records)
+        self._library = open_library(records)
         self._process: QueryProcess | None = None
         self.history: History | None = None
         self._picture: Picture | None = None
@@ -165,8 +166,7 @@ class SensorQueryEnv(gym.Env[Observation, Any]):
     def process(self) -> QueryProcess:
         """The process behind the environment, assembled at the first use."""
         if self._process is None:
-            library = RecordLibrary(self._records)
-            parts = make_parts(self.config, 1, library, interface=self.interface)
+            parts = make_parts(self.config, 1, self._library, interface=self.interface)
             self._process = QueryProcess(parts)
         return self._process
 

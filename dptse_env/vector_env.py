@@ -17,9 +17,9 @@ from dptse_env.config import resolve
 from dptse_env.parts import make_interface, make_parts, warn_where_void
 from dptse_env.process import QueryProcess
 from dptse_env.reset_options import per_episode
-from dptse_env.traffic import RecordLibrary
+from dptse_env.traffic import Records, open_library
 from dptse_env.utils.arrays import Action, BoolArray, FloatArray, IntArray, Observation
-from dptse_env.utils.validation import integer, path_or_none
+from dptse_env.utils.validation import integer
 from dptse_env.utils.vector_info import Rows, in_vector_form, object_array, repeated_rows
 
 _MODES = {mode.value: mode for mode in AutoresetMode}
@@ -88,7 +88,7 @@ class SensorQueryVectorEnv(VectorEnv[Observation, Action, Any]):
         *,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         render_mode: str | None = None,
-        records: str | None = None,
+        records: Records = None,
         threads: int | None = None,
         **overrides: Any,
     ) -> None:
@@ -99,7 +99,8 @@ class SensorQueryVectorEnv(VectorEnv[Observation, Action, Any]):
             preset: Name of a preset in `dptse_env.config.PRESETS`.
             autoreset_mode: A mode or its value, see above.
             render_mode: None; a batch is not drawn.
-            records: Folder of the record cache; None for the user's cache.
+            records: Folder of the record cache, or a library of records; None for the user's
+                cache.
             threads: Threads of the estimator, each for a block of episodes; None for one per core.
                 Their number changes the time only.
             **overrides: As in `dptse_env.env.SensorQueryEnv`.
@@ -126,7 +127,7 @@ class SensorQueryVectorEnv(VectorEnv[Observation, Action, Any]):
         self.single_observation_space = self.interface.observations.space
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
-        self._records = path_or_none("records", records)
+        self._library = open_library(records)
         self._threads = None if threads is None else integer("threads", threads, 1, 1024)
         self._process: QueryProcess | None = None
         self._generators: list[tuple[np.random.Generator, int] | None] = [None] * self.num_envs
@@ -139,8 +140,7 @@ class SensorQueryVectorEnv(VectorEnv[Observation, Action, Any]):
     def process(self) -> QueryProcess:
         """The process behind the environment, assembled at the first use."""
         if self._process is None:
-            library = RecordLibrary(self._records)
-            parts = make_parts(self.config, self.num_envs, library, interface=self.interface)
+            parts = make_parts(self.config, self.num_envs, self._library, interface=self.interface)
             self._process = QueryProcess(parts, self._threads)
         return self._process
 

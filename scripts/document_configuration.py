@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import os
 import re
 import types
 import typing
@@ -39,6 +40,7 @@ from dptse_env.traffic import (
     Incident,
     IncidentDistribution,
     Recordings,
+    RecordLibrary,
     SumoScenario,
 )
 from dptse_env.utils.fields import Interval, allowed_numbers, field_hints
@@ -95,7 +97,7 @@ def describe_type(hint: Any) -> str:
     if hint in SECTIONS:
         return f"mapping, see [below](#{_anchor(SECTIONS[hint])})"
     if origin in (typing.Union, types.UnionType):
-        return " or ".join(describe_type(item) for item in items)
+        return " or ".join(dict.fromkeys(describe_type(item) for item in items))
     if origin is typing.Literal:
         return ", ".join(f"`{item}`" for item in items)
     if origin is tuple and items[-1] is Ellipsis:
@@ -106,6 +108,7 @@ def describe_type(hint: Any) -> str:
             f"{len(each)} values, each {each[0]}" if len(set(each)) == 1 else f"({'; '.join(each)})"
         )
     plain = {str: "text", bool: "true or false", type(None): "`None`"}
+    plain |= {os.PathLike[str]: "text", RecordLibrary: "a `RecordLibrary`"}
     return plain.get(hint, "a name, a class or an object")
 
 

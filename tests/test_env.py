@@ -360,7 +360,7 @@ def test_a_sequential_episode_renders_one_column_a_second():
         ({"corridor": {"n_mainline": 2**63}}, r"^corridor\.n_mainline must be .* in 2\.\.1000, go"),
         ({"corridor": 3}, r"^corridor must be a Corridor, or return one, got 3"),
         ({"render_every": 0}, r"^render_every must be an integer >= 1, got 0"),
-        ({"records": 1}, r"^records must be a path or None, got 1"),
+        ({"records": 1}, r"^records must be a path, a RecordLibrary or None, got 1"),
         ({"observation": 3}, r"^observation must be a sequence, got 3"),
         ({"estimator": 3}, r"^estimator must be a class, or callable with .*, got 3"),
         ({"reward": 3}, r"^reward must be callable with a ScoredSecond, got 3"),

@@ -24,7 +24,7 @@ from .vectors import MODES, assert_same, short, staggered
         ({"threads": 0}, r"^threads must be an integer in 1\.\.1024, got 0"),
         ({"bandwith": 2}, r"^bandwith is unknown; allowed: corridor, estimator"),
         ({"epsilon": -1}, r"^privacy\.epsilon must be a number in \[.*\], got -1"),
-        ({"records": 1}, r"^records must be a path or None, got 1"),
+        ({"records": 1}, r"^records must be a path, a RecordLibrary or None, got 1"),
     ],
 )
 def test_bad_keywords_name_themselves(keywords, message):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import json
 import platform
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,6 +16,7 @@ from agents.experiments.cells import Design
 from agents.experiments.files import write_json
 from dptse_env.config import EnvConfig
 from dptse_env.estimators.tuned_settings import available_settings, settings_name
+from dptse_env.utils.digests import package_digest
 
 PROVENANCE_FILE = "run.json"
 
@@ -78,11 +78,7 @@ def machine(packages: Sequence[str]) -> dict[str, str]:
 
 def source_digest() -> str:
     """Return a digest of the package's code, which changes more often than its version."""
-    digest = hashlib.sha256()
-    root = Path(dptse_env.__file__).parent
-    for path in sorted(root.rglob("*.py")):
-        digest.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
-    return digest.hexdigest()[:12]
+    return package_digest(dptse_env)
 
 
 def check_folder(folder: Path, provenance: Mapping[str, Any]) -> dict[str, Any] | None:

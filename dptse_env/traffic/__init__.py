@@ -9,7 +9,7 @@ from dptse_env.traffic.drivers import Drivers
 from dptse_env.traffic.dwell import average_dwell
 from dptse_env.traffic.field_record import AnyRecord, FieldRecord, with_vehicles
 from dptse_env.traffic.incident import Incident, IncidentDistribution
-from dptse_env.traffic.library import RecordLibrary
+from dptse_env.traffic.library import RecordLibrary, Records, open_library
 from dptse_env.traffic.presets import (
     CORRIDORS,
     PAPER_HIGHWAY,
@@ -52,6 +52,7 @@ __all__ = [
     "RecordLibrary",
     "RecordingError",
     "Recordings",
+    "Records",
     "RoadFile",
     "Scenario",
     "SumoScenario",
@@ -61,6 +62,7 @@ __all__ = [
     "find_corridor",
     "is_road_file",
     "mean_dwell",
+    "open_library",
     "randomised",
     "ranges",
     "read_corridor",

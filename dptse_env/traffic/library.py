@@ -22,6 +22,7 @@ from collections import OrderedDict
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
+from typing import Any
 
 import platformdirs
 from tqdm import tqdm
@@ -40,7 +41,7 @@ from dptse_env.traffic.sumo import (
 from dptse_env.traffic.sumo_network import NetworkError
 from dptse_env.traffic.worker import WorkerPool
 from dptse_env.utils.threads import n_cores
-from dptse_env.utils.validation import integer
+from dptse_env.utils.validation import integer, require
 
 CACHE_VARIABLE = "DPTSE_CACHE"
 """Environment variable with the directory of the records."""
@@ -72,14 +73,18 @@ class RecordLibrary:
 
     def __init__(self, path: str | os.PathLike[str] | None = None, n_open: int = 64) -> None:
         """Store the path; nothing is read or written yet."""
+        self.is_default = path is None
         self.path = default_path() if path is None else Path(path).expanduser()
         self.n_open = integer("library.n_open", n_open, 1)
         self._open: OrderedDict[tuple[str, int], AnyRecord] = OrderedDict()
         self._lock = threading.Lock()
 
-    def __reduce__(self) -> tuple[type["RecordLibrary"], tuple[Path, int]]:
-        """Pickle as the path alone: each process opens the records itself."""
-        return type(self), (self.path, self.n_open)
+    def __reduce__(self) -> tuple[type["RecordLibrary"], tuple[Any, ...]]:
+        """Pickle as the path alone: each process opens the records itself.
+
+        The default path is found anew, as another machine may have another one.
+        """
+        return type(self), (None if self.is_default else self.path, self.n_open)
 
     def get(self, corridor: Corridor, seed: int) -> AnyRecord:
         """Return the record of a traffic seed, which is made now if it is missing or damaged.
@@ -154,7 +159,14 @@ class RecordLibrary:
         folder = f"records-v{RECORD_VERSION}-sumo-{sumo_version()}"
         return self.path / folder / corridor.digest[:32] / f"{seed:08d}"
 
+    def bring(self, corridor: Corridor, seed: int) -> None:
+        """Bring a record that is elsewhere into the library, before it is opened or made.
+
+        Here nothing is elsewhere; a subclass may copy it from another machine.
+        """
+
     def _load_or_record(self, corridor: Corridor, seed: int) -> AnyRecord:
+        self.bring(corridor, seed)
         if corridor.recordings is not None:
             return corridor.recordings.load(seed, corridor.record_layout)
         path, source = self.record_path(corridor, seed), _source(corridor, seed)
@@ -240,6 +252,27 @@ class RecordLibrary:
                     f"be made: {error}"
                 )
             raise type(error)(message) from error
+
+
+Records = str | os.PathLike[str] | RecordLibrary | None
+"""A folder of records, a library, or None for the user's cache."""
+
+
+def open_library(records: Records) -> RecordLibrary:
+    """Return a library as it is, and that of a folder or of the user's cache otherwise.
+
+    Raises:
+        ValueError: ``records`` is none of them.
+    """
+    if isinstance(records, RecordLibrary):
+        return records
+    require(
+        records is None or isinstance(records, str | os.PathLike),
+        "records",
+        "a path, a RecordLibrary or None",
+        records,
+    )
+    return RecordLibrary(records)
 
 
 def _source(corridor: Corridor, seed: int) -> dict[str, object]:

@@ -1,12 +1,15 @@
 """Arrays in a folder with a manifest: written completely or not at all, checked when read."""
 
+import contextlib
 import errno
 import hashlib
+import io
 import json
 import os
 import shutil
+import tarfile
 import uuid
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,10 +36,7 @@ def save_arrays(path: Path, arrays: Mapping[str, NDArray[Any]], header: Mapping[
     Raises:
         OSError: It cannot be written; `path` is then unchanged.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.parent / f".{path.name}-{uuid.uuid4().hex}"
-    temporary.mkdir()
-    try:
+    with _published(path) as temporary:
         for name, array in arrays.items():
             with _array_path(temporary, name).open("wb") as file:
                 np.save(file, array, allow_pickle=False)
@@ -46,9 +46,6 @@ def save_arrays(path: Path, arrays: Mapping[str, NDArray[Any]], header: Mapping[
             json.dump(manifest, text, indent=2)
             text.flush()
             os.fsync(text.fileno())
-        _publish(temporary, path)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def load_arrays(
@@ -80,6 +77,52 @@ def load_arrays(
         raise
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         raise InvalidRecordError(f"{path}: {error!r}") from error
+
+
+def pack(path: Path) -> bytes:
+    """Return the files of the directory `path` as one compressed archive, for `unpack`.
+
+    Raises:
+        OSError: They cannot be read.
+    """
+    archive = io.BytesIO()
+    with tarfile.open(fileobj=archive, mode="w:gz", compresslevel=1) as tar:
+        for file in sorted(path.iterdir()):
+            tar.add(file, file.name)
+    return archive.getvalue()
+
+
+def unpack(archive: bytes, path: Path) -> None:
+    """Write the files of an archive to the directory `path`, completely or not at all.
+
+    An existing directory stays as it is.
+
+    Raises:
+        OSError: They cannot be written; `path` is then unchanged.
+        ValueError: The archive has something else than files.
+    """
+    with tarfile.open(fileobj=io.BytesIO(archive)) as tar, _published(path) as temporary:
+        for member in tar:
+            content = tar.extractfile(member)
+            if content is None or Path(member.name).name != member.name:
+                raise ValueError(f"an archive of a record must have files alone, got {member.name}")
+            with (temporary / member.name).open("wb") as file:
+                shutil.copyfileobj(content, file)
+                file.flush()
+                os.fsync(file.fileno())
+
+
+@contextlib.contextmanager
+def _published(path: Path) -> Iterator[Path]:
+    """Give a new directory to write to, and rename it to `path` if the body ends well."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.parent / f".{path.name}-{uuid.uuid4().hex}"
+    temporary.mkdir()
+    try:
+        yield temporary
+        _publish(temporary, path)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def _array_path(directory: Path, name: str) -> Path:

@@ -1,7 +1,6 @@
 """Checks of single arguments: each failure names the path, what is allowed, and the value."""
 
 import math
-import os
 from collections.abc import Iterable
 
 from dptse_env.utils.fields import POSITIVE, Interval, number
@@ -40,10 +39,3 @@ def non_negative(path: str, value: object) -> float:
 def inside(path: str, value: object, low: float, high: float) -> float:
     """Return `value` as a ``float`` strictly between `low` and `high`, or raise ``ValueError``."""
     return number(float, value, path, Interval(low, high, open_low=True, open_high=True))
-
-
-def path_or_none(path: str, value: object) -> str | None:
-    """Return a file-system path as a string, or None, or raise ``ValueError``."""
-    if value is None or isinstance(value, str | os.PathLike):
-        return None if value is None else os.fspath(value)
-    raise ValueError(f"{path} must be a path or None, got {value!r}")
