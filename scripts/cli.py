@@ -15,7 +15,10 @@ from typing import Any
 
 import tyro
 
+from agents.engines.choice import EngineName, make_engine
+from agents.engines.engine import Engine, EngineError
 from agents.evaluation.environments import given_keywords, make_config
+from agents.experiments.runner import Workplace
 from dptse_env.traffic import (
     Corridor,
     NetworkError,
@@ -23,26 +26,48 @@ from dptse_env.traffic import (
     RecordLibrary,
     SumoVersionError,
 )
+from dptse_env.utils.threads import n_cores
 
 
 @dataclass(frozen=True)
-class Recording:
-    """Options for recording missing traffic."""
+class Machines:
+    """Where tasks run, and where records of traffic are kept. Results depend on none of it."""
 
+    engine: EngineName = "local"
+    """Where missing traffic is recorded and tasks run: in processes of this machine (local), or on
+    a Ray cluster (ray)."""
+    address: str | None = None
+    """Address of the Ray cluster, host:port of its head node, or auto for the one on this machine;
+    RAY_ADDRESS if not given, or else a new one on this machine."""
     workers: int | None = None
-    """Processes that record missing traffic; all cores if not given."""
+    """Processes of this machine; one for each core if not given."""
     records: Path | None = None
     """Folder of the record cache; the user's cache if not given."""
+
+    def start_engine(self) -> Engine:
+        """Return the engine.
+
+        Raises:
+            EngineError: Ray is missing, or there is no suitable cluster.
+            ValueError: An argument is out of range or of another engine.
+        """
+        return make_engine(
+            self.engine, n_cores() if self.workers is None else self.workers, self.address
+        )
+
+    def workplace(self, folder: Path) -> Workplace:
+        """Return a folder with the engine that works for it."""
+        return Workplace(folder, self.start_engine(), records_argument(self.records))
 
     def library(self, corridor: Corridor, seeds: Sequence[int]) -> RecordLibrary:
         """Return the library of records, after recording what is missing."""
         library = RecordLibrary(self.records)
-        library.ensure(corridor, seeds, workers=self.workers, progress=True)
+        self.start_engine().record(library, corridor, seeds, progress=True)
         return library
 
 
 @dataclass(frozen=True)
-class Road(Recording):
+class Road(Machines):
     """An environment and its road."""
 
     corridor: str | None = None
@@ -58,7 +83,12 @@ class Road(Recording):
         return given_keywords(self.keywords, self.corridor)
 
 
-_NOT_RESULTS = ("workers", "records", "output")
+FAILURES = (
+    OSError, ValueError, NetworkError, RecordingError, SumoVersionError, EngineError,
+)  # fmt: skip
+"""Errors that end a program with their message alone."""
+
+NOT_RESULTS = ("engine", "address", "workers", "records", "output")
 """Arguments that results do not depend on."""
 
 
@@ -76,7 +106,7 @@ def run(main: Callable[[Any], None], arguments: Any, description: str | None) ->
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(message)s")
     try:
         main(tyro.cli(arguments, description=description))
-    except (OSError, ValueError, NetworkError, RecordingError, SumoVersionError) as problem:
+    except FAILURES as problem:
         print(f"error: {problem}", file=sys.stderr)
         raise SystemExit(2) from problem
 
@@ -107,7 +137,7 @@ def _words(args: Any) -> Iterator[str]:
         value = getattr(args, field.name)
         if dataclasses.is_dataclass(value):
             yield from _words(value)
-        elif value != field.default and field.name not in _NOT_RESULTS:
+        elif value != field.default and field.name not in NOT_RESULTS:
             yield "--" + field.name.replace("_", "-")
             if value is not True:
                 values = value if isinstance(value, tuple) else (value,)

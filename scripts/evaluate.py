@@ -8,7 +8,9 @@ python scripts/evaluate.py --suite query-suite-v1 --verify results/suites/query-
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,22 +19,23 @@ from typing import Any
 import gymnasium as gym
 from tqdm import tqdm
 
-from agents.evaluation.environments import make_config, make_vector
-from agents.evaluation.episodes import EpisodeScore, Policy, run_episodes, seed_kind, watch_episode
+from agents.engines.engine import run_tasks
+from agents.evaluation.environments import make_config
+from agents.evaluation.episodes import EpisodeScore, seed_kind, watch_episode
 from agents.evaluation.figures import (
     RoadMap,
     draw_maps,
     estimate_map,
     save_figure,
 )
+from agents.evaluation.ladder import Rung, run_rung
 from agents.evaluation.policies import NamedSchedule, PolicySource, find_policy
 from agents.evaluation.report import Report
 from dptse_env.config import EnvConfig, parse_seeds
-from dptse_env.policies import TRANSFERABLE
 from dptse_env.schedules import OBSERVATION_SCHEDULES
-from dptse_env.traffic import is_road_file
+from dptse_env.traffic import Records, is_road_file
 from dptse_env.utils.validation import require
-from scripts.cli import Road, records_argument, run
+from scripts.cli import NOT_RESULTS, Road, records_argument, run
 from scripts.evaluate_suite import evaluate_suite
 
 ALL = "all"
@@ -51,7 +54,7 @@ class Args(Road):
     load those that you trust."""
     suite: str | None = None
     """Score the policies in the cells of a suite, such as query-suite-v1, which say everything but
-    workers, records and output."""
+    the policies, machines and output."""
     verify: Path | None = None
     """Card of a suite of which a drawn cell is run again, to see whether its errors are right."""
     stochastic: bool = False
@@ -81,7 +84,9 @@ class Args(Road):
     """Folder for table, scores and figures."""
 
 
-def make_keywords(args: Args, estimator: str, source: PolicySource) -> dict[str, Any]:
+def make_keywords(
+    args: Args, estimator: str, source: PolicySource, records: Records = None
+) -> dict[str, Any]:
     """Return the keywords of the environment in which a policy acts.
 
     Raises:
@@ -92,7 +97,7 @@ def make_keywords(args: Args, estimator: str, source: PolicySource) -> dict[str,
         **source.keywords,
         "estimator": estimator,
         "traffic_seeds": args.seeds,
-        "records": records_argument(args.records),
+        "records": records_argument(args.records) if records is None else records,
     }
     for key in ("privacy", "epsilon", "delta", "bandwidth", "parameters"):
         if getattr(args, key) is not None:
@@ -134,34 +139,47 @@ def evaluate(
     args: Args, sources: Mapping[str, PolicySource]
 ) -> dict[tuple[str, str], list[EpisodeScore]]:
     """Run every schedule and policy with every estimator, on all traffic seeds at once."""
-    seeds = parse_seeds(args.seeds)
-    # All cells are made before the first runs: bad input shows before anything is recorded.
-    cells = {}
-    for estimator in args.estimators:
-        for name, source in sources.items():
-            env = make_vector(args.env, len(seeds), make_keywords(args, estimator, source))
-            cells[estimator, name] = env, load(args, source, env)
-    args.library(reference_config(args).corridor, seeds)
+    seeds, keys = parse_seeds(args.seeds), list(itertools.product(args.estimators, sources))
+    # All are made before the first runs: bad input shows before anything is recorded.
+    for estimator, name in keys:
+        make_rung(args, estimator, name, sources[name]).make()
+    place = args.workplace(args.output)
+    place.record(reference_config(args).corridor, seeds)
+    threads = 1 if place.engine.is_parallel else None
+    rungs = [make_rung(args, *key, sources[key[1]], place.records, threads) for key in keys]
     scores: dict[tuple[str, str], list[EpisodeScore]] = {}
-    with tqdm(
-        total=len(cells) * len(seeds), desc="evaluating", unit="episode", mininterval=0.5
-    ) as bar:
-        for key in list(cells):
-            env, policy = cells.pop(key)  # frees the traffic it has loaded after the run
-            scores[key] = run_episodes(
-                env,
-                policy,
-                traffic_seeds=seeds,
-                seeds=[args.noise_seed + seed for seed in seeds],
-                deterministic=not args.stochastic,
-            )
+    bar = tqdm(total=len(rungs) * len(seeds), desc="evaluating", unit="episode", mininterval=0.5)
+    run = run_tasks(place.engine, run_rung, rungs, bar.set_postfix_str)
+    with bar, contextlib.closing(run) as finished:
+        for rung, episodes in finished:
+            scores[rung.key] = episodes
             bar.update(len(seeds))
-    return scores
+    return {key: scores[key] for key in keys}
 
 
-def load(args: Args, source: PolicySource, env: Any) -> Policy:
-    """Bind a schedule or a policy to an environment, scalar or vector."""
-    return source.load(env, allow=TRANSFERABLE if args.transfer else (), seed=args.noise_seed)
+def make_rung(
+    args: Args,
+    estimator: str,
+    name: str,
+    source: PolicySource,
+    records: Records = None,
+    threads: int | None = None,
+) -> Rung:
+    """Return the task of a policy with an estimator.
+
+    Raises:
+        ValueError: An argument is no JSON object or no file of parameters.
+    """
+    return Rung(
+        key=(estimator, name),
+        source=source,
+        env=args.env,
+        keywords={**make_keywords(args, estimator, source, records), "threads": threads},
+        seeds=parse_seeds(args.seeds),
+        noise_seed=args.noise_seed,
+        deterministic=not args.stochastic,
+        transferred=args.transfer,
+    )
 
 
 def draw_traffic(
@@ -175,7 +193,7 @@ def draw_traffic(
     maps: list[RoadMap] = []
     for name in (args.reference, *schedules[:1], *learned[:1]):
         env = gym.make(args.env, **make_keywords(args, estimator, sources[name]))
-        policy = load(args, sources[name], env)
+        policy = make_rung(args, estimator, name, sources[name]).load(env)
         score, history = watch_episode(env, policy, traffic_seed=seed, seed=args.noise_seed + seed)
         maps += [
             *([] if maps else [RoadMap("true density", history.truth, history)]),
@@ -194,7 +212,7 @@ def suite_options(args: Args) -> tuple[str, Path]:
     """
     if args.suite is None:
         raise ValueError("verify needs the suite of the card, such as --suite query-suite-v1")
-    own = ("suite", "policies", "verify", "workers", "records", "output")
+    own = ("suite", "policies", "verify", *NOT_RESULTS)
     given = [
         each.name
         for each in dataclasses.fields(args)

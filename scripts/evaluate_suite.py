@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from agents.evaluation.policies import find_policy
-from agents.experiments.engine import LocalProcesses
-from agents.experiments.runner import Workplace
 from agents.suite.card import FAILED, Card
 from agents.suite.cells import ONE, ZERO, Suite, find_suite
 from agents.suite.suite import run_suite
 from agents.suite.table import score_table, shipped_cards
 from agents.suite.verifying import verify
-from scripts.cli import Recording, records_argument
+from dptse_env.traffic import Records
+from scripts.cli import Machines, records_argument
 
 
 def evaluate_suite(
-    name: str, policies: Sequence[str], card: Path | None, folder: Path, options: Recording
+    name: str, policies: Sequence[str], card: Path | None, folder: Path, options: Machines
 ) -> None:
     """Score policies in a suite and leave their cards in a folder, or verify a card.
 
@@ -32,10 +30,7 @@ def evaluate_suite(
         return
     if not policies:
         raise ValueError(f"policies must be one or more, to be scored in {suite.name}")
-    workers = os.cpu_count() or 1 if options.workers is None else options.workers
-    engine = LocalProcesses(workers)
-    place = Workplace(folder, engine, records_argument(options.records), options.workers)
-    cards = run_suite(suite, policies, place)
+    cards = run_suite(suite, policies, options.workplace(folder))
     _print(suite, cards, {**{each.name: each for each in cards}, **shipped_cards(suite)})
     print(f"cards are in {folder}/")
 
@@ -50,7 +45,7 @@ def _print(suite: Suite, cards: Sequence[Card], known: Mapping[str, Card]) -> No
         print(score_table(cards, references[0], references[1], suite))
 
 
-def _verify(suite: Suite, path: Path, policies: Sequence[str], records: str | None) -> None:
+def _verify(suite: Suite, path: Path, policies: Sequence[str], records: Records) -> None:
     card = Card.read(path)
     card.check(suite, path)
     if len(policies) > 1:

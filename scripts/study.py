@@ -30,7 +30,6 @@ import tyro
 
 from agents.evaluation.environments import given_keywords
 from agents.experiments.cells import Design
-from agents.experiments.engine import LocalProcesses
 from agents.experiments.runner import Workplace
 from agents.studies.choices import study as choice_study
 from agents.studies.choices.plan import ChoiceDesign
@@ -46,27 +45,21 @@ from agents.studies.policies.plan import BASELINES, CELLS, PolicyCell, PolicyDes
 from agents.studies.privacy import study as privacy_study
 from agents.studies.privacy.plan import PrivacyDesign
 from dptse_env.config import parse_seeds
-from scripts.cli import command, records_argument, resumable, run
+from scripts.cli import Machines, command, resumable, run
 
 RESULTS = Path("results")
 
 
 @dataclass(frozen=True)
-class StudyOptions:
+class StudyOptions(Machines):
     """Arguments that results do not depend on."""
 
-    workers: int = os.cpu_count() or 1
-    """Processes that record missing traffic and run episodes."""
-    records: Path | None = None
-    """Folder of the record cache; the user's cache if not given."""
     output: Path | None = None
     """Folder for everything; a folder in results/ if not given."""
 
-    def workplace(self, *default: str) -> Workplace:
+    def place(self, *default: str) -> Workplace:
         """Return the workplace; the default gives the parts of the name of a folder in results/."""
-        folder = self.output or RESULTS / "-".join(default)
-        engine = LocalProcesses(self.workers)
-        return Workplace(folder, engine, records_argument(self.records), self.workers)
+        return self.workplace(self.output or RESULTS / "-".join(default))
 
 
 @dataclass(frozen=True)
@@ -176,29 +169,29 @@ def main(args: Paper | Privacy | LedgerStudy | EstimatorStudy | ChoiceStudy | Po
     """Run a study."""
     if isinstance(args, Paper):
         design = args.design.quick() if args.quick else args.design
-        place = args.workplace("paper", *which(design, args.quick))
+        place = args.place("paper", *which(design, args.quick))
         paper_study.run(design, place, command("study.py paper", args))
     elif isinstance(args, Privacy):
         private = args.design.quick() if args.quick else args.design
-        place = args.workplace("privacy", *which(private, args.quick))
+        place = args.place("privacy", *which(private, args.quick))
         privacy_study.run(private, place, command("study.py privacy", args))
     elif isinstance(args, LedgerStudy):
         planned = args.design.quick() if args.quick else args.design
-        place = args.workplace("ledger", *which(planned, args.quick))
+        place = args.place("ledger", *which(planned, args.quick))
         ledger_study.run(planned, place, command("study.py ledger", args))
     elif isinstance(args, EstimatorStudy):
         chosen = args.design.quick() if args.quick else args.design
-        place = args.workplace("estimators", *which(chosen, args.quick))
+        place = args.place("estimators", *which(chosen, args.quick))
         estimator_study.run(chosen, place, command("study.py estimators", args))
     elif isinstance(args, ChoiceStudy):
         mapped = args.design.quick() if args.quick else args.design
-        place = args.workplace("choices", *(["quick"] if args.quick else []))
+        place = args.place("choices", *(["quick"] if args.quick else []))
         choice_study.run(mapped, place, command("study.py choices", args))
     elif isinstance(args.step, Freeze):
         freeze(args.step)
         return
     else:
-        place = args.step.workplace("policies")
+        place = args.step.place("policies")
         policy_study.run(place)
     print(f"report, figures and scores are in {place.folder}/")
 
@@ -233,7 +226,7 @@ def policy_design(args: Freeze, cells: tuple[PolicyCell, ...] = CELLS) -> Policy
 
 def freeze(args: Freeze, cells: tuple[PolicyCell, ...] = CELLS) -> None:
     """Freeze policies and choices, and print the choices."""
-    design, place = policy_design(args, cells), args.workplace("policies")
+    design, place = policy_design(args, cells), args.place("policies")
     manifest, is_new = policy_study.freeze(
         design,
         place,

@@ -22,12 +22,12 @@ from agents.filters.training import FilterTraining
 from dptse_env.config import parse_seeds
 from dptse_env.estimators.learned.weights import read_network
 from dptse_env.utils.validation import integer
-from scripts.cli import Recording, records_argument, resumable, run
+from scripts.cli import Machines, records_argument, resumable, run
 from scripts.training_bar import Bar, watched
 
 
 @dataclass(frozen=True)
-class Args(Recording):
+class Args(Machines):
     """Train a recurrent network as an estimator."""
 
     seed: int = 0

@@ -1,6 +1,6 @@
 """Tune the estimators' settings on training traffic, one set per configuration.
 
-python scripts/tune.py --estimators ekf ukf --privacy paper corrected --seeds 0:8 --workers 2
+python scripts/tune.py --estimators ekf ukf --privacy paper corrected --seeds 0:8 --trials-at-once 2
 
 Each set is left in <output>/<estimator>-<ARZ parameters>-<privacy preset>.json, a file that
 estimator_settings takes, as a keyword or in the table environment of a road file.
@@ -11,8 +11,8 @@ where it stopped, and with more --trials it searches on; other arguments need an
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,9 +20,9 @@ import optuna
 from rich.table import Table
 from tqdm import tqdm
 
+from agents.engines.engine import Workers
 from agents.evaluation.environments import given_keywords
 from agents.evaluation.terminal import make_table, print_table
-from agents.experiments.engine import make_pool
 from agents.experiments.seeds import TUNING
 from agents.search.space import SPACE
 from agents.search.tuning import TuningStudy, locked_study, scores_of
@@ -30,11 +30,11 @@ from agents.search.tuning_task import TuningTask
 from dptse_env.model import ARZParameters
 from dptse_env.model.parameters import read_parameters
 from dptse_env.utils.validation import integer
-from scripts.cli import Recording, records_argument, resumable, run
+from scripts.cli import Machines, resumable, run
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(Machines):
     """Tune the estimators' settings."""
 
     env: str = "dptse_env:dptse/PaperHighway-v0"
@@ -55,8 +55,8 @@ class Args:
     """Traffic seeds, first:stop; training seeds only."""
     trials: int = 60
     """Trials per configuration, those of earlier runs included."""
-    workers: int = 1
-    """Processes, each with a separate trial; results depend on the number."""
+    trials_at_once: int = 1
+    """Trials that run at once; results depend on the number."""
     schedule: str = "paper"
     """Query schedule, or a saved policy: its .zip file or shipped name."""
     bandwidth: int | None = None
@@ -79,8 +79,6 @@ class Args:
     """Ending of the names of the sets; empty for default sets."""
     sampler_seed: int = 0
     """Seeds the search."""
-    records: Path | None = None
-    """Folder of the record cache; the user's cache if not given."""
     output: Path = Path("results/tuning")
     """Folder for the sets and the journals."""
 
@@ -99,7 +97,7 @@ def make_tasks(args: Args) -> list[TuningTask]:
     if args.bandwidth is not None:
         keywords["bandwidth"] = args.bandwidth
     integer("trials", args.trials, 1)
-    integer("workers", args.workers, 1)
+    integer("trials_at_once", args.trials_at_once, 1)
     tasks: dict[str, TuningTask] = {}
     for estimator, source, privacy in itertools.product(
         args.estimators, args.parameters, args.privacy
@@ -115,7 +113,6 @@ def make_tasks(args: Args) -> list[TuningTask]:
             seeds=args.seeds,
             schedule=args.schedule,
             noise_seed=args.noise_seed,
-            records=records_argument(args.records),
             with_noise_scale=args.noise_scale,
             with_demand=args.demand,
             with_repairs=args.repairs,
@@ -132,7 +129,7 @@ def make_tasks(args: Args) -> list[TuningTask]:
     return list(tasks.values())
 
 
-def tune(study: TuningStudy, args: Args, pool: ProcessPoolExecutor) -> None:
+def tune(study: TuningStudy, args: Args, workers: Workers) -> None:
     """Run the trials that a study lacks, with a progress bar."""
     done = study.n_finished()
     with tqdm(
@@ -146,7 +143,7 @@ def tune(study: TuningStudy, args: Args, pool: ProcessPoolExecutor) -> None:
             bar.update(study.n_finished() - bar.n)
 
         show()
-        study.run(args.trials, pool, args.workers, show)
+        study.run(args.trials, workers, args.trials_at_once, show)
 
 
 def add_rows(table: Table, study: TuningStudy) -> None:
@@ -169,14 +166,16 @@ def main(args: Args) -> None:
     """Record what is missing, tune every configuration, and leave the sets."""
     tasks = make_tasks(args)
     corridor = tasks[0].config().corridor
-    Recording(args.workers, args.records).library(corridor, tasks[0].traffic_seeds)
+    place = args.workplace(args.output)
+    place.record(corridor, tasks[0].traffic_seeds)
+    tasks = [dataclasses.replace(task, records=place.records) for task in tasks]
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     errors = "density RMSE\n[veh/km]", "speed RMSE\n[km/h]"
     table = make_table("scores on the tuning traffic", "set", "settings", "reward", *errors, left=2)
-    with make_pool(args.workers) as pool:
+    with place.engine.open() as workers:
         for task in tasks:
             with locked_study(task, args.output, args.sampler_seed) as study:
-                tune(study, args, pool)
+                tune(study, args, workers)
                 study.write(args.output / f"{task.name}.json")
                 add_rows(table, study)
     print_table(table)

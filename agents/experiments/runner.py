@@ -4,39 +4,42 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Generic
 
 import gymnasium as gym
 
+from agents.engines.engine import Engine
 from agents.evaluation.environments import make_vector, without_void_warning
 from agents.evaluation.episodes import EpisodeScore, run_episode
 from agents.experiments.cells import CellT, Design
-from agents.experiments.engine import Engine
 from agents.experiments.ledger import Ledger
 from dptse_env.schedules import make_schedule
-from dptse_env.traffic import Corridor, RecordLibrary
+from dptse_env.traffic import Corridor, RecordLibrary, Records
 from dptse_env.vector_env import SensorQueryVectorEnv
 
 
 @dataclass(frozen=True)
 class Workplace:
-    """Folder and processes of a study.
+    """Folder and engine of a study.
 
     Attributes:
-        records: Folder of the record cache; None for the user's cache.
-        recorders: Processes that record missing traffic; None for all cores.
+        cache: Folder of the record cache; None for the user's cache.
     """
 
     folder: Path
     engine: Engine
-    records: str | None = None
-    recorders: int | None = None
+    cache: str | None = None
+
+    @cached_property
+    def records(self) -> RecordLibrary:
+        """The library of records, which tasks take along."""
+        return self.engine.shared(RecordLibrary(self.cache))
 
     def record(self, corridor: Corridor, seeds: Sequence[int]) -> None:
         """Record the traffic that is missing."""
-        library = RecordLibrary(self.records)
-        library.ensure(corridor, seeds, self.recorders, progress=True)
+        self.engine.record(RecordLibrary(self.cache), corridor, seeds, progress=True)
 
 
 @dataclass(frozen=True)
@@ -45,7 +48,7 @@ class EpisodeTask(Generic[CellT]):
 
     Attributes:
         keywords: Keywords of ``gym.make`` that make it.
-        records: Folder of the record cache; None for the user's cache.
+        records: Library of records.
     """
 
     env: str
@@ -53,11 +56,11 @@ class EpisodeTask(Generic[CellT]):
     cell: CellT
     keywords: Mapping[str, Any]
     seeds: tuple[int, ...]
-    records: str | None
+    records: Records
 
 
 def make_env(
-    env: str, keywords: Mapping[str, Any], seeds: Sequence[int], records: str | None
+    env: str, keywords: Mapping[str, Any], seeds: Sequence[int], records: Records
 ) -> gym.Env[Any, Any]:
     """Make an environment for `run_episode`.
 
@@ -73,7 +76,7 @@ def make_batch(
     env: str,
     keywords: Mapping[str, Any],
     seeds: Sequence[int],
-    records: str | None = None,
+    records: Records = None,
     threads: int | None = 1,
 ) -> SensorQueryVectorEnv:
     """Make a vector environment for `run_episodes`, one episode for each traffic seed.
@@ -94,7 +97,7 @@ def run_task(task: EpisodeTask[Any]) -> list[EpisodeScore]:
 
 
 def missing_tasks(
-    design: Design[CellT], ledger: Ledger[CellT, EpisodeScore], records: str | None
+    design: Design[CellT], ledger: Ledger[CellT, EpisodeScore], records: Records
 ) -> list[EpisodeTask[CellT]]:
     """Return the episodes that a ledger lacks, one task a cell."""
     lacking = {cell: ledger.lacking(cell, design.traffic_seeds) for cell in design.cells()}

@@ -17,7 +17,7 @@ from dptse_env.estimators.learned.cells import Cells, input_channels, make_cells
 from dptse_env.estimators.learned.channels import Released, Rows, make_released, make_rows
 from dptse_env.process import QueryProcess
 from dptse_env.schedules import make_schedule
-from dptse_env.traffic import Corridor
+from dptse_env.traffic import Corridor, Records
 
 Float32Array = NDArray[np.float32]
 
@@ -71,13 +71,13 @@ class _Recorder:
         self._estimator.update(*arguments)
 
 
-def collect(scenario: Scenario, estimator: Mapping[str, Any], records: str | None) -> Collected:
+def collect(scenario: Scenario, estimator: Mapping[str, Any], records: Records) -> Collected:
     """Play a scenario with an estimator.
 
     Args:
         scenario: The scenario.
         estimator: Keywords ``estimator`` and ``estimator_settings``.
-        records: Folder of the record cache; None for the user's cache.
+        records: Library of records, or its folder; None for the user's cache.
     """
     seeds = scenario.traffic_seeds
     keywords = {**scenario.keywords, **estimator, "traffic_seeds": list(seeds), "records": records}

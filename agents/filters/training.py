@@ -26,6 +26,7 @@ from agents.training.run_files import (
     write_progress,
 )
 from dptse_env.estimators.learned.weights import read_network, write_network
+from dptse_env.traffic import Records
 
 WEIGHTS, PLAYED = "network.npz", "played.npz"
 """The trained network, and the network that the scenarios of a round are collected with."""
@@ -53,7 +54,7 @@ class FilterTraining:
         plan: FilterPlan,
         folder: Path,
         *,
-        records: str | None = None,
+        records: Records = None,
         watchers: Sequence[Watcher] = (),
         progress: Callable[[str, float], None] = lambda stage, fraction: None,
         compiled: bool = False,
@@ -63,7 +64,7 @@ class FilterTraining:
         Args:
             plan: The plan.
             folder: The folder; made if it is missing.
-            records: Folder of the record cache; None for the user's cache.
+            records: Library of records, or its folder; None for the user's cache.
             watchers: Receive every row of the learning curve, those read from the folder first.
             progress: Called with the name of a stage and the fraction of it that is done.
             compiled: Whether torch compiles the step, which takes a C++ compiler and half a minute

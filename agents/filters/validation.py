@@ -12,6 +12,7 @@ from agents.evaluation.episodes import WARM_UP, run_episodes
 from agents.experiments.seeds import TUNING
 from dptse_env.process import QueryProcess
 from dptse_env.schedules import make_schedule
+from dptse_env.traffic import Records
 
 SCHEDULE = "round-robin"
 
@@ -66,7 +67,7 @@ def score(
     keywords: Mapping[str, Any],
     schedule: str,
     seeds: Sequence[int],
-    records: str | None = None,
+    records: Records = None,
 ) -> Score:
     """Run a cell over traffic seeds, all episodes at once."""
     keywords = {**keywords, "traffic_seeds": list(seeds), "records": records}
@@ -88,7 +89,7 @@ def score(
 
 
 def validate(
-    weights: str, envs: Sequence[str], seeds: Sequence[int], records: str | None = None
+    weights: str, envs: Sequence[str], seeds: Sequence[int], records: Records = None
 ) -> dict[str, Score]:
     """Return the scores of a network, given by name or file, in some environments."""
     settings = {"recurrent": {"weights": weights, "outside": True}}

@@ -48,7 +48,7 @@ class PlanTask:
         neighbours: Neighbours of the best plan that a round tries; twice as many random plans
             begin the search, and four times as many episodes run at once.
         seed: Seeds the search.
-        records: Folder of the record cache; the user's cache if not given.
+        records: Library of records, or its folder; None for the user's cache.
         corridor: Road in place of the environment's: the name of a shipped corridor, a road file
             that ends in .toml, or a JSON object of corridor fields.
     """

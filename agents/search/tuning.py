@@ -1,6 +1,6 @@
 """Tune an estimator's settings on training traffic with Optuna, in a journal that can be resumed.
 
-One process proposes trials and writes the journal; episodes run in an executor.
+One process proposes trials and writes the journal; episodes run on the workers of an engine.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import json
 import logging
 import math
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import date
@@ -23,6 +23,7 @@ import optuna
 from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock, JournalStorage
 from optuna.trial import FrozenTrial, TrialState
 
+from agents.engines.engine import Workers
 from agents.evaluation.episodes import WARM_UP, EpisodeScore
 from agents.experiments.files import replacing
 from agents.search.space import DEMAND_START, at_bound, holds, nested, rounded, values_of
@@ -133,7 +134,7 @@ class TuningStudy:
     def run(
         self,
         n_trials: int,
-        executor: Executor,
+        workers: Workers,
         n_parallel: int = 1,
         on_trial: Callable[[], None] | None = None,
     ) -> None:
@@ -146,7 +147,7 @@ class TuningStudy:
         try:
             while True:
                 while len(running) < n_parallel and self._n_counted() < n_trials:
-                    self._submit(self._propose(), executor, running)
+                    self._submit(self._propose(), workers, running)
                 if not running:
                     return
                 for future in wait(running, return_when=FIRST_COMPLETED).done:
@@ -155,7 +156,7 @@ class TuningStudy:
                     finished = self._tell(trial)
                     del running[future]
                     if not finished:
-                        self._submit(trial, executor, running)
+                        self._submit(trial, workers, running)
                     elif on_trial is not None:
                         on_trial()
         except BaseException:
@@ -178,12 +179,12 @@ class TuningStudy:
     def _submit(
         self,
         trial: _Running,
-        executor: Executor,
+        workers: Workers,
         running: dict[Future[list[EpisodeScore]], _Running],
     ) -> None:
         done = len(trial.scores)
         seeds = self.task.traffic_seeds[done : done + BATCH]
-        running[executor.submit(self._score, self.task, trial.settings, seeds)] = trial
+        running[workers.submit(self._score, self.task, trial.settings, seeds)] = trial
 
     def _tell(self, running: _Running) -> bool:
         """Report the latest batch; return whether the trial is finished."""

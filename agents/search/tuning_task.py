@@ -24,6 +24,7 @@ from dptse_env.config import TRAINING_SEEDS, EnvConfig, parse_seeds
 from dptse_env.estimators import EstimatorSettings
 from dptse_env.estimators.tuned_settings import settings_name
 from dptse_env.model import ARZParameters
+from dptse_env.traffic import Records
 from dptse_env.utils.validation import integer, require
 
 
@@ -40,7 +41,7 @@ class TuningTask:
         keywords: Other keywords of the environment; a mapping ``privacy`` goes with the preset.
         schedule: Query schedule, or a saved policy: its ``.zip`` file or shipped name.
         noise_seed: Noise and estimators are seeded with this plus the traffic seed.
-        records: Folder of the record cache; the user's cache if None.
+        records: Library of records, or its folder; None for the user's cache.
         with_noise_scale: Whether to search the scale of the noise of flows or speeds, too.
         with_demand: Whether to search demand states and the noise that goes with them, too.
         with_repairs: Whether to search the cap of reported speeds and what the process noise is of,
@@ -63,7 +64,7 @@ class TuningTask:
     keywords: Mapping[str, Any] = field(default_factory=dict)
     schedule: str = "paper"
     noise_seed: int = TUNING.start
-    records: str | None = None
+    records: Records = None
     with_noise_scale: bool = False
     with_demand: bool = False
     with_repairs: bool = False

@@ -21,6 +21,7 @@ from dptse_env.parts import privacy_report
 from dptse_env.policies import TRANSFERABLE
 from dptse_env.release import Capped
 from dptse_env.release.paced import Paced
+from dptse_env.traffic import Records
 from dptse_env.vector_env import SensorQueryVectorEnv
 
 POLICY_SEED = 0
@@ -32,12 +33,12 @@ class SuiteTask:
     """A policy in a cell, with everything that a worker needs.
 
     Attributes:
-        records: Folder of the record cache; None for the user's cache.
+        records: Library of records, or its folder; None for the user's cache.
     """
 
     policy: PolicySource
     cell: SuiteCell
-    records: str | None
+    records: Records
 
 
 def run_cell(task: SuiteTask) -> CellResult:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+from agents.engines.engine import run_tasks
 from agents.evaluation.policies import PolicySource, find_policy
 from agents.experiments.provenance import machine, source_digest
 from agents.experiments.runner import Workplace
@@ -63,7 +64,8 @@ def run_suite(
     _record(tasks, place)
     place.folder.mkdir(parents=True, exist_ok=True)
     bar = tqdm(total=len(tasks), desc=suite.name, unit="cell", disable=not progress)
-    with bar, contextlib.closing(place.engine.run(run_cell, tasks)) as finished:
+    run = run_tasks(place.engine, run_cell, tasks, bar.set_postfix_str)
+    with bar, contextlib.closing(run) as finished:
         for task, result in finished:
             name = card_name(task.policy.source)
             cards[name] = _with(cards[name], result, suite)

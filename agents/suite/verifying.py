@@ -11,6 +11,7 @@ from agents.evaluation.policies import PolicySource
 from agents.suite.card import DONE, Card
 from agents.suite.cells import Suite
 from agents.suite.running import SuiteTask, run_cell
+from dptse_env.traffic import Records
 
 TOLERANCE = 1e-6
 """Largest relative difference of an error that counts as the same."""
@@ -33,7 +34,7 @@ class Verification(NamedTuple):
 
 
 def verify(
-    card: Card, suite: Suite, policy: PolicySource, records: str | None, draw: int | None = None
+    card: Card, suite: Suite, policy: PolicySource, records: Records, draw: int | None = None
 ) -> Verification:
     """Run a drawn cell of a card again and compare errors, densities and speeds by traffic seed.
 
@@ -41,7 +42,7 @@ def verify(
         card: The card, checked against the suite.
         suite: The suite.
         policy: The policy that the card is of.
-        records: Folder of the record cache; None for the user's cache.
+        records: Library of records, or its folder; None for the user's cache.
         draw: Seeds the draw; at random if None, so that a card cannot be made for one cell.
 
     Raises:

@@ -24,6 +24,7 @@ from agents.training.run_files import (
 from agents.training.validation import Validation
 from dptse_env.parts import make_interface
 from dptse_env.sb3.saved import ActingPolicy, save_policy
+from dptse_env.traffic import Records
 
 POLICY, BEST = "policy.zip", "best.zip"
 
@@ -51,7 +52,7 @@ class Training:
         plan: TrainingPlan,
         folder: Path,
         *,
-        records: str | None = None,
+        records: Records = None,
         commit: str | None = None,
         watchers: tuple[Watcher, ...] = (),
         progress: Callable[[str, float], None] = lambda stage, fraction: None,
@@ -61,7 +62,7 @@ class Training:
         Args:
             plan: The plan.
             folder: The folder; made if it is missing.
-            records: Folder of the record cache; None for the user's cache.
+            records: Library of records, or its folder; None for the user's cache.
             commit: State of the sources, for the record.
             watchers: Receive every row, those read from the folder first.
             progress: Called between two rows with the name of a stage and the fraction of it that

@@ -9,12 +9,13 @@ from typing import Any
 
 from agents.evaluation.episodes import EpisodeScore, run_episodes
 from agents.evaluation.policies import find_policy
-from agents.experiments.engine import run_all
 from agents.experiments.ledger import Ledger
 from agents.experiments.runner import Workplace, make_batch
+from agents.experiments.tasks import run_all
 from agents.studies.choices.cell import ChoiceCell
 from agents.studies.choices.plan import ChoiceDesign
 from dptse_env.policies import TRANSFERABLE
+from dptse_env.traffic import Records
 
 POLICY_SEED = 0
 """Seeds the draws of a schedule."""
@@ -26,13 +27,13 @@ class ChoiceTask:
 
     Attributes:
         keywords: Keywords of ``gym.make`` that make it.
-        records: Folder of the record cache; None for the user's cache.
+        records: Library of records, or its folder; None for the user's cache.
     """
 
     cell: ChoiceCell
     keywords: Mapping[str, Any]
     seeds: tuple[int, ...]
-    records: str | None
+    records: Records
 
 
 def run_missing(

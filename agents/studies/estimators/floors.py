@@ -10,6 +10,7 @@ from agents.evaluation.episodes import WARM_UP, run_episodes
 from agents.experiments.runner import make_batch
 from agents.studies.estimators.plan import EstimatorDesign
 from dptse_env.schedules import make_schedule
+from dptse_env.traffic import Records
 from dptse_env.utils.arrays import FloatArray
 
 SMOOTHED = 11
@@ -23,7 +24,7 @@ class Floor(NamedTuple):
     error: float
 
 
-def floors(design: EstimatorDesign, world: str, records: str | None) -> list[Floor]:
+def floors(design: EstimatorDesign, world: str, records: Records) -> list[Floor]:
     """Return the error of the truth a second ago, and of its moving average."""
     cell, seeds = design.cell(world, "random_walk"), design.traffic_seeds[:16]
     env = make_batch(cell.place.env, design.keywords(cell), seeds, records)

@@ -27,6 +27,7 @@ from dptse_env.estimators.batch import Measurements
 from dptse_env.estimators.compiled.blend import CompiledBlend
 from dptse_env.model import ARZModel
 from dptse_env.schedules import make_schedule
+from dptse_env.traffic import Records
 from dptse_env.utils.arrays import FloatArray, IntArray
 
 STACK = "agents.studies.estimators.linear_stack:LinearStack"
@@ -144,7 +145,7 @@ def stack_settings(world: World, fit: str = "", name: str = "") -> StackSettings
 
 
 def fit_stack(
-    world: World, seeds: Sequence[int], schedules: Sequence[str], records: str | None
+    world: World, seeds: Sequence[int], schedules: Sequence[str], records: Records
 ) -> dict[str, Any]:
     """Fit a stack by ridge regression on traffic seeds, and return it as plain JSON."""
     keywords = {**world.keywords, "estimator": STACK, "estimator_settings": stack_settings(world)}

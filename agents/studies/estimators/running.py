@@ -12,9 +12,9 @@ from typing import Any
 from agents.evaluation.episodes import run_episodes
 from agents.evaluation.honesty import EstimateWatcher, EstimatorScore
 from agents.evaluation.policies import find_policy
-from agents.experiments.engine import run_all
 from agents.experiments.ledger import Ledger
 from agents.experiments.runner import Workplace, make_batch
+from agents.experiments.tasks import run_all
 from agents.studies.estimators.cell import EstimatorCell
 from agents.studies.estimators.linear_stack import fit_stack, write_fits
 from agents.studies.estimators.plan import EstimatorDesign
@@ -22,6 +22,7 @@ from agents.studies.estimators.tampering import tamper
 from agents.studies.estimators.worlds import WORLDS
 from dptse_env.config import parse_seeds
 from dptse_env.policies import TRANSFERABLE
+from dptse_env.traffic import Records
 
 POLICY_SEED = 0
 """Seeds the draws of a schedule."""
@@ -36,14 +37,14 @@ class EstimatorTask:
 
     Attributes:
         keywords: Keywords of ``gym.make`` that make it.
-        records: Folder of the record cache; None for the user's cache.
+        records: Library of records, or its folder; None for the user's cache.
         threads: Threads that estimate; None for one per core.
     """
 
     cell: EstimatorCell
     keywords: Mapping[str, Any]
     seeds: tuple[int, ...]
-    records: str | None
+    records: Records
     threads: int | None
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from agents.evaluation.environments import make_vector
 from agents.evaluation.statistics import geometric_mean_interval
 from agents.studies.estimators.plan import EstimatorDesign
+from dptse_env.traffic import Records
 
 N_EPISODES, TURNS, STEPS = 1024, 15, 5
 
@@ -33,7 +34,7 @@ class StepTime:
 def measure(
     design: EstimatorDesign,
     world: str,
-    records: str | None,
+    records: Records,
     n_episodes: int = N_EPISODES,
     turns: int = TURNS,
 ) -> list[StepTime]:

@@ -13,6 +13,7 @@ from agents.experiments.runner import Workplace, make_batch
 from agents.studies.ledger.cell import LedgerCell
 from agents.studies.ledger.plan import LedgerDesign
 from dptse_env.schedules import make_schedule
+from dptse_env.traffic import Records
 
 POLICY_SEED = 0
 """Seeds the draws of a schedule."""
@@ -24,7 +25,7 @@ class LedgerTask:
 
     Attributes:
         keywords: Keywords of ``gym.make`` that make it.
-        records: Folder of the record cache; None for the user's cache.
+        records: Library of records, or its folder; None for the user's cache.
         threads: Threads that estimate; None for one per core.
     """
 
@@ -32,7 +33,7 @@ class LedgerTask:
     cell: LedgerCell
     keywords: Mapping[str, Any]
     seeds: tuple[int, ...]
-    records: str | None
+    records: Records
     threads: int | None
 
 

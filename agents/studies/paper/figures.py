@@ -32,6 +32,7 @@ from agents.studies.paper.results import PaperResults
 from agents.studies.paper.timing import PAPER_SECONDS
 from dptse_env.rendering import History
 from dptse_env.schedules import make_schedule
+from dptse_env.traffic import Records
 
 AXES = {"bandwidth": "number of CV segments", "epsilon": "ε", "delta": "δ"}
 OFF_SCALE = 1.3
@@ -186,7 +187,7 @@ def _time_panel(axis: Axes, results: PaperResults, places: Any, relative: bool) 
 Watched = dict[PaperCell, tuple[EpisodeScore, History]]
 
 
-def watch_pictures(design: PaperDesign, records: str | None) -> Watched:
+def watch_pictures(design: PaperDesign, records: Records) -> Watched:
     """Run the episodes of result 2: the first traffic seed, every estimator and setting."""
     seed, watched = design.traffic_seeds[0], {}
     names = design.all_estimators

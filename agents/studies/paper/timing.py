@@ -16,6 +16,7 @@ from agents.experiments.ledger import Ledger
 from agents.experiments.runner import make_env
 from agents.studies.paper.plan import PaperCell, PaperDesign
 from dptse_env.schedules import make_schedule
+from dptse_env.traffic import Records
 
 PAPER_SECONDS = {"ekf": 0.06, "ukf": 0.026, "enkf": 0.040, "mhe": 0.045}
 """The paper's seconds a step: MATLAB R2019b, a 3.6 GHz i7-7700."""
@@ -78,7 +79,7 @@ def untimed(
 def time_all(
     design: PaperDesign,
     ledger: Ledger[PaperCell, StepTime],
-    records: str | None,
+    records: Records,
     progress: bool = True,
 ) -> None:
     """Time the episodes that a ledger lacks, one after the other in this process."""

@@ -14,6 +14,7 @@ from agents.studies.policies.plan import DETERMINISTIC, Entry, PolicyCell, Polic
 from agents.studies.policies.queries import QueryCounter, QueryCounts
 from dptse_env.config import EnvConfig
 from dptse_env.policies import TRANSFERABLE
+from dptse_env.traffic import Records
 from dptse_env.vector_env import SensorQueryVectorEnv
 
 POLICY_SEED = 0
@@ -27,7 +28,7 @@ class EntryTask:
     Attributes:
         noise: Noise is seeded with this plus the traffic seed.
         transferred: Whether the policy acts in a cell that it was not trained for.
-        records: Folder of the record cache; None for the user's cache.
+        records: Library of records, or its folder; None for the user's cache.
         threads: Threads that estimate; None for one per core.
     """
 
@@ -38,7 +39,7 @@ class EntryTask:
     seeds: tuple[int, ...]
     noise: int
     transferred: bool
-    records: str | None
+    records: Records
     threads: int | None
 
     def make(self) -> tuple[SensorQueryVectorEnv, Policy]:
@@ -103,7 +104,7 @@ def make_task(
     *,
     seeds: Sequence[int],
     noise: int,
-    records: str | None = None,
+    records: Records = None,
     threads: int | None = None,
 ) -> EntryTask:
     """Return the task of an entry, with the frozen policy and the settings tuned for it.

@@ -11,19 +11,18 @@ import numpy as np
 from agents.evaluation.episodes import EpisodeScore
 from agents.evaluation.figures import save_figure
 from agents.experiments.cells import DENSITY, METRICS, SPEED
-from agents.experiments.engine import run_all
 from agents.experiments.ledger import Ledger
 from agents.experiments.plots import LABELS
 from agents.experiments.provenance import check_folder, design_provenance, take_folder
 from agents.experiments.reports import write_report
 from agents.experiments.runner import Workplace, missing_tasks, run_task
 from agents.experiments.tables import write_summary
+from agents.experiments.tasks import run_all
 from agents.studies.privacy import tables
 from agents.studies.privacy.account import Traffic, Trips, make_account, measure_trips
 from agents.studies.privacy.figures import draw_claimed, draw_epsilon, draw_modes
 from agents.studies.privacy.plan import OPEN_LOOP, PrivacyCell, PrivacyDesign
 from agents.studies.privacy.results import PrivacyResults
-from dptse_env.traffic import RecordLibrary
 
 TEMPLATES = Path(__file__).parent
 
@@ -62,7 +61,7 @@ def read_results(
     lacking = trips.lacking(key, design.traffic_seeds)
     if lacking:
         place.record(config.corridor, lacking)
-        library = RecordLibrary(place.records)
+        library = place.records
         trips.append(key, [measure_trips(config.corridor, seed, library) for seed in lacking])
     lengths = np.concatenate([trips.rows[key, seed].lengths for seed in design.traffic_seeds])
     horizon = config.horizon_steps

@@ -1,16 +1,20 @@
+import contextlib
 import dataclasses
 import multiprocessing
 import os
 import signal
 import time
+from concurrent.futures import Future
 from pathlib import Path
 
 import pytest
 
+from agents.engines.engine import run_tasks
+from agents.engines.local import LocalProcesses, follow_parent
 from agents.evaluation.episodes import EpisodeScore, run_episode
-from agents.experiments.engine import LocalProcesses, follow_parent, run_all
 from agents.experiments.ledger import Ledger
 from agents.experiments.runner import EpisodeTask, make_env, missing_tasks, run_task
+from agents.experiments.tasks import run_all
 from agents.studies.paper.plan import SETTINGS, PaperCell, PaperDesign
 from dptse_env.config import resolve
 from dptse_env.schedules import make_schedule
@@ -72,18 +76,27 @@ def test_workers_find_what_this_process_finds(ledger, tmp_path):
     assert ledger.path.read_bytes() == alone.path.read_bytes()
 
 
-class Reversed:
-    """An engine of another kind: it runs the last task first."""
+class Backwards:
+    """An engine of another kind, and its workers: two tasks at once, of which the first is late."""
 
-    is_parallel = False
+    is_parallel, capacity, place = False, 2, "elsewhere"
 
-    def run(self, work, tasks):
-        for task in reversed(tasks):
-            yield task, work(task)
+    @contextlib.contextmanager
+    def open(self):
+        self.late = []
+        yield self
+
+    def submit(self, work, task):
+        future = Future()
+        self.late.append((future, work, task))
+        if len(self.late) == 2:
+            for late, its_work, its_task in reversed(self.late):
+                late.set_result(its_work(its_task))
+        return future
 
 
 def test_any_engine_fills_a_ledger(ledger, tmp_path):
-    run_all(TASKS, ledger, Reversed(), run_task, progress=False)
+    run_all(TASKS, ledger, Backwards(), run_task, progress=False)
     alone = Ledger(tmp_path / "alone.csv", PaperCell, EpisodeScore)
     run_all(TASKS, alone, LocalProcesses(1), run_task, progress=False)
     assert ledger.path.read_bytes() == alone.path.read_bytes()
@@ -109,7 +122,7 @@ def wait_for_ever(seconds):
 def test_an_interrupt_ends_what_runs_and_leaves_no_process(tmp_path, monkeypatch):
     monkeypatch.setenv("ENDS", str(tmp_path))
     start = time.monotonic()
-    results = LocalProcesses(2).run(wait_for_ever, [600, 0])
+    results = run_tasks(LocalProcesses(2), wait_for_ever, [600, 0])
     assert next(results) == (0, 0)
     deadline = time.monotonic() + 60
     while not list(tmp_path.iterdir()):

@@ -16,7 +16,7 @@ from agents.suite.table import cell_table, score_table
 from agents.suite.verifying import verify
 from dptse_env.config import TEST_SEEDS
 from dptse_env.schedules import make_schedule
-from tests.agents.engines import Noting
+from tests.agents.noting import Noting
 from tests.agents.policies import save
 
 from .small import SHORT, SMALL

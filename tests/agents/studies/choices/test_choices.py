@@ -7,9 +7,9 @@ import pytest
 
 pytest.importorskip("tyro")
 
+from agents.engines.local import LocalProcesses
 from agents.evaluation.policies import read_saved_policy
 from agents.experiments.cells import ERROR
-from agents.experiments.engine import LocalProcesses
 from agents.experiments.ledger import Ledger
 from agents.experiments.runner import Workplace
 from agents.studies.choices import study, tables

@@ -5,7 +5,7 @@ import pytest
 
 from agents.experiments.runner import Workplace
 from agents.studies.estimators import study
-from tests.agents.engines import Noting, cut
+from tests.agents.noting import Noting, cut
 
 from .made_up import DESIGN, add_worlds
 

@@ -6,7 +6,7 @@ import pytest
 
 from agents.experiments.runner import Workplace
 from agents.studies.ledger.study import run
-from tests.agents.engines import Noting, cut
+from tests.agents.noting import Noting, cut
 from tests.agents.studies.ledger.made_up import DESIGN
 
 # Both values of delta are the same, which halves the cells.

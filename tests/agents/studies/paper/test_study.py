@@ -7,7 +7,7 @@ from PIL import Image
 from agents.experiments.runner import Workplace
 from agents.studies.paper.plan import PaperDesign
 from agents.studies.paper.study import run
-from tests.agents.engines import Noting, cut
+from tests.agents.noting import Noting, cut
 
 DESIGN = PaperDesign(
     env="dptse_env:dptse/ShortHighway-v0",

@@ -4,13 +4,13 @@ import shutil
 
 import pytest
 
-from agents.experiments.engine import LocalProcesses
+from agents.engines.local import LocalProcesses
 from agents.experiments.runner import Workplace
 from agents.experiments.seeds import STUDY_TEST, STUDY_VALIDATION
 from agents.studies.policies.manifest import find_checkpoints
 from agents.studies.policies.plan import PolicyCell, PolicyDesign
 from agents.studies.policies.study import freeze, run
-from tests.agents.engines import Noting, cut
+from tests.agents.noting import Noting, cut
 from tests.agents.policies import SHORT, save
 
 WALK = {"estimator": "random_walk", "bandwidth": 2}

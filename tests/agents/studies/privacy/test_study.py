@@ -6,7 +6,7 @@ import pytest
 from agents.experiments.runner import Workplace
 from agents.studies.privacy.plan import PrivacyDesign
 from agents.studies.privacy.study import run
-from tests.agents.engines import Noting, cut
+from tests.agents.noting import Noting, cut
 
 DESIGN = PrivacyDesign(
     env="dptse_env:dptse/ShortHighway-v0",

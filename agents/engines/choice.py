@@ -1,0 +1,36 @@
+"""The engine that a command line chooses."""
+
+from __future__ import annotations
+
+import importlib.util
+from typing import Literal
+
+from agents.engines.engine import Engine, EngineError
+from agents.engines.local import LocalProcesses
+
+EngineName = Literal["local", "ray"]
+
+
+def make_engine(name: EngineName, workers: int, address: str | None) -> Engine:
+    """Make an engine.
+
+    Args:
+        name: ``local``, processes of this machine, or ``ray``, a cluster.
+        workers: Number of local processes. A cluster has as many as it has processors.
+        address: Address of the cluster; see `agents.engines.ray_cluster.RayCluster`.
+
+    Raises:
+        EngineError: Ray is missing, or there is no suitable cluster.
+        ValueError: An argument is out of range or of the other engine.
+    """
+    if name == "local":
+        if address is not None:
+            raise ValueError(f"address must be given with the engine ray, got {address!r}")
+        return LocalProcesses(workers)
+    if importlib.util.find_spec("ray") is None:
+        raise EngineError(
+            "the engine ray needs Ray: pip install 'dptse-env[ray]', here and on all nodes"
+        )
+    from agents.engines.ray_cluster import RayCluster  # noqa: PLC0415 (Ray is optional)
+
+    return RayCluster(address)

@@ -1,0 +1,293 @@
+"""`RayCluster`: the engine of many machines."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import platform
+import socket
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future
+from typing import Any
+
+import ray
+from ray.exceptions import RayError, RayTaskError
+from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+from tqdm import tqdm
+
+import dptse_env
+from agents.engines.engine import EngineError, ResultT, Workers, run_tasks
+from agents.engines.served_library import LocalServer, ServedLibrary
+from dptse_env.traffic import Corridor, RecordingError, RecordLibrary
+from dptse_env.traffic.stored_arrays import pack, unpack
+from dptse_env.utils.digests import package_digest
+
+RETRIES = 3
+"""Further attempts at a task whose worker or node dies. An error of the task itself is final."""
+
+CONNECT_SECONDS = 10.0
+"""Longest time for a connection to a cluster [s]."""
+
+PROBE_SECONDS = 20.0
+"""Longest time for the answer of a node [s]."""
+
+POLL_SECONDS = 1.0
+"""Time between two looks at which nodes there are [s]."""
+
+
+class RayCluster:
+    """Runs tasks on a Ray cluster; see `Engine`.
+
+    The program that starts tasks runs on a node of the cluster. Every node has this package, of the
+    same version. Records that a task reads come from the library of the program's node, and those
+    that a task makes go there. Other files that a task names have to be readable under the same
+    path on every node: trained policies, networks, road files with imported records.
+
+    Args:
+        address: Address of the cluster, host:port, or "auto" for the one on this machine. If None,
+            that of the environment variable ``RAY_ADDRESS``; where there is none, a cluster of this
+            machine alone is started, which ends with the program.
+
+    Raises:
+        EngineError: There is no cluster at the address, it has other versions, or a node does not
+            have this package.
+    """
+
+    is_parallel = True
+
+    def __init__(self, address: str | None = None) -> None:
+        """Connect, and ask every node for its version of this package."""
+        if not ray.is_initialized():
+            _connect(address or os.environ.get("RAY_ADDRESS"))
+        self._node = ray.get_runtime_context().get_node_id()
+        self._digest = package_digest(dptse_env)
+        self._suitable: set[str] = set()
+        self._n_processors, self._looked = 0, 0.0
+        self._look()
+
+    @contextlib.contextmanager
+    def open(self) -> Iterator[Workers]:
+        """See `Engine.open`."""
+        workers = _RayWorkers(self)
+        try:
+            yield workers
+        except BaseException:
+            workers.cancel()
+            raise
+
+    def record(
+        self, library: RecordLibrary, corridor: Corridor, seeds: Sequence[int], progress: bool
+    ) -> None:
+        """See `Engine.record`; records are written here as they come."""
+        missing = library.missing(corridor, seeds)
+        tasks = [(library, corridor, seed, self._node) for seed in missing]
+        bar = tqdm(total=len(tasks), desc=corridor.name, unit="record", disable=not progress)
+        with bar, contextlib.closing(run_tasks(self, _record, tasks, bar.set_postfix_str)) as done:
+            for (_, _, seed, _), archive in done:
+                if archive is not None:
+                    unpack(archive, library.record_path(corridor, seed))
+                bar.update()
+
+    def shared(self, library: RecordLibrary) -> RecordLibrary:
+        """See `Engine.shared`."""
+        here = NodeAffinitySchedulingStrategy(self._node, soft=False)
+        options = {"num_cpus": 0, "scheduling_strategy": here, "max_restarts": -1}
+        server = ray.remote(LocalServer).options(**options, max_task_retries=-1)
+        path = None if library.is_default else library.path
+        return ServedLibrary(path, _RemoteServer(server.remote(library)), library.n_open)
+
+    @property
+    def n_nodes(self) -> int:
+        """Number of nodes now."""
+        self._look()
+        return self._n_nodes
+
+    @property
+    def n_processors(self) -> int:
+        """Number of processors of all nodes now."""
+        self._look()
+        return self._n_processors
+
+    def _look(self) -> None:
+        """Count nodes and processors, and check nodes that are new."""
+        if time.monotonic() - self._looked < POLL_SECONDS:
+            return
+        nodes = [node for node in ray.nodes() if node["Alive"]]  # type: ignore[no-untyped-call]
+        new = [node for node in nodes if node["NodeID"] not in self._suitable]
+        for node, answer in zip(new, _probe([node["NodeID"] for node in new]), strict=True):
+            if answer != self._digest:
+                found = (
+                    answer if " " in answer else f"has another version of this package, {answer}"
+                )
+                raise EngineError(
+                    f"node {node['NodeManagerAddress']} {found}: install that of this program "
+                    f"there, dptse-env {dptse_env.__version__} with digest {self._digest}"
+                )
+            self._suitable.add(node["NodeID"])
+        self._n_nodes = len(nodes)
+        self._n_processors = int(sum(node["Resources"].get("CPU", 0) for node in nodes))
+        self._looked = time.monotonic()
+
+
+class _RayWorkers:
+    """Runs calls on a cluster."""
+
+    def __init__(self, cluster: RayCluster) -> None:
+        self._cluster, self._running = cluster, dict[Future[Any], Any]()
+        # Spread, so that all nodes have tasks from the first on.
+        self._call = ray.remote(_call).options(max_retries=RETRIES, scheduling_strategy="SPREAD")
+
+    @property
+    def capacity(self) -> int:
+        """See `Workers.capacity`."""
+        return max(2 * self._cluster.n_processors, 2)
+
+    @property
+    def place(self) -> str:
+        """See `Workers.place`."""
+        n = self._cluster.n_nodes
+        return f"{n} node{'' if n == 1 else 's'}"
+
+    def submit(self, work: Callable[..., ResultT], /, *arguments: Any) -> Future[ResultT]:
+        """See `Workers.submit`."""
+        reference = self._call.remote(work, *arguments)
+        outcome: Future[ResultT] = Future()
+        self._running[outcome] = reference
+
+        def end(inner: Future[ResultT]) -> None:
+            self._running.pop(outcome, None)
+            problem = inner.exception()
+            if problem is None:
+                outcome.set_result(inner.result())
+            else:
+                outcome.set_exception(_explained(problem))
+
+        reference.future().add_done_callback(end)
+        return outcome
+
+    def cancel(self) -> None:
+        """End what still runs; it is done again at the next start."""
+        for reference in list(self._running.values()):
+            ray.cancel(reference, force=True)
+
+
+class _RemoteServer:
+    """Asks an actor for records; see `agents.engines.served_library.Server`."""
+
+    def __init__(self, actor: Any) -> None:
+        self._actor = actor
+
+    def record(self, corridor: Corridor, seed: int) -> bytes | None:
+        archive: bytes | None = ray.get(self._actor.record.remote(corridor, seed))
+        return archive
+
+
+def _connect(address: str | None) -> None:
+    """Connect to a cluster, or start one on this machine.
+
+    Raises:
+        EngineError: There is none at the address, or it has another version of Ray or Python.
+    """
+    if address is not None and address != "auto":
+        _reach(address)
+    environment = {"OMP_NUM_THREADS": "1"}
+    try:
+        ray.init(
+            address=address or "local",
+            runtime_env={"env_vars": environment},
+            log_to_driver=False,
+            include_dashboard=False if address is None else None,
+            logging_level=logging.WARNING,
+        )
+    except (ConnectionError, RuntimeError, ValueError, RayError) as problem:
+        there = "on this machine" if address in (None, "auto") else f"at {address}"
+        raise EngineError(
+            f"no cluster {there} takes this program (Python {platform.python_version()}, Ray "
+            f"{ray.__version__}): {problem}"
+        ) from problem
+
+
+def _reach(address: str) -> None:
+    """Check that a machine listens at an address; Ray itself would try for a minute.
+
+    Raises:
+        EngineError: None does, or the address is no host:port.
+    """
+    host, colon, port = address.rpartition(":")
+    if not (host and colon and port.isdecimal()) or "://" in address:
+        raise EngineError(
+            f"address must be host:port of a cluster's head node, or auto, got {address!r}. Run "
+            "the program on a node of the cluster"
+        )
+    try:
+        socket.create_connection((host, int(port)), CONNECT_SECONDS).close()
+    except OSError as problem:
+        raise EngineError(
+            f"no cluster answers at {address} ({problem}): start one there with 'ray start "
+            "--head', or give --address another one"
+        ) from problem
+
+
+def _probe(nodes: Sequence[str]) -> list[str]:
+    """Return the digest of this package on nodes, or in words why there is none."""
+
+    # Nested, so that it travels as a value: a node may lack the module that it stands in.
+    def digest_there() -> str:
+        try:
+            import agents.engines.engine  # noqa: F401, PLC0415
+            import dptse_env as package  # noqa: PLC0415
+            from dptse_env.utils.digests import package_digest as digest  # noqa: PLC0415
+        except ImportError as problem:
+            return f"lacks this package ({problem})"
+        return digest(package)
+
+    remote = ray.remote(digest_there)
+    asked = [
+        remote.options(
+            num_cpus=0, scheduling_strategy=NodeAffinitySchedulingStrategy(node, soft=False)
+        ).remote()
+        for node in nodes
+    ]
+    answers = []
+    for reference in asked:
+        try:
+            answer = ray.get(reference, timeout=PROBE_SECONDS)
+        except RayError as problem:
+            answers.append(f"does not answer ({type(problem).__name__})")
+            continue
+        answers.append(answer)
+    return answers
+
+
+def _call(work: Callable[..., ResultT], *arguments: Any) -> ResultT:
+    """Run a task on a worker; an error of a file or of a recording names the node."""
+    try:
+        return work(*arguments)
+    except (OSError, RecordingError) as problem:
+        node = ray.util.get_node_ip_address()  # type: ignore[no-untyped-call]
+        raise type(problem)(f"on node {node}: {problem}") from problem
+
+
+def _record(task: tuple[RecordLibrary, Corridor, int, str]) -> bytes | None:
+    """Make a record in the node's library; return its archive, or None on the node ``home``."""
+    library, corridor, seed, home = task
+    library.ensure(corridor, [seed], workers=1)
+    if ray.get_runtime_context().get_node_id() == home:
+        return None
+    return pack(library.record_path(corridor, seed))
+
+
+def _explained(problem: BaseException) -> BaseException:
+    """Return the error of a task itself, or else one that says how its worker was lost."""
+    if isinstance(problem, RayTaskError) and isinstance(problem.cause, Exception):
+        problem.cause.__cause__ = problem  # it has the traceback on the worker
+        return problem.cause
+    if isinstance(problem, RayError):
+        reason = str(problem).strip().splitlines()[0]
+        return EngineError(
+            f"a task was lost {RETRIES + 1} times ({type(problem).__name__}: {reason}): results "
+            "so far are kept, the same command goes on from there"
+        )
+    return problem
