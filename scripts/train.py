@@ -1,6 +1,7 @@
 """Train a query policy in a folder.
 
 python scripts/train.py --seed 0 --output results/training/pl-0
+python scripts/train.py --seeds 0:5 --workers 2 --output results/training/pl
 python scripts/train.py --steps 2000000 --output results/training/maskable-0 recipe:maskable
 
 The folder gets run.json (the settings), progress.csv (the learning curve), checkpoint.pt,
@@ -12,19 +13,24 @@ need another folder.
 from __future__ import annotations
 
 import subprocess
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
 import torch
 import tyro
+from tqdm import tqdm
 
+from agents.experiments.runner import Workplace
 from agents.training.plan import TrainingPlan
 from agents.training.recipes import MaskablePPORecipe, MaskRecipe, PlackettLuceRecipe, ScoresRecipe
+from agents.training.run_files import Row, read_progress
+from agents.training.several_seeds import train_all
 from agents.training.training import BEST, POLICY, Training
 from dptse_env.config import parse_seeds
 from dptse_env.utils.validation import integer
-from scripts.cli import Road, records_argument, resumable, run
+from scripts.cli import Road, resumable, run
 from scripts.training_bar import Bar, watched
 
 AnyRecipe = (
@@ -43,6 +49,9 @@ class Args(Road):
     """Environment id."""
     seed: int = 0
     """Training seed."""
+    seeds: str | None = None
+    """Training seeds, first:stop, in place of one: trainings run at once on the engine, each in a
+    folder of its own in the output, named by its seed."""
     steps: int | None = None
     """Seconds of traffic to train for by PPO, all episodes together, each with one decision;
     2,000,000 if not given. The recipe plackett-luce is trained in rounds and takes none."""
@@ -68,8 +77,8 @@ class Args(Road):
     """Recipe of the training."""
 
 
-def make_plan(args: Args) -> TrainingPlan:
-    """Return the plan that the arguments describe.
+def make_plan(args: Args, seed: int) -> TrainingPlan:
+    """Return the plan that the arguments describe, with a training seed.
 
     Raises:
         ValueError: An argument is out of range, or ``keywords`` is no JSON object.
@@ -77,7 +86,7 @@ def make_plan(args: Args) -> TrainingPlan:
     return TrainingPlan(
         env=args.env,
         recipe=args.recipe,
-        seed=args.seed,
+        seed=seed,
         steps=args.recipe.default_steps if args.steps is None else args.steps,
         traffic_seeds=parse_seeds(args.traffic, "traffic"),
         validation_seeds=parse_seeds(args.validation, "validation"),
@@ -101,13 +110,49 @@ def commit() -> str | None:
     return head.stdout.strip() or None
 
 
+def train_several(args: Args, seeds: Sequence[int], place: Workplace) -> None:
+    """Train with several seeds at once, with one bar over all of them."""
+    plans = {args.output / str(seed): make_plan(args, seed) for seed in seeds}
+    plan = plans[args.output / str(seeds[0])]
+    done = dict.fromkeys(plans, 0)
+    total = len(plans) * plan.steps_at(plan.n_updates)
+    with tqdm(total=total, desc="training", unit="step", unit_scale=True) as bar:
+
+        def on_rows(folder: Path, rows: list[Row]) -> None:
+            steps = int(rows[-1]["steps"])
+            bar.update(steps - done[folder])
+            done[folder] = steps
+
+        train_all(
+            plans,
+            place.engine,
+            records=place.records,
+            commit=commit(),
+            threads=args.threads,
+            on_rows=on_rows,
+        )
+    for folder in plans:
+        print(f"{folder}: {summary(read_progress(folder)[-1])}")
+
+
+def summary(row: Row) -> str:
+    """Return the errors in validation of a row of the learning curve, in words."""
+    errors = row["validation"], row["validation_drawn"]
+    return "error in validation {:.4f} deterministic, {:.4f} drawn".format(*errors)
+
+
 @resumable()
 def main(args: Args) -> None:
     """Record missing traffic, train, and leave the policy."""
-    plan = make_plan(args)
+    seeds = (args.seed,) if args.seeds is None else parse_seeds(args.seeds)
+    plan = make_plan(args, seeds[0])
     torch.set_num_threads(integer("threads", args.threads, 1))
+    place = args.workplace(args.output)
     for world in plan.worlds:
-        args.library(world.config.corridor, (*plan.traffic_seeds, *plan.validation_seeds))
+        place.record(world.config.corridor, (*plan.traffic_seeds, *plan.validation_seeds))
+    if args.seeds is not None:
+        train_several(args, seeds, place)
+        return
     bar = Bar(
         "steps",
         ("error", "validation"),
@@ -119,17 +164,14 @@ def main(args: Args) -> None:
         training = Training(
             plan,
             args.output,
-            records=records_argument(args.records),
+            records=place.records,
             commit=commit(),
+            engine=place.engine,
             watchers=watchers,
             progress=bar.show,
         )
         training.run()
-    last = training.rows[-1]
-    print(
-        f"error in validation {last['validation']:.4f} deterministic, "
-        f"{last['validation_drawn']:.4f} drawn; {args.output}/{POLICY} and {BEST}"
-    )
+    print(f"{summary(training.rows[-1])}; {args.output}/{POLICY} and {BEST}")
 
 
 if __name__ == "__main__":

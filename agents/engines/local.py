@@ -70,6 +70,10 @@ class LocalProcesses:
         return library
 
 
+THIS_PROCESS = LocalProcesses(1)
+"""Runs tasks one by one in the calling process."""
+
+
 class _Caller:
     """Runs calls in the calling process, at once."""
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
 import torch
 
+from agents.engines.engine import Engine
 from agents.evaluation.environments import make_vector
 from agents.experiments.seeds import training_seed
 from agents.training.episodes import make_episodes
@@ -17,9 +18,12 @@ from agents.training.plan import TrainingPlan
 from agents.training.policy_iteration import collect_swaps, raise_scores
 from agents.training.recipes import PlackettLuceRecipe
 from agents.training.regression import Practice, regress
+from agents.training.swap_parts import collect_parts, untrained
+from agents.training.swaps import Swaps
 from agents.training.worlds import World
 from dptse_env.parts import make_interface
 from dptse_env.sb3 import PlackettLucePolicy, RoadChannels
+from dptse_env.vector_env import SensorQueryVectorEnv
 
 
 class PlackettLuceLearner:
@@ -31,13 +35,14 @@ class PlackettLuceLearner:
         recipe: PlackettLuceRecipe,
         keywords: Mapping[str, Any],
         progress: Callable[[str, float], None],
+        engine: Engine,
     ) -> None:
         """Make an untrained policy; ``keywords`` are further ones of all environments."""
         self._plan, self._recipe, self._keywords = plan, recipe, keywords
-        self._progress = progress
+        self._progress, self._engine = progress, engine
         self._rounds, self._is_begun = 0, False
         torch.manual_seed(plan.seed)
-        self.policy = _untrained(plan.worlds[0], recipe)
+        self.policy = untrained(plan.worlds[0], recipe)
         others = [_sharing(self.policy, world) for world in plan.worlds[1:]]
         self.policies = (self.policy, *others)
         # Draws of the training must not depend on how many weights were drawn before them.
@@ -82,37 +87,46 @@ class PlackettLuceLearner:
 
     def _swap(self, record: Record) -> None:
         """Do the rounds of swaps that are left, in episodes whose memory is freed afterwards."""
-        plan, settings = self._plan, self._recipe.swaps
-        environments = [
-            make_vector(
-                world.env,
-                world.part(settings.episodes),
-                {**world.keywords, **self._keywords, "action": self._recipe.action},
-            )
-            for world in plan.worlds
-        ]
+        settings = self._recipe.swaps
+        environments = self._environments() if settings.parts == 1 else []
         while self._rounds < settings.rounds:
             start = time.perf_counter()
-            tried = [
-                collect_swaps(policy, env, settings, self._rounds, plan.seed, self._progress)
-                for policy, env in zip(self.policies, environments, strict=True)
-            ]
+            tried = self._try(environments)
             step, progress = settings.step_of(self._rounds), partial(self._progress, "fit")
             raise_scores(self.policies, tried, settings, step, progress)
             self._rounds += 1
             error = sum(float(swaps.error.mean()) for swaps in tried) / len(tried)
             record(time.perf_counter() - start, {"error": error})
 
+    def _environments(self) -> list[SensorQueryVectorEnv]:
+        """Make an environment of a round's episodes for each world."""
+        return [
+            make_vector(
+                world.env,
+                world.part(self._recipe.swaps.episodes),
+                {**world.keywords, **self._keywords, "action": self._recipe.action},
+            )
+            for world in self._plan.worlds
+        ]
 
-def _untrained(world: World, recipe: PlackettLuceRecipe) -> PlackettLucePolicy:
-    interface = make_interface(world.config)
-    return PlackettLucePolicy(
-        interface.observations.space,
-        interface.actions.space,
-        road=RoadChannels.from_config(world.config),
-        width=recipe.width,
-        rule=recipe.rule,
-    )
+    def _try(self, environments: Sequence[SensorQueryVectorEnv]) -> list[Swaps]:
+        """Return the swaps of a round in each world: tried here, or in parts on the engine."""
+        plan, recipe = self._plan, self._recipe
+        if recipe.swaps.parts == 1:
+            return [
+                collect_swaps(policy, env, recipe.swaps, self._rounds, plan.seed, self._progress)
+                for policy, env in zip(self.policies, environments, strict=True)
+            ]
+        return collect_parts(
+            plan.worlds,
+            self.policies,
+            recipe,
+            self._keywords,
+            seed=plan.seed,
+            index=self._rounds,
+            engine=self._engine,
+            progress=partial(self._progress, "swaps"),
+        )
 
 
 def _sharing(policy: PlackettLucePolicy, world: World) -> PlackettLucePolicy:

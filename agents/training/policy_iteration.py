@@ -39,7 +39,9 @@ def collect_swaps(
     settings: SwapRounds,
     index: int,
     seed: int,
-    progress: Callable[[str, float], None],
+    progress: Callable[[str, float], None] = lambda stage, fraction: None,
+    *,
+    first: int = 0,
 ) -> Swaps:
     """Return the swaps of a round, tried under ``policy``.
 
@@ -50,22 +52,28 @@ def collect_swaps(
         index: Number of the round, counted from 0.
         seed: Training seed. Draws depend on it and on ``index`` alone, but for those of torch.
         progress: Called with the name of a stage and the fraction of it that is done.
+        first: Number in the round of the first episode; draws depend on it, too.
 
     Raises:
         ValueError: There is nothing to swap, or the horizon is too short (`try_swaps`).
     """
-    first, parts = training_seed(seed) + SEED_STRIDE * (index + 1), []
+    begin, parts = first_seed(seed, index) + first, []
     for part in try_swaps(
         env,
         policy,
-        list(range(first, first + env.num_envs)),
-        np.random.default_rng([seed, index]),
+        list(range(begin, begin + env.num_envs)),
+        np.random.default_rng([seed, index, first] if first else [seed, index]),
         seconds=settings.seconds,
         trials=settings.trials,
     ):
         parts.append(part)
         progress("swaps", len(parts) * settings.seconds / env.config.horizon_steps)
     return Swaps.from_parts(parts)
+
+
+def first_seed(seed: int, index: int) -> int:
+    """Return the seed of the first episode of a round, counted from 0, with a training seed."""
+    return training_seed(seed) + SEED_STRIDE * (index + 1)
 
 
 class _Gains:

@@ -74,6 +74,9 @@ class SwapRounds:
     """Seconds over which the effect of a swap is measured, and between two states of an episode."""
     trials: int = 3
     """Swaps tried in each state."""
+    parts: int = 1
+    """Parts of a round's episodes, for as many workers; numbers depend on it, since each part has
+    draws of its own, and not on where it runs."""
     step: float = 25.0
     """Rise of a score, in the first round, for an expected gain of one mean one-second error."""
     final_step: float = 5.0
@@ -91,7 +94,7 @@ class SwapRounds:
         """Check values."""
         integer("recipe.swaps.rounds", self.rounds, 0, 99)
         integer("recipe.swaps.episodes", self.episodes, 1, 9999)
-        for name in ("seconds", "trials", "batches", "batch_size"):
+        for name in ("seconds", "trials", "parts", "batches", "batch_size"):
             integer(f"recipe.swaps.{name}", getattr(self, name), 1)
         positive("recipe.swaps.step", self.step)
         positive("recipe.swaps.final_step", self.final_step)

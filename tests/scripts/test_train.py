@@ -11,6 +11,7 @@ import pytest
 pytest.importorskip("sb3_contrib")
 pytest.importorskip("tyro")
 
+import torch
 import tyro
 
 from agents.training.recipes import RECIPES, MaskablePPORecipe
@@ -53,6 +54,18 @@ def test_it_trains_and_continues(tmp_path, capsys):
     assert (tmp_path / "policy.zip").read_bytes() == before
     with pytest.raises(ValueError, match="seed is 0 there and 1 now"):
         train.main(arguments(tmp_path, "--seed", "1"))
+
+
+def test_several_seeds_are_trained_in_folders_of_their_own(tmp_path, capsys):
+    train.main(arguments(tmp_path / "all", "--seeds", "0:2", "--workers", "1"))
+    assert f"{tmp_path}/all/1: error in validation 0." in capsys.readouterr().out
+    train.main(arguments(tmp_path / "alone", "--seed", "1"))
+    kept = [
+        torch.load(tmp_path / folder / "checkpoint.pt", weights_only=True)["learner"]["policy"]
+        for folder in ("all/1", "alone", "all/0")
+    ]
+    assert all(torch.equal(kept[0][name], value) for name, value in kept[1].items())
+    assert not all(torch.equal(kept[2][name], value) for name, value in kept[1].items())
 
 
 def test_ctrl_c_leaves_a_training_to_continue(tmp_path, monkeypatch, capsys):
@@ -124,19 +137,19 @@ def test_former_names_of_options_are_kept():
 
 def test_arguments_become_the_plan():
     args = Args(seed=3, traffic="4:6", validation="1000", keywords='{"bandwidth": 3}')
-    plan = make_plan(args)
+    plan = make_plan(args, 3)
     assert (plan.seed, plan.traffic_seeds, plan.validation_seeds) == (3, (4, 5), (1000,))
     assert plan.config.bandwidth == 3
     assert plan.config.action == "slots"
     assert (plan.steps, plan.n_updates) == (0, 8)  # rounds of swaps alone
-    sequential = make_plan(Args(recipe=MaskablePPORecipe()))
+    sequential = make_plan(Args(recipe=MaskablePPORecipe()), 0)
     assert sequential.n_updates == 313  # 2 million decisions of five picks, 32,000 an update
 
 
 @pytest.mark.parametrize("text", ["{", "[1]", "3"])
 def test_keywords_must_be_an_object(text):
     with pytest.raises(ValueError, match="keywords must be a JSON object, got"):
-        make_plan(Args(keywords=text))
+        make_plan(Args(keywords=text), 0)
 
 
 def test_tensorboard_is_optional_and_its_absence_is_logged(tmp_path, monkeypatch, caplog):

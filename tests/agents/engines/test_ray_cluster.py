@@ -154,5 +154,5 @@ def test_a_machine_without_a_cluster_says_so(ray, monkeypatch):
         raise ConnectionError("Could not find any running Ray instance.")
 
     monkeypatch.setattr(ray, "init", refuse)
-    with pytest.raises(EngineError, match="no cluster on this machine takes .* Could not find"):
+    with pytest.raises(EngineError, match=r"no cluster on this machine takes .* Could not find"):
         RayCluster("auto")

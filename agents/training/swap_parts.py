@@ -1,0 +1,118 @@
+"""Parts of a round of swaps, each with draws of its own, so that workers can share a round."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from agents.engines.engine import Engine, run_tasks
+from agents.evaluation.environments import make_vector
+from agents.training.policy_iteration import collect_swaps, first_seed
+from agents.training.recipes import PlackettLuceRecipe
+from agents.training.swaps import Swaps
+from agents.training.worlds import World
+from dptse_env.parts import make_interface
+from dptse_env.sb3 import PlackettLucePolicy, RoadChannels
+
+
+@dataclass(frozen=True)
+class SwapPart:
+    """Some episodes of a round in a world, with everything that a worker needs to play them.
+
+    Attributes:
+        keywords: Keywords of the environment beside those of the world.
+        weights: Weights of the policy.
+        seed: Training seed.
+        index: Number of the round, counted from 0.
+        episodes: Numbers of the episodes in the round.
+    """
+
+    world: World
+    recipe: PlackettLuceRecipe
+    keywords: Mapping[str, Any]
+    weights: Mapping[str, Any]
+    seed: int
+    index: int
+    episodes: range
+
+
+def collect_part(part: SwapPart) -> Swaps:
+    """Try the swaps of a part; its draws do not depend on the other parts."""
+    env = make_vector(part.world.env, len(part.episodes), dict(part.keywords))
+    with torch.random.fork_rng(devices=[]):
+        policy = untrained(part.world, part.recipe)
+        policy.load_state_dict(part.weights)
+        torch.manual_seed(first_seed(part.seed, part.index) + part.episodes.start)
+        return collect_swaps(
+            policy, env, part.recipe.swaps, part.index, part.seed, first=part.episodes.start
+        )
+
+
+def collect_parts(
+    worlds: Sequence[World],
+    policies: Sequence[PlackettLucePolicy],
+    recipe: PlackettLuceRecipe,
+    keywords: Mapping[str, Any],
+    *,
+    seed: int,
+    index: int,
+    engine: Engine,
+    progress: Callable[[float], None],
+) -> list[Swaps]:
+    """Return the swaps of a round in each of the worlds, tried in parts on an engine.
+
+    Args:
+        worlds: The worlds.
+        policies: The policy of each of them.
+        recipe: Its settings of swaps say how many parts there are.
+        keywords: Further keywords of all environments.
+        seed: Training seed.
+        index: Number of the round, counted from 0.
+        engine: Runs the parts.
+        progress: Called with the fraction of the parts that are done.
+    """
+    parts = [
+        SwapPart(
+            world,
+            recipe,
+            {**world.keywords, **keywords, "action": recipe.action},
+            policy.state_dict(),
+            seed,
+            index,
+            episodes,
+        )
+        for world, policy in zip(worlds, policies, strict=True)
+        for episodes in split(world.part(recipe.swaps.episodes), recipe.swaps.parts)
+    ]
+    places = {id(part): place for place, part in enumerate(parts)}
+    tried: dict[int, Swaps] = {}
+    for part, swaps in run_tasks(engine, collect_part, parts):
+        tried[places[id(part)]] = swaps
+        progress(len(tried) / len(parts))
+    return [
+        Swaps.from_parts([tried[k] for k, part in enumerate(parts) if part.world is world])
+        for world in worlds
+    ]
+
+
+def split(count: int, parts: int) -> list[range]:
+    """Return the numbers below ``count`` in at most ``parts`` ranges of nearly equal length."""
+    n = min(parts, count)
+    edges = [count * k // n for k in range(n + 1)]
+    return [range(*pair) for pair in itertools.pairwise(edges)]
+
+
+def untrained(world: World, recipe: PlackettLuceRecipe) -> PlackettLucePolicy:
+    """Return a policy for a world with the initial weights that torch draws."""
+    interface = make_interface(world.config)
+    return PlackettLucePolicy(
+        interface.observations.space,
+        interface.actions.space,
+        road=RoadChannels.from_config(world.config),
+        width=recipe.width,
+        rule=recipe.rule,
+    )
