@@ -161,7 +161,15 @@ def run_audit(args: Args) -> Finding:
     worlds = choose_target(config, record, args.target, args.policy)
     policy = make_policy(config, args.policy, worlds)
     start = time.perf_counter()
-    runs = attack(config, worlds, policy, args.runs, noise_factor=args.noise_factor, seed=args.seed)
+    runs = attack(
+        config,
+        worlds,
+        policy,
+        args.runs,
+        noise_factor=args.noise_factor,
+        seed=args.seed,
+        engine=args.start_engine(),
+    )
     seconds = time.perf_counter() - start
     report = privacy_report(config)
     return Finding(
@@ -186,7 +194,15 @@ def run_pairs(args: Args) -> PairsFinding:
     records = [with_vehicles(library.get(config.corridor, seed), "an audit") for seed in seeds]
     policy = args.policy if args.policy in PUBLIC_SCHEDULES else "round-robin"
     title = make_title(args, config)
-    return study_pairs(config, records, args.runs, title=title, policy=policy, seed=args.seed)
+    return study_pairs(
+        config,
+        records,
+        args.runs,
+        title=title,
+        policy=policy,
+        seed=args.seed,
+        engine=args.start_engine(),
+    )
 
 
 def main(args: Args) -> None:

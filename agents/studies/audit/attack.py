@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
 from tqdm import tqdm
 
+from agents.engines.engine import Engine, run_tasks
+from agents.engines.local import THIS_PROCESS
 from agents.studies.audit.releases import Overheard, Terms, attacked
 from agents.studies.audit.strategies import FixedQueries
 from agents.studies.audit.worlds import AdjacentWorlds
@@ -78,6 +81,22 @@ class Adversary:
         self.score += np.sum((released / terms.sigma - midpoint) * difference, axis=(1, 2))
 
 
+@dataclass(frozen=True)
+class Batch:
+    """Some runs in both worlds, with everything that a worker needs to play them.
+
+    Attributes:
+        runs: Numbers of the runs, which seed their noise.
+    """
+
+    config: EnvConfig
+    worlds: AdjacentWorlds
+    policy: FixedQueries
+    runs: range
+    noise_factor: float
+    seed: int
+
+
 def attack(
     config: EnvConfig,
     worlds: AdjacentWorlds,
@@ -87,6 +106,7 @@ def attack(
     noise_factor: float = 1.0,
     seed: int = 0,
     batch: int = BATCH,
+    engine: Engine = THIS_PROCESS,
     progress: bool = True,
 ) -> Runs:
     """Play both worlds and score every transcript.
@@ -103,38 +123,49 @@ def attack(
         noise_factor: Multiplies the noise that the configuration declares.
         seed: Seeds the noise, >= 0.
         batch: Runs per world that are played at once; results do not depend on it.
+        engine: Plays the batches.
         progress: Whether to show a progress bar.
     """
     config = attacked_form(config)
-    size = min(batch, n_runs)
-    traffic = TrafficTable(config.corridor, (0, 1), worlds)
-    release = Overheard(make_release(config, 2 * size, traffic))
-    process = QueryProcess(make_parts(config, 2 * size, traffic=traffic, release=release))
+    batches = [
+        Batch(config, worlds, policy, range(n_runs)[first : first + batch], noise_factor, seed)
+        for first in range(0, n_runs, batch)
+    ]
+    played: dict[int, Runs] = {}
+    bar = tqdm(total=2 * n_runs, desc="attacking", unit="run", disable=not progress)
+    run = run_tasks(engine, play, batches, bar.set_postfix_str)
+    with bar, contextlib.closing(run) as finished:
+        for each, runs in finished:
+            played[each.runs.start] = runs
+            bar.update(2 * len(each.runs))
+    in_order = [played[each.runs.start] for each in batches]
+    return Runs(
+        np.concatenate([runs.scores for runs in in_order], axis=1),
+        np.concatenate([runs.distances for runs in in_order], axis=1),
+    )
+
+
+def play(batch: Batch) -> Runs:
+    """Play a batch of runs in both worlds."""
+    config, n = batch.config, 2 * len(batch.runs)
+    traffic = TrafficTable(config.corridor, (0, 1), batch.worlds)
+    release = Overheard(make_release(config, n, traffic))
+    process = QueryProcess(make_parts(config, n, traffic=traffic, release=release))
     played = attacked(release.model)
-    played.scale_noise(noise_factor)
-    adversary = Adversary(config, worlds, 2 * size)
-    parts = []
-    with tqdm(
-        total=2 * n_runs, desc="attacking", unit="run", mininterval=0.5, disable=not progress
-    ) as bar:
-        for first in range(0, n_runs, size):
-            runs = range(first, min(first + size, n_runs))
-            n = 2 * len(runs)
-            for world in (0, 1):
-                # A run's noise stream does not depend on the batch.
-                streams = [np.random.default_rng((seed, world, run)) for run in runs]
-                options = {"traffic_seed": world, "start": 0}
-                process.reset(world * len(runs) + np.arange(len(runs)), streams, options)
-            adversary.reset(n)
-            for step in range(config.horizon_steps):
-                queries = policy.queries(step, adversary.score)
-                process.step(np.arange(n), queries.astype(np.int8))
-                terms = played.terms(release.last)
-                adversary.update(step + 1, process.queried[:n], release.last.values, terms)
-            parts.append([adversary.score.reshape(2, -1), np.sqrt(adversary.square).reshape(2, -1)])
-            bar.update(n)
-    scores, distances = (np.concatenate(part, axis=1) for part in zip(*parts, strict=True))
-    return Runs(scores, distances)
+    played.scale_noise(batch.noise_factor)
+    adversary = Adversary(config, batch.worlds, n)
+    for world in (0, 1):
+        # A run's noise stream does not depend on the batch.
+        streams = [np.random.default_rng((batch.seed, world, run)) for run in batch.runs]
+        options = {"traffic_seed": world, "start": 0}
+        process.reset(world * len(streams) + np.arange(len(streams)), streams, options)
+    adversary.reset(n)
+    for step in range(config.horizon_steps):
+        queries = batch.policy.queries(step, adversary.score)
+        process.step(np.arange(n), queries.astype(np.int8))
+        terms = played.terms(release.last)
+        adversary.update(step + 1, process.queried, release.last.values, terms)
+    return Runs(adversary.score.reshape(2, -1), np.sqrt(adversary.square).reshape(2, -1))
 
 
 def attacked_form(config: EnvConfig) -> EnvConfig:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +11,8 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from agents.engines.engine import Engine, run_tasks
+from agents.engines.local import THIS_PROCESS
 from agents.evaluation.terminal import make_table, print_table
 from agents.experiments.files import write_json
 from agents.studies.audit.distances import protects_seconds, replaces
@@ -20,7 +23,7 @@ from dptse_env.config import EnvConfig
 from dptse_env.parts import make_release, privacy_report
 from dptse_env.release import PrivacyReport, ReleaseRequest, TrafficTable
 from dptse_env.traffic import Corridor, Record, RecordLibrary
-from dptse_env.utils.arrays import FloatArray, IntArray
+from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.validation import require
 
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95, 1.0)
@@ -138,6 +141,29 @@ class PairsFinding:
         write_json(path, content)
 
 
+@dataclass(frozen=True, eq=False)
+class PairsTask:
+    """Pairs of trips of a record, with everything that a worker needs to replay them.
+
+    Attributes:
+        plan: Public queries of the episode.
+        seed: Seeds the noise of the episode.
+        pairs: Vehicles, shape (n, 2).
+    """
+
+    config: EnvConfig
+    record: Record
+    plan: BoolArray
+    seed: int
+    pairs: IntArray
+
+
+def run_pairs(task: PairsTask) -> FloatArray:
+    """Return the squared distances of the pairs in units of the noise, shape (n,)."""
+    series = play_series(task.config, task.record, task.plan, task.seed)
+    return replay_pairs(task.config, task.record, series, task.pairs)
+
+
 def study_pairs(
     config: EnvConfig,
     records: Sequence[Record],
@@ -146,6 +172,7 @@ def study_pairs(
     title: str = "",
     policy: str = "round-robin",
     seed: int = 0,
+    engine: Engine = THIS_PROCESS,
     progress: bool = True,
 ) -> PairsFinding:
     """Replay pairs of trips of records, each under the public numbers of an episode of its own.
@@ -157,21 +184,27 @@ def study_pairs(
         title: What is replayed.
         policy: Name of the public schedule of the episodes.
         seed: Seeds the pairs, and the noise of the episodes.
+        engine: Replays the records.
         progress: Whether to show a progress bar.
 
     Raises:
         ValueError: A record has fewer than two vehicles.
     """
-    generator, privacy, squares = np.random.default_rng(seed), privacy_report(config), []
-    plan = public_plan(config, policy)
-    for index, record in enumerate(tqdm(records, unit="record", disable=not progress)):
+    generator, privacy = np.random.default_rng(seed), privacy_report(config)
+    plan, tasks = public_plan(config, policy), []
+    for index, record in enumerate(records):
         vehicles = np.unique(record.vehicle).astype(np.int64)
         require(len(vehicles) >= 2, "traffic", "records of 2 vehicles or more", len(vehicles))
         first = generator.integers(len(vehicles), size=n_pairs)
         other = (first + generator.integers(1, len(vehicles), size=n_pairs)) % len(vehicles)
-        series = play_series(config, record, plan, seed + index)
         pairs = vehicles[np.stack([first, other], axis=1)]
-        squares.append(replay_pairs(config, record, series, pairs))
-    return PairsFinding(
-        title, privacy, np.concatenate(squares) / privacy.mu**2, len(records), policy
-    )
+        tasks.append(PairsTask(config, record, plan, seed + index, pairs))
+    squares: dict[int, FloatArray] = {}
+    bar = tqdm(total=len(tasks), unit="record", disable=not progress)
+    run = run_tasks(engine, run_pairs, tasks, bar.set_postfix_str)
+    with bar, contextlib.closing(run) as finished:
+        for task, distances in finished:
+            squares[task.seed] = distances
+            bar.update()
+    parts = np.concatenate([squares[task.seed] for task in tasks]) / privacy.mu**2
+    return PairsFinding(title, privacy, parts, len(records), policy)

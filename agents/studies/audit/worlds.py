@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -68,6 +69,10 @@ class AdjacentWorlds(RecordLibrary):
         super().__init__()
         self.rest, self.trajectories, self.description = rest, trajectories, description
         self._records = tuple(_add(rest, each) for each in trajectories)
+
+    def __reduce__(self) -> tuple[type[AdjacentWorlds], tuple[Any, ...]]:
+        """Pickle with the records, which no folder has."""
+        return type(self), (self.rest, self.trajectories, self.description)
 
     def get(self, corridor: Corridor, seed: int) -> Record:
         """Return the record of a world."""

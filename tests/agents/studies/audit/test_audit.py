@@ -3,6 +3,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from agents.engines.local import LocalProcesses
 from agents.studies.audit.attack import Adversary, attack
 from agents.studies.audit.distances import ReleaseDistances, plan_contributions
 from agents.studies.audit.gaussian_planner import planned_distance
@@ -291,6 +292,16 @@ def test_less_noise_puts_the_worlds_further_apart(record):
 @pytest.mark.parametrize("privacy", [{}, {"preset": "paper"}, {"boundary_inputs": "private"}])
 def test_runs_do_not_depend_on_the_batch(privacy, record):
     assert_runs_do_not_depend_on_the_batch(config(**privacy), record)
+
+
+def test_runs_come_out_the_same_wherever_they_are_played(record):
+    setting = config()
+    worlds = choose_target(setting, record, "worst-case", "hunter")
+    policy = make_policy(setting, "adaptive", worlds)
+    here = attack(setting, worlds, policy, 5, batch=2, progress=False)
+    there = attack(setting, worlds, policy, 5, batch=2, engine=LocalProcesses(2), progress=False)
+    np.testing.assert_array_equal(here.scores, there.scores)
+    np.testing.assert_array_equal(here.distances, there.distances)
 
 
 def test_adapting_stays_below_mu_and_stops_early(record):
