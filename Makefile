@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 
 export OMP_NUM_THREADS = 1
 
-.PHONY: help setup docs demo policy-study audit test test-slow lint format benchmark wheel-test clean clean-kernels reproduce privacy-study ledger-study choice-study
+.PHONY: help setup docs demo policy-study audit test test-slow test-ray lint format benchmark wheel-test clean clean-kernels reproduce privacy-study ledger-study choice-study
 
 help:  ## Show this list.
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -64,6 +64,9 @@ test: setup  ## Run the tests, without the slow ones.
 
 test-slow: setup  ## Run the slow tests: before a release, and after a change to kernels, workers or benchmarks.
 	$(BIN)/python -m pytest -m slow
+
+test-ray: setup  ## Run the tests of Ray clusters on this machine, with killed workers and lost nodes.
+	$(BIN)/python -m pytest -m ray
 
 docs: setup  ## Write the generated page of keywords anew: docs/configuration.md.
 	$(BIN)/python scripts/document_configuration.py
