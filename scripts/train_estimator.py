@@ -22,7 +22,7 @@ from agents.filters.training import FilterTraining
 from dptse_env.config import parse_seeds
 from dptse_env.estimators.learned.weights import read_network
 from dptse_env.utils.validation import integer
-from scripts.cli import Machines, records_argument, resumable, run
+from scripts.cli import Machines, resumable, run
 from scripts.training_bar import Bar, watched
 
 
@@ -110,20 +110,22 @@ def main(args: Args) -> None:
     """Record missing traffic, train, and leave the network."""
     plan = make_plan(args)
     torch.set_num_threads(integer("threads", args.threads, 1))
+    place = args.workplace(args.output)
     for envs, seeds in (
         (plan.ranges.envs, plan.traffic_seeds), (plan.validation_envs, plan.validation_seeds)
     ):  # fmt: skip
         for env in envs:
-            args.library(make_config(*parse_env(env)).corridor, seeds)
+            place.record(make_config(*parse_env(env)).corridor, seeds)
     bar = Bar("update", ("error", "validation", "chi2"), plan.n_passes, unit="pass")
     with watched(bar, args.output, args.tensorboard) as watchers:
         training = FilterTraining(
             plan,
             args.output,
-            records=records_argument(args.records),
+            records=place.records,
             watchers=watchers,
             progress=bar.show,
             compiled=args.compiled,
+            engine=place.engine,
         )
         training.run()
     print(f"the network is in {args.output / 'network.npz'}")

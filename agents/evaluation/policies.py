@@ -133,6 +133,10 @@ class SavedModel:
 
     source: str
 
+    def __reduce__(self) -> tuple[type[SavedModel], tuple[str]]:
+        """Go to other processes without the model, which not every library can pickle."""
+        return SavedModel, (self.source,)
+
     @property
     def path(self) -> str:
         """The file."""

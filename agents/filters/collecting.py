@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -112,6 +114,36 @@ def collect(scenario: Scenario, estimator: Mapping[str, Any], records: Records) 
         outside=np.stack(recorder.outside),
         truth=np.stack(truths),
     )
+
+
+@dataclass(frozen=True)
+class CollectTask:
+    """A scenario and the estimator that plays it, with everything that a worker needs.
+
+    Attributes:
+        index: Number of the scenario.
+        estimator: Name of the estimator.
+        network: Weights file of the recurrent network, as bytes, where that is the estimator.
+        records: Library of records, or its folder; None for the user's cache.
+    """
+
+    index: int
+    scenario: Scenario
+    estimator: str
+    network: bytes | None
+    records: Records
+
+
+def run_collect(task: CollectTask) -> Collected:
+    """Play a scenario."""
+    if task.network is None:
+        return collect(task.scenario, {"estimator": task.estimator}, task.records)
+    with tempfile.TemporaryDirectory(prefix="dptse-network-") as folder:
+        path = Path(folder) / "network.npz"
+        path.write_bytes(task.network)
+        settings = {"recurrent": {"weights": str(path), "outside": True}}
+        estimator = {"estimator": task.estimator, "estimator_settings": settings}
+        return collect(task.scenario, estimator, task.records)
 
 
 def _single(array: Any) -> Float32Array:

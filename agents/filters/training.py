@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 
+from agents.engines.engine import Engine, run_tasks
+from agents.engines.local import THIS_PROCESS
 from agents.experiments.files import replacing
 from agents.experiments.provenance import take_folder
 from agents.filters.batches import Batch, draw_batch
 from agents.filters.card import make_card
-from agents.filters.collecting import Collected, collect
+from agents.filters.collecting import Collected, CollectTask, run_collect
 from agents.filters.plan import OWN, FilterPlan
 from agents.filters.torch_network import RecurrentNetwork, State, second_loss
 from agents.filters.validation import validate
@@ -58,6 +60,7 @@ class FilterTraining:
         watchers: Sequence[Watcher] = (),
         progress: Callable[[str, float], None] = lambda stage, fraction: None,
         compiled: bool = False,
+        engine: Engine = THIS_PROCESS,
     ) -> None:
         """Take the folder and restore its state.
 
@@ -69,12 +72,14 @@ class FilterTraining:
             progress: Called with the name of a stage and the fraction of it that is done.
             compiled: Whether torch compiles the step, which takes a C++ compiler and half a minute
                 and makes passes some 1.6 times as fast; the last digits of numbers depend on it.
+            engine: Plays the scenarios.
 
         Raises:
             ValueError: The folder belongs to another plan, or its checkpoint is damaged.
             OSError: The folder cannot be written.
         """
         self.plan, self.folder, self._records = plan, folder, records
+        self._engine = engine
         self._watchers, self._progress = watchers, progress
         checkpoint = read_checkpoint(folder)
         take_folder(folder, plan.provenance())
@@ -107,18 +112,19 @@ class FilterTraining:
         self._save(WEIGHTS)
 
     def _collect(self, index: int) -> list[Collected]:
-        estimator: dict[str, Any] = {"estimator": self.plan.rounds[index].estimator}
-        if estimator["estimator"] == OWN:
-            weights = {"weights": str(self.folder / PLAYED), "outside": True}
-            estimator = {
-                "estimator": "recurrent", "estimator_settings": {"recurrent": weights},
-            }  # fmt: skip
-        collected: list[Collected] = []
-        scenarios = self.plan.scenarios(index)
-        for k, scenario in enumerate(scenarios):
-            self._progress(f"round {index + 1}, collecting", k / len(scenarios))
-            collected.append(collect(scenario, estimator, self._records))
-        return collected
+        estimator, network = self.plan.rounds[index].estimator, None
+        if estimator == OWN:
+            estimator, network = "recurrent", (self.folder / PLAYED).read_bytes()
+        tasks = [
+            CollectTask(k, scenario, estimator, network, self._records)
+            for k, scenario in enumerate(self.plan.scenarios(index))
+        ]
+        collected: dict[int, Collected] = {}
+        with contextlib.closing(run_tasks(self._engine, run_collect, tasks)) as finished:
+            for task, played in finished:
+                collected[task.index] = played
+                self._progress(f"round {index + 1}, collecting", len(collected) / len(tasks))
+        return [collected[k] for k in range(len(tasks))]
 
     def _pass(self, index: int, collected: Sequence[Collected]) -> None:
         """Pass over some episodes, drawn from all scenarios on a road."""

@@ -7,6 +7,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+from agents.engines.local import THIS_PROCESS, LocalProcesses  # noqa: E402
 from agents.evaluation.environments import make_vector  # noqa: E402
 from agents.evaluation.episodes import run_episodes  # noqa: E402
 from agents.filters.batches import draw_batch, make_batch  # noqa: E402
@@ -83,6 +84,15 @@ def test_the_loss_is_the_environments_error():
     honest = second_loss(batch.road, estimated, batch.truth, 1.0)
     wide = estimated * torch.tensor([1.0, 1.0, 50.0, 50.0])
     assert second_loss(batch.road, wide, batch.truth, 1.0) > honest
+
+
+def test_a_network_comes_out_the_same_wherever_scenarios_are_played(tmp_path):
+    trained = {}
+    for name, engine in {"here": THIS_PROCESS, "there": LocalProcesses(2)}.items():
+        training = FilterTraining(PLAN, tmp_path / name, engine=engine)
+        training.run()
+        trained[name] = training.network.state_dict()
+    assert all(torch.equal(trained["there"][key], value) for key, value in trained["here"].items())
 
 
 def test_a_batch_mixes_the_scenarios_of_a_road():

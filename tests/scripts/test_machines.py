@@ -1,0 +1,42 @@
+"""Engines on the command line."""
+
+import socket
+
+import pytest
+
+pytest.importorskip("tyro")
+
+from scripts import record
+from scripts.cli import run
+
+
+def refused(monkeypatch, capsys, tmp_path, *arguments):
+    fixed = ["--corridor", "short-highway", "--seeds", "0:1", "--records", str(tmp_path / "cache")]
+    monkeypatch.setattr("sys.argv", ["record.py", *fixed, *arguments])
+    with pytest.raises(SystemExit) as ended:
+        run(record.main, record.Args, None)
+    assert ended.value.code == 2
+    assert not (tmp_path / "cache").exists()
+    (line,) = capsys.readouterr().err.splitlines()
+    return line
+
+
+def test_a_cluster_that_does_not_answer_is_one_line(monkeypatch, capsys, tmp_path):
+    pytest.importorskip("ray")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+    line = refused(monkeypatch, capsys, tmp_path, "--engine", "ray", "--address", address)
+    assert line.startswith(f"error: no cluster answers at {address}")
+    assert "ray start --head" in line
+
+
+def test_the_missing_extra_is_one_line(monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr("agents.engines.choice.importlib.util.find_spec", lambda name: None)
+    line = refused(monkeypatch, capsys, tmp_path, "--engine", "ray")
+    assert "pip install 'dptse-env[ray]'" in line
+
+
+def test_an_address_is_for_a_cluster(monkeypatch, capsys, tmp_path):
+    line = refused(monkeypatch, capsys, tmp_path, "--address", "auto")
+    assert line == "error: address must be given with the engine ray, got 'auto'"
