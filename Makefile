@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 
 export OMP_NUM_THREADS = 1
 
-.PHONY: help setup docs demo policy-study audit test test-slow test-ray lint format benchmark wheel-test clean clean-kernels reproduce privacy-study ledger-study choice-study
+.PHONY: help setup docs demo policy-study audit test test-slow test-gymnasium test-ray lint format benchmark wheel-test clean clean-kernels reproduce privacy-study ledger-study choice-study
 
 help:  ## Show this list.
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -64,6 +64,13 @@ test: setup  ## Run the tests, without the slow ones.
 
 test-slow: setup  ## Run the slow tests: before a release, and after a change to kernels, workers or benchmarks.
 	$(BIN)/python -m pytest -m slow
+
+test-gymnasium: setup  ## Run the tests of environments with the oldest Gymnasium, which RLlib needs.
+	$(BIN)/python -m pip install --quiet --no-deps --upgrade --target build/gymnasium gymnasium==1.2.2
+	PYTHONPATH=build/gymnasium $(BIN)/python -c 'import gymnasium; assert gymnasium.__version__ == "1.2.2"'
+	PYTHONPATH=build/gymnasium $(BIN)/python -m pytest -m 'not slow' -n 2 tests/sb3 tests/spaces tests/test_env.py \
+		tests/test_extending.py tests/test_plugin.py tests/test_process.py tests/test_query_options.py \
+		tests/test_vector_bad_input.py tests/test_vector_env.py tests/test_vector_lock_step.py
 
 test-ray: setup  ## Run the tests of Ray clusters on this machine, with killed workers and lost nodes.
 	$(BIN)/python -m pytest -m ray
