@@ -90,6 +90,8 @@ class Args(Road):
     """Seeds the noise."""
     output: Path = Path("results/audit")
     """Folder for the result, a JSON file."""
+    json: bool = False
+    """Print the result as JSON, for a program, in place of a table."""
 
 
 PRIVACY = (
@@ -208,10 +210,13 @@ def run_pairs(args: Args) -> PairsFinding:
 def main(args: Args) -> None:
     """Attack or replay, and leave table and file."""
     finding = run_pairs(args) if args.target == PAIRS else run_audit(args)
-    finding.print()
     noise = "" if args.noise_factor == 1.0 else f"-noise-{args.noise_factor:g}"
     path = args.output / f"{finding.privacy.preset}-{args.target}-{finding.policy}{noise}.json"
     finding.write(path, dataclasses.asdict(args))
+    if args.json:
+        print(path.read_text(encoding="utf-8"), end="")
+        return
+    finding.print()
     print(f"the result is in {path}")
 
 

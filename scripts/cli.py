@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import logging
+import re
 import shlex
 import sys
 import warnings
@@ -88,11 +89,18 @@ FAILURES = (
 )  # fmt: skip
 """Errors that end a program with their message alone."""
 
-NOT_RESULTS = ("engine", "address", "workers", "records", "output")
+NOT_RESULTS = ("engine", "address", "workers", "records", "output", "json")
 """Arguments that results do not depend on."""
 
 
-def run(main: Callable[[Any], None], arguments: Any, description: str | None) -> None:
+def run(
+    main: Callable[[Any], None],
+    arguments: Any,
+    description: str | None,
+    *,
+    program: str | None = None,
+    words: Sequence[str] | None = None,
+) -> None:
     """Parse the command line into ``arguments`` and call ``main`` with them.
 
     Bad input, a file that cannot be read or written and a failed recording end the program with
@@ -102,10 +110,14 @@ def run(main: Callable[[Any], None], arguments: Any, description: str | None) ->
         main: The program.
         arguments: A dataclass, or a union of dataclasses for subcommands.
         description: Text for ``--help``.
+        program: Name of the program in its help; that of the file if None.
+        words: The command line; that of the process if None.
     """
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(message)s")
+    # Examples stand in lines of their own; the help would run them together.
+    description = re.sub(r"\n(?=python |dptse )", "\n\n", description or "")
     try:
-        main(tyro.cli(arguments, description=description))
+        main(tyro.cli(arguments, prog=program, args=words, description=description))
     except FAILURES as problem:
         print(f"error: {problem}", file=sys.stderr)
         raise SystemExit(2) from problem

@@ -30,7 +30,7 @@ from agents.evaluation.figures import (
 )
 from agents.evaluation.ladder import Rung, run_rung
 from agents.evaluation.policies import NamedSchedule, PolicySource, find_policy
-from agents.evaluation.report import Report
+from agents.evaluation.report import SUMMARY, Report
 from dptse_env.config import EnvConfig, parse_seeds
 from dptse_env.schedules import OBSERVATION_SCHEDULES
 from dptse_env.traffic import Records, is_road_file
@@ -82,6 +82,8 @@ class Args(Road):
     """Seeds noise and estimators; one stream per traffic seed, the same for every schedule."""
     output: Path = Path("results/evaluation")
     """Folder for table, scores and figures."""
+    json: bool = False
+    """Print the result as JSON, for a program, in place of a table."""
 
 
 def make_keywords(
@@ -239,11 +241,15 @@ def main(args: Args) -> None:
     traffic = f"{len(seeds)} episodes on {seed_kind(seeds)} traffic"
     title = f"{args.env.rpartition('/')[2]}, {parameters}, {noise}, {traffic}"
     report = Report(scores, args.reference, title)
-    report.print()
     report.write(args.output, dataclasses.asdict(args))
+    if args.json:
+        print((args.output / SUMMARY).read_text(encoding="utf-8"), end="")
+    else:
+        report.print()
     report.draw(args.output / "schedules.png")
     draw_traffic(args, report, sources, noise)
-    print(f"scores and figures are in {args.output}/")
+    if not args.json:
+        print(f"scores and figures are in {args.output}/")
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ python scripts/record.py --env dptse_env:dptse/PrivateHighway-v0 --keywords '{"i
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 
 from dptse_env.config import parse_seeds
@@ -22,6 +23,8 @@ class Args(Road):
     """Traffic seeds, first:stop."""
     random: bool = False
     """Draw demand level and incident anew for every seed instead of taking the corridor's own."""
+    json: bool = False
+    """Print the result as JSON, for a program, in place of a table."""
 
 
 def main(args: Args) -> None:
@@ -32,6 +35,11 @@ def main(args: Args) -> None:
     corridor, seeds = make_corridor(args.env, keywords), parse_seeds(args.seeds)
     library = args.library(corridor, seeds)
     dwell = average_dwell(corridor, (library.get(corridor, seed) for seed in seeds))
+    if args.json:
+        folder = library.record_path(corridor, seeds[0]).parent
+        found = {"corridor": corridor.name, "seeds": seeds, "folder": str(folder), "dwell": dwell}
+        print(json.dumps(found, indent=2))
+        return
     print(f"{corridor.name}: {len(seeds)} record(s) in {library.path}")
     print(f"mean dwell on a mainline segment (T_avg): {dwell:.2f} s")
 

@@ -28,6 +28,7 @@ from agents.training.recipes import MaskablePPORecipe, MaskRecipe, PlackettLuceR
 from agents.training.run_files import Row, read_progress
 from agents.training.several_seeds import train_all
 from agents.training.training import BEST, POLICY, Training
+from dptse_env.command_line import TOOLS
 from dptse_env.config import parse_seeds
 from dptse_env.utils.validation import integer
 from scripts.cli import Road, resumable, run
@@ -100,6 +101,8 @@ def make_plan(args: Args, seed: int) -> TrainingPlan:
 def commit() -> str | None:
     """Return the git commit of the sources, with "+" appended where files differ; None if none."""
     sources = Path(__file__).parent
+    if TOOLS in sources.parents:
+        return None  # a repository around an installation is somebody else's
     try:
         head = subprocess.run(
             ["git", "describe", "--always", "--abbrev=40", "--exclude=*", "--dirty=+"],

@@ -20,6 +20,7 @@ from tqdm import tqdm
 import dptse_env
 from agents.engines.engine import EngineError, ResultT, Workers, run_tasks
 from agents.engines.served_library import LocalServer, ServedLibrary
+from dptse_env.command_line import TOOLS
 from dptse_env.traffic import Corridor, RecordingError, RecordLibrary
 from dptse_env.traffic.stored_arrays import pack, unpack
 from dptse_env.utils.digests import package_digest
@@ -192,11 +193,13 @@ def _connect(address: str | None) -> None:
     """
     if address is not None and address != "auto":
         _reach(address)
-    environment = {"OMP_NUM_THREADS": "1"}
+    environment: dict[str, Any] = {"env_vars": {"OMP_NUM_THREADS": "1"}}
+    if TOOLS.is_dir():
+        environment["worker_process_setup_hook"] = "dptse_env.command_line.add_tools_path"
     try:
         ray.init(
             address=address or "local",
-            runtime_env={"env_vars": environment},
+            runtime_env=environment,
             log_to_driver=False,
             include_dashboard=False if address is None else None,
             logging_level=logging.WARNING,

@@ -20,6 +20,9 @@ from agents.evaluation.terminal import make_table, print_table, print_text
 
 METRICS = ("rmse_density", "rmse_speed", "reward")
 
+SUMMARY = "summary.json"
+"""File of the table and its origin."""
+
 
 @dataclass(frozen=True)
 class Row:
@@ -93,7 +96,7 @@ class Report:
         return table
 
     def write(self, folder: Path, arguments: Mapping[str, Any]) -> None:
-        """Write all scores to ``episodes.csv``, the table and its origin to ``summary.json``."""
+        """Write all scores to ``episodes.csv``, the table and its origin to `SUMMARY`."""
         folder.mkdir(parents=True, exist_ok=True)
         columns = [field.name for field in dataclasses.fields(EpisodeScore)]
         with (folder / "episodes.csv").open("w", newline="", encoding="utf-8") as file:
@@ -109,7 +112,7 @@ class Report:
             "versions": {name: version(name) for name in packages},
             "rows": [dataclasses.asdict(row) for row in self.rows.values()],
         }
-        (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+        (folder / SUMMARY).write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
 
     def draw(self, path: Path) -> None:
         """Save a figure of density and speed errors of all policies."""

@@ -1,0 +1,32 @@
+"""``dptse``: the package's tools as commands, with or without a checkout.
+
+The tools live in the top-level packages ``agents`` and ``scripts`` of the repository. A wheel has
+them in a folder of this package, so that an installation adds no packages of these names; the
+folder is put on the path when a tool runs.
+"""
+
+import importlib.util
+import sys
+from pathlib import Path
+
+TOOLS = Path(__file__).parent / "_tools"
+"""Folder of the tools in a wheel; an editable installation has them beside this package."""
+
+
+def add_tools_path() -> None:
+    """Make the tools importable in this process; worker processes inherit the path, or call it."""
+    if TOOLS.is_dir() and str(TOOLS) not in sys.path:
+        sys.path.insert(0, str(TOOLS))
+
+
+def main() -> None:
+    """Run the command that the arguments name."""
+    add_tools_path()
+    # Policies and parts of one's own, "module:Class", are found as by ``python -m``.
+    here = str(Path.cwd())
+    if here not in sys.path:
+        sys.path.append(here)
+    if importlib.util.find_spec("tyro") is None:
+        print("error: dptse needs more packages: pip install 'dptse-env[train]'", file=sys.stderr)
+        raise SystemExit(2)
+    importlib.import_module("scripts.dptse").main(sys.argv[1:])

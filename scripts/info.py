@@ -1,0 +1,80 @@
+"""Print versions, machine and caches, as a bug report needs them.
+
+python scripts/info.py
+python scripts/info.py --json
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import platform
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import dptse_env
+from dptse_env.registration import ENVIRONMENTS
+from dptse_env.traffic import RecordLibrary
+from dptse_env.utils.digests import package_digest
+from dptse_env.utils.threads import n_cores
+from scripts.cli import run
+
+PACKAGES = (
+    "gymnasium", "libsumo", "eclipse-sumo", "numpy", "scipy", "numba", "filterpy", "qpsolvers",
+    "piqp", "matplotlib", "torch", "stable-baselines3", "sb3-contrib", "optuna", "ray",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Args:
+    """Print versions, machine and caches."""
+
+    json: bool = False
+    """Print JSON, for a program."""
+
+
+def collect() -> dict[str, Any]:
+    """Return what a bug report needs, as plain JSON."""
+    library = RecordLibrary()
+    records = [path for path in library.path.glob("records-*/*/*") if path.name[0] != "."]
+    return {
+        "dptse-env": dptse_env.__version__,
+        "digest": package_digest(dptse_env),
+        "folder": str(Path(dptse_env.__file__).parent),
+        "python": sys.version.split()[0],
+        "platform": platform.platform(),
+        "cores": n_cores(),
+        "packages": {name: installed(name) for name in PACKAGES},
+        "records": {"folder": str(library.path), "number": len(records)},
+        "environments": list(ENVIRONMENTS),
+    }
+
+
+def installed(package: str) -> str | None:
+    """Return the version of a package; None if it is missing."""
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def main(args: Args) -> None:
+    """Print."""
+    found = collect()
+    if args.json:
+        print(json.dumps(found, indent=2))
+        return
+    packages = found.pop("packages")
+    records, ids = found.pop("records"), found.pop("environments")
+    for name, value in found.items():
+        print(f"{name:<18} {value}")
+    print(f"{'records':<18} {records['number']} in {records['folder']}")
+    print(f"{'environments':<18} {', '.join(ids)}")
+    for name, version in packages.items():
+        print(f"{name:<18} {version or 'not installed'}")
+
+
+if __name__ == "__main__":
+    run(main, Args, __doc__)
