@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 
 export OMP_NUM_THREADS = 1
 
-.PHONY: help setup docs demo policy-study audit test test-slow test-gymnasium test-ray lint format benchmark wheel-test clean clean-kernels reproduce privacy-study ledger-study choice-study
+.PHONY: help setup docs site demo policy-study audit test test-slow test-gymnasium test-ray lint format benchmark wheel-test clean clean-kernels reproduce privacy-study ledger-study choice-study
 
 help:  ## Show this list.
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -74,6 +74,10 @@ test-gymnasium: setup  ## Run the tests of environments with the oldest Gymnasiu
 
 test-ray: setup  ## Run the tests of Ray clusters on this machine, with killed workers and lost nodes.
 	$(BIN)/python -m pytest -m ray
+
+site: setup  ## Build the documentation site, warnings as errors; build/site.
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[docs]'
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 docs: setup  ## Write the generated page of keywords anew: docs/configuration.md.
 	$(BIN)/python scripts/document_configuration.py
