@@ -8,12 +8,13 @@ from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).parents[2]
-SHOWN = ("results/*/REPORT.md", "results/*/*.png", "examples/cluster.yaml")
+SHOWN = ("results/*/REPORT.md", "results/*/*.png", "examples/**/*.*")
 """Files outside of the folder of pages that are part of the site."""
 
 ELSEWHERE = {
     "../dptse_env/spaces/actions.py": "reference/spaces.md",
     "../results": "results.md",
+    "../examples": "integrations.md",
 }
 """Pages of the site for links that lead to a file or folder of the repository."""
 

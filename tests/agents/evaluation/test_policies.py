@@ -1,5 +1,6 @@
 import hashlib
 import json
+import pickle
 import subprocess
 import sys
 import zipfile
@@ -150,6 +151,17 @@ def test_a_bad_model_is_named(models, tmp_path):
     one, other = (find_policy(models[name]).identity for name in ("mask", "scores"))
     assert len(one) == 64
     assert one != other
+
+
+def test_a_saved_model_goes_to_workers_without_what_it_loaded(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "mine_d.py").write_text(
+        "class Model:\n    def load(path, device):\n        return lambda: path\n"
+    )
+    (tmp_path / "mine.zip").write_text("weights")
+    policy = find_policy(f"mine_d:Model={tmp_path}/mine.zip")
+    assert policy.model() == f"{tmp_path}/mine.zip"
+    assert pickle.loads(pickle.dumps(policy)) == policy
 
 
 def test_a_schedule_of_a_module_is_told_apart_by_its_code(tmp_path, monkeypatch):

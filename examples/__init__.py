@@ -1,0 +1,1 @@
+"""Short programs that train on the environments with libraries other than stable-baselines3."""
