@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 
 export OMP_NUM_THREADS = 1
 
-.PHONY: help setup docs site demo policy-study audit test test-slow test-gymnasium test-ray lint format benchmark wheel-test clean clean-kernels reproduce privacy-study ledger-study choice-study
+.PHONY: help setup docs site dist demo policy-study audit test test-slow test-gymnasium test-ray lint format benchmark wheel-test clean clean-kernels reproduce privacy-study ledger-study choice-study
 
 help:  ## Show this list.
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -96,6 +96,10 @@ benchmark: setup  ## Time the estimators and thousands of episodes beside their 
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[benchmark]'
 	$(BIN)/python benchmarks/bench_estimators.py
 	$(BIN)/python benchmarks/bench_throughput.py
+
+dist: setup  ## Build and check the archives of a release; dist/.
+	$(BIN)/python -m build --outdir dist
+	$(BIN)/python -m twine check --strict dist/*
 
 wheel-test: setup  ## Build the wheel, install it elsewhere and use it there.
 	$(BIN)/python tests/wheel/run.py

@@ -1,4 +1,7 @@
-"""Build the wheel, install it into a fresh virtual environment elsewhere, and use it."""
+"""Build both archives, install the wheel into a fresh virtual environment elsewhere, and use it.
+
+The wheel is built from the source archive, so that both have what they need.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,7 @@ import subprocess
 import sys
 import tempfile
 import venv
+import zipfile
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -45,10 +49,11 @@ def main() -> None:
     """Build, install and use the wheel in a temporary folder."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        call(
-            sys.executable, "-m", "build", "--wheel", "--outdir", folder / "dist", ROOT, cwd=folder
-        )
+        call(sys.executable, "-m", "build", "--outdir", folder / "dist", ROOT, cwd=folder)
         (wheel,) = (folder / "dist").glob("*.whl")
+        (source,) = (folder / "dist").glob("*.tar.gz")
+        call(sys.executable, "-m", "twine", "check", "--strict", wheel, source, cwd=folder)
+        check_content(wheel)
         venv.create(folder / "venv", with_pip=True)
         python = folder / "venv" / "bin" / "python"
         pins = ROOT / "constraints.txt"
@@ -62,6 +67,23 @@ def main() -> None:
         call(python, "-m", "pip", "install", "--quiet", "gymnasium==1.2.2", cwd=folder)
         call(python, "-W", "error", "use.py", cwd=folder, DPTSE_CACHE=str(folder / "cache"))
         use_tools(python, wheel, folder)
+
+
+def check_content(wheel: Path) -> None:
+    """Check that a wheel has the package, its data, and nothing else."""
+    names = zipfile.ZipFile(wheel).namelist()
+    foreign = [name for name in names if not name.startswith(("dptse_env/", "dptse_env-"))]
+    left_over = [name for name in names if name.endswith((".pyc", ".nbi", ".nbc", ".tmp"))]
+    assert not foreign + left_over, foreign + left_over
+    tools = "dptse_env/_tools"
+    for needed in (
+        "dptse_env/policies/private-highway.zip",
+        "dptse_env/estimators/learned/shipped/highway-flows.npz",
+        f"{tools}/scripts/dptse.py",
+        f"{tools}/agents/suite/cards/query-suite-v1/round-robin.json",
+        f"{tools}/agents/studies/paper/report.md.j2",
+    ):
+        assert needed in names, needed
 
 
 def use_tools(python: Path, wheel: Path, folder: Path) -> None:
