@@ -39,46 +39,40 @@ class SensorQueryEnv(gym.Env[Observation, Any]):
     .slices`` has the place of each. F is the number of fixed sensors, and the density and speed
     scales are constants of the corridor.
 
-    ========================= ==== ============================================ =========
-    block                     size value                                        bounds
-    ========================= ==== ============================================ =========
-    density                   S    estimated density / density scale            [0, 4]
-    speed                     S    estimated speed / speed scale                [0, 4]
-    density_log_std           S    log of (standard deviation / scale)          [-10, 5]
-    speed_log_std             S    the same for the speed                       [-10, 5]
-    released_density          G    last released density / scale                [-5, 5]
-    released_speed            G    last released speed / scale; where flows are [-5, 5]
-                                   released, ``released_flow`` takes its place
-    density_innovation        G    normalised innovation, 0 if not observed     [-10, 10]
-    speed_innovation          G    the same for the second released quantity    [-10, 10]
-    age                       n    seconds since last observed / 60, at most 1  [0, 1]
-    queried                   G    the last query                               {0, 1}
-    fixed_density_innovation  F    normalised innovation of the fixed sensors   [-10, 10]
-    fixed_speed_innovation    F    the same for the second released quantity    [-10, 10]
-    bandwidth                 1    queries a step / n                           [0, 1]
-    epsilon                   1    log10 of the privacy parameter               [-6, 6]
-    picked                    G    picks so far (``action="sequential"`` only)  {0, 1}
-    last_price                G    log10 of the last price / 2, 0 before the    [-5, 5]
-                                   first query (release models with prices)
-    tracer                    n    mean charge of a vehicle on the segment over [0, 1]
-                                   its budget (release models with prices)
-    ========================= ==== ============================================ =========
+    | block                    | size | value                                           | bounds    |
+    | :--                      | :--  | :--                                             | :--       |
+    | density                  | S    | estimated density / density scale               | [0, 4]    |
+    | speed                    | S    | estimated speed / speed scale                   | [0, 4]    |
+    | density_log_std          | S    | log of (standard deviation / scale)             | [-10, 5]  |
+    | speed_log_std            | S    | the same for the speed                          | [-10, 5]  |
+    | released_density         | G    | last released density / scale                   | [-5, 5]   |
+    | released_speed           | G    | last released speed / scale (or flow)           | [-5, 5]   |
+    | density_innovation       | G    | normalised innovation, 0 if not observed        | [-10, 10] |
+    | speed_innovation         | G    | the same for the second released quantity       | [-10, 10] |
+    | age                      | n    | seconds since last observed / 60, at most 1     | [0, 1]    |
+    | queried                  | G    | the last query                                  | {0, 1}    |
+    | fixed_density_innovation | F    | normalised innovation of the fixed sensors      | [-10, 10] |
+    | fixed_speed_innovation   | F    | the same for the second released quantity       | [-10, 10] |
+    | bandwidth                | 1    | queries a step / n                              | [0, 1]    |
+    | epsilon                  | 1    | log10 of the privacy parameter                  | [-6, 6]   |
+    | picked                   | G    | picks so far (``action="sequential"`` only)     | {0, 1}    |
+    | last_price               | G    | log10 of the last price / 2; 0 before the first | [-5, 5]   |
+    | tracer                   | n    | mean charge of a vehicle there over its budget  | [0, 1]    |
 
-    Values beyond the bounds are clipped. ``observation`` chooses other blocks.
+    ``released_flow`` takes the place of ``released_speed`` where flows are released; ``last_price``
+    and ``tracer`` are there under release models with prices. Values beyond the bounds are clipped.
+    ``observation`` chooses other blocks.
 
     **Action**: ``action`` chooses the encoding; a sampled action never raises. B is the largest
-    number of queries that the bandwidth pays for.
+    number of queries that the bandwidth pays for; under ``sequential`` an action picks one option,
+    until the bandwidth pays for no other.
 
-    ============== ============================ ============================================
-    ``action``     space                        meaning
-    ============== ============================ ============================================
-    ``mask``       ``MultiBinary(G)``           one flag per option (default)
-    ``scores``     ``Box(-1, 1, (G,))``         the options of highest score
-    ``slots``      ``MultiDiscrete([G] * B)``   one option for each of the B queries
-    ``sequential`` ``Discrete(G)``              one option per action, until the bandwidth pays
-                                                for no other; `action_masks` has those that may
-                                                be picked next
-    ============== ============================ ============================================
+    | ``action``     | space                      | meaning                                   |
+    | :--            | :--                        | :--                                       |
+    | ``mask``       | ``MultiBinary(G)``         | one flag per option (default)             |
+    | ``scores``     | ``Box(-1, 1, (G,))``       | the options of highest score              |
+    | ``slots``      | ``MultiDiscrete([G] * B)`` | one option for each of the B queries      |
+    | ``sequential`` | ``Discrete(G)``            | one option per action, see `action_masks` |
 
     **Reward**: minus the root mean squared error over the mainline, density and speed each in
     units of its scale; ``reward`` chooses one of the two or another reward.
@@ -87,22 +81,20 @@ class SensorQueryEnv(gym.Env[Observation, Any]):
 
     **Info**: numbers are floats and have the same keys at the reset and at every step.
 
-    ================= =====================================================================
-    key               value
-    ================= =====================================================================
-    ``rmse_density``  error of the estimated mainline densities [veh/km]; true traffic
-    ``rmse_speed``    error of the speeds of occupied segments [km/h]; true traffic
-    ``n_occupied``    mainline segments with a vehicle; true traffic
-    ``n_dropped``     requested options that were cut, repeated or replaced
-    ``queried``       the options that were queried, flags of shape (G,)
-    ``diverged``      1 if the estimator diverged in this second and was started anew
-    ``fallback``      1 if its update had no solution in this second, so that it only predicted
-    ``mu``            privacy loss of a vehicle so far, at most: Gaussian DP parameter
-    ``epsilon``       the same as epsilon at the configured delta
-    ``truth``         true traffic, with ``truth_in_info=True`` only
-    ``privacy``       at the reset only: the guarantee and its account (`privacy`)
-    ``inherited``     at the reset only: keywords whose values belong to another road
-    ================= =====================================================================
+    | key              | value                                                                     |
+    | :--              | :--                                                                       |
+    | ``rmse_density`` | error of the estimated mainline densities [veh/km]; true traffic          |
+    | ``rmse_speed``   | error of the speeds of occupied segments [km/h]; true traffic             |
+    | ``n_occupied``   | mainline segments with a vehicle; true traffic                            |
+    | ``n_dropped``    | requested options that were cut, repeated or replaced                     |
+    | ``queried``      | the options that were queried, flags of shape (G,)                        |
+    | ``diverged``     | 1 if the estimator diverged in this second and was started anew           |
+    | ``fallback``     | 1 if its update had no solution in this second, so that it only predicted |
+    | ``mu``           | privacy loss of a vehicle so far, at most: Gaussian DP parameter          |
+    | ``epsilon``      | the same as epsilon at the configured delta                               |
+    | ``truth``        | true traffic, with ``truth_in_info=True`` only                            |
+    | ``privacy``      | at the reset only: the guarantee and its account (`privacy`)              |
+    | ``inherited``    | at the reset only: keywords whose values belong to another road           |
 
     Values marked "true traffic" serve training and evaluation, as the reward does. They are not
     covered by the guarantee, and no policy may act on them. The others are public.
