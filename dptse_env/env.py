@@ -39,25 +39,25 @@ class SensorQueryEnv(gym.Env[Observation, Any]):
     .slices`` has the place of each. F is the number of fixed sensors, and the density and speed
     scales are constants of the corridor.
 
-    | block                    | size | value                                           | bounds    |
-    | :--                      | :--  | :--                                             | :--       |
-    | density                  | S    | estimated density / density scale               | [0, 4]    |
-    | speed                    | S    | estimated speed / speed scale                   | [0, 4]    |
-    | density_log_std          | S    | log of (standard deviation / scale)             | [-10, 5]  |
-    | speed_log_std            | S    | the same for the speed                          | [-10, 5]  |
-    | released_density         | G    | last released density / scale                   | [-5, 5]   |
-    | released_speed           | G    | last released speed / scale (or flow)           | [-5, 5]   |
-    | density_innovation       | G    | normalised innovation, 0 if not observed        | [-10, 10] |
-    | speed_innovation         | G    | the same for the second released quantity       | [-10, 10] |
-    | age                      | n    | seconds since last observed / 60, at most 1     | [0, 1]    |
-    | queried                  | G    | the last query                                  | {0, 1}    |
-    | fixed_density_innovation | F    | normalised innovation of the fixed sensors      | [-10, 10] |
-    | fixed_speed_innovation   | F    | the same for the second released quantity       | [-10, 10] |
-    | bandwidth                | 1    | queries a step / n                              | [0, 1]    |
-    | epsilon                  | 1    | log10 of the privacy parameter                  | [-6, 6]   |
-    | picked                   | G    | picks so far (``action="sequential"`` only)     | {0, 1}    |
-    | last_price               | G    | log10 of the last price / 2; 0 before the first | [-5, 5]   |
-    | tracer                   | n    | mean charge of a vehicle there over its budget  | [0, 1]    |
+    | block                    | size | value                                       | bounds    |
+    | :--                      | :--  | :--                                         | :--       |
+    | density                  | S    | estimated density / density scale           | [0, 4]    |
+    | speed                    | S    | estimated speed / speed scale               | [0, 4]    |
+    | density_log_std          | S    | log of (standard deviation / scale)         | [-10, 5]  |
+    | speed_log_std            | S    | the same for the speed                      | [-10, 5]  |
+    | released_density         | G    | last released density / scale               | [-5, 5]   |
+    | released_speed           | G    | last released speed / scale (or flow)       | [-5, 5]   |
+    | density_innovation       | G    | normalised innovation, 0 if not observed    | [-10, 10] |
+    | speed_innovation         | G    | the same for the second released quantity   | [-10, 10] |
+    | age                      | n    | seconds since last observed / 60, at most 1 | [0, 1]    |
+    | queried                  | G    | the last query                              | {0, 1}    |
+    | fixed_density_innovation | F    | normalised innovation of the fixed sensors  | [-10, 10] |
+    | fixed_speed_innovation   | F    | the same for the second released quantity   | [-10, 10] |
+    | bandwidth                | 1    | queries a step / n                          | [0, 1]    |
+    | epsilon                  | 1    | log10 of the privacy parameter              | [-6, 6]   |
+    | picked                   | G    | picks so far (``sequential`` only)          | {0, 1}    |
+    | last_price               | G    | log10 of last price / 2; 0 before the first | [-5, 5]   |
+    | tracer                   | n    | mean charge of a vehicle over its budget    | [0, 1]    |
 
     ``released_flow`` takes the place of ``released_speed`` where flows are released; ``last_price``
     and ``tracer`` are there under release models with prices. Values beyond the bounds are clipped.
