@@ -7,6 +7,8 @@ import logging
 import os
 import platform
 import socket
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
@@ -17,6 +19,7 @@ from ray.exceptions import RayError, RayTaskError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 from tqdm import tqdm
 
+import agents
 import dptse_env
 from agents.engines.engine import EngineError, ResultT, Workers, run_tasks
 from agents.engines.served_library import LocalServer, ServedLibrary
@@ -30,6 +33,9 @@ RETRIES = 3
 
 CONNECT_SECONDS = 10.0
 """Longest time for a connection to a cluster [s]."""
+
+HEALTH_SECONDS = 12.0
+"""Longest time for a cluster to say that it works [s]."""
 
 PROBE_SECONDS = 20.0
 """Longest time for the answer of a node [s]."""
@@ -63,7 +69,7 @@ class RayCluster:
         if not ray.is_initialized():
             _connect(address or os.environ.get("RAY_ADDRESS"))
         self._node = ray.get_runtime_context().get_node_id()
-        self._digest = package_digest(dptse_env)
+        self._digest = _digest()
         self._suitable: set[str] = set()
         self._n_processors, self._looked = 0, 0.0
         self._look()
@@ -115,20 +121,21 @@ class RayCluster:
         """Count nodes and processors, and check nodes that are new."""
         if time.monotonic() - self._looked < POLL_SECONDS:
             return
-        nodes = [node for node in ray.nodes() if node["Alive"]]  # type: ignore[no-untyped-call]
-        new = [node for node in nodes if node["NodeID"] not in self._suitable]
-        for node, answer in zip(new, _probe([node["NodeID"] for node in new]), strict=True):
-            if answer != self._digest:
+        nodes = _alive()
+        new = nodes.keys() - self._suitable
+        for name, answer in _probe(sorted(new)).items():
+            # A node that has gone meanwhile has no say.
+            if answer != self._digest and name in _alive():
                 found = (
                     answer if " " in answer else f"has another version of this package, {answer}"
                 )
                 raise EngineError(
-                    f"node {node['NodeManagerAddress']} {found}: install that of this program "
-                    f"there, dptse-env {dptse_env.__version__} with digest {self._digest}"
+                    f"node {nodes[name]['NodeManagerAddress']} {found}: install that of this "
+                    f"program there, dptse-env {dptse_env.__version__} with digest {self._digest}"
                 )
-            self._suitable.add(node["NodeID"])
+        self._suitable |= new
         self._n_nodes = len(nodes)
-        self._n_processors = int(sum(node["Resources"].get("CPU", 0) for node in nodes))
+        self._n_processors = int(sum(node["Resources"].get("CPU", 0) for node in nodes.values()))
         self._looked = time.monotonic()
 
 
@@ -213,7 +220,7 @@ def _connect(address: str | None) -> None:
 
 
 def _reach(address: str) -> None:
-    """Check that a machine listens at an address; Ray itself would try for a minute.
+    """Check that a cluster answers at an address; `ray.init` would try for minutes.
 
     Raises:
         EngineError: None does, or the address is no host:port.
@@ -231,36 +238,56 @@ def _reach(address: str) -> None:
             f"no cluster answers at {address} ({problem}): start one there with 'ray start "
             "--head', or give --address another one"
         ) from problem
+    command = [sys.executable, "-m", "ray.scripts.scripts", "health-check", "--address", address]
+    try:
+        answer = subprocess.run(
+            command, capture_output=True, text=True, check=False, timeout=HEALTH_SECONDS
+        )
+    except subprocess.TimeoutExpired as problem:
+        raise EngineError(
+            f"what listens at {address} does not answer as a Ray cluster: give --address that of a "
+            "head node, as 'ray start --head' prints it"
+        ) from problem
+    if answer.returncode:
+        lines = answer.stderr.strip().splitlines() or ["it is not healthy"]
+        raise EngineError(f"the cluster at {address} cannot be used: {lines[-1]}")
 
 
-def _probe(nodes: Sequence[str]) -> list[str]:
-    """Return the digest of this package on nodes, or in words why there is none."""
+def _alive() -> dict[str, dict[str, Any]]:
+    """Return what Ray knows of the nodes that are alive, by their ids."""
+    nodes = ray.nodes()  # type: ignore[no-untyped-call]
+    return {node["NodeID"]: node for node in nodes if node["Alive"]}
+
+
+def _digest() -> str:
+    """Return the digest of this package and of the tools on this machine."""
+    return package_digest(dptse_env) + package_digest(agents)
+
+
+def _probe(nodes: Sequence[str]) -> dict[str, str]:
+    """Return the digest of this package on nodes, or in words why there is none, by their ids."""
 
     # Nested, so that it travels as a value: a node may lack the module that it stands in.
     def digest_there() -> str:
         try:
-            import agents.engines.engine  # noqa: F401, PLC0415
-            import dptse_env as package  # noqa: PLC0415
-            from dptse_env.utils.digests import package_digest as digest  # noqa: PLC0415
+            from agents.engines.ray_cluster import _digest as digest  # noqa: PLC0415
         except ImportError as problem:
             return f"lacks this package ({problem})"
-        return digest(package)
+        return digest()
 
     remote = ray.remote(digest_there)
-    asked = [
-        remote.options(
+    asked = {
+        node: remote.options(
             num_cpus=0, scheduling_strategy=NodeAffinitySchedulingStrategy(node, soft=False)
         ).remote()
         for node in nodes
-    ]
-    answers = []
-    for reference in asked:
+    }
+    answers = {}
+    for node, reference in asked.items():
         try:
-            answer = ray.get(reference, timeout=PROBE_SECONDS)
+            answers[node] = ray.get(reference, timeout=PROBE_SECONDS)
         except RayError as problem:
-            answers.append(f"does not answer ({type(problem).__name__})")
-            continue
-        answers.append(answer)
+            answers[node] = f"does not answer ({type(problem).__name__})"
     return answers
 
 

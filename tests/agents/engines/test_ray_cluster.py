@@ -1,6 +1,8 @@
+import http.server
 import operator
 import os
 import socket
+import threading
 import time
 from pathlib import Path
 
@@ -119,7 +121,7 @@ def test_nodes_with_another_version_are_refused(cluster, monkeypatch):
     from agents.engines import ray_cluster
 
     cluster.add_node(num_cpus=1)
-    monkeypatch.setattr(ray_cluster, "package_digest", lambda package: "0123456789ab")
+    monkeypatch.setattr(ray_cluster, "_digest", lambda: "0123456789ab")
     with pytest.raises(EngineError, match=r"node \S+ has another version .*0123456789ab"):
         ray_cluster.RayCluster(cluster.address)
 
@@ -143,6 +145,20 @@ def test_an_address_without_a_cluster_is_an_error_within_30_seconds(ray, address
     with pytest.raises(EngineError, match=message.replace("ray start", ".*ray start")):
         RayCluster(address)
     assert time.monotonic() - start < 30
+
+
+def test_another_server_at_the_address_is_an_error_within_30_seconds(ray):
+    from agents.engines.ray_cluster import RayCluster
+
+    with http.server.ThreadingHTTPServer(
+        ("127.0.0.1", 0), http.server.SimpleHTTPRequestHandler
+    ) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        start = time.monotonic()
+        with pytest.raises(EngineError, match="does not answer as a Ray cluster"):
+            RayCluster(f"127.0.0.1:{server.server_port}")
+        assert time.monotonic() - start < 30
+        server.shutdown()
 
 
 def test_a_machine_without_a_cluster_says_so(ray, monkeypatch):
