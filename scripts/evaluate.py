@@ -20,8 +20,8 @@ import gymnasium as gym
 from tqdm import tqdm
 
 from agents.engines.engine import run_tasks
-from agents.evaluation.environments import make_config
-from agents.evaluation.episodes import EpisodeScore, seed_kind, watch_episode
+from agents.evaluation.environments import make_config, unwrap
+from agents.evaluation.episodes import EpisodeScore, run_episode, seed_kind, watch_episode
 from agents.evaluation.figures import (
     RoadMap,
     draw_maps,
@@ -29,8 +29,10 @@ from agents.evaluation.figures import (
     save_figure,
 )
 from agents.evaluation.ladder import Rung, run_rung
+from agents.evaluation.page import write_page
 from agents.evaluation.policies import NamedSchedule, PolicySource, find_policy
 from agents.evaluation.report import SUMMARY, Report
+from agents.evaluation.watched import Watched
 from dptse_env.config import EnvConfig, parse_seeds
 from dptse_env.schedules import OBSERVATION_SCHEDULES
 from dptse_env.traffic import Records, is_road_file
@@ -40,6 +42,9 @@ from scripts.evaluate_suite import evaluate_suite
 
 ALL = "all"
 """The schedule that runs with a bandwidth that covers the road."""
+
+PAGE = "page.html"
+"""File of the page to look at."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +87,8 @@ class Args(Road):
     """Seeds noise and estimators; one stream per traffic seed, the same for every schedule."""
     output: Path = Path("results/evaluation")
     """Folder for table, scores and figures."""
+    html: bool = False
+    """Leave a page to look at, too: page.html, interactive, which needs no network."""
     json: bool = False
     """Print the result as JSON, for a program, in place of a table."""
 
@@ -206,6 +213,32 @@ def draw_traffic(
     save_figure(draw_maps([maps], width=8.4), args.output / "space_time.png", title)
 
 
+def shown(args: Args, report: Report, sources: Mapping[str, PolicySource]) -> list[str]:
+    """Return the policies to show: the reference, the best schedule and the best policies."""
+    ranked = [name for name in report.ranked(args.estimators[0]) if name != ALL]
+    rules = [name for name in ranked if isinstance(sources[name], NamedSchedule)]
+    learned = [name for name in ranked if name not in rules]
+    best = [name for name in rules if name != args.reference]
+    return [args.reference, *best[:1], *learned[:2]]
+
+
+def watch(args: Args, name: str, source: PolicySource) -> Watched:
+    """Run the first episode of a policy with the first estimator, and keep what happens."""
+    rung, seed = make_rung(args, args.estimators[0], name, source), parse_seeds(args.seeds)[0]
+    keywords = {key: value for key, value in rung.keywords.items() if key != "threads"}
+    env = gym.make(args.env, **keywords)
+    process = unwrap(env).process
+    watched = Watched(name, process.config.corridor, seed)
+    run_episode(
+        env,
+        rung.load(env),
+        traffic_seed=seed,
+        seed=args.noise_seed + seed,
+        on_second=lambda: watched.append(process),
+    )
+    return watched
+
+
 def suite_options(args: Args) -> tuple[str, Path]:
     """Return the suite, and the folder of its cards.
 
@@ -248,6 +281,9 @@ def main(args: Args) -> None:
         report.print()
     report.draw(args.output / "schedules.png")
     draw_traffic(args, report, sources, noise)
+    if args.html:
+        episodes = [watch(args, name, sources[name]) for name in shown(args, report, sources)]
+        write_page(args.output / PAGE, report, episodes)
     if not args.json:
         print(f"scores and figures are in {args.output}/")
 

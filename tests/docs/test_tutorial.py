@@ -42,6 +42,7 @@ def test_it_runs_from_top_to_bottom(tmp_path, monkeypatch, capsys):
     assert "mean error 0." in printed
     assert "it asks segments [" in printed
     assert (tmp_path / "results/learned/space_time.png").is_file()
+    assert (tmp_path / "results/learned/page.html").is_file()
     assert "mine:Fastest" in (tmp_path / "results/fastest/summary.json").read_text()
 
 
