@@ -18,15 +18,18 @@ DENSITY_MAP = "viridis"
 ERROR_COLOUR = "#c1272d"
 QUERY_COLOUR = "#1b2a41"
 NO_QUERY_COLOUR = "#eef1f5"
+LIMIT_STEP = 10.0
+"""Step in which the axis of errors grows [veh/km]."""
 SMOOTH_FROM = 500
 """Horizon [s] from which on the query panel has fewer pixels than seconds."""
 
 
 @dataclass
 class History:
-    """Truth, estimate and queries of the first episode of a process, second by second.
+    """Truth, estimate and queries of an episode of a process, second by second.
 
     Attributes:
+        episode: Number of the episode in the process.
         horizon: Length of a full episode [s].
         lengths: Lengths of the mainline segments [km].
         density_scale: Density at the end of the colour scale [veh/km].
@@ -36,6 +39,7 @@ class History:
         rmse: Density error over the mainline [veh/km], a number per second.
     """
 
+    episode: int
     horizon: int
     lengths: tuple[float, ...]
     density_scale: float
@@ -45,11 +49,11 @@ class History:
     rmse: list[float] = field(default_factory=list)
 
     @classmethod
-    def from_process(cls, process: QueryProcess) -> History:
-        """Start a history with the present state of ``process``."""
+    def from_process(cls, process: QueryProcess, episode: int = 0) -> History:
+        """Start a history with the present state of an episode of ``process``."""
         corridor = process.config.corridor
         lengths = corridor.segment_lengths[: corridor.n_mainline]
-        history = cls(process.config.horizon_steps, lengths, corridor.density_scale)
+        history = cls(episode, process.config.horizon_steps, lengths, corridor.density_scale)
         history.append(process)
         return history
 
@@ -67,12 +71,12 @@ class History:
 
     def append(self, process: QueryProcess) -> None:
         """Add the present second, or replace it where a decision took several actions."""
-        n = process.interface.n_mainline
-        second = int(process.elapsed[0])
-        self.truth[second:] = [process.truth(np.zeros(1, dtype=np.int64))[0, :n, 0]]
-        self.estimate[second:] = [process.estimate.density[0, :n].copy()]
-        self.queried[second:] = [process.interface.queries.covered(process.queried[:1])[0]]
-        self.rmse[second:] = [float(process.error.density[0])]
+        n, e = process.interface.n_mainline, self.episode
+        second, rows = int(process.elapsed[e]), np.array([e])
+        self.truth[second:] = [process.truth(rows)[0, :n, 0]]
+        self.estimate[second:] = [process.estimate.density[e, :n].copy()]
+        self.queried[second:] = [process.interface.queries.covered(process.queried[rows])[0]]
+        self.rmse[second:] = [float(process.error.density[e])]
 
 
 class Picture:
@@ -117,6 +121,9 @@ class Picture:
         # The layout stays as it is: working it out takes most of the time of a drawing.
         figure.canvas.draw()
         figure.set_layout_engine("none")
+        for artist in (*self._maps, self._error):
+            artist.set_animated(True)  # left out of the background
+        self._limit, self._background = 0.0, None
 
     def draw(self, history: History) -> NDArray[np.uint8]:
         """Return the picture of ``history`` as RGB, shape (height, width, 3)."""
@@ -126,6 +133,19 @@ class Picture:
             values[:, : len(series)] = np.transpose(series)[history.rows]
             image.set_data(values)
         self._error.set_data(range(len(history.rmse)), history.rmse)
-        self._error.axes.set_ylim(0.0, 1.05 * max(*history.rmse, 1.0))
-        self._canvas.draw()
+        self._draw_background(LIMIT_STEP * np.ceil(max(history.rmse) / LIMIT_STEP + 0.05))
+        self._canvas.restore_region(self._background)
+        for artist in (*self._maps, self._error):
+            artist.axes.draw_artist(artist)
+            for spine in artist.axes.spines.values():
+                artist.axes.draw_artist(spine)
         return np.array(self._canvas.buffer_rgba())[..., :3].copy()
+
+    def _draw_background(self, limit: float) -> None:
+        """Draw what stays from second to second, anew where the axis of errors must grow."""
+        if limit == self._limit:
+            return
+        self._limit = limit
+        self._error.axes.set_ylim(0.0, limit)
+        self._canvas.draw()
+        self._background = self._canvas.copy_from_bbox(self._canvas.figure.bbox)

@@ -12,14 +12,16 @@ import numpy as np
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
 
 from dptse_env.config import resolve
 from dptse_env.parts import make_interface, make_parts, warn_where_void
 from dptse_env.process import QueryProcess
+from dptse_env.rendering import History, Picture
 from dptse_env.reset_options import per_episode
 from dptse_env.traffic import Records, open_library
 from dptse_env.utils.arrays import Action, BoolArray, FloatArray, IntArray, Observation
-from dptse_env.utils.validation import integer
+from dptse_env.utils.validation import integer, require
 from dptse_env.utils.vector_info import Rows, in_vector_form, object_array, repeated_rows
 
 _MODES = {mode.value: mode for mode in AutoresetMode}
@@ -81,6 +83,8 @@ class SensorQueryVectorEnv(VectorEnv[Observation, Action, Any]):
     spreads them over the records, so that the episodes of a batch differ in their time of day.
     """
 
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
+
     def __init__(
         self,
         num_envs: int = 1,
@@ -88,6 +92,7 @@ class SensorQueryVectorEnv(VectorEnv[Observation, Action, Any]):
         *,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         render_mode: str | None = None,
+        render_episode: int = 0,
         records: Records = None,
         threads: int | None = None,
         **overrides: Any,
@@ -98,7 +103,8 @@ class SensorQueryVectorEnv(VectorEnv[Observation, Action, Any]):
             num_envs: Number n of episodes.
             preset: Name of a preset in `dptse_env.config.PRESETS`.
             autoreset_mode: A mode or its value, see above.
-            render_mode: None; a batch is not drawn.
+            render_mode: None or ``"rgb_array"``.
+            render_episode: Number of the episode that `render` draws.
             records: Folder of the record cache, or a library of records; None for the user's
                 cache.
             threads: Threads of the estimator, each for a block of episodes; None for one per core.
@@ -112,14 +118,15 @@ class SensorQueryVectorEnv(VectorEnv[Observation, Action, Any]):
             UserWarning: A release model with a guarantee is configured, and other keywords void
                 it, or values of another road are used on this one.
         """
-        if render_mode is not None:
-            raise ValueError(
-                f"render_mode must be None, got {render_mode!r}: a batch of episodes is not drawn; "
-                "make one with gymnasium.make to see it"
-            )
+        modes = (None, *self.metadata["render_modes"])
+        require(render_mode in modes, "render_mode", "None or 'rgb_array'", render_mode)
+        self.render_mode = render_mode
         self.num_envs = integer("num_envs", num_envs, 1, 1_000_000)
+        self.render_episode = integer("render_episode", render_episode, 0, self.num_envs - 1)
+        self.history: History | None = None
+        self._picture: Picture | None = None
         self.autoreset_mode = _mode(autoreset_mode)
-        self.metadata = {"render_modes": [], "autoreset_mode": self.autoreset_mode}
+        self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
         self.config = resolve(preset, overrides)
         warn_where_void(self.config)
         self.interface = make_interface(self.config)
@@ -228,6 +235,8 @@ class SensorQueryVectorEnv(VectorEnv[Observation, Action, Any]):
             outcome = self.process.step(live, actions[live])
             self._observation[live] = outcome.observation
             reward[live], truncated[live] = outcome.reward, outcome.truncated
+            if self.history is not None and not over[self.render_episode]:
+                self.history.append(self.process)
         to_reset, final = over, None
         if self.autoreset_mode is AutoresetMode.SAME_STEP and truncated.any():
             to_reset, done = truncated, np.flatnonzero(truncated)
@@ -251,10 +260,32 @@ class SensorQueryVectorEnv(VectorEnv[Observation, Action, Any]):
         """Return the guarantee of an episode, or what voids it, and the account behind it."""
         return self.process.privacy()
 
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
+        """Return the episode ``render_episode`` so far as the one picture of a tuple.
+
+        It is that of `dptse_env.env.SensorQueryEnv.render`, shape (height, width, 3). Where an
+        episode is reset in the step in which it ends, the picture is that of the new one.
+
+        Raises:
+            gymnasium.error.ResetNeeded: No episode has begun.
+        """
+        if self.render_mode is None:
+            gym.logger.warn(
+                "render() needs gym.make_vec(..., render_mode='rgb_array'); nothing was drawn"
+            )
+            return None
+        if self.history is None:
+            raise gym.error.ResetNeeded("nothing to render: call reset() first")
+        if self._picture is None:
+            self._picture = Picture(self.history)
+        return (self._picture.draw(self.history),)
+
     def _reset(self, episodes: IntArray, options: Mapping[str, Any] | None = None) -> None:
         generators = [self._generator(e)[0] for e in episodes]
         self._observation[episodes] = self.process.reset(episodes, generators, options).observation
         self._was_reset[episodes] = True
+        if self.render_mode is not None and self.render_episode in episodes:
+            self.history = History.from_process(self.process, self.render_episode)
 
     def _infos(self, episodes: IntArray, reset: IntArray) -> dict[str, Any]:
         """Return the infos of ``episodes``, and the reset infos of those in ``reset``."""

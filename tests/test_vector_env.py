@@ -194,3 +194,32 @@ def test_a_void_guarantee_is_warned_of_at_the_caller():
     with pytest.warns(UserWarning, match="no privacy is guaranteed") as caught:
         SensorQueryVectorEnv(2, "private-highway", privacy={"boundary_inputs": "true"})
     assert [warning.filename for warning in caught] == [__file__]
+
+
+def test_it_draws_the_chosen_episode_as_the_scalar_environment_does():
+    env = short(num_envs=3, render_mode="rgb_array", render_episode=2, horizon=20)
+    with pytest.raises(gym.error.ResetNeeded, match="nothing to render"):
+        env.render()
+    alone = gym.make(SHORT, render_mode="rgb_array", horizon=20)
+    options = {"traffic_seed": 0, "start": 0}
+    env.reset(seed=5, options=options)
+    alone.reset(seed=7, options=options)
+    actions = np.zeros((3, 6), dtype=np.int8)
+    actions[:, :2], actions[2] = 1, [0, 0, 1, 1, 0, 0]
+    for _ in range(12):
+        env.step(actions)
+        alone.step(actions[2])
+    (picture,) = env.render()
+    assert (picture == alone.render()).all()
+    # The next episode begins with an empty picture.
+    for _ in range(9):
+        env.step(actions)
+    assert len(env.history.truth) == 1
+    assert (env.render()[0] != picture).any()
+
+
+def test_a_batch_that_is_not_to_be_drawn_says_so():
+    env = short(num_envs=2)
+    env.reset(seed=0)
+    with pytest.warns(UserWarning, match="render_mode='rgb_array'"):
+        assert env.render() is None
