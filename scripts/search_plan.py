@@ -17,15 +17,14 @@ import tyro
 from tqdm import tqdm
 
 from agents.experiments.files import replacing
-from agents.search.plans import PlanSearch, PlanTask, validation_scores
+from agents.search.plans import PlanScorer, PlanSearch, PlanTask, validation_scores
 from dptse_env.schedules.plans import Plan, read_plan, write_plan
-from dptse_env.traffic import RecordLibrary
 from dptse_env.utils.validation import integer
-from scripts.cli import resumable, run
+from scripts.cli import Machines, resumable, run
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(Machines):
     """Search an open-loop query plan."""
 
     task: tyro.conf.OmitArgPrefixes[PlanTask] = field(default_factory=PlanTask)
@@ -72,25 +71,32 @@ def main(args: Args) -> None:
     task = args.task
     if task.kind == "best-static":
         task = dataclasses.replace(task, period=1)
-    search = PlanSearch(task)
-    path = args.output / f"{search.plan().name}.json"
+    place = args.workplace(args.output)
     corridor = task.make(1, task.traffic_seeds).config.corridor
-    RecordLibrary(task.records).ensure(corridor, task.traffic_seeds, progress=True)
+    search = PlanSearch(task)  # its errors show before anything is recorded
+    path = args.output / f"{search.plan().name}.json"
+    place.record(corridor, task.traffic_seeds)
     args.output.mkdir(parents=True, exist_ok=True)
-    if not resumed(search, path):
-        search.begin()
-        save(path, search.plan())
-    done = search.n_rounds
-    with tqdm(total=max(args.rounds, done), initial=done, desc=path.stem, unit="round") as bar:
-
-        def on_round() -> None:
+    with place.engine.open() as workers:
+        shared = workers if place.engine.is_parallel else None
+        scorer = PlanScorer(
+            task, task.traffic_seeds, task.batch, records=place.records, workers=shared
+        )
+        search = PlanSearch(task, scorer)
+        if not resumed(search, path):
+            search.begin()
             save(path, search.plan())
-            bar.set_postfix_str(f"{search.n_adopted} adopted", refresh=False)
-            bar.update()
+        done = search.n_rounds
+        with tqdm(total=max(args.rounds, done), initial=done, desc=path.stem, unit="round") as bar:
 
-        search.go_on(args.rounds, on_round)
+            def on_round() -> None:
+                save(path, search.plan())
+                bar.set_postfix_str(f"{search.n_adopted} adopted", refresh=False)
+                bar.update()
+
+            search.go_on(args.rounds, on_round)
     plan = search.plan()
-    scores = validation_scores(task, plan)
+    scores = validation_scores(task, plan, records=place.records)
     save(path, dataclasses.replace(plan, provenance={**plan.provenance, "validation": scores}))
     print(f"mean reward on validation traffic: {scores}\nthe plan is in {path}")
 

@@ -15,12 +15,14 @@ from importlib.metadata import version
 
 import numpy as np
 
+from agents.engines.engine import Workers
 from agents.evaluation.environments import given_keywords, make_vector
 from agents.evaluation.episodes import WARM_UP
 from agents.experiments.seeds import PLAN_SEARCH
 from dptse_env.config import TRAINING_SEEDS, VALIDATION_SEEDS, parse_seeds
 from dptse_env.schedules import PLANS, Shifting
 from dptse_env.schedules.plans import Plan, PlanContext
+from dptse_env.traffic import Records
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.validation import integer
 from dptse_env.vector_env import SensorQueryVectorEnv
@@ -48,7 +50,6 @@ class PlanTask:
         neighbours: Neighbours of the best plan that a round tries; twice as many random plans
             begin the search, and four times as many episodes run at once.
         seed: Seeds the search.
-        records: Library of records, or its folder; None for the user's cache.
         corridor: Road in place of the environment's: the name of a shipped corridor, a road file
             that ends in .toml, or a JSON object of corridor fields.
     """
@@ -62,7 +63,6 @@ class PlanTask:
     seeds: str = "0:64"
     neighbours: int = 31
     seed: int = 0
-    records: str | None = None
     corridor: str | None = None
 
     def check(self) -> None:
@@ -92,10 +92,12 @@ class PlanTask:
         """Episodes that run at once."""
         return FIRST_SEEDS * (self.neighbours + 1)
 
-    def make(self, n_episodes: int, seeds: tuple[int, ...]) -> SensorQueryVectorEnv:
+    def make(
+        self, n_episodes: int, seeds: tuple[int, ...], records: Records = None
+    ) -> SensorQueryVectorEnv:
         """Make the environment for a number of episodes on some traffic seeds."""
         keywords = given_keywords("{}", self.corridor)
-        keywords |= {"estimator": self.estimator, "records": self.records}
+        keywords |= {"estimator": self.estimator, "records": records}
         for name in ("parameters", "bandwidth"):
             if getattr(self, name) is not None:
                 keywords[name] = getattr(self, name)
@@ -111,15 +113,32 @@ class PlanScorer:
         free: Mainline segments without a fixed sensor, shape (A,).
     """
 
-    def __init__(self, task: PlanTask, seeds: tuple[int, ...], n_episodes: int) -> None:
+    def __init__(
+        self,
+        task: PlanTask,
+        seeds: tuple[int, ...],
+        n_episodes: int,
+        *,
+        records: Records = None,
+        workers: Workers | None = None,
+    ) -> None:
         """Make the environment; nothing is recorded before `scores`.
+
+        Args:
+            task: What is searched for.
+            seeds: Traffic seeds that may be asked for.
+            n_episodes: Episodes that run at once.
+            records: Library of records, or its folder; None for the user's cache.
+            workers: Share the plans of a call of `scores`; None for this process alone.
 
         Raises:
             ValueError: A value of the task is out of range, or queries are not of single segments.
         """
         task.check()
-        self.env = task.make(n_episodes, seeds)
+        self.env = task.make(n_episodes, seeds, records)
         self.n_episodes = n_episodes
+        self._task, self._seeds, self._records = task, seeds, records
+        self._workers = workers
         config = self.env.config
         if not config.queries.are_plain:
             raise ValueError(
@@ -136,6 +155,8 @@ class PlanScorer:
 
     def scores(self, plans: BoolArray, seeds: IntArray, noise: int) -> FloatArray:
         """Return mean rewards of plans (m, period, n) on traffic seeds (r,), shape (m, r)."""
+        if self._workers is not None:
+            return self._shared(self._workers, plans, seeds, noise)
         m, r = len(plans), len(seeds)
         most = self.n_episodes // r
         if m > most:
@@ -152,6 +173,37 @@ class PlanScorer:
                 total += transition.reward
         mean: FloatArray = total[: m * r] / (n_steps - WARM_UP)
         return mean.reshape(m, r)
+
+    def _shared(
+        self, workers: Workers, plans: BoolArray, seeds: IntArray, noise: int
+    ) -> FloatArray:
+        """Return the scores of plans, some from each worker."""
+        n = min(len(plans), max(workers.capacity // 2, 1))
+        blocks = [
+            PlanBlock(self._task, self._seeds, self._records, block, seeds, noise)
+            for block in np.array_split(plans, n)
+        ]
+        scored = [workers.submit(score_block, block) for block in blocks]
+        return np.concatenate([future.result() for future in scored])
+
+
+@dataclass(frozen=True, eq=False)
+class PlanBlock:
+    """Plans to score, with everything that a worker needs; see `PlanScorer.scores`."""
+
+    task: PlanTask
+    known_seeds: tuple[int, ...]
+    records: Records
+    plans: BoolArray
+    seeds: IntArray
+    noise: int
+
+
+def score_block(block: PlanBlock) -> FloatArray:
+    """Return the scores of some plans, shape (m, r)."""
+    n = min(len(block.plans) * len(block.seeds), max(block.task.batch, len(block.seeds)))
+    scorer = PlanScorer(block.task, block.known_seeds, n, records=block.records)
+    return scorer.scores(block.plans, block.seeds, block.noise)
 
 
 class PlanSearch:
@@ -207,10 +259,9 @@ class PlanSearch:
     def plan(self) -> Plan:
         """Return the best plan so far, with its provenance."""
         config = self._scorer.env.config
-        task = dataclasses.asdict(self.task)
-        del task["records"]
         provenance = {
-            "task": task, "rounds": self.n_rounds, "adopted": self.n_adopted,
+            "task": dataclasses.asdict(self.task),
+            "rounds": self.n_rounds, "adopted": self.n_adopted,
             "privacy": dataclasses.asdict(config.privacy), "warm_up": WARM_UP,
             "noise_seed": PLAN_SEARCH.start, "date": date.today().isoformat(),
             "versions": {name: version(name) for name in ("dptse-env", "libsumo", "numpy")},
@@ -274,10 +325,12 @@ class PlanSearch:
         return plan
 
 
-def validation_scores(task: PlanTask, plan: Plan, n_seeds: int = 16) -> dict[str, float]:
+def validation_scores(
+    task: PlanTask, plan: Plan, n_seeds: int = 16, records: Records = None
+) -> dict[str, float]:
     """Return the mean rewards of a plan and of a round robin on validation traffic."""
     seeds = tuple(VALIDATION_SEEDS[:n_seeds])
-    scorer = PlanScorer(task, seeds, n_seeds)
+    scorer = PlanScorer(task, seeds, n_seeds, records=records)
     round_robin = even_plan(scorer, scorer.n_mainline)
     plans = {"plan": plan_masks(plan, scorer.n_mainline), "round-robin": round_robin}
     return {

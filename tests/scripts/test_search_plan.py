@@ -11,9 +11,9 @@ SHORT = "dptse_env:dptse/ShortHighway-v0"
 
 def arguments(folder, **changes):
     keywords = {"kind": "optimised-plan", "period": 2, "neighbours": 3, **changes}
-    rounds = keywords.pop("rounds", 2)
+    rounds, workers = keywords.pop("rounds", 2), keywords.pop("workers", 1)
     task = PlanTask(env=SHORT, estimator="random_walk", seeds="0:4", **keywords)
-    return Args(task=task, rounds=rounds, output=folder)
+    return Args(task=task, rounds=rounds, workers=workers, output=folder)
 
 
 def test_it_leaves_a_plan_and_goes_on(tmp_path, capsys):
@@ -26,6 +26,15 @@ def test_it_leaves_a_plan_and_goes_on(tmp_path, capsys):
     assert len(plan.sets) == 2
     main(arguments(tmp_path, rounds=3))
     assert read_plan(path).provenance["rounds"] == 3
+
+
+def test_workers_find_the_same_plan(tmp_path):
+    plans = []
+    for workers in (1, 2):
+        main(arguments(tmp_path / str(workers), workers=workers))
+        (path,) = (tmp_path / str(workers)).glob("*.json")
+        plans.append(read_plan(path))
+    assert plans[0] == plans[1]
 
 
 def test_a_static_set_has_one_set(tmp_path):

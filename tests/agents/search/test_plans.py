@@ -3,6 +3,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from agents.engines.local import LocalProcesses
 from agents.evaluation.environments import make_vector
 from agents.evaluation.episodes import WARM_UP
 from agents.search.plans import (
@@ -50,6 +51,15 @@ def test_scores_do_not_depend_on_the_blocks(scorer):
     wide = scorer.scores(plans, seeds, 0)
     narrow = PlanScorer(TASK, TASK.traffic_seeds, 4).scores(plans, seeds, 0)
     np.testing.assert_array_equal(wide, narrow)
+
+
+def test_scores_do_not_depend_on_who_plays(scorer):
+    plans = np.stack([np.roll(even_plan(scorer, 3), k, axis=1) for k in range(5)])
+    seeds = np.arange(4)
+    with LocalProcesses(2).open() as workers:
+        there = PlanScorer(TASK, TASK.traffic_seeds, TASK.batch, workers=workers)
+        shared = there.scores(plans, seeds, 7)
+    np.testing.assert_array_equal(shared, scorer.scores(plans, seeds, 7))
 
 
 class Fake(PlanScorer):
@@ -174,7 +184,7 @@ def test_a_plan_is_searched_on_a_road_of_one_s_own():
 
 def test_plans_are_of_single_segments():
     class Sums(PlanTask):
-        def make(self, n_episodes, seeds):
+        def make(self, n_episodes, seeds, records=None):
             keywords = {"privacy": SumRelease, "query_spans": (1, 2), "traffic_seeds": seeds}
             return make_vector(self.env, n_episodes, keywords)
 
