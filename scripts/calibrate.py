@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from agents.evaluation.terminal import make_table, print_table
-from agents.experiments.files import replacing
+from agents.files import replacing
 from dptse_env.config import parse_seeds
 from dptse_env.model import ARZParameters, available_parameters, load_parameters
 from dptse_env.model.calibration import calibrate

@@ -16,7 +16,7 @@ from pathlib import Path
 import tyro
 from tqdm import tqdm
 
-from agents.experiments.files import replacing
+from agents.files import replacing
 from agents.search.plans import PlanScorer, PlanSearch, PlanTask, validation_scores
 from dptse_env.schedules.plans import Plan, read_plan, write_plan
 from dptse_env.utils.validation import integer

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from agents.evaluation.report import Report
 from agents.evaluation.watched import Watched
-from agents.experiments.files import write_atomically
+from agents.files import write_atomically
 
 LARGEST_PAGE = 5_000_000
 """Most bytes of a page; seconds are left out of its maps until it has no more."""

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
 from agents.experiments.cells import KeyT
-from agents.experiments.files import write_csv
+from agents.files import write_csv
 
 
 class Scored(Protocol):

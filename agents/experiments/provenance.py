@@ -13,7 +13,7 @@ from typing import Any
 import dptse_env
 from agents.evaluation.episodes import WARM_UP
 from agents.experiments.cells import Design
-from agents.experiments.files import write_json
+from agents.files import write_json
 from dptse_env.config import EnvConfig
 from dptse_env.estimators.tuned_settings import available_settings, settings_name
 from dptse_env.utils.digests import package_digest

@@ -14,7 +14,6 @@ from typing import Any
 import jinja2
 
 from agents.evaluation.episodes import WARM_UP
-from agents.experiments.files import write_atomically
 from agents.experiments.tables import (
     format_interval,
     format_number,
@@ -22,6 +21,7 @@ from agents.experiments.tables import (
     settings_table,
     versions_table,
 )
+from agents.files import write_atomically
 
 TEMPLATE, REPORT = "report.md.j2", "REPORT.md"
 

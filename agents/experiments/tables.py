@@ -10,7 +10,7 @@ from typing import Any
 from agents.evaluation.episodes import EpisodeScore
 from agents.evaluation.statistics import Interval
 from agents.experiments.cells import METRICS, CellT, DesignT, Results
-from agents.experiments.files import write_csv
+from agents.files import write_csv
 
 
 def markdown(

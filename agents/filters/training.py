@@ -12,8 +12,8 @@ import torch
 
 from agents.engines.engine import Engine, run_tasks
 from agents.engines.local import THIS_PROCESS
-from agents.experiments.files import replacing
 from agents.experiments.provenance import take_folder
+from agents.files import replacing
 from agents.filters.batches import Batch, draw_batch
 from agents.filters.card import make_card
 from agents.filters.collecting import Collected, CollectTask, run_collect

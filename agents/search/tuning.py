@@ -25,7 +25,7 @@ from optuna.trial import FrozenTrial, TrialState
 
 from agents.engines.engine import Workers
 from agents.evaluation.episodes import WARM_UP, EpisodeScore
-from agents.experiments.files import replacing
+from agents.files import replacing
 from agents.search.space import DEMAND_START, at_bound, holds, nested, rounded, values_of
 from agents.search.tuning_task import TuningTask, score_episodes
 from dptse_env.estimators import EstimatorSettings

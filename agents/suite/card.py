@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from agents.experiments.files import write_json
+from agents.files import write_json
 from agents.suite.cells import Suite
 from dptse_env.utils.digests import json_digest
 

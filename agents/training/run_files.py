@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from agents.experiments.files import write_atomically
+from agents.files import write_atomically
 
 CHECKPOINT, PROGRESS = "checkpoint.pt", "progress.csv"
 

@@ -16,8 +16,8 @@ from pathlib import Path
 import torch
 
 from agents.engines.engine import Engine, Workers
-from agents.experiments.files import write_atomically
 from agents.experiments.provenance import PROVENANCE_FILE, check_folder
+from agents.files import write_atomically
 from agents.training.plan import TrainingPlan
 from agents.training.run_files import CHECKPOINT, PROGRESS, Row, read_checkpoint, read_progress
 from agents.training.training import BEST, POLICY, Training

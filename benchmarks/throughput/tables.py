@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from agents.experiments import tables
-from agents.experiments.files import write_csv as write_rows
 from agents.experiments.plots import LABELS
+from agents.files import write_csv as write_rows
 from benchmarks.throughput.results import Result, Results, best, find
 from benchmarks.throughput.rows import ESTIMATORS, FEW, SIZES, THREADS, vector_name
 

@@ -14,7 +14,7 @@ from tqdm import tqdm
 from agents.engines.engine import Engine, run_tasks
 from agents.engines.local import THIS_PROCESS
 from agents.evaluation.terminal import make_table, print_table
-from agents.experiments.files import write_json
+from agents.files import write_json
 from agents.studies.audit.distances import protects_seconds, replaces
 from agents.studies.audit.releases import AttackedRelease, attacked
 from agents.studies.audit.series import PublicSeries, play_series

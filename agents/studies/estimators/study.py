@@ -10,7 +10,6 @@ from typing import Any
 
 from agents.evaluation.figures import save_figure
 from agents.evaluation.honesty import JUMP, LEVELS, SLOW, EstimatorScore
-from agents.experiments.files import write_json
 from agents.experiments.ledger import Ledger
 from agents.experiments.provenance import (
     check_folder,
@@ -20,6 +19,7 @@ from agents.experiments.provenance import (
 )
 from agents.experiments.reports import write_report
 from agents.experiments.runner import Workplace
+from agents.files import write_json
 from agents.studies.estimators import tables, targets
 from agents.studies.estimators.cell import EstimatorCell
 from agents.studies.estimators.figures import draw_coverage, draw_elsewhere, draw_worlds

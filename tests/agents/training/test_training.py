@@ -10,7 +10,7 @@ pytest.importorskip("sb3_contrib")
 
 import torch
 
-from agents.experiments.files import write_atomically
+from agents.files import write_atomically
 from agents.training.recipes import RECIPES, RegressionRounds
 from agents.training.run_files import CHECKPOINT, PROGRESS, read_progress
 from agents.training.training import BEST, POLICY, Training

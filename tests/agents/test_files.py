@@ -2,7 +2,7 @@ import json
 
 import pytest
 
-from agents.experiments.files import replacing, write_atomically, write_json
+from agents.files import replacing, write_atomically, write_json
 
 
 def test_text_and_bytes_are_written_as_they_are(tmp_path):
