@@ -79,8 +79,9 @@ site: setup  ## Build the documentation site, warnings as errors; build/site.
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[docs]'
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
-docs: setup  ## Write the generated page of keywords anew: docs/configuration.md.
+docs: setup  ## Write the generated page of keywords and the notebook of the tutorial anew.
 	$(BIN)/python scripts/document_configuration.py
+	$(BIN)/python docs/_site/notebook.py
 
 lint: setup  ## Check style, types and import rules.
 	$(BIN)/ruff check

@@ -1,7 +1,9 @@
 """The tutorial, from top to bottom, in an empty folder."""
 
+import json
 import os
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -20,6 +22,20 @@ def blocks():
 def test_it_takes_a_newcomer_few_commands():
     shell = [text for language, _, text in blocks() if language == "bash"]
     assert sum(len(text.splitlines()) for text in shell) <= 8
+
+
+def test_the_notebook_is_the_tutorial():
+    path = TUTORIAL.parent / "_site" / "notebook.py"
+    code = runpy.run_path(str(path))
+    assert code["NOTEBOOK"].read_text(encoding="utf-8") == code["notebook_text"]()
+    cells = json.loads(code["notebook_text"]())["cells"]
+    shown = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
+    assert len(shown) == len(blocks())
+    assert sum(text.startswith("!dptse") for text in shown) == 4
+    assert any(text.startswith("%%writefile mine.py") for text in shown)
+    for text in shown:
+        if text[0] not in "!%":
+            compile(text, "cell", "exec")
 
 
 @pytest.mark.slow
