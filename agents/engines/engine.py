@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import AbstractContextManager
 from itertools import islice
 from typing import Any, Protocol, TypeVar
+
+from tqdm import tqdm
 
 from dptse_env.traffic import Corridor, RecordLibrary
 
@@ -30,7 +33,7 @@ class Workers(Protocol):
 
     @property
     def place(self) -> str:
-        """Where calls run now, for a progress bar; empty for this machine."""
+        """Machines that run the calls now, for a progress bar; empty for this machine."""
 
     def submit(self, work: Callable[..., ResultT], /, *arguments: Any) -> Future[ResultT]:
         """Run ``work(*arguments)`` on a worker.
@@ -98,3 +101,56 @@ def run_tasks(
                 return
             for future in wait(running, return_when=FIRST_COMPLETED).done:
                 yield running.pop(future), future.result()
+
+
+def run_shown(
+    engine: Engine,
+    work: Callable[[TaskT], ResultT],
+    tasks: Sequence[TaskT],
+    take: Callable[[TaskT, ResultT], None],
+    *,
+    size: Callable[[TaskT], int] = lambda task: 1,
+    progress: bool = True,
+    **bar: Any,
+) -> None:
+    """Run tasks as `run_tasks` does, with a progress bar, and hand over each result as it comes.
+
+    Args:
+        engine: Runs the tasks.
+        work: Runs one; a function of a module.
+        tasks: The tasks; they can be pickled.
+        take: Called with each task and its result.
+        size: Units of the bar that a task stands for.
+        progress: Whether to show the bar.
+        bar: Further options of `tqdm`.
+    """
+    shown = tqdm(total=sum(map(size, tasks)), disable=not progress, **bar)
+    # Closed at once: an interrupt between two results must end the workers, too.
+    run = contextlib.closing(run_tasks(engine, work, tasks, shown.set_postfix_str))
+    with shown, run as finished:
+        for task, result in finished:
+            take(task, result)
+            shown.update(size(task))
+
+
+def run_in_order(
+    engine: Engine,
+    work: Callable[[TaskT], ResultT],
+    tasks: Sequence[TaskT],
+    on_done: Callable[[float], None] = lambda fraction: None,
+    **options: Any,
+) -> list[ResultT]:
+    """Run tasks and return their results, in the order of the tasks.
+
+    ``on_done`` is called after each with the fraction of them that is done, ``options`` are those
+    of `run_shown`.
+    """
+    places = {id(task): place for place, task in enumerate(tasks)}
+    results: dict[int, ResultT] = {}
+
+    def take(task: TaskT, result: ResultT) -> None:
+        results[places[id(task)]] = result
+        on_done(len(results) / len(tasks))
+
+    run_shown(engine, work, tasks, take, **options)
+    return [results[place] for place in range(len(tasks))]

@@ -17,11 +17,10 @@ from typing import Any
 import ray
 from ray.exceptions import RayError, RayTaskError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
-from tqdm import tqdm
 
 import agents
 import dptse_env
-from agents.engines.engine import EngineError, ResultT, Workers, run_tasks
+from agents.engines.engine import EngineError, ResultT, Workers, run_shown
 from agents.engines.served_library import LocalServer, ServedLibrary
 from dptse_env.command_line import TOOLS
 from dptse_env.traffic import Corridor, RecordingError, RecordLibrary
@@ -42,6 +41,9 @@ PROBE_SECONDS = 20.0
 
 POLL_SECONDS = 1.0
 """Time between two looks at which nodes there are [s]."""
+
+RecordTask = tuple[RecordLibrary, Corridor, int, str]
+"""Library, road and traffic seed of a record, and the node that the library lies on."""
 
 
 class RayCluster:
@@ -90,12 +92,12 @@ class RayCluster:
         """See `Engine.record`; records are written here as they come."""
         missing = library.missing(corridor, seeds)
         tasks = [(library, corridor, seed, self._node) for seed in missing]
-        bar = tqdm(total=len(tasks), desc=corridor.name, unit="record", disable=not progress)
-        with bar, contextlib.closing(run_tasks(self, _record, tasks, bar.set_postfix_str)) as done:
-            for (_, _, seed, _), archive in done:
-                if archive is not None:
-                    unpack(archive, library.record_path(corridor, seed))
-                bar.update()
+
+        def take(task: RecordTask, archive: bytes | None) -> None:
+            if archive is not None:
+                unpack(archive, library.record_path(corridor, task[2]))
+
+        run_shown(self, _record, tasks, take, progress=progress, desc=corridor.name, unit="record")
 
     def shared(self, library: RecordLibrary) -> RecordLibrary:
         """See `Engine.shared`."""
@@ -300,7 +302,7 @@ def _call(work: Callable[..., ResultT], *arguments: Any) -> ResultT:
         raise type(problem)(f"on node {node}: {problem}") from problem
 
 
-def _record(task: tuple[RecordLibrary, Corridor, int, str]) -> bytes | None:
+def _record(task: RecordTask) -> bytes | None:
     """Make a record in the node's library; return its archive, or None on the node ``home``."""
     library, corridor, seed, home = task
     library.ensure(corridor, [seed], workers=1)

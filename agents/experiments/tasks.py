@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol, TypeVar
 
-from tqdm import tqdm
-
-from agents.engines.engine import Engine, run_tasks
+from agents.engines.engine import Engine, run_shown
 from agents.experiments.cells import Key, KeyT
 from agents.experiments.ledger import Ledger, ScoredT
 
@@ -38,11 +35,15 @@ def run_all(
 
     ``work`` runs a task and returns a record for each of its seeds.
     """
-    total = sum(len(task.seeds) for task in tasks)
-    bar = tqdm(total=total, desc="episodes", unit="episode", mininterval=0.5, disable=not progress)
-    # Closed at once: an interrupt between two results must end the workers, too.
-    with bar, contextlib.closing(run_tasks(engine, work, tasks, bar.set_postfix_str)) as finished:
-        for task, records in finished:
-            ledger.append(task.cell, records)
-            bar.update(len(records))
+    run_shown(
+        engine,
+        work,
+        tasks,
+        lambda task, records: ledger.append(task.cell, records),
+        size=lambda task: len(task.seeds),
+        progress=progress,
+        desc="episodes",
+        unit="episode",
+        mininterval=0.5,
+    )
     ledger.sort()

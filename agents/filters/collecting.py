@@ -121,13 +121,11 @@ class CollectTask:
     """A scenario and the estimator that plays it, with everything that a worker needs.
 
     Attributes:
-        index: Number of the scenario.
         estimator: Name of the estimator.
         network: Weights file of the recurrent network, as bytes, where that is the estimator.
         records: Library of records, or its folder; None for the user's cache.
     """
 
-    index: int
     scenario: Scenario
     estimator: str
     network: bytes | None

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import contextlib
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from agents.engines.engine import Engine, run_tasks
+from agents.engines.engine import Engine, run_in_order
 from agents.engines.local import THIS_PROCESS
 from agents.experiments.provenance import take_folder
 from agents.files import replacing
@@ -116,15 +116,11 @@ class FilterTraining:
         if estimator == OWN:
             estimator, network = "recurrent", (self.folder / PLAYED).read_bytes()
         tasks = [
-            CollectTask(k, scenario, estimator, network, self._records)
-            for k, scenario in enumerate(self.plan.scenarios(index))
+            CollectTask(scenario, estimator, network, self._records)
+            for scenario in self.plan.scenarios(index)
         ]
-        collected: dict[int, Collected] = {}
-        with contextlib.closing(run_tasks(self._engine, run_collect, tasks)) as finished:
-            for task, played in finished:
-                collected[task.index] = played
-                self._progress(f"round {index + 1}, collecting", len(collected) / len(tasks))
-        return [collected[k] for k in range(len(tasks))]
+        on_done = partial(self._progress, f"round {index + 1}, collecting")
+        return run_in_order(self._engine, run_collect, tasks, on_done, progress=False)
 
     def _pass(self, index: int, collected: Sequence[Collected]) -> None:
         """Pass over some episodes, drawn from all scenarios on a road."""

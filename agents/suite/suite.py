@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from tqdm import tqdm
-
-from agents.engines.engine import run_tasks
+from agents.engines.engine import run_shown
 from agents.evaluation.policies import PolicySource, find_policy
 from agents.experiments.provenance import machine, source_digest
 from agents.experiments.runner import Workplace
@@ -63,14 +60,13 @@ def run_suite(
     tasks.sort(key=lambda task: _size(task.cell), reverse=True)  # no worker ends with a long one
     _record(tasks, place)
     place.folder.mkdir(parents=True, exist_ok=True)
-    bar = tqdm(total=len(tasks), desc=suite.name, unit="cell", disable=not progress)
-    run = run_tasks(place.engine, run_cell, tasks, bar.set_postfix_str)
-    with bar, contextlib.closing(run) as finished:
-        for task, result in finished:
-            name = card_name(task.policy.source)
-            cards[name] = _with(cards[name], result, suite)
-            cards[name].write(place.folder / f"{name}.json")
-            bar.update()
+
+    def take(task: SuiteTask, result: CellResult) -> None:
+        name = card_name(task.policy.source)
+        cards[name] = _with(cards[name], result, suite)
+        cards[name].write(place.folder / f"{name}.json")
+
+    run_shown(place.engine, run_cell, tasks, take, progress=progress, desc=suite.name, unit="cell")
     return [cards[name] for name in names]
 
 

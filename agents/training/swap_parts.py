@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from agents.engines.engine import Engine, run_tasks
+from agents.engines.engine import Engine, run_in_order
 from agents.evaluation.environments import make_vector
 from agents.training.policy_iteration import collect_swaps, first_seed
 from agents.training.recipes import PlackettLuceRecipe
@@ -88,13 +88,11 @@ def collect_parts(
         for world, policy in zip(worlds, policies, strict=True)
         for episodes in split(world.part(recipe.swaps.episodes), recipe.swaps.parts)
     ]
-    places = {id(part): place for place, part in enumerate(parts)}
-    tried: dict[int, Swaps] = {}
-    for part, swaps in run_tasks(engine, collect_part, parts):
-        tried[places[id(part)]] = swaps
-        progress(len(tried) / len(parts))
+    tried = run_in_order(engine, collect_part, parts, progress, progress=False)
     return [
-        Swaps.from_parts([tried[k] for k, part in enumerate(parts) if part.world is world])
+        Swaps.from_parts(
+            [swaps for part, swaps in zip(parts, tried, strict=True) if part.world is world]
+        )
         for world in worlds
     ]
 

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
-from tqdm import tqdm
 
-from agents.engines.engine import Engine, run_tasks
+from agents.engines.engine import Engine, run_in_order
 from agents.engines.local import THIS_PROCESS
 from agents.studies.audit.releases import Overheard, Terms, attacked
 from agents.studies.audit.strategies import FixedQueries
@@ -131,17 +129,18 @@ def attack(
         Batch(config, worlds, policy, range(n_runs)[first : first + batch], noise_factor, seed)
         for first in range(0, n_runs, batch)
     ]
-    played: dict[int, Runs] = {}
-    bar = tqdm(total=2 * n_runs, desc="attacking", unit="run", disable=not progress)
-    run = run_tasks(engine, play, batches, bar.set_postfix_str)
-    with bar, contextlib.closing(run) as finished:
-        for each, runs in finished:
-            played[each.runs.start] = runs
-            bar.update(2 * len(each.runs))
-    in_order = [played[each.runs.start] for each in batches]
+    played = run_in_order(
+        engine,
+        play,
+        batches,
+        size=lambda each: 2 * len(each.runs),
+        progress=progress,
+        desc="attacking",
+        unit="run",
+    )
     return Runs(
-        np.concatenate([runs.scores for runs in in_order], axis=1),
-        np.concatenate([runs.distances for runs in in_order], axis=1),
+        np.concatenate([runs.scores for runs in played], axis=1),
+        np.concatenate([runs.distances for runs in played], axis=1),
     )
 
 

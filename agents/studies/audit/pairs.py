@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
-from agents.engines.engine import Engine, run_tasks
+from agents.engines.engine import Engine, run_in_order
 from agents.engines.local import THIS_PROCESS
 from agents.evaluation.terminal import make_table, print_table
 from agents.files import write_json
@@ -199,12 +197,6 @@ def study_pairs(
         other = (first + generator.integers(1, len(vehicles), size=n_pairs)) % len(vehicles)
         pairs = vehicles[np.stack([first, other], axis=1)]
         tasks.append(PairsTask(config, record, plan, seed + index, pairs))
-    squares: dict[int, FloatArray] = {}
-    bar = tqdm(total=len(tasks), unit="record", disable=not progress)
-    run = run_tasks(engine, run_pairs, tasks, bar.set_postfix_str)
-    with bar, contextlib.closing(run) as finished:
-        for task, distances in finished:
-            squares[task.seed] = distances
-            bar.update()
-    parts = np.concatenate([squares[task.seed] for task in tasks]) / privacy.mu**2
+    squares = run_in_order(engine, run_pairs, tasks, progress=progress, unit="record")
+    parts = np.concatenate(squares) / privacy.mu**2
     return PairsFinding(title, privacy, parts, len(records), policy)
