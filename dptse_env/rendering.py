@@ -49,11 +49,16 @@ class History:
     rmse: list[float] = field(default_factory=list)
 
     @classmethod
-    def from_process(cls, process: QueryProcess, episode: int = 0) -> History:
-        """Start a history with the present state of an episode of ``process``."""
+    def empty(cls, process: QueryProcess, episode: int = 0) -> History:
+        """Return the history of an episode of ``process`` that is to begin."""
         corridor = process.config.corridor
         lengths = corridor.segment_lengths[: corridor.n_mainline]
-        history = cls(episode, process.config.horizon_steps, lengths, corridor.density_scale)
+        return cls(episode, process.config.horizon_steps, lengths, corridor.density_scale)
+
+    @classmethod
+    def from_process(cls, process: QueryProcess, episode: int = 0) -> History:
+        """Start a history with the present state of an episode of ``process``."""
+        history = cls.empty(process, episode)
         history.append(process)
         return history
 

@@ -158,8 +158,9 @@ def run_audit(args: Args) -> Finding:
     check(args)
     config = attacked_config(args)
     make_planner(config, args.policy).require_kind(args.target)
-    library = args.library(config.corridor, [args.traffic_seed])
-    record = with_vehicles(library.get(config.corridor, args.traffic_seed), "an audit")
+    place = args.workplace(args.output)
+    place.record(config.corridor, [args.traffic_seed])
+    record = with_vehicles(place.records.get(config.corridor, args.traffic_seed), "an audit")
     worlds = choose_target(config, record, args.target, args.policy)
     policy = make_policy(config, args.policy, worlds)
     start = time.perf_counter()
@@ -170,7 +171,7 @@ def run_audit(args: Args) -> Finding:
         args.runs,
         noise_factor=args.noise_factor,
         seed=args.seed,
-        engine=args.start_engine(),
+        engine=place.engine,
     )
     seconds = time.perf_counter() - start
     report = privacy_report(config)
@@ -192,8 +193,11 @@ def run_pairs(args: Args) -> PairsFinding:
     check(args)
     config = attacked_config(args)
     seeds = range(args.traffic_seed, args.traffic_seed + args.n_records)
-    library = args.library(config.corridor, seeds)
-    records = [with_vehicles(library.get(config.corridor, seed), "an audit") for seed in seeds]
+    place = args.workplace(args.output)
+    place.record(config.corridor, seeds)
+    records = [
+        with_vehicles(place.records.get(config.corridor, seed), "an audit") for seed in seeds
+    ]
     policy = args.policy if args.policy in PUBLIC_SCHEDULES else "round-robin"
     title = make_title(args, config)
     return study_pairs(
@@ -203,7 +207,7 @@ def run_pairs(args: Args) -> PairsFinding:
         title=title,
         policy=policy,
         seed=args.seed,
-        engine=args.start_engine(),
+        engine=place.engine,
     )
 
 

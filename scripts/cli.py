@@ -32,7 +32,7 @@ from dptse_env.utils.threads import n_cores
 
 @dataclass(frozen=True)
 class Machines:
-    """Where tasks run, and where records of traffic are kept. Results depend on none of it."""
+    """Machines that run tasks, and the folder of records. Results depend on none of it."""
 
     engine: EngineName = "local"
     """Where missing traffic is recorded and tasks run: in processes of this machine (local), or on

@@ -8,7 +8,6 @@ python scripts/evaluate.py --suite query-suite-v1 --verify results/suites/query-
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import itertools
 from collections.abc import Mapping
@@ -17,9 +16,8 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-from tqdm import tqdm
 
-from agents.engines.engine import run_tasks
+from agents.engines.engine import run_in_order
 from agents.evaluation.environments import make_config, unwrap
 from agents.evaluation.episodes import EpisodeScore, run_episode, seed_kind, watch_episode
 from agents.evaluation.figures import (
@@ -34,6 +32,7 @@ from agents.evaluation.policies import NamedSchedule, PolicySource, find_policy
 from agents.evaluation.report import SUMMARY, Report
 from agents.evaluation.watched import Watched
 from dptse_env.config import EnvConfig, parse_seeds
+from dptse_env.rendering import History
 from dptse_env.schedules import OBSERVATION_SCHEDULES
 from dptse_env.traffic import Records, is_road_file
 from dptse_env.utils.validation import require
@@ -154,16 +153,17 @@ def evaluate(
         make_rung(args, estimator, name, sources[name]).make()
     place = args.workplace(args.output)
     place.record(reference_config(args).corridor, seeds)
-    threads = 1 if place.engine.is_parallel else None
-    rungs = [make_rung(args, *key, sources[key[1]], place.records, threads) for key in keys]
-    scores: dict[tuple[str, str], list[EpisodeScore]] = {}
-    bar = tqdm(total=len(rungs) * len(seeds), desc="evaluating", unit="episode", mininterval=0.5)
-    run = run_tasks(place.engine, run_rung, rungs, bar.set_postfix_str)
-    with bar, contextlib.closing(run) as finished:
-        for rung, episodes in finished:
-            scores[rung.key] = episodes
-            bar.update(len(seeds))
-    return {key: scores[key] for key in keys}
+    rungs = [make_rung(args, *key, sources[key[1]], place.records, place.threads) for key in keys]
+    scores = run_in_order(
+        place.engine,
+        run_rung,
+        rungs,
+        size=lambda rung: len(rung.seeds),
+        desc="evaluating",
+        unit="episode",
+        mininterval=0.5,
+    )
+    return dict(zip(keys, scores, strict=True))
 
 
 def make_rung(
@@ -228,7 +228,7 @@ def watch(args: Args, name: str, source: PolicySource) -> Watched:
     keywords = {key: value for key, value in rung.keywords.items() if key != "threads"}
     env = gym.make(args.env, **keywords)
     process = unwrap(env).process
-    watched = Watched(name, process.config.corridor, seed)
+    watched = Watched(name, process.config.corridor, seed, History.empty(process))
     run_episode(
         env,
         rung.load(env),

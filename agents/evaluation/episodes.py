@@ -247,13 +247,12 @@ def watch_episode(
         The score, and the history from the reset on; its first entry is the state at the reset.
     """
     process = unwrap(env).process
-    history: list[History] = []
-
-    def on_second() -> None:
-        if history:
-            history[0].append(process)
-        else:
-            history.append(History.from_process(process))
-
-    score = run_episode(env, policy, traffic_seed=traffic_seed, seed=seed, on_second=on_second)
-    return score, history[0]
+    history = History.empty(process)
+    score = run_episode(
+        env,
+        policy,
+        traffic_seed=traffic_seed,
+        seed=seed,
+        on_second=lambda: history.append(process),
+    )
+    return score, history

@@ -22,7 +22,7 @@ LARGEST_PAGE = 5_000_000
 """Most bytes of a page; seconds are left out of its maps until it has no more."""
 
 LEVELS = 254
-"""Levels that the values of a map are rounded to; 255 stands for none."""
+"""Levels that the values of a map are rounded to, which fit into a byte."""
 
 
 def write_page(path: Path, report: Report, watched: Sequence[Watched]) -> None:
@@ -63,8 +63,8 @@ def page_data(report: Report, watched: Sequence[Watched], every: int = 1) -> dic
     """Return all that the page shows, as plain JSON."""
     first = watched[0]
     corridor, n = first.corridor, first.corridor.n_mainline
-    seconds = range(0, len(first.truth), every)
-    largest = max(corridor.density_scale, *(float(np.max(each.truth)) for each in watched))
+    seconds = range(0, len(first.history.truth), every)
+    largest = max(corridor.density_scale, *(float(np.max(each.history.truth)) for each in watched))
     return {
         "title": report.title,
         "reference": report.reference,
@@ -93,14 +93,14 @@ def page_data(report: Report, watched: Sequence[Watched], every: int = 1) -> dic
         "seconds": list(seconds),
         "traffic_seed": first.traffic_seed,
         "scale": largest,
-        "truth": packed(first.truth[::every], largest),
+        "truth": packed(first.history.truth[::every], largest),
         "policies": [
             {
                 "name": each.name,
-                "density": packed(each.density[::every], largest),
+                "density": packed(each.history.estimate[::every], largest),
                 "deviation": packed(each.density_std[::every], largest),
-                "queried": packed([flags.astype(float) for flags in each.queried[::every]], 1.0),
-                "error": [round(value, 3) for value in each.error[::every]],
+                "queried": packed(each.history.queried[::every], 1.0),
+                "error": [round(value, 3) for value in each.history.rmse[::every]],
                 "epsilon": [
                     round(value, 4) if math.isfinite(value) else None
                     for value in each.epsilon[::every]

@@ -37,6 +37,11 @@ class Workplace:
         """The library of records, which tasks take along."""
         return self.engine.shared(RecordLibrary(self.cache))
 
+    @property
+    def threads(self) -> int | None:
+        """Threads of each task: 1 where tasks share a machine; None for one per core."""
+        return 1 if self.engine.is_parallel else None
+
     def record(self, corridor: Corridor, seeds: Sequence[int]) -> None:
         """Record the traffic that is missing."""
         self.engine.record(RecordLibrary(self.cache), corridor, seeds, progress=True)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, wait
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -90,19 +90,19 @@ def train_all(
         check_folder(folder, plan.provenance(commit))
         folder.mkdir(parents=True, exist_ok=True)
     with engine.open() as workers:
-        running = {
-            _begin(workers, Stretch(plan, _read(folder), records, commit, threads, seconds)): folder
-            for folder, plan in plans.items()
-        }
+        running = {}
+        for folder, plan in plans.items():
+            stretch = Stretch(plan, _read(folder), records, commit, threads, seconds)
+            running[_begin(workers, stretch)] = folder, stretch
         while running:
             for future in wait(running, return_when=FIRST_COMPLETED).done:
-                folder = running.pop(future)
+                folder, stretch = running.pop(future)
                 is_finished, files = future.result()
                 _write(folder, files)
                 on_rows(folder, read_progress(folder))
                 if not is_finished:
-                    next_one = Stretch(plans[folder], files, records, commit, threads, seconds)
-                    running[_begin(workers, next_one)] = folder
+                    stretch = replace(stretch, files=files)
+                    running[_begin(workers, stretch)] = folder, stretch
 
 
 def _begin(workers: Workers, stretch: Stretch) -> Future[tuple[bool, dict[str, bytes]]]:

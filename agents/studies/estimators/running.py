@@ -58,11 +58,10 @@ def run_missing(
     }.items():
         place.record(corridor, seeds)
     fit_missing(design, place)
-    threads = 1 if place.engine.is_parallel else None
     fit = str(place.folder / FITS)
     tasks = [
         EstimatorTask(
-            cell, design.keywords(cell, fit), design.seeds_of(cell), place.records, threads
+            cell, design.keywords(cell, fit), design.seeds_of(cell), place.records, place.threads
         )
         for cell in lacking
     ]

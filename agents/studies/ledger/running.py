@@ -45,9 +45,8 @@ def lacking_tasks(
     A schedule that draws at random draws for all episodes of a cell at once.
     """
     seeds = design.traffic_seeds
-    threads = 1 if place.engine.is_parallel else None
     return [
-        LedgerTask(design.env, cell, design.keywords(cell), seeds, place.records, threads)
+        LedgerTask(design.env, cell, design.keywords(cell), seeds, place.records, place.threads)
         for cell in dict.fromkeys(cells)
         if ledger.lacking(cell, seeds)
     ]

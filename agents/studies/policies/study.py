@@ -142,7 +142,7 @@ def _run(
             seeds=seeds,
             noise=noise,
             records=place.records,
-            threads=1 if place.engine.is_parallel else None,
+            threads=place.threads,
         )
         for entry in entries
     ]

@@ -17,6 +17,7 @@ from agents.evaluation.episodes import EpisodeScore, run_episode
 from agents.evaluation.page import packed, page_data, write_page
 from agents.evaluation.report import Report
 from agents.evaluation.watched import Watched
+from dptse_env.rendering import History
 from dptse_env.schedules import make_schedule
 from scripts.evaluate import Args, main
 
@@ -27,7 +28,7 @@ CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 def watched(name):
     env = gym.make(SHORT, horizon=80, estimator="random_walk")
     process = unwrap(env).process
-    episode = Watched(name, process.config.corridor, 0)
+    episode = Watched(name, process.config.corridor, 0, History.empty(process))
     run_episode(
         env, make_schedule(name, env), traffic_seed=0, seed=0,
         on_second=lambda: episode.append(process),
@@ -64,10 +65,12 @@ def test_the_page_has_what_happened(report, episodes):
     data = json.loads(json.dumps(page_data(report, episodes)))
     first = episodes[0]
     assert data["seconds"] == list(range(81))
-    assert np.abs(unpacked(data["truth"]) - first.truth).max() <= data["truth"]["step"]
+    assert np.abs(unpacked(data["truth"]) - first.history.truth).max() <= data["truth"]["step"]
     paper, other = data["policies"]
-    assert paper["error"] == pytest.approx(first.error, abs=1e-3)
-    assert unpacked(paper["queried"]).astype(bool).tolist() == [q.tolist() for q in first.queried]
+    assert paper["error"] == pytest.approx(first.history.rmse, abs=1e-3)
+    assert unpacked(paper["queried"]).astype(bool).tolist() == [
+        q.tolist() for q in first.history.queried
+    ]
     assert paper["queried"] != other["queried"]
     corridor = first.corridor
     assert data["road"]["edges"][-1] == pytest.approx(sum(corridor.segment_lengths[:6]))
