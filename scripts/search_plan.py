@@ -17,7 +17,8 @@ import tyro
 from tqdm import tqdm
 
 from agents.files import replacing
-from agents.search.plans import PlanScorer, PlanSearch, PlanTask, validation_scores
+from agents.search.plan_scores import PlanScorer, PlanTask
+from agents.search.plans import PlanSearch, validation_scores
 from dptse_env.schedules.plans import Plan, read_plan, write_plan
 from dptse_env.utils.validation import integer
 from scripts.cli import Machines, resumable, run

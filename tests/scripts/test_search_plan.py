@@ -2,7 +2,7 @@ import json
 
 import pytest
 
-from agents.search.plans import PlanTask
+from agents.search.plan_scores import PlanTask
 from dptse_env.schedules.plans import read_plan
 from scripts.search_plan import Args, main
 

@@ -6,14 +6,8 @@ import pytest
 from agents.engines.local import LocalProcesses
 from agents.evaluation.environments import make_vector
 from agents.evaluation.episodes import WARM_UP
-from agents.search.plans import (
-    PlanScorer,
-    PlanSearch,
-    PlanTask,
-    even_plan,
-    plan_masks,
-    validation_scores,
-)
+from agents.search.plan_scores import PlanScorer, PlanTask
+from agents.search.plans import PlanSearch, even_plan, plan_masks, validation_scores
 from dptse_env.schedules.plans import PlanContext
 from tests.release.sums import SumRelease
 
