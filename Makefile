@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 
 export OMP_NUM_THREADS = 1
 
-.PHONY: help setup docs site dist demo policy-study audit test test-slow test-gymnasium test-ray lint format benchmark wheel-test clean clean-kernels reproduce privacy-study ledger-study choice-study
+.PHONY: help setup docs site dist demo policy-study audit test test-slow test-gymnasium test-ray lint format benchmark wheel-test clean reproduce privacy-study ledger-study choice-study
 
 help:  ## Show this list.
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -104,9 +104,6 @@ dist: setup  ## Build and check the archives of a release; dist/.
 
 wheel-test: setup  ## Build the wheel, install it elsewhere and use it there.
 	$(BIN)/python tests/wheel/run.py
-
-clean-kernels:  ## Drop numba's compiled kernels, as needed after a change to one.
-	find dptse_env -name '*.nb[ic]' -delete
 
 clean:  ## Remove the virtual environment, builds and caches; results/ stays.
 	rm -rf $(VENV) build dist .mypy_cache .pytest_cache .ruff_cache .hypothesis

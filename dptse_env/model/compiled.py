@@ -3,12 +3,12 @@
 from functools import cached_property
 
 import numpy as np
-from numba import njit
 
 from dptse_env.model.arz import ARZModel
 from dptse_env.model.kernels import advance, make_scratch
 from dptse_env.model.road_arrays import RoadArrays, make_road_arrays
 from dptse_env.utils.arrays import FloatArray
+from dptse_env.utils.kernels import kernel
 
 
 class CompiledARZModel(ARZModel):
@@ -34,7 +34,7 @@ class CompiledARZModel(ARZModel):
         return jacobian
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _step_batch(
     road: RoadArrays, states: FloatArray, inputs: FloatArray, after: FloatArray
 ) -> None:
@@ -44,7 +44,7 @@ def _step_batch(
         advance(road, states[i], inputs[i], after[i], blocks, scratch)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _jacobian_batch(
     road: RoadArrays, states: FloatArray, inputs: FloatArray, jacobian: FloatArray
 ) -> None:

@@ -4,9 +4,6 @@ The equations are those of `dptse_env.model.arz`, written for one cell at a time
 depends on at most three cells, its parties: itself and those at its downstream face. A step's
 Jacobian is a weighted sum of the outflows' gradients, by a table of the road.
 
-numba caches compiled code by the file of a function, not by the functions it calls: after a change
-here, delete the `*.nbi` files of the packages that call these kernels.
-
 Kernels do not allocate: callers pass scratch space (`make_scratch`), so that a kernel can run
 inside another, once per step and episode.
 """
@@ -14,11 +11,11 @@ inside another, once per step and episode.
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from dptse_env.model.relations import STANDING, VACUUM
 from dptse_env.model.road_arrays import EXIT, LINK, MERGE, RoadArrays
 from dptse_env.utils.arrays import FloatArray
+from dptse_env.utils.kernels import kernel_part
 
 # Columns of the table of cells: values, then partial derivatives by the cell's rho and psi.
 _W, _V, _D, _W_RHO, _W_PSI, _V_RHO, _V_PSI, _D_RHO, _D_PSI = range(9)
@@ -36,7 +33,7 @@ class Scratch(NamedTuple):
     by_factor: FloatArray
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def make_scratch(road: RoadArrays) -> Scratch:
     """Allocate the working space for a road."""
     n = road.jam.size
@@ -44,13 +41,13 @@ def make_scratch(road: RoadArrays) -> Scratch:
     return Scratch(np.empty((n, 9)), np.empty((n, 2)), np.zeros((n, 3, 4)), by_factor)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def pressure(density: float, jam: float, v_f: float, gamma: float) -> float:
     """p(rho) [km/h]."""
     return float(v_f * (max(density, 0.0) / jam) ** gamma)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def supply(
     w: float, speed: float, jam: float, v_f: float, gamma: float
 ) -> tuple[float, float, float]:
@@ -65,7 +62,7 @@ def supply(
     return settled * speed, speed * slope, settled - speed * slope
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _tabulate(road: RoadArrays, state: FloatArray, cells: FloatArray) -> None:
     """Fill the table of cells: w, speed, demand and their derivatives."""
     v_f, gamma = road.free_flow_speed, road.gamma
@@ -101,7 +98,7 @@ def _tabulate(road: RoadArrays, state: FloatArray, cells: FloatArray) -> None:
 # tuple of arrays would take more time than the arithmetic.
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _link(cells: FloatArray, a: int, b: int, jam: float, v_f: float, gamma: float) -> Outflow:
     s, by_w, by_v = supply(cells[a, _W], cells[b, _V], jam, v_f, gamma)
     if cells[a, _D] <= s:
@@ -117,7 +114,7 @@ def _link(cells: FloatArray, a: int, b: int, jam: float, v_f: float, gamma: floa
     )
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _merge(
     cells: FloatArray, a: int, b: int, other: int, jam: float, v_f: float, gamma: float
 ) -> Outflow:
@@ -146,7 +143,7 @@ def _merge(
     )
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _diverge(
     cells: FloatArray,
     a: int,
@@ -179,7 +176,7 @@ def _diverge(
     )
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _exit(
     cells: FloatArray, a: int, density: float, jam: float, v_f: float, gamma: float
 ) -> Outflow:
@@ -192,7 +189,7 @@ def _exit(
     return s, slope * cells[a, _W_RHO], slope * cells[a, _W_PSI], 0.0, 0.0, 0.0, 0.0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _flows_out(
     road: RoadArrays,
     cells: FloatArray,
@@ -223,7 +220,7 @@ def _flows_out(
         gradient[c, 0, 3] += flow[0] * cells[c, _W_PSI]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _sources(
     road: RoadArrays,
     cells: FloatArray,
@@ -256,7 +253,7 @@ def _sources(
         after[2 * c + 1] += road.step_ratio[c] * source * w_in
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def advance(
     road: RoadArrays,
     state: FloatArray,

@@ -6,12 +6,12 @@ vehicles: removing a vehicle from a record does not change the contributions of 
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from dptse_env.release.vehicle_table import VehicleTable, widened
 from dptse_env.traffic import Record
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+from dptse_env.utils.kernels import kernel
 
 
 class Contributions:
@@ -67,7 +67,7 @@ class Contributions:
         return counts, speeds
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _collect(
     start: IntArray,
     vehicle: NDArray[np.int32],

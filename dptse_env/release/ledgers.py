@@ -9,13 +9,13 @@ nor pays. Whether it does depends on its own trip and on public numbers alone.
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from dptse_env.model.rows import covered
 from dptse_env.release.vehicle_table import VehicleTable, widened
 from dptse_env.traffic import Record
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+from dptse_env.utils.kernels import kernel
 
 
 class Columns(NamedTuple):
@@ -123,7 +123,7 @@ class Ledgers:
         return Sums(counts, deviations, refused)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _collect(
     first: IntArray,
     span: IntArray,

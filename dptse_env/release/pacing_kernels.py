@@ -3,10 +3,11 @@
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
 from dptse_env.model.parameters import SECONDS_PER_HOUR
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+from dptse_env.utils.kernel_loops import copy_vector
+from dptse_env.utils.kernels import kernel, kernel_part
 
 Packed = tuple[Any, ...]
 
@@ -43,7 +44,7 @@ class PacedColumns(NamedTuple):
     level: FloatArray  # (C,) price level
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def pace(
     road_: Packed,
     columns_: Packed,
@@ -80,7 +81,7 @@ def pace(
     inflow = np.empty((2, road.n_segments))
     for k in range(episodes.size):
         paid, rate = tracer[episodes[k]], rates[episodes[k]]
-        before[:] = paid
+        copy_vector(paid, before)
         _carry(road, density[k], speed[k], before, paid, inflow)
         _remaining(road, speed[k], rate, rest)
         charged[:] = 0.0
@@ -100,7 +101,7 @@ def pace(
             rate[s] += (seen - rate[s]) / MEMORY
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _carry(
     road: PacedRoad,
     density: FloatArray,
@@ -136,13 +137,13 @@ def _carry(
             after[place] = (1.0 - share) * before[place] + share * before[s]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _moved(length: float, speed: float) -> float:
     """Return the share of the vehicles on a length [km] that leave it in a second."""
     return float(min(speed / (SECONDS_PER_HOUR * length), 1.0))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _remaining(road: PacedRoad, speed: FloatArray, rate: FloatArray, rest: FloatArray) -> None:
     """Write the queried seconds that a vehicle on each record column has still to come."""
     n, S = road.n_mainline, road.n_segments
@@ -164,13 +165,13 @@ def _remaining(road: PacedRoad, speed: FloatArray, rate: FloatArray, rest: Float
             rest[place] = rest[s] + _seconds(road.length[s], speed[s]) * rate[place]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _seconds(length: float, speed: float) -> float:
     """Return the time [s] on a length [km] at a speed [km/h]."""
     return float(SECONDS_PER_HOUR * length / min(max(speed, SLOWEST), FASTEST))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def divide(
     columns_: Packed, n_places: int, observed: BoolArray, whole: float, prices: FloatArray
 ) -> None:

@@ -9,7 +9,6 @@ has two entries.
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
 from dptse_env.estimators.compiled.algebra import propagate
 from dptse_env.estimators.compiled.ekf_kernels import project
@@ -17,6 +16,8 @@ from dptse_env.estimators.compiled.ekf_rows import measured, released
 from dptse_env.model.kernels import advance
 from dptse_env.model.road_arrays import RoadArrays
 from dptse_env.utils.arrays import FloatArray, IntArray
+from dptse_env.utils.kernel_loops import copy_matrix, copy_vector
+from dptse_env.utils.kernels import kernel_part
 
 
 class Problem(NamedTuple):
@@ -60,7 +61,7 @@ class Work(NamedTuple):
     sums: FloatArray  # (2, n) each segment's share of a trace, then whether it is queried
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def make_work(road: RoadArrays, problem: Problem) -> Work:
     """Allocate the scratch space."""
     s, n = road.jam.size, problem.n_mainline
@@ -72,7 +73,7 @@ def make_work(road: RoadArrays, problem: Problem) -> Work:
     )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def look_ahead(
     road: RoadArrays,
     problem: Problem,
@@ -83,22 +84,24 @@ def look_ahead(
     scratch: Any,
 ) -> None:
     """Predict one step, x = f(x, u), P = F P F' + Q, and linearise releases and reward there."""
-    work.covariance[:] = covariance
+    copy_matrix(covariance, work.covariance)
     if problem.is_walk:
-        work.mean[:] = mean
+        copy_vector(mean, work.mean)
         _linearise(road, problem, work)
         drift(problem, work.covariance, work)
     else:
-        work.mean[:] = mean
+        copy_vector(mean, work.mean)
         advance(road, work.mean, inputs, work.mean, work.blocks, scratch)
         project(road, work.mean, problem.is_box)
-        work.blocks[:, :, 1] *= road.free_flow_speed
-        work.blocks[:, :, 2] /= road.free_flow_speed
+        for s in range(work.blocks.shape[0]):
+            for slot in range(work.blocks.shape[1]):
+                work.blocks[s, slot, 1] *= road.free_flow_speed
+                work.blocks[s, slot, 2] /= road.free_flow_speed
         step(road, problem, work.covariance, work)
         _linearise(road, problem, work)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def step(road: RoadArrays, problem: Problem, covariance: FloatArray, work: Work) -> None:
     """Replace a covariance by that of the next second, with the same F."""
     if problem.is_walk:
@@ -109,7 +112,7 @@ def step(road: RoadArrays, problem: Problem, covariance: FloatArray, work: Work)
         propagate(road, work.blocks, no_factors, noise, covariance, work.product, work.transposed)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def drift(problem: Problem, covariance: FloatArray, work: Work) -> None:
     """Add a random walk of density and speed: T^-1 Q T^-T to each segment's block."""
     for s in range(work.rows.shape[0]):
@@ -122,7 +125,7 @@ def drift(problem: Problem, covariance: FloatArray, work: Work) -> None:
         covariance[2 * s + 1, 2 * s + 1] += (b + p * p * a) / (q * q)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _linearise(road: RoadArrays, problem: Problem, work: Work) -> None:
     """Linearise releases and reward at the mean, and weigh the reward's terms."""
     v_f, scale, n = road.free_flow_speed, problem.density_scale, problem.n_mainline
@@ -146,7 +149,7 @@ def _linearise(road: RoadArrays, problem: Problem, work: Work) -> None:
             work.weights[n + s] = problem.term_weights[1] * occupied
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@kernel_part(fastmath={"contract"})
 def downdate(
     covariance: FloatArray,
     first: int,
@@ -186,7 +189,7 @@ def downdate(
             covariance[i, j] -= x * row1[j] + y * row2[j]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def condition(problem: Problem, segments: IntArray, covariance: FloatArray, work: Work) -> None:
     """Update a covariance of states by the releases of segments."""
     for s in segments:
@@ -194,7 +197,7 @@ def condition(problem: Problem, segments: IntArray, covariance: FloatArray, work
         downdate(covariance, 2 * s, 2 * s + 1, 1.0, rows, problem.noise, work.vectors)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def to_traffic(problem: Problem, covariance: FloatArray, work: Work) -> None:
     """Turn a covariance of states into that of density and speed over the mainline."""
     n, d = problem.n_mainline, 1.0 / problem.units[0]
@@ -213,7 +216,7 @@ def to_traffic(problem: Problem, covariance: FloatArray, work: Work) -> None:
             traffic[n + s, n + t] = u * speed + v * speed_too
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def hold_speeds(problem: Problem, work: Work) -> None:
     """Limit the weight of each speed, so that its variance counts up to the square of the cap."""
     n, largest = problem.n_mainline, problem.speed_cap**2

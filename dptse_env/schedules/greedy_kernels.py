@@ -1,7 +1,6 @@
 """Compiled kernels of the schedules that use the estimator's covariance, episode by episode."""
 
 import numpy as np
-from numba import njit
 
 from dptse_env.estimators.compiled.ekf_kernels import Packed
 from dptse_env.model.kernels import make_scratch
@@ -18,11 +17,13 @@ from dptse_env.schedules.covariance_kernels import (
     to_traffic,
 )
 from dptse_env.utils.arrays import BoolArray, FloatArray
+from dptse_env.utils.kernel_loops import copy_matrix, copy_vector
+from dptse_env.utils.kernels import kernel, kernel_part
 
 TRACE, LOGDET = 0, 1
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def choose_greedily(
     road_: Packed,
     problem_: Packed,
@@ -56,10 +57,10 @@ def choose_greedily(
         pick(problem, criterion, work, queried[k])
         if keeps:
             condition(problem, np.flatnonzero(queried[k]), work.covariance, work)
-            covariances[k] = work.covariance
+            copy_matrix(work.covariance, covariances[k])
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def pick(problem: Problem, criterion: int, work: Work, queried: BoolArray) -> None:
     """Pick B segments, each with the largest gain given those before."""
     n, bandwidth, can_query, noise = (
@@ -86,7 +87,7 @@ def pick(problem: Problem, criterion: int, work: Work, queried: BoolArray) -> No
             downdate(traffic, best, n + best, rows[best, 0], by_both, noise, vectors)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _fill_up(n_left: int, queried: BoolArray) -> None:
     """Use remaining bandwidth on segments with a fixed sensor, without gain."""
     for s in range(queried.size):
@@ -95,7 +96,7 @@ def _fill_up(n_left: int, queried: BoolArray) -> None:
             n_left -= 1
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
+@kernel_part(fastmath={"contract", "reassoc"})
 def _products(
     n: int, s: int, traffic: FloatArray, weights: FloatArray
 ) -> tuple[float, float, float]:
@@ -110,7 +111,7 @@ def _products(
     return xx, xy, yy
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _gain(
     n: int,
     criterion: int,
@@ -140,7 +141,7 @@ def _gain(
     return float(g11 / s11 + (g22 - 2.0 * ratio * g12 + ratio * ratio * g11) / left)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def choose_by_swaps(
     road_: Packed,
     problem_: Packed,
@@ -161,7 +162,7 @@ def choose_by_swaps(
     for k in range(means.shape[0]):
         look_ahead(road, problem, means[k], covariances[k], inputs[k], work, scratch)
         condition(problem, problem.always, work.covariance, work)
-        ahead[:] = work.covariance
+        copy_matrix(work.covariance, ahead)
         to_traffic(problem, ahead, work)
         hold_speeds(problem, work)
         pick(problem, TRACE, work, queried[k])
@@ -178,12 +179,12 @@ def choose_by_swaps(
                 )
                 if value < least:
                     least = value
-                    queried[k] = tried
-                    best[:] = work.covariance
-        covariances[k] = best
+                    copy_vector(tried, queried[k])
+                    copy_matrix(work.covariance, best)
+        copy_matrix(best, covariances[k])
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _roll_out(
     road: RoadArrays,
     problem: Problem,
@@ -195,9 +196,9 @@ def _roll_out(
     work: Work,
 ) -> float:
     """Return the sum of weighted traces over the horizon; write the coming step's P to `first`."""
-    after[:] = ahead
+    copy_matrix(ahead, after)
     condition(problem, np.flatnonzero(queried), after, work)
-    first[:] = after
+    copy_matrix(after, first)
     total = _spread(problem, after, work)
     for _ in range(horizon - 1):
         step(road, problem, after, work)
@@ -216,7 +217,7 @@ def _roll_out(
     return total
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _spread(problem: Problem, covariance: FloatArray, work: Work) -> float:
     """Return the weighted trace; write each segment's share of it, and zeros, to `work.sums`."""
     n, d, total = problem.n_mainline, 1.0 / problem.units[0], 0.0

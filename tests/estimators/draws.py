@@ -5,6 +5,10 @@ from types import SimpleNamespace
 import numpy as np
 
 from dptse_env.estimators.compiled.normals import fill, make_bits
+from tests.estimators.parts import compiled
+
+fill = compiled(fill)
+make_bits = compiled(make_bits)
 
 
 class Replay:

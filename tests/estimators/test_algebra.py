@@ -15,6 +15,14 @@ from dptse_env.estimators.compiled.algebra import (
 from dptse_env.model.compiled import CompiledARZModel
 from dptse_env.model.parameters import load_parameters
 from dptse_env.traffic import PAPER_HIGHWAY
+from tests.estimators.parts import compiled
+
+is_covariance = compiled(is_covariance)
+mirror = compiled(mirror)
+propagate = compiled(propagate)
+scratch_vectors = compiled(scratch_vectors)
+segment_update = compiled(segment_update)
+sum_update = compiled(sum_update)
 
 MODEL = CompiledARZModel(PAPER_HIGHWAY, load_parameters("paper"))
 N = MODEL.n_states

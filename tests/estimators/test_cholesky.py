@@ -5,6 +5,9 @@ import pytest
 from scipy.linalg import cho_solve, cholesky
 
 from dptse_env.estimators.compiled.cholesky import solve
+from tests.estimators.parts import compiled
+
+solve = compiled(solve)
 
 
 @pytest.mark.parametrize("m", [1, 2, 3, 4, 5, 28, 38])

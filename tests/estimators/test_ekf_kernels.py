@@ -8,8 +8,11 @@ from dptse_env.estimators.compiled.ekf_rows import released
 from dptse_env.estimators.open_loop import estimated_traffic
 from dptse_env.model.relations import VACUUM
 from dptse_env.model.road_arrays import make_road_arrays
+from tests.estimators.parts import compiled
 
 from .episodes import RELEASES, model_of, scale_of, simulate, started
+
+released = compiled(released)
 
 
 @pytest.mark.parametrize("name", ["ekf", "ukf", "mhe"])

@@ -17,6 +17,16 @@ from dptse_env.estimators.compiled.interior_point import approach
 from dptse_env.estimators.compiled.road_order import Space
 from dptse_env.estimators.horizon import natural_residual
 from dptse_env.estimators.horizon import solve as solve_by_library
+from tests.estimators.parts import compiled
+
+close_envelope = compiled(close_envelope)
+factorise = compiled(factorise)
+invert = compiled(invert)
+multiply = compiled(multiply)
+refactorise = compiled(refactorise)
+solve = compiled(solve)
+solve_many = compiled(solve_many)
+approach = compiled(approach)
 
 N, WIDTH = 120, 14
 

@@ -11,6 +11,11 @@ from dptse_env.estimators.compiled.normals import (
     make_bits,
     make_stream,
 )
+from tests.estimators.parts import compiled
+
+_draw_bits = compiled(_draw_bits)
+fill = compiled(fill)
+make_bits = compiled(make_bits)
 
 
 def drawn(n, seed=0):

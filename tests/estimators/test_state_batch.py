@@ -15,7 +15,14 @@ from dptse_env.estimators.compiled.state_batch import (
 from dptse_env.model import ARZModel, load_parameters
 from dptse_env.model.road_arrays import make_road_arrays
 from dptse_env.traffic import PAPER_HIGHWAY, SHORT_HIGHWAY
+from tests.estimators.parts import compiled
 from tests.model.roads import UNEVEN
+
+advance_states = compiled(advance_states)
+make_batch_scratch = compiled(make_batch_scratch)
+measured_speeds = compiled(measured_speeds)
+project_states = compiled(project_states)
+released_by_states = compiled(released_by_states)
 
 WIDTH = 104
 

@@ -9,8 +9,11 @@ from dptse_env.estimators.compiled.dense import eliminate
 from dptse_env.estimators.compiled.ukf import CompiledUKF
 from dptse_env.model import ARZModel, load_parameters
 from dptse_env.traffic import PAPER_HIGHWAY
+from tests.estimators.parts import compiled
 
 from .episodes import RELEASES, SIGMA, run, scale_of, simulate, started
+
+eliminate = compiled(eliminate)
 
 BACKENDS = ("compiled", "reference")
 both_backends = pytest.mark.parametrize("backend", BACKENDS)

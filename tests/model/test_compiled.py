@@ -7,6 +7,7 @@ from dptse_env.model.arz import ARZModel
 from dptse_env.model.compiled import CompiledARZModel
 from dptse_env.model.kernels import advance, make_scratch
 from dptse_env.model.road_arrays import make_road_arrays
+from tests.estimators.parts import compiled
 
 from .roads import (
     HIGHWAY,
@@ -19,6 +20,9 @@ from .roads import (
     random_inputs,
     random_states,
 )
+
+advance = compiled(advance)
+make_scratch = compiled(make_scratch)
 
 ROADS = {
     "highway": HIGHWAY,

@@ -10,7 +10,6 @@ The caller uses another solver where the method does not converge.
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from dptse_env.estimators.compiled.chain import Chain, WindowScratch
 from dptse_env.estimators.compiled.stages import UNSOLVED
@@ -18,6 +17,8 @@ from dptse_env.estimators.compiled.window import gradient, natural_residual, sol
 from dptse_env.estimators.horizon import AT_BOUND
 from dptse_env.model.road_arrays import RoadArrays
 from dptse_env.utils.arrays import FloatArray, IntArray
+from dptse_env.utils.kernel_loops import copy_matrix
+from dptse_env.utils.kernels import kernel_part
 
 LARGEST_SET = 96
 # Rounds that change all variables at once, which is fast but may cycle, and all rounds; the later
@@ -38,7 +39,7 @@ class ActiveSet(NamedTuple):
     members: IntArray  # (LARGEST_SET, 2) stage and component of active variables
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def make_active_set(n_stages: int, width: int) -> ActiveSet:
     """Allocate an empty active set."""
     return ActiveSet(
@@ -49,7 +50,7 @@ def make_active_set(n_stages: int, width: int) -> ActiveSet:
     )
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def minimise(
     road: RoadArrays,
     chain: Chain,
@@ -66,11 +67,13 @@ def minimise(
     |z - clip(z - g / diag H, lower, upper)|; without one `UNSOLVED` is returned.
     """
     n, width = lower.size, z.shape[1]
-    slope, step, free = np.zeros((3, n_stages, width))
+    # Not parts of one array, whose layout numba would not know.
+    slope, step = np.zeros((n_stages, width)), np.zeros((n_stages, width))
+    free = np.empty((n_stages, width))
     active.slot[:] = -1
     gradient(road, chain, n_stages, z, slope)
     solve(road, chain, n_stages, 0, scratch, slope, step)
-    free[:] = z[:n_stages] - step
+    _write_difference(z, step, free)
     n_columns, settled = 0, False
     for turn in range(ROUNDS):
         m = _members(n_stages, n, active)
@@ -84,7 +87,7 @@ def minimise(
             t, i = active.members[a]
             excess[a] = free[t, i] - (lower[i] if active.side[t, i] < 0 else upper[i])
         multipliers = _solve_multipliers(active, m, excess)
-        z[:n_stages] = free
+        copy_matrix(free, z)
         for a in range(m):
             _subtract(multipliers[a], _column(active, a), z, n_stages)
         if not _revise(n_stages, lower, upper, active, multipliers, z, turn >= BLOCK_ROUNDS):
@@ -109,7 +112,14 @@ def minimise(
     return UNSOLVED
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
+def _write_difference(z: FloatArray, step: FloatArray, out: FloatArray) -> None:
+    for t in range(out.shape[0]):
+        for i in range(out.shape[1]):
+            out[t, i] = z[t, i] - step[t, i]
+
+
+@kernel_part
 def _members(n_stages: int, n: int, active: ActiveSet) -> int:
     """List the active variables and return their number, -1 if there are too many."""
     m = 0
@@ -123,7 +133,7 @@ def _members(n_stages: int, n: int, active: ActiveSet) -> int:
     return m
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _columns(
     road: RoadArrays,
     chain: Chain,
@@ -150,13 +160,13 @@ def _columns(
     return n_columns
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _column(active: ActiveSet, a: int) -> FloatArray:
     column: FloatArray = active.columns[active.slot[active.members[a, 0], active.members[a, 1]]]
     return column
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _solve_multipliers(active: ActiveSet, m: int, excess: FloatArray) -> FloatArray:
     """Return the multipliers that remove the excess of active variables, by a Cholesky solve."""
     L, x = np.empty((m, m)), excess.copy()
@@ -183,14 +193,14 @@ def _solve_multipliers(active: ActiveSet, m: int, excess: FloatArray) -> FloatAr
     return x
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _subtract(factor: float, column: FloatArray, z: FloatArray, n_stages: int) -> None:
     for t in range(n_stages):
         for i in range(z.shape[1]):
             z[t, i] -= factor * column[t, i]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _revise(
     n_stages: int,
     lower: FloatArray,
@@ -219,7 +229,7 @@ def _revise(
     return changed
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _set_near_bounds(n_stages: int, lower: FloatArray, upper: FloatArray, z: FloatArray) -> None:
     """Set components within rounding of a bound to it: speeds are quotients of components."""
     for t in range(n_stages):
@@ -230,7 +240,7 @@ def _set_near_bounds(n_stages: int, lower: FloatArray, upper: FloatArray, z: Flo
                 z[t, i] = upper[i]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _fix(active: ActiveSet, m: int, lower: FloatArray, upper: FloatArray, z: FloatArray) -> None:
     for a in range(m):
         t, i = active.members[a]

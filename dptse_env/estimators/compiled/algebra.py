@@ -6,10 +6,10 @@ multiply-adds and, unlike other options, keeps NaNs, by which divergence is dete
 """
 
 import numpy as np
-from numba import njit
 
 from dptse_env.model.road_arrays import RoadArrays
 from dptse_env.utils.arrays import FloatArray
+from dptse_env.utils.kernels import kernel_part
 
 VECTOR_WIDTH = 8  # numbers in a register
 
@@ -19,7 +19,7 @@ def padded(n: int) -> int:
     return -(-n // VECTOR_WIDTH) * VECTOR_WIDTH
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@kernel_part(fastmath={"contract"})
 def _multiply(road: RoadArrays, blocks: FloatArray, right: FloatArray, out: FloatArray) -> None:
     """Write F right to `out`, with F given by its 2x2 blocks."""
     width = right.shape[1]
@@ -42,7 +42,7 @@ def _multiply(road: RoadArrays, blocks: FloatArray, right: FloatArray, out: Floa
                     lower[j] += d * first[j] + e * second[j]
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@kernel_part(fastmath={"contract"})
 def _multiply_factors(
     road: RoadArrays, by_factor: FloatArray, right: FloatArray, out: FloatArray
 ) -> None:
@@ -58,7 +58,7 @@ def _multiply_factors(
             kept[j] = factor[j]
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@kernel_part(fastmath={"contract"})
 def propagate(
     road: RoadArrays,
     blocks: FloatArray,
@@ -97,7 +97,7 @@ def propagate(
         covariance[i, i] += noise[i]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def mirror(covariance: FloatArray) -> None:
     """Copy the lower half to the upper one."""
     for i in range(covariance.shape[0]):
@@ -105,14 +105,14 @@ def mirror(covariance: FloatArray) -> None:
             covariance[j, i] = covariance[i, j]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def scratch_vectors(width: int) -> tuple[FloatArray, ...]:
     """Allocate the working space of `segment_update` and `sum_update`."""
     work = np.zeros((8, width))
     return work[0], work[1], work[2], work[3], work[4], work[5], work[6], work[7]
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@kernel_part(fastmath={"contract"})
 def segment_update(
     covariance: FloatArray,
     segment: int,
@@ -164,7 +164,7 @@ def segment_update(
     return True
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@kernel_part(fastmath={"contract"})
 def sum_update(
     covariance: FloatArray,
     first: int,
@@ -229,7 +229,7 @@ def sum_update(
     return True
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@kernel_part(fastmath={"contract"})
 def _gain(
     c: FloatArray,
     total: float,
@@ -246,7 +246,7 @@ def _gain(
         shift[j] += k[j] * step
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@kernel_part(fastmath={"contract"})
 def _downdate(
     covariance: FloatArray,
     c1: FloatArray,
@@ -264,7 +264,7 @@ def _downdate(
             covariance[i, j] -= x1 * c1[j] + y1 * k1[j] + (x2 * c2[j] + y2 * k2[j])
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _read_rows(covariance: FloatArray, row: int, first: FloatArray, second: FloatArray) -> None:
     """Write two adjacent rows of a symmetric matrix whose lower half alone is valid."""
     for j in range(row + 1):
@@ -277,12 +277,12 @@ def _read_rows(covariance: FloatArray, row: int, first: FloatArray, second: Floa
         second[j] = covariance[j, row + 1]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _is_variance(total: float, noise: float) -> bool:
     return 0.0 < total < np.inf and total >= noise * (1.0 - 1e-9)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def is_covariance(covariance: FloatArray, variances: FloatArray) -> bool:
     """Return whether variances are finite and not negative and no correlation exceeds one.
 

@@ -10,17 +10,17 @@ out makes correlations between groups weaker, and changes nothing within them.
 """
 
 import numpy as np
-from numba import njit
 
 from dptse_env.estimators.compiled.band import Band
 from dptse_env.estimators.localisation import WHITENING
 from dptse_env.model.road_arrays import RoadArrays
 from dptse_env.utils.arrays import FloatArray, IntArray
+from dptse_env.utils.kernels import kernel_part
 
 LARGEST_GROUP = 4  # rho, psi and a demand factor, and what sensors release of the segment
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@kernel_part(fastmath={"contract"})
 def _multiply(
     road: RoadArrays,
     band: Band,
@@ -80,7 +80,7 @@ def _multiply(
             kept[j] = source[j]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def make_tables(band: Band) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Allocate the scratch space of `propagate`."""
     n, reach, step = band.order.size, band.reach, band.step
@@ -93,7 +93,7 @@ def make_tables(band: Band) -> tuple[FloatArray, FloatArray, FloatArray, FloatAr
     )
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def propagate(
     road: RoadArrays,
     band: Band,
@@ -129,7 +129,7 @@ def propagate(
     confine(band.first, band.group, band.start, moved, covariance)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def confine(
     first: IntArray, group: IntArray, start: IntArray, wide: FloatArray, covariance: FloatArray
 ) -> None:
@@ -146,7 +146,7 @@ def confine(
     cut(first, group, wide, lost_beyond(first, group, start, wide, roots), covariance)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def block_roots(wide: FloatArray, start: IntArray) -> FloatArray:
     """Return the roots of all groups' own covariances."""
     roots = np.zeros((start.size - 1, LARGEST_GROUP, LARGEST_GROUP))
@@ -155,7 +155,7 @@ def block_roots(wide: FloatArray, start: IntArray) -> FloatArray:
     return roots
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def lost_beyond(
     first: IntArray, group: IntArray, start: IntArray, wide: FloatArray, roots: FloatArray
 ) -> FloatArray:
@@ -175,7 +175,7 @@ def lost_beyond(
     return lost
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def cut(
     first: IntArray, group: IntArray, wide: FloatArray, lost: FloatArray, covariance: FloatArray
 ) -> None:
@@ -196,7 +196,7 @@ def cut(
         covariance[i, reach] *= 1.0 + lost[a] * WHITENING * scale * scale
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def block_root(covariance: FloatArray, place: int, size: int, root: FloatArray) -> None:
     """Write the lower root of a group's own covariance, its variances enlarged by `WHITENING`."""
     diagonal = covariance.shape[1] - 1
@@ -210,7 +210,7 @@ def block_root(covariance: FloatArray, place: int, size: int, root: FloatArray) 
             root[i, j] = total / root[j, j] if j < i else np.sqrt(total)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _correlation(
     wide: FloatArray, start: IntArray, a: int, b: int, roots: FloatArray, block: FloatArray
 ) -> float:

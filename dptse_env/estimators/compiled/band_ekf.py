@@ -6,7 +6,6 @@ first. `Filters` have covariances `(n, n_x, H + 1)`.
 """
 
 import numpy as np
-from numba import njit
 
 from dptse_env.estimators.compiled.band import Band
 from dptse_env.estimators.compiled.band_algebra import make_tables, propagate
@@ -31,9 +30,11 @@ from dptse_env.estimators.compiled.ekf_rows import Rows, linearise, make_rows
 from dptse_env.model.kernels import advance, make_scratch
 from dptse_env.model.road_arrays import RoadArrays
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+from dptse_env.utils.kernel_loops import all_finite, any_of
+from dptse_env.utils.kernels import kernel, kernel_part
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def predict(
     road_: Packed, filters_: Packed, band_: Packed, episodes: IntArray, inputs: FloatArray
 ) -> None:
@@ -54,7 +55,7 @@ def predict(
         add_noise(band, noise, coupling, covariance)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def add_noise(band: Band, noise: FloatArray, coupling: FloatArray, covariance: FloatArray) -> None:
     """Add process noise: variances `(n_x,)` of the state, `(S,)` covariances of rho and psi."""
     for p in range(band.order.size):
@@ -63,7 +64,7 @@ def add_noise(band: Band, noise: FloatArray, coupling: FloatArray, covariance: F
         covariance[band.segment[s] + 1, band.reach - 1] += coupling[s]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def update(
     road_: Packed,
     filters_: Packed,
@@ -93,7 +94,7 @@ def update(
         )
         filters.innovations[e] = 0.0
         sound = True
-        if observed[k].any():
+        if any_of(observed[k]):
             work = begin(band.order.size, band.start.size - 1)
             innovations = filters.innovations[e]
             sound = _take_in(road, band, covariance, observed[k], rows, innovations, work)
@@ -101,12 +102,12 @@ def update(
             for p in range(band.order.size):
                 mean[band.order[p]] += work.shift[p] * band.scale[p]
             project(road, mean, filters.is_box)
-        filters.diverged[e] = not (sound and np.isfinite(mean).all() and is_covariance(covariance))
+        filters.diverged[e] = not (sound and all_finite(mean) and is_covariance(covariance))
         if filters.diverged[e]:
             restart(filters, band, e)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _take_in(
     road: RoadArrays,
     band: Band,
@@ -139,7 +140,7 @@ def _take_in(
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _row(
     road: RoadArrays,
     band: Band,
@@ -163,7 +164,7 @@ def _row(
     return n
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def restart(filters: Filters, band: Band, episode: int) -> None:
     """Reset an episode's filter to its prior."""
     filters.means[episode] = filters.priors[episode]
@@ -174,7 +175,7 @@ def restart(filters: Filters, band: Band, episode: int) -> None:
         covariance[p, band.reach] = filters.initial_variance[band.order[p]]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def summarise(road_: Packed, filters_: Packed, band_: Packed, out: FloatArray) -> None:
     """Write density, speed and their standard deviations to `out` `(4, n, S)`, physical units."""
     road, filters, band = RoadArrays(*road_), Filters(*filters_), Band(*band_)

@@ -7,7 +7,6 @@ or flows. Those of the measured segments join the state, each after the psi of i
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from dptse_env.estimators.compiled.band import Band
 from dptse_env.estimators.compiled.band_algebra import (
@@ -27,6 +26,7 @@ from dptse_env.estimators.compiled.sigma_points import Points
 from dptse_env.estimators.compiled.state_batch import released_by_states
 from dptse_env.model.road_arrays import RoadArrays
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+from dptse_env.utils.kernels import kernel_part
 
 
 class Joint(NamedTuple):
@@ -43,7 +43,7 @@ class Joint(NamedTuple):
     centre: FloatArray  # (S,) means of the outputs, where they are measured
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def join(road: RoadArrays, band: Band, observed: BoolArray) -> Joint:
     """Return the joint state of the observed rows, its covariance still to be written."""
     n, n_segments = band.order.size, road.jam.size
@@ -77,7 +77,7 @@ def join(road: RoadArrays, band: Band, observed: BoolArray) -> Joint:
     return Joint(base, state, output, first, last, group, start, covariance, means)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def gather(
     road: RoadArrays,
     points: Points,

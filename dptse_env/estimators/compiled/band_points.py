@@ -8,21 +8,21 @@ at place i is that of column k modulo K, if k lies from i - H - D to i + D, and 
 """
 
 import numpy as np
-from numba import njit
 
 from dptse_env.estimators.compiled.band import Band
 from dptse_env.estimators.compiled.band_algebra import LARGEST_GROUP
 from dptse_env.estimators.compiled.sigma_points import Points
 from dptse_env.utils.arrays import FloatArray, IntArray
+from dptse_env.utils.kernels import inline_part, kernel_part
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@inline_part
 def n_columns(band: Band) -> int:
     """Return K."""
     return band.reach + 2 * band.step + 1
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
+@kernel_part(fastmath={"contract", "reassoc"})
 def factorise(band: Band, covariance: FloatArray, root: FloatArray) -> bool:
     """Write L with L L' = P, both in the form of a band; return whether all pivots are positive."""
     reach = band.reach
@@ -45,7 +45,7 @@ def factorise(band: Band, covariance: FloatArray, root: FloatArray) -> bool:
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def draw(points: Points, band: Band, e: int, mean: FloatArray, root: FloatArray) -> None:
     """Write one episode's points of a mean and the root of its covariance."""
     count = n_columns(band)
@@ -59,7 +59,7 @@ def draw(points: Points, band: Band, e: int, mean: FloatArray, root: FloatArray)
             row[1 + count + k % count] -= shift
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def distances_at(
     band: Band, place: int, row: FloatArray, unit: float, weight: float, out: FloatArray
 ) -> float:
@@ -83,7 +83,7 @@ def distances_at(
     return weight * total
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
+@kernel_part(fastmath={"contract", "reassoc"})
 def moments(base: IntArray, distances: FloatArray, weight: float, wide: FloatArray) -> None:
     """Write weighted inner products of the points' distances at n places.
 
@@ -104,7 +104,7 @@ def moments(base: IntArray, distances: FloatArray, weight: float, wide: FloatArr
             wide[i, j - i + furthest] = weight * total
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def add_surplus(shift: FloatArray, surplus: float, wide: FloatArray) -> None:
     """Add what the first point's weight contributes, `surplus` times shift shift', to `wide`."""
     furthest = wide.shape[1] - 1
@@ -113,7 +113,7 @@ def add_surplus(shift: FloatArray, surplus: float, wide: FloatArray) -> None:
             wide[i, j - i + furthest] += surplus * shift[i] * shift[j]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def add_lost_surplus(
     start: IntArray,
     shift: FloatArray,

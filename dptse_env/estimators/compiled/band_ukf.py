@@ -7,7 +7,6 @@ update. `Filters` have covariances `(n, n_x, H + 1)`, and `Points` fewer columns
 """
 
 import numpy as np
-from numba import njit
 
 from dptse_env.estimators.compiled.band import Band
 from dptse_env.estimators.compiled.band_ekf import add_noise, restart
@@ -32,9 +31,11 @@ from dptse_env.estimators.compiled.state_batch import (
 from dptse_env.estimators.compiled.ukf_outputs import row_noise
 from dptse_env.model.road_arrays import RoadArrays
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+from dptse_env.utils.kernel_loops import all_finite, copy_matrix, copy_vector
+from dptse_env.utils.kernels import kernel, kernel_part
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def predict(
     road_: Packed,
     filters_: Packed,
@@ -60,8 +61,8 @@ def predict(
         project_states(road, states, filters.is_box)
         joint = join(road, band, nothing)
         gather(road, points, band, e, unread, joint)
-        covariance[:] = joint.covariance
-        mean[:] = points.centres[e]
+        copy_matrix(joint.covariance, covariance)
+        copy_vector(points.centres[e], mean)
         project(road, mean, filters.is_box)
         if filters.noise_in_w:
             couple(road, filters.density_scale, mean, points.noise[e], points.coupling[e])
@@ -69,7 +70,7 @@ def predict(
         points.moved[e] = True
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def update(
     road_: Packed,
     filters_: Packed,
@@ -98,14 +99,14 @@ def update(
                 gather(road, points, band, e, centre[k], joint)
                 sound = _take_in(road, filters, points, band, e, rows, values[k], noise, joint)
             points.moved[e] = False
-        finite = np.isfinite(filters.means[e]).all()
+        finite = all_finite(filters.means[e])
         filters.diverged[e] = not (sound and finite and is_covariance(filters.covariances[e]))
         if filters.diverged[e]:
             restart(filters, band, e)
             points.moved[e] = False
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _stay(road: RoadArrays, filters: Filters, points: Points, band: Band, e: int) -> bool:
     """Make points without a prediction, after another update in the same step."""
     root = np.empty(filters.covariances.shape[1:])
@@ -117,7 +118,7 @@ def _stay(road: RoadArrays, filters: Filters, points: Points, band: Band, e: int
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _take_in(
     road: RoadArrays,
     filters: Filters,
@@ -157,7 +158,7 @@ def _take_in(
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _row(
     road: RoadArrays,
     band: Band,
@@ -184,7 +185,7 @@ def _row(
     return float((values[m, kind] - total / span) / unit)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _take_out(
     filters: Filters, points: Points, band: Band, e: int, joint: Joint, work: Update
 ) -> None:

@@ -3,11 +3,11 @@
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from dptse_env.estimators.compiled.band_algebra import LARGEST_GROUP, block_root
 from dptse_env.estimators.localisation import WHITENING
 from dptse_env.utils.arrays import FloatArray, IntArray
+from dptse_env.utils.kernels import kernel_part
 
 
 class Update(NamedTuple):
@@ -22,7 +22,7 @@ class Update(NamedTuple):
     root: FloatArray  # of a group's covariance, and in its last column `root^-1 c / a`
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def begin(n: int, n_groups: int) -> Update:
     """Return the working space ahead of the first measurement."""
     places, groups = np.zeros((3, n)), np.ones((3, n_groups))
@@ -30,7 +30,7 @@ def begin(n: int, n_groups: int) -> Update:
     return Update(places[0], groups[0], places[1], places[2], groups[1], groups[2], root)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def finish(covariance: FloatArray, group: IntArray, work: Update) -> None:
     """Scale the covariance after the last measurement."""
     reach = covariance.shape[1] - 1
@@ -40,7 +40,7 @@ def finish(covariance: FloatArray, group: IntArray, work: Update) -> None:
             covariance[i, q] *= scale * work.scale[group[i - reach + q]]
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@kernel_part(fastmath={"contract"})
 def scalar_update(
     covariance: FloatArray,
     first: IntArray,
@@ -111,7 +111,7 @@ def scalar_update(
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _measure_groups(
     covariance: FloatArray, low: int, high: int, start: IntArray, work: Update
 ) -> None:
@@ -131,7 +131,7 @@ def _measure_groups(
         work.sums[a] = running
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _weaken(
     covariance: FloatArray, start: int, end: int, inverse: float, lost: float, work: Update
 ) -> None:
@@ -144,7 +144,7 @@ def _weaken(
             covariance[i, j - i + reach] += lost * enlarged * before
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def variance_of(
     covariance: FloatArray, first: IntArray, places: IntArray, slopes: FloatArray
 ) -> float:
@@ -159,7 +159,7 @@ def variance_of(
     return total
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def is_covariance(covariance: FloatArray) -> bool:
     """Return whether variances are finite and not negative and no correlation exceeds one."""
     n, reach = covariance.shape[0], covariance.shape[1] - 1

@@ -3,10 +3,10 @@
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from dptse_env.model.road_arrays import RoadArrays
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+from dptse_env.utils.kernels import kernel_part
 
 
 class Chain(NamedTuple):
@@ -40,7 +40,7 @@ class WindowScratch(NamedTuple):
     sweep: FloatArray  # (4, padded) scratch
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def make_window_scratch(
     road: RoadArrays, n_stages: int, n_states: int, width: int
 ) -> WindowScratch:

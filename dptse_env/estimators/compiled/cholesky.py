@@ -1,12 +1,12 @@
 """Compiled solution of linear equations with a small definite matrix and many right-hand sides."""
 
 import numpy as np
-from numba import njit
 
 from dptse_env.utils.arrays import FloatArray
+from dptse_env.utils.kernels import kernel_part
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
+@kernel_part(fastmath={"contract", "reassoc"})
 def _factor(matrix: FloatArray) -> bool:
     """Replace the lower half of a symmetric matrix by L, L L' = matrix, with its diagonal inverted.
 
@@ -27,7 +27,7 @@ def _factor(matrix: FloatArray) -> bool:
     return True
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@kernel_part(fastmath={"contract"})
 def _subtract(right: FloatArray, i: int, first: int, last: int, factors: FloatArray) -> None:
     """Subtract `factors` times rows first..last-1 from row i, four at a time."""
     row = right[i]
@@ -43,7 +43,7 @@ def _subtract(right: FloatArray, i: int, first: int, last: int, factors: FloatAr
             row[j] -= x * a[j]
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@kernel_part(fastmath={"contract"})
 def solve(matrix: FloatArray, right: FloatArray) -> bool:
     """Replace `right` by `matrix^-1 right`, the matrix by its factor; return whether it has one."""
     if not _factor(matrix):

@@ -1,12 +1,12 @@
 """Compiled linear algebra on dense, padded matrices that several filters share."""
 
 import numpy as np
-from numba import njit
 
 from dptse_env.utils.arrays import FloatArray
+from dptse_env.utils.kernels import kernel_part
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@kernel_part(fastmath={"contract"})
 def eliminate(matrix: FloatArray, n: int, width: int) -> bool:
     """Replace rows [S, C] by [U, V] with U' U = S and V' V = C' S^-1 C.
 
@@ -41,7 +41,7 @@ def eliminate(matrix: FloatArray, n: int, width: int) -> bool:
     return True
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
+@kernel_part(fastmath={"contract", "reassoc"})
 def products(
     left: FloatArray, n_left: int, right: FloatArray, n_right: int, is_lower: bool, out: FloatArray
 ) -> None:

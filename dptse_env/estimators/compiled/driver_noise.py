@@ -5,8 +5,6 @@ With `psi = rho w`, independent deviations of rho and w are to first order devia
 `[[a, w a], [w a, w^2 a + rho^2 b]]`, with a and b the variances of rho and w.
 """
 
-from numba import njit
-
 from dptse_env.estimators.compiled.moments import mean_of
 from dptse_env.estimators.compiled.normals import Draws
 from dptse_env.model.arz import LEAST_DENSITY
@@ -14,16 +12,17 @@ from dptse_env.model.parameters import LARGEST_W
 from dptse_env.model.relations import VACUUM
 from dptse_env.model.road_arrays import RoadArrays
 from dptse_env.utils.arrays import FloatArray
+from dptse_env.utils.kernels import kernel_part
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def drivers(rho: float, psi: float, jam: float, v_f: float) -> tuple[float, float]:
     """Return the density [veh/km] and the w [km/h] at a mean, as `dptse_env.estimators.noise`."""
     w = psi / rho if rho > VACUUM * jam else v_f
     return max(rho, LEAST_DENSITY), min(max(w, 0.0), LARGEST_W * v_f)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def couple(
     road: RoadArrays, scale: float, mean: FloatArray, variance: FloatArray, coupling: FloatArray
 ) -> None:
@@ -44,7 +43,7 @@ def couple(
         variance[2 * s + 1] = w * coupling[s] + share * share * variance[2 * s + 1]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def add_coupling(covariance: FloatArray, coupling: FloatArray) -> None:
     """Add to a covariance what the noise of each segment's rho and psi have in common."""
     for s in range(coupling.size):
@@ -52,7 +51,7 @@ def add_coupling(covariance: FloatArray, coupling: FloatArray) -> None:
         covariance[2 * s + 1, 2 * s] += coupling[s]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def couple_members(
     road: RoadArrays,
     scale: float,

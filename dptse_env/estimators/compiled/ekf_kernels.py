@@ -7,7 +7,6 @@ psi by rho_m v_f, so that variances of all components are of one order.
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
 from dptse_env.estimators.compiled.algebra import (
     is_covariance,
@@ -36,6 +35,8 @@ from dptse_env.model.parameters import LARGEST_W
 from dptse_env.model.relations import VACUUM
 from dptse_env.model.road_arrays import RoadArrays
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+from dptse_env.utils.kernel_loops import all_finite, any_of, copy_vector
+from dptse_env.utils.kernels import kernel, kernel_part
 
 # A `RoadArrays` or `Filters` as a plain tuple: calling compiled code from Python with a named tuple
 # costs 2 us more, a tenth of a step. Functions that Python calls take these.
@@ -59,13 +60,14 @@ class Filters(NamedTuple):
     is_box: bool  # whether means are projected into the paper's box, not the cone
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def predict(road_: Packed, filters_: Packed, episodes: IntArray, inputs: FloatArray) -> None:
     """Predict one step ahead under inputs `(k, n_u)`: x = f(x, u), P = F P F' + Q."""
     road, filters = RoadArrays(*road_), Filters(*filters_)
     scratch = make_scratch(road)
     blocks, by_factor = np.empty((*road.neighbours.shape, 4)), scratch.by_factor
-    product, transposed = np.empty((2, *filters.covariances.shape[1:]))
+    size = filters.covariances.shape[1:]
+    product, transposed = np.empty(size), np.empty(size)  # not one array: layouts stay known
     noise, coupling = np.empty(filters.process_variance.size), np.empty(road.jam.size)
     for k in range(episodes.size):
         mean = filters.means[episodes[k]]
@@ -81,7 +83,7 @@ def predict(road_: Packed, filters_: Packed, episodes: IntArray, inputs: FloatAr
             add_coupling(covariance, coupling)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def process_noise(
     road: RoadArrays, filters: Filters, mean: FloatArray, variance: FloatArray
 ) -> None:
@@ -89,26 +91,29 @@ def process_noise(
 
     Its second components are those of `process_variance`, psi or w.
     """
-    variance[:] = filters.process_variance
+    copy_vector(filters.process_variance, variance)
     if filters.growth_variance == 0.0:
         return
     for s in range(road.jam.size):
         variance[2 * s] += filters.growth_variance * mean[2 * s] / filters.density_scale
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def normalise(
     road: RoadArrays, density_scale: float, blocks: FloatArray, by_factor: FloatArray
 ) -> None:
     """Normalise a step's derivatives: rho by rho_m, psi by rho_m v_f."""
     v_f = road.free_flow_speed
-    blocks[:, :, 1] *= v_f
-    blocks[:, :, 2] /= v_f
-    by_factor[:, 0] /= density_scale
-    by_factor[:, 1] /= density_scale * v_f
+    for s in range(blocks.shape[0]):
+        for slot in range(blocks.shape[1]):
+            blocks[s, slot, 1] *= v_f
+            blocks[s, slot, 2] /= v_f
+    for e in range(by_factor.shape[0]):
+        by_factor[e, 0] /= density_scale
+        by_factor[e, 1] /= density_scale * v_f
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def update(
     road_: Packed,
     filters_: Packed,
@@ -152,7 +157,7 @@ def update(
             )
         if n_wide > 0 and sound:
             sound = update_wide(road, covariance, observed[k], rows, shift, work)
-        if observed[k].any():
+        if any_of(observed[k]):
             mirror(covariance)
             for s in range(road.jam.size):
                 mean[2 * s] += shift[2 * s] * filters.density_scale
@@ -160,17 +165,15 @@ def update(
             for i in range(2 * road.jam.size, mean.size):
                 mean[i] += shift[i]
             project(road, mean, filters.is_box)
-        filters.diverged[e] = not (
-            sound and np.isfinite(mean).all() and is_covariance(covariance, shift)
-        )
+        filters.diverged[e] = not (sound and all_finite(mean) and is_covariance(covariance, shift))
         if filters.diverged[e]:
             restart(filters, e)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def restart(filters: Filters, episode: int) -> None:
     """Reset an episode's filter to its prior."""
-    filters.means[episode] = filters.priors[episode]
+    copy_vector(filters.priors[episode], filters.means[episode])
     filters.innovations[episode] = 0.0
     covariance = filters.covariances[episode]
     covariance[:] = 0.0
@@ -178,7 +181,7 @@ def restart(filters: Filters, episode: int) -> None:
         covariance[i, i] = filters.initial_variance[i]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def project(road: RoadArrays, mean: FloatArray, is_box: bool) -> None:
     """Project a mean into its bounds, as `ARZModel.project`; a NaN stays NaN."""
     v_f = road.free_flow_speed
@@ -196,7 +199,7 @@ def project(road: RoadArrays, mean: FloatArray, is_box: bool) -> None:
         mean[i] = _clip(mean[i], LEAST_FACTOR, LARGEST_FACTOR)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def summarise(road_: Packed, filters_: Packed, out: FloatArray) -> None:
     """Write density, speed and their standard deviations to `out` `(4, n, S)`, physical units."""
     road, filters = RoadArrays(*road_), Filters(*filters_)
@@ -205,7 +208,7 @@ def summarise(road_: Packed, filters_: Packed, out: FloatArray) -> None:
             summarise_segment(road, filters, e, s, filters.covariances[e], s, out)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def summarise_segment(
     road: RoadArrays,
     filters: Filters,
@@ -228,7 +231,7 @@ def summarise_segment(
     out[3, e, s] = np.sqrt(max(variance, 0.0))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _clip(value: float, low: float, high: float) -> float:
     if value < low:
         return low

@@ -6,13 +6,13 @@ A row is the average of one or several neighbouring segments. All of a `Rows` is
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from dptse_env.estimators.compiled.algebra import sum_update
 from dptse_env.model.arz import MEASUREMENT_FLOOR
 from dptse_env.model.kernels import pressure
 from dptse_env.model.road_arrays import RoadArrays
 from dptse_env.utils.arrays import BoolArray, FloatArray
+from dptse_env.utils.kernels import kernel_part
 
 
 class Rows(NamedTuple):
@@ -25,14 +25,14 @@ class Rows(NamedTuple):
     slopes: FloatArray  # (S, 2) derivatives of each segment's second number by its components
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def make_rows(road: RoadArrays) -> Rows:
     """Allocate the rows of a measurement."""
     n_rows, n_segments = road.row_first.size, road.jam.size
     return Rows(np.empty((n_rows, 4)), np.empty((n_rows, 2)), np.zeros((n_segments, 2)))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def measured(
     rho: float, psi: float, jam: float, v_f: float, gamma: float
 ) -> tuple[float, float, float]:
@@ -44,7 +44,7 @@ def measured(
     return psi / floored - p, slope, 1.0 / floored
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def released(
     road: RoadArrays, s: int, rho: float, psi: float, centre: float
 ) -> tuple[float, float, float]:
@@ -60,7 +60,7 @@ def released(
     return flow, -(1.0 + gamma) * p - centre, 1.0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def linearise(
     road: RoadArrays,
     density_scale: float,
@@ -95,7 +95,7 @@ def linearise(
         rows.noise[m, 1] = (sigma[m, 1] / unit) ** 2
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def innovate(
     road: RoadArrays,
     covariance: FloatArray,
@@ -113,7 +113,7 @@ def innovate(
             innovations[m, 1] = rows.single[m, 1] / np.sqrt(second + rows.noise[m, 1])
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def row_variances(
     covariance: FloatArray, first: int, span: int, slopes: FloatArray
 ) -> tuple[float, float]:
@@ -132,7 +132,7 @@ def row_variances(
     return density / span**2, second / span**2
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def variance_along(covariance: FloatArray, s: int, by_rho: float, by_psi: float) -> float:
     """Return the variance of a quantity with these derivatives by a segment's rho and psi."""
     a, b = covariance[2 * s, 2 * s], covariance[2 * s, 2 * s + 1]
@@ -140,7 +140,7 @@ def variance_along(covariance: FloatArray, s: int, by_rho: float, by_psi: float)
     return float(by_rho * by_rho * a + 2.0 * by_rho * by_psi * b + by_psi * by_psi * c)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def update_wide(
     road: RoadArrays,
     covariance: FloatArray,

@@ -9,7 +9,6 @@ and are small enough for one thread.
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from dptse_env.estimators.compiled.cholesky import solve
@@ -34,6 +33,8 @@ from dptse_env.estimators.compiled.state_batch import (
 from dptse_env.model.parameters import LARGEST_W
 from dptse_env.model.road_arrays import RoadArrays
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+from dptse_env.utils.kernel_loops import copy_vector
+from dptse_env.utils.kernels import kernel, kernel_part
 
 
 class Ensembles(NamedTuple):
@@ -69,7 +70,7 @@ class Measured(NamedTuple):
     centre: FloatArray  # (S,)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def restart(road_: Packed, ensembles_: Packed, episodes: IntArray) -> None:
     """Draw the members of episodes around their priors."""
     road, ensembles = RoadArrays(*road_), Ensembles(*ensembles_)
@@ -77,7 +78,7 @@ def restart(road_: Packed, ensembles_: Packed, episodes: IntArray) -> None:
         _restart(road, ensembles, e)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _restart(road: RoadArrays, ensembles: Ensembles, e: int) -> None:
     members, n = ensembles.members[e], ensembles.n_members
     for i in range(members.shape[0]):
@@ -88,13 +89,13 @@ def _restart(road: RoadArrays, ensembles: Ensembles, e: int) -> None:
     project_states(road, members, ensembles.is_box)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _make_draws(size: int) -> Draws:
     """Allocate at least `size` numbers, an even number of them, as `fill` writes pairs."""
     return np.empty(size + size % 2, dtype=np.float32)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _perturb(members: FloatArray, n: int, deviation: FloatArray, draws: Draws) -> None:
     """Add noise to the first n columns; those beyond repeat the first."""
     for i in range(members.shape[0]):
@@ -104,7 +105,7 @@ def _perturb(members: FloatArray, n: int, deviation: FloatArray, draws: Draws) -
         row[n:] = row[0]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def predict(road_: Packed, ensembles_: Packed, episodes: IntArray, inputs: FloatArray) -> None:
     """Predict members one step ahead under inputs `(k, n_u)`, with noise, and project them."""
     road, ensembles = RoadArrays(*road_), Ensembles(*ensembles_)
@@ -124,12 +125,12 @@ def predict(road_: Packed, ensembles_: Packed, episodes: IntArray, inputs: Float
         project_states(road, members, ensembles.is_box)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _process_deviation(
     road: RoadArrays, ensembles: Ensembles, members: FloatArray, deviation: FloatArray
 ) -> None:
     """Write the deviations `(n_x,)` of the process noise of a step that leaves the members."""
-    deviation[:] = ensembles.process_deviation
+    copy_vector(ensembles.process_deviation, deviation)
     if ensembles.density_growth == 0.0:
         return
     scale = ensembles.density_scale
@@ -139,7 +140,7 @@ def _process_deviation(
         deviation[2 * s] = np.sqrt(deviation[2 * s] ** 2 + grown)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _inflate(members: FloatArray, n: int, factor: float) -> None:
     for i in range(members.shape[0]):
         row, mean = members[i], mean_of(members[i], n)
@@ -147,7 +148,7 @@ def _inflate(members: FloatArray, n: int, factor: float) -> None:
             row[j] = mean + factor * (row[j] - mean)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def update(
     road_: Packed,
     ensembles_: Packed,
@@ -181,7 +182,7 @@ def update(
             _restart(road, ensembles, e)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _update_members(
     road: RoadArrays,
     ensembles: Ensembles,
@@ -233,7 +234,7 @@ def _update_members(
     return is_finite(members)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _update_locally(
     ensembles: Ensembles,
     e: int,
@@ -256,7 +257,7 @@ def _update_locally(
     return is_finite(members)
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@kernel_part(fastmath={"contract"})
 def _compare(
     road: RoadArrays,
     ensembles: Ensembles,
@@ -302,7 +303,7 @@ def _compare(
     return differences, noise
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _taper(ensembles: Ensembles, rows: IntArray, joint: FloatArray, gain: FloatArray) -> None:
     """Weigh covariances among outputs, and those with the states, by distance."""
     for i in range(joint.shape[0]):
@@ -313,7 +314,7 @@ def _taper(ensembles: Ensembles, rows: IntArray, joint: FloatArray, gain: FloatA
             gain[i, j] *= weights[j]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def summarise(road_: Packed, members: FloatArray, n: int, out: FloatArray) -> None:
     """Write density and speed of the mean and the deviations of members to `out` `(4, n, S)`."""
     road = RoadArrays(*road_)

@@ -9,11 +9,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from dptse_env.estimators.localisation import RowTapers, positions
 from dptse_env.model import ARZModel
 from dptse_env.utils.arrays import FloatArray, IntArray
+from dptse_env.utils.kernels import kernel_part
 
 
 class Near(NamedTuple):
@@ -42,7 +42,7 @@ def make_near(model: ARZModel, tapers: RowTapers, reach: float) -> Near:
     )
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
+@kernel_part(fastmath={"contract", "reassoc"})
 def _product(one: FloatArray, other: FloatArray) -> float:
     total = 0.0
     for j in range(one.size):
@@ -50,7 +50,7 @@ def _product(one: FloatArray, other: FloatArray) -> float:
     return total
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def joint_band(
     near: Near,
     among: FloatArray,
@@ -97,7 +97,7 @@ def joint_band(
     return outputs, first, band
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@kernel_part(fastmath={"contract"})
 def solve_band(outputs: IntArray, first: IntArray, band: FloatArray, right: FloatArray) -> bool:
     """Replace rows of `right` by `S^-1 right`, S by its factor; return whether it has one."""
     n, reach = band.shape[0], band.shape[1] - 1
@@ -130,7 +130,7 @@ def solve_band(outputs: IntArray, first: IntArray, band: FloatArray, right: Floa
     return True
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@kernel_part(fastmath={"contract"})
 def move_members(
     near: Near,
     tapers: FloatArray,

@@ -11,16 +11,16 @@ lies beyond `last` is zero.
 """
 
 import numpy as np
-from numba import njit
 
 from dptse_env.utils.arrays import FloatArray, IntArray
+from dptse_env.utils.kernels import kernel_part
 
 SPARE = 4  # numbers at the end of a row that hold no entry
 # Relative change below which a row of a factor counts as unchanged: a few roundings.
 UNCHANGED = 1e-12
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def close_envelope(first: IntArray, last: IntArray) -> None:
     """Write the last column of every row of the factor, and lower `first` to never decrease."""
     for j in range(first.size - 2, -1, -1):
@@ -34,7 +34,7 @@ def close_envelope(first: IntArray, last: IntArray) -> None:
     last[i : first.size] = first.size - 1
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@kernel_part(fastmath={"contract"})
 def _eliminate(
     factor: FloatArray, first: IntArray, last: IntArray, i: int, row: FloatArray
 ) -> bool:
@@ -62,7 +62,7 @@ def _eliminate(
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def factorise(matrix: FloatArray, first: IntArray, last: IntArray, factor: FloatArray) -> bool:
     """Write the factor U of a matrix `(N, width)`; return whether all pivots are sound."""
     for i in range(first.size):
@@ -74,7 +74,7 @@ def factorise(matrix: FloatArray, first: IntArray, last: IntArray, factor: Float
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def refactorise(
     matrix: FloatArray,
     first: IntArray,
@@ -123,7 +123,7 @@ def refactorise(
         i += 1
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@kernel_part(fastmath={"contract"})
 def _read_row(
     matrix: FloatArray, last: IntArray, free: FloatArray, i: int, row: FloatArray
 ) -> None:
@@ -138,7 +138,7 @@ def _read_row(
         row[j] = mask[j] * given[j]
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
+@kernel_part(fastmath={"contract", "reassoc"})
 def _replace(row: FloatArray, old: FloatArray, diagonal: FloatArray) -> bool:
     """Replace a row of a factor; return whether it changed by more than roundings."""
     excess = 0
@@ -150,7 +150,7 @@ def _replace(row: FloatArray, old: FloatArray, diagonal: FloatArray) -> bool:
     return excess > 0
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
+@kernel_part(fastmath={"contract", "reassoc"})
 def solve(factor: FloatArray, last: IntArray, x: FloatArray) -> None:
     """Replace x `(N,)` by `(U' U)^-1 x`."""
     n = x.size
@@ -169,7 +169,7 @@ def solve(factor: FloatArray, last: IntArray, x: FloatArray) -> None:
         rest[0] = total / row[0]
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
+@kernel_part(fastmath={"contract", "reassoc"})
 def multiply(matrix: FloatArray, last: IntArray, x: FloatArray, out: FloatArray) -> None:
     """Write the product of a matrix `(N, width)` and x `(N,)`."""
     out[:] = 0.0
@@ -182,7 +182,7 @@ def multiply(matrix: FloatArray, last: IntArray, x: FloatArray, out: FloatArray)
         out[i] += total + row[0] * a
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@kernel_part(fastmath={"contract"})
 def solve_many(factor: FloatArray, last: IntArray, x: FloatArray) -> None:
     """Replace each column of x `(N, m)` by `(U' U)^-1` times it."""
     n, m = x.shape
@@ -206,7 +206,7 @@ def solve_many(factor: FloatArray, last: IntArray, x: FloatArray) -> None:
             here[k] *= inverse
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
+@kernel_part(fastmath={"contract", "reassoc"})
 def invert(factor: FloatArray, last: IntArray, inverse: FloatArray, work: FloatArray) -> None:
     """Write the entries of `(U' U)^-1` where the factor has entries (Takahashi et al., 1973).
 

@@ -10,11 +10,11 @@ stays as it is.
 """
 
 import numpy as np
-from numba import njit
 
 from dptse_env.estimators.compiled.envelope import factorise, multiply, solve
 from dptse_env.estimators.compiled.road_order import Space
 from dptse_env.utils.arrays import FloatArray
+from dptse_env.utils.kernels import kernel_part
 
 ROUNDS = 50
 # The natural residual at which the bounds that bind show.
@@ -26,7 +26,7 @@ INSIDE, CENTRED = 0.01, 0.1
 SHORT = 0.995
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def approach(
     space: Space, start: int, end: int, low: FloatArray, high: FloatArray, x: FloatArray,
     slope: FloatArray,
@@ -100,7 +100,7 @@ def approach(
     return rounds
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _longest(
     step: FloatArray,
     below: FloatArray,

@@ -1,13 +1,15 @@
 """Compiled kernels of the moving horizon estimator, episode by episode."""
 
+import math
+
 import numpy as np
-from numba import njit
 
 from dptse_env.estimators.compiled import ekf_kernels as kernels
 from dptse_env.estimators.compiled.active_set import make_active_set, minimise
 from dptse_env.estimators.compiled.chain import make_window_scratch
 from dptse_env.estimators.compiled.ekf_kernels import Filters, Packed, process_noise, project
 from dptse_env.estimators.compiled.ekf_rows import released, row_variances
+from dptse_env.estimators.compiled.moments import is_finite
 from dptse_env.estimators.compiled.stages import (
     UNSOLVED,
     Windows,
@@ -21,21 +23,23 @@ from dptse_env.estimators.compiled.window import factorise
 from dptse_env.model.kernels import advance, make_scratch
 from dptse_env.model.road_arrays import RoadArrays
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+from dptse_env.utils.kernel_loops import all_finite, any_of, copy_matrix, copy_vector
+from dptse_env.utils.kernels import kernel, kernel_part
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def restart(filters_: Packed, windows_: Packed, episode: int) -> None:
     """Reset an episode to a window of a single stage, its prior."""
     filters, windows = Filters(*filters_), Windows(*windows_)
     kernels.restart(filters, episode)
     windows.length[episode], windows.updated[episode] = 1, 0
-    windows.arrival_variance[episode] = filters.initial_variance
+    copy_vector(filters.initial_variance, windows.arrival_variance[episode])
     enter(filters, windows, episode, 0)
-    windows.point[episode] = windows.solution[episode, 0]
+    copy_vector(windows.solution[episode, 0], windows.point[episode])
     windows.rounds[episode] = 0
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def predict(
     road_: Packed, filters_: Packed, windows_: Packed, episodes: IntArray, inputs: FloatArray
 ) -> None:
@@ -49,24 +53,25 @@ def predict(
         if windows.length[e] == windows.solution.shape[1]:  # there was no update
             shift(windows, e)
         length, point = windows.length[e], windows.point[e]
-        point[:] = 0.0
-        for t in range(length):
-            point += windows.solution[e, t]
-        point /= length
-        state[:] = filters.means[e]
+        for i in range(point.size):
+            total = 0.0
+            for t in range(length):
+                total += windows.solution[e, t, i]
+            point[i] = total / length
+        copy_vector(filters.means[e], state)
         process_noise(road, filters, state, windows.process_variance[e, length - 1])
         project(road, state, False)
         advance(road, state, inputs[k], state, blocks, scratch)
         project(road, state, filters.is_box)
-        filters.means[e] = state
-        windows.inputs[e, length - 1] = inputs[k]
+        copy_vector(state, filters.means[e])
+        copy_vector(inputs[k], windows.inputs[e, length - 1])
         if not windows.along:
             linearise_step(road, filters, windows, e, length - 1, point)
         windows.length[e] = length + 1
         enter(filters, windows, e, length)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def write_sides(windows: Windows, e: int, z: FloatArray) -> None:
     """Write at which bound each variable of a solution `(L, padded)` is."""
     for t in range(windows.length[e]):
@@ -75,7 +80,7 @@ def write_sides(windows: Windows, e: int, z: FloatArray) -> None:
             windows.side[e, t, i] = int(at_upper) - int(at_lower)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def update(
     road_: Packed,
     filters_: Packed,
@@ -98,21 +103,21 @@ def update(
         )
         length, chain = windows.length[e], chain_of(windows, e)
         if sound and factorise(road, chain, length, scratch):
-            filters.covariances[e] = scratch.factors[length - 1]
+            copy_matrix(scratch.factors[length - 1], filters.covariances[e])
             innovate(road, filters, windows, e, scratch.before)
-            if observed[k].any():
+            if any_of(observed[k]):
                 side = windows.side[e, : capacity - 1]
-                active.side[:] = side
+                copy_matrix(side, active.side)
                 z = windows.solution[e].copy()
                 rounds = minimise(
                     road, chain, length, scratch, windows.lower, windows.upper, active, z
                 )
                 windows.rounds[e] = rounds
                 if rounds != UNSOLVED:
-                    side[:] = active.side
+                    copy_matrix(active.side, side)
                     accept(road, filters, windows, e, z)
             # An optimum that is not finite has no residual and counts as unsolved.
-            sound = bool(np.isfinite(filters.covariances[e]).all())
+            sound = is_finite(filters.covariances[e])
         else:
             sound = False
         filters.diverged[e] = not sound
@@ -120,7 +125,7 @@ def update(
             restart(filters_, windows_, e)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def enter_measurements(
     road: RoadArrays,
     filters: Filters,
@@ -135,15 +140,15 @@ def enter_measurements(
     if windows.length[e] == windows.solution.shape[1]:
         shift(windows, e)
     last = windows.length[e] - 1
-    windows.observed[e, last] = observed
-    windows.centre[e, last] = centre
+    copy_vector(observed, windows.observed[e, last])
+    copy_vector(centre, windows.centre[e, last])
     windows.rounds[e] = 0
     sound = _measure(road, filters, windows, e, values, sigma)
     _linearise(road, filters, windows, e)
     return sound
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _linearise(road: RoadArrays, filters: Filters, windows: Windows, e: int) -> None:
     """Linearise the last stage, or all stages where that is along the solution."""
     last = windows.length[e] - 1
@@ -157,7 +162,7 @@ def _linearise(road: RoadArrays, filters: Filters, windows: Windows, e: int) -> 
             linearise_step(road, filters, windows, e, t, point)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _measure(
     road: RoadArrays,
     filters: Filters,
@@ -168,7 +173,7 @@ def _measure(
 ) -> bool:
     """Write values and noise of the last stage; return whether they and the mean are finite."""
     last, mean = windows.length[e] - 1, filters.means[e]
-    sound = bool(np.isfinite(mean).all())
+    sound = all_finite(mean)
     for m in range(road.row_first.size):
         first, span = road.row_first[m], road.row_span[m]
         for j in range(2):
@@ -176,7 +181,7 @@ def _measure(
             value = values[m, j] / unit if windows.observed[e, last, m] else 0.0
             windows.values[e, last, m, j] = value
             windows.noise[e, last, m, j] = (sigma[m, j] / unit) ** 2
-            sound = sound and bool(np.isfinite(value))
+            sound = sound and math.isfinite(value)
         density = 0.0
         for s in range(first, first + span):
             density += mean[2 * s]
@@ -184,17 +189,17 @@ def _measure(
     return sound
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def accept(road: RoadArrays, filters: Filters, windows: Windows, e: int, z: FloatArray) -> None:
     """Accept a solution `(L, padded)`, whose last state is the estimate."""
-    windows.solution[e] = z
+    copy_matrix(z, windows.solution[e])
     last = windows.length[e] - 1
     for i in range(windows.units.size):
         filters.means[e, i] = z[last, i] * windows.units[i]
     project(road, filters.means[e], filters.is_box)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def innovate(
     road: RoadArrays, filters: Filters, windows: Windows, e: int, before: FloatArray
 ) -> None:

@@ -1,12 +1,12 @@
 """Statistics of the members of an ensemble, whose numbers lie in rows; compiled."""
 
 import numpy as np
-from numba import njit
 
 from dptse_env.utils.arrays import FloatArray
+from dptse_env.utils.kernels import kernel_part
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
+@kernel_part(fastmath={"contract", "reassoc"})
 def mean_of(row: FloatArray, n: int) -> float:
     """Return the mean of the first n relative to the first, exact for equal numbers."""
     first, total = row[0], 0.0
@@ -15,7 +15,7 @@ def mean_of(row: FloatArray, n: int) -> float:
     return float(first + total / n)
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
+@kernel_part(fastmath={"contract", "reassoc"})
 def moments_of(row: FloatArray, n: int) -> tuple[float, float]:
     """Return mean and standard deviation of the first n."""
     mean, total = mean_of(row, n), 0.0
@@ -24,7 +24,7 @@ def moments_of(row: FloatArray, n: int) -> tuple[float, float]:
     return mean, np.sqrt(total / (n - 1))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def centre_row(row: FloatArray, n: int, unit: float, out: FloatArray) -> float:
     """Write distances from the mean, zero beyond n, and return the mean, both over `unit`."""
     mean, inverse = mean_of(row, n), 1.0 / unit
@@ -34,7 +34,7 @@ def centre_row(row: FloatArray, n: int, unit: float, out: FloatArray) -> float:
     return mean * inverse
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
+@kernel_part(fastmath={"contract", "reassoc"})
 def is_finite(matrix: FloatArray) -> bool:
     """Return whether all numbers of a matrix are finite."""
     total = 0.0

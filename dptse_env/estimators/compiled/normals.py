@@ -12,9 +12,11 @@ from typing import Any
 
 import numpy as np
 from llvmlite import ir  # type: ignore[import-untyped]
-from numba import njit, types
+from numba import types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
+
+from dptse_env.utils.kernels import kernel_part
 
 Stream = NDArray[np.uint64]  # (4, STREAM_WIDTH)
 Bits = NDArray[np.uint64]
@@ -40,7 +42,7 @@ def make_stream(generator: np.random.Generator) -> Stream:
     return generator.integers(0, 2**64 - 1, size=(4, STREAM_WIDTH), dtype=np.uint64, endpoint=True)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def make_bits(n: int) -> Bits:
     """Allocate the scratch space of `fill` for up to n numbers."""
     return np.empty(-(-n // (2 * STREAM_WIDTH)) * STREAM_WIDTH, dtype=np.uint64)
@@ -66,7 +68,7 @@ _tuple_of: Any = types.UniTuple  # untyped
 _split: Any = intrinsic(_split_of)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _draw_bits(stream: Stream, out: Bits) -> None:
     """Fill `out`, in complete blocks of STREAM_WIDTH, by xoshiro256++."""
     first, second, third, fourth = stream[0], stream[1], stream[2], stream[3]
@@ -84,7 +86,7 @@ def _draw_bits(stream: Stream, out: Bits) -> None:
             fourth[i] = (d << np.uint64(45)) | (d >> np.uint64(19))
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@kernel_part(fastmath={"contract"})
 def _transform(bits: Bits, first: Draws, second: Draws) -> None:
     """Turn each number into two normals: its upper half gives the radius, the lower the angle."""
     for i in range(bits.size):
@@ -107,7 +109,7 @@ def _transform(bits: Bits, first: Draws, second: Draws) -> None:
         second[i] = radius * (sine * a + a)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def fill(stream: Stream, out: Draws, bits: Bits) -> None:
     """Fill `out` with standard normal numbers and advance the stream.
 

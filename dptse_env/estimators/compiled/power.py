@@ -4,8 +4,10 @@ from typing import Any
 
 import numpy as np
 from llvmlite import ir  # type: ignore[import-untyped]
-from numba import njit, types
+from numba import types
 from numba.extending import intrinsic
+
+from dptse_env.utils.kernels import inline_part
 
 _ROOT_HALF = 0x3FE6A09E667F3BCD  # bits of sqrt(1/2)
 _SHIFT = 6755399441055744.0  # 1.5 * 2^52: adding it rounds, and leaves the integer in the low bits
@@ -39,7 +41,7 @@ _bits: Any = intrinsic(_bits_of)
 _float: Any = intrinsic(_float_of)
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@inline_part
 def power(base: float, exponent: float) -> float:
     """Return `base ** exponent` to a few units in the last place, for exponents from 0.05 to 10.
 

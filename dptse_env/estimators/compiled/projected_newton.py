@@ -9,7 +9,6 @@ may become short.
 """
 
 import numpy as np
-from numba import njit
 
 from dptse_env.estimators.compiled.chain import Chain
 from dptse_env.estimators.compiled.envelope import refactorise, solve
@@ -18,6 +17,8 @@ from dptse_env.estimators.compiled.window import gradient, natural_residual
 from dptse_env.estimators.horizon import AT_BOUND
 from dptse_env.model.road_arrays import RoadArrays
 from dptse_env.utils.arrays import FloatArray
+from dptse_env.utils.kernel_loops import copy_matrix
+from dptse_env.utils.kernels import kernel_part
 
 TRIALS = 40  # most lengths of a step that are tried in a round
 # The natural residual above which a solution is corrected again, the largest accepted one, and the
@@ -26,7 +27,7 @@ REFINED, ACCEPTED, NEAR = 3e-13, 1e-9, 1e-7
 SUFFICIENT = 1e-4  # share of the fall along the gradient that is enough (Armijo, 1966)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def descend(
     road: RoadArrays,
     chain: Chain,
@@ -77,12 +78,13 @@ def descend(
             return True, turn + 1  # no better than it was, which is good enough
         if not is_found:
             return False, turn + 1
-        z[:], slope[:] = trial, trial_slope
+        copy_matrix(trial, z)
+        copy_matrix(trial_slope, slope)
     space.vector[:] = 0.0
     return residual <= ACCEPTED, n_rounds
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _find_direction(
     n_stages: int,
     order: Order,
@@ -116,7 +118,7 @@ def _find_direction(
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _move(
     n_stages: int,
     order: Order,
@@ -134,7 +136,7 @@ def _move(
             out[t, i] = _clip(z[t, i] - length * step, lower[i], upper[i])
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _clip(value: float, low: float, high: float) -> float:
     """Clip to bounds; near one it is the bound: speeds are quotients of components."""
     if value < low + AT_BOUND:
@@ -142,7 +144,7 @@ def _clip(value: float, low: float, high: float) -> float:
     return high if value > high - AT_BOUND else value
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _falls(
     n_stages: int,
     n: int,

@@ -6,7 +6,6 @@ proportion to the road, and the others are computed where they are asked for.
 """
 
 import numpy as np
-from numba import njit
 
 from dptse_env.estimators.compiled.chain import Chain
 from dptse_env.estimators.compiled.ekf_kernels import Filters, Packed
@@ -24,9 +23,11 @@ from dptse_env.estimators.compiled.road_program import minimise
 from dptse_env.estimators.compiled.stages import UNSOLVED, Windows, chain_of
 from dptse_env.model.road_arrays import RoadArrays
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+from dptse_env.utils.kernel_loops import any_of
+from dptse_env.utils.kernels import kernel, kernel_part
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def update(
     road_: Packed,
     filters_: Packed,
@@ -49,14 +50,14 @@ def update(
         )
         chain = chain_of(windows, e)
         sound = sound and _spread(road, filters, windows, order, e, chain, space)
-        if sound and observed[k].any():
+        if sound and any_of(observed[k]):
             _solve(road, filters, windows, order, e, chain, space)
         filters.diverged[e] = not sound
         if not sound:
             restart(filters_, windows_, e)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def solve(
     road_: Packed,
     filters_: Packed,
@@ -75,7 +76,7 @@ def solve(
             _solve(road, filters, windows, order, e, chain, space)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _assemble(road: RoadArrays, chain: Chain, n_stages: int, order: Order, space: Space) -> bool:
     """Write H and its factor; return whether it has one."""
     assemble(road, chain, n_stages, order, space)
@@ -84,7 +85,7 @@ def _assemble(road: RoadArrays, chain: Chain, n_stages: int, order: Order, space
     return factorise(space.matrix, first, space.last, space.factor)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _solve(
     road: RoadArrays,
     filters: Filters,
@@ -103,7 +104,7 @@ def _solve(
         accept(road, filters, windows, e, z)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _spread(
     road: RoadArrays,
     filters: Filters,
@@ -143,7 +144,7 @@ def _spread(
     return bool(np.isfinite(total))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _copy_block(
     order: Order, length: int, inverse: FloatArray, s: int, c: int, covariance: FloatArray
 ) -> None:
@@ -154,7 +155,7 @@ def _copy_block(
             covariance[i, j] = covariance[j, i] = inverse[min(p, q), abs(p - q)]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def write_covariance(
     road_: Packed, filters_: Packed, windows_: Packed, order_: Packed, space_: Packed, e: int
 ) -> None:

@@ -6,16 +6,16 @@ vanish, since a flow depends on either demand or supply. All quantities are norm
 """
 
 import numpy as np
-from numba import njit
 
 from dptse_env.estimators.compiled.chain import Chain
 from dptse_env.estimators.compiled.envelope import close_envelope
 from dptse_env.estimators.compiled.road_order import Order, Space, place
 from dptse_env.model.road_arrays import RoadArrays
 from dptse_env.utils.arrays import FloatArray, IntArray
+from dptse_env.utils.kernels import kernel_part
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def assemble(road: RoadArrays, chain: Chain, n_stages: int, order: Order, space: Space) -> None:
     """Write H without the last stage's measurements; `first` and `last` also have room for them."""
     n_variables, last_stage = n_stages * chain.arrival.size, n_stages - 1
@@ -48,7 +48,7 @@ def assemble(road: RoadArrays, chain: Chain, n_stages: int, order: Order, space:
     close_envelope(first, space.last[:n_variables])
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _list_step(
     road: RoadArrays,
     chain: Chain,
@@ -84,7 +84,7 @@ def _list_step(
     return m
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _add(matrix: FloatArray, first: IntArray, i: int, j: int, value: float) -> None:
     """Add to entry (i, j) of a symmetric matrix in a band, and make room for it."""
     upper, column = min(i, j), max(i, j)
@@ -92,7 +92,7 @@ def _add(matrix: FloatArray, first: IntArray, i: int, j: int, value: float) -> N
     first[column] = min(first[column], upper)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def add_rows(
     road: RoadArrays,
     chain: Chain,

@@ -12,13 +12,13 @@ from contextlib import contextmanager
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from dptse_env.estimators.compiled.envelope import SPARE
 from dptse_env.estimators.localisation import positions
 from dptse_env.model import ARZModel
 from dptse_env.model.road_arrays import RoadArrays
 from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray, IntArray
+from dptse_env.utils.kernels import kernel, kernel_part
 
 
 class Order(NamedTuple):
@@ -74,7 +74,7 @@ def make_order(model: ARZModel, road: RoadArrays, n_stages: int) -> Order:
     )
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def make_space(order: Order, n_stages: int) -> Space:
     """Allocate the working space of windows of up to L stages."""
     n = n_stages * order.before.size
@@ -123,13 +123,13 @@ class Spaces:
             self._idle.append(space)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def place(order: Order, n_stages: int, t: int, i: int) -> int:
     """Return the place of component i of stage t among the variables of a window of L stages."""
     return int(n_stages * order.before[i] + t * order.stride[i] + order.within[i])
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def write_line(order: Order, n_stages: int, table: FloatArray, line: FloatArray) -> None:
     """Write a table by stage and component `(L, padded)` as a line along the road `(N,)`."""
     for t in range(n_stages):
@@ -137,7 +137,7 @@ def write_line(order: Order, n_stages: int, table: FloatArray, line: FloatArray)
             line[place(order, n_stages, t, i)] = table[t, i]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def read_line(order: Order, n_stages: int, line: FloatArray, table: FloatArray) -> None:
     """Write a line along the road `(N,)` as a table by stage and component `(L, padded)`."""
     for t in range(n_stages):

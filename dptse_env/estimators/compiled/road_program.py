@@ -8,7 +8,6 @@ arrives.
 """
 
 import numpy as np
-from numba import njit
 
 from dptse_env.estimators.compiled.chain import Chain
 from dptse_env.estimators.compiled.envelope import factorise
@@ -20,6 +19,7 @@ from dptse_env.estimators.compiled.window import gradient
 from dptse_env.estimators.horizon import AT_BOUND
 from dptse_env.model.road_arrays import RoadArrays
 from dptse_env.utils.arrays import BoolArray, FloatArray
+from dptse_env.utils.kernels import kernel_part
 
 # The projected Newton method is tried again and again. Before each attempt but the first the
 # interior-point method is applied in places that begin and end so many segments from a component
@@ -30,7 +30,7 @@ ROUNDS = (12, 20, 20, 20, 40)
 HALVINGS = (0, 30, 30, 30, 400)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def minimise(
     road: RoadArrays,
     chain: Chain,
@@ -70,7 +70,7 @@ def minimise(
     return UNSOLVED
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _approach(
     road: RoadArrays,
     chain: Chain,
@@ -117,7 +117,7 @@ def _approach(
     return rounds
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _mark(x: FloatArray, low: FloatArray, high: FloatArray, reach: int) -> BoolArray:
     """Return which components are within a reach of one that is outside of its bounds."""
     is_near = np.zeros(x.size, np.bool_)

@@ -1,13 +1,12 @@
 """Compiled outputs of many states: averages over neighbouring segments, as rows measure them."""
 
-from numba import njit
-
 from dptse_env.estimators.compiled.state_batch import released_by_states
 from dptse_env.model.road_arrays import RoadArrays
 from dptse_env.utils.arrays import FloatArray
+from dptse_env.utils.kernels import kernel_part
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@kernel_part(fastmath={"contract"})
 def average_outputs(
     road: RoadArrays,
     states: FloatArray,

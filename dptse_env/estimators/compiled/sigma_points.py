@@ -8,11 +8,10 @@ states and measurements is positive semidefinite by construction, also of projec
 
 from typing import NamedTuple
 
-from numba import njit
-
 from dptse_env.estimators.compiled.algebra import mirror
 from dptse_env.estimators.compiled.dense import products
 from dptse_env.utils.arrays import BoolArray, FloatArray
+from dptse_env.utils.kernels import kernel_part
 
 
 class Points(NamedTuple):
@@ -31,7 +30,7 @@ class Points(NamedTuple):
     spread: float  # points are the mean plus and minus spread times columns of a root of P
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def draw(points: Points, e: int, mean: FloatArray, root: FloatArray) -> None:
     """Write one episode's points of a mean and the upper root of its covariance."""
     states, n = points.states[e], mean.size
@@ -45,7 +44,7 @@ def draw(points: Points, e: int, mean: FloatArray, root: FloatArray) -> None:
             row[1 + n + k] -= shift
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
+@kernel_part(fastmath={"contract", "reassoc"})
 def distances_from_first(row: FloatArray, scale: float, weight: float, out: FloatArray) -> float:
     """Write normalised distances from the first point and return their weighted sum."""
     first, inverse, total = row[0], 1.0 / scale, 0.0
@@ -55,7 +54,7 @@ def distances_from_first(row: FloatArray, scale: float, weight: float, out: Floa
     return weight * total
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@kernel_part(fastmath={"contract"})
 def gather(
     points: Points,
     e: int,

@@ -3,7 +3,6 @@
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from dptse_env.estimators.compiled.chain import Chain
 from dptse_env.estimators.compiled.ekf_kernels import Filters, normalise, project
@@ -11,6 +10,8 @@ from dptse_env.estimators.compiled.ekf_rows import released
 from dptse_env.model.kernels import advance, make_scratch
 from dptse_env.model.road_arrays import RoadArrays
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+from dptse_env.utils.kernel_loops import copy_blocks, copy_matrix, copy_vector
+from dptse_env.utils.kernels import kernel_part
 
 UNSOLVED = -1  # instead of a number of rounds
 
@@ -49,7 +50,7 @@ class Windows(NamedTuple):
     along: bool  # whether to linearise along the last solution
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def enter(filters: Filters, windows: Windows, e: int, t: int) -> None:
     """Add the mean as a stage without measurements."""
     for i in range(windows.units.size):
@@ -60,29 +61,29 @@ def enter(filters: Filters, windows: Windows, e: int, t: int) -> None:
     windows.noise[e, t] = 1.0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def shift(windows: Windows, e: int) -> None:
     """Drop the oldest stage."""
     windows.length[e] -= 1
-    windows.arrival_variance[e] = windows.moving_variance
+    copy_vector(windows.moving_variance, windows.arrival_variance[e])
     for t in range(windows.solution.shape[1] - 1):
-        windows.predicted[e, t] = windows.predicted[e, t + 1]
-        windows.inputs[e, t] = windows.inputs[e, t + 1]
-        windows.process_variance[e, t] = windows.process_variance[e, t + 1]
-        windows.blocks[e, t] = windows.blocks[e, t + 1]
-        windows.by_factor[e, t] = windows.by_factor[e, t + 1]
-        windows.offsets[e, t] = windows.offsets[e, t + 1]
-        windows.observed[e, t] = windows.observed[e, t + 1]
-        windows.values[e, t] = windows.values[e, t + 1]
-        windows.noise[e, t] = windows.noise[e, t + 1]
-        windows.centre[e, t] = windows.centre[e, t + 1]
-        windows.slopes[e, t] = windows.slopes[e, t + 1]
-        windows.constants[e, t] = windows.constants[e, t + 1]
-        windows.solution[e, t] = windows.solution[e, t + 1]
-        windows.side[e, t] = windows.side[e, t + 1]
+        copy_vector(windows.predicted[e, t + 1], windows.predicted[e, t])
+        copy_vector(windows.inputs[e, t + 1], windows.inputs[e, t])
+        copy_vector(windows.process_variance[e, t + 1], windows.process_variance[e, t])
+        copy_blocks(windows.blocks[e, t + 1], windows.blocks[e, t])
+        copy_matrix(windows.by_factor[e, t + 1], windows.by_factor[e, t])
+        copy_vector(windows.offsets[e, t + 1], windows.offsets[e, t])
+        copy_vector(windows.observed[e, t + 1], windows.observed[e, t])
+        copy_matrix(windows.values[e, t + 1], windows.values[e, t])
+        copy_matrix(windows.noise[e, t + 1], windows.noise[e, t])
+        copy_vector(windows.centre[e, t + 1], windows.centre[e, t])
+        copy_matrix(windows.slopes[e, t + 1], windows.slopes[e, t])
+        copy_vector(windows.constants[e, t + 1], windows.constants[e, t])
+        copy_vector(windows.solution[e, t + 1], windows.solution[e, t])
+        copy_vector(windows.side[e, t + 1], windows.side[e, t])
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _physical(road: RoadArrays, windows: Windows, point: FloatArray) -> FloatArray:
     """Return the state in the cone nearest to a normalised point."""
     state = np.empty(windows.units.size)
@@ -92,7 +93,7 @@ def _physical(road: RoadArrays, windows: Windows, point: FloatArray) -> FloatArr
     return state
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def linearise_step(
     road: RoadArrays, filters: Filters, windows: Windows, e: int, t: int, point: FloatArray
 ) -> None:
@@ -114,10 +115,10 @@ def linearise_step(
         offsets[2 * c] /= scale
         offsets[2 * c + 1] /= scale * v_f
     normalise(road, scale, blocks, by_factor)
-    windows.by_factor[e, t] = by_factor[: state.size - n]
+    copy_matrix(by_factor[: state.size - n], windows.by_factor[e, t])
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def linearise_measurement(
     road: RoadArrays, filters: Filters, windows: Windows, e: int, t: int, point: FloatArray
 ) -> None:
@@ -132,7 +133,7 @@ def linearise_measurement(
         windows.constants[e, t, s] = (second - by_rho * rho - by_psi * psi) / unit
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def chain_of(windows: Windows, e: int) -> Chain:
     """Return the linearised window of an episode; its arrays are views."""
     return Chain(

@@ -8,7 +8,6 @@ without a branch and compiles to vector instructions. Padding columns must also 
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from dptse_env.estimators.compiled.power import power
 from dptse_env.model.arz import (
@@ -22,6 +21,7 @@ from dptse_env.model.parameters import LARGEST_W
 from dptse_env.model.relations import VACUUM
 from dptse_env.model.road_arrays import EXIT, LINK, MERGE, RoadArrays
 from dptse_env.utils.arrays import FloatArray
+from dptse_env.utils.kernels import kernel_part
 
 
 class BatchScratch(NamedTuple):
@@ -35,7 +35,7 @@ class BatchScratch(NamedTuple):
     row: FloatArray  # (4, width)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def make_batch_scratch(road: RoadArrays, width: int) -> BatchScratch:
     """Allocate the scratch space for a road and a batch of states."""
     n = road.jam.size
@@ -43,7 +43,7 @@ def make_batch_scratch(road: RoadArrays, width: int) -> BatchScratch:
     return BatchScratch(table[0], table[1], table[2], table[3], table[4], np.empty((4, width)))
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@kernel_part(fastmath={"contract"})
 def _tabulate(
     rho_row: FloatArray,
     psi_row: FloatArray,
@@ -73,7 +73,7 @@ def _tabulate(
         root[j] = critical
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@kernel_part(fastmath={"contract"})
 def _supplies(
     w_row: FloatArray,
     root: FloatArray,
@@ -96,7 +96,7 @@ def _supplies(
         out[j] = out[j] if speed[j] >= w_row[j] * share else settled
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _merge(
     scratch: BatchScratch, c: int, down: int, other: int, jam: float, v_f: float, gamma: float
 ) -> None:
@@ -116,7 +116,7 @@ def _merge(
         flow[j] = demand[j] if total <= supply[j] or total <= 0.0 else served
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _flow_out(road: RoadArrays, scratch: BatchScratch, c: int, inputs: FloatArray) -> None:
     v_f, gamma = road.free_flow_speed, road.gamma
     kind, down, third = road.kind[c], road.parties[c, 1], road.parties[c, 2]
@@ -148,7 +148,7 @@ def _flow_out(road: RoadArrays, scratch: BatchScratch, c: int, inputs: FloatArra
         flow[j] = demand[j] if demand[j] <= supply[j] else supply[j]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _enter(
     road: RoadArrays, scratch: BatchScratch, e: int, inputs: FloatArray, states: FloatArray
 ) -> None:
@@ -170,7 +170,7 @@ def _enter(
         psi[j] += entered * w_in
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@kernel_part(fastmath={"contract"})
 def _leave(
     rho: FloatArray, psi: FloatArray, flow: FloatArray, w: FloatArray, ratio: float, pull: float,
     v_f: float,
@@ -181,7 +181,7 @@ def _leave(
         rho[j] -= gone
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@kernel_part(fastmath={"contract"})
 def _arrive(
     rho: FloatArray, psi: FloatArray, flow: FloatArray, w: FloatArray, ratio: float
 ) -> None:
@@ -191,7 +191,7 @@ def _arrive(
         psi[j] += come * w[j]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def advance_states(
     road: RoadArrays, states: FloatArray, inputs: FloatArray, scratch: BatchScratch
 ) -> None:
@@ -215,7 +215,7 @@ def advance_states(
         _arrive(states[2 * end], states[2 * end + 1], scratch.flow[start], scratch.w[start], part)
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@kernel_part(fastmath={"contract"})
 def _into_cone(
     rho_row: FloatArray, psi_row: FloatArray, jam: float, v_f: float, gamma: float
 ) -> None:
@@ -230,14 +230,14 @@ def _into_cone(
         psi_row[j] = high if psi > high else psi
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _into_box(row: FloatArray, largest: float) -> None:
     for j in range(row.size):
         value = 0.0 if row[j] < 0.0 else row[j]
         row[j] = largest if value > largest else value
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def project_states(road: RoadArrays, states: FloatArray, is_box: bool) -> None:
     """Project every column into its bounds, as `ARZModel.project`; a NaN stays NaN."""
     v_f, gamma = road.free_flow_speed, road.gamma
@@ -255,7 +255,7 @@ def project_states(road: RoadArrays, states: FloatArray, is_box: bool) -> None:
             row[j] = LARGEST_FACTOR if factor > LARGEST_FACTOR else factor
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@kernel_part(fastmath={"contract"})
 def measured_speeds(
     rho_row: FloatArray, psi_row: FloatArray, jam: float, v_f: float, gamma: float, out: FloatArray
 ) -> None:
@@ -266,7 +266,7 @@ def measured_speeds(
         out[j] = psi_row[j] / rho - v_f * power(rho * by_jam, gamma)
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@kernel_part(fastmath={"contract"})
 def released_by_states(
     road: RoadArrays,
     s: int,

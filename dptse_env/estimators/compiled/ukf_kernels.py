@@ -8,7 +8,6 @@ worse at small alpha.
 """
 
 import numpy as np
-from numba import njit
 
 from dptse_env.estimators.compiled.algebra import is_covariance, mirror
 from dptse_env.estimators.compiled.dense import eliminate
@@ -35,9 +34,11 @@ from dptse_env.estimators.compiled.ukf_outputs import (
 )
 from dptse_env.model.road_arrays import RoadArrays
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+from dptse_env.utils.kernel_loops import all_finite, copy_matrix, copy_vector
+from dptse_env.utils.kernels import kernel, kernel_part
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def predict(
     road_: Packed, filters_: Packed, points_: Packed, episodes: IntArray, inputs: FloatArray
 ) -> None:
@@ -49,7 +50,7 @@ def predict(
     for k in range(episodes.size):
         e = episodes[k]
         mean, covariance, states = filters.means[e], filters.covariances[e], points.states[e]
-        root[:] = covariance
+        copy_matrix(covariance, root)
         if not eliminate(root, n, filters.covariances.shape[2]):
             mean[:] = np.nan  # detected by the update, which resets the filter
         process_noise(road, filters, mean, points.noise[e])
@@ -57,7 +58,7 @@ def predict(
         advance_states(road, states, inputs[k], scratch)
         project_states(road, states, filters.is_box)
         gather(points, e, distances, shift, covariance)
-        mean[:] = points.centres[e]
+        copy_vector(points.centres[e], mean)
         project(road, mean, filters.is_box)
         if filters.noise_in_w:
             couple(road, filters.density_scale, mean, points.noise[e], points.coupling[e])
@@ -67,7 +68,7 @@ def predict(
         points.moved[e] = True
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def update(
     road_: Packed,
     filters_: Packed,
@@ -103,14 +104,14 @@ def update(
             points.moved[e] = False
         mean, covariance = filters.means[e], filters.covariances[e]
         filters.diverged[e] = not (
-            sound and np.isfinite(mean).all() and is_covariance(covariance, variances)
+            sound and all_finite(mean) and is_covariance(covariance, variances)
         )
         if filters.diverged[e]:
             restart(filters, e)
             points.moved[e] = False
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _stay(road: RoadArrays, filters: Filters, points: Points, e: int, work: Outputs) -> bool:
     """Make points without a prediction, after another update in the same step."""
     covariance = filters.covariances[e]
@@ -124,7 +125,7 @@ def _stay(road: RoadArrays, filters: Filters, points: Points, e: int, work: Outp
     return True
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@kernel_part(fastmath={"contract"})
 def _update_episode(
     road: RoadArrays,
     filters: Filters,
@@ -162,7 +163,7 @@ def _update_episode(
     return True
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@kernel_part(fastmath={"contract"})
 def _reduce(joint: FloatArray, width: int, start: int, covariance: FloatArray) -> None:
     """Subtract V' V from the lower half of the covariance, two rows of V at a time."""
     n = covariance.shape[0]

@@ -6,7 +6,6 @@ The numbers of m measured rows are ordered densities first, then speeds or flows
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from dptse_env.estimators.compiled.dense import products
 from dptse_env.estimators.compiled.ekf_kernels import Filters
@@ -14,6 +13,7 @@ from dptse_env.estimators.compiled.sigma_points import Points, distances_from_fi
 from dptse_env.estimators.compiled.state_batch import released_by_states
 from dptse_env.model.road_arrays import RoadArrays
 from dptse_env.utils.arrays import FloatArray, IntArray
+from dptse_env.utils.kernels import kernel_part
 
 
 class Outputs(NamedTuple):
@@ -32,13 +32,13 @@ class Outputs(NamedTuple):
     noise: FloatArray  # (M, 2) variances of the noise in both numbers, normalised
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def first_column(m: int) -> int:
     """Return the column of `Outputs.joint` where the covariances with the states begin."""
     return (2 * m + 7) // 8 * 8
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def make_outputs(n_rows: int, n_states: int, width: int) -> Outputs:
     """Allocate the scratch space of `update` for points `(n_states, width)`."""
     # An odd number of cache lines, so that the numbers of a column lie in different cache sets.
@@ -50,7 +50,7 @@ def make_outputs(n_rows: int, n_states: int, width: int) -> Outputs:
     )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def row_noise(
     road: RoadArrays,
     filters: Filters,
@@ -69,7 +69,7 @@ def row_noise(
             noise[i, 0] += filters.count_variance[r] * density / road.row_span[r]
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@kernel_part(fastmath={"contract"})
 def measure(
     road: RoadArrays,
     filters: Filters,
@@ -123,7 +123,7 @@ def measure(
         joint[i, i] += work.noise[i, 0]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _average_densities(
     row_first: IntArray, row_span: IntArray, rows: IntArray, start: int, joint: FloatArray
 ) -> None:
@@ -143,7 +143,7 @@ def _average_densities(
                 joint[j, m + i] = _average(joint, m + i, column, span)
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@kernel_part(fastmath={"contract"})
 def _add_flows(
     road: RoadArrays,
     row: int,
@@ -162,7 +162,7 @@ def _add_flows(
         out[j] /= span
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@kernel_part(fastmath={"contract"})
 def _density_row(
     points: Points, covariance: FloatArray, e: int, first: int, span: int, out: FloatArray
 ) -> None:
@@ -186,7 +186,7 @@ def _density_row(
         out[j] /= span
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _average(table: FloatArray, i: int, column: int, span: int) -> float:
     """Return the average over adjacent segments of numbers in row i, of the first in `column`."""
     total = table[i, column]

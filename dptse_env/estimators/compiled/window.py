@@ -7,7 +7,6 @@ further inverses. All quantities are normalised; vectors and rows are padded as 
 """
 
 import numpy as np
-from numba import njit
 
 from dptse_env.estimators.compiled.algebra import (
     mirror,
@@ -26,9 +25,11 @@ from dptse_env.estimators.compiled.window_rows import (
 )
 from dptse_env.model.road_arrays import RoadArrays
 from dptse_env.utils.arrays import FloatArray
+from dptse_env.utils.kernel_loops import copy_matrix, copy_vector
+from dptse_env.utils.kernels import kernel_part
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def factorise(road: RoadArrays, chain: Chain, n_stages: int, scratch: WindowScratch) -> bool:
     """Filter covariances through the window; return whether all variances are sound."""
     n, width = scratch.before.shape
@@ -41,7 +42,7 @@ def factorise(road: RoadArrays, chain: Chain, n_stages: int, scratch: WindowScra
             for i in range(n):
                 P[i, i] = chain.arrival_variance[i]
         else:
-            P[:] = scratch.factors[t - 1]
+            copy_matrix(scratch.factors[t - 1], P)
             propagate(
                 road,
                 chain.blocks[t - 1],
@@ -52,7 +53,7 @@ def factorise(road: RoadArrays, chain: Chain, n_stages: int, scratch: WindowScra
                 scratch.product[1],
             )
         if t == n_stages - 1:
-            scratch.before[:] = P
+            copy_matrix(P, scratch.before)
         for m in range(road.row_first.size):
             if chain.observed[t, m] and road.row_span[m] == 1:
                 s = road.row_first[m]
@@ -66,7 +67,7 @@ def factorise(road: RoadArrays, chain: Chain, n_stages: int, scratch: WindowScra
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _update_wide(
     road: RoadArrays,
     chain: Chain,
@@ -86,7 +87,7 @@ def _update_wide(
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _write_diagonal(road: RoadArrays, chain: Chain, n_stages: int, scratch: WindowScratch) -> None:
     """Write the diagonal of H."""
     n = 2 * road.jam.size
@@ -108,7 +109,7 @@ def _write_diagonal(road: RoadArrays, chain: Chain, n_stages: int, scratch: Wind
             diagonal[n + e] += w[2 * c] * by_rho**2 + w[2 * c + 1] * by_psi**2 + w[n + e]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def gradient(road: RoadArrays, chain: Chain, n_stages: int, z: FloatArray, out: FloatArray) -> None:
     """Write H z + q / 2, half the objective's gradient, `(L, padded)`."""
     out[:n_stages] = 0.0
@@ -118,7 +119,7 @@ def gradient(road: RoadArrays, chain: Chain, n_stages: int, z: FloatArray, out: 
     _add_slope_of_steps(road, chain, n_stages, z, out)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _add_slope_of_steps(
     road: RoadArrays, chain: Chain, n_stages: int, z: FloatArray, out: FloatArray
 ) -> None:
@@ -156,7 +157,7 @@ def _add_slope_of_steps(
             out[t, n + e] -= by_rho * gap[2 * c] + by_psi * gap[2 * c + 1] + weighed
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def natural_residual(
     n_stages: int,
     diagonal: FloatArray,
@@ -176,7 +177,7 @@ def natural_residual(
     return largest
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def solve(
     road: RoadArrays,
     chain: Chain,
@@ -191,7 +192,8 @@ def solve(
     Forwards, m = A m_before + P (r - C'C/R A m_before), like a filter's mean; backwards, with the
     costate a = A' l of the next stage, d = m + P a and l = r - C'C/R d + a.
     """
-    mean, change, costate, slope = scratch.sweep
+    sweep = scratch.sweep  # taken apart one by one, so that numba knows the layout
+    mean, change, costate, slope = sweep[0], sweep[1], sweep[2], sweep[3]
     width, nothing = mean.size, np.zeros(mean.size)
     has_factors = chain.by_factor.shape[1] > 0
     mean[:] = 0.0
@@ -204,7 +206,7 @@ def solve(
         weigh(scratch.information[t], mean, right[t], change)
         if scratch.n_wide[t] > 0:
             weigh_wide(road, chain, t, scratch, mean, change)
-        out[t] = mean
+        copy_vector(mean, out[t])
         _add_product(scratch.factors[t], change, out[t])
     slope[:] = 0.0
     for t in range(n_stages - 1, -1, -1):
@@ -221,7 +223,7 @@ def solve(
             costate[i] += slope[i]
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@kernel_part(fastmath={"contract"})
 def _add_product(P: FloatArray, x: FloatArray, out: FloatArray) -> None:
     """Add P x to `out`, P symmetric."""
     n, width = P.shape
@@ -237,7 +239,7 @@ def _add_product(P: FloatArray, x: FloatArray, out: FloatArray) -> None:
             out[j] += a * upper[j] + b * lower[j]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _move(road: RoadArrays, blocks: FloatArray, x: FloatArray, out: FloatArray) -> None:
     """Write the traffic's part of A x, without what demand factors contribute."""
     for c in range(road.jam.size):
@@ -249,7 +251,7 @@ def _move(road: RoadArrays, blocks: FloatArray, x: FloatArray, out: FloatArray) 
         out[2 * c], out[2 * c + 1] = first, second
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _move_factors(road: RoadArrays, by_factor: FloatArray, x: FloatArray, out: FloatArray) -> None:
     """Add to A x what demand factors contribute, and write their own part; they stay."""
     n = 2 * road.jam.size
@@ -260,7 +262,7 @@ def _move_factors(road: RoadArrays, by_factor: FloatArray, x: FloatArray, out: F
         out[n + e] = factor
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _move_back(road: RoadArrays, blocks: FloatArray, x: FloatArray, out: FloatArray) -> None:
     """Write the traffic's part of A' x, and zeros for demand factors."""
     out[:] = 0.0
@@ -272,7 +274,7 @@ def _move_back(road: RoadArrays, blocks: FloatArray, x: FloatArray, out: FloatAr
             out[2 * b + 1] += block[1] * first + block[3] * second
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _move_factors_back(
     road: RoadArrays, by_factor: FloatArray, x: FloatArray, out: FloatArray
 ) -> None:

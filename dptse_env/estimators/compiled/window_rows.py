@@ -4,14 +4,14 @@ A row of one segment adds a 2 x 2 block to H, which is kept per segment. A row o
 adds a block that couples all of them; it is applied as a product of vectors instead.
 """
 
-from numba import njit
-
 from dptse_env.estimators.compiled.chain import Chain, WindowScratch
 from dptse_env.model.road_arrays import RoadArrays
 from dptse_env.utils.arrays import FloatArray
+from dptse_env.utils.kernel_loops import copy_vector
+from dptse_env.utils.kernels import kernel_part
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def inform(road: RoadArrays, chain: Chain, n_stages: int, scratch: WindowScratch) -> None:
     """Write the information of single segments, and list the rows of several segments."""
     for t in range(n_stages):
@@ -33,7 +33,7 @@ def inform(road: RoadArrays, chain: Chain, n_stages: int, scratch: WindowScratch
         scratch.n_wide[t] = n_wide
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def add_diagonal(road: RoadArrays, chain: Chain, n_stages: int, scratch: WindowScratch) -> None:
     """Add the diagonal of C'C/R to that of H."""
     for t in range(n_stages):
@@ -51,17 +51,17 @@ def add_diagonal(road: RoadArrays, chain: Chain, n_stages: int, scratch: WindowS
                 diagonal[2 * s + 1] += w_second * by_psi**2 / span**2
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def weigh(information: FloatArray, x: FloatArray, right: FloatArray, out: FloatArray) -> None:
     """Write right - C'C/R x of a stage, C the rows of single segments."""
-    out[:] = right
+    copy_vector(right, out)
     for s in range(information.shape[0]):
         a, b, c = information[s]
         out[2 * s] -= a * x[2 * s] + b * x[2 * s + 1]
         out[2 * s + 1] -= b * x[2 * s] + c * x[2 * s + 1]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def weigh_wide(
     road: RoadArrays,
     chain: Chain,
@@ -86,7 +86,7 @@ def weigh_wide(
             out[2 * s + 1] -= slopes[s, 1] * second
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def add_slope(
     road: RoadArrays, chain: Chain, n_stages: int, z: FloatArray, out: FloatArray
 ) -> None:

@@ -1,7 +1,6 @@
 """The step of a recurrent network, compiled, for blocks of episodes."""
 
 import numpy as np
-from numba import njit
 
 from dptse_env.estimators.learned.cells import DENSITY_RANGE, N_FIXED, SPEED_RANGE, Cells
 from dptse_env.estimators.learned.channels import (
@@ -20,12 +19,13 @@ from dptse_env.estimators.learned.network import (
     Network,
 )
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+from dptse_env.utils.kernels import inline_part, kernel, kernel_part
 
 N_CHANNELS = len(CHANNELS)
 _ONE, _TWO, _HALF = np.float32(1.0), np.float32(2.0), np.float32(0.5)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def read(
     cells: Cells,
     episodes: IntArray,
@@ -86,7 +86,7 @@ def read(
             age[episode, s] = 0.0 if sums[s, 0] > 0.0 else age[episode, s] + 1.0
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@inline_part
 def _predict_second(flows: bool, centre: float, prior: FloatArray, second: FloatArray) -> None:
     """Write the second number of a cell, its variance, and its derivatives by speed and density."""
     rho, v = prior[0], prior[1]
@@ -96,7 +96,7 @@ def _predict_second(flows: bool, centre: float, prior: FloatArray, second: Float
     second[2], second[3] = by_speed, slip
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@inline_part
 def _read_row(
     values: FloatArray,
     sigma: FloatArray,
@@ -126,7 +126,7 @@ def _read_row(
         sums[s, 1] += share
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@inline_part
 def _write(
     cells: Cells,
     s: int,
@@ -159,13 +159,13 @@ def _write(
     row[17] = 0.25 * np.log(1.0 + min(age, LONGEST_AGE))
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@inline_part
 def _correction(value: float) -> float:
     held: float = _held(value, -LARGEST_CORRECTION, LARGEST_CORRECTION)
     return held
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def advance(
     cells: Cells,
     network: Network,
@@ -211,7 +211,7 @@ def advance(
             _read_heads(row[4:8], network.heads_bias[4:8], unit, limit, ahead[episodes[i], s])
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@kernel_part(fastmath={"contract"})
 def _gate(
     g: Float32Array, q: Float32Array, g_bias: Float32Array, q_bias: Float32Array, h: Float32Array
 ) -> None:
@@ -226,7 +226,7 @@ def _gate(
         h[j] = z * h[j] + (_ONE - z) * candidate
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@inline_part
 def _tanh(x: np.float32) -> np.float32:
     """Return tanh to some 1e-7, as an expression that compiles to vector instructions.
 
@@ -242,7 +242,7 @@ def _tanh(x: np.float32) -> np.float32:
     return _TWO * t / (_ONE + t * t)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part
 def _read_heads(
     raw: Float32Array, bias: Float32Array, unit: float, limit: float, out: FloatArray
 ) -> None:
@@ -253,7 +253,7 @@ def _read_heads(
     out[3] = limit * np.exp(_held(float(raw[3] + bias[3]), LOWEST_SPREAD, HIGHEST_SPREAD))
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@inline_part
 def _held(x: float, low: float, high: float) -> float:
     held: float = min(max(x, low), high)
     return held

@@ -1,0 +1,154 @@
+"""Compiled functions: kernels, which Python calls, and the parts that kernels call.
+
+numba compiles a kernel at its first call and keeps the machine code on disk: beside the module
+where that folder is writable, else in the user's cache, or in the folder of ``NUMBA_CACHE_DIR``.
+Parts are compiled into the kernels that call them; called from Python they run as Python.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import logging
+from collections.abc import Callable, Iterator
+from functools import cache
+from types import CodeType, FunctionType, ModuleType
+from typing import Any, TypeVar, cast, overload
+
+from numba import njit, types
+from numba.core.caching import FunctionCache, NullCache
+from numba.core.registry import CPUDispatcher
+
+logger = logging.getLogger(__name__)
+
+_PACKAGE = __name__.partition(".")[0]
+
+_OPTIONS: dict[str, Any] = {"error_model": "numpy", "nogil": True, "no_cfunc_wrapper": True}
+_WITHOUT_PYTHON = {"nopython": True, "no_cpython_wrapper": True}
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def kernel(function: Function) -> Function:
+    """Compile a function that Python calls, which then runs without the interpreter's lock.
+
+    Its machine code is kept under a fingerprint of the function and of all parts and constants
+    that it reaches: a change of any of them compiles it anew.
+    """
+    compiled: Any = njit(**_OPTIONS)(function)
+    try:
+        compiled._cache = _KernelCache(function)
+    except RuntimeError:  # numba found no folder that it may write to
+        compiled._cache = _NoCache(function)
+    return cast("Function", compiled)
+
+
+@overload
+def kernel_part(function: Function, /) -> Function: ...
+@overload
+def kernel_part(**options: Any) -> Callable[[Function], Function]: ...
+def kernel_part(function: Any = None, /, **options: Any) -> Any:
+    """Let kernels call a function; ``options`` are numba's, such as `fastmath`.
+
+    A part has no entry for Python and no place on disk, which saves time when it is compiled.
+    """
+
+    def decorate(function: Any) -> Any:
+        return _Part(function, targetoptions={**_OPTIONS, **_WITHOUT_PYTHON, **options})
+
+    return decorate if function is None else decorate(function)
+
+
+def inline_part(function: Function) -> Function:
+    """Let kernels call a function whose body takes the place of each call."""
+    return cast("Function", njit(error_model="numpy", inline="always")(function))
+
+
+class _Part(CPUDispatcher):
+    """numba's dispatcher of a function whose machine code has no entry for Python."""
+
+    def add_overload(self, result: Any) -> None:
+        """Keep a compiled version for kernels, away from the table that Python calls by."""
+        self.overloads[tuple(result.signature.args)] = result
+
+    def get_call_template(self, args: Any, kws: Any) -> Any:
+        """Have one version for constants and variables of a type."""
+        kws = {name: types.unliteral(value) for name, value in kws.items()}
+        return super().get_call_template(tuple(types.unliteral(a) for a in args), kws)
+
+    def _compile_for_args(self, *args: Any, **keywords: Any) -> Any:
+        """Return the function itself where numba asks what a call from Python is to run."""
+        return self.py_func
+
+
+class _KernelCache(FunctionCache):
+    """numba's cache of a function, with the fingerprint in its keys."""
+
+    def load_overload(self, signature: Any, context: Any) -> Any:
+        """Return kept machine code; where there is none, say that compiling begins."""
+        kept = super().load_overload(signature, context)
+        if kept is None:
+            _announce(self._py_func, f"kept in {self.cache_path}")
+        return kept
+
+    def _index_key(self, signature: Any, codegen: Any) -> tuple[Any, ...]:
+        return (fingerprint(self._py_func), *super()._index_key(signature, codegen))
+
+
+class _NoCache(NullCache):
+    """The cache of a kernel where no folder can keep it."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._function = function
+
+    def load_overload(self, signature: Any, context: Any) -> None:
+        """Say that compiling begins, and how to have it once only."""
+        _announce(self._function, "for this process only: set NUMBA_CACHE_DIR to keep it")
+
+
+@cache
+def _announce(function: Callable[..., Any], fate: str) -> None:
+    """Say once in a process that a kernel is being compiled, since that takes seconds."""
+    module = function.__module__.removeprefix(f"{_PACKAGE}.")
+    logger.warning("Compiling %s.%s (%s)", module, function.__name__, fate)
+
+
+@cache
+def fingerprint(function: FunctionType) -> str:
+    """Digest of a function's code, and of the functions and constants that it uses."""
+    digest, seen, waiting = hashlib.sha256(), set(), [function]
+    while waiting:
+        following = waiting.pop()
+        if following in seen:
+            continue
+        seen.add(following)
+        for code in _codes(following.__code__):
+            constants = [c for c in code.co_consts if not isinstance(c, CodeType)]
+            digest.update(repr((code.co_code, code.co_names, code.co_varnames, constants)).encode())
+            for value in _used(following, code):
+                if isinstance(value, FunctionType):
+                    waiting.append(value)
+                else:
+                    digest.update(repr(value).encode())
+    return digest.hexdigest()
+
+
+def _codes(code: CodeType) -> Iterator[CodeType]:
+    """Yield a function's code and that of the functions inside it."""
+    yield code
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield from _codes(constant)
+
+
+def _used(function: FunctionType, code: CodeType) -> Iterator[Any]:
+    """Yield the functions that a code refers to, the fields of named tuples, and constants."""
+    values = [function.__globals__[name] for name in code.co_names if name in function.__globals__]
+    modules = [m for m in values if isinstance(m, ModuleType) and m.__name__.startswith(_PACKAGE)]
+    values += [vars(m)[name] for m in modules for name in code.co_names if name in vars(m)]
+    for value in values:
+        if callable(value):
+            inside = inspect.unwrap(value)
+            yield inside if isinstance(inside, FunctionType) else getattr(inside, "_fields", None)
+        elif not isinstance(value, ModuleType):
+            yield value

@@ -1,0 +1,111 @@
+"""Compiled functions: what is kept on disk, when it is compiled anew, and what is said then."""
+
+import importlib
+import logging
+import sys
+
+import pytest
+from numba.core.caching import FunctionCache
+
+from dptse_env.utils.kernels import fingerprint
+
+MODULE = """
+from typing import NamedTuple
+
+from dptse_env.utils.kernels import kernel, kernel_part
+
+FACTOR = 2.0
+
+
+class Pair(NamedTuple):
+    first: float
+    second: float
+
+
+@kernel_part
+def scaled(x):
+    return x * FACTOR
+
+
+@kernel
+def run(x):
+    return Pair(scaled(x), x).first
+"""
+
+
+@pytest.fixture
+def load(tmp_path, monkeypatch):
+    """Return a function that writes a module, imports it afresh and returns it."""
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+
+    def load(text=MODULE):
+        (tmp_path / "kernels_of_a_test.py").write_text(text, encoding="utf-8")
+        sys.modules.pop("kernels_of_a_test", None)
+        importlib.invalidate_caches()
+        return importlib.import_module("kernels_of_a_test")
+
+    yield load
+    sys.modules.pop("kernels_of_a_test", None)
+
+
+CHANGES = {
+    "a part": ("x * FACTOR", "x + FACTOR"),
+    "a constant": ("FACTOR = 2.0", "FACTOR = 3.0"),
+    "a number in a part": ("x * FACTOR", "x * 5.0 * FACTOR"),
+    "the kernel": (".first", ".second"),
+    "a named tuple": ("second: float", "other: float"),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_a_change_of_anything_that_a_kernel_reaches_changes_its_fingerprint(load, change):
+    before = fingerprint(load().run.py_func)
+    assert fingerprint(load(MODULE.replace(*CHANGES[change])).run.py_func) != before
+
+
+def test_the_fingerprint_is_that_of_the_code_and_not_of_the_process(load):
+    before = fingerprint(load().run.py_func)
+    assert fingerprint(load("# A comment\n" + MODULE).run.py_func) == before
+
+
+def test_a_kernel_is_kept_on_disk_and_compiled_anew_when_a_part_changes(load):
+    def fresh(text=MODULE):
+        run = load(text).run
+        return run(1.5), sum(run.stats.cache_hits.values())
+
+    assert fresh() == (3.0, 0)
+    assert fresh() == (3.0, 1)
+    assert fresh(MODULE.replace("FACTOR = 2.0", "FACTOR = 4.0")) == (6.0, 0)
+
+
+def test_compiling_is_said_once_and_loading_is_not(load, caplog):
+    with caplog.at_level(logging.WARNING, logger="dptse_env.utils.kernels"):
+        run = load().run
+        run(1.5)
+        run(2)
+        assert len(caplog.messages) == 1
+        assert "Compiling kernels_of_a_test.run (kept in" in caplog.text
+        caplog.clear()
+        load().run(1.5)
+        assert not caplog.messages
+
+
+def test_a_kernel_runs_where_no_folder_can_keep_it_and_says_so(load, monkeypatch, caplog):
+    monkeypatch.setattr(FunctionCache._impl_class, "_locator_classes", [])
+    with caplog.at_level(logging.WARNING, logger="dptse_env.utils.kernels"):
+        assert load().run(1.5) == 3.0
+    assert "for this process only: set NUMBA_CACHE_DIR" in caplog.text
+
+
+def test_a_part_runs_as_python_when_python_calls_it(load):
+    assert load().scaled(1.5) == 3.0
+    with pytest.raises(TypeError, match="can't multiply sequence"):
+        load().scaled("a")
+
+
+def test_a_part_has_one_version_for_constants_and_variables(load):
+    text = MODULE.replace("Pair(scaled(x), x).first", "scaled(x) + scaled(1.0) + scaled(2.0)")
+    module = load(text)
+    assert module.run(1.5) == 9.0
+    assert len(module.scaled.overloads) == 1
