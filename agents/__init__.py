@@ -1,7 +1,7 @@
 """Evaluation, training, search and studies on top of dptse_env. They need the extra ``train``."""
 
-import importlib.util
+from dptse_env.utils.extras import needed_for
 
-_MISSING = [name for name in ("jinja2", "rich") if importlib.util.find_spec(name) is None]
-if _MISSING:
-    raise ImportError(f"agents needs {', '.join(_MISSING)}: pip install 'dptse-env[train]'")
+with needed_for("agents"):
+    import jinja2  # noqa: F401
+    import rich  # noqa: F401

@@ -5,9 +5,11 @@ them in a folder of this package, so that an installation adds no packages of th
 folder is put on the path when a tool runs.
 """
 
-import importlib.util
+import importlib
 import sys
 from pathlib import Path
+
+from dptse_env.utils.extras import MissingExtraError, needed_for
 
 TOOLS = Path(__file__).parent / "_tools"
 """Folder of the tools in a wheel; an editable installation has them beside this package."""
@@ -26,7 +28,9 @@ def main() -> None:
     here = str(Path.cwd())
     if here not in sys.path:
         sys.path.append(here)
-    if importlib.util.find_spec("tyro") is None:
-        print("error: dptse needs more packages: pip install 'dptse-env[train]'", file=sys.stderr)
-        raise SystemExit(2)
-    importlib.import_module("scripts.dptse").main(sys.argv[1:])
+    try:
+        with needed_for("dptse"):
+            importlib.import_module("scripts.dptse").main(sys.argv[1:])
+    except MissingExtraError as problem:
+        print(f"error: {problem}", file=sys.stderr)
+        raise SystemExit(2) from problem

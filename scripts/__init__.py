@@ -1,7 +1,7 @@
 """Command-line entry points, one job each. They need the extra ``train``."""
 
-import importlib.util
+from dptse_env.utils.extras import needed_for
 
-_MISSING = [name for name in ("rich", "tyro") if importlib.util.find_spec(name) is None]
-if _MISSING:
-    raise ImportError(f"scripts needs {', '.join(_MISSING)}: pip install 'dptse-env[train]'")
+with needed_for("dptse"):
+    import rich  # noqa: F401
+    import tyro  # noqa: F401

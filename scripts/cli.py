@@ -27,6 +27,7 @@ from dptse_env.traffic import (
     RecordLibrary,
     SumoVersionError,
 )
+from dptse_env.utils.extras import MissingExtraError
 from dptse_env.utils.threads import n_cores
 
 
@@ -49,7 +50,8 @@ class Machines:
         """Return the engine.
 
         Raises:
-            EngineError: Ray is missing, or there is no suitable cluster.
+            EngineError: There is no suitable cluster.
+            MissingExtraError: Ray is not installed.
             ValueError: An argument is out of range or of another engine.
         """
         return make_engine(
@@ -85,7 +87,8 @@ class Road(Machines):
 
 
 FAILURES = (
-    OSError, ValueError, NetworkError, RecordingError, SumoVersionError, EngineError,
+    OSError, ValueError, MissingExtraError, NetworkError, RecordingError, SumoVersionError,
+    EngineError,
 )  # fmt: skip
 """Errors that end a program with their message alone."""
 
@@ -103,8 +106,8 @@ def run(
 ) -> None:
     """Parse the command line into ``arguments`` and call ``main`` with them.
 
-    Bad input, a file that cannot be read or written and a failed recording end the program with
-    status 2 and their message in one line; any other exception keeps its traceback.
+    Bad input, a missing extra, a file that cannot be read or written and a failed recording end the
+    program with status 2 and their message in one line; any other exception keeps its traceback.
 
     Args:
         main: The program.

@@ -86,8 +86,6 @@ def main(args: Args) -> None:
             Options(args.longest_gap, args.skip_start, args.skip_end, args.pause),
             {key: value for key, value in environment.items() if key != "traffic_seeds"},
         )
-    except ImportError as missing:
-        raise ValueError(str(missing)) from missing
     except KeyboardInterrupt:
         print("interrupted: nothing was written", file=sys.stderr)
         raise SystemExit(130) from None

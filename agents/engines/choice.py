@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import importlib.util
 from typing import Literal
 
-from agents.engines.engine import Engine, EngineError
+from agents.engines.engine import Engine
 from agents.engines.local import LocalProcesses
+from dptse_env.utils.extras import needed_for
 
 EngineName = Literal["local", "ray"]
 
@@ -20,17 +20,14 @@ def make_engine(name: EngineName, workers: int, address: str | None) -> Engine:
         address: Address of the cluster; see `agents.engines.ray_cluster.RayCluster`.
 
     Raises:
-        EngineError: Ray is missing, or there is no suitable cluster.
+        EngineError: There is no suitable cluster.
+        MissingExtraError: Ray is not installed.
         ValueError: An argument is out of range or of the other engine.
     """
     if name == "local":
         if address is not None:
             raise ValueError(f"address must be given with the engine ray, got {address!r}")
         return LocalProcesses(workers)
-    if importlib.util.find_spec("ray") is None:
-        raise EngineError(
-            "the engine ray needs Ray: pip install 'dptse-env[ray]', here and on all nodes"
-        )
-    from agents.engines.ray_cluster import RayCluster  # noqa: PLC0415 (Ray is optional)
-
+    with needed_for("the engine ray, here and on all nodes,"):
+        from agents.engines.ray_cluster import RayCluster  # noqa: PLC0415 (Ray is optional)
     return RayCluster(address)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from agents.evaluation.report import Report
 from agents.evaluation.watched import Watched
 from agents.files import write_atomically
+from dptse_env.utils.extras import needed_for
 
 LARGEST_PAGE = 5_000_000
 """Most bytes of a page; seconds are left out of its maps until it has no more."""
@@ -34,7 +35,7 @@ def write_page(path: Path, report: Report, watched: Sequence[Watched]) -> None:
         watched: An episode of some of them, on the same traffic.
 
     Raises:
-        ImportError: plotly is missing.
+        MissingExtraError: plotly is not installed.
         OSError: The file cannot be written.
         ValueError: There is no episode, or the page would be too large.
     """
@@ -128,11 +129,9 @@ def plotly_source() -> str:
     """Return the source of plotly.js, which the page carries along.
 
     Raises:
-        ImportError: plotly is missing.
+        MissingExtraError: plotly is not installed.
     """
-    try:
+    with needed_for("an HTML page"):
         from plotly.offline import get_plotlyjs  # noqa: PLC0415 (pages alone need it)
-    except ImportError as missing:
-        raise ImportError("a page needs plotly: pip install 'dptse-env[train]'") from missing
     source: str = get_plotlyjs()
     return source

@@ -14,6 +14,7 @@ from dptse_env.parts import make_interface
 from dptse_env.sb3.channels import RoadChannels
 from dptse_env.sb3.policy import PlackettLucePolicy
 from dptse_env.sb3.torch_modules import KERNEL_SIZE
+from dptse_env.utils.extras import needed_for
 from dptse_env.utils.validation import integer
 
 Shapes: TypeAlias = dict[str, tuple[int, ...]]
@@ -149,10 +150,10 @@ class _MaskablePerceptron(_Perceptron):
         return super().shapes(config, arguments)
 
     def make(self, config: EnvConfig, arguments: Mapping[str, Any]) -> BasePolicy:
-        # Only such a policy needs sb3-contrib.
-        from sb3_contrib.common.maskable.policies import (  # noqa: PLC0415
-            MaskableActorCriticPolicy,
-        )
+        with needed_for("a policy with masks"):  # no other one needs sb3-contrib
+            from sb3_contrib.common.maskable.policies import (  # noqa: PLC0415
+                MaskableActorCriticPolicy,
+            )
 
         policy: BasePolicy = MaskableActorCriticPolicy(
             *_spaces(config), _no_rate, ortho_init=False, **arguments

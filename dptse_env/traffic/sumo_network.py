@@ -23,6 +23,7 @@ from xml.etree import ElementTree
 
 from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.presets import SHIPPED_CORRIDORS
+from dptse_env.utils.extras import missing_extra
 
 LANE_WIDTH_M = 3.2
 RAMP_ANGLE = math.radians(45.0)  # a flat ramp would stretch the junction over half a segment
@@ -41,7 +42,7 @@ Point = tuple[float, float]
 
 
 class NetworkError(RuntimeError):
-    """A network cannot be compiled: netconvert is missing or refused it."""
+    """A network cannot be compiled: netconvert refused it."""
 
 
 class Geometry(NamedTuple):
@@ -86,7 +87,8 @@ def network_xml(corridor: Corridor) -> str:
     """Return the corridor's compiled network: the packaged one, else a fresh compilation.
 
     Raises:
-        NetworkError: The geometry is not that of a preset, and netconvert is missing or fails.
+        MissingExtraError: The geometry is not that of a preset, and netconvert is missing.
+        NetworkError: netconvert fails.
     """
     geometry = Geometry.from_corridor(corridor)
     for preset in SHIPPED_CORRIDORS:
@@ -111,7 +113,8 @@ def compile_network(geometry: Geometry) -> str:
         same geometry always gives the same text.
 
     Raises:
-        NetworkError: `eclipse-sumo` is not installed, or netconvert fails.
+        MissingExtraError: `eclipse-sumo` is not installed.
+        NetworkError: netconvert fails.
     """
     command = [str(_netconvert()), *NETCONVERT_OPTIONS]
     with tempfile.TemporaryDirectory(prefix="dptse-network-") as directory:
@@ -136,10 +139,7 @@ def _netconvert() -> Path:
     """Return the path of the netconvert of `eclipse-sumo`; SUMO_HOME is not used."""
     spec = importlib.util.find_spec("sumo")
     if spec is None or spec.origin is None:
-        raise NetworkError(
-            "a corridor with another geometry is compiled by netconvert, which comes with "
-            "eclipse-sumo: pip install 'dptse-env[corridors]'"
-        )
+        raise missing_extra("sumo", "netconvert, which compiles a corridor of another geometry,")
     suffix = ".exe" if os.name == "nt" else ""
     return Path(spec.origin).parent / "bin" / f"netconvert{suffix}"
 

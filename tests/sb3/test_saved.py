@@ -452,4 +452,4 @@ except ImportError as problem:
 def test_the_extra_is_named_where_it_is_missing(missing):
     code = WITHOUT.format(missing=missing)
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert f"{missing} is not installed: pip install 'dptse-env[train]'" in run.stdout
+    assert f"{missing}, which is not installed: pip install 'dptse-env[train]'" in run.stdout

@@ -125,7 +125,9 @@ def test_a_shell_completes_commands_and_options(shell, capsys):
 
 
 def test_without_the_extra_it_says_what_to_install(monkeypatch, capsys):
-    monkeypatch.setattr(command_line.importlib.util, "find_spec", lambda name: None)
+    for name in ("scripts", "scripts.dptse"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    monkeypatch.setitem(sys.modules, "tyro", None)
     with pytest.raises(SystemExit) as ended:
         command_line.main()
     assert ended.value.code == 2

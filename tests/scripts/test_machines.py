@@ -1,6 +1,7 @@
 """Engines on the command line."""
 
 import socket
+import sys
 
 import pytest
 
@@ -32,7 +33,8 @@ def test_a_cluster_that_does_not_answer_is_one_line(monkeypatch, capsys, tmp_pat
 
 
 def test_the_missing_extra_is_one_line(monkeypatch, capsys, tmp_path):
-    monkeypatch.setattr("agents.engines.choice.importlib.util.find_spec", lambda name: None)
+    monkeypatch.setitem(sys.modules, "ray", None)
+    monkeypatch.delitem(sys.modules, "agents.engines.ray_cluster", raising=False)
     line = refused(monkeypatch, capsys, tmp_path, "--engine", "ray")
     assert "pip install 'dptse-env[ray]'" in line
 

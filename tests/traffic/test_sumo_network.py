@@ -12,6 +12,7 @@ from dptse_env.traffic.sumo_network import (
     network_xml,
     packaged_network,
 )
+from dptse_env.utils.extras import MissingExtraError
 
 needs_netconvert = pytest.mark.skipif(
     importlib.util.find_spec("sumo") is None, reason="eclipse-sumo (extra corridors) is missing"
@@ -90,5 +91,5 @@ def test_a_missing_netconvert_names_the_extra(monkeypatch):
         return None if name == "sumo" else found(name, *rest)
 
     monkeypatch.setattr(importlib.util, "find_spec", without_sumo)
-    with pytest.raises(NetworkError, match=r"pip install 'dptse-env\[corridors\]'"):
+    with pytest.raises(MissingExtraError, match=r"pip install 'dptse-env\[corridors\]'"):
         compile_network(Geometry.from_corridor(PAPER_HIGHWAY)._replace(n_mainline=21))

@@ -99,7 +99,7 @@ def import_trajectories(
     Raises:
         ValueError: An argument is out of range, the folder exists, or a file cannot be imported
             (`TrajectoryError`); the message has its path, and the row where there is one.
-        ImportError: A library that a format needs is not installed.
+        MissingExtraError: A library that a format needs is not installed.
         OSError: The folder cannot be written.
     """
     require_name("source.format", source.format, FORMATS)

@@ -17,8 +17,8 @@ from dptse_env.traffic.importers.points import (
     require_numbers,
 )
 from dptse_env.traffic.importers.source import Source
-from dptse_env.traffic.importers.tables import EXTRA
 from dptse_env.utils.arrays import FloatArray
+from dptse_env.utils.extras import needed_for
 
 CHUNK_POINTS = 100_000
 """Points that are handed on together."""
@@ -36,15 +36,13 @@ class I24:
 
         Raises:
             TrajectoryError: The file is damaged, or a document lacks a field.
-            ImportError: ijson is not installed.
+            MissingExtraError: ijson is not installed.
         """
         problem = open_error(path)
         if problem is not None:
             raise problem
-        try:
+        with needed_for("JSON of trajectories"):
             import ijson  # noqa: PLC0415  (optional)
-        except ImportError as missing:
-            raise ImportError(f"JSON of trajectories is read by ijson: {EXTRA}") from missing
         row, waiting = 0, []
         try:
             with open_bytes(path) as file:

@@ -17,6 +17,7 @@ import numpy as np
 
 from dptse_env.traffic.importers.points import Labels, TrajectoryError, open_bytes, open_error
 from dptse_env.utils.arrays import FloatArray, IntArray
+from dptse_env.utils.extras import needed_for
 
 CHUNK_BYTES = 2 << 20
 """Bytes of a text file that are parsed at a time."""
@@ -25,7 +26,6 @@ CHUNK_ROWS = 1 << 17
 HEAD_BYTES = 1 << 16
 """Bytes at the start of a text file by which its delimiter and columns are told."""
 PARQUET = (".parquet", ".pq")
-EXTRA = "pip install 'dptse-env[corridors]'"
 
 
 class Chunk(NamedTuple):
@@ -49,14 +49,12 @@ def arrow() -> Any:
     """Return the package pyarrow.
 
     Raises:
-        ImportError: It is not installed.
+        MissingExtraError: It is not installed.
     """
-    try:
+    with needed_for("a table of trajectories"):
         for module in ("compute", "csv", "parquet"):
             importlib.import_module(f"pyarrow.{module}")
         return importlib.import_module("pyarrow")
-    except ImportError as problem:
-        raise ImportError(f"tables of trajectories are read by pyarrow: {EXTRA}") from problem
 
 
 def is_parquet(path: Path) -> bool:

@@ -2,14 +2,12 @@
 
 from dptse_env.traffic.sumo_import.configuration import Files, read_configuration, seconds
 from dptse_env.traffic.sumo_import.layout import Layout
-from dptse_env.traffic.sumo_import.net import SumolibMissingError
 from dptse_env.traffic.sumo_import.road import ImportedRoad, find_layout, import_road
 
 __all__ = [
     "Files",
     "ImportedRoad",
     "Layout",
-    "SumolibMissingError",
     "find_layout",
     "import_road",
     "read_configuration",

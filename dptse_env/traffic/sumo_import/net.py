@@ -13,7 +13,7 @@ from types import ModuleType
 from typing import Any
 from xml.etree import ElementTree
 
-from dptse_env.traffic.sumo_network import NetworkError
+from dptse_env.utils.extras import needed_for
 
 NEWEST_VERSION = (1, 20)
 """Newest version of network files that the supported release of SUMO reads."""
@@ -22,10 +22,6 @@ VEHICLE_CLASS = "passenger"
 """Lanes that this class may not use (bus lanes, hard shoulders, pavements) do not count."""
 
 GZIP_MAGIC = b"\x1f\x8b"
-
-
-class SumolibMissingError(NetworkError, ImportError):
-    """sumolib, which reads networks, is not installed."""
 
 
 _UNREADABLE = (
@@ -49,7 +45,7 @@ class Net:
 
     Raises:
         ValueError: There is no such file, or it is no network that SUMO reads.
-        SumolibMissingError: `eclipse-sumo`, which brings sumolib, is not installed.
+        MissingExtraError: `eclipse-sumo`, which brings sumolib, is not installed.
     """
 
     def __init__(self, path: Path, internal_links: bool = True) -> None:
@@ -224,11 +220,6 @@ def _check_head(path: Path) -> None:
 
 
 def _sumolib() -> ModuleType:
-    try:
+    with needed_for("a SUMO network"):
         import sumolib  # noqa: PLC0415  (heavy, and only an import needs it)
-    except ImportError as error:
-        raise SumolibMissingError(
-            "networks are read by sumolib, which comes with eclipse-sumo: "
-            "pip install 'dptse-env[corridors]'"
-        ) from error
     return sumolib  # type: ignore[no-any-return]

@@ -62,7 +62,7 @@ def find_layout(
 
     Raises:
         ValueError: The network or the path is of no use; the message names the file or the field.
-        SumolibMissingError: `eclipse-sumo` is not installed.
+        MissingExtraError: `eclipse-sumo` is not installed.
     """
     require(segment_length >= 40.0, "segment_length", "at least 40 m", segment_length)
     require(len(path) >= 1, "path", "at least one edge", list(path))

@@ -1,15 +1,16 @@
 import contextlib
 import gc
 import operator
+import sys
 import time
 import weakref
 
 import pytest
 
-from agents.engines import choice
 from agents.engines.choice import make_engine
-from agents.engines.engine import EngineError, run_tasks
+from agents.engines.engine import run_tasks
 from agents.engines.local import LocalProcesses
+from dptse_env.utils.extras import MissingExtraError
 
 
 def slow_negative(number):
@@ -112,6 +113,7 @@ def test_an_address_belongs_to_a_cluster():
 
 
 def test_the_extra_is_named_where_ray_is_missing(monkeypatch):
-    monkeypatch.setattr(choice.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(EngineError, match=r"pip install 'dptse-env\[ray\]'"):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    monkeypatch.delitem(sys.modules, "agents.engines.ray_cluster", raising=False)
+    with pytest.raises(MissingExtraError, match=r"pip install 'dptse-env\[ray\]'"):
         make_engine("ray", 1, None)
