@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 
 export OMP_NUM_THREADS = 1
 
-.PHONY: help setup docs site dist demo policy-study audit test test-slow test-gymnasium test-ray lint format benchmark wheel-test clean reproduce privacy-study ledger-study choice-study
+.PHONY: help setup docs site dist demo policy-study audit test test-slow test-gymnasium test-lowest test-ray lint format benchmark wheel-test clean reproduce privacy-study ledger-study choice-study
 
 help:  ## Show this list.
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -102,8 +102,12 @@ dist: setup  ## Build and check the archives of a release; dist/.
 	$(BIN)/python -m build --outdir dist
 	$(BIN)/python -m twine check --strict dist/*
 
-wheel-test: setup  ## Build the wheel, install it elsewhere and use it there.
-	$(BIN)/python tests/wheel/run.py
+wheel-test: setup  ## Build the archives, install the wheel for PYTHON elsewhere and use it there.
+	$(BIN)/python tests/wheel/run.py --python $(PYTHON)
+
+test-lowest: setup  ## Use the wheel, and run the tests, with the lowest versions that are allowed; TORCH=2.13.0 for another torch.
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt uv
+	$(BIN)/python tests/wheel/run.py --python $(PYTHON) --lowest $(TORCH:%=--torch %)
 
 clean:  ## Remove the virtual environment, builds and caches; results/ stays.
 	rm -rf $(VENV) build dist .mypy_cache .pytest_cache .ruff_cache .hypothesis

@@ -23,7 +23,9 @@ from scripts.cli import run
 
 PACKAGES = (
     "gymnasium", "libsumo", "eclipse-sumo", "numpy", "scipy", "numba", "filterpy", "qpsolvers",
-    "piqp", "matplotlib", "torch", "stable-baselines3", "sb3-contrib", "optuna", "ray",
+    "piqp", "matplotlib", "platformdirs", "tomli-w", "tqdm", "torch", "stable-baselines3",
+    "sb3-contrib", "optuna", "plotly", "jinja2", "rich", "tyro", "pyarrow", "ijson", "ray",
+    "filelock",
 )  # fmt: skip
 
 

@@ -6,7 +6,6 @@ from typing import Literal
 
 from agents.engines.engine import Engine
 from agents.engines.local import LocalProcesses
-from dptse_env.utils.extras import needed_for
 
 EngineName = Literal["local", "ray"]
 
@@ -28,6 +27,6 @@ def make_engine(name: EngineName, workers: int, address: str | None) -> Engine:
         if address is not None:
             raise ValueError(f"address must be given with the engine ray, got {address!r}")
         return LocalProcesses(workers)
-    with needed_for("the engine ray, here and on all nodes,"):
-        from agents.engines.ray_cluster import RayCluster  # noqa: PLC0415 (Ray is optional)
+    from agents.engines.ray_cluster import RayCluster  # noqa: PLC0415 (Ray is optional)
+
     return RayCluster(address)

@@ -14,10 +14,6 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from typing import Any
 
-import ray
-from ray.exceptions import RayError, RayTaskError
-from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
-
 import agents
 import dptse_env
 from agents.engines.engine import EngineError, ResultT, Workers, run_shown
@@ -26,6 +22,12 @@ from dptse_env.command_line import TOOLS
 from dptse_env.traffic import Corridor, RecordingError, RecordLibrary
 from dptse_env.traffic.stored_arrays import pack, unpack
 from dptse_env.utils.digests import package_digest
+from dptse_env.utils.extras import needed_for
+
+with needed_for("the engine ray, here and on all nodes,"):
+    import ray
+    from ray.exceptions import RayError, RayTaskError
+    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 RETRIES = 3
 """Further attempts at a task whose worker or node dies. An error of the task itself is final."""

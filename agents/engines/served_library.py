@@ -6,10 +6,12 @@ import os
 from pathlib import Path
 from typing import Any, Protocol
 
-from filelock import FileLock
-
 from dptse_env.traffic import Corridor, RecordLibrary
 from dptse_env.traffic.stored_arrays import pack, unpack
+from dptse_env.utils.extras import needed_for
+
+with needed_for("a library of records on another machine"):
+    from filelock import FileLock
 
 
 class Server(Protocol):

@@ -1,8 +1,10 @@
 """The commands of ``dptse``."""
 
 import json
+import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -11,6 +13,7 @@ pytest.importorskip("tyro")
 
 import dptse_env
 from dptse_env import command_line
+from dptse_env.utils.extras import EXTRAS
 from scripts import dptse
 from scripts.dptse import COMMANDS, as_commands
 
@@ -94,6 +97,15 @@ def test_information_for_programs_and_people(capsys):
     page = capsys.readouterr().out
     assert found["digest"] in page
     assert found["packages"]["gymnasium"] in page
+
+
+def test_information_names_all_that_is_required(capsys):
+    text = (Path(dptse_env.__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8")
+    project = tomllib.loads(text)["project"]
+    extras = [project["optional-dependencies"][name] for name in EXTRAS]
+    wanted = {re.split(r"[^\w-]", each)[0] for each in sum(extras, project["dependencies"])}
+    dptse.main(["info", "--json"])
+    assert wanted - set(json.loads(capsys.readouterr().out)["packages"]) == set()
 
 
 def test_records_for_programs(tmp_path, capsys):

@@ -1,20 +1,24 @@
-"""Build both archives, install the wheel into a fresh virtual environment elsewhere, and use it.
+"""Build both archives, install the wheel into fresh virtual environments elsewhere, and use it.
 
 The wheel is built from the source archive, so that both have what they need.
 """
 
 from __future__ import annotations
 
+import argparse
 import os
 import shutil
 import subprocess
 import sys
+import tarfile
 import tempfile
-import venv
-import zipfile
+from dataclasses import dataclass
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[2]
+from archives import check_source, check_wheel
+
+HERE = Path(__file__).resolve().parent
+ROOT = HERE.parents[1]
 SHORT = ["--env", "dptse_env:dptse/ShortHighway-v0"]
 COMMANDS = [
     ["--version"],
@@ -35,7 +39,33 @@ COMMANDS = [
 ]  # fmt: skip
 """A newcomer's commands, as short as they can be."""
 
-USE = Path(__file__).with_name("use.py")
+
+@dataclass(frozen=True)
+class Installed:
+    """A virtual environment in a temporary folder, and the versions that it takes."""
+
+    folder: Path
+    pins: Path
+    lowest: bool
+
+    @property
+    def python(self) -> Path:
+        """Its interpreter."""
+        return self.folder / "venv" / "bin" / "python"
+
+    @property
+    def ignored(self) -> tuple[str, ...]:
+        """Warnings that are no errors: old libraries use what newer ones deprecate."""
+        return ("-W", "ignore::DeprecationWarning") if self.lowest else ()
+
+    def install(self, *wanted: object) -> None:
+        """Install packages."""
+        pip = ("-m", "pip", "install", "--quiet", "--constraint", self.pins)
+        call(self.python, *pip, *wanted, cwd=self.folder)
+
+    def run(self, *command: object, cwd: Path) -> None:
+        """Run a command with a record cache of its own."""
+        call(*command, cwd=cwd, DPTSE_CACHE=str(self.folder / "cache"), OMP_NUM_THREADS="1")
 
 
 def call(*command: object, cwd: Path, **environment: str) -> None:
@@ -47,60 +77,86 @@ def call(*command: object, cwd: Path, **environment: str) -> None:
 
 def main() -> None:
     """Build, install and use the wheel in a temporary folder."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--python", default=sys.executable, help="interpreter to install it for")
+    parser.add_argument(
+        "--lowest", action="store_true",
+        help="take the lowest versions that pyproject.toml allows, and run the fast tests, too",
+    )  # fmt: skip
+    parser.add_argument("--torch", help="with --lowest: a version of torch instead of the lowest")
+    args = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         call(sys.executable, "-m", "build", "--outdir", folder / "dist", ROOT, cwd=folder)
         (wheel,) = (folder / "dist").glob("*.whl")
         (source,) = (folder / "dist").glob("*.tar.gz")
         call(sys.executable, "-m", "twine", "check", "--strict", wheel, source, cwd=folder)
-        check_content(wheel)
-        venv.create(folder / "venv", with_pip=True)
-        python = folder / "venv" / "bin" / "python"
-        pins = ROOT / "constraints.txt"
-        call(python, "-m", "pip", "install", "--quiet", "-c", pins, wheel, cwd=folder)
-        # Another project's parts: copied, so that the build leaves nothing in the checkout.
-        shutil.copytree(ROOT / "tests" / "plugin", folder / "plugin")
-        call(python, "-m", "pip", "install", "--quiet", "-c", pins, folder / "plugin", cwd=folder)
-        (folder / "use.py").write_text(USE.read_text())
-        call(python, "-W", "error", "use.py", cwd=folder, DPTSE_CACHE=str(folder / "cache"))
+        check_wheel(wheel, ROOT)
+        check_source(source, ROOT)
+        pins = lowest_versions(folder, args.python, args.torch) if args.lowest else None
+        installed = Installed(folder, pins or ROOT / "constraints.txt", args.lowest)
+        call(args.python, "-m", "venv", folder / "venv", cwd=folder)
+        use_package(installed, wheel)
+        use_tools(installed, wheel)
+        if args.lowest:
+            run_tests(installed, wheel, source)
+
+
+def lowest_versions(folder: Path, python: str, torch: str | None) -> Path:
+    """Write the lowest versions of all that is required directly, as constraints."""
+    override, lowest = folder / "override.txt", folder / "lowest.txt"
+    override.write_text("" if torch is None else f"torch=={torch}\n")
+    extras = [word for extra in ("train", "corridors", "ray") for word in ("--extra", extra)]
+    call(
+        sys.executable, "-m", "uv", "pip", "compile", "--quiet", "--resolution", "lowest-direct",
+        *extras, "--override", override, "--python", python, "--no-annotate",
+        "--output-file", lowest, ROOT / "pyproject.toml", cwd=folder,
+    )  # fmt: skip
+    return lowest
+
+
+def use_package(installed: Installed, wheel: Path) -> None:
+    """Use the wheel without extras, as another project would."""
+    folder = installed.folder
+    # Another project's parts: copied, so that the build leaves nothing in the checkout.
+    shutil.copytree(ROOT / "tests" / "plugin", folder / "plugin")
+    installed.install(wheel, folder / "plugin")
+    use = (installed.python, "-W", "error", *installed.ignored, HERE / "use.py")
+    installed.run(*use, cwd=folder)
+    installed.run(installed.python, HERE / "extras.py", cwd=folder)
+    if not installed.lowest:
         # The lowest Gymnasium that is allowed must serve as well as the pinned one.
-        call(python, "-m", "pip", "install", "--quiet", "gymnasium==1.2.2", cwd=folder)
-        call(python, "-W", "error", "use.py", cwd=folder, DPTSE_CACHE=str(folder / "cache"))
-        use_tools(python, wheel, folder)
+        pip = ("-m", "pip", "install", "--quiet")
+        call(installed.python, *pip, "gymnasium==1.2.2", cwd=folder)
+        installed.run(*use, cwd=folder)
 
 
-def check_content(wheel: Path) -> None:
-    """Check that a wheel has the package, its data, and nothing else."""
-    names = zipfile.ZipFile(wheel).namelist()
-    foreign = [name for name in names if not name.startswith(("dptse_env/", "dptse_env-"))]
-    left_over = [name for name in names if name.endswith((".pyc", ".nbi", ".nbc", ".tmp"))]
-    assert not foreign + left_over, foreign + left_over
-    tools = "dptse_env/_tools"
-    for needed in (
-        "dptse_env/policies/private-highway.zip",
-        "dptse_env/estimators/learned/shipped/highway-flows.npz",
-        f"{tools}/scripts/dptse.py",
-        f"{tools}/agents/suite/cards/query-suite-v1/round-robin.json",
-        f"{tools}/agents/studies/paper/report.md.j2",
-    ):
-        assert needed in names, needed
-
-
-def use_tools(python: Path, wheel: Path, folder: Path) -> None:
+def use_tools(installed: Installed, wheel: Path) -> None:
     """Train, evaluate and look at a policy with the installed commands, from an empty folder."""
-    pins, empty = ROOT / "constraints.txt", folder / "empty"
+    empty = installed.folder / "empty"
     empty.mkdir()
-    call(python, "-m", "pip", "install", "--quiet", "-c", pins, "torch", cwd=empty)
-    call(python, "-m", "pip", "install", "--quiet", "-c", pins, f"{wheel}[train]", cwd=empty)
-    (packages,) = (folder / "venv").glob("lib/python*/site-packages")
+    # torch first: a looser request may bring another build.
+    installed.install("torch")
+    installed.install(f"{wheel}[train]")
+    (packages,) = (installed.folder / "venv").glob("lib/python*/site-packages")
     assert not {"agents", "scripts"} & {path.name for path in packages.iterdir()}
     for words in COMMANDS:
-        call(
-            python.with_name("dptse"), *words, cwd=empty,
-            DPTSE_CACHE=str(folder / "cache"), OMP_NUM_THREADS="1",
-        )  # fmt: skip
+        installed.run(installed.python.with_name("dptse"), *words, cwd=empty)
     assert (empty / "trained" / "policy.zip").is_file()
     assert (empty / "ladder" / "summary.json").is_file()
+    installed.run(installed.python, HERE / "extras.py", "train", cwd=installed.folder)
+
+
+def run_tests(installed: Installed, wheel: Path, source: Path) -> None:
+    """Run the fast tests of the source archive, with all extras that they use."""
+    installed.install(
+        f"{wheel}[train,corridors,ray]", "dp-accounting", "hypothesis", "pytest", "pytest-xdist"
+    )
+    with tarfile.open(source) as archive:
+        archive.extractall(installed.folder, filter="data")
+    (unpacked,) = installed.folder.glob("dptse_env-*")
+    pytest = ("-m", "pytest", "-q", "-m", "not slow and not ray", "-n", "2", *installed.ignored)
+    installed.run(installed.python, *pytest, cwd=unpacked)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,119 @@
+"""Use an installed wheel without some of its extras: what wants one says which, in one sentence."""
+
+import importlib
+import json
+import pkgutil
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+
+import dptse_env
+from dptse_env.command_line import add_tools_path
+from dptse_env.utils.extras import MissingExtraError
+
+LONGER = json.dumps({"n_mainline": 7})
+"""A corridor whose network does not come with the package."""
+IMPORT = ["import", "trajectories", "--corridor", "short-highway", "--output", "imported"]
+
+WITHOUT_EXTRAS = {
+    "train": [[], ["--version"], ["info"], ["evaluate", "--help"], ["import", "network"]],
+}
+WITH_TRAIN = {
+    "corridors": [
+        ["record", "--corridor", LONGER, "--seeds", "0:1"],
+        ["import", "network", "--net", "road.net.xml", "--path", "a b"],
+        [*IMPORT, "--format", "ngsim", "--files", "points.csv"],
+        [*IMPORT, "--format", "i24", "--files", "points.json"],
+    ],
+    "ray": [
+        ["record", "--corridor", "short-highway", "--seeds", "0:1", "--engine", "ray"],
+        ["evaluate", "--engine", "ray", "--seeds", "2000:2001", "--output", "ladder"],
+    ],
+}
+"""Commands by the extra that they lack, where the extra `train` is installed."""
+
+
+def main(with_train: bool) -> None:
+    """Import every module, and call what wants an extra that is not installed."""
+    add_tools_path()
+    packages = ("dptse_env", "agents", "scripts") if with_train else ("dptse_env",)
+    lacking = {name: extra for package in packages for name, extra in lacks(package)}
+    print(f"modules that want an extra: {lacking}")
+    if with_train:
+        assert set(lacking.values()) == {"ray"}, lacking
+    else:
+        assert set(lacking.values()) == {"train"}, lacking
+        assert all(name.startswith("dptse_env.sb3") for name in lacking), lacking
+        for package in ("agents", "scripts"):
+            assert dict(lacks(package)) == {package: "train"}
+    check_corridor()
+    Path("road.net.xml").write_text('<net version="1.20"/>')
+    Path("points.csv").write_text("Vehicle_ID\n1\n")
+    Path("points.json").write_text("[]")
+    for extra, commands in (WITH_TRAIN if with_train else WITHOUT_EXTRAS).items():
+        for words in commands:
+            check_command(extra, words)
+
+
+def lacks(package: str) -> list[tuple[str, str]]:
+    """Import the modules of a package, and return those that lack an extra, with the extra.
+
+    Raises:
+        ImportError: A module lacks something, and does not say which extra brings it.
+    """
+    found = []
+
+    def importable(name: str) -> bool:
+        try:
+            importlib.import_module(name)
+        except MissingExtraError as problem:
+            found.append((name, extra_of(str(problem))))
+            return False
+        return True
+
+    if importable(package):
+        module = sys.modules[package]
+        for each in pkgutil.iter_modules(module.__path__, f"{package}."):
+            if each.ispkg:
+                found += lacks(each.name)
+            elif not each.name.endswith(".__main__"):
+                importable(each.name)
+    return found
+
+
+def check_corridor() -> None:
+    """Make an environment on a road whose network has to be compiled."""
+    env = gym.make("dptse_env:dptse/ShortHighway-v0", corridor=json.loads(LONGER), bandwidth=1)
+    said = ""
+    try:
+        env.reset(seed=0)
+    except MissingExtraError as problem:
+        said = str(problem)
+    assert extra_of(said) == "corridors"
+
+
+def check_command(extra: str, words: list[str]) -> None:
+    """Run a command of ``dptse``, which must name an extra and fail."""
+    program = Path(sys.executable).with_name("dptse")
+    ended = subprocess.run([program, *words], capture_output=True, text=True, check=False)
+    said = [line for line in ended.stderr.splitlines() if not line.startswith("INFO ")]
+    assert ended.returncode == 2, (words, ended)
+    assert len(said) == 1, (words, ended)
+    assert said[0].startswith("error: "), (words, said)
+    assert extra_of(said[0]) == extra, (words, said)
+    print(f"dptse {' '.join(words)}\n  {said[0]}")
+
+
+def extra_of(message: str) -> str:
+    """Return the extra that a message names."""
+    found = re.search(r"pip install 'dptse-env\[(\w+)\]'", message)
+    assert found, message
+    return found[1]
+
+
+if __name__ == "__main__":
+    assert Path(sys.prefix) in Path(dptse_env.__file__).parents, dptse_env.__file__
+    main(with_train=sys.argv[1:] == ["train"])
