@@ -106,10 +106,9 @@ def lowest_versions(folder: Path, python: str, torch: str | None) -> Path:
     """Write the lowest versions of all that is required directly, as constraints."""
     override, lowest = folder / "override.txt", folder / "lowest.txt"
     override.write_text("" if torch is None else f"torch=={torch}\n")
-    extras = [word for extra in ("train", "corridors", "ray") for word in ("--extra", extra)]
     call(
         sys.executable, "-m", "uv", "pip", "compile", "--quiet", "--resolution", "lowest-direct",
-        *extras, "--override", override, "--python", python, "--no-annotate",
+        "--extra", "dev", "--override", override, "--python", python, "--no-annotate",
         "--output-file", lowest, ROOT / "pyproject.toml", cwd=folder,
     )  # fmt: skip
     return lowest
@@ -149,6 +148,7 @@ def use_tools(installed: Installed, wheel: Path) -> None:
 
 def run_tests(installed: Installed, wheel: Path, source: Path) -> None:
     """Run the fast tests of the source archive, with all extras that they use."""
+    call(installed.python, "-m", "pip", "uninstall", "--yes", "dptse-plugin", cwd=installed.folder)
     installed.install(
         f"{wheel}[train,corridors,ray]", "dp-accounting", "hypothesis", "pytest", "pytest-xdist"
     )
