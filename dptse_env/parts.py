@@ -7,8 +7,11 @@ import warnings
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from dptse_env.config import TIME_STEP, EnvConfig
 from dptse_env.estimators import Estimator, make_estimator
+from dptse_env.fusion import Fusion, FusionSetup
 from dptse_env.model import ARZModel
 from dptse_env.release import (
     BOUNDARIES,
@@ -20,6 +23,7 @@ from dptse_env.release import (
     ReleaseModel,
     ReleaseSetup,
     TrafficTable,
+    TwoMechanisms,
 )
 from dptse_env.release.report import in_order
 from dptse_env.spaces.actions import ACTION_ENCODINGS, ActionEncoding
@@ -77,6 +81,7 @@ class Parts:
         model: The traffic model of the estimator and the boundary.
         boundary: The model's inputs at the road's ends and ramps.
         estimator: The estimator.
+        fusion: What turns releases into measurements of all vehicles; None where they are.
     """
 
     config: EnvConfig
@@ -86,6 +91,7 @@ class Parts:
     model: ARZModel
     boundary: BoundaryModel
     estimator: Estimator
+    fusion: Fusion | None
 
     @property
     def n_episodes(self) -> int:
@@ -179,23 +185,42 @@ def make_release(
         traffic: The true traffic; made of the user's records if None.
     """
     preset = config.privacy.preset
-    release: ReleaseModel = RELEASE_MODELS.find(preset)(
-        ReleaseSetup(
-            name=RELEASE_MODELS.name_of(preset),
-            settings=config.privacy,
-            traffic=make_traffic(config) if traffic is None else traffic,
-            bandwidth=config.bandwidth,
-            horizon=config.horizon_steps,
-            n_episodes=n_episodes,
-            queries=config.queries,
-        )
+    model: type[ReleaseModel] = RELEASE_MODELS.find(preset)
+    setup = ReleaseSetup(
+        name=RELEASE_MODELS.name_of(preset),
+        settings=config.privacy,
+        traffic=make_traffic(config) if traffic is None else traffic,
+        bandwidth=config.bandwidth,
+        horizon=config.horizon_steps,
+        n_episodes=n_episodes,
+        queries=config.queries,
     )
-    return release
+    if config.has_separate_sensors:
+        return TwoMechanisms(model, setup, config.penetration, config.detectors)
+    return model(setup)
 
 
 def make_traffic(config: EnvConfig, library: RecordLibrary | None = None) -> TrafficTable:
     """Make the table of the true traffic; nothing is recorded or loaded."""
     return TrafficTable(config.corridor, config.traffic_seeds, library or RecordLibrary())
+
+
+def make_fusion(config: EnvConfig, model: ARZModel, n_episodes: int = 1) -> Fusion | None:
+    """Make what turns releases into measurements of all vehicles; None where they are."""
+    if not (config.has_separate_sensors or config.fusion.innovation_test):
+        return None
+    corridor, rows = config.corridor, model.rows
+    setup = FusionSetup(
+        config.fusion,
+        rows,
+        n_options=config.queries.n_options,
+        lengths=np.array(corridor.segment_lengths)[rows.first] * rows.span,
+        share=config.penetration.published_share,
+        limits=np.array(corridor.speed_limits)[rows.first],
+        releases_flow=flow_centre(config) is not None,
+        n_episodes=n_episodes,
+    )
+    return Fusion(setup)
 
 
 def privacy_report(config: EnvConfig) -> PrivacyReport:
@@ -268,4 +293,5 @@ def make_parts(
     estimator = estimator or make_estimator(
         config.estimator, config.backend, model, n_episodes, config.settings()
     )
-    return Parts(config, interface, traffic, release, model, boundary, estimator)
+    fusion = make_fusion(config, model, n_episodes)
+    return Parts(config, interface, traffic, release, model, boundary, estimator, fusion)

@@ -56,6 +56,7 @@ class QueryProcess:
         boundary: The model's inputs at the road's ends and ramps.
         model: The traffic model.
         estimator: The estimator.
+        fusion: What turns releases into measurements of all vehicles; None where they are.
         n_episodes: Size of the batch.
         time: Second of the record that each episode stands at, shape (n,).
         traffic_index: Index into ``config.traffic_seeds`` of each episode's traffic, shape (n,).
@@ -76,7 +77,7 @@ class QueryProcess:
         """
         self.config, self.interface = parts.config, parts.interface
         self.traffic, self.release, self.boundary = parts.traffic, parts.release, parts.boundary
-        self.model, self.estimator = parts.model, parts.estimator
+        self.model, self.estimator, self.fusion = parts.model, parts.estimator, parts.fusion
         self._threads = EpisodeThreads(threads if self.estimator.is_compiled else 1)
         self._checks_estimates = is_foreign(self.estimator)
         self._checks_releases = is_foreign(self.release)
@@ -145,6 +146,8 @@ class QueryProcess:
         self.pending.reset(episodes)
         self.release.reset(episodes, [noise for _, noise, _ in streams])
         self.boundary.reset(episodes)
+        if self.fusion is not None:
+            self.fusion.reset(episodes)
         prior = nominal_state(self.config.corridor, self.model, self.time[episodes])
         self.estimator.reset(episodes, prior, [draws for _, _, draws in streams])
         self.queried[episodes] = False
@@ -205,7 +208,13 @@ class QueryProcess:
             check_released(self.release, released, request)
         measured, at_boundary = split_release(released, self.model)
         self.boundary.update(episodes, *at_boundary)
-        observed, values = observed[:, :n_rows], measured.values
+        if released.missing is not None:
+            observed = observed & ~released.missing
+        observed = observed[:, :n_rows]
+        if self.fusion is not None:
+            prediction = self._predicted(episodes)
+            measured = self.fusion.read(episodes, observed, measured, prediction)
+        values = measured.values
         self._in_threads(episodes, self.estimator.update, observed, *measured)
         self.queried[episodes] = queried
         self.released[episodes] = np.where(observed[:, :, None], values, self.released[episodes])

@@ -29,9 +29,10 @@ from dptse_env.estimators.settings import (
     RecurrentSettings,
     SigmaPointSettings,
 )
+from dptse_env.fusion import FusionSettings
 from dptse_env.model import ARZParameters
 from dptse_env.registration import ENVIRONMENTS
-from dptse_env.release import CappedSettings, PrivacySettings
+from dptse_env.release import CappedSettings, Detectors, PrivacySettings
 from dptse_env.traffic import (
     Corridor,
     Demand,
@@ -39,6 +40,7 @@ from dptse_env.traffic import (
     Drivers,
     Incident,
     IncidentDistribution,
+    Penetration,
     Recordings,
     RecordLibrary,
     SumoScenario,
@@ -51,6 +53,9 @@ PAGE = Path(__file__).parents[1] / "docs" / "configuration.md"
 SECTIONS: Mapping[type, str] = {
     PrivacySettings: "`privacy`, for every release model",
     CappedSettings: "`privacy`, for the release model `capped`",
+    Penetration: "`penetration`",
+    Detectors: "`detectors`",
+    FusionSettings: "`fusion`",
     Corridor: "`corridor`",
     Demand: "`demand`, fixed",
     DemandDistribution: "`demand`, drawn for each traffic seed",

@@ -17,11 +17,13 @@ from dptse_env.estimators.tuned_settings import (
     load_settings,
     settings_name,
 )
+from dptse_env.fusion import FusionSettings
 from dptse_env.model import ARZParameters, available_parameters, load_parameters
 from dptse_env.release import (
     RELEASE_MODELS,
     BandwidthUnit,
     CappedSettings,
+    Detectors,
     PacedSettings,
     PrivacySettings,
     QueryOptions,
@@ -29,7 +31,7 @@ from dptse_env.release import (
 from dptse_env.spaces.actions import ACTION_ENCODINGS
 from dptse_env.spaces.observations import BLOCKS, DEFAULT
 from dptse_env.spaces.rewards import REWARDS
-from dptse_env.traffic import CORRIDORS, Corridor, randomised
+from dptse_env.traffic import CORRIDORS, Corridor, Penetration, randomised
 from dptse_env.utils.fields import Interval, checked_fields
 from dptse_env.utils.validation import require_name
 
@@ -79,6 +81,9 @@ class EnvConfig:
         observation: Blocks of the observation, in order: names, ``"package.module:Class"``, classes
             or objects; ``"default"`` stands for all default blocks.
         privacy: The release model with its epsilon and delta, and what they protect.
+        penetration: Which vehicles are connected and answer queries; a number is their share.
+        detectors: Errors of the fixed sensors.
+        fusion: How answers of connected vehicles and of fixed sensors become measurements.
         reward: The reward: ``joint``, ``density``, ``speed``, a registered name,
             ``"package.module:function"``, or a function of a `ScoredSecond`.
         horizon: Length of an episode [s]; None for the whole record.
@@ -105,6 +110,9 @@ class EnvConfig:
     action: Any = "mask"
     observation: tuple[Any, ...] = (DEFAULT,)
     privacy: PrivacySettings = field(default_factory=PrivacySettings)
+    penetration: Penetration = field(default_factory=Penetration)
+    detectors: Detectors = field(default_factory=Detectors)
+    fusion: FusionSettings = field(default_factory=FusionSettings)
     reward: Any = "joint"
     horizon: Annotated[int, Interval(1, 100_000)] | None = None
     random_start: bool = False
@@ -137,6 +145,7 @@ class EnvConfig:
             raise ValueError(f"traffic_seeds must be 1 to {MOST_SEEDS} seeds, got {len(seeds)}")
         if len(set(seeds)) < len(seeds):
             raise ValueError(f"traffic_seeds must be distinct, got {seeds}")
+        self._check_sensors()
         if self.corridor.recordings is not None:
             self.corridor.recordings.require(seeds)
             needs = RELEASE_MODELS.find(self.privacy.preset).needs_vehicles
@@ -172,6 +181,34 @@ class EnvConfig:
                 f"query_spans must be (1,) where mean speeds are released, got {spans}"
             )
 
+    @property
+    def has_separate_sensors(self) -> bool:
+        """True if fixed sensors measure other things than queries do."""
+        return not (self.penetration.is_complete and self.detectors.are_exact)
+
+    def _check_sensors(self) -> None:
+        """Check that the road can have this penetration and these detectors."""
+        corridor, factor = self.corridor, self.detectors.factor
+        if isinstance(factor, tuple) and len(factor) != len(corridor.fixed_sensors):
+            raise ValueError(
+                f"detectors.factor must be one number, or one for each of the "
+                f"{len(corridor.fixed_sensors)} fixed sensors, got {factor}"
+            )
+        if (
+            self.has_separate_sensors
+            and not corridor.fixed_sensors
+            and (not self.detectors.are_exact)
+        ):
+            raise ValueError(
+                f"detectors must be left out on a road without fixed sensors, got {self.detectors}"
+            )
+        recordings = corridor.recordings
+        if self.has_separate_sensors and recordings is not None and not recordings.has_vehicles:
+            raise ValueError(
+                "penetration.share must be 1, and detectors left out, on a road of measured "
+                "fields, which have no vehicles"
+            )
+
     def _check_settings(self) -> None:
         settings, expected = self.estimator_settings, settings_type(self.estimator)
         if isinstance(settings, str):
@@ -192,6 +229,7 @@ class EnvConfig:
             self.query_spans,
             self.price_levels,
             self.bandwidth_unit,
+            self.has_separate_sensors,
         )
 
     @property

@@ -14,6 +14,7 @@ from dptse_env.model.parameters import read_parameters
 from dptse_env.release import RELEASE_MODELS, PrivacySettings
 from dptse_env.traffic import (
     Corridor,
+    Penetration,
     RoadFile,
     find_corridor,
     is_road_file,
@@ -77,6 +78,8 @@ def resolve(preset: str, overrides: Mapping[str, Any]) -> EnvConfig:
         values["corridor"] = road.corridor
     corridor = _corridor(base.corridor, values)
     values["privacy"] = _privacy(base.privacy, values)
+    if "penetration" in values and not isinstance(values["penetration"], Mapping | Penetration):
+        values["penetration"] = {"share": values["penetration"]}
     _read_seeds(values, corridor)
     if isinstance(values.get("observation"), str):
         values["observation"] = (values["observation"],)

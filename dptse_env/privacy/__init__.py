@@ -1,6 +1,6 @@
 """Differential privacy, mathematics only: Gaussian relations, sensitivities, noise, accounts."""
 
-from dptse_env.privacy.account import ReleaseAccount
+from dptse_env.privacy.account import EpsilonTable, ReleaseAccount
 from dptse_env.privacy.gaussian import (
     analytic_multiplier,
     compose,
@@ -20,6 +20,7 @@ from dptse_env.privacy.sensitivity import (
 
 __all__ = [
     "Adjacency",
+    "EpsilonTable",
     "ReleaseAccount",
     "ReleaseSensitivity",
     "Sensitivity",

@@ -7,6 +7,33 @@ import numpy as np
 from dptse_env.privacy.gaussian import epsilon_of
 from dptse_env.utils.arrays import FloatArray, IntArray
 
+N_LEVELS = 256
+"""Levels of mu at which epsilon is tabulated; one between them is rounded up."""
+
+
+class EpsilonTable:
+    """Epsilon at fixed levels of mu, so that a step takes no root finding.
+
+    Attributes:
+        mu: The largest mu, that of a complete episode.
+    """
+
+    def __init__(self, mu: float, delta: float) -> None:
+        """Store the numbers of a complete episode."""
+        self.mu, self._delta = mu, delta
+
+    @cached_property
+    def _epsilons(self) -> FloatArray:
+        """Epsilon at the levels of mu, shape (N_LEVELS + 1,)."""
+        levels = self.mu * np.arange(1, N_LEVELS + 1) / N_LEVELS
+        return np.array([0.0, *(epsilon_of(mu, self._delta) for mu in levels.tolist())])
+
+    def bounds(self, mu: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return mu, held to the largest, and epsilon, rounded up to one of 256 levels of mu."""
+        mu = np.minimum(mu, self.mu)
+        level = np.ceil(mu / self.mu * N_LEVELS * (1.0 - 1e-12)).astype(np.int64)
+        return mu, self._epsilons[level]
+
 
 class ReleaseAccount:
     """Privacy loss of a vehicle by the number of released steps that its data may have entered.

@@ -10,6 +10,7 @@ from dptse_env.release.base import (
 )
 from dptse_env.release.boundary import BOUNDARIES, BoundaryModel
 from dptse_env.release.checks import check_released
+from dptse_env.release.detectors import Detectors
 from dptse_env.release.gaussian import Capped, Corrected, GaussianRelease, Paper, require_gaussian
 from dptse_env.release.mechanism import GaussianMechanism, Mechanism
 from dptse_env.release.paced import Paced
@@ -25,6 +26,7 @@ from dptse_env.release.settings import (
     Unit,
 )
 from dptse_env.release.traffic_table import TrafficTable
+from dptse_env.release.two_mechanisms import TwoMechanisms
 from dptse_env.release.void_reasons import VOID_REASONS
 from dptse_env.utils.registry import Registry
 
@@ -54,6 +56,7 @@ __all__ = [
     "Capped",
     "CappedSettings",
     "Corrected",
+    "Detectors",
     "GaussianMechanism",
     "GaussianRelease",
     "MeasuredRows",
@@ -74,6 +77,7 @@ __all__ = [
     "Released",
     "SpeedRelease",
     "TrafficTable",
+    "TwoMechanisms",
     "Unit",
     "check_released",
     "require_gaussian",

@@ -33,6 +33,7 @@ class ReleaseSetup:
         horizon: Steps of an episode.
         n_episodes: Size n of the batch.
         queries: The G options that can be queried; the mainline segments where they are not given.
+        budget_share: Part of the privacy budget mu^2 that the releases may spend.
     """
 
     name: str
@@ -42,6 +43,7 @@ class ReleaseSetup:
     horizon: int
     n_episodes: int
     queries: QueryOptions = NO_OPTIONS
+    budget_share: float = 1.0
 
     def __post_init__(self) -> None:
         """Fill in the options."""
@@ -64,6 +66,17 @@ class ReleaseSetup:
         """Columns of a release: the M rows, then the boundary segments if they are released."""
         private = self.settings.boundary == "private"
         return self.rows.n_rows + (self.corridor.n_boundaries if private else 0)
+
+    @cached_property
+    def places(self) -> IntArray:
+        """The first record column of each column of a release, shape (n_columns,)."""
+        boundaries = np.arange(self.n_columns - self.rows.n_rows)
+        return np.concatenate([self.rows.first, self.corridor.n_segments + boundaries])
+
+    @property
+    def n_places(self) -> int:
+        """Record columns: the segments, and the boundary segments if they are released."""
+        return self.corridor.n_segments + self.n_columns - self.rows.n_rows
 
     @cached_property
     def lengths(self) -> FloatArray:
@@ -136,11 +149,14 @@ class Released(NamedTuple):
             (2,) where all columns have the same.
         centre: Speeds [km/h] that the flows are centred on, of the segments and of the boundary
             segments if they are released, shape (k, S) or (k, S + R); None for the `flow_centre`.
+        missing: Columns that were observed and did not answer, shape (k, n_columns); None where
+            all did.
     """
 
     values: FloatArray
     sigma: FloatArray
     centre: FloatArray | None = None
+    missing: BoolArray | None = None
 
 
 class MeasuredRows(NamedTuple):

@@ -25,12 +25,23 @@ class Contributions:
     """
 
     def __init__(
-        self, n_slots: int, n_steps: int, n_episodes: int, largest_speed: float, cap: int | None
+        self,
+        n_slots: int,
+        n_steps: int,
+        n_episodes: int,
+        largest_speed: float,
+        cap: int | None,
+        places: IntArray,
     ) -> None:
-        """Prepare for up to `n_slots` records; speeds are clipped to `largest_speed` [km/h]."""
+        """Prepare for up to `n_slots` records; speeds are clipped to `largest_speed` [km/h].
+
+        `places` are the distinct record columns of the columns of a release.
+        """
         self.cap = cap
         self._limit = n_steps if cap is None else cap
         self.vehicles = VehicleTable(n_slots, n_steps, largest_speed)
+        self._column: IntArray = np.full(int(places.max()) + 1, -1, dtype=np.int64)
+        self._column[places] = np.arange(places.size)
         self.exposures: NDArray[np.int32] = np.zeros((n_episodes, 0), dtype=np.int32)
 
     def load(self, slot: int, record: Record) -> None:
@@ -62,7 +73,7 @@ class Contributions:
         table = self.vehicles
         _collect(
             table.start, table.vehicle, table.segment, table.speed, episodes, slots, times,
-            observed, self._limit, self.exposures, counts, speeds,
+            self._column, observed, self._limit, self.exposures, counts, speeds,
         )  # fmt: skip
         return counts, speeds
 
@@ -76,18 +87,19 @@ def _collect(
     episodes: IntArray,
     slots: IntArray,
     times: IntArray,
+    column: IntArray,
     observed: BoolArray,
     limit: int,
     exposures: NDArray[np.int32],
     counts: FloatArray,
     speeds: FloatArray,
 ) -> None:
-    n_columns = observed.shape[1]
     for k in range(episodes.size):
         spent = exposures[episodes[k]]
         for row in range(start[slots[k], times[k]], start[slots[k], times[k] + 1]):
             s, v = segment[row], vehicle[row]
-            if s < n_columns and observed[k, s] and spent[v] < limit:
+            c = column[s] if s < column.size else -1
+            if c >= 0 and observed[k, c] and spent[v] < limit:
                 spent[v] += 1
-                counts[k, s] += 1.0
-                speeds[k, s] += speed[row]
+                counts[k, c] += 1.0
+                speeds[k, c] += speed[row]

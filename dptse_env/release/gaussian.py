@@ -1,5 +1,6 @@
 """Release models with Gaussian noise: `Paper`, `Corrected` and `Capped`."""
 
+import math
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -165,6 +166,11 @@ def require_gaussian(release: ReleaseModel, user: str) -> GaussianRelease:
 class Paper(GaussianRelease):
     """True density and mean speed of all vehicles, with the noise as printed in the paper."""
 
+    def __init__(self, setup: ReleaseSetup) -> None:
+        """See `GaussianRelease`."""
+        super().__init__(setup)
+        self._in_order = np.array_equal(setup.places, np.arange(setup.n_places))
+
     def _sensitivity(self) -> Sensitivity:
         setup, corridor = self.setup, self.setup.corridor
         return paper_sensitivity(
@@ -186,7 +192,8 @@ class Paper(GaussianRelease):
     def true_values(self, request: ReleaseRequest) -> FloatArray:
         """See `GaussianRelease.true_values`."""
         setup = self.setup
-        return setup.traffic.aggregates(request.traffic, request.times, setup.n_columns)
+        values = setup.traffic.aggregates(request.traffic, request.times, setup.n_places)
+        return values if self._in_order else values[:, setup.places]
 
 
 class Corrected(Paper):
@@ -229,6 +236,7 @@ class Capped(GaussianRelease):
             setup.n_episodes,
             corridor.largest_speed_limit,
             setup.settings.contribution_cap,
+            setup.places,
         )
 
     def _sensitivity(self) -> Sensitivity:
@@ -244,7 +252,8 @@ class Capped(GaussianRelease):
 
     def _noise_std(self) -> tuple[float, ...]:
         settings = self._settings
-        return joint_noise_std(self.sensitivity, settings.epsilon, settings.delta, settings.share)
+        noise = joint_noise_std(self.sensitivity, settings.epsilon, settings.delta, settings.share)
+        return tuple(std / math.sqrt(self.setup.budget_share) for std in noise)
 
     def _void_reasons(self) -> tuple[str, ...]:
         return ("speed_sensitivity",) if self._settings.speed_release == "mean" else ()

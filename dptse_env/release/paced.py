@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from dptse_env.privacy import epsilon_of, mu_of
+from dptse_env.privacy import EpsilonTable, epsilon_of, mu_of
 from dptse_env.release.base import Released, ReleaseModel, ReleaseRequest, ReleaseSetup
 from dptse_env.release.ledgers import Columns, Ledgers, Sums
 from dptse_env.release.noise import NoiseStreams, grid_of
@@ -29,9 +29,6 @@ from dptse_env.utils.vector_info import Rows, object_array
 
 ROUNDING = 1e-9
 """Part of the budget that is kept back for rounding errors of ledgers."""
-
-N_LEVELS = 256
-"""Levels of mu at which epsilon is tabulated; one between them is rounded up."""
 
 
 class Paced(ReleaseModel):
@@ -73,11 +70,12 @@ class Paced(ReleaseModel):
         assert isinstance(setup.settings, PacedSettings)
         self._settings = settings = setup.settings
         corridor, n = setup.corridor, setup.n_episodes
-        self.mu = mu_of(settings.epsilon, settings.delta)
+        self.mu = mu_of(settings.epsilon, settings.delta) * math.sqrt(setup.budget_share)
+        self._epsilons = EpsilonTable(self.mu, settings.delta)
         self._squares = 2.0 if settings.adjacency == "replace" else 1.0
         self.budget = self.mu**2 / self._squares
-        first, span, level = _columns(setup)
-        places = int((first + span).max())
+        span, level = _columns(setup)
+        first, places = setup.places, setup.n_places
         self.ledgers = Ledgers(
             Columns(first, span, places),
             VehicleTable(
@@ -214,13 +212,6 @@ class Paced(ReleaseModel):
         values /= lengths
         return Released(values, deviations / lengths, centre)
 
-    @cached_property
-    def _epsilons(self) -> FloatArray:
-        """Epsilon at the levels of mu, shape (N_LEVELS + 1,)."""
-        levels = self.mu * np.arange(1, N_LEVELS + 1) / N_LEVELS
-        delta = self._settings.delta
-        return np.array([0.0, *(epsilon_of(mu, delta) for mu in levels.tolist())])
-
     def spent(self, episodes: IntArray, steps: IntArray) -> tuple[FloatArray, FloatArray]:
         """See `ReleaseModel.spent`.
 
@@ -231,9 +222,7 @@ class Paced(ReleaseModel):
 
     def _losses(self, paid: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return mu and epsilon of vehicles that have paid these amounts at most."""
-        mu = np.minimum(np.sqrt(self._squares * paid), self.mu)
-        level = np.ceil(mu / self.mu * N_LEVELS * (1.0 - 1e-12)).astype(np.int64)
-        return mu, self._epsilons[level]
+        return self._epsilons.bounds(np.sqrt(self._squares * paid))
 
     def report(self) -> PrivacyReport:
         """See `ReleaseModel.report`."""
@@ -293,20 +282,19 @@ class Paced(ReleaseModel):
         }
 
 
-def _columns(setup: ReleaseSetup) -> tuple[IntArray, IntArray, FloatArray]:
-    """Return the first record column, the span and the price level of each column."""
+def _columns(setup: ReleaseSetup) -> tuple[IntArray, FloatArray]:
+    """Return the span and the price level of each column."""
     rows, options = setup.rows, setup.queries
-    boundaries = np.arange(setup.n_columns - rows.n_rows)
+    span = np.ones(setup.n_columns, dtype=np.int64)
+    span[: rows.n_rows] = rows.span
     level = np.ones(setup.n_columns)
     level[: options.n_options] = options.level
-    return (
-        np.concatenate([rows.first, setup.corridor.n_segments + boundaries]),
-        np.concatenate([rows.span, np.ones_like(boundaries)]),
-        level,
-    )
+    return span, level
 
 
 def _coverage(options: QueryOptions) -> float:
     """Return the share of the mainline that a step's queries cover if all options are alike."""
+    if options.n_options == 0:
+        return 0.0
     bought = options.bandwidth * float(np.mean(options.span / options.cost))
     return min(bought / options.n_mainline, 1.0)

@@ -37,6 +37,8 @@ class QueryOptions:
         cost: What each costs of the bandwidth, shape (G,).
         n_mainline: Mainline segments n.
         bandwidth: What the queries of a step may cost together.
+        separate_sensors: Whether a fixed sensor has a row of its own where its segment can be
+            queried, too, since the two measure different things.
     """
 
     first: IntArray
@@ -45,6 +47,7 @@ class QueryOptions:
     cost: IntArray
     n_mainline: int
     bandwidth: int
+    separate_sensors: bool = False
 
     @classmethod
     def make(
@@ -54,6 +57,7 @@ class QueryOptions:
         spans: Sequence[int] = (1,),
         levels: Sequence[float] = (1.0,),
         unit: BandwidthUnit = "segments",
+        separate_sensors: bool = False,
     ) -> QueryOptions:
         """Return all options of some spans and price levels.
 
@@ -63,6 +67,7 @@ class QueryOptions:
             spans: The keyword ``query_spans``.
             levels: The keyword ``price_levels``.
             unit: The keyword ``bandwidth_unit``.
+            separate_sensors: See the attribute.
 
         Raises:
             ValueError: Spans or levels are none, repeated or out of order, there are too many
@@ -79,6 +84,7 @@ class QueryOptions:
             cost=span if unit == "segments" else np.ones_like(span),
             n_mainline=n_mainline,
             bandwidth=bandwidth,
+            separate_sensors=separate_sensors,
         )
 
     def __str__(self) -> str:
@@ -129,8 +135,8 @@ class QueryOptions:
     def rows(self, corridor: Corridor) -> MeasurementRows:
         """Return the rows of a release: options, then ramps, then sensors without an option.
 
-        The last are mainline segments with a fixed sensor that are no option of span 1 and price
-        level 1.
+        The last are mainline segments with a fixed sensor: those that are no option of span 1 and
+        price level 1, or all where sensors are separate.
         """
         others = np.array(self._others(corridor), dtype=np.int64)
         return MeasurementRows(
@@ -142,13 +148,14 @@ class QueryOptions:
     def sensor_rows(self, corridor: Corridor) -> tuple[int, ...]:
         """Return the row of each of the corridor's fixed sensors."""
         others = {s: self.n_options + k for k, s in enumerate(self._others(corridor))}
-        row = self._singles | others
+        row = others if self.separate_sensors else self._singles | others
         return tuple(row[s] for s in corridor.fixed_sensors)
 
     def _others(self, corridor: Corridor) -> list[int]:
         """Return the segments of the rows that are no options."""
         n = self.n_mainline
-        sensors = [s for s in corridor.fixed_sensors if s < n and s not in self._singles]
+        shared = {} if self.separate_sensors else self._singles
+        sensors = [s for s in corridor.fixed_sensors if s < n and s not in shared]
         return [*range(n, corridor.n_segments), *sensors]
 
     @cached_property

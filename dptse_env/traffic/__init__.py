@@ -10,6 +10,7 @@ from dptse_env.traffic.dwell import average_dwell
 from dptse_env.traffic.field_record import AnyRecord, FieldRecord, with_vehicles
 from dptse_env.traffic.incident import Incident, IncidentDistribution
 from dptse_env.traffic.library import RecordLibrary, Records, open_library
+from dptse_env.traffic.penetration import Penetration
 from dptse_env.traffic.presets import (
     CORRIDORS,
     PAPER_HIGHWAY,
@@ -48,6 +49,7 @@ __all__ = [
     "IncidentDistribution",
     "InvalidRecordError",
     "NetworkError",
+    "Penetration",
     "Record",
     "RecordLibrary",
     "RecordingError",

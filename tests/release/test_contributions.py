@@ -19,8 +19,9 @@ def records(draw):
     return record(places, speeds, COLUMNS)
 
 
-def loaded(some, n_episodes, cap):
-    contributions = Contributions(len(some), T + 1, n_episodes, LIMIT, cap)
+def loaded(some, n_episodes, cap, n_columns=COLUMNS):
+    places = np.arange(n_columns)
+    contributions = Contributions(len(some), T + 1, n_episodes, LIMIT, cap, places)
     for slot, one in enumerate(some):
         contributions.load(slot, one)
     return contributions
@@ -50,7 +51,7 @@ def by_hand(one, masks, cap, n_columns):
 )
 def test_counts_of_a_batch_are_those_by_hand(some, masks, cap, n_columns):
     masks = masks[..., :n_columns]
-    contributions, slots = loaded(some, 3, cap), np.array([1, 0])
+    contributions, slots = loaded(some, 3, cap, n_columns), np.array([1, 0])
     episodes = np.array([2, 0])
     expected = [by_hand(some[slot], masks[k], cap, n_columns) for k, slot in enumerate(slots)]
     for t in range(1, T + 1):
@@ -109,7 +110,7 @@ def test_a_new_episode_starts_from_nothing_and_leaves_others_alone():
 
 
 def test_a_wider_record_loaded_later_keeps_what_was_counted():
-    contributions = Contributions(2, T + 1, 1, LIMIT, None)
+    contributions = Contributions(2, T + 1, 1, LIMIT, None, np.arange(3))
     one, first = np.zeros(1, dtype=np.int64), np.ones(1, dtype=np.int64)
     contributions.load(0, standing(2))
     contributions.collect(one, one, first, np.ones((1, COLUMNS), dtype=bool))

@@ -82,7 +82,8 @@ class Mutant(Contributions):
 
     def __init__(self, records, cap, key, charges=lambda segment: True):
         largest_speed = corridor(1).speed_limit
-        super().__init__(len(records), records[0].n_steps, len(records), largest_speed, cap)
+        places = np.arange(records[0].n_columns)
+        super().__init__(len(records), records[0].n_steps, len(records), largest_speed, cap, places)
         self.records, self.key, self.charges, self.spent = records, key, charges, {}
 
     def reset(self, episodes):

@@ -11,7 +11,7 @@ from agents.engines.engine import Engine, run_in_order
 from agents.engines.local import THIS_PROCESS
 from agents.studies.audit.releases import Overheard, Terms, attacked
 from agents.studies.audit.strategies import FixedQueries
-from agents.studies.audit.worlds import AdjacentWorlds
+from agents.studies.audit.worlds import AdjacentWorlds, audited
 from dptse_env.config import EnvConfig
 from dptse_env.parts import make_parts, make_release
 from dptse_env.process import QueryProcess
@@ -124,7 +124,7 @@ def attack(
         engine: Plays the batches.
         progress: Whether to show a progress bar.
     """
-    config = attacked_form(config)
+    config = audited(attacked_form(config), worlds)
     batches = [
         Batch(config, worlds, policy, range(n_runs)[first : first + batch], noise_factor, seed)
         for first in range(0, n_runs, batch)

@@ -14,6 +14,7 @@ from dptse_env.release import (
     Released,
     ReleaseModel,
     ReleaseRequest,
+    TwoMechanisms,
     require_gaussian,
 )
 from dptse_env.release.noise import NoiseStreams
@@ -125,12 +126,63 @@ class AttackedPaced:
         return sums
 
 
+class AttackedPair:
+    """Queries and fixed sensors together: the adversary reads both mechanisms."""
+
+    follows_estimates: ClassVar[bool] = True
+
+    def __init__(self, model: TwoMechanisms) -> None:
+        """Attack this model."""
+        self.model = model
+        self.parts = [attacked(part) for part in model.parts]
+        self._columns = np.cumsum([part.setup.n_columns for part in model.parts])[:-1]
+
+    def scale_noise(self, factor: float) -> None:
+        """See `AttackedRelease.scale_noise`."""
+        for part in self.parts:
+            part.scale_noise(factor)
+
+    def terms(self, released: Released) -> Terms:
+        """See `AttackedRelease.terms`; those of the parts side by side."""
+        values = np.split(released.values, self._columns, axis=1)
+        sigma = np.split(np.broadcast_to(released.sigma, released.values.shape), self._columns, 1)
+        terms = [
+            part.terms(Released(value, deviation))
+            for part, value, deviation in zip(self.parts, values, sigma, strict=True)
+        ]
+        return Terms(*(np.concatenate(arrays, axis=1) for arrays in zip(*terms, strict=True)))
+
+    def sums(self, request: ReleaseRequest, terms: Terms) -> FloatArray:
+        """See `AttackedRelease.sums`."""
+        observed = np.split(request.observed, self._columns, axis=1)
+        sums, starts = [], np.zeros(len(terms), dtype=np.int64)
+        for part, seen in zip(self.parts, observed, strict=True):
+            sizes = self._term_sizes(part.model)
+            own = [
+                array[:, start : start + size]
+                for array, start, size in zip(terms, starts, sizes, strict=True)
+            ]
+            starts += sizes
+            sums.append(part.sums(request._replace(observed=seen), Terms(*own)))
+        return np.concatenate(sums, axis=1)
+
+    @staticmethod
+    def _term_sizes(model: ReleaseModel) -> IntArray:
+        """Return how many columns of deviations, prices and centres a part has."""
+        n_columns = model.setup.n_columns
+        if isinstance(model, Paced):
+            return np.array([n_columns, n_columns, model.setup.n_places])
+        return np.array([n_columns, 0, 0])
+
+
 def attacked(model: ReleaseModel) -> AttackedRelease:
     """Return how a release model is attacked.
 
     Raises:
         ValueError: It has noise that the adversary does not know the distribution of.
     """
+    if isinstance(model, TwoMechanisms):
+        return AttackedPair(model)
     if isinstance(model, Paced):
         return AttackedPaced(model)
     return AttackedGaussian(require_gaussian(model, "the audit"))

@@ -7,8 +7,9 @@ import numpy as np
 from agents.studies.audit.distances import protects_seconds, replaces
 from agents.studies.audit.gaussian_planner import GaussianPlanner
 from agents.studies.audit.paced_planner import PacedPlanner
+from agents.studies.audit.pair_planner import PairPlanner
 from agents.studies.audit.planning import Pair, Planner
-from agents.studies.audit.releases import AttackedGaussian, AttackedPaced, attacked
+from agents.studies.audit.releases import AttackedGaussian, AttackedPaced, AttackedPair, attacked
 from agents.studies.audit.strategies import FixedQueries
 from agents.studies.audit.worlds import AdjacentWorlds, Trajectory
 from dptse_env.config import EnvConfig
@@ -19,6 +20,7 @@ from dptse_env.utils.validation import require
 PLANNERS: dict[type, type[Planner]] = {
     AttackedGaussian: GaussianPlanner,
     AttackedPaced: PacedPlanner,
+    AttackedPair: PairPlanner,
 }
 """Planners by the way a release model is attacked."""
 

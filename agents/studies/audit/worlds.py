@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 
-from dptse_env.traffic import Corridor, Record, RecordLibrary
+from dptse_env.config import EnvConfig
+from dptse_env.traffic import Corridor, Penetration, Record, RecordLibrary
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 
 
@@ -95,3 +96,33 @@ def _add(rest: Record, added: Trajectory) -> Record:
     order = np.argsort(joined["step"], kind="stable")
     ordered = {name: column[order] for name, column in joined.items()}
     return Record(**ordered, n_steps=rest.n_steps, n_columns=rest.n_columns)
+
+
+@dataclass(frozen=True)
+class AuditedPenetration(Penetration):
+    """A penetration under which two worlds differ in one vehicle alone, which is connected.
+
+    The worlds have traffic seeds of their own and yet the same vehicles, so that what is drawn for
+    them must not depend on the seed.
+
+    Attributes:
+        target: Index of the vehicle in which the worlds differ.
+    """
+
+    target: int = 0
+
+    def _uniform(self, traffic_seed: int, stream: int, n: int) -> FloatArray:
+        """Return the numbers of the one traffic; the target's lies below every share."""
+        uniform = super()._uniform(0, stream, n)
+        if self.target < n:
+            uniform[self.target] = 0.0
+        return uniform
+
+
+def audited(config: EnvConfig, worlds: AdjacentWorlds) -> EnvConfig:
+    """Return a configuration under which the vehicle in which two worlds differ is connected."""
+    if config.penetration.is_complete:
+        return config
+    given = {each.name: getattr(config.penetration, each.name) for each in fields(Penetration)}
+    target = worlds.rest.n_vehicles
+    return replace(config, penetration=AuditedPenetration(**given, target=target))

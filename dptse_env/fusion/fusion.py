@@ -1,0 +1,183 @@
+"""Fusion of two kinds of sensors, ahead of the estimator and alike for every estimator.
+
+It reads public numbers alone, the releases and the estimator's prediction, so that no guarantee
+depends on it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dptse_env.estimators import Estimate
+from dptse_env.fusion.innovation_test import InnovationTest
+from dptse_env.fusion.settings import FusionSettings
+from dptse_env.fusion.share_filter import ShareFilter
+from dptse_env.model import MeasurementRows
+from dptse_env.release import MeasuredRows
+from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+
+
+@dataclass(frozen=True)
+class FusionSetup:
+    """Configuration that a fusion is made for.
+
+    Attributes:
+        settings: Its settings.
+        rows: The M rows of a measurement.
+        n_options: How many of them are queries, which come first.
+        lengths: Length of each row [km], shape (M,).
+        share: Published share p of connected vehicles.
+        limits: Speed limit of each row [km/h], shape (M,).
+        releases_flow: Whether flows are released, else mean speeds.
+        n_episodes: Size n of the batch.
+    """
+
+    settings: FusionSettings
+    rows: MeasurementRows
+    n_options: int
+    lengths: FloatArray
+    share: float
+    limits: FloatArray
+    releases_flow: bool
+    n_episodes: int
+
+
+class Fusion:
+    """Turns answers of connected vehicles into measurements of all vehicles, with their errors.
+
+    A query counts n_c connected vehicles of n, of which every one is connected with probability p:
+    ``n_c / p`` estimates n with a variance of ``n (1 - p) / p`` beside the mechanism's. So it is
+    with the sum of ``v - c`` over them, whose variance is ``n (1 - p) / p`` times the mean of
+    ``(v - c)^2``. The mean speed of n_c of n vehicles has the variance ``s^2 (1/n_c - 1/n)``, with
+    s the spread of speeds. For n and the mean speed the estimator's prediction is taken, of one
+    vehicle at least.
+
+    Attributes:
+        share: Estimated share of each episode; None where the published one is taken.
+        test: The innovation test; None without one.
+    """
+
+    def __init__(self, setup: FusionSetup) -> None:
+        """Prepare for episodes; each needs a `reset` before its first second."""
+        self.setup, settings = setup, setup.settings
+        self._weights = setup.rows.weights
+        self.share = (
+            ShareFilter(settings, setup.share, setup.n_episodes)
+            if settings.share == "estimated"
+            else None
+        )
+        self.test = (
+            InnovationTest(settings, setup.n_episodes, setup.rows.n_rows)
+            if settings.innovation_test
+            else None
+        )
+
+    def reset(self, episodes: IntArray) -> None:
+        """Begin new episodes, shape (k,)."""
+        if self.share is not None:
+            self.share.reset(episodes)
+        if self.test is not None:
+            self.test.reset(episodes)
+
+    def read(
+        self,
+        episodes: IntArray,
+        observed: BoolArray,
+        measured: MeasuredRows,
+        prediction: Estimate,
+    ) -> MeasuredRows:
+        """Return the measurements of a second that the estimator is given.
+
+        Args:
+            episodes: Distinct rows of the batch, shape (k,).
+            observed: Rows that answered, shape (k, M).
+            measured: The released rows.
+            prediction: The estimator's prediction for this second, rows of shape (k, S).
+        """
+        expected = self._expected(measured, prediction)
+        values, sigma = measured.values.copy(), measured.sigma.copy()
+        self._scale_queries(episodes, observed, values, sigma, expected)
+        if self.test is not None:
+            sigma = self.test.weigh(
+                episodes, observed, values - expected.mean, sigma, expected.deviation
+            )
+        return MeasuredRows(values, sigma, measured.centre)
+
+    def _expected(self, measured: MeasuredRows, prediction: Estimate) -> _Expected:
+        """Return what the prediction says of the rows."""
+        weights = self._weights.T
+        density = np.maximum(prediction.density @ weights, 0.0)
+        speed = prediction.speed @ weights
+        density_std = prediction.density_std @ weights
+        speed_std = prediction.speed_std @ weights
+        if not self.setup.releases_flow:
+            mean = np.stack([density, speed], axis=-1)
+            deviation = np.stack([density_std, speed_std], axis=-1)
+            return _Expected(density, np.zeros_like(speed), speed, mean, deviation)
+        offset = speed - measured.centre @ weights
+        mean = np.stack([density, density * offset], axis=-1)
+        deviation = np.stack(
+            [density_std, np.hypot(density_std * offset, density * speed_std)], axis=-1
+        )
+        return _Expected(density, offset, speed, mean, deviation)
+
+    def _scale_queries(
+        self,
+        episodes: IntArray,
+        observed: BoolArray,
+        values: FloatArray,
+        sigma: FloatArray,
+        expected: _Expected,
+    ) -> None:
+        """Write what the answers of connected vehicles say of all vehicles, and its error."""
+        setup, queries = self.setup, slice(0, self.setup.n_options)
+        length, density = setup.lengths[queries], expected.density[:, queries]
+        count = np.maximum(density * length, 1.0)
+        p, p_variance = np.array([[setup.share]]), np.zeros((1, 1))
+        if self.share is not None:
+            p, p_variance = self.share.update(
+                episodes, observed[:, queries], values[:, queries, 0], sigma[:, queries, 0],
+                density, expected.deviation[:, queries, 0], length,
+            )  # fmt: skip
+        sampling = count * (1.0 - p) / p / length**2
+        spread = setup.settings.speed_spread
+        doubt = p_variance / p**2
+        values[:, queries, 0] /= p
+        sigma[:, queries, 0] = np.sqrt(
+            (sigma[:, queries, 0] / p) ** 2 + sampling + density**2 * doubt
+        )
+        if setup.releases_flow:
+            square = expected.offset[:, queries] ** 2 + spread**2
+            values[:, queries, 1] /= p
+            flow = density * expected.offset[:, queries]
+            sigma[:, queries, 1] = np.sqrt(
+                (sigma[:, queries, 1] / p) ** 2 + sampling * square + flow**2 * doubt
+            )
+        else:
+            answering = p * count
+            # Without a connected vehicle the speed limit is released.
+            none = np.exp(-answering) * (setup.limits[queries] - expected.speed[:, queries]) ** 2
+            sigma[:, queries, 1] = np.sqrt(
+                sigma[:, queries, 1] ** 2 + spread**2 * (1.0 - p) / answering + none
+            )
+
+
+@dataclass(frozen=True)
+class _Expected:
+    """What a prediction says of M rows, shape (k, M), and (k, M, 2) for both quantities.
+
+    Attributes:
+        density: Densities [veh/km], at least 0.
+        offset: Speeds less the centres of flows [km/h]; 0 where mean speeds are released.
+        speed: Speeds [km/h].
+        mean: The measurements that are expected.
+        deviation: Standard deviations of the predicted ones.
+    """
+
+    density: FloatArray
+    offset: FloatArray
+    speed: FloatArray
+    mean: FloatArray
+    deviation: FloatArray

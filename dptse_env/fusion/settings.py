@@ -1,0 +1,44 @@
+"""Settings of the fusion: the keyword ``fusion`` of an environment."""
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+from dptse_env.utils.fields import Interval, checked_fields
+
+ShareSource = Literal["published", "estimated"]
+"""Source of the share of connected vehicles: the public one, or the releases."""
+
+
+@dataclass(frozen=True)
+class FusionSettings:
+    """How answers of connected vehicles and of fixed sensors become measurements of all vehicles.
+
+    Attributes:
+        share: Source of the share of connected vehicles: ``published``, or ``estimated``, a state
+            that is learned from the releases.
+        share_deviation: Standard deviation of the prior of an estimated share, over the published
+            one.
+        share_walk: Standard deviation of a second of its random walk, over the published one.
+        speed_spread: Standard deviation of the vehicles' speeds on a segment [km/h], for the
+            sampling error of speeds.
+        innovation_test: Whether measurements that keep disagreeing with the prediction are given
+            less weight.
+        threshold: Mean normalised innovation, in its own standard deviations, from which a
+            measurement has less weight.
+        memory: Time constant of these means [s].
+
+    Raises:
+        ValueError: A value is out of range.
+    """
+
+    share: ShareSource = "published"
+    share_deviation: Annotated[float, Interval(0.01, 10)] = 0.5
+    share_walk: Annotated[float, Interval(0, 1)] = 0.002
+    speed_spread: Annotated[float, Interval(0, 100)] = 12.0
+    innovation_test: bool = False
+    threshold: Annotated[float, Interval(0.1, 100)] = 1.5
+    memory: Annotated[float, Interval(1, 10_000)] = 60.0
+
+    def __post_init__(self) -> None:
+        """Check values."""
+        checked_fields(self, "fusion")

@@ -1,0 +1,289 @@
+"""Queries that connected vehicles answer, and fixed sensors that see all: two mechanisms."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from dptse_env.model import MeasurementRows
+from dptse_env.privacy import EpsilonTable, epsilon_of
+from dptse_env.release.base import Released, ReleaseModel, ReleaseRequest, ReleaseSetup
+from dptse_env.release.detectors import DetectorErrors, Detectors
+from dptse_env.release.queries import QueryOptions
+from dptse_env.release.report import PrivacyReport, in_order
+from dptse_env.release.traffic_table import TrafficTable
+from dptse_env.traffic import AnyRecord, Penetration, with_vehicles
+from dptse_env.utils.arrays import FloatArray, IntArray
+from dptse_env.utils.vector_info import Rows
+
+DETECTORS_SHARE = 0.25
+"""Part of the privacy budget mu^2 of a connected vehicle that pays for the fixed sensors."""
+
+
+@dataclass(frozen=True)
+class PartSetup(ReleaseSetup):
+    """Setup of a mechanism that releases some of the columns of a release.
+
+    Attributes:
+        whole: The setup of all columns.
+        start: The first column of the part.
+        stop: The first column after the part.
+    """
+
+    whole: ReleaseSetup | None = None
+    start: int = 0
+    stop: int = 0
+
+    @property
+    def _whole(self) -> ReleaseSetup:
+        assert self.whole is not None
+        return self.whole
+
+    @cached_property
+    def rows(self) -> MeasurementRows:
+        """The rows among the part's columns."""
+        rows = self._whole.rows
+        part = slice(self.start, self.stop)
+        return MeasurementRows(rows.first[part], rows.span[part], rows.n_segments)
+
+    @cached_property
+    def n_columns(self) -> int:
+        """Columns of the part."""
+        return self.stop - self.start
+
+    @cached_property
+    def lengths(self) -> FloatArray:
+        """See `ReleaseSetup.lengths`."""
+        return self._whole.lengths[self.start : self.stop]
+
+    @cached_property
+    def always_observed(self) -> IntArray:
+        """See `ReleaseSetup.always_observed`."""
+        always = self._whole.always_observed
+        return always[(always >= self.start) & (always < self.stop)] - self.start
+
+
+class ConnectedTraffic(TrafficTable):
+    """The traffic that connected vehicles report: their density, and their mean speeds."""
+
+    def __init__(self, traffic: TrafficTable, penetration: Penetration) -> None:
+        """Prepare a table for the traffic seeds of another; nothing is loaded."""
+        super().__init__(traffic.corridor, traffic.traffic_seeds, traffic.library)
+        self._penetration = penetration
+
+    def record(self, index: int) -> AnyRecord:
+        """Return the rows of the connected vehicles in the record of ``traffic_seeds[index]``."""
+        record = with_vehicles(super().record(index), "the keyword penetration")
+        return self._penetration.reports(self.traffic_seeds[index], record)
+
+
+class TwoMechanisms(ReleaseModel):
+    """Two release models of one kind: of connected vehicles for queries, of all for fixed sensors.
+
+    A query sums over the connected vehicles of its segments; a fixed sensor over all vehicles of
+    its segment. The mechanisms share no ledger, since a fixed sensor cannot tell which vehicle is
+    which: each has a part of the budget mu^2 for the trip of a vehicle. Their squared parameters
+    add up to that of a connected vehicle (composition of Gaussian mechanisms); a vehicle that is
+    not connected is seen by the fixed sensors alone and has their smaller parameter.
+
+    Without fixed sensors the queries have the whole budget.
+
+    Attributes:
+        queries: Release model of the queries.
+        sensors: Release model of the fixed sensors, and of boundary segments that are released;
+            None without any.
+    """
+
+    def __init__(
+        self,
+        model: type[ReleaseModel],
+        setup: ReleaseSetup,
+        penetration: Penetration,
+        detectors: Detectors,
+    ) -> None:
+        """Make both models; nothing is loaded."""
+        super().__init__(setup)
+        split = setup.queries.n_options
+        has_sensors = setup.always_observed.size > 0
+        self.takes_noise, self.has_prices = model.takes_noise, model.has_prices  # type: ignore[misc]
+        self._claims = model.claims_guarantee
+        self._connected = ConnectedTraffic(setup.traffic, penetration)
+        self._split = split if has_sensors else setup.n_columns
+
+        def part(start: int, stop: int, traffic: TrafficTable, share: float) -> ReleaseModel:
+            is_sensors = start > 0
+            return model(
+                PartSetup(
+                    setup.name, setup.settings, traffic,
+                    bandwidth=0 if is_sensors else setup.bandwidth,
+                    horizon=setup.horizon, n_episodes=setup.n_episodes,
+                    queries=_no_options(setup) if is_sensors else setup.queries,
+                    budget_share=share if self._claims else 1.0,
+                    whole=setup, start=start, stop=stop,
+                )
+            )  # fmt: skip
+
+        share = DETECTORS_SHARE if has_sensors else 0.0
+        self.queries = part(0, self._split, self._connected, 1.0 - share)
+        self.sensors = None
+        self._errors = None
+        if has_sensors:
+            self.sensors = part(self._split, setup.n_columns, setup.traffic, share)
+            if not detectors.are_exact:
+                self._errors = self._detector_errors(detectors)
+        self._flow = model.flow_centre(setup.corridor, setup.settings) is not None
+
+    def _detector_errors(self, detectors: Detectors) -> DetectorErrors:
+        setup = self.setup
+        columns = np.array(setup.queries.sensor_rows(setup.corridor), dtype=np.int64)
+        return DetectorErrors(
+            detectors, columns - self._split, setup.lengths[columns], setup.n_episodes
+        )
+
+    @property
+    def parts(self) -> tuple[ReleaseModel, ...]:
+        """The models that there are."""
+        return (self.queries,) if self.sensors is None else (self.queries, self.sensors)
+
+    @property
+    def sigma(self) -> FloatArray:
+        """See `ReleaseModel.sigma`: those of a query, before it is divided by the share."""
+        return self.queries.sigma
+
+    @property
+    def shared(self) -> tuple[Any, ...]:
+        """What depends on traffic alone, of both."""
+        arrays = [array for part in self.parts for array in (*part.shared, part.setup)]
+        return (*arrays, self._connected)
+
+    def load(self, index: int, record: AnyRecord) -> None:
+        """See `ReleaseModel.load`; queries read the connected vehicles alone."""
+        self._connected.load([index])
+        self.queries.load(index, self._connected.record(index))
+        if self.sensors is not None:
+            self.sensors.load(index, record)
+
+    def reset(self, episodes: IntArray, generators: Sequence[np.random.Generator]) -> None:
+        """See `ReleaseModel.reset`; each mechanism has streams of its own."""
+        streams = list(zip(*(generator.spawn(3) for generator in generators), strict=True))
+        self.queries.reset(episodes, streams[0])
+        if self.sensors is not None:
+            self.sensors.reset(episodes, streams[1])
+        if self._errors is not None:
+            self._errors.reset(episodes, streams[2])
+
+    def release(self, request: ReleaseRequest) -> Released:
+        """See `ReleaseModel.release`."""
+        request = request._replace(prediction=_once(request.prediction))
+        observed, split = request.observed, self._split
+        queried = self.queries.release(request._replace(observed=observed[:, :split]))
+        if self.sensors is None:
+            return queried
+        seen, missing = observed[:, split:], None
+        if self._errors is not None:
+            missing = np.zeros(observed.shape, dtype=bool)
+            missing[:, self.setup.queries.sensor_rows(self.setup.corridor)] = self._errors.silent(
+                request.episodes
+            )
+            seen = seen & ~missing[:, split:]
+        sensed = self.sensors.release(request._replace(observed=seen))
+        if self._errors is not None:
+            sensed = self._errors.apply(request.episodes, sensed, releases_flow=self._flow)
+        both = queried, sensed
+        shapes = [(*part.values.shape,) for part in both]
+        return Released(
+            np.concatenate([part.values for part in both], axis=1),
+            np.concatenate(
+                [np.broadcast_to(p.sigma, s) for p, s in zip(both, shapes, strict=True)], axis=1
+            ),
+            sensed.centre,
+            missing,
+        )
+
+    def spent(self, episodes: IntArray, steps: IntArray) -> tuple[FloatArray, FloatArray]:
+        """See `ReleaseModel.spent`: that of a connected vehicle, under both mechanisms."""
+        squares = sum(part.spent(episodes, steps)[0] ** 2 for part in self.parts)
+        return self._epsilons.bounds(np.sqrt(squares))
+
+    @cached_property
+    def _epsilons(self) -> EpsilonTable:
+        return EpsilonTable(self._mu, self.setup.settings.delta)
+
+    @cached_property
+    def _mu(self) -> float:
+        """Parameter of both mechanisms together."""
+        return math.hypot(*(part.report().mu for part in self.parts))
+
+    def report(self) -> PrivacyReport:
+        """See `ReleaseModel.report`; it is that of a connected vehicle, under both mechanisms."""
+        reports, settings = [part.report() for part in self.parts], self.setup.settings
+        own, mu = reports[0], self._mu
+        reasons = in_order(reason for report in reports for reason in report.void_reasons)
+        epsilon = epsilon_of(mu, settings.delta)
+        if epsilon > settings.epsilon * (1.0 + 1e-9):
+            reasons = in_order({*reasons, "releases_not_composed"})
+        protected = f"a connected vehicle: {own.protects}, under queries and fixed sensors together"
+        details = {
+            f"{name}_mu": report.mu
+            for name, report in zip(("queries", "sensors"), reports, strict=False)
+        }
+        return replace(
+            own,
+            guarantee="none" if reasons else own.guarantee.replace(own.protects, protected),
+            void_reasons=reasons,
+            protects=protected,
+            mu=mu,
+            epsilon=epsilon,
+            epsilon_strict=epsilon_of(mu, own.strict_delta),
+            details={**own.details, **details},
+        )
+
+    def public_state(self, episodes: IntArray) -> tuple[FloatArray, FloatArray] | None:
+        """See `ReleaseModel.public_state`, of the queries."""
+        return self.queries.public_state(episodes)
+
+    def public_info(self, episodes: IntArray) -> Rows:
+        """See `ReleaseModel.public_info`, of the queries."""
+        return self.queries.public_info(episodes)
+
+    def give_noise(self, noise: FloatArray) -> None:
+        """See `ReleaseModel.give_noise`."""
+        self.queries.give_noise(noise[:, : self._split])
+        if self.sensors is not None:
+            self.sensors.give_noise(noise[:, self._split :])
+
+    def budgets_spent(self, episodes: IntArray) -> FloatArray:
+        """See `ReleaseModel.budgets_spent`: parts of the budget of a connected vehicle."""
+        spent = sum(part.setup.budget_share * part.budgets_spent(episodes) for part in self.parts)
+        return np.asarray(spent, dtype=np.float64)
+
+    def private_info(self, episodes: IntArray, traffic: IntArray) -> Rows:
+        """Return those of the queries, and those of the fixed sensors as ``sensor_<name>``."""
+        infos = dict(self.queries.private_info(episodes, traffic))
+        if self.sensors is not None:
+            for name, rows in self.sensors.private_info(episodes, traffic).items():
+                infos[f"sensor_{name}"] = rows
+        return infos
+
+
+def _no_options(setup: ReleaseSetup) -> QueryOptions:
+    """Return options of which there are none, on a setup's road."""
+    none = np.zeros(0, dtype=np.int64)
+    return QueryOptions(none, none, np.zeros(0), none, setup.corridor.n_mainline, 0)
+
+
+def _once(prediction: Callable[[], Any]) -> Callable[[], Any]:
+    """Return a function that asks for a prediction at most once."""
+    found: list[Any] = []
+
+    def remembered() -> Any:
+        if not found:
+            found.append(prediction())
+        return found[0]
+
+    return remembered

@@ -1,0 +1,125 @@
+"""The audit of a vehicle that answers queries and passes fixed sensors."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from agents.studies.audit.attack import attack
+from agents.studies.audit.strategies import FixedQueries
+from agents.studies.audit.targets import choose_target, make_policy
+from agents.studies.audit.worlds import AdjacentWorlds, AuditedPenetration, Trajectory, audited
+from dptse_env.config import resolve
+from dptse_env.parts import privacy_report
+from dptse_env.privacy.audit_statistics import Claim, audit
+from dptse_env.release import two_mechanisms
+from dptse_env.traffic import Penetration, RecordLibrary
+
+HORIZON, SENSOR = 60, 3
+
+
+def config(preset="capped", **privacy):
+    given = {"preset": preset, "epsilon": 2.0, "adjacency": "add_remove", **privacy}
+    if preset == "capped":
+        given = {"cap": 20, **given}
+    return resolve(
+        "short-highway",
+        {
+            "penetration": 0.3,
+            "horizon": HORIZON,
+            "privacy": given,
+            "corridor": {"fixed_sensors": [SENSOR, 7]},
+        },
+    )
+
+
+@pytest.fixture(scope="module")
+def record():
+    return RecordLibrary().get(config().corridor, 0)
+
+
+def standing(record, segment=SENSOR):
+    seconds = np.arange(1, HORIZON + 1)
+    there = Trajectory.constant(seconds, segment, 0.0)
+    return AdjacentWorlds(record, (there, Trajectory.absent()))
+
+
+def reached(setting, worlds, segment=SENSOR, *, queried=True):
+    plan = np.zeros((HORIZON, 6), dtype=bool)
+    plan[:, segment] = queried
+    runs = attack(setting, worlds, FixedQueries(plan), 2, progress=False)
+    return runs.distances.max() / privacy_report(setting).mu
+
+
+def test_a_vehicle_that_both_see_is_as_visible_as_the_account_says(record):
+    assert reached(config(), standing(record)) == pytest.approx(1.0, rel=1e-9)
+
+
+def test_each_mechanism_alone_has_its_part(record):
+    share = two_mechanisms.DETECTORS_SHARE
+    alone = reached(config(), standing(record), queried=False)
+    assert alone == pytest.approx(np.sqrt(share), rel=1e-9)
+    queried = reached(config(), standing(record, segment=1), segment=1)
+    assert queried == pytest.approx(np.sqrt(1.0 - share), rel=1e-9)
+
+
+def test_the_paced_ledgers_of_both_stay_below_mu(record):
+    setting = config("paced")
+    assert 0.9 < reached(setting, standing(record)) <= 1.0 + 1e-12
+
+
+def test_a_mechanism_that_forgets_its_share_is_found_out(record, monkeypatch):
+    monkeypatch.setattr(two_mechanisms, "DETECTORS_SHARE", 0.0)
+    sound = two_mechanisms.PartSetup.__init__
+
+    def generous(self, *args, **keywords):
+        keywords["budget_share"] = 1.0
+        sound(self, *args, **keywords)
+
+    monkeypatch.setattr(two_mechanisms.PartSetup, "__init__", generous)
+    setting = config()
+    declared = 1.0 * np.sqrt(2.0)
+    assert privacy_report(setting).void_reasons == ("releases_not_composed",)
+    assert reached(setting, standing(record)) * declared > 1.4
+
+
+@pytest.mark.parametrize("adjacency", ["add_remove", "replace"])
+@pytest.mark.parametrize("preset", ["capped", "paced"])
+def test_the_worst_case_of_the_planner_reaches_most_of_mu(preset, adjacency, record):
+    setting = config(preset, adjacency=adjacency)
+    worlds = choose_target(setting, record, "worst-case", "hunter")
+    runs = attack(setting, worlds, make_policy(setting, "hunter", worlds), 2, progress=False)
+    part = runs.distances.max() / privacy_report(setting).mu
+    assert 0.85 < part <= 1.0 + 1e-9
+
+
+def test_other_kinds_of_targets_are_refused(record):
+    with pytest.raises(ValueError, match="target must be one of"):
+        choose_target(config(), record, "deleted", "hunter")
+
+
+def test_both_worlds_have_the_same_connected_vehicles_and_the_target_is_one(record):
+    setting = audited(config(), standing(record))
+    penetration = setting.penetration
+    assert isinstance(penetration, AuditedPenetration)
+    n = record.n_vehicles + 1
+    zero, one = (penetration.connected(seed, n) for seed in (0, 1))
+    np.testing.assert_array_equal(zero, one)
+    assert zero[record.n_vehicles]
+    np.testing.assert_array_equal(zero[:-1], Penetration(0.3).connected(0, n - 1))
+    whole = dataclasses.replace(config(), penetration=Penetration())
+    assert audited(whole, standing(record)) is whole
+
+
+@pytest.mark.slow
+def test_scores_of_many_runs_agree_with_the_guarantee_and_weak_noise_does_not(record):
+    setting, worlds = config(), standing(record)
+    plan = np.zeros((HORIZON, 6), dtype=bool)
+    plan[:, SENSOR] = True
+    report = privacy_report(setting)
+    claim = Claim(report.mu, report.claimed_epsilon, report.claimed_delta)
+    for factor, verdict in ((1.0, "not rejected"), (0.6, "rejected")):
+        runs = attack(
+            setting, worlds, FixedQueries(plan), 3_000, noise_factor=factor, progress=False
+        )
+        assert audit(*runs.scores, claim).verdict == verdict

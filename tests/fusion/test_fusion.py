@@ -1,0 +1,188 @@
+"""Fusion: what answers of connected vehicles say of all vehicles, and which sensors to believe."""
+
+import numpy as np
+import pytest
+
+from dptse_env.estimators import Estimate
+from dptse_env.fusion import Fusion, FusionSettings, FusionSetup
+from dptse_env.fusion.innovation_test import InnovationTest
+from dptse_env.fusion.share_filter import ShareFilter
+from dptse_env.model import MeasurementRows
+from dptse_env.release import MeasuredRows
+
+LENGTH, LIMIT, SPREAD = 0.1, 100.0, 12.0
+N_SEGMENTS = 4
+
+
+def make(n_episodes=1, share=0.2, *, flow=True, n_options=3, **settings):
+    rows = MeasurementRows.single(N_SEGMENTS)
+    lengths, limits = np.full(N_SEGMENTS, LENGTH), np.full(N_SEGMENTS, LIMIT)
+    given = FusionSettings(speed_spread=SPREAD, **settings)
+    fusion = Fusion(FusionSetup(given, rows, n_options, lengths, share, limits, flow, n_episodes))
+    fusion.reset(np.arange(n_episodes))
+    return fusion
+
+
+def predicted(density, speed, n_episodes=1, density_std=5.0, speed_std=3.0):
+    def of(value):
+        return np.broadcast_to(np.float64(value), (n_episodes, N_SEGMENTS)).copy()
+
+    return Estimate(of(density), of(speed), of(density_std), of(speed_std))
+
+
+def measured(values, sigma=1.0, centre=50.0):
+    values = np.asarray(values, dtype=np.float64)
+    return MeasuredRows(
+        values, np.full(values.shape, sigma), np.full((len(values), N_SEGMENTS), centre)
+    )
+
+
+@pytest.mark.parametrize("share", [0.05, 0.3, 0.9])
+def test_the_error_of_a_scaled_count_and_flow_is_as_large_as_it_says(share):
+    """Vehicles that are connected by chance, counted over the share, against all of them."""
+    generator = np.random.default_rng(0)
+    n, episodes, speed, centre = 20, 4_000, 70.0, 60.0
+    connected = generator.random((episodes, N_SEGMENTS, n)) < share
+    speeds = generator.normal(speed, SPREAD, connected.shape)
+    counts, flows = connected.sum(axis=2), (connected * (speeds - centre)).sum(axis=2)
+    truth = np.stack([np.full(counts.shape, n), (speeds - centre).sum(axis=2)], axis=-1) / LENGTH
+    released = np.stack([counts, flows], axis=-1) / LENGTH
+    fusion = make(episodes, share, n_options=N_SEGMENTS)
+    found = fusion.read(
+        np.arange(episodes),
+        np.ones(counts.shape, dtype=bool),
+        measured(released, 1e-9, centre),
+        predicted(n / LENGTH, speed, episodes),
+    )
+    errors = (found.values - truth) / found.sigma
+    np.testing.assert_allclose(errors.mean(axis=(0, 1)), 0.0, atol=0.03)
+    np.testing.assert_allclose(errors.std(axis=(0, 1)), 1.0, atol=0.04)
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5])
+def test_the_error_of_a_mean_speed_is_as_large_as_it_says(share):
+    generator = np.random.default_rng(0)
+    n, episodes, speed = 60, 4_000, 70.0
+    connected = generator.random((episodes, N_SEGMENTS, n)) < share
+    speeds = generator.normal(speed, SPREAD, connected.shape)
+    counts = connected.sum(axis=2)
+    means = (connected * speeds).sum(axis=2) / np.maximum(counts, 1)
+    released = np.stack([counts / LENGTH, np.where(counts > 0, means, LIMIT)], axis=-1)
+    fusion = make(episodes, share, flow=False, n_options=N_SEGMENTS)
+    found = fusion.read(
+        np.arange(episodes),
+        np.ones(counts.shape, dtype=bool),
+        measured(released, 1e-9, np.nan),
+        predicted(n / LENGTH, speed, episodes),
+    )
+    errors = (found.values[..., 1] - speeds.mean(axis=2)) / found.sigma[..., 1]
+    assert 0.9 < errors.std() < 1.15
+
+
+def test_sampling_error_grows_as_the_share_falls():
+    values, before = np.ones((1, N_SEGMENTS, 2)), np.zeros(2)
+    for share in (0.9, 0.3, 0.1, 0.01):
+        found = make(share=share).read(
+            np.arange(1), np.ones((1, N_SEGMENTS), dtype=bool), measured(values), predicted(50, 60)
+        )
+        assert (found.sigma[0, :3] > before).all()
+        before = found.sigma[0, 0]
+        np.testing.assert_allclose(found.values[0, :3], 1.0 / share)
+        # The last row is a fixed sensor's.
+        np.testing.assert_array_equal(found.values[0, 3], 1.0)
+        np.testing.assert_array_equal(found.sigma[0, 3], 1.0)
+
+
+def test_where_all_vehicles_are_connected_nothing_changes():
+    values = np.random.default_rng(0).normal(50.0, 10.0, (2, N_SEGMENTS, 2))
+    given = measured(values, 3.0)
+    found = make(2, share=1.0).read(
+        np.arange(2), np.ones((2, N_SEGMENTS), dtype=bool), given, predicted(50, 60, 2)
+    )
+    np.testing.assert_array_equal(found.values, given.values)
+    np.testing.assert_allclose(found.sigma, given.sigma, rtol=1e-15)
+
+
+# --- the share as a state ---------------------------------------------------------------------
+
+
+def feed(share_filter, share, n_seconds, density=60.0, n_episodes=1):
+    generator, length = np.random.default_rng(1), np.full(3, LENGTH)
+    episodes, shape = np.arange(n_episodes), (n_episodes, 3)
+    n = int(density * LENGTH)
+    for _ in range(n_seconds):
+        values = generator.binomial(n, share, shape) / LENGTH + generator.normal(0.0, 2.0, shape)
+        share_filter.update(
+            episodes,
+            np.ones(shape, dtype=bool),
+            values,
+            np.full(shape, 2.0),
+            np.full(shape, density),
+            np.full(shape, 1.0),
+            length,
+        )
+
+
+def test_a_share_is_found_from_counts_and_its_error_is_as_large_as_it_says():
+    share_filter = ShareFilter(FusionSettings(share_walk=0.0), 0.3, 300)
+    feed(share_filter, 0.15, 200, n_episodes=300)
+    errors = (share_filter.mean - 0.15) / np.sqrt(share_filter.variance)
+    assert abs(share_filter.mean.mean() - 0.15) < 0.005
+    assert 0.8 < errors.std() < 1.25
+
+
+def test_without_answers_a_share_stays_as_published_and_grows_uncertain():
+    share_filter = ShareFilter(FusionSettings(), 0.3, 1)
+    before = share_filter.variance.copy()
+    nothing = np.zeros((1, 3), dtype=bool)
+    values = np.full((1, 3), np.inf)  # of rows that nobody asked for
+    share_filter.update(
+        np.arange(1), nothing, values, np.ones((1, 3)), np.ones((1, 3)), np.ones((1, 3)), np.ones(3)
+    )
+    assert share_filter.mean[0] == 0.3
+    assert share_filter.variance[0] > before[0]
+
+
+def test_a_reset_forgets_the_share():
+    share_filter = ShareFilter(FusionSettings(), 0.3, 2)
+    feed(share_filter, 0.9, 50, n_episodes=2)
+    share_filter.reset(np.array([1]))
+    assert share_filter.mean[0] > 0.7
+    assert share_filter.mean[1] == 0.3
+
+
+# --- the innovation test ----------------------------------------------------------------------
+
+
+def weighed(bias, n_seconds=400, sigma=2.0, deviation=1.0):
+    """Play a sensor with a bias; return the mean factor on its deviation at the end."""
+    test = InnovationTest(FusionSettings(innovation_test=True), 200, 1)
+    generator, episodes = np.random.default_rng(2), np.arange(200)
+    shape, spread = (200, 1, 2), np.hypot(sigma, deviation)
+    for _ in range(n_seconds):
+        innovation = generator.normal(bias, spread, shape)
+        found = test.weigh(
+            episodes,
+            np.ones((200, 1), dtype=bool),
+            innovation,
+            np.full(shape, sigma),
+            np.full(shape, deviation),
+        )
+    return float((found / sigma).mean())
+
+
+def test_a_sensor_that_agrees_keeps_its_weight_and_a_biased_one_loses_it():
+    assert weighed(0.0) < 1.02
+    assert weighed(4.0) > 1.7
+    assert weighed(-4.0) > 1.7
+
+
+def test_rows_without_a_measurement_keep_their_mean():
+    test = InnovationTest(FusionSettings(innovation_test=True), 1, 2)
+    observed = np.array([[True, False]])
+    innovation = np.full((1, 2, 2), 5.0)
+    test.weigh(np.arange(1), observed, innovation, np.ones((1, 2, 2)), np.ones((1, 2, 2)))
+    assert (test.mean[0, 0] > 0.0).all()
+    assert not test.mean[0, 1].any()
+    test.reset(np.arange(1))
+    assert not test.mean.any()

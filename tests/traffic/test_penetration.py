@@ -1,0 +1,97 @@
+"""Which vehicles are connected: nested in the share, and the same for every policy."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from dptse_env.config import resolve
+from dptse_env.traffic import Penetration, Record
+
+SHARES = (0.01, 0.1, 0.3, 0.9, 1.0)
+
+
+def road_of(n_vehicles, n_steps=4):
+    """A record in which every vehicle stands on segment 0 in every second."""
+    step, vehicle = (grid.ravel() for grid in np.indices((n_steps, n_vehicles)))
+    speed = 10.0 + vehicle
+    return Record(step, vehicle, np.zeros_like(step), speed, n_steps=n_steps, n_columns=3)
+
+
+def test_connected_vehicles_at_a_share_are_connected_at_every_larger_one():
+    sets = [Penetration(share).connected(7, 5_000) for share in SHARES]
+    for smaller, larger in itertools.pairwise(sets):
+        assert not (smaller & ~larger).any()
+    assert sets[-1].all()
+    for share, connected in zip(SHARES, sets, strict=True):
+        assert abs(connected.mean() - share) < 4.0 * np.sqrt(share * (1.0 - share) / 5_000) + 1e-12
+
+
+def test_a_vehicle_is_connected_whatever_others_there_are():
+    some, more = (Penetration(0.3).connected(7, n) for n in (10, 1_000))
+    np.testing.assert_array_equal(some, more[:10])
+
+
+@pytest.mark.parametrize("change", [{"seed": 1}, {"traffic_seed": 8}])
+def test_another_seed_connects_other_vehicles(change):
+    def connected(seed=0, traffic_seed=7):
+        return Penetration(0.5, seed=seed).connected(traffic_seed, 1_000)
+
+    # Two independent sets share about half of the vehicles' flags.
+    assert 0.4 < (connected() == connected(**change)).mean() < 0.6
+
+
+def test_a_share_of_a_range_is_drawn_for_each_traffic_seed():
+    penetration = Penetration((0.1, 0.4))
+    shares = np.array([penetration.share_of(seed) for seed in range(200)])
+    assert ((shares >= 0.1) & (shares <= 0.4)).all()
+    assert abs(shares.mean() - 0.25) < 0.03
+    assert len(set(shares.tolist())) == 200
+    assert shares[3] == penetration.share_of(3)
+    assert penetration.published_share == pytest.approx(0.25)
+    connected = [penetration.connected(seed, 4_000).mean() for seed in range(5)]
+    np.testing.assert_allclose(connected, shares[:5], atol=0.03)
+
+
+def test_only_connected_vehicles_report_and_keep_their_index():
+    record, penetration = road_of(100), Penetration(0.2)
+    reported = penetration.reports(7, record)
+    connected = np.flatnonzero(penetration.connected(7, 100))
+    assert set(reported.vehicle.tolist()) == set(connected.tolist())
+    np.testing.assert_array_equal(reported.speed, 10.0 + reported.vehicle)
+    assert (reported.n_steps, reported.n_columns) == (4, 3)
+
+
+def test_some_of_the_connected_vehicles_misreport_their_speed():
+    record = road_of(2_000, n_steps=1)
+    reported = Penetration(0.5, misreporting=0.25, misreport_factor=2.0).reports(7, record)
+    factor = reported.speed / (10.0 + reported.vehicle)
+    assert set(np.round(factor, 3).tolist()) == {1.0, 2.0}
+    assert abs((factor > 1.5).mean() - 0.25) < 0.06
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        (0.0, r"penetration.share must be .* \(0, 1\]"),
+        (1.2, r"penetration.share must be .* \(0, 1\]"),
+        ([0.4, 0.1], r"penetration.share must be \(low, high\), got \(0.4, 0.1\)"),
+        ([0.0, 0.1], r"penetration.share\[0\] must be"),
+        ({"share": 0.1, "class": "car"}, "penetration.class is unknown"),
+        ({"misreporting": 1.5}, "penetration.misreporting must be"),
+        ("ten percent", "penetration.share must be"),
+    ],
+)
+def test_bad_values_are_refused_by_path(value, message):
+    with pytest.raises(ValueError, match=message):
+        resolve("short-highway", {"penetration": value})
+
+
+@pytest.mark.parametrize("value", [0.1, [0.1, 0.2], {"share": 0.1, "seed": 3}, {"seed": 3}])
+def test_a_number_a_pair_and_a_mapping_are_taken(value):
+    config = resolve("short-highway", {"penetration": value})
+    assert config.has_separate_sensors == (value != {"seed": 3})
+
+
+def test_a_range_of_one_share_is_the_share():
+    assert Penetration((0.2, 0.2)) == Penetration(0.2)
