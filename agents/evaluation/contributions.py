@@ -11,7 +11,7 @@ import numpy as np
 
 from agents.evaluation.episodes import EpisodeScore
 from dptse_env.process import QueryProcess
-from dptse_env.release import Capped, CappedSettings, PacedSettings, ReleaseModel
+from dptse_env.release import Capped, CappedSettings, PacedSettings, ReleaseModel, TwoMechanisms
 from dptse_env.release.paced import Paced
 from dptse_env.release.vehicle_table import VehicleTable
 from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray, IntArray
@@ -85,6 +85,7 @@ class TripSums:
 class LedgerWatcher:
     """Follows the vehicles of a batch of episodes; call it after the reset and every second.
 
+    Where queries and fixed sensors are two mechanisms, it follows those that answer queries.
     Episodes begin at second 0 of their records. A vehicle that still drives at the end of an
     episode counts with what it has done by then.
     """
@@ -96,7 +97,8 @@ class LedgerWatcher:
             ValueError: The release model keeps no account of single vehicles.
         """
         self._process, self._seeds = process, tuple(traffic_seeds)
-        self._table = vehicle_table(process.release)
+        self._release = of_queries(process.release)
+        self._table = vehicle_table(self._release)
         self._n_mainline = process.interface.n_mainline
         shape = (len(self._seeds), self._n_mainline)
         self._met, self._refused = np.zeros((2, *shape), dtype=np.int64)
@@ -104,7 +106,7 @@ class LedgerWatcher:
 
     def __call__(self) -> None:
         """Count the contributions of the second that has passed."""
-        release = self._process.release
+        release = self._release
         paid, _ = payments(release)
         if self._before is None:  # the call after the reset, before any query
             self._seconds, self._met_of, self._refused_of = np.zeros((3, *paid.shape), dtype=int)
@@ -170,10 +172,15 @@ class LedgerWatcher:
         self, episodes: Sequence[EpisodeScore]
     ) -> list[tuple[int, EpisodeScore, FloatArray, BoolArray]]:
         """Return place, score, spent parts of budgets, and who was on the mainline."""
-        paid, budget = payments(self._process.release)
+        paid, budget = payments(self._release)
         return [
             (k, score, paid[k] / budget, self._seconds[k] > 0) for k, score in enumerate(episodes)
         ]
+
+
+def of_queries(release: ReleaseModel) -> ReleaseModel:
+    """Return the release model of the queries, where fixed sensors have one of their own."""
+    return release.queries if isinstance(release, TwoMechanisms) else release
 
 
 def payments(release: ReleaseModel) -> tuple[AnyArray, float]:

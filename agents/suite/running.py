@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from agents.evaluation.contributions import LedgerWatcher
+from agents.evaluation.contributions import LedgerWatcher, of_queries
 from agents.evaluation.episodes import EpisodeScore, run_episodes
 from agents.evaluation.honesty import EstimateWatcher
 from agents.evaluation.policies import PolicySource
@@ -95,7 +95,7 @@ class _Watchers:
     def __init__(self, env: SensorQueryVectorEnv, seeds: tuple[int, ...]) -> None:
         self._process = env.process
         self._estimates = EstimateWatcher(env.process)
-        has_accounts = isinstance(env.process.release, Capped | Paced)
+        has_accounts = isinstance(of_queries(env.process.release), Capped | Paced)
         self._ledgers = LedgerWatcher(env.process, seeds) if has_accounts else None
         self.n_queries, self.n_seconds = 0, -1  # the first call is that after the reset
 

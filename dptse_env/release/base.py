@@ -212,7 +212,7 @@ class ReleaseModel(ABC):
     """True where the model reads the vehicles of a record, which measured fields have not."""
     has_prices: ClassVar[bool] = False
     """True where queries have prices, which `public_state` gives."""
-    takes_noise: ClassVar[bool] = False
+    takes_noise: bool = False
     """True where `give_noise` works, which trainings by swaps need."""
 
     @classmethod

@@ -41,7 +41,7 @@ class GaussianRelease(ReleaseModel):
         sensitivity: L2 sensitivities of both released quantities over an episode.
     """
 
-    takes_noise: ClassVar[bool] = True
+    takes_noise: bool = True
 
     def __init__(self, setup: ReleaseSetup) -> None:
         """Compute sensitivity and noise; nothing is loaded."""

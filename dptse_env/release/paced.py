@@ -57,7 +57,7 @@ class Paced(ReleaseModel):
     needs_vehicles: ClassVar[bool] = True
     releases_sums: ClassVar[bool] = True
     has_prices: ClassVar[bool] = True
-    takes_noise: ClassVar[bool] = True
+    takes_noise: bool = True
 
     @classmethod
     def flow_centre(cls, corridor: Corridor, settings: PacedSettings) -> float | None:

@@ -110,7 +110,7 @@ class TwoMechanisms(ReleaseModel):
         super().__init__(setup)
         split = setup.queries.n_options
         has_sensors = setup.always_observed.size > 0
-        self.takes_noise, self.has_prices = model.takes_noise, model.has_prices  # type: ignore[misc]
+        self.takes_noise = model.takes_noise
         self._claims = model.claims_guarantee
         self._connected = ConnectedTraffic(setup.traffic, penetration)
         self._split = split if has_sensors else setup.n_columns
