@@ -129,60 +129,73 @@ def _long(name: str, description: str, **keywords: Any) -> SuiteCell:
 
 _CAPPED = {"preset": "capped", "epsilon": 5.0, "cap": 64}
 
+_FIRST = (
+    _cell(
+        "paper", "PaperHighway-v0, noise as printed, EKF, B = 5", PAPER,
+        estimator="ekf", bandwidth=5,
+    ),
+    _cell(
+        "capped-ekf-5", "PrivateHighway-v0, EKF, B = 5", PRIVATE,
+        estimator="ekf", bandwidth=5,
+    ),
+    _cell(
+        "capped-recurrent-5", "PrivateHighway-v0, recurrent, B = 5", PRIVATE,
+        estimator="recurrent", bandwidth=5,
+    ),
+    _cell(
+        "paced-ekf-2", "PrivateHighway-v1, EKF, B = 2", PACED,
+        estimator="ekf", bandwidth=2,
+    ),
+    _cell(
+        "paced-recurrent-2", "PrivateHighway-v1, recurrent, B = 2", PACED,
+        estimator="recurrent", bandwidth=2,
+    ),
+    _cell(
+        "paced-recurrent-5", "PrivateHighway-v1, recurrent, B = 5", PACED,
+        estimator="recurrent", bandwidth=5,
+    ),
+    _cell(
+        "other-drivers", "paced-recurrent-2 with drivers by Krauss and two peaks of demand",
+        PACED, estimator="recurrent", bandwidth=2, demand=_TWO_PEAKS,
+        corridor={"drivers": {"model": "Krauss"}},
+    ),
+    _cell(
+        "short", "ShortHighway-v0, paced, recurrent, B = 1", SHORT,
+        estimator="recurrent", bandwidth=1, privacy={"preset": "paced", "epsilon": 5.0},
+        parameters="w99-3lane",
+    ),
+    _long(
+        "long-capped-recurrent-8", "LongHighway-v0, capped, recurrent, B = 8",
+        estimator="recurrent", bandwidth=8, privacy=_CAPPED,
+    ),
+    _long(
+        "long-recurrent-8", "LongHighway-v0, recurrent, B = 8",
+        estimator="recurrent", bandwidth=8,
+    ),
+    _long("long-ekf-4", "LongHighway-v0, EKF, B = 4", estimator="ekf", bandwidth=4),
+    _long(
+        "long-recurrent-2", "LongHighway-v0, recurrent, B = 2",
+        estimator="recurrent", bandwidth=2,
+    ),
+)  # fmt: skip
+
+_CONNECTED = _cell(
+    "connected-recurrent-5",
+    "paced-recurrent-5 with one vehicle in ten connected, and detectors on segments 3, 7 and 11",
+    PACED,
+    estimator="recurrent",
+    bandwidth=5,
+    penetration=0.1,
+    corridor={"fixed_sensors": [3, 7, 11]},
+)
+
 SUITES = {
-    "query-suite-v1": Suite(
-        "query-suite-v1",
-        (
-            _cell(
-                "paper", "PaperHighway-v0, noise as printed, EKF, B = 5", PAPER,
-                estimator="ekf", bandwidth=5,
-            ),
-            _cell(
-                "capped-ekf-5", "PrivateHighway-v0, EKF, B = 5", PRIVATE,
-                estimator="ekf", bandwidth=5,
-            ),
-            _cell(
-                "capped-recurrent-5", "PrivateHighway-v0, recurrent, B = 5", PRIVATE,
-                estimator="recurrent", bandwidth=5,
-            ),
-            _cell(
-                "paced-ekf-2", "PrivateHighway-v1, EKF, B = 2", PACED,
-                estimator="ekf", bandwidth=2,
-            ),
-            _cell(
-                "paced-recurrent-2", "PrivateHighway-v1, recurrent, B = 2", PACED,
-                estimator="recurrent", bandwidth=2,
-            ),
-            _cell(
-                "paced-recurrent-5", "PrivateHighway-v1, recurrent, B = 5", PACED,
-                estimator="recurrent", bandwidth=5,
-            ),
-            _cell(
-                "other-drivers", "paced-recurrent-2 with drivers by Krauss and two peaks of demand",
-                PACED, estimator="recurrent", bandwidth=2, demand=_TWO_PEAKS,
-                corridor={"drivers": {"model": "Krauss"}},
-            ),
-            _cell(
-                "short", "ShortHighway-v0, paced, recurrent, B = 1", SHORT,
-                estimator="recurrent", bandwidth=1, privacy={"preset": "paced", "epsilon": 5.0},
-                parameters="w99-3lane",
-            ),
-            _long(
-                "long-capped-recurrent-8", "LongHighway-v0, capped, recurrent, B = 8",
-                estimator="recurrent", bandwidth=8, privacy=_CAPPED,
-            ),
-            _long(
-                "long-recurrent-8", "LongHighway-v0, recurrent, B = 8",
-                estimator="recurrent", bandwidth=8,
-            ),
-            _long("long-ekf-4", "LongHighway-v0, EKF, B = 4", estimator="ekf", bandwidth=4),
-            _long(
-                "long-recurrent-2", "LongHighway-v0, recurrent, B = 2",
-                estimator="recurrent", bandwidth=2,
-            ),
-        ),
+    suite.name: suite
+    for suite in (
+        Suite("query-suite-v1", _FIRST),
+        Suite("query-suite-v2", (*_FIRST, _CONNECTED)),
     )
-}  # fmt: skip
+}
 """The suites by name."""
 
 
