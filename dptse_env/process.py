@@ -11,7 +11,7 @@ import numpy as np
 
 from dptse_env.estimators import Estimate, check_estimate
 from dptse_env.parts import Parts, complete_report
-from dptse_env.release import ReleaseRequest, check_released, split_release
+from dptse_env.release import MeasuredRows, ReleaseRequest, check_released, split_release
 from dptse_env.release.nominal import nominal_state
 from dptse_env.reset_options import ResetOptions
 from dptse_env.spaces.actions import PendingPicks, check_decision
@@ -195,7 +195,7 @@ class QueryProcess:
 
     def _advance(self, episodes: IntArray, queried: BoolArray) -> None:
         """Advance one second: predict, release, update, and store the query."""
-        traffic, n_rows = self.traffic_index[episodes], self.model.rows.n_rows
+        traffic = self.traffic_index[episodes]
         inputs = self.boundary.inputs(episodes, traffic, self.time[episodes])
         self._in_threads(episodes, self.estimator.predict, inputs)
         self.time[episodes] += 1
@@ -203,23 +203,44 @@ class QueryProcess:
         request = ReleaseRequest(
             episodes, traffic, self.time[episodes], observed, lambda: self._predicted(episodes)
         )
+        observed, measured, at_boundary = self.measure(request)
+        self.boundary.update(episodes, *at_boundary)
+        self._in_threads(episodes, self.estimator.update, observed, *measured)
+        self.queried[episodes] = queried
+        values, before = measured.values, self.released[episodes]
+        self.released[episodes] = np.where(observed[:, :, None], values, before)
+        covered = self.release.setup.covered(observed)
+        self.age[episodes] = np.where(covered, 0, self.age[episodes] + 1)
+
+    def measure(
+        self, request: ReleaseRequest
+    ) -> tuple[BoolArray, MeasuredRows, tuple[FloatArray, FloatArray | None]]:
+        """Release a second, which charges its vehicles, and read the release.
+
+        Returns:
+            Rows that answered, shape (k, M), what the estimator is given of them, and the releases
+            of the boundary segments with their centres (`dptse_env.release.split_release`).
+        """
         released = self.release.release(request)
         if self._checks_releases:
             check_released(self.release, released, request)
         measured, at_boundary = split_release(released, self.model)
-        self.boundary.update(episodes, *at_boundary)
+        observed = request.observed
         if released.missing is not None:
             observed = observed & ~released.missing
-        observed = observed[:, :n_rows]
+        observed = observed[:, : self.model.rows.n_rows]
         if self.fusion is not None:
-            prediction = self._predicted(episodes)
-            measured = self.fusion.read(episodes, observed, measured, prediction)
-        values = measured.values
-        self._in_threads(episodes, self.estimator.update, observed, *measured)
-        self.queried[episodes] = queried
-        self.released[episodes] = np.where(observed[:, :, None], values, self.released[episodes])
-        covered = self.release.setup.covered(observed)
-        self.age[episodes] = np.where(covered, 0, self.age[episodes] + 1)
+            measured = self.fusion.read(request.episodes, observed, measured, request.prediction())
+        return observed, measured, at_boundary
+
+    @property
+    def expected_sigma(self) -> FloatArray:
+        """Standard deviations of the noise of a query's measurement before an episode, shape (2,).
+
+        Those of the release model, scaled to all vehicles where not every one is connected.
+        """
+        sigma = self.release.sigma
+        return sigma if self.fusion is None else self.fusion.scaled(sigma)
 
     def _in_threads(self, episodes: IntArray, work: Any, *rows: Any) -> None:
         """Call ``work`` on blocks of episodes and of their rows, in several threads."""

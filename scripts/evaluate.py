@@ -2,8 +2,8 @@
 
 python scripts/evaluate.py --schedules paper round-robin --seeds 2000:2020
 python scripts/evaluate.py --policies results/training/primary/pl-0/best.zip
-python scripts/evaluate.py --suite query-suite-v1 --policies round-robin my_package:MySchedule
-python scripts/evaluate.py --suite query-suite-v1 --verify results/suites/query-suite-v1/mine.json
+python scripts/evaluate.py --suite query-suite-v2 --policies round-robin my_package:MySchedule
+python scripts/evaluate.py --suite query-suite-v2 --verify results/suites/query-suite-v1/mine.json
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class Args(Road):
     "module:Class", and models of stable-baselines3 as "module:Class=file.zip", which are unpickled:
     load those that you trust."""
     suite: str | None = None
-    """Score the policies in the cells of a suite, such as query-suite-v1, which say everything but
+    """Score the policies in the cells of a suite, such as query-suite-v2, which say everything but
     the policies, machines and output."""
     verify: Path | None = None
     """Card of a suite of which a drawn cell is run again, to see whether its errors are right."""
@@ -246,7 +246,7 @@ def suite_options(args: Args) -> tuple[str, Path]:
         ValueError: There is an argument that the suite says, or a card to verify and no suite.
     """
     if args.suite is None:
-        raise ValueError("verify needs the suite of the card, such as --suite query-suite-v1")
+        raise ValueError("verify needs the suite of the card, such as --suite query-suite-v2")
     own = ("suite", "policies", "verify", *NOT_RESULTS)
     given = [
         each.name

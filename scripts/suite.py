@@ -17,7 +17,7 @@ from scripts.evaluate_suite import evaluate_suite
 class Args(Machines):
     """Score policies in the cells of a query suite."""
 
-    name: str = "query-suite-v1"
+    name: str = "query-suite-v2"
     """Name of the suite."""
     policies: tuple[str, ...] = ()
     """Schedules and policies: names, files of saved ones, "module:Class", and models of

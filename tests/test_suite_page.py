@@ -18,7 +18,7 @@ def part(name):
 
 
 def test_the_tables_of_the_page_are_those_of_the_cards():
-    suite = find_suite("query-suite-v1")
+    suite = find_suite("query-suite-v2")
     cards = shipped_cards(suite)
     zero, one = cards[ZERO], cards[ONE]
     assert part("scores") == score_table(list(cards.values()), zero, one, suite).strip()

@@ -81,6 +81,12 @@ class Fusion:
         if self.test is not None:
             self.test.reset(episodes)
 
+    def scaled(self, sigma: FloatArray) -> FloatArray:
+        """Return deviations (2,) of a query's noise, scaled by the published share."""
+        p = self.setup.share
+        scaled: FloatArray = sigma / np.array([p, p if self.setup.releases_flow else 1.0])
+        return scaled
+
     def read(
         self,
         episodes: IntArray,

@@ -209,7 +209,7 @@ def _problem(process: QueryProcess, inflation: CovarianceInflation) -> Problem:
     config, model = process.config, process.model
     corridor, settings, term = config.corridor, config.settings(), process.interface.reward.term
     n, rho_m, v_f = corridor.n_mainline, model.density_scale, model.speed_scale
-    sigma = np.array(settings.noise_scale) * process.release.sigma / model.measurement_scale
+    sigma = np.array(settings.noise_scale) * process.expected_sigma / model.measurement_scale
     is_walk = config.estimator == "random_walk"
     if inflation.process_noise is None and not is_walk:
         given = settings.process_noise_in

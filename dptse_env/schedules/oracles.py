@@ -11,7 +11,7 @@ import numpy as np
 
 from dptse_env.estimators import Estimator
 from dptse_env.process import QueryProcess
-from dptse_env.release import MeasuredRows, ReleaseRequest, split_release
+from dptse_env.release import MeasuredRows, ReleaseRequest
 from dptse_env.schedules.base import ProcessSchedule, require_plain
 from dptse_env.spaces.rewards import ScoredSecond, estimation_error
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray, Observation
@@ -46,11 +46,12 @@ class OracleError(ProcessSchedule):
 
 @dataclass(frozen=True)
 class _NextSecond:
-    """Truth, releases and estimator of the coming second of k episodes."""
+    """Truth, measurements and estimator of the coming second of k episodes."""
 
     episodes: IntArray
     truth: FloatArray
-    released: MeasuredRows
+    answered: BoolArray
+    measured: MeasuredRows
     estimator: Estimator
 
 
@@ -106,18 +107,16 @@ class _Realised(ProcessSchedule):
             all_columns,
             lambda: ahead.estimator.estimate().at(episodes),
         )
-        released, _ = split_release(ahead.release.release(request), ahead.model)
+        answered, measured, _ = ahead.measure(request)
         truth = ahead.traffic.aggregates(traffic, times + 1)
-        return _NextSecond(episodes, truth, released, ahead.estimator)
+        return _NextSecond(episodes, truth, answered, measured, ahead.estimator)
 
     def _reward(self, coming: _NextSecond, queried: BoolArray) -> FloatArray:
         """Return the rewards (k,) of querying ``queried`` (k, n_mainline)."""
         process, n, episodes = self.process, self.n_mainline, coming.episodes
-        observed = np.zeros(coming.truth.shape[:2], dtype=bool)
-        observed[:, [*process.config.corridor.fixed_sensors]] = True
-        observed[:, :n] |= queried
+        observed = process.release.setup.observed(queried)[:, : process.model.rows.n_rows]
         estimator = _copied(coming.estimator)
-        estimator.update(episodes, observed, *coming.released)
+        estimator.update(episodes, observed & coming.answered, *coming.measured)
         estimate, truth = estimator.estimate().at(episodes), coming.truth[:, :n]
         density, speed = truth[..., 0], truth[..., 1]
         error = estimation_error(density, speed, estimate.density[:, :n], estimate.speed[:, :n])

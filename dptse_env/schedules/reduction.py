@@ -31,7 +31,7 @@ class ExpectedReduction(ProcessSchedule):
     def __init__(self, process: QueryProcess, seed: int | None = None) -> None:
         """Bind the schedule to a process (``env.unwrapped.process``)."""
         super().__init__(process, seed)
-        self._noise = np.square(process.release.sigma)
+        self._noise = np.square(process.expected_sigma)
         corridor, term = process.config.corridor, process.interface.reward.term
         self._of_density = (term != "speed") / corridor.density_scale**2
         self._of_speed = (term != "density") / corridor.speed_scale**2
