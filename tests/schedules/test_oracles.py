@@ -98,7 +98,7 @@ def test_the_oracle_of_gains_tries_every_segment_without_noise(privacy):
         process = env.unwrapped.process
         coming = make_schedule("oracle-gain", env)._look(np.array([0]))
         length = process.config.corridor.segment_length
-        counts = coming.released.values[0, :6, 0]
+        counts = coming.measured.values[0, :6, 0]
         if privacy == "paper":
             np.testing.assert_allclose(counts, coming.truth[0, :6, 0], atol=0.02)
         else:
