@@ -26,7 +26,7 @@ demo: setup  ## Train a small query policy and evaluate it beside the schedules 
 		--traffic 0:32 --validation 1000:1008 --no-tensorboard --output results/demo/training \
 		recipe:plackett-luce --recipe.regression.rounds 2 --recipe.regression.batches 600 \
 		--recipe.swaps.rounds 1 --recipe.swaps.episodes 96 --recipe.swaps.batches 300
-	$(BIN)/python scripts/evaluate.py --policies results/demo/training/policy.zip --output results/demo
+	$(BIN)/python scripts/evaluate.py --policies results/demo/training/policy.zip --output results/demo --force
 
 reproduce: setup  ## Repeat the paper's results and judge its claims; results/paper.
 	$(BIN)/python scripts/study.py paper
@@ -49,15 +49,15 @@ choice-study: setup  ## Map where a choice of queries pays, with the policies of
 		--paced $(wildcard results/training/paced-roads/*/best.zip)
 
 audit: setup  ## Attack the privacy presets, 5,000 runs in each of two worlds; results/audit.
-	$(BIN)/python scripts/audit.py --env dptse_env:dptse/PaperHighway-v0 --target replaced
-	$(BIN)/python scripts/audit.py --env dptse_env:dptse/PaperHighway-v0 --privacy corrected --target replaced
-	$(BIN)/python scripts/audit.py --env dptse_env:dptse/PrivateHighway-v0 --noise-factor 0.709
-	$(BIN)/python scripts/audit.py --env dptse_env:dptse/PrivateHighway-v0
-	$(BIN)/python scripts/audit.py --noise-factor 0.709
-	$(BIN)/python scripts/audit.py
-	$(BIN)/python scripts/audit.py --target replaced
-	$(BIN)/python scripts/audit.py --target opposite
-	$(BIN)/python scripts/audit.py --target pairs --traffic-seed 2000 --runs 2000
+	$(BIN)/python scripts/audit.py --force --env dptse_env:dptse/PaperHighway-v0 --target replaced
+	$(BIN)/python scripts/audit.py --force --env dptse_env:dptse/PaperHighway-v0 --privacy corrected --target replaced
+	$(BIN)/python scripts/audit.py --force --env dptse_env:dptse/PrivateHighway-v0 --noise-factor 0.709
+	$(BIN)/python scripts/audit.py --force --env dptse_env:dptse/PrivateHighway-v0
+	$(BIN)/python scripts/audit.py --force --noise-factor 0.709
+	$(BIN)/python scripts/audit.py --force
+	$(BIN)/python scripts/audit.py --force --target replaced
+	$(BIN)/python scripts/audit.py --force --target opposite
+	$(BIN)/python scripts/audit.py --force --target pairs --traffic-seed 2000 --runs 2000
 
 test: setup  ## Run the tests, without the slow ones.
 	$(BIN)/python -m pytest -m 'not slow' -n 2

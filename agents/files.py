@@ -12,6 +12,26 @@ from pathlib import Path
 from typing import Any
 
 
+def refuse_to_replace(paths: Iterable[Path], force: bool) -> None:
+    """Refuse to write over what an earlier run left, unless that is wanted.
+
+    Programs that go on where they stopped hold their settings to those of the folder instead, see
+    `agents.experiments.provenance`.
+
+    Args:
+        paths: Files that are going to be written.
+        force: Whether they may be replaced.
+
+    Raises:
+        FileExistsError: One is there, and it may not be replaced.
+    """
+    there = [str(path) for path in paths if path.exists()]
+    if there and not force:
+        raise FileExistsError(
+            f"{', '.join(there)} would be replaced: choose another --output, or give --force"
+        )
+
+
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """Yield a temporary path, whose file takes the place of ``path`` when the body is done.

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from agents.evaluation.environments import make_config
+from agents.files import refuse_to_replace
 from agents.studies.audit.attack import attack
 from agents.studies.audit.pairs import PairsFinding, study_pairs
 from agents.studies.audit.report import Finding
@@ -90,6 +91,8 @@ class Args(Road):
     """Seeds the noise."""
     output: Path = Path("results/audit")
     """Folder for the result, a JSON file."""
+    force: bool = False
+    """Replace the file of an earlier audit."""
     json: bool = False
     """Print the result as JSON, for a program, in place of a table."""
 
@@ -155,7 +158,6 @@ def make_title(args: Args, config: EnvConfig) -> str:
 
 def run_audit(args: Args) -> Finding:
     """Choose two worlds, play them, and test the claim."""
-    check(args)
     config = attacked_config(args)
     make_planner(config, args.policy).require_kind(args.target)
     place = args.workplace(args.output)
@@ -190,7 +192,6 @@ def run_audit(args: Args) -> Finding:
 
 def run_pairs(args: Args) -> PairsFinding:
     """Replay pairs of trips of several records."""
-    check(args)
     config = attacked_config(args)
     seeds = range(args.traffic_seed, args.traffic_seed + args.n_records)
     place = args.workplace(args.output)
@@ -198,24 +199,37 @@ def run_pairs(args: Args) -> PairsFinding:
     records = [
         with_vehicles(place.records.get(config.corridor, seed), "an audit") for seed in seeds
     ]
-    policy = args.policy if args.policy in PUBLIC_SCHEDULES else "round-robin"
     title = make_title(args, config)
     return study_pairs(
         config,
         records,
         args.runs,
         title=title,
-        policy=policy,
+        policy=played_policy(args),
         seed=args.seed,
         engine=place.engine,
     )
 
 
+def result_path(args: Args) -> Path:
+    """Return the file of the result."""
+    preset, noise = attacked_config(args).privacy.preset, args.noise_factor
+    ending = "" if noise == 1.0 else f"-noise-{noise:g}"
+    return args.output / f"{preset}-{args.target}-{played_policy(args)}{ending}.json"
+
+
+def played_policy(args: Args) -> str:
+    """Return the policy that is played: pairs take public schedules alone."""
+    is_played = args.target != PAIRS or args.policy in PUBLIC_SCHEDULES
+    return args.policy if is_played else "round-robin"
+
+
 def main(args: Args) -> None:
     """Attack or replay, and leave table and file."""
+    check(args)
+    path = result_path(args)
+    refuse_to_replace([path], args.force)
     finding = run_pairs(args) if args.target == PAIRS else run_audit(args)
-    noise = "" if args.noise_factor == 1.0 else f"-noise-{args.noise_factor:g}"
-    path = args.output / f"{finding.privacy.preset}-{args.target}-{finding.policy}{noise}.json"
     finding.write(path, dataclasses.asdict(args))
     if args.json:
         print(path.read_text(encoding="utf-8"), end="")

@@ -7,6 +7,7 @@ python scripts/calibrate.py --corridor '{"speed_limit": 90}' --name my-road
 from __future__ import annotations
 
 import dataclasses
+import logging
 from dataclasses import dataclass
 from datetime import date
 from importlib.metadata import version
@@ -15,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from agents.evaluation.terminal import make_table, print_table
-from agents.files import replacing
+from agents.files import refuse_to_replace, replacing
 from dptse_env.config import parse_seeds
 from dptse_env.model import ARZParameters, available_parameters, load_parameters
 from dptse_env.model.calibration import calibrate
@@ -30,6 +31,8 @@ from dptse_env.model.prediction import (
 from dptse_env.release.traffic_table import TrafficTable
 from dptse_env.traffic import Corridor, RecordLibrary, average_dwell
 from scripts.cli import Road, make_corridor, run
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -46,6 +49,10 @@ class Args(Road):
     """Models to try at most."""
     output: Path = Path("results/calibration")
     """Folder for the fitted set and the errors."""
+    force: bool = False
+    """Replace a set of this name in the folder."""
+    json: bool = False
+    """Print the file of the fitted set as JSON, for a program, in place of tables."""
 
 
 def load_series(
@@ -68,7 +75,7 @@ def shipped_parameters(corridor: Corridor) -> list[ARZParameters]:
         try:
             CompiledARZModel(corridor, load_parameters(name))
         except ValueError as problem:
-            print(f"without {name}: {problem}")
+            logger.info("without %s: %s", name, problem)
         else:
             known.append(load_parameters(name))
     return known
@@ -104,6 +111,8 @@ def main(args: Args) -> None:
     shared = sorted(set(train) & set(held_out))
     if shared:
         raise ValueError(f"held_out must not share seeds with train, both have {shared}")
+    path = args.output / f"{args.name}.json"
+    refuse_to_replace([path], args.force)
     corridor = make_corridor(args.env, args.given_keywords())
     library = args.library(corridor, (*train, *held_out))
     dwell = average_dwell(corridor, (library.get(corridor, seed) for seed in train))
@@ -113,12 +122,6 @@ def main(args: Args) -> None:
     )  # fmt: skip
     candidates = [*shipped_parameters(corridor), fit.parameters]
     errors = compare(corridor, candidates, load_series(corridor, held_out, library))
-    print_errors(errors, f"{corridor.name}, held-out seeds {args.held_out}")
-    print(f"fitted: {fit.parameters}")
-    if fit.at_bounds:
-        print(f"at the bounds of the search: {', '.join(fit.at_bounds)}")
-    print(f"mean time on a mainline segment: {dwell:.2f} s")
-    path = args.output / f"{args.name}.json"
     provenance = {
         "corridor": corridor.name,
         "train": args.train,
@@ -134,6 +137,14 @@ def main(args: Args) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as temporary:
         write_parameters(temporary, fit.parameters, provenance)
+    if args.json:
+        print(path.read_text(encoding="utf-8"), end="")
+        return
+    print_errors(errors, f"{corridor.name}, held-out seeds {args.held_out}")
+    print(f"fitted: {fit.parameters}")
+    if fit.at_bounds:
+        print(f"at the bounds of the search: {', '.join(fit.at_bounds)}")
+    print(f"mean time on a mainline segment: {dwell:.2f} s")
     print(f"written to {path}")
 
 

@@ -86,13 +86,18 @@ class Road(Machines):
         return given_keywords(self.keywords, self.corridor)
 
 
-FAILURES = (
-    OSError, ValueError, MissingExtraError, NetworkError, RecordingError, SumoVersionError,
-    EngineError,
+BAD_INPUT = (
+    ValueError, FileNotFoundError, FileExistsError, IsADirectoryError, NotADirectoryError,
+    PermissionError,
 )  # fmt: skip
-"""Errors that end a program with their message alone."""
+"""Errors of what a program was given, which end it with status 2 and their message alone."""
 
-NOT_RESULTS = ("engine", "address", "workers", "records", "output", "json")
+FAILURES = (
+    OSError, MissingExtraError, NetworkError, RecordingError, SumoVersionError, EngineError,
+)  # fmt: skip
+"""Errors of a run, which end a program with status 1 and their message alone."""
+
+NOT_RESULTS = ("engine", "address", "workers", "records", "output", "json", "force")
 """Arguments that results do not depend on."""
 
 
@@ -106,8 +111,9 @@ def run(
 ) -> None:
     """Parse the command line into ``arguments`` and call ``main`` with them.
 
-    Bad input, a missing extra, a file that cannot be read or written and a failed recording end the
-    program with status 2 and their message in one line; any other exception keeps its traceback.
+    Bad input ends the program with status 2, and a run that fails with status 1, both with a
+    message in one line. Ctrl-C ends it with status 130. Any other exception is a mistake of the
+    program, and keeps its traceback.
 
     Args:
         main: The program.
@@ -121,9 +127,19 @@ def run(
     description = re.sub(r"\n(?=python |dptse )", "\n\n", description or "")
     try:
         main(tyro.cli(arguments, prog=program, args=words, description=description))
-    except FAILURES as problem:
-        print(f"error: {problem}", file=sys.stderr)
-        raise SystemExit(2) from problem
+    except (*BAD_INPUT, *FAILURES) as problem:
+        print(f"error: {_in_words(problem)}", file=sys.stderr)
+        raise SystemExit(2 if isinstance(problem, BAD_INPUT) else 1) from problem
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        raise SystemExit(130) from None
+
+
+def _in_words(problem: BaseException) -> str:
+    """Return the message of an error; of one of the system without its number."""
+    if isinstance(problem, OSError) and problem.strerror and problem.filename:
+        return f"{problem.filename}: {problem.strerror}"
+    return str(problem)
 
 
 @contextlib.contextmanager

@@ -29,8 +29,9 @@ from agents.evaluation.figures import (
 from agents.evaluation.ladder import Rung, run_rung
 from agents.evaluation.page import write_page
 from agents.evaluation.policies import NamedSchedule, PolicySource, find_policy
-from agents.evaluation.report import SUMMARY, Report
+from agents.evaluation.report import EPISODES, SUMMARY, Report
 from agents.evaluation.watched import Watched
+from agents.files import refuse_to_replace
 from dptse_env.config import EnvConfig, parse_seeds
 from dptse_env.rendering import History
 from dptse_env.schedules import OBSERVATION_SCHEDULES
@@ -42,8 +43,8 @@ from scripts.evaluate_suite import evaluate_suite
 ALL = "all"
 """The schedule that runs with a bandwidth that covers the road."""
 
-PAGE = "page.html"
-"""File of the page to look at."""
+ERRORS, MAPS, PAGE = "schedules.png", "space_time.png", "page.html"
+"""Files of the figures and of the page to look at."""
 
 
 @dataclass(frozen=True)
@@ -88,6 +89,8 @@ class Args(Road):
     """Folder for table, scores and figures."""
     html: bool = False
     """Leave a page to look at, too: page.html, interactive, which needs no network."""
+    force: bool = False
+    """Replace the files of an earlier evaluation in the folder."""
     json: bool = False
     """Print the result as JSON, for a program, in place of a table."""
 
@@ -210,7 +213,7 @@ def draw_traffic(
             RoadMap(f"{name}: queried", history.queried, history),
         ]
     title = f"Traffic seed {seed}, {estimator}, {noise}"
-    save_figure(draw_maps([maps], width=8.4), args.output / "space_time.png", title)
+    save_figure(draw_maps([maps], width=8.4), args.output / MAPS, title)
 
 
 def shown(args: Args, report: Report, sources: Mapping[str, PolicySource]) -> list[str]:
@@ -247,24 +250,31 @@ def suite_options(args: Args) -> tuple[str, Path]:
     """
     if args.suite is None:
         raise ValueError("verify needs the suite of the card, such as --suite query-suite-v2")
-    own = ("suite", "policies", "verify", *NOT_RESULTS)
+    own = {"suite", "policies", "verify", *NOT_RESULTS} - {"force"}
     given = [
         each.name
         for each in dataclasses.fields(args)
         if each.name not in own and getattr(args, each.name) != each.default
     ]
     if given:
-        raise ValueError(f"{given[0]} is what the cells of a suite say: leave it out")
+        raise ValueError(f"{given[0]} has no use with a suite, whose cells say all: leave it out")
     is_default = args.output == Args.output
     return args.suite, Path("results/suites") / args.suite if is_default else args.output
+
+
+def written(args: Args) -> list[Path]:
+    """Return the files that an evaluation writes."""
+    names = (EPISODES, SUMMARY, ERRORS, MAPS, *([PAGE] if args.html else []))
+    return [args.output / name for name in names]
 
 
 def main(args: Args) -> None:
     """Record what is missing, evaluate, and leave table, scores and figures."""
     if args.suite is not None or args.verify is not None:
         suite, folder = suite_options(args)
-        evaluate_suite(suite, args.policies, args.verify, folder, args)
+        evaluate_suite(suite, args.policies, args.verify, folder, args, args.json)
         return
+    refuse_to_replace(written(args), args.force)
     sources = find_sources(args)
     require(len(parse_seeds(args.seeds)) >= 2, "seeds", "at least two, for an interval", args.seeds)
     scores = evaluate(args, sources)
@@ -279,7 +289,7 @@ def main(args: Args) -> None:
         print((args.output / SUMMARY).read_text(encoding="utf-8"), end="")
     else:
         report.print()
-    report.draw(args.output / "schedules.png")
+    report.draw(args.output / ERRORS)
     draw_traffic(args, report, sources, noise)
     if args.html:
         episodes = [watch(args, name, sources[name]) for name in shown(args, report, sources)]

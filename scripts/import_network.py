@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from agents.files import refuse_to_replace, replacing
 from dptse_env.traffic import write_corridor
 from dptse_env.traffic.sumo_import import (
     Files,
@@ -68,12 +69,15 @@ class Args:
     """Further options of SUMO, as in --options="--time-to-teleport=-1 --eager-insert=true"."""
     seed: int = 0
     """Traffic seed of the run that demand and exit shares are counted in."""
+    force: bool = False
+    """Replace the road file if it is there."""
 
 
 def main(args: Args) -> None:
     """Import, write the road and print what it is."""
     if args.output.suffix != ".toml":
         raise ValueError(f"output must be a .toml file, got {args.output}")
+    refuse_to_replace([args.output], args.force)
     files = _files(args)
     path, between = _path(args)
     ends = (args.first_position, args.last_position)
@@ -88,7 +92,8 @@ def main(args: Args) -> None:
         speed_limit=args.speed_limit,
         seed=args.seed,
     )
-    write_corridor(args.output, road.corridor, comment=_comment(road))
+    with replacing(args.output) as temporary:
+        write_corridor(temporary, road.corridor, comment=_comment(road))
     print(_comment(road))
     print(f"written: {args.output}")
 

@@ -10,6 +10,7 @@ have the settings that were tuned for that preset.
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +18,7 @@ from agents.evaluation.environments import make_config
 from agents.evaluation.measured_field import Replay, field_corridor, read_field
 from agents.evaluation.terminal import make_table, print_table
 from agents.experiments.plots import LABELS
+from dptse_env.estimators import EstimatorSettings
 from dptse_env.traffic.importers.fields import FieldSource
 from dptse_env.utils.validation import integer
 from scripts.cli import run
@@ -50,6 +52,8 @@ class Args:
     """Estimators."""
     weights: str = "highway"
     """Network of the estimator `recurrent`, by name or file."""
+    json: bool = False
+    """Print the errors as JSON, for a program, in place of a table."""
 
 
 def main(args: Args) -> None:
@@ -64,20 +68,29 @@ def main(args: Args) -> None:
         measured, corridor, base.arz_parameters, args.bandwidth, args.epsilon, args.delta,
         args.window, args.repeats,
     )  # fmt: skip
+    scores = {name: replay.run(name, settings(args, name)) for name in args.estimators}
+    if args.json:
+        print(json.dumps({name: score._asdict() for name, score in scores.items()}, indent=2))
+        return
     density, speed = replay.sigma
     table = make_table(
         f"noise: {density:.1f} veh/km, {speed:.1f} km/h",
         "estimator", "error x 1000", "density [veh/km]", "speed [km/h]", "chi2 density",
         "chi2 speed",
     )  # fmt: skip
-    for name in args.estimators:
-        keywords: dict[str, Any] = {"privacy": "corrected", "estimator": name}
-        if name == "recurrent":
-            recurrent = {"weights": args.weights, "outside": True}
-            keywords["estimator_settings"] = {"recurrent": recurrent}
-        score = replay.run(name, make_config(PAPER, keywords).settings())
+    for name, score in scores.items():
         table.add_row(LABELS[name], *(f"{value:.2f}" for value in score))
     print_table(table)
+
+
+def settings(args: Args, estimator: str) -> EstimatorSettings:
+    """Return the settings of an estimator: those tuned for the preset."""
+    keywords: dict[str, Any] = {"privacy": "corrected", "estimator": estimator}
+    if estimator == "recurrent":
+        recurrent = {"weights": args.weights, "outside": True}
+        keywords["estimator_settings"] = {"recurrent": recurrent}
+    found: EstimatorSettings = make_config(PAPER, keywords).settings()
+    return found
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import tyro
 from tqdm import tqdm
@@ -40,16 +41,16 @@ def resumed(search: PlanSearch, path: Path) -> bool:
     """Resume the search of the plan in a file; return whether there is one.
 
     Raises:
-        ValueError: The file is of another search.
+        ValueError: The file is of another search or version.
     """
     if not path.exists():
         return False
     found = read_plan(path)
-    task = found.provenance.get("task", {})
+    now, there = identity(search.plan()), identity(found)
     differences = [
-        f"{key} is {task.get(key)!r} there and {value!r} now"
-        for key, value in search.plan().provenance["task"].items()
-        if task.get(key) != value
+        f"{key} is {there.get(key)!r} there and {value!r} now"
+        for key, value in now.items()
+        if there.get(key) != value
     ]
     if differences:
         raise ValueError(
@@ -57,6 +58,12 @@ def resumed(search: PlanSearch, path: Path) -> bool:
         )
     search.resume(found)
     return True
+
+
+def identity(plan: Plan) -> dict[str, Any]:
+    """Return what two searches must share for one to go on with the other's plan."""
+    task, versions = (plan.provenance.get(key, {}) for key in ("task", "versions"))
+    return {**task, **{name: versions.get(name) for name in ("dptse-env", "libsumo")}}
 
 
 def save(path: Path, plan: Plan) -> None:

@@ -26,12 +26,14 @@ class Args(Machines):
     """Card of which a drawn cell is run again, to see whether its errors are right."""
     output: Path | None = None
     """Folder of the cards; results/suites/<name> if not given."""
+    json: bool = False
+    """Print the cards, or the verification, as JSON, for a program, in place of tables."""
 
 
 def main(args: Args) -> None:
     """Score policies, or verify a card."""
     folder = args.output or Path("results/suites") / args.name
-    evaluate_suite(args.name, args.policies, args.verify, folder, args)
+    evaluate_suite(args.name, args.policies, args.verify, folder, args, args.json)
 
 
 if __name__ == "__main__":

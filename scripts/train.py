@@ -22,6 +22,7 @@ import torch
 import tyro
 from tqdm import tqdm
 
+from agents.experiments.provenance import check_folder
 from agents.experiments.runner import Workplace
 from agents.training.plan import TrainingPlan
 from agents.training.recipes import MaskablePPORecipe, MaskRecipe, PlackettLuceRecipe, ScoresRecipe
@@ -151,6 +152,9 @@ def main(args: Args) -> None:
     plan = make_plan(args, seeds[0])
     torch.set_num_threads(integer("threads", args.threads, 1))
     place = args.workplace(args.output)
+    folders = [args.output] if args.seeds is None else [args.output / str(each) for each in seeds]
+    for folder, each in zip(folders, seeds, strict=True):
+        check_folder(folder, make_plan(args, each).provenance(None))
     for world in plan.worlds:
         place.record(world.config.corridor, (*plan.traffic_seeds, *plan.validation_seeds))
     if args.seeds is not None:

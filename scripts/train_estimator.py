@@ -16,6 +16,7 @@ from pathlib import Path
 import torch
 
 from agents.evaluation.environments import make_config, parse_env
+from agents.experiments.provenance import check_folder
 from agents.filters.plan import FilterPlan, Round
 from agents.filters.scenarios import ScenarioRanges
 from agents.filters.training import FilterTraining
@@ -110,6 +111,7 @@ def main(args: Args) -> None:
     """Record missing traffic, train, and leave the network."""
     plan = make_plan(args)
     torch.set_num_threads(integer("threads", args.threads, 1))
+    check_folder(args.output, plan.provenance())
     place = args.workplace(args.output)
     for envs, seeds in (
         (plan.ranges.envs, plan.traffic_seeds), (plan.validation_envs, plan.validation_seeds)

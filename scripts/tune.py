@@ -24,8 +24,9 @@ from agents.engines.engine import Workers
 from agents.evaluation.environments import given_keywords
 from agents.evaluation.terminal import make_table, print_table
 from agents.experiments.seeds import TUNING
+from agents.files import refuse_to_replace
 from agents.search.space import SPACE
-from agents.search.tuning import TuningStudy, locked_study, scores_of
+from agents.search.tuning import TuningStudy, journal_path, locked_study, scores_of
 from agents.search.tuning_task import TuningTask
 from dptse_env.model import ARZParameters
 from dptse_env.model.parameters import read_parameters
@@ -81,6 +82,8 @@ class Args(Machines):
     """Seeds the search."""
     output: Path = Path("results/tuning")
     """Folder for the sets and the journals."""
+    force: bool = False
+    """Replace sets in the folder that have no journal there."""
 
 
 def make_tasks(args: Args) -> list[TuningTask]:
@@ -165,6 +168,8 @@ def add_rows(table: Table, study: TuningStudy) -> None:
 def main(args: Args) -> None:
     """Record what is missing, tune every configuration, and leave the sets."""
     tasks = make_tasks(args)
+    foreign = [task for task in tasks if not journal_path(task, args.output).exists()]
+    refuse_to_replace([args.output / f"{task.name}.json" for task in foreign], args.force)
     corridor = tasks[0].config().corridor
     place = args.workplace(args.output)
     place.record(corridor, tasks[0].traffic_seeds)

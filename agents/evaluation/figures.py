@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from agents.evaluation.episodes import EpisodeScore
 from agents.evaluation.statistics import Interval
+from agents.files import replacing
 from dptse_env.rendering import DENSITY_MAP, QUERY_COLOUR, History
 from dptse_env.utils.arrays import FloatArray
 
@@ -36,7 +37,8 @@ def save_figure(figure: Figure, path: Path, title: str) -> None:
     figure.suptitle(title, x=0.01, ha="left", fontsize=10)
     path.parent.mkdir(parents=True, exist_ok=True)
     FigureCanvasAgg(figure)
-    figure.savefig(path, format="png")
+    with replacing(path) as temporary:
+        figure.savefig(temporary, format="png")
 
 
 def add_frame(axis: Axes, lines: Literal["both", "x", "y"] = "both") -> None:

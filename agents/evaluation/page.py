@@ -37,10 +37,10 @@ def write_page(path: Path, report: Report, watched: Sequence[Watched]) -> None:
     Raises:
         MissingExtraError: plotly is not installed.
         OSError: The file cannot be written.
-        ValueError: There is no episode, or the page would be too large.
+        ValueError: There is no episode, or one without data, or the page would be too large.
     """
-    if not watched:
-        raise ValueError("a page needs one watched episode or more")
+    if not watched or not all(each.history.truth for each in watched):
+        raise ValueError("a page needs one watched episode or more, each of a second at least")
     for every in (1, 2, 5, 10, 30, 60):
         page = render(report, watched, every)
         if len(page.encode()) <= LARGEST_PAGE:

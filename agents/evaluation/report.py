@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import json
 from collections.abc import Mapping
@@ -17,11 +16,12 @@ from agents.evaluation.episodes import EpisodeScore
 from agents.evaluation.figures import save_errors
 from agents.evaluation.statistics import Interval, mean_interval, paired_difference
 from agents.evaluation.terminal import make_table, print_table, print_text
+from agents.files import write_atomically, write_csv
 
 METRICS = ("rmse_density", "rmse_speed", "reward")
 
-SUMMARY = "summary.json"
-"""File of the table and its origin."""
+EPISODES, SUMMARY = "episodes.csv", "summary.json"
+"""Files of all scores, and of the table and its origin."""
 
 
 @dataclass(frozen=True)
@@ -96,14 +96,18 @@ class Report:
         return table
 
     def write(self, folder: Path, arguments: Mapping[str, Any]) -> None:
-        """Write all scores to ``episodes.csv``, the table and its origin to `SUMMARY`."""
+        """Write all scores to `EPISODES`, the table and its origin to `SUMMARY`."""
         folder.mkdir(parents=True, exist_ok=True)
         columns = [field.name for field in dataclasses.fields(EpisodeScore)]
-        with (folder / "episodes.csv").open("w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file)
-            writer.writerow(["estimator", "schedule", *columns])
-            for key, scores in self.scores.items():
-                writer.writerows([*key, *dataclasses.astuple(score)] for score in scores)
+        write_csv(
+            folder / EPISODES,
+            ["estimator", "schedule", *columns],
+            (
+                [*key, *dataclasses.astuple(score)]
+                for key, scores in self.scores.items()
+                for score in scores
+            ),
+        )
         packages = ("dptse-env", "gymnasium", "libsumo", "numba", "numpy")
         summary = {
             "title": self.title,
@@ -112,7 +116,7 @@ class Report:
             "versions": {name: version(name) for name in packages},
             "rows": [dataclasses.asdict(row) for row in self.rows.values()],
         }
-        (folder / SUMMARY).write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+        write_atomically(folder / SUMMARY, json.dumps(summary, indent=2) + "\n")
 
     def draw(self, path: Path) -> None:
         """Save a figure of density and speed errors of all policies."""

@@ -95,9 +95,12 @@ def check_folder(folder: Path, provenance: Mapping[str, Any]) -> dict[str, Any] 
             )
         return None
     try:
-        recorded: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        made_with, _ = recorded["made_with"], recorded["sources"]
-    except (json.JSONDecodeError, KeyError) as problem:
+        recorded: dict[str, Any] = json.loads(path.read_bytes())
+        made_with = recorded["made_with"]
+        parts = made_with["settings"], recorded["tuned"], recorded["sources"]
+        if tuple(map(type, parts)) != (dict, list, list):
+            raise ValueError("settings must be a mapping, tuned and sources lists")
+    except (ValueError, KeyError, TypeError) as problem:
         raise ValueError(f"{path} is not as this program writes it: {problem!r}") from problem
     differences = list(_differences(made_with, provenance["made_with"]))
     if differences:

@@ -143,7 +143,9 @@ class Card:
             ValueError: It is not as this class writes it, or was changed afterwards.
         """
         try:
-            content = json.loads(path.read_text(encoding="utf-8"))
+            content = json.loads(path.read_bytes())
+            if not isinstance(content, dict):
+                raise ValueError("it must be a JSON object")
             digest = content.pop("digest")
             results = {
                 name: CellResult.from_json(each) for name, each in content["results"].items()

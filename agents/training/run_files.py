@@ -38,12 +38,24 @@ def write_progress(folder: Path, rows: Sequence[Row], columns: Sequence[str] = C
 
 
 def read_progress(folder: Path) -> list[Row]:
-    """Return the learning curve; rows lack the values that are missing in the file."""
-    with (folder / PROGRESS).open(encoding="utf-8", newline="") as file:
-        return [
-            {name: json.loads(value) for name, value in row.items() if value}
-            for row in csv.DictReader(file)
-        ]
+    """Return the learning curve; rows lack the values that are missing in the file.
+
+    Raises:
+        ValueError: It is damaged.
+    """
+    path = folder / PROGRESS
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            rows = [
+                {name: json.loads(value) for name, value in row.items() if value}
+                for row in csv.DictReader(file, strict=True)
+            ]
+    except (ValueError, TypeError, csv.Error) as problem:
+        message = f"{path} is damaged: {problem}; remove the folder to start over"
+        raise ValueError(message) from problem
+    if not rows or any("update" not in row for row in rows):
+        raise ValueError(f"{path} is damaged: rows are missing; remove the folder to start over")
+    return rows
 
 
 def write_checkpoint(folder: Path, content: dict[str, Any]) -> None:

@@ -78,7 +78,7 @@ def read_settings(path: str | Path) -> EstimatorSettings:
         ValueError: The file has another format, or a setting is out of range; the message starts
             with the path of the file.
     """
-    return _parse(Path(path).read_text(encoding="utf-8"), str(path))
+    return _parse(Path(path).read_bytes(), str(path))
 
 
 def tuned_estimator(path: str | Path) -> str:
@@ -87,7 +87,7 @@ def tuned_estimator(path: str | Path) -> str:
     Raises:
         ValueError: The file has another format.
     """
-    return str(parse_object(Path(path).read_text(encoding="utf-8"), str(path), _KEYS)["estimator"])
+    return str(parse_object(Path(path).read_bytes(), str(path), _KEYS)["estimator"])
 
 
 def write_settings(
@@ -121,7 +121,7 @@ def write_settings(
     Path(path).write_text(text, encoding="utf-8")
 
 
-def _parse(text: str, path: str) -> EstimatorSettings:
+def _parse(text: str | bytes, path: str) -> EstimatorSettings:
     content = parse_object(text, path, _KEYS)
     name = settings_name(content["estimator"], content["parameters"], content["privacy"])
     if content["name"] != name and not content["name"].startswith(f"{name}-"):

@@ -103,7 +103,7 @@ def read_parameters(path: str | Path) -> ARZParameters:
         ValueError: The file has another format or a value is out of range; the message starts with
             the path of the file.
     """
-    return _parse(Path(path).read_text(encoding="utf-8"), str(path))
+    return _parse(Path(path).read_bytes(), str(path))
 
 
 def write_parameters(
@@ -114,7 +114,7 @@ def write_parameters(
     Path(path).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 
-def _parse(text: str, path: str) -> ARZParameters:
+def _parse(text: str | bytes, path: str) -> ARZParameters:
     content = parse_object(text, path, {"parameters": dict, "provenance": dict})
     try:
         return ARZParameters.from_mapping(content["parameters"])

@@ -97,7 +97,7 @@ def read_plan(path: str | Path) -> Plan:
     Raises:
         ValueError: The file has another format; the message starts with its path.
     """
-    return _parse(Path(path).read_text(encoding="utf-8"), str(path))
+    return _parse(Path(path).read_bytes(), str(path))
 
 
 def write_plan(path: str | Path, plan: Plan) -> None:
@@ -162,7 +162,7 @@ def _first_with(plan: Plan, segment: int) -> int:
     return next(i for i, segments in enumerate(plan.sets) if segment in segments)
 
 
-def _parse(text: str, path: str) -> Plan:
+def _parse(text: str | bytes, path: str) -> Plan:
     content = parse_object(text, path, _KEYS)
     kind = PLAN_ALIASES.get(content["kind"], content["kind"])
     if kind not in PLANS:

@@ -162,10 +162,10 @@ def _manifest(recordings: Recordings) -> dict[str, Any]:
     """Read a manifest and hold it to the digest; what was read once need not be read again."""
     path = Path(recordings.folder) / MANIFEST
     try:
-        manifest = parse_object(path.read_text(encoding="utf-8"), str(path), _KEYS)
-    except (OSError, UnicodeDecodeError) as problem:
-        reason = problem.strerror if isinstance(problem, OSError) else str(problem)
-        raise InvalidRecordError(f"{path}: recordings cannot be read: {reason}") from problem
+        manifest = parse_object(path.read_bytes(), str(path), _KEYS)
+    except OSError as problem:
+        message = f"{path}: recordings cannot be read: {problem.strerror}"
+        raise InvalidRecordError(message) from problem
     except ValueError as problem:
         raise InvalidRecordError(str(problem)) from problem
     wanted = RECORDINGS_FORMAT, RECORDINGS_VERSION

@@ -16,11 +16,11 @@ def shipped_texts(package: str, folder: str) -> dict[str, str]:
     }
 
 
-def parse_object(text: str, path: str, keys: Mapping[str, type]) -> dict[str, Any]:
+def parse_object(text: str | bytes, path: str, keys: Mapping[str, type]) -> dict[str, Any]:
     """Parse a JSON object that has exactly the given keys.
 
     Args:
-        text: The JSON.
+        text: The JSON, as text or as the bytes of a file.
         path: Its path, for error messages.
         keys: Type of each value by its key.
 
@@ -30,7 +30,7 @@ def parse_object(text: str, path: str, keys: Mapping[str, type]) -> dict[str, An
     """
     try:
         content = json.loads(text)
-    except (json.JSONDecodeError, RecursionError) as problem:
+    except (ValueError, RecursionError) as problem:
         raise ValueError(f"{path} must be JSON: {problem}") from problem
     if not isinstance(content, dict) or set(content) != set(keys):
         got = str(sorted(content) if isinstance(content, dict) else content)[:200]

@@ -1,6 +1,7 @@
 import csv
 import dataclasses
 import json
+import re
 from pathlib import Path
 
 import gymnasium as gym
@@ -190,14 +191,19 @@ def test_a_card_is_verified(tmp_path, capsys):
     path = tmp_path / "cards" / "paper.json"
     main(Args(suite="small-v1", verify=path))
     assert ": errors agree, mean error x 1000 " in capsys.readouterr().out
+    main(Args(suite="small-v1", verify=path, json=True))
+    assert json.loads(capsys.readouterr().out)["is_same"] is True
     card = Card.read(path)
     better = {
         name: dataclasses.replace(each, error=tuple(0.5 * value for value in each.error))
         for name, each in card.results.items()
     }
     dataclasses.replace(card, results=better).write(path)
-    with pytest.raises(ValueError, match=r"the mean error x 1000 is .* on the card and .* now"):
+    with pytest.raises(SystemExit) as ended:
         main(Args(suite="small-v1", verify=path))
+    assert ended.value.code == 1
+    said = capsys.readouterr().err
+    assert re.search(r"the mean error x 1000 is .* on the card and .* now", said)
     with pytest.raises(ValueError, match="policies must be one, that of the card"):
         main(Args(suite="small-v1", verify=path, policies=("paper", "static")))
     with pytest.raises(ValueError, match="'static' is not the policy of the card"):
@@ -209,8 +215,12 @@ def test_a_card_is_verified(tmp_path, capsys):
     ("changes", "message"),
     [
         ({"suite": "v9"}, "suite must be one of .*query-suite-v2, small-v1, got 'v9'"),
-        ({"seeds": "2000:2004"}, "seeds is what the cells of a suite say: leave it out"),
-        ({"env": SHORT}, "env is what the cells of a suite say"),
+        (
+            {"seeds": "2000:2004"},
+            "seeds has no use with a suite, whose cells say all: leave it out",
+        ),
+        ({"env": SHORT}, "env has no use with a suite"),
+        ({"force": True}, "force has no use with a suite"),
         ({"policies": ()}, "policies must be one or more, to be scored in small-v1"),
         ({"suite": None, "verify": Path("card.json")}, "verify needs the suite of the card"),
         ({"workers": 0}, "workers must be"),

@@ -11,12 +11,12 @@ from scripts import record
 from scripts.cli import run
 
 
-def refused(monkeypatch, capsys, tmp_path, *arguments):
+def refused(monkeypatch, capsys, tmp_path, *arguments, status=2):
     fixed = ["--corridor", "short-highway", "--seeds", "0:1", "--records", str(tmp_path / "cache")]
     monkeypatch.setattr("sys.argv", ["record.py", *fixed, *arguments])
     with pytest.raises(SystemExit) as ended:
         run(record.main, record.Args, None)
-    assert ended.value.code == 2
+    assert ended.value.code == status
     assert not (tmp_path / "cache").exists()
     (line,) = capsys.readouterr().err.splitlines()
     return line
@@ -27,7 +27,8 @@ def test_a_cluster_that_does_not_answer_is_one_line(monkeypatch, capsys, tmp_pat
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{free.getsockname()[1]}"
-    line = refused(monkeypatch, capsys, tmp_path, "--engine", "ray", "--address", address)
+    words = "--engine", "ray", "--address", address
+    line = refused(monkeypatch, capsys, tmp_path, *words, status=1)
     assert line.startswith(f"error: no cluster answers at {address}")
     assert "ray start --head" in line
 
@@ -35,7 +36,7 @@ def test_a_cluster_that_does_not_answer_is_one_line(monkeypatch, capsys, tmp_pat
 def test_the_missing_extra_is_one_line(monkeypatch, capsys, tmp_path):
     monkeypatch.setitem(sys.modules, "ray", None)
     monkeypatch.delitem(sys.modules, "agents.engines.ray_cluster", raising=False)
-    line = refused(monkeypatch, capsys, tmp_path, "--engine", "ray")
+    line = refused(monkeypatch, capsys, tmp_path, "--engine", "ray", status=1)
     assert "pip install 'dptse-env[ray]'" in line
 
 

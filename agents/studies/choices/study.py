@@ -58,7 +58,8 @@ def design_provenance(design: ChoiceDesign) -> dict[str, Any]:
         f"{env} {traffic}": environment_provenance(env, design.schedule, [cells[cell]])
         for (env, traffic), cell in first.items()
     }
-    made_with = {"cells": environments, "policies": saved}
+    versions = next(iter(environments.values()))["versions"]
+    made_with = {"versions": versions, "cells": environments, "policies": saved}
     return results_provenance(made_with, list(cells.values()))
 
 

@@ -67,8 +67,10 @@ def freeze(
             f"{place.folder / TEST} exists: test traffic has been run, nothing can be frozen any "
             "more. Choose another --output"
         )
+    provenance = design_provenance(design)
+    check_folder(place.folder, provenance)  # drafting takes a while
     drafted = draft(design, checkpoints, tuned, command)
-    take_folder(place.folder, design_provenance(design))
+    take_folder(place.folder, provenance)
     manifest = write_draft(place.folder, drafted)
     if manifest.frozen:
         return manifest, False
