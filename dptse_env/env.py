@@ -15,6 +15,7 @@ from dptse_env.rendering import History, Picture
 from dptse_env.traffic import Records, open_library
 from dptse_env.utils.arrays import Observation
 from dptse_env.utils.validation import integer
+from dptse_env.window import Window
 
 _ONLY = np.zeros(1, dtype=np.int64)
 
@@ -103,10 +104,11 @@ class SensorQueryEnv(gym.Env[Observation, Any]):
     the record).
 
     **Rendering**: ``render_mode="rgb_array"`` draws true density, estimate, queries and error over
-    space and time. The picture shows true traffic.
+    space and time; ``"human"`` shows the same in a window at every reset and step (extra
+    ``video``). The picture shows true traffic.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 (Gymnasium's own)
+    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 30}  # noqa: RUF012 (Gymnasium's own)
 
     def __init__(
         self,
@@ -121,7 +123,7 @@ class SensorQueryEnv(gym.Env[Observation, Any]):
 
         Args:
             preset: Name of a preset in `dptse_env.config.PRESETS`.
-            render_mode: None or ``"rgb_array"``.
+            render_mode: None, ``"rgb_array"`` or ``"human"``.
             render_every: Simulated time between two drawings [s]; in between, `render` returns the
                 last one.
             records: Folder of the record cache, or a library of records; None for the user's
@@ -131,6 +133,7 @@ class SensorQueryEnv(gym.Env[Observation, Any]):
 
         Raises:
             ValueError: A key is unknown or a value out of range; the message names it.
+            MissingExtraError: ``render_mode`` is ``"human"`` and pygame is not installed.
 
         Warns:
             UserWarning: A release model with a guarantee is configured, and other keywords void
@@ -138,10 +141,12 @@ class SensorQueryEnv(gym.Env[Observation, Any]):
         """
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(
-                f"render_mode must be None or 'rgb_array', got {render_mode!r}; wrap the "
-                "environment in gymnasium.wrappers.HumanRendering to see it in a window"
+                f"render_mode must be None, 'rgb_array' or 'human', got {render_mode!r}"
             )
         self.render_mode = render_mode
+        self._window: Window | None = None
+        if render_mode == "human":
+            self._window = Window("dptse-env", self.metadata["render_fps"])
         self.render_every = integer("render_every", render_every, 1)
         self.config = resolve(preset, overrides)
         warn_where_void(self.config)
@@ -173,11 +178,15 @@ class SensorQueryEnv(gym.Env[Observation, Any]):
 
         Raises:
             ValueError: An option is unknown or out of range.
+            gymnasium.error.Error: ``render_mode`` is ``"human"``, and there is no display.
         """
         super().reset(seed=seed)
         outcome = self.process.reset(_ONLY, [self.np_random], options)
         if self.render_mode is not None:
             self.history, self._frame = History.from_process(self.process), None
+        if self._window is not None:
+            self._window.reopen()
+            self._window.show(self._drawn())
         info = self.process.info(0)
         info |= self.process.reset_info()
         return outcome.observation[0], info
@@ -195,6 +204,8 @@ class SensorQueryEnv(gym.Env[Observation, Any]):
         outcome = process.step(_ONLY, np.asarray(action)[None])
         if self.history is not None:
             self.history.append(process)
+        if self._window is not None:
+            self._window.show(self._drawn())
         return (
             outcome.observation[0],
             float(outcome.reward[0]),
@@ -224,6 +235,8 @@ class SensorQueryEnv(gym.Env[Observation, Any]):
     def render(self) -> NDArray[np.uint8] | None:
         """Return the episode so far as a picture over space and time, shape (height, width, 3).
 
+        With ``render_mode="human"`` the window shows it already, and nothing is returned.
+
         Raises:
             gymnasium.error.ResetNeeded: No episode has begun.
         """
@@ -234,12 +247,23 @@ class SensorQueryEnv(gym.Env[Observation, Any]):
             return None
         if self.history is None:
             raise gym.error.ResetNeeded("nothing to render: call reset() first")
+        return None if self._window is not None else self._drawn().copy()
+
+    def _drawn(self) -> NDArray[np.uint8]:
+        """Return the picture of the present second, drawn anew if it is due."""
+        assert self.history is not None
         second = int(self.process.elapsed[0])
         if self._frame is None or self._is_due(second - self._frame[0]):
             if self._picture is None:
                 self._picture = Picture(self.history)
             self._frame = second, self._picture.draw(self.history)
-        return self._frame[1].copy()
+        return self._frame[1]
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._window is not None:
+            self._window.close()
+        super().close()
 
     def _is_due(self, since: int) -> bool:
         """Return whether a picture that is ``since`` seconds old is to be drawn again."""

@@ -83,7 +83,7 @@ class SensorQueryVectorEnv(VectorEnv[Observation, Action, Any]):
     spreads them over the records, so that the episodes of a batch differ in their time of day.
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 30}  # noqa: RUF012
 
     def __init__(
         self,

@@ -395,7 +395,7 @@ def test_a_sequential_episode_renders_one_column_a_second():
             r"^parameters\.jam_density must be a number in \[.*\], got 5e-324",
         ),
         ({"preset": "none"}, r"^preset must be one of paper-highway, .*, got 'none'"),
-        ({"render_mode": "human"}, r"HumanRendering"),
+        ({"render_mode": "ansi"}, r"^render_mode must be None, .rgb_array. or .human., got .ansi."),
     ],
 )  # fmt: skip
 def test_bad_keywords_name_themselves(keywords, message):

@@ -11,6 +11,7 @@ EXTRAS: Mapping[str, tuple[str, ...]] = {
     ),
     "corridors": ("ijson", "pyarrow", "sumo", "sumolib"),
     "ray": ("filelock", "ray"),
+    "video": ("moviepy", "pygame"),
 }  # fmt: skip
 """Modules that each extra brings. `sumo` and `sumolib` come with eclipse-sumo."""
 
