@@ -1,14 +1,9 @@
-"""The tutorial, from top to bottom, in an empty folder."""
+"""The tutorial, and the notebook that is made of it."""
 
 import json
-import os
 import re
 import runpy
-import subprocess
-import sys
 from pathlib import Path
-
-import pytest
 
 TUTORIAL = Path(__file__).parents[2] / "docs" / "tutorial.md"
 BLOCK = re.compile(r"```(\w+)(?: title=\"([\w.]+)\")?\n(.*?)```", re.DOTALL)
@@ -36,37 +31,3 @@ def test_the_notebook_is_the_tutorial():
     for text in shown:
         if text[0] not in "!%":
             compile(text, "cell", "exec")
-
-
-@pytest.mark.slow
-def test_it_runs_from_top_to_bottom(tmp_path, monkeypatch, capsys):
-    pytest.importorskip("stable_baselines3")
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.syspath_prepend(str(tmp_path))
-    names = {}
-    for language, file, text in blocks():
-        if file:
-            (tmp_path / file).write_text(text)
-        elif language == "python":
-            exec(text, names)
-        else:
-            for line in text.splitlines():
-                if line.startswith("dptse "):
-                    run(line, tmp_path)
-    printed = capsys.readouterr().out
-    assert "(5, 0.05)-differential privacy" in printed
-    assert "mean error 0." in printed
-    assert "it asks segments [" in printed
-    assert (tmp_path / "results/learned/space_time.png").is_file()
-    assert (tmp_path / "results/learned/page.html").is_file()
-    assert "mine:Fastest" in (tmp_path / "results/fastest/summary.json").read_text()
-
-
-def run(line, folder):
-    """Run a command as the installed program would."""
-    words = [sys.executable, "-c", DPTSE, *line.split()[1:]]
-    done = subprocess.run(
-        words, cwd=folder, env=os.environ | {"OMP_NUM_THREADS": "1"}, check=False,
-        capture_output=True, text=True,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
