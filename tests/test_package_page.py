@@ -3,10 +3,6 @@
 import tomllib
 from pathlib import Path
 
-import pytest
-
-pytest.importorskip("hatchling")
-
 from hatch_build import for_package_page
 
 ROOT = Path(__file__).parents[1]

@@ -150,7 +150,12 @@ def run_tests(installed: Installed, wheel: Path, source: Path) -> None:
     """Run the fast tests of the source archive, with all extras that they use."""
     call(installed.python, "-m", "pip", "uninstall", "--yes", "dptse-plugin", cwd=installed.folder)
     installed.install(
-        f"{wheel}[train,corridors,ray]", "dp-accounting", "hypothesis", "pytest", "pytest-xdist"
+        f"{wheel}[train,corridors,ray]",
+        "dp-accounting",
+        "hatchling",
+        "hypothesis",
+        "pytest",
+        "pytest-xdist",
     )
     with tarfile.open(source) as archive:
         archive.extractall(installed.folder, filter="data")
