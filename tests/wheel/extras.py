@@ -14,7 +14,8 @@ import dptse_env
 from dptse_env.command_line import add_tools_path
 from dptse_env.utils.extras import MissingExtraError
 
-LONGER = json.dumps({"n_mainline": 7})
+SHORT = ["--env", "dptse_env:dptse/ShortHighway-v0"]
+LONGER = {"n_mainline": 7}
 """A corridor whose network does not come with the package."""
 IMPORT = ["import", "trajectories", "--corridor", "short-highway", "--output", "imported"]
 
@@ -23,7 +24,7 @@ WITHOUT_EXTRAS = {
 }
 WITH_TRAIN = {
     "corridors": [
-        ["record", "--corridor", LONGER, "--seeds", "0:1"],
+        ["record", *SHORT, "--corridor", json.dumps(LONGER), "--seeds", "0:1"],
         ["import", "network", "--net", "road.net.xml", "--path", "a b"],
         [*IMPORT, "--format", "ngsim", "--files", "points.csv"],
         [*IMPORT, "--format", "i24", "--files", "points.json"],
@@ -86,7 +87,7 @@ def lacks(package: str) -> list[tuple[str, str]]:
 
 def check_corridor() -> None:
     """Make an environment on a road whose network has to be compiled."""
-    env = gym.make("dptse_env:dptse/ShortHighway-v0", corridor=json.loads(LONGER), bandwidth=1)
+    env = gym.make("dptse_env:dptse/ShortHighway-v0", corridor=LONGER, bandwidth=1)
     said = ""
     try:
         env.reset(seed=0)
