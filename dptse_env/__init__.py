@@ -12,6 +12,6 @@ The module prefix makes the id known in subprocesses too.
 from dptse_env.registration import register_environments, register_part
 
 __all__ = ["register_environments", "register_part"]
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 register_environments()

@@ -1,8 +1,10 @@
-"""The README on a package page."""
+"""What is stated about a release: the README on a package page, the version, the repository."""
 
+import re
 import tomllib
 from pathlib import Path
 
+import dptse_env
 from hatch_build import for_package_page
 
 ROOT = Path(__file__).parents[1]
@@ -28,6 +30,17 @@ def test_without_a_repository_their_words_stay():
         " `env`, there, [far](https://far.example).\n"
         '[below](#below)\n```python\ntools["a"](b)\n```\n'
     )
+
+
+def test_every_file_states_the_same_version():
+    project, changelog, citation = (
+        (ROOT / name).read_text(encoding="utf-8")
+        for name in ("pyproject.toml", "CHANGELOG.md", "CITATION.cff")
+    )
+    latest = re.search(r"^## \[(\d.*)\] - (.*)$", changelog, re.MULTILINE)
+    assert latest is not None
+    assert tomllib.loads(project)["project"]["version"] == dptse_env.__version__ == latest[1]
+    assert f"\nversion: {latest[1]}\ndate-released: {latest[2]}\n" in citation
 
 
 def test_the_citation_names_the_same_repository():
