@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -200,9 +201,8 @@ class QueryProcess:
         self._in_threads(episodes, self.estimator.predict, inputs)
         self.time[episodes] += 1
         observed = self.release.setup.observed(queried)
-        request = ReleaseRequest(
-            episodes, traffic, self.time[episodes], observed, lambda: self._predicted(episodes)
-        )
+        prediction = cache(lambda: self._predicted(episodes))
+        request = ReleaseRequest(episodes, traffic, self.time[episodes], observed, prediction)
         observed, measured, at_boundary = self.measure(request)
         self.boundary.update(episodes, *at_boundary)
         self._in_threads(episodes, self.estimator.update, observed, *measured)

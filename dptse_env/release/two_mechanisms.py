@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -179,7 +179,6 @@ class TwoMechanisms(ReleaseModel):
 
     def release(self, request: ReleaseRequest) -> Released:
         """See `ReleaseModel.release`."""
-        request = request._replace(prediction=_once(request.prediction))
         observed, split = request.observed, self._split
         queried = self.queries.release(request._replace(observed=observed[:, :split]))
         if self.sensors is None:
@@ -275,15 +274,3 @@ def _no_options(setup: ReleaseSetup) -> QueryOptions:
     """Return options of which there are none, on a setup's road."""
     none = np.zeros(0, dtype=np.int64)
     return QueryOptions(none, none, np.zeros(0), none, setup.corridor.n_mainline, 0)
-
-
-def _once(prediction: Callable[[], Any]) -> Callable[[], Any]:
-    """Return a function that asks for a prediction at most once."""
-    found: list[Any] = []
-
-    def remembered() -> Any:
-        if not found:
-            found.append(prediction())
-        return found[0]
-
-    return remembered
