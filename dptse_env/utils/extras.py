@@ -9,11 +9,11 @@ EXTRAS: Mapping[str, tuple[str, ...]] = {
     "train": (
         "jinja2", "optuna", "plotly", "rich", "sb3_contrib", "stable_baselines3", "torch", "tyro",
     ),
-    "corridors": ("ijson", "pyarrow", "sumo", "sumolib"),
+    "corridors": ("ijson", "pyarrow", "sumo"),
     "ray": ("filelock", "ray"),
     "video": ("moviepy", "pygame"),
 }  # fmt: skip
-"""Modules that each extra brings. `sumo` and `sumolib` come with eclipse-sumo."""
+"""Modules that each extra brings. `sumo` comes with eclipse-sumo."""
 
 
 class MissingExtraError(ImportError):

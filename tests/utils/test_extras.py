@@ -11,7 +11,7 @@ import pytest
 from dptse_env.utils.extras import EXTRAS, MissingExtraError, needed_for
 
 PROJECT = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text(encoding="utf-8"))
-BROUGHT_BY = {"sumo": "eclipse_sumo", "sumolib": "eclipse_sumo"}
+BROUGHT_BY = {"sumo": "eclipse_sumo"}
 
 
 @pytest.mark.parametrize("extra", EXTRAS)

@@ -9,11 +9,8 @@ import zlib
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 from xml.etree import ElementTree
-
-from dptse_env.utils.extras import needed_for
 
 NEWEST_VERSION = (1, 20)
 """Newest version of network files that the supported release of SUMO reads."""
@@ -45,16 +42,16 @@ class Net:
 
     Raises:
         ValueError: There is no such file, or it is no network that SUMO reads.
-        MissingExtraError: `eclipse-sumo`, which brings sumolib, is not installed.
     """
 
     def __init__(self, path: Path, internal_links: bool = True) -> None:
         """Read the file."""
-        library = _sumolib()
+        import sumolib  # noqa: PLC0415  (heavy, and only an import needs it)
+
         self.path = path
         _check_head(path)
         try:
-            self._net: Any = library.net.readNet(str(path), withInternal=internal_links)
+            self._net: Any = sumolib.net.readNet(str(path), withInternal=internal_links)
         except _UNREADABLE as error:
             raise ValueError(f"net: {path}: no network of SUMO: {error}") from error
         self._internal_links = internal_links
@@ -217,9 +214,3 @@ def _check_head(path: Path) -> None:
             f"net: {path}: version must be at most {newest}, got {version}; write it with the "
             "netconvert of the supported release"
         )
-
-
-def _sumolib() -> ModuleType:
-    with needed_for("a SUMO network"):
-        import sumolib  # noqa: PLC0415  (heavy, and only an import needs it)
-    return sumolib  # type: ignore[no-any-return]

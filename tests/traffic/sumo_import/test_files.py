@@ -2,7 +2,6 @@
 
 import gzip
 import re
-import sys
 from dataclasses import replace
 
 import pytest
@@ -102,12 +101,6 @@ def test_networks_of_no_use_are_refused(tmp_path, content, message):
     with pytest.raises(ValueError, match=expected) as refused:
         find_layout(Files(path, ()), PATH, 100.0)
     assert "\n" not in str(refused.value)
-
-
-def test_without_sumolib_the_extra_is_named(files, monkeypatch):
-    monkeypatch.setitem(sys.modules, "sumolib", None)
-    with pytest.raises(ImportError, match=r"pip install 'dptse-env\[corridors\]'"):
-        find_layout(files, PATH, 100.0)
 
 
 def test_a_folder_and_a_missing_network_are_refused(tmp_path):
