@@ -33,4 +33,4 @@ def main() -> None:
             importlib.import_module("scripts.dptse").main(sys.argv[1:])
     except MissingExtraError as problem:
         print(f"error: {problem}", file=sys.stderr)
-        raise SystemExit(2) from problem
+        raise SystemExit(1) from problem

@@ -25,7 +25,7 @@ PACKAGES = (
     "gymnasium", "libsumo", "eclipse-sumo", "numpy", "scipy", "numba", "filterpy", "qpsolvers",
     "piqp", "matplotlib", "platformdirs", "tomli-w", "tqdm", "torch", "stable-baselines3",
     "sb3-contrib", "optuna", "plotly", "jinja2", "rich", "tyro", "pyarrow", "ijson", "ray",
-    "filelock",
+    "filelock", "moviepy", "pygame",
 )  # fmt: skip
 
 
