@@ -16,9 +16,6 @@ class Window:
     """A window for pictures of one size, by pygame.
 
     Closing it by hand ends the showing and nothing else: the episode goes on.
-
-    Attributes:
-        is_open: Whether there is a window.
     """
 
     def __init__(self, title: str, frames_per_second: int) -> None:
@@ -37,7 +34,7 @@ class Window:
 
     @property
     def is_open(self) -> bool:
-        """Whether there is a window."""
+        """True while there is a window."""
         return self._surface is not None
 
     def reopen(self) -> None:

@@ -172,7 +172,7 @@ class Fusion:
 
 @dataclass(frozen=True)
 class _Expected:
-    """What a prediction says of M rows, shape (k, M), and (k, M, 2) for both quantities.
+    """A prediction of M rows, arrays of shape (k, M), and (k, M, 2) for both quantities.
 
     Attributes:
         density: Densities [veh/km], at least 0.

@@ -11,7 +11,7 @@ ShareSource = Literal["published", "estimated"]
 
 @dataclass(frozen=True)
 class FusionSettings:
-    """How answers of connected vehicles and of fixed sensors become measurements of all vehicles.
+    """Settings by which answers of both kinds of sensors become measurements of all vehicles.
 
     Attributes:
         share: Source of the share of connected vehicles: ``published``, or ``estimated``, a state

@@ -157,7 +157,7 @@ class TwoMechanisms(ReleaseModel):
 
     @property
     def shared(self) -> tuple[Any, ...]:
-        """What depends on traffic alone, of both."""
+        """Arrays and tables of both that depend on traffic alone."""
         arrays = [array for part in self.parts for array in (*part.shared, part.setup)]
         return (*arrays, self._connected)
 
