@@ -95,6 +95,37 @@ def test_vehicles_do_pay_and_run_out_meanwhile():
     assert len(ledgers[0]) != len(ledgers[1]) or not np.array_equal(*ledgers)
 
 
+PARTLY = {
+    "penetration": [0.05, 0.4],
+    "fusion": {"share": "estimated", "innovation_test": True},
+    "detectors": {"dropout": 0.2, "absolute": 0.5},
+}
+
+
+@pytest.mark.parametrize("boundary", ["nominal", "private"])
+@pytest.mark.parametrize("estimator", CHECKED)
+def test_neither_traffic_nor_who_is_connected_shows(estimator, boundary):
+    env = make(estimator=estimator, privacy={"boundary_inputs": boundary}, **PARTLY)
+    first, second = transcript(env, 0), transcript(env, 1)
+    assert same(first, second)
+    assert not np.array_equal(first[1]["observation"], first[-1]["observation"])
+
+
+def test_a_share_that_only_the_truth_shows_would_be_noticed():
+    env = make(**PARTLY)
+    process = env.unwrapped.process
+    read = process.fusion.read
+
+    def knowing(episodes, observed, measured, prediction):
+        seeds = [SEEDS[index] for index in process.traffic_index[episodes]]
+        shares = np.array([process.config.penetration.share_of(seed) for seed in seeds])
+        measured = measured._replace(values=measured.values / shares[:, None, None])
+        return read(episodes, observed, measured, prediction)
+
+    process.fusion.read = knowing
+    assert unlike(env)
+
+
 # --- mutations that must be caught --------------------------------------------------------------
 
 
