@@ -108,7 +108,7 @@ class RandomWalk(BatchEstimator):
         self.variances[episodes, :, which] = (1.0 - gain) ** 2 * variance + gain**2 * noise
 
     def _update_rows(self, measured: Measurements) -> None:
-        """Update the segments of one row after the other: by its density, then by its flow."""
+        """Update the segments of one row after the other: by its density, then its other number."""
         rows = self.model.rows
         self.innovations[measured.episodes] = 0.0
         for m in range(rows.n_rows):
@@ -121,10 +121,12 @@ class RandomWalk(BatchEstimator):
             centre = measured.centre[seen, covered]
             share = np.full(centre.shape, 1.0 / rows.span[m])
             self._update_average(episodes, m, covered, 0, share, values[:, 0], noise[:, 0])
-            density = np.maximum(self.means[episodes, covered, 0], self._least_density[covered, 0])
-            share = density * share
-            flow = values[:, 1] + np.sum(share * centre, axis=1)
-            self._update_average(episodes, m, covered, 1, share, flow, noise[:, 1])
+            second = values[:, 1]
+            if self.model.reference_speed is not None:
+                density = self.means[episodes, covered, 0]
+                share = np.maximum(density, self._least_density[covered, 0]) * share
+                second = second + np.sum(share * centre, axis=1)
+            self._update_average(episodes, m, covered, 1, share, second, noise[:, 1])
 
     def _update_average(
         self,

@@ -119,9 +119,10 @@ def test_no_infinity_is_clipped_into_bounds(release, bad, which):
         np.testing.assert_array_equal(walk.innovations[1], 0.0)
 
 
-def test_a_row_of_one_segment_is_read_alike_wherever_it_stands():
+@pytest.mark.parametrize("release", RELEASES)
+def test_a_row_of_one_segment_is_read_alike_wherever_it_stands(release):
     """Rows that are the segments in another order take the other path of the code."""
-    plain = simulate(n_steps=40, release="flow")
+    plain = simulate(n_steps=40, release=release)
     n = plain.model.n_segments
     order = np.random.default_rng(3).permutation(n)
     turned = with_rows(plain.model, MeasurementRows(order, np.ones(n, dtype=np.int64), n))
