@@ -5,6 +5,7 @@ python scripts/study.py privacy --quick    # the price of a privacy guarantee, i
 python scripts/study.py ledger             # capped contributions beside paced ledgers
 python scripts/study.py estimators         # every estimator under every release model
 python scripts/study.py choices            # where a choice of queries pays, and what it saves
+python scripts/study.py penetration        # when not every vehicle is connected
 python scripts/study.py policies freeze --policies primary=results/training/primary
 python scripts/study.py policies run       # learned policies against every baseline
 python scripts/study.py privacy --corridor my-road.toml    # the same on a road of your own
@@ -39,6 +40,8 @@ from agents.studies.ledger import study as ledger_study
 from agents.studies.ledger.plan import LedgerDesign
 from agents.studies.paper import study as paper_study
 from agents.studies.paper.plan import PaperDesign
+from agents.studies.penetration import study as penetration_study
+from agents.studies.penetration.plan import PenetrationDesign
 from agents.studies.policies import study as policy_study
 from agents.studies.policies.manifest import MANIFEST_FILE, find_checkpoints, read_tuned
 from agents.studies.policies.plan import BASELINES, CELLS, PolicyCell, PolicyDesign
@@ -113,6 +116,16 @@ class ChoiceStudy(StudyOptions):
 
 
 @dataclass(frozen=True)
+class PenetrationStudy(StudyOptions):
+    """Measure errors by the share of connected vehicles, and what fusion with detectors gains."""
+
+    quick: bool = False
+    """Three traffic seeds, and fewer shares, estimators and release models."""
+    design: tyro.conf.OmitArgPrefixes[PenetrationDesign] = field(default_factory=PenetrationDesign)
+    """The plan."""
+
+
+@dataclass(frozen=True)
 class Freeze(StudyOptions):
     """Fix policies and choices before test traffic is touched."""
 
@@ -160,12 +173,21 @@ Study = (
     | Annotated[LedgerStudy, tyro.conf.subcommand("ledger")]
     | Annotated[EstimatorStudy, tyro.conf.subcommand("estimators")]
     | Annotated[ChoiceStudy, tyro.conf.subcommand("choices")]
+    | Annotated[PenetrationStudy, tyro.conf.subcommand("penetration")]
     | Annotated[Policies, tyro.conf.subcommand("policies")]
 )
 
 
 @resumable()
-def main(args: Paper | Privacy | LedgerStudy | EstimatorStudy | ChoiceStudy | Policies) -> None:
+def main(
+    args: Paper
+    | Privacy
+    | LedgerStudy
+    | EstimatorStudy
+    | ChoiceStudy
+    | PenetrationStudy
+    | Policies,
+) -> None:
     """Run a study."""
     if isinstance(args, Paper):
         design = args.design.quick() if args.quick else args.design
@@ -187,6 +209,10 @@ def main(args: Paper | Privacy | LedgerStudy | EstimatorStudy | ChoiceStudy | Po
         mapped = args.design.quick() if args.quick else args.design
         place = args.place("choices", *(["quick"] if args.quick else []))
         choice_study.run(mapped, place, command("study.py choices", args))
+    elif isinstance(args, PenetrationStudy):
+        connected = args.design.quick() if args.quick else args.design
+        place = args.place("penetration", *(["quick"] if args.quick else []))
+        penetration_study.run(connected, place, command("study.py penetration", args))
     elif isinstance(args.step, Freeze):
         freeze(args.step)
         return

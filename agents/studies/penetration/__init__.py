@@ -1,0 +1,1 @@
+"""The study of penetration: errors by the share of connected vehicles, and what fusion gains."""
