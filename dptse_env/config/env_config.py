@@ -82,7 +82,7 @@ class EnvConfig:
             or objects; ``"default"`` stands for all default blocks.
         privacy: The release model with its epsilon and delta, and what they protect.
         penetration: Which vehicles are connected and answer queries; a number is their share.
-        detectors: Errors of the fixed sensors.
+        detectors: Errors of the fixed sensors, and their part of the privacy budget.
         fusion: How answers of connected vehicles and of fixed sensors become measurements.
         reward: The reward: ``joint``, ``density``, ``speed``, a registered name,
             ``"package.module:function"``, or a function of a `ScoredSecond`.
@@ -184,7 +184,7 @@ class EnvConfig:
     @property
     def has_separate_sensors(self) -> bool:
         """True if fixed sensors measure other things than queries do."""
-        return not (self.penetration.is_complete and self.detectors.are_exact)
+        return not self.penetration.is_complete or self.detectors != Detectors()
 
     def _check_sensors(self) -> None:
         """Check that the road can have this penetration and these detectors."""
@@ -194,11 +194,7 @@ class EnvConfig:
                 f"detectors.factor must be one number, or one for each of the "
                 f"{len(corridor.fixed_sensors)} fixed sensors, got {factor}"
             )
-        if (
-            self.has_separate_sensors
-            and not corridor.fixed_sensors
-            and (not self.detectors.are_exact)
-        ):
+        if self.detectors != Detectors() and not corridor.fixed_sensors:
             raise ValueError(
                 f"detectors must be left out on a road without fixed sensors, got {self.detectors}"
             )

@@ -15,8 +15,12 @@ from dptse_env.fusion.innovation_test import InnovationTest
 from dptse_env.fusion.settings import FusionSettings
 from dptse_env.fusion.share_filter import ShareFilter
 from dptse_env.model import MeasurementRows
+from dptse_env.model.parameters import SECONDS_PER_HOUR
 from dptse_env.release import MeasuredRows
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+
+LEAST_SPEED = 5.0
+"""Speed from which on the time on a segment does not grow any more [km/h]."""
 
 
 @dataclass(frozen=True)
@@ -147,7 +151,8 @@ class Fusion:
                 episodes, observed[:, queries], values[:, queries, 0], sigma[:, queries, 0],
                 density, expected.deviation[:, queries, 0], length,
             )  # fmt: skip
-        sampling = count * (1.0 - p) / p / length**2
+        alike = self._seconds_alike(expected.speed[:, queries], length)
+        sampling = alike * count * (1.0 - p) / p / length**2
         spread = setup.settings.speed_spread
         doubt = p_variance / p**2
         values[:, queries, 0] /= p
@@ -166,8 +171,16 @@ class Fusion:
             # Without a connected vehicle the speed limit is released.
             none = np.exp(-answering) * (setup.limits[queries] - expected.speed[:, queries]) ** 2
             sigma[:, queries, 1] = np.sqrt(
-                sigma[:, queries, 1] ** 2 + spread**2 * (1.0 - p) / answering + none
+                sigma[:, queries, 1] ** 2 + alike * (spread**2 * (1.0 - p) / answering + none)
             )
+
+    def _seconds_alike(self, speed: FloatArray, length: FloatArray) -> FloatArray | float:
+        """Return the seconds for which answers count as one, shape (k, G), 1 at least."""
+        factor = self.setup.settings.dwell_factor
+        if factor == 0.0:
+            return 1.0
+        dwell = SECONDS_PER_HOUR * length / np.maximum(speed, LEAST_SPEED)
+        return np.maximum(factor * dwell, 1.0)
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,11 @@ class FusionSettings:
         share_walk: Standard deviation of a second of its random walk, over the published one.
         speed_spread: Standard deviation of the vehicles' speeds on a segment [km/h], for the
             sampling error of speeds.
+        dwell_factor: Part of the time that a vehicle spends on a segment for which its answers
+            count as one: the variance of sampling is that many seconds times as large, if it is
+            more than one. Answers of a segment have the same sampling error while the same vehicles
+            are there. It suits `recurrent`, whose deviations are honest; filters on the ARZ model
+            trust it too much, and err more where answers weigh less.
         innovation_test: Whether measurements that keep disagreeing with the prediction are given
             less weight.
         threshold: Mean normalised innovation, in its own standard deviations, from which a
@@ -35,6 +40,7 @@ class FusionSettings:
     share_deviation: Annotated[float, Interval(0.01, 10)] = 0.5
     share_walk: Annotated[float, Interval(0, 1)] = 0.002
     speed_spread: Annotated[float, Interval(0, 100)] = 12.0
+    dwell_factor: Annotated[float, Interval(0, 100)] = 0.0
     innovation_test: bool = False
     threshold: Annotated[float, Interval(0.1, 100)] = 1.5
     memory: Annotated[float, Interval(1, 10_000)] = 60.0

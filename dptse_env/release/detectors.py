@@ -1,7 +1,7 @@
-"""Errors of the fixed sensors: miscounts, random errors and seconds without an answer."""
+"""Fixed sensors as a mechanism of their own: their errors, and their part of the budget."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
@@ -16,7 +16,7 @@ CountFactor = Annotated[float, Interval(0, 10)]
 
 @dataclass(frozen=True)
 class Detectors:
-    """Errors of the fixed sensors beside the noise of the release.
+    """Errors of the fixed sensors beside the noise of the release, and their part of the budget.
 
     A detector reports ``factor`` times what is released of it, plus a normal error whose standard
     deviation is ``absolute`` vehicles plus ``relative`` times the count. Of these, ``absolute`` and
@@ -28,6 +28,8 @@ class Detectors:
         dropout: Probability that a sensor does not answer in a second.
         absolute: Standard deviation of a count at zero vehicles [veh].
         relative: Further standard deviation, as a share of the count.
+        budget_share: Part of the privacy budget mu^2 of a connected vehicle that pays for the fixed
+            sensors.
 
     Raises:
         ValueError: A value is out of range, or counts have an error except at zero vehicles.
@@ -37,6 +39,7 @@ class Detectors:
     dropout: Annotated[float, Interval(0, 1, open_high=True)] = 0.0
     absolute: Annotated[float, Interval(0, 1000)] = 0.0
     relative: Annotated[float, Interval(0, 10)] = 0.0
+    budget_share: Annotated[float, Interval(0.01, 0.99)] = 0.25
 
     def __post_init__(self) -> None:
         """Check values."""
@@ -50,7 +53,7 @@ class Detectors:
     @property
     def are_exact(self) -> bool:
         """True if detectors have no errors."""
-        return self == Detectors()
+        return replace(self, budget_share=Detectors.budget_share) == Detectors()
 
 
 class DetectorErrors:

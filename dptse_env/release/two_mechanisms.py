@@ -21,9 +21,6 @@ from dptse_env.traffic import AnyRecord, Penetration, with_vehicles
 from dptse_env.utils.arrays import FloatArray, IntArray
 from dptse_env.utils.vector_info import Rows
 
-DETECTORS_SHARE = 0.25
-"""Part of the privacy budget mu^2 of a connected vehicle that pays for the fixed sensors."""
-
 
 @dataclass(frozen=True)
 class PartSetup(ReleaseSetup):
@@ -128,7 +125,7 @@ class TwoMechanisms(ReleaseModel):
                 )
             )  # fmt: skip
 
-        share = DETECTORS_SHARE if has_sensors else 0.0
+        share = detectors.budget_share if has_sensors else 0.0
         self.queries = part(0, self._split, self._connected, 1.0 - share)
         self.sensors = None
         self._errors = None

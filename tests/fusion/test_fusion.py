@@ -93,6 +93,20 @@ def test_sampling_error_grows_as_the_share_falls():
         np.testing.assert_array_equal(found.sigma[0, 3], 1.0)
 
 
+@pytest.mark.parametrize("flow", [True, False])
+def test_answers_count_as_one_while_a_vehicle_is_on_the_segment(flow):
+    values, every = np.ones((1, N_SEGMENTS, 2)), np.ones((1, N_SEGMENTS), dtype=bool)
+    speed = 36.0  # a segment of 0.1 km in 10 s
+
+    def read(factor, sigma=1e-9):
+        fusion = make(share=0.2, flow=flow, dwell_factor=factor)
+        return fusion.read(np.arange(1), every, measured(values, sigma), predicted(50, speed))
+
+    once, alike = read(0.0).sigma[0, :3], read(1.0).sigma[0, :3]
+    np.testing.assert_allclose((alike / once) ** 2, 10.0, rtol=1e-6)
+    np.testing.assert_allclose(read(0.05).sigma[0, :3], once)  # never less than a second
+
+
 def test_where_all_vehicles_are_connected_nothing_changes():
     values = np.random.default_rng(0).normal(50.0, 10.0, (2, N_SEGMENTS, 2))
     given = measured(values, 3.0)

@@ -135,6 +135,21 @@ def test_what_is_spent_grows_to_mu_and_not_beyond(preset):
     assert past > 0.5 * mu
 
 
+@pytest.mark.parametrize("share", [0.1, 0.6])
+@pytest.mark.parametrize("preset", ["capped", "paced"])
+def test_sensors_have_the_part_of_the_budget_that_is_asked_for(preset, share):
+    keywords = {"penetration": 0.1, "privacy": preset, "detectors": {"budget_share": share}}
+    config = resolve("private-highway-v1", keywords)
+    whole, release = privacy_report(config).mu, make_release(config)
+    assert release.sensors.report().mu ** 2 == pytest.approx(share * whole**2, rel=1e-6)
+    assert whole == pytest.approx(mu_of(config.privacy.epsilon, config.privacy.delta), rel=1e-6)
+
+
+def test_a_part_of_the_budget_makes_two_mechanisms_of_one():
+    config = resolve("short-highway", {"detectors": {"budget_share": 0.5}})
+    assert isinstance(make_release(config), TwoMechanisms)
+
+
 def test_without_sensors_queries_have_the_whole_budget():
     process = make(corridor={"fixed_sensors": []}, privacy={"preset": "paced"})
     assert process.release.sensors is None
@@ -241,6 +256,7 @@ def test_a_known_error_is_in_the_deviation_of_the_release():
     [
         ({"detectors": {"relative": 0.1}}, "detectors.absolute must be > 0"),
         ({"detectors": {"dropout": 1.0}}, "detectors.dropout must be"),
+        ({"detectors": {"budget_share": 0.0}}, "detectors.budget_share must be"),
         ({"detectors": {"factor": [1.0, 1.0, 1.0]}}, "one for each of the 2 fixed sensors"),
         ({"detectors": {"factor": -1.0}}, "detectors.factor must be"),
         (

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from dptse_env.privacy import epsilon_of, mu_of
-from dptse_env.release.two_mechanisms import DETECTORS_SHARE
+from dptse_env.release import Detectors
 
 EPSILON, DELTA = 5.0, 0.05
 PRINTED, CORRECTED, CAPPED, PACED = RELEASES = ("paper", "corrected", "capped", "paced")
@@ -32,6 +32,10 @@ FUSIONS: dict[str, dict[str, Any]] = {
     TESTED: {"innovation_test": True},
     ESTIMATED: {"share": "estimated"},
 }
+
+OF_ESTIMATOR: dict[str, dict[str, Any]] = {"recurrent": {"dwell_factor": 1.0}}
+"""Settings of the fusion by estimator: the one whose deviations are honest is told how alike the
+answers of successive seconds are."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +76,7 @@ class PenetrationCell:
             "epsilon": whole_epsilon() if self.arm == WHOLE else EPSILON,
             "estimator": self.estimator,
             "penetration": penetration,
-            "fusion": FUSIONS[self.fusion],
+            "fusion": {**FUSIONS[self.fusion], **OF_ESTIMATOR.get(self.estimator, {})},
         }
 
     def detectors(self, places: tuple[int, ...]) -> dict[str, Any]:
@@ -95,4 +99,4 @@ def whole_epsilon() -> float:
     Beside queries, detectors have a part of the budget mu^2. Where nothing is queried, what the
     queries could have spent is not spent, and the detectors' part is all that is released.
     """
-    return epsilon_of(mu_of(EPSILON, DELTA) / math.sqrt(DETECTORS_SHARE), DELTA)
+    return epsilon_of(mu_of(EPSILON, DELTA) / math.sqrt(Detectors().budget_share), DELTA)

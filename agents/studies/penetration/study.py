@@ -27,7 +27,7 @@ from agents.studies.penetration.figures import draw_arms, draw_errors
 from agents.studies.penetration.plan import PenetrationDesign
 from agents.studies.penetration.results import PenetrationResults
 from agents.studies.penetration.running import run_missing
-from dptse_env.release.two_mechanisms import DETECTORS_SHARE
+from dptse_env.release import Detectors
 
 TEMPLATES = Path(__file__).parent
 
@@ -70,7 +70,7 @@ def report(
         "DELTA": DELTA,
         "PRINTED": PRINTED,
         "PACED": PACED,
-        "DETECTORS_SHARE": DETECTORS_SHARE,
+        "DETECTORS_SHARE": Detectors().budget_share,
         "UNKNOWN_SHARES": UNKNOWN_SHARES,
         "whole_epsilon": whole_epsilon(),
     }

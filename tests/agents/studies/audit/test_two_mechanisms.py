@@ -56,7 +56,7 @@ def test_a_vehicle_that_both_see_is_as_visible_as_the_account_says(record):
 
 
 def test_each_mechanism_alone_has_its_part(record):
-    share = two_mechanisms.DETECTORS_SHARE
+    share = config().detectors.budget_share
     alone = reached(config(), standing(record), queried=False)
     assert alone == pytest.approx(np.sqrt(share), rel=1e-9)
     queried = reached(config(), standing(record, segment=1), segment=1)
@@ -69,7 +69,6 @@ def test_the_paced_ledgers_of_both_stay_below_mu(record):
 
 
 def test_a_mechanism_that_forgets_its_share_is_found_out(record, monkeypatch):
-    monkeypatch.setattr(two_mechanisms, "DETECTORS_SHARE", 0.0)
     sound = two_mechanisms.PartSetup.__init__
 
     def generous(self, *args, **keywords):
