@@ -40,7 +40,9 @@ def load(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
 
     def load(text=MODULE):
-        (tmp_path / "kernels_of_a_test.py").write_text(text, encoding="utf-8")
+        path = tmp_path / "kernels_of_a_test.py"
+        if not path.exists() or path.read_text(encoding="utf-8") != text:
+            path.write_text(text, encoding="utf-8")  # else the file stays as old as it is
         sys.modules.pop("kernels_of_a_test", None)
         importlib.invalidate_caches()
         return importlib.import_module("kernels_of_a_test")
