@@ -295,7 +295,8 @@ def main(args: Args) -> None:
         episodes = [watch(args, name, sources[name]) for name in shown(args, report, sources)]
         write_page(args.output / PAGE, report, episodes)
     if not args.json:
-        print(f"scores and figures are in {args.output}/")
+        page = f"; a browser opens {args.output / PAGE}" if args.html else ""
+        print(f"scores and figures are in {args.output}/{page}")
 
 
 if __name__ == "__main__":

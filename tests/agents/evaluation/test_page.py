@@ -114,7 +114,7 @@ def test_a_title_cannot_break_the_page(report, episodes, tmp_path):
     assert len(text.encode()) <= 5_000_000
 
 
-def test_evaluate_leaves_a_page(tmp_path):
+def test_evaluate_leaves_a_page_and_says_where(tmp_path, capsys):
     main(
         Args(
             env=SHORT, schedules=("round-robin",), estimators=("random_walk",), seeds="2000:2002",
@@ -123,6 +123,7 @@ def test_evaluate_leaves_a_page(tmp_path):
     )  # fmt: skip
     text = (tmp_path / "page.html").read_text()
     assert '"name":"round-robin"' in text
+    assert str(tmp_path / "page.html") in capsys.readouterr().out
 
 
 PROBE = """
