@@ -28,7 +28,7 @@ BESIDE_THEM = {
     "LICENSE", "Makefile", "README.md", "constraints.txt", "hatch_build.py", "mkdocs.yml",
     "pyproject.toml",
 }  # fmt: skip
-IN_A_SOURCE_ARCHIVE = IN_A_WHEEL | {".ipynb", ".md", ".png", ".toml", ".yaml", ".yml"}
+IN_A_SOURCE_ARCHIVE = IN_A_WHEEL | {".css", ".ipynb", ".md", ".png", ".toml", ".yaml", ".yml"}
 
 LARGEST = 4_000_000
 """Most bytes of an archive."""
