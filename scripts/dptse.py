@@ -88,7 +88,12 @@ def split(words: Sequence[str]) -> tuple[str, Sequence[str]]:
         print(overview(groups))
         raise SystemExit(0 if len(words) > 1 else 2)
     tried = " ".join(words[: 2 if groups else 1])
-    nearest = difflib.get_close_matches(tried, COMMANDS, n=1, cutoff=0.5)
+    # "impot network" is nearest to a command of two words, "evalaute x" to one of one.
+    meant = " ".join(words[:2]) if len(words) > 1 else tried
+    nearest = [
+        *difflib.get_close_matches(meant, COMMANDS, n=1, cutoff=0.8),
+        *difflib.get_close_matches(tried, COMMANDS, n=1, cutoff=0.5),
+    ]
     hint = f", did you mean {nearest[0]!r}?" if nearest else ""
     print(f"error: there is no command {tried!r}{hint} See {PROGRAM} --help.", file=sys.stderr)
     raise SystemExit(2)

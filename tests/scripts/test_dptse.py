@@ -54,6 +54,8 @@ def test_the_version_is_that_of_the_package(capsys):
     [
         (["recrod"], "error: there is no command 'recrod', did you mean 'record'?"),
         (["import", "netwrk"], "no command 'import netwrk', did you mean 'import network'?"),
+        (["impot", "network"], "no command 'impot', did you mean 'import network'?"),
+        (["evalaute", "--html"], "no command 'evalaute', did you mean 'evaluate'?"),
         (["xyzzy"], "error: there is no command 'xyzzy' See dptse --help."),
     ],
 )
