@@ -1,4 +1,5 @@
 import base64
+import dataclasses
 import json
 import re
 import shutil
@@ -98,6 +99,14 @@ def test_seconds_are_left_out_of_a_page_that_would_be_too_large(
 def test_a_page_without_episodes_is_refused(report, tmp_path):
     with pytest.raises(ValueError, match="a page needs one watched episode"):
         write_page(tmp_path / "page.html", report, [])
+
+
+def test_a_page_without_data_is_refused(report, episodes, tmp_path):
+    empty = dataclasses.replace(episodes[0])
+    empty.history = dataclasses.replace(empty.history, truth=[])
+    with pytest.raises(ValueError, match="of a second at least"):
+        write_page(tmp_path / "page.html", report, [episodes[0], empty])
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_the_extra_is_named_where_plotly_is_missing(report, episodes, tmp_path, monkeypatch):
