@@ -102,7 +102,10 @@ def check_folder(folder: Path, provenance: Mapping[str, Any]) -> dict[str, Any] 
             raise ValueError("settings must be a mapping, tuned and sources lists")
     except (ValueError, KeyError, TypeError) as problem:
         raise ValueError(f"{path} is not as this program writes it: {problem!r}") from problem
-    differences = list(_differences(made_with, provenance["made_with"]))
+    now = provenance["made_with"]
+    differences = list(_differences(made_with, now))
+    differences += [f"{key} is missing there" for key in now if key not in made_with]
+    differences += [f"{key} is only there" for key in made_with if key not in now]
     if differences:
         raise ValueError(
             f"{folder} was made with other settings: {'; '.join(differences[:5])}. Choose "

@@ -2,6 +2,7 @@
 
 import errno
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ pytest.importorskip("tyro")
 from agents.evaluation.policies import find_policy
 from agents.suite.card import Card
 from agents.suite.cells import SUITES
+from dptse_env import __version__
 from dptse_env.traffic import RecordingError
 from scripts import dptse, info
 from tests.agents.suite.small import SMALL
@@ -177,6 +179,15 @@ def test_a_folder_of_something_else_stays_as_it_is(name, content, message, tmp_p
     assert message in line
     assert kept.read_text() == (content or "mine")
     assert list(folder.iterdir()) == [kept]
+
+
+def test_a_folder_of_another_study_is_refused(tmp_path, capsys):
+    content = (ROOT / "results" / "paper" / "run.json").read_text()
+    kept = tmp_path / "run.json"
+    kept.write_text(re.sub(r'"dptse-env": "[^"]*"', f'"dptse-env": "{__version__}"', content))
+    line = refused(capsys, "study", "choices", "--quick", "--output", tmp_path)
+    assert "cells is missing there" in line
+    assert list(tmp_path.iterdir()) == [kept]
 
 
 def written(folder, name):
