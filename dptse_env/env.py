@@ -215,7 +215,7 @@ class SensorQueryEnv(gym.Env[Observation, Any]):
         )
 
     def action_masks(self) -> NDArray[np.bool_]:
-        """Return which options may be picked next, shape (G,), for ``action="sequential"``.
+        """Return flags (G,) of the options that may be picked next, for ``action="sequential"``.
 
         Raises:
             ValueError: A step takes one action only.

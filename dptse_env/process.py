@@ -53,11 +53,11 @@ class QueryProcess:
         config: The configuration.
         interface: Action encoding, observation and reward.
         traffic: The true traffic.
-        release: What leaves the road.
+        release: The release model, which makes all data that leaves the road.
         boundary: The model's inputs at the road's ends and ramps.
         model: The traffic model.
         estimator: The estimator.
-        fusion: What turns releases into measurements of all vehicles; None where they are.
+        fusion: Turns releases into measurements of all vehicles; None where they are these.
         n_episodes: Size of the batch.
         time: Second of the record that each episode stands at, shape (n,).
         traffic_index: Index into ``config.traffic_seeds`` of each episode's traffic, shape (n,).
@@ -98,7 +98,7 @@ class QueryProcess:
         self._is_fork = False
 
     def fork(self) -> QueryProcess:
-        """Return a copy for looking ahead, streams of noise included.
+        """Return a copy that can be stepped to look ahead, with the same streams of noise.
 
         A fork that is stepped like its origin gives the same bits, and the origin is not affected.
         It shares traffic and model, cannot be reset, and takes some 40 us an episode to make.

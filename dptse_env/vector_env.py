@@ -246,7 +246,7 @@ class SensorQueryVectorEnv(VectorEnv[Observation, Action, Any]):
         return Transition(self._observation.copy(), reward, truncated, to_reset, final)
 
     def action_masks(self) -> BoolArray:
-        """Return which options may be picked next, shape (n, G), for ``sequential``.
+        """Return flags of the options that may be picked next, shape (n, G), for ``sequential``.
 
         Raises:
             ValueError: An action is not the pick of one option.

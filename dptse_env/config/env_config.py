@@ -67,23 +67,24 @@ class EnvConfig:
             (`dptse_env.estimators.tuned_settings`), whichever estimator it was tuned for. None for
             the set ``<estimator>-<ARZ parameters>-<privacy preset>-<corridor>``, or that without
             the corridor's name, if one ships, else the estimator's defaults.
-        bandwidth: Most mainline segments to query a step; what the queries of a step may cost
-            together, in ``bandwidth_unit``.
+        bandwidth: Largest total cost of the queries of a step, in ``bandwidth_unit``; by default a
+            number of mainline segments.
         query_spans: Numbers of neighbouring mainline segments that one query may cover, ascending.
             Several segments are released as one sum. Others than 1 need a release model that
             releases sums.
         price_levels: Factors on the release model's price among which a query chooses. Others than
             1 need a release model that releases sums.
-        bandwidth_unit: What a query costs of the bandwidth: ``segments``, as much as it has
-            segments, or ``sums``, one.
+        bandwidth_unit: Cost of a query: ``segments``, the number of segments that it covers, or
+            ``sums``, one.
         action: The action encoding: ``mask``, ``scores``, ``slots``, ``sequential``, a registered
             name, ``"package.module:Class"``, or a class.
         observation: Blocks of the observation, in order: names, ``"package.module:Class"``, classes
             or objects; ``"default"`` stands for all default blocks.
-        privacy: The release model with its epsilon and delta, and what they protect.
-        penetration: Which vehicles are connected and answer queries; a number is their share.
+        privacy: The release model with its epsilon, delta and unit of protection.
+        penetration: The vehicles that are connected and answer queries; a number is their share.
         detectors: Errors of the fixed sensors, and their part of the privacy budget.
-        fusion: How answers of connected vehicles and of fixed sensors become measurements.
+        fusion: Settings by which answers of connected vehicles and fixed sensors become
+            measurements.
         reward: The reward: ``joint``, ``density``, ``speed``, a registered name,
             ``"package.module:function"``, or a function of a `ScoredSecond`.
         horizon: Length of an episode [s]; None for the whole record.

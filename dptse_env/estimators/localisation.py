@@ -87,7 +87,7 @@ def row_tapers(model: ARZModel, reach: float) -> RowTapers:
 
 
 class Places(NamedTuple):
-    """Where n numbers lie along a road: components of a state, or what a segment releases."""
+    """Places of n numbers along a road: components of a state, or released values."""
 
     segment: IntArray  # (n,)
     position: FloatArray  # (n,) counted in mainline segments of any length, multiples of a half

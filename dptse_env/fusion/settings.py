@@ -21,11 +21,11 @@ class FusionSettings:
         share_walk: Standard deviation of a second of its random walk, over the published one.
         speed_spread: Standard deviation of the vehicles' speeds on a segment [km/h], for the
             sampling error of speeds.
-        dwell_factor: Part of the time that a vehicle spends on a segment for which its answers
-            count as one: the variance of sampling is that many seconds times as large, if it is
-            more than one. Answers of a segment have the same sampling error while the same vehicles
-            are there. It suits `recurrent`, whose deviations are honest; filters on the ARZ model
-            trust it too much, and err more where answers weigh less.
+        dwell_factor: Allowance for answers of a segment that have the same sampling error, since
+            the same vehicles are there: the variance of sampling is multiplied by this factor times
+            the seconds that a vehicle spends on the segment, where the product is more than one. It
+            suits `recurrent`, whose deviations are honest; filters on the ARZ model trust their
+            prediction too much, and err more where answers weigh less.
         innovation_test: Whether measurements that keep disagreeing with the prediction are given
             less weight.
         threshold: Mean normalised innovation, in its own standard deviations, from which a

@@ -11,7 +11,7 @@ from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 
 
 def covered(first: IntArray, span: IntArray, n: int) -> BoolArray:
-    """Return which of n neighbours in a row are covered by `span` of them from `first` on.
+    """Return flags of n neighbours in a row: True for `span` of them from `first` on.
 
     Shape (M, n), for `first` and `span` of shape (M,).
     """

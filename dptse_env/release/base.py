@@ -30,7 +30,7 @@ class ReleaseSetup:
         name: Name of the model, for reports.
         settings: The privacy settings.
         traffic: The true traffic, with its corridor.
-        bandwidth: What the queries of a step may cost together, in the unit of ``queries``.
+        bandwidth: Largest total cost of the queries of a step, in the unit of ``queries``.
         horizon: Steps of an episode.
         n_episodes: Size n of the batch.
         queries: The G options that can be queried; the mainline segments where they are not given.
@@ -258,7 +258,7 @@ class ReleaseModel(ABC):
 
     @property
     def shared(self) -> tuple[AnyArray, ...]:
-        """Arrays that depend on traffic alone: a fork of the process shares them."""
+        """Arrays that depend on the traffic alone, so that forks of the process share them."""
         return ()
 
     def spent(self, episodes: IntArray, steps: IntArray) -> tuple[FloatArray, FloatArray]:

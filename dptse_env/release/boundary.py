@@ -24,7 +24,7 @@ class BoundaryModel(ABC):
     @property
     @abstractmethod
     def shared(self) -> tuple[FloatArray, ...]:
-        """Arrays that depend on traffic alone: a fork of the process shares them."""
+        """Arrays that depend on the traffic alone, so that forks of the process share them."""
 
     @abstractmethod
     def inputs(self, episodes: IntArray, traffic: IntArray, times: IntArray) -> FloatArray:

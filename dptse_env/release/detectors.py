@@ -32,7 +32,8 @@ class Detectors:
             sensors.
 
     Raises:
-        ValueError: A value is out of range, or counts have an error except at zero vehicles.
+        ValueError: A value is out of range, or ``relative`` is positive and ``absolute`` is 0, so
+            that a count of zero vehicles would have no error.
     """
 
     factor: CountFactor | tuple[CountFactor, ...] = 1.0

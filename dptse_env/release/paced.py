@@ -44,8 +44,8 @@ class Paced(ReleaseModel):
     Attributes:
         mu: Parameter of Gaussian differential privacy of all releases together.
         budget: Budget of a vehicle, a part of which ledgers keep back for rounding.
-        ledgers: What the vehicles have paid.
-        pacing: What sets the prices.
+        ledgers: Charges that the vehicles have paid.
+        pacing: Rule that sets the prices.
         noise: Standard normal noise.
         prices: Prices of the last release, shape (n, C); public, as the centres are.
         centres: Centres of the last release [km/h], of the segments and of the boundary segments

@@ -36,7 +36,7 @@ class QueryOptions:
         level: Factor on the release model's price, shape (G,).
         cost: What each costs of the bandwidth, shape (G,).
         n_mainline: Mainline segments n.
-        bandwidth: What the queries of a step may cost together.
+        bandwidth: Largest total cost of the queries of a step.
         separate_sensors: Whether a fixed sensor has a row of its own where its segment can be
             queried, too, since the two measure different things.
     """
@@ -63,7 +63,7 @@ class QueryOptions:
 
         Args:
             n_mainline: Mainline segments.
-            bandwidth: What the queries of a step may cost together.
+            bandwidth: Largest total cost of the queries of a step.
             spans: The keyword ``query_spans``.
             levels: The keyword ``price_levels``.
             unit: The keyword ``bandwidth_unit``.

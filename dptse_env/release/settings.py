@@ -138,8 +138,8 @@ class PacedSettings(PrivacySettings):
         ratio: Ratio r of the charge for a deviation of D and the charge for being counted; noise
             of flows has D / sqrt(r) times the deviation of that of counts. At most 1 for the
             adjacency ``replace``.
-        pacing: What sets the prices: ``tracer``, a registered name, ``"package.module:Class"``, or
-            a class.
+        pacing: Rule that sets the prices: ``tracer``, a registered name,
+            ``"package.module:Class"``, or a class.
 
     Raises:
         ValueError: A field is out of range; the message names its path below ``privacy``.

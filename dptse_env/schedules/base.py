@@ -33,7 +33,7 @@ class Schedule(ABC):
     Attributes:
         queries: The G options.
         n_mainline: Mainline segments.
-        bandwidth: What the queries of a step may cost together.
+        bandwidth: Largest total cost of the queries of a step.
         uses_truth: Whether the choice depends on the true traffic. Such a schedule is a bound on
             policies, not a policy.
     """
@@ -112,7 +112,7 @@ class Schedule(ABC):
         return self.interface.observations.block(observation, name)
 
     def mask(self, chosen: IntArray) -> BoolArray:
-        """Return the mask of the chosen options, (k, anything) to (k, G)."""
+        """Return flags (k, G) of the chosen options, given their indices (k, m) for any m."""
         mask = np.zeros((len(chosen), self.queries.n_options), dtype=bool)
         np.put_along_axis(mask, chosen, True, axis=1)
         return mask
@@ -130,7 +130,11 @@ class Schedule(ABC):
         return mask
 
     def completed(self, chosen: IntArray) -> BoolArray:
-        """Return the mask of chosen options (k, anything), and of others as far as they fit."""
+        """Return flags (k, G) of chosen options, and of others that the bandwidth still pays for.
+
+        Args:
+            chosen: Indices of the chosen options, shape (k, m) for any m.
+        """
         mask = self.mask(chosen)
         if chosen.shape[1] == self.queries.most_queries:
             return mask

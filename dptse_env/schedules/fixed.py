@@ -69,7 +69,8 @@ class LargestVariance(Schedule):
 
     With the standard deviations s_rho and s_v of the observation, in the reward's units, it is
     s_rho^2 + s_v^2, or one of the two for a reward, or a ``term``, of density or speed alone. The
-    blocks are clipped at exp(-10) and exp(5), beyond which segments tie. It costs a sort.
+    blocks are clipped at exp(-10) and exp(5), beyond which segments tie. A step sorts the
+    segments once.
     """
 
     def __init__(
@@ -103,7 +104,7 @@ class StaleVariance(Schedule):
     the reward's units; for a reward of one term, that term alone. The age compensates for an
     estimator that is overconfident about segments without recent measurements, the cap of a tenth
     of the free speed for one that is underconfident about speeds on nearly empty segments. Both
-    were selected on validation traffic. It costs a sort.
+    were selected on validation traffic. A step sorts the segments once.
     """
 
     age_power: ClassVar[float] = 2.0

@@ -25,7 +25,7 @@ class OracleError(ProcessSchedule):
 
     The squared error is ``((rho_est - rho) / rho_0)^2 + m ((v_est - v) / v_0)^2`` with the
     reward's scales and m = 1 where there is a vehicle, else 0; for a reward of one term, that
-    term alone. It costs a sort.
+    term alone. A step sorts the segments once.
     """
 
     name: ClassVar[str] = "oracle-error"

@@ -23,7 +23,7 @@ class ExpectedReduction(ProcessSchedule):
     in units a, b of the reward, with the term that the reward has. The variance of a speed that is
     released as a flow is that of the flow's noise over the squared density. Errors of different
     segments, and of density and speed, count as independent: for estimators whose deviations are
-    honest, such as `recurrent`. It costs a sort.
+    honest, such as `recurrent`. A step sorts the segments once.
     """
 
     name: ClassVar[str] = "expected-reduction"

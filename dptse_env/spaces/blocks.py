@@ -61,7 +61,7 @@ class ObservationSetup:
 
     Attributes:
         corridor: The road.
-        bandwidth: What the queries of a step may cost together.
+        bandwidth: Largest total cost of the queries of a step.
         epsilon: Privacy parameter epsilon.
         n_options: Options G that can be queried.
         sensor_rows: The row of a release in which each fixed sensor is, F of them.

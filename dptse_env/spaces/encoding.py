@@ -89,7 +89,7 @@ class ActionEncoding(ABC):
         """
 
     def available(self, picked: BoolArray) -> BoolArray:
-        """Return which options (k, n_options) a decision may have beside the picked ones.
+        """Return flags (k, n_options) of what a decision may have beside the picked options.
 
         They are not picked yet, and do not cost more than is left of the bandwidth.
         """

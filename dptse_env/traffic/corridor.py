@@ -199,7 +199,7 @@ class Corridor(RoadSegments):
 
     @property
     def published_demand(self) -> Demand:
-        """The demand, or that which random levels are about."""
+        """The public demand: the base of a `DemandDistribution`, or else the demand itself."""
         demand = self.demand
         return demand.base if isinstance(demand, DemandDistribution) else demand
 
@@ -212,7 +212,7 @@ class Corridor(RoadSegments):
 
     @property
     def record_layout(self) -> dict[str, Any]:
-        """What the columns and the length of a record depend on, as plain JSON."""
+        """The fields that the columns and the length of a record depend on, as plain JSON."""
         return {
             "n_mainline": self.n_mainline,
             "on_ramps": list(self.on_ramps),

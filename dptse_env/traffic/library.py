@@ -160,9 +160,9 @@ class RecordLibrary:
         return self.path / folder / corridor.digest[:32] / f"{seed:08d}"
 
     def bring(self, corridor: Corridor, seed: int) -> None:
-        """Bring a record that is elsewhere into the library, before it is opened or made.
+        """Do nothing; a subclass may copy a record from another machine into the library.
 
-        Here nothing is elsewhere; a subclass may copy it from another machine.
+        It is called before a record is opened or made.
         """
 
     def _load_or_record(self, corridor: Corridor, seed: int) -> AnyRecord:

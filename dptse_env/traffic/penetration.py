@@ -70,7 +70,7 @@ class Penetration:
         return low + (high - low) * float(self._uniform(traffic_seed, 1, 1)[0])
 
     def connected(self, traffic_seed: int, n_vehicles: int) -> BoolArray:
-        """Return which vehicles of the traffic of a seed are connected, shape (n_vehicles,)."""
+        """Return flags of the connected vehicles in the traffic of a seed, shape (n_vehicles,)."""
         connected: BoolArray = self._uniform(traffic_seed, 0, n_vehicles) < self.share_of(
             traffic_seed
         )

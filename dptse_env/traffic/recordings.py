@@ -57,7 +57,7 @@ class Recordings:
 
     @property
     def has_vehicles(self) -> bool:
-        """Whether the records have vehicles; measured fields have none."""
+        """True if the records have vehicles; measured fields have none."""
         return bool(_manifest(self)["kind"] == "vehicles")
 
     def require(self, seeds: Iterable[int]) -> None:

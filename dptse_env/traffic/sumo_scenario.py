@@ -123,7 +123,7 @@ class SumoScenario:
 
     @property
     def traffic(self) -> dict[str, object]:
-        """What determines the traffic: the content of the files, not their names or folder."""
+        """Description of what determines the traffic: contents of files, not their names."""
         n_routes = len(self.routes)
         return {
             "net": self.sha256[0],
@@ -160,7 +160,7 @@ class SumoScenario:
 
 
 class Places:
-    """Where record columns are on the edges of a network.
+    """Places of the record columns on the edges of a network.
 
     Args:
         columns: as in `SumoScenario`.

@@ -53,7 +53,7 @@ class Rows(NamedTuple):
 
 
 class Released(NamedTuple):
-    """What is measured in a second in k episodes; values and sigma are 0 where nothing is."""
+    """Measurements of a second in k episodes; values and sigma are 0 where there is none."""
 
     observed: Any  # (k, M), 1 or 0
     values: Any  # (k, M, 2)

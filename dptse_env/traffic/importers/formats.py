@@ -124,7 +124,7 @@ def _required(path: Path, by_name: Mapping[str, str], name: str, option: str) ->
 
 
 def _equals(labels: Labels, value: object) -> BoolArray:
-    """Return which rows have a value, or one of several, as text or as a number."""
+    """Return flags of the rows that have a value, or one of several, as text or as a number."""
 
     def same(name: str, value: object) -> bool:
         try:

@@ -1,4 +1,4 @@
-"""Where points are on a road: branch, position along the road and record column."""
+"""Places of points on a road: branch, position along the road and record column."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ LINE_SPACING = 0.005
 
 
 class Placed(NamedTuple):
-    """Where n points are.
+    """Places of n points.
 
     Attributes:
         branch: 0 for the mainline, 1..I for the on-ramps, I+1..I+O for the off-ramps, or `OFF`.

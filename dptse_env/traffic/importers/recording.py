@@ -34,7 +34,7 @@ PICTURE_POINTS = 20_000
 
 @dataclass(frozen=True)
 class Options:
-    """How trajectories are cut.
+    """Settings by which trajectories are cut into windows.
 
     Attributes:
         longest_gap: Longest time without points that is filled by interpolation [s].

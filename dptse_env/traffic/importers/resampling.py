@@ -39,7 +39,7 @@ HALF_WIDTH = 0.5
 
 @dataclass
 class Counts:
-    """What happened to rows and vehicles, in words of the report."""
+    """Numbers of rows and vehicles by their fate, as the report names it."""
 
     rows: int = 0
     no_vehicle: int = 0
@@ -176,7 +176,7 @@ def _ordered(rows: Rows, counts: Counts, where: str) -> Rows:
 
 
 def _piece_numbers(vehicle: IntArray, joined: BoolArray) -> IntArray:
-    """Return which piece of its vehicle's trajectory each row is in, from 0."""
+    """Return the piece of its vehicle's trajectory that each row is in, counted from 0."""
     new_vehicle = np.concatenate([[True], np.diff(vehicle) != 0])
     cut = np.concatenate([[False], ~joined]) & ~new_vehicle
     total = np.cumsum(cut)

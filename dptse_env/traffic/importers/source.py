@@ -24,13 +24,13 @@ SPEEDS = {"m/s": 3.6, "km/h": 1.0, "ft/s": 1.09728, "mi/h": 1.609344}
 UNITS = {"time": TIMES, "length": LENGTHS, "speed": SPEEDS}
 
 ROLES = ("time", "vehicle", "x", "y", "speed", "lane", "edge", "group", "extent")
-"""What a column may be: see `dptse_env.traffic.importers.points.Points`; ``extent`` is the length
-of a vehicle along `x`, for data in which `x` is a corner of its box."""
+"""Roles of columns: see `dptse_env.traffic.importers.points.Points`; ``extent`` is the length of a
+vehicle along `x`, for data in which `x` is a corner of its box."""
 
 
 @dataclass(frozen=True)
 class Part:
-    """How vehicles on a part of the road are known; without any field, all others are on it.
+    """Criteria for vehicles on a part of the road; without any, all other vehicles are on it.
 
     Attributes:
         lanes: names of its lanes.
@@ -48,7 +48,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Layout:
-    """Where the road lies in the data. Lengths are in the file's unit.
+    """Position of the road in the data. Lengths are in the file's unit.
 
     Attributes:
         origin: position of the upstream end of the first mainline segment.
@@ -87,7 +87,7 @@ class Layout:
 
 @dataclass(frozen=True)
 class Source:
-    """What a file of trajectories means.
+    """Meaning of a file of trajectories.
 
     Attributes:
         format: name of the format; see `dptse_env.traffic.importers.FORMATS`.

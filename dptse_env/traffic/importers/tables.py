@@ -37,7 +37,7 @@ class Chunk(NamedTuple):
 
 
 class Head(NamedTuple):
-    """What the start of a text file tells: columns, delimiter, lines above the data."""
+    """Format of a text file, as its start shows it: columns, delimiter, lines above the data."""
 
     columns: list[str]
     delimiter: str

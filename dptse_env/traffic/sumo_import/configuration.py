@@ -37,7 +37,7 @@ SHOWN = re.compile(
 
 @dataclass(frozen=True)
 class Files:
-    """What a simulation reads.
+    """Files and options of a simulation.
 
     Attributes:
         net: network file.
@@ -77,7 +77,7 @@ class Files:
 
     @property
     def internal_links(self) -> bool:
-        """Whether vehicles drive on the internal edges of junctions."""
+        """True if vehicles drive on the internal edges of junctions."""
         return not any(
             option in ("--no-internal-links", "--no-internal-links=true", "--no-internal-links=1")
             for option in self.options
