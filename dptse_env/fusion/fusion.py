@@ -7,6 +7,7 @@ depends on it.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -66,7 +67,7 @@ class Fusion:
     def __init__(self, setup: FusionSetup) -> None:
         """Prepare for episodes; each needs a `reset` before its first second."""
         self.setup, settings = setup, setup.settings
-        self._weights = setup.rows.weights
+        self._weights = setup.rows.weights.T
         self.share = (
             ShareFilter(settings, setup.share, setup.n_episodes)
             if settings.share == "estimated"
@@ -106,7 +107,8 @@ class Fusion:
             measured: The released rows.
             prediction: The estimator's prediction for this second, rows of shape (k, S).
         """
-        expected = self._expected(measured, prediction)
+        centre = measured.centre if self.setup.releases_flow else None
+        expected = _Expected(prediction, self._weights, centre)
         values, sigma = measured.values.copy(), measured.sigma.copy()
         self._scale_queries(episodes, observed, values, sigma, expected)
         if self.test is not None:
@@ -114,24 +116,6 @@ class Fusion:
                 episodes, observed, values - expected.mean, sigma, expected.deviation
             )
         return MeasuredRows(values, sigma, measured.centre)
-
-    def _expected(self, measured: MeasuredRows, prediction: Estimate) -> _Expected:
-        """Return what the prediction says of the rows."""
-        weights = self._weights.T
-        density = np.maximum(prediction.density @ weights, 0.0)
-        speed = prediction.speed @ weights
-        density_std = prediction.density_std @ weights
-        speed_std = prediction.speed_std @ weights
-        if not self.setup.releases_flow:
-            mean = np.stack([density, speed], axis=-1)
-            deviation = np.stack([density_std, speed_std], axis=-1)
-            return _Expected(density, np.zeros_like(speed), speed, mean, deviation)
-        offset = speed - measured.centre @ weights
-        mean = np.stack([density, density * offset], axis=-1)
-        deviation = np.stack(
-            [density_std, np.hypot(density_std * offset, density * speed_std)], axis=-1
-        )
-        return _Expected(density, offset, speed, mean, deviation)
 
     def _scale_queries(
         self,
@@ -149,7 +133,7 @@ class Fusion:
         if self.share is not None:
             p, p_variance = self.share.update(
                 episodes, observed[:, queries], values[:, queries, 0], sigma[:, queries, 0],
-                density, expected.deviation[:, queries, 0], length,
+                density, expected.density_std[:, queries], length,
             )  # fmt: skip
         alike = self._seconds_alike(expected.speed[:, queries], length)
         sampling = alike * count * (1.0 - p) / p / length**2
@@ -183,20 +167,51 @@ class Fusion:
         return np.maximum(factor * dwell, 1.0)
 
 
-@dataclass(frozen=True)
 class _Expected:
-    """A prediction of M rows, arrays of shape (k, M), and (k, M, 2) for both quantities.
+    """A prediction of M rows.
 
     Attributes:
-        density: Densities [veh/km], at least 0.
-        offset: Speeds less the centres of flows [km/h]; 0 where mean speeds are released.
-        speed: Speeds [km/h].
-        mean: The measurements that are expected.
-        deviation: Standard deviations of the predicted ones.
+        density: Densities [veh/km], at least 0, shape (k, M).
+        speed: Speeds [km/h], shape (k, M).
     """
 
-    density: FloatArray
-    offset: FloatArray
-    speed: FloatArray
-    mean: FloatArray
-    deviation: FloatArray
+    def __init__(
+        self, prediction: Estimate, weights: FloatArray, centre: FloatArray | None
+    ) -> None:
+        """Average a prediction over the rows.
+
+        Args:
+            prediction: Rows of shape (k, S).
+            weights: Weights of the segments in each row, shape (S, M).
+            centre: Speeds that flows are centred on [km/h], (k, S); None for mean speeds.
+        """
+        self._prediction, self._weights, self._centre = prediction, weights, centre
+        self.density: FloatArray = np.maximum(prediction.density @ weights, 0.0)
+        self.speed: FloatArray = prediction.speed @ weights
+
+    @cached_property
+    def offset(self) -> FloatArray:
+        """Speeds less the centres of flows [km/h], shape (k, M)."""
+        assert self._centre is not None
+        offset: FloatArray = self.speed - self._centre @ self._weights
+        return offset
+
+    @cached_property
+    def density_std(self) -> FloatArray:
+        """Standard deviations of the densities [veh/km], shape (k, M)."""
+        deviation: FloatArray = self._prediction.density_std @ self._weights
+        return deviation
+
+    @property
+    def mean(self) -> FloatArray:
+        """The measurements that are expected, shape (k, M, 2)."""
+        second = self.speed if self._centre is None else self.density * self.offset
+        return np.stack([self.density, second], axis=-1)
+
+    @property
+    def deviation(self) -> FloatArray:
+        """Standard deviations of these, as predicted, shape (k, M, 2)."""
+        second = self._prediction.speed_std @ self._weights
+        if self._centre is not None:
+            second = np.hypot(self.density_std * self.offset, self.density * second)
+        return np.stack([self.density_std, second], axis=-1)

@@ -80,13 +80,18 @@ class ReleaseSetup:
         return self.corridor.n_segments + self.n_columns - self.rows.n_rows
 
     @cached_property
+    def spans(self) -> IntArray:
+        """Number of record columns that each column of a release covers, shape (n_columns,)."""
+        boundaries = np.ones(self.n_columns - self.rows.n_rows, dtype=np.int64)
+        return np.concatenate([self.rows.span, boundaries])
+
+    @cached_property
     def lengths(self) -> FloatArray:
         """Length of each column of a release [km], shape (n_columns,)."""
-        corridor, rows = self.corridor, self.rows
-        every = np.array(corridor.with_boundaries(corridor.segment_lengths))
+        every = np.array(self.corridor.with_boundaries(self.corridor.segment_lengths))
         # Sums over several segments are released where all lengths on the mainline are equal.
-        boundaries = every[corridor.n_segments :][: self.n_columns - rows.n_rows]
-        return np.concatenate([every[rows.first] * rows.span, boundaries])
+        lengths: FloatArray = every[self.places] * self.spans
+        return lengths
 
     @cached_property
     def always_observed(self) -> IntArray:

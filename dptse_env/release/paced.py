@@ -74,8 +74,9 @@ class Paced(ReleaseModel):
         self._epsilons = EpsilonTable(self.mu, settings.delta)
         self._squares = 2.0 if settings.adjacency == "replace" else 1.0
         self.budget = self.mu**2 / self._squares
-        span, level = _columns(setup)
-        first, places = setup.places, setup.n_places
+        first, span, places = setup.places, setup.spans, setup.n_places
+        level = np.ones(setup.n_columns)
+        level[: setup.queries.n_options] = setup.queries.level
         self.ledgers = Ledgers(
             Columns(first, span, places),
             VehicleTable(
@@ -280,16 +281,6 @@ class Paced(ReleaseModel):
             "individual_epsilon": object_array([self._losses(row)[1].tolist() for row in paid]),
             "n_refused": self._refused[episodes].copy(),
         }
-
-
-def _columns(setup: ReleaseSetup) -> tuple[IntArray, FloatArray]:
-    """Return the span and the price level of each column."""
-    rows, options = setup.rows, setup.queries
-    span = np.ones(setup.n_columns, dtype=np.int64)
-    span[: rows.n_rows] = rows.span
-    level = np.ones(setup.n_columns)
-    level[: options.n_options] = options.level
-    return span, level
 
 
 def _coverage(options: QueryOptions) -> float:

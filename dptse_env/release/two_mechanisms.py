@@ -14,7 +14,7 @@ from dptse_env.model import MeasurementRows
 from dptse_env.privacy import EpsilonTable, epsilon_of
 from dptse_env.release.base import Released, ReleaseModel, ReleaseRequest, ReleaseSetup
 from dptse_env.release.detectors import DetectorErrors, Detectors
-from dptse_env.release.queries import QueryOptions
+from dptse_env.release.queries import NO_OPTIONS
 from dptse_env.release.report import PrivacyReport, in_order
 from dptse_env.release.traffic_table import TrafficTable
 from dptse_env.traffic import AnyRecord, Penetration, with_vehicles
@@ -52,11 +52,6 @@ class PartSetup(ReleaseSetup):
     def n_columns(self) -> int:
         """Columns of the part."""
         return self.stop - self.start
-
-    @cached_property
-    def lengths(self) -> FloatArray:
-        """See `ReleaseSetup.lengths`."""
-        return self._whole.lengths[self.start : self.stop]
 
     @cached_property
     def always_observed(self) -> IntArray:
@@ -112,6 +107,8 @@ class TwoMechanisms(ReleaseModel):
         self._connected = ConnectedTraffic(setup.traffic, penetration)
         self._split = split if has_sensors else setup.n_columns
 
+        no_options = replace(NO_OPTIONS, n_mainline=setup.corridor.n_mainline)
+
         def part(start: int, stop: int, traffic: TrafficTable, share: float) -> ReleaseModel:
             is_sensors = start > 0
             return model(
@@ -119,7 +116,7 @@ class TwoMechanisms(ReleaseModel):
                     setup.name, setup.settings, traffic,
                     bandwidth=0 if is_sensors else setup.bandwidth,
                     horizon=setup.horizon, n_episodes=setup.n_episodes,
-                    queries=_no_options(setup) if is_sensors else setup.queries,
+                    queries=no_options if is_sensors else setup.queries,
                     budget_share=share if self._claims else 1.0,
                     whole=setup, start=start, stop=stop,
                 )
@@ -132,15 +129,19 @@ class TwoMechanisms(ReleaseModel):
         if has_sensors:
             self.sensors = part(self._split, setup.n_columns, setup.traffic, share)
             if not detectors.are_exact:
-                self._errors = self._detector_errors(detectors)
+                self._errors = DetectorErrors(
+                    detectors,
+                    self._sensor_columns - self._split,
+                    setup.lengths[self._sensor_columns],
+                    setup.n_episodes,
+                )
         self._flow = model.flow_centre(setup.corridor, setup.settings) is not None
 
-    def _detector_errors(self, detectors: Detectors) -> DetectorErrors:
+    @cached_property
+    def _sensor_columns(self) -> IntArray:
+        """Column of each fixed sensor, shape (F,)."""
         setup = self.setup
-        columns = np.array(setup.queries.sensor_rows(setup.corridor), dtype=np.int64)
-        return DetectorErrors(
-            detectors, columns - self._split, setup.lengths[columns], setup.n_episodes
-        )
+        return np.array(setup.queries.sensor_rows(setup.corridor), dtype=np.int64)
 
     @property
     def parts(self) -> tuple[ReleaseModel, ...]:
@@ -160,8 +161,8 @@ class TwoMechanisms(ReleaseModel):
 
     def load(self, index: int, record: AnyRecord) -> None:
         """See `ReleaseModel.load`; queries read the connected vehicles alone."""
-        self._connected.load([index])
-        self.queries.load(index, self._connected.record(index))
+        for _, reported in self._connected.load([index]):
+            self.queries.load(index, reported)
         if self.sensors is not None:
             self.sensors.load(index, record)
 
@@ -183,19 +184,16 @@ class TwoMechanisms(ReleaseModel):
         seen, missing = observed[:, split:], None
         if self._errors is not None:
             missing = np.zeros(observed.shape, dtype=bool)
-            missing[:, self.setup.queries.sensor_rows(self.setup.corridor)] = self._errors.silent(
-                request.episodes
-            )
+            missing[:, self._sensor_columns] = self._errors.silent(request.episodes)
             seen = seen & ~missing[:, split:]
         sensed = self.sensors.release(request._replace(observed=seen))
         if self._errors is not None:
             sensed = self._errors.apply(request.episodes, sensed, releases_flow=self._flow)
         both = queried, sensed
-        shapes = [(*part.values.shape,) for part in both]
         return Released(
-            np.concatenate([part.values for part in both], axis=1),
+            np.concatenate([each.values for each in both], axis=1),
             np.concatenate(
-                [np.broadcast_to(p.sigma, s) for p, s in zip(both, shapes, strict=True)], axis=1
+                [np.broadcast_to(each.sigma, each.values.shape) for each in both], axis=1
             ),
             sensed.centre,
             missing,
@@ -265,9 +263,3 @@ class TwoMechanisms(ReleaseModel):
             for name, rows in self.sensors.private_info(episodes, traffic).items():
                 infos[f"sensor_{name}"] = rows
         return infos
-
-
-def _no_options(setup: ReleaseSetup) -> QueryOptions:
-    """Return options of which there are none, on a setup's road."""
-    none = np.zeros(0, dtype=np.int64)
-    return QueryOptions(none, none, np.zeros(0), none, setup.corridor.n_mainline, 0)
