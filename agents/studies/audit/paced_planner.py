@@ -8,13 +8,11 @@ from typing import ClassVar
 
 import numpy as np
 
-from agents.studies.audit.attack import attack
 from agents.studies.audit.distances import protects_seconds, replaces
 from agents.studies.audit.planning import Pair, Planner, Second
 from agents.studies.audit.series import PublicSeries, play_series
 from agents.studies.audit.strategies import (
     PUBLIC_SCHEDULES,
-    FixedQueries,
     always_observed,
     public_plan,
 )
@@ -143,22 +141,11 @@ class PacedPlanner(Planner):
             Trajectory(seconds, segments, still + corridor.largest_speed_limit),
         )
 
-    def reached(self, worlds: AdjacentWorlds) -> float:
-        """See `Planner.reached`: that of one episode in each world."""
-        queries = FixedQueries(self.plan(worlds))
-        return float(attack(self.config, worlds, queries, 1, progress=False).distances.max())
-
     def worthwhile(self, worlds: AdjacentWorlds, world: int) -> tuple[list[Second], int]:
-        """See `Planner.worthwhile`: every second.
-
-        Where the bandwidth does not suffice for both vehicles, it serves them by turns.
-        """
+        """See `Planner.worthwhile`: every second that needs a query, for both by turns."""
         vehicle = worlds.trajectories[world]
         always = np.isin(vehicle.segment, always_observed(self.config))
-        chosen = vehicle.only(self.queryable(vehicle) & ~always)
-        rows = zip((chosen.step - 1).tolist(), chosen.segment.tolist(), strict=True)
-        seconds = [(float((step + world) % 2), step, segment, world) for step, segment in rows]
-        return seconds, len(seconds)
+        return self.by_turns(vehicle, self.queryable(vehicle) & ~always, world)
 
     def hunting_plan(self, worlds: AdjacentWorlds) -> BoolArray:
         """See `Planner.hunting_plan`; what is left of the bandwidth goes round all segments.

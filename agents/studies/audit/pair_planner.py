@@ -7,10 +7,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from agents.studies.audit.attack import attack
 from agents.studies.audit.distances import replaces
 from agents.studies.audit.planning import Pair, Planner, Second
-from agents.studies.audit.strategies import FixedQueries
 from agents.studies.audit.worlds import AdjacentWorlds, Trajectory
 from dptse_env.traffic import Record
 from dptse_env.utils.arrays import FloatArray, IntArray
@@ -46,17 +44,8 @@ class PairPlanner(Planner):
         elsewhere = Trajectory.constant(seconds, there, 0.0)
         return {f"{added}, or on segment {there} instead": (stands, elsewhere)}
 
-    def reached(self, worlds: AdjacentWorlds) -> float:
-        """See `Planner.reached`: that of one episode in each world."""
-        queries = FixedQueries(self.plan(worlds))
-        return float(attack(self.config, worlds, queries, 1, progress=False).distances.max())
-
     def worthwhile(self, worlds: AdjacentWorlds, world: int) -> tuple[list[Second], int]:
-        """See `Planner.worthwhile`: every second, for both vehicles by turns."""
+        """See `Planner.worthwhile`: every second on the mainline, for both vehicles by turns."""
         vehicle = worlds.trajectories[world]
-        chosen = vehicle.only(
-            self.queryable(vehicle) & (vehicle.segment < self.config.corridor.n_mainline)
-        )
-        rows = zip((chosen.step - 1).tolist(), chosen.segment.tolist(), strict=True)
-        seconds = [(float((step + world) % 2), step, segment, world) for step, segment in rows]
-        return seconds, len(seconds)
+        on_mainline = vehicle.segment < self.config.corridor.n_mainline
+        return self.by_turns(vehicle, self.queryable(vehicle) & on_mainline, world)

@@ -8,6 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from agents.studies.audit.attack import attack
 from agents.studies.audit.distances import replaces
 from agents.studies.audit.strategies import (
     PUBLIC_SCHEDULES,
@@ -55,9 +56,13 @@ class Planner(ABC):
     def made_up(self, record: Record, kind: str) -> Mapping[str, Pair]:
         """Return pairs of made-up trajectories of a kind, by the difference in words."""
 
-    @abstractmethod
     def reached(self, worlds: AdjacentWorlds) -> float:
-        """Return the distance that the policy reaches between two worlds, about."""
+        """Return the distance that the policy reaches between two worlds, about.
+
+        It is that of one episode in each world.
+        """
+        queries = FixedQueries(self.plan(worlds))
+        return float(attack(self.config, worlds, queries, 1, progress=False).distances.max())
 
     @abstractmethod
     def worthwhile(self, worlds: AdjacentWorlds, world: int) -> tuple[list[Second], int]:
@@ -65,6 +70,18 @@ class Planner(ABC):
 
         Those of the least cost are taken first.
         """
+
+    def by_turns(
+        self, vehicle: Trajectory, rows: BoolArray, world: int
+    ) -> tuple[list[Second], int]:
+        """Return all seconds of some rows of a world's vehicle, for `worthwhile`.
+
+        Where the bandwidth does not suffice for both vehicles, it serves them by turns.
+        """
+        chosen = vehicle.only(rows)
+        steps = zip((chosen.step - 1).tolist(), chosen.segment.tolist(), strict=True)
+        seconds = [(float((step + world) % 2), step, segment, world) for step, segment in steps]
+        return seconds, len(seconds)
 
     def require_kind(self, kind: str) -> None:
         """Refuse kinds of targets that the release model or the adjacency does not have.
