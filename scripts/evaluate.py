@@ -3,7 +3,7 @@
 python scripts/evaluate.py --schedules paper round-robin --seeds 2000:2020
 python scripts/evaluate.py --policies results/training/primary/pl-0/best.zip
 python scripts/evaluate.py --suite query-suite-v2 --policies round-robin my_package:MySchedule
-python scripts/evaluate.py --suite query-suite-v2 --verify results/suites/query-suite-v1/mine.json
+python scripts/evaluate.py --suite query-suite-v2 --verify results/suites/query-suite-v2/mine.json
 """
 
 from __future__ import annotations

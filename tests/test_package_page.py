@@ -1,4 +1,4 @@
-"""What is stated about a release: the README on a package page, the version, the repository."""
+"""Statements about a release: the README on a package page, the version, the repository."""
 
 import re
 import tomllib

@@ -27,7 +27,7 @@ NOT_RUN = {
     "libraries.md": 1,  # TorchRL is not installed
     "pictures.md": 1,  # a display
 }
-"""How many blocks of a page are compiled only."""
+"""Number of blocks of a page that are compiled only."""
 
 
 def of(*languages):

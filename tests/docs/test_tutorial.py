@@ -1,21 +1,17 @@
 """The tutorial, and the notebook that is made of it."""
 
 import json
-import re
 import runpy
 from pathlib import Path
 
+from .blocks import blocks_of
+
 TUTORIAL = Path(__file__).parents[2] / "docs" / "tutorial.md"
-BLOCK = re.compile(r"```(\w+)(?: title=\"([\w.]+)\")?\n(.*?)```", re.DOTALL)
-DPTSE = "import dptse_env.command_line as c; c.main()"
-
-
-def blocks():
-    return BLOCK.findall(TUTORIAL.read_text(encoding="utf-8"))
+BLOCKS = blocks_of(TUTORIAL)
 
 
 def test_it_takes_a_newcomer_few_commands():
-    shell = [text for language, _, text in blocks() if language == "bash"]
+    shell = [block.text for block in BLOCKS if block.language == "bash"]
     assert sum(len(text.splitlines()) for text in shell) <= 8
 
 
@@ -25,7 +21,7 @@ def test_the_notebook_is_the_tutorial():
     assert code["NOTEBOOK"].read_text(encoding="utf-8") == code["notebook_text"]()
     cells = json.loads(code["notebook_text"]())["cells"]
     shown = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
-    assert len(shown) == len(blocks())
+    assert len(shown) == len(BLOCKS)
     assert sum(text.startswith("!dptse") for text in shown) == 4
     assert any(text.startswith("%%writefile mine.py") for text in shown)
     for text in shown:

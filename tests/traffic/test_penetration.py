@@ -1,4 +1,4 @@
-"""Which vehicles are connected: nested in the share, and the same for every policy."""
+"""The connected vehicles: nested in the share, and the same for every policy."""
 
 import itertools
 

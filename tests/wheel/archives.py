@@ -1,4 +1,4 @@
-"""What the archives of a release hold: the tracked files of some folders, and nothing else."""
+"""Contents of a release's archives: the tracked files of some folders, and nothing else."""
 
 from __future__ import annotations
 
