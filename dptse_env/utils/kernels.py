@@ -3,21 +3,29 @@
 numba compiles a kernel at its first call and keeps the machine code on disk: beside the module
 where that folder is writable, else in the user's cache, or in the folder of ``NUMBA_CACHE_DIR``.
 Parts are compiled into the kernels that call them; called from Python they run as Python.
+
+Processes take turns: one compiles a function, and the others load what it has kept. At the first
+function that is not on disk a process starts others, which compile those that will be needed next;
+see `dptse_env.utils.compile_ahead`.
 """
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import inspect
 import logging
 from collections.abc import Callable, Iterator
 from functools import cache
+from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
 from typing import Any, TypeVar, cast, overload
 
-from numba import njit, types
+from numba import config, njit, types
 from numba.core.caching import FunctionCache, NullCache
 from numba.core.registry import CPUDispatcher
+
+from dptse_env.utils import compile_ahead
 
 logger = logging.getLogger(__name__)
 
@@ -35,7 +43,9 @@ def kernel(function: Function) -> Function:
     Its machine code is kept under a fingerprint of the function and of all parts and constants
     that it reaches: a change of any of them compiles it anew.
     """
-    compiled: Any = njit(**_OPTIONS)(function)
+    if config.DISABLE_JIT:
+        return function
+    compiled: Any = _Dispatcher(function, targetoptions={**_OPTIONS, "nopython": True})
     try:
         compiled._cache = _KernelCache(function)
     except RuntimeError:  # numba found no folder that it may write to
@@ -47,14 +57,25 @@ def kernel(function: Function) -> Function:
 def kernel_part(function: Function, /) -> Function: ...
 @overload
 def kernel_part(**options: Any) -> Callable[[Function], Function]: ...
-def kernel_part(function: Any = None, /, **options: Any) -> Any:
-    """Let kernels call a function; ``options`` are numba's, such as `fastmath`.
+def kernel_part(function: Any = None, /, *, kept: bool = False, **options: Any) -> Any:
+    """Let kernels call a function.
 
-    A part has no entry for Python and no place on disk, which saves time when it is compiled.
+    A part has no entry for Python, which saves time when it is compiled.
+
+    Args:
+        function: The function.
+        kept: Keep its machine code on disk as that of a kernel. Another process can then compile
+            it, and each kernel that calls it does not have to. It pays where compiling takes some
+            half a second or more.
+        options: Options of numba, such as `fastmath`.
     """
 
     def decorate(function: Any) -> Any:
-        return _Part(function, targetoptions={**_OPTIONS, **_WITHOUT_PYTHON, **options})
+        part: Any = _Part(function, targetoptions={**_OPTIONS, **_WITHOUT_PYTHON, **options})
+        if kept:
+            with contextlib.suppress(RuntimeError):  # numba found no folder that it may write to
+                part._cache = _KernelCache(function)
+        return part
 
     return decorate if function is None else decorate(function)
 
@@ -64,7 +85,25 @@ def inline_part(function: Function) -> Function:
     return cast("Function", njit(error_model="numpy", inline="always")(function))
 
 
-class _Part(CPUDispatcher):
+def compile_unless_busy(function: Any, signature: tuple[Any, ...]) -> None:
+    """Compile a kernel or a kept part, or load it; do nothing while another process compiles it."""
+    if not function._cache.is_busy():
+        function.compile(signature)
+
+
+class _Dispatcher(CPUDispatcher):
+    """numba's dispatcher of a function that one process at a time compiles."""
+
+    def compile(self, sig: Any) -> Any:
+        """Compile or load the version for a signature."""
+        try:
+            return super().compile(sig)
+        finally:
+            if isinstance(self._cache, _KernelCache):
+                self._cache.end_turn()
+
+
+class _Part(_Dispatcher):
     """numba's dispatcher of a function whose machine code has no entry for Python."""
 
     def add_overload(self, result: Any) -> None:
@@ -84,12 +123,32 @@ class _Part(CPUDispatcher):
 class _KernelCache(FunctionCache):
     """numba's cache of a function, with the fingerprint in its keys."""
 
+    _turn: Any = None
+
     def load_overload(self, signature: Any, context: Any) -> Any:
-        """Return kept machine code; where there is none, say that compiling begins."""
+        """Return kept machine code; where there is none, say that compiling begins.
+
+        Another process may be compiling the function: then wait, and return what it has kept.
+        """
         kept = super().load_overload(signature, context)
         if kept is None:
-            _announce(self._py_func, f"kept in {self.cache_path}")
+            folder = Path(self.cache_path)
+            self._turn = compile_ahead.take_turn(self._py_func, folder)
+            kept = super().load_overload(signature, context)
+            if kept is None:
+                _announce(self._py_func, f"kept in {folder}")
+                compile_ahead.start(self._py_func, signature, folder)
         return kept
+
+    def is_busy(self) -> bool:
+        """Return whether another process is compiling the function."""
+        return compile_ahead.is_taken(self._py_func, Path(self.cache_path))
+
+    def end_turn(self) -> None:
+        """Let other processes load the function, or compile it where this one has failed."""
+        if self._turn is not None:
+            self._turn.release()
+            self._turn = None
 
     def _index_key(self, signature: Any, codegen: Any) -> tuple[Any, ...]:
         return (fingerprint(self._py_func), *super()._index_key(signature, codegen))

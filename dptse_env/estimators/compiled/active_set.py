@@ -50,7 +50,7 @@ def make_active_set(n_stages: int, width: int) -> ActiveSet:
     )
 
 
-@kernel_part
+@kernel_part(kept=True)
 def minimise(
     road: RoadArrays,
     chain: Chain,
@@ -133,7 +133,7 @@ def _members(n_stages: int, n: int, active: ActiveSet) -> int:
     return m
 
 
-@kernel_part
+@kernel_part(kept=True)
 def _columns(
     road: RoadArrays,
     chain: Chain,

@@ -43,7 +43,7 @@ def _subtract(right: FloatArray, i: int, first: int, last: int, factors: FloatAr
             row[j] -= x * a[j]
 
 
-@kernel_part(fastmath={"contract"})
+@kernel_part(kept=True, fastmath={"contract"})
 def solve(matrix: FloatArray, right: FloatArray) -> bool:
     """Replace `right` by `matrix^-1 right`, the matrix by its factor; return whether it has one."""
     if not _factor(matrix):

@@ -78,7 +78,7 @@ def restart(road_: Packed, ensembles_: Packed, episodes: IntArray) -> None:
         _restart(road, ensembles, e)
 
 
-@kernel_part
+@kernel_part(kept=True)
 def _restart(road: RoadArrays, ensembles: Ensembles, e: int) -> None:
     members, n = ensembles.members[e], ensembles.n_members
     for i in range(members.shape[0]):
@@ -182,7 +182,7 @@ def update(
             _restart(road, ensembles, e)
 
 
-@kernel_part
+@kernel_part(kept=True)
 def _update_members(
     road: RoadArrays,
     ensembles: Ensembles,
@@ -234,7 +234,7 @@ def _update_members(
     return is_finite(members)
 
 
-@kernel_part
+@kernel_part(kept=True)
 def _update_locally(
     ensembles: Ensembles,
     e: int,
@@ -257,7 +257,7 @@ def _update_locally(
     return is_finite(members)
 
 
-@kernel_part(fastmath={"contract"})
+@kernel_part(kept=True, fastmath={"contract"})
 def _compare(
     road: RoadArrays,
     ensembles: Ensembles,

@@ -50,7 +50,7 @@ def _product(one: FloatArray, other: FloatArray) -> float:
     return total
 
 
-@kernel_part
+@kernel_part(kept=True)
 def joint_band(
     near: Near,
     among: FloatArray,

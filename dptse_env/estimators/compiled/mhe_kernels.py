@@ -125,7 +125,7 @@ def update(
             restart(filters_, windows_, e)
 
 
-@kernel_part
+@kernel_part(kept=True)
 def enter_measurements(
     road: RoadArrays,
     filters: Filters,
@@ -148,7 +148,7 @@ def enter_measurements(
     return sound
 
 
-@kernel_part
+@kernel_part(kept=True)
 def _linearise(road: RoadArrays, filters: Filters, windows: Windows, e: int) -> None:
     """Linearise the last stage, or all stages where that is along the solution."""
     last = windows.length[e] - 1
@@ -162,7 +162,7 @@ def _linearise(road: RoadArrays, filters: Filters, windows: Windows, e: int) -> 
             linearise_step(road, filters, windows, e, t, point)
 
 
-@kernel_part
+@kernel_part(kept=True)
 def _measure(
     road: RoadArrays,
     filters: Filters,

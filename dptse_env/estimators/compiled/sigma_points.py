@@ -54,7 +54,7 @@ def distances_from_first(row: FloatArray, scale: float, weight: float, out: Floa
     return weight * total
 
 
-@kernel_part(fastmath={"contract"})
+@kernel_part(kept=True, fastmath={"contract"})
 def gather(
     points: Points,
     e: int,

@@ -61,7 +61,7 @@ def enter(filters: Filters, windows: Windows, e: int, t: int) -> None:
     windows.noise[e, t] = 1.0
 
 
-@kernel_part
+@kernel_part(kept=True)
 def shift(windows: Windows, e: int) -> None:
     """Drop the oldest stage."""
     windows.length[e] -= 1
@@ -93,7 +93,7 @@ def _physical(road: RoadArrays, windows: Windows, point: FloatArray) -> FloatArr
     return state
 
 
-@kernel_part
+@kernel_part(kept=True)
 def linearise_step(
     road: RoadArrays, filters: Filters, windows: Windows, e: int, t: int, point: FloatArray
 ) -> None:

@@ -111,7 +111,7 @@ def update(
             points.moved[e] = False
 
 
-@kernel_part
+@kernel_part(kept=True)
 def _stay(road: RoadArrays, filters: Filters, points: Points, e: int, work: Outputs) -> bool:
     """Make points without a prediction, after another update in the same step."""
     covariance = filters.covariances[e]
@@ -125,7 +125,7 @@ def _stay(road: RoadArrays, filters: Filters, points: Points, e: int, work: Outp
     return True
 
 
-@kernel_part(fastmath={"contract"})
+@kernel_part(kept=True, fastmath={"contract"})
 def _update_episode(
     road: RoadArrays,
     filters: Filters,

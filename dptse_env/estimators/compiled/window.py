@@ -29,7 +29,7 @@ from dptse_env.utils.kernel_loops import copy_matrix, copy_vector
 from dptse_env.utils.kernels import kernel_part
 
 
-@kernel_part
+@kernel_part(kept=True)
 def factorise(road: RoadArrays, chain: Chain, n_stages: int, scratch: WindowScratch) -> bool:
     """Filter covariances through the window; return whether all variances are sound."""
     n, width = scratch.before.shape
@@ -67,7 +67,7 @@ def factorise(road: RoadArrays, chain: Chain, n_stages: int, scratch: WindowScra
     return True
 
 
-@kernel_part
+@kernel_part(kept=True)
 def _update_wide(
     road: RoadArrays,
     chain: Chain,
@@ -87,7 +87,7 @@ def _update_wide(
     return True
 
 
-@kernel_part
+@kernel_part(kept=True)
 def _write_diagonal(road: RoadArrays, chain: Chain, n_stages: int, scratch: WindowScratch) -> None:
     """Write the diagonal of H."""
     n = 2 * road.jam.size
@@ -109,7 +109,7 @@ def _write_diagonal(road: RoadArrays, chain: Chain, n_stages: int, scratch: Wind
             diagonal[n + e] += w[2 * c] * by_rho**2 + w[2 * c + 1] * by_psi**2 + w[n + e]
 
 
-@kernel_part
+@kernel_part(kept=True)
 def gradient(road: RoadArrays, chain: Chain, n_stages: int, z: FloatArray, out: FloatArray) -> None:
     """Write H z + q / 2, half the objective's gradient, `(L, padded)`."""
     out[:n_stages] = 0.0
@@ -177,7 +177,7 @@ def natural_residual(
     return largest
 
 
-@kernel_part
+@kernel_part(kept=True)
 def solve(
     road: RoadArrays,
     chain: Chain,

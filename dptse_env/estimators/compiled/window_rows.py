@@ -11,7 +11,7 @@ from dptse_env.utils.kernel_loops import copy_vector
 from dptse_env.utils.kernels import kernel_part
 
 
-@kernel_part
+@kernel_part(kept=True)
 def inform(road: RoadArrays, chain: Chain, n_stages: int, scratch: WindowScratch) -> None:
     """Write the information of single segments, and list the rows of several segments."""
     for t in range(n_stages):
