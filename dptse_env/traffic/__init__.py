@@ -5,7 +5,8 @@ Importing this package does not import libsumo; only making a record does.
 
 from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.demand import Demand, DemandDistribution
-from dptse_env.traffic.drivers import Drivers
+from dptse_env.traffic.detailed_record import DetailedRecord
+from dptse_env.traffic.drivers import Drivers, VehicleClass
 from dptse_env.traffic.dwell import average_dwell
 from dptse_env.traffic.field_record import AnyRecord, FieldRecord, with_vehicles
 from dptse_env.traffic.incident import Incident, IncidentDistribution
@@ -43,6 +44,7 @@ __all__ = [
     "Corridor",
     "Demand",
     "DemandDistribution",
+    "DetailedRecord",
     "Drivers",
     "FieldRecord",
     "Incident",
@@ -59,6 +61,7 @@ __all__ = [
     "Scenario",
     "SumoScenario",
     "SumoVersionError",
+    "VehicleClass",
     "average_dwell",
     "draw_scenario",
     "find_corridor",
