@@ -11,7 +11,7 @@ from dptse_env.traffic.dwell import average_dwell
 from dptse_env.traffic.field_record import AnyRecord, FieldRecord, with_vehicles
 from dptse_env.traffic.incident import Incident, IncidentDistribution
 from dptse_env.traffic.library import RecordLibrary, Records, open_library
-from dptse_env.traffic.penetration import Penetration
+from dptse_env.traffic.penetration import ClassShare, DensitySource, Penetration
 from dptse_env.traffic.presets import (
     CORRIDORS,
     PAPER_HIGHWAY,
@@ -33,6 +33,7 @@ from dptse_env.traffic.stored_arrays import InvalidRecordError
 from dptse_env.traffic.sumo import RecordingError, SumoVersionError, simulate
 from dptse_env.traffic.sumo_network import NetworkError
 from dptse_env.traffic.sumo_scenario import SumoScenario
+from dptse_env.traffic.surroundings import ReportRecord
 from dptse_env.traffic.worker import simulate_in_child
 
 __all__ = [
@@ -41,9 +42,11 @@ __all__ = [
     "PAPER_HIGHWAY",
     "SHORT_HIGHWAY",
     "AnyRecord",
+    "ClassShare",
     "Corridor",
     "Demand",
     "DemandDistribution",
+    "DensitySource",
     "DetailedRecord",
     "Drivers",
     "FieldRecord",
@@ -57,6 +60,7 @@ __all__ = [
     "RecordingError",
     "Recordings",
     "Records",
+    "ReportRecord",
     "RoadFile",
     "Scenario",
     "SumoScenario",
