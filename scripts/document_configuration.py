@@ -34,6 +34,7 @@ from dptse_env.model import ARZParameters
 from dptse_env.registration import ENVIRONMENTS
 from dptse_env.release import CappedSettings, Detectors, PrivacySettings
 from dptse_env.traffic import (
+    ClassShare,
     Corridor,
     Demand,
     DemandDistribution,
@@ -44,6 +45,7 @@ from dptse_env.traffic import (
     Recordings,
     RecordLibrary,
     SumoScenario,
+    VehicleClass,
 )
 from dptse_env.utils.fields import Interval, allowed_numbers, field_hints
 from dptse_env.vector_env import SensorQueryVectorEnv
@@ -54,12 +56,14 @@ SECTIONS: Mapping[type, str] = {
     PrivacySettings: "`privacy`, for every release model",
     CappedSettings: "`privacy`, for the release model `capped`",
     Penetration: "`penetration`",
+    ClassShare: "`penetration.by_class`",
     Detectors: "`detectors`",
     FusionSettings: "`fusion`",
     Corridor: "`corridor`",
     Demand: "`demand`, fixed",
     DemandDistribution: "`demand`, drawn for each traffic seed",
     Drivers: "`corridor.drivers`",
+    VehicleClass: "`corridor.vehicle_classes`",
     SumoScenario: "`corridor.network`",
     Recordings: "`corridor.recordings`",
     Incident: "`incident`, fixed",

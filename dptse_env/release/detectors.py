@@ -1,5 +1,6 @@
 """Fixed sensors as a mechanism of their own: their errors, and their part of the budget."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated
@@ -29,7 +30,8 @@ class Detectors:
         absolute: Standard deviation of a count at zero vehicles [veh].
         relative: Further standard deviation, as a share of the count.
         budget_share: Part of the privacy budget mu^2 of a connected vehicle that pays for the fixed
-            sensors.
+            sensors; None for 1 / (1 + 3 sqrt(p)), which grows from a quarter as the share p of
+            connected vehicles falls, and answers of queries with it tell less.
 
     Raises:
         ValueError: A value is out of range, or ``relative`` is positive and ``absolute`` is 0, so
@@ -40,7 +42,7 @@ class Detectors:
     dropout: Annotated[float, Interval(0, 1, open_high=True)] = 0.0
     absolute: Annotated[float, Interval(0, 1000)] = 0.0
     relative: Annotated[float, Interval(0, 10)] = 0.0
-    budget_share: Annotated[float, Interval(0.01, 0.99)] = 0.25
+    budget_share: Annotated[float, Interval(0.01, 0.99)] | None = None
 
     def __post_init__(self) -> None:
         """Check values."""
@@ -50,6 +52,12 @@ class Detectors:
                 "detectors.absolute must be > 0 where detectors.relative is, or a count of zero "
                 f"vehicles would have no error, got {self.absolute:g}"
             )
+
+    def part_of_budget(self, share: float) -> float:
+        """Return their part of the budget, given the published share of connected vehicles."""
+        if self.budget_share is not None:
+            return self.budget_share
+        return 1.0 / (1.0 + 3.0 * math.sqrt(share))
 
     @property
     def are_exact(self) -> bool:

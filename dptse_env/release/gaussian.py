@@ -4,7 +4,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
@@ -166,6 +166,8 @@ def require_gaussian(release: ReleaseModel, user: str) -> GaussianRelease:
 class Paper(GaussianRelease):
     """True density and mean speed of all vehicles, with the noise as printed in the paper."""
 
+    density_reports: ClassVar[Literal["", "mean", "centred"]] = "mean"
+
     def __init__(self, setup: ReleaseSetup) -> None:
         """See `GaussianRelease`."""
         super().__init__(setup)
@@ -218,6 +220,7 @@ class Capped(GaussianRelease):
     settings_type: ClassVar[type[PrivacySettings]] = CappedSettings
     claims_guarantee: ClassVar[bool] = True
     needs_vehicles: ClassVar[bool] = True
+    density_reports: ClassVar[Literal["", "mean", "centred"]] = "centred"
 
     @classmethod
     def flow_centre(cls, corridor: Corridor, settings: CappedSettings) -> float | None:
@@ -248,6 +251,7 @@ class Capped(GaussianRelease):
             segment_length=min(corridor.segment_lengths),
             largest_speed=corridor.largest_speed_limit,
             mean_speed_slope=slope if settings.speed_release == "mean" else None,
+            signed_counts=self.setup.density.is_centred,
         )
 
     def _noise_std(self) -> tuple[float, ...]:
@@ -267,7 +271,7 @@ class Capped(GaussianRelease):
         settings = self._settings
         cap = {"cap": settings.cap} if settings.unit == "trip" else {}
         shared = {"adjacency": settings.adjacency, "share": settings.share}
-        return {"unit": settings.unit, **cap, **shared}
+        return {"unit": settings.unit, **cap, **shared, **self.setup.density.details}
 
     @property
     def shared(self) -> tuple[AnyArray, ...]:
@@ -287,11 +291,12 @@ class Capped(GaussianRelease):
     def true_values(self, request: ReleaseRequest) -> FloatArray:
         """See `GaussianRelease.true_values`; unobserved columns hold zeros."""
         setup, corridor = self.setup, self.setup.corridor
-        counts, speeds = self.contributions.collect(
-            request.episodes, request.traffic, request.times, request.observed
-        )
+        counts, deviations, speeds = self.contributions.collect(
+            request.episodes, request.traffic, request.times, request.observed,
+            setup.density_terms(request.prediction),
+        )  # fmt: skip
         values = np.empty((*counts.shape, 2))
-        np.divide(counts, setup.lengths, out=values[..., 0])
+        np.divide(deviations, setup.lengths, out=values[..., 0])
         if self._settings.speed_release == "flow":
             speeds -= 0.5 * corridor.largest_speed_limit * counts
             np.divide(speeds, setup.lengths, out=values[..., 1])

@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -37,7 +37,8 @@ class Paced(ReleaseModel):
     A vehicle on a queried segment pays for its own deviation from the speed that the estimator
     predicts there, as in `dptse_env.release.ledgers`; prices are those of a pacing
     (`dptse_env.release.pacing`). With mu the parameter of the guarantee, a vehicle has a budget of
-    mu^2 / 2 against its replacement by another, and of mu^2 against being added or removed. The
+    mu^2 / 2 against its replacement by another, and of mu^2 against being added or removed; where
+    vehicles report deviations of densities in place of being counted, the first is mu^2 / 4. The
     guarantee holds for any query policy, any estimator and any pacing: ``docs/privacy.md`` has the
     proof.
 
@@ -57,6 +58,7 @@ class Paced(ReleaseModel):
     needs_vehicles: ClassVar[bool] = True
     releases_sums: ClassVar[bool] = True
     has_prices: ClassVar[bool] = True
+    density_reports: ClassVar[Literal["", "mean", "centred"]] = "centred"
     takes_noise: bool = True
 
     @classmethod
@@ -72,7 +74,9 @@ class Paced(ReleaseModel):
         corridor, n = setup.corridor, setup.n_episodes
         self.mu = mu_of(settings.epsilon, settings.delta) * math.sqrt(setup.budget_share)
         self._epsilons = EpsilonTable(self.mu, settings.delta)
-        self._squares = 2.0 if settings.adjacency == "replace" else 1.0
+        # The counts of two vehicles on one segment cancel; deviations may be opposite.
+        replaced = 4.0 if setup.density.is_centred else 2.0
+        self._squares = replaced if settings.adjacency == "replace" else 1.0
         self.budget = self.mu**2 / self._squares
         first, span, places = setup.places, setup.spans, setup.n_places
         level = np.ones(setup.n_columns)
@@ -93,7 +97,7 @@ class Paced(ReleaseModel):
         offered = (1.0 - 2.0 * ROUNDING) * self.budget
         made_for = PacingSetup(
             corridor, offered, settings.pace, settings.ratio, first, span, level,
-            setup.always_observed, _coverage(setup.queries), places, n,
+            setup.always_observed, _coverage(setup.queries), places, n, setup.density.mean_square,
         )  # fmt: skip
         pacing = EventPacing if settings.unit == "event" else PACINGS.find(settings.pacing)
         self.pacing = pacing(made_for)
@@ -144,7 +148,8 @@ class Paced(ReleaseModel):
         density, speed = self._public(request, prediction.density, prediction.speed)
         step = PublicStep(episodes, request.observed, density, speed)
         prices = check_prices(self.pacing.prices(step), request.observed.shape)
-        centre = self._centres(speed)
+        fastest = self.setup.corridor.largest_speed_limit
+        centre = self.setup.at_places(np.clip(speed, 0.0, fastest))
         self.prices[episodes], self.centres[episodes] = prices, centre
         self._charge(episodes, request.observed, prices)
         sums = self.collect(request, prices, centre)
@@ -161,17 +166,6 @@ class Paced(ReleaseModel):
             return density, speed
         nominal = np.array(self.setup.corridor.speed_limits)
         return np.where(finite, density, 0.0), np.where(finite, speed, nominal)
-
-    def _centres(self, speed: FloatArray) -> FloatArray:
-        """Return the centres of segments, and of boundary segments that are released: (k, places).
-
-        The centre of a boundary segment is that of the road's segment next to it.
-        """
-        corridor, S = self.setup.corridor, speed.shape[1]
-        centre: FloatArray = np.clip(speed, 0.0, corridor.largest_speed_limit)
-        if self.ledgers.n_places == S:
-            return centre
-        return np.concatenate([centre, centre[:, corridor.boundary_neighbours]], axis=1)
 
     def _charge(self, episodes: IntArray, observed: BoolArray, prices: FloatArray) -> None:
         """Add the largest payment that a vehicle can make in this second."""
@@ -193,8 +187,9 @@ class Paced(ReleaseModel):
         if self._settings.unit == "event":
             self.ledgers.reset(request.episodes)
         return self.ledgers.collect(
-            request.episodes, request.traffic, request.times, request.observed, prices, centre
-        )
+            request.episodes, request.traffic, request.times, request.observed, prices, centre,
+            self.setup.density_terms(request.prediction),
+        )  # fmt: skip
 
     def _published(
         self, episodes: IntArray, sums: Sums, prices: FloatArray, centre: FloatArray
@@ -227,10 +222,10 @@ class Paced(ReleaseModel):
 
     def report(self) -> PrivacyReport:
         """See `ReleaseModel.report`."""
-        settings, mu = self._settings, self.mu
+        settings, mu, density = self._settings, self.mu, self.setup.density
         return replace(
             super().report(),
-            guarantee=settings.guarantee("count and flow", settings.protected),
+            guarantee=settings.guarantee(f"{density.quantity} and flow", settings.protected),
             void_reasons=(),
             protects=settings.protected,
             mu=mu,
@@ -243,6 +238,7 @@ class Paced(ReleaseModel):
                 "pace": settings.pace,
                 "clip": settings.clip,
                 "ratio": settings.ratio,
+                **density.details,
             },
         )
 

@@ -41,6 +41,7 @@ class PacingSetup:
         coverage: Expected share of the mainline's segments that a step's queries cover.
         n_places: Record columns: the segments, and the boundary segments if they are released.
         n_episodes: Size n of the batch.
+        mean_square: Expected square of what a vehicle contributes to the first sum: 1 for counts.
     """
 
     corridor: Corridor
@@ -54,6 +55,7 @@ class PacingSetup:
     coverage: float
     n_places: int
     n_episodes: int
+    mean_square: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -124,7 +126,8 @@ class TracerPacing(Pacing):
     of a trip has R queried seconds: the sum, over the segments from here on, of the rate of
     querying times the length over the predicted speed, which is held to [8, 102] km/h, and a margin
     of 2 s. The price on a segment is ``max(pace b - m, 0.01 b) / R``, and that of a query the mean
-    over its segments, times its level.
+    over its segments, times its level. Where vehicles contribute deviations of what they report in
+    place of being counted, they pay less for it, and prices are higher in proportion.
 
     Rates of querying are averages over the last minute or so. They begin at equal rates for all
     segments, so that a policy that keeps querying the same place is soon paced for that.
@@ -164,6 +167,8 @@ class TracerPacing(Pacing):
         self._rates = np.tile(self._first_rates, (n, 1))
         self._tracer = np.zeros((n, setup.n_places))
         self._offer = setup.pace * setup.budget, LEAST_SHARE * setup.budget
+        speeds = MEAN_SQUARE * setup.ratio
+        self._relative_charge = (setup.mean_square + speeds) / (1.0 + speeds)
 
     def reset(self, episodes: IntArray) -> None:
         """See `Pacing.reset`."""
@@ -178,7 +183,7 @@ class TracerPacing(Pacing):
             1.0 + MEAN_SQUARE * self.setup.ratio, self._rates,
             self._tracer, prices,
         )  # fmt: skip
-        return prices
+        return prices / self._relative_charge
 
     def expected_price(self, speed: FloatArray) -> float:
         """Return the price at the upstream end, at these speeds and the rates of the beginning."""
@@ -186,7 +191,7 @@ class TracerPacing(Pacing):
         n, length = corridor.n_mainline, np.array(corridor.segment_lengths[: corridor.n_mainline])
         seconds = SECONDS_PER_HOUR * length / np.clip(speed[:n], kernels.SLOWEST, kernels.FASTEST)
         queried = float((self._first_rates[:n] * seconds).sum()) + kernels.MARGIN
-        return self._offer[0] / queried
+        return self._offer[0] / queried / self._relative_charge
 
     def tracer(self, episodes: IntArray) -> FloatArray:
         """See `Pacing.tracer`."""

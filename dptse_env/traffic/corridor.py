@@ -10,13 +10,14 @@ length, lanes and limit of the segment that it lies next to.
 import dataclasses
 import hashlib
 import json
+import math
 import re
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Annotated, Any
 
 from dptse_env.traffic.demand import Demand, DemandDistribution, Share
-from dptse_env.traffic.drivers import Drivers
+from dptse_env.traffic.drivers import ANY_CLASS, Drivers, VehicleClass
 from dptse_env.traffic.incident import Incident, IncidentDistribution
 from dptse_env.traffic.recordings import Recordings
 from dptse_env.traffic.road_segments import RoadSegments
@@ -81,6 +82,10 @@ class Corridor(RoadSegments):
             `demand` are what is published of them, the range of a `DemandDistribution` scales them
             (SUMO's ``--scale``), `exit_shares` are published too, an incident limits the vehicles
             on its segment, and `drivers` must be left at its default.
+        vehicle_classes: classes of vehicles, whose shares add up to 1; none where all vehicles are
+            alike.
+        detailed: whether records hold each vehicle's position, lane and class too, as
+            `dptse_env.traffic.DetailedRecord` does. The vehicles move alike.
         recordings: imported traffic that episodes replay; None where SUMO simulates the traffic.
             With recordings the demand is a description of them, and there is no incident.
 
@@ -110,6 +115,8 @@ class Corridor(RoadSegments):
     ramp_speed_limit: SpeedLimit | tuple[SpeedLimit, ...] | None = None
     network: SumoScenario | None = None
     recordings: Recordings | None = None
+    vehicle_classes: tuple[VehicleClass, ...] = ()
+    detailed: bool = False
 
     def __post_init__(self) -> None:
         """Check the fields and bring them to their declared types."""
@@ -142,6 +149,21 @@ class Corridor(RoadSegments):
             allowed = "fixed where traffic is recorded"
             require(fixed, "corridor.demand", allowed, self.demand)
         self._check_network()
+        self._check_classes()
+
+    def _check_classes(self) -> None:
+        classes = self.vehicle_classes
+        if not classes:
+            return
+        simulated = self.network is None and self.recordings is None
+        allowed = "left out where the traffic has classes of its own"
+        require(simulated, "corridor.vehicle_classes", allowed, classes)
+        names = [each.name for each in classes]
+        unique = len(set(names)) == len(names)
+        require(unique, "corridor.vehicle_classes", "classes of different names", names)
+        total = math.fsum(each.share for each in classes)
+        allowed = "classes whose shares add up to 1"
+        require(math.isclose(total, 1.0, abs_tol=1e-9), "corridor.vehicle_classes", allowed, total)
 
     def _check_ramps(self) -> None:
         for name in ("on_ramps", "off_ramps"):
@@ -211,6 +233,11 @@ class Corridor(RoadSegments):
         return self.incident if isinstance(self.incident, tuple) else (self.incident,)
 
     @property
+    def class_names(self) -> tuple[str, ...]:
+        """Names of the vehicle classes of simulated traffic; one where all vehicles are alike."""
+        return tuple(each.name for each in self.vehicle_classes) or (ANY_CLASS,)
+
+    @property
     def record_layout(self) -> dict[str, Any]:
         """The fields that the columns and the length of a record depend on, as plain JSON."""
         return {
@@ -235,6 +262,10 @@ class Corridor(RoadSegments):
             del content[name]
         if self.drivers == Drivers():
             del content["drivers"]  # as in digests from before drivers could be chosen
+        if not self.vehicle_classes:
+            del content["vehicle_classes"]  # likewise
+        if not self.detailed:
+            del content["detailed"]  # likewise
         for name, value in UNIFORM.items():
             if content[name] == value:
                 del content[name]  # as before ramps could differ
@@ -253,6 +284,7 @@ class Corridor(RoadSegments):
                 "scale": scale,
                 "incident": content["incident"],
                 "duration": self.duration,
+                **({"detailed": True} if self.detailed else {}),
             }
         kinds = [type(each).__name__ for each in self.incidents] or ["NoneType"]
         content["kinds"] = [type(self.demand).__name__, *kinds]

@@ -1,9 +1,11 @@
-"""Drivers: how vehicles follow one another in the simulation."""
+"""Drivers and vehicle classes: how vehicles follow one another in the simulation, and which."""
 
+import re
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from dptse_env.utils.fields import Interval, checked_fields
+from dptse_env.utils.validation import require
 
 CarFollowing = Literal["W99", "Krauss", "IDM"]
 """SUMO's name of a car-following model."""
@@ -13,6 +15,9 @@ Rate = Annotated[float, Interval(0.1, 20)]
 """Change of a speed [m/s^2]."""
 Share = Annotated[float, Interval(0, 1)]
 """Part of a whole."""
+
+ANY_CLASS = "car"
+"""Name of the class of all vehicles where a corridor has no classes."""
 
 
 @dataclass(frozen=True)
@@ -50,3 +55,38 @@ class Drivers:
         }
         values = {name: f"{value:g}" for name, value in given.items() if value is not None}
         return {"carFollowModel": self.model, **values}
+
+
+@dataclass(frozen=True)
+class VehicleClass:
+    """A class of vehicles, such as trucks.
+
+    Attributes:
+        name: lower-case letters, digits and hyphens.
+        share: share of the vehicles that are of this class.
+        length: length of a vehicle [m].
+        largest_speed: largest speed of a vehicle [km/h]; None for SUMO's default.
+        drivers: the car-following model of its vehicles; None for that of the corridor.
+
+    Raises:
+        ValueError: A value is out of range.
+    """
+
+    name: str
+    share: Annotated[float, Interval(0, 1, open_low=True)]
+    length: Annotated[float, Interval(1, 50)] = 5.0
+    largest_speed: Annotated[float, Interval(1, 300)] | None = None
+    drivers: Drivers | None = None
+
+    def __post_init__(self) -> None:
+        """Check values."""
+        checked_fields(self, "vehicle_class")
+        is_name = bool(re.fullmatch(r"[a-z][a-z0-9-]*", self.name))
+        require(is_name, "vehicle_class.name", "lower-case letters, digits and hyphens", self.name)
+
+    def attributes(self, drivers: Drivers) -> dict[str, str]:
+        """Return the attributes of SUMO's vehicle type, given the corridor's drivers."""
+        values = (self.drivers or drivers).attributes() | {"length": f"{self.length:g}"}
+        if self.largest_speed is not None:
+            values["maxSpeed"] = f"{self.largest_speed / 3.6:g}"
+        return values

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from dptse_env.traffic.detailed_record import DetailedRecord
 from dptse_env.traffic.record import Record
 from dptse_env.traffic.stored_arrays import (
     MANIFEST,
@@ -94,14 +95,14 @@ AnyRecord = Record | FieldRecord
 
 
 def load_record(path: Path, source: Mapping[str, object]) -> AnyRecord:
-    """Open a stored record of either kind; arguments and errors are those of `Record.load`."""
+    """Open a stored record of any kind; arguments and errors are those of `Record.load`."""
     try:
-        is_field = json.loads((path / MANIFEST).read_text(encoding="utf-8")).get("format")
+        found = json.loads((path / MANIFEST).read_text(encoding="utf-8")).get("format")
     except (OSError, ValueError, AttributeError, RecursionError):
-        is_field = None  # what is wrong with it is found below
-    if is_field == FIELD_FORMAT:
-        return FieldRecord.load(path, source)
-    return Record.load(path, source)
+        found = None  # what is wrong with it is found below
+    kinds = {FIELD_FORMAT: FieldRecord, DetailedRecord.FORMAT: DetailedRecord}
+    kind: type[AnyRecord] = kinds.get(found, Record)
+    return kind.load(path, source)
 
 
 def with_vehicles(record: AnyRecord, user: str) -> Record:

@@ -28,8 +28,8 @@ import platformdirs
 from tqdm import tqdm
 
 from dptse_env.traffic.corridor import Corridor
-from dptse_env.traffic.field_record import AnyRecord
-from dptse_env.traffic.record import RECORD_VERSION, Record
+from dptse_env.traffic.field_record import AnyRecord, load_record
+from dptse_env.traffic.record import RECORD_VERSION
 from dptse_env.traffic.stored_arrays import InvalidRecordError
 from dptse_env.traffic.sumo import (
     RecordingError,
@@ -171,7 +171,7 @@ class RecordLibrary:
             return corridor.recordings.load(seed, corridor.record_layout)
         path, source = self.record_path(corridor, seed), _source(corridor, seed)
         try:
-            return Record.load(path, source)
+            return load_record(path, source)
         except FileNotFoundError:
             pass  # the usual first use
         except InvalidRecordError as error:
@@ -179,7 +179,7 @@ class RecordLibrary:
             _discard(path)
         self._record(corridor, [seed])
         try:
-            return Record.load(path, source)
+            return load_record(path, source)
         except (OSError, InvalidRecordError) as error:
             raise RecordingError.from_cause(corridor, seed, str(error)) from error
 

@@ -1,28 +1,20 @@
 """Records: segment and speed of each vehicle at every second."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dptse_env.traffic.stored_arrays import InvalidRecordError, load_arrays, save_arrays
+from dptse_env.utils.arrays import BoolArray
 from dptse_env.utils.validation import integer, require
 
-RECORD_FORMAT = "dptse-record"
 RECORD_VERSION = 1
 """Version of the format, raised when content or layout change: older records are made again."""
-
-COLUMNS: dict[str, np.dtype[Any]] = {
-    "step": np.dtype("<i4"),
-    "vehicle": np.dtype("<i4"),
-    "segment": np.dtype("<i2"),
-    "speed": np.dtype("<f4"),
-}
-"""Columns of the vehicle table and how they are stored."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +37,15 @@ class Record:
             have a vehicle twice in one step.
     """
 
+    FORMAT: ClassVar[str] = "dptse-record"
+    COLUMNS: ClassVar[Mapping[str, np.dtype[Any]]] = {
+        "step": np.dtype("<i4"),
+        "vehicle": np.dtype("<i4"),
+        "segment": np.dtype("<i2"),
+        "speed": np.dtype("<f4"),
+    }
+    """Columns of the vehicle table and how they are stored."""
+
     step: NDArray[np.int32]
     vehicle: NDArray[np.int32]
     segment: NDArray[np.int16]
@@ -56,7 +57,7 @@ class Record:
         """Check the fields and bring them to their declared types."""
         object.__setattr__(self, "n_steps", integer("record.n_steps", self.n_steps, 1))
         object.__setattr__(self, "n_columns", integer("record.n_columns", self.n_columns, 1))
-        for name, dtype in COLUMNS.items():
+        for name, dtype in self.COLUMNS.items():
             column = np.asarray(getattr(self, name), dtype=dtype)
             require(column.ndim == 1, f"record.{name}", "one-dimensional", column.shape)
             allowed = f"as long as record.step ({len(self.step)})"
@@ -129,19 +130,25 @@ class Record:
         integer("step", step, 0, self.n_steps - 1)
         return slice(int(self.offsets[step]), int(self.offsets[step + 1]))
 
-    def without(self, vehicle: int) -> "Record":
+    def without(self, vehicle: int) -> Self:
         """Return the adjacent record, in the sense of differential privacy, without a vehicle.
 
         The other vehicles move as before; they are not simulated again.
         """
-        keep = self.vehicle != vehicle
-        columns = {name: getattr(self, name)[keep] for name in COLUMNS}
-        return Record(**columns, n_steps=self.n_steps, n_columns=self.n_columns)
+        return self.where(self.vehicle != vehicle)
 
-    def in_memory(self) -> "Record":
+    def where(self, keep: BoolArray) -> Self:
+        """Return the record of some rows, given by flags of shape (rows,).
+
+        Vehicles keep their indices.
+        """
+        columns: dict[str, Any] = {name: getattr(self, name)[keep] for name in self.COLUMNS}
+        return replace(self, **columns)
+
+    def in_memory(self) -> Self:
         """Return the same record, independent of the files it was mapped from."""
-        columns = {name: np.array(getattr(self, name)) for name in COLUMNS}
-        return Record(**columns, n_steps=self.n_steps, n_columns=self.n_columns)
+        columns: dict[str, Any] = {name: np.array(getattr(self, name)) for name in self.COLUMNS}
+        return replace(self, **columns)
 
     def save(self, path: Path, source: Mapping[str, object]) -> None:
         """Write the record to the directory `path`, completely or not at all.
@@ -156,16 +163,19 @@ class Record:
             OSError: It cannot be written; `path` is then unchanged.
         """
         header = {
-            "format": RECORD_FORMAT,
+            "format": self.FORMAT,
             "version": RECORD_VERSION,
-            "n_steps": self.n_steps,
-            "n_columns": self.n_columns,
+            **self._properties(),
             "source": dict(source),
         }
-        save_arrays(path, {name: getattr(self, name) for name in COLUMNS}, header)
+        save_arrays(path, {name: getattr(self, name) for name in self.COLUMNS}, header)
+
+    def _properties(self) -> dict[str, Any]:
+        """Return the fields that are no columns, as plain JSON."""
+        return {"n_steps": self.n_steps, "n_columns": self.n_columns}
 
     @classmethod
-    def load(cls, path: Path, source: Mapping[str, object]) -> "Record":
+    def load(cls, path: Path, source: Mapping[str, object]) -> Self:
         """Open a stored record; its columns are mapped into memory, read-only.
 
         Args:
@@ -177,10 +187,11 @@ class Record:
             InvalidRecordError: The record is damaged, incomplete, of another format version, or of
                 another source.
         """
-        wanted = {"format": RECORD_FORMAT, "version": RECORD_VERSION, "source": dict(source)}
-        columns, header = load_arrays(path, list(COLUMNS), wanted)
+        wanted = {"format": cls.FORMAT, "version": RECORD_VERSION, "source": dict(source)}
+        columns, header = load_arrays(path, list(cls.COLUMNS), wanted)
         try:
-            return cls(**columns, n_steps=header["n_steps"], n_columns=header["n_columns"])
+            fields: dict[str, Any] = {**columns, **header}
+            return cls(**{name: value for name, value in fields.items() if name not in wanted})
         except (ValueError, LookupError, TypeError) as error:
             raise InvalidRecordError(f"{path}: {error!r}") from error
 

@@ -29,11 +29,12 @@ class Scenario:
         departures: (V,) desired departure times [s], non-decreasing; a vehicle's index is its id.
         origins: (V,) index of the on-ramp, or `MAINLINE`.
         exits: (V,) index of the off-ramp, or `MAINLINE`.
+        classes: (V,) index into the corridor's vehicle classes.
         sumo_seed: seed of SUMO's random desired speeds.
         scale: factor on the corridor's demand [-].
 
     On a road that is recorded from SUMO files of its own (`Corridor.network`), the vehicles are
-    those of the files, and departures, origins and exits are empty.
+    those of the files, and departures, origins, exits and classes are empty.
     """
 
     seed: int
@@ -42,6 +43,7 @@ class Scenario:
     departures: NDArray[np.float64]
     origins: NDArray[np.int64]
     exits: NDArray[np.int64]
+    classes: NDArray[np.int64]
     sumo_seed: int
     scale: float = 1.0
 
@@ -54,14 +56,16 @@ class Scenario:
 def draw_scenario(corridor: Corridor, seed: int) -> Scenario:
     """Draw the scenario of a traffic seed; the same seed gives the same scenario.
 
-    Demand, incident, arrivals and SUMO have separate random streams, so that a change of one does
-    not affect the others.
+    Demand, incident, arrivals, SUMO and classes have separate random streams, so that a change of
+    one does not affect the others.
 
     Raises:
         ValueError: The seed is not an integer >= 0.
     """
     integer("traffic seed", seed, 0)
-    demand_seed, incident_seed, arrival_seed, sumo_seed = np.random.SeedSequence(seed).spawn(4)
+    demand_seed, incident_seed, arrival_seed, sumo_seed, class_seed = np.random.SeedSequence(
+        seed
+    ).spawn(5)
     demand, scale = corridor.demand, 1.0
     if isinstance(demand, DemandDistribution):
         scale = demand.draw_scale(np.random.default_rng(demand_seed))
@@ -81,6 +85,7 @@ def draw_scenario(corridor: Corridor, seed: int) -> Scenario:
         departures=departures,
         origins=origins,
         exits=_exits(corridor, demand, departures, origins, generator),
+        classes=_classes(corridor, len(departures), np.random.default_rng(class_seed)),
         sumo_seed=int(np.random.default_rng(sumo_seed).integers(2**31 - 1)),
         scale=scale,
     )
@@ -121,3 +126,13 @@ def _exits(
         leaves = generator.random(len(origins)) < value_at(profile, departures)
         exits[leaves & (exits == MAINLINE) & (entry_face < face)] = ramp
     return exits
+
+
+def _classes(
+    corridor: Corridor, n_vehicles: int, generator: np.random.Generator
+) -> NDArray[np.int64]:
+    """Draw the class of each vehicle."""
+    shares = [each.share for each in corridor.vehicle_classes] or [1.0]
+    bounds = np.cumsum(shares)[:-1]
+    classes: NDArray[np.int64] = np.searchsorted(bounds, generator.random(n_vehicles), side="right")
+    return classes

@@ -20,17 +20,19 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
-from typing import Self
-from xml.etree import ElementTree
+from typing import Any, Self
 
 import numpy as np
 
 from dptse_env.traffic import sumo_files
+from dptse_env.traffic.branches import Road
 from dptse_env.traffic.corridor import Corridor
+from dptse_env.traffic.detailed_record import DetailedRecord
 from dptse_env.traffic.incident import limit_changes
 from dptse_env.traffic.record import Record
-from dptse_env.traffic.scenario import MAINLINE, Scenario, draw_scenario
-from dptse_env.traffic.sumo_network import edge_ids, network_xml, ramp_edges
+from dptse_env.traffic.scenario import Scenario, draw_scenario
+from dptse_env.traffic.sumo_network import edge_ids, network_xml
+from dptse_env.traffic.sumo_routes import routes_xml
 
 SUPPORTED_SUMO = "1.28"
 """Release series that records are made with: others simulate the same scenario differently."""
@@ -211,82 +213,49 @@ def _command(folder: Path, network: str, corridor: Corridor, scenario: Scenario)
     """Write SUMO's input files and return its command line."""
     network_file, route_file = folder / "corridor.net.xml", folder / "scenario.rou.xml"
     network_file.write_text(network, encoding="utf-8")
-    route_file.write_bytes(ElementTree.tostring(_routes(corridor, scenario)))
+    route_file.write_bytes(routes_xml(corridor, scenario))
     files = ["-n", str(network_file), "-r", str(route_file)]
     return ["sumo", *files, "--seed", str(scenario.sumo_seed), *OPTIONS]
 
 
-def _routes(corridor: Corridor, scenario: Scenario) -> ElementTree.Element:
-    """Describe the vehicles and their routes in SUMO's XML."""
-    root = ElementTree.Element("routes")
-    ElementTree.SubElement(root, "vType", {"id": "car", **corridor.drivers.attributes()})
-    for origin in range(MAINLINE, corridor.n_on_ramps):
-        for end in range(MAINLINE, corridor.n_off_ramps):
-            first = 0 if origin == MAINLINE else corridor.on_ramps[origin]
-            last = corridor.n_mainline if end == MAINLINE else corridor.off_ramps[end]
-            if first >= last:
-                continue
-            edges = (
-                *_entry_edges(corridor, origin),
-                *(f"main_{i}" for i in range(first, last)),
-                *_exit_edges(corridor, end),
-            )
-            ElementTree.SubElement(root, "route", id=f"{origin}:{end}", edges=" ".join(edges))
-    for vehicle, (departure, origin, end) in enumerate(
-        zip(scenario.departures, scenario.origins, scenario.exits, strict=True)
-    ):
-        ElementTree.SubElement(
-            root,
-            "vehicle",
-            id=str(vehicle),
-            type="car",
-            route=f"{origin}:{end}",
-            depart=f"{departure:.3f}",
-            # As fast as is safe, on the lane that suits the route, and by default at the start of
-            # the boundary segment, so that it is measured there. About 4,700 veh/h can then enter
-            # the paper's mainline; others queue outside. With `departPos="last"` 9 % more can
-            # enter, but vehicles start at the far end of an empty boundary segment.
-            departSpeed="max",
-            departLane="best",
-        )
-    return root
-
-
-def _entry_edges(corridor: Corridor, origin: int) -> list[str]:
-    if origin == MAINLINE:
-        return ["upstream"]
-    name = f"on_{origin}"
-    return [f"before_{name}", *ramp_edges(name, corridor.on_ramp_segments[origin])]
-
-
-def _exit_edges(corridor: Corridor, end: int) -> list[str]:
-    if end == MAINLINE:
-        return ["downstream"]
-    name = f"off_{end}"
-    return [*ramp_edges(name, corridor.off_ramp_segments[end]), f"after_{name}"]
-
-
 def _observe(libsumo: ModuleType, corridor: Corridor, scenario: Scenario) -> Record:
     """Run the loaded simulation to its end and collect the vehicle table."""
-    edges = edge_ids(corridor)
+    edges, details = edge_ids(corridor), corridor.detailed
     vehicles_on, speed_of = libsumo.edge.getLastStepVehicleIDs, libsumo.vehicle.getSpeed
+    position_of, lane_of = libsumo.vehicle.getLanePosition, libsumo.vehicle.getLaneIndex
     n_on: list[int] = []
     names: list[str] = []
     speed: list[float] = []
+    position: list[float] = []
+    lane: list[int] = []
     for _ in seconds(libsumo, corridor, scenario):
         for edge in edges:
             here = vehicles_on(edge)
             n_on.append(len(here))
             names += here
             speed += map(speed_of, here)
+            if details:
+                position += map(position_of, here)
+                lane += map(lane_of, here)
     # The other columns are made once at the end: this loop is all that recording adds to a bare
     # simulation.
     cells = np.repeat(np.arange(len(n_on)), n_on)
-    return Record(
-        step=(cells // len(edges)).astype(np.int32),
-        vehicle=np.fromstring(" ".join(names), dtype=np.int32, sep=" "),
-        segment=(cells % len(edges)).astype(np.int16),
-        speed=(KMH * np.array(speed, dtype=np.float64)).astype(np.float32),
-        n_steps=corridor.duration + 1,
-        n_columns=len(edges),
+    vehicle = np.fromstring(" ".join(names), dtype=np.int32, sep=" ")
+    columns: dict[str, Any] = {
+        "step": cells // len(edges),
+        "vehicle": vehicle,
+        "segment": cells % len(edges),
+        "speed": KMH * np.array(speed, dtype=np.float64),
+        "n_steps": corridor.duration + 1,
+        "n_columns": len(edges),
+    }
+    if not details:
+        return Record(**columns)
+    start = Road(corridor).column_starts[1]
+    return DetailedRecord(
+        **columns,
+        position=start[columns["segment"]] + np.array(position, dtype=np.float64) / 1000.0,
+        lane=np.array(lane),
+        vehicle_class=scenario.classes[vehicle].astype(np.int16),
+        classes=corridor.class_names,
     )

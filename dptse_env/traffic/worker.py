@@ -20,6 +20,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from dptse_env.traffic.corridor import Corridor
+from dptse_env.traffic.field_record import load_record, with_vehicles
 from dptse_env.traffic.record import Record
 from dptse_env.traffic.sumo import RecordingError
 
@@ -159,6 +160,6 @@ def simulate_in_child(corridor: Corridor, seed: int) -> Record:
     with tempfile.TemporaryDirectory(prefix="dptse-record-") as directory, WorkerPool() as pool:
         path = Path(directory) / "record"
         pool.record(corridor, seed, path, {})
-        record = Record.load(path, {})
+        record = with_vehicles(load_record(path, {}), "a simulation")
         # The files are removed with the directory.
         return record.in_memory()

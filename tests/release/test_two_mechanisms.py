@@ -32,9 +32,9 @@ def make(n_episodes=1, **keywords):
     return QueryProcess(make_parts(resolve("short-highway", given), n_episodes))
 
 
-def begin(process, seed=3):
+def begin(process, seed=3, start=150):
     episodes = np.arange(process.n_episodes)
-    options = {"traffic_seed": 1, "start": 150}
+    options = {"traffic_seed": 1, "start": start}
     generators = [np.random.default_rng(seed) for _ in episodes]
     return process.reset(episodes, generators, options)
 
@@ -69,7 +69,9 @@ def test_queries_count_connected_vehicles_and_sensors_all(preset):
     process = make(privacy={"preset": preset, "epsilon": 10_000.0, **OWN_NOISE[preset]})
     begin(process)
     record = process.traffic.record(1)
-    connected = process.config.penetration.reports(process.config.traffic_seeds[1], record)
+    connected = process.config.penetration.reports(
+        process.config.traffic_seeds[1], record, process.config.corridor
+    )
     length = process.config.corridor.segment_lengths[0]
     for released, request in play(process, 20):
         t = int(request.times[0])
@@ -163,7 +165,9 @@ def test_only_connected_vehicles_have_ledgers_of_queries():
     process = make(privacy={"preset": "paced"}, truth_in_info=True)
     begin(process)
     play(process, 30)
-    connected = process.config.penetration.connected(process.config.traffic_seeds[1], 10_000)
+    connected = process.config.penetration.connected(
+        process.config.traffic_seeds[1], process.traffic.record(1)
+    )
     truth = process.info(0)["truth"]
     queries, sensors = (np.array(truth[name]) for name in ("ledgers", "sensor_ledgers"))
     assert (queries > 0.0).any()
@@ -288,3 +292,51 @@ def test_the_environment_keeps_gymnasiums_rules(preset):
     )
     check_env(env.unwrapped, skip_render_check=True)
     env.close()
+
+
+# --- densities from reports, and connected classes --------------------------------------------
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("source", ["spacing", "neighbours"])
+def test_reports_give_the_density_of_all_vehicles(preset, source):
+    """Nearly without noise, what the estimator is given is near the truth on average."""
+    penetration = {"share": SHARE, "density_from": source, "report_clip": 3.0}
+    # Every vehicle counts in every second, and noise is next to nothing.
+    own = {"cap": 1_000} if preset == "capped" else {}
+    privacy = {"preset": preset, "epsilon": 1e4, **own}
+    process = make(privacy=privacy, penetration=penetration, estimator="random_walk", horizon=200)
+    begin(process, start=0)
+    errors, total, read = [], [], process.fusion.read
+
+    def spy(episodes, observed, measured, prediction):
+        found = read(episodes, observed, measured, prediction)
+        truth = process.truth(episodes)[0, 1, 0]
+        errors.append(found.values[0, 1, 0] - truth)
+        total.append(truth)
+        return found
+
+    process.fusion.read = spy
+    play(process, 200, queried=(1, 2))
+    assert abs(np.mean(errors)) < 0.2 * np.mean(total)
+    assert np.corrcoef(np.array(errors) + total, total)[0, 1] > 0.5
+
+
+@pytest.mark.parametrize("preset", ["capped", "paced"])
+def test_connected_classes_answer_and_others_do_not(preset):
+    classes = [{"name": "car", "share": 0.7}, {"name": "truck", "share": 0.3, "length": 12.0}]
+    process = make(
+        privacy=preset,
+        corridor={"fixed_sensors": SENSORS, "vehicle_classes": classes},
+        penetration={"by_class": [{"name": "truck", "share": 1.0}]},
+    )
+    begin(process)
+    record = process.release._connected.record(1)
+    details = process.release._connected.library.get(process.release._connected.corridor, 1)
+    trucks = np.flatnonzero(details.class_of_vehicles() == 1)
+    assert 0 < len(trucks) < 0.5 * details.n_vehicles
+    assert set(record.vehicle.tolist()) == set(trucks.tolist())
+    play(process, 20)
+    assert process.release.queries.report().mu == pytest.approx(
+        mu_of(1.0, 0.05) * math.sqrt(1.0 - 1.0 / (1.0 + 3.0 * math.sqrt(0.3)))
+    )

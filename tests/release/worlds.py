@@ -4,7 +4,13 @@ import dataclasses
 
 import numpy as np
 
-from dptse_env.release import RELEASE_MODELS, ReleaseRequest, ReleaseSetup, TrafficTable
+from dptse_env.release import (
+    COUNTED,
+    RELEASE_MODELS,
+    ReleaseRequest,
+    ReleaseSetup,
+    TrafficTable,
+)
 from dptse_env.release.contributions import Contributions
 from dptse_env.traffic import SHORT_HIGHWAY, Demand, Record
 
@@ -39,15 +45,18 @@ class Worlds:
     def ensure(self, corridor, seeds):
         """All vehicles are present."""
 
-    def release(self, settings, counted=None, horizon=None, kind=None):
+    def release(self, settings, counted=None, horizon=None, kind=None, density=COUNTED):
         """A release model of all record columns, with other contributions if any are given.
 
-        It is of another class than that of the settings if one is given.
+        It is of another class than that of the settings if one is given. Vehicles are counted, or
+        report densities.
         """
         n, duration = len(self.records), self.records[0].n_steps - 1
         traffic = TrafficTable(corridor(duration), tuple(range(n)), self)
         settings = dataclasses.replace(settings, boundary_inputs="private")
-        setup = ReleaseSetup(settings.preset, settings, traffic, 2, horizon or duration, n)
+        setup = ReleaseSetup(
+            settings.preset, settings, traffic, 2, horizon or duration, n, density=density
+        )
         release = (kind or RELEASE_MODELS[settings.preset])(setup)
         if counted is not None:
             release.contributions = counted
@@ -56,11 +65,11 @@ class Worlds:
         return release
 
 
-def squared_distance(release, policy, n_steps, always=(), std=None):
+def squared_distance(release, policy, n_steps, always=(), std=None, prediction=None):
     """Squared distance of two worlds' true values in units of the noise, over all steps.
 
-    The policy is a function of what world 0 has released so far, and both worlds are queried
-    alike: the distance given equal past releases, which is what the proof bounds.
+    The policy is a function of what world 0 has released so far, and both worlds are queried and
+    predicted alike: the distance given equal past releases, which is what the proof bounds.
     """
     std = release.sigma if std is None else std
     release.reset(BOTH, [np.random.default_rng(1), np.random.default_rng(2)])
@@ -69,7 +78,9 @@ def squared_distance(release, policy, n_steps, always=(), std=None):
     for t in range(1, n_steps + 1):
         observed = np.array(policy(past), dtype=bool)
         observed[list(always)] = True
-        request = ReleaseRequest(BOTH, BOTH, np.full(2, t), np.stack([observed, observed]))
+        request = ReleaseRequest(
+            BOTH, BOTH, np.full(2, t), np.stack([observed, observed]), prediction
+        )
         values = release.true_values(request)
         total += float(np.sum(((values[0] - values[1])[observed] / std) ** 2))
         released = np.where(observed[:, None], values[0] + noise[t], 0.0)
@@ -90,7 +101,7 @@ class Mutant(Contributions):
         super().reset(episodes)
         self.spent = {}
 
-    def collect(self, episodes, slots, times, observed):
+    def collect(self, episodes, slots, times, observed, terms):
         counts, speeds = np.zeros((2, *observed.shape))
         for k, (slot, time) in enumerate(zip(slots, times, strict=True)):
             whole = self.records[slot]
@@ -103,4 +114,4 @@ class Mutant(Contributions):
                 self.spent[account] = self.spent.get(account, 0) + charged
                 counts[k, segment] += 1
                 speeds[k, segment] += min(whole.speed[row], self.vehicles.largest_speed)
-        return counts, speeds
+        return counts, counts, speeds

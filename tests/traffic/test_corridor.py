@@ -15,6 +15,7 @@ from dptse_env.traffic import (
     Incident,
     IncidentDistribution,
     SumoScenario,
+    VehicleClass,
 )
 
 
@@ -113,6 +114,8 @@ def test_the_digest_covers_what_shapes_the_traffic_and_nothing_else():
             columns=tuple(((f"edge {i}", 0.0, 100.0),) for i in range(25)),
             folder=".",
         ),
+        "vehicle_classes": (VehicleClass("car", 0.9), VehicleClass("truck", 0.1, length=12.0)),
+        "detailed": True,
     }
     observed = {
         "name": "other",

@@ -20,7 +20,6 @@ from dptse_env.traffic import (
     library,
     randomised,
 )
-from dptse_env.traffic.record import COLUMNS
 from dptse_env.traffic.worker import Worker
 
 ENSURE = """
@@ -31,7 +30,7 @@ RecordLibrary(sys.argv[1]).ensure(SHORT_HIGHWAY, range(int(sys.argv[2])), worker
 
 
 def assert_same(first, second):
-    for name in COLUMNS:
+    for name in Record.COLUMNS:
         np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
 
 
@@ -104,7 +103,7 @@ def test_ensure_records_what_is_missing_and_leaves_the_rest(tmp_path, short_reco
     forbid_recording(monkeypatch)
     records.ensure(SHORT_HIGHWAY, range(4))
     assert_same(records.get(SHORT_HIGHWAY, 0), short_record)
-    assert len(everything_in(tmp_path)) == 4 * (len(COLUMNS) + 1)
+    assert len(everything_in(tmp_path)) == 4 * (len(Record.COLUMNS) + 1)
 
 
 def test_ensure_shows_a_progress_bar_on_stderr_only_on_request(tmp_path, capsys):
@@ -130,7 +129,7 @@ def test_a_damaged_record_is_made_again_with_a_logged_warning(tmp_path, short_re
     caplog.clear()
     assert_same(RecordLibrary(tmp_path).get(SHORT_HIGHWAY, 0), short_record)
     assert caplog.text == ""
-    assert len(everything_in(tmp_path)) == len(COLUMNS) + 1
+    assert len(everything_in(tmp_path)) == len(Record.COLUMNS) + 1
 
 
 def test_a_record_of_another_seed_is_not_taken_for_this_one(tmp_path, caplog, short_record):
@@ -188,7 +187,7 @@ def test_a_killed_worker_leaves_a_valid_library_and_names_its_seed(tmp_path, mon
 def test_a_killed_process_leaves_a_valid_library(tmp_path, caplog):
     process = start_ensure(tmp_path, 200)
     deadline = time.monotonic() + 30
-    while len(everything_in(tmp_path)) < 3 * (len(COLUMNS) + 1):
+    while len(everything_in(tmp_path)) < 3 * (len(Record.COLUMNS) + 1):
         assert time.monotonic() < deadline, "nothing was recorded"
         time.sleep(0.01)
     os.killpg(process.pid, signal.SIGKILL)
@@ -206,7 +205,7 @@ def test_processes_recording_the_same_seeds_agree(tmp_path, short_record):
         _, errors = process.communicate(timeout=60)
         assert process.returncode == 0, errors
     assert_same(RecordLibrary(tmp_path).get(SHORT_HIGHWAY, 0), short_record)
-    assert len(everything_in(tmp_path)) == 3 * (len(COLUMNS) + 1)
+    assert len(everything_in(tmp_path)) == 3 * (len(Record.COLUMNS) + 1)
 
 
 def test_a_library_pickles_as_its_path(tmp_path):

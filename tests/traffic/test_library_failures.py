@@ -24,7 +24,6 @@ from dptse_env.traffic import (
     library,
     sumo,
 )
-from dptse_env.traffic.record import COLUMNS
 from dptse_env.traffic.worker import Worker
 
 LONG_HIGHWAY = dataclasses.replace(SHORT_HIGHWAY, duration=3000)
@@ -88,7 +87,7 @@ def interrupted_ensure(path, interrupt):
         start_new_session=True,
     )
     children = [int(process.stdout.readline()) for _ in range(2)]
-    wait_for(lambda: len(everything_in(path)) >= 4 * (len(COLUMNS) + 1))
+    wait_for(lambda: len(everything_in(path)) >= 4 * (len(Record.COLUMNS) + 1))
     interrupt(process.pid)
     _, said = process.communicate(timeout=60)
     return process.returncode, said, children
@@ -134,7 +133,7 @@ def test_a_record_whose_worker_is_killed_is_made_by_another(tmp_path, monkeypatc
         for seed in seeds
     )
     assert "ended with code -9" in caplog.text
-    assert len(everything_in(tmp_path)) == len(seeds) * (len(COLUMNS) + 1)
+    assert len(everything_in(tmp_path)) == len(seeds) * (len(Record.COLUMNS) + 1)
 
 
 def test_a_record_whose_worker_is_always_killed_is_given_up(tmp_path, monkeypatch, caplog):
@@ -190,7 +189,7 @@ def test_ctrl_c_ends_all_processes_and_no_record_is_tried_again(tmp_path, send):
     assert "attempt" not in said
     assert not any(map(runs, children))
     assert holds_valid_records(tmp_path, 400)
-    assert len(everything_in(tmp_path)) % (len(COLUMNS) + 1) == 0
+    assert len(everything_in(tmp_path)) % (len(Record.COLUMNS) + 1) == 0
 
 
 def test_what_a_dead_writer_left_is_removed_when_it_is_old(tmp_path):

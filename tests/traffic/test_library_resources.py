@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from dptse_env.traffic import SHORT_HIGHWAY, RecordLibrary
-from dptse_env.traffic.record import COLUMNS
+from dptse_env.traffic import SHORT_HIGHWAY, Record, RecordLibrary
 from tests.traffic.test_library_failures import tiny_record
 
 N_OPEN = 64
@@ -37,7 +36,7 @@ def test_descriptors_stay_bounded_over_a_thousand_records(thousand):
     for seed in range(1000):
         records.get(SHORT_HIGHWAY, seed)
         most = max(most, n_descriptors())
-    assert most - before == len(COLUMNS) * N_OPEN
+    assert most - before == len(Record.COLUMNS) * N_OPEN
     del records
     gc.collect()
     assert n_descriptors() == before

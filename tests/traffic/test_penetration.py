@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from dptse_env.config import resolve
-from dptse_env.traffic import Penetration, Record
+from dptse_env.release import Paper
+from dptse_env.traffic import SHORT_HIGHWAY, ClassShare, DetailedRecord, Penetration, Record
 
 SHARES = (0.01, 0.1, 0.3, 0.9, 1.0)
 
@@ -19,7 +20,7 @@ def road_of(n_vehicles, n_steps=4):
 
 
 def test_connected_vehicles_at_a_share_are_connected_at_every_larger_one():
-    sets = [Penetration(share).connected(7, 5_000) for share in SHARES]
+    sets = [Penetration(share).connected(7, road_of(5_000, 1)) for share in SHARES]
     for smaller, larger in itertools.pairwise(sets):
         assert not (smaller & ~larger).any()
     assert sets[-1].all()
@@ -28,14 +29,14 @@ def test_connected_vehicles_at_a_share_are_connected_at_every_larger_one():
 
 
 def test_a_vehicle_is_connected_whatever_others_there_are():
-    some, more = (Penetration(0.3).connected(7, n) for n in (10, 1_000))
+    some, more = (Penetration(0.3).connected(7, road_of(n, 1)) for n in (10, 1_000))
     np.testing.assert_array_equal(some, more[:10])
 
 
 @pytest.mark.parametrize("change", [{"seed": 1}, {"traffic_seed": 8}])
 def test_another_seed_connects_other_vehicles(change):
     def connected(seed=0, traffic_seed=7):
-        return Penetration(0.5, seed=seed).connected(traffic_seed, 1_000)
+        return Penetration(0.5, seed=seed).connected(traffic_seed, road_of(1_000, 1))
 
     # Two independent sets share about half of the vehicles' flags.
     assert 0.4 < (connected() == connected(**change)).mean() < 0.6
@@ -48,15 +49,15 @@ def test_a_share_of_a_range_is_drawn_for_each_traffic_seed():
     assert abs(shares.mean() - 0.25) < 0.03
     assert len(set(shares.tolist())) == 200
     assert shares[3] == penetration.share_of(3)
-    assert penetration.published_share == pytest.approx(0.25)
-    connected = [penetration.connected(seed, 4_000).mean() for seed in range(5)]
+    assert penetration.published_share(SHORT_HIGHWAY) == pytest.approx(0.25)
+    connected = [penetration.connected(seed, road_of(4_000, 1)).mean() for seed in range(5)]
     np.testing.assert_allclose(connected, shares[:5], atol=0.03)
 
 
 def test_only_connected_vehicles_report_and_keep_their_index():
     record, penetration = road_of(100), Penetration(0.2)
-    reported = penetration.reports(7, record)
-    connected = np.flatnonzero(penetration.connected(7, 100))
+    reported = penetration.reports(7, record, SHORT_HIGHWAY)
+    connected = np.flatnonzero(penetration.connected(7, record))
     assert set(reported.vehicle.tolist()) == set(connected.tolist())
     np.testing.assert_array_equal(reported.speed, 10.0 + reported.vehicle)
     assert (reported.n_steps, reported.n_columns) == (4, 3)
@@ -64,7 +65,9 @@ def test_only_connected_vehicles_report_and_keep_their_index():
 
 def test_some_of_the_connected_vehicles_misreport_their_speed():
     record = road_of(2_000, n_steps=1)
-    reported = Penetration(0.5, misreporting=0.25, misreport_factor=2.0).reports(7, record)
+    reported = Penetration(0.5, misreporting=0.25, misreport_factor=2.0).reports(
+        7, record, SHORT_HIGHWAY
+    )
     factor = reported.speed / (10.0 + reported.vehicle)
     assert set(np.round(factor, 3).tolist()) == {1.0, 2.0}
     assert abs((factor > 1.5).mean() - 0.25) < 0.06
@@ -95,3 +98,113 @@ def test_a_number_a_pair_and_a_mapping_are_taken(value):
 
 def test_a_range_of_one_share_is_the_share():
     assert Penetration((0.2, 0.2)) == Penetration(0.2)
+
+
+# --- by class ---------------------------------------------------------------------------------
+
+CLASSES = [{"name": "car", "share": 0.8}, {"name": "truck", "share": 0.2, "length": 12.0}]
+TRUCKS = [{"name": "truck", "share": 0.5}]
+
+
+def of_two_classes(n_vehicles):
+    """A record in which every third vehicle is a truck."""
+    plain = road_of(n_vehicles, n_steps=1)
+    columns = {name: getattr(plain, name) for name in Record.COLUMNS}
+    return DetailedRecord(
+        **columns, n_steps=1, n_columns=3,
+        position=np.zeros(n_vehicles), lane=np.zeros(n_vehicles),
+        vehicle_class=np.arange(n_vehicles) % 3 == 0, classes=("car", "truck"),
+    )  # fmt: skip
+
+
+def test_a_share_of_each_class_is_connected_and_no_vehicle_of_others():
+    record = of_two_classes(6_000)
+    trucks = record.vehicle_class == 1
+    connected = Penetration(by_class=(ClassShare("truck", 0.5),)).connected(7, record)
+    assert not connected[~trucks].any()
+    assert connected[trucks].mean() == pytest.approx(0.5, abs=0.05)
+    both = Penetration(by_class=(ClassShare("truck", 0.5), ClassShare("car", 0.1)))
+    assert both.connected(7, record)[~trucks].mean() == pytest.approx(0.1, abs=0.02)
+    # The same vehicles as under one share.
+    np.testing.assert_array_equal(connected[trucks], Penetration(0.5).connected(7, record)[trucks])
+
+
+def test_the_published_share_adds_up_those_of_the_classes():
+    config = resolve(
+        "short-highway",
+        {"corridor": {"vehicle_classes": CLASSES}, "penetration": {"by_class": TRUCKS}},
+    )
+    assert config.penetration.published_share(config.corridor) == pytest.approx(0.1)
+    assert config.has_separate_sensors
+    assert config.penetration.needs_details
+
+
+@pytest.mark.parametrize(
+    ("penetration", "message"),
+    [
+        (
+            {"by_class": [{"name": "bus", "share": 0.5}]},
+            r"penetration\.by_class\[0\]\.name must be a class of the traffic, car, truck, got "
+            r"'bus'",
+        ),
+        (
+            {"by_class": TRUCKS, "share": 0.3},
+            r"penetration\.share must be left out, or be what penetration\.by_class adds up to, "
+            r"0\.1, got 0\.3",
+        ),
+        ({"by_class": TRUCKS * 2}, r"penetration\.by_class must name each class once"),
+        ({"by_class": TRUCKS, "share": [0.1, 0.2]}, r"penetration\.share must be one number"),
+        ({"by_class": [{"name": "truck", "share": 0}]}, r"penetration\.by_class\[0\]\.share must"),
+        ({"by_class": [{"name": "truck"}]}, r"penetration\.by_class\[0\]"),
+        ({"density_from": "radar"}, r"penetration\.density_from must be"),
+        ({"neighbour_range": 0.0}, r"penetration\.neighbour_range must be"),
+        ({"report_clip": 0.0}, r"penetration\.report_clip must be"),
+    ],
+)
+def test_classes_and_reports_that_do_not_fit_are_refused_by_path(penetration, message):
+    corridor = {"vehicle_classes": CLASSES}
+    with pytest.raises(ValueError, match=message):
+        resolve("short-highway", {"corridor": corridor, "penetration": penetration})
+
+
+def test_traffic_without_classes_has_one():
+    with pytest.raises(ValueError, match=r"must be a class of the traffic, car, got 'truck'"):
+        resolve("short-highway", {"penetration": {"by_class": TRUCKS}})
+    resolve("short-highway", {"penetration": {"by_class": [{"name": "car", "share": 0.2}]}})
+
+
+def test_shares_of_classes_that_do_not_add_up_to_all_vehicles_are_refused():
+    corridor = {"vehicle_classes": CLASSES[:1]}
+    with pytest.raises(ValueError, match=r"corridor\.vehicle_classes .* add up to 1, got 0\.8"):
+        resolve("short-highway", {"corridor": corridor})
+
+
+class WithoutReports(Paper):
+    """A release model that knows of counts alone."""
+
+    density_reports = ""
+
+
+def test_a_release_model_without_reports_refuses_them():
+    penetration = {"share": 0.1, "density_from": "spacing"}
+    keywords = {"privacy": WithoutReports, "penetration": penetration}
+    with pytest.raises(ValueError, match=r"density_from must be 'count' with the release model"):
+        resolve("short-highway", keywords)
+
+
+def test_an_estimated_share_needs_counts():
+    keywords = {
+        "privacy": "paced",
+        "penetration": {"share": 0.1, "density_from": "neighbours"},
+        "fusion": {"share": "estimated"},
+    }
+    with pytest.raises(ValueError, match=r"fusion\.share must be 'published'"):
+        resolve("short-highway", keywords)
+
+
+def test_records_without_details_cannot_say_which_classes_are_connected():
+    penetration = Penetration(by_class=(ClassShare("car", 0.5),))
+    with pytest.raises(ValueError, match="import it again with --detailed"):
+        penetration.connected(0, road_of(3))
+    with pytest.raises(ValueError, match=r"by_class\[0\]\.name must be a class of the traffic"):
+        Penetration(by_class=(ClassShare("bus", 0.5),)).connected(0, of_two_classes(3))

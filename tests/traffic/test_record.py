@@ -9,7 +9,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dptse_env.traffic import InvalidRecordError, Record, mean_dwell
-from dptse_env.traffic.record import COLUMNS
 from dptse_env.traffic.stored_arrays import _checksum
 
 SOURCE = {"corridor": "abc", "seed": 3, "sumo": "1.28.0"}
@@ -29,7 +28,7 @@ def small_record(**changed):
 
 def assert_same(first, second):
     assert (first.n_steps, first.n_columns) == (second.n_steps, second.n_columns)
-    for name in COLUMNS:
+    for name in Record.COLUMNS:
         np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
 
 
@@ -66,7 +65,7 @@ def test_rows_and_grids_agree_with_a_loop(entries):
 
 def test_columns_have_the_declared_types_are_contiguous_and_read_only():
     record = small_record()
-    for name, dtype in COLUMNS.items():
+    for name, dtype in Record.COLUMNS.items():
         column = getattr(record, name)
         assert column.dtype == dtype
         assert column.flags.c_contiguous
@@ -197,7 +196,7 @@ def double_a_vehicle(path):
     np.save(path / "vehicle.npy", vehicle)
     manifest = json.loads((path / "manifest.json").read_text())
     del manifest["sha256"]
-    edit_manifest(path, sha256=_checksum(path, list(COLUMNS), manifest))
+    edit_manifest(path, sha256=_checksum(path, list(Record.COLUMNS), manifest))
 
 
 def edit_manifest(path, **changes):

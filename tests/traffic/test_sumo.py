@@ -12,6 +12,7 @@ from dptse_env.traffic import (
     PAPER_HIGHWAY,
     SHORT_HIGHWAY,
     Drivers,
+    Record,
     RecordingError,
     SumoVersionError,
     draw_scenario,
@@ -20,7 +21,6 @@ from dptse_env.traffic import (
     simulate_in_child,
     sumo,
 )
-from dptse_env.traffic.record import COLUMNS
 from dptse_env.traffic.sumo import running, seconds
 from dptse_env.traffic.sumo_network import packaged_network
 
@@ -29,7 +29,7 @@ INCIDENT = PAPER_HIGHWAY.incident.segment
 
 
 def assert_same(first, second):
-    for name in COLUMNS:
+    for name in Record.COLUMNS:
         np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
 
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from dptse_env.traffic import SHORT_HIGHWAY, Record, RecordingError, simulate, simulate_in_child
-from dptse_env.traffic.record import COLUMNS
 from dptse_env.traffic.worker import Worker, WorkerDiedError, WorkerPool
 
 SCRIPT = """
@@ -25,7 +24,7 @@ def worker():
 
 
 def assert_same(first, second):
-    for name in COLUMNS:
+    for name in Record.COLUMNS:
         np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
 
 

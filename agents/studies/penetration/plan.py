@@ -10,6 +10,7 @@ from typing import Any
 
 from agents.experiments.cells import Design
 from agents.studies.penetration.cell import (
+    COUNT,
     DETECTORS,
     ESTIMATED,
     FACTORS,
@@ -17,11 +18,15 @@ from agents.studies.penetration.cell import (
     GUARANTEED,
     HEALTHY,
     MISREPORTING,
+    MIXED,
     PACED,
     PRINTED,
     QUERIES,
     RELEASES,
+    REPORTED,
     TESTED,
+    TRUCK_SHARE,
+    TRUCKS,
     UNKNOWN,
     UNKNOWN_SHARES,
     WHOLE,
@@ -55,6 +60,8 @@ class PenetrationDesign(Design[PenetrationCell]):
         policy_shares: Shares at which they are.
         policy_estimators: Estimators with which they are.
         fault_estimators: Estimators that meet faults, under ``paper`` and ``paced``.
+        report_estimators: Estimators that are given densities from spacings and neighbours, and
+            traffic with trucks.
     """
 
     schedule: str = "round-robin"
@@ -71,6 +78,7 @@ class PenetrationDesign(Design[PenetrationCell]):
     policy_shares: tuple[float, ...] = (0.03, 0.1, 0.3, 1.0)
     policy_estimators: tuple[str, ...] = ("ekf", "recurrent")
     fault_estimators: tuple[str, ...] = ("ekf", "ukf", "enkf", "mhe", "recurrent")
+    report_estimators: tuple[str, ...] = ("ekf", "enkf", "recurrent")
 
     def check(self) -> None:
         """See `Design.check`."""
@@ -96,6 +104,7 @@ class PenetrationDesign(Design[PenetrationCell]):
             shares=(self.base_share, 1.0),
             policy_shares=(self.base_share,),
             fault_estimators=("ekf",),
+            report_estimators=("ekf",),
         )
 
     def fused(self, release: str, estimator: str, share: float | None = None) -> PenetrationCell:
@@ -126,6 +135,15 @@ class PenetrationDesign(Design[PenetrationCell]):
         return PenetrationCell(
             release, estimator, FUSED, share, self.schedule, UNKNOWN, fusion=fusion
         )
+
+    def reported(self, release: str, estimator: str, share: float, source: str) -> PenetrationCell:
+        """Return the cell of both kinds of sensors with densities from a source."""
+        return dataclasses.replace(self.fused(release, estimator, share), density_from=source)
+
+    def classes(self, release: str, estimator: str, world: str, source: str) -> PenetrationCell:
+        """Return the cell of traffic with trucks, of queries alone."""
+        base = self.queries(release, estimator, TRUCK_SHARE)
+        return dataclasses.replace(base, world=world, density_from=source)
 
     def faulty(
         self, release: str, estimator: str, worlds: tuple[str, ...], fusion: str = ""
@@ -159,6 +177,12 @@ class PenetrationDesign(Design[PenetrationCell]):
                 yield self.queries(*pair, share)
             yield self.alone(*pair, DETECTORS)
             yield self.alone(*pair, WHOLE)
+        for pair in itertools.product(self.releases, self.report_estimators):
+            for share, source in itertools.product(self.shares, REPORTED):
+                yield self.reported(*pair, share, source)
+        for pair in itertools.product(self.printed_and_paced, self.report_estimators):
+            for world, source in itertools.product((MIXED, TRUCKS), (COUNT, *REPORTED)):
+                yield self.classes(*pair, world, source)
         if PACED in self.releases:
             for estimator, share in itertools.product(self.policy_estimators, self.policy_shares):
                 for policy in self.policies_of(estimator):

@@ -70,7 +70,7 @@ def report(
         "DELTA": DELTA,
         "PRINTED": PRINTED,
         "PACED": PACED,
-        "DETECTORS_SHARE": Detectors().budget_share,
+        "detectors_share": Detectors().part_of_budget(design.base_share),
         "UNKNOWN_SHARES": UNKNOWN_SHARES,
-        "whole_epsilon": whole_epsilon(),
+        "whole_epsilon": whole_epsilon(design.base_share),
     }

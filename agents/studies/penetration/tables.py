@@ -9,14 +9,18 @@ from agents.experiments.cells import DENSITY, ERROR, SPEED
 from agents.experiments.plots import LABELS
 from agents.experiments.tables import markdown
 from agents.studies.penetration.cell import (
+    COUNT,
     DETECTORS,
     ESTIMATED,
     FACTORS,
     GUARANTEED,
     HEALTHY,
     MISREPORTING,
+    MIXED,
     QUERIES,
+    REPORTED,
     TESTED,
+    TRUCKS,
     WHOLE,
     WITHOUT,
     PenetrationCell,
@@ -102,6 +106,44 @@ def queries_table(results: PenetrationResults) -> str:
         for estimator in design.estimators
     ]
     return markdown(["", *map(share_label, design.shares)], rows)
+
+
+def reports_table(results: PenetrationResults, release: str) -> str:
+    """Return errors by share with densities from counts, and what other sources gain on them."""
+    design = results.design
+    rows = []
+    for estimator in design.report_estimators:
+        cells = [design.fused(release, estimator, share) for share in design.shares]
+        errors = (f"{results.mean(cell, ERROR).mean:.1f}" for cell in cells)
+        rows.append([LABELS[estimator], COUNT, *errors])
+        for source in REPORTED:
+            gains = (
+                gain(results.below(design.reported(release, estimator, cell.share, source), cell))
+                for cell in cells
+            )
+            rows.append(["", source, *gains])
+    return markdown(["", "density from", *map(share_label, design.shares)], rows)
+
+
+def classes_table(results: PenetrationResults) -> str:
+    """Return errors where a tenth of the vehicles are connected at random, or all trucks are."""
+    design = results.design
+    rows = []
+    for release in design.printed_and_paced:
+        for estimator in design.report_estimators:
+            for source in (COUNT, *REPORTED):
+                mixed, trucks = (
+                    design.classes(release, estimator, world, source) for world in (MIXED, TRUCKS)
+                )
+                rows.append([
+                    _name(release, estimator),
+                    source,
+                    _errors(results, mixed),
+                    _errors(results, trucks),
+                    percent(results.loss([trucks], mixed)),
+                ])  # fmt: skip
+    header = ["", "density from", "a tenth at random", "all trucks", "error of trucks above [%]"]
+    return markdown(header, rows)
 
 
 def policies_table(results: PenetrationResults, estimator: str) -> str:

@@ -12,6 +12,7 @@ import numpy as np
 
 from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.demand import Demand
+from dptse_env.traffic.field_record import load_record, with_vehicles
 from dptse_env.traffic.importers.fcd import FCD
 from dptse_env.traffic.importers.formats import EXID, HIGHD, NGSIM, TABLE, TGSIM
 from dptse_env.traffic.importers.i24 import I24
@@ -120,7 +121,8 @@ def import_trajectories(
             sources.append(_describe(seed, recording, window, record))
 
         def load(seed: int) -> Record:
-            return Record.load(record_path(folder, seed), record_source(seed, bare.record_layout))
+            source = record_source(seed, bare.record_layout)
+            return with_vehicles(load_record(record_path(folder, seed), source), "an import")
 
         # One at a time, since an open record holds four file descriptors.
         measured = measure(bare, lambda: map(load, seeds[splits[0].name]))

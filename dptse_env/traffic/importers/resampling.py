@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dptse_env.traffic.branches import Road
 from dptse_env.traffic.importers.checks import Checks
-from dptse_env.traffic.importers.placing import Road
 from dptse_env.traffic.importers.points import TrajectoryError
 from dptse_env.traffic.importers.spill import Rows
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray

@@ -8,16 +8,23 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from dptse_env.traffic import SHORT_HIGHWAY, RecordLibrary, simulate, sumo
+from dptse_env.traffic import (
+    SHORT_HIGHWAY,
+    DetailedRecord,
+    Record,
+    RecordLibrary,
+    simulate,
+    sumo,
+)
 from dptse_env.traffic.importers import (
     Layout,
+    Options,
     Part,
     Source,
     Split,
     TrajectoryError,
     import_trajectories,
 )
-from dptse_env.traffic.record import COLUMNS
 from dptse_env.traffic.sumo_network import edge_ids
 
 TRAINING = [Split("training", 1.0, range(1000))]
@@ -43,17 +50,33 @@ def recorded(folder):
     return record
 
 
-def run(folder, name, tmp_path, source=Source("fcd")):  # noqa: B008
-    return import_trajectories([folder / name], source, SHORT_HIGHWAY, tmp_path / "new", TRAINING)
+def run(folder, name, tmp_path, source=Source("fcd"), **options):  # noqa: B008
+    return import_trajectories(
+        [folder / name], source, SHORT_HIGHWAY, tmp_path / "new", TRAINING, Options(**options)
+    )
 
 
 @pytest.mark.parametrize("suffix", ["xml", "xml.gz", "csv", "parquet"])
 def test_imported_fcd_is_the_record_number_for_number(suffix, folder, recorded, tmp_path):
     imported = run(folder, f"fcd.{suffix}", tmp_path)
     record = RecordLibrary(tmp_path).get(imported.corridor, 0)
-    for name in COLUMNS:
+    for name in Record.COLUMNS:
         np.testing.assert_array_equal(getattr(record, name), getattr(recorded, name))
     assert (record.n_steps, record.n_columns) == (recorded.n_steps, recorded.n_columns)
+
+
+@pytest.mark.parametrize("suffix", ["xml", "csv", "parquet"])
+def test_positions_lanes_and_classes_are_those_of_a_detailed_recording(
+    suffix, folder, recorded, tmp_path
+):
+    imported = run(folder, f"fcd.{suffix}", tmp_path, detailed=True)
+    record = RecordLibrary(tmp_path).get(imported.corridor, 0)
+    expected = simulate(dataclasses.replace(SHORT_HIGHWAY, detailed=True), 3)
+    assert isinstance(record, DetailedRecord)
+    for name in (*Record.COLUMNS, "lane", "vehicle_class"):
+        np.testing.assert_array_equal(getattr(record, name), getattr(expected, name))
+    np.testing.assert_allclose(record.position, expected.position, atol=1e-6)
+    assert record.classes == expected.classes == ("car",)
 
 
 @pytest.mark.filterwarnings("ignore:.*values measured or tuned on")
@@ -153,7 +176,7 @@ def test_an_uneven_road_with_long_ramps_is_imported_number_for_number(tmp_path, 
         [tmp_path / "fcd.csv"], Source("fcd"), road, tmp_path / "new", TRAINING
     )
     record = RecordLibrary(tmp_path).get(imported.corridor, 0)
-    for name in COLUMNS:
+    for name in Record.COLUMNS:
         np.testing.assert_array_equal(getattr(record, name), getattr(recorded, name))
     # By position: edges of the mainline start at kilometres.
     edges = {name: name for name in edge_ids(road)}

@@ -79,6 +79,40 @@ def test_speeds_are_derived_where_none_are_given(tmp_path):
     np.testing.assert_allclose(record.speed, 72.0, atol=4.0)
 
 
+def test_a_detailed_import_keeps_positions_lanes_and_classes(tmp_path):
+    points = stream(headway=4.0)
+    vehicle = points[:, 0].astype(int)
+    kind = np.where(vehicle % 3 == 0, "truck", "car")
+    path = plain(tmp_path / "a.csv", points, lane=2 + vehicle % 2, kind=kind)
+    columns = {**PLAIN.columns, "lane": "lane", "vehicle_class": "kind"}
+    source = dataclasses.replace(PLAIN, columns=columns)
+    record = record_of(run(path, source, detailed=True))
+    assert record.classes == ("car", "truck")
+    every_third = np.flatnonzero(record.class_of_vehicles() == 1)
+    assert set(np.diff(every_third).tolist()) == {3}
+    assert set(record.lane.tolist()) == {2, 3}
+    assert (np.diff(record.lane[np.argsort(record.vehicle, kind="stable")]) != 0).sum() > 5
+    lanes = [set(record.lane[record.vehicle == v].tolist()) for v in range(record.n_vehicles)]
+    assert all(len(each) <= 1 for each in lanes)
+    on_segment = record.position - 0.1 * record.segment
+    assert on_segment[record.segment < 4].min() >= 0.0
+    assert on_segment[record.segment < 4].max() <= 0.1
+    first = record.vehicle == record.vehicle[0]
+    np.testing.assert_allclose(np.diff(record.position[first]), 0.02, atol=1e-5)
+    # Nothing else changes.
+    folder = tmp_path / "plain"
+    folder.mkdir()
+    bare = record_of(run(path.rename(folder / "a.csv"), source))
+    for name in bare.COLUMNS:
+        np.testing.assert_array_equal(getattr(record, name), getattr(bare, name))
+
+
+def test_vehicles_whose_class_is_not_given_are_of_one_class(tmp_path):
+    record = record_of(run(plain(tmp_path / "a.csv", stream()), detailed=True))
+    assert record.classes == ("vehicle",)
+    assert not record.vehicle_class.any()
+
+
 def test_demand_and_dwell_are_measured(tmp_path):
     corridor = run(plain(tmp_path / "a.csv", stream(headway=2.0))).corridor
     assert corridor.demand.mainline[0][1] == pytest.approx(1800.0, rel=0.1)

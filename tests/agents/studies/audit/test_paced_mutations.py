@@ -32,13 +32,13 @@ class LedgerForEachSegment(Ledgers):
 
 
 class FreeSensors(Ledgers):
-    def collect(self, episodes, slots, times, observed, prices, centre):
+    def collect(self, episodes, slots, times, observed, *public):
         free = observed & np.isin(np.arange(observed.shape[1]), ROAD.fixed_sensors)
         budget, paid = self.budget, self.paid[episodes].copy()
         self.budget = np.inf
-        unpaid = super().collect(episodes, slots, times, free, prices, centre)
+        unpaid = super().collect(episodes, slots, times, free, *public)
         self.budget, self.paid[episodes] = budget, paid
-        charged = super().collect(episodes, slots, times, observed & ~free, prices, centre)
+        charged = super().collect(episodes, slots, times, observed & ~free, *public)
         return Sums(*(one + other for one, other in zip(charged, unpaid, strict=True)))
 
 
