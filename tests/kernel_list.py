@@ -1,4 +1,4 @@
-"""Write the list of functions that other processes compile ahead, see `dptse_env.utils.kernel_list`.
+"""Write the list of functions that other processes compile: `dptse_env.utils.kernel_list`.
 
 python tests/kernel_list.py
 

@@ -1,7 +1,6 @@
 """Recording in child processes, separate from another simulation or several at once.
 
-The child is a plain ``python -m dptse_env.traffic.child``. Unlike a multiprocessing worker it never
-imports the caller's ``__main__``, so it works from a notebook, a pipe or an unguarded script.
+The child is a plain process of the interpreter, see `dptse_env.utils.python_process`.
 
 When the parent ends in any way, the child's stdin is closed, and the child ends after the record in
 progress.
@@ -10,11 +9,9 @@ progress.
 import contextlib
 import json
 import logging
-import os
 import pickle
 import queue
 import subprocess
-import sys
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -23,6 +20,7 @@ from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.field_record import load_record, with_vehicles
 from dptse_env.traffic.record import Record
 from dptse_env.traffic.sumo import RecordingError
+from dptse_env.utils import python_process
 
 ATTEMPTS = 3
 """Attempts to make a record whose worker is killed, for instance for lack of memory. A failure that
@@ -40,17 +38,15 @@ class Worker:
 
     def __init__(self) -> None:
         """Start the child."""
-        # The parent's path, so that the child finds the same packages in any working directory.
-        path = os.pathsep.join(entry or str(Path.cwd()) for entry in sys.path)
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115
         # Removed with the child, even if it is killed.
         self._folder = tempfile.TemporaryDirectory(prefix="dptse-worker-")
         self._process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "dptse_env.traffic.child"],
+            python_process.command("dptse_env.traffic.child"),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._errors,
-            env=os.environ | {"PYTHONPATH": path, "TMPDIR": self._folder.name},
+            env=python_process.environment() | {"TMPDIR": self._folder.name},
         )
 
     @property

@@ -30,7 +30,9 @@ def main() -> int:
 
 def _end_with_stdin() -> None:
     """End this process, in the middle of a function too, when the parent ends."""
-    sys.stdin.buffer.read()
+    # Not through `sys.stdin`, whose lock this thread would hold when the interpreter shuts down.
+    while os.read(0, 1):
+        pass
     os._exit(0)
 
 

@@ -10,7 +10,7 @@ EXTRAS: Mapping[str, tuple[str, ...]] = {
         "jinja2", "optuna", "plotly", "rich", "sb3_contrib", "stable_baselines3", "torch", "tyro",
     ),
     "corridors": ("ijson", "pyarrow", "sumo"),
-    "ray": ("filelock", "ray"),
+    "ray": ("ray",),
     "video": ("moviepy", "pygame"),
 }  # fmt: skip
 """Modules that each extra brings. `sumo` comes with eclipse-sumo."""

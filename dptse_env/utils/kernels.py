@@ -94,6 +94,8 @@ def compile_unless_busy(function: Any, signature: tuple[Any, ...]) -> None:
 class _Dispatcher(CPUDispatcher):
     """numba's dispatcher of a function that one process at a time compiles."""
 
+    _cache: Any
+
     def compile(self, sig: Any) -> Any:
         """Compile or load the version for a signature."""
         try:
