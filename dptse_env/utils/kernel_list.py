@@ -13,8 +13,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from numba import types
-
 PATH = Path(__file__).with_name("kernel_list.json")
 
 
@@ -67,6 +65,8 @@ def find(path: str) -> Any:
 
 def _spelled(kind: Any, tuples: dict[str, list[Any]]) -> Any:
     """Return a type as JSON: a list is a tuple, a name with a colon a named tuple."""
+    from numba import types  # noqa: PLC0415  (only compiled estimators import numba)
+
     if isinstance(kind, types.BaseNamedTuple):
         name, fields = path_of(kind.instance_class), [_spelled(field, tuples) for field in kind]
         if tuples.setdefault(name, fields) != fields:
@@ -83,6 +83,8 @@ def _spelled(kind: Any, tuples: dict[str, list[Any]]) -> Any:
 
 
 def _read(spelled: Any, tuples: dict[str, list[Any]]) -> Any:
+    from numba import types  # noqa: PLC0415  (only compiled estimators import numba)
+
     if isinstance(spelled, list):
         return types.BaseTuple.from_types([_read(field, tuples) for field in spelled])
     if ":" in spelled:
