@@ -97,11 +97,14 @@ class Fusion:
     def scaled(self, sigma: FloatArray) -> FloatArray:
         """Return deviations (2,) of a query's noise, scaled by the published share."""
         setup, p = self.setup, self.setup.share
-        density = 1.0 / p
-        if setup.density.is_centred:
-            density = 1.0 if setup.density_is_mean else setup.density.clip / p
+        density = self._report_scale if setup.density.has_reports else 1.0 / p
         scaled: FloatArray = sigma * np.array([density, 1.0 / p if setup.releases_flow else 1.0])
         return scaled
+
+    @property
+    def _report_scale(self) -> float:
+        """Factor on released reports that makes densities of them."""
+        return 1.0 if self.setup.density_is_mean else self.setup.density.clip / self.setup.share
 
     def read(
         self,
@@ -150,7 +153,7 @@ class Fusion:
         sampling = alike * count * (1.0 - p) / p / length**2
         spread = setup.settings.speed_spread
         doubt = p_variance / p**2
-        if setup.density.is_centred:
+        if setup.density.has_reports:
             self._read_reports(values[:, queries, 0], sigma[:, queries, 0], expected, alike)
         else:
             values[:, queries, 0] /= p
@@ -198,11 +201,9 @@ class Fusion:
             # Without a connected vehicle a density of 0 is released.
             sampling = sampling + np.exp(-answering) * density**2
         else:
-            scale = setup.density.clip / setup.share
-            values *= scale
+            values *= self._report_scale
             values += setup.density.centres(expected.state) @ self._weights[:, queries]
-            sigma *= scale
-        sigma[:] = np.sqrt(sigma**2 + alike * sampling)
+        sigma[:] = np.sqrt((sigma * self._report_scale) ** 2 + alike * sampling)
 
     def _seconds_alike(self, speed: FloatArray, length: FloatArray) -> FloatArray | float:
         """Return the seconds for which answers count as one, shape (k, G), 1 at least."""

@@ -5,14 +5,20 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dptse_env.estimators import Estimate
 from dptse_env.model import ARZModel, MeasurementRows
-from dptse_env.release.density import COUNTED, COUNTS, DensityRelease, DeviationTerms
+from dptse_env.release.density import (
+    COUNTED,
+    COUNTS,
+    DensityRelease,
+    DensityReports,
+    DeviationTerms,
+)
 from dptse_env.release.queries import NO_OPTIONS, QueryOptions
 from dptse_env.release.report import PrivacyReport
 from dptse_env.release.settings import PrivacySettings
@@ -120,7 +126,7 @@ class ReleaseSetup:
 
     def density_terms(self, prediction: Callable[[], Estimate]) -> DeviationTerms:
         """Return the terms by which vehicles tell of the density; counts need no prediction."""
-        if not self.density.is_centred:
+        if not self.density.has_reports:
             return COUNTS
         return self.density.terms(self.at_places(prediction().density))
 
@@ -236,10 +242,8 @@ class ReleaseModel(ABC):
     """True where the model reads the vehicles of a record, which measured fields have not."""
     has_prices: ClassVar[bool] = False
     """True where queries have prices, which `public_state` gives."""
-    density_reports: ClassVar[Literal["", "mean", "centred"]] = ""
-    """Form in which the model releases what vehicles report of the density around them
-    (`dptse_env.release.density`): their mean, or a sum that is centred on the prediction; empty
-    where it cannot."""
+    density_reports: ClassVar[DensityReports] = ""
+    """Form in which the model releases what vehicles report of the density around them."""
     takes_noise: bool = False
     """True where `give_noise` works, which trainings by swaps need."""
 

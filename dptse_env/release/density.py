@@ -1,4 +1,4 @@
-"""What is released of densities: counts of vehicles, or deviations of what vehicles report.
+"""Releases of densities: counts of vehicles, or deviations of what vehicles report.
 
 A vehicle reports the road x that it has to itself, by its spacing or by the number of its
 neighbours (`dptse_env.traffic.ReportRecord`). With the density c that the estimator predicts, which
@@ -10,7 +10,7 @@ with k the density, the expected sum of u over the connected vehicles of a segme
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,10 @@ from numpy.typing import NDArray
 from dptse_env.traffic import Corridor, DensitySource, Penetration
 from dptse_env.utils.arrays import FloatArray
 from dptse_env.utils.kernels import kernel_part
+
+DensityReports = Literal["", "mean", "centred"]
+"""Form in which a release model releases what vehicles report of the density around them: their
+mean, or a sum that is centred on the prediction; empty where it cannot."""
 
 MEAN_SQUARES = {"spacing": 0.25, "neighbours": 0.15}
 """Mean square of a report's deviation at a clip of 1, on the shipped roads."""
@@ -43,7 +47,7 @@ COUNTS = DeviationTerms(np.zeros((1, 1)), 1.0)
 
 
 class DensityRelease(NamedTuple):
-    """How the vehicles of a mechanism tell of the density.
+    """The form in which the vehicles of a mechanism tell of the density.
 
     Attributes:
         source: ``count``, ``spacing`` or ``neighbours``.
@@ -61,24 +65,24 @@ class DensityRelease(NamedTuple):
         return cls(penetration.density_from, penetration.report_clip, corridor.density_scale)
 
     @property
-    def is_centred(self) -> bool:
-        """True where deviations are released in place of counts."""
+    def has_reports(self) -> bool:
+        """True where vehicles report the density around them in place of being counted."""
         return self.source != "count"
 
     @property
     def quantity(self) -> str:
         """Name of what is released."""
-        return f"deviation of {self.source}" if self.is_centred else "count"
+        return f"deviation of {self.source}" if self.has_reports else "count"
 
     @property
     def mean_square(self) -> float:
         """Expected square of what a vehicle contributes: 1 for counts."""
-        return MEAN_SQUARES[self.source] / self.clip**2 if self.is_centred else 1.0
+        return MEAN_SQUARES[self.source] / self.clip**2 if self.has_reports else 1.0
 
     @property
     def details(self) -> dict[str, str | float]:
         """Entries of a privacy report; none for counts."""
-        return {"density_from": self.source, "report_clip": self.clip} if self.is_centred else {}
+        return {"density_from": self.source, "report_clip": self.clip} if self.has_reports else {}
 
     def centres(self, density: FloatArray) -> FloatArray:
         """Return the densities that reports are compared with [veh/km], shape (k, S).

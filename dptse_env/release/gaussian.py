@@ -4,7 +4,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from dptse_env.privacy import (
 )
 from dptse_env.release.base import Released, ReleaseModel, ReleaseRequest, ReleaseSetup
 from dptse_env.release.contributions import Contributions
+from dptse_env.release.density import DensityReports
 from dptse_env.release.mechanism import GaussianMechanism, Mechanism
 from dptse_env.release.noise import NoiseStreams
 from dptse_env.release.report import STRICT_DELTA, PrivacyReport, QuantityReport, in_order
@@ -166,7 +167,7 @@ def require_gaussian(release: ReleaseModel, user: str) -> GaussianRelease:
 class Paper(GaussianRelease):
     """True density and mean speed of all vehicles, with the noise as printed in the paper."""
 
-    density_reports: ClassVar[Literal["", "mean", "centred"]] = "mean"
+    density_reports: ClassVar[DensityReports] = "mean"
 
     def __init__(self, setup: ReleaseSetup) -> None:
         """See `GaussianRelease`."""
@@ -220,7 +221,7 @@ class Capped(GaussianRelease):
     settings_type: ClassVar[type[PrivacySettings]] = CappedSettings
     claims_guarantee: ClassVar[bool] = True
     needs_vehicles: ClassVar[bool] = True
-    density_reports: ClassVar[Literal["", "mean", "centred"]] = "centred"
+    density_reports: ClassVar[DensityReports] = "centred"
 
     @classmethod
     def flow_centre(cls, corridor: Corridor, settings: CappedSettings) -> float | None:
@@ -251,7 +252,7 @@ class Capped(GaussianRelease):
             segment_length=min(corridor.segment_lengths),
             largest_speed=corridor.largest_speed_limit,
             mean_speed_slope=slope if settings.speed_release == "mean" else None,
-            signed_counts=self.setup.density.is_centred,
+            signed_counts=self.setup.density.has_reports,
         )
 
     def _noise_std(self) -> tuple[float, ...]:

@@ -4,12 +4,13 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import numpy as np
 
 from dptse_env.privacy import EpsilonTable, epsilon_of, mu_of
 from dptse_env.release.base import Released, ReleaseModel, ReleaseRequest, ReleaseSetup
+from dptse_env.release.density import DensityReports
 from dptse_env.release.ledgers import Columns, Ledgers, Sums
 from dptse_env.release.noise import NoiseStreams, grid_of
 from dptse_env.release.pacing import (
@@ -58,7 +59,7 @@ class Paced(ReleaseModel):
     needs_vehicles: ClassVar[bool] = True
     releases_sums: ClassVar[bool] = True
     has_prices: ClassVar[bool] = True
-    density_reports: ClassVar[Literal["", "mean", "centred"]] = "centred"
+    density_reports: ClassVar[DensityReports] = "centred"
     takes_noise: bool = True
 
     @classmethod
@@ -75,7 +76,7 @@ class Paced(ReleaseModel):
         self.mu = mu_of(settings.epsilon, settings.delta) * math.sqrt(setup.budget_share)
         self._epsilons = EpsilonTable(self.mu, settings.delta)
         # The counts of two vehicles on one segment cancel; deviations may be opposite.
-        replaced = 4.0 if setup.density.is_centred else 2.0
+        replaced = 4.0 if setup.density.has_reports else 2.0
         self._squares = replaced if settings.adjacency == "replace" else 1.0
         self.budget = self.mu**2 / self._squares
         first, span, places = setup.places, setup.spans, setup.n_places

@@ -17,8 +17,8 @@ ConnectedShare = Annotated[float, Interval(0, 1, open_low=True)]
 """A share of connected vehicles."""
 
 DensitySource = Literal["count", "spacing", "neighbours"]
-"""What densities are estimated from: the number of connected vehicles, their spacings to the
-vehicles ahead of them, or the numbers of vehicles around them."""
+"""Source of estimated densities: the number of connected vehicles, their spacings to the vehicles
+ahead of them, or the numbers of vehicles around them."""
 
 
 @dataclass(frozen=True)
@@ -111,10 +111,14 @@ class Penetration:
         """True if records must hold positions, lanes and classes."""
         return bool(self.by_class) or self.density_from != "count"
 
+    @property
+    def _class_shares(self) -> dict[str, float]:
+        return {each.name: each.share for each in self.by_class}
+
     def published_share(self, corridor: Corridor) -> float:
         """Return the public share of all vehicles: p, the middle of its range, or from classes."""
         if self.by_class and corridor.vehicle_classes:
-            shares = {each.name: each.share for each in self.by_class}
+            shares = self._class_shares
             return sum(each.share * shares.get(each.name, 0.0) for each in corridor.vehicle_classes)
         return sum(self.share) / 2.0 if isinstance(self.share, tuple) else self.share
 
@@ -163,7 +167,7 @@ class Penetration:
         if self.by_class:
             details = _with_details(record)
             self._require_classes(details.classes)
-            shares = {each.name: each.share for each in self.by_class}
+            shares = self._class_shares
             of_class = np.array([shares.get(name, 0.0) for name in details.classes])
             share = of_class[details.class_of_vehicles()]
         connected: BoolArray = self._uniform(traffic_seed, 0, record.n_vehicles) < share

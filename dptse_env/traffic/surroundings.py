@@ -1,4 +1,4 @@
-"""What vehicles see around them: the vehicle ahead in their lane, and the vehicles near them."""
+"""Surroundings of vehicles: the vehicle ahead in the lane, and the vehicles near by."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What vehicles see around them, in traffic placed by hand."""
+"""Surroundings of vehicles, in traffic placed by hand."""
 
 import dataclasses
 

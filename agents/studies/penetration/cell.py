@@ -26,7 +26,7 @@ FACTORS = {HIGH: 4.0 / 3.0, LOW: 2.0 / 3.0}
 UNKNOWN_SHARES = (0.02, 0.3)
 """Range of a share that is drawn for each traffic seed."""
 COUNT, *REPORTED = ("count", "spacing", "neighbours")
-"""What densities are estimated from."""
+"""Sources of densities."""
 
 TRUCK_SHARE = 0.1
 CLASSES = [
