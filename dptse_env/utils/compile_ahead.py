@@ -40,6 +40,7 @@ SILENT_WAIT = 1.0
 CHILD = "dptse_env.utils.compile_child"
 
 _expected: list[str] = []
+_unlocked: set[Path] = set()
 
 
 def expect(estimator: str) -> None:
@@ -159,11 +160,21 @@ def _lock(path: Path) -> Any:
 
 
 def _taken(lock: Any, wait: float) -> bool:
-    """Try to take a lock for some seconds; return whether it is taken."""
+    """Try to take a lock for some seconds; return whether no other process has it."""
     from filelock import Timeout  # noqa: PLC0415  (slow to import)
 
     try:
         lock.acquire(timeout=wait)
     except Timeout:
         return False
+    except (OSError, NotImplementedError) as error:
+        _say_unlocked(Path(lock.lock_file).parent, error)
     return True
+
+
+def _say_unlocked(folder: Path, error: Exception) -> None:
+    """Say once that a folder, whose file system may have no locks, takes none."""
+    if folder not in _unlocked:
+        _unlocked.add(folder)
+        message = "%s takes no locks (%s); processes may compile the same function there"
+        logger.warning(message, folder, error)

@@ -123,6 +123,19 @@ def test_the_turn_ends_where_compiling_fails(load):
     assert not run._cache.is_busy()
 
 
+@pytest.mark.parametrize("error", [OSError(37, "No locks available"), NotImplementedError("flock")])
+def test_a_folder_without_locks_is_compiled_into_all_the_same(load, monkeypatch, caplog, error):
+    def acquire(*_, **__):
+        raise error
+
+    monkeypatch.setattr(FileLock, "acquire", acquire)
+    module = load()
+    with caplog.at_level(logging.WARNING, logger=LOG):
+        assert module.run(1.5) == 3.0
+        assert module.run(1) == 2.0
+    assert caplog.text.count("takes no locks") == 1
+
+
 # --- children ---------------------------------------------------------------------------------
 
 
