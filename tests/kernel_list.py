@@ -12,6 +12,8 @@ import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from typing import Any
 
 import gymnasium as gym
@@ -55,29 +57,46 @@ def compiled(estimator: str) -> list[Listed]:
         env.reset(seed=0)
         env.step(env.action_space.sample())
         env.close()
-    # This process begins with the first kernels: others begin with the last ones. Within a kernel,
-    # parts come before what calls them.
-    return [entry for kernel in reversed(listener.kernels) for entry in kernel]
+    return list(_backwards(listener.kernels))
+
+
+@dataclass
+class _Compiled:
+    """A compiled function, None if it is not kept, and what was compiled for it before it."""
+
+    entry: Listed | None = None
+    parts: list[_Compiled] = field(default_factory=list)
+
+
+def _backwards(compiled: list[_Compiled]) -> Iterator[Listed]:
+    """Yield kept functions after their parts, and otherwise the last one first.
+
+    The process that starts others begins with the first function, and so they meet in the middle.
+    """
+    for function in reversed(compiled):
+        yield from _backwards(function.parts)
+        if function.entry is not None:
+            yield function.entry
 
 
 class _Listener(event.Listener):
-    """Collects what is compiled and kept, a list for each kernel that Python calls."""
+    """Collects what is compiled for each kernel that Python calls."""
 
     def __init__(self) -> None:
-        self.kernels: list[list[Listed]] = []
-        self._depth = 0
+        self.kernels: list[_Compiled] = []
+        self._levels = [self.kernels]
 
     def on_start(self, happened: Any) -> None:
-        if self._depth == 0:
-            self.kernels.append([])
-        self._depth += 1
+        begun = _Compiled()
+        self._levels[-1].append(begun)
+        self._levels.append(begun.parts)
 
     def on_end(self, happened: Any) -> None:
-        self._depth -= 1
+        self._levels.pop()
         dispatcher = happened.data["dispatcher"]
         if hasattr(dispatcher._cache, "end_turn"):
             path = kernel_list.path_of(dispatcher.py_func)
-            self.kernels[-1].append(Listed(path, tuple(happened.data["args"])))
+            self._levels[-1][-1].entry = Listed(path, tuple(happened.data["args"]))
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ see `dptse_env.utils.compile_ahead`.
 from __future__ import annotations
 
 import contextlib
+import gc
 import hashlib
 import inspect
 import logging
@@ -23,6 +24,7 @@ from typing import Any, TypeVar, cast, overload
 
 from numba import config, njit, types
 from numba.core.caching import FunctionCache, NullCache
+from numba.core.compiler_lock import global_compiler_lock
 from numba.core.registry import CPUDispatcher
 
 from dptse_env.utils import compile_ahead
@@ -33,6 +35,9 @@ _PACKAGE = __name__.partition(".")[0]
 
 _OPTIONS: dict[str, Any] = {"error_model": "numpy", "nogil": True, "no_cfunc_wrapper": True}
 _WITHOUT_PYTHON = {"nopython": True, "no_cpython_wrapper": True}
+
+COLLECTED_EVERY = 100_000
+"""Objects after which Python looks for garbage while a kernel is compiled."""
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -91,6 +96,21 @@ def compile_unless_busy(function: Any, signature: tuple[Any, ...]) -> None:
         function.compile(signature)
 
 
+@contextlib.contextmanager
+def _collecting_seldom() -> Iterator[None]:
+    """Let Python collect garbage seldom, since numba's compiler makes objects by the million.
+
+    The default takes a tenth of the time of compiling.
+    """
+    thresholds = gc.get_threshold()
+    if thresholds[0] > 0:  # with 0 the caller has none collected
+        gc.set_threshold(max(thresholds[0], COLLECTED_EVERY), *thresholds[1:])
+    try:
+        yield
+    finally:
+        gc.set_threshold(*thresholds)
+
+
 class _Dispatcher(CPUDispatcher):
     """numba's dispatcher of a function that one process at a time compiles."""
 
@@ -99,7 +119,8 @@ class _Dispatcher(CPUDispatcher):
     def compile(self, sig: Any) -> Any:
         """Compile or load the version for a signature."""
         try:
-            return super().compile(sig)
+            with global_compiler_lock, _collecting_seldom():
+                return super().compile(sig)
         finally:
             if isinstance(self._cache, _KernelCache):
                 self._cache.end_turn()

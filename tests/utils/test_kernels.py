@@ -1,13 +1,17 @@
 """Compiled functions: what is kept on disk, when it is compiled anew, and what is said then."""
 
+import gc
 import importlib
 import logging
 import sys
+from contextlib import suppress
 
 import pytest
+from numba.core import event
 from numba.core.caching import FunctionCache
+from numba.core.errors import TypingError
 
-from dptse_env.utils.kernels import fingerprint
+from dptse_env.utils.kernels import COLLECTED_EVERY, fingerprint
 
 MODULE = """
 from typing import NamedTuple
@@ -111,3 +115,31 @@ def test_a_part_has_one_version_for_constants_and_variables(load):
     module = load(text)
     assert module.run(1.5) == 9.0
     assert len(module.scaled.overloads) == 1
+
+
+class _Thresholds(event.Listener):
+    """Collects the thresholds of Python's garbage collector while functions are compiled."""
+
+    def __init__(self):
+        self.seen = []
+
+    def on_start(self, happened):
+        self.seen.append(gc.get_threshold())
+
+    def on_end(self, happened):
+        self.seen.append(gc.get_threshold())
+
+
+@pytest.mark.parametrize("text", [MODULE, MODULE.replace("x * FACTOR", "x.nothing")])
+@pytest.mark.parametrize("first", [700, 0, 2 * COLLECTED_EVERY])
+def test_garbage_is_collected_seldom_only_while_a_kernel_is_compiled(load, text, first):
+    usual, listener = gc.get_threshold(), _Thresholds()
+    gc.set_threshold(first, 10, 10)
+    try:
+        with event.install_listener("numba:compile", listener), suppress(TypingError):
+            load(text).run(1.5)
+        assert gc.get_threshold()[0] == first
+    finally:
+        gc.set_threshold(*usual)
+    expected = max(first, COLLECTED_EVERY) if first else 0
+    assert {seen[0] for seen in listener.seen} == {expected}
