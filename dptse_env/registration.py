@@ -3,7 +3,7 @@
 Entry points and registries are named by strings, so registering imports nothing heavy.
 """
 
-from importlib import import_module
+from pkgutil import resolve_name
 from typing import Any
 
 from gymnasium.envs.registration import register, registry
@@ -61,5 +61,4 @@ def register_part(keyword: str, name: str, part: Any) -> None:
     """
     if keyword not in REGISTRIES:
         raise ValueError(f"keyword must be one of {', '.join(REGISTRIES)}, got {keyword!r}")
-    module, _, attribute = REGISTRIES[keyword].partition(":")
-    getattr(import_module(module), attribute).register(name, part)
+    resolve_name(REGISTRIES[keyword]).register(name, part)

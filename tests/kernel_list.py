@@ -22,6 +22,7 @@ from numba.core import event
 from dptse_env.utils import kernel_list
 from dptse_env.utils.compile_ahead import PROCESSES_VARIABLE
 from dptse_env.utils.kernel_list import Listed
+from dptse_env.utils.registry import name_of_class
 
 ID = "dptse/PrivateHighway-v1"
 ESTIMATORS = ("ekf", "ukf", "enkf", "mhe", "recurrent")
@@ -95,7 +96,7 @@ class _Listener(event.Listener):
         self._levels.pop()
         dispatcher = happened.data["dispatcher"]
         if hasattr(dispatcher._cache, "end_turn"):
-            path = kernel_list.path_of(dispatcher.py_func)
+            path = name_of_class(dispatcher.py_func)
             self._levels[-1][-1].entry = Listed(path, tuple(happened.data["args"]))
 
 

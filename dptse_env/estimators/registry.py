@@ -1,6 +1,6 @@
 """Estimators by name and backend."""
 
-import importlib
+from pkgutil import resolve_name
 from typing import Any, NamedTuple, get_args
 
 import numpy as np
@@ -102,13 +102,13 @@ def make_estimator(
     settings = settings_type(estimator)() if settings is None else settings
     check_demand(estimator, settings)
     has_demand = getattr(settings, "demand", None) is not None
-    model_of_backend = _load(getattr(_MODELS, backend))(
+    model_of_backend = resolve_name(getattr(_MODELS, backend))(
         model.network, model.parameters, model.time_step, model.reference_speed, model.rows,
         has_demand,
     )  # fmt: skip
     if isinstance(estimator, str):
         compile_ahead.expect(estimator)
-    factory = _load(getattr(part, backend)) if isinstance(part, Backends) else part
+    factory = resolve_name(getattr(part, backend)) if isinstance(part, Backends) else part
     made: Estimator = factory(model_of_backend, n_episodes, settings)
     if is_foreign(made):
         _check_attributes(made, model, n_episodes)
@@ -168,9 +168,3 @@ def _check_attributes(estimator: Estimator, model: ARZModel, n_episodes: int) ->
     if getattr(estimator, "is_compiled", None) is None:
         raise ValueError(f"estimator {name} must have 'is_compiled', got None")
     check_estimate(estimator, estimator.estimate(), model.n_segments)
-
-
-def _load(path: str) -> type:
-    module, _, name = path.partition(":")
-    loaded: type = getattr(importlib.import_module(module), name)
-    return loaded

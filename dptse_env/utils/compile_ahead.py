@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from dptse_env.utils import kernel_list, python_process
+from dptse_env.utils.registry import name_of_class
 from dptse_env.utils.threads import n_cores
 
 logger = logging.getLogger(__name__)
@@ -64,7 +65,7 @@ def take_turn(function: Callable[..., Any], folder: Path, wait: float = LONGEST_
     After `wait` seconds it is returned all the same, not taken, since compiling a function twice
     loses time only.
     """
-    lock, path = _lock_of(function, folder), kernel_list.path_of(function)
+    lock, path = _lock_of(function, folder), name_of_class(function)
     if not _taken(lock, min(SILENT_WAIT, wait)):
         logger.warning("Waiting for another process, which compiles %s", path)
         if not _taken(lock, wait):
@@ -77,7 +78,7 @@ def start(function: Callable[..., Any], signature: Any, folder: Path) -> None:
     n_processes = _n_processes()
     if n_processes == 0:
         return
-    missing = kernel_list.Listed(kernel_list.path_of(function), tuple(signature))
+    missing = kernel_list.Listed(name_of_class(function), tuple(signature))
     for estimator in _expected:
         if missing in kernel_list.listed(estimator):
             _expected.remove(estimator)

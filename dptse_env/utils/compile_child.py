@@ -8,8 +8,9 @@ import os
 import signal
 import sys
 import threading
+from pkgutil import resolve_name
 
-from dptse_env.utils.kernel_list import find, listed
+from dptse_env.utils.kernel_list import listed
 from dptse_env.utils.kernels import compile_unless_busy
 
 
@@ -21,7 +22,7 @@ def main() -> int:
     failed = False
     for function, signature in listed(sys.argv[1]):
         try:
-            compile_unless_busy(find(function), signature)
+            compile_unless_busy(resolve_name(function), signature)
         except Exception as error:  # the list is out of date; the parent reports it
             print(f"{function}: {type(error).__name__}: {error}", file=sys.stderr)
             failed = True

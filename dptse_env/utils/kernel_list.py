@@ -7,11 +7,13 @@ An entry that fits no more costs time only: what is missing is compiled at its f
 
 from __future__ import annotations
 
-import importlib
 import json
 from functools import cache
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any, NamedTuple
+
+from dptse_env.utils.registry import name_of_class
 
 PATH = Path(__file__).with_name("kernel_list.json")
 
@@ -52,23 +54,13 @@ def written(lists: dict[str, list[Listed]]) -> str:
     return '{{"tuples": {}, "estimators": {{\n{}\n}}}}\n'.format(*parts)
 
 
-def path_of(function: Any) -> str:
-    """Return a function of a module as ``"module:name"``."""
-    return f"{function.__module__}:{function.__qualname__}"
-
-
-def find(path: str) -> Any:
-    """Import what ``"module:name"`` names."""
-    module, _, name = path.partition(":")
-    return getattr(importlib.import_module(module), name)
-
-
 def _spelled(kind: Any, tuples: dict[str, list[Any]]) -> Any:
     """Return a type as JSON: a list is a tuple, a name with a colon a named tuple."""
     from numba import types  # noqa: PLC0415  (only compiled estimators import numba)
 
     if isinstance(kind, types.BaseNamedTuple):
-        name, fields = path_of(kind.instance_class), [_spelled(field, tuples) for field in kind]
+        name = name_of_class(kind.instance_class)
+        fields = [_spelled(field, tuples) for field in kind]
         if tuples.setdefault(name, fields) != fields:
             raise ValueError(f"the fields of {name} have other types in one function than another")
         return name
@@ -89,7 +81,7 @@ def _read(spelled: Any, tuples: dict[str, list[Any]]) -> Any:
         return types.BaseTuple.from_types([_read(field, tuples) for field in spelled])
     if ":" in spelled:
         fields = [_read(field, tuples) for field in tuples[spelled]]
-        return types.BaseTuple.from_types(fields, find(spelled))
+        return types.BaseTuple.from_types(fields, resolve_name(spelled))
     name, *array = spelled.split()
     scalar = types.boolean if name == "bool" else getattr(types, name)
     if not array:
