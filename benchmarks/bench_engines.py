@@ -33,9 +33,9 @@ from agents.engines.engine import Engine, Workers, run_tasks
 from agents.engines.local import LocalProcesses
 from agents.engines.ray_cluster import RayCluster
 from agents.evaluation.ladder import Rung, run_rung
-from agents.evaluation.policies import find_policy
 from agents.experiments.provenance import machine
 from agents.files import write_json
+from agents.policies import find_policy
 from benchmarks.cluster_model import JobTimes, simulate
 from dptse_env.config import resolve
 from dptse_env.traffic import Corridor, RecordLibrary

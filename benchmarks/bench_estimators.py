@@ -15,7 +15,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 from dataclasses import dataclass, replace
 
 from agents.evaluation.terminal import make_table, print_table
-from agents.experiments.plots import LABELS
+from agents.figures import LABELS
 from benchmarks.peers import FILTERS, FilterPeer
 from benchmarks.replay import recorded
 from benchmarks.steps import REFERENCES, Row, Steps, step_times

@@ -19,9 +19,9 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from agents.evaluation.environments import without_void_warning
-from agents.evaluation.statistics import Interval, geometric_mean_interval
+from agents.environments import quietly
 from agents.evaluation.terminal import make_table, print_table
+from agents.statistics import Interval, geometric_mean_interval
 from benchmarks.throughput.measure import queries, take_turns
 from scripts.cli import run
 
@@ -72,7 +72,7 @@ def measure(args: Args, release: str) -> dict[str, Interval]:
 
 def steps(keywords: Mapping[str, Any], n_episodes: int, block: int) -> Callable[[], int]:
     """Return a function that takes a block of steps of a batch and returns their number."""
-    with without_void_warning():
+    with quietly():
         env = gym.make_vec(
             ID, num_envs=n_episodes, threads=1, traffic_seeds=TRAFFIC_SEEDS, **keywords
         )

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from agents.evaluation.terminal import make_table, print_table
-from agents.experiments.plots import LABELS
+from agents.figures import LABELS
 from benchmarks.long_roads import long_road
 from benchmarks.replay import replay_of
 from benchmarks.steps import Row, Steps, step_times

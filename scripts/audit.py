@@ -13,7 +13,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from agents.evaluation.environments import make_config
+from agents.environments import make_config
 from agents.files import refuse_to_replace
 from agents.studies.audit.attack import attack
 from agents.studies.audit.pairs import PairsFinding, study_pairs

@@ -18,7 +18,7 @@ import tyro
 
 from agents.engines.choice import EngineName, make_engine
 from agents.engines.engine import Engine, EngineError
-from agents.evaluation.environments import given_keywords, make_config
+from agents.environments import given_keywords, make_config
 from agents.experiments.runner import Workplace
 from dptse_env.traffic import (
     Corridor,

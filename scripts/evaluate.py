@@ -18,20 +18,20 @@ from typing import Any
 import gymnasium as gym
 
 from agents.engines.engine import run_in_order
-from agents.evaluation.environments import make_config, unwrap
+from agents.environments import make_config, unwrap
 from agents.evaluation.episodes import EpisodeScore, run_episode, seed_kind, watch_episode
-from agents.evaluation.figures import (
+from agents.evaluation.ladder import Rung, run_rung
+from agents.evaluation.page import write_page
+from agents.evaluation.report import EPISODES, SUMMARY, Report
+from agents.evaluation.watched import Watched
+from agents.figures import (
     RoadMap,
     draw_maps,
     estimate_map,
     save_figure,
 )
-from agents.evaluation.ladder import Rung, run_rung
-from agents.evaluation.page import write_page
-from agents.evaluation.policies import NamedSchedule, PolicySource, find_policy
-from agents.evaluation.report import EPISODES, SUMMARY, Report
-from agents.evaluation.watched import Watched
 from agents.files import refuse_to_replace
+from agents.policies import NamedSchedule, PolicySource, find_policy
 from dptse_env.config import EnvConfig, parse_seeds
 from dptse_env.rendering import History
 from dptse_env.schedules import OBSERVATION_SCHEDULES
@@ -209,7 +209,7 @@ def draw_traffic(
         score, history = watch_episode(env, policy, traffic_seed=seed, seed=args.noise_seed + seed)
         maps += [
             *([] if maps else [RoadMap("true density", history.truth, history)]),
-            estimate_map(history, score, f"{name}: estimate"),
+            estimate_map(history, score.rmse_density, f"{name}: estimate"),
             RoadMap(f"{name}: queried", history.queried, history),
         ]
     title = f"Traffic seed {seed}, {estimator}, {noise}"

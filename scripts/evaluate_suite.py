@@ -7,7 +7,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from agents.evaluation.policies import find_policy
+from agents.policies import find_policy
 from agents.suite.card import FAILED, Card
 from agents.suite.cells import ONE, ZERO, Suite, find_suite
 from agents.suite.suite import run_suite

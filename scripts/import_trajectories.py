@@ -17,7 +17,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from agents.evaluation.environments import given_keywords
+from agents.environments import given_keywords
 from dptse_env.config import TEST_SEEDS, TRAINING_SEEDS, VALIDATION_SEEDS
 from dptse_env.traffic import is_road_file, ranges, read_road
 from dptse_env.traffic.importers import (

@@ -14,10 +14,10 @@ import json
 from dataclasses import dataclass
 from typing import Any
 
-from agents.evaluation.environments import make_config
-from agents.evaluation.measured_field import Replay, field_corridor, read_field
+from agents.environments import make_config
 from agents.evaluation.terminal import make_table, print_table
-from agents.experiments.plots import LABELS
+from agents.figures import LABELS
+from agents.measured_field import Replay, field_corridor, read_field
 from dptse_env.estimators import EstimatorSettings
 from dptse_env.traffic.importers.fields import FieldSource
 from dptse_env.utils.validation import integer

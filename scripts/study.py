@@ -29,7 +29,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from agents.evaluation.environments import given_keywords
+from agents.environments import given_keywords
 from agents.experiments.cells import Design
 from agents.experiments.runner import Workplace
 from agents.studies.choices import study as choice_study

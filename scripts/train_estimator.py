@@ -15,7 +15,7 @@ from pathlib import Path
 
 import torch
 
-from agents.evaluation.environments import make_config, parse_env
+from agents.environments import make_config, parse_env
 from agents.experiments.provenance import check_folder
 from agents.filters.plan import FilterPlan, Round
 from agents.filters.scenarios import ScenarioRanges

@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from agents.evaluation.environments import make_vector
+from agents.environments import make_vector
 from dptse_env.config import resolve
 from dptse_env.parts import make_parts
 from dptse_env.process import QueryProcess

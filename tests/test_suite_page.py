@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from agents.evaluation.policies import find_policy
+from agents.policies import find_policy
 from agents.suite.cells import ONE, SUITES, ZERO, find_suite
 from agents.suite.table import score_table, shipped_cards, suite_table
 from agents.suite.verifying import verify

@@ -15,7 +15,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from agents.evaluation.environments import unwrap
+from agents.environments import unwrap
 from dptse_env.config import TEST_SEEDS, TRAINING_SEEDS, VALIDATION_SEEDS
 from dptse_env.process import QueryProcess
 from dptse_env.rendering import History

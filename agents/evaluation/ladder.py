@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from agents.evaluation.environments import make_vector
+from agents.environments import make_vector
 from agents.evaluation.episodes import EpisodeScore, Policy, run_episodes
-from agents.evaluation.policies import NamedSchedule, PolicySource
+from agents.policies import NamedSchedule, PolicySource
 from dptse_env.policies import TRANSFERABLE
 from dptse_env.vector_env import SensorQueryVectorEnv
 

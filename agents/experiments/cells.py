@@ -11,9 +11,9 @@ from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
-from agents.evaluation.environments import given_keywords, make_config, without_void_warning
+from agents.environments import given_keywords, make_config, quietly
 from agents.evaluation.episodes import EpisodeScore, check_test_seeds
-from agents.evaluation.statistics import Interval, mean_interval, paired_difference
+from agents.statistics import Interval, mean_interval, paired_difference
 from dptse_env.config import TEST_SEEDS, EnvConfig, parse_seeds
 from dptse_env.schedules import OBSERVATION_SCHEDULES
 from dptse_env.utils.arrays import FloatArray
@@ -116,7 +116,7 @@ class Design(ABC, Generic[CellT]):
         """
         self.check()
         seeds = {"traffic_seeds": list(self.traffic_seeds)}
-        with without_void_warning():
+        with quietly():
             return [
                 make_config(self.env, {**self.keywords(each), **seeds}) for each in self.cells()
             ]

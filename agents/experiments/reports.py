@@ -14,7 +14,7 @@ from typing import Any
 import jinja2
 
 from agents.evaluation.episodes import WARM_UP
-from agents.experiments.tables import (
+from agents.experiments.old_tables import (
     format_interval,
     format_number,
     format_range,

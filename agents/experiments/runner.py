@@ -11,7 +11,7 @@ from typing import Any, Generic
 import gymnasium as gym
 
 from agents.engines.engine import Engine
-from agents.evaluation.environments import make_vector, without_void_warning
+from agents.environments import make_vector, quietly
 from agents.evaluation.episodes import EpisodeScore, run_episode
 from agents.experiments.cells import CellT, Design
 from agents.experiments.ledger import Ledger
@@ -73,7 +73,7 @@ def make_env(
         ValueError: A keyword is unknown or out of range.
     """
     seeded: dict[str, Any] = {"traffic_seeds": list(seeds), "records": records}
-    with without_void_warning():
+    with quietly():
         return gym.make(env, disable_env_checker=True, **seeded, **keywords)
 
 
@@ -90,7 +90,7 @@ def make_batch(
         ValueError: A keyword is unknown or out of range.
     """
     more = {"traffic_seeds": list(seeds), "records": records, "threads": threads}
-    with without_void_warning():
+    with quietly():
         return make_vector(env, len(seeds), {**keywords, **more})
 
 

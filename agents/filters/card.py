@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib.metadata import version
 from typing import Any
 
-from agents.evaluation.environments import make_config, parse_env
+from agents.environments import make_config, parse_env
 from agents.experiments.provenance import source_digest
 from agents.filters.plan import FilterPlan
 from dptse_env.estimators.learned.channels import CHANNELS

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.evaluation.environments import make_vector
+from agents.environments import make_vector
 from agents.evaluation.episodes import run_episodes
 from agents.filters.scenarios import Scenario
 from dptse_env.estimators.batch import checked_measurements

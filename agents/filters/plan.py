@@ -13,8 +13,8 @@ import numpy as np
 
 from agents.evaluation.episodes import require_seeds
 from agents.experiments.provenance import machine, source_digest
-from agents.experiments.seeds import TUNING
 from agents.filters.scenarios import Scenario, ScenarioRanges
+from agents.seeds import TUNING
 from dptse_env.config import TRAINING_SEEDS, VALIDATION_SEEDS
 from dptse_env.estimators.learned.weights import read_network
 from dptse_env.utils.validation import inside, integer, positive, require

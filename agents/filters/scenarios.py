@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from agents.evaluation.environments import make_config, parse_env
+from agents.environments import make_config, parse_env
 from agents.filters.roads import ROADS
 from dptse_env.utils.validation import require
 

@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from agents.evaluation.environments import make_vector, parse_env
+from agents.environments import make_vector, parse_env
 from agents.evaluation.episodes import WARM_UP, run_episodes
-from agents.experiments.seeds import TUNING
+from agents.seeds import TUNING
 from dptse_env.process import QueryProcess
 from dptse_env.schedules import make_schedule
 from dptse_env.traffic import Records

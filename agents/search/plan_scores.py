@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from agents.engines.engine import Workers
-from agents.evaluation.environments import given_keywords, make_vector
+from agents.environments import given_keywords, make_vector
 from agents.evaluation.episodes import WARM_UP
 from dptse_env.config import TRAINING_SEEDS, parse_seeds
 from dptse_env.schedules import PLANS

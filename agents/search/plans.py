@@ -15,8 +15,8 @@ from importlib.metadata import version
 import numpy as np
 
 from agents.evaluation.episodes import WARM_UP
-from agents.experiments.seeds import PLAN_SEARCH
 from agents.search.plan_scores import FIRST_SEEDS, PlanScorer, PlanTask
+from agents.seeds import PLAN_SEARCH
 from dptse_env.config import VALIDATION_SEEDS
 from dptse_env.schedules import Shifting
 from dptse_env.schedules.plans import Plan, PlanContext

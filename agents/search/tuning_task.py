@@ -15,11 +15,11 @@ from typing import Any
 
 import gymnasium as gym
 
-from agents.evaluation.environments import make_vector, unwrap
+from agents.environments import make_vector, unwrap
 from agents.evaluation.episodes import WARM_UP, EpisodeScore, run_episodes
-from agents.evaluation.policies import PolicySource, find_policy
-from agents.experiments.seeds import TUNING
+from agents.policies import PolicySource, find_policy
 from agents.search.space import Knob, search_space
+from agents.seeds import TUNING
 from dptse_env.config import TRAINING_SEEDS, EnvConfig, parse_seeds
 from dptse_env.estimators import EstimatorSettings
 from dptse_env.estimators.tuned_settings import settings_name

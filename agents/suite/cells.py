@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
-from agents.evaluation.environments import make_config, without_void_warning
+from agents.environments import make_config, quietly
 from agents.evaluation.episodes import WARM_UP
-from agents.experiments.seeds import SUITE
+from agents.seeds import SUITE
 from dptse_env.config import EnvConfig, parse_seeds
 from dptse_env.estimators.learned.weights import member_for, read_network
 from dptse_env.parts import flow_centre
@@ -55,7 +55,7 @@ class SuiteCell:
     @cached_property
     def config(self) -> EnvConfig:
         """The configuration of the cell, with the default action encoding."""
-        with without_void_warning():
+        with quietly():
             return make_config(self.env, {**self.keywords, "traffic_seeds": self.seeds})
 
     @cached_property

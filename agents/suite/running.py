@@ -12,8 +12,8 @@ import numpy as np
 from agents.evaluation.contributions import LedgerWatcher, of_queries
 from agents.evaluation.episodes import EpisodeScore, run_episodes
 from agents.evaluation.honesty import EstimateWatcher
-from agents.evaluation.policies import PolicySource
 from agents.experiments.runner import make_batch
+from agents.policies import PolicySource
 from agents.suite.card import DONE, FAILED, CellResult
 from agents.suite.cells import SuiteCell
 from agents.suite.guard import Guarded, PolicyError, foreign_code

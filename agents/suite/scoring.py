@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import stats
 
-from agents.evaluation.statistics import Interval
+from agents.statistics import Interval
 from agents.suite.card import DONE, Card, CellResult
 from agents.suite.cells import Suite
 

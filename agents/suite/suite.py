@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from agents.engines.engine import run_shown
-from agents.evaluation.policies import PolicySource, find_policy
 from agents.experiments.provenance import machine, source_digest
 from agents.experiments.runner import Workplace
+from agents.policies import PolicySource, find_policy
 from agents.suite.card import DONE, Card, CellResult
 from agents.suite.cells import Suite, SuiteCell
 from agents.suite.running import SuiteTask, run_cell

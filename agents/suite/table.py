@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from agents.evaluation.statistics import Interval
-from agents.experiments.tables import markdown
+from agents.experiments.old_tables import markdown
+from agents.statistics import Interval
 from agents.suite.card import DONE, Card, CellResult
 from agents.suite.cells import Suite
 from agents.suite.scoring import scores, suite_score

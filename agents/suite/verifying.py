@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agents.evaluation.policies import PolicySource
+from agents.policies import PolicySource
 from agents.suite.card import DONE, Card
 from agents.suite.cells import Suite
 from agents.suite.running import SuiteTask, run_cell

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
-from agents.experiments.seeds import training_seed
+from agents.seeds import training_seed
 from agents.training.recipes import Recipe
 from dptse_env.sb3 import SB3VecEnv
 from dptse_env.utils.arrays import Action, BoolArray, Observation

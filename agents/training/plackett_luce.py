@@ -10,8 +10,8 @@ from typing import Any
 import torch
 
 from agents.engines.engine import Engine
-from agents.evaluation.environments import make_vector
-from agents.experiments.seeds import training_seed
+from agents.environments import make_vector
+from agents.seeds import training_seed
 from agents.training.episodes import make_episodes
 from agents.training.learner import Record
 from agents.training.plan import TrainingPlan

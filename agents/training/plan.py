@@ -10,10 +10,10 @@ from functools import cached_property
 from importlib.metadata import version
 from typing import Any
 
-from agents.evaluation.environments import make_config, parse_env
+from agents.environments import make_config, parse_env
 from agents.evaluation.episodes import WARM_UP
 from agents.experiments.provenance import machine, source_digest
-from agents.experiments.seeds import TRAINING_VALIDATION, TRAININGS
+from agents.seeds import TRAINING_VALIDATION, TRAININGS
 from agents.training.recipes import Recipe
 from agents.training.worlds import World
 from dptse_env.config import TRAINING_SEEDS, VALIDATION_SEEDS, EnvConfig

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from agents.experiments.seeds import training_seed
+from agents.seeds import training_seed
 from agents.training.recipes import SwapRounds
 from agents.training.swaps import Swaps, try_swaps
 from dptse_env.sb3 import PlackettLucePolicy

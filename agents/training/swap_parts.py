@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from agents.engines.engine import Engine, run_in_order
-from agents.evaluation.environments import make_vector
+from agents.environments import make_vector
 from agents.training.policy_iteration import collect_swaps, first_seed
 from agents.training.recipes import PlackettLuceRecipe
 from agents.training.swaps import Swaps

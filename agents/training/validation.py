@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from agents.evaluation.environments import make_vector
+from agents.environments import make_vector
 from agents.evaluation.episodes import Policy, require_seeds, run_episodes
-from agents.experiments.seeds import TRAINING_VALIDATION
+from agents.seeds import TRAINING_VALIDATION
 from dptse_env.config import VALIDATION_SEEDS
 from dptse_env.utils.arrays import FloatArray
 

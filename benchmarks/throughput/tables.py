@@ -8,8 +8,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from agents.experiments import tables
-from agents.experiments.plots import LABELS
+from agents.experiments import old_tables as tables
+from agents.figures import LABELS
 from agents.files import write_csv as write_rows
 from benchmarks.throughput.results import Result, Results, best, find
 from benchmarks.throughput.rows import ESTIMATORS, FEW, SIZES, THREADS, vector_name

@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip("tyro")
 
-from agents.evaluation.policies import find_policy
+from agents.policies import find_policy
 from agents.suite.card import Card
 from agents.suite.cells import SUITES
 from dptse_env import __version__

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from agents.evaluation.environments import make_config
+from agents.environments import make_config
 from dptse_env.traffic import (
     PAPER_HIGHWAY,
     SHORT_HIGHWAY,

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from agents.evaluation.policies import find_policy
 from agents.experiments.demand import TWO_PEAKS
+from agents.policies import find_policy
 
 HIGHWAY, LONG = "highway", "long"
 CAPPED, PACED = "capped", "paced"

@@ -4,8 +4,15 @@ from __future__ import annotations
 
 from matplotlib.figure import Figure
 
-from agents.evaluation.figures import finish_figure, make_figure, set_log_ticks
-from agents.experiments.plots import GREY, Look, draw_curve, shifted
+from agents.figures import (
+    GREY,
+    Look,
+    draw_curve,
+    finish_figure,
+    make_figure,
+    set_log_ticks,
+    shifted,
+)
 from agents.studies.choices.cell import ROADS
 from agents.studies.choices.plan import GAIN, ORACLE
 from agents.studies.choices.results import ChoiceResults

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
-from agents.evaluation.environments import make_config, without_void_warning
+from agents.environments import make_config, quietly
 from agents.evaluation.episodes import check_test_seeds
-from agents.evaluation.policies import SavedPolicy, read_saved_policy
 from agents.experiments.cells import Design
+from agents.policies import SavedPolicy, read_saved_policy
 from agents.studies.choices.cell import (
     CAPPED,
     EKF,
@@ -185,7 +185,7 @@ class ChoiceDesign(Design[ChoiceCell]):
     def configs(self) -> list[EnvConfig]:
         """See `Design.configs`."""
         self.check()
-        with without_void_warning():
+        with quietly():
             return [self.config(cell) for cell in self.cells()]
 
     def saved_policies(self) -> Sequence[SavedPolicy]:

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from agents.evaluation.statistics import Interval, bootstrap, percent_below
 from agents.experiments.cells import ERROR, Results
+from agents.statistics import Interval, bootstrap, percent_below
 from agents.studies.choices.cell import ChoiceCell
 from agents.studies.choices.plan import ChoiceDesign, World
 from dptse_env.utils.arrays import FloatArray

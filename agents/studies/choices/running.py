@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from agents.evaluation.episodes import EpisodeScore, run_episodes
-from agents.evaluation.policies import find_policy
 from agents.experiments.ledger import Ledger
 from agents.experiments.runner import Workplace, make_batch
 from agents.experiments.tasks import run_all
+from agents.policies import find_policy
 from agents.studies.choices.cell import ChoiceCell
 from agents.studies.choices.plan import ChoiceDesign
 from dptse_env.policies import TRANSFERABLE

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from agents.evaluation.episodes import EpisodeScore
-from agents.evaluation.figures import save_figure
 from agents.experiments.ledger import Ledger
 from agents.experiments.provenance import (
     check_folder,
@@ -17,6 +16,7 @@ from agents.experiments.provenance import (
 )
 from agents.experiments.reports import write_report
 from agents.experiments.runner import Workplace
+from agents.figures import save_figure
 from agents.studies.choices import tables
 from agents.studies.choices.cell import HIGHWAY, ROADS, ChoiceCell
 from agents.studies.choices.figures import draw_gains

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from agents.evaluation.statistics import Interval
 from agents.experiments.cells import DENSITY, ERROR, SPEED
-from agents.experiments.tables import markdown
+from agents.experiments.old_tables import markdown
+from agents.statistics import Interval
 from agents.studies.choices.cell import OTHER_TRAFFIC
 from agents.studies.choices.plan import REFERENCE, World
 from agents.studies.choices.results import ChoiceResults

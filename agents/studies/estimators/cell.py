@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from agents.evaluation.policies import find_policy
-from agents.experiments.plots import LABELS
+from agents.figures import LABELS
+from agents.policies import find_policy
 from agents.studies.estimators.linear_stack import STACK, stack_settings
 from agents.studies.estimators.worlds import WORLDS, World
 from dptse_env.policies import shipped_policies

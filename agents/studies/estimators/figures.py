@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 
-from agents.evaluation.figures import add_frame, draw_dot, finish_figure, make_figure
 from agents.evaluation.honesty import LEVELS
 from agents.experiments.cells import ERROR
+from agents.figures import add_frame, draw_dot, finish_figure, make_figure
 from agents.studies.estimators.cell import ESTIMATOR_LABELS, LEARNED, LINEAR
 from agents.studies.estimators.results import EstimatorResults
 

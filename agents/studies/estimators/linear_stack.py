@@ -16,11 +16,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from agents.evaluation.environments import make_config
+from agents.environments import make_config
 from agents.evaluation.episodes import WARM_UP, run_episodes
 from agents.experiments.runner import make_batch
-from agents.experiments.seeds import TUNING
 from agents.files import write_json
+from agents.seeds import TUNING
 from agents.studies.estimators.worlds import World
 from dptse_env.estimators import Estimate, EstimatorSettings
 from dptse_env.estimators.batch import Measurements

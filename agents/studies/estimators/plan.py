@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-from agents.evaluation.environments import make_config, without_void_warning
+from agents.environments import make_config, quietly
 from agents.experiments.cells import Design
 from agents.studies.estimators.cell import DEFAULT_WEIGHTS, LEARNED, LINEAR, EstimatorCell
 from agents.studies.estimators.worlds import ELSEWHERE, GUARANTEES, MAIN, WORLDS, World
@@ -147,7 +147,7 @@ class EstimatorDesign(Design[EstimatorCell]):
         """See `Design.configs`."""
         self.check()
         self.saved_networks()
-        with without_void_warning():
+        with quietly():
             return [self.config(cell) for cell in self.cells()]
 
     def keywords(self, cell: EstimatorCell, fit: str = "") -> dict[str, Any]:

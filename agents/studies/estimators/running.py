@@ -11,10 +11,10 @@ from typing import Any
 
 from agents.evaluation.episodes import run_episodes
 from agents.evaluation.honesty import EstimateWatcher, EstimatorScore
-from agents.evaluation.policies import find_policy
 from agents.experiments.ledger import Ledger
 from agents.experiments.runner import Workplace, make_batch
 from agents.experiments.tasks import run_all
+from agents.policies import find_policy
 from agents.studies.estimators.cell import EstimatorCell
 from agents.studies.estimators.linear_stack import fit_stack, write_fits
 from agents.studies.estimators.plan import EstimatorDesign

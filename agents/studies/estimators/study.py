@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from agents.evaluation.figures import save_figure
 from agents.evaluation.honesty import JUMP, LEVELS, SLOW, EstimatorScore
 from agents.experiments.ledger import Ledger
 from agents.experiments.provenance import (
@@ -19,6 +18,7 @@ from agents.experiments.provenance import (
 )
 from agents.experiments.reports import write_report
 from agents.experiments.runner import Workplace
+from agents.figures import save_figure
 from agents.files import write_json
 from agents.studies.estimators import tables, targets
 from agents.studies.estimators.cell import EstimatorCell

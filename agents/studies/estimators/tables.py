@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from agents.evaluation.honesty import LEVELS, REGIMES
-from agents.evaluation.statistics import Interval
 from agents.experiments.cells import DENSITY, ERROR, SPEED, UnmeasuredError
-from agents.experiments.tables import format_interval, markdown
+from agents.experiments.old_tables import format_interval, markdown
+from agents.statistics import Interval
 from agents.studies.estimators.cell import ESTIMATOR_LABELS, LEARNED, EstimatorCell
 from agents.studies.estimators.results import EstimatorResults
 from agents.studies.estimators.targets import judge, networks

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from agents.evaluation.environments import make_vector
-from agents.evaluation.statistics import geometric_mean_interval
+from agents.environments import make_vector
+from agents.statistics import geometric_mean_interval
 from agents.studies.estimators.plan import EstimatorDesign
 from dptse_env.traffic import Records
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from agents.evaluation.statistics import Interval
 from agents.experiments.cells import DENSITY
+from agents.statistics import Interval
 from agents.studies.ledger.cell import CAPPED, DEMAND, EXACT, PACED, PLAIN, REFERENCE
 from agents.studies.ledger.results import REFUSED, LedgerResults
 

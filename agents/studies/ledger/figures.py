@@ -8,25 +8,23 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from agents.evaluation.figures import (
+from agents.experiments.cells import METRICS
+from agents.figures import (
     ERROR_TICKS,
+    Look,
     add_frame,
     add_legend,
-    draw_dot,
-    finish_figure,
-    make_figure,
-    set_log_ticks,
-)
-from agents.evaluation.statistics import Interval
-from agents.experiments.cells import METRICS
-from agents.experiments.plots import (
-    Look,
     draw_curve,
+    draw_dot,
     draw_level,
     error_label,
+    finish_figure,
+    make_figure,
     set_log_axes,
+    set_log_ticks,
     shifted,
 )
+from agents.statistics import Interval
 from agents.studies.ledger.cell import CAPPED, EXACT, PACED
 from agents.studies.ledger.plan import Named
 from agents.studies.ledger.results import LedgerResults

@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from agents.evaluation.contributions import LENGTHS, QUANTILES, TripSums
-from agents.evaluation.statistics import Interval, mean_interval
 from agents.experiments.cells import DENSITY, Results
+from agents.statistics import Interval, mean_interval
 from agents.studies.ledger.cell import CAPPED, PACED, LedgerCell
 from agents.studies.ledger.plan import LedgerDesign
 from dptse_env.utils.arrays import FloatArray

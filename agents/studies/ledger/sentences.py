@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from agents.evaluation.statistics import Interval
 from agents.experiments.cells import DENSITY, METRICS, SPEED, Change
-from agents.experiments.tables import format_interval
+from agents.experiments.old_tables import format_interval
+from agents.statistics import Interval
 from agents.studies.ledger.cell import CAPPED, DEMAND, EXACT, PACED, PLAIN, REFERENCE
 from agents.studies.ledger.expectations import judge_all
 from agents.studies.ledger.results import EXHAUSTED, REFUSED, EqualError, LedgerResults

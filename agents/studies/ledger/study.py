@@ -7,14 +7,14 @@ from pathlib import Path
 from typing import Any
 
 from agents.evaluation.contributions import LedgerScore, TripSums
-from agents.evaluation.figures import save_figure
 from agents.experiments.cells import METRICS
 from agents.experiments.ledger import Ledger
+from agents.experiments.old_tables import write_summary
 from agents.experiments.provenance import check_folder, design_provenance, take_folder
 from agents.experiments.reports import write_report
 from agents.experiments.runner import Workplace
-from agents.experiments.tables import write_summary
 from agents.experiments.tasks import run_all
+from agents.figures import save_figure
 from agents.studies.ledger import sentences, tables
 from agents.studies.ledger.cell import CAPPED, REFERENCE, LedgerCell
 from agents.studies.ledger.figures import draw_epsilon, draw_ladder, draw_ledgers

@@ -6,10 +6,15 @@ import itertools
 
 from agents.evaluation.contributions import LENGTHS, QUANTILES
 from agents.evaluation.episodes import EpisodeScore
-from agents.evaluation.statistics import Interval
-from agents.experiments import tables
+from agents.experiments import old_tables as tables
 from agents.experiments.cells import DENSITY, METRICS
-from agents.experiments.tables import compared_errors, compared_header, format_interval, markdown
+from agents.experiments.old_tables import (
+    compared_errors,
+    compared_header,
+    format_interval,
+    markdown,
+)
+from agents.statistics import Interval
 from agents.studies.ledger.cell import CAPPED, FILTER_LABELS, FILTERS, MECHANISMS, PACED, LedgerCell
 from agents.studies.ledger.expectations import judge_all
 from agents.studies.ledger.plan import Named

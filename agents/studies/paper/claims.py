@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from agents.evaluation.statistics import Interval
 from agents.experiments.cells import UnmeasuredError
+from agents.statistics import Interval
 from agents.studies.paper.plan import SETTINGS, Setting
 from agents.studies.paper.results import PaperResults
 

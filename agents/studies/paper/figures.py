@@ -12,21 +12,25 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import NullFormatter
 
 from agents.evaluation.episodes import EpisodeScore, watch_episode
-from agents.evaluation.figures import (
+from agents.experiments.cells import DENSITY, METRICS, SPEED
+from agents.experiments.runner import make_env
+from agents.figures import (
     ERROR_TICKS,
+    ESTIMATOR_LOOKS,
+    LABELS,
     RoadMap,
     add_frame,
     add_legend,
+    draw_curve,
+    draw_level,
     draw_maps,
     estimate_map,
     make_figure,
     set_log_ticks,
+    shifted,
     spread,
 )
-from agents.evaluation.statistics import Interval, geometric_mean_interval, mean_interval
-from agents.experiments.cells import DENSITY, METRICS, SPEED
-from agents.experiments.plots import ESTIMATOR_LOOKS, LABELS, draw_curve, draw_level, shifted
-from agents.experiments.runner import make_env
+from agents.statistics import Interval, geometric_mean_interval, mean_interval
 from agents.studies.paper.plan import PAPER_ESTIMATORS, SETTINGS, PaperCell, PaperDesign, Setting
 from agents.studies.paper.results import PaperResults
 from agents.studies.paper.timing import PAPER_SECONDS
@@ -206,6 +210,6 @@ def draw_pictures(design: PaperDesign, watched: Watched) -> Figure:
         episodes = [watched[design.picture(name, setting)] for name in design.all_estimators]
         maps = [RoadMap(f"{setting}\ntruth", episodes[0][1].truth, episodes[0][1])]
         for name, (score, history) in zip(design.all_estimators, episodes, strict=True):
-            maps.append(estimate_map(history, score, LABELS[name]))
+            maps.append(estimate_map(history, score.rmse_density, LABELS[name]))
         columns.append(maps)
     return draw_maps(columns, width=14.0)

@@ -7,14 +7,14 @@ from itertools import combinations, pairwise
 
 import numpy as np
 
-from agents.evaluation.statistics import (
+from agents.experiments.cells import DENSITY, METRICS, SPEED
+from agents.figures import LABELS
+from agents.statistics import (
     Interval,
     geometric_mean_interval,
     mean_interval,
     paired_difference,
 )
-from agents.experiments.cells import DENSITY, METRICS, SPEED
-from agents.experiments.plots import LABELS
 from agents.studies.paper.plan import PAPER_ESTIMATORS, Setting
 from agents.studies.paper.results import PaperResults, correlations, roughness, slopes
 from dptse_env.utils.arrays import FloatArray

@@ -10,7 +10,7 @@ from functools import partial
 from itertools import product
 
 from agents.experiments.cells import DENSITY, METRICS, SPEED
-from agents.experiments.plots import LABELS
+from agents.figures import LABELS
 from agents.studies.paper.claims import ABOVE_ZERO, BELOW_ZERO, Claim, ExpectedRange
 from agents.studies.paper.measures import (
     above_baseline,

@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Any
 
 from agents.evaluation.episodes import EpisodeScore
-from agents.evaluation.figures import save_figure
 from agents.experiments.ledger import Ledger
+from agents.experiments.old_tables import format_range, write_summary
 from agents.experiments.provenance import check_folder, design_provenance, take_folder
 from agents.experiments.reports import write_report
 from agents.experiments.runner import Workplace, missing_tasks, run_task
-from agents.experiments.tables import format_range, write_summary
 from agents.experiments.tasks import run_all
+from agents.figures import save_figure
 from agents.studies.paper import paper_claims, plan, tables
 from agents.studies.paper.claims import judge_all
 from agents.studies.paper.figures import (

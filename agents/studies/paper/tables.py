@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 from agents.evaluation.episodes import EpisodeScore
-from agents.evaluation.statistics import geometric_mean_interval, mean_interval
-from agents.experiments import tables
-from agents.experiments.plots import LABELS
-from agents.experiments.tables import format_interval, markdown
+from agents.experiments import old_tables as tables
+from agents.experiments.old_tables import format_interval, markdown
+from agents.figures import LABELS
+from agents.statistics import geometric_mean_interval, mean_interval
 from agents.studies.paper.claims import Outcome
 from agents.studies.paper.measures import percent
 from agents.studies.paper.plan import PAPER_ESTIMATORS, SETTINGS

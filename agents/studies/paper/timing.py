@@ -10,7 +10,7 @@ from typing import Any
 import gymnasium as gym
 from tqdm import tqdm
 
-from agents.evaluation.environments import unwrap
+from agents.environments import unwrap
 from agents.evaluation.episodes import run_episode
 from agents.experiments.ledger import Ledger
 from agents.experiments.runner import make_env

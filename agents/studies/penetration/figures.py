@@ -7,16 +7,19 @@ from collections.abc import Sequence
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from agents.evaluation.figures import ERROR_TICKS, finish_figure, make_figure, set_log_ticks
 from agents.experiments.cells import ERROR, METRICS
-from agents.experiments.plots import (
+from agents.figures import (
+    ERROR_TICKS,
     ESTIMATOR_LOOKS,
     LABELS,
     Look,
     draw_curve,
     draw_level,
     error_label,
+    finish_figure,
+    make_figure,
     set_log_axes,
+    set_log_ticks,
     shifted,
 )
 from agents.studies.penetration.results import PenetrationResults

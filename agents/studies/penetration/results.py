@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from agents.evaluation.statistics import Interval, mean_interval
 from agents.experiments.cells import ERROR, Results
+from agents.statistics import Interval, mean_interval
 from agents.studies.penetration.cell import (
     DETECTORS,
     GUARANTEED,

@@ -7,12 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from agents.evaluation.episodes import EpisodeScore
-from agents.evaluation.figures import save_figure
 from agents.experiments.ledger import Ledger
-from agents.experiments.plots import LABELS
 from agents.experiments.provenance import check_folder, design_provenance, take_folder
 from agents.experiments.reports import write_report
 from agents.experiments.runner import Workplace
+from agents.figures import LABELS, save_figure
 from agents.studies.penetration import tables
 from agents.studies.penetration.cell import (
     DELTA,

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import itertools
 
-from agents.evaluation.statistics import Interval
 from agents.experiments.cells import DENSITY, ERROR, SPEED
-from agents.experiments.plots import LABELS
-from agents.experiments.tables import markdown
+from agents.experiments.old_tables import markdown
+from agents.figures import LABELS
+from agents.statistics import Interval
 from agents.studies.penetration.cell import (
     COUNT,
     DETECTORS,

@@ -7,8 +7,8 @@ from itertools import cycle
 import numpy as np
 from matplotlib.figure import Figure
 
-from agents.evaluation.figures import draw_dot, finish_figure, make_figure
-from agents.evaluation.statistics import mean
+from agents.figures import draw_dot, finish_figure, make_figure
+from agents.statistics import mean
 from agents.studies.policies.plan import PRIMARY, REFERENCE, Entry
 from agents.studies.policies.queries import (
     BIN,

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from agents.evaluation.policies import SavedPolicy, read_saved_policy
 from agents.files import write_json
+from agents.policies import SavedPolicy, read_saved_policy
 from agents.studies.policies.plan import MODES, Entry, Learner, PolicyCell, PolicyDesign
 from dptse_env.config import EnvConfig
 from dptse_env.estimators.tuned_settings import read_settings

@@ -9,7 +9,8 @@ from functools import cached_property
 import numpy as np
 
 from agents.evaluation.episodes import EpisodeScore
-from agents.evaluation.statistics import (
+from agents.experiments import cells
+from agents.statistics import (
     Interval,
     bootstrap,
     crossed_t,
@@ -17,7 +18,6 @@ from agents.evaluation.statistics import (
     percent_below,
     percent_of_way,
 )
-from agents.experiments import cells
 from agents.studies.policies.curves import Curve
 from agents.studies.policies.manifest import CellChoice, Manifest
 from agents.studies.policies.plan import PRIMARY, REFERENCE, Entry, Learner, PolicyDesign

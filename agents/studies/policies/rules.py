@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from agents.evaluation.statistics import Interval
+from agents.statistics import Interval
 from agents.studies.policies.plan import REFERENCE, Learner
 from agents.studies.policies.results import PolicyResults
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from agents.evaluation.episodes import EpisodeScore, Policy, run_episodes
-from agents.evaluation.policies import NamedSchedule, PolicySource, SavedPolicy
 from agents.experiments.runner import make_batch
+from agents.policies import NamedSchedule, PolicySource, SavedPolicy
 from agents.studies.policies.manifest import Manifest
 from agents.studies.policies.plan import DETERMINISTIC, Entry, PolicyCell, PolicyDesign
 from agents.studies.policies.queries import QueryCounter, QueryCounts

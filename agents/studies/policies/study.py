@@ -6,16 +6,16 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from agents import seeds as noise_seeds
 from agents.evaluation.episodes import EpisodeScore
-from agents.evaluation.figures import save_figure
-from agents.evaluation.statistics import crossed_t
-from agents.experiments import seeds as noise_seeds
 from agents.experiments.ledger import Ledger, ScoredT
 from agents.experiments.provenance import check_folder, take_folder
 from agents.experiments.reports import write_report
 from agents.experiments.runner import Workplace
-from agents.experiments.seeds import STUDY_TEST, STUDY_VALIDATION
 from agents.experiments.tasks import run_all
+from agents.figures import save_figure
+from agents.seeds import STUDY_TEST, STUDY_VALIDATION
+from agents.statistics import crossed_t
 from agents.studies.policies import rules, tables
 from agents.studies.policies.curves import read_curves
 from agents.studies.policies.figures import draw_cells, draw_curves, draw_queries, draw_ranking

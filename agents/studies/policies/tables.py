@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from agents.evaluation.episodes import EpisodeScore
-from agents.evaluation.statistics import iqm, mean
-from agents.experiments import tables
-from agents.experiments.tables import format_interval, interval_columns, markdown
+from agents.experiments import old_tables as tables
+from agents.experiments.old_tables import format_interval, interval_columns, markdown
 from agents.files import write_csv
+from agents.statistics import iqm, mean
 from agents.studies.policies.plan import REFERENCE, Learner
 from agents.studies.policies.results import ERROR, METRICS, PolicyResults
 from agents.studies.policies.rules import TargetVerdict

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from agents.evaluation.environments import make_config, without_void_warning
+from agents.environments import make_config, quietly
 from agents.studies.privacy.plan import PrivacyCell, PrivacyDesign
 from dptse_env.config import EnvConfig
 from dptse_env.parts import privacy_report
@@ -72,7 +72,7 @@ def mu_alone(
 
 def make_account(design: PrivacyDesign, cell: PrivacyCell, contributions: Sequence[int]) -> Account:
     """Return the guarantee behind a cell's noise, by numbers of steps in which a vehicle is met."""
-    with without_void_warning():
+    with quietly():
         config = make_config(design.env, design.keywords(cell))
     report, privacy = privacy_report(config), config.privacy
     density_std, second_std = (release.noise_std for release in report.releases)

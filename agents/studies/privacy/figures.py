@@ -8,9 +8,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from agents.evaluation.figures import finish_figure, make_figure, set_log_ticks
 from agents.experiments.cells import DENSITY, METRICS, SPEED
-from agents.experiments.plots import (
+from agents.figures import (
     ESTIMATOR_LOOKS,
     GREY,
     LABELS,
@@ -18,7 +17,10 @@ from agents.experiments.plots import (
     draw_curve,
     draw_level,
     error_label,
+    finish_figure,
+    make_figure,
     set_log_axes,
+    set_log_ticks,
     shifted,
 )
 from agents.studies.privacy.account import Account

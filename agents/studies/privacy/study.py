@@ -9,15 +9,14 @@ from typing import Any
 import numpy as np
 
 from agents.evaluation.episodes import EpisodeScore
-from agents.evaluation.figures import save_figure
 from agents.experiments.cells import DENSITY, METRICS, SPEED
 from agents.experiments.ledger import Ledger
-from agents.experiments.plots import LABELS
+from agents.experiments.old_tables import write_summary
 from agents.experiments.provenance import check_folder, design_provenance, take_folder
 from agents.experiments.reports import write_report
 from agents.experiments.runner import Workplace, missing_tasks, run_task
-from agents.experiments.tables import write_summary
 from agents.experiments.tasks import run_all
+from agents.figures import LABELS, save_figure
 from agents.studies.privacy import tables
 from agents.studies.privacy.account import Traffic, Trips, make_account, measure_trips
 from agents.studies.privacy.figures import draw_claimed, draw_epsilon, draw_modes

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from agents.experiments import tables
+from agents.experiments import old_tables as tables
 from agents.experiments.cells import METRICS
-from agents.experiments.plots import LABELS
-from agents.experiments.tables import (
+from agents.experiments.old_tables import (
     compared_errors,
     compared_header,
     format_interval,
     format_number,
     markdown,
 )
+from agents.figures import LABELS
 from agents.studies.privacy.plan import BOUNDARY_MODES
 from agents.studies.privacy.results import PrivacyResults
 

@@ -2,6 +2,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from agents.environments import make_config
 from agents.evaluation.contributions import (
     LENGTHS,
     NEARLY_SPENT,
@@ -9,7 +10,6 @@ from agents.evaluation.contributions import (
     LedgerWatcher,
     vehicle_table,
 )
-from agents.evaluation.environments import make_config
 from agents.evaluation.episodes import run_episode, run_episodes
 from agents.experiments.runner import make_batch
 from dptse_env.parts import make_release

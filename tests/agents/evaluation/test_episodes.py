@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from agents.evaluation.environments import make_config, unwrap
+from agents.environments import make_config, unwrap
 from agents.evaluation.episodes import (
     check_test_seeds,
     run_episode,

@@ -4,14 +4,14 @@ import pytest
 from PIL import Image
 
 from agents.evaluation.episodes import watch_episode
-from agents.evaluation.figures import (
+from agents.figures import (
     RoadMap,
     draw_maps,
     estimate_map,
     save_errors,
     save_figure,
 )
-from agents.evaluation.statistics import Interval
+from agents.statistics import Interval
 from dptse_env.schedules import make_schedule
 
 SHORT = "dptse_env:dptse/ShortHighway-v0"
@@ -29,16 +29,20 @@ def test_a_map_names_exactly_the_error_of_the_score(watched):
     squares = (np.array(history.estimate) - np.array(history.truth)) ** 2
     pooled = np.sqrt(squares[61:].mean())
     assert score.rmse_density == pytest.approx(pooled)
-    assert estimate_map(history, score, "EKF").title == f"EKF, RMSE {pooled:.1f} veh/km"
+    assert (
+        estimate_map(history, score.rmse_density, "EKF").title == f"EKF, RMSE {pooled:.1f} veh/km"
+    )
     # One second makes a difference where its error is large.
     history.estimate[60] = history.estimate[60] + 1e4
-    assert estimate_map(history, score, "EKF").title == f"EKF, RMSE {pooled:.1f} veh/km"
+    assert (
+        estimate_map(history, score.rmse_density, "EKF").title == f"EKF, RMSE {pooled:.1f} veh/km"
+    )
 
 
 def test_maps_stand_in_columns_with_one_bar(watched, tmp_path):
     score, history = watched
     column = [
-        RoadMap("truth", history.truth, history), estimate_map(history, score, "estimate"),
+        RoadMap("truth", history.truth, history), estimate_map(history, score.rmse_density, "estimate"),
         RoadMap("queried", history.queried, history),
     ]  # fmt: skip
     figure = draw_maps([column, column], width=8.0)

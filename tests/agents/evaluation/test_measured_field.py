@@ -3,8 +3,8 @@ import pytest
 
 pytest.importorskip("tyro")
 
-from agents.evaluation.environments import make_config
-from agents.evaluation.measured_field import Field, Replay, field_corridor, read_field
+from agents.environments import make_config
+from agents.measured_field import Field, Replay, field_corridor, read_field
 from dptse_env.traffic.importers.fields import FieldSource
 from scripts import replay_field
 

@@ -12,8 +12,8 @@ import pytest
 
 pytest.importorskip("plotly")
 
+from agents.environments import unwrap
 from agents.evaluation import page
-from agents.evaluation.environments import unwrap
 from agents.evaluation.episodes import EpisodeScore, run_episode
 from agents.evaluation.page import packed, page_data, write_page
 from agents.evaluation.report import Report

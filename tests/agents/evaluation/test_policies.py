@@ -9,9 +9,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from agents.evaluation.environments import make_vector
+from agents.environments import make_vector
 from agents.evaluation.episodes import run_episodes
-from agents.evaluation.policies import find_policy, read_saved_policy
+from agents.policies import find_policy, read_saved_policy
 from dptse_env import sb3
 from dptse_env.policies import TRANSFERABLE
 from dptse_env.schedules import make_schedule
@@ -108,7 +108,7 @@ def test_a_name_is_looked_up_in_the_package(tmp_path, monkeypatch):
 def test_a_card_is_read_without_torch(tmp_path):
     path = save(tmp_path / "policy.zip")
     code = (
-        "import sys; import scripts.evaluate; from agents.evaluation.policies import find_policy; "
+        "import sys; import scripts.evaluate; from agents.policies import find_policy; "
         f"assert find_policy({str(path)!r}).action == 'slots'; assert 'torch' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from agents.evaluation.statistics import (
+from agents.statistics import (
     Interval,
     bootstrap,
     crossed_t,

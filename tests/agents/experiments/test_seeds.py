@@ -2,8 +2,8 @@ from itertools import combinations
 
 import numpy as np
 
-from agents.experiments import seeds
-from agents.experiments.seeds import TRAINING, TRAININGS, training_seed
+from agents import seeds
+from agents.seeds import TRAINING, TRAININGS, training_seed
 from dptse_env.config import TEST_SEEDS
 
 NOISE_SEEDS = {name: value for name, value in vars(seeds).items() if isinstance(value, range)}

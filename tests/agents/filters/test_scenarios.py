@@ -3,7 +3,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from agents.evaluation.environments import make_config, parse_env
+from agents.environments import make_config, parse_env
 from agents.filters.roads import ROADS
 from agents.filters.scenarios import MECHANISMS, SCHEDULES, ScenarioRanges
 

@@ -8,7 +8,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from agents.engines.local import THIS_PROCESS, LocalProcesses  # noqa: E402
-from agents.evaluation.environments import make_vector  # noqa: E402
+from agents.environments import make_vector  # noqa: E402
 from agents.evaluation.episodes import run_episodes  # noqa: E402
 from agents.filters.batches import draw_batch, make_batch  # noqa: E402
 from agents.filters.collecting import collect  # noqa: E402

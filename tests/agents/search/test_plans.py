@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from agents.engines.local import LocalProcesses
-from agents.evaluation.environments import make_vector
+from agents.environments import make_vector
 from agents.evaluation.episodes import WARM_UP
 from agents.search.plan_scores import PlanScorer, PlanTask
 from agents.search.plans import PlanSearch, even_plan, plan_masks, validation_scores

@@ -2,7 +2,7 @@ import time
 
 import pytest
 
-from agents.evaluation.policies import find_policy
+from agents.policies import find_policy
 from agents.suite import guard
 from agents.suite.card import DONE, FAILED
 from agents.suite.running import SuiteTask, run_cell

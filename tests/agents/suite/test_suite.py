@@ -4,11 +4,11 @@ import json
 import numpy as np
 import pytest
 
-from agents.evaluation.environments import make_config
+from agents.environments import make_config
 from agents.evaluation.episodes import run_episodes
-from agents.evaluation.policies import find_policy
 from agents.experiments.runner import Workplace, make_batch
-from agents.experiments.seeds import SUITE
+from agents.policies import find_policy
+from agents.seeds import SUITE
 from agents.suite.card import DONE, FAILED, Card
 from agents.suite.cells import SUITES, find_suite
 from agents.suite.suite import card_name, run_suite

@@ -8,8 +8,8 @@ import gymnasium as gym
 import numpy as np
 import torch
 
-from agents.evaluation.environments import make_vector
-from agents.experiments.seeds import training_seed
+from agents.environments import make_vector
+from agents.seeds import training_seed
 from agents.training.policy_iteration import collect_swaps, raise_scores
 from agents.training.recipes import SwapRounds
 from agents.training.run_files import read_progress

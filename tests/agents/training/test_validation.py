@@ -7,7 +7,7 @@ pytest.importorskip("torch")
 import torch
 
 from agents.evaluation.episodes import run_episode
-from agents.experiments.seeds import TRAINING_VALIDATION
+from agents.seeds import TRAINING_VALIDATION
 from agents.training.validation import Validation
 from dptse_env.schedules import make_schedule
 from dptse_env.spaces.actions import ACTION_ENCODINGS

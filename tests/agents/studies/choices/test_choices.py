@@ -8,10 +8,10 @@ import pytest
 pytest.importorskip("tyro")
 
 from agents.engines.local import LocalProcesses
-from agents.evaluation.policies import read_saved_policy
 from agents.experiments.cells import ERROR
 from agents.experiments.ledger import Ledger
 from agents.experiments.runner import Workplace
+from agents.policies import read_saved_policy
 from agents.studies.choices import study, tables
 from agents.studies.choices.cell import CAPPED, HIGHWAY, PACED, ChoiceCell
 from agents.studies.choices.plan import ORACLE, ChoiceDesign, World

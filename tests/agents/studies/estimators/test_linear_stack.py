@@ -3,7 +3,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from agents.evaluation.environments import make_vector
+from agents.environments import make_vector
 from agents.evaluation.episodes import run_episodes
 from agents.studies.estimators.linear_stack import (
     EQUAL,

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from agents.evaluation.environments import make_vector
+from agents.environments import make_vector
 from agents.evaluation.episodes import run_episodes
 from agents.studies.estimators import tampering
 from agents.studies.estimators.tampering import tamper

@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from agents.evaluation.environments import make_config
+from agents.environments import make_config
 from agents.studies.ledger.cell import EXACT, PACED
 from agents.studies.ledger.pacing import EqualRates
 from dptse_env.parts import privacy_report

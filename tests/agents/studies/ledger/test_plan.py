@@ -3,7 +3,7 @@ import math
 
 import pytest
 
-from agents.evaluation.environments import make_config
+from agents.environments import make_config
 from agents.studies.ledger.cell import CAPPED, EXACT, PACED, FilterSets
 from agents.studies.ledger.plan import LedgerDesign
 from tests.agents.studies.ledger.made_up import DESIGN, SHORT

@@ -4,10 +4,10 @@ import math
 import numpy as np
 import pytest
 
-from agents.evaluation.statistics import Interval
 from agents.experiments.cells import DENSITY, METRICS
 from agents.experiments.provenance import design_provenance
 from agents.experiments.reports import fill
+from agents.statistics import Interval
 from agents.studies.ledger import sentences, study, tables
 from agents.studies.ledger.cell import CAPPED, EXACT, PACED
 from agents.studies.ledger.expectations import EXPECTATIONS, judge_all

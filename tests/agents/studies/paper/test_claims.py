@@ -1,7 +1,7 @@
 import pytest
 
-from agents.evaluation.statistics import Interval
 from agents.experiments.cells import UnmeasuredError
+from agents.statistics import Interval
 from agents.studies.paper.claims import BELOW_ZERO, Claim, ExpectedRange, combine, judge, judge_part
 from agents.studies.paper.plan import SETTINGS
 

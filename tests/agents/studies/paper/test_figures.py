@@ -5,8 +5,8 @@ import pytest
 from matplotlib.figure import Figure
 
 from agents.evaluation.episodes import run_episode
-from agents.evaluation.statistics import Interval
 from agents.experiments.runner import make_env
+from agents.statistics import Interval
 from agents.studies.paper.figures import (
     LAYOUTS,
     draw_open_loop,

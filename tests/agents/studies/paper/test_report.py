@@ -3,11 +3,11 @@ import dataclasses
 
 import pytest
 
-from agents.evaluation.statistics import mean_interval
 from agents.experiments.cells import METRICS
+from agents.experiments.old_tables import markdown, settings_table, versions_table, write_summary
 from agents.experiments.provenance import design_provenance
 from agents.experiments.reports import fill
-from agents.experiments.tables import markdown, settings_table, versions_table, write_summary
+from agents.statistics import mean_interval
 from agents.studies.paper import study
 from agents.studies.paper.claims import judge_all
 from agents.studies.paper.paper_claims import CLAIMS, PROJECT_TARGETS

@@ -10,10 +10,10 @@ pytest.importorskip("tyro")
 
 from agents.engines.local import LocalProcesses
 from agents.evaluation.episodes import EpisodeScore
-from agents.evaluation.statistics import paired_difference
 from agents.experiments.cells import ERROR
 from agents.experiments.ledger import Ledger
 from agents.experiments.runner import EpisodeTask, Workplace
+from agents.statistics import paired_difference
 from agents.studies.penetration import cell as cells
 from agents.studies.penetration import study
 from agents.studies.penetration.cell import PenetrationCell

@@ -4,7 +4,7 @@ import pytest
 
 from agents.evaluation.episodes import EpisodeScore
 from agents.experiments.ledger import Ledger
-from agents.experiments.seeds import STUDY_TEST
+from agents.seeds import STUDY_TEST
 from agents.studies.policies.freezing import choose, draft, write_draft
 from agents.studies.policies.manifest import (
     CellChoice,

@@ -4,8 +4,8 @@ import dataclasses
 import numpy as np
 import pytest
 
+from agents.experiments.old_tables import versions_table
 from agents.experiments.reports import fill
-from agents.experiments.tables import versions_table
 from agents.studies.policies import study, tables
 from agents.studies.policies.curves import read_curves
 from agents.studies.policies.manifest import find_checkpoints

@@ -5,7 +5,7 @@ import pytest
 
 from agents.evaluation.episodes import run_episodes
 from agents.experiments.runner import make_batch
-from agents.experiments.seeds import STUDY_TEST
+from agents.seeds import STUDY_TEST
 from agents.studies.policies.freezing import draft
 from agents.studies.policies.plan import (
     Entry,

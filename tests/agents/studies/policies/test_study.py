@@ -6,7 +6,7 @@ import pytest
 
 from agents.engines.local import LocalProcesses
 from agents.experiments.runner import Workplace
-from agents.experiments.seeds import STUDY_TEST, STUDY_VALIDATION
+from agents.seeds import STUDY_TEST, STUDY_VALIDATION
 from agents.studies.policies.manifest import find_checkpoints
 from agents.studies.policies.plan import PolicyCell, PolicyDesign
 from agents.studies.policies.study import freeze, run

@@ -5,14 +5,19 @@ import math
 import numpy as np
 import pytest
 
-from agents.evaluation.environments import make_config, without_void_warning
+from agents.environments import make_config, quietly
 from agents.evaluation.episodes import EpisodeScore
-from agents.evaluation.statistics import Interval
 from agents.experiments.cells import DENSITY, METRICS, SPEED, Change
+from agents.experiments.old_tables import (
+    format_number,
+    settings_table,
+    versions_table,
+    write_summary,
+)
 from agents.experiments.provenance import design_provenance
 from agents.experiments.reports import fill
 from agents.experiments.runner import EpisodeTask, run_task
-from agents.experiments.tables import format_number, settings_table, versions_table, write_summary
+from agents.statistics import Interval
 from agents.studies.privacy import study, tables
 from agents.studies.privacy.account import make_account, measure_trips, mu_alone, mu_met
 from agents.studies.privacy.plan import BOUNDARY_MODES, PrivacyCell, PrivacyDesign, Protection
@@ -37,7 +42,7 @@ BASE = DESIGN.cell("ekf")
 
 
 def config_of(cell):
-    with without_void_warning():
+    with quietly():
         return make_config(SHORT, cell.keywords)
 
 

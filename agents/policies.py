@@ -17,7 +17,7 @@ from typing import Any
 
 from gymnasium import spaces
 
-from agents.evaluation.episodes import Policy
+from dptse_env.evaluation import Policy
 from dptse_env.policies import read_policy, shipped_policies
 from dptse_env.schedules import make_schedule
 from dptse_env.utils.digests import file_digest

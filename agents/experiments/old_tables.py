@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from agents.evaluation.episodes import EpisodeScore
-from agents.evaluation.statistics import Interval
 from agents.experiments.cells import METRICS, CellT, DesignT, Results
 from agents.files import write_csv
+from agents.statistics import Interval
 
 
 def markdown(

@@ -112,7 +112,7 @@ def make_vector(env: str, n_episodes: int, keywords: Mapping[str, Any]) -> Senso
 
 
 @contextlib.contextmanager
-def without_void_warning() -> Iterator[None]:
+def quietly() -> Iterator[None]:
     """Suppress warnings of a void guarantee, and of an id with a newer version.
 
     A study reports the guarantee itself, and names the version that it is about.

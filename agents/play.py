@@ -1,0 +1,185 @@
+"""Cells, the units that every table of results is made of, and the one place that plays them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock
+
+from agents.environments import make_config, make_vector, quietly
+from agents.policies import NamedSchedule, find_policy
+from agents.watchers import WATCHERS
+from dptse_env.evaluation import Row, evaluate
+from dptse_env.policies import TRANSFERABLE
+from dptse_env.traffic import Corridor, RecordLibrary, Records, open_library
+from dptse_env.utils.digests import file_digest
+
+POLICY_SEED = 0
+"""Seeds the draws of a schedule, and torch for the draws of a learned policy."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A query policy in an environment, to be played on some traffic seeds.
+
+    Attributes:
+        env: Environment id.
+        policy: What `agents.policies.find_policy` takes: the name of a schedule or of a policy that
+            comes with the package, the file of a saved policy, or a class.
+        keywords: Keywords of ``gym.make`` as plain JSON, without traffic seeds and records.
+        labels: Columns that tell the cell apart in tables: strings and numbers.
+        noise_seed: Noise is seeded with this plus the traffic seed.
+        deterministic: Whether the policy takes its likeliest action.
+        transferred: Whether the policy may act in an environment that it was not trained for.
+        watchers: Names in `agents.watchers.WATCHERS`, which add columns to the rows.
+        seeds: Traffic seeds in place of the study's.
+    """
+
+    env: str
+    policy: str = "paper"
+    keywords: Mapping[str, Any] = field(default_factory=dict)
+    labels: Mapping[str, Any] = field(default_factory=dict)
+    noise_seed: int = 0
+    deterministic: bool = True
+    transferred: bool = False
+    watchers: tuple[str, ...] = ()
+    seeds: tuple[int, ...] | None = None
+
+    @property
+    def id(self) -> str:
+        """Everything that the rows depend on but the seeds, as JSON.
+
+        Digests stand for the files that it names, so a policy that was trained again is another
+        cell.
+
+        Raises:
+            FileNotFoundError: There is no such policy.
+            ValueError: The file of the policy is not a saved one.
+        """
+        source = find_policy(self.policy)
+        identity = source.identity
+        content = {
+            "env": self.env,
+            "policy": identity if isinstance(source, NamedSchedule) else f"sha256:{identity}",
+            "keywords": _with_digests(self.keywords),
+            "noise_seed": self.noise_seed,
+            "deterministic": self.deterministic,
+            "watchers": list(self.watchers),
+        }
+        return json.dumps(content, sort_keys=True)
+
+    @property
+    def all_keywords(self) -> dict[str, Any]:
+        """Keywords of ``gym.make``, those that the policy needs among them."""
+        return {**self.keywords, **find_policy(self.policy).keywords}
+
+    def check(self) -> None:
+        """Check keywords, policy and watchers without playing, recording or compiling.
+
+        Raises:
+            FileNotFoundError: There is no such policy.
+            ValueError: A keyword is unknown or out of range, or the policy is unknown or does not
+                suit the environment.
+        """
+        unknown = [name for name in self.watchers if name not in WATCHERS]
+        if unknown:
+            raise ValueError(f"watchers must be of {', '.join(WATCHERS)}, got {unknown[0]!r}")
+        with quietly():
+            env = make_vector(self.env, 1, self.all_keywords)
+            env.process  # noqa: B018 (an estimator refuses a road when it is made)
+            self.load_policy(env)
+
+    def load_policy(self, env: Any) -> Any:
+        """Bind the policy to an environment.
+
+        Raises:
+            ValueError: It is unknown or does not suit.
+        """
+        allow = TRANSFERABLE if self.transferred else ()
+        return find_policy(self.policy).load(env, allow=allow, seed=POLICY_SEED)
+
+
+def _with_digests(value: Any) -> Any:
+    """Return plain JSON with the digest of a file in place of its name."""
+    if isinstance(value, Mapping):
+        return {key: _with_digests(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_with_digests(each) for each in value]
+    if isinstance(value, str) and Path(value).is_file():
+        return f"sha256:{file_digest(value)}"
+    return value
+
+
+def play(
+    cell: Cell, seeds: Sequence[int], records: Records = None, threads: int | None = 1
+) -> list[Row]:
+    """Play a cell on some traffic seeds, all at once, and return a row for each.
+
+    Traffic that was never recorded is recorded first.
+
+    Args:
+        cell: The cell.
+        seeds: Traffic seeds.
+        records: Folder of the record cache or a library; None for the user's cache.
+        threads: Threads of the estimator; None for one per core.
+
+    Raises:
+        FileNotFoundError: There is no such policy.
+        ValueError: A keyword is out of range, or the policy does not suit.
+        RecordingError: SUMO could not make a record.
+    """
+    more = {"traffic_seeds": list(seeds), "records": records, "threads": threads}
+    with quietly():
+        env = make_vector(cell.env, len(seeds), {**cell.all_keywords, **more})
+    record(env.config.corridor, seeds, records)
+    policy = cell.load_policy(env)
+    if not isinstance(find_policy(cell.policy), NamedSchedule):
+        import torch  # noqa: PLC0415 (schedules alone do without)
+
+        torch.manual_seed(POLICY_SEED)
+    return evaluate(
+        env,
+        policy,
+        seeds,
+        cell.noise_seed,
+        deterministic=cell.deterministic,
+        watchers=[WATCHERS[name] for name in cell.watchers],
+    )
+
+
+def record(
+    corridor: Corridor, seeds: Sequence[int], records: Records = None, progress: bool = False
+) -> None:
+    """Record the traffic that is missing on this machine.
+
+    Of several processes that lack the same records, one makes them with all cores, and the others
+    wait.
+
+    Raises:
+        ValueError: A seed is out of range or was not recorded.
+        RecordingError: A recording fails.
+        NetworkError: The corridor has to be compiled and cannot be.
+        SumoVersionError: libsumo is missing, broken or of another release series.
+    """
+    library: RecordLibrary = open_library(records)
+    if not library.missing(corridor, seeds):
+        return
+    library.path.mkdir(parents=True, exist_ok=True)
+    name = hashlib.sha256(corridor.digest.encode()).hexdigest()[:16]
+    with FileLock(library.path / f".{name}.lock"):
+        library.ensure(corridor, seeds, progress=progress)
+
+
+def corridor_of(cell: Cell) -> Corridor:
+    """Return the road of a cell.
+
+    Raises:
+        ValueError: A keyword is unknown or out of range.
+    """
+    with quietly():
+        return make_config(cell.env, cell.all_keywords).corridor

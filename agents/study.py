@@ -1,0 +1,246 @@
+"""Studies: cells played on traffic seeds, their rows on disk, and a report made of the rows alone.
+
+The rows of a study stand in ``rows.parquet`` of its folder: a line for each episode, with the
+study, the version of the package that played it, the cell's id and its labels. While a study runs,
+each finished cell has a file of its own under ``rows/``; they are packed when all are there, and
+taken up again after an interruption.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import polars as pl
+
+import dptse_env
+from agents.executors import AnyExecutor, ThisProcess, run_shown
+from agents.files import replacing, write_atomically
+from agents.play import Cell, corridor_of, play, record
+from dptse_env.evaluation import Row
+from dptse_env.traffic import Records
+
+ROWS, TABLES = "rows.parquet", "tables.md"
+"""Files of a study's folder, beside its figures."""
+
+ORIGIN = ("study", "version", "cell")
+"""Columns in front of the labels."""
+
+Report = Callable[[pl.DataFrame, Path], str]
+"""Makes Markdown of the rows of a study, and draws figures into its folder."""
+
+
+class Place(NamedTuple):
+    """Where a study works.
+
+    Attributes:
+        folder: Its results.
+        executor: What plays its cells.
+        records: Folder of the record cache; None for the user's cache.
+    """
+
+    folder: Path
+    executor: AnyExecutor
+    records: Records = None
+
+
+@dataclass(frozen=True)
+class Study:
+    """A question, as cells and a report.
+
+    Attributes:
+        name: Its name, and that of its folder of results.
+        cells: What is played.
+        seeds: Traffic seeds of every cell that has none of its own.
+        report: Makes Markdown of the rows, of whatever version, and draws the figures.
+        follow: Returns the cells that the rows of the first ones ask for, such as those of a policy
+            that validation has chosen.
+        measures: Further tables that the report reads, by the name of their file in the folder;
+            each is measured once.
+    """
+
+    name: str
+    cells: tuple[Cell, ...]
+    seeds: tuple[int, ...]
+    report: Report
+    follow: Callable[[pl.DataFrame, Path], Sequence[Cell]] | None = None
+    measures: Mapping[str, Callable[[Place], pl.DataFrame]] = field(default_factory=dict)
+
+    def seeds_of(self, cell: Cell) -> tuple[int, ...]:
+        """Return the traffic seeds of a cell."""
+        return self.seeds if cell.seeds is None else cell.seeds
+
+
+def run(study: Study, place: Place, progress: bool = True) -> None:
+    """Play what the rows of a study lack, measure what its folder lacks, and write its report.
+
+    Raises:
+        ValueError: A cell is out of range, found before the first one is played, or the rows in the
+            folder are damaged or of another study.
+        RecordingError: Traffic cannot be recorded.
+        ExecutorError: Workers died again and again.
+        OSError: The folder cannot be written to.
+    """
+    place.folder.mkdir(parents=True, exist_ok=True)
+    _play_missing(study, study.cells, place, progress)
+    if study.follow is not None:
+        rows = read_rows(study.name, place.folder)
+        _play_missing(study, study.follow(rows, place.folder), place, progress)
+    for name, measure in study.measures.items():
+        if not (place.folder / name).exists():
+            write_table(place.folder / name, measure(place))
+    write_report(study, place.folder)
+
+
+def write_report(study: Study, folder: Path) -> None:
+    """Write the tables and figures of the rows that a folder has.
+
+    Raises:
+        FileNotFoundError: It has none.
+        ValueError: They are damaged or of another study.
+    """
+    rows = read_rows(study.name, folder)
+    if rows.is_empty():
+        raise FileNotFoundError(f"{folder / ROWS} is not there: run the study without --report")
+    content = study.report(rows, folder).strip()
+    write_atomically(folder / TABLES, f"{content}\n\n{_footer(rows)}\n")
+
+
+def _footer(rows: pl.DataFrame) -> str:
+    """Return where the rows of a report come from."""
+    counts = rows.group_by("version").len().sort("version")
+    versions = ", ".join(f"{version} ({n:,} episodes)" for version, n in counts.iter_rows())
+    return f"Played by dptse-env {versions}. Differences are paired within one version."
+
+
+def _play_missing(study: Study, cells: Sequence[Cell], place: Place, progress: bool) -> None:
+    """Play the cells that the rows lack, and pack all rows into one file."""
+    unique = list({cell.id: cell for cell in cells}.values())
+    present = read_rows(study.name, place.folder)
+    played = _played(present)
+    missing = [
+        cell for cell in unique if not set(study.seeds_of(cell)) <= played.get(cell.id, set())
+    ]
+    for cell in missing:
+        cell.check()
+    corridors = {(corridor_of(cell), study.seeds_of(cell)): None for cell in missing}
+    for corridor, seeds in corridors:
+        record(corridor, seeds, place.records, progress)
+    folder = place.folder / "rows"
+    threads = None if isinstance(place.executor, ThisProcess) else 1
+    tasks = [
+        _Task(study.name, cell, study.seeds_of(cell), place.records, threads) for cell in missing
+    ]
+    if missing:
+        folder.mkdir(exist_ok=True)
+    run_shown(
+        place.executor,
+        _play_task,
+        tasks,
+        lambda task, rows: write_table(_file_of(folder, task.cell.id), rows),
+        size=lambda task: len(task.seeds),
+        progress=progress,
+        desc=study.name,
+        unit="episode",
+        mininterval=0.5,
+    )
+    if folder.is_dir():
+        rows = read_rows(study.name, place.folder)
+        write_table(place.folder / ROWS, rows.sort("cell", "version", "traffic_seed"))
+        shutil.rmtree(folder)
+
+
+class _Task(NamedTuple):
+    """A cell with everything that a worker needs."""
+
+    study: str
+    cell: Cell
+    seeds: tuple[int, ...]
+    records: Records
+    threads: int | None
+
+
+def _play_task(task: _Task) -> pl.DataFrame:
+    rows = play(task.cell, task.seeds, task.records, task.threads)
+    return table_of(task.study, task.cell, rows)
+
+
+def table_of(study: str, cell: Cell, rows: Sequence[Row]) -> pl.DataFrame:
+    """Return the rows of a cell with their origin and its labels.
+
+    Raises:
+        ValueError: A label is named like a measured column.
+    """
+    clash = sorted(cell.labels.keys() & {*ORIGIN, *rows[0]})
+    if clash:
+        raise ValueError(f"labels must differ from the names of columns, got {clash[0]!r}")
+    origin = (study, dptse_env.__version__, cell.id)
+    head = dict(zip(ORIGIN, origin, strict=True)) | dict(cell.labels)
+    return pl.DataFrame([{**head, **row} for row in rows], infer_schema_length=None)
+
+
+def _file_of(folder: Path, cell_id: str) -> Path:
+    return folder / f"{hashlib.sha256(cell_id.encode()).hexdigest()[:24]}.parquet"
+
+
+def _played(rows: pl.DataFrame) -> dict[str, set[int]]:
+    """Return the traffic seeds on which each cell was played."""
+    if rows.is_empty():
+        return {}
+    grouped = rows.group_by("cell").agg(pl.col("traffic_seed").unique())
+    return {cell: set(seeds) for cell, seeds in grouped.iter_rows()}
+
+
+def read_rows(study: str, folder: Path) -> pl.DataFrame:
+    """Return all rows in the folder of a study, those of an interrupted run too.
+
+    Raises:
+        ValueError: A file is damaged, or of another study.
+    """
+    files = [folder / ROWS, *sorted((folder / "rows").glob("*.parquet"))]
+    tables = [read_table(path, (*ORIGIN, "traffic_seed")) for path in files if path.exists()]
+    for path, table in zip((path for path in files if path.exists()), tables, strict=True):
+        others = [name for name in table["study"].unique() if name != study]
+        if others:
+            raise ValueError(
+                f"{path} has rows of the study {others[0]!r}, not of {study!r}: choose another "
+                "--output"
+            )
+    if not tables:
+        return pl.DataFrame()
+    rows: pl.DataFrame = pl.concat(tables, how="diagonal_relaxed")
+    return rows.unique((*ORIGIN[1:], "traffic_seed"), keep="last", maintain_order=True)
+
+
+def read_table(path: Path, columns: Sequence[str] = ()) -> pl.DataFrame:
+    """Return a table with the given columns among its own.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: It is damaged, or lacks a column.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} is not there")
+    try:
+        table = pl.read_parquet(path)
+    except (pl.exceptions.PolarsError, OSError) as problem:
+        reason = str(problem).splitlines()[0]
+        raise ValueError(f"{path} is not a table that this program wrote: {reason}") from problem
+    lacking = [name for name in columns if name not in table.columns]
+    if lacking:
+        raise ValueError(f"{path} must have a column {lacking[0]!r}, has {table.columns}")
+    return table
+
+
+def write_table(path: Path, table: pl.DataFrame) -> None:
+    """Write a table in one piece, compressed.
+
+    Raises:
+        OSError: It cannot be written; the old one stays.
+    """
+    with replacing(path) as temporary:
+        table.write_parquet(temporary, compression="zstd", compression_level=19)

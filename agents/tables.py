@@ -1,0 +1,162 @@
+"""Tables of reports: rows by their labels, means, paired differences, and Markdown."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from agents.statistics import Interval, mean_interval, paired_difference
+from dptse_env.utils.arrays import FloatArray
+
+DENSITY, SPEED, ERROR = "rmse_density", "rmse_speed", "error"
+METRICS = {DENSITY: ("density", "veh/km"), SPEED: ("speed", "km/h")}
+"""Name and unit of each error of an estimate; `ERROR` is minus the mean reward, x 1000."""
+
+Labels = Mapping[str, Any]
+
+
+class UnmeasuredError(LookupError):
+    """The rows that a number needs are not there."""
+
+
+def pick(rows: pl.DataFrame, labels: Labels) -> pl.DataFrame:
+    """Return the rows of a cell by its labels, in the order of traffic seeds.
+
+    Where it was played by several versions, it is the rows of the last one.
+
+    Raises:
+        UnmeasuredError: There are none.
+        ValueError: The labels are those of several cells.
+    """
+    found = rows.filter(*(pl.col(name) == value for name, value in labels.items()))
+    if found.is_empty():
+        raise UnmeasuredError(dict(labels))
+    return _one_cell(found.filter(pl.col("version") == _last(found)), labels)
+
+
+def pick_pair(
+    rows: pl.DataFrame, labels: Labels, reference: Labels
+) -> tuple[pl.DataFrame, pl.DataFrame]:
+    """Return the rows of two cells on the same traffic seeds, played by one version.
+
+    Raises:
+        UnmeasuredError: No version has played both on two traffic seeds.
+        ValueError: Labels are those of several cells.
+    """
+    pair = []
+    for each in (labels, reference):
+        pair.append(rows.filter(*(pl.col(name) == value for name, value in each.items())))
+    both = pair[0].join(pair[1], on=["version", "traffic_seed"], how="semi")
+    if both.is_empty():
+        raise UnmeasuredError(dict(labels), dict(reference))
+    version = _last(both)
+    seeds = both.filter(pl.col("version") == version)["traffic_seed"].unique()
+    first, second = (
+        _one_cell(
+            each.filter(
+                pl.col("version") == version, pl.col("traffic_seed").is_in(seeds.implode())
+            ),
+            name,
+        )
+        for each, name in zip(pair, (labels, reference), strict=True)
+    )
+    return first, second
+
+
+def _last(rows: pl.DataFrame) -> str:
+    versions: list[str] = rows["version"].unique().to_list()
+    return max(versions, key=lambda text: [int(part) for part in text.split(".")[:3]])
+
+
+def _one_cell(rows: pl.DataFrame, labels: Labels) -> pl.DataFrame:
+    if rows["traffic_seed"].n_unique() < len(rows):
+        raise ValueError(f"{dict(labels)} are the labels of several cells")
+    return rows.sort("traffic_seed")
+
+
+def values_of(rows: pl.DataFrame, metric: str) -> FloatArray:
+    """Return a column, or `ERROR`, as an array, shape (n,)."""
+    if metric == ERROR:
+        return -1000.0 * rows["reward"].to_numpy().astype(np.float64)
+    return rows[metric].to_numpy().astype(np.float64)
+
+
+def values(rows: pl.DataFrame, labels: Labels, metric: str) -> FloatArray:
+    """Return a column of a cell, or `ERROR`, for each traffic seed, shape (n_seeds,)."""
+    return values_of(pick(rows, labels), metric)
+
+
+def mean(rows: pl.DataFrame, labels: Labels, metric: str) -> Interval:
+    """Return the mean of a column of a cell over its traffic seeds, with its 95 % interval."""
+    return mean_interval(values(rows, labels, metric))
+
+
+def difference(rows: pl.DataFrame, labels: Labels, reference: Labels, metric: str) -> Interval:
+    """Return by how much a cell exceeds a reference, paired by traffic and noise."""
+    pair = pick_pair(rows, labels, reference)
+    return paired_difference(*(values_of(each, metric) for each in pair))
+
+
+def below(rows: pl.DataFrame, labels: Labels, reference: Labels, metric: str = ERROR) -> Interval:
+    """Return by how much the mean of a cell lies below that of a reference [%], paired.
+
+    The interval is that of the difference over the mean of the reference.
+    """
+    own, other = (values_of(each, metric) for each in pick_pair(rows, labels, reference))
+    scale, found = 100.0 / float(other.mean()), mean_interval(other - own)
+    return Interval(scale * found.mean, scale * found.low, scale * found.high, found.n)
+
+
+def markdown(
+    header: Sequence[str], rows: Iterable[Sequence[str]], first: str = "---", rest: str = ":-:"
+) -> str:
+    """Return a Markdown table, its first column and the rest with the given rules below them."""
+    lines = [header, [first, *[rest] * (len(header) - 1)], *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def grid(
+    corner: str, rows: Sequence[Any], columns: Sequence[Any], entry: Callable[[Any, Any], str]
+) -> str:
+    """Return a Markdown table of what ``entry`` gives for each row and column.
+
+    What was not measured is a dash.
+    """
+    return markdown(
+        [corner, *map(str, columns)],
+        [[str(row), *(cell(entry, row, column) for column in columns)] for row in rows],
+    )
+
+
+def cell(entry: Callable[..., str], *arguments: Any) -> str:
+    """Return what ``entry`` gives, and a dash where it was not measured."""
+    try:
+        return entry(*arguments)
+    except UnmeasuredError:
+        return "-"
+
+
+def format_interval(interval: Interval) -> str:
+    """Return a mean with its interval, three significant digits or two decimals each."""
+
+    def digits(value: float) -> str:
+        if 0.0 < abs(value) < 0.1:
+            return f"{value:.2g}"
+        return f"{value:.1f}" if abs(value) >= 100 else f"{value:.2f}"
+
+    return f"{digits(interval.mean)} [{digits(interval.low)}, {digits(interval.high)}]"
+
+
+def format_number(value: float) -> str:
+    """Return three significant digits without an exponent."""
+    return f"{float(f'{value:.3g}'):g}" if abs(value) < 1e5 else f"{value:,.0f}"
+
+
+def format_range(values: Sequence[int]) -> str:
+    """Return integers briefly, as their first and last where none is left out."""
+    if list(values) == list(range(values[0], values[-1] + 1)):
+        return f"{values[0]} to {values[-1]}"
+    return ", ".join(map(str, values))

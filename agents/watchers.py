@@ -1,0 +1,382 @@
+"""Watchers that add columns to the rows of episodes: payments, honesty, queries.
+
+All look at the true traffic, for evaluation only.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from scipy import stats
+
+from dptse_env.evaluation import WARM_UP, Row, WatcherFactory
+from dptse_env.process import QueryProcess
+from dptse_env.release import Capped, CappedSettings, PacedSettings, ReleaseModel, TwoMechanisms
+from dptse_env.release.paced import Paced
+from dptse_env.release.vehicle_table import VehicleTable
+from dptse_env.traffic import draw_scenario
+from dptse_env.traffic.incident import Incident
+from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray
+
+NEARLY_SPENT = 0.95
+"""Part of the budget above which a vehicle has run out of it."""
+QUANTILES = (0.1, 0.25, 0.5, 0.75, 0.9)
+"""Quantiles of what is spent at the end of a trip."""
+LENGTHS = (0, 30, 60, 90, 120, 150, 180)
+"""Lengths of trips [s] at which their bins begin; the last has no end."""
+
+
+class Contributions:
+    """Payments of the vehicles of a batch of episodes, by place and by length of trip.
+
+    A contribution is counted once for each second in which a query covers a vehicle. Where queries
+    and fixed sensors are two mechanisms, it is those that answer queries. Episodes begin at second
+    0 of their records. A vehicle that still drives at the end of an episode counts with what it has
+    done by then.
+
+    Columns:
+
+    - ``n_met``: contributions that queries called for;
+    - ``n_refused``: those that a ledger or a cap refused;
+    - ``n_vehicles``: vehicles that were on the mainline;
+    - ``n_exhausted``: those that had spent more than `NEARLY_SPENT` of their budget at the end;
+    - ``quantiles``: `QUANTILES` of the part of the budget that vehicles had spent;
+    - ``met``, ``refused``: contributions by mainline segment;
+    - ``vehicles``: vehicles by the seconds that they were on the mainline, in bins of `LENGTHS`;
+    - ``spent``, ``met_of``, ``refused_of``: parts of the budget spent, and contributions, by bin.
+
+    Raises:
+        ValueError: The release model keeps no account of single vehicles.
+    """
+
+    def __init__(self, process: QueryProcess) -> None:
+        """Prepare for the episodes of a process."""
+        self._process, self._release = process, of_queries(process.release)
+        self._table = vehicle_table(self._release)
+        self._n_mainline = process.interface.n_mainline
+        shape = (process.n_episodes, self._n_mainline)
+        self._met, self._refused = np.zeros((2, *shape), dtype=np.int64)
+        self._before: AnyArray | None = None
+
+    def __call__(self) -> None:
+        """Count the contributions of the second that has passed."""
+        release = self._release
+        paid, _ = payments(release)
+        if self._before is None:  # the call after the reset, before any query
+            self._seconds, self._met_of, self._refused_of = np.zeros((3, *paid.shape), dtype=int)
+        else:
+            covered = covered_places(release, self._process.queried)
+            pays = paid > (0.0 if _is_cleared(release) else self._before)
+            for k in range(len(paid)):
+                self._follow(k, covered[k], pays[k])
+        self._before = paid.copy()
+
+    def _follow(self, k: int, covered: BoolArray, pays: BoolArray) -> None:
+        """Count the contributions of one episode: covered places, and who has paid."""
+        table, n = self._table, self._n_mainline
+        slot, time = self._process.traffic_index[k], self._process.time[k]
+        rows = slice(table.start[slot, time], table.start[slot, time + 1])
+        vehicle, place = table.vehicle[rows], table.segment[rows]
+        self._seconds[k, vehicle[place < n]] += 1
+        met = np.append(covered, False)[np.minimum(place, len(covered))]
+        vehicle, place = vehicle[met], place[met]
+        refused = ~pays[vehicle]
+        self._met_of[k, vehicle] += 1
+        self._refused_of[k, vehicle[refused]] += 1
+        self._met[k] += np.bincount(place, minlength=n)[:n]
+        self._refused[k] += np.bincount(place[refused], minlength=n)[:n]
+
+    def rows(self) -> list[Row]:
+        """See `dptse_env.evaluation.Watcher.rows`."""
+        paid, budget = payments(self._release)
+        return [self._row(k, paid[k] / budget) for k in range(len(paid))]
+
+    def _row(self, k: int, spent: FloatArray) -> Row:
+        on_road = self._seconds[k] > 0
+        length = np.digitize(self._seconds[k, on_road], LENGTHS) - 1
+
+        def by_length(values: AnyArray | None = None) -> list[float]:
+            return list(map(float, np.bincount(length, values, minlength=len(LENGTHS))))
+
+        return {
+            "n_met": int(self._met_of[k].sum()),
+            "n_refused": int(self._refused_of[k].sum()),
+            "n_vehicles": int(on_road.sum()),
+            "n_exhausted": int((spent[on_road] > NEARLY_SPENT).sum()),
+            "quantiles": np.quantile(spent[on_road], QUANTILES).tolist(),
+            "met": self._met[k].tolist(),
+            "refused": self._refused[k].tolist(),
+            "vehicles": by_length(),
+            "spent": by_length(spent[on_road]),
+            "met_of": by_length(self._met_of[k, on_road]),
+            "refused_of": by_length(self._refused_of[k, on_road]),
+        }
+
+
+def of_queries(release: ReleaseModel) -> ReleaseModel:
+    """Return the release model of the queries, where fixed sensors have one of their own."""
+    return release.queries if isinstance(release, TwoMechanisms) else release
+
+
+def payments(release: ReleaseModel) -> tuple[AnyArray, float]:
+    """Return what vehicles have paid, shape (n_episodes, n_vehicles), and the budget of a trip.
+
+    The budget is infinite where a trip has none.
+
+    Raises:
+        ValueError: The release model keeps no account of single vehicles.
+    """
+    settings = release.setup.settings
+    if isinstance(release, Paced) and isinstance(settings, PacedSettings):
+        budget = release.ledgers.budget if settings.unit == "trip" else math.inf
+        return release.ledgers.paid, budget
+    if isinstance(release, Capped) and isinstance(settings, CappedSettings):
+        return release.contributions.exposures, settings.contribution_cap or math.inf
+    raise ValueError(f"privacy.preset must keep account of vehicles, got {release.setup.name!r}")
+
+
+def vehicle_table(release: ReleaseModel) -> VehicleTable:
+    """Return the vehicles of the true traffic that a release model reads.
+
+    Raises:
+        ValueError: The release model keeps no account of single vehicles.
+    """
+    payments(release)
+    if isinstance(release, Paced):
+        return release.ledgers.vehicles
+    assert isinstance(release, Capped)
+    return release.contributions.vehicles
+
+
+def covered_places(release: ReleaseModel, queried: BoolArray) -> BoolArray:
+    """Return which record columns the queries and the fixed sensors cover, shape (k, places)."""
+    observed = release.setup.observed(queried)
+    if not isinstance(release, Paced):
+        return observed
+    covered: BoolArray = observed @ release.ledgers.covers > 0.0
+    return covered
+
+
+def _is_cleared(release: ReleaseModel) -> bool:
+    """Return whether every second has ledgers of its own, which begin at zero."""
+    settings = release.setup.settings
+    return isinstance(settings, PacedSettings) and settings.unit == "event"
+
+
+LEVELS = (50, 90, 95)
+"""Nominal coverage of intervals [%]."""
+REGIMES = ("jam", "front", "free")
+"""Regimes of a segment in a second: at a front its speed and a neighbour's differ by more than
+`JUMP`; elsewhere it is in a jam below `SLOW`, or else in free flow."""
+JUMP, SLOW = 30.0, 50.0
+"""Speeds [km/h]."""
+
+
+class Honesty:
+    """Honesty of the estimates of a batch of episodes, after the warm-up.
+
+    Columns:
+
+    - ``chi2_density``, ``chi2_speed``: mean squares of errors over their reported deviations,
+      speeds of occupied segments only;
+    - ``density_50``, ..., ``speed_95``: values within the reported interval of 50, 90, 95 % [%];
+    - for each of `REGIMES` ``n_jam``, the seconds of segments in it, and ``density_jam`` and
+      ``speed_jam``, the sums of their squared errors [(veh/km)^2, (km/h)^2].
+    """
+
+    def __init__(self, process: QueryProcess) -> None:
+        """Begin with nothing."""
+        self._process, n = process, process.n_episodes
+        self._cells, self._occupied = np.zeros(n), np.zeros(n)
+        self._chi2 = np.zeros((n, 2))
+        self._inside = np.zeros((n, 2, len(LEVELS)))
+        self._counts = np.zeros((n, len(REGIMES)))
+        self._squares = np.zeros((n, len(REGIMES), 2))
+        self._bounds = stats.norm.ppf(0.5 + np.array(LEVELS) / 200.0)
+
+    def __call__(self) -> None:
+        """Add the present second, unless it is part of the warm-up."""
+        process = self._process
+        if process.elapsed[0] <= WARM_UP:
+            return
+        n, estimate = process.interface.n_mainline, process.estimate
+        truth = process.truth(np.arange(process.n_episodes))[:, :n]
+        occupied = truth[..., 0] > 0.0
+        means = np.stack([estimate.density, estimate.speed], -1)[:, :n]
+        spread = np.stack([estimate.density_std, estimate.speed_std], -1)[:, :n]
+        counts = np.stack([np.ones_like(occupied), occupied], -1)
+        error = np.where(counts, means - truth, 0.0)
+        ratio = np.abs(error) / spread
+        self._cells += n
+        self._occupied += occupied.sum(axis=1)
+        self._chi2 += np.sum(ratio**2, axis=1)
+        within = (ratio[..., None] <= self._bounds) & counts[..., None]
+        self._inside += within.sum(axis=1)
+        for k, members in enumerate(regimes(truth[..., 1], occupied)):
+            self._counts[:, k] += members.sum(axis=1)
+            self._squares[:, k] += np.sum(error**2 * members[..., None], axis=1)
+
+    def rows(self) -> list[Row]:
+        """See `dptse_env.evaluation.Watcher.rows`."""
+        totals = np.stack([self._cells, np.maximum(self._occupied, 1.0)], axis=-1)
+        chi2, inside = self._chi2 / totals, 100.0 * self._inside / totals[..., None]
+        kinds = ("density", "speed")
+        rows = []
+        for k in range(len(totals)):
+            row: Row = {f"chi2_{kind}": float(chi2[k, i]) for i, kind in enumerate(kinds)}
+            for i, kind in enumerate(kinds):
+                row |= {f"{kind}_{level}": float(inside[k, i, j]) for j, level in enumerate(LEVELS)}
+            for j, regime in enumerate(REGIMES):
+                row[f"n_{regime}"] = float(self._counts[k, j])
+                for i, kind in enumerate(kinds):
+                    row[f"{kind}_{regime}"] = float(self._squares[k, j, i])
+            rows.append(row)
+        return rows
+
+
+def regimes(speed: FloatArray, occupied: BoolArray) -> tuple[BoolArray, BoolArray, BoolArray]:
+    """Return the members of `REGIMES` among occupied segments, shape (n, N) each.
+
+    Args:
+        speed: True speeds [km/h], shape (n, N).
+        occupied: Flags, shape (n, N).
+    """
+    jumps = np.abs(np.diff(speed, axis=1)) > JUMP
+    jumps &= occupied[:, 1:] & occupied[:, :-1]
+    front = np.zeros_like(occupied)
+    front[:, 1:] |= jumps
+    front[:, :-1] |= jumps
+    jam = occupied & ~front & (speed < SLOW)
+    return jam, front, occupied & ~front & ~jam
+
+
+PHASES = ("before", "during", "after")
+BIN = 20
+"""Length of a bin of time [s]."""
+NEAR = 2
+"""Segments on either side that count as near the incident."""
+
+
+class Queries:
+    """Queries of a batch of episodes by segment and time, relative to their first incident.
+
+    Columns:
+
+    - ``incident``: segment of the incident; -1 without one, and then all is ``before``;
+    - ``start``: second at which it begins; 0 without one;
+    - ``seconds``: seconds before, during and after the incident;
+    - ``before``, ``during``, ``after``: queries of each segment in these phases;
+    - ``near``: queries near the incident in each `BIN` of the episode.
+    """
+
+    def __init__(self, process: QueryProcess) -> None:
+        """Look up the incidents."""
+        n, n_mainline = process.n_episodes, process.interface.n_mainline
+        config = process.config
+        self._process = process
+        seeds = [config.traffic_seeds[index] for index in process.traffic_index]
+        scenarios = [draw_scenario(config.corridor, seed) for seed in seeds]
+        incidents = [next(iter(scenario.incidents), None) for scenario in scenarios]
+        self._segment = np.array([-1 if each is None else each.segment for each in incidents])
+        self._start, self._end = np.array([_span(each) for each in incidents]).T
+        distance = np.abs(np.arange(n_mainline) - self._segment[:, None])
+        self._near = (distance <= NEAR) & (self._segment >= 0)[:, None]
+        self._counts = np.zeros((n, len(PHASES), n_mainline), dtype=np.int64)
+        self._seconds = np.zeros((n, len(PHASES)), dtype=np.int64)
+        self._near_counts = np.zeros((n, -(-config.horizon_steps // BIN)), dtype=np.int64)
+        self._begun = False
+
+    def __call__(self) -> None:
+        """Count the queries of the second that has passed."""
+        if not self._begun:  # the call after the reset, before any query
+            self._begun = True
+            return
+        process = self._process
+        episodes, time = np.arange(process.n_episodes), process.time
+        phase = (time > self._start).astype(np.int64) + (time > self._end)
+        queried = process.interface.queries.covered(process.queried)
+        self._counts[episodes, phase] += queried
+        self._seconds[episodes, phase] += 1
+        place = (process.elapsed - 1) // BIN
+        self._near_counts[episodes, place] += (queried & self._near).sum(axis=1)
+
+    def rows(self) -> list[Row]:
+        """See `dptse_env.evaluation.Watcher.rows`."""
+        return [
+            {
+                "incident": int(self._segment[k]),
+                "start": float(self._start[k]) if self._segment[k] >= 0 else 0.0,
+                "seconds": self._seconds[k].tolist(),
+                **{name: self._counts[k, i].tolist() for i, name in enumerate(PHASES)},
+                "near": self._near_counts[k].tolist(),
+            }
+            for k in range(len(self._segment))
+        ]
+
+
+def _span(incident: Incident | None) -> tuple[float, float]:
+    """Return when an incident begins and when its last phase ends [s]."""
+    if incident is None:
+        return np.inf, np.inf
+    return incident.start, incident.phases[-1][1]
+
+
+def by_segment(episodes: Sequence[Row]) -> FloatArray:
+    """Return the share of seconds in which each segment is queried, shape (n_mainline,)."""
+    counts = np.sum([each[phase] for each in episodes for phase in PHASES], axis=0)
+    share: FloatArray = counts / sum(sum(each["seconds"]) for each in episodes)
+    return share
+
+
+def by_offset(episodes: Sequence[Row], phase: str) -> tuple[FloatArray, FloatArray]:
+    """Return offsets from the incident's segment, and the share of seconds each is queried.
+
+    Only seconds in which a segment has this offset count. Episodes without an incident are left
+    out.
+    """
+    n = len(episodes[0][phase])
+    queries, seconds = np.zeros(2 * n - 1), np.zeros(2 * n - 1)
+    for each in episodes:
+        if each["incident"] >= 0:
+            window = slice(n - 1 - each["incident"], 2 * n - 1 - each["incident"])
+            queries[window] += each[phase]
+            seconds[window] += each["seconds"][PHASES.index(phase)]
+    seen = seconds > 0
+    return np.arange(1 - n, n)[seen].astype(np.float64), queries[seen] / seconds[seen]
+
+
+def near_since_start(
+    episodes: Sequence[Row], edges: Sequence[float]
+) -> tuple[FloatArray, FloatArray]:
+    """Return seconds since the incident's start, and the share of queries near it.
+
+    Args:
+        episodes: Rows of `Queries`; those without an incident are left out.
+        edges: Edges of intervals of `BIN` seconds from the start on [s]; a bin of an episode counts
+            in the interval that holds its middle.
+    """
+    bounds = np.array(edges, dtype=np.float64)
+    near, queries = np.zeros(len(bounds) - 1), np.zeros(len(bounds) - 1)
+    for each in episodes:
+        if each["incident"] < 0:
+            continue
+        n_seconds = sum(each["seconds"])
+        counts = each["near"][: n_seconds // BIN]  # without a bin that is cut off
+        middle = BIN * (np.arange(len(counts)) + 0.5) - each["start"]
+        place = np.digitize(middle, bounds) - 1
+        inside = (place >= 0) & (place < len(near))
+        total = sum(sum(each[phase]) for phase in PHASES)
+        np.add.at(near, place[inside], np.asarray(counts)[inside])
+        np.add.at(queries, place[inside], total / n_seconds * BIN)
+    seen = queries > 0
+    return (bounds[:-1] + BIN / 2)[seen], near[seen] / queries[seen]
+
+
+WATCHERS: dict[str, WatcherFactory] = {
+    "contributions": Contributions,
+    "honesty": Honesty,
+    "queries": Queries,
+}
+"""Watchers by the names that cells give."""

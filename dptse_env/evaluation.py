@@ -1,0 +1,234 @@
+"""Whole episodes of a query policy, and their errors: `evaluate`.
+
+Policies are paired by common random numbers: a traffic seed gives an episode the same traffic and
+the same noise under every policy, since noise is drawn for all segments whichever are queried.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Protocol
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import AutoresetMode
+
+from dptse_env.env import SensorQueryEnv
+from dptse_env.process import QueryProcess
+from dptse_env.schedules import make_schedule
+from dptse_env.vector_env import SensorQueryVectorEnv
+
+WARM_UP = 60
+"""Seconds at the start of an episode that do not count: the road fills, the estimator settles."""
+
+Row = dict[str, Any]
+"""What was measured in an episode, by name; see `evaluate`."""
+
+
+class Policy(Protocol):
+    """A query policy: a schedule, or a model of stable-baselines3."""
+
+    def predict(
+        self,
+        observation: Any,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = False,
+    ) -> tuple[Any, Any]:
+        """Return an action and the policy's next state."""
+
+
+class Watcher(Protocol):
+    """Follows a batch of episodes, and adds columns to their rows."""
+
+    def __call__(self) -> None:
+        """Look at the process: once after the reset, then after every second."""
+
+    def rows(self) -> Sequence[Row]:
+        """Return the further columns of each episode, after the last second."""
+
+
+WatcherFactory = Callable[[QueryProcess], Watcher]
+"""Makes a watcher of a batch of episodes, just after their reset."""
+
+
+def evaluate(
+    env: gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any],
+    policy: Any,
+    seeds: Sequence[int],
+    noise_seed: int = 0,
+    *,
+    warm_up: int = WARM_UP,
+    deterministic: bool = True,
+    watchers: Sequence[WatcherFactory] = (),
+) -> list[Row]:
+    """Play an episode on each traffic seed, and return a row for each.
+
+    A scalar environment plays them one after another, a vector environment as many at once as it
+    has episodes. Both give the same rows, but for policies that draw at random: these draw for a
+    whole batch at once, so other numbers from the same distribution.
+
+    Args:
+        env: An environment of this package from ``gym.make`` or ``gym.make_vec``, wrapped or not;
+            its ``traffic_seeds`` include the seeds.
+        policy: What `dptse_env.schedules.make_schedule` takes: the name of a schedule, a class, or
+            an object with ``predict``, such as a model of stable-baselines3.
+        seeds: Traffic seeds, one or more.
+        noise_seed: Noise and estimator are seeded with this plus the traffic seed.
+        warm_up: Seconds at the start of an episode that do not count [s].
+        deterministic: Whether the policy is asked for its likeliest action.
+        watchers: Make objects that add columns to the rows.
+
+    Returns:
+        A dictionary for each seed, in their order:
+
+        - ``traffic_seed``: the traffic;
+        - ``rmse_density``: density error, pooled over mainline segments and seconds [veh/km];
+        - ``rmse_speed``: speed error, pooled over occupied mainline segments and seconds [km/h];
+        - ``reward``: mean reward of a second;
+        - ``n_dropped``: requests that could not be served;
+        - ``n_diverged``: seconds in which the estimator diverged and was started anew;
+        - ``n_fallback``: seconds in which its update had no solution, so that it only predicted;
+
+        and the columns of the watchers.
+
+    Raises:
+        ValueError: There is no seed or one that the environment does not have, the schedule is
+            unknown, episodes are not longer than the warm-up, or a vector environment resets
+            episodes in the step in which they end.
+        TypeError: The environment is none of this package.
+    """
+    if not seeds:
+        raise ValueError("seeds must be one or more traffic seeds, got none")
+    bare = env.unwrapped
+    batch: _Single | _Batch
+    if isinstance(bare, SensorQueryVectorEnv):
+        batch = _Batch(bare)
+    elif isinstance(bare, SensorQueryEnv):
+        batch = _Single(env, bare)
+    else:
+        raise TypeError(f"env must be an environment of dptse_env, got {type(bare).__name__}")
+    player = make_schedule(policy, bare)
+    rows: list[Row] = []
+    for first in range(0, len(seeds), batch.size):
+        wanted = list(seeds[first : first + batch.size])
+        # The last batch may be short: its last episode is then played by all that are left.
+        filled = wanted + wanted[-1:] * (batch.size - len(wanted))
+        observation = batch.reset(filled, noise_seed)
+        looking = [watcher(batch.process) for watcher in watchers]
+        seconds = _play(batch, player, observation, deterministic, looking)
+        found = _pool(seconds, filled, warm_up)
+        for watcher in looking:
+            found = [{**row, **more} for row, more in zip(found, watcher.rows(), strict=True)]
+        rows += found[: len(wanted)]
+    return rows
+
+
+class _Single:
+    """One episode at a time, of a scalar environment with all its wrappers."""
+
+    size = 1
+
+    def __init__(self, env: Any, bare: SensorQueryEnv) -> None:
+        self._env, self.process = env, bare.process
+
+    def reset(self, seeds: list[int], noise_seed: int) -> Any:
+        (seed,) = seeds
+        observation, _ = self._env.reset(seed=noise_seed + seed, options={"traffic_seed": seed})
+        return observation
+
+    def step(self, action: Any) -> tuple[Any, Any]:
+        observation, reward, *_ = self._env.step(action)
+        return observation, reward
+
+
+class _Batch:
+    """All episodes of a vector environment at once."""
+
+    def __init__(self, env: SensorQueryVectorEnv) -> None:
+        if env.autoreset_mode is AutoresetMode.SAME_STEP:
+            raise ValueError(
+                "env must be made with another autoreset_mode than 'SameStep', which resets "
+                "episodes before their last second is read"
+            )
+        actions = env.interface.actions
+        if env.num_envs > 1 and actions.picks_one_by_one and actions.costs is not None:
+            raise ValueError(
+                f"action {env.config.action!r} takes different numbers of actions for a second "
+                f"where queries cost different amounts ({env.config.queries}): episodes cannot be "
+                "played as a batch; use another encoding, or one episode at a time"
+            )
+        self._env, self.process, self.size = env, env.process, env.num_envs
+
+    def reset(self, seeds: list[int], noise_seed: int) -> Any:
+        observation, _ = self._env.reset(
+            seed=[noise_seed + seed for seed in seeds], options={"traffic_seed": seeds}
+        )
+        return observation
+
+    def step(self, actions: Any) -> tuple[Any, Any]:
+        transition = self._env.advance(actions)
+        return transition.observation, transition.reward
+
+
+_SERIES = ("rmse_density", "rmse_speed", "n_occupied", "n_dropped", "diverged", "fallback")
+"""Keys of ``info`` that a row is made of."""
+
+
+def _play(
+    batch: _Single | _Batch,
+    policy: Policy,
+    observation: Any,
+    deterministic: bool,
+    watchers: Sequence[Watcher],
+) -> list[dict[str, Any]]:
+    """Play episodes to their end; return `_SERIES`, reward and time of every second, (n,) each."""
+    process, n = batch.process, batch.process.n_episodes
+    state: Any = None
+    episode_start = np.ones(n, dtype=bool)
+    seconds: list[dict[str, Any]] = []
+    _look(watchers)
+    while not process.over.all():
+        action, state = policy.predict(observation, state, episode_start, deterministic)
+        episode_start = np.zeros(n, dtype=bool)
+        before = process.time.copy()
+        observation, reward = batch.step(action)
+        # Sequential actions may leave the traffic where it is, in all episodes or in none.
+        if (process.time > before).all():
+            info = process.infos(np.arange(n))
+            series = {key: info[key] for key in _SERIES}
+            seconds.append({"reward": np.ravel(reward), "time": process.elapsed, **series})
+            _look(watchers)
+    return seconds
+
+
+def _look(watchers: Sequence[Watcher]) -> None:
+    for watcher in watchers:
+        watcher()
+
+
+def _pool(
+    seconds: Sequence[Mapping[str, Any]], traffic_seeds: Sequence[int], warm_up: int
+) -> list[Row]:
+    """Pool the seconds of each episode that count."""
+    tables = {key: np.array([second[key] for second in seconds]) for key in seconds[0]}
+    rows = []
+    for k, traffic_seed in enumerate(traffic_seeds):
+        counts = tables["time"][:, k] > warm_up
+        if not counts.any():
+            raise ValueError(f"the episode must be longer than the warm-up of {warm_up} s")
+        series = {key: table[counts, k] for key, table in tables.items()}
+        n_occupied = series["n_occupied"]
+        squares = n_occupied * series["rmse_speed"] ** 2
+        row = {
+            "traffic_seed": int(traffic_seed),
+            "rmse_density": math.sqrt(np.mean(series["rmse_density"] ** 2)),
+            "rmse_speed": math.sqrt(np.sum(squares) / max(n_occupied.sum(), 1.0)),
+            "reward": float(np.mean(series["reward"])),
+            "n_dropped": float(series["n_dropped"].sum()),
+            "n_diverged": float(series["diverged"].sum()),
+            "n_fallback": float(series["fallback"].sum()),
+        }
+        rows.append(row)
+    return rows
