@@ -16,9 +16,10 @@ import subprocess
 import sys
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
+from functools import partial
+from itertools import islice
 from typing import Any, Literal, TypeVar
 
 import loky
@@ -65,8 +66,8 @@ class ThisProcess(Executor):
 class LocalProcesses(Executor):
     """Runs tasks in processes of this machine, of one thread each.
 
-    They leave Ctrl-C to this process, and end with it however it ends. After one has died, the next
-    call starts new ones.
+    They leave Ctrl-C to this process, and end with it however it ends. When one dies, all tasks
+    that are not done are run again by new ones, each up to `RETRIES` times.
 
     Args:
         workers: Number of processes.
@@ -79,17 +80,54 @@ class LocalProcesses(Executor):
         """Check the number; processes start with the first call."""
         self.workers = integer("workers", workers, 1)
         self.ahead = 2 * workers
+        self._is_cancelled = False
 
     def submit(self, fn: Callable[..., ResultT], /, *args: Any, **kwargs: Any) -> Future[ResultT]:
         """Run a call in one of the processes."""
-        future: Future[ResultT] = self._pool().submit(fn, *args, **kwargs)
-        return future
+        self._is_cancelled = False
+        outcome: Future[ResultT] = Future()
+        self._begin(outcome, partial(fn, *args, **kwargs), RETRIES)
+        return outcome
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """End the processes; with ``cancel_futures`` without waiting for what they run."""
+        self._is_cancelled = cancel_futures
         self._pool().shutdown(wait=wait, kill_workers=cancel_futures)
 
+    def _begin(self, outcome: Future[ResultT], call: Callable[[], ResultT], retries: int) -> None:
+        try:
+            inner = self._pool().submit(call)
+        except BrokenExecutor as problem:
+            self._end(outcome, call, retries, problem)
+            return
+
+        def end(inner: Future[ResultT]) -> None:
+            problem = inner.exception()
+            if problem is None:
+                outcome.set_result(inner.result())
+            else:
+                self._end(outcome, call, retries, problem)
+
+        inner.add_done_callback(end)
+
+    def _end(
+        self,
+        outcome: Future[ResultT],
+        call: Callable[[], ResultT],
+        retries: int,
+        problem: BaseException,
+    ) -> None:
+        if not isinstance(problem, BrokenExecutor) or self._is_cancelled:
+            outcome.set_exception(problem)
+        elif retries == 0:
+            outcome.set_exception(ExecutorError(_lost(type(problem).__name__)))
+        else:
+            # In a thread of its own: this one may belong to the processes that are replaced.
+            again = outcome, call, retries - 1
+            threading.Thread(target=self._begin, args=again, daemon=True).start()
+
     def _pool(self) -> Any:
+        """Return the processes, new ones where one has died."""
         return loky.get_reusable_executor(
             self.workers,
             initializer=_follow_parent,
@@ -277,9 +315,8 @@ def run_tasks(
 ) -> Generator[tuple[TaskT, ResultT], None, None]:
     """Yield tasks with their results, in whatever order they end.
 
-    A task whose worker died is submitted again, up to `RETRIES` times. Tasks are taken one by one
-    as workers come free, and nothing is kept of one that is yielded: memory does not grow with
-    their number. Closing the generator ends what still runs.
+    Tasks are taken one by one as workers come free, and nothing is kept of one that is yielded:
+    memory does not grow with their number. Closing the generator ends what still runs.
 
     Args:
         executor: One of this module.
@@ -289,36 +326,18 @@ def run_tasks(
     Raises:
         ExecutorError: Workers died again and again. Errors of ``work`` are raised as they are.
     """
-    waiting, running = iter(tasks), dict[Future[ResultT], tuple[TaskT, int]]()
-    again: deque[tuple[TaskT, int]] = deque()
+    waiting, running = iter(tasks), dict[Future[ResultT], TaskT]()
     try:
         while True:
-            for _ in range(executor.ahead - len(running)):
-                task, deaths = again.popleft() if again else (next(waiting, _END), 0)
-                if task is _END:
-                    break
-                try:
-                    running[executor.submit(work, task)] = task, deaths
-                except BrokenExecutor:  # a worker has died since the last look: all are told below
-                    again.appendleft((task, deaths))
-                    break
-            if not running and not again:
+            for task in islice(waiting, max(executor.ahead - len(running), 0)):
+                running[executor.submit(work, task)] = task
+            if not running:
                 return
             for future in wait(running, return_when=FIRST_COMPLETED).done:
-                task, deaths = running.pop(future)
-                problem = future.exception()
-                if not isinstance(problem, BrokenExecutor):
-                    yield task, future.result()
-                elif deaths < RETRIES:
-                    again.append((task, deaths + 1))
-                else:
-                    raise ExecutorError(_lost(type(problem).__name__)) from problem
+                yield running.pop(future), future.result()
     except BaseException:
         executor.shutdown(cancel_futures=True)
         raise
-
-
-_END: Any = object()
 
 
 def run_shown(

@@ -153,12 +153,23 @@ def play(
 
 
 def record(
-    corridor: Corridor, seeds: Sequence[int], records: Records = None, progress: bool = False
+    corridor: Corridor,
+    seeds: Sequence[int],
+    records: Records = None,
+    *,
+    progress: bool = False,
+    workers: int | None = None,
 ) -> None:
     """Record the traffic that is missing on this machine.
 
-    Of several processes that lack the same records, one makes them with all cores, and the others
-    wait.
+    Of several processes that lack the same records, one makes them and the others wait.
+
+    Args:
+        corridor: The road.
+        seeds: Traffic seeds.
+        records: Folder of the record cache or a library; None for the user's cache.
+        progress: Whether to show a progress bar.
+        workers: Processes that record; None for one per core.
 
     Raises:
         ValueError: A seed is out of range or was not recorded.
@@ -172,7 +183,7 @@ def record(
     library.path.mkdir(parents=True, exist_ok=True)
     name = hashlib.sha256(corridor.digest.encode()).hexdigest()[:16]
     with FileLock(library.path / f".{name}.lock"):
-        library.ensure(corridor, seeds, progress=progress)
+        library.ensure(corridor, seeds, workers, progress)
 
 
 def corridor_of(cell: Cell) -> Corridor:

@@ -129,7 +129,7 @@ def _play_missing(study: Study, cells: Sequence[Cell], place: Place, progress: b
         cell.check()
     corridors = {(corridor_of(cell), study.seeds_of(cell)): None for cell in missing}
     for corridor, seeds in corridors:
-        record(corridor, seeds, place.records, progress)
+        record(corridor, seeds, place.records, progress=progress)
     folder = place.folder / "rows"
     threads = None if isinstance(place.executor, ThisProcess) else 1
     tasks = [

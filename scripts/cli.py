@@ -16,10 +16,10 @@ from typing import Any
 
 import tyro
 
-from agents.engines.choice import EngineName, make_engine
-from agents.engines.engine import Engine, EngineError
 from agents.environments import given_keywords, make_config
-from agents.experiments.runner import Workplace
+from agents.executors import AnyExecutor, ExecutorError, ExecutorName, make_executor
+from agents.play import record
+from agents.study import Place
 from dptse_env.traffic import (
     Corridor,
     NetworkError,
@@ -35,9 +35,8 @@ from dptse_env.utils.threads import n_cores
 class Machines:
     """Machines that run tasks, and the folder of records. Results depend on none of it."""
 
-    engine: EngineName = "local"
-    """Where missing traffic is recorded and tasks run: in processes of this machine (local), or on
-    a Ray cluster (ray)."""
+    executor: ExecutorName = "local"
+    """Where tasks run: in processes of this machine (local), or on a Ray cluster (ray)."""
     address: str | None = None
     """Address of the Ray cluster, host:port of its head node, or auto for the one on this machine;
     RAY_ADDRESS if not given, or else a new one on this machine."""
@@ -46,26 +45,25 @@ class Machines:
     records: Path | None = None
     """Folder of the record cache; the user's cache if not given."""
 
-    def start_engine(self) -> Engine:
-        """Return the engine.
+    def start_executor(self) -> AnyExecutor:
+        """Return what runs the tasks.
 
         Raises:
-            EngineError: There is no suitable cluster.
+            ExecutorError: There is no suitable cluster.
             MissingExtraError: Ray is not installed.
-            ValueError: An argument is out of range or of another engine.
+            ValueError: An argument is out of range or of another executor.
         """
-        return make_engine(
-            self.engine, n_cores() if self.workers is None else self.workers, self.address
-        )
+        workers = n_cores() if self.workers is None else self.workers
+        return make_executor(self.executor, workers, self.address)
 
-    def workplace(self, folder: Path) -> Workplace:
-        """Return a folder with the engine that works for it."""
-        return Workplace(folder, self.start_engine(), records_argument(self.records))
+    def place(self, folder: Path) -> Place:
+        """Return a folder with the executor that works for it."""
+        return Place(folder, self.start_executor(), self.records)
 
     def library(self, corridor: Corridor, seeds: Sequence[int]) -> RecordLibrary:
         """Return the library of records, after recording what is missing."""
         library = RecordLibrary(self.records)
-        self.start_engine().record(library, corridor, seeds, progress=True)
+        record(corridor, seeds, library, progress=True, workers=self.workers)
         return library
 
 
@@ -93,11 +91,11 @@ BAD_INPUT = (
 """Errors of what a program was given, which end it with status 2 and their message alone."""
 
 FAILURES = (
-    OSError, MissingExtraError, NetworkError, RecordingError, SumoVersionError, EngineError,
+    OSError, MissingExtraError, NetworkError, RecordingError, SumoVersionError, ExecutorError,
 )  # fmt: skip
 """Errors of a run, which end a program with status 1 and their message alone."""
 
-NOT_RESULTS = ("engine", "address", "workers", "records", "output", "json", "force")
+NOT_RESULTS = ("executor", "address", "workers", "records", "output", "json", "force")
 """Arguments that results do not depend on."""
 
 
