@@ -6,6 +6,10 @@ training, plus the number of the episode. Choices and reports never share a rang
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+from dptse_env.config import TEST_SEEDS, TRAINING_SEEDS, VALIDATION_SEEDS
+
 EVALUATION = range(1_000_000)
 """``scripts/evaluate.py``, and the studies of estimators, of privacy and of ledgers."""
 TUNING = range(1_000_000, 2_000_000)
@@ -30,3 +34,10 @@ TRAININGS = 1_000
 def training_seed(seed: int) -> int:
     """Return the seed of the first episode of a training, a million apart from the next one's."""
     return TRAINING.start + seed * (len(TRAINING) // TRAININGS)
+
+
+def seed_kind(seeds: Sequence[int]) -> str:
+    """Return which range traffic seeds belong to: training, validation, test, or mixed."""
+    ranges = {"training": TRAINING_SEEDS, "validation": VALIDATION_SEEDS, "test": TEST_SEEDS}
+    kinds = [name for name, members in ranges.items() if set(seeds) <= set(members)]
+    return kinds[0] if kinds else "mixed"

@@ -160,3 +160,23 @@ def format_range(values: Sequence[int]) -> str:
     if list(values) == list(range(values[0], values[-1] + 1)):
         return f"{values[0]} to {values[-1]}"
     return ", ".join(map(str, values))
+
+
+def compared_header(reference: str) -> list[str]:
+    """Return the headers of the columns of `compared_errors`."""
+    columns = [(f"{name} RMSE [{unit}]", f"against {reference}") for name, unit in METRICS.values()]
+    return [column for pair in columns for column in pair]
+
+
+def compared_errors(rows: pl.DataFrame, labels: Labels, reference: Labels | None) -> list[str]:
+    """Return both errors of a cell, each with its paired difference to a reference, if any."""
+    row = []
+    for metric in METRICS:
+        row.append(cell(lambda m: format_interval(mean(rows, labels, m)), metric))
+        if reference is None or labels == reference:
+            row.append("-")
+        else:
+            row.append(
+                cell(lambda m: format_interval(difference(rows, labels, reference, m)), metric)
+            )
+    return row

@@ -21,7 +21,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from agents.evaluation.terminal import make_table, print_table
+from agents.terminal import make_table, print_table
 from benchmarks.long_roads import long_road
 from dptse_env.config import parse_seeds
 from dptse_env.schedules import make_schedule

@@ -14,7 +14,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 from dataclasses import dataclass, replace
 
-from agents.evaluation.terminal import make_table, print_table
+from agents.terminal import make_table, print_table
 from agents.figures import LABELS
 from benchmarks.peers import FILTERS, FilterPeer
 from benchmarks.replay import recorded

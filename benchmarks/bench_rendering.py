@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import gymnasium as gym
 
-from agents.evaluation.terminal import make_table, print_table
+from agents.terminal import make_table, print_table
 from dptse_env.registration import ENVIRONMENTS
 from dptse_env.utils.validation import integer
 from scripts.cli import run

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from agents.evaluation.terminal import make_table, print_table
+from agents.terminal import make_table, print_table
 from agents.figures import LABELS
 from benchmarks.long_roads import long_road
 from benchmarks.replay import replay_of

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from agents.evaluation.terminal import make_table, print_table
+from agents.terminal import make_table, print_table
 from agents.files import refuse_to_replace, replacing
 from dptse_env.config import parse_seeds
 from dptse_env.model import ARZParameters, available_parameters, load_parameters

@@ -2,49 +2,50 @@
 
 python scripts/evaluate.py --schedules paper round-robin --seeds 2000:2020
 python scripts/evaluate.py --policies results/training/primary/pl-0/best.zip
-python scripts/evaluate.py --suite query-suite-v2 --policies round-robin my_package:MySchedule
-python scripts/evaluate.py --suite query-suite-v2 --verify results/suites/query-suite-v2/mine.json
 """
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
-from collections.abc import Mapping
+import json
+import shutil
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
+import polars as pl
 
-from agents.engines.engine import run_in_order
-from agents.environments import make_config, unwrap
-from agents.evaluation.episodes import EpisodeScore, run_episode, seed_kind, watch_episode
-from agents.evaluation.ladder import Rung, run_rung
-from agents.evaluation.page import write_page
-from agents.evaluation.report import EPISODES, SUMMARY, Report
-from agents.evaluation.watched import Watched
-from agents.figures import (
-    RoadMap,
-    draw_maps,
-    estimate_map,
-    save_figure,
-)
+from agents.environments import make_config
+from agents.figures import RoadMap, draw_maps, estimate_map, save_errors, save_figure
 from agents.files import refuse_to_replace
-from agents.policies import NamedSchedule, PolicySource, find_policy
+from agents.page import watch, write_page
+from agents.play import Cell
+from agents.policies import NamedSchedule, find_policy
+from agents.seeds import seed_kind
+from agents.statistics import Interval
+from agents.study import ROWS, TABLES, Place, Study, read_rows
+from agents.study import run as run_study
+from agents.tables import (
+    METRICS,
+    compared_errors,
+    compared_header,
+    difference,
+    markdown,
+    mean,
+)
+from agents.terminal import make_table, print_table, print_text
 from dptse_env.config import EnvConfig, parse_seeds
-from dptse_env.rendering import History
 from dptse_env.schedules import OBSERVATION_SCHEDULES
-from dptse_env.traffic import Records, is_road_file
+from dptse_env.traffic import is_road_file
 from dptse_env.utils.validation import require
-from scripts.cli import NOT_RESULTS, Road, records_argument, run
-from scripts.evaluate_suite import evaluate_suite
+from scripts.cli import Road, resumable, run
 
 ALL = "all"
 """The schedule that runs with a bandwidth that covers the road."""
 
 ERRORS, MAPS, PAGE = "schedules.png", "space_time.png", "page.html"
-"""Files of the figures and of the page to look at."""
+"""Files of the figures and of the interactive page."""
 
 
 @dataclass(frozen=True)
@@ -57,11 +58,6 @@ class Args(Road):
     """Policies: files of saved ones, names of those that come with the package, schedules as
     "module:Class", and models of stable-baselines3 as "module:Class=file.zip", which are unpickled:
     load those that you trust."""
-    suite: str | None = None
-    """Score the policies in the cells of a suite, such as query-suite-v2, which say everything but
-    the policies, machines and output."""
-    verify: Path | None = None
-    """Card of a suite of which a drawn cell is run again, to see whether its errors are right."""
     stochastic: bool = False
     """Let trained policies draw their actions instead of taking the likeliest."""
     transfer: bool = False
@@ -86,217 +82,259 @@ class Args(Road):
     noise_seed: int = 0
     """Seeds noise and estimators; one stream per traffic seed, the same for every schedule."""
     output: Path = Path("results/evaluation")
-    """Folder for table, scores and figures."""
+    """Folder for tables, rows and figures."""
     html: bool = False
-    """Leave a page to look at, too: page.html, interactive, which needs no network."""
+    """Write an interactive page, too: page.html, which needs no network."""
     force: bool = False
     """Replace the files of an earlier evaluation in the folder."""
     json: bool = False
     """Print the result as JSON, for a program, in place of a table."""
 
 
-def make_keywords(
-    args: Args, estimator: str, source: PolicySource, records: Records = None
-) -> dict[str, Any]:
-    """Return the keywords of the environment in which a policy acts.
+def make_cell(args: Args, estimator: str, name: str, policy: str) -> Cell:
+    """Return the cell of a policy with an estimator.
 
     Raises:
+        FileNotFoundError: There is no such saved policy.
         ValueError: An argument is no JSON object or no file of parameters.
     """
-    keywords: dict[str, Any] = {
-        **args.given_keywords(),
-        **source.keywords,
-        "estimator": estimator,
-        "traffic_seeds": args.seeds,
-        "records": records_argument(args.records) if records is None else records,
-    }
+    keywords: dict[str, Any] = {**args.given_keywords(), "estimator": estimator}
     for key in ("privacy", "epsilon", "delta", "bandwidth", "parameters"):
         if getattr(args, key) is not None:
             keywords[key] = getattr(args, key)
     if not is_road_file(keywords.get("corridor")):
         keywords.setdefault("parameters", "w99-3lane")
-    if source.source == ALL:
+    if policy == ALL:
         keywords["bandwidth"] = make_config(args.env, keywords).corridor.n_mainline
-    return keywords
-
-
-def reference_config(args: Args) -> EnvConfig:
-    """Return the configuration of the reference with the first estimator."""
-    keywords = make_keywords(args, args.estimators[0], find_policy(args.reference))
-    return make_config(args.env, keywords)
-
-
-def find_sources(args: Args) -> dict[str, PolicySource]:
-    """Return schedules and policies by their names in tables.
-
-    Raises:
-        FileNotFoundError: There is no such saved policy.
-        ValueError: A file is no saved policy, or two names are the same.
-    """
-    sources = {name: find_policy(name) for name in (*args.schedules, args.reference)}
-    for source in args.policies:
-        path = Path(source)
-        # Files of runs have one name; their folders differ.
-        name = f"{path.parent.name}/{path.stem}" if path.suffix == ".zip" else source
-        if name in sources:
-            raise ValueError(
-                f"schedules and policies must have different names, {name!r} is there twice"
-            )
-        sources[name] = find_policy(source)
-    return sources
-
-
-def evaluate(
-    args: Args, sources: Mapping[str, PolicySource]
-) -> dict[tuple[str, str], list[EpisodeScore]]:
-    """Run every schedule and policy with every estimator, on all traffic seeds at once."""
-    seeds, keys = parse_seeds(args.seeds), list(itertools.product(args.estimators, sources))
-    # All are made before the first runs: bad input shows before anything is recorded.
-    for estimator, name in keys:
-        make_rung(args, estimator, name, sources[name]).make()
-    place = args.workplace(args.output)
-    place.record(reference_config(args).corridor, seeds)
-    rungs = [make_rung(args, *key, sources[key[1]], place.records, place.threads) for key in keys]
-    scores = run_in_order(
-        place.engine,
-        run_rung,
-        rungs,
-        size=lambda rung: len(rung.seeds),
-        desc="evaluating",
-        unit="episode",
-        mininterval=0.5,
-    )
-    return dict(zip(keys, scores, strict=True))
-
-
-def make_rung(
-    args: Args,
-    estimator: str,
-    name: str,
-    source: PolicySource,
-    records: Records = None,
-    threads: int | None = None,
-) -> Rung:
-    """Return the task of a policy with an estimator.
-
-    Raises:
-        ValueError: An argument is no JSON object or no file of parameters.
-    """
-    return Rung(
-        key=(estimator, name),
-        source=source,
+    return Cell(
         env=args.env,
-        keywords={**make_keywords(args, estimator, source, records), "threads": threads},
-        seeds=parse_seeds(args.seeds),
+        policy=policy,
+        keywords=keywords,
+        labels={"estimator": estimator, "policy": name},
         noise_seed=args.noise_seed,
         deterministic=not args.stochastic,
         transferred=args.transfer,
     )
 
 
-def draw_traffic(
-    args: Args, report: Report, sources: Mapping[str, PolicySource], noise: str
-) -> None:
-    """Draw the first traffic with the reference, the best schedule and the best policy."""
-    estimator, seed = args.estimators[0], parse_seeds(args.seeds)[0]
-    ranked = [name for name in report.ranked(estimator) if name not in (args.reference, ALL)]
-    learned = [name for name in ranked if not isinstance(sources[name], NamedSchedule)]
-    schedules = [name for name in ranked if name not in learned]
-    maps: list[RoadMap] = []
-    for name in (args.reference, *schedules[:1], *learned[:1]):
-        env = gym.make(args.env, **make_keywords(args, estimator, sources[name]))
-        policy = make_rung(args, estimator, name, sources[name]).load(env)
-        score, history = watch_episode(env, policy, traffic_seed=seed, seed=args.noise_seed + seed)
-        maps += [
-            *([] if maps else [RoadMap("true density", history.truth, history)]),
-            estimate_map(history, score.rmse_density, f"{name}: estimate"),
-            RoadMap(f"{name}: queried", history.queried, history),
-        ]
-    title = f"Traffic seed {seed}, {estimator}, {noise}"
-    save_figure(draw_maps([maps], width=8.4), args.output / MAPS, title)
-
-
-def shown(args: Args, report: Report, sources: Mapping[str, PolicySource]) -> list[str]:
-    """Return the policies to show: the reference, the best schedule and the best policies."""
-    ranked = [name for name in report.ranked(args.estimators[0]) if name != ALL]
-    rules = [name for name in ranked if isinstance(sources[name], NamedSchedule)]
-    learned = [name for name in ranked if name not in rules]
-    best = [name for name in rules if name != args.reference]
-    return [args.reference, *best[:1], *learned[:2]]
-
-
-def watch(args: Args, name: str, source: PolicySource) -> Watched:
-    """Run the first episode of a policy with the first estimator, and keep what happens."""
-    rung, seed = make_rung(args, args.estimators[0], name, source), parse_seeds(args.seeds)[0]
-    keywords = {key: value for key, value in rung.keywords.items() if key != "threads"}
-    env = gym.make(args.env, **keywords)
-    process = unwrap(env).process
-    watched = Watched(name, process.config.corridor, seed, History.empty(process))
-    run_episode(
-        env,
-        rung.load(env),
-        traffic_seed=seed,
-        seed=args.noise_seed + seed,
-        on_second=lambda: watched.append(process),
-    )
-    return watched
-
-
-def suite_options(args: Args) -> tuple[str, Path]:
-    """Return the suite, and the folder of its cards.
+def make_cells(args: Args) -> dict[tuple[str, str], Cell]:
+    """Return the cells by estimator and policy.
 
     Raises:
-        ValueError: There is an argument that the suite says, or a card to verify and no suite.
+        FileNotFoundError: There is no such saved policy.
+        ValueError: A file is no saved policy, or two names are the same.
     """
-    if args.suite is None:
-        raise ValueError("verify needs the suite of the card, such as --suite query-suite-v2")
-    own = {"suite", "policies", "verify", *NOT_RESULTS} - {"force"}
-    given = [
-        each.name
-        for each in dataclasses.fields(args)
-        if each.name not in own and getattr(args, each.name) != each.default
+    policies = {name: name for name in (*args.schedules, args.reference)}
+    for source in args.policies:
+        path = Path(source)
+        # Files of trainings have one name; their folders differ.
+        name = f"{path.parent.name}/{path.stem}" if path.suffix == ".zip" else source
+        if name in policies:
+            raise ValueError(
+                f"schedules and policies must have different names, {name!r} is there twice"
+            )
+        policies[name] = source
+    return {
+        key: make_cell(args, *key, policies[key[1]])
+        for key in itertools.product(args.estimators, policies)
+    }
+
+
+def reference_config(args: Args) -> EnvConfig:
+    """Return the configuration of the reference with the first estimator."""
+    cell = make_cell(args, args.estimators[0], args.reference, args.reference)
+    return make_config(cell.env, cell.all_keywords)
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """The rows of an evaluation, summarised.
+
+    Attributes:
+        title: What was evaluated.
+        reference: Policy that the others are compared with.
+        policies: Names of all policies.
+        rows: An episode each.
+    """
+
+    title: str
+    reference: str
+    estimators: Sequence[str]
+    policies: Sequence[str]
+    rows: pl.DataFrame
+
+    def mean(self, estimator: str, policy: str, metric: str) -> Interval:
+        """Return the mean of an error with its interval."""
+        return mean(self.rows, _labels(estimator, policy), metric)
+
+    def ranked(self, estimator: str) -> list[str]:
+        """Return the policies by mean density error, best first."""
+        return sorted(
+            self.policies, key=lambda name: self.mean(estimator, name, "rmse_density").mean
+        )
+
+    def print(self) -> None:
+        """Print a table for each estimator, best density error first."""
+        print_text(f"{self.title}; mean ± half of the 95 % interval")
+        against = f"against\n{self.reference}"
+        metrics = {name: f"{kind} RMSE\n[{unit}]" for name, (kind, unit) in METRICS.items()}
+        columns = [column for metric in metrics.values() for column in (metric, against)]
+        for estimator in self.estimators:
+            table = make_table(f"estimator {estimator}", "policy", *columns)
+            for policy in self.ranked(estimator):
+                cells = []
+                for metric in METRICS:
+                    own = self.mean(estimator, policy, metric)
+                    cells.append(f"{own.mean:.2f} ± {own.half_width:.2f}")
+                    less = self._difference(estimator, policy, metric)
+                    cells.append(
+                        "-"
+                        if policy == self.reference
+                        else f"{less.mean:+.2f} ± {less.half_width:.2f}"
+                    )
+                table.add_row(policy, *cells)
+            print_table(table)
+
+    def markdown(self) -> str:
+        """Return the tables as Markdown."""
+        parts = [f"# {self.title}"]
+        for estimator in self.estimators:
+            reference = _labels(estimator, self.reference)
+            rows = [
+                [name, *compared_errors(self.rows, _labels(estimator, name), reference)]
+                for name in self.ranked(estimator)
+            ]
+            header = ["policy", *compared_header(self.reference)]
+            parts += [f"## Estimator `{estimator}`", markdown(header, rows)]
+        return "\n\n".join(parts)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return means and paired differences as plain JSON."""
+        return {
+            "title": self.title,
+            "reference": self.reference,
+            "rows": [
+                {
+                    **_labels(estimator, policy),
+                    "mean": {
+                        metric: vars(self.mean(estimator, policy, metric))
+                        for metric in (*METRICS, "reward")
+                    },
+                    "difference": {
+                        metric: vars(self._difference(estimator, policy, metric))
+                        for metric in (*METRICS, "reward")
+                    },
+                }
+                for estimator in self.estimators
+                for policy in self.ranked(estimator)
+            ],
+        }
+
+    def draw(self, path: Path) -> None:
+        """Save a figure of density and speed errors of all policies."""
+        ranked = self.ranked(self.estimators[0])
+        series = {
+            name: {
+                policy: {metric: self.mean(name, policy, metric) for metric in METRICS}
+                for policy in ranked
+            }
+            for name in self.estimators
+        }
+        save_errors(path, ranked, series, self.title)
+
+    def _difference(self, estimator: str, policy: str, metric: str) -> Interval:
+        reference = _labels(estimator, self.reference)
+        return difference(self.rows, _labels(estimator, policy), reference, metric)
+
+
+def _labels(estimator: str, policy: str) -> dict[str, str]:
+    return {"estimator": estimator, "policy": policy}
+
+
+def shown(found: Evaluation, cells: dict[tuple[str, str], Cell]) -> list[str]:
+    """Return the policies to show: the reference, the best schedule and the best policies."""
+    estimator = found.estimators[0]
+    ranked = [name for name in found.ranked(estimator) if name not in (found.reference, ALL)]
+    sources = {name: find_policy(cells[estimator, name].policy) for name in ranked}
+    rules = [name for name in ranked if isinstance(sources[name], NamedSchedule)]
+    learned = [name for name in ranked if name not in rules]
+    return [found.reference, *rules[:1], *learned[:2]]
+
+
+def draw_traffic(
+    args: Args, found: Evaluation, cells: dict[tuple[str, str], Cell], noise: str, place: Place
+) -> None:
+    """Draw the first traffic seed under some policies, and write the page if it is wanted."""
+    estimator, seed = args.estimators[0], parse_seeds(args.seeds)[0]
+    episodes = [
+        watch(name, cells[estimator, name], seed, place.records) for name in shown(found, cells)
     ]
-    if given:
-        raise ValueError(f"{given[0]} has no use with a suite, whose cells say all: leave it out")
-    is_default = args.output == Args.output
-    return args.suite, Path("results/suites") / args.suite if is_default else args.output
+    history = episodes[0].history
+    maps = [RoadMap("true density", history.truth, history)]
+    for each in episodes:
+        rmse = each.row["rmse_density"]
+        maps.append(estimate_map(each.history, rmse, f"{each.name}: estimate"))
+        maps.append(RoadMap(f"{each.name}: queried", each.history.queried, each.history))
+    title = f"Traffic seed {seed}, {estimator}, {noise}"
+    save_figure(draw_maps([maps], width=8.4), args.output / MAPS, title)
+    if args.html:
+        errors = [
+            (
+                name,
+                {
+                    metric: (own.mean, own.half_width)
+                    for metric in METRICS
+                    for own in [found.mean(estimator, name, metric)]
+                },
+            )
+            for name in found.ranked(estimator)
+        ]
+        write_page(args.output / PAGE, found.title, errors, episodes, seed)
 
 
-def written(args: Args) -> list[Path]:
-    """Return the files that an evaluation writes."""
-    names = (EPISODES, SUMMARY, ERRORS, MAPS, *([PAGE] if args.html else []))
-    return [args.output / name for name in names]
-
-
+@resumable()
 def main(args: Args) -> None:
-    """Record what is missing, evaluate, and leave table, scores and figures."""
-    if args.suite is not None or args.verify is not None:
-        suite, folder = suite_options(args)
-        evaluate_suite(suite, args.policies, args.verify, folder, args, args.json)
-        return
-    refuse_to_replace(written(args), args.force)
-    sources = find_sources(args)
-    require(len(parse_seeds(args.seeds)) >= 2, "seeds", "at least two, for an interval", args.seeds)
-    scores = evaluate(args, sources)
-    seeds, config = parse_seeds(args.seeds), reference_config(args)
+    """Record what is missing, evaluate, and write tables, rows and figures."""
+    names = (ROWS, TABLES, ERRORS, MAPS, *([PAGE] if args.html else []))
+    refuse_to_replace([args.output / name for name in names], args.force)
+    cells, seeds = make_cells(args), parse_seeds(args.seeds)
+    require(len(seeds) >= 2, "seeds", "at least two, for an interval", args.seeds)
+    for cell in cells.values():
+        cell.check()
+    config = reference_config(args)
     privacy, parameters = config.privacy, config.arz_parameters.name
     noise = f"{privacy.preset} noise at ({privacy.epsilon:g}, {privacy.delta:g})"
     traffic = f"{len(seeds)} episodes on {seed_kind(seeds)} traffic"
     title = f"{args.env.rpartition('/')[2]}, {parameters}, {noise}, {traffic}"
-    report = Report(scores, args.reference, title)
-    report.write(args.output, dataclasses.asdict(args))
+    ids = {cell.id for cell in cells.values()}
+
+    def summarise(rows: pl.DataFrame) -> Evaluation:
+        policies = list(dict.fromkeys(name for _, name in cells))
+        # An interrupted evaluation may have left rows of other cells.
+        own = rows.filter(pl.col("cell").is_in(ids))
+        return Evaluation(title, args.reference, args.estimators, policies, own)
+
+    study = Study(
+        "evaluation",
+        tuple(cells.values()),
+        seeds,
+        lambda rows, folder: summarise(rows).markdown(),
+    )
+    place = args.place(args.output)
+    if args.force and (args.output / ROWS).exists():
+        (args.output / ROWS).unlink()
+        shutil.rmtree(args.output / "rows", ignore_errors=True)
+    run_study(study, place)
+    found = summarise(read_rows("evaluation", args.output))
     if args.json:
-        print((args.output / SUMMARY).read_text(encoding="utf-8"), end="")
+        print(json.dumps(found.to_dict(), indent=2))
     else:
-        report.print()
-    report.draw(args.output / ERRORS)
-    draw_traffic(args, report, sources, noise)
-    if args.html:
-        episodes = [watch(args, name, sources[name]) for name in shown(args, report, sources)]
-        write_page(args.output / PAGE, report, episodes)
+        found.print()
+    found.draw(args.output / ERRORS)
+    draw_traffic(args, found, cells, noise, place)
     if not args.json:
         page = f"; a browser opens {args.output / PAGE}" if args.html else ""
-        print(f"scores and figures are in {args.output}/{page}")
+        print(f"tables and figures are in {args.output}/{page}")
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from agents.environments import make_config
-from agents.evaluation.terminal import make_table, print_table
+from agents.terminal import make_table, print_table
 from agents.figures import LABELS
 from agents.measured_field import Replay, field_corridor, read_field
 from dptse_env.estimators import EstimatorSettings

@@ -22,7 +22,7 @@ from tqdm import tqdm
 
 from agents.engines.engine import Workers
 from agents.environments import given_keywords
-from agents.evaluation.terminal import make_table, print_table
+from agents.terminal import make_table, print_table
 from agents.files import refuse_to_replace
 from agents.search.space import SPACE
 from agents.search.tuning import TuningStudy, journal_path, locked_study, scores_of

@@ -1,1 +1,1 @@
-"""Studies on test traffic, each with its plan, measurements and report template."""
+"""The studies of the package, a file each: cells, seeds, and the report that is made of rows."""

@@ -5,8 +5,8 @@ import json
 import pytest
 from rich.console import Console
 
-from agents.evaluation import terminal
-from agents.evaluation.terminal import make_table, print_table
+from agents import terminal
+from agents.terminal import make_table, print_table
 from scripts import audit, calibrate, evaluate, tune
 
 SHORT = "dptse_env:dptse/ShortHighway-v0"

@@ -11,7 +11,7 @@ import numpy as np
 
 from agents.engines.engine import Engine, run_in_order
 from agents.engines.local import THIS_PROCESS
-from agents.evaluation.terminal import make_table, print_table
+from agents.terminal import make_table, print_table
 from agents.files import write_json
 from agents.studies.audit.distances import protects_seconds, replaces
 from agents.studies.audit.releases import AttackedRelease, attacked

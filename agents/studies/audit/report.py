@@ -10,7 +10,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from agents.evaluation.terminal import make_table, print_table, print_text
+from agents.terminal import make_table, print_table, print_text
 from agents.experiments.reports import fill
 from agents.files import write_json
 from dptse_env.privacy import epsilon_of

@@ -1,0 +1,210 @@
+"""Watched episodes, and an interactive page about an evaluation that needs no network."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from agents.environments import quietly, unwrap
+from agents.files import write_atomically
+from agents.play import Cell
+from agents.tables import DENSITY, SPEED
+from dptse_env.evaluation import Row, evaluate
+from dptse_env.process import QueryProcess
+from dptse_env.rendering import DENSITY_MAP, History
+from dptse_env.traffic import Records
+from dptse_env.utils.arrays import FloatArray
+from dptse_env.utils.extras import needed_for
+
+FRAMES = 140
+"""Most positions of the slider: more would make the page large and slow."""
+
+TRUTH = "#444444"
+COLOURS = ("#1b4f72", "#c1272d", "#5d8233", "#7d5ba6", "#b9770e")
+
+
+class Watched:
+    """An episode of one policy, second by second, from the state at the reset on.
+
+    Attributes:
+        name: The policy.
+        history: Truth, estimates, queries and errors.
+        density_std: Deviations that the estimator reports of the mainline densities [veh/km], an
+            array (n_mainline,) for each second.
+        epsilon: Privacy loss so far, a number for each second; infinite where none is bounded.
+        row: The row of the episode.
+    """
+
+    row: Row
+
+    def __init__(self, name: str, process: QueryProcess) -> None:
+        """Begin with nothing."""
+        self.name, self._process = name, process
+        self.history = History.empty(process)
+        self.density_std: list[FloatArray] = []
+        self.epsilon: list[float] = []
+
+    def __call__(self) -> None:
+        """Add the present second."""
+        process, n = self._process, self._process.interface.n_mainline
+        self.history.append(process)
+        self.density_std.append(process.estimate.density_std[0, :n].copy())
+        self.epsilon.append(float(process.info(0)["epsilon"]))
+
+    def rows(self) -> list[Row]:
+        """See `dptse_env.evaluation.Watcher.rows`: no further columns."""
+        return [{}]
+
+
+def watch(name: str, cell: Cell, seed: int, records: Records = None) -> Watched:
+    """Play a cell on one traffic seed, and keep what happens."""
+    more = {"traffic_seeds": [seed], "records": records}
+    with quietly():
+        env = gym.make(cell.env, disable_env_checker=True, **{**cell.all_keywords, **more})
+    watched = Watched(name, unwrap(env).process)
+    (watched.row,) = evaluate(
+        env,
+        cell.load_policy(env),
+        [seed],
+        cell.noise_seed,
+        deterministic=cell.deterministic,
+        watchers=[lambda process: watched],
+    )
+    return watched
+
+
+def write_page(
+    path: Path,
+    title: str,
+    errors: Sequence[tuple[str, dict[str, tuple[float, float]]]],
+    episodes: Sequence[Watched],
+    seed: int,
+) -> None:
+    """Write a page with errors of all policies, and episodes over space and time with a slider.
+
+    Args:
+        path: The file.
+        title: What was evaluated.
+        errors: For each policy its name, and mean and half width of the interval by metric.
+        episodes: Episodes of some policies on one traffic.
+        seed: Their traffic seed.
+
+    Raises:
+        MissingExtraError: plotly is not installed.
+        OSError: The file cannot be written.
+    """
+    with needed_for("an HTML page"):
+        import plotly.graph_objects as go  # noqa: PLC0415
+        from plotly.subplots import make_subplots  # noqa: PLC0415
+
+    first = episodes[0].history
+    n_rows = 3 + len(episodes)
+    titles = ["Errors of all policies", f"True density, traffic seed {seed} [veh/km]"]
+    for each in episodes:
+        titles.append(f"{each.name}: estimate [veh/km], and what it queried")
+    figure = make_subplots(
+        rows=n_rows,
+        cols=1,
+        subplot_titles=[*titles, "Along the road at the second of the slider [veh/km]"],
+        row_heights=[0.8, *[1.0] * (1 + len(episodes)), 1.4],
+        vertical_spacing=0.28 / n_rows,
+    )
+    for metric, unit, colour in ((DENSITY, "veh/km", COLOURS[0]), (SPEED, "km/h", COLOURS[1])):
+        spread = {"type": "data", "array": [each[metric][1] for _, each in errors]}
+        figure.add_bar(
+            x=[name for name, _ in errors],
+            y=[each[metric][0] for _, each in errors],
+            error_y=spread,
+            name=f"{'density' if metric == DENSITY else 'speed'} RMSE [{unit}]",
+            marker_color=colour,
+            row=1,
+            col=1,
+        )
+    places = np.cumsum([0.0, *first.lengths])
+    largest = max(first.density_scale, float(np.max(first.truth)))
+    shades = {"coloraxis": "coloraxis", "x": list(range(len(first.truth))), "y": places.round(3)}
+    figure.add_heatmap(z=_columns(first.truth), name="truth", **shades, row=2, col=1)
+    middles = (places[:-1] + places[1:]) / 2
+    for k, each in enumerate(episodes):
+        figure.add_heatmap(
+            z=_columns(each.history.estimate), name=each.name, **shades, row=3 + k, col=1
+        )
+        seconds, segments = np.nonzero(np.array(each.history.queried))
+        figure.add_scattergl(
+            x=seconds,
+            y=middles[segments],
+            mode="markers",
+            marker={"size": 2, "color": "white", "opacity": 0.6},
+            hoverinfo="skip",
+            showlegend=False,
+            row=3 + k,
+            col=1,
+        )
+    n_fixed = len(figure.data)
+    for trace in _profile(go, episodes, middles, 0):
+        figure.add_trace(trace, row=n_rows, col=1)
+    moving = list(range(n_fixed, len(figure.data)))
+    seconds_shown = range(0, len(first.truth), max(math.ceil(len(first.truth) / FRAMES), 1))
+    figure.frames = [
+        go.Frame(data=_profile(go, episodes, middles, second), traces=moving, name=str(second))
+        for second in seconds_shown
+    ]
+    figure.update_layout(
+        title=title,
+        template="plotly_white",
+        height=230 * n_rows,
+        barmode="group",
+        coloraxis={"colorscale": DENSITY_MAP, "cmin": 0, "cmax": largest},
+        legend={"orientation": "h", "y": -0.12},
+        sliders=[_slider(seconds_shown)],
+    )
+    for row in range(2, 3 + len(episodes)):
+        figure.update_yaxes(title="road [km]", row=row, col=1)
+        figure.update_xaxes(title="second" if row == 2 + len(episodes) else None, row=row, col=1)
+    figure.update_xaxes(title="road [km]", row=n_rows, col=1)
+    figure.update_yaxes(range=[0, largest], row=n_rows, col=1)
+    write_atomically(path, figure.to_html(include_plotlyjs=True, full_html=True))
+
+
+def _columns(seconds: Sequence[Any]) -> Any:
+    """Return a map with a row for each segment, to a tenth."""
+    return np.array(seconds).T.round(1)
+
+
+def _profile(go: Any, episodes: Sequence[Watched], middles: FloatArray, second: int) -> list[Any]:
+    """Return truth and estimates along the road in one second."""
+    truth = episodes[0].history.truth[second].round(1)
+    line = {"color": TRUTH, "width": 3}
+    traces = [go.Scatter(x=middles, y=truth, name="truth", line=line, mode="lines")]
+    for k, each in enumerate(episodes):
+        error = {"type": "data", "array": (1.96 * each.density_std[second]).round(1)}
+        rmse, epsilon = each.history.rmse[second], each.epsilon[second]
+        loss = f", ε {epsilon:.2f}" if math.isfinite(epsilon) else ""
+        traces.append(
+            go.Scatter(
+                x=middles,
+                y=each.history.estimate[second].round(1),
+                error_y=error,
+                name=f"{each.name}: RMSE {rmse:.1f} veh/km{loss}",
+                mode="lines+markers",
+                line={"color": COLOURS[k % len(COLOURS)]},
+            )
+        )
+    return traces
+
+
+def _slider(seconds: Sequence[int]) -> dict[str, Any]:
+    now = {"mode": "immediate", "frame": {"duration": 0, "redraw": True}}
+    return {
+        "currentvalue": {"prefix": "second "},
+        "pad": {"t": 40},
+        "steps": [
+            {"label": str(each), "method": "animate", "args": [[str(each)], now]}
+            for each in seconds
+        ],
+    }
