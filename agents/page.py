@@ -112,7 +112,7 @@ def write_page(
         cols=1,
         subplot_titles=[*titles, "Along the road at the second of the slider [veh/km]"],
         row_heights=[0.8, *[1.0] * (1 + len(episodes)), 1.4],
-        vertical_spacing=0.28 / n_rows,
+        vertical_spacing=0.36 / n_rows,
     )
     for metric, unit, colour in ((DENSITY, "veh/km", COLOURS[0]), (SPEED, "km/h", COLOURS[1])):
         spread = {"type": "data", "array": [each[metric][1] for _, each in errors]}
@@ -157,7 +157,7 @@ def write_page(
     figure.update_layout(
         title=title,
         template="plotly_white",
-        height=230 * n_rows,
+        height=240 * n_rows,
         barmode="group",
         coloraxis={"colorscale": DENSITY_MAP, "cmin": 0, "cmax": largest},
         legend={"orientation": "h", "y": -0.12},
@@ -165,10 +165,13 @@ def write_page(
     )
     for row in range(2, 3 + len(episodes)):
         figure.update_yaxes(title="road [km]", row=row, col=1)
-        figure.update_xaxes(title="second" if row == 2 + len(episodes) else None, row=row, col=1)
+        last = row == 2 + len(episodes)
+        ends = [-0.5, len(first.truth) - 0.5]
+        figure.update_xaxes(title="second" if last else None, range=ends, row=row, col=1)
     figure.update_xaxes(title="road [km]", row=n_rows, col=1)
     figure.update_yaxes(range=[0, largest], row=n_rows, col=1)
-    write_atomically(path, figure.to_html(include_plotlyjs=True, full_html=True))
+    # Playing at once would draw the moving curves alone.
+    write_atomically(path, figure.to_html(include_plotlyjs=True, auto_play=False))
 
 
 def _columns(seconds: Sequence[Any]) -> Any:

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from agents.environments import make_vector
-from agents.evaluation.episodes import run_episodes
 from agents.policies import find_policy, read_saved_policy
 from dptse_env import sb3
+from dptse_env.evaluation import evaluate
 from dptse_env.policies import TRANSFERABLE
 from dptse_env.schedules import make_schedule
 from tests.agents.policies import SHORT, save
@@ -132,9 +132,9 @@ def test_a_saved_model_acts_in_the_encoding_of_its_action_space(action, models):
     policy = find_policy(models[action])
     assert policy.keywords == {"action": action}
     env = make_vector(SHORT, 2, {"action": action, "horizon": 70})
-    scores = run_episodes(env, policy.load(env), traffic_seeds=(0, 1), seeds=(0, 1))
-    assert all(-1.0 < score.reward < 0.0 for score in scores)
-    assert all(score.n_dropped == 0 for score in scores if action == "sequential")
+    rows = evaluate(env, policy.load(env), (0, 1))
+    assert all(-1.0 < row["reward"] < 0.0 for row in rows)
+    assert all(row["n_dropped"] == 0 for row in rows if action == "sequential")
     other = make_vector(SHORT, 2, {"action": action, "corridor": "paper-highway"})
     with pytest.raises(ValueError, match="has the observation_space"):
         policy.load(other)

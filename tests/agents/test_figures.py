@@ -1,9 +1,7 @@
-import gymnasium as gym
 import numpy as np
 import pytest
 from PIL import Image
 
-from agents.evaluation.episodes import watch_episode
 from agents.figures import (
     RoadMap,
     draw_maps,
@@ -11,38 +9,35 @@ from agents.figures import (
     save_errors,
     save_figure,
 )
+from agents.page import watch
+from agents.play import Cell
 from agents.statistics import Interval
-from dptse_env.schedules import make_schedule
 
 SHORT = "dptse_env:dptse/ShortHighway-v0"
 
 
 @pytest.fixture(scope="module")
 def watched():
-    env = gym.make(SHORT, traffic_seeds="0:1", estimator="random_walk")
-    return watch_episode(env, make_schedule("paper", env), traffic_seed=0, seed=1)
+    episode = watch("paper", Cell(SHORT, "paper", {"estimator": "random_walk"}), 0)
+    return episode.row["rmse_density"], episode.history
 
 
-def test_a_map_names_exactly_the_error_of_the_score(watched):
-    """The seconds of the figure's error are those of the score: from 61 on, not from 60."""
-    score, history = watched
+def test_a_map_names_exactly_the_error_of_the_row(watched):
+    """The seconds of the figure's error are those of the row: from 61 on, not from 60."""
+    rmse, history = watched
     squares = (np.array(history.estimate) - np.array(history.truth)) ** 2
     pooled = np.sqrt(squares[61:].mean())
-    assert score.rmse_density == pytest.approx(pooled)
-    assert (
-        estimate_map(history, score.rmse_density, "EKF").title == f"EKF, RMSE {pooled:.1f} veh/km"
-    )
+    assert rmse == pytest.approx(pooled)
+    assert estimate_map(history, rmse, "EKF").title == f"EKF, RMSE {pooled:.1f} veh/km"
     # One second makes a difference where its error is large.
     history.estimate[60] = history.estimate[60] + 1e4
-    assert (
-        estimate_map(history, score.rmse_density, "EKF").title == f"EKF, RMSE {pooled:.1f} veh/km"
-    )
+    assert estimate_map(history, rmse, "EKF").title == f"EKF, RMSE {pooled:.1f} veh/km"
 
 
 def test_maps_stand_in_columns_with_one_bar(watched, tmp_path):
-    score, history = watched
+    rmse, history = watched
     column = [
-        RoadMap("truth", history.truth, history), estimate_map(history, score.rmse_density, "estimate"),
+        RoadMap("truth", history.truth, history), estimate_map(history, rmse, "estimate"),
         RoadMap("queried", history.queried, history),
     ]  # fmt: skip
     figure = draw_maps([column, column], width=8.0)

@@ -1,0 +1,170 @@
+"""Ray clusters of several nodes on this machine, and their faults."""
+
+import contextlib
+import http.server
+import operator
+import os
+import socket
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from agents.executors import THIS_PROCESS, ExecutorError, RayCluster, run_tasks
+from agents.study import Place, run
+from dptse_env.traffic.library import CACHE_VARIABLE
+from tests.agents.faults import TRACES, rows_of, study
+
+pytestmark = [
+    pytest.mark.ray,
+    pytest.mark.slow,
+    # Ray leaves sockets and files to its own shutdown.
+    pytest.mark.filterwarnings("ignore::ResourceWarning"),
+    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
+]
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="session")
+def ray():
+    """Ray, if it is installed; its clusters are of this machine alone and ask for no token."""
+    os.environ |= {"RAY_AUTH_MODE": "disabled", "RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0"}
+    return pytest.importorskip("ray")
+
+
+@pytest.fixture
+def cluster(ray):
+    """A cluster without nodes but its head, which runs no task; the driver runs there."""
+    from ray.cluster_utils import Cluster
+
+    made = Cluster(initialize_head=True, head_node_args={"num_cpus": 0})
+    yield made
+    with contextlib.suppress(Exception):
+        ray.shutdown()
+    made.shutdown()
+
+
+@pytest.fixture
+def traces(tmp_path, monkeypatch):
+    """Let the faults of the study befall, and leave traces in a folder."""
+    folder = tmp_path / "traces"
+    folder.mkdir()
+    monkeypatch.setenv(TRACES, str(folder))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def expected(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("undisturbed")
+    run(study(), Place(folder, THIS_PROCESS), progress=False)
+    return rows_of(folder)
+
+
+def add_nodes(cluster, traces, n):
+    for _ in range(n):
+        cluster.add_node(num_cpus=1, env_vars={TRACES: str(traces)})
+
+
+def wait_until(condition, seconds=60):
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def raise_type(kind):
+    raise kind("as it is")
+
+
+def read(path):
+    return Path(path).read_bytes()
+
+
+def test_errors_are_those_of_the_task(cluster, tmp_path):
+    cluster.add_node(num_cpus=2)
+    executor = RayCluster(cluster.address)
+    assert dict(run_tasks(executor, operator.neg, range(20))) == {k: -k for k in range(20)}
+    with pytest.raises(KeyError, match="as it is"):
+        list(run_tasks(executor, raise_type, [KeyError]))
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        list(run_tasks(executor, read, [str(tmp_path / "nowhere")]))
+    with pytest.raises(ExecutorError, match="a task was lost 4 times"):
+        list(run_tasks(executor, os._exit, [1]))
+    assert list(run_tasks(executor, abs, [-1])) == [(-1, 1)]
+
+
+def test_nodes_make_the_records_that_they_lack(cluster, tmp_path, expected):
+    for k in (1, 2):
+        cluster.add_node(num_cpus=1, env_vars={CACHE_VARIABLE: str(tmp_path / f"cache-{k}")})
+    run(study(), Place(tmp_path, RayCluster(cluster.address)), progress=False)
+    assert rows_of(tmp_path).equals(expected)
+    for k in (1, 2):
+        records = (tmp_path / f"cache-{k}").glob("*/*/0*")
+        assert sorted(path.name for path in records) == ["00002000", "00002001"]
+
+
+def test_a_killed_worker(cluster, traces, tmp_path, expected):
+    add_nodes(cluster, traces, 2)
+    run(study(), Place(tmp_path, RayCluster(cluster.address)), progress=False)
+    assert (traces / "killed").exists()
+    assert rows_of(tmp_path).equals(expected)
+
+
+def test_a_removed_node(cluster, traces, tmp_path, expected):
+    add_nodes(cluster, traces, 1)
+    leaving = cluster.add_node(num_cpus=1, env_vars={TRACES: str(traces)})
+    executor = RayCluster(cluster.address)
+    job = threading.Thread(target=run, args=(study(), Place(tmp_path, executor), False))
+    job.start()
+    # Here, as Ray starts and ends nodes in the main thread alone.
+    wait_until(lambda: len(list(traces.glob("played-*"))) >= 2)
+    cluster.remove_node(leaving, allow_graceful=False)
+    job.join()
+    assert rows_of(tmp_path).equals(expected)
+
+
+def test_a_killed_driver_goes_on(cluster, traces, tmp_path, expected):
+    add_nodes(cluster, traces, 2)
+    command = [sys.executable, "-m", "tests.agents.faults", str(tmp_path), cluster.address]
+    driver = subprocess.Popen(command, cwd=ROOT)
+    wait_until(lambda: len(list((tmp_path / "rows").glob("*.parquet"))) >= 2)
+    driver.kill()
+    driver.wait()
+    assert not (tmp_path / "rows.parquet").exists()
+    assert subprocess.run(command, cwd=ROOT, check=False).returncode == 0
+    assert rows_of(tmp_path).equals(expected)
+
+
+@pytest.mark.parametrize(
+    ("address", "message"),
+    [
+        ("127.0.0.1:{free}", "no cluster answers at .*ray start --head"),
+        ("no-such-host.invalid:6379", "no cluster answers at no-such-host.invalid:6379"),
+        ("127.0.0.1", "address must be host:port"),
+        ("ray://127.0.0.1:10001", "address must be host:port.* Run the program on a node"),
+    ],
+)
+def test_an_address_without_a_cluster_is_an_error_within_30_seconds(ray, address, message):
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = address.format(free=free.getsockname()[1])
+    start = time.monotonic()
+    with pytest.raises(ExecutorError, match=message):
+        RayCluster(address)
+    assert time.monotonic() - start < 30
+
+
+def test_another_server_at_the_address_is_an_error_within_30_seconds(ray):
+    with http.server.ThreadingHTTPServer(
+        ("127.0.0.1", 0), http.server.SimpleHTTPRequestHandler
+    ) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        start = time.monotonic()
+        with pytest.raises(ExecutorError, match="does not answer as a Ray cluster"):
+            RayCluster(f"127.0.0.1:{server.server_port}")
+        assert time.monotonic() - start < 30
+        server.shutdown()

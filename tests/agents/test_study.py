@@ -1,0 +1,200 @@
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import polars as pl
+import pytest
+
+from agents.executors import THIS_PROCESS, LocalProcesses
+from agents.play import Cell, play
+from agents.study import Place, Study, read_rows, run, write_report, write_table
+from agents.tables import UnmeasuredError, below, difference, grid, mean, pick, values
+from tests.agents.faults import SHORT, TRACES, rows_of, study
+from tests.agents.policies import save
+
+ROOT = Path(__file__).parents[2]
+KEYWORDS = {"estimator": "random_walk", "horizon": 80}
+
+
+def report(rows, folder):
+    assert (folder / "extra.parquet").exists()
+    return grid(
+        "B",
+        [1, 2, 9],
+        ["mean"],
+        lambda row, _: f"{mean(rows, {'bandwidth': row}, 'rmse_density').mean:.6f}",
+    )
+
+
+def small(calls=None, **changes):
+    cells = tuple(
+        Cell(SHORT, "round-robin", {**KEYWORDS, "bandwidth": b}, {"bandwidth": b}) for b in (1, 2)
+    )
+
+    def measure(place):
+        if calls is not None:
+            calls.append(place.folder)
+        return pl.DataFrame({"a": [1]})
+
+    return replace(
+        Study("small", cells, (2000, 2001), report, measures={"extra.parquet": measure}), **changes
+    )
+
+
+def test_a_study_plays_what_its_rows_lack_and_reports(tmp_path):
+    calls, place = [], Place(tmp_path, THIS_PROCESS)
+    first = small(calls)
+    run(first, place, progress=False)
+    rows = rows_of(tmp_path)
+    expected = [row for cell in first.cells for row in play(cell, first.seeds)]
+    assert rows.select("bandwidth", "traffic_seed").rows() == [
+        (1, 2000), (1, 2001), (2, 2000), (2, 2001),
+    ]  # fmt: skip
+    assert rows["reward"].to_list() == [row["reward"] for row in expected]
+    tables = (tmp_path / "tables.md").read_text()
+    assert f"| 1 | {rows['rmse_density'][:2].mean():.6f} |" in tables
+    assert "| 9 | - |" in tables
+    assert not (tmp_path / "rows").exists()
+    # Rows that are there are not played again, whatever their version, and the report is theirs.
+    old = rows.with_columns(version=pl.lit("0.1.0"), rmse_density=pl.lit(7.0))
+    write_table(tmp_path / "rows.parquet", old)
+    more = Cell(SHORT, "round-robin", {**KEYWORDS, "bandwidth": 3}, {"bandwidth": 3})
+    run(replace(first, cells=(*first.cells, more)), place, progress=False)
+    assert sorted(rows_of(tmp_path)["version"].to_list())[:4] == ["0.1.0"] * 4
+    assert "| 1 | 7.000000 |" in (tmp_path / "tables.md").read_text()
+    assert "0.1.0 (4 episodes)" in (tmp_path / "tables.md").read_text()
+    assert calls == [tmp_path]
+
+
+def test_cells_may_follow_from_rows(tmp_path):
+    def follow(rows, folder):
+        best = rows.group_by("bandwidth").agg(pl.col("reward").mean()).sort("reward")
+        chosen = int(best["bandwidth"][-1])
+        keywords = {**KEYWORDS, "bandwidth": chosen}
+        return [Cell(SHORT, "static", keywords, {"bandwidth": 10 + chosen}, seeds=(2005,))]
+
+    run(small(follow=follow), Place(tmp_path, THIS_PROCESS), progress=False)
+    assert rows_of(tmp_path)["bandwidth"].to_list()[-1] == 12
+    assert rows_of(tmp_path)["traffic_seed"].to_list()[-1] == 2005
+
+
+def test_bad_cells_are_refused_before_the_first_is_played(tmp_path):
+    good = small().cells[0]
+    for bad, message in [
+        (replace(good, keywords={**KEYWORDS, "estimator": "nobody"}), "estimator must be one of"),
+        (replace(good, policy="nobody"), "schedule must be one of"),
+        (replace(good, watchers=("nobody",)), "watchers must be of"),
+        (replace(good, keywords={"cargo": 1}), "cargo"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            run(small(cells=(good, bad)), Place(tmp_path, THIS_PROCESS), progress=False)
+        assert not (tmp_path / "rows").exists()
+
+
+def test_broken_tables_and_those_of_another_study_are_refused(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"rows\.parquet is not there"):
+        write_report(small(), tmp_path)
+    path = tmp_path / "rows.parquet"
+    table = pl.DataFrame({"study": ["other"], "version": ["1"], "cell": ["x"], "traffic_seed": [1]})
+    write_table(path, table)
+    with pytest.raises(ValueError, match="rows of the study 'other', not of 'small'"):
+        read_rows("small", tmp_path)
+    write_table(path, table.drop("cell"))
+    with pytest.raises(ValueError, match="must have a column 'cell'"):
+        read_rows("small", tmp_path)
+    path.write_bytes(path.read_bytes()[:-9])
+    with pytest.raises(ValueError, match="is not a table that this program wrote"):
+        read_rows("small", tmp_path)
+
+
+def test_labels_are_not_named_like_columns(tmp_path):
+    cell = replace(small().cells[0], labels={"reward": 1})
+    with pytest.raises(ValueError, match=r"labels must differ .* got 'reward'"):
+        run(small(cells=(cell,)), Place(tmp_path, THIS_PROCESS), progress=False)
+
+
+def test_an_id_says_all_that_rows_depend_on(tmp_path):
+    cell = small().cells[0]
+    changes = [
+        {"env": "dptse_env:dptse/PaperHighway-v0"}, {"policy": "paper"}, {"noise_seed": 1},
+        {"keywords": {"bandwidth": 2}}, {"deterministic": False}, {"watchers": ("queries",)},
+    ]  # fmt: skip
+    ids = {cell.id, *(replace(cell, **change).id for change in changes)}
+    assert len(ids) == len(changes) + 1
+    assert replace(cell, labels={}, seeds=(1,)).id == cell.id
+    # A policy that was trained again is another cell, and so is a road that was edited.
+    path = save(tmp_path / "policy.zip", seed=0)
+    trained = replace(cell, policy=str(path))
+    before = trained.id
+    save(path, seed=1)
+    assert trained.id != before
+    road = tmp_path / "road.toml"
+    road.write_text("a = 1")
+    edited = replace(cell, keywords={"corridor": str(road)})
+    before = edited.id
+    assert str(tmp_path) not in before
+    road.write_text("a = 2")
+    assert edited.id != before
+
+
+def test_pairs_are_of_one_version():
+    rows = pl.DataFrame(
+        {
+            "version": ["0.2.0"] * 4 + ["0.10.0"] * 3,
+            "policy": ["a", "a", "b", "b", "a", "a", "c"],
+            "traffic_seed": [1, 2, 1, 2, 1, 2, 1],
+            "reward": [-0.1, -0.2, -0.2, -0.4, -0.3, -0.3, -0.5],
+        }
+    )
+    a, b, c = ({"policy": name} for name in "abc")
+    assert values(rows, a, "error").tolist() == [300.0, 300.0]  # the last version has a, too
+    assert difference(rows, a, b, "error").mean == pytest.approx(-150.0)
+    assert below(rows, a, b).mean == pytest.approx(50.0)
+    with pytest.raises(UnmeasuredError):
+        difference(rows, b, c, "error")
+    with pytest.raises(UnmeasuredError):
+        pick(rows, {"policy": "d"})
+    with pytest.raises(ValueError, match="labels of several cells"):
+        pick(rows.filter(pl.col("version") == "0.2.0"), {})
+
+
+@pytest.fixture(scope="module")
+def expected(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("undisturbed")
+    run(study(), Place(folder, THIS_PROCESS), progress=False)
+    return rows_of(folder)
+
+
+@pytest.fixture
+def traces(tmp_path, monkeypatch):
+    folder = tmp_path / "traces"
+    folder.mkdir()
+    monkeypatch.setenv(TRACES, str(folder))
+    return folder
+
+
+def test_a_killed_worker_loses_nothing(tmp_path, traces, expected):
+    run(study(), Place(tmp_path, LocalProcesses(2)), progress=False)
+    assert (traces / "killed").exists()
+    assert rows_of(tmp_path).equals(expected)
+
+
+@pytest.mark.slow
+def test_a_killed_program_goes_on(tmp_path, traces, expected):
+    command = [sys.executable, "-m", "tests.agents.faults", str(tmp_path)]
+    program = subprocess.Popen(command, cwd=ROOT)
+    deadline = time.monotonic() + 120
+    while len(list((tmp_path / "rows").glob("*.parquet"))) < 2:
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    program.kill()
+    program.wait()
+    kept = sorted((tmp_path / "rows").glob("*.parquet"))
+    assert 2 <= len(kept) < 6
+    n_played = len(list(traces.glob("played-*")))
+    time.sleep(2.0)  # workers end with their program
+    assert len(list(traces.glob("played-*"))) <= n_played + 2
+    assert subprocess.run(command, cwd=ROOT, check=False).returncode == 0
+    assert rows_of(tmp_path).equals(expected)

@@ -1,0 +1,220 @@
+from types import SimpleNamespace
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from agents.environments import make_config
+from agents.play import Cell, play
+from agents.watchers import (
+    LENGTHS,
+    NEARLY_SPENT,
+    PHASES,
+    QUANTILES,
+    Honesty,
+    by_offset,
+    by_segment,
+    near_since_start,
+    regimes,
+    vehicle_table,
+)
+from dptse_env.estimators import Estimate
+from dptse_env.evaluation import evaluate
+from dptse_env.parts import make_release
+from dptse_env.traffic import RecordLibrary, draw_scenario
+
+SHORT = "dptse_env:dptse/ShortHighway-v0"
+N_MAINLINE = 6
+SEEDS = (2000, 2001)
+PACED = {"preset": "paced", "epsilon": 5.0, "pace": 1.0, "clip": 20.0}
+CAPPED = {"preset": "capped", "epsilon": 5.0, "cap": 8}
+
+
+def watch(privacy, watchers=("contributions",), **keywords):
+    """Return the rows of two episodes."""
+    keywords = {"estimator": "ekf", "privacy": privacy, **keywords}
+    return play(Cell(SHORT, "round-robin", keywords, watchers=watchers), SEEDS)
+
+
+def truth_of(privacy, seed):
+    """Return the sum of refused contributions and the last ``truth`` of an episode."""
+    keywords = {"estimator": "ekf", "privacy": privacy, "traffic_seeds": [seed]}
+    env = gym.make(SHORT, disable_env_checker=True, truth_in_info=True, **keywords)
+    process, refused = env.unwrapped.process, []
+
+    class Noting:
+        def __call__(self):
+            refused.append(process.info(0)["truth"].get("n_refused", 0))
+
+        def rows(self):
+            return [{}]
+
+    evaluate(env, "round-robin", [seed], watchers=[lambda process: Noting()])
+    return sum(refused), process.info(0)["truth"]
+
+
+@pytest.fixture(scope="module")
+def paced():
+    return watch(PACED)
+
+
+def test_watching_changes_nothing(paced):
+    for row, watched in zip(watch(PACED, ()), paced, strict=True):
+        assert row.items() <= watched.items()
+
+
+def test_refusals_and_ledgers_are_those_of_the_truth(paced):
+    for row, seed in zip(paced, SEEDS, strict=True):
+        refused, truth = truth_of(PACED, seed)
+        assert row["n_refused"] == refused > 0
+        spent = np.array(truth["ledgers"])
+        assert row["n_exhausted"] == (spent > NEARLY_SPENT).sum() > 0
+        record = RecordLibrary().get(make_config(SHORT, {}).corridor, seed)
+        on_road = np.unique(record.vehicle[record.segment < N_MAINLINE])
+        assert row["n_vehicles"] == on_road.size
+        expected = np.quantile(spent[on_road], QUANTILES)
+        np.testing.assert_allclose(np.array(row["quantiles"]), expected, rtol=1e-5)
+
+
+def test_places_and_lengths_add_up(paced):
+    for row in paced:
+        assert np.array(row["vehicles"]).sum() == row["n_vehicles"]
+        assert np.array(row["refused"]).shape == (N_MAINLINE,)
+        # Ramps have fixed sensors, too: what is met there has no place on the mainline.
+        assert 0 < np.array(row["met"]).sum() < row["n_met"]
+        assert np.array(row["refused_of"]).sum() == row["n_refused"]
+        assert (np.array(row["refused"]) <= np.array(row["met"])).all()
+        assert (np.array(row["spent"]) <= np.array(row["vehicles"])).all()
+
+
+def test_lengths_are_seconds_on_the_mainline(paced):
+    record = RecordLibrary().get(make_config(SHORT, {}).corridor, SEEDS[0])
+    counted = (record.segment < N_MAINLINE) & (record.step > 0)
+    seconds = np.bincount(record.vehicle[counted])
+    by_hand = np.histogram(seconds[seconds > 0], [*LENGTHS, np.inf])[0]
+    np.testing.assert_array_equal(np.array(paced[0]["vehicles"]), by_hand)
+
+
+def test_a_cap_refuses_what_comes_after_it():
+    rows = watch(CAPPED)
+    for row, seed in zip(rows, SEEDS, strict=True):
+        _, truth = truth_of(CAPPED, seed)
+        counted = np.array(truth["exposures"])
+        assert row["n_met"] - row["n_refused"] == counted.sum()
+        assert row["n_refused"] > 0
+        assert row["n_exhausted"] == (counted == CAPPED["cap"]).sum() > 0
+
+
+@pytest.mark.parametrize("preset", ["capped", "paced"])
+def test_where_every_second_has_a_budget_nobody_runs_out(preset):
+    rows = watch({"preset": preset, "epsilon": 5.0, "unit": "event"})
+    for row in rows:
+        assert row["n_met"] > 100
+        assert (row["n_refused"], row["n_exhausted"]) == (0, 0)
+
+
+def test_released_boundary_segments_are_met_too(paced):
+    rows = watch({**PACED, "boundary_inputs": "private"})
+    for row, nominal in zip(rows, paced, strict=True):
+        assert row["n_met"] > nominal["n_met"]
+
+
+def test_a_release_model_without_accounts_is_refused():
+    release = make_release(make_config(SHORT, {"privacy": {"preset": "corrected"}}))
+    with pytest.raises(ValueError, match=r"privacy\.preset must keep account .* got 'corrected'"):
+        vehicle_table(release)
+
+
+def test_regimes_part_the_occupied_segments():
+    speed = np.array([[90.0, 95.0, 40.0, 30.0, 20.0, 0.0, 100.0, 90.0]])
+    occupied = np.array([[True] * 5 + [False] + [True] * 2])
+    jam, front, free = regimes(speed, occupied)
+    assert front.tolist() == [[False, True, True, False, False, False, False, False]]
+    assert jam.tolist() == [[False, False, False, True, True, False, False, False]]
+    assert free.tolist() == [[True, False, False, False, False, False, True, True]]
+
+
+class Process:
+    """Two episodes of one mainline segment and a ramp, whose estimates miss by given errors."""
+
+    n_episodes = 2
+
+    def __init__(self):
+        self.elapsed = np.array([61, 61])
+        self.estimate = None
+        self.interface = SimpleNamespace(n_mainline=1)
+
+    def play(self, errors, occupied=True):
+        truth = np.zeros((2, 2, 2))
+        truth[..., 0], truth[..., 1] = (30.0 if occupied else 0.0), 90.0
+        self.truth = lambda _: truth
+        off = np.array(errors)[:, None]
+        ones = np.ones((2, 2))
+        self.estimate = Estimate(truth[..., 0] + off, truth[..., 1] - off, 2 * ones, 4 * ones)
+
+
+def test_deviations_are_held_against_errors():
+    process = Process()
+    watcher = Honesty(process)
+    for errors in ([1.0, 4.0], [1.0, 0.0]):
+        process.play(errors)
+        watcher()
+    first, second = watcher.rows()
+    assert first["chi2_density"] == pytest.approx(0.25)
+    assert first["chi2_speed"] == pytest.approx(1 / 16)
+    assert second["chi2_density"] == pytest.approx(0.5 * (2.0**2 + 0.0))
+    assert (first["density_50"], first["density_95"]) == (100.0, 100.0)
+    assert (second["density_90"], second["density_95"]) == (50.0, 50.0)  # 2 deviations exceed 1.96
+    assert second["speed_50"] == 50.0
+    assert (first["n_free"], first["n_jam"], first["n_front"]) == (2.0, 0.0, 0.0)
+    assert first["density_free"] == pytest.approx(2.0)
+    assert second["speed_free"] == pytest.approx(16.0)
+
+
+def test_the_warm_up_and_speeds_of_empty_segments_do_not_count():
+    process = Process()
+    watcher = Honesty(process)
+    process.play([50.0, 50.0])
+    process.elapsed[:] = 60
+    watcher()
+    process.elapsed[:] = 61
+    process.play([2.0, 2.0], occupied=False)
+    watcher()
+    found = watcher.rows()[0]
+    assert found["chi2_density"] == pytest.approx(1.0)
+    assert found["chi2_speed"] == 0.0
+    assert found["n_free"] == 0.0
+
+
+@pytest.fixture(scope="module")
+def queried():
+    return watch(PACED, ("queries",))
+
+
+def test_queries_are_counted_by_segment_and_phase(queried):
+    corridor = make_config(SHORT, {}).corridor
+    for row, seed in zip(queried, SEEDS, strict=True):
+        incident = draw_scenario(corridor, seed).incidents[0]
+        assert (row["incident"], row["start"]) == (incident.segment, incident.start)
+        assert sum(row["seconds"]) == 240
+        for phase, seconds in zip(PHASES, row["seconds"], strict=True):
+            assert sum(row[phase]) == 2 * seconds
+    np.testing.assert_allclose(by_segment(queried), 1 / 3, atol=0.01)
+
+
+def made_up(incident, start, seconds, counts, near):
+    phases = dict(zip(PHASES, counts, strict=True))
+    return {"incident": incident, "start": start, "seconds": seconds, "near": near, **phases}
+
+
+def test_offsets_and_times_are_counted_from_the_incident():
+    none = [0, 0, 0]
+    rows = [
+        made_up(0, 20.0, [20, 40, 0], ([20, 0, 0], [0, 40, 0], none), [20, 40, 40]),
+        made_up(-1, 0.0, [60, 0, 0], ([60, 0, 0], none, none), [0, 0, 0]),
+    ]
+    offsets, shares = by_offset(rows, "during")
+    assert dict(zip(offsets, shares, strict=True)) == {0.0: 0.0, 1.0: 1.0, 2.0: 0.0}
+    seconds, near = near_since_start(rows, (-20.0, 0.0, 20.0, 40.0))
+    assert seconds.tolist() == [-10.0, 10.0, 30.0]
+    np.testing.assert_allclose(near, [1.0, 2.0, 2.0])
