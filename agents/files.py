@@ -15,8 +15,7 @@ from typing import Any
 def refuse_to_replace(paths: Iterable[Path], force: bool) -> None:
     """Refuse to write over what an earlier run left, unless that is wanted.
 
-    Programs that go on where they stopped hold their settings to those of the folder instead, see
-    `agents.experiments.provenance`.
+    Programs that go on where they stopped do not ask.
 
     Args:
         paths: Files that are going to be written.

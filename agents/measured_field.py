@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from agents.evaluation.episodes import WARM_UP
 from dptse_env.estimators import make_estimator
+from dptse_env.evaluation import WARM_UP
 from dptse_env.model import ARZModel, ARZParameters
 from dptse_env.privacy import paper_sensitivity, single_noise_std
 from dptse_env.traffic import Corridor, Demand

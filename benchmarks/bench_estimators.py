@@ -14,8 +14,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 from dataclasses import dataclass, replace
 
-from agents.terminal import make_table, print_table
 from agents.figures import LABELS
+from agents.terminal import make_table, print_table
 from benchmarks.peers import FILTERS, FilterPeer
 from benchmarks.replay import recorded
 from benchmarks.steps import REFERENCES, Row, Steps, step_times

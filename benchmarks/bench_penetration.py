@@ -20,8 +20,8 @@ import gymnasium as gym
 import numpy as np
 
 from agents.environments import quietly
-from agents.terminal import make_table, print_table
 from agents.statistics import Interval, geometric_mean_interval
+from agents.terminal import make_table, print_table
 from benchmarks.throughput.measure import queries, take_turns
 from scripts.cli import run
 

@@ -17,8 +17,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from agents.terminal import make_table, print_table
 from agents.figures import LABELS
+from agents.terminal import make_table, print_table
 from benchmarks.long_roads import long_road
 from benchmarks.replay import replay_of
 from benchmarks.steps import Row, Steps, step_times

@@ -11,24 +11,20 @@ from __future__ import annotations
 import json
 import platform
 import signal
-import statistics
 import sys
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
 
-from agents.experiments.reports import fill
 from benchmarks.throughput import tables
 from benchmarks.throughput.children import measure_all
 from benchmarks.throughput.results import Results
 from benchmarks.throughput.rows import HORIZON, QUICK, Row, Sizes, catalogue, chosen
-from benchmarks.throughput.targets import targets
 from dptse_env.config import PRESETS, parse_seeds
 from dptse_env.traffic import RecordLibrary
 from dptse_env.utils.threads import n_cores
 from scripts.cli import run
 
-TEMPLATES = Path(tables.__file__).parent
 PRESET_OF = {"PaperHighway": "paper-highway", "PrivateHighway": "private-highway"}
 
 
@@ -43,7 +39,7 @@ class Args:
     seconds: float = 1.5
     """Time that a row's turns take [s], beside its start."""
     output: Path = Path("results/throughput")
-    """Folder of table.md, REPORT.md, throughput.csv and throughput.json."""
+    """Folder of tables.md, throughput.csv and throughput.json."""
     quick: bool = False
     """Fewer rows, records and repeats: whether it runs, not how fast."""
 
@@ -60,18 +56,21 @@ def record(rows: list[Row]) -> None:
 def report(results: Results, repeats: int) -> str:
     """Return all tables and their origin."""
     packages = ("dptse-env", "libsumo", "gymnasium", "numba", "numpy", "stable-baselines3")
-    content = {
-        "results": results,
-        "repeats": repeats,
-        "horizon": HORIZON,
-        "tables": tables,
-        "cores": tables.cores(results),
-        "median": statistics.median,
-        "targets": list(targets(results)),
-        "versions": {name: version(name) for name in packages},
-        "machine": f"python {platform.python_version()}, {n_cores()} cores ({platform.machine()})",
-    }
-    return fill(TEMPLATES, content)
+    versions = ", ".join(f"{name} {version(name)}" for name in packages)
+    machine = f"Python {platform.python_version()}, {n_cores()} cores ({platform.machine()})"
+    problems = [f"- {name}: {found.problem}" for name, found in results.items() if found.problem]
+    return "\n\n".join(
+        [
+            "## In short",
+            tables.summary(results),
+            "## Many episodes in one process",
+            tables.vectorised(results),
+            "## All other rows",
+            tables.remaining(results),
+            *(["## Not measured", "\n".join(problems)] if problems else []),
+            f"Measured {repeats} times, episodes of {HORIZON} s; {machine}; {versions}.\n",
+        ]
+    )
 
 
 def main(args: Args) -> None:
@@ -92,8 +91,7 @@ def main(args: Args) -> None:
     text = report(results, repeats)
     print(text)
     args.output.mkdir(parents=True, exist_ok=True)
-    (args.output / "REPORT.md").write_text(text, encoding="utf-8")
-    (args.output / "table.md").write_text(tables.summary(results), encoding="utf-8")
+    (args.output / "tables.md").write_text(text, encoding="utf-8")
     tables.write_csv(args.output / "throughput.csv", results)
     plain = [
         {"row": each.row.name, "work": each.row.work, "options": each.row.options,

@@ -13,10 +13,10 @@ from typing import Any
 from rich.table import Table
 
 from agents.evaluation.episodes import EpisodeScore
-from agents.terminal import make_table, print_table, print_text
 from agents.figures import save_errors
 from agents.files import write_atomically, write_csv
 from agents.statistics import Interval, mean_interval, paired_difference
+from agents.terminal import make_table, print_table, print_text
 
 METRICS = ("rmse_density", "rmse_speed", "reward")
 

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from agents.experiments import old_tables as tables
+from agents import tables
 from agents.figures import LABELS
 from agents.files import write_csv as write_rows
 from benchmarks.throughput.results import Result, Results, best, find
@@ -30,7 +30,7 @@ def number(value: float | None, form: str = "{:,.0f}") -> str:
 
 def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """Return a table; the first column is text, the others are numbers."""
-    return tables.markdown(header, rows, ":--", "--:") + "\n"
+    return tables.markdown(header, rows, ":--", "--:")
 
 
 def rate(result: Result, arm: str) -> str:
@@ -136,17 +136,6 @@ def remaining(results: Results) -> str:
         for arm in (result.repeats[0].arms if result.repeats else [NONE])
     ]
     return markdown(header, lines)
-
-
-def cores(results: Results) -> list[float]:
-    """Return the shares of a core that single-threaded work had: below one on a busy machine."""
-    return [
-        samples.cores
-        for result in results.values()
-        for measured in result.repeats
-        for arm, samples in measured.arms.items()
-        if arm in ("bare", "recording", "one thread", "kernel") and samples.cores is not None
-    ]
 
 
 def write_csv(path: Path, results: Results) -> None:

@@ -11,14 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.bench_throughput import report
-from benchmarks.throughput import tables
 from benchmarks.throughput.children import RowError, measure, measure_all
 from benchmarks.throughput.environments import Driver, Kernel, make_batch
 from benchmarks.throughput.measure import Measured, Samples, queries, resident, take_turns
-from benchmarks.throughput.results import Result, best
+from benchmarks.throughput.results import Result
 from benchmarks.throughput.rows import QUICK, Row, Sizes, catalogue, chosen
-from benchmarks.throughput.targets import targets
 
 ROOT = Path(__file__).parents[2]
 
@@ -59,46 +56,6 @@ def test_turns_alternate_and_set_up_is_off_the_clock():
     assert log == ["-", "a", "b"] * 3
     assert len(arms["a"].rates) == 3
     assert min(arms["a"].rates) > 1 / 0.05
-
-
-def test_targets_are_judged_by_the_measured_ratios():
-    found = results(
-        result("vector-ekf-5-1024", one_thread=[30_000.0], kernel=[40_000.0]),
-        result("vector-ukf-5-1024", one_thread=[9_999.0]),
-        result("libsumo", bare=[1_000.0], recording=[850.0]),
-        result("async-2", environment=[2_000.0]),
-        result("async-8", environment=[4_000.0]),
-        result("memory-paper", peak=1_500.0, libraries=400.0,
-               notes={"early": 900.0, "late": 901.0, "records": 256.0}),
-    )  # fmt: skip
-    known = [target for target in targets(found) if target.verdict != "not measured"]
-    verdicts = [(round(target.measured, 3), target.verdict) for target in known]
-    assert verdicts == [
-        (0.75, "met"), (30_000.0, "met"), (30.0, "met"), (7.5, "missed"), (9_999.0, "missed"),
-        (0.85, "met"), (1_100.0, "missed"), (1.0, "met"),
-    ]  # fmt: skip
-    assert [t.verdict for t in targets({})] == ["not measured"] * 14
-    assert best(found, "async-") == "async-8"
-
-
-def test_tables_name_what_is_missing():
-    found = results(
-        result("libsumo", bare=[1_000.0, 1_200.0, 1_100.0], recording=[900.0]),
-        result("sumo-rl", environment=[220.0]),
-        result("async-4", peak=300.0, libraries=200.0, environment=[4_400.0]),
-        Result(Row("scalar-ekf", "m:f"), problem="failed: no road"),
-        Result(Row("sync-8", "m:f"), problem="failed: no lane"),
-    )
-    lines = tables.summary(found).splitlines()
-    assert "| libsumo alone, simulated seconds | 1,100 ± 7% | – | 1 | – |" in lines
-    assert "| sumo-rl, single intersection, 5 s a step | 220 ± 0% | – | 1 | – |" in lines
-    assert "| one episode, EKF | failed: no road | – | – | – |" in lines
-    assert "| AsyncVectorEnv of 4, EKF | – | 4,400 ± 0% | 2 | 300 (200) |" in lines
-    assert "| SyncVectorEnv of 8, EKF | failed: no lane | – | – | – |" in lines
-    assert not any("UKF" in line for line in lines)
-    text = report(found, 1)
-    assert "## Not measured\n\n- scalar-ekf: failed: no road\n- sync-8: failed: no lane\n\n" in text
-    assert "## Not measured" not in report(results(result("ppo", PPO=[1.0])), 1)
 
 
 def test_a_module_that_is_absent_is_reported_and_the_rest_is_measured():
@@ -162,7 +119,7 @@ def test_the_command_writes_its_tables(tmp_path):
          "plain-ekf", "--output", tmp_path],
         cwd=ROOT, check=True, capture_output=True, text=True,
     )  # fmt: skip
-    assert (tmp_path / "REPORT.md").read_text() == done.stdout.removesuffix("\n")
+    assert (tmp_path / "tables.md").read_text() == done.stdout.removesuffix("\n")
     with (tmp_path / "throughput.csv").open() as file:
         assert {line["row"] for line in csv.DictReader(file)} == {"sync-8", "plain-ekf"}
     assert len(json.loads((tmp_path / "throughput.json").read_text())) == 2

@@ -11,12 +11,12 @@ import numpy as np
 
 from agents.engines.engine import Engine, run_in_order
 from agents.engines.local import THIS_PROCESS
-from agents.terminal import make_table, print_table
 from agents.files import write_json
 from agents.studies.audit.distances import protects_seconds, replaces
 from agents.studies.audit.releases import AttackedRelease, attacked
 from agents.studies.audit.series import PublicSeries, play_series
 from agents.studies.audit.strategies import public_plan
+from agents.terminal import make_table, print_table
 from dptse_env.config import EnvConfig
 from dptse_env.parts import make_release, privacy_report
 from dptse_env.release import PrivacyReport, ReleaseRequest, TrafficTable
