@@ -8,7 +8,7 @@ from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).parents[2]
-SHOWN = ("results/*/REPORT.md", "results/*/*.png", "examples/**/*.*")
+SHOWN = ("results/*/*.md", "results/*/*.png", "examples/**/*.*")
 """Files outside of the folder of pages that are part of the site."""
 
 ELSEWHERE = {
@@ -20,7 +20,7 @@ ELSEWHERE = {
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add reports, their figures and example files."""
+    """Add results, their figures and example files."""
     for pattern in SHOWN:
         for path in sorted(ROOT.glob(pattern)):
             name = path.relative_to(ROOT).as_posix()

@@ -1,4 +1,4 @@
-"""Engines on the command line."""
+"""Executors on the command line."""
 
 import socket
 import sys
@@ -7,17 +7,17 @@ import pytest
 
 pytest.importorskip("tyro")
 
-from scripts import record
+from scripts import evaluate
 from scripts.cli import run
 
 
 def refused(monkeypatch, capsys, tmp_path, *arguments, status=2):
-    fixed = ["--corridor", "short-highway", "--seeds", "0:1", "--records", str(tmp_path / "cache")]
-    monkeypatch.setattr("sys.argv", ["record.py", *fixed, *arguments])
+    fixed = ["--env", "dptse_env:dptse/ShortHighway-v0", "--output", str(tmp_path / "out")]
+    monkeypatch.setattr("sys.argv", ["evaluate.py", *fixed, *arguments])
     with pytest.raises(SystemExit) as ended:
-        run(record.main, record.Args, None)
+        run(evaluate.main, evaluate.Args, None)
     assert ended.value.code == status
-    assert not (tmp_path / "cache").exists()
+    assert not (tmp_path / "out").exists()
     (line,) = capsys.readouterr().err.splitlines()
     return line
 
@@ -27,7 +27,7 @@ def test_a_cluster_that_does_not_answer_is_one_line(monkeypatch, capsys, tmp_pat
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{free.getsockname()[1]}"
-    words = "--engine", "ray", "--address", address
+    words = "--executor", "ray", "--address", address
     line = refused(monkeypatch, capsys, tmp_path, *words, status=1)
     assert line.startswith(f"error: no cluster answers at {address}")
     assert "ray start --head" in line
@@ -35,11 +35,10 @@ def test_a_cluster_that_does_not_answer_is_one_line(monkeypatch, capsys, tmp_pat
 
 def test_the_missing_extra_is_one_line(monkeypatch, capsys, tmp_path):
     monkeypatch.setitem(sys.modules, "ray", None)
-    monkeypatch.delitem(sys.modules, "agents.engines.ray_cluster", raising=False)
-    line = refused(monkeypatch, capsys, tmp_path, "--engine", "ray", status=1)
+    line = refused(monkeypatch, capsys, tmp_path, "--executor", "ray", status=1)
     assert "pip install 'dptse-env[ray]'" in line
 
 
 def test_an_address_is_for_a_cluster(monkeypatch, capsys, tmp_path):
     line = refused(monkeypatch, capsys, tmp_path, "--address", "auto")
-    assert line == "error: address must be given with the engine ray, got 'auto'"
+    assert line == "error: address must be given with the executor ray, got 'auto'"
