@@ -33,6 +33,9 @@ ORIGIN = ("study", "version", "cell")
 Report = Callable[[pl.DataFrame, Path], str]
 """Makes Markdown of the rows of a study, and draws figures into its folder."""
 
+Follow = Callable[[pl.DataFrame, Path], Sequence[Cell]]
+"""Returns the cells that the rows of other cells ask for."""
+
 
 class Place(NamedTuple):
     """Where a study works.
@@ -67,7 +70,7 @@ class Study:
     cells: tuple[Cell, ...]
     seeds: tuple[int, ...]
     report: Report
-    follow: Callable[[pl.DataFrame, Path], Sequence[Cell]] | None = None
+    follow: Follow | None = None
     measures: Mapping[str, Callable[[Place], pl.DataFrame]] = field(default_factory=dict)
 
     def seeds_of(self, cell: Cell) -> tuple[int, ...]:

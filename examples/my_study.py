@@ -73,6 +73,7 @@ def report(rows: pl.DataFrame, folder: Path) -> str:
         except UnmeasuredError:
             continue
         draw_curve(axis, BANDWIDTHS, errors, look, rule)
+    axis.set_xticks(BANDWIDTHS)
     axis.set_xlabel("segments queried a second")
     axis.set_ylabel(error_label(DENSITY))
     save_figure(finish_figure(figure), folder / "errors.png", "ShortHighway-v0, EKF")

@@ -15,8 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from agents.terminal import make_table, print_table
 from agents.files import refuse_to_replace, replacing
+from agents.terminal import make_table, print_table
 from dptse_env.config import parse_seeds
 from dptse_env.model import ARZParameters, available_parameters, load_parameters
 from dptse_env.model.calibration import calibrate

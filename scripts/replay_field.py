@@ -15,9 +15,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from agents.environments import make_config
-from agents.terminal import make_table, print_table
 from agents.figures import LABELS
 from agents.measured_field import Replay, field_corridor, read_field
+from agents.terminal import make_table, print_table
 from dptse_env.estimators import EstimatorSettings
 from dptse_env.traffic.importers.fields import FieldSource
 from dptse_env.utils.validation import integer

@@ -10,15 +10,18 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import pkgutil
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
 
-from agents.files import refuse_to_replace
-from agents.study import TABLES, Study, write_report
+from agents.environments import given_keywords
+from agents.play import Cell
+from agents.study import Follow, Study, write_report
 from agents.study import run as run_study
 from dptse_env.config import parse_seeds
+from dptse_env.utils.validation import require
 from scripts.cli import Machines, resumable, run
 
 STUDIES = ("paper", "guarantees", "estimators", "policies", "suite")
@@ -37,7 +40,10 @@ class Args(Machines):
     quick: bool = False
     """Three traffic seeds for each cell, to see whether it runs."""
     seeds: str | None = None
-    """Traffic seeds, first:stop, in place of the study's own: needs another output."""
+    """Traffic seeds, first:stop, in place of the study's own; needs another output."""
+    corridor: str | None = None
+    """Road in place of the study's own: the name of a shipped corridor, a road file that ends in
+    .toml, or a JSON object of corridor fields; needs another output."""
     policies: tuple[str, ...] = ()
     """Trained policies for the study of policies, each name=path."""
     output: Path | None = None
@@ -63,17 +69,24 @@ def find_study(args: Args) -> Study:
     else:
         raise ValueError(f"study must be one of {', '.join(STUDIES)}, got {args.name!r}")
     seeds = found.seeds if args.seeds is None else parse_seeds(args.seeds)
-    cells = found.cells
-    if args.seeds is not None:
-        cells = tuple(dataclasses.replace(cell, seeds=None) for cell in cells)
-    if args.quick:
-        seeds = seeds[:QUICK_SEEDS]
-        cells = tuple(
-            dataclasses.replace(cell, seeds=cell.seeds and cell.seeds[:QUICK_SEEDS])
-            for cell in cells
-        )
-    study: Study = dataclasses.replace(found, cells=cells, seeds=seeds)
+    road, most = given_keywords("{}", args.corridor), QUICK_SEEDS if args.quick else None
+
+    def changed(cell: Cell) -> Cell:
+        own = None if args.seeds is not None or cell.seeds is None else cell.seeds[:most]
+        return dataclasses.replace(cell, keywords={**cell.keywords, **road}, seeds=own)
+
+    follow = found.follow
+    if follow is not None:
+        follow = _changed_too(follow, changed)
+    study: Study = dataclasses.replace(
+        found, cells=tuple(map(changed, found.cells)), seeds=seeds[:most], follow=follow
+    )
     return study
+
+
+def _changed_too(follow: Follow, changed: Callable[[Cell], Cell]) -> Follow:
+    """Return a function whose cells are changed as those that are played first."""
+    return lambda rows, folder: [changed(cell) for cell in follow(rows, folder)]
 
 
 def _own(name: str) -> Study:
@@ -96,8 +109,13 @@ def main(args: Args) -> None:
     """Play what is missing, and report."""
     study = find_study(args)
     folder = args.output or RESULTS / f"{study.name}{'-quick' if args.quick else ''}"
-    if args.seeds is not None and args.output is None:
-        refuse_to_replace([folder / TABLES], force=False)
+    for name in ("seeds", "corridor"):
+        require(
+            getattr(args, name) is None or args.output is not None,
+            name,
+            "given with an output of its own, since the rows are others",
+            getattr(args, name),
+        )
     if args.report:
         write_report(study, folder)
     else:

@@ -22,12 +22,12 @@ from tqdm import tqdm
 
 from agents.engines.engine import Workers
 from agents.environments import given_keywords
-from agents.terminal import make_table, print_table
 from agents.files import refuse_to_replace
 from agents.search.space import SPACE
 from agents.search.tuning import TuningStudy, journal_path, locked_study, scores_of
 from agents.search.tuning_task import TuningTask
 from agents.seeds import TUNING
+from agents.terminal import make_table, print_table
 from dptse_env.model import ARZParameters
 from dptse_env.model.parameters import read_parameters
 from dptse_env.utils.validation import integer

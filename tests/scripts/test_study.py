@@ -42,6 +42,16 @@ def test_a_report_without_rows_is_refused(tmp_path):
         main(Args(name=MINE, report=True, output=tmp_path))
 
 
+def test_seeds_and_road_can_be_others_with_an_output_of_their_own(tmp_path):
+    for changes in ({"seeds": "2900:2902"}, {"corridor": "paper-highway"}):
+        with pytest.raises(ValueError, match="given with an output of its own"):
+            main(Args(name=MINE, **changes))
+    study = find_study(Args(name=MINE, seeds="2900:2902", corridor="paper-highway"))
+    assert study.seeds == (2900, 2901)
+    assert {cell.keywords["corridor"] for cell in study.cells} == {"paper-highway"}
+    assert {cell.id for cell in study.cells}.isdisjoint(cell.id for cell in STUDY.cells)
+
+
 @pytest.mark.slow
 def test_a_study_of_ones_own_runs_from_the_command_line(tmp_path):
     words = (MINE, "--output", str(tmp_path / "out"), "--workers", "1")
