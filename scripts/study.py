@@ -10,7 +10,8 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import pkgutil
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -78,10 +79,33 @@ def find_study(args: Args) -> Study:
     follow = found.follow
     if follow is not None:
         follow = _changed_too(follow, changed)
-    study: Study = dataclasses.replace(
-        found, cells=tuple(map(changed, found.cells)), seeds=seeds[:most], follow=follow
-    )
+    cells = tuple(map(changed, found.cells))
+    if road:
+        cells = _suitable(cells)
+    study: Study = dataclasses.replace(found, cells=cells, seeds=seeds[:most], follow=follow)
     return study
+
+
+def _suitable(cells: Sequence[Cell]) -> tuple[Cell, ...]:
+    """Return the cells that a road takes, and say which it refuses.
+
+    Raises:
+        ValueError: It refuses all.
+    """
+    taken, refused = [], []
+    for cell in cells:
+        try:
+            cell.check()
+        except ValueError as problem:
+            refused.append(problem)
+        else:
+            taken.append(cell)
+    if not taken:
+        raise refused[0]
+    if refused:
+        n = f"{len(refused)} of {len(cells)} cells"
+        print(f"{n} do not suit the road and are left out: {refused[0]}", file=sys.stderr)
+    return tuple(taken)
 
 
 def _changed_too(follow: Follow, changed: Callable[[Cell], Cell]) -> Follow:

@@ -42,7 +42,15 @@ def test_a_report_without_rows_is_refused(tmp_path):
         main(Args(name=MINE, report=True, output=tmp_path))
 
 
-def test_seeds_and_road_can_be_others_with_an_output_of_their_own(tmp_path):
+def test_cells_that_do_not_suit_a_road_are_left_out_and_told(capsys):
+    study = find_study(
+        Args(name=MINE, corridor='{"fixed_sensors": [], "n_mainline": 2, "lanes": 1}')
+    )
+    assert {cell.keywords["bandwidth"] for cell in study.cells} == {1, 2}
+    assert "2 of 6 cells do not suit the road" in capsys.readouterr().err
+
+
+def test_seeds_and_road_can_be_others_with_an_output_of_their_own():
     for changes in ({"seeds": "2900:2902"}, {"corridor": "paper-highway"}):
         with pytest.raises(ValueError, match="given with an output of its own"):
             main(Args(name=MINE, **changes))
