@@ -7,9 +7,8 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from agents.engines.local import THIS_PROCESS, LocalProcesses  # noqa: E402
 from agents.environments import make_vector  # noqa: E402
-from agents.evaluation.episodes import run_episodes  # noqa: E402
+from agents.executors import THIS_PROCESS  # noqa: E402
 from agents.filters.batches import draw_batch, make_batch  # noqa: E402
 from agents.filters.collecting import collect  # noqa: E402
 from agents.filters.plan import OWN, Round  # noqa: E402
@@ -17,10 +16,28 @@ from agents.filters.torch_network import RecurrentNetwork, second_loss  # noqa: 
 from agents.filters.training import FilterTraining  # noqa: E402
 from agents.training.run_files import read_progress  # noqa: E402
 from dptse_env.estimators.learned.weights import read_network, write_network  # noqa: E402
-from dptse_env.schedules import make_schedule  # noqa: E402
+from dptse_env.evaluation import evaluate  # noqa: E402
+from tests.agents.elsewhere import Elsewhere  # noqa: E402
 from tests.estimators.learned.networks import card  # noqa: E402
 
 from .plans import PLAN, SHORT  # noqa: E402
+
+
+class Seen:
+    """A watcher that keeps what a function finds in every second, the reset first."""
+
+    def __init__(self, look):
+        self.look, self.values = look, []
+
+    def begin(self, process):
+        self.process = process
+        return self
+
+    def __call__(self):
+        self.values.append(self.look(self.process))
+
+    def rows(self):
+        return [{}] * self.process.n_episodes
 
 
 @pytest.fixture(autouse=True)
@@ -42,14 +59,11 @@ def test_the_network_with_gradients_is_the_estimator(tmp_path):
         batch = make_batch([(collect(scenario, own, None), np.arange(2))])
         keywords = {**scenario.keywords, **own, "traffic_seeds": list(scenario.traffic_seeds)}
         env = make_vector(SHORT, 2, {**keywords, "action": "scores"})
-        estimates = []
-        run_episodes(
-            env, make_schedule(scenario.schedule, env), traffic_seeds=scenario.traffic_seeds,
-            seeds=[scenario.noise_seed + seed for seed in scenario.traffic_seeds],
-            on_second=lambda env=env, kept=estimates: kept.append(env.process.estimate),
-        )  # fmt: skip
+        seen = Seen(lambda process: process.estimate)
+        seeds, noise = scenario.traffic_seeds, scenario.noise_seed
+        evaluate(env, scenario.schedule, seeds, noise, watchers=[seen.begin])
         state = network.begin(batch.start)
-        for t, estimate in enumerate(estimates[1:]):
+        for t, estimate in enumerate(seen.values[1:]):
             state = network(batch.road, batch.second(t), batch.outside[t], state)
             present = network.read(batch.road, state.hidden)[0].detach().numpy()
             np.testing.assert_allclose(present[..., 0], estimate.density, rtol=2e-4, atol=2e-3)
@@ -59,15 +73,13 @@ def test_the_network_with_gradients_is_the_estimator(tmp_path):
 def test_the_collected_truth_is_that_of_the_environment():
     scenario = PLAN.scenarios(0)[0]
     collected = collect(scenario, {"estimator": "ekf"}, None)
-    corridor, table = collected.corridor, []
+    corridor = collected.corridor
     assert collected.outside.shape == (corridor.duration, 2, corridor.n_segments, 2)
     keywords = {**scenario.keywords, "traffic_seeds": list(scenario.traffic_seeds)}
     env = make_vector(SHORT, 2, {**keywords, "estimator": "ekf", "action": "scores"})
-    run_episodes(
-        env, make_schedule(scenario.schedule, env), traffic_seeds=scenario.traffic_seeds,
-        seeds=[0, 1], on_second=lambda: table.append(env.process.truth(np.arange(2))),
-    )  # fmt: skip
-    np.testing.assert_allclose(collected.truth, np.array(table[1:]), rtol=1e-6)
+    seen = Seen(lambda process: process.truth(np.arange(2)))
+    evaluate(env, scenario.schedule, scenario.traffic_seeds, watchers=[seen.begin])
+    np.testing.assert_allclose(collected.truth, np.array(seen.values[1:]), rtol=1e-6)
 
 
 def test_the_loss_is_the_environments_error():
@@ -88,8 +100,8 @@ def test_the_loss_is_the_environments_error():
 
 def test_a_network_comes_out_the_same_wherever_scenarios_are_played(tmp_path):
     trained = {}
-    for name, engine in {"here": THIS_PROCESS, "there": LocalProcesses(2)}.items():
-        training = FilterTraining(PLAN, tmp_path / name, engine=engine)
+    for name, executor in {"here": THIS_PROCESS, "there": Elsewhere()}.items():
+        training = FilterTraining(PLAN, tmp_path / name, executor=executor)
         training.run()
         trained[name] = training.network.state_dict()
     assert all(torch.equal(trained["there"][key], value) for key, value in trained["here"].items())
