@@ -18,6 +18,7 @@ from agents.audit.report import Finding
 from agents.audit.strategies import STRATEGIES
 from agents.environments import make_config
 from agents.files import refuse_to_replace
+from agents.play import Cell
 from dptse_env.config import EnvConfig
 from dptse_env.parts import privacy_report
 from dptse_env.privacy import mu_of
@@ -94,7 +95,8 @@ def attacked_config(args: Args) -> EnvConfig:
     """Return the configuration of the environment under attack.
 
     Raises:
-        ValueError: A setting of the release model is given twice, or another value is bad.
+        ValueError: A setting of the release model is given twice, another value is bad, or the
+            estimator does not suit the road.
     """
     keywords = args.given_keywords()
     privacy = {name: getattr(args, name) for name in PRIVACY} | {"preset": args.privacy}
@@ -109,6 +111,7 @@ def attacked_config(args: Args) -> EnvConfig:
     for name in ("bandwidth", "estimator"):
         if getattr(args, name) is not None:
             keywords[name] = getattr(args, name)
+    Cell(args.env, "none", keywords).check()
     return make_config(args.env, keywords)
 
 

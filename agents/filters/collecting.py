@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from agents.environments import make_vector
 from agents.filters.scenarios import Scenario
+from agents.play import record
 from dptse_env.estimators.batch import checked_measurements
 from dptse_env.estimators.learned.cells import Cells, input_channels, make_cells
 from dptse_env.estimators.learned.channels import Released, Rows, make_released, make_rows
@@ -106,6 +107,7 @@ def collect(scenario: Scenario, estimator: Mapping[str, Any], records: Records) 
     keywords |= {"action": "scores", "threads": 1}
     env = make_vector(scenario.env, len(seeds), keywords)
     process = env.process
+    record(env.config.corridor, seeds, records)
     recorder, watcher = _Recorder(process), _Watcher(process)
     process.estimator = recorder  # type: ignore[assignment]
     evaluate(env, scenario.schedule, seeds, scenario.noise_seed, watchers=[lambda _: watcher])

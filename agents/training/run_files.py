@@ -55,6 +55,8 @@ def check_plan(folder: Path, plan: Mapping[str, Any]) -> None:
         kept = json.loads(path.read_bytes())
     except ValueError as problem:
         raise ValueError(f"{path} is damaged: {problem}") from problem
+    if not isinstance(kept, dict):
+        raise ValueError(f"{path} is damaged: it has no plan")
     difference = first_difference(kept, plan)
     if difference is not None:
         raise ValueError(

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import torch
 
 from agents.executors import AnyExecutor, ExecutorError, run_shown
+from agents.play import record
 from agents.training.plan import TrainingPlan
 from agents.training.run_files import check_plan, read_checkpoint
 from agents.training.training import POLICY, Training
@@ -35,6 +36,10 @@ class TrainingTask(NamedTuple):
 def run_training(task: TrainingTask) -> None:
     """Train to the end of the plan, from the checkpoint in the folder if there is one."""
     torch.set_num_threads(task.threads)
+    plan = task.plan
+    for world in plan.worlds:
+        seeds = (*plan.traffic_seeds, *plan.validation_seeds)
+        record(world.config.corridor, seeds, task.records)
     Training(task.plan, task.folder, records=task.records).run()
 
 

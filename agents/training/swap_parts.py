@@ -11,6 +11,7 @@ import torch
 
 from agents.environments import make_vector
 from agents.executors import AnyExecutor, run_in_order
+from agents.play import record
 from agents.training.policy_iteration import collect_swaps, first_seed
 from agents.training.recipes import PlackettLuceRecipe
 from agents.training.swaps import Swaps
@@ -43,6 +44,7 @@ class SwapPart:
 def collect_part(part: SwapPart) -> Swaps:
     """Try the swaps of a part; its draws do not depend on the other parts."""
     env = make_vector(part.world.env, len(part.episodes), dict(part.keywords))
+    record(env.config.corridor, env.config.traffic_seeds, part.keywords.get("records"))
     with torch.random.fork_rng(devices=[]):
         policy = untrained(part.world, part.recipe)
         policy.load_state_dict(part.weights)
