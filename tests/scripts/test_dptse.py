@@ -26,7 +26,14 @@ def test_every_script_is_a_command():
     assert {command.module for command in COMMANDS.values()} == modules
 
 
-@pytest.mark.parametrize("name", [name for name in COMMANDS if name != "completion"])
+HELP = ["train", "import network", "evaluate"]
+"""Commands with arguments in groups, of two words, and the longest one; the others are slow."""
+REST = [name for name in COMMANDS if name not in (*HELP, "completion")]
+
+
+@pytest.mark.parametrize(
+    "name", [*HELP, *(pytest.param(name, marks=pytest.mark.slow) for name in REST)]
+)
 def test_every_command_has_a_page_of_help(name, capsys):
     with pytest.raises(SystemExit) as ended:
         dptse.main([*name.split(), "--help"])

@@ -1,4 +1,3 @@
-import json
 import os
 import signal
 import subprocess
@@ -166,21 +165,3 @@ def test_rows_reach_tensorboard(tmp_path):
     writer({"update": 1, "steps": 40, "error": 0.5})
     writer.close()
     assert list(tmp_path.glob("events*"))
-
-
-def test_the_commit_is_known_or_none(monkeypatch):
-    found = train.commit()
-    assert found is None or len(found.rstrip("+")) == 40
-
-    def missing(*args, **keywords):
-        raise FileNotFoundError
-
-    monkeypatch.setattr("subprocess.run", missing)
-    assert train.commit() is None
-
-
-def test_the_folder_describes_the_training(tmp_path):
-    train.main(arguments(tmp_path))
-    record = json.loads((tmp_path / "run.json").read_text())
-    assert record["commit"] == train.commit()
-    assert record["made_with"]["keywords"] == {"horizon": 64}
