@@ -5,9 +5,8 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from agents.studies.paper.timing import Stopwatch
 from benchmarks.throughput.environments import libraries, make_batch
-from benchmarks.throughput.measure import Measured, resident, take_turns
+from benchmarks.throughput.measure import Measured, Stopwatch, resident, take_turns
 
 STEPS, MINIBATCH, EPOCHS = 32, 2048, 10
 """A rollout of each episode [steps], samples of a gradient step, passes through a rollout."""
