@@ -18,7 +18,7 @@ PACKAGES = {
     "scripts": "dptse_env/_tools/scripts",
 }
 """Folders of the repository that are in a wheel, and where."""
-IN_A_WHEEL = {"", ".j2", ".json", ".npz", ".py", ".typed", ".xml", ".zip"}
+IN_A_WHEEL = {"", ".json", ".npz", ".py", ".typed", ".xml", ".zip"}
 """Kinds of files of the packages: code, templates, settings and cards, networks, policies."""
 
 FOLDERS = {*PACKAGES, "benchmarks", "docs", "examples", "tests"}
