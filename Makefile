@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 
 export OMP_NUM_THREADS = 1
 
-.PHONY: help setup docs site dist demo policy-study audit test test-slow test-gymnasium test-lowest test-ray test-tutorial lint format benchmark wheel-test clean reproduce privacy-study ledger-study choice-study penetration-study
+.PHONY: help setup docs site dist demo policy-study audit test test-slow test-gymnasium test-lowest test-ray test-tutorial lint format benchmark wheel-test clean reproduce privacy-study ledger-study penetration-study
 
 help:  ## Show this list.
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -37,16 +37,11 @@ privacy-study: setup  ## Measure the price of the guarantee; results/privacy.
 ledger-study: setup  ## Put capped contributions and paced ledgers side by side; results/ledger.
 	$(BIN)/python scripts/study.py ledger
 
-policy-study: setup  ## Hold the trained policies of results/training against every baseline; results/policies.
-	$(BIN)/python scripts/study.py policies freeze --test-seeds 2064:2128 --policies \
+policy-study: setup  ## Hold the trained policies of results/training against rules; results/repeated.
+	$(BIN)/python scripts/study.py policies --output results/repeated --policies \
 		primary=results/training/primary primary:regression=results/training/regression \
-		$(foreach cell,paper bandwidth-3 bandwidth-7 epsilon-1 epsilon-10,$(cell)=results/training/$(cell))
-	$(BIN)/python scripts/study.py policies run
-
-choice-study: setup  ## Map where a choice of queries pays, with the policies of results/training; results/choices.
-	$(BIN)/python scripts/study.py choices \
-		--capped $(wildcard results/training/capped-roads/*/best.zip) \
-		--paced $(wildcard results/training/paced-roads/*/best.zip)
+		$(foreach place,paper bandwidth-3 bandwidth-7 epsilon-1 epsilon-10,$(place)=results/training/$(place)) \
+		$(foreach release,capped paced,$(release)=results/training/$(release)-roads)
 
 penetration-study: setup  ## Measure errors by the share of connected vehicles, and what fusion gains; results/penetration.
 	$(BIN)/python scripts/study.py penetration

@@ -30,6 +30,7 @@ from agents.figures import (
     Look,
     draw_curve,
     draw_dot,
+    error_label,
     finish_figure,
     make_figure,
     save_figure,
@@ -54,7 +55,6 @@ from agents.study import Study
 from agents.tables import (
     DENSITY,
     ERROR,
-    METRICS,
     SPEED,
     Labels,
     UnmeasuredError,
@@ -243,7 +243,7 @@ def choose(rows: pl.DataFrame) -> dict[str, Chosen]:
     """Return the choices that the rows of validation traffic make, by setting."""
     found = {}
     for setting in SETTINGS:
-        groups = [labels for labels in groups_of(rows, VALIDATION, setting)]
+        groups = groups_of(rows, VALIDATION, setting)
         errors = {name_of(labels): float(table(rows, ERROR, labels).mean()) for labels in groups}
         groups.sort(key=lambda labels: errors[name_of(labels)])
         rules = [labels["policy"] for labels in groups if labels["kind"] == "rule"]
@@ -454,7 +454,9 @@ def below(rows: pl.DataFrame, labels: Labels, reference: Labels) -> Interval:
 def groups_of(rows: pl.DataFrame, part: str, setting: str) -> list[Labels]:
     """Return the labels of all groups of cells that were played in a setting."""
     names = list(rule(setting, REFERENCE))
-    return rows.filter(part=part, setting=setting).select(names).unique(maintain_order=True).to_dicts()
+    return (
+        rows.filter(part=part, setting=setting).select(names).unique(maintain_order=True).to_dicts()
+    )
 
 
 def name_of(labels: Labels) -> str:
@@ -476,7 +478,7 @@ def chosen_learners(chosen: Mapping[str, Chosen], setting: str) -> list[Labels]:
 
 # What is reported: the settings.
 
-ALL_METRICS = {ERROR: ("density-and-speed error", "x 1000"), **METRICS}
+COLUMNS = {ERROR: "error x 1000", DENSITY: error_label(DENSITY), SPEED: error_label(SPEED)}
 
 
 class Rank(NamedTuple):
@@ -502,7 +504,7 @@ def ranking(rows: pl.DataFrame, setting: str, best: str) -> list[Rank]:
     ranks = []
     for labels in groups_of(rows, TEST, setting):
         errors = table(rows, ERROR, labels)
-        means = {m: bootstrap(mean, table(rows, m, labels)) for m in ALL_METRICS}
+        means = {m: bootstrap(mean, table(rows, m, labels)) for m in COLUMNS}
         less = below(rows, labels, rule(setting, best))
         interquartile = bootstrap(iqm, errors)
         name, kind = name_of(labels), labels["kind"]
@@ -512,10 +514,7 @@ def ranking(rows: pl.DataFrame, setting: str, best: str) -> list[Rank]:
 
 def ranking_table(ranks: Sequence[Rank], best: str) -> str:
     """Return a ranking."""
-    header = [
-        "policy", "kind", "error x 1000", "IQM", "below best rule [%]",
-        *(f"{name} RMSE [{unit}]" for name, unit in METRICS.values()),
-    ]  # fmt: skip
+    header = ["policy", "kind", "IQM", "below best rule [%]", *COLUMNS.values()]
     lines = []
     for rank in ranks:
         is_best = (rank.name, rank.kind) == (best, "rule")
@@ -524,10 +523,9 @@ def ranking_table(ranks: Sequence[Rank], best: str) -> str:
             [
                 f"**{rank.name}**" if rank.kind == "learned" else rank.name,
                 rank.kind + seeds,
-                format_interval(rank.errors[ERROR]),
                 format_interval(rank.iqm),
                 "best on validation" if is_best else format_interval(rank.below),
-                *(format_interval(rank.errors[metric]) for metric in METRICS),
+                *(format_interval(rank.errors[metric]) for metric in COLUMNS),
             ]
         )
     return markdown(header, lines)
@@ -562,15 +560,15 @@ def primary_tables(rows: pl.DataFrame, choice: Chosen) -> list[str]:
     """Return the chosen policy of the primary setting by training seed, and more about it."""
     own = learned(PRIMARY, choice.recipe, choice.mode, PRIMARY)
     other = {**own, "mode": DRAWN if choice.mode == LIKELIEST else LIKELIEST}
-    best, paper, oracle = (rule(PRIMARY, name) for name in (choice.rule, REFERENCE, ORACLE))
-    seeds = rows.filter(**own)["training_seed"].unique().sort().to_list()
+    references = {f"below {name} [%]": rule(PRIMARY, name) for name in (choice.rule, REFERENCE)}
+    best, oracle = rule(PRIMARY, choice.rule), rule(PRIMARY, ORACLE)
+    seeds = rows.filter(**own)["training_seed"].unique().sort()
     groups = {"all": own, **{str(seed): {**own, "training_seed": seed} for seed in seeds}}
 
     def entry(seed: str, column: str) -> str:
-        if column == "error x 1000":
-            return format_interval(bootstrap(mean, table(rows, ERROR, groups[seed])))
-        reference = best if column == f"below {choice.rule} [%]" else paper
-        return format_interval(below(rows, groups[seed], reference))
+        if column in references:
+            return format_interval(below(rows, groups[seed], references[column]))
+        return format_interval(bootstrap(mean, table(rows, ERROR, groups[seed])))
 
     def difference() -> str:
         errors, reference = tables(rows, ERROR, own, best)
@@ -583,18 +581,17 @@ def primary_tables(rows: pl.DataFrame, choice: Chosen) -> list[str]:
     def less(labels: Labels, reference: Labels) -> str:
         return format_interval(below(rows, labels, reference))
 
-    columns = ["error x 1000", f"below {choice.rule} [%]", f"below {REFERENCE} [%]"]
-    name = f"{choice.recipe}, {choice.mode}"
     numbers = {
-        f"error of {choice.rule} above that of {name}, x 1000, crossed t": cell(difference),
-        f"way of {name} from {choice.rule} to {ORACLE} [%]": cell(way),
-        f"{name} below the same, {other['mode']} [%]": cell(less, own, other),
-        f"{choice.rule} below {REFERENCE} [%]": cell(less, best, paper),
-        f"{ORACLE} below {choice.rule} [%]": cell(less, oracle, best),
+        f"error of {choice.rule} above it, x 1000, Student's t for crossed effects": cell(
+            difference
+        ),
+        f"its way from {choice.rule} to {ORACLE} [%]": cell(way),
+        f"below itself, {other['mode']} [%]": cell(less, own, other),
+        f"{choice.rule} below {REFERENCE} [%]": cell(less, best, rule(PRIMARY, REFERENCE)),
     }
     return [
-        f"{name}:",
-        grid("training seed", list(groups), columns, entry),
+        f"{choice.recipe}, {choice.mode}:",
+        grid("training seed", list(groups), ["error x 1000", *references], entry),
         markdown(["", "mean [95 % interval]"], numbers.items()),
     ]
 
@@ -715,8 +712,8 @@ class Gains(dict[tuple[World, int, str], Interval]):
         places = {share(bandwidth): (world, bandwidth) for bandwidth in world.bandwidths}
         yield self.table("B (share of the road)", places)
         yield (
-            f"Bandwidth saved at the same error [%], at least so much where {ROUND_ROBIN} errs more "
-            "even with the largest B:"
+            f"Bandwidth saved at the same error [%]; at least so much where {ROUND_ROBIN} errs "
+            "more even with the largest B:"
         )
         yield grid(
             "B",
@@ -766,12 +763,12 @@ KIND_COLOURS = {"rule": "#5f6b7a", "bound": COLOURS[4], "learned": COLOURS[0]}
 def draw_ladder(ranks: Sequence[Rank], path: Path) -> None:
     """Draw the errors of all policies in the primary setting, a panel for each error."""
     figure = make_figure(10.4, 1.5 + 0.3 * len(ranks), dpi=120)
-    axes = figure.subplots(1, len(ALL_METRICS), sharey=True)
+    axes = figure.subplots(1, len(COLUMNS), sharey=True)
     places = np.arange(len(ranks))[::-1]
-    for axis, (metric, (name, unit)) in zip(axes, ALL_METRICS.items(), strict=True):
+    for axis, (metric, label) in zip(axes, COLUMNS.items(), strict=True):
         for place, rank in zip(places, ranks, strict=True):
             draw_dot(axis, rank.errors[metric], place, KIND_COLOURS[rank.kind], rank.kind)
-        axis.set_xlabel(f"{name} [{unit}]")
+        axis.set_xlabel(label, fontsize=9)
     axes[0].set_yticks(places, [rank.name for rank in ranks])
     title = f"{SETTINGS[PRIMARY].description}; 95 % intervals"
     save_figure(finish_figure(figure, margin=0.12), path, title)
@@ -779,9 +776,7 @@ def draw_ladder(ranks: Sequence[Rank], path: Path) -> None:
 
 def draw_settings(rows: pl.DataFrame, chosen: Mapping[str, Chosen], path: Path) -> None:
     """Draw how far the chosen policies lie below the best rule and the paper's, by setting."""
-    lines = [
-        (setting, labels) for setting in chosen for labels in chosen_learners(chosen, setting)
-    ]
+    lines = [(setting, labels) for setting in chosen for labels in chosen_learners(chosen, setting)]
     figure = make_figure(9.0, 1.8 + 0.45 * max(len(lines), 1), dpi=120)
     axis = figure.subplots()
     places = np.arange(len(lines))[::-1]
@@ -804,8 +799,8 @@ def draw_queries(rows: pl.DataFrame, choice: Chosen, path: Path) -> None:
     """Draw where and when policies of the primary setting query."""
     groups = [rule(PRIMARY, name) for name in dict.fromkeys((choice.rule, REFERENCE, ORACLE))]
     groups.append(learned(PRIMARY, choice.recipe, LIKELIEST, PRIMARY))
-    figure = make_figure(11.0, 6.4, dpi=100)
-    axes = figure.subplots(2, 3)
+    figure = make_figure(9.0, 6.4, dpi=110)
+    axes = figure.subplots(2, 2)
     for colour, labels in zip(COLOURS, groups, strict=False):
         episodes = rows.filter(**labels).to_dicts()
         if not episodes or episodes[0].get("incident") is None:
@@ -813,22 +808,23 @@ def draw_queries(rows: pl.DataFrame, choice: Chosen, path: Path) -> None:
         shares = by_segment(episodes)
         style: dict[str, Any] = {"color": colour, "marker": "o", "markersize": 3}
         axes[0, 0].plot(1 + np.arange(len(shares)), shares, label=labels["policy"], **style)
-        for axis, phase in zip(axes[1], PHASES, strict=True):
-            axis.plot(*by_offset(episodes, phase), **style)
         axes[0, 1].plot(*near_since_start(episodes, range(-240, 361, BIN)), color=colour)
+        for axis, phase in zip(axes[1], PHASES, strict=False):
+            axis.plot(*by_offset(episodes, phase), **style)
     axes[0, 0].set_xlabel("segment")
-    axes[0, 0].set_ylabel("share of seconds in which it is queried")
     axes[0, 1].set_xlabel("time since the start of the incident [s]")
-    axes[0, 1].set_ylabel(f"share of queries\nwithin {NEAR} segments of it")
-    for axis, phase in zip(axes[1], PHASES, strict=True):
+    axes[0, 1].set_ylabel(f"share of queries within {NEAR} segments")
+    for axis, phase in zip(axes[1], PHASES, strict=False):
         axis.set_xlabel(f"segments downstream of the incident, {phase} it")
         axis.axvline(0.0, color=GREY, linewidth=0.8)
-    axes[1, 0].set_ylabel("share of seconds in which it is queried")
-    axes[0, 2].axis("off")
     for axis in (axes[0, 0], *axes[1]):
+        axis.set_ylabel("share of seconds")
         axis.set_ylim(bottom=0.0)
-    title = f"{SETTINGS[PRIMARY].description}: queries"
-    save_figure(finish_figure(figure, margin=0.12), path, title)
+    for axis in axes.ravel():
+        axis.xaxis.label.set_size(9)
+        axis.yaxis.label.set_size(9)
+    title = f"{SETTINGS[PRIMARY].description}: how often segments are queried"
+    save_figure(finish_figure(figure), path, title)
 
 
 LOOKS = {
@@ -867,6 +863,8 @@ def draw_gains(gains: Gains, path: Path) -> None:
 
 def report(rows: pl.DataFrame, folder: Path) -> str:
     """Return the tables, and draw the figures."""
+    names = {*rule(PRIMARY, REFERENCE), *group(WORLDS[0], 1, LEARNED)} - set(rows.columns)
+    rows = rows.with_columns(pl.lit(None).alias(name) for name in names)  # of a part not played yet
     chosen = choose(rows)
     rankings = {setting: ranking(rows, setting, each.rule) for setting, each in chosen.items()}
     gains = Gains(rows)
@@ -875,7 +873,10 @@ def report(rows: pl.DataFrame, folder: Path) -> str:
         choice = chosen[PRIMARY]
         draw_ladder(rankings[PRIMARY], folder / "fig_ladder.png")
         draw_queries(rows, choice, folder / "fig_queries.png")
-        parts += ["## The primary setting", *(primary_tables(rows, choice) if choice.recipe else [])]
+        parts += [
+            "## The primary setting",
+            *(primary_tables(rows, choice) if choice.recipe else []),
+        ]
     draw_settings(rows, chosen, folder / "fig_settings.png")
     parts += ["## The other settings", secondary_table(rows, chosen), "## Rankings"]
     for setting, ranks in rankings.items():
