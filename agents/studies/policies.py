@@ -27,6 +27,7 @@ import polars as pl
 from agents.figures import (
     COLOURS,
     GREY,
+    LABELS,
     Look,
     draw_curve,
     draw_dot,
@@ -66,6 +67,7 @@ from agents.tables import (
 )
 from agents.tables import mean as mean_of
 from agents.watchers import BIN, NEAR, PHASES, by_offset, by_segment, near_since_start
+from dptse_env.config import VALIDATION_SEEDS
 from dptse_env.traffic import CORRIDORS
 from dptse_env.utils.arrays import FloatArray
 
@@ -133,13 +135,12 @@ class Trained(NamedTuple):
     file: str
 
 
-def find_trained(given: Sequence[str], which: str = "best.zip") -> list[Trained]:
+def find_trained(given: Sequence[str]) -> list[Trained]:
     """Return the policies that were given.
 
     Args:
         given: ``place=path`` or ``place:recipe=path``; a path is a saved policy, the folder of a
-            training, or a folder of those.
-        which: The file to take from the folder of a training.
+            training, or a folder of those, of each of which the best policy is taken.
 
     Raises:
         FileNotFoundError: A path leads to no saved policy.
@@ -154,7 +155,7 @@ def find_trained(given: Sequence[str], which: str = "best.zip") -> list[Trained]
                 f"policies must be place=path or place:recipe=path, with a place of "
                 f"{', '.join((*SETTINGS, CAPPED, PACED))}, got {text!r}"
             )
-        for file in _files(Path(path), which):
+        for file in _files(Path(path)):
             saved = read_saved_policy(file)
             key = place, recipe or saved.recipe, saved.training_seed
             if key in found:
@@ -166,12 +167,12 @@ def find_trained(given: Sequence[str], which: str = "best.zip") -> list[Trained]
     return list(found.values())
 
 
-def _files(path: Path, which: str) -> list[Path]:
+def _files(path: Path) -> list[Path]:
     if path.is_file():
         return [path]
-    found = [path / which] if (path / which).is_file() else sorted(path.glob(f"*/{which}"))
+    found = sorted([*path.glob("best.zip"), *path.glob("*/best.zip")])
     if not found:
-        raise FileNotFoundError(f"there is no {which} in {path} nor one folder below it")
+        raise FileNotFoundError(f"there is no best.zip in {path} nor one folder below it")
     return found
 
 
@@ -244,13 +245,14 @@ def choose(rows: pl.DataFrame) -> dict[str, Chosen]:
     found = {}
     for setting in SETTINGS:
         groups = groups_of(rows, VALIDATION, setting)
-        errors = {name_of(labels): float(table(rows, ERROR, labels).mean()) for labels in groups}
-        groups.sort(key=lambda labels: errors[name_of(labels)])
-        rules = [labels["policy"] for labels in groups if labels["kind"] == "rule"]
-        best: Labels = next((labels for labels in groups if labels["kind"] == "learned"), {})
+        errors = [float(table(rows, ERROR, labels).mean()) for labels in groups]
+        ranked = sorted(zip(errors, groups, strict=True), key=lambda pair: pair[0])
+        rules = [labels["policy"] for _, labels in ranked if labels["kind"] == "rule"]
+        recipes = [labels for _, labels in ranked if labels["kind"] == "learned"]
         if rules:
-            recipe, mode = best.get("policy", ""), best.get("mode", "")
-            found[setting] = Chosen(rules[0], recipe, mode, errors)
+            best = recipes[0] if recipes else {"policy": "", "mode": ""}
+            by_name = {name_of(labels): round(error, 4) for error, labels in ranked}
+            found[setting] = Chosen(rules[0], best["policy"], best["mode"], by_name)
     return found
 
 
@@ -320,7 +322,7 @@ class World(NamedTuple):
     @property
     def name(self) -> str:
         """Its name in tables."""
-        return f"{self.release}, {'EKF' if self.estimator == EKF else 'recurrent'}"
+        return f"{self.release}, {LABELS[self.estimator]}"
 
     @property
     def rule(self) -> str:
@@ -451,19 +453,19 @@ def below(rows: pl.DataFrame, labels: Labels, reference: Labels) -> Interval:
     return bootstrap(percent_below, *tables(rows, ERROR, labels, reference))
 
 
-def groups_of(rows: pl.DataFrame, part: str, setting: str) -> list[Labels]:
+def groups_of(rows: pl.DataFrame, part: str, setting: str) -> list[dict[str, Any]]:
     """Return the labels of all groups of cells that were played in a setting."""
     names = list(rule(setting, REFERENCE))
-    return (
-        rows.filter(part=part, setting=setting).select(names).unique(maintain_order=True).to_dicts()
-    )
+    found = rows.filter(part=part, setting=setting).select(names).unique(maintain_order=True)
+    return list(found.iter_rows(named=True))
 
 
 def name_of(labels: Labels) -> str:
     """Return the name of a group in tables."""
-    moved = labels["trained_in"] not in ("", labels["setting"])
-    origin = f", from {labels['trained_in']}" if moved else ""
-    return labels["policy"] + origin + (" (drawn)" if labels["mode"] == DRAWN else "")
+    name: str = labels["policy"]
+    if labels["trained_in"] not in ("", labels["setting"]):
+        name += f", from {labels['trained_in']}"
+    return name + (" (drawn)" if labels["mode"] == DRAWN else "")
 
 
 def chosen_learners(chosen: Mapping[str, Chosen], setting: str) -> list[Labels]:
@@ -898,6 +900,10 @@ def study(policies: Sequence[str]) -> Study:
     trained = find_trained(policies)
 
     def follow(rows: pl.DataFrame, folder: Path) -> list[Cell]:
+        seeds = rows.filter(part=VALIDATION)["traffic_seed"].unique()
+        outside = sorted(set(seeds) - set(VALIDATION_SEEDS))
+        if outside:
+            raise ValueError(f"choices must rest on validation traffic, got seed {outside[0]}")
         chosen = choose(rows)
         write_json(folder / "chosen.json", {name: each._asdict() for name, each in chosen.items()})
         return list(test_cells(chosen, trained))
