@@ -453,6 +453,11 @@ def below(rows: pl.DataFrame, labels: Labels, reference: Labels) -> Interval:
     return bootstrap(percent_below, *tables(rows, ERROR, labels, reference))
 
 
+def less_than(rows: pl.DataFrame, labels: Labels, reference: Labels) -> str:
+    """Return `below` as an entry of a table."""
+    return format_interval(below(rows, labels, reference))
+
+
 def groups_of(rows: pl.DataFrame, part: str, setting: str) -> list[dict[str, Any]]:
     """Return the labels of all groups of cells that were played in a setting."""
     names = list(rule(setting, REFERENCE))
@@ -490,7 +495,7 @@ class Rank(NamedTuple):
         n_runs: Training seeds behind it.
         errors: Means by metric.
         iqm: Interquartile mean of the error.
-        below: How far its error lies below that of the best rule [%].
+        less: How far its error lies below that of the best rule [%].
     """
 
     name: str
@@ -498,7 +503,7 @@ class Rank(NamedTuple):
     n_runs: int
     errors: dict[str, Interval]
     iqm: Interval
-    below: Interval
+    less: str
 
 
 def ranking(rows: pl.DataFrame, setting: str, best: str) -> list[Rank]:
@@ -507,7 +512,7 @@ def ranking(rows: pl.DataFrame, setting: str, best: str) -> list[Rank]:
     for labels in groups_of(rows, TEST, setting):
         errors = table(rows, ERROR, labels)
         means = {m: bootstrap(mean, table(rows, m, labels)) for m in COLUMNS}
-        less = below(rows, labels, rule(setting, best))
+        less = cell(less_than, rows, labels, rule(setting, best))
         interquartile = bootstrap(iqm, errors)
         name, kind = name_of(labels), labels["kind"]
         ranks.append(Rank(name, kind, len(errors), means, interquartile, less))
@@ -526,7 +531,7 @@ def ranking_table(ranks: Sequence[Rank], best: str) -> str:
                 f"**{rank.name}**" if rank.kind == "learned" else rank.name,
                 rank.kind + seeds,
                 format_interval(rank.iqm),
-                "best on validation" if is_best else format_interval(rank.below),
+                "best on validation" if is_best else rank.less,
                 *(format_interval(rank.errors[metric]) for metric in COLUMNS),
             ]
         )
@@ -544,7 +549,7 @@ def choice_table(rows: pl.DataFrame, chosen: Mapping[str, Chosen]) -> str:
         best = min(names, key=lambda name: table(rows, ERROR, rule(setting, name)).mean())
         if best == own["policy"]:
             return "the same"
-        return f"{best} ({format_interval(below(rows, rule(setting, best), own))} % below)"
+        return f"{best} ({less_than(rows, rule(setting, best), own)} % below)"
 
     lines = [
         [
@@ -562,14 +567,14 @@ def primary_tables(rows: pl.DataFrame, choice: Chosen) -> list[str]:
     """Return the chosen policy of the primary setting by training seed, and more about it."""
     own = learned(PRIMARY, choice.recipe, choice.mode, PRIMARY)
     other = {**own, "mode": DRAWN if choice.mode == LIKELIEST else LIKELIEST}
-    references = {f"below {name} [%]": rule(PRIMARY, name) for name in (choice.rule, REFERENCE)}
-    best, oracle = rule(PRIMARY, choice.rule), rule(PRIMARY, ORACLE)
+    best, paper, oracle = (rule(PRIMARY, name) for name in (choice.rule, REFERENCE, ORACLE))
     seeds = rows.filter(**own)["training_seed"].unique().sort()
+    references = {f"below {choice.rule} [%]": best, f"below {REFERENCE} [%]": paper}
     groups = {"all": own, **{str(seed): {**own, "training_seed": seed} for seed in seeds}}
 
     def entry(seed: str, column: str) -> str:
         if column in references:
-            return format_interval(below(rows, groups[seed], references[column]))
+            return less_than(rows, groups[seed], references[column])
         return format_interval(bootstrap(mean, table(rows, ERROR, groups[seed])))
 
     def difference() -> str:
@@ -580,16 +585,11 @@ def primary_tables(rows: pl.DataFrame, choice: Chosen) -> list[str]:
     def way() -> str:
         return format_interval(bootstrap(percent_of_way, *tables(rows, ERROR, own, best, oracle)))
 
-    def less(labels: Labels, reference: Labels) -> str:
-        return format_interval(below(rows, labels, reference))
-
     numbers = {
-        f"error of {choice.rule} above it, x 1000, Student's t for crossed effects": cell(
-            difference
-        ),
+        f"error of {choice.rule} above its own, x 1000, by crossed t": cell(difference),
         f"its way from {choice.rule} to {ORACLE} [%]": cell(way),
-        f"below itself, {other['mode']} [%]": cell(less, own, other),
-        f"{choice.rule} below {REFERENCE} [%]": cell(less, best, rule(PRIMARY, REFERENCE)),
+        f"below itself, {other['mode']} [%]": cell(less_than, rows, own, other),
+        f"{choice.rule} below {REFERENCE} [%]": cell(less_than, rows, best, paper),
     }
     return [
         f"{choice.recipe}, {choice.mode}:",
@@ -609,8 +609,7 @@ def secondary_table(rows: pl.DataFrame, chosen: Mapping[str, Chosen]) -> str:
             except UnmeasuredError:
                 continue
             test = crossed_t(reference - errors)
-            less = format_interval(below(rows, *pair))
-            line = [setting, name_of(labels), str(len(errors)), choice.rule, less]
+            line = [setting, name_of(labels), str(len(errors)), choice.rule, less_than(rows, *pair)]
             found[str(labels)] = (line, *test)
     adjusted = holm({name: p_value for name, (_, _, p_value) in found.items()})
 
