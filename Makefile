@@ -41,7 +41,7 @@ policy-study: setup  ## Hold the trained policies of results/training against ru
 	$(BIN)/python scripts/study.py policies --output results/repeated --policies \
 		primary=results/training/primary primary:regression=results/training/regression \
 		$(foreach place,paper bandwidth-3 bandwidth-7 epsilon-1 epsilon-10,$(place)=results/training/$(place)) \
-		$(foreach release,capped paced,$(release)=results/training/$(release)-roads)
+		$(foreach release,capped paced,$(patsubst %,$(release)=%,$(wildcard results/training/$(release)-roads)))
 
 penetration-study: setup  ## Measure errors by the share of connected vehicles, and what fusion gains; results/penetration.
 	$(BIN)/python scripts/study.py penetration

@@ -883,7 +883,7 @@ def report(rows: pl.DataFrame, folder: Path) -> str:
     for setting, ranks in rankings.items():
         parts.append(f"### {setting}: {SETTINGS[setting].description}")
         parts.append(ranking_table(ranks, chosen[setting].rule))
-    parts += ["## Seconds that estimators lost", lost_table(rows)]
+    parts += ["## Lost seconds and dropped requests", lost_table(rows)]
     draw_gains(gains, folder / "fig_gains.png")
     parts.append("## Gains over a round robin: everything together")
     parts.append(f"B = {JOINT_BANDWIDTH}, error x 1000 and RMSE of density [veh/km], speed [km/h]:")
