@@ -552,7 +552,7 @@ def draw_arms(rows: pl.DataFrame, path: Path) -> None:
     figure = make_figure(11.0, 6.0, dpi=100)
     looks = {BOTH: Look("#d55e00", "s"), QUERIES: Look("#0072b2", "o", "--")}
     names = {BOTH: "queries and detectors", QUERIES: "queries alone"}
-    axes = figure.subplots(2, len(RELEASES), sharey="row").ravel()
+    axes = figure.subplots(2, len(RELEASES), sharex=True, sharey="row").ravel()
     for axis, pair in zip(axes, itertools.product((EKF, LEARNED), RELEASES), strict=True):
         estimator, release = pair
         level = {"detectors alone, with the whole budget": alone(release, estimator)}
@@ -566,6 +566,7 @@ def draw_arms(rows: pl.DataFrame, path: Path) -> None:
         set_log_axes(axis, [100.0 * share for share in SHARES.values()])
         set_log_ticks(axis.yaxis, ERROR_TICKS)
         axis.set_title(f"{release}, {LABELS[estimator]}", fontsize=9)
+    for axis in axes[len(RELEASES) :]:
         axis.set_xlabel("connected vehicles [%]", fontsize=8)
     for axis in axes[:: len(RELEASES)]:
         axis.set_ylabel("error x 1000", fontsize=8)
@@ -575,6 +576,9 @@ def draw_arms(rows: pl.DataFrame, path: Path) -> None:
 
 def report(rows: pl.DataFrame, folder: Path) -> str:
     """Return the tables of both parts, and draw their figures."""
+    # An interrupted run may have the rows, and so the labels, of one part alone.
+    lacking = {*in_world(""), *sensed("", "")} - {*rows.columns}
+    rows = rows.with_columns(pl.lit(None).alias(name) for name in lacking)
     draw_worlds(rows, folder / "fig_estimators.png")
     draw_elsewhere(rows, folder / "fig_elsewhere.png")
     draw_arms(rows, folder / "fig_arms.png")
