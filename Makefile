@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 
 export OMP_NUM_THREADS = 1
 
-.PHONY: help setup docs site dist demo policy-study audit test test-slow test-gymnasium test-lowest test-ray test-tutorial lint format benchmark wheel-test clean reproduce privacy-study ledger-study choice-study penetration-study
+.PHONY: help setup docs site dist demo policy-study audit test test-slow test-gymnasium test-lowest test-ray test-tutorial lint format benchmark wheel-test clean reproduce privacy-study ledger-study choice-study estimator-study
 
 help:  ## Show this list.
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -48,8 +48,8 @@ choice-study: setup  ## Map where a choice of queries pays, with the policies of
 		--capped $(wildcard results/training/capped-roads/*/best.zip) \
 		--paced $(wildcard results/training/paced-roads/*/best.zip)
 
-penetration-study: setup  ## Measure errors by the share of connected vehicles, and what fusion gains; results/penetration.
-	$(BIN)/python scripts/study.py penetration
+estimator-study: setup  ## Put estimators side by side, where all vehicles answer and where a share does; results/estimators.
+	$(BIN)/python scripts/study.py estimators
 
 audit: setup  ## Attack the privacy presets, 5,000 runs in each of two worlds; results/audit.
 	$(BIN)/python scripts/audit.py --force --env dptse_env:dptse/PaperHighway-v0 --target replaced
