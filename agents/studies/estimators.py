@@ -248,8 +248,8 @@ def sensed_cells() -> list[Cell]:
     for pair in itertools.product(RELEASES, ESTIMATORS):
         for share in SHARES.values():
             found += [sensed(*pair, share), sensed(*pair, share, QUERIES)]
-        found += [alone(*pair, PART), alone(*pair)]
-    for estimator, name, policy in itertools.product((EKF, LEARNED), RANKED_SHARES, RANKED):
+        found += [alone(*pair, PART)] + [alone(*pair)] * (pair[0] in GUARANTEED)
+    for estimator, name, policy in itertools.product((EKF, LEARNED), RANKED_SHARES, RANKED[1:]):
         found.append(sensed("paced", estimator, SHARES[name], policy=policy))
     for pair in itertools.product(FAULTY_RELEASES, ESTIMATORS):
         found.append(unknown(*pair))
