@@ -406,7 +406,7 @@ def world_tables(rows: pl.DataFrame, times: pl.DataFrame) -> list[str]:
         return f"{mean(rows, labels, ERROR).mean:.1f} ({chi2(rows, labels)})"
 
     numbers = [str(k) for k in range(N_NETWORKS)]
-    parts += ["## Training seeds of the network", "Error x 1000 (χ²); 0 comes with the package."]
+    parts += ["## Training seeds of the network", "Error x 1000 (χ²). Only 0 is in the package."]
     parts.append(grid("", [*MAIN, *GUARANTEES], numbers, network))
     lines = {LABELS[each["estimator"]]: each for each in times.iter_rows(named=True)}
     text = "{ratio:.2f} [{low:.2f}, {high:.2f}]"
