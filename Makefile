@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 
 export OMP_NUM_THREADS = 1
 
-.PHONY: help setup docs site dist demo policy-study audit test test-slow test-gymnasium test-lowest test-ray test-tutorial lint format benchmark wheel-test clean reproduce privacy-study ledger-study penetration-study
+.PHONY: help setup docs site dist demo reproduce audit test test-slow test-gymnasium test-lowest test-ray test-tutorial lint format benchmark wheel-test clean
 
 help:  ## Show this list.
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -28,23 +28,12 @@ demo: setup  ## Train a small query policy and evaluate it beside the schedules 
 		--recipe.swaps.rounds 1 --recipe.swaps.episodes 96 --recipe.swaps.batches 300
 	$(BIN)/python scripts/evaluate.py --policies results/demo/training/policy.zip --output results/demo --force
 
-reproduce: setup  ## Repeat the paper's results and judge its claims; results/paper.
+reproduce: setup  ## Write the reports of all studies anew, after playing what their rows lack; results/.
 	$(BIN)/python scripts/study.py paper
-
-privacy-study: setup  ## Measure the price of the guarantee; results/privacy.
-	$(BIN)/python scripts/study.py privacy
-
-ledger-study: setup  ## Put capped contributions and paced ledgers side by side; results/ledger.
-	$(BIN)/python scripts/study.py ledger
-
-policy-study: setup  ## Hold the trained policies of results/training against rules; results/repeated.
-	$(BIN)/python scripts/study.py policies --output results/repeated --policies \
-		primary=results/training/primary primary:regression=results/training/regression \
-		$(foreach place,paper bandwidth-3 bandwidth-7 epsilon-1 epsilon-10,$(place)=results/training/$(place)) \
-		$(foreach release,capped paced,$(patsubst %,$(release)=%,$(wildcard results/training/$(release)-roads)))
-
-penetration-study: setup  ## Measure errors by the share of connected vehicles, and what fusion gains; results/penetration.
-	$(BIN)/python scripts/study.py penetration
+	$(BIN)/python scripts/study.py guarantees
+	$(BIN)/python scripts/study.py estimators
+	$(BIN)/python scripts/study.py policies
+	$(BIN)/python scripts/study.py suite
 
 audit: setup  ## Attack the privacy presets, 5,000 runs in each of two worlds; results/audit.
 	$(BIN)/python scripts/audit.py --force --env dptse_env:dptse/PaperHighway-v0 --target replaced

@@ -79,11 +79,28 @@ def find_study(args: Args) -> Study:
     follow = found.follow
     if follow is not None:
         follow = _changed_too(follow, changed)
-    cells = tuple(map(changed, found.cells))
+    cells = tuple(map(changed, _without_roads(found.cells) if road else found.cells))
     if road:
         cells = _suitable(cells)
     study: Study = dataclasses.replace(found, cells=cells, seeds=seeds[:most], follow=follow)
     return study
+
+
+def _without_roads(cells: Sequence[Cell]) -> tuple[Cell, ...]:
+    """Return the cells that have no road of their own, and say how many have one.
+
+    On another road these would not be what their labels say.
+
+    Raises:
+        ValueError: All have one.
+    """
+    taken = tuple(cell for cell in cells if "corridor" not in cell.keywords)
+    if not taken:
+        raise ValueError("corridor must be left out: every cell of the study has a road of its own")
+    if len(taken) < len(cells):
+        n = f"{len(cells) - len(taken)} of {len(cells)} cells"
+        print(f"{n} have a road of their own and are left out", file=sys.stderr)
+    return taken
 
 
 def _suitable(cells: Sequence[Cell]) -> tuple[Cell, ...]:

@@ -1,4 +1,5 @@
 import re
+from dataclasses import replace
 
 import polars as pl
 import pytest
@@ -9,6 +10,8 @@ from scripts.study import STUDIES, Args, find_study, main
 from tests.scripts.commands import run_script
 
 MINE = "examples.my_study:STUDY"
+FIRST = replace(STUDY.cells[0], keywords={**STUDY.cells[0].keywords, "corridor": "paper-highway"})
+ROADS, OWN_ROAD = (replace(STUDY, cells=(FIRST, *more)) for more in (STUDY.cells[1:], ()))
 
 
 @pytest.mark.parametrize("name", STUDIES)
@@ -48,6 +51,15 @@ def test_cells_that_do_not_suit_a_road_are_left_out_and_told(capsys):
     )
     assert {cell.keywords["bandwidth"] for cell in study.cells} == {1, 2}
     assert "2 of 6 cells do not suit the road" in capsys.readouterr().err
+
+
+def test_cells_with_a_road_of_their_own_are_left_out_and_told(capsys):
+    road = '{"n_mainline": 6}'
+    study = find_study(Args(name=f"{__name__}:ROADS", corridor=road))
+    assert [cell.labels["bandwidth"] for cell in study.cells] == [2, 3, 1, 2, 3]
+    assert "1 of 6 cells have a road of their own" in capsys.readouterr().err
+    with pytest.raises(ValueError, match="every cell of the study has a road of its own"):
+        find_study(Args(name=f"{__name__}:OWN_ROAD", corridor=road))
 
 
 def test_seeds_and_road_can_be_others_with_an_output_of_their_own():
