@@ -34,12 +34,10 @@ from agents.figures import (
     ERROR_TICKS,
     ESTIMATOR_LOOKS,
     LABELS,
-    RoadMap,
     add_frame,
     add_legend,
     draw_curve,
     draw_level,
-    draw_maps,
     error_label,
     make_figure,
     save_figure,
@@ -68,7 +66,7 @@ from agents.tables import (
 )
 from dptse_env.evaluation import Row, evaluate
 from dptse_env.process import QueryProcess
-from dptse_env.rendering import History
+from dptse_env.rendering import DENSITY_MAP, History
 from dptse_env.utils.arrays import FloatArray
 
 ENV = "dptse_env:dptse/PaperHighway-v0"
@@ -88,7 +86,7 @@ SWEEPS: dict[str, tuple[float, ...]] = {
 }
 """Values of results 1, 3 and 4, by the keyword that varies."""
 PRIVACY = ("epsilon", "delta")
-AXES = {"bandwidth": "number of CV segments", "epsilon": "ε", "delta": "δ"}
+AXES = {"bandwidth": "CV segments", "epsilon": "ε", "delta": "δ"}
 PAPER_SECONDS = {"ekf": 0.06, "ukf": 0.026, "enkf": 0.040, "mhe": 0.045}
 """The paper's seconds a step: MATLAB R2019b, a 3.6 GHz i7-7700."""
 CLOSE, SMALL, SIMILAR = 5.0, 10.0, 0.9
@@ -100,7 +98,7 @@ N_TIMED = 10
 """Traffic seeds behind each time of a step."""
 PICTURE = {"bandwidth": 7}
 RUN_TIME, SPACE_TIME = "run_time.parquet", "space_time.parquet"
-DPI = 100
+DPI = 90
 SHADES = ("#0072b2", "#56b4e9", "#d55e00", "#e69f00")
 MAPS = ("truth", "estimate")
 EVERY = 5
@@ -569,7 +567,7 @@ def by_setting(
 def draw_sweeps(found: Found, path: Path, field: str, metrics: Iterable[str], columns: int) -> None:
     """Draw errors along a sweep, a panel for each metric and setting, with 95 % intervals."""
     panels = [(metric, setting) for metric in metrics for setting in SETTINGS]
-    figure = make_figure(3.4 * columns + 0.4, 2.9 * len(panels) / columns + 0.8, DPI)
+    figure = make_figure(2.0 * columns + 4.4, 2.6 * len(panels) / columns + 0.8, DPI)
     axes = figure.subplots(len(panels) // columns, columns, squeeze=False)
     for axis, (metric, setting) in zip(axes.flat, panels, strict=True):
         for k, name in enumerate(ESTIMATORS[:-1]):
@@ -602,32 +600,36 @@ def draw_sweeps(found: Found, path: Path, field: str, metrics: Iterable[str], co
         axis.set_xlabel(AXES[field])
     add_legend(figure, axes.flat, columns=6)
     fixed = ", ".join(f"{AXES[name]} = {value:g}" for name, value in BASE.items() if name != field)
-    save_figure(figure, path, f"Error against the {AXES[field]}; {fixed}")
+    save_figure(figure, path, f"Error against {AXES[field]}; {fixed}")
 
 
 def draw_space_time(table: pl.DataFrame, path: Path) -> None:
     """Draw maps of density: truth on top, then each estimator; a column for each setting."""
     corridor = corridor_of(CELLS[0])
-    lengths = corridor.segment_lengths[: corridor.n_mainline]
-    road = History(0, corridor.duration, lengths, corridor.density_scale)  # for the scales alone
-
-    def shown(name: str, setting: Setting, column: str, title: str) -> RoadMap:
-        (row,) = pick(table, labels_of(name, setting, **PICTURE)).iter_rows(named=True)
-        seconds = np.repeat(row[column], EVERY, axis=0)
-        return RoadMap(title.format(row[DENSITY]), list(seconds), road)
-
-    columns = [
-        [
-            shown(ESTIMATORS[0], setting, "truth", f"{setting}\ntruth"),
-            *(
-                shown(name, setting, "estimate", LABELS[name] + ", RMSE {:.1f} veh/km")
-                for name in ESTIMATORS
-            ),
-        ]
-        for setting in SETTINGS
-    ]
-    title = f"Density, traffic seed {SEEDS[0]}, {PICTURE['bandwidth']} CV segments"
-    save_figure(draw_maps(columns, width=14.0), path, title)
+    figure = make_figure(2.4 * len(SETTINGS) + 0.8, 6.4, DPI)
+    panels = figure.subplots(1 + len(ESTIMATORS), len(SETTINGS), sharex=True, sharey=True)
+    for k, setting in enumerate(SETTINGS):
+        for axis, name in zip(panels[:, k], ("truth", *ESTIMATORS), strict=True):
+            estimator = ESTIMATORS[0] if name == "truth" else name
+            labels = labels_of(estimator, setting, **PICTURE)
+            (row,) = pick(table, labels).iter_rows(named=True)
+            title = str(setting) if name == "truth" else f"{LABELS[name]}, {row[DENSITY]:.1f}"
+            axis.set_title(title, loc="left", fontsize=8, pad=2)
+            axis.tick_params(labelsize=7)
+            image = axis.imshow(
+                np.transpose(row["truth" if name == "truth" else "estimate"]),
+                origin="lower", aspect="auto", interpolation="nearest", cmap=DENSITY_MAP,
+                extent=(0.0, corridor.duration, 0.0, corridor.n_mainline * corridor.segment_length),
+                vmin=0.0, vmax=corridor.density_scale,
+            )  # fmt: skip
+        axis.set_xlabel("time [s]", fontsize=8)
+    for axis in panels[:, 0]:
+        axis.set_ylabel("road [km]", fontsize=7)
+    bar = figure.colorbar(image, ax=panels.ravel().tolist(), fraction=0.02, pad=0.01, extend="max")
+    bar.set_label("density [veh/km]", fontsize=8)
+    title = "True density, and estimates below it with their RMSE [veh/km]"
+    more = f"traffic seed {SEEDS[0]}, {PICTURE['bandwidth']} CV segments"
+    save_figure(figure, path, f"{title}; {more}")
 
 
 def draw_times(found: Found, path: Path) -> None:
