@@ -249,16 +249,17 @@ class Found:
         """Sort both by cell."""
         self._rows, self._times = _by_cell(rows), {} if times is None else _by_cell(times)
 
-    def table(self, labels: Labels, metric: str = DENSITY) -> pl.DataFrame:
-        """Return the rows of a cell, or its run times.
+    def cell(self, labels: Labels, metric: str) -> tuple[str, dict[int, float]]:
+        """Return the version that played a cell, and a column of its rows by traffic seed.
 
         Raises:
-            UnmeasuredError: There are none.
+            UnmeasuredError: It was not played.
         """
-        tables = self._times if metric == SECONDS else self._rows
-        if tuple(labels.values()) not in tables:
+        columns = (self._times if metric == SECONDS else self._rows).get(tuple(labels.values()))
+        if columns is None:
             raise UnmeasuredError(labels, metric)
-        return tables[tuple(labels.values())]
+        values = zip(columns["traffic_seed"], columns[metric], strict=True)
+        return columns["version"][0], dict(values)
 
     def curves(self, setting: Setting, *curves: Curve) -> list[FloatArray]:
         """Return curves (n_points, n_seeds), paired on the seeds that all their cells have.
@@ -271,20 +272,21 @@ class Found:
         for estimator, metric, field in curves:
             found.append([])
             for labels in curve_of(field, estimator, setting):
-                table = self.table(labels, metric)
-                versions.add(table["version"][0])
-                found[-1].append(dict(table.select("traffic_seed", metric).iter_rows()))
+                version, values = self.cell(labels, metric)
+                versions.add(version)
+                found[-1].append(values)
         seeds = sorted(set.intersection(*(set(point) for curve in found for point in curve)))
         if len(versions) > 1 or len(seeds) < 2:
             raise UnmeasuredError(curves, versions)
         return [np.array([[point[seed] for seed in seeds] for point in curve]) for curve in found]
 
 
-def _by_cell(table: pl.DataFrame) -> dict[tuple[Any, ...], pl.DataFrame]:
+def _by_cell(table: pl.DataFrame) -> dict[tuple[Any, ...], dict[str, list[Any]]]:
     found = {}
     for each in CELLS:
         with contextlib.suppress(UnmeasuredError):
-            found[tuple(each.labels.values())] = pick(table, each.labels)
+            rows = pick(table, each.labels)
+            found[tuple(each.labels.values())] = rows.to_dict(as_series=False)
     return found
 
 
@@ -492,6 +494,11 @@ def report(rows: pl.DataFrame, folder: Path) -> str:
     draw_times(found, folder / "fig5_run_time.png")
     if (folder / SPACE_TIME).exists():
         draw_space_time(read_table(folder / SPACE_TIME, MAPS), folder / "fig2_space_time.png")
+    return tables_of(found)
+
+
+def tables_of(found: Found) -> str:
+    """Return the verdicts, the errors and times at the base point, and each claim in numbers."""
 
     def verdict(claim: Claim, setting: Setting) -> str:
         verdicts = [measure(found, claim, setting, part)[1] for part in claim.parts]
@@ -517,9 +524,11 @@ def report(rows: pl.DataFrame, folder: Path) -> str:
         return LABELS[name] + paper
 
     def lost(name: str, setting: Setting) -> str:
-        tables = [found.table(labels) for labels in cells_of(name, setting)]
-        sums = [sum(float(each[column].sum()) for each in tables) for column in LOST]
-        return f"{' / '.join(f'{each:.0f}' for each in sums)} in {sum(map(len, tables))}"
+        cells, counts = cells_of(name, setting), []
+        for column in LOST:
+            episodes = [each for labels in cells for each in found.cell(labels, column)[1].values()]
+            counts.append(f"{sum(episodes):.0f}")
+        return f"{' / '.join(counts)} in {len(episodes)}"
 
     def part(claim: Claim, part: Part, setting: Setting) -> str:
         interval, verdict = measure(found, claim, setting, part)
