@@ -96,13 +96,16 @@ their correlation along the grid exceeds this."""
 SECONDS = "seconds"
 N_TIMED = 10
 """Traffic seeds behind each time of a step."""
-PICTURE = {"bandwidth": 7}
+PICTURE_SEGMENTS = 7
+"""CV segments of result 2."""
 RUN_TIME, SPACE_TIME = "run_time.parquet", "space_time.parquet"
-DPI = 90
-SHADES = ("#0072b2", "#56b4e9", "#d55e00", "#e69f00")
 MAPS = ("truth", "estimate")
 EVERY = 5
 """Seconds between two columns of the map of space and time [s]."""
+LOST = ("n_diverged", "n_fallback", "n_dropped")
+DPI = 90
+SHADES = ("#0072b2", "#56b4e9", "#d55e00", "#e69f00")
+"""Colours of the settings."""
 
 
 class Setting(NamedTuple):
@@ -222,7 +225,7 @@ def measure_space_time(place: Place) -> pl.DataFrame:
     """Return true and estimated densities of an episode of each estimator, to 1 veh/km."""
     record(corridor_of(CELLS[0]), SEEDS[:1], place.records)
     rows = []
-    for labels in once(labels_of(*pair, **PICTURE) for pair in _PAIRS):
+    for labels in once(labels_of(*pair, bandwidth=PICTURE_SEGMENTS) for pair in _PAIRS):
         (row,) = evaluate(_make_env(labels, place), SCHEDULE, SEEDS[:1], watchers=[_Watch])
         maps = {name: np.rint(row[name][::EVERY]).astype(int).tolist() for name in MAPS}
         rows.append({"version": dptse_env.__version__, **labels, **row, **maps})
@@ -334,7 +337,7 @@ def correlation(a: FloatArray, b: FloatArray) -> Interval:
     each = (a * b).sum(axis=0) / np.sqrt((a**2).sum(axis=0) * (b**2).sum(axis=0))
     # A perfect correlation would go to infinity.
     z = mean_interval(np.arctanh(np.clip(each, -1.0 + 1e-9, 1.0 - 1e-9)))
-    return Interval(*(math.tanh(end) for end in (z.mean, z.low, z.high)), z.n)
+    return Interval(math.tanh(z.mean), math.tanh(z.low), math.tanh(z.high), z.n)
 
 
 def ratio(a: FloatArray, b: FloatArray) -> Interval:
@@ -463,7 +466,6 @@ CLAIMS = (
 """Claims of the paper's section on results, in its order."""
 
 HOLDS, FAILS, OPEN = "holds", "does not hold", "undecided"
-LOST = ("n_diverged", "n_fallback", "n_dropped")
 SIGNS = {HOLDS: "✓", FAILS: "✗", OPEN: "?"}
 
 
@@ -519,9 +521,10 @@ def tables_of(found: Found) -> str:
         return f"{text}; {ratio(own, ekf).mean:.2f}"
 
     def timed(name: str) -> str:
-        seconds = PAPER_SECONDS.get(name)
-        paper = "" if seconds is None else f" (the paper: {1e3 * seconds:g}; {seconds / 0.06:.2f})"
-        return LABELS[name] + paper
+        if name not in PAPER_SECONDS:
+            return LABELS[name]
+        seconds, ekf = PAPER_SECONDS[name], PAPER_SECONDS["ekf"]
+        return f"{LABELS[name]} (the paper: {1e3 * seconds:g}; {seconds / ekf:.2f})"
 
     def lost(name: str, setting: Setting) -> str:
         cells, counts = cells_of(name, setting), []
@@ -530,7 +533,7 @@ def tables_of(found: Found) -> str:
             counts.append(f"{sum(episodes):.0f}")
         return f"{' / '.join(counts)} in {len(episodes)}"
 
-    def part(claim: Claim, part: Part, setting: Setting) -> str:
+    def measured(claim: Claim, part: Part, setting: Setting) -> str:
         interval, verdict = measure(found, claim, setting, part)
         return f"{format_interval(interval)} {SIGNS[verdict]}"
 
@@ -555,7 +558,7 @@ def tables_of(found: Found) -> str:
         text += [
             f"### {claim.statement}",
             f"{claim.quantity}, in ({claim.low:g}, {claim.high:g})",
-            by_setting("part", claim.parts, partial(part, claim), lambda part: part.name),
+            by_setting("part", claim.parts, partial(measured, claim), lambda part: part.name),
         ]
     return "\n\n".join(text)
 
@@ -590,11 +593,12 @@ def draw_sweeps(found: Found, path: Path, field: str, metrics: Iterable[str], co
         if field in PRIVACY:
             axis.set_xscale("log")
             set_log_ticks(axis.xaxis, SWEEPS[field])
+        if field == "epsilon":
+            axis.set_yscale("log")
+            set_log_ticks(axis.yaxis, ERROR_TICKS)
         with contextlib.suppress(UnmeasuredError):
             alone = level(*found.curves(setting, Curve("open_loop", metric)))
             if field == "epsilon":
-                axis.set_yscale("log")
-                set_log_ticks(axis.yaxis, ERROR_TICKS)
                 draw_level(axis, alone, label=LABELS["open_loop"])
             else:
                 axis.annotate(
@@ -620,7 +624,7 @@ def draw_space_time(table: pl.DataFrame, path: Path) -> None:
     for k, setting in enumerate(SETTINGS):
         for axis, name in zip(panels[:, k], ("truth", *ESTIMATORS), strict=True):
             estimator = ESTIMATORS[0] if name == "truth" else name
-            labels = labels_of(estimator, setting, **PICTURE)
+            labels = labels_of(estimator, setting, bandwidth=PICTURE_SEGMENTS)
             (row,) = pick(table, labels).iter_rows(named=True)
             title = str(setting) if name == "truth" else f"{LABELS[name]}, {row[DENSITY]:.1f}"
             axis.set_title(title, loc="left", fontsize=8, pad=2)
@@ -637,7 +641,7 @@ def draw_space_time(table: pl.DataFrame, path: Path) -> None:
     bar = figure.colorbar(image, ax=panels.ravel().tolist(), fraction=0.02, pad=0.01, extend="max")
     bar.set_label("density [veh/km]", fontsize=8)
     title = "True density, and estimates below it with their RMSE [veh/km]"
-    more = f"traffic seed {SEEDS[0]}, {PICTURE['bandwidth']} CV segments"
+    more = f"traffic seed {SEEDS[0]}, {PICTURE_SEGMENTS} CV segments, dptse-env {row['version']}"
     save_figure(figure, path, f"{title}; {more}")
 
 

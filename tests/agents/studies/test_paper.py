@@ -1,4 +1,3 @@
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,7 +8,7 @@ import pytest
 from agents.executors import THIS_PROCESS
 from agents.statistics import Interval
 from agents.studies import paper
-from agents.studies.paper import CELLS, SETTINGS, STUDY, Found, Stopwatch, judge, tables_of
+from agents.studies.paper import CELLS, SETTINGS, STUDY, Found, judge, tables_of
 from agents.study import Place, read_rows, read_table, run, write_report
 from agents.tables import format_interval, mean
 
@@ -32,23 +31,22 @@ def entries(text, first):
     return line.strip("| ").split(" | ")[1:]
 
 
-def test_the_recorded_rows_are_those_of_the_cells(rows, times):
+def test_the_recorded_rows_are_those_of_the_cells_and_the_tables_are_theirs(rows, times):
     played = dict(rows.group_by("cell").agg("traffic_seed").iter_rows())
     assert {cell.id for cell in CELLS} == played.keys()
     assert all(set(STUDY.seeds_of(cell)) == set(played[cell.id]) for cell in CELLS)
-    # The keywords that were played are the labels.
-    assert all(cell.keywords == cell.labels for cell in CELLS)
     text = tables_of(Found(rows, times))
     assert (RESULTS / "tables.md").read_text().startswith(text)
     for k, setting in enumerate(SETTINGS):
-        labels = paper.labels_of("ukf", setting)
-        expected = format_interval(mean(rows, labels, "rmse_density"))
-        assert entries(text, "UKF")[k].startswith(expected)
+        density = mean(rows, paper.labels_of("ukf", setting), "rmse_density")
+        assert entries(text, "UKF")[k].startswith(format_interval(density))
 
 
-@pytest.mark.parametrize("cell", [*CELLS[:110:22], CELLS[-1]], ids=lambda cell: cell.id[-60:])
-def test_cells_suit(cell):
-    cell.check()
+def test_cells_suit():
+    for estimator in paper.ESTIMATORS:
+        cell = next(each for each in reversed(CELLS) if each.labels["estimator"] == estimator)
+        cell.check()
+        assert cell.keywords == cell.labels
 
 
 @pytest.mark.parametrize(
@@ -57,8 +55,6 @@ def test_cells_suit(cell):
         ("ukf", "rmse_density", 0.5, "P3.", "holds (3 of 3)"),
         ("ukf", "rmse_density", 2.0, "P3.", "does not hold (0 of 3)"),
         ("enkf", "rmse_speed", 2.0, "P6.", "holds (3 of 3)"),
-        ("enkf", "rmse_speed", 0.2, "P6.", "does not hold (0 of 3)"),
-        ("mhe", "rmse_density", 3.0, "P7.", "does not hold"),
         ("ekf", "seconds", 1000.0, "P20.", "holds (3 of 3)"),
     ],
 )
@@ -66,26 +62,22 @@ def test_a_verdict_follows_what_was_measured(
     rows, times, estimator, column, factor, claim, verdict
 ):
     changed = pl.when(pl.col("estimator") == estimator).then(factor).otherwise(1.0)
-    tables = [
-        each.with_columns(pl.col(column) * changed) if column in each.columns else each
-        for each in (rows, times)
-    ]
-    assert all(each.startswith(verdict) for each in entries(tables_of(Found(*tables)), claim))
+    if column == "seconds":
+        times = times.with_columns(pl.col(column) * changed)
+    else:
+        rows = rows.with_columns(pl.col(column) * changed)
+    assert entries(tables_of(Found(rows, times)), claim) == [verdict] * 4
 
 
-@pytest.mark.parametrize("lacking", ["times", "rows", "version"])
-def test_what_cannot_be_compared_is_a_dash(rows, times, lacking):
+@pytest.mark.parametrize("how", ["lacking", "of another version"])
+def test_what_cannot_be_compared_is_a_dash(rows, how):
     mhe = (pl.col("estimator") == "mhe") & (pl.col("privacy") == "paper")
-    if lacking == "times":
-        found, claim, there = Found(rows), "P20.", "-"
-    elif lacking == "rows":
-        found, claim, there = Found(rows.filter(~mhe), times), "P10.", "does not hold (0 of 2)"
-    else:  # differences are within one version
-        other = pl.when(mhe).then(pl.lit("0.2.0")).otherwise("version")
-        found = Found(rows.with_columns(version=other), times)
-        claim, there = "P10.", "does not hold (0 of 2)"
-    assert entries(tables_of(found), claim) == ["-", "-", there, there]
-    assert entries(tables_of(found), "P16.")[3] == "holds (4 of 4)"
+    version = pl.when(mhe).then(pl.lit("0.2.0")).otherwise("version")
+    found = Found(rows.filter(~mhe) if how == "lacking" else rows.with_columns(version=version))
+    text = tables_of(found)
+    assert entries(text, "P10.") == ["-", "-", *["does not hold (0 of 2)"] * 2]
+    assert entries(text, "P16.")[3] == "holds (4 of 4)"
+    assert entries(text, "P20.") == ["-"] * 4
 
 
 def test_a_part_is_undecided_where_its_interval_has_an_end_of_the_range():
@@ -105,18 +97,6 @@ def test_statistics_of_curves():
     assert paper.roughness_gap(zigzag, line).mean == pytest.approx(4.0, abs=0.01)
     assert paper.fall_gap(2.0 * line, line).mean == pytest.approx(3.0, abs=0.01)
     assert paper.correlation(line, 3.0 * line + 1.0).mean == pytest.approx(1.0)
-
-
-def test_a_stopwatch_adds_up_the_time_in_methods():
-    class Sleeper:
-        def nap(self):
-            time.sleep(0.02)
-            return "rested"
-
-    sleeper = Sleeper()
-    watch = Stopwatch(sleeper, ["nap"])
-    assert [sleeper.nap(), sleeper.nap()] == ["rested"] * 2
-    assert 0.04 <= watch.seconds < 1.0
 
 
 @pytest.mark.slow
