@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from agents.studies.paper.timing import Stopwatch
+from agents.studies.paper import Stopwatch
 from benchmarks.throughput.environments import libraries, make_batch
 from benchmarks.throughput.measure import Measured, resident, take_turns
 
