@@ -306,7 +306,7 @@ class Scores:
             axis.plot(*np.array(found).reshape(-1, 2).T, linestyle="", label=policy, **look)
         axis.axvline(0.0, color=GREY, linewidth=0.8)
         axis.set_xlim(-0.5, 1.05)
-        axis.set_xlabel("score")
+        axis.set_xlabel("score, those below -0.5 left out")
         axis.set_yticks(places, self._tasks)
         add_frame(axis)
         add_legend(figure, [axis])
@@ -354,13 +354,13 @@ def _policy_table(rows: pl.DataFrame, task: Task, policies: Sequence[str]) -> st
             float(values_of(own, metric).mean())
             for metric in (ERROR, DENSITY, SPEED, "chi2_density", "chi2_speed", "queries_a_second")
         )
-        met, refused = own["n_met"].sum(), own["n_refused"].sum()
+        refused = own["percent_refused"].drop_nulls().to_numpy()
         numbers = [
             f"{error:.1f}",
             f"{density:.2f}",
             f"{speed:.2f}",
             f"{chi2_density:.2f}, {chi2_speed:.2f}",
-            f"{100.0 * refused / max(met, 1):.1f}" if own["n_met"].null_count() == 0 else "-",
+            f"{refused.mean():.1f}" if len(refused) else "-",
             f"{queries:.1f}",
         ]
         lines.append((error, [f"`{policy}`", *numbers]))
