@@ -53,9 +53,10 @@ def main(args: Args) -> None:
         for name, source in named.items()
         for cell in suitable([make_cell(task, name, source) for task in TASKS], source)
     ]
-    study = entry(cells)
+    study = entry(cells, TASKS)
     run_study(study, args.place(args.output))
-    print_scores(Scores(beside_recorded(read_rows(study.name, args.output), study.cells)), named)
+    rows = beside_recorded(read_rows(study.name, args.output), study.cells)
+    print_scores(Scores(rows, TASKS), named)
     print(f"tables and the figure are in {args.output}/")
 
 
