@@ -297,13 +297,14 @@ class Scores:
         axis = figure.subplots()
         places = np.arange(len(self._tasks))[::-1]
         for k, policy in enumerate(shown):
-            look = {"color": f"C{k % 10}", "marker": _MARKERS[k // 10 % len(_MARKERS)]}
+            marker = _MARKERS[k // 10 % len(_MARKERS)]
             found = [
                 (self.by_task[policy, task].mean, place)
                 for task, place in zip(self._tasks, places, strict=True)
                 if (policy, task) in self.by_task
             ]
-            axis.plot(*np.array(found).reshape(-1, 2).T, linestyle="", label=policy, **look)
+            scores, heights = np.array(found).reshape(-1, 2).T
+            axis.plot(scores, heights, marker, color=f"C{k % 10}", label=policy)
         axis.axvline(0.0, color=GREY, linewidth=0.8)
         axis.set_xlim(-0.5, 1.05)
         axis.set_xlabel("score, those below -0.5 left out")
