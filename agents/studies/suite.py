@@ -22,7 +22,7 @@ from agents.figures import GREY, add_frame, add_legend, make_figure, save_figure
 from agents.play import Cell
 from agents.seeds import SUITE
 from agents.statistics import Interval
-from agents.study import Study, read_rows
+from agents.study import ROWS, Study, read_table
 from agents.tables import (
     DENSITY,
     ERROR,
@@ -170,7 +170,7 @@ def entry(cells: Sequence[Cell], tasks: Sequence[Task] = TASKS) -> Study:
         cells: Cells of the policies, see `make_cell`.
         tasks: Tasks in the order of the tables.
     """
-    recorded = read_rows("suite", RECORDED).filter(pl.col("version") == dptse_env.__version__)
+    recorded = read_table(RECORDED / ROWS).filter(pl.col("version") == dptse_env.__version__)
     present = set(recorded.select("policy", "task").iter_rows())
     played = {each.labels["task"] for each in cells}
     references = [
@@ -194,7 +194,7 @@ def beside_recorded(rows: pl.DataFrame, cells: Sequence[Cell]) -> pl.DataFrame:
     A folder may have rows of an earlier state of the same file, which is another cell.
     """
     own = rows.filter(pl.col("cell").is_in([each.id for each in cells]))
-    both: pl.DataFrame = pl.concat([read_rows("suite", RECORDED), own], how="diagonal_relaxed")
+    both: pl.DataFrame = pl.concat([read_table(RECORDED / ROWS), own], how="diagonal_relaxed")
     return both.unique(("version", "cell", "traffic_seed"), keep="last", maintain_order=True)
 
 

@@ -50,11 +50,14 @@ def test_bad_policies_are_named_before_anything_is_played(
     assert not (tmp_path / "out").exists()
 
 
-def test_a_policy_that_fails_is_one_line(monkeypatch, tmp_path, capsys):
+def test_a_policy_that_fails_is_one_line_and_finished_rows_stay(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(suite, "TASKS", SMALL)
     words = ["--policies", f"{HERE}:Raising", "--output", str(tmp_path), "--workers", "1"]
-    with pytest.raises(SystemExit) as ended:
-        run(main, Args, None, words=words)
-    assert ended.value.code == 1
-    line = capsys.readouterr().err.splitlines()[-1]
-    assert line.startswith(f"error: '{HERE}:Raising' in task wide")
+    for _ in range(2):
+        with pytest.raises(SystemExit) as ended:
+            run(main, Args, None, words=words)
+        assert ended.value.code == 1
+        line = capsys.readouterr().err.splitlines()[-1]
+        assert line.startswith(f"error: '{HERE}:Raising' in task wide")
+        assert "ValueError: no third segment" in line
+        assert set(read_rows("suite", tmp_path)["task"]) == {"plain"}

@@ -6,7 +6,6 @@ import pytest
 from scipy import stats
 
 from agents.executors import THIS_PROCESS
-from agents.play import PlayError
 from agents.seeds import SUITE
 from agents.studies.suite import (
     ONE,
@@ -116,13 +115,3 @@ def test_a_policy_is_scored_beside_those_that_are_recorded(tmp_path):
     assert "mine" not in set(beside_recorded(read_rows("suite", tmp_path), [other])["policy"])
     # Where the references are recorded, the policy alone is played.
     assert entry([make_cell(TASKS[0], "mine", "static")]).cells[1:] == ()
-
-
-def test_a_policy_that_fails_is_named_and_finished_rows_stay(tmp_path):
-    study = entry([make_cell(task, "mine", f"{HERE}:Raising") for task in SMALL], SMALL)
-    message = f"{HERE}:Raising' in task wide, policy mine: ValueError: no third segment .*test_suite"
-    for _ in range(2):
-        with pytest.raises(PlayError, match=message):
-            run(study, Place(tmp_path, THIS_PROCESS), progress=False)
-        kept = read_rows("suite", tmp_path)
-        assert set(kept.select("policy", "task").iter_rows()) == {("mine", "plain")}
