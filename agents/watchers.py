@@ -374,9 +374,58 @@ def near_since_start(
     return (bounds[:-1] + BIN / 2)[seen], near[seen] / queries[seen]
 
 
+class Summary:
+    """Honesty, refusals and queries of a batch of episodes, in a few columns.
+
+    Columns:
+
+    - ``chi2_density``, ``chi2_speed``: as `Honesty` has them;
+    - ``percent_refused``: of the contributions that queries called for, the share that a ledger or
+      a cap refused; None where the release model keeps no account of vehicles;
+    - ``queries_a_second``: requests that were served.
+    """
+
+    def __init__(self, process: QueryProcess) -> None:
+        """Prepare for the episodes of a process."""
+        self._process, self._honesty = process, Honesty(process)
+        has_accounts = isinstance(of_queries(process.release), Capped | Paced)
+        self._contributions = Contributions(process) if has_accounts else None
+        self._queries, self._seconds = np.zeros(process.n_episodes), 0
+        self._begun = False
+
+    def __call__(self) -> None:
+        """Follow the second that has passed."""
+        self._honesty()
+        if self._contributions is not None:
+            self._contributions()
+        if self._begun:  # the first call is that after the reset, before any query
+            self._queries += self._process.queried.sum(axis=1)
+            self._seconds += 1
+        self._begun = True
+
+    def rows(self) -> list[Row]:
+        """See `dptse_env.evaluation.Watcher.rows`."""
+        refused: list[float | None] = [None] * len(self._queries)
+        if self._contributions is not None:
+            counted = self._contributions.rows()
+            refused = [100.0 * row["n_refused"] / max(row["n_met"], 1) for row in counted]
+        return [
+            {
+                "chi2_density": chi2["chi2_density"],
+                "chi2_speed": chi2["chi2_speed"],
+                "percent_refused": share,
+                "queries_a_second": float(queries / self._seconds),
+            }
+            for chi2, share, queries in zip(
+                self._honesty.rows(), refused, self._queries, strict=True
+            )
+        ]
+
+
 WATCHERS: dict[str, WatcherFactory] = {
     "contributions": Contributions,
     "honesty": Honesty,
     "queries": Queries,
+    "summary": Summary,
 }
 """Watchers by the names that cells give."""

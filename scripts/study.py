@@ -10,8 +10,7 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import pkgutil
-import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,7 +22,7 @@ from agents.study import Follow, Study, write_report
 from agents.study import run as run_study
 from dptse_env.config import parse_seeds
 from dptse_env.utils.validation import require
-from scripts.cli import Machines, resumable, run
+from scripts.cli import Machines, resumable, run, suitable
 
 STUDIES = ("paper", "guarantees", "estimators", "policies", "suite")
 RESULTS = Path("results")
@@ -81,7 +80,7 @@ def find_study(args: Args) -> Study:
         follow = _changed_too(follow, changed)
     cells = tuple(map(changed, _without_roads(found.cells) if road else found.cells))
     if road:
-        cells = _suitable(cells)
+        cells = suitable(cells, "the road")
     study: Study = dataclasses.replace(found, cells=cells, seeds=seeds[:most], follow=follow)
     return study
 
@@ -101,28 +100,6 @@ def _without_roads(cells: Sequence[Cell]) -> tuple[Cell, ...]:
         n = f"{len(cells) - len(taken)} of {len(cells)} cells"
         print(f"{n} have a road of their own and are left out", file=sys.stderr)
     return taken
-
-
-def _suitable(cells: Sequence[Cell]) -> tuple[Cell, ...]:
-    """Return the cells that a road takes, and say which it refuses.
-
-    Raises:
-        ValueError: It refuses all.
-    """
-    taken, refused = [], []
-    for cell in cells:
-        try:
-            cell.check()
-        except ValueError as problem:
-            refused.append(problem)
-        else:
-            taken.append(cell)
-    if not taken:
-        raise refused[0]
-    if refused:
-        n = f"{len(refused)} of {len(cells)} cells"
-        print(f"{n} do not suit the road and are left out: {refused[0]}", file=sys.stderr)
-    return tuple(taken)
 
 
 def _changed_too(follow: Follow, changed: Callable[[Cell], Cell]) -> Follow:

@@ -218,3 +218,18 @@ def test_offsets_and_times_are_counted_from_the_incident():
     seconds, near = near_since_start(rows, (-20.0, 0.0, 20.0, 40.0))
     assert seconds.tolist() == [-10.0, 10.0, 30.0]
     np.testing.assert_allclose(near, [1.0, 2.0, 2.0])
+
+
+@pytest.mark.parametrize("privacy", [PACED, "paper"])
+def test_a_summary_is_of_honesty_refusals_and_queries(privacy):
+    has_accounts = privacy != "paper"
+    more = ("honesty", *(("contributions",) if has_accounts else ()))
+    keywords = {"horizon": 120, "bandwidth": 2}
+    for row, whole in zip(
+        watch(privacy, ("summary",), **keywords), watch(privacy, more, **keywords), strict=True
+    ):
+        assert row["chi2_density"] == whole["chi2_density"]
+        assert row["chi2_speed"] == whole["chi2_speed"]
+        assert row["queries_a_second"] == 2.0
+        share = 100.0 * whole["n_refused"] / whole["n_met"] if has_accounts else None
+        assert row["percent_refused"] == share

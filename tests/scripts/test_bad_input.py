@@ -8,13 +8,9 @@ import pytest
 
 pytest.importorskip("tyro")
 
-from agents.policies import find_policy
-from agents.suite.card import Card
-from agents.suite.cells import SUITES
 from dptse_env import __version__
 from dptse_env.traffic import RecordingError
 from scripts import dptse, info
-from tests.agents.suite.small import SMALL
 
 ROOT = Path(__file__).parents[2]
 SHORT = ["--env", "dptse_env:dptse/ShortHighway-v0"]
@@ -52,7 +48,6 @@ PLAN = shipped("dptse_env/schedules/plans/*.json")
 SETTINGS = shipped("dptse_env/estimators/tuned/*.json")
 NETWORK_WEIGHTS = shipped("dptse_env/estimators/learned/shipped/*.npz")
 POLICY = shipped("dptse_env/policies/*.zip")
-CARD = shipped("agents/suite/cards/**/*.json")
 
 FIELD = ["--source.cell", "0.1", "--source.interval", "5"]
 ROAD = [
@@ -72,7 +67,6 @@ FILES = {
     "model": (
         "m.zip", POLICY, lambda path: ["suite", "--policies", f"stable_baselines3:PPO={path}"]
     ),
-    "card": ("c.json", CARD, lambda path: ["suite", "--verify", path]),
     "first network": (
         "n.npz", NETWORK_WEIGHTS, lambda path: ["train-estimator", "--initial", path]
     ),
@@ -132,7 +126,7 @@ def test_a_file_that_cannot_be_read_is_named(kind, how, tmp_path, capsys, monkey
     elif how != "missing":
         path.write_bytes(bytes(range(256)) if how == "noise" else content[: len(content) * 2 // 3])
     command = words(path)
-    output = [] if command[0] == "replay-field" or "--verify" in command else ["--output", "out"]
+    output = [] if command[0] == "replay-field" else ["--output", "out"]
     if command[:2] == ["import", "network"]:
         output = ["--output", "out.toml"]
     if command[0] == "record":
@@ -240,17 +234,6 @@ def test_with_force_they_are_replaced_and_standard_output_is_json(tmp_path, caps
     status, out, _ = run(capsys, *words, "--force")
     assert status == 0
     assert json.loads(out) == json.loads(path.read_text())
-
-
-def test_a_card_begun_by_another_version_is_refused(tmp_path, capsys, monkeypatch):
-    monkeypatch.setitem(SUITES, "s", SMALL)
-    made_with = {"dptse-env": "0.0.1"}
-    card = Card(SMALL.name, "paper", "paper", find_policy("paper").identity, made_with)
-    card.write(tmp_path / "paper.json")
-    before = (tmp_path / "paper.json").read_bytes()
-    line = refused(capsys, "suite", "--name", "s", "--policies", "paper", "--output", tmp_path)
-    assert "was begun with other versions (dptse-env)" in line
-    assert (tmp_path / "paper.json").read_bytes() == before
 
 
 @pytest.mark.parametrize(
