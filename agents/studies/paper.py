@@ -152,10 +152,10 @@ def once(many: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
     return list({tuple(labels.values()): labels for labels in many}.values())
 
 
-_PAIRS = [(name, setting) for setting in SETTINGS for name in ESTIMATORS]
+PAIRS = [(name, setting) for setting in SETTINGS for name in ESTIMATORS]
 CELLS = tuple(
     Cell(ENV, SCHEDULE, keywords=labels, labels=labels)
-    for labels in once(each for pair in _PAIRS for each in cells_of(*pair))
+    for labels in once(each for pair in PAIRS for each in cells_of(*pair))
 )
 
 
@@ -192,7 +192,7 @@ def measure_run_time(place: Place) -> pl.DataFrame:
     """
     record(corridor_of(CELLS[0]), SEEDS[:N_TIMED], place.records)
     timed = []
-    for labels in once(labels_of(*pair) for pair in _PAIRS):
+    for labels in once(labels_of(*pair) for pair in PAIRS):
         env = _make_env(labels, place)
         evaluate(env, SCHEDULE, SEEDS[:1])  # kernels load before anything counts
         process = unwrap(env).process
@@ -225,7 +225,7 @@ def measure_space_time(place: Place) -> pl.DataFrame:
     """Return true and estimated densities of an episode of each estimator, to 1 veh/km."""
     record(corridor_of(CELLS[0]), SEEDS[:1], place.records)
     rows = []
-    for labels in once(labels_of(*pair, bandwidth=PICTURE_SEGMENTS) for pair in _PAIRS):
+    for labels in once(labels_of(*pair, bandwidth=PICTURE_SEGMENTS) for pair in PAIRS):
         (row,) = evaluate(_make_env(labels, place), SCHEDULE, SEEDS[:1], watchers=[_Watch])
         maps = {name: np.rint(row[name][::EVERY]).astype(int).tolist() for name in MAPS}
         rows.append({"version": dptse_env.__version__, **labels, **row, **maps})
