@@ -10,7 +10,8 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import pkgutil
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +19,7 @@ import tyro
 
 from agents.environments import given_keywords
 from agents.play import Cell
+from agents.seeds import seed_kind
 from agents.study import Follow, Study, write_report
 from agents.study import run as run_study
 from dptse_env.config import parse_seeds
@@ -40,7 +42,8 @@ class Args(Machines):
     quick: bool = False
     """Three traffic seeds for each cell, to see whether it runs."""
     seeds: str | None = None
-    """Traffic seeds, first:stop, in place of the study's own; needs another output."""
+    """Test traffic seeds, first:stop, in place of the study's own; needs another output. What is
+    played on validation traffic keeps its seeds."""
     corridor: str | None = None
     """Road in place of the study's own: the name of a shipped corridor, a road file that ends in
     .toml, or a JSON object of corridor fields; needs another output."""
@@ -72,7 +75,10 @@ def find_study(args: Args) -> Study:
     road, most = given_keywords("{}", args.corridor), QUICK_SEEDS if args.quick else None
 
     def changed(cell: Cell) -> Cell:
-        own = None if args.seeds is not None or cell.seeds is None else cell.seeds[:most]
+        own = cell.seeds
+        if own is not None and args.seeds is not None and seed_kind(own) != "validation":
+            own = None
+        own = None if own is None else own[:most]
         return dataclasses.replace(cell, keywords={**cell.keywords, **road}, seeds=own)
 
     follow = found.follow
@@ -81,8 +87,11 @@ def find_study(args: Args) -> Study:
     cells = tuple(map(changed, _without_roads(found.cells) if road else found.cells))
     if road:
         cells = suitable(cells, "the road")
-    study: Study = dataclasses.replace(found, cells=cells, seeds=seeds[:most], follow=follow)
-    return study
+    # Further tables are measured on the study's own road.
+    measures = {} if road else found.measures
+    return dataclasses.replace(
+        found, cells=cells, seeds=seeds[:most], follow=follow, measures=measures
+    )
 
 
 def _without_roads(cells: Sequence[Cell]) -> tuple[Cell, ...]:
