@@ -380,8 +380,8 @@ class Summary:
     Columns:
 
     - ``chi2_density``, ``chi2_speed``: as `Honesty` has them;
-    - ``percent_refused``: of the contributions that queries called for, the share that a ledger or
-      a cap refused; None where the release model keeps no account of vehicles;
+    - ``n_met``, ``n_refused``: as `Contributions` has them; None where the release model keeps no
+      account of vehicles;
     - ``queries_a_second``: requests that were served.
     """
 
@@ -405,19 +405,17 @@ class Summary:
 
     def rows(self) -> list[Row]:
         """See `dptse_env.evaluation.Watcher.rows`."""
-        refused: list[float | None] = [None] * len(self._queries)
+        counted: list[Row] = [{}] * len(self._queries)
         if self._contributions is not None:
             counted = self._contributions.rows()
-            refused = [100.0 * row["n_refused"] / max(row["n_met"], 1) for row in counted]
         return [
             {
-                "chi2_density": chi2["chi2_density"],
-                "chi2_speed": chi2["chi2_speed"],
-                "percent_refused": share,
+                **{name: chi2[name] for name in ("chi2_density", "chi2_speed")},
+                **{name: counts.get(name) for name in ("n_met", "n_refused")},
                 "queries_a_second": float(queries / self._seconds),
             }
-            for chi2, share, queries in zip(
-                self._honesty.rows(), refused, self._queries, strict=True
+            for chi2, counts, queries in zip(
+                self._honesty.rows(), counted, self._queries, strict=True
             )
         ]
 

@@ -355,13 +355,13 @@ def _policy_table(rows: pl.DataFrame, task: Task, policies: Sequence[str]) -> st
             float(values_of(own, metric).mean())
             for metric in (ERROR, DENSITY, SPEED, "chi2_density", "chi2_speed", "queries_a_second")
         )
-        refused = own["percent_refused"].drop_nulls().to_numpy()
+        met, refused = (float(own[name].sum()) for name in ("n_met", "n_refused"))
         numbers = [
             f"{error:.1f}",
             f"{density:.2f}",
             f"{speed:.2f}",
             f"{chi2_density:.2f}, {chi2_speed:.2f}",
-            f"{refused.mean():.1f}" if len(refused) else "-",
+            f"{100.0 * refused / met:.1f}" if met else "-",
             f"{queries:.1f}",
         ]
         lines.append((error, [f"`{policy}`", *numbers]))
