@@ -42,6 +42,7 @@ class Contributions:
     - ``n_refused``: those that a ledger or a cap refused;
     - ``n_vehicles``: vehicles that were on the mainline;
     - ``n_exhausted``: those that had spent more than `NEARLY_SPENT` of their budget at the end;
+    - ``longest``: seconds that the one that stayed longest was on the mainline;
     - ``quantiles``: `QUANTILES` of the part of the budget that vehicles had spent;
     - ``met``, ``refused``: contributions by mainline segment;
     - ``vehicles``: vehicles by the seconds that they were on the mainline, in bins of `LENGTHS`;
@@ -105,6 +106,7 @@ class Contributions:
             "n_refused": int(self._refused_of[k].sum()),
             "n_vehicles": int(on_road.sum()),
             "n_exhausted": int((spent[on_road] > NEARLY_SPENT).sum()),
+            "longest": int(self._seconds[k].max()),
             "quantiles": np.quantile(spent[on_road], QUANTILES).tolist(),
             "met": self._met[k].tolist(),
             "refused": self._refused[k].tolist(),

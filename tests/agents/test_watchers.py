@@ -93,6 +93,7 @@ def test_lengths_are_seconds_on_the_mainline(paced):
     seconds = np.bincount(record.vehicle[counted])
     by_hand = np.histogram(seconds[seconds > 0], [*LENGTHS, np.inf])[0]
     np.testing.assert_array_equal(np.array(paced[0]["vehicles"]), by_hand)
+    assert paced[0]["longest"] == seconds.max()
 
 
 def test_a_cap_refuses_what_comes_after_it():
