@@ -123,7 +123,6 @@ def cut(folder, name, size, tmp_path):
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("fcd.xml", r"fcd\.xml, row \d+: it is no complete XML file"),
         ("fcd.xml.gz", r"fcd\.xml\.gz, row \d+: it is no complete XML file"),
         ("fcd.csv", r"fcd\.csv, row \d+.*Expected 11 columns"),
         ("fcd.parquet", r"fcd\.parquet: it is no complete Parquet file"),

@@ -248,10 +248,8 @@ def test_additional_files_write_nothing(tmp_path, monkeypatch):
     ("change", "message"),
     [
         ({"options": ("--fcd-output=all.xml",)}, "network.options must be free of outputs"),
-        ({"options": ("--seed=3",)}, "network.options must be free of outputs"),
         ({"options": ("-v",)}, "network.options must be --name=value each"),
         ({"step_length": 0.3}, "network.step_length must be a whole part of a second"),
-        ({"warm_up": 3}, "network.warm_up must be at most begin = 0 s"),
         ({"sha256": ()}, "network.sha256 must be one for each of 2 files"),
         ({"columns": ((("in", 5.0, 5.0),),)}, r"network.columns\[0\] must be stretches that end"),
         ({"columns": ((("in", 0.0, 5.0),), (("in", 4.0, 9.0),))}, "without overlap on edge 'in'"),
