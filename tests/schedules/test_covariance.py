@@ -9,12 +9,12 @@ from dptse_env.schedules import COVARIANCE_SCHEDULES, make_schedule
 from dptse_env.schedules.covariance import (
     NO_INFLATION,
     CovarianceInflation,
-    CovarianceSchedule,
     GreedyLogdet,
     GreedyTrace,
     InflatedTrace,
 )
 from dptse_env.schedules.rollout import Rollout
+from tests.cases import chosen as cases
 
 from .playing import begin, make_batch, play
 
@@ -126,8 +126,13 @@ def chosen(schedule, observation):
     return [np.flatnonzero(row).tolist() for row in schedule.predict(observation)[0]]
 
 
-@pytest.mark.parametrize("reward", ["joint", "density", "speed"])
-@pytest.mark.parametrize("inflation", INFLATIONS)
+@pytest.mark.parametrize(
+    ("inflation", "reward"),
+    cases(
+        [("trusting", "joint"), ("occupied", "speed"), ("capped", "density"), ("noisy", "joint")],
+        itertools.product(INFLATIONS, ["joint", "density", "speed"]),
+    ),
+)
 def test_greedy_trace_is_that_of_explicit_updates(inflation, reward):
     env = make_batch(bandwidth=3, reward=reward)
     own = INFLATIONS[inflation]
@@ -143,8 +148,8 @@ def test_greedy_trace_is_that_of_explicit_updates(inflation, reward):
 @pytest.mark.parametrize("keywords", [
     {"privacy": {"preset": "capped"}, "estimator": "ekf"},
     {"estimator": "ukf"}, {"estimator": "enkf"}, {"estimator": "mhe"},
-    {"estimator": "random_walk"}, {"estimator": "ekf", "backend": "reference"},
     {"estimator": "random_walk", "privacy": {"preset": "capped"}},
+    {"estimator": "ekf", "backend": "reference"},
 ], ids=str)  # fmt: skip
 def test_greedy_works_on_every_covariance(keywords):
     env = make_batch(bandwidth=3, **keywords)
@@ -157,9 +162,8 @@ def test_greedy_works_on_every_covariance(keywords):
                 assert cost(queried) == pytest.approx(cost(plain.greedy(3, cost)), rel=1e-9)
 
 
-@pytest.mark.parametrize("reward", ["joint", "density"])
-def test_greedy_logdet_is_that_of_explicit_updates(reward):
-    env = make_batch(bandwidth=3, reward=reward)
+def test_greedy_logdet_is_that_of_explicit_updates():
+    env = make_batch(bandwidth=3)
     schedule = GreedyLogdet(env.unwrapped.process)
     for observation in states(env):
         for episode, queried in enumerate(chosen(schedule, observation)):
@@ -220,11 +224,11 @@ def test_rollout_takes_the_best_single_swap(horizon):
     assert improved > 0 or horizon == 1
 
 
-@pytest.mark.parametrize("name", COVARIANCE_SCHEDULES)
-def test_an_estimator_without_a_covariance_is_refused(name):
+def test_an_estimator_without_a_covariance_is_refused():
     env = make_batch(estimator="open_loop")
-    with pytest.raises(ValueError, match=rf"'{name}' needs .* covariance, 'open_loop' has none"):
-        make_schedule(name, env)
+    for name in COVARIANCE_SCHEDULES:
+        with pytest.raises(ValueError, match=rf"'{name}' needs .* covariance"):
+            make_schedule(name, env)
 
 
 def test_bad_inflations_are_named():
@@ -234,13 +238,11 @@ def test_bad_inflations_are_named():
         CovarianceInflation(process_noise=(0.1, -0.1))
     with pytest.raises(ValueError, match=r"schedule\.horizon must be"):
         Rollout(make_batch().unwrapped.process, horizon=0)
-    assert issubclass(InflatedTrace, CovarianceSchedule)
 
 
 def test_noise_in_w_is_refused_where_the_schedule_would_need_it():
     env = make_batch(estimator_settings={"process_noise_in": "w"})
-    message = r"^estimator_settings\.process_noise_in must be 'psi' for a schedule .*, got 'w'$"
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=r"^estimator_settings\.process_noise_in must be 'psi'"):
         make_schedule("greedy-trace", env)
     make_schedule("inflated-trace", env)  # which has a process noise of its own
 

@@ -10,7 +10,6 @@ from dptse_env.traffic import (
     DetailedRecord,
     InvalidRecordError,
     Record,
-    RecordLibrary,
     simulate,
 )
 from dptse_env.traffic.branches import Road
@@ -72,18 +71,6 @@ def test_a_plain_record_is_no_detailed_one_nor_the_other_way_round(tmp_path):
     Record([0], [0], [0], [1.0], n_steps=1, n_columns=1).save(tmp_path / "plain", {})
     with pytest.raises(InvalidRecordError, match="plain"):
         DetailedRecord.load(tmp_path / "plain", {})
-
-
-def test_vehicles_move_alike_whether_details_are_recorded(short_record, tmp_path):
-    library = RecordLibrary(tmp_path)
-    library.ensure(DETAILED, [0])
-    details = library.get(DETAILED, 0)
-    assert isinstance(details, DetailedRecord)
-    for name in Record.COLUMNS:
-        np.testing.assert_array_equal(getattr(details, name), getattr(short_record, name))
-    # One folder holds both: they are different records of the same traffic.
-    library.ensure(SHORT_HIGHWAY, [0])
-    assert type(library.get(SHORT_HIGHWAY, 0)) is Record
 
 
 def test_positions_lie_on_the_segments_and_lanes_on_the_road():

@@ -218,7 +218,7 @@ def test_a_missing_or_broken_libsumo_is_an_error_of_the_library(tmp_path, monkey
 
     with monkeypatch.context() as patch:
         patch.setattr(sumo.importlib.metadata, "version", missing)
-        with pytest.raises(SumoVersionError, match="neither find nor make the 1 .*libsumo"):
+        with pytest.raises(SumoVersionError, match=r"neither find nor make the 1 .*libsumo"):
             RecordLibrary(tmp_path).get(SHORT_HIGHWAY, 0)
     monkeypatch.setitem(sys.modules, "libsumo", None)
     records = RecordLibrary(tmp_path)

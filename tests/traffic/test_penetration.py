@@ -54,19 +54,12 @@ def test_a_share_of_a_range_is_drawn_for_each_traffic_seed():
     np.testing.assert_allclose(connected, shares[:5], atol=0.03)
 
 
-def test_only_connected_vehicles_report_and_keep_their_index():
-    record, penetration = road_of(100), Penetration(0.2)
-    reported = penetration.reports(7, record, SHORT_HIGHWAY)
-    connected = np.flatnonzero(penetration.connected(7, record))
-    assert set(reported.vehicle.tolist()) == set(connected.tolist())
-    np.testing.assert_array_equal(reported.speed, 10.0 + reported.vehicle)
-    assert (reported.n_steps, reported.n_columns) == (4, 3)
-
-
-def test_some_of_the_connected_vehicles_misreport_their_speed():
+def test_the_connected_vehicles_report_and_some_misreport_their_speed():
     record = road_of(2_000, n_steps=1)
-    reported = Penetration(0.5, misreporting=0.25, misreport_factor=2.0).reports(
-        7, record, SHORT_HIGHWAY
+    penetration = Penetration(0.5, misreporting=0.25, misreport_factor=2.0)
+    reported = penetration.reports(7, record, SHORT_HIGHWAY)
+    np.testing.assert_array_equal(
+        reported.vehicle, np.flatnonzero(penetration.connected(7, record))
     )
     factor = reported.speed / (10.0 + reported.vehicle)
     assert set(np.round(factor, 3).tolist()) == {1.0, 2.0}
@@ -97,10 +90,6 @@ def test_bad_values_are_refused_by_path(value, message):
 def test_a_number_a_pair_and_a_mapping_are_taken(value):
     config = resolve("short-highway", {"penetration": value})
     assert config.has_separate_sensors == (value != {"seed": 3})
-
-
-def test_a_range_of_one_share_is_the_share():
-    assert Penetration((0.2, 0.2)) == Penetration(0.2)
 
 
 # --- by class ---------------------------------------------------------------------------------
@@ -163,18 +152,6 @@ def test_classes_and_reports_that_do_not_fit_are_refused_by_path(penetration, me
     corridor = {"vehicle_classes": CLASSES}
     with pytest.raises(ValueError, match=message):
         resolve("short-highway", {"corridor": corridor, "penetration": penetration})
-
-
-def test_traffic_without_classes_has_one():
-    with pytest.raises(ValueError, match=r"must be a class of the traffic, car, got 'truck'"):
-        resolve("short-highway", {"penetration": {"by_class": TRUCKS}})
-    resolve("short-highway", {"penetration": {"by_class": [{"name": "car", "share": 0.2}]}})
-
-
-def test_shares_of_classes_that_do_not_add_up_to_all_vehicles_are_refused():
-    corridor = {"vehicle_classes": CLASSES[:1]}
-    with pytest.raises(ValueError, match=r"corridor\.vehicle_classes .* add up to 1, got 0\.8"):
-        resolve("short-highway", {"corridor": corridor})
 
 
 class WithoutReports(Paper):

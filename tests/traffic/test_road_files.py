@@ -93,22 +93,6 @@ def test_what_a_file_leaves_out_is_derived_from_the_road(road):
     assert read.assumed == ("average_dwell",)
 
 
-def test_paths_in_a_file_start_at_its_folder(road):
-    assert read_road(road).environment["parameters"] == str(road.parent / "arz.json")
-
-
-def test_a_measured_dwell_is_not_assumed(road):
-    road.write_text("average_dwell = 9.5\n" + ROAD)
-    read = read_road(road)
-    assert read.corridor.average_dwell == 9.5
-    assert read.assumed == ()
-
-
-def test_a_byte_order_mark_is_accepted(road):
-    road.write_text("\ufeff" + ROAD, encoding="utf-8")
-    assert read_corridor(road).lanes == 2
-
-
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
@@ -153,13 +137,6 @@ def test_the_keywords_of_a_file_come_after_the_callers(road):
     assert config.bandwidth == 1
 
 
-def test_parameters_and_settings_that_are_not_the_roads_own_are_named(road):
-    road.write_text(ROAD.partition("[environment]")[0])
-    with pytest.warns(UserWarning, match="on another road"):
-        config = resolve("paper-highway", {"corridor": str(road)})
-    assert {"parameters", "estimator_settings", "corridor.average_dwell"} == set(config.inherited)
-
-
 def test_a_complete_file_warns_of_nothing(road):
     from dptse_env.estimators.tuned_settings import load_settings, write_settings
     from dptse_env.model import load_parameters
@@ -182,14 +159,6 @@ def test_a_complete_file_warns_of_nothing(road):
     assert config.inherited == ()
     assert config.arz_parameters == arz
     assert config.settings() == load_settings("ekf-w99-3lane-paced")
-
-
-def test_files_of_parameters_that_are_missing_or_damaged(road):
-    with pytest.raises(ValueError, match=r"parameters: .*arz\.json cannot be read"):
-        resolve("private-highway-v1", {"corridor": str(road)})
-    (road.parent / "arz.json").write_text("{}")
-    with pytest.raises(ValueError, match=r"arz\.json"):
-        resolve("private-highway-v1", {"corridor": str(road)})
 
 
 def test_a_corridor_of_any_kind_is_written_and_read_alike(tmp_path):

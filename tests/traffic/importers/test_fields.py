@@ -57,14 +57,6 @@ def test_a_field_becomes_a_road_with_records_of_its_own(tmp_path):
     assert demand == pytest.approx(np.mean(flows), rel=1e-3)
 
 
-def test_flows_give_the_same_field_as_speeds(tmp_path):
-    by_speed = import_field(write(tmp_path), ROAD, tmp_path / "a", SPLITS, 100)[0]
-    source = write(tmp_path, speed=None, flow=tmp_path / "flow.txt", flow_unit="veh/s")
-    by_flow = import_field(source, ROAD, tmp_path / "b", SPLITS, 100)[0]
-    records = [RecordLibrary(tmp_path).get(corridor, 0) for corridor in (by_speed, by_flow)]
-    np.testing.assert_allclose(records[0].speed, records[1].speed, rtol=1e-9)
-
-
 def test_environments_play_a_field_and_refuse_what_needs_vehicles(tmp_path):
     import_field(write(tmp_path), ROAD, tmp_path / "road", SPLITS, 100)
     path = str(tmp_path / "road" / "road.toml")

@@ -76,13 +76,6 @@ def test_grouped_digits_of_a_portal_are_read(tmp_path, expected):
     np.testing.assert_array_equal(counts(imported), expected)
 
 
-def test_frames_that_miss_whole_seconds_are_interpolated(tmp_path):
-    columns = ngsim(stream(), shift=0.0)  # from x.7 s on
-    imported = run(write_csv(tmp_path / "a.csv", columns), Source("ngsim"))
-    assert imported.report["windows"][0]["start"] == EPOCH / 1000 + 0.3
-    np.testing.assert_allclose(RecordLibrary().get(imported.corridor, 0).speed, 72.0, rtol=1e-4)
-
-
 def highd(points, folder, period=0.04):
     """Write a recording: even vehicles move to the right, odd ones to the left, on 400 m."""
     vehicle, time, x, speed = points.T
@@ -132,13 +125,6 @@ def test_one_direction_of_highd_may_be_chosen(tmp_path, expected):
     # frame 1 is at 0.04 s: the grid is the file's
     assert abs(counts(imported)[:, :4].sum() - expected[:20, :4].sum()) <= 12
     assert first_file(imported)["other_group"] == len(points)
-
-
-def test_highd_needs_its_file_of_directions(tmp_path):
-    path = highd(stream(period=0.04), tmp_path)
-    (tmp_path / "01_tracksMeta.csv").unlink()
-    with pytest.raises(TrajectoryError, match=r"directions must be in .*01_tracksMeta\.csv"):
-        run(path, Source("highd", groups=("lower",)))
 
 
 def test_exid_has_frames_lanelets_in_lists_and_a_plane(tmp_path, expected):
@@ -279,17 +265,6 @@ def test_a_directory_or_a_missing_file_is_refused(tmp_path):
     (tmp_path / "a.csv.gz").write_bytes(b"not compressed")
     with pytest.raises(TrajectoryError, match="the file cannot be read: Not a gzipped file"):
         run(tmp_path / "a.csv.gz", PLAIN)
-
-
-def test_missing_columns_of_a_format_are_named(tmp_path):
-    columns = ngsim(stream())
-    del columns["Lane_ID"], columns["v_Vel"]
-    path = write_csv(tmp_path / "a.csv", columns)
-    with pytest.raises(TrajectoryError, match=r"columns must be v_Vel, Lane_ID .*found Vehicle_ID"):
-        run(path, Source("ngsim"))
-    (tmp_path / "b.txt").write_text("1 2 3\n")
-    with pytest.raises(TrajectoryError, match=r"without header must have 18 columns .*, got 3"):
-        run(tmp_path / "b.txt", Source("ngsim"))
 
 
 @pytest.mark.parametrize(("missing", "name"), [("pyarrow", "a.csv"), ("ijson", "a.json")])

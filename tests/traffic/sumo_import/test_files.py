@@ -1,6 +1,5 @@
 """What is read, and what is refused in one line that names the file."""
 
-import gzip
 import re
 from dataclasses import replace
 
@@ -77,12 +76,6 @@ def test_times_are_seconds_or_clock_times(text, expected):
     assert seconds(text, "begin") == expected
 
 
-def test_gzipped_networks_are_read(files, tmp_path):
-    packed = tmp_path / "road.net.xml.gz"
-    packed.write_bytes(gzip.compress(files.net.read_bytes()))
-    assert find_layout(replace(files, net=packed), PATH, 100.0) == find_layout(files, PATH, 100.0)
-
-
 @pytest.mark.parametrize(
     ("content", "message"),
     [
@@ -100,13 +93,6 @@ def test_networks_of_no_use_are_refused(tmp_path, content, message):
     with pytest.raises(ValueError, match=expected) as refused:
         find_layout(Files(path, ()), PATH, 100.0)
     assert "\n" not in str(refused.value)
-
-
-def test_a_folder_and_a_missing_network_are_refused(tmp_path):
-    with pytest.raises(ValueError, match=r"net: .* must be a file, got a folder"):
-        find_layout(Files(tmp_path, ()), PATH, 100.0)
-    with pytest.raises(ValueError, match=r"net: .*gone\.net\.xml cannot be read: No such file"):
-        find_layout(Files(tmp_path / "gone.net.xml", ()), PATH, 100.0)
 
 
 ELSEWHERE = '<routes><vehicle id="v" depart="0"><route edges="elsewhere"/></vehicle></routes>'
