@@ -6,22 +6,13 @@ import json
 import gymnasium as gym
 import pytest
 
-from dptse_env.config import PRESETS, resolve
+from dptse_env.config import resolve
 from dptse_env.release import MOST_OPTIONS
 
 from .release.sums import MeanRelease, SumRelease
 
 SUMS = "tests.release.sums:SumRelease"
 KEYWORDS = {"privacy": SUMS, "query_spans": [1, 2, 4], "price_levels": [0.5, 1, 2]}
-
-
-def test_by_default_the_options_are_the_segments():
-    for config in PRESETS.values():
-        assert (config.query_spans, config.price_levels) == ((1,), (1.0,))
-        assert config.bandwidth_unit == "segments"
-        assert config.queries.are_plain
-        assert config.queries.n_options == config.corridor.n_mainline
-        assert config.queries.most_queries == config.bandwidth
 
 
 def test_a_configuration_with_spans_survives_json_and_a_spec():
@@ -37,28 +28,23 @@ def test_a_configuration_with_spans_survives_json_and_a_spec():
     assert again.action_space == env.action_space
 
 
-def test_the_table_follows_the_keywords():
-    options = resolve("short-highway", {**KEYWORDS, "bandwidth": 4}).queries
-    assert options.n_options == 3 * (6 + 5 + 3)
-    assert options.bandwidth == 4
-    assert set(options.level.tolist()) == {0.5, 1.0, 2.0}
-
-
 @pytest.mark.parametrize(
     ("keywords", "message"),
-    [({"query_spans": [2, 1]}, r"^query_spans must be ascending, distinct .*, got \(2, 1\)$"), ({"query_spans": [1, 1]}, r"^query_spans must be ascending, distinct .*, got \(1, 1\)$"), ({"query_spans": [1, 7]}, r"^query_spans must be .* in 1\.\.6, got \(1, 7\)$"), ({"price_levels": [1, 2, 1.0]}, r"^price_levels must be distinct factors, got \(1\.0, "), (
+    [
+        ({"query_spans": [2, 1]}, r"^query_spans must be ascending, distinct .*, got \(2, 1\)$"),
+        ({"query_spans": [1, 1]}, r"^query_spans must be ascending, distinct .*, got \(1, 1\)$"),
+        ({"query_spans": [1, 7]}, r"^query_spans must be .* in 1\.\.6, got \(1, 7\)$"),
+        ({"price_levels": [1, 2, 1.0]}, r"^price_levels must be distinct factors, got \(1\.0, "),
+        (
             {"query_spans": [3, 4]},
             r"^bandwidth must be in 3\.\.6, to pay for a query of 3 segments",
-        ), ({"bandwidth": 7}, r"^bandwidth must be in 1\.\.6, got 7$"),],
+        ),
+        ({"bandwidth": 7}, r"^bandwidth must be in 1\.\.6, got 7$"),
+    ],
 )
 def test_bad_queries_are_named(keywords, message):
     with pytest.raises(ValueError, match=message):
         resolve("short-highway", {"privacy": SumRelease, **keywords})
-
-
-def test_a_sum_costs_one_where_sums_are_counted():
-    keywords = {"privacy": SumRelease, "query_spans": [3, 4], "bandwidth_unit": "sums"}
-    assert resolve("short-highway", {**keywords, "bandwidth": 1}).queries.most_queries == 1
 
 
 @pytest.mark.parametrize("key", ["query_spans", "price_levels"])

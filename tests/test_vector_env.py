@@ -1,23 +1,13 @@
 import pickle
-import subprocess
-import sys
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
 
 from dptse_env.vector_env import SensorQueryVectorEnv
 
 from .vectors import COUNTED, EPISODES, SHORT, assert_same, short, staggered
-
-
-@pytest.mark.parametrize("mode", AutoresetMode)
-def test_the_mode_is_declared(mode):
-    for env in (short(autoreset_mode=mode), short(autoreset_mode=mode.value)):
-        assert env.metadata["autoreset_mode"] is mode
-    assert short().metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
 
 
 def test_next_step_ignores_the_action_of_an_episode_that_begins_again():
@@ -163,33 +153,6 @@ def test_a_pickled_environment_goes_on_where_it_was():
         assert_same(env.step(actions), copy.step(actions), tolerance=0)
 
 
-def test_a_spec_survives_json():
-    env = short(autoreset_mode="SameStep")
-    again = gym.make_vec(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
-    assert again.unwrapped.config == env.unwrapped.config
-    assert again.num_envs == 3
-    assert_same(env.reset(seed=1), again.reset(seed=1), tolerance=0)
-
-
-def test_one_episode_and_closing_twice():
-    env = short(num_envs=1)
-    assert env.reset(seed=0)[0].shape == (1, *env.single_observation_space.shape)
-    env.close()
-    env.close()
-    assert env.closed
-
-
-def test_no_work_in_a_constructor():
-    code = (
-        "import sys, gymnasium as gym; gym.make_vec('dptse_env:dptse/PaperHighway-v0', 4); "
-        "print({'libsumo', 'torch', 'stable_baselines3'} & set(sys.modules) or 'light')"
-    )
-    result = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=False
-    )
-    assert result.stdout.strip() == "light", result.stderr
-
-
 def test_a_void_guarantee_is_warned_of_at_the_caller():
     with pytest.warns(UserWarning, match="no privacy is guaranteed") as caught:
         SensorQueryVectorEnv(2, "private-highway", privacy={"boundary_inputs": "true"})
@@ -216,10 +179,3 @@ def test_it_draws_the_chosen_episode_as_the_scalar_environment_does():
         env.step(actions)
     assert len(env.history.truth) == 1
     assert (env.render()[0] != picture).any()
-
-
-def test_a_batch_that_is_not_to_be_drawn_says_so():
-    env = short(num_envs=2)
-    env.reset(seed=0)
-    with pytest.warns(UserWarning, match="render_mode='rgb_array'"):
-        assert env.render() is None

@@ -10,7 +10,6 @@ import torch
 from dptse_env.config import PRESETS, resolve
 from dptse_env.parts import make_interface
 from dptse_env.sb3 import RoadChannels
-from dptse_env.sb3.channels import CENTRES
 from dptse_env.sb3.torch_modules import RoadFeatures
 
 
@@ -77,5 +76,3 @@ def test_channels_of_real_observations_are_of_order_one():
     shown = road(torch.tensor(np.stack(seen))).abs()
     assert shown.mean() < 1.5
     assert shown.amax(dim=(0, 2)).median() > 0.5
-
-

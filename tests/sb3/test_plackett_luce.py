@@ -1,7 +1,6 @@
 import itertools
 import math
 
-import numpy as np
 import pytest
 
 pytest.importorskip("torch")
@@ -62,11 +61,7 @@ def test_the_mode_is_the_highest_scores_and_ties_go_upstream():
     assert sets[distribution.log_prob(sets).argmax()].tolist() == [2, 0, 3]
 
 
-@pytest.mark.parametrize("spread", [
-    0.0,
-    1e3,
-    3e38,
-])
+@pytest.mark.parametrize("spread", [0.0, 1e3, 3e38])
 def test_extreme_scores_stay_finite_in_single_precision(spread):
     scores = (spread * torch.tensor([[1.0, -1.0, 0.5, 0.0, 1.0, -1.0]])).repeat(64, 1)
     scores.requires_grad_()
@@ -90,9 +85,9 @@ def test_gradients_are_those_of_finite_differences():
 @pytest.mark.parametrize(
     ("scores", "size", "message"),
     [
-    (torch.zeros(1, 3), 4, r"size must be in 1\.\.3, got 4"),
-    (torch.tensor([[0.0, torch.inf]]), 1, "scores must be finite"),
-],
+        (torch.zeros(1, 3), 4, r"size must be in 1\.\.3, got 4"),
+        (torch.tensor([[0.0, torch.inf]]), 1, "scores must be finite"),
+    ],
 )
 def test_bad_distributions(scores, size, message):
     with pytest.raises(ValueError, match=message):
@@ -102,10 +97,10 @@ def test_bad_distributions(scores, size, message):
 @pytest.mark.parametrize(
     ("chosen", "message"),
     [
-    ([[1, 1], [0, 2]], "distinct"),
-    ([[1, 4], [0, 2]], r"in \[0, 3\]"),
-    ([[1, 2, 3], [0, 1, 2]], r"shape \(2, 2\), got \(2, 3\)"),
-],
+        ([[1, 1], [0, 2]], "distinct"),
+        ([[1, 4], [0, 2]], r"in \[0, 3\]"),
+        ([[1, 2, 3], [0, 1, 2]], r"shape \(2, 2\), got \(2, 3\)"),
+    ],
 )
 def test_bad_sets(chosen, message):
     with pytest.raises(ValueError, match=message):

@@ -7,7 +7,7 @@ pytest.importorskip("stable_baselines3")
 
 import torch
 
-from dptse_env.config import PRESETS, resolve
+from dptse_env.config import resolve
 from dptse_env.parts import make_interface
 from dptse_env.sb3 import PlackettLucePolicy, RoadChannels
 
@@ -115,5 +115,3 @@ def test_spaces_that_do_not_fit_are_refused():
     for wrong in misfits:
         with pytest.raises(ValueError, match=r"MultiDiscrete\(\[6\] \* B\).* of action='slots'"):
             PlackettLucePolicy(seen, wrong, road=road)
-
-

@@ -1,7 +1,5 @@
 import io
 import json
-import subprocess
-import sys
 import zipfile
 from importlib.resources import files
 
@@ -107,19 +105,19 @@ def test_the_file_is_small_and_describes_the_policy(stored):
 @pytest.mark.parametrize(
     ("keywords", "message"),
     [
-    ({"bandwidth": 3}, r"bandwidth is 2 for the policy and 3 for the environment"),
-    ({"action": "mask"}, r"action is 'slots' for the policy and 'mask' for the environment"),
-    (
+        ({"bandwidth": 3}, r"bandwidth is 2 for the policy and 3 for the environment"),
+        ({"action": "mask"}, r"action is 'slots' for the policy and 'mask' for the environment"),
+        (
             {"incident": "none"},
             r"corridor is 'short-highway \(6 .*\), traffic (\w{8})' for the policy and "
             r"'short-highway \(6 .*\), traffic (?!\1)\w{8}' for the environment",
         ),
-    (
+        (
             {"privacy": "capped"},
             r"\['mainline released_speed'\] are of .*\['mainline released_flow'\] of the env",
         ),
-    ({"corridor": {"fixed_sensors": [7]}}, "observation is '.*fixed_speed_innovation:1"),
-],
+        ({"corridor": {"fixed_sensors": [7]}}, "observation is '.*fixed_speed_innovation:1"),
+    ],
 )
 @pytest.mark.filterwarnings("ignore:privacy.preset")
 def test_a_policy_that_does_not_fit_is_refused(stored, keywords, message):
@@ -276,10 +274,7 @@ def _arguments(card):
     return card["policy"]["arguments"]
 
 
-@pytest.mark.parametrize("net_arch", [
-    [8, 4],
-    {"pi": [8], "vf": [4, 4]},
-])
+@pytest.mark.parametrize("net_arch", [[8, 4], {"pi": [8], "vf": [4, 4]}])
 @pytest.mark.parametrize("action", ["scores", "mask"])
 def test_perceptrons_of_all_shapes_are_loaded(tmp_path, action, net_arch):
     config = resolve("short-highway", {"action": action})
@@ -354,5 +349,3 @@ def test_shipped_policies_act_where_they_were_trained(name):
         observation, *_, infos = env.step(actions)
         assert (infos["queried"].sum(axis=1) == env.config.bandwidth).all()
         assert not infos["n_dropped"].any()
-
-

@@ -13,13 +13,7 @@ from .playing import begin, make_batch, make_single, play
 BOUNDED = {"preset": "capped", "epsilon": 5.0, "cap": 3}
 
 
-@pytest.mark.parametrize(
-    "reward",
-    [
-        "joint",
-        "density",
-    ],
-)
+@pytest.mark.parametrize("reward", ["joint", "density"])
 def test_oracle_error_asks_where_the_estimate_is_worst(reward):
     env = make_batch(reward=reward, bandwidth=3)
     # The road is empty at first: most segments have no speed to be wrong about.
@@ -85,14 +79,7 @@ def test_the_greedy_oracle_adds_the_best_segment_each_time():
         before.append(queried)
 
 
-@pytest.mark.parametrize(
-    "privacy",
-    [
-        "paper",
-        {"preset": "paced"},
-    ],
-    ids=str,
-)
+@pytest.mark.parametrize("privacy", ["paper", {"preset": "paced"}], ids=str)
 def test_the_oracle_of_gains_tries_every_segment_without_noise(privacy):
     keywords = {"bandwidth": 2, "privacy": privacy}
     queries, _ = play(make_single(**keywords), "oracle-gain", 4)

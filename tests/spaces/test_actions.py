@@ -13,6 +13,8 @@ from dptse_env.spaces.actions import (
 )
 
 FIRST = np.zeros(1, dtype=np.int64)
+
+
 class Played:
     """An encoding with the state of a batch of episodes."""
 
@@ -101,13 +103,13 @@ def test_decode_undoes_encode(name, seed):
 @pytest.mark.parametrize(
     ("kind", "action", "message"),
     [
-    (MaskAction, np.ones(5, dtype=np.int8), r"shape \(6,\) of MultiBinary\(6\), got \(5,\)"),
-    (MaskAction, np.full(6, 2), "0 and 1 only"),
-    (ScoresAction, np.full(6, np.nan), "finite floats"),
-    (SlotsAction, np.array([0.0, 1.0]), "integers"),
-    (SlotsAction, np.array([0, 6]), r"\[0, 5\]"),
-    (SequentialAction, np.array(-1), r"\[0, 5\]"),
-],
+        (MaskAction, np.ones(5, dtype=np.int8), r"shape \(6,\) of MultiBinary\(6\), got \(5,\)"),
+        (MaskAction, np.full(6, 2), "0 and 1 only"),
+        (ScoresAction, np.full(6, np.nan), "finite floats"),
+        (SlotsAction, np.array([0.0, 1.0]), "integers"),
+        (SlotsAction, np.array([0, 6]), r"\[0, 5\]"),
+        (SequentialAction, np.array(-1), r"\[0, 5\]"),
+    ],
 )
 def test_bad_actions_are_refused_and_leave_no_trace(kind, action, message):
     played = Played(kind)

@@ -1,5 +1,4 @@
 import dataclasses
-import pickle
 
 import numpy as np
 import pytest
@@ -75,10 +74,7 @@ def test_blocks_hold_what_their_names_say():
     assert sum(map(len, expected.values())) == observation.shape[1]
 
 
-@pytest.mark.parametrize("fill", [
-    0.0,
-    1e9,
-])
+@pytest.mark.parametrize("fill", [0.0, 1e9])
 def test_observations_stay_inside_the_space(fill):
     encoder = encoding()
     with np.errstate(invalid="ignore"):
@@ -112,5 +108,3 @@ def test_blocks_can_be_chosen_and_come_in_the_given_order():
 def test_a_block_stands_once(blocks):
     with pytest.raises(ValueError, match="observation has two blocks named 'age'"):
         encoding(blocks)
-
-

@@ -32,13 +32,7 @@ def test_a_distribution_scales_every_rate_by_one_factor_within_its_range():
     assert 1.45 < max(factors) <= 1.5
 
 
-@pytest.mark.parametrize(
-    "scale",
-    [
-        (0.0, 1.0),
-        (1.2, 0.8),
-    ],
-)
+@pytest.mark.parametrize("scale", [(0.0, 1.0), (1.2, 0.8)])
 def test_a_scale_that_is_no_positive_range_is_refused(scale):
     with pytest.raises(ValueError, match=r"demand\.scale"):
         DemandDistribution(Demand(((0, 1.0),)), scale=scale)

@@ -79,14 +79,7 @@ def test_bad_values_are_refused_by_path(value, message):
         resolve("short-highway", {"penetration": value})
 
 
-@pytest.mark.parametrize(
-    "value",
-    [
-        0.1,
-        [0.1, 0.2],
-        {"seed": 3},
-    ],
-)
+@pytest.mark.parametrize("value", [0.1, [0.1, 0.2], {"seed": 3}])
 def test_a_number_a_pair_and_a_mapping_are_taken(value):
     config = resolve("short-highway", {"penetration": value})
     assert config.has_separate_sensors == (value != {"seed": 3})

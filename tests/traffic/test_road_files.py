@@ -44,13 +44,7 @@ def road(tmp_path):
     return path
 
 
-@pytest.mark.parametrize(
-    "corridor",
-    [
-        randomised(PAPER_HIGHWAY),
-    ],
-    ids=lambda c: c.name,
-)
+@pytest.mark.parametrize("corridor", [randomised(PAPER_HIGHWAY)], ids=lambda c: c.name)
 def test_a_corridor_survives_a_file(corridor, tmp_path):
     write_corridor(tmp_path / "road.toml", corridor, comment="a road\nin two lines")
     assert read_corridor(tmp_path / "road.toml") == corridor

@@ -65,13 +65,7 @@ def test_configurations_of_no_use_are_refused(tmp_path, change, message):
         read_configuration(path)
 
 
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("01:30:00", 5400.0),
-        ("1:00:00:10.5", 86410.5),
-    ],
-)
+@pytest.mark.parametrize(("text", "expected"), [("01:30:00", 5400.0), ("1:00:00:10.5", 86410.5)])
 def test_times_are_seconds_or_clock_times(text, expected):
     assert seconds(text, "begin") == expected
 
