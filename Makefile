@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 
 export OMP_NUM_THREADS = 1
 
-.PHONY: help setup docs site dist demo policy-study audit test test-slow test-gymnasium test-lowest test-ray test-tutorial lint format benchmark wheel-test clean reproduce privacy-study ledger-study choice-study penetration-study
+.PHONY: help setup docs site dist demo policy-study audit test test-slow test-gymnasium test-lowest test-ray test-tutorial lint format benchmark wheel-test clean clean-kernels reproduce privacy-study ledger-study choice-study penetration-study
 
 help:  ## Show this list.
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -117,3 +117,6 @@ test-lowest: setup  ## Use the wheel, and run the tests, with the lowest version
 
 clean:  ## Remove the virtual environment, builds and caches; results/ stays.
 	rm -rf $(VENV) build dist .mypy_cache .pytest_cache .ruff_cache .hypothesis
+
+clean-kernels: setup  ## Remove the compiled kernels, which all environments of this user share.
+	$(BIN)/python -c 'import shutil; from dptse_env.utils.kernels import default_folder; shutil.rmtree(default_folder())'
