@@ -63,7 +63,7 @@ audit: setup  ## Attack the privacy presets, 5,000 runs in each of two worlds; r
 	$(BIN)/python scripts/audit.py --force --target pairs --traffic-seed 2000 --runs 2000
 
 test: setup  ## Run the tests, without the slow ones.
-	$(BIN)/python -m pytest -m 'not slow' -n 2
+	$(BIN)/python -m pytest -m 'not slow' -n 2 --dist loadfile
 
 test-tutorial: setup  ## Run the tutorial as a notebook, two to four minutes.
 	$(BIN)/python -m pytest tests/docs/test_notebook.py
@@ -74,7 +74,7 @@ test-slow: setup  ## Run the slow tests: before a release, and after a change to
 test-gymnasium: setup  ## Run the tests of environments with the oldest Gymnasium, which RLlib needs.
 	$(BIN)/python -m pip install --quiet --no-deps --upgrade --target build/gymnasium gymnasium==1.2.2
 	PYTHONPATH=build/gymnasium $(BIN)/python -c 'import gymnasium; assert gymnasium.__version__ == "1.2.2"'
-	PYTHONPATH=build/gymnasium $(BIN)/python -m pytest -m 'not slow' -n 2 tests/sb3 tests/spaces tests/test_env.py \
+	PYTHONPATH=build/gymnasium $(BIN)/python -m pytest -m 'not slow' -n 2 --dist loadfile tests/sb3 tests/spaces tests/test_env.py \
 		tests/test_extending.py tests/test_plugin.py tests/test_process.py tests/test_query_options.py \
 		tests/test_vector_bad_input.py tests/test_vector_env.py tests/test_vector_lock_step.py
 
