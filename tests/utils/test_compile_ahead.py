@@ -15,9 +15,9 @@ from dptse_env.utils import compile_ahead, kernel_list, python_process
 from dptse_env.utils.kernels import compile_unless_busy
 from tests.kernel_list import ESTIMATORS, compiled_afresh
 
-from .test_kernels import MODULE, load
+from .test_kernels import MODULE, kept, load
 
-__all__ = ["load"]  # a fixture
+__all__ = ["kept", "load"]  # fixtures
 
 LOG = "dptse_env.utils.compile_ahead"
 
