@@ -20,7 +20,9 @@ from dptse_env.traffic import (
     library,
     randomised,
     sumo,
+    worker,
 )
+from dptse_env.traffic.worker import WorkerDiedError
 from tests.traffic.test_recorder import LONG_HIGHWAY, assert_same, everything_in
 
 
@@ -150,18 +152,30 @@ def test_bad_seeds_and_counts_are_refused(tmp_path):
     assert everything_in(tmp_path) == []
 
 
-def test_what_sumo_reports_is_not_tried_again(tmp_path, monkeypatch, caplog):
+@pytest.mark.parametrize(
+    ("error", "n_attempts"), [(RecordingError, 1), (WorkerDiedError, worker.ATTEMPTS)]
+)
+def test_a_dead_worker_is_replaced_and_what_sumo_reports_is_not_tried_again(
+    tmp_path, monkeypatch, caplog, error, n_attempts
+):
     tasks = []
 
-    def refused(self, corridor, seed, path, source):
-        tasks.append(seed)
-        raise RecordingError.from_cause(corridor, seed, "no valid route")
+    class Failing:
+        alive = False
 
-    monkeypatch.setattr(library.WorkerPool, "record", refused)
-    with pytest.raises(RecordingError, match="no valid route"):
-        RecordLibrary(tmp_path).ensure(SHORT_HIGHWAY, [1, 2], workers=2)
-    assert len(tasks) == len(set(tasks))
-    assert caplog.text == ""
+        def record(self, corridor, seed, path, source):
+            tasks.append(seed)
+            raise error.from_cause(corridor, seed, "no valid route")
+
+        def close(self):
+            tasks.append("closed")
+
+    monkeypatch.setattr(worker, "Worker", Failing)
+    monkeypatch.setattr(library, "simulation_is_loaded", lambda: True)  # children even for one
+    with pytest.raises(RecordingError, match=r"holds 0 of the 1 .*no valid route"):
+        RecordLibrary(tmp_path).get(SHORT_HIGHWAY, 5)
+    assert tasks == [5, "closed"] * n_attempts
+    assert len(caplog.records) == n_attempts - 1
 
 
 def test_what_a_dead_writer_left_is_removed_when_it_is_old(tmp_path):
