@@ -110,9 +110,14 @@ def test_the_oracle_of_gains_tries_every_segment_without_noise(privacy):
 
 
 @pytest.mark.parametrize(
-    "name", ["oracle-error", "oracle-gain", "oracle-greedy", "oracle-brute-force"]
+    ("name", "keywords"),
+    [
+        ("oracle-error", {"privacy": BOUNDED}),
+        ("oracle-gain", {"privacy": BOUNDED}),
+        ("oracle-greedy", {"estimator": "enkf"}),
+        ("oracle-brute-force", {"privacy": BOUNDED}),
+    ],
 )
-@pytest.mark.parametrize("keywords", [{"privacy": BOUNDED}, {"estimator": "enkf"}], ids=str)
 def test_an_oracle_leaves_the_process_as_it_is(name, keywords):
     """Whoever follows an oracle's queries without calling it meets the same numbers."""
     env = make_batch(**keywords)
