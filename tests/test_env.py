@@ -126,15 +126,6 @@ def test_info_has_the_same_finite_numbers_at_every_step():
         info["queried"] = flags
 
 
-def test_what_is_returned_is_not_touched_later():
-    env = short(truth_in_info=True)
-    seen = play(env, 10)
-    kept = pickle.loads(pickle.dumps(seen))
-    for _ in range(10):
-        env.step(env.action_space.sample())
-    assert_same(seen, kept)
-
-
 def test_truth_is_shown_only_on_request():
     assert "truth" not in short().reset(seed=0)[1]
     info = short(truth_in_info=True).reset(seed=0)[1]
@@ -232,15 +223,6 @@ def test_render_every_redraws_every_kth_second_and_at_the_end():
         pictures.append(env.render())
     drawn = [k for k in range(1, 11) if (pictures[k] != pictures[k - 1]).any()]
     assert drawn == [4, 8, 10]
-
-
-def test_a_sequential_episode_renders_one_column_a_second():
-    env = short(action="sequential", bandwidth=3, render_mode="rgb_array")
-    play(env, 30)
-    history = env.unwrapped.history
-    for series in (history.truth, history.estimate, history.queried, history.rmse):
-        assert len(series) == 11
-    assert [int(flags.sum()) for flags in history.queried] == [0] + [3] * 10
 
 
 @pytest.mark.parametrize(

@@ -91,18 +91,6 @@ def test_a_recurrent_network_is_refused_outside_its_ranges_and_runs_if_told_so(r
     assert np.isfinite(rewards).all()
 
 
-def test_the_road_survives_the_spec_and_a_vector_environment(road_file):
-    env = make(road_file)
-    with pytest.warns(UserWarning, match="estimator_settings: .* on another road"):
-        again = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
-    assert again.unwrapped.config.corridor == env.unwrapped.config.corridor == ROAD
-    with pytest.warns(UserWarning, match="estimator_settings: .* on another road"):
-        vector = gym.make_vec(ID, num_envs=2, corridor=road_file, traffic_seeds=[0])
-    vector.reset(seed=0)
-    _, reward, *_ = vector.step(vector.action_space.sample())
-    assert np.isfinite(reward).all()
-
-
 def test_schedules_run_on_an_uneven_road(road_file):
     env = make(road_file)
     policy = make_schedule("largest-deviation", env)

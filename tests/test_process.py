@@ -176,17 +176,6 @@ def test_residuals_are_the_noise_that_is_declared(keywords):
     assert abs(np.mean(r[:, 1:] * r[:, :-1])) < bound
 
 
-def test_queries_do_not_change_the_noise():
-    released = []
-    for actions in (np.zeros((1, 6), dtype=np.int8), np.ones((1, 6), dtype=np.int8)):
-        process = make(1)
-        process.reset(ALL[:1], generators([4]))
-        for _ in range(50):
-            process.step(ALL[:1], actions)
-        released.append(process.released[0, 5])  # a fixed sensor's
-    np.testing.assert_array_equal(*released)
-
-
 def test_released_values_are_kept_until_the_next_query():
     process = make(1)
     process.reset(ALL[:1], generators([4]))
@@ -267,15 +256,3 @@ def test_a_step_that_is_not_solved_for_keeps_the_prediction_and_says_so(
     process.step(ALL[:1], nobody[:1])
     assert process.info(0)["fallback"] == 0.0
     assert (process.estimate.density[0] != predicted["density"][0]).any()
-
-
-def test_a_missing_solver_is_reported_at_once_and_at_every_step():
-    settings = {"mhe": {"solver": "gurobi"}}
-    with pytest.warns(RuntimeWarning, match=r"'gurobi' is not installed"):
-        process = make(1, estimator="mhe", backend="reference", estimator_settings=settings)
-    process.reset(ALL[:1], generators([4]))
-    assert process.info(0)["fallback"] == 0.0
-    for _ in range(3):
-        outcome = process.step(ALL[:1], np.ones((1, 6), dtype=np.int8))
-        assert process.info(0)["fallback"] == 1.0
-        assert np.isfinite(outcome.reward).all()

@@ -7,7 +7,7 @@ pytest.importorskip("stable_baselines3")
 
 import torch
 
-from dptse_env.config import PRESETS, resolve
+from dptse_env.config import PRESETS
 from dptse_env.parts import make_interface
 from dptse_env.sb3 import RoadChannels
 from dptse_env.sb3.torch_modules import RoadFeatures
@@ -57,13 +57,6 @@ def test_ramps_stand_where_they_join_and_fixed_sensors_with_them():
     first = starts["fixed_density_innovation"]
     assert {i: round(x) - first for i, x in enumerate(innovation) if x is not None} == {5: 1, 11: 2}
     assert [np.flatnonzero(mark).tolist() for mark in road.marks] == [[3, 9], [5, 11], [14]]
-
-
-def test_a_layout_is_plain_and_independent_of_what_may_change():
-    road = RoadChannels.from_config(PRESETS["private-highway"])
-    changes = {"estimator": "ukf", "bandwidth": 3, "epsilon": 1.0, "action": "slots"}
-    assert RoadChannels.from_config(resolve("private-highway", changes)) == road
-    assert hash(road) == hash(RoadChannels.from_config(PRESETS["private-highway"]))
 
 
 def test_channels_of_real_observations_are_of_order_one():

@@ -66,12 +66,6 @@ def test_a_segment_with_a_fixed_sensor_is_queried_when_there_is_no_other():
         assert (every[:, -1] == 14).all()
 
 
-def test_a_policy_may_be_told_to_query_segments_with_sensors():
-    policy = make_policy(skips_sensors=False)
-    actions, _ = policy.predict(observations(policy, 500).numpy())
-    assert (actions == 14).any()
-
-
 def test_neighbours_and_the_whole_road_count():
     policy = make_policy()
     channels = policy.features(observations(policy, 1)).requires_grad_()

@@ -151,7 +151,7 @@ def test_other_environments_are_refused():
             SB3VecEnv(env)
 
 
-@pytest.mark.parametrize("action", ["mask", "sequential"])
+@pytest.mark.parametrize("action", ["sequential"])
 def test_ppo_learns_and_is_evaluated(action):
     env = VecMonitor(make(4, action=action))
     model = PPO("MlpPolicy", env, n_steps=16, batch_size=32, n_epochs=2, seed=0, device="cpu")

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from dptse_env.config import resolve
-from dptse_env.release import Paper
 from dptse_env.traffic import SHORT_HIGHWAY, ClassShare, DetailedRecord, Penetration, Record
 
 SHARES = (0.01, 0.1, 0.3, 0.9, 1.0)
@@ -145,29 +144,6 @@ def test_classes_and_reports_that_do_not_fit_are_refused_by_path(penetration, me
     corridor = {"vehicle_classes": CLASSES}
     with pytest.raises(ValueError, match=message):
         resolve("short-highway", {"corridor": corridor, "penetration": penetration})
-
-
-class WithoutReports(Paper):
-    """A release model that knows of counts alone."""
-
-    density_reports = ""
-
-
-def test_a_release_model_without_reports_refuses_them():
-    penetration = {"share": 0.1, "density_from": "spacing"}
-    keywords = {"privacy": WithoutReports, "penetration": penetration}
-    with pytest.raises(ValueError, match=r"density_from must be 'count' with the release model"):
-        resolve("short-highway", keywords)
-
-
-def test_an_estimated_share_needs_counts():
-    keywords = {
-        "privacy": "paced",
-        "penetration": {"share": 0.1, "density_from": "neighbours"},
-        "fusion": {"share": "estimated"},
-    }
-    with pytest.raises(ValueError, match=r"fusion\.share must be 'published'"):
-        resolve("short-highway", keywords)
 
 
 def test_records_without_details_cannot_say_which_classes_are_connected():

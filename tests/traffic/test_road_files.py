@@ -7,8 +7,6 @@ import pytest
 from dptse_env.config import resolve
 from dptse_env.traffic import (
     PAPER_HIGHWAY,
-    SHORT_HIGHWAY,
-    Corridor,
     find_corridor,
     randomised,
     read_corridor,
@@ -153,22 +151,3 @@ def test_a_complete_file_warns_of_nothing(road):
     assert config.inherited == ()
     assert config.arz_parameters == arz
     assert config.settings() == load_settings("ekf-w99-3lane-paced")
-
-
-def test_a_corridor_of_any_kind_is_written_and_read_alike(tmp_path):
-    corridor = Corridor(
-        name="plain",
-        n_mainline=4,
-        on_ramps=(),
-        off_ramps=(2,),
-        exit_shares=(0.2,),
-        demand=SHORT_HIGHWAY.demand.__class__(mainline=((0.0, 1000.0),)),
-        incident=None,
-        fixed_sensors=(3,),
-        duration=100,
-        drivers=dataclasses.replace(SHORT_HIGHWAY.drivers, headway=1.2),
-    )
-    write_corridor(tmp_path / "plain.toml", corridor, {"bandwidth": 2})
-    read = read_road(tmp_path / "plain.toml")
-    assert read.corridor == corridor
-    assert read.environment == {"bandwidth": 2}

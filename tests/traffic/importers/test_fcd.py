@@ -2,7 +2,6 @@
 
 import dataclasses
 import gzip
-import re
 
 import numpy as np
 import pytest
@@ -18,7 +17,6 @@ from dptse_env.traffic import (
 from dptse_env.traffic.importers import (
     Layout,
     Options,
-    Part,
     Source,
     Split,
     TrajectoryError,
@@ -67,15 +65,6 @@ def test_imported_fcd_is_the_record_number_for_number(suffix, folder, recorded, 
     assert record.classes == recorded.classes == ("car",)
 
 
-def test_a_centre_line_places_vehicles_in_the_plane(folder, recorded, tmp_path):
-    line = ((-100.0, 0.0), (250.0, 0.0), (700.0, 0.0))
-    layout = Layout(origin=100.0, centre_line=line, mainline=Part(lateral=(-3.5, 3.5)))
-    imported = run(folder, "fcd.csv", tmp_path, Source("fcd", layout=layout))
-    record = RecordLibrary(tmp_path).get(imported.corridor, 0)
-    wrong = np.abs(record.counts[:, :6] - recorded.counts[:, :6])
-    assert wrong.sum() < 0.02 * recorded.counts[:, :6].sum()  # ramps touch the mainline
-
-
 def cut(folder, name, size, tmp_path):
     path = tmp_path / name
     path.write_bytes((folder / name).read_bytes()[:size])
@@ -98,23 +87,6 @@ def test_truncated_files_are_refused(name, message, folder, recorded, tmp_path):
     with pytest.raises(TrajectoryError, match=message):
         import_trajectories([path], Source("fcd"), SHORT_HIGHWAY, tmp_path / "new", TRAINING)
     assert sorted(each.name for each in tmp_path.iterdir()) == [name]
-
-
-def test_bad_xml_is_named_by_row_and_field(folder, recorded, tmp_path):
-    text = (folder / "fcd.xml").read_text()
-    for pattern, replaced, message in (
-        (
-            r' speed="[^"]*"',
-            "",
-            r"row \d+: a vehicle must have the attributes .*'speed' is missing",
-        ),
-        (r' speed="[^"]*"', ' speed="fast"', r"row \d+ and after: speed: could not convert"),
-        (r' pos="[^"]*"', ' pos="nan"', r"row \d+: pos must be a finite number, got nan"),
-    ):
-        path = tmp_path / "bad.xml"
-        path.write_text(re.sub(pattern, replaced, text, count=1))
-        with pytest.raises(TrajectoryError, match=message):
-            import_trajectories([path], Source("fcd"), SHORT_HIGHWAY, tmp_path / "new", TRAINING)
 
 
 def test_edges_that_the_road_does_not_have_are_named(folder, recorded, tmp_path):

@@ -68,14 +68,6 @@ def test_ngsims_portal_has_a_header_more_columns_and_other_sites(tmp_path, expec
     assert first_file(imported)["rows"] == n
 
 
-def test_grouped_digits_of_a_portal_are_read(tmp_path, expected):
-    columns = ngsim(stream())
-    columns["Global_Time"] = [f'"{value:,}"' for value in columns["Global_Time"]]
-    columns["Local_Y"] = [f'"{value:,}"' for value in columns["Local_Y"]]
-    imported = run(write_csv(tmp_path / "portal.csv", columns), Source("ngsim"))
-    np.testing.assert_array_equal(counts(imported), expected)
-
-
 def highd(points, folder, period=0.04):
     """Write a recording: even vehicles move to the right, odd ones to the left, on 400 m."""
     vehicle, time, x, speed = points.T

@@ -85,12 +85,6 @@ def test_a_detailed_import_keeps_positions_lanes_and_classes(tmp_path):
         np.testing.assert_array_equal(getattr(record, name), getattr(bare, name))
 
 
-def test_demand_and_dwell_are_measured(tmp_path):
-    corridor = run(plain(tmp_path / "a.csv", stream(headway=2.0))).corridor
-    assert corridor.demand.mainline[0][1] == pytest.approx(1800.0, rel=0.1)
-    assert corridor.average_dwell == pytest.approx(4.5, abs=0.5)  # 5 s, less what a window cuts
-
-
 def test_ramps_are_told_by_lanes_or_lateral_positions(tmp_path):
     def branch(vehicle, x):
         on, off = (vehicle % 3 == 1) & (x < 150), (vehicle % 3 == 2) & (x > 250)
@@ -190,18 +184,6 @@ def test_vehicles_are_conserved_in_the_report(tmp_path):
     assert file["appeared"] == file["vanished"] == 0
     assert file["entered"] == 30 - 1
     assert file["rows"] == file["seconds"] * 10 + 4 or file["rows"] > 9 * file["seconds"]
-
-
-def test_an_id_that_is_used_again_is_another_vehicle(tmp_path):
-    points = stream(headway=4.0)
-    points[:, 0] %= 8  # a vehicle is there for 20 s, its id is free again after 12 s
-    imported = run(plain(tmp_path / "a.csv", points))
-    file = first_file(imported)
-    assert file["vehicles"] == 8
-    assert file["pieces"] == len(np.unique(stream(headway=4.0)[:, 0]))
-    record = record_of(imported, 1)
-    steps = [np.sort(record.step[record.vehicle == v]) for v in np.unique(record.vehicle)]
-    assert all((np.diff(each) == 1).all() for each in steps)
 
 
 def test_a_jump_to_another_place_cuts(tmp_path):

@@ -74,10 +74,6 @@ def test_the_ends_may_lie_inside_edges(files):
     assert part.columns[len(part.lengths) + 3][-1] == ("out", pytest.approx(200.0, abs=5.0), 300.0)
 
 
-def test_first_and_last_edge_stand_for_the_shortest_path(files):
-    assert find_layout(files, ("in", "out"), 100.0, between=True) == find_layout(files, PATH, 100.0)
-
-
 def test_roads_that_meet_at_one_junction_are_one_ramp(tmp_path):
     edges = EDGES.replace(
         "</edges>", '<edge id="second" from="alone" to="n1" numLanes="1" speed="20"/></edges>'
