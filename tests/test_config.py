@@ -187,18 +187,9 @@ def test_every_privacy_keyword_is_reachable_from_json():
     [
         ({"cap": 0}, r"^privacy\.cap must be an integer in 1\.\.1000000, got 0$"),
         ({"delta": 0.5}, r"^privacy\.delta must be a number in \[1e-12, 0\.5\), got 0\.5$"),
-        (
-            {"unit": "week"},
-            r"^privacy\.unit must be one of 'trip', 'horizon', 'event', got 'week'$",
-        ),
-        (
-            {"speed_release": "mean", "adjacency": "add_remove"},
-            r"^privacy\.adjacency must be 'replace' where mean speeds are released",
-        ),
-        (
-            {"preset": "paper", "speed_release": "flow"},
-            r"^privacy\.speed_release is unknown; allowed: preset, epsilon, delta, bound",
-        ),
+        ({"unit": "week"}, r"^privacy\.unit must"),
+        ({"speed_release": "mean", "adjacency": "add_remove"}, r"^privacy\.adjacency must"),
+        ({"preset": "paper", "speed_release": "flow"}, r"^privacy\.speed_release is unknown"),
     ],
 )
 def test_bad_privacy_is_named_with_its_path(privacy, message):

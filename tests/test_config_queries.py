@@ -35,10 +35,7 @@ def test_a_configuration_with_spans_survives_json_and_a_spec():
         ({"query_spans": [1, 1]}, r"^query_spans must be ascending, distinct .*, got \(1, 1\)$"),
         ({"query_spans": [1, 7]}, r"^query_spans must be .* in 1\.\.6, got \(1, 7\)$"),
         ({"price_levels": [1, 2, 1.0]}, r"^price_levels must be distinct factors, got \(1\.0, "),
-        (
-            {"query_spans": [3, 4]},
-            r"^bandwidth must be in 3\.\.6, to pay for a query of 3 segments",
-        ),
+        ({"query_spans": [3, 4]}, r"^bandwidth must"),
         ({"bandwidth": 7}, r"^bandwidth must be in 1\.\.6, got 7$"),
     ],
 )

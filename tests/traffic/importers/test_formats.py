@@ -177,10 +177,7 @@ def test_i24_is_an_array_of_documents_by_vehicle_without_speeds(tmp_path, expect
         ("[]", "must be a JSON array of documents, got none"),
         ("[3]", "row 1: a document must be an object, got 3"),
         ('[{"_id": 1}]', "row 1: fields timestamp, x_position, y_position, direction are missing"),
-        (
-            json.dumps([{**i24(stream())[0], "x_position": [1.0]}]),
-            "row 1: lists must be of one length, got {'timestamp'",
-        ),
+        (json.dumps([{**i24(stream())[0], "x_position": [1.0]}]), "row 1: lists must"),
     ],
 )
 def test_bad_json_is_named_by_document_and_field(text, message, tmp_path):
