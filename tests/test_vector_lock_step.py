@@ -8,21 +8,23 @@ import pytest
 
 from dptse_env.estimators import ESTIMATORS
 from dptse_env.registration import ENVIRONMENTS
-from dptse_env.spaces.actions import ACTION_ENCODINGS
 from dptse_env.utils.threads import SMALLEST_BLOCK
 from tests.cases import chosen
 
 from .vectors import COUNTED, assert_same, briefly, lock_step, short
 
-EVERY_WAY = [(e, a, "paper") for e in ESTIMATORS for a in ACTION_ENCODINGS]
-EVERY_WAY += [(e, "mask", COUNTED) for e in ESTIMATORS]
-WAYS = [
-    ("ekf", "mask", COUNTED), ("ukf", "scores", "paper"), ("enkf", "slots", "paper"),
-    ("mhe", "sequential", "paper"), ("blend", "mask", COUNTED), ("recurrent", "slots", "paper"),
-]  # fmt: skip
 
-
-@pytest.mark.parametrize(("estimator", "action", "privacy"), chosen(WAYS, EVERY_WAY))
+@pytest.mark.parametrize(
+    ("estimator", "action", "privacy"),
+    [
+        ("ekf", "mask", COUNTED),
+        ("ukf", "scores", "paper"),
+        ("enkf", "slots", "paper"),
+        ("mhe", "sequential", "paper"),
+        ("blend", "mask", COUNTED),
+        ("recurrent", "slots", "paper"),
+    ],
+)
 def test_a_batch_is_so_many_scalar_environments(estimator, action, privacy):
     keywords = {"estimator": estimator, "action": action, "privacy": privacy}
     lock_step({**keywords, "truth_in_info": True}, n_steps=17)
