@@ -7,6 +7,7 @@ machine code was written while the test ran.
 
 import os
 
+import numpy as np
 import pytest
 from numba.core import event
 
@@ -34,7 +35,8 @@ class CpuLimit(event.Listener):
 
     def __init__(self, limit):
         self._limit = limit
-        self._seconds = self._left_out = self._left_out_since = 0.0
+        self._seconds = 0.0
+        self._left_out = self._left_out_since = np.zeros(2)
         self._depth = 0
         event.register("numba:compile", self)
 
@@ -80,34 +82,29 @@ class CpuLimit(event.Listener):
     def on_start(self, happened=None):
         """Leave out what follows."""
         if self._depth == 0:
-            self._left_out_since = _own_seconds()
+            self._left_out_since = _used()
         self._depth += 1
 
     def on_end(self, happened=None):
         """Go on counting."""
         self._depth -= 1
         if self._depth == 0:
-            self._left_out += _own_seconds() - self._left_out_since
+            self._left_out = self._left_out + _used() - self._left_out_since
 
     def _count(self):
-        self._left_out = 0.0
-        own, children, kernels = _own_seconds(), _seconds_of_children(), _last_compiled()
+        self._left_out = np.zeros(2)
+        before, kernels = _used(), _last_compiled()
         try:
             return (yield)
         finally:
-            self._seconds += _own_seconds() - own - self._left_out
-            if _last_compiled() == kernels:
-                self._seconds += _seconds_of_children() - children
+            own, children = _used() - before - self._left_out
+            self._seconds += own + (children if _last_compiled() == kernels else 0.0)
 
 
-def _own_seconds():
+def _used():
+    """Return the CPU seconds of this process and of its children that have ended."""
     times = os.times()
-    return times.user + times.system
-
-
-def _seconds_of_children():
-    times = os.times()
-    return times.children_user + times.children_system
+    return np.array([times.user + times.system, times.children_user + times.children_system])
 
 
 def _last_compiled():

@@ -18,18 +18,20 @@ def burn(seconds=0.3):
 def own():
     burn()
 
+def in_a_child():
+    command = "for i in range(10_000_000): pass"
+    subprocess.run([sys.executable, "-c", command], check=True)
+
 @pytest.fixture(scope="module")
 def shared():
     burn()
+    in_a_child()
 """
 
 TOO_LONG = {
     "a test": "def test(): burn()",
     "its fixture": "def test(own): pass",
-    "a child process": """
-def test():
-    subprocess.run([sys.executable, "-c", "for i in range(10_000_000): pass"], check=True)
-""",
+    "a child process": "def test(): in_a_child()",
 }
 
 LEFT_OUT = {
