@@ -11,7 +11,7 @@ from stable_baselines3.common.env_checker import check_env as sb3_check_env
 from dptse_env.process import TRUTH_INFO
 from dptse_env.registration import ENVIRONMENTS
 from dptse_env.spaces.actions import ACTION_ENCODINGS
-from tests.cases import chosen
+from tests.cases import fast_and_slow
 
 from .vectors import briefly
 
@@ -49,7 +49,7 @@ EVERY = sorted({(each, "mask") for each in IDS} | {(SHORT, name) for name in ACT
 CHECKED = [(SHORT, "mask"), (SHORT, "sequential"), ("dptse_env:dptse/PrivateHighway-v1", "mask")]
 
 
-@pytest.mark.parametrize(("env_id", "action"), chosen(CHECKED, EVERY))
+@pytest.mark.parametrize(("env_id", "action"), fast_and_slow(EVERY, CHECKED))
 def test_the_checkers_find_nothing(env_id, action, monkeypatch):
     # Gymnasium's checker tries every render mode: the window is one in memory.
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")

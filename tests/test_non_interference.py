@@ -25,7 +25,7 @@ from dptse_env.schedules import (
     make_schedule,
 )
 from dptse_env.spaces.actions import ACTION_ENCODINGS
-from tests.cases import chosen
+from tests.cases import fast_and_slow
 
 SEEDS = (0, 1)
 START, STEPS = 250, 30
@@ -134,7 +134,7 @@ PAIRS = [
 EVERY_PAIR = list(itertools.product(ACTION_ENCODINGS, ESTIMATORS))
 
 
-@pytest.mark.parametrize(("action", "estimator"), chosen(PAIRS, EVERY_PAIR))
+@pytest.mark.parametrize(("action", "estimator"), fast_and_slow(EVERY_PAIR, PAIRS))
 def test_traffic_does_not_show(estimator, action):
     env = blind(make_private(estimator=estimator, action=action))
     first, second = transcript(env, 0), transcript(env, 1)
@@ -149,7 +149,7 @@ SCHEDULES = [
 EVERY_SCHEDULE = list(itertools.product(BLIND_SCHEDULES, ["nominal", "private"]))
 
 
-@pytest.mark.parametrize(("schedule", "boundary"), chosen(SCHEDULES, EVERY_SCHEDULE))
+@pytest.mark.parametrize(("schedule", "boundary"), fast_and_slow(EVERY_SCHEDULE, SCHEDULES))
 def test_traffic_does_not_show_through_a_schedule(schedule, boundary):
     env = blind(make_private(privacy={"boundary_inputs": boundary}))
     assert same(transcript(env, 0, schedule), transcript(env, 1, schedule))
@@ -160,7 +160,7 @@ UNITS = [("ekf", "trip"), ("enkf", "horizon"), ("mhe", "event"), ("random_walk",
 
 @pytest.mark.parametrize(
     ("estimator", "unit"),
-    chosen(UNITS, itertools.product(ESTIMATORS, ["trip", "horizon", "event"])),
+    fast_and_slow(itertools.product(ESTIMATORS, ["trip", "horizon", "event"]), UNITS),
 )
 def test_traffic_does_not_show_where_boundaries_are_released(estimator, unit):
     privacy = {"boundary_inputs": "private", "unit": unit, "cap": 3}
@@ -249,13 +249,15 @@ def test_an_oracle_shows(oracle):
 # --- the presets of the paper, but for their declared exception ---------------------------------
 
 
-@pytest.mark.parametrize(("action", "estimator"), chosen(PAIRS, EVERY_PAIR))
+@pytest.mark.parametrize(("action", "estimator"), fast_and_slow(EVERY_PAIR, PAIRS))
 def test_the_papers_presets_show_traffic_through_their_boundary_only(estimator, action):
     env = with_nominal_boundary(blind(make_paper(estimator=estimator, action=action)))
     assert same(transcript(env, 0), transcript(env, 1))
 
 
-@pytest.mark.parametrize("schedule", chosen([name for name, _ in SCHEDULES], BLIND_SCHEDULES))
+@pytest.mark.parametrize(
+    "schedule", fast_and_slow(BLIND_SCHEDULES, [name for name, _ in SCHEDULES])
+)
 def test_the_papers_presets_show_nothing_through_a_schedule(schedule):
     env = with_nominal_boundary(blind(make_paper()))
     assert same(transcript(env, 0, schedule), transcript(env, 1, schedule))

@@ -15,7 +15,7 @@ from dptse_env.model import ARZModel, load_parameters
 from dptse_env.release import RELEASE_MODELS
 from dptse_env.schedules import make_schedule
 from dptse_env.traffic import write_corridor
-from tests.cases import chosen
+from tests.cases import fast_and_slow
 from tests.model.roads import UNEVEN
 
 ID = "dptse_env:dptse/PrivateHighway-v1"
@@ -48,7 +48,7 @@ def play(env, steps=40):
 
 @pytest.mark.parametrize(
     "estimator",
-    chosen(["ekf", "enkf", "mhe", "random_walk"], sorted(set(ESTIMATORS) - {"recurrent"})),
+    fast_and_slow(sorted(set(ESTIMATORS) - {"recurrent"}), ["ekf", "enkf", "mhe", "random_walk"]),
 )
 def test_every_estimator_runs_on_an_uneven_road(road_file, estimator):
     env = make(road_file, estimator=estimator)

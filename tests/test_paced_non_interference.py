@@ -14,7 +14,7 @@ import pytest
 
 from dptse_env.estimators import ESTIMATORS
 from dptse_env.release import Paced, Pacing
-from tests.cases import chosen
+from tests.cases import fast_and_slow
 
 from .test_non_interference import (
     EVERY_PAIR,
@@ -70,7 +70,7 @@ WAYS = [
 EVERY_WAY = itertools.product(ESTIMATORS, ["trip", "event"], ["nominal", "private"])
 
 
-@pytest.mark.parametrize(("estimator", "unit", "boundary"), chosen(WAYS, EVERY_WAY))
+@pytest.mark.parametrize(("estimator", "unit", "boundary"), fast_and_slow(EVERY_WAY, WAYS))
 def test_traffic_does_not_show(estimator, unit, boundary):
     env = make(estimator=estimator, privacy={"unit": unit, "boundary_inputs": boundary})
     first, second = transcript(env, 0), transcript(env, 1)
@@ -82,13 +82,13 @@ def test_traffic_does_not_show(estimator, unit, boundary):
     assert first[-1]["sigmas"].shape == (1, *first[-1]["prices"].shape[1:], 2)
 
 
-@pytest.mark.parametrize(("action", "estimator"), chosen(PAIRS[:4], EVERY_PAIR))
+@pytest.mark.parametrize(("action", "estimator"), fast_and_slow(EVERY_PAIR, PAIRS[:4]))
 def test_traffic_does_not_show_through_an_action(action, estimator):
     env = make(estimator=estimator, action=action)
     assert same(transcript(env, 0), transcript(env, 1))
 
 
-@pytest.mark.parametrize(("schedule", "boundary"), chosen(SCHEDULES, EVERY_SCHEDULE))
+@pytest.mark.parametrize(("schedule", "boundary"), fast_and_slow(EVERY_SCHEDULE, SCHEDULES))
 def test_traffic_does_not_show_through_a_schedule(schedule, boundary):
     env = make(privacy={"boundary_inputs": boundary, "clip": 25.0})
     assert same(transcript(env, 0, schedule), transcript(env, 1, schedule))
@@ -116,9 +116,9 @@ PARTLY = {
 
 @pytest.mark.parametrize(
     ("estimator", "boundary"),
-    chosen(
-        [("ekf", "private"), ("ukf", "nominal"), ("mhe", "private"), ("random_walk", "nominal")],
+    fast_and_slow(
         itertools.product(ESTIMATORS, ["nominal", "private"]),
+        [("ekf", "private"), ("ukf", "nominal"), ("mhe", "private"), ("random_walk", "nominal")],
     ),
 )
 def test_neither_traffic_nor_who_is_connected_shows(estimator, boundary):
@@ -231,7 +231,7 @@ def test_ledgers_that_are_used_in_public_would_show(kind):
     assert unlike(make(kind, privacy=LITTLE))
 
 
-@pytest.mark.parametrize("estimator", chosen(["ekf", "mhe", "random_walk"], ESTIMATORS))
+@pytest.mark.parametrize("estimator", fast_and_slow(ESTIMATORS, ["ekf", "mhe", "random_walk"]))
 def test_true_boundary_inputs_would_show(estimator):
     with pytest.warns(UserWarning, match="boundary_inputs"):
         env = make(estimator=estimator, privacy={"boundary_inputs": "true"})

@@ -10,7 +10,7 @@ from dptse_env.estimators import ESTIMATORS
 from dptse_env.parts import make_parts
 from dptse_env.process import QueryProcess
 from dptse_env.spaces.actions import ACTION_ENCODINGS
-from tests.cases import chosen
+from tests.cases import fast_and_slow
 
 from .estimators.solvers import lying, missing, silent, stop_compiled_solvers
 
@@ -47,7 +47,7 @@ WAYS = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("estimator", "action", "privacy"), chosen(WAYS, EVERY_WAY))
+@pytest.mark.parametrize(("estimator", "action", "privacy"), fast_and_slow(EVERY_WAY, WAYS))
 def test_a_batch_is_so_many_single_episodes(estimator, action, privacy):
     keywords = {"estimator": estimator, "action": action, "privacy": privacy}
     batch = make(3, truth_in_info=True, **keywords)
@@ -75,8 +75,8 @@ FORKS = [
 
 @pytest.mark.parametrize(
     ("estimator", "privacy", "backend"),
-    chosen(
-        FORKS, itertools.product(ESTIMATORS, ["paper", COUNTED, PAID], ["compiled", "reference"])
+    fast_and_slow(
+        itertools.product(ESTIMATORS, ["paper", COUNTED, PAID], ["compiled", "reference"]), FORKS
     ),
 )
 def test_a_fork_goes_on_as_its_origin_would_have(estimator, privacy, backend):

@@ -97,9 +97,8 @@ def test_what_is_returned_is_not_touched_later():
     assert_same(seen, kept, tolerance=0)
 
 
-@pytest.mark.parametrize("truth_in_info", [True])
-def test_infos_become_the_scalar_ones(truth_in_info):
-    keywords = {**EPISODES, "privacy": COUNTED, "truth_in_info": truth_in_info}
+def test_infos_become_the_scalar_ones():
+    keywords = {**EPISODES, "privacy": COUNTED, "truth_in_info": True}
     wrapped = DictInfoToList(RecordEpisodeStatistics(short(**keywords)))
     scalar = gym.make(SHORT, **keywords)
     wrapped.reset(seed=8)

@@ -9,7 +9,7 @@ import pytest
 from dptse_env.estimators import ESTIMATORS
 from dptse_env.registration import ENVIRONMENTS
 from dptse_env.utils.threads import SMALLEST_BLOCK
-from tests.cases import chosen
+from tests.cases import fast_and_slow
 
 from .vectors import COUNTED, assert_same, briefly, lock_step, short
 
@@ -43,7 +43,9 @@ def test_autoreset_is_that_of_gymnasium(mode, truth_in_info):
     lock_step(keywords, n_steps=20, autoreset_mode=mode)
 
 
-@pytest.mark.parametrize("estimator", chosen(["ekf", "enkf", "mhe", "recurrent"], ESTIMATORS))
+@pytest.mark.parametrize(
+    "estimator", fast_and_slow(ESTIMATORS, ["ekf", "enkf", "mhe", "recurrent"])
+)
 def test_threads_change_nothing(estimator):
     n = 3 * SMALLEST_BLOCK
     one, two = (short(n, estimator=estimator, threads=threads) for threads in (1, 2))

@@ -145,6 +145,7 @@ def card(text):
 
 
 WRONG = [
+    (lambda: card("[" * 20 + "]" * 20), "nested more than 16 levels deep"),
     (lambda: card("[" * 60_000), "nested more than 16 levels deep"),
     (lambda: card(" " * 70_000), r"entry 'card\.json' has more than 65536 bytes"),
     (lambda: card('{"fits": NaN}'), "must have finite numbers, got NaN"),

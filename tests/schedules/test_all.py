@@ -13,7 +13,7 @@ from dptse_env.schedules import (
     make_schedule,
 )
 from dptse_env.spaces.actions import ACTION_ENCODINGS
-from tests.cases import chosen
+from tests.cases import fast_and_slow
 
 from .playing import begin, make_batch, make_single, play
 
@@ -26,7 +26,7 @@ KINDS = (
 """One for each way to choose: by the clock, by observations, by a memory, and by the process."""
 
 
-@pytest.mark.parametrize("name", chosen(KINDS, NAMES))
+@pytest.mark.parametrize("name", fast_and_slow(NAMES, KINDS))
 def test_every_encoding_asks_the_same_full_set(name):
     expected, rewards = play(make_batch(), name, 8)
     assert (expected.sum(axis=2) == 2).all()
@@ -36,7 +36,7 @@ def test_every_encoding_asks_the_same_full_set(name):
         np.testing.assert_array_equal(own, rewards)
 
 
-@pytest.mark.parametrize("name", chosen(KINDS, sorted(set(NAMES) - {"random"})))
+@pytest.mark.parametrize("name", fast_and_slow(sorted(set(NAMES) - {"random"}), KINDS))
 def test_a_batch_asks_what_its_episodes_ask_alone(name):
     queries, rewards = play(make_batch(), name, 8)
     for episode in range(3):
@@ -46,7 +46,7 @@ def test_a_batch_asks_what_its_episodes_ask_alone(name):
         np.testing.assert_array_equal(own[:, 0], rewards[:, episode])
 
 
-@pytest.mark.parametrize("name", chosen(KINDS, sorted(set(NAMES) - {"random"})))
+@pytest.mark.parametrize("name", fast_and_slow(sorted(set(NAMES) - {"random"}), KINDS))
 def test_a_schedule_begins_anew_with_the_episode_and_may_be_asked_twice(name):
     env = make_batch()
     schedule = make_schedule(name, env)
@@ -84,7 +84,9 @@ SKIPS_SENSORS = (
 
 @pytest.mark.parametrize(
     "name",
-    chosen(("oldest-first", "stale-variance", "inflated-trace", "oracle-error"), SKIPS_SENSORS),
+    fast_and_slow(
+        SKIPS_SENSORS, ("oldest-first", "stale-variance", "inflated-trace", "oracle-error")
+    ),
 )
 def test_a_segment_with_a_fixed_sensor_is_queried_last(name):
     queries, _ = play(make_batch(bandwidth=5), name, 6)

@@ -33,6 +33,12 @@ def queried(name, n_steps, **keywords):
     return sets
 
 
+def test_sets_start_as_far_apart_as_possible():
+    for bandwidth in (5, 7, 11):
+        (start,) = queried("static", 1, bandwidth=bandwidth)
+        assert start == [15 * i // bandwidth for i in range(bandwidth)]
+
+
 def test_the_paper_shifts_one_segment_every_four_steps():
     sets = queried("paper", 61)
     assert sets[:4] == [[0, 3, 6, 9, 12]] * 4
@@ -126,7 +132,8 @@ def test_deviations_are_weighed_by_age(name, expected):
     age[1], density[1] = 8 / 60, 0.3  # far ahead under both
     age[2], density[2] = 24 / 60, 0.05  # 1.6 with the square of the age, 0.06 with the age
     density[12], speed[12] = 0.5, 0.1
-    speed[5] = 0.3  # held to 0.1 under a cap
+    density[8] = 0.28  # between these two
+    speed[5] = 1.5  # held to 0.1 under a cap
     blocks = {"age": age, "density_log_std": np.log(density), "speed_log_std": np.log(speed)}
     observation = env.observation(1, **{
         key: np.pad(value, (0, env.interface.observations.slices[key].stop

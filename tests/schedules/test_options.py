@@ -11,7 +11,7 @@ from dptse_env.release import QueryOptions
 from dptse_env.schedules import COVARIANCE_SCHEDULES, OBSERVATION_SCHEDULES, make_schedule
 from dptse_env.schedules.ranking import best_options, option_values
 from dptse_env.spaces.actions import ACTION_ENCODINGS
-from tests.cases import chosen as cases
+from tests.cases import fast_and_slow
 
 from ..release.sums import SumRelease
 from .playing import begin, make_batch, make_single, play
@@ -33,13 +33,10 @@ def make(road, action="mask"):
 
 @pytest.mark.parametrize(
     ("name", "road"),
-    cases(
-        [
+    fast_and_slow(itertools.product(NAMES, ROADS), [
             ("round-robin", "both"), ("oldest-first", "sums"), ("stale-variance", "spans"),
             ("speed-front", "levels"), ("largest-deviation", "only sums"), ("oracle-error", "both"),
-        ],
-        itertools.product(NAMES, ROADS),
-    ),
+        ]),
 )  # fmt: skip
 def test_every_encoding_asks_the_same_and_for_as_much_as_it_may(name, road):
     env = make(road)
@@ -56,7 +53,8 @@ def test_every_encoding_asks_the_same_and_for_as_much_as_it_may(name, road):
 
 
 @pytest.mark.parametrize(
-    "name", cases(["paper", "stale-variance", "oracle-error"], sorted(set(NAMES) - {"random"}))
+    "name",
+    fast_and_slow(sorted(set(NAMES) - {"random"}), ["paper", "stale-variance", "oracle-error"]),
 )
 def test_a_batch_asks_what_its_episodes_ask_alone(name):
     keywords = {"privacy": SumRelease, **ROADS["spans"]}

@@ -187,7 +187,7 @@ def test_bad_json_is_named_by_document_and_field(text, message, tmp_path):
         run(path, Source("i24", layout=Layout(origin=310000.0)))
 
 
-@pytest.mark.parametrize("sign", ["_"])
+@pytest.mark.parametrize("sign", ["-", "_"])
 def test_tgsim_has_runs_and_two_spellings(sign, tmp_path, expected):
     vehicle, time, x, speed = stream().T
     columns = {
