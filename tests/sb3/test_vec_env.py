@@ -147,7 +147,7 @@ def test_a_step_needs_actions_and_closing_twice_is_fine():
 
 
 def test_another_autoreset_mode_is_refused():
-    with pytest.raises(ValueError, match="autoreset_mode='SameStep', .* got 'NextStep'"):
+    with pytest.raises(ValueError, match=r"autoreset_mode='SameStep', .* got 'NextStep'"):
         make(autoreset_mode="NextStep")
 
 
