@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 
 export OMP_NUM_THREADS = 1
 
-.PHONY: help setup docs site dist demo reproduce audit test test-slow test-gymnasium test-lowest test-ray test-tutorial lint format benchmark wheel-test clean
+.PHONY: help setup docs site dist demo reproduce audit test test-slow test-gymnasium test-lowest test-ray test-tutorial lint format benchmark wheel-test clean clean-kernels
 
 help:  ## Show this list.
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -47,7 +47,7 @@ audit: setup  ## Attack the privacy presets, 5,000 runs in each of two worlds; r
 	$(BIN)/python scripts/audit.py --force --target pairs --traffic-seed 2000 --runs 2000
 
 test: setup  ## Run the tests, without the slow ones.
-	$(BIN)/python -m pytest -m 'not slow' -n 2
+	$(BIN)/python -m pytest -m 'not slow' -n 2 --dist loadfile
 
 test-tutorial: setup  ## Run the tutorial as a notebook, two to four minutes.
 	$(BIN)/python -m pytest tests/docs/test_notebook.py
@@ -58,7 +58,7 @@ test-slow: setup  ## Run the slow tests: before a release, and after a change to
 test-gymnasium: setup  ## Run the tests of environments with the oldest Gymnasium, which RLlib needs.
 	$(BIN)/python -m pip install --quiet --no-deps --upgrade --target build/gymnasium gymnasium==1.2.2
 	PYTHONPATH=build/gymnasium $(BIN)/python -c 'import gymnasium; assert gymnasium.__version__ == "1.2.2"'
-	PYTHONPATH=build/gymnasium $(BIN)/python -m pytest -m 'not slow' -n 2 tests/sb3 tests/spaces tests/test_env.py \
+	PYTHONPATH=build/gymnasium $(BIN)/python -m pytest -m 'not slow' -n 2 --dist loadfile tests/sb3 tests/spaces tests/test_env.py \
 		tests/test_extending.py tests/test_plugin.py tests/test_process.py tests/test_query_options.py \
 		tests/test_vector_bad_input.py tests/test_vector_env.py tests/test_vector_lock_step.py
 
@@ -101,3 +101,6 @@ test-lowest: setup  ## Use the wheel, and run the tests, with the lowest version
 
 clean:  ## Remove the virtual environment, builds and caches; results/ stays.
 	rm -rf $(VENV) build dist .mypy_cache .pytest_cache .ruff_cache .hypothesis
+
+clean-kernels: setup  ## Remove the compiled kernels, which all environments of this user share.
+	$(BIN)/python -c 'import shutil; from dptse_env.utils.kernels import default_folder; shutil.rmtree(default_folder())'
