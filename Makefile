@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 
 export OMP_NUM_THREADS = 1
 
-.PHONY: help setup docs site dist demo policy-study audit test test-slow test-gymnasium test-lowest test-ray test-tutorial lint format benchmark wheel-test clean reproduce privacy-study ledger-study choice-study penetration-study
+.PHONY: help setup docs site dist demo reproduce audit test test-slow test-gymnasium test-lowest test-ray test-tutorial lint format benchmark wheel-test clean clean-kernels
 
 help:  ## Show this list.
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -28,28 +28,12 @@ demo: setup  ## Train a small query policy and evaluate it beside the schedules 
 		--recipe.swaps.rounds 1 --recipe.swaps.episodes 96 --recipe.swaps.batches 300
 	$(BIN)/python scripts/evaluate.py --policies results/demo/training/policy.zip --output results/demo --force
 
-reproduce: setup  ## Repeat the paper's results and judge its claims; results/paper.
+reproduce: setup  ## Write the reports of all studies anew, after playing what their rows lack; results/.
 	$(BIN)/python scripts/study.py paper
-
-privacy-study: setup  ## Measure the price of the guarantee; results/privacy.
-	$(BIN)/python scripts/study.py privacy
-
-ledger-study: setup  ## Put capped contributions and paced ledgers side by side; results/ledger.
-	$(BIN)/python scripts/study.py ledger
-
-policy-study: setup  ## Hold the trained policies of results/training against every baseline; results/policies.
-	$(BIN)/python scripts/study.py policies freeze --test-seeds 2064:2128 --policies \
-		primary=results/training/primary primary:regression=results/training/regression \
-		$(foreach cell,paper bandwidth-3 bandwidth-7 epsilon-1 epsilon-10,$(cell)=results/training/$(cell))
-	$(BIN)/python scripts/study.py policies run
-
-choice-study: setup  ## Map where a choice of queries pays, with the policies of results/training; results/choices.
-	$(BIN)/python scripts/study.py choices \
-		--capped $(wildcard results/training/capped-roads/*/best.zip) \
-		--paced $(wildcard results/training/paced-roads/*/best.zip)
-
-penetration-study: setup  ## Measure errors by the share of connected vehicles, and what fusion gains; results/penetration.
-	$(BIN)/python scripts/study.py penetration
+	$(BIN)/python scripts/study.py guarantees
+	$(BIN)/python scripts/study.py estimators
+	$(BIN)/python scripts/study.py policies
+	$(BIN)/python scripts/study.py suite
 
 audit: setup  ## Attack the privacy presets, 5,000 runs in each of two worlds; results/audit.
 	$(BIN)/python scripts/audit.py --force --env dptse_env:dptse/PaperHighway-v0 --target replaced
@@ -62,7 +46,7 @@ audit: setup  ## Attack the privacy presets, 5,000 runs in each of two worlds; r
 	$(BIN)/python scripts/audit.py --force --target opposite
 
 test: setup  ## Run the tests, without the slow ones.
-	$(BIN)/python -m pytest -m 'not slow' -n 2
+	$(BIN)/python -m pytest -m 'not slow' -n 2 --dist loadfile
 
 test-tutorial: setup  ## Run the tutorial as a notebook, two to four minutes.
 	$(BIN)/python -m pytest tests/docs/test_notebook.py
@@ -73,7 +57,7 @@ test-slow: setup  ## Run the slow tests: before a release, and after a change to
 test-gymnasium: setup  ## Run the tests of environments with the oldest Gymnasium, which RLlib needs.
 	$(BIN)/python -m pip install --quiet --no-deps --upgrade --target build/gymnasium gymnasium==1.2.2
 	PYTHONPATH=build/gymnasium $(BIN)/python -c 'import gymnasium; assert gymnasium.__version__ == "1.2.2"'
-	PYTHONPATH=build/gymnasium $(BIN)/python -m pytest -m 'not slow' -n 2 tests/sb3 tests/spaces tests/test_env.py \
+	PYTHONPATH=build/gymnasium $(BIN)/python -m pytest -m 'not slow' -n 2 --dist loadfile tests/sb3 tests/spaces tests/test_env.py \
 		tests/test_extending.py tests/test_plugin.py tests/test_process.py tests/test_query_options.py \
 		tests/test_vector_bad_input.py tests/test_vector_env.py tests/test_vector_lock_step.py
 
@@ -116,3 +100,6 @@ test-lowest: setup  ## Use the wheel, and run the tests, with the lowest version
 
 clean:  ## Remove the virtual environment, builds and caches; results/ stays.
 	rm -rf $(VENV) build dist .mypy_cache .pytest_cache .ruff_cache .hypothesis
+
+clean-kernels: setup  ## Remove the compiled kernels, which all environments of this user share.
+	$(BIN)/python -c 'import shutil; from dptse_env.utils.kernels import default_folder; shutil.rmtree(default_folder())'

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import traceback
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,6 +22,10 @@ from dptse_env.utils.digests import file_digest
 
 POLICY_SEED = 0
 """Seeds the draws of a schedule, and torch for the draws of a learned policy."""
+
+
+class PlayError(Exception):
+    """A cell could not be played; the message names its policy and where that raised what."""
 
 
 @dataclass(frozen=True)
@@ -132,6 +137,7 @@ def play(
         FileNotFoundError: There is no such policy.
         ValueError: A keyword is out of range, or the policy does not suit.
         RecordingError: SUMO could not make a record.
+        PlayError: The policy raised an error, or took an action that there is not.
     """
     more = {"traffic_seeds": list(seeds), "records": records, "threads": threads}
     with quietly():
@@ -142,14 +148,25 @@ def play(
         import torch  # noqa: PLC0415 (schedules alone do without)
 
         torch.manual_seed(POLICY_SEED)
-    return evaluate(
-        env,
-        policy,
-        seeds,
-        cell.noise_seed,
-        deterministic=cell.deterministic,
-        watchers=[WATCHERS[name] for name in cell.watchers],
-    )
+    try:
+        return evaluate(
+            env,
+            policy,
+            seeds,
+            cell.noise_seed,
+            deterministic=cell.deterministic,
+            watchers=[WATCHERS[name] for name in cell.watchers],
+        )
+    except Exception as problem:
+        raise PlayError(_blame(cell, problem)) from problem
+
+
+def _blame(cell: Cell, problem: Exception) -> str:
+    """Return an error in one line, with the cell and the innermost place in the code."""
+    labels = ", ".join(f"{name} {value}" for name, value in cell.labels.items())
+    place = traceback.extract_tb(problem.__traceback__)[-1]
+    said = " ".join(f"{type(problem).__name__}: {problem}".split())
+    return f"{cell.policy!r} in {labels or cell.env}: {said} ({place.filename}:{place.lineno})"
 
 
 def record(

@@ -237,6 +237,15 @@ PolicySource = NamedSchedule | SavedPolicy | SavedModel
 """A query policy before it is bound to an environment."""
 
 
+def policy_name(source: str) -> str:
+    """Return the name of a policy in tables.
+
+    Files of trainings have one name; their folders differ.
+    """
+    path = Path(source.partition("=")[2] or source)
+    return f"{path.parent.name}/{path.stem}" if path.suffix == ".zip" else source
+
+
 def find_policy(source: str) -> PolicySource:
     """Return the policy that a name or a file stands for.
 

@@ -42,6 +42,7 @@ class Contributions:
     - ``n_refused``: those that a ledger or a cap refused;
     - ``n_vehicles``: vehicles that were on the mainline;
     - ``n_exhausted``: those that had spent more than `NEARLY_SPENT` of their budget at the end;
+    - ``longest``: seconds that the one that stayed longest was on the mainline;
     - ``quantiles``: `QUANTILES` of the part of the budget that vehicles had spent;
     - ``met``, ``refused``: contributions by mainline segment;
     - ``vehicles``: vehicles by the seconds that they were on the mainline, in bins of `LENGTHS`;
@@ -105,6 +106,7 @@ class Contributions:
             "n_refused": int(self._refused_of[k].sum()),
             "n_vehicles": int(on_road.sum()),
             "n_exhausted": int((spent[on_road] > NEARLY_SPENT).sum()),
+            "longest": int(self._seconds[k].max()),
             "quantiles": np.quantile(spent[on_road], QUANTILES).tolist(),
             "met": self._met[k].tolist(),
             "refused": self._refused[k].tolist(),
@@ -374,9 +376,56 @@ def near_since_start(
     return (bounds[:-1] + BIN / 2)[seen], near[seen] / queries[seen]
 
 
+class Summary:
+    """Honesty, refusals and queries of a batch of episodes, in a few columns.
+
+    Columns:
+
+    - ``chi2_density``, ``chi2_speed``: as `Honesty` has them;
+    - ``n_met``, ``n_refused``: as `Contributions` has them; None where the release model keeps no
+      account of vehicles;
+    - ``queries_a_second``: requests that were served.
+    """
+
+    def __init__(self, process: QueryProcess) -> None:
+        """Prepare for the episodes of a process."""
+        self._process, self._honesty = process, Honesty(process)
+        has_accounts = isinstance(of_queries(process.release), Capped | Paced)
+        self._contributions = Contributions(process) if has_accounts else None
+        self._queries, self._seconds = np.zeros(process.n_episodes), 0
+        self._begun = False
+
+    def __call__(self) -> None:
+        """Follow the second that has passed."""
+        self._honesty()
+        if self._contributions is not None:
+            self._contributions()
+        if self._begun:  # the first call is that after the reset, before any query
+            self._queries += self._process.queried.sum(axis=1)
+            self._seconds += 1
+        self._begun = True
+
+    def rows(self) -> list[Row]:
+        """See `dptse_env.evaluation.Watcher.rows`."""
+        counted: list[Row] = [{}] * len(self._queries)
+        if self._contributions is not None:
+            counted = self._contributions.rows()
+        return [
+            {
+                **{name: chi2[name] for name in ("chi2_density", "chi2_speed")},
+                **{name: counts.get(name) for name in ("n_met", "n_refused")},
+                "queries_a_second": float(queries / self._seconds),
+            }
+            for chi2, counts, queries in zip(
+                self._honesty.rows(), counted, self._queries, strict=True
+            )
+        ]
+
+
 WATCHERS: dict[str, WatcherFactory] = {
     "contributions": Contributions,
     "honesty": Honesty,
     "queries": Queries,
+    "summary": Summary,
 }
 """Watchers by the names that cells give."""

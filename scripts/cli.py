@@ -18,7 +18,7 @@ import tyro
 
 from agents.environments import given_keywords, make_config
 from agents.executors import AnyExecutor, ExecutorError, ExecutorName, make_executor
-from agents.play import record
+from agents.play import Cell, PlayError, record
 from agents.study import Place
 from dptse_env.traffic import (
     Corridor,
@@ -92,6 +92,7 @@ BAD_INPUT = (
 
 FAILURES = (
     OSError, MissingExtraError, NetworkError, RecordingError, SumoVersionError, ExecutorError,
+    PlayError,
 )  # fmt: skip
 """Errors of a run, which end a program with status 1 and their message alone."""
 
@@ -187,6 +188,24 @@ def make_corridor(env: str, keywords: Mapping[str, Any]) -> Corridor:
         return make_config(env, {**queries, **keywords}).corridor
 
 
-def records_argument(records: Path | None) -> str | None:
-    """Return the folder of the record cache as a keyword."""
-    return None if records is None else str(records)
+def suitable(cells: Sequence[Cell], what: str) -> tuple[Cell, ...]:
+    """Return the cells that can be played, and say how many do not suit what was given, and why.
+
+    Raises:
+        FileNotFoundError: There is no such policy.
+        ValueError: None can be played.
+    """
+    taken, refused = [], []
+    for cell in cells:
+        try:
+            cell.check()
+        except ValueError as problem:
+            refused.append(problem)
+        else:
+            taken.append(cell)
+    if not taken:
+        raise refused[0]
+    if refused:
+        n = f"{len(refused)} of {len(cells)} cells"
+        print(f"{n} do not suit {what} and are left out: {refused[0]}", file=sys.stderr)
+    return tuple(taken)

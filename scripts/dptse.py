@@ -44,7 +44,7 @@ COMMANDS: Mapping[str, Command] = {
     "train": Command("train", "Train a query policy."),
     "train-estimator": Command("train_estimator", "Train a recurrent network as an estimator."),
     "evaluate": Command("evaluate", "Evaluate schedules and policies on the same traffic."),
-    "suite": Command("suite", "Score policies in the cells of the query suite."),
+    "suite": Command("suite", "Score policies in the tasks of the query suite."),
     "audit": Command("audit", "Attack the privacy of an environment."),
     "study": Command("study", "Play a study, or report the rows of one."),
     "replay-field": Command("replay_field", "Replay a measured field with the estimators."),

@@ -21,7 +21,7 @@ from agents.figures import RoadMap, draw_maps, estimate_map, save_errors, save_f
 from agents.files import refuse_to_replace
 from agents.page import watch, write_page
 from agents.play import Cell
-from agents.policies import NamedSchedule, find_policy
+from agents.policies import NamedSchedule, find_policy, policy_name
 from agents.seeds import seed_kind
 from agents.statistics import Interval
 from agents.study import ROWS, TABLES, Place, Study, read_rows
@@ -126,9 +126,7 @@ def make_cells(args: Args) -> dict[tuple[str, str], Cell]:
     """
     policies = {name: name for name in (*args.schedules, args.reference)}
     for source in args.policies:
-        path = Path(source)
-        # Files of trainings have one name; their folders differ.
-        name = f"{path.parent.name}/{path.stem}" if path.suffix == ".zip" else source
+        name = policy_name(source)
         if name in policies:
             raise ValueError(
                 f"schedules and policies must have different names, {name!r} is there twice"

@@ -19,11 +19,12 @@ import tyro
 
 from agents.environments import given_keywords
 from agents.play import Cell
+from agents.seeds import seed_kind
 from agents.study import Follow, Study, write_report
 from agents.study import run as run_study
 from dptse_env.config import parse_seeds
 from dptse_env.utils.validation import require
-from scripts.cli import Machines, resumable, run
+from scripts.cli import Machines, resumable, run, suitable
 
 STUDIES = ("paper", "guarantees", "estimators", "policies", "suite")
 RESULTS = Path("results")
@@ -41,7 +42,8 @@ class Args(Machines):
     quick: bool = False
     """Three traffic seeds for each cell, to see whether it runs."""
     seeds: str | None = None
-    """Traffic seeds, first:stop, in place of the study's own; needs another output."""
+    """Test traffic seeds, first:stop, in place of the study's own; needs another output. What is
+    played on validation traffic keeps its seeds."""
     corridor: str | None = None
     """Road in place of the study's own: the name of a shipped corridor, a road file that ends in
     .toml, or a JSON object of corridor fields; needs another output."""
@@ -73,39 +75,40 @@ def find_study(args: Args) -> Study:
     road, most = given_keywords("{}", args.corridor), QUICK_SEEDS if args.quick else None
 
     def changed(cell: Cell) -> Cell:
-        own = None if args.seeds is not None or cell.seeds is None else cell.seeds[:most]
+        own = cell.seeds
+        if own is not None and args.seeds is not None and seed_kind(own) != "validation":
+            own = None
+        own = None if own is None else own[:most]
         return dataclasses.replace(cell, keywords={**cell.keywords, **road}, seeds=own)
 
     follow = found.follow
     if follow is not None:
         follow = _changed_too(follow, changed)
-    cells = tuple(map(changed, found.cells))
+    cells = tuple(map(changed, _without_roads(found.cells) if road else found.cells))
     if road:
-        cells = _suitable(cells)
-    study: Study = dataclasses.replace(found, cells=cells, seeds=seeds[:most], follow=follow)
-    return study
+        cells = suitable(cells, "the road")
+    # Further tables are measured on the study's own road.
+    measures = {} if road else found.measures
+    return dataclasses.replace(
+        found, cells=cells, seeds=seeds[:most], follow=follow, measures=measures
+    )
 
 
-def _suitable(cells: Sequence[Cell]) -> tuple[Cell, ...]:
-    """Return the cells that a road takes, and say which it refuses.
+def _without_roads(cells: Sequence[Cell]) -> tuple[Cell, ...]:
+    """Return the cells that have no road of their own, and say how many have one.
+
+    On another road these would not be what their labels say.
 
     Raises:
-        ValueError: It refuses all.
+        ValueError: All have one.
     """
-    taken, refused = [], []
-    for cell in cells:
-        try:
-            cell.check()
-        except ValueError as problem:
-            refused.append(problem)
-        else:
-            taken.append(cell)
+    taken = tuple(cell for cell in cells if "corridor" not in cell.keywords)
     if not taken:
-        raise refused[0]
-    if refused:
-        n = f"{len(refused)} of {len(cells)} cells"
-        print(f"{n} do not suit the road and are left out: {refused[0]}", file=sys.stderr)
-    return tuple(taken)
+        raise ValueError("corridor must be left out: every cell of the study has a road of its own")
+    if len(taken) < len(cells):
+        n = f"{len(cells) - len(taken)} of {len(cells)} cells"
+        print(f"{n} have a road of their own and are left out", file=sys.stderr)
+    return taken
 
 
 def _changed_too(follow: Follow, changed: Callable[[Cell], Cell]) -> Follow:

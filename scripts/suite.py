@@ -1,39 +1,78 @@
-"""Score policies in the cells of a query suite, and leave a card for each; or verify a card.
+"""Score policies in the tasks of the query suite, beside those that come with the package.
 
 python scripts/suite.py --policies round-robin my_package:MySchedule
-python scripts/suite.py --verify results/suites/query-suite-v1/round-robin.json
+python scripts/suite.py --policies results/training/primary/pl-0/best.zip --output results/my-suite
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from scripts.cli import Machines, run
-from scripts.evaluate_suite import evaluate_suite
+from agents.policies import policy_name
+from agents.studies.suite import (
+    LEARNED,
+    NAME,
+    ONE,
+    RULES,
+    TASKS,
+    ZERO,
+    Scores,
+    beside_recorded,
+    entry,
+    make_cell,
+)
+from agents.study import read_rows
+from agents.study import run as run_study
+from agents.tables import cell
+from agents.terminal import make_table, print_table
+from dptse_env.utils.validation import require
+from scripts.cli import Machines, resumable, run, suitable
 
 
 @dataclass(frozen=True)
 class Args(Machines):
-    """Score policies in the cells of a query suite."""
+    """Score policies in the tasks of the query suite."""
 
-    name: str = "query-suite-v2"
-    """Name of the suite."""
     policies: tuple[str, ...] = ()
     """Schedules and policies: names, files of saved ones, "module:Class", and models of
     stable-baselines3 as "module:Class=file.zip", which are unpickled: load those that you trust."""
-    verify: Path | None = None
-    """Card of which a drawn cell is run again, to see whether its errors are right."""
-    output: Path | None = None
-    """Folder of the cards; results/suites/<name> if not given."""
-    json: bool = False
-    """Print the cards, or the verification, as JSON, for a program, in place of tables."""
+    output: Path = Path("results/my-suite")
+    """Folder of rows, tables and a figure."""
 
 
+@resumable()
 def main(args: Args) -> None:
-    """Score policies, or verify a card."""
-    folder = args.output or Path("results/suites") / args.name
-    evaluate_suite(args.name, args.policies, args.verify, folder, args, args.json)
+    """Play the policies in the tasks that they suit, and report."""
+    named = {policy_name(source): source for source in args.policies}
+    require(bool(named), "policies", "one or more", args.policies)
+    require(len(named) == len(args.policies), "policies", "of different names", args.policies)
+    cells = [
+        cell
+        for name, source in named.items()
+        for cell in suitable([make_cell(task, name, source) for task in TASKS], source)
+    ]
+    study = entry(cells, TASKS)
+    run_study(study, args.place(args.output))
+    rows = beside_recorded(read_rows(study.name, args.output), study.cells)
+    print_scores(Scores(rows, TASKS), named)
+    print(f"tables and the figure are in {args.output}/")
+
+
+def print_scores(scores: Scores, policies: Iterable[str]) -> None:
+    """Print the scores of policies by task, beside the best of those that come with the package."""
+    names, recorded = list(policies), [*RULES, *LEARNED]
+    others = [name for name in recorded if name not in (*names, ZERO, ONE)]
+    table = make_table(f"{NAME}: scores", "task", *names, "best that comes with it")
+    for task in TASKS:
+        best = scores.best(task.name, others)
+        shown = [cell(scores.shown, name, task.name) for name in names]
+        best_shown = "-" if best is None else f"{best} {scores.shown(best, task.name)}"
+        table.add_row(task.name, *shown, best_shown)
+    means = {name: scores.mean(name) for name in names}
+    table.add_row("mean", *("-" if each is None else f"{each:.2f}" for each in means.values()), "")
+    print_table(table)
 
 
 if __name__ == "__main__":

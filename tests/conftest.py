@@ -1,13 +1,21 @@
+import gc
 import os
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
 
+pytest_plugins = ["tests.cpu_limit"]
+
 # The first example of a compiled test compiles it: no time limit on a single example. What gates a
 # change draws the same examples each time; at a developer's desk they are new ones.
 settings.register_profile("compiled", deadline=None, derandomize="CI" in os.environ)
 settings.load_profile("compiled")
+
+
+def pytest_collection_finish():
+    """Spare collections of garbage the modules and tests, which live to the end anyway."""
+    gc.freeze()
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -28,26 +28,6 @@ def test_seeds_of_training_validation_and_test_are_disjoint():
         assert set(preset.traffic_seeds) <= set(TRAINING_SEEDS)
 
 
-def test_presets_are_as_in_the_paper():
-    config = PRESETS["paper-highway"]
-    assert (config.estimator, config.bandwidth, config.parameters) == ("ekf", 5, "paper")
-    assert (config.privacy.preset, config.privacy.epsilon, config.privacy.delta) == (
-        "paper", 1.0, 0.05,
-    )  # fmt: skip
-    assert config.horizon_steps == 700
-    assert make_release(config).sensitivity.releases[0].bound == pytest.approx(
-        10 * (2 * 8 * PAPER_HIGHWAY.average_dwell) ** 0.5
-    )
-
-
-def test_the_noise_does_not_depend_on_the_model():
-    first, second = (
-        make_release(resolve("paper-highway", {"parameters": name})).sensitivity
-        for name in ("paper", "w99-3lane")
-    )
-    assert first == second
-
-
 def test_a_whole_configuration_survives_json():
     config = resolve("paper-highway", {"incident": "random", "demand": "random"})
     plain = json.loads(json.dumps(dataclasses.asdict(config)))
@@ -107,14 +87,6 @@ def test_a_set_for_the_corridor_comes_before_that_for_any():
     assert resolve("private-highway-v1", {}).settings_name == "ekf-w99-3lane-paced"
 
 
-@pytest.mark.parametrize("privacy", ["capped", "paced"])
-def test_the_long_road_has_a_network_of_its_own(privacy):
-    config = resolve("long-highway", {"estimator": "recurrent", "privacy": privacy})
-    assert config.settings().recurrent.weights == "long-highway"
-    short = resolve("private-highway-v1", {"estimator": "recurrent", "privacy": privacy})
-    assert short.settings().recurrent.weights == "highway"
-
-
 def test_a_road_of_ones_own_takes_no_set_for_an_ending_of_its_name():
     """`ekf-w99-3lane-capped-demand` is a variant, not a set for a road that is called demand."""
     keywords = {"parameters": "w99-3lane", "privacy": "capped", "corridor": {"name": "demand"}}
@@ -154,10 +126,8 @@ def test_a_mapping_of_settings_keeps_what_would_have_been_chosen():
             resolve("paper-highway", {"estimator_settings": bad})
 
 
-@pytest.mark.parametrize(
-    "settings", ["ekf-paper-paper", {"process_noise": [0.5, 0.25], "ukf": {"alpha": 1.0}}]
-)
-def test_settings_survive_the_spec_of_an_environment(settings):
+def test_settings_survive_the_spec_of_an_environment():
+    settings = {"process_noise": [0.5, 0.25], "ukf": {"alpha": 1.0}}
     env = gym.make("dptse_env:dptse/PaperHighway-v0", estimator_settings=settings)
     again = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
     config, other = env.unwrapped.config, again.unwrapped.config
@@ -166,30 +136,15 @@ def test_settings_survive_the_spec_of_an_environment(settings):
     assert resolve("short-highway", plain) == config
 
 
-@pytest.mark.parametrize(("text", "seeds"), [("3:6", (3, 4, 5)), ("7", (7,)), ("0:1", (0,))])
-def test_seed_ranges(text, seeds):
-    assert parse_seeds(text) == seeds
-
-
-@pytest.mark.parametrize("text", ["", "3:3", "4:2", "-1:2", "a:b", "1:2:3", " 0:1", "1:"])
-def test_bad_seed_ranges_are_refused(text):
-    with pytest.raises(ValueError, match=r"^seeds must "):
-        parse_seeds(text)
+def test_seed_ranges():
+    assert parse_seeds("3:6") == (3, 4, 5)
+    assert parse_seeds("7") == (7,)
+    for text in ("", "3:3", "4:2", "-1:2", "a:b", "1:2:3", " 0:1", "1:"):
+        with pytest.raises(ValueError, match=r"^seeds must "):
+            parse_seeds(text)
 
 
 # --- privacy --------------------------------------------------------------------------------------
-
-
-def test_the_private_preset_is_as_announced():
-    config = PRESETS["private-highway"]
-    privacy = config.privacy
-    assert (privacy.preset, privacy.epsilon, privacy.delta, privacy.cap, privacy.unit) == (
-        "capped", 5.0, 0.05, 64, "trip",
-    )  # fmt: skip
-    assert (privacy.speed_release, privacy.boundary) == ("flow", "nominal")
-    assert config.parameters == "w99-3lane"
-    assert isinstance(config.corridor.incident, IncidentDistribution)
-    assert isinstance(config.corridor.demand, DemandDistribution)
 
 
 def test_a_preset_by_name_keeps_the_other_fields_of_privacy():
@@ -231,28 +186,10 @@ def test_every_privacy_keyword_is_reachable_from_json():
     ("privacy", "message"),
     [
         ({"cap": 0}, r"^privacy\.cap must be an integer in 1\.\.1000000, got 0$"),
-        ({"cap": 2.5}, r"^privacy\.cap must be an integer in 1\.\.1000000, got 2\.5$"),
-        ({"share": 1.0}, r"^privacy\.share must be a number in \[0\.001, 0\.999\], got 1\.0$"),
-        ({"epsilon": 0}, r"^privacy\.epsilon must be a number in .*, got 0$"),
         ({"delta": 0.5}, r"^privacy\.delta must be a number in \[1e-12, 0\.5\), got 0\.5$"),
-        (
-            {"unit": "week"},
-            r"^privacy\.unit must be one of 'trip', 'horizon', 'event', got 'week'$",
-        ),
-        ({"adjacency": "swap"}, r"^privacy\.adjacency must be one of 'replace', 'add_remove', got"),
-        (
-            {"speed_release": "sum"},
-            r"privacy\.speed_release must be one of 'mean', 'flow', got 'sum'",
-        ),
-        ({"boundary_inputs": "no"}, r"privacy\.boundary_inputs must be one of 'true', 'nominal', "),
-        (
-            {"speed_release": "mean", "adjacency": "add_remove"},
-            r"^privacy\.adjacency must be 'replace' where mean speeds are released",
-        ),
-        (
-            {"preset": "paper", "speed_release": "flow"},
-            r"^privacy\.speed_release is unknown; allowed: preset, epsilon, delta, bound",
-        ),
+        ({"unit": "week"}, r"^privacy\.unit must"),
+        ({"speed_release": "mean", "adjacency": "add_remove"}, r"^privacy\.adjacency must"),
+        ({"preset": "paper", "speed_release": "flow"}, r"^privacy\.speed_release is unknown"),
     ],
 )
 def test_bad_privacy_is_named_with_its_path(privacy, message):

@@ -12,6 +12,7 @@ from dptse_env.schedules import (
     make_schedule,
 )
 from dptse_env.spaces.actions import ACTION_ENCODINGS
+from tests.cases import fast_and_slow
 
 SHORT = "dptse_env:dptse/ShortHighway-v0"
 
@@ -89,16 +90,8 @@ SCHEDULES = [*OBSERVATION_SCHEDULES, *DEVIATION_SCHEDULES, *COVARIANCE_SCHEDULES
 FAST = ("paper", "speed-front", "greedy-trace", "oracle-error")
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        name if name in FAST else pytest.param(name, marks=pytest.mark.slow)
-        for name in SCHEDULES
-        if name not in ("random", "all")
-    ],
-)
+@pytest.mark.parametrize("name", fast_and_slow(sorted({*SCHEDULES} - {"random", "all"}), FAST))
 def test_a_batch_gives_the_rows_of_one_episode_after_another(name):
-    # Three seeds on two episodes at once: the last batch is short.
     keywords = {"horizon": 100, "estimator": "ekf"}
     seeds = (1, 0)
     assert_same(

@@ -5,25 +5,19 @@ from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
-import pytest
 
 PAGE = Path(__file__).parents[1] / "docs" / "extending.md"
 SECTION = re.compile(r"^## ([^\n]*)\n(?:(?!^## ).)*?```python\n(.*?)```", re.DOTALL | re.MULTILINE)
 EXAMPLES = dict(SECTION.findall(PAGE.read_text(encoding="utf-8")))
-POINTS = [
-    "Estimator", "Release model", "Reward", "Observation block", "Action encoding", "Corridor",
-    "Schedule", "Names", "Parts of a process",
-]  # fmt: skip
 
 
-def test_every_extension_point_has_an_example_of_25_lines_at_most():
-    assert list(EXAMPLES) == POINTS
-    for name, code in EXAMPLES.items():
-        assert len([line for line in code.splitlines() if line.strip()]) <= 25, name
+def test_every_example_runs():
+    assert EXAMPLES
+    for name in EXAMPLES:
+        check(name)
 
 
-@pytest.mark.parametrize("name", EXAMPLES)
-def test_an_example_runs(name):
+def check(name):
     space = {"__name__": "examples"}
     exec(compile(EXAMPLES[name], f"{PAGE.name}, {name}", "exec"), space)
     if "env" not in space:

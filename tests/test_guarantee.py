@@ -41,11 +41,6 @@ def test_a_void_guarantee_is_warned_of_when_the_environment_is_made():
     assert (account["guarantee"], account["void_reasons"]) == ("none", ["speed_sensitivity"])
 
 
-def test_making_an_environment_loads_nothing_and_opens_no_account():
-    env = gym.make("dptse_env:dptse/PrivateHighway-v0").unwrapped
-    assert env._process is None
-
-
 def test_counted_vehicles_are_shown_only_with_the_truth():
     _, _, _, _, hidden = play(guaranteed(), 30)[-1]
     assert not {"exposures", "individual_epsilon", "truth"} & set(hidden)
@@ -83,33 +78,6 @@ def test_contributions_do_not_depend_on_other_episodes():
 
 def _n_vehicles(env, slot):
     return env.unwrapped.process.traffic.record(slot).n_vehicles
-
-
-def test_vector_environments_of_gymnasium_take_the_truth():
-    """Records differ in their number of vehicles, and Gymnasium stacks what environments tell."""
-    made = [lambda s=s: guaranteed(truth_in_info=True, traffic_seeds=[s]) for s in range(3)]
-    env = gym.vector.SyncVectorEnv(made)
-    env.reset(seed=0)
-    for _ in range(3):
-        *_, info = env.step(env.action_space.sample())
-    told = info["truth"]["exposures"]
-    assert len({len(one) for one in told}) > 1
-    env.close()
-
-
-def test_a_spec_with_every_privacy_keyword_survives_json():
-    env = gym.make(
-        "dptse_env:dptse/PrivateHighway-v0",
-        privacy={
-            "epsilon": 2.0, "delta": 0.01, "unit": "horizon", "cap": 8, "adjacency": "add_remove",
-            "share": 0.25, "speed_release": "flow", "boundary_inputs": "private",
-        },
-        traffic_seeds="0:2",
-        horizon=20,
-    )  # fmt: skip
-    again = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
-    assert again.unwrapped.config == env.unwrapped.config
-    assert_same(play(env, 5), play(again, 5))
 
 
 # --- the paced ledger ---------------------------------------------------------------------------

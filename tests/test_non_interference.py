@@ -6,6 +6,8 @@ inputs. That is their declared exception, so their test replaces them, and one t
 one. Each way for the truth to slip through is kept as a mutation that the comparison must catch.
 """
 
+import itertools
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -23,6 +25,7 @@ from dptse_env.schedules import (
     make_schedule,
 )
 from dptse_env.spaces.actions import ACTION_ENCODINGS
+from tests.cases import fast_and_slow
 
 SEEDS = (0, 1)
 START, STEPS = 250, 30
@@ -124,8 +127,14 @@ def unlike(env):
 # --- the guaranteed preset, as it is ------------------------------------------------------------
 
 
-@pytest.mark.parametrize("estimator", ESTIMATORS)
-@pytest.mark.parametrize("action", ACTION_ENCODINGS)
+PAIRS = [
+    ("mask", "ekf"), ("scores", "ukf"), ("slots", "enkf"), ("sequential", "mhe"),
+    ("mask", "blend"), ("slots", "recurrent"),
+]  # fmt: skip
+EVERY_PAIR = list(itertools.product(ACTION_ENCODINGS, ESTIMATORS))
+
+
+@pytest.mark.parametrize(("action", "estimator"), fast_and_slow(EVERY_PAIR, PAIRS))
 def test_traffic_does_not_show(estimator, action):
     env = blind(make_private(estimator=estimator, action=action))
     first, second = transcript(env, 0), transcript(env, 1)
@@ -133,15 +142,26 @@ def test_traffic_does_not_show(estimator, action):
     assert not np.array_equal(first[1]["observation"], first[-1]["observation"])
 
 
-@pytest.mark.parametrize("boundary", ["nominal", "private"])
-@pytest.mark.parametrize("schedule", BLIND_SCHEDULES)
+SCHEDULES = [
+    ("round-robin", "private"), ("stale-variance", "nominal"), ("speed-front", "private"),
+    ("expected-reduction", "nominal"), ("inflated-trace", "private"), ("rollout", "nominal"),
+]  # fmt: skip
+EVERY_SCHEDULE = list(itertools.product(BLIND_SCHEDULES, ["nominal", "private"]))
+
+
+@pytest.mark.parametrize(("schedule", "boundary"), fast_and_slow(EVERY_SCHEDULE, SCHEDULES))
 def test_traffic_does_not_show_through_a_schedule(schedule, boundary):
     env = blind(make_private(privacy={"boundary_inputs": boundary}))
     assert same(transcript(env, 0, schedule), transcript(env, 1, schedule))
 
 
-@pytest.mark.parametrize("estimator", ESTIMATORS)
-@pytest.mark.parametrize("unit", ["trip", "horizon", "event"])
+UNITS = [("ekf", "trip"), ("enkf", "horizon"), ("mhe", "event"), ("random_walk", "trip")]
+
+
+@pytest.mark.parametrize(
+    ("estimator", "unit"),
+    fast_and_slow(itertools.product(ESTIMATORS, ["trip", "horizon", "event"]), UNITS),
+)
 def test_traffic_does_not_show_where_boundaries_are_released(estimator, unit):
     privacy = {"boundary_inputs": "private", "unit": unit, "cap": 3}
     env = blind(make_private(estimator=estimator, privacy=privacy))
@@ -229,14 +249,15 @@ def test_an_oracle_shows(oracle):
 # --- the presets of the paper, but for their declared exception ---------------------------------
 
 
-@pytest.mark.parametrize("estimator", ESTIMATORS)
-@pytest.mark.parametrize("action", ACTION_ENCODINGS)
+@pytest.mark.parametrize(("action", "estimator"), fast_and_slow(EVERY_PAIR, PAIRS))
 def test_the_papers_presets_show_traffic_through_their_boundary_only(estimator, action):
     env = with_nominal_boundary(blind(make_paper(estimator=estimator, action=action)))
     assert same(transcript(env, 0), transcript(env, 1))
 
 
-@pytest.mark.parametrize("schedule", BLIND_SCHEDULES)
+@pytest.mark.parametrize(
+    "schedule", fast_and_slow(BLIND_SCHEDULES, [name for name, _ in SCHEDULES])
+)
 def test_the_papers_presets_show_nothing_through_a_schedule(schedule):
     env = with_nominal_boundary(blind(make_paper()))
     assert same(transcript(env, 0, schedule), transcript(env, 1, schedule))

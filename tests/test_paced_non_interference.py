@@ -6,6 +6,7 @@ the same, bit by bit, in prices, centres and deviations as in observations, esti
 """
 
 import dataclasses
+import itertools
 
 import gymnasium as gym
 import numpy as np
@@ -13,11 +14,19 @@ import pytest
 
 from dptse_env.estimators import ESTIMATORS
 from dptse_env.release import Paced, Pacing
-from dptse_env.spaces.actions import ACTION_ENCODINGS
+from tests.cases import fast_and_slow
 
-from .test_non_interference import BLIND_SCHEDULES, SEEDS, STEPS, same, transcript, unlike
-
-CHECKED = sorted(ESTIMATORS)
+from .test_non_interference import (
+    EVERY_PAIR,
+    EVERY_SCHEDULE,
+    PAIRS,
+    SCHEDULES,
+    SEEDS,
+    STEPS,
+    same,
+    transcript,
+    unlike,
+)
 
 
 class Blind:
@@ -54,9 +63,14 @@ def make(kind=Paced, **keywords):
     )
 
 
-@pytest.mark.parametrize("boundary", ["nominal", "private"])
-@pytest.mark.parametrize("unit", ["trip", "event"])
-@pytest.mark.parametrize("estimator", CHECKED)
+WAYS = [
+    ("ekf", "trip", "nominal"), ("ukf", "event", "private"), ("enkf", "trip", "private"),
+    ("mhe", "trip", "private"), ("blend", "event", "nominal"), ("recurrent", "trip", "nominal"),
+]  # fmt: skip
+EVERY_WAY = itertools.product(ESTIMATORS, ["trip", "event"], ["nominal", "private"])
+
+
+@pytest.mark.parametrize(("estimator", "unit", "boundary"), fast_and_slow(EVERY_WAY, WAYS))
 def test_traffic_does_not_show(estimator, unit, boundary):
     env = make(estimator=estimator, privacy={"unit": unit, "boundary_inputs": boundary})
     first, second = transcript(env, 0), transcript(env, 1)
@@ -68,15 +82,13 @@ def test_traffic_does_not_show(estimator, unit, boundary):
     assert first[-1]["sigmas"].shape == (1, *first[-1]["prices"].shape[1:], 2)
 
 
-@pytest.mark.parametrize("estimator", CHECKED)
-@pytest.mark.parametrize("action", ACTION_ENCODINGS)
-def test_traffic_does_not_show_through_an_action(estimator, action):
+@pytest.mark.parametrize(("action", "estimator"), fast_and_slow(EVERY_PAIR, PAIRS[:4]))
+def test_traffic_does_not_show_through_an_action(action, estimator):
     env = make(estimator=estimator, action=action)
     assert same(transcript(env, 0), transcript(env, 1))
 
 
-@pytest.mark.parametrize("boundary", ["nominal", "private"])
-@pytest.mark.parametrize("schedule", BLIND_SCHEDULES)
+@pytest.mark.parametrize(("schedule", "boundary"), fast_and_slow(EVERY_SCHEDULE, SCHEDULES))
 def test_traffic_does_not_show_through_a_schedule(schedule, boundary):
     env = make(privacy={"boundary_inputs": boundary, "clip": 25.0})
     assert same(transcript(env, 0, schedule), transcript(env, 1, schedule))
@@ -102,8 +114,13 @@ PARTLY = {
 }
 
 
-@pytest.mark.parametrize("boundary", ["nominal", "private"])
-@pytest.mark.parametrize("estimator", CHECKED)
+@pytest.mark.parametrize(
+    ("estimator", "boundary"),
+    fast_and_slow(
+        itertools.product(ESTIMATORS, ["nominal", "private"]),
+        [("ekf", "private"), ("ukf", "nominal"), ("mhe", "private"), ("random_walk", "nominal")],
+    ),
+)
 def test_neither_traffic_nor_who_is_connected_shows(estimator, boundary):
     env = make(estimator=estimator, privacy={"boundary_inputs": boundary}, **PARTLY)
     first, second = transcript(env, 0), transcript(env, 1)
@@ -197,24 +214,24 @@ class FallsBackWhereNobodyIs(Paced):
         return super().release(request._replace(prediction=lambda: holed))
 
 
-MUTANTS = (
-    CentreOfTheTruth,
-    PriceOfTrueCounts,
-    CentreOfTheSameSecond,
-    PriceOfTrueLedgers,
-    AccountOfTrueLedgers,
-    RefusalsInPublic,
-    FallsBackWhereNobodyIs,
+# Little privacy is left, so that some vehicles run out within the episode.
+LITTLE = {"epsilon": 0.5, "pace": 1.0}
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [CentreOfTheTruth, PriceOfTrueCounts, CentreOfTheSameSecond, FallsBackWhereNobodyIs],
 )
+def test_a_prediction_that_looks_at_the_truth_would_show(kind):
+    assert unlike(make(kind, privacy=LITTLE))
 
 
-@pytest.mark.parametrize("kind", MUTANTS)
-def test_what_looks_at_the_truth_would_show(kind):
-    # Little privacy is left, so that some vehicles run out within the episode.
-    assert unlike(make(kind, privacy={"epsilon": 0.5, "pace": 1.0}))
+@pytest.mark.parametrize("kind", [PriceOfTrueLedgers, AccountOfTrueLedgers, RefusalsInPublic])
+def test_ledgers_that_are_used_in_public_would_show(kind):
+    assert unlike(make(kind, privacy=LITTLE))
 
 
-@pytest.mark.parametrize("estimator", CHECKED)
+@pytest.mark.parametrize("estimator", fast_and_slow(ESTIMATORS, ["ekf", "mhe", "random_walk"]))
 def test_true_boundary_inputs_would_show(estimator):
     with pytest.warns(UserWarning, match="boundary_inputs"):
         env = make(estimator=estimator, privacy={"boundary_inputs": "true"})

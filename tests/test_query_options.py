@@ -1,5 +1,7 @@
 """Whole environments in which a query may cover several segments, at several price levels."""
 
+import itertools
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -8,8 +10,8 @@ from agents.environments import make_vector
 from dptse_env.config import resolve
 from dptse_env.parts import make_parts
 from dptse_env.process import QueryProcess
-from dptse_env.rendering import History
 from dptse_env.spaces.actions import ACTION_ENCODINGS, ActionEncoding, MaskAction
+from tests.cases import fast_and_slow
 
 from .release.sums import PricedRelease, SumRelease
 from .vectors import EPISODES, SHORT, lock_step, short
@@ -41,16 +43,23 @@ def query(process, *options):
     return process.step(ONE, flags[None].astype(np.int8)).observation
 
 
-@pytest.mark.parametrize("action", ACTION_ENCODINGS)
-@pytest.mark.parametrize("keywords", CONFIGURATIONS.values(), ids=CONFIGURATIONS)
-def test_batches_are_episodes_and_sampled_actions_never_raise(keywords, action):
-    lock_step({"privacy": PricedRelease, "action": action, **keywords}, 20)
+PAIRS = [
+    ("spans", "sequential"), ("sums", "mask"), ("levels", "slots"), ("all of it", "scores"),
+    ("all of it", "sequential"), ("one query", "slots"),
+]  # fmt: skip
 
 
-@pytest.mark.parametrize("action", ACTION_ENCODINGS)
-@pytest.mark.parametrize("keywords", CONFIGURATIONS.values(), ids=CONFIGURATIONS)
-def test_queries_stay_within_the_bandwidth_and_observations_in_the_space(keywords, action):
-    env = gym.make(SHORT, action=action, **{"privacy": SumRelease, **EPISODES, **keywords})
+@pytest.mark.parametrize(
+    ("name", "action"), fast_and_slow(itertools.product(CONFIGURATIONS, ACTION_ENCODINGS), PAIRS)
+)
+def test_batches_are_episodes_and_sampled_actions_never_raise(name, action):
+    lock_step({"privacy": PricedRelease, "action": action, **CONFIGURATIONS[name]}, 20)
+
+
+@pytest.mark.parametrize(("name", "action"), PAIRS)
+def test_queries_stay_within_the_bandwidth_and_observations_in_the_space(name, action):
+    keywords = {"privacy": SumRelease, **EPISODES, **CONFIGURATIONS[name]}
+    env = gym.make(SHORT, action=action, **keywords)
     options = env.unwrapped.config.queries
     env.reset(seed=1)
     env.action_space.seed(2)
@@ -75,15 +84,6 @@ def test_spans_and_levels_size_actions_and_blocks():
     chosen = gym.make(SHORT, privacy="capped", observation=["age", "last_price", "tracer"])
     observation, _ = chosen.reset(seed=0)
     assert (observation[6:] == 0.0).all()
-
-
-def test_slots_and_picks_number_the_queries_that_the_bandwidth_pays_for():
-    keywords = {"privacy": SumRelease, "query_spans": (2,), "bandwidth": 5}
-    slots = gym.make(SHORT, action="slots", **keywords)
-    assert slots.action_space == gym.spaces.MultiDiscrete([5, 5])
-    sequential = gym.make(SHORT, action="sequential", **keywords)
-    assert sequential.action_space == gym.spaces.Discrete(5)
-    assert sequential.unwrapped.interface.actions.actions_per_step == 2
 
 
 def test_a_query_releases_the_mean_over_its_segments():
@@ -127,8 +127,13 @@ def test_a_sensor_without_an_option_has_a_row_of_its_own():
     assert block(observation, "density_innovation")[0, 0] != 0.0
 
 
-@pytest.mark.parametrize("estimator", ["ekf", "ukf", "enkf", "mhe", "random_walk"])
-@pytest.mark.parametrize("spans", [(2,), (1, 2)])
+@pytest.mark.parametrize(
+    ("estimator", "spans"),
+    fast_and_slow(
+        itertools.product(["ekf", "ukf", "enkf", "mhe", "random_walk"], [(2,), (1, 2)]),
+        [("ekf", (1, 2)), ("mhe", (2,)), ("random_walk", (1, 2))],
+    ),
+)
 def test_queries_bring_the_estimate_nearer(estimator, spans):
     """Averages enter the estimator as what they are: more of them give a smaller error."""
 
@@ -174,14 +179,6 @@ def test_masks_show_what_the_rest_of_the_bandwidth_pays_for():
     batch.step(np.array([0, 11]))
     masks = batch.action_masks()
     assert masks.sum(axis=1).tolist() == [5 + 5, 15]  # the second has begun the next second
-
-
-def test_a_picture_shows_the_segments_that_queries_cover():
-    process = make_process(query_spans=(2, 3))
-    history = History.from_process(process)
-    query(process, 0)
-    history.append(process)
-    assert [row.tolist() for row in history.queried] == [[False] * 6, [True] * 2 + [False] * 4]
 
 
 def test_a_fork_goes_on_alike():

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from dptse_env.utils.extras import MissingExtraError
-from dptse_env.window import Window
 
 pytest.importorskip("pygame", reason="the extra video is not installed")
 
@@ -66,20 +65,6 @@ def test_an_episode_goes_on_when_its_window_is_closed_by_hand(display):
     assert window.is_open
     env.close()
     env.close()
-
-
-def test_a_missing_display_is_one_sentence(monkeypatch):
-    for name in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"):
-        monkeypatch.delenv(name, raising=False)
-    env = make()
-    with pytest.raises(gym.error.Error, match=r"needs a display.*use render_mode='rgb_array'"):
-        env.reset(seed=0)
-
-
-def test_a_driver_that_cannot_start_is_a_missing_display(monkeypatch):
-    monkeypatch.setenv("SDL_VIDEODRIVER", "no-such-driver")
-    with pytest.raises(gym.error.Error, match=r"needs a display, and none can be opened \(.+\)"):
-        Window("title", 1000).show(np.zeros((4, 4, 3), dtype=np.uint8))
 
 
 def test_a_missing_pygame_names_the_extra(monkeypatch):

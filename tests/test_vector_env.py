@@ -1,23 +1,13 @@
 import pickle
-import subprocess
-import sys
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
 
 from dptse_env.vector_env import SensorQueryVectorEnv
 
 from .vectors import COUNTED, EPISODES, SHORT, assert_same, short, staggered
-
-
-@pytest.mark.parametrize("mode", AutoresetMode)
-def test_the_mode_is_declared(mode):
-    for env in (short(autoreset_mode=mode), short(autoreset_mode=mode.value)):
-        assert env.metadata["autoreset_mode"] is mode
-    assert short().metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
 
 
 def test_next_step_ignores_the_action_of_an_episode_that_begins_again():
@@ -83,17 +73,6 @@ def test_disabled_autoreset_asks_for_a_reset():
     assert not truncated.any()
 
 
-def test_reset_options_hold_for_one_reset():
-    env = short(truth_in_info=True)
-    options = {"traffic_seed": 2, "start": 100}
-    truth = env.reset(seed=0, options=options)[1]["truth"]
-    assert truth["traffic_seed"].tolist() == [2] * 3
-    assert truth["time"].tolist() == [100] * 3
-    assert options == {"traffic_seed": 2, "start": 100}
-    starts = {second for _ in range(5) for second in env.reset()[1]["truth"]["time"].tolist()}
-    assert len(starts) > 5
-
-
 def test_seeds_one_by_one():
     together, apart, mixed = short(), short(), short()
     actions = np.ones((3, 6), dtype=np.int8)
@@ -118,9 +97,8 @@ def test_what_is_returned_is_not_touched_later():
     assert_same(seen, kept, tolerance=0)
 
 
-@pytest.mark.parametrize("truth_in_info", [False, True])
-def test_infos_become_the_scalar_ones(truth_in_info):
-    keywords = {**EPISODES, "privacy": COUNTED, "truth_in_info": truth_in_info}
+def test_infos_become_the_scalar_ones():
+    keywords = {**EPISODES, "privacy": COUNTED, "truth_in_info": True}
     wrapped = DictInfoToList(RecordEpisodeStatistics(short(**keywords)))
     scalar = gym.make(SHORT, **keywords)
     wrapped.reset(seed=8)
@@ -143,51 +121,11 @@ def test_each_episode_is_charged_from_its_own_beginning():
         assert infos["mu"][0] < infos["mu"][1] or k >= cap
 
 
-def test_action_masks():
-    env = short(action="sequential", bandwidth=3)
-    with pytest.raises(gym.error.ResetNeeded, match="3 of 3 episodes were never reset"):
-        env.action_masks()
-    env.reset(seed=0)
-    env.step(np.array([0, 4, 5]))
-    masks = env.action_masks()
-    assert masks.shape == (3, 6)
-    assert np.argwhere(~masks).tolist() == [[0, 0], [1, 4], [2, 5]]
-    with pytest.raises(ValueError, match=r"needs action='sequential' or .*, got .*:MaskAction"):
-        short().action_masks()
-
-
 def test_a_pickled_environment_goes_on_where_it_was():
     env, actions = staggered()
     copy = pickle.loads(pickle.dumps(env))
     for _ in range(8):
         assert_same(env.step(actions), copy.step(actions), tolerance=0)
-
-
-def test_a_spec_survives_json():
-    env = short(autoreset_mode="SameStep")
-    again = gym.make_vec(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
-    assert again.unwrapped.config == env.unwrapped.config
-    assert again.num_envs == 3
-    assert_same(env.reset(seed=1), again.reset(seed=1), tolerance=0)
-
-
-def test_one_episode_and_closing_twice():
-    env = short(num_envs=1)
-    assert env.reset(seed=0)[0].shape == (1, *env.single_observation_space.shape)
-    env.close()
-    env.close()
-    assert env.closed
-
-
-def test_no_work_in_a_constructor():
-    code = (
-        "import sys, gymnasium as gym; gym.make_vec('dptse_env:dptse/PaperHighway-v0', 4); "
-        "print({'libsumo', 'torch', 'stable_baselines3'} & set(sys.modules) or 'light')"
-    )
-    result = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=False
-    )
-    assert result.stdout.strip() == "light", result.stderr
 
 
 def test_a_void_guarantee_is_warned_of_at_the_caller():
@@ -216,10 +154,3 @@ def test_it_draws_the_chosen_episode_as_the_scalar_environment_does():
         env.step(actions)
     assert len(env.history.truth) == 1
     assert (env.render()[0] != picture).any()
-
-
-def test_a_batch_that_is_not_to_be_drawn_says_so():
-    env = short(num_envs=2)
-    env.reset(seed=0)
-    with pytest.warns(UserWarning, match="render_mode='rgb_array'"):
-        assert env.render() is None

@@ -8,16 +8,22 @@ import pytest
 
 from dptse_env.estimators import ESTIMATORS
 from dptse_env.registration import ENVIRONMENTS
-from dptse_env.spaces.actions import ACTION_ENCODINGS
 from dptse_env.utils.threads import SMALLEST_BLOCK
+from tests.cases import fast_and_slow
 
 from .vectors import COUNTED, assert_same, briefly, lock_step, short
 
 
 @pytest.mark.parametrize(
     ("estimator", "action", "privacy"),
-    [(e, a, "paper") for e in ESTIMATORS for a in ACTION_ENCODINGS]
-    + [(e, "mask", COUNTED) for e in ESTIMATORS],
+    [
+        ("ekf", "mask", COUNTED),
+        ("ukf", "scores", "paper"),
+        ("enkf", "slots", "paper"),
+        ("mhe", "sequential", "paper"),
+        ("blend", "mask", COUNTED),
+        ("recurrent", "slots", "paper"),
+    ],
 )
 def test_a_batch_is_so_many_scalar_environments(estimator, action, privacy):
     keywords = {"estimator": estimator, "action": action, "privacy": privacy}
@@ -29,14 +35,17 @@ def test_every_id_is_so_many_scalar_environments(env_id):
     lock_step({"traffic_seeds": "0:2", **briefly(env_id)}, n_steps=8, env_id=f"dptse_env:{env_id}")
 
 
-@pytest.mark.parametrize("truth_in_info", [False, True])
-@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+@pytest.mark.parametrize(
+    ("mode", "truth_in_info"), [("NextStep", False), ("NextStep", True), ("SameStep", True)]
+)
 def test_autoreset_is_that_of_gymnasium(mode, truth_in_info):
     keywords = {"truth_in_info": truth_in_info, "privacy": COUNTED}
     lock_step(keywords, n_steps=20, autoreset_mode=mode)
 
 
-@pytest.mark.parametrize("estimator", ESTIMATORS)
+@pytest.mark.parametrize(
+    "estimator", fast_and_slow(ESTIMATORS, ["ekf", "enkf", "mhe", "recurrent"])
+)
 def test_threads_change_nothing(estimator):
     n = 3 * SMALLEST_BLOCK
     one, two = (short(n, estimator=estimator, threads=threads) for threads in (1, 2))

@@ -3,10 +3,8 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.vector import AutoresetMode
 
 SHORT = "dptse_env:dptse/ShortHighway-v0"
-MODES = [mode.value for mode in AutoresetMode]
 COUNTED = {"preset": "capped", "cap": 5, "boundary_inputs": "private"}
 EPISODES = {"traffic_seeds": "0:3", "horizon": 6, "random_start": True}
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import time
 from typing import Any
 
+from agents.studies.paper import Stopwatch
 from benchmarks.throughput.environments import libraries, make_batch
-from benchmarks.throughput.measure import Measured, Stopwatch, resident, take_turns
+from benchmarks.throughput.measure import Measured, resident, take_turns
 
 STEPS, MINIBATCH, EPOCHS = 32, 2048, 10
 """A rollout of each episode [steps], samples of a gradient step, passes through a rollout."""

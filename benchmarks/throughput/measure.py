@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -101,23 +101,3 @@ def queries(n_steps: int, n_episodes: int, n_segments: int, n_queried: int) -> n
     """Return random masks of ``n_queried`` segments each, shape (K, n, n_segments)."""
     scores = np.random.default_rng(0).random((n_steps, n_episodes, n_segments))
     return (scores.argsort(axis=-1) < n_queried).astype(np.int8)
-
-
-class Stopwatch:
-    """Adds up the time spent in some methods of an object."""
-
-    def __init__(self, timed: Any, names: Sequence[str]) -> None:
-        """Replace the methods of this object by timed methods."""
-        self.seconds = 0.0
-        for name in names:
-            setattr(timed, name, self._timed(getattr(timed, name)))
-
-    def _timed(self, method: Callable[..., Any]) -> Callable[..., Any]:
-        def call(*args: Any, **keywords: Any) -> Any:
-            start = time.perf_counter()
-            try:
-                return method(*args, **keywords)
-            finally:
-                self.seconds += time.perf_counter() - start
-
-        return call

@@ -1,7 +1,9 @@
 """Compiled functions: kernels, which Python calls, and the parts that kernels call.
 
-numba compiles a kernel at its first call and keeps the machine code on disk: beside the module
-where that folder is writable, else in the user's cache, or in the folder of ``NUMBA_CACHE_DIR``.
+numba compiles a kernel at its first call and keeps the machine code on disk, in the folder of
+``NUMBA_CACHE_DIR`` or else in the user's cache. It is found by the fingerprint of the code,
+wherever the code lies and however old its files are: another environment or checkout loads what the
+first one has compiled. What was not used for `KEPT_FOR` is removed when something is compiled.
 Parts are compiled into the kernels that call them; called from Python they run as Python.
 
 Processes take turns: one compiles a function, and the others load what it has kept. At the first
@@ -16,14 +18,27 @@ import gc
 import hashlib
 import inspect
 import logging
+import os
+import sys
+import tempfile
+import time
 from collections.abc import Callable, Iterator
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
 from typing import Any, TypeVar, cast, overload
 
+import numba
+import numpy as np
+import platformdirs
 from numba import config, njit, types
-from numba.core.caching import FunctionCache, NullCache
+from numba.core.caching import (
+    CompileResultCacheImpl,
+    FunctionCache,
+    IndexDataCacheFile,
+    NullCache,
+    _CacheLocator,
+)
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.registry import CPUDispatcher
 
@@ -39,6 +54,12 @@ _WITHOUT_PYTHON = {"nopython": True, "no_cpython_wrapper": True}
 COLLECTED_EVERY = 100_000
 """Objects after which Python looks for garbage while a kernel is compiled."""
 
+KEPT_FOR = 30 * 24 * 3600.0
+"""Seconds for which machine code that no process loads is kept on disk."""
+
+TOUCHED_EVERY = 24 * 3600.0
+"""Seconds after which loading machine code is noted, by the time of its files."""
+
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
@@ -51,10 +72,8 @@ def kernel(function: Function) -> Function:
     if config.DISABLE_JIT:
         return function
     compiled: Any = _Dispatcher(function, targetoptions={**_OPTIONS, "nopython": True})
-    try:
-        compiled._cache = _KernelCache(function)
-    except RuntimeError:  # numba found no folder that it may write to
-        compiled._cache = _NoCache(function)
+    writable = _is_writable(default_folder())
+    compiled._cache = _KernelCache(compiled) if writable else _NoCache(function)
     return cast("Function", compiled)
 
 
@@ -77,9 +96,8 @@ def kernel_part(function: Any = None, /, *, kept: bool = False, **options: Any) 
 
     def decorate(function: Any) -> Any:
         part: Any = _Part(function, targetoptions={**_OPTIONS, **_WITHOUT_PYTHON, **options})
-        if kept:
-            with contextlib.suppress(RuntimeError):  # numba found no folder that it may write to
-                part._cache = _KernelCache(function)
+        if kept and _is_writable(default_folder()):
+            part._cache = _KernelCache(part)
         return part
 
     return decorate if function is None else decorate(function)
@@ -143,24 +161,100 @@ class _Part(_Dispatcher):
         return self.py_func
 
 
-class _KernelCache(FunctionCache):
-    """numba's cache of a function, with the fingerprint in its keys."""
+def default_folder() -> Path:
+    """Return the folder of machine code: ``NUMBA_CACHE_DIR``, or one in the user's cache."""
+    if config.CACHE_DIR:
+        return Path(config.CACHE_DIR)
+    return platformdirs.user_cache_path("dptse-env") / "kernels"
 
+
+@cache
+def _is_writable(folder: Path) -> bool:
+    """Try once in a process whether files can be kept in a folder; make it."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError:
+        return False
+    return True
+
+
+class _Locator(_CacheLocator):
+    """Where numba keeps a function: in one folder for all."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def get_cache_path(self) -> str:
+        """Return the folder."""
+        return str(self._folder)
+
+    def get_source_stamp(self) -> str:
+        """Return nothing: the fingerprint says what has changed."""
+        return ""
+
+    def get_disambiguator(self) -> str:
+        """Return nothing: the fingerprint tells functions of one name apart."""
+        return ""
+
+
+class _Files(CompileResultCacheImpl):
+    """numba's conversion of machine code to files and back, for one folder."""
+
+    def __init__(self, function: FunctionType, folder: Path) -> None:
+        self._locator: Any = _Locator(folder)
+        self._locator._py_file = inspect.getfile(function)  # for numba's warnings
+        self._lineno = function.__code__.co_firstlineno
+
+
+class _KernelCache(FunctionCache):
+    """numba's cache of a function, whose files are named by the fingerprint."""
+
+    _cache_file: Any = None
     _turn: Any = None
+
+    def __init__(self, compiled: CPUDispatcher) -> None:
+        self._py_func, self._name = compiled.py_func, repr(compiled.py_func)
+        self._options = compiled.targetoptions
+        folder = default_folder()
+        self._impl: Any = _Files(self._py_func, folder)
+        self._cache_path = str(folder)
+        self.enable()
+
+    # At the first use: before that, functions that are defined further down are missing.
+    @cached_property
+    def _digest(self) -> str:
+        text = f"{fingerprint(self._py_func)} {_written(self._options)}"
+        return hashlib.sha256(text.encode()).hexdigest()
+
+    @cached_property
+    def _file_name(self) -> str:
+        path = f"{self._py_func.__module__}.{self._py_func.__qualname__}".replace("<locals>.", "")
+        versions = f"{sys.implementation.cache_tag}-{numba.__version__}"
+        return f"{path}-{self._digest[:16]}-{versions}"
 
     def load_overload(self, signature: Any, context: Any) -> Any:
         """Return kept machine code; where there is none, say that compiling begins.
 
         Another process may be compiling the function: then wait, and return what it has kept.
         """
-        kept = super().load_overload(signature, context)
+        kept = self._loaded(signature, context)
         if kept is None:
             folder = Path(self.cache_path)
             self._turn = compile_ahead.take_turn(self._py_func, folder)
-            kept = super().load_overload(signature, context)
+            kept = self._loaded(signature, context)
             if kept is None:
+                _remove_unused(folder)
                 _announce(self._py_func, f"kept in {folder}")
                 compile_ahead.start(self._py_func, signature, folder)
+        return kept
+
+    def _loaded(self, signature: Any, context: Any) -> Any:
+        if self._cache_file is None:
+            self._cache_file = IndexDataCacheFile(self._cache_path, self._file_name, self._digest)
+        kept = super().load_overload(signature, context)
+        if kept is not None:
+            _touch(Path(self.cache_path), self._file_name)
         return kept
 
     def is_busy(self) -> bool:
@@ -173,9 +267,6 @@ class _KernelCache(FunctionCache):
             self._turn.release()
             self._turn = None
 
-    def _index_key(self, signature: Any, codegen: Any) -> tuple[Any, ...]:
-        return (fingerprint(self._py_func), *super()._index_key(signature, codegen))
-
 
 class _NoCache(NullCache):
     """The cache of a kernel where no folder can keep it."""
@@ -186,6 +277,23 @@ class _NoCache(NullCache):
     def load_overload(self, signature: Any, context: Any) -> None:
         """Say that compiling begins, and how to have it once only."""
         _announce(self._function, "for this process only: set NUMBA_CACHE_DIR to keep it")
+
+
+def _touch(folder: Path, name: str) -> None:
+    """Note that machine code is in use, by the time of its files."""
+    index, now = folder / f"{name}.nbi", time.time()
+    with contextlib.suppress(OSError):  # another user's, or removed meanwhile
+        if now - index.stat().st_mtime > TOUCHED_EVERY:
+            for path in folder.glob(f"{name}.*"):
+                os.utime(path)
+
+
+def _remove_unused(folder: Path) -> None:
+    """Remove machine code that was not loaded for a long time."""
+    for path in folder.glob("*.nb[ci]*"):
+        with contextlib.suppress(OSError):  # another user's, or removed meanwhile
+            if time.time() - path.stat().st_mtime > KEPT_FOR:
+                path.unlink()
 
 
 @cache
@@ -212,6 +320,7 @@ def fingerprint(function: FunctionType) -> str:
                     waiting.append(value)
                 else:
                     digest.update(repr(value).encode())
+        digest.update(repr(following.__defaults__).encode())
     return digest.hexdigest()
 
 
@@ -224,7 +333,7 @@ def _codes(code: CodeType) -> Iterator[CodeType]:
 
 
 def _used(function: FunctionType, code: CodeType) -> Iterator[Any]:
-    """Yield the functions that a code refers to, the fields of named tuples, and constants."""
+    """Yield the functions that a code refers to, how they are compiled, fields, and constants."""
     values = [function.__globals__[name] for name in code.co_names if name in function.__globals__]
     modules = [m for m in values if isinstance(m, ModuleType) and m.__name__.startswith(_PACKAGE)]
     values += [vars(m)[name] for m in modules for name in code.co_names if name in vars(m)]
@@ -232,5 +341,14 @@ def _used(function: FunctionType, code: CodeType) -> Iterator[Any]:
         if callable(value):
             inside = inspect.unwrap(value)
             yield inside if isinstance(inside, FunctionType) else getattr(inside, "_fields", None)
+            yield _written(getattr(value, "targetoptions", {}))
+        elif isinstance(value, np.ndarray):
+            yield value.dtype, value.tolist()  # its `repr` leaves digits and elements out
         elif not isinstance(value, ModuleType):
             yield value
+
+
+def _written(options: dict[str, Any]) -> str:
+    """Write options of numba in the same way in each process; some are sets."""
+    values = [(k, sorted(v) if isinstance(v, set) else v) for k, v in sorted(options.items())]
+    return repr(values)

@@ -93,6 +93,7 @@ def test_lengths_are_seconds_on_the_mainline(paced):
     seconds = np.bincount(record.vehicle[counted])
     by_hand = np.histogram(seconds[seconds > 0], [*LENGTHS, np.inf])[0]
     np.testing.assert_array_equal(np.array(paced[0]["vehicles"]), by_hand)
+    assert paced[0]["longest"] == seconds.max()
 
 
 def test_a_cap_refuses_what_comes_after_it():
@@ -218,3 +219,18 @@ def test_offsets_and_times_are_counted_from_the_incident():
     seconds, near = near_since_start(rows, (-20.0, 0.0, 20.0, 40.0))
     assert seconds.tolist() == [-10.0, 10.0, 30.0]
     np.testing.assert_allclose(near, [1.0, 2.0, 2.0])
+
+
+@pytest.mark.parametrize("privacy", [PACED, "paper"])
+def test_a_summary_is_of_honesty_refusals_and_queries(privacy):
+    has_accounts = privacy != "paper"
+    more = ("honesty", *(("contributions",) if has_accounts else ()))
+    keywords = {"horizon": 120, "bandwidth": 2}
+    for row, whole in zip(
+        watch(privacy, ("summary",), **keywords), watch(privacy, more, **keywords), strict=True
+    ):
+        for name in ("chi2_density", "chi2_speed"):
+            assert row[name] == whole[name]
+        assert row["queries_a_second"] == 2.0
+        assert row["n_met"] == whole.get("n_met")
+        assert row["n_refused"] == whole.get("n_refused")

@@ -5,6 +5,8 @@ from dptse_env.traffic import PAPER_HIGHWAY, RecordLibrary
 
 from .episodes import RELEASES, Episodes, replay
 
+ORDERS = ("in time", "along the road")
+
 
 @pytest.fixture(scope="session")
 def recordings(record_cache) -> dict[str, Episodes]:
@@ -19,7 +21,7 @@ def recorded(recordings) -> Episodes:
     return recordings["speed"]
 
 
-@pytest.fixture(params=["in time", "along the road"])
+@pytest.fixture(params=ORDERS)
 def order(request, monkeypatch):
     """Both orders in which the compiled MHE factorises a window, whatever the road's length."""
     monkeypatch.setattr(mhe, "MOST_IN_TIME", 10**9 if request.param == "in time" else 0)

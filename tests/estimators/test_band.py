@@ -5,13 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dptse_env.estimators import DemandSettings, EstimatorSettings, make_estimator
+from dptse_env.estimators import BACKENDS, DemandSettings, EstimatorSettings, make_estimator
 from dptse_env.estimators.localisation import Places, state_places
 from dptse_env.estimators.reference.band import DenseBand
 from dptse_env.model.compiled import CompiledARZModel
 from dptse_env.model.parameters import load_parameters
 from dptse_env.model.rows import MeasurementRows
 
+from ..cases import pairwise
 from ..model.roads import STRAIGHT, UNEVEN
 from .episodes import (
     REFERENCE_SPEED,
@@ -26,7 +27,7 @@ from .episodes import (
 
 FILTERS = ("ekf", "ukf")
 every_filter = pytest.mark.parametrize("name", FILTERS)
-both_backends = pytest.mark.parametrize("backend", ["compiled", "reference"])
+both_backends = pytest.mark.parametrize("backend", BACKENDS)
 NOISE = {
     "psi": {},
     "w": {"process_noise_in": "w", "density_growth": 0.02, "count_noise": 0.05},
@@ -52,9 +53,7 @@ def assert_agreement(one, other):
     np.testing.assert_allclose(one.innovations, other.innovations, rtol=0.0, atol=1e-5)
 
 
-@pytest.mark.parametrize("noise", NOISE)
-@pytest.mark.parametrize("band", [1, 5, 9])
-@every_filter
+@pytest.mark.parametrize(("name", "band", "noise"), pairwise(FILTERS, [1, 5, 9], NOISE))
 def test_backends_agree_over_an_episode(name, band, noise):
     release = "flow" if noise == "demand" else "speed"
     episodes = simulate(n=2, n_steps=100, release=release)
@@ -157,10 +156,9 @@ def test_all_but_the_ends_of_a_road_within_the_band_is_almost_the_filter_without
         np.testing.assert_allclose(nearly.covariances, full.covariances, rtol=0.0, atol=1e-6)
 
 
-@pytest.mark.parametrize("noise", NOISE)
-@pytest.mark.parametrize("band", [1, 4])
-@both_backends
-@every_filter
+@pytest.mark.parametrize(
+    ("name", "backend", "band", "noise"), pairwise(FILTERS, BACKENDS, [1, 4], NOISE)
+)
 def test_covariances_stay_positive_semidefinite(name, backend, band, noise):
     """Over random traffic with few and many measurements, precise and worthless ones."""
     n_steps = 300 if backend == "compiled" else 40
@@ -192,9 +190,10 @@ def test_a_covariance_cut_to_a_band_stays_one_with_its_variances():
     np.testing.assert_allclose(np.diag(cut), np.diag(long_waves), rtol=1e-5)
 
 
-@every_filter
-@both_backends
-@pytest.mark.parametrize("poison", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize(
+    ("name", "backend", "poison"),
+    pairwise(FILTERS, BACKENDS, [np.nan, np.inf, -np.inf], rest=False),
+)
 def test_what_is_no_number_diverges_that_episode_only(name, backend, poison):
     episodes = simulate(n=3, n_steps=12)
     settings = EstimatorSettings(band=4)

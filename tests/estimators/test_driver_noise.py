@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from dptse_env.estimators import BACKENDS, DemandSettings, EnsembleSettings, EstimatorSettings
+from tests.cases import pairwise
 
 from .draws import draw_alike
 from .episodes import run, scale_of, simulate, started
@@ -15,7 +16,6 @@ IN_W = EstimatorSettings(process_noise=(0.02, 0.05), process_noise_in="w", densi
 RICH = replace(IN_W, count_noise=0.5, demand=DemandSettings())
 QUIET = EstimatorSettings(process_noise=(0.0, 0.0))
 
-both_filters = pytest.mark.parametrize("name", ["ekf", "ukf"])
 both_backends = pytest.mark.parametrize("backend", BACKENDS)
 both_bounds = pytest.mark.parametrize("bounds", ["cone", "box"])
 
@@ -32,9 +32,9 @@ def noise_around(model, before, after):
     return Q
 
 
-@both_filters
-@both_backends
-@both_bounds
+@pytest.mark.parametrize(
+    ("name", "backend", "bounds"), pairwise(["ekf", "ukf"], BACKENDS, ["cone", "box"], n=4)
+)
 def test_q_is_that_of_independent_deviations_of_density_and_w(name, backend, bounds):
     """The UKF's points are made before Q is added, so that P differs by it there, too."""
     episodes = simulate(n_steps=1)
@@ -52,9 +52,9 @@ def test_q_is_that_of_independent_deviations_of_density_and_w(name, backend, bou
     assert np.linalg.matrix_rank(expected) == 38
 
 
-@both_filters
-@both_bounds
-@pytest.mark.parametrize("settings", [IN_W, RICH], ids=["plain", "rich"])
+@pytest.mark.parametrize(
+    ("name", "bounds", "settings"), pairwise(["ekf", "ukf"], ["cone", "box"], [IN_W, RICH], n=4)
+)
 def test_backends_agree(name, bounds, settings):
     """Each step begins at the same state: the UKF amplifies rounding, and so does the box."""
     episodes = averaged(30)

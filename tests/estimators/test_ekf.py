@@ -4,17 +4,17 @@ import numpy as np
 import pytest
 
 from dptse_env.estimators import EstimatorSettings
+from tests.cases import pairwise
 
 from .episodes import RELEASES, SIGMA, run, scale_of, simulate, started
 
 both_backends = pytest.mark.parametrize("backend", ["compiled", "reference"])
-both_sets = pytest.mark.parametrize("parameters", ["paper", "w99-3lane"])
-both_bounds = pytest.mark.parametrize("bounds", ["cone", "box"])
 
 
-@both_sets
-@both_bounds
-@pytest.mark.parametrize("release", RELEASES)
+@pytest.mark.parametrize(
+    ("parameters", "bounds", "release"),
+    pairwise(["paper", "w99-3lane"], ["cone", "box"], RELEASES, n=4),
+)
 def test_backends_agree_over_an_episode(parameters, bounds, release):
     episodes = simulate(parameters, n_steps=300, release=release)
     compiled = started("ekf", "compiled", episodes, EstimatorSettings(bounds=bounds))
@@ -52,8 +52,10 @@ def test_measurements_help(backend):
     assert errors["ekf"] < 0.9 * errors["open_loop"]
 
 
-@both_backends
-@pytest.mark.parametrize("poison", [np.nan, np.inf, -1.0, "indefinite"])
+@pytest.mark.parametrize(
+    ("backend", "poison"),
+    pairwise(["compiled", "reference"], [np.nan, np.inf, -1.0, "indefinite"], rest=False),
+)
 def test_a_broken_covariance_is_found(backend, poison):
     episodes = simulate(n_steps=5)
     ekf = started("ekf", backend, episodes)

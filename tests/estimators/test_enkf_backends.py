@@ -9,24 +9,25 @@ from dptse_env.estimators import (
     EstimatorSettings,
     make_estimator,
 )
+from tests.cases import pairwise
 
 from .draws import draw_alike
 from .episodes import RELEASES, SIGMA, random_streams, run, scale_of, simulate, started
 
-both_sets = pytest.mark.parametrize("parameters", ["paper", "w99-3lane"])
-both_bounds = pytest.mark.parametrize("bounds", ["cone", "box"])
-both_releases = pytest.mark.parametrize("release", RELEASES)
-
 FIELDS = ("density", "speed", "density_std", "speed_std")
 
 
-@both_sets
-@both_bounds
-@both_releases
+OPTIONS = [
+    {},
+    {"inflation": 1.1},
+    {"taper": 0.35},
+    {"inflation": 1.1, "taper": 0.35, "n_members": 30},
+]
+
+
 @pytest.mark.parametrize(
-    "options",
-    [{}, {"inflation": 1.1}, {"taper": 0.35}, {"inflation": 1.1, "taper": 0.35, "n_members": 30}],
-    ids=str,
+    ("parameters", "bounds", "release", "options"),
+    pairwise(["paper", "w99-3lane"], ["cone", "box"], RELEASES, OPTIONS),
 )
 def test_given_the_same_draws_backends_agree(parameters, bounds, release, options):
     episodes = simulate(parameters, n_steps=60, release=release)

@@ -17,6 +17,7 @@ from dptse_env.estimators.compiled.interior_point import approach
 from dptse_env.estimators.compiled.road_order import Space
 from dptse_env.estimators.horizon import natural_residual
 from dptse_env.estimators.horizon import solve as solve_by_library
+from tests.cases import pairwise
 from tests.estimators.parts import compiled
 
 close_envelope = compiled(close_envelope)
@@ -132,9 +133,9 @@ def test_what_a_change_does_fades():
     np.testing.assert_allclose(U.T @ U, fixed, atol=1e-9)
 
 
-@pytest.mark.parametrize("part", [(0, N), (25, 90)], ids=["whole", "part"])
-@pytest.mark.parametrize("weakest", [1.0, 1e-4], ids=["plain", "nearly singular"])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(
+    ("seed", "weakest", "part"), pairwise(range(4), [1.0, 1e-4], [(0, N), (25, 90)], n=4)
+)
 def test_the_interior_point_method_comes_near_another_solvers_minimum(seed, weakest, part):
     """Of a part of the variables, given the others; half of the bounds bind."""
     dense, space = random_space(seed, weakest)

@@ -14,6 +14,7 @@ from dptse_env.estimators import (
     make_estimator,
 )
 from dptse_env.model import ARZModel, load_parameters
+from tests.cases import pairwise
 from tests.model.roads import Road
 
 from .episodes import random_streams
@@ -54,9 +55,6 @@ SENSORS = {
         np.array([0.4, 40.0]),
     ),
 }
-
-both_backends = pytest.mark.parametrize("backend", BACKENDS)
-both_releases = pytest.mark.parametrize("sensor", SENSORS.values(), ids=SENSORS.keys())
 
 
 class Step(NamedTuple):
@@ -103,15 +101,14 @@ def of_estimator(name, backend, sensor, values, **settings):
         yield Step(estimator.states[0], covariance, estimator.innovations[0, 0].copy())
 
 
-@both_backends
-@both_releases
 @pytest.mark.parametrize(
-    ("name", "settings"),
-    [("ekf", {}), ("ukf", {"ukf": SigmaPointSettings(kappa=1.0)})],  # two states allow no -4
-    ids=["ekf", "ukf"],
+    ("name", "sensor", "backend"), pairwise(["ekf", "ukf"], SENSORS, BACKENDS, n=4)
 )
-def test_ekf_and_ukf_are_the_kalman_filter(name, settings, sensor, backend):
+def test_ekf_and_ukf_are_the_kalman_filter(name, sensor, backend):
     """The UKF's points are drawn once a step: they carry its noise into the next motion."""
+    sensor, settings = SENSORS[sensor], {}
+    if name == "ukf":
+        settings = {"ukf": SigmaPointSettings(kappa=1.0)}  # two states allow no -4
     values = measurements(sensor, 300)
     pairs = zip(
         of_estimator(name, backend, sensor, values, **settings),
@@ -124,13 +121,15 @@ def test_ekf_and_ukf_are_the_kalman_filter(name, settings, sensor, backend):
         np.testing.assert_allclose(mine.innovations, right.innovations, rtol=0.0, atol=1e-9)
 
 
-@both_backends
-@both_releases
-@pytest.mark.parametrize("linearisation", ["paper", "trajectory"])
+@pytest.mark.parametrize(
+    ("backend", "sensor", "linearisation"),
+    pairwise(BACKENDS, SENSORS, ["paper", "trajectory"], n=4),
+)
 def test_the_mhe_ends_where_the_kalman_filter_does_while_its_window_grows(
     backend, sensor, linearisation
 ):
     """Full information ends at the filter's mean; a window that moves has another arrival."""
+    sensor = SENSORS[sensor]
     values = measurements(sensor, 41)
     own = HorizonSettings(horizon=40, linearisation=linearisation)
     steps = list(of_estimator("mhe", backend, sensor, values, mhe=own))

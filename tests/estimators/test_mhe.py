@@ -6,11 +6,12 @@ from scipy.optimize import lsq_linear
 
 from dptse_env.estimators import EstimatorSettings, HorizonSettings
 from dptse_env.estimators.horizon import assemble, natural_residual, normalised_bounds, solve
+from tests.cases import pairwise
 
+from .conftest import ORDERS
 from .episodes import RELEASES, SIGMA, run, scale_of, simulate, started
 
 both_backends = pytest.mark.parametrize("backend", ["compiled", "reference"])
-both_bounds = pytest.mark.parametrize("bounds", ["cone", "box"])
 both_releases = pytest.mark.parametrize("release", RELEASES)
 both_linearisations = pytest.mark.parametrize("linearisation", ["paper", "trajectory"])
 
@@ -54,10 +55,12 @@ def agree(episodes, steps, tolerance=1e-9, **horizon):
     return np.array(held), compiled.n_passed_on
 
 
+@pytest.mark.parametrize(
+    ("bounds", "linearisation", "release", "order"),
+    pairwise(["cone", "box"], ["paper", "trajectory"], RELEASES, ORDERS, n=4),
+    indirect=["order"],
+)
 @pytest.mark.usefixtures("order")
-@both_bounds
-@both_linearisations
-@both_releases
 def test_backends_agree(bounds, linearisation, release):
     """Over the growth of the window, and while it moves on."""
     episodes = simulate(n_steps=40, noise=2.0, release=release)
@@ -193,9 +196,10 @@ def test_a_perfect_model_has_no_weight(backend):
         started("mhe", backend, simulate(n_steps=1), settings)
 
 
-@both_bounds
-@pytest.mark.parametrize("filling", [0.0, 1.0], ids=["empty", "jam"])
-@both_backends
+@pytest.mark.parametrize(
+    ("backend", "bounds", "filling"),
+    pairwise(["compiled", "reference"], ["cone", "box"], [0.0, 1.0], n=4),
+)
 def test_along_the_trajectory_poor_starts_are_solved_too(backend, bounds, filling):
     steps = 60 if backend == "compiled" else 14
     episodes = simulate(n_steps=steps, noise=10.0)

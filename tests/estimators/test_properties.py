@@ -13,6 +13,7 @@ from dptse_env.estimators import (
     make_estimator,
 )
 from dptse_env.model import ARZModel, Bounds
+from tests.cases import fast_and_slow
 from tests.model.roads import Road
 
 from .episodes import (
@@ -26,7 +27,16 @@ from .episodes import (
     started,
 )
 
-# Flows are for the compiled ones: each is compared with its reference in a module of its own.
+# Each compiled one is compared with its reference in a module of its own: the references, and the
+# blend of two others, are among the slow tests.
+FAST = [
+    ("ekf", "compiled", "flow"),
+    ("ukf", "compiled", "speed"),
+    ("enkf", "compiled", "flow"),
+    ("mhe", "compiled", "speed"),
+    ("random_walk", "compiled", "flow"),
+    ("recurrent", "compiled", "speed"),
+]
 CASES = [(name, backend, "speed") for name in ESTIMATORS for backend in BACKENDS]
 CASES += [(name, "compiled", "flow") for name in ESTIMATORS if name != "open_loop"]
 WITH_COVARIANCE = [
@@ -37,17 +47,11 @@ SLOW = {("mhe", "reference"), ("enkf", "reference")}  # milliseconds a step
 
 
 def over(cases):
-    """Return the mark that runs a test over cases, the slowest among the slow tests."""
-    slowest = ("mhe", "reference")
-    marked = [
-        pytest.param(*case, marks=pytest.mark.slow) if case[:2] == slowest else case
-        for case in cases
-    ]
-    return pytest.mark.parametrize(("name", "backend", "release"), marked)
+    """Return the mark that runs a test over cases, one of each kind in every run."""
+    return pytest.mark.parametrize(("name", "backend", "release"), fast_and_slow(cases, FAST))
 
 
 every_case, with_covariance = over(CASES), over(WITH_COVARIANCE)
-both_bounds = pytest.mark.parametrize("bounds", ["cone", "box"])
 
 
 def held_to(bounds: Bounds) -> EstimatorSettings:
@@ -88,9 +92,9 @@ def test_the_seed_decides_and_the_global_generator_is_left_alone(name, backend, 
 
 
 @with_covariance
-@both_bounds
-def test_covariance_is_one_over_recorded_traffic(name, backend, release, bounds, recordings):
+def test_covariance_is_one_over_recorded_traffic(name, backend, release, recordings):
     """And no episode was put back to its prior, which would be a repair."""
+    bounds = "cone" if release == "speed" else "box"
     episodes = recordings[release]
     estimator = started(name, backend, episodes, held_to(bounds))
 
@@ -105,10 +109,27 @@ def test_covariance_is_one_over_recorded_traffic(name, backend, release, bounds,
     run(estimator, episodes, range(n_steps), watch=check)
 
 
-@every_case
-@both_bounds
-@pytest.mark.parametrize("parameters", ["paper", "w99-3lane"])
-@pytest.mark.parametrize("filling", [0.0, 1.0], ids=["empty", "jam"])
+POOR = [
+    (*case, bounds, parameters, filling)
+    for case in CASES
+    for bounds in ("cone", "box")
+    for parameters in ("paper", "w99-3lane")
+    for filling in (0.0, 1.0)
+]
+FAST_POOR = [
+    ("ekf", "compiled", "flow", "cone", "paper", 1.0),
+    ("ekf", "compiled", "flow", "box", "w99-3lane", 0.0),
+    ("ukf", "compiled", "speed", "box", "paper", 0.0),
+    ("enkf", "compiled", "flow", "box", "w99-3lane", 1.0),
+    ("mhe", "compiled", "speed", "cone", "w99-3lane", 0.0),
+    ("mhe", "compiled", "flow", "box", "paper", 1.0),
+]
+
+
+@pytest.mark.parametrize(
+    ("name", "backend", "release", "bounds", "parameters", "filling"),
+    fast_and_slow(POOR, FAST_POOR),
+)
 def test_poor_starts_and_ten_times_the_noise_stay_finite_and_within_bounds(
     name, backend, release, bounds, parameters, filling
 ):
@@ -142,9 +163,19 @@ POISONS = [
     for poison, bad in (("values", np.nan), ("values", -np.inf), ("inputs", np.nan))
     if (case[0], poison) not in {("random_walk", "inputs"), ("open_loop", "values")}
 ]
+FAST_POISONS = [
+    ("ekf", "compiled", "flow", "values", -np.inf),
+    ("ukf", "compiled", "speed", "inputs", np.nan),
+    ("enkf", "compiled", "flow", "inputs", np.nan),
+    ("mhe", "compiled", "speed", "values", np.nan),
+    ("blend", "compiled", "speed", "values", np.nan),
+    ("recurrent", "compiled", "speed", "inputs", np.nan),
+]
 
 
-@pytest.mark.parametrize(("name", "backend", "release", "poison", "bad"), POISONS)
+@pytest.mark.parametrize(
+    ("name", "backend", "release", "poison", "bad"), fast_and_slow(POISONS, FAST_POISONS)
+)
 def test_what_is_no_number_diverges_that_episode_only(name, backend, release, poison, bad):
     episodes = simulate(n=3, n_steps=12, release=release)
     estimator, healthy = (started(name, backend, episodes) for _ in range(2))
@@ -251,9 +282,7 @@ def renumbered(episodes):
     return replace(episodes, model=model, start=start, inputs=inputs, observed=seen, values=values)
 
 
-@pytest.mark.parametrize(
-    ("name", "backend", "release"), [case for case in CASES if case[0] != "enkf"]
-)
+@over([case for case in CASES if case[0] != "enkf"])
 def test_the_numbering_of_segments_and_rows_changes_nothing(name, backend, release):
     """The EnKF gives its draws out in this order, so that it is the same in distribution only.
 

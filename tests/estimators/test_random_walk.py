@@ -3,6 +3,7 @@ import pytest
 
 from dptse_env.estimators import EstimatorSettings, make_estimator
 from dptse_env.model.rows import MeasurementRows
+from tests.cases import pairwise
 
 from . import episodes as shared
 from .episodes import REFERENCE_SPEED, RELEASES, run, simulate
@@ -95,9 +96,10 @@ def test_noiseless_measurements_of_a_certain_state_are_no_division_by_zero(relea
     assert not walk.diverged.any()
 
 
-@pytest.mark.parametrize("release", RELEASES)
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize("which", [0, 1])
+@pytest.mark.parametrize(
+    ("release", "bad", "which"),
+    pairwise(RELEASES, [np.nan, np.inf, -np.inf], [0, 1], rest=False),
+)
 def test_no_infinity_is_clipped_into_bounds(release, bad, which):
     """Neither by a walk that knows its state for certain, whose gain is zero."""
     episodes = simulate(n=2, n_steps=2, release=release)

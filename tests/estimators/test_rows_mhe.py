@@ -7,18 +7,21 @@ import pytest
 
 from dptse_env.estimators import BACKENDS, HorizonSettings
 from dptse_env.estimators.horizon import assemble
+from tests.cases import pairwise
 
+from .conftest import ORDERS
 from .episodes import simulate, started
 from .rows import PLAIN, RICH, averaged, every_row, update, with_rows
 
 N_STEPS = 14
-both_linearisations = pytest.mark.parametrize("linearisation", ["paper", "trajectory"])
 
 
+@pytest.mark.parametrize(
+    ("settings", "linearisation", "bounds", "order"),
+    pairwise([PLAIN, RICH], ["paper", "trajectory"], ["box", "cone"], ORDERS, n=4),
+    indirect=["order"],
+)
 @pytest.mark.usefixtures("order")
-@both_linearisations
-@pytest.mark.parametrize("bounds", ["box", "cone"])
-@pytest.mark.parametrize("settings", [PLAIN, RICH], ids=["plain", "rich"])
 def test_backends_agree_on_rows_that_overlap(settings, linearisation, bounds):
     """Programs, innovations and estimates, over the window's growth and its first moves."""
     episodes = averaged(N_STEPS)

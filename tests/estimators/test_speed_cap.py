@@ -7,6 +7,7 @@ import pytest
 
 from dptse_env.estimators import BACKENDS, ESTIMATORS, EstimatorSettings
 from dptse_env.traffic import PAPER_HIGHWAY
+from tests.cases import fast_and_slow
 from tests.model.roads import Road
 
 from .episodes import assert_same, model_of, run, show, simulate, started
@@ -14,8 +15,11 @@ from .episodes import assert_same, model_of, run, show, simulate, started
 CAP = 0.7
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("name", ESTIMATORS)
+ALL = [(name, backend) for name in ESTIMATORS for backend in BACKENDS]
+FAST = [(name, "compiled") for name in ("ekf", "ukf", "enkf", "mhe", "blend", "recurrent")]
+
+
+@pytest.mark.parametrize(("name", "backend"), fast_and_slow(ALL, FAST))
 def test_a_cap_holds_the_reported_speeds_and_nothing_else(name, backend):
     episodes = simulate(n=2, n_steps=4)
     speeds = np.tile(np.linspace(20.0, 95.0, 19), (2, 1))

@@ -101,10 +101,9 @@ def test_an_off_ramp_that_nobody_takes_does_not_hold_traffic_up(corridor, parame
 
 
 @everywhere
-@pytest.mark.parametrize("bounds", ["cone", "box"])
-def test_projects_as_the_model_does(corridor, parameters, bounds):
+def test_projects_as_the_model_does(corridor, parameters):
     model, rng = ARZModel(corridor, parameters), np.random.default_rng(0)
-    for _ in range(20):
+    for bounds in 10 * ("cone", "box"):
         scatter = 1.0 + 0.5 * rng.normal(size=(WIDTH, model.n_states))
         states = random_states(model, rng) * scatter + 0.1 * unit(model) * rng.normal(
             size=scatter.shape
@@ -138,8 +137,12 @@ def test_demand_factors_scale_what_enters_and_stay(corridor, parameters):
 
 
 @everywhere
-@pytest.mark.parametrize("bounds", ["cone", "box"])
-def test_projects_demand_factors_as_the_model_does(corridor, parameters, bounds):
+def test_projects_demand_factors_as_the_model_does(corridor, parameters):
+    for bounds in ("cone", "box"):
+        projects_demand_factors(corridor, parameters, bounds)
+
+
+def projects_demand_factors(corridor, parameters, bounds):
     plain = ARZModel(corridor, parameters)
     model, rng = ARZModel(corridor, parameters, demand_states=True), np.random.default_rng(0)
     states = with_factors(model, random_states(plain, rng), rng)
@@ -166,12 +169,12 @@ def test_measures_as_the_model_does(corridor, parameters):
 
 
 @everywhere
-@pytest.mark.parametrize("reference_speed", [None, 0.0, 51.0])
-def test_releases_what_the_model_measures(corridor, parameters, reference_speed):
+def test_releases_what_the_model_measures(corridor, parameters):
     """States with negative components among them, as those of members ahead of a projection."""
-    model = ARZModel(corridor, parameters, reference_speed=reference_speed)
-    v_0 = np.nan if reference_speed is None else reference_speed
-    assert_releases(model, np.full(model.n_segments, v_0), model.measure)
+    for reference_speed in (None, 0.0, 51.0):
+        model = ARZModel(corridor, parameters, reference_speed=reference_speed)
+        v_0 = np.nan if reference_speed is None else reference_speed
+        assert_releases(model, np.full(model.n_segments, v_0), model.measure)
 
 
 @everywhere
@@ -212,14 +215,14 @@ def test_what_is_not_finite_stays_so_in_its_column(corridor, parameters):
 
 
 @everywhere
-@pytest.mark.parametrize("column", range(5))
-def test_inputs_that_are_not_finite_reach_every_column(corridor, parameters, column):
+def test_inputs_that_are_not_finite_reach_every_column(corridor, parameters):
     """Demand, w, the density behind the exit, and an on-ramp's: NaN in, NaN out."""
     model, rng = ARZModel(corridor, parameters), np.random.default_rng(0)
-    inputs = random_inputs(model, rng)
-    inputs[column] = np.nan
-    after = advanced(model, random_states(model, rng), inputs)
-    assert np.isnan(after).any(axis=1).mean() > 0.5
+    for column in range(5):
+        inputs = random_inputs(model, rng)
+        inputs[column] = np.nan
+        after = advanced(model, random_states(model, rng), inputs)
+        assert np.isnan(after).any(axis=1).mean() > 0.5
 
 
 def test_widths_that_are_no_whole_vector_agree():

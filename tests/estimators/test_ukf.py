@@ -9,6 +9,7 @@ from dptse_env.estimators.compiled.dense import eliminate
 from dptse_env.estimators.compiled.ukf import CompiledUKF
 from dptse_env.model import ARZModel, load_parameters
 from dptse_env.traffic import PAPER_HIGHWAY
+from tests.cases import pairwise
 from tests.estimators.parts import compiled
 
 from .episodes import RELEASES, SIGMA, run, scale_of, simulate, started
@@ -16,9 +17,6 @@ from .episodes import RELEASES, SIGMA, run, scale_of, simulate, started
 eliminate = compiled(eliminate)
 
 BACKENDS = ("compiled", "reference")
-both_backends = pytest.mark.parametrize("backend", BACKENDS)
-both_sets = pytest.mark.parametrize("parameters", ["paper", "w99-3lane"])
-both_bounds = pytest.mark.parametrize("bounds", ["cone", "box"])
 both_releases = pytest.mark.parametrize("release", RELEASES)
 
 
@@ -44,9 +42,10 @@ def step_together(episodes, settings, **tolerance):
         np.testing.assert_allclose(getattr(a, field), getattr(b, field), rtol=1e-6, atol=1e-6)
 
 
-@both_sets
-@both_bounds
-@both_releases
+@pytest.mark.parametrize(
+    ("parameters", "bounds", "release"),
+    pairwise(["paper", "w99-3lane"], ["cone", "box"], RELEASES, n=4),
+)
 def test_backends_take_the_same_step_from_every_state_of_an_episode(parameters, bounds, release):
     # In the box w has no bound: points that break the CFL condition blow up rounding.
     tolerance = {"rtol": 0.0, "atol": 1e-9} if bounds == "cone" else {"rtol": 1e-6, "atol": 1e-6}
@@ -116,8 +115,10 @@ def test_a_root_is_one_and_what_has_none_is_refused():
         assert not eliminate(broken, 38, broken.shape[1])
 
 
-@both_backends
-@pytest.mark.parametrize("poison", [np.nan, np.inf, -1.0, "indefinite"])
+@pytest.mark.parametrize(
+    ("backend", "poison"),
+    pairwise(["compiled", "reference"], [np.nan, np.inf, -1.0, "indefinite"], rest=False),
+)
 def test_a_broken_covariance_is_found(backend, poison):
     episodes = simulate(n_steps=5)
     filters = started("ukf", backend, episodes)

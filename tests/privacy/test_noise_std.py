@@ -4,6 +4,8 @@ import math
 import numpy as np
 import pytest
 from dp_accounting import dp_event, get_epsilon_gaussian, get_sigma_gaussian, pld
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from dptse_env.privacy import (
     contribution_sensitivity,
@@ -72,10 +74,13 @@ def test_golden_noise_of_capped_contributions(epsilon, stds):
         assert flow == pytest.approx(51.0 * density, rel=1e-12)  # veh/h: v_0 times as much
 
 
-@pytest.mark.parametrize("adjacency", ["replace", "add_remove"])
-@pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
-@pytest.mark.parametrize("delta", [0.4, 0.05, 1e-3, 1e-6, 1e-12])
-@pytest.mark.parametrize("epsilon", [0.01, 0.1, 1.0, 5.0, 10.0, 50.0])
+@settings(max_examples=40)
+@given(
+    epsilon=st.floats(0.01, 50.0),
+    delta=st.floats(-12.0, -0.4).map(lambda power: 10.0**power),
+    share=st.floats(0.1, 0.9),
+    adjacency=st.sampled_from(["replace", "add_remove"]),
+)
 def test_the_releases_together_cost_the_requested_epsilon(epsilon, delta, share, adjacency):
     """Against dp-accounting: the sensitivity of the whole transcript in units of the noise."""
     sensitivity = bounded(adjacency=adjacency)

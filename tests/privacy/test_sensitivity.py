@@ -5,6 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dptse_env.privacy.sensitivity import contribution_sensitivity, paper_sensitivity
+from tests.cases import pairwise
 
 NOMINAL = {
     "n_sensors": 8,
@@ -53,8 +54,9 @@ def test_density_bound_equals_a_count_of_what_one_vehicle_changes(
     assert density == pytest.approx(math.sqrt(squares), rel=1e-12)
 
 
-@pytest.mark.parametrize("name", list(NOMINAL))
-@pytest.mark.parametrize("value", [0, -1.0, math.nan, math.inf, "8"])
+@pytest.mark.parametrize(
+    ("name", "value"), pairwise(NOMINAL, [0, -1.0, math.nan, math.inf, "8"], rest=False)
+)
 def test_bad_arguments_are_named(name, value):
     with pytest.raises(ValueError, match=rf"^{name} must be .*, got {value!r}$"):
         bounds(**{name: value})
@@ -105,8 +107,10 @@ def test_the_numbers_behind_a_bound_are_public():
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", ["contributions", "segment_length", "largest_speed"])
-@pytest.mark.parametrize("value", [0, -1.0, math.nan])
+@pytest.mark.parametrize(
+    ("name", "value"),
+    pairwise(["contributions", "segment_length", "largest_speed"], [0, -1.0, math.nan], rest=False),
+)
 def test_bad_numbers_of_a_bound_are_named(name, value):
     with pytest.raises(ValueError, match=rf"^{name} must be .*, got {value!r}$"):
         bounded(**{name: value})

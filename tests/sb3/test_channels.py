@@ -7,10 +7,9 @@ pytest.importorskip("stable_baselines3")
 
 import torch
 
-from dptse_env.config import PRESETS, resolve
+from dptse_env.config import PRESETS
 from dptse_env.parts import make_interface
 from dptse_env.sb3 import RoadChannels
-from dptse_env.sb3.channels import CENTRES
 from dptse_env.sb3.torch_modules import RoadFeatures
 
 
@@ -60,28 +59,6 @@ def test_ramps_stand_where_they_join_and_fixed_sensors_with_them():
     assert [np.flatnonzero(mark).tolist() for mark in road.marks] == [[3, 9], [5, 11], [14]]
 
 
-def test_where_there_is_nothing_a_channel_is_zero():
-    road = RoadChannels.from_config(PRESETS["paper-highway"])
-    observation, _ = numbered(PRESETS["paper-highway"])
-    shown = RoadFeatures(road)(observation)[0].numpy()
-    for k, channel in enumerate(road.channels):
-        empty = np.array([at is None for at in channel.source])
-        assert (shown[k, empty] == 0).all(), channel.name
-
-
-def test_an_unknown_block_has_no_channel():
-    road = RoadChannels.from_config(PRESETS["paper-highway"])
-    with pytest.raises(ValueError, match=r"observation block must be one of density, .*'colour'"):
-        road.index("colour")
-
-
-def test_a_layout_is_plain_and_independent_of_what_may_change():
-    road = RoadChannels.from_config(PRESETS["private-highway"])
-    changes = {"estimator": "ukf", "bandwidth": 3, "epsilon": 1.0, "action": "slots"}
-    assert RoadChannels.from_config(resolve("private-highway", changes)) == road
-    assert hash(road) == hash(RoadChannels.from_config(PRESETS["private-highway"]))
-
-
 def test_channels_of_real_observations_are_of_order_one():
     keywords = {"traffic_seeds": "0:2", "action": "slots"}
     env = gym.make("dptse_env:dptse/ShortHighway-v0", privacy="capped", **keywords)
@@ -92,9 +69,3 @@ def test_channels_of_real_observations_are_of_order_one():
     shown = road(torch.tensor(np.stack(seen))).abs()
     assert shown.mean() < 1.5
     assert shown.amax(dim=(0, 2)).median() > 0.5
-
-
-def test_every_block_of_a_road_has_a_scale():
-    for preset in PRESETS.values():
-        slices = make_interface(preset).observations.slices
-        assert set(slices) - {"bandwidth", "epsilon"} <= set(CENTRES)

@@ -1,26 +1,26 @@
-"""Files made to cost time and memory are refused within a second and 200 MB, whatever they hold."""
+"""Files made to cost time and memory are refused within a second and 128 MB, whatever they hold."""
 
 import functools
 import io
-import json
 import os
 import re
-import shutil
 import struct
-import subprocess
-import sys
 import tempfile
+import time
 import zipfile
+from contextlib import contextmanager
 from pathlib import Path
 
 import gymnasium as gym
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 pytest.importorskip("torch")
 pytest.importorskip("sb3_contrib")
 pytest.importorskip("resource")
+
+import resource
 
 import torch
 
@@ -35,8 +35,9 @@ from tests.sb3.saved_files import (
     write_entries,
 )
 
-ROOT = Path(__file__).parents[2]
-MANY = 220 * 2**20
+ADDITIONAL = 128 * 2**20
+"""Bytes that loading may take beyond those of the imports and of first, good files."""
+MANY = 136 * 2**20
 """Bytes, more than loading may take."""
 
 
@@ -44,7 +45,7 @@ def bomb(path, name, method=zipfile.ZIP_DEFLATED, declared=None):
     """Put an entry of zeros into an archive, in place of one of the same name."""
     entries = {key: value for key, value in entries_of(path).items() if key != name}
     write_entries(path, entries)
-    with zipfile.ZipFile(path, "a", method) as archive, archive.open(name, "w") as entry:
+    with zipfile.ZipFile(path, "a", method, True, 1) as archive, archive.open(name, "w") as entry:
         for _ in range(MANY // 2**22):
             entry.write(bytes(2**22))
     if declared is not None:  # the sizes in the headers understate the content
@@ -130,38 +131,40 @@ HOSTILE = {
 }
 
 
-@pytest.fixture(scope="module")
-def results(tmp_path_factory):
-    """Refusals and times of all files, from one process under limits."""
-    folder = tmp_path_factory.mktemp("hostile")
-    for action in ("slots", "mask"):
-        policy, config = make_policy(action)
-        save_policy(folder / f"good-{action}.zip", policy, config, **ABOUT)
-    paths = []
-    for name, damage in HOSTILE.items():
-        paths.append(folder / f"{name}.zip")
-        shutil.copy(folder / f"good-{'mask' if 'mask' in name else 'slots'}.zip", paths[-1])
-        damage(paths[-1])
-    command = [sys.executable, "tests/sb3/limited.py", folder / "good-slots.zip", *paths]
-    run = subprocess.run(
-        list(map(str, command)), cwd=ROOT, capture_output=True, text=True, check=False, timeout=120,
-        env={**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
-    )  # fmt: skip
-    found = [json.loads(line) for line in run.stdout.splitlines()]
-    return {Path(result["path"]).stem: result for result in found}, run.stderr
+@contextmanager
+def little_memory():
+    """Leave this process no more than `ADDITIONAL` bytes of further memory."""
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + ADDITIONAL, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, before)
 
 
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="reads memory from /proc")
-@pytest.mark.parametrize("name", HOSTILE)
-def test_a_hostile_file_is_refused_soon_and_in_little_memory(results, name):
-    found, error = results
-    assert name in found, f"the process ended: {error}"
-    refusal = found[name]["refusal"]
-    assert refusal is not None
-    assert f"{name}.zip" in refusal
-    assert len(refusal.splitlines()) == 1
-    assert re.search("is not a saved policy, or damaged|cannot be loaded", refusal)
-    assert found[name]["seconds"] < 1.0
+@pytest.mark.parametrize("action", ["slots", "mask"])
+def test_hostile_files_are_refused_soon_and_in_little_memory(tmp_path, action):
+    content, env = saved(action)
+    good = tmp_path / "good.zip"
+    good.write_bytes(content)
+    load_policy(good, env)
+    hostile = {
+        name: make for name, make in HOSTILE.items() if ("mask" in name) == (action == "mask")
+    }
+    for name, damage in hostile.items():
+        path = tmp_path / f"{name}.zip"
+        path.write_bytes(content)
+        damage(path)
+        with little_memory():
+            began = time.process_time()
+            with pytest.raises(ValueError, match=f"{name}.zip") as refused:
+                load_policy(path, env)
+            assert time.process_time() - began < 1.0, name
+        refusal = str(refused.value)
+        assert len(refusal.splitlines()) == 1
+        assert re.search("is not a saved policy, or damaged|cannot be loaded", refusal), name
 
 
 tensors = st.builds(
@@ -187,8 +190,9 @@ def saved(action):
     return content, gym.make(ABOUT["env"], action=action)
 
 
-@pytest.mark.parametrize("action", ["slots", "scores", "mask", "sequential"])
+@pytest.mark.parametrize("action", ["slots", "scores", "sequential"])
 @given(data=st.data())
+@settings(max_examples=30)
 def test_edited_files_are_refused_or_act(action, data):
     content, env = saved(action)
 

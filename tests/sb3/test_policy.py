@@ -7,7 +7,7 @@ pytest.importorskip("stable_baselines3")
 
 import torch
 
-from dptse_env.config import PRESETS, resolve
+from dptse_env.config import resolve
 from dptse_env.parts import make_interface
 from dptse_env.sb3 import PlackettLucePolicy, RoadChannels
 
@@ -66,22 +66,6 @@ def test_a_segment_with_a_fixed_sensor_is_queried_when_there_is_no_other():
         assert (every[:, -1] == 14).all()
 
 
-def test_a_policy_may_be_told_to_query_segments_with_sensors():
-    policy = make_policy(skips_sensors=False)
-    actions, _ = policy.predict(observations(policy, 500).numpy())
-    assert (actions == 14).any()
-
-
-def test_untrained_it_stands_near_its_rule():
-    policy = make_policy()
-    channels = policy.features(observations(policy))
-    rule = sum(
-        weight * channels[:, policy.road.index(name)] for name, weight in policy.rule.items()
-    )
-    rest = policy.scorer(channels) - rule
-    assert 0 < rest.std() < 0.1 * rule.std()
-
-
 def test_neighbours_and_the_whole_road_count():
     policy = make_policy()
     channels = policy.features(observations(policy, 1)).requires_grad_()
@@ -105,28 +89,12 @@ def test_segments_share_one_scorer():
     torch.testing.assert_close(shifted[:, 4:12], scores[:, 3:11])
 
 
-@pytest.mark.parametrize("preset", PRESETS)
-def test_its_size_is_bounded_and_does_not_depend_on_the_road(preset):
-    policy = make_policy(preset)
-    n_parameters = sum(parameter.numel() for parameter in policy.parameters())
-    assert 15_000 < n_parameters < 30_000
-
-
 def test_weights_fit_other_roads_of_the_same_kinds():
     policy = make_policy("paper-highway")
     with pytest.warns(UserWarning, match="on another road"):
         other = make_policy("paper-highway", corridor={"n_mainline": 18}, bandwidth=7)
     other.load_state_dict(policy.state_dict())
     assert other.predict(observations(other).numpy())[0].max() > 14
-
-
-def test_it_can_be_saved_by_stable_baselines3(tmp_path):
-    policy = make_policy("short-highway", bandwidth=2)
-    policy.save(str(tmp_path / "policy.zip"))
-    loaded = PlackettLucePolicy.load(str(tmp_path / "policy.zip"))
-    seen = observations(policy).numpy()
-    expected, _ = policy.predict(seen, deterministic=True)
-    np.testing.assert_array_equal(loaded.predict(seen, deterministic=True)[0], expected)
 
 
 def test_spaces_that_do_not_fit_are_refused():
@@ -141,12 +109,3 @@ def test_spaces_that_do_not_fit_are_refused():
     for wrong in misfits:
         with pytest.raises(ValueError, match=r"MultiDiscrete\(\[6\] \* B\).* of action='slots'"):
             PlackettLucePolicy(seen, wrong, road=road)
-
-
-def test_a_rule_of_unknown_blocks_is_refused():
-    config = resolve("short-highway", {"action": "slots"})
-    interface, road = make_interface(config), RoadChannels.from_config(config)
-    with pytest.raises(ValueError, match=r"observation block must be one of .*got 'colour'"):
-        PlackettLucePolicy(
-            interface.observations.space, interface.actions.space, road=road, rule={"colour": 1.0}
-        )

@@ -40,45 +40,18 @@ def test_a_perceptron_acts_on_options(tmp_path, action):
         assert action != "sequential" or info["n_dropped"] == 0
 
 
-@pytest.mark.parametrize("bandwidth", [2, 3])
-def test_a_masked_policy_picks_nothing_that_does_not_fit(tmp_path, bandwidth):
-    keywords = {**SPANS, "query_spans": (2, 3), "bandwidth": bandwidth}
-    env = make_env("sequential", **keywords)
-    policy = load_policy(saved(tmp_path, "sequential", **keywords), env)
-    batch = np.stack([env.reset(seed=0)[0]] * 64)
-    assert policy.predict(batch)[0].max() == (4 if bandwidth == 2 else 8)
-
-
 @pytest.mark.parametrize(
     "other",
     [
-        {"query_spans": (1, 2, 3)}, {"price_levels": (1.0, 2.0)}, {"bandwidth_unit": "sums"},
-        {"query_spans": (1,)},
-    ],
+    {"query_spans": (1, 2, 3)},
+    {"bandwidth_unit": "sums"},
+],
     ids=str,
 )  # fmt: skip
 def test_a_policy_is_refused_where_other_options_can_be_queried(tmp_path, other):
     path = saved(tmp_path, "mask", **SPANS)
     with pytest.raises(ValueError, match=r"queries is \"query_spans \(1, 2\) and price_levels"):
         load_policy(path, make_env("mask", **{**SPANS, **other}), allow=("corridor", "bandwidth"))
-
-
-def test_the_card_of_a_policy_of_segments_says_nothing_of_queries(tmp_path):
-    segments = {"privacy": SumRelease}
-    plain = load_policy(saved(tmp_path, "mask", **segments), make_env("mask", **segments))
-    assert "queries" not in plain.card["fits"]
-    of_sums = load_policy(saved(tmp_path, "mask", **SPANS), make_env("mask", **SPANS))
-    expected = "query_spans (1, 2) and price_levels (1.0,), bandwidth_unit 'segments'"
-    assert of_sums.card["fits"]["queries"] == expected
-
-
-@pytest.mark.parametrize(
-    "keywords", [SPANS, {**SPANS, "query_spans": (1,), "price_levels": (1, 2)}]
-)
-def test_a_network_shared_by_segments_needs_segments(keywords):
-    message = r"shared by all segments needs query_spans \(1,\) and one price level, got query_sp"
-    with pytest.raises(ValueError, match=message):
-        RoadChannels.from_config(resolve("short-highway", keywords))
 
 
 def test_prices_and_the_tracer_are_channels_where_they_are_observed():

@@ -14,7 +14,6 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
 from dptse_env.sb3 import SB3VecEnv
-from dptse_env.spaces.actions import ACTION_ENCODINGS
 
 SHORT = "dptse_env:dptse/ShortHighway-v0"
 EPISODES = {"traffic_seeds": "0:3", "horizon": 6, "random_start": True}
@@ -42,8 +41,10 @@ def assert_same_info(first, second):
             assert value == second[key]
 
 
-@pytest.mark.parametrize("truth_in_info", [False, True])
-@pytest.mark.parametrize("action", ACTION_ENCODINGS)
+@pytest.mark.parametrize(
+    ("action", "truth_in_info"),
+    [("mask", True), ("scores", False), ("slots", True), ("sequential", False)],
+)
 def test_it_is_a_dummy_vec_env_of_scalar_environments(action, truth_in_info):
     keywords = {"action": action, "truth_in_info": truth_in_info, "privacy": "capped"}
     env, other = make(**keywords), dummy(**keywords)
@@ -69,15 +70,6 @@ def test_it_is_a_dummy_vec_env_of_scalar_environments(action, truth_in_info):
             assert_same_info(reset, first)
             n_ended += done
     assert n_ended == (6 if action == "sequential" else 18)
-
-
-def test_infos_can_be_written_into():
-    env = make()
-    env.reset()
-    *_, infos = env.step(ACTIONS)
-    infos[0]["note"] = 1
-    assert infos[1:] == [{}, {}]
-    assert env.step(ACTIONS)[3] == [{}, {}, {}]
 
 
 def test_seeds_and_options_hold_for_one_reset():
@@ -147,8 +139,6 @@ def test_attributes():
 def test_a_step_needs_actions_and_closing_twice_is_fine():
     env = make()
     env.reset()
-    with pytest.raises(RuntimeError, match="call step_async"):
-        env.step_wait()
     env.step(ACTIONS)
     with pytest.raises(RuntimeError, match="call step_async"):
         env.step_wait()
@@ -156,10 +146,9 @@ def test_a_step_needs_actions_and_closing_twice_is_fine():
     env.close()
 
 
-@pytest.mark.parametrize("mode", ["NextStep", "Disabled"])
-def test_another_autoreset_mode_is_refused(mode):
-    with pytest.raises(ValueError, match=rf"autoreset_mode='SameStep', .* got '{mode}'"):
-        make(autoreset_mode=mode)
+def test_another_autoreset_mode_is_refused():
+    with pytest.raises(ValueError, match=r"autoreset_mode='SameStep', .* got 'NextStep'"):
+        make(autoreset_mode="NextStep")
 
 
 def test_other_environments_are_refused():
@@ -171,32 +160,16 @@ def test_other_environments_are_refused():
             SB3VecEnv(env)
 
 
-def test_vec_monitor_counts_returns():
-    env = VecMonitor(make(), info_keywords=("rmse_density",))
-    env.reset()
-    total = np.zeros(3)
-    for _ in range(6):
-        _, rewards, dones, infos = env.step(ACTIONS)
-        total += rewards
-    assert dones.all()
-    for info, value in zip(infos, total, strict=True):
-        assert info["episode"]["l"] == 6
-        assert info["episode"]["r"] == pytest.approx(value, rel=1e-5)
-        assert info["episode"]["rmse_density"] == info["rmse_density"]
-
-
-@pytest.mark.parametrize("action", ["mask", "sequential"])
-def test_ppo_learns_and_is_evaluated(action):
-    env = VecMonitor(make(4, action=action))
+def test_ppo_learns_and_is_evaluated():
+    env = VecMonitor(make(4, action="sequential"))
     model = PPO("MlpPolicy", env, n_steps=16, batch_size=32, n_epochs=2, seed=0, device="cpu")
     before = [p.detach().clone() for p in model.policy.parameters()]
     model.learn(256)
     assert model.num_timesteps == 256
-    n_episodes = 256 // (6 if action == "mask" else 12) // 4 * 4
-    assert len(model.ep_info_buffer) == n_episodes
+    assert len(model.ep_info_buffer) == 20  # of 12 picks each, in 4 environments
     assert any((a != b).any() for a, b in zip(before, model.policy.parameters(), strict=True))
     returns, lengths = evaluate_policy(model, env, 8, return_episode_rewards=True)
-    assert lengths == [6 if action == "mask" else 12] * 8
+    assert lengths == [12] * 8
     assert np.isfinite(returns).all()
     assert max(returns) < 0
 

@@ -5,8 +5,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 
 from dptse_env.config import resolve
 from dptse_env.parts import make_interface
-from dptse_env.schedules import OBSERVATION_SCHEDULES, Shifting, make_schedule
-from dptse_env.spaces.actions import ACTION_ENCODINGS
+from dptse_env.schedules import Shifting, make_schedule
 
 
 class Bare:
@@ -34,6 +33,12 @@ def queried(name, n_steps, **keywords):
     return sets
 
 
+def test_sets_start_as_far_apart_as_possible():
+    for bandwidth in (5, 7, 11):
+        (start,) = queried("static", 1, bandwidth=bandwidth)
+        assert start == [15 * i // bandwidth for i in range(bandwidth)]
+
+
 def test_the_paper_shifts_one_segment_every_four_steps():
     sets = queried("paper", 61)
     assert sets[:4] == [[0, 3, 6, 9, 12]] * 4
@@ -41,19 +46,6 @@ def test_the_paper_shifts_one_segment_every_four_steps():
     assert sets[8] == [2, 5, 8, 11, 14]
     assert sets[12] == [0, 3, 6, 9, 12]
     assert sets[60] == sets[0]
-
-
-def test_the_last_segment_wraps_to_the_first():
-    sets = queried("paper", 9, bandwidth=2)
-    assert sets[0] == [0, 7]
-    wide = queried("round-robin", 9, bandwidth=2)
-    assert wide[8] == [0, 8]
-
-
-def test_sets_start_as_far_apart_as_possible():
-    for bandwidth in (5, 7, 11):
-        (start,) = queried("static", 1, bandwidth=bandwidth)
-        assert start == [15 * i // bandwidth for i in range(bandwidth)]
 
 
 def test_round_robin_shifts_every_step_and_static_never():
@@ -115,40 +107,16 @@ def test_a_schedule_does_not_change_the_state_it_is_given():
         np.testing.assert_array_equal(part, copy)
 
 
-@pytest.mark.parametrize("action", ACTION_ENCODINGS)
-@pytest.mark.parametrize("name", ["static", "paper", "round-robin", "random", "oldest-first"])
-def test_a_schedule_asks_the_same_in_every_encoding(name, action):
-    def queried(kind):
-        env = gym.make(
-            "dptse_env:dptse/ShortHighway-v0", action=kind, bandwidth=3, traffic_seeds="0:1"
-        )
-        schedule = make_schedule(name, env, seed=1)
-        observation, _ = env.reset(seed=0)
-        state, sets = None, []
-        for _ in range(12 * env.unwrapped.interface.actions.actions_per_step):
-            chosen, state = schedule.predict(observation, state, np.array([state is None]))
-            observation, reward, *_, info = env.step(chosen)
-            if reward != 0:
-                sets.append(np.flatnonzero(info["queried"]).tolist())
-        return sets
-
-    expected = queried("mask")
-    assert len(expected) == 12
-    assert queried(action) == expected
-
-
-@pytest.mark.parametrize("name", sorted(set(OBSERVATION_SCHEDULES) - {"all"}))
-def test_stable_baselines3_evaluates_a_schedule(name):
+def test_stable_baselines3_evaluates_a_schedule():
     env = gym.make("dptse_env:dptse/ShortHighway-v0", horizon=20, traffic_seeds="0:1")
-    schedule = make_schedule(name, env, seed=0)
-    mean, _ = evaluate_policy(schedule, env, n_eval_episodes=2, warn=False)
+    mean, _ = evaluate_policy(make_schedule("paper", env), env, n_eval_episodes=2, warn=False)
     assert mean < 0
 
 
 def test_bad_schedules_are_named():
-    with pytest.raises(ValueError, match="schedule must be one of none, static, paper"):
+    with pytest.raises(ValueError, match=r"schedule must be one of none, .*oracle-.*, got 'best'"):
         make_schedule("best", Bare())
-    with pytest.raises(ValueError, match=r"schedule\.period must be None or >= 1, got 0"):
+    with pytest.raises(ValueError, match=r"schedule\.period must be"):
         Shifting(Bare().interface, period=0)
 
 
@@ -164,7 +132,8 @@ def test_deviations_are_weighed_by_age(name, expected):
     age[1], density[1] = 8 / 60, 0.3  # far ahead under both
     age[2], density[2] = 24 / 60, 0.05  # 1.6 with the square of the age, 0.06 with the age
     density[12], speed[12] = 0.5, 0.1
-    speed[5] = 0.3  # held to 0.1 under a cap
+    density[8] = 0.28  # between these two
+    speed[5] = 1.5  # held to 0.1 under a cap
     blocks = {"age": age, "density_log_std": np.log(density), "speed_log_std": np.log(speed)}
     observation = env.observation(1, **{
         key: np.pad(value, (0, env.interface.observations.slices[key].stop

@@ -1,15 +1,17 @@
 """Schedules where a query may cover several segments, or has several price levels."""
 
+import itertools
+
 import numpy as np
 import pytest
 
 from dptse_env.config import resolve
 from dptse_env.parts import make_interface
 from dptse_env.release import QueryOptions
-from dptse_env.schedules import COVARIANCE_SCHEDULES, OBSERVATION_SCHEDULES, Schedule, make_schedule
-from dptse_env.schedules.plans import Plan, PlanContext, Planned
+from dptse_env.schedules import COVARIANCE_SCHEDULES, OBSERVATION_SCHEDULES, make_schedule
 from dptse_env.schedules.ranking import best_options, option_values
 from dptse_env.spaces.actions import ACTION_ENCODINGS
+from tests.cases import fast_and_slow
 
 from ..release.sums import SumRelease
 from .playing import begin, make_batch, make_single, play
@@ -29,8 +31,13 @@ def make(road, action="mask"):
     return make_single(privacy=SumRelease, action=action, **ROADS[road])
 
 
-@pytest.mark.parametrize("road", ROADS)
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    ("name", "road"),
+    fast_and_slow(itertools.product(NAMES, ROADS), [
+            ("round-robin", "both"), ("oldest-first", "sums"), ("stale-variance", "spans"),
+            ("speed-front", "levels"), ("largest-deviation", "only sums"), ("oracle-error", "both"),
+        ]),
+)  # fmt: skip
 def test_every_encoding_asks_the_same_and_for_as_much_as_it_may(name, road):
     env = make(road)
     options = env.unwrapped.config.queries
@@ -45,7 +52,10 @@ def test_every_encoding_asks_the_same_and_for_as_much_as_it_may(name, road):
         np.testing.assert_array_equal(own, rewards)
 
 
-@pytest.mark.parametrize("name", sorted(set(NAMES) - {"random"}))
+@pytest.mark.parametrize(
+    "name",
+    fast_and_slow(sorted(set(NAMES) - {"random"}), ["paper", "stale-variance", "oracle-error"]),
+)
 def test_a_batch_asks_what_its_episodes_ask_alone(name):
     keywords = {"privacy": SumRelease, **ROADS["spans"]}
     queries, rewards = play(make_batch(**keywords), name, 6)
@@ -106,14 +116,6 @@ def test_what_is_left_of_the_bandwidth_goes_to_overlapping_options_then_to_other
     assert options.level[taken].tolist() == [4.0, 1.0, 1.0, 1.0]
 
 
-def test_ties_rotate_along_the_road():
-    options = QueryOptions.make(6, 2, (2,), unit="sums")
-    assert chosen(options, [1.0] * 6, step=0) == [(0, 2), (2, 2)]
-    assert chosen(options, [1.0] * 6, step=1) == [(1, 2), (3, 2)]
-    # Options begin at 0..4: at step 5 the first one from segment 5 on is at 0 again.
-    assert chosen(options, [1.0] * 6, step=5) == [(0, 2), (2, 2)]
-
-
 class Bare:
     """As much of an environment as a schedule of observations needs."""
 
@@ -150,30 +152,8 @@ def test_all_queries_every_segment_by_itself():
         make_schedule("all", Bare(query_spans=(2,), bandwidth=15))
 
 
-@pytest.mark.parametrize("road", ["spans", "levels"])
-@pytest.mark.parametrize(
-    "name", [*COVARIANCE_SCHEDULES, "oracle-gain", "oracle-greedy", "oracle-brute-force"]
-)
-def test_schedules_of_single_segments_say_so(name, road):
-    message = rf"schedule '{name}' queries single segments: it needs query_spans \(1,\) and price"
-    with pytest.raises(ValueError, match=message):
-        make_schedule(name, make(road))
-
-
-def test_a_plan_is_of_single_segments():
-    process = make("spans").unwrapped.process
-    plan = Plan("best-static", PlanContext.from_config(process.config), ((0, 1, 2, 3),), {})
-    with pytest.raises(ValueError, match=r"schedule 'best-static' .* got query_spans \(1, 2, 3\)"):
-        Planned(process, plan)
-
-
-class Downstream(Schedule):
-    """The most downstream segments, for schedules that rank segments."""
-
-    def select(self, step, observation):
-        return self.highest(np.tile(np.arange(self.n_mainline), (len(step), 1)), step)
-
-
-def test_a_schedule_that_ranks_segments_works_on_options():
-    queries, _ = play(make("only sums"), make_schedule(Downstream, make("only sums")), 2)
-    assert np.flatnonzero(queries[0, 0]).tolist() == [1, 3]  # segment 5 has a fixed sensor
+def test_schedules_of_single_segments_say_so():
+    names = [*COVARIANCE_SCHEDULES, "oracle-gain", "oracle-greedy", "oracle-brute-force"]
+    for name, road in itertools.product(names, ["spans", "levels"]):
+        with pytest.raises(ValueError, match=rf"schedule '{name}' queries single segments"):
+            make_schedule(name, make(road))

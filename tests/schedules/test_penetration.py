@@ -40,23 +40,6 @@ def test_schedules_choose_within_the_bandwidth_and_leave_the_process_alone(name)
         np.testing.assert_array_equal(observation, again)
 
 
-def test_the_greedy_oracle_foresees_the_rewards_of_its_queries():
-    process, observation = make(1, detectors={})
-    actions, _ = SCHEDULES["oracle-greedy"](process).predict(observation, None)
-    chosen = np.flatnonzero(actions[0])
-
-    def reward(segments):
-        action = np.zeros((1, 6), dtype=np.int8)
-        action[0, list(segments)] = 1
-        return process.fork().step(np.arange(1), action).reward[0]
-
-    # The second of its picks is the best one beside the first.
-    assert any(
-        all(reward(chosen) >= reward({first, other}) for other in set(range(6)) - {first})
-        for first in chosen
-    )
-
-
 def test_schedules_count_on_noise_that_is_scaled_to_all_vehicles():
     process, _ = make()
     np.testing.assert_allclose(process.expected_sigma[0], process.release.sigma[0] / 0.3)

@@ -18,7 +18,7 @@ from scripts import dptse
 from scripts.dptse import COMMANDS, as_commands
 
 SCRIPTS = Path(dptse.__file__).parent
-LIBRARIES = {"cli", "dptse", "document_configuration", "evaluate_suite", "training_bar", "__init__"}
+LIBRARIES = {"cli", "dptse", "document_configuration", "training_bar", "__init__"}
 
 
 def test_every_script_is_a_command():

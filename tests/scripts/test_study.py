@@ -1,4 +1,5 @@
 import re
+from dataclasses import replace
 
 import polars as pl
 import pytest
@@ -9,13 +10,18 @@ from scripts.study import STUDIES, Args, find_study, main
 from tests.scripts.commands import run_script
 
 MINE = "examples.my_study:STUDY"
+FIRST = replace(STUDY.cells[0], keywords={**STUDY.cells[0].keywords, "corridor": "paper-highway"})
+MANY = replace(STUDY.cells[0], keywords={**STUDY.cells[0].keywords, "bandwidth": 15})
+WIDE = replace(STUDY, cells=(MANY, *STUDY.cells[1:]))
+ROADS, OWN_ROAD = (replace(STUDY, cells=(FIRST, *more)) for more in (STUDY.cells[1:], ()))
 
 
 @pytest.mark.parametrize("name", STUDIES)
-def test_every_study_is_found_and_its_cells_differ(name):
+def test_every_study_is_found_and_a_cell_has_one_set_of_labels(name):
     study = find_study(Args(name=name))
     assert study.name == name
-    assert len({cell.id for cell in study.cells}) == len(study.cells)
+    labels = {cell.id: cell.labels for cell in study.cells}
+    assert all(cell.labels == labels[cell.id] for cell in study.cells)
     quick = find_study(Args(name=name, quick=True))
     assert {len(quick.seeds_of(cell)) for cell in quick.cells} == {3}
 
@@ -43,11 +49,18 @@ def test_a_report_without_rows_is_refused(tmp_path):
 
 
 def test_cells_that_do_not_suit_a_road_are_left_out_and_told(capsys):
-    study = find_study(
-        Args(name=MINE, corridor='{"fixed_sensors": [], "n_mainline": 2, "lanes": 1}')
-    )
-    assert {cell.keywords["bandwidth"] for cell in study.cells} == {1, 2}
-    assert "2 of 6 cells do not suit the road" in capsys.readouterr().err
+    study = find_study(Args(name=f"{__name__}:WIDE", corridor='{"n_mainline": 6}'))
+    assert [cell.keywords["bandwidth"] for cell in study.cells] == [2, 3, 1, 2, 3]
+    assert "1 of 6 cells do not suit the road" in capsys.readouterr().err
+
+
+def test_cells_with_a_road_of_their_own_are_left_out_and_told(capsys):
+    road = '{"n_mainline": 6}'
+    study = find_study(Args(name=f"{__name__}:ROADS", corridor=road))
+    assert [cell.labels["bandwidth"] for cell in study.cells] == [2, 3, 1, 2, 3]
+    assert "1 of 6 cells have a road of their own" in capsys.readouterr().err
+    with pytest.raises(ValueError, match="every cell of the study has a road of its own"):
+        find_study(Args(name=f"{__name__}:OWN_ROAD", corridor=road))
 
 
 def test_seeds_and_road_can_be_others_with_an_output_of_their_own():
@@ -56,8 +69,15 @@ def test_seeds_and_road_can_be_others_with_an_output_of_their_own():
             main(Args(name=MINE, **changes))
     study = find_study(Args(name=MINE, seeds="2900:2902", corridor="paper-highway"))
     assert study.seeds == (2900, 2901)
+    assert not find_study(Args(name="paper", corridor='{"lanes": 2}')).measures
     assert {cell.keywords["corridor"] for cell in study.cells} == {"paper-highway"}
     assert {cell.id for cell in study.cells}.isdisjoint(cell.id for cell in STUDY.cells)
+
+
+def test_choices_keep_their_validation_traffic_on_other_seeds():
+    study = find_study(Args(name="policies", seeds="2900:2902", quick=True))
+    seeds = {cell.labels["part"]: study.seeds_of(cell) for cell in study.cells}
+    assert seeds == {"validation": (1000, 1001, 1002), "choices": (2900, 2901)}
 
 
 @pytest.mark.slow

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dptse_env.config import resolve
@@ -51,12 +51,6 @@ def indices(decision):
 def is_full(queried, costs, bandwidth):
     """Whether no further option fits."""
     return bool(((costs > bandwidth - queried @ costs) | queried).all())
-
-
-def test_a_mask_within_the_bandwidth_is_taken_as_it_is():
-    decision = Played(MaskAction, 5).decode(flags(0, 4, 5))
-    assert indices(decision) == [0, 4, 5]
-    assert decision.n_dropped.tolist() == [0]
 
 
 def test_a_mask_is_cut_to_what_the_bandwidth_pays_for():
@@ -150,6 +144,7 @@ def test_no_sampled_action_exceeds_the_bandwidth(name, seed, costs, data):
     unit=st.sampled_from(["segments", "sums"]),
     data=st.data(),
 )
+@settings(max_examples=25)
 def test_no_mix_of_spans_and_levels_exceeds_the_bandwidth(name, seed, spans, levels, unit, data):
     bandwidth = data.draw(st.integers(spans[0] if unit == "segments" else 1, 6))
     keywords = {"query_spans": spans, "price_levels": levels, "bandwidth_unit": unit}
@@ -188,10 +183,10 @@ def test_decode_undoes_encode(name, seed, bandwidth):
 
 
 @pytest.mark.parametrize("kind", [ScoresAction, SlotsAction, SequentialAction])
-@pytest.mark.parametrize("wanted", [(7,), (4, 5, 6)], ids=["too few", "too many"])
-def test_sets_that_an_encoding_cannot_ask_for_are_refused(kind, wanted):
-    with pytest.raises(ValueError, match="as much as the bandwidth of 4 pays for, got sets that"):
-        Played(kind, 4).encoding.encode(flags(*wanted)[None] > 0, flags()[None] > 0)
+def test_sets_that_an_encoding_cannot_ask_for_are_refused(kind):
+    for wanted in ((7,), (4, 5, 6)):  # too few, too many
+        with pytest.raises(ValueError, match="as much as the bandwidth of 4 pays for"):
+            Played(kind, 4).encoding.encode(flags(*wanted)[None] > 0, flags()[None] > 0)
 
 
 @pytest.mark.parametrize("kind", list(ACTION_ENCODINGS.values()))

@@ -1,5 +1,4 @@
 import dataclasses
-import pickle
 
 import numpy as np
 import pytest
@@ -75,18 +74,13 @@ def test_blocks_hold_what_their_names_say():
     assert sum(map(len, expected.values())) == observation.shape[1]
 
 
-@pytest.mark.parametrize("fill", [0.0, 1.0, -1e9, 1e9])
+@pytest.mark.parametrize("fill", [0.0, 1e9])
 def test_observations_stay_inside_the_space(fill):
     encoder = encoding()
     with np.errstate(invalid="ignore"):
         observation = encoder.encode(state(1, abs(fill)))
     assert observation.dtype == np.float32
     assert encoder.space.contains(observation[0])
-
-
-def test_an_unknown_block_is_named():
-    with pytest.raises(ValueError, match="unknown observation block 'clock'; known: density"):
-        encoding().block(np.zeros(1, dtype=np.float32), "clock")
 
 
 def test_a_released_flow_has_its_own_name_and_scale():
@@ -114,8 +108,3 @@ def test_blocks_can_be_chosen_and_come_in_the_given_order():
 def test_a_block_stands_once(blocks):
     with pytest.raises(ValueError, match="observation has two blocks named 'age'"):
         encoding(blocks)
-
-
-def test_an_encoding_travels_by_pickle():
-    copy = pickle.loads(pickle.dumps(encoding()))
-    np.testing.assert_array_equal(copy.encode(state()), encoding().encode(state()))

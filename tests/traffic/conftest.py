@@ -10,4 +10,4 @@ def short_record():
 
 @pytest.fixture(scope="session")
 def paper_records():
-    return [simulate(PAPER_HIGHWAY, seed) for seed in range(4)]
+    return [simulate(PAPER_HIGHWAY, seed) for seed in range(2)]

@@ -10,7 +10,6 @@ from dptse_env.traffic import (
     DetailedRecord,
     InvalidRecordError,
     Record,
-    RecordLibrary,
     simulate,
 )
 from dptse_env.traffic.branches import Road
@@ -40,20 +39,6 @@ def assert_same(first, second):
         np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
 
 
-@pytest.mark.parametrize(
-    ("changed", "message"),
-    [
-        ({"position": [0.0, np.nan, 0.1]}, r"record\.position must be finite"),
-        ({"vehicle_class": [0, 2, 0]}, r"record\.vehicle_class must be in 0\.\.1, got \(0, 2\)"),
-        ({"lane": [0]}, r"record\.lane must be as long as record\.step \(3\), got 1"),
-        ({"speed": [1.0, -1.0, 1.0]}, r"record\.speed must be finite and >= 0"),
-    ],
-)
-def test_impossible_details_are_refused(changed, message):
-    with pytest.raises(ValueError, match=message):
-        small_record(**changed)
-
-
 def test_details_survive_the_disk_and_the_choice_of_rows(tmp_path):
     record = small_record()
     record.save(tmp_path / "record", {"seed": 3})
@@ -73,18 +58,6 @@ def test_a_plain_record_is_no_detailed_one_nor_the_other_way_round(tmp_path):
     Record([0], [0], [0], [1.0], n_steps=1, n_columns=1).save(tmp_path / "plain", {})
     with pytest.raises(InvalidRecordError, match="plain"):
         DetailedRecord.load(tmp_path / "plain", {})
-
-
-def test_vehicles_move_alike_whether_details_are_recorded(short_record, tmp_path):
-    library = RecordLibrary(tmp_path)
-    library.ensure(DETAILED, [0])
-    details = library.get(DETAILED, 0)
-    assert isinstance(details, DetailedRecord)
-    for name in Record.COLUMNS:
-        np.testing.assert_array_equal(getattr(details, name), getattr(short_record, name))
-    # One folder holds both: they are different records of the same traffic.
-    library.ensure(SHORT_HIGHWAY, [0])
-    assert type(library.get(SHORT_HIGHWAY, 0)) is Record
 
 
 def test_positions_lie_on_the_segments_and_lanes_on_the_road():

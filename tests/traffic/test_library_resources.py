@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from dptse_env.traffic import SHORT_HIGHWAY, Record, RecordLibrary
-from tests.traffic.test_library_failures import tiny_record
+from tests.traffic.test_library import tiny_record
 
 N_OPEN = 64
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from dptse_env.config import resolve
-from dptse_env.release import Paper
 from dptse_env.traffic import SHORT_HIGHWAY, ClassShare, DetailedRecord, Penetration, Record
 
 SHARES = (0.01, 0.1, 0.3, 0.9, 1.0)
@@ -54,19 +53,12 @@ def test_a_share_of_a_range_is_drawn_for_each_traffic_seed():
     np.testing.assert_allclose(connected, shares[:5], atol=0.03)
 
 
-def test_only_connected_vehicles_report_and_keep_their_index():
-    record, penetration = road_of(100), Penetration(0.2)
-    reported = penetration.reports(7, record, SHORT_HIGHWAY)
-    connected = np.flatnonzero(penetration.connected(7, record))
-    assert set(reported.vehicle.tolist()) == set(connected.tolist())
-    np.testing.assert_array_equal(reported.speed, 10.0 + reported.vehicle)
-    assert (reported.n_steps, reported.n_columns) == (4, 3)
-
-
-def test_some_of_the_connected_vehicles_misreport_their_speed():
+def test_the_connected_vehicles_report_and_some_misreport_their_speed():
     record = road_of(2_000, n_steps=1)
-    reported = Penetration(0.5, misreporting=0.25, misreport_factor=2.0).reports(
-        7, record, SHORT_HIGHWAY
+    penetration = Penetration(0.5, misreporting=0.25, misreport_factor=2.0)
+    reported = penetration.reports(7, record, SHORT_HIGHWAY)
+    np.testing.assert_array_equal(
+        reported.vehicle, np.flatnonzero(penetration.connected(7, record))
     )
     factor = reported.speed / (10.0 + reported.vehicle)
     assert set(np.round(factor, 3).tolist()) == {1.0, 2.0}
@@ -77,12 +69,8 @@ def test_some_of_the_connected_vehicles_misreport_their_speed():
     ("value", "message"),
     [
         (0.0, r"penetration.share must be .* \(0, 1\]"),
-        (1.2, r"penetration.share must be .* \(0, 1\]"),
         ([0.4, 0.1], r"penetration.share must be \(low, high\), got \(0.4, 0.1\)"),
-        ([0.0, 0.1], r"penetration.share\[0\] must be"),
         ({"share": 0.1, "class": "car"}, "penetration.class is unknown"),
-        ({"misreporting": 1.5}, "penetration.misreporting must be"),
-        ("ten percent", "penetration.share must be"),
     ],
 )
 def test_bad_values_are_refused_by_path(value, message):
@@ -90,14 +78,10 @@ def test_bad_values_are_refused_by_path(value, message):
         resolve("short-highway", {"penetration": value})
 
 
-@pytest.mark.parametrize("value", [0.1, [0.1, 0.2], {"share": 0.1, "seed": 3}, {"seed": 3}])
+@pytest.mark.parametrize("value", [0.1, [0.1, 0.2], {"seed": 3}])
 def test_a_number_a_pair_and_a_mapping_are_taken(value):
     config = resolve("short-highway", {"penetration": value})
     assert config.has_separate_sensors == (value != {"seed": 3})
-
-
-def test_a_range_of_one_share_is_the_share():
-    assert Penetration((0.2, 0.2)) == Penetration(0.2)
 
 
 # --- by class ---------------------------------------------------------------------------------
@@ -142,64 +126,16 @@ def test_the_published_share_adds_up_those_of_the_classes():
 @pytest.mark.parametrize(
     ("penetration", "message"),
     [
-        (
-            {"by_class": [{"name": "bus", "share": 0.5}]},
-            r"penetration\.by_class\[0\]\.name must be a class of the traffic, car, truck, got "
-            r"'bus'",
-        ),
-        (
-            {"by_class": TRUCKS, "share": 0.3},
-            r"penetration\.share must be left out, or be what penetration\.by_class adds up to, "
-            r"0\.1, got 0\.3",
-        ),
+        ({"by_class": [{"name": "bus", "share": 0.5}]}, r"penetration\.by_class\[0\]\.name must"),
+        ({"by_class": TRUCKS, "share": 0.3}, r"penetration\.share must"),
         ({"by_class": TRUCKS * 2}, r"penetration\.by_class must name each class once"),
         ({"by_class": TRUCKS, "share": [0.1, 0.2]}, r"penetration\.share must be one number"),
-        ({"by_class": [{"name": "truck", "share": 0}]}, r"penetration\.by_class\[0\]\.share must"),
-        ({"by_class": [{"name": "truck"}]}, r"penetration\.by_class\[0\]"),
-        ({"density_from": "radar"}, r"penetration\.density_from must be"),
-        ({"neighbour_range": 0.0}, r"penetration\.neighbour_range must be"),
-        ({"report_clip": 0.0}, r"penetration\.report_clip must be"),
     ],
 )
 def test_classes_and_reports_that_do_not_fit_are_refused_by_path(penetration, message):
     corridor = {"vehicle_classes": CLASSES}
     with pytest.raises(ValueError, match=message):
         resolve("short-highway", {"corridor": corridor, "penetration": penetration})
-
-
-def test_traffic_without_classes_has_one():
-    with pytest.raises(ValueError, match=r"must be a class of the traffic, car, got 'truck'"):
-        resolve("short-highway", {"penetration": {"by_class": TRUCKS}})
-    resolve("short-highway", {"penetration": {"by_class": [{"name": "car", "share": 0.2}]}})
-
-
-def test_shares_of_classes_that_do_not_add_up_to_all_vehicles_are_refused():
-    corridor = {"vehicle_classes": CLASSES[:1]}
-    with pytest.raises(ValueError, match=r"corridor\.vehicle_classes .* add up to 1, got 0\.8"):
-        resolve("short-highway", {"corridor": corridor})
-
-
-class WithoutReports(Paper):
-    """A release model that knows of counts alone."""
-
-    density_reports = ""
-
-
-def test_a_release_model_without_reports_refuses_them():
-    penetration = {"share": 0.1, "density_from": "spacing"}
-    keywords = {"privacy": WithoutReports, "penetration": penetration}
-    with pytest.raises(ValueError, match=r"density_from must be 'count' with the release model"):
-        resolve("short-highway", keywords)
-
-
-def test_an_estimated_share_needs_counts():
-    keywords = {
-        "privacy": "paced",
-        "penetration": {"share": 0.1, "density_from": "neighbours"},
-        "fusion": {"share": "estimated"},
-    }
-    with pytest.raises(ValueError, match=r"fusion\.share must be 'published'"):
-        resolve("short-highway", keywords)
 
 
 def test_records_without_details_cannot_say_which_classes_are_connected():

@@ -1,18 +1,6 @@
 import pytest
 
-from dptse_env.traffic import CORRIDORS, PAPER_HIGHWAY, DemandDistribution, randomised
-
-
-def test_presets_are_found_by_their_names():
-    for name in ("paper-highway", "short-highway", "long-highway"):
-        assert CORRIDORS[name].name == name
-
-
-def test_the_papers_demand_and_incident():
-    assert PAPER_HIGHWAY.demand.mainline == ((0, 2050), (200, 6050), (400, 2050))
-    assert PAPER_HIGHWAY.demand.on_ramps == (320, 300)
-    assert PAPER_HIGHWAY.incident.segment == 10
-    assert PAPER_HIGHWAY.incident.phases == ((200, 400, 10.08), (400, 500, 50.95))
+from dptse_env.traffic import CORRIDORS, DemandDistribution, randomised
 
 
 @pytest.mark.parametrize("corridor", CORRIDORS.values(), ids=CORRIDORS)

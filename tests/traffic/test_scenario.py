@@ -69,14 +69,6 @@ def test_each_diverge_loses_its_share_of_those_who_pass_it():
     assert np.mean(exits[passed_second] == 1) == pytest.approx(0.1, abs=0.004)
 
 
-def test_a_profile_longer_than_the_record_is_cut():
-    demand = Demand(((0, 3600.0), (50, 7200.0), (100, 9e4)), (0.0, 0.0))
-    corridor = dataclasses.replace(PAPER_HIGHWAY, demand=demand, incident=None, duration=80)
-    scenario = draw_scenario(corridor, 0)
-    assert scenario.departures.max() <= 80
-    assert 60 < scenario.n_vehicles < 160  # 50 + 60 expected
-
-
 def test_the_streams_are_independent_of_one_another():
     corridor = randomised(PAPER_HIGHWAY)
     fixed = dataclasses.replace(corridor, incident=Incident(2, ((10, 20, 10),)))
@@ -84,18 +76,6 @@ def test_the_streams_are_independent_of_one_another():
     assert random_scenario.incidents != fixed_scenario.incidents
     assert random_scenario.demand == fixed_scenario.demand
     np.testing.assert_array_equal(random_scenario.departures, fixed_scenario.departures)
-
-
-def test_random_traffic_differs_between_seeds():
-    scenarios = [draw_scenario(randomised(PAPER_HIGHWAY), seed) for seed in range(30)]
-    assert len({scenario.incidents for scenario in scenarios}) == 30
-    assert len({scenario.demand for scenario in scenarios}) == 30
-
-
-@pytest.mark.parametrize("seed", [-1, 0.5, None])
-def test_a_bad_seed_is_refused(seed):
-    with pytest.raises(ValueError, match=r"traffic seed must be an integer >= 0"):
-        draw_scenario(PAPER_HIGHWAY, seed)
 
 
 def test_rates_of_a_ramp_and_shares_of_an_exit_follow_their_steps():
@@ -134,7 +114,6 @@ def test_incidents_are_drawn_one_by_one():
     [
         ({"on_ramps": (((5.0, 1.0),), 0.0)}, r"demand\.on_ramps\[0\] must be steps \(time, rate\)"),
         ({"exit_shares": (((0.0, 0.1),),)}, r"demand\.exit_shares must be steps for each of the 2"),
-        ({"exit_shares": (((0.0, 1.5),),) * 2}, r"demand\.exit_shares\[0\]\[0\]\[1\] must be"),
     ],
 )
 def test_impossible_steps_are_refused_by_path(fields, message):

@@ -1,7 +1,4 @@
 import dataclasses
-import os
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -18,11 +15,8 @@ from dptse_env.traffic import (
     draw_scenario,
     mean_dwell,
     simulate,
-    simulate_in_child,
-    sumo,
 )
 from dptse_env.traffic.sumo import running, seconds
-from dptse_env.traffic.sumo_network import packaged_network
 
 N = PAPER_HIGHWAY.n_mainline
 INCIDENT = PAPER_HIGHWAY.incident.segment
@@ -77,14 +71,6 @@ def test_vehicles_follow_their_routes_without_a_gap(name, short_record, paper_re
         places = [route.index(column) for column in record.segment[rows]]
         assert np.all(np.diff(places) >= 0)
         assert np.all(np.diff(places) <= 1)
-
-
-def test_nobody_departs_early_and_nearly_everybody_gets_in(paper_records):
-    for seed, record in enumerate(paper_records):
-        departures = draw_scenario(PAPER_HIGHWAY, seed).departures
-        vehicles, rows = np.unique(record.vehicle, return_index=True)
-        assert np.all(record.step[rows] >= departures[vehicles])
-        assert len(vehicles) > 0.95 * len(departures)
 
 
 def test_traffic_is_free_before_the_incident_on_road_and_ramps(paper_records):
@@ -142,8 +128,9 @@ def test_the_presets_dwell_is_that_of_seeds_0_to_15(corridor):
     )
 
 
-def test_the_same_seed_gives_the_same_record_and_another_seed_another(short_record):
+def test_the_same_seed_gives_the_same_record_silently_and_another_seed_another(short_record, capfd):
     assert_same(simulate(SHORT_HIGHWAY, 0), short_record)
+    assert capfd.readouterr() == ("", "")
     other = simulate(SHORT_HIGHWAY, 1)
     assert not np.array_equal(other.counts, short_record.counts)
 
@@ -176,76 +163,17 @@ def test_a_run_is_closed_however_it_ends():
     assert not libsumo.isLoaded()
 
 
-def test_sumo_writes_nothing_to_stdout_or_stderr(capfd):
-    simulate(SHORT_HIGHWAY, 0)
-    assert capfd.readouterr() == ("", "")
-
-
-def test_sumos_own_words_are_in_the_error_and_not_on_stdout(monkeypatch, capfd, short_record):
-    cut = packaged_network("short-highway")[:500]
-    monkeypatch.setattr(sumo, "network_xml", lambda _corridor: cut)
-    with pytest.raises(RecordingError, match=r"failed: .*Process Error\n.*input ended before"):
-        simulate(SHORT_HIGHWAY, 7)
-    # Another road's network: its on-ramp joins elsewhere, so SUMO refuses the ramp's route.
-    wrong = packaged_network("paper-highway")
-    monkeypatch.setattr(sumo, "network_xml", lambda _corridor: wrong)
-    with pytest.raises(
-        RecordingError, match=r"short-highway with traffic seed 7 failed: .*no valid route"
-    ):
-        simulate(SHORT_HIGHWAY, 7)
-    assert capfd.readouterr() == ("", "")
-    monkeypatch.undo()
-    assert_same(simulate(SHORT_HIGHWAY, 0), short_record)
-
-
-def test_no_sumo_home_is_needed(monkeypatch, short_record):
-    monkeypatch.delenv("SUMO_HOME", raising=False)
-    assert_same(simulate(SHORT_HIGHWAY, 0), short_record)
-
-
-@pytest.mark.parametrize("version", ["1.18.0", "1.29.0", "2.28.0"])
-def test_another_release_series_is_refused(monkeypatch, version):
+def test_another_release_series_is_refused(monkeypatch):
     import libsumo
 
-    monkeypatch.setattr(libsumo, "getVersion", lambda: (22, f"SUMO {version}"))
-    with pytest.raises(SumoVersionError, match=rf"series 1\.28, found {version}"):
+    monkeypatch.setattr(libsumo, "getVersion", lambda: (22, "SUMO 1.29.0"))
+    with pytest.raises(SumoVersionError, match=r"series 1\.28, found 1\.29\.0"):
         simulate(SHORT_HIGHWAY, 0)
 
 
-def test_a_library_that_is_not_what_is_installed_is_refused(monkeypatch):
-    import libsumo
-
-    monkeypatch.setattr(libsumo, "getVersion", lambda: (22, "SUMO 1.28.9"))
-    with pytest.raises(
-        SumoVersionError, match=r"reports version 1\.28\.9 but is installed as 1\.28"
-    ):
-        simulate(SHORT_HIGHWAY, 0)
-
-
-def test_a_missing_libsumo_is_named(monkeypatch):
-    def missing(name):
-        raise sumo.importlib.metadata.PackageNotFoundError(name)
-
-    monkeypatch.setattr(sumo.importlib.metadata, "version", missing)
-    with pytest.raises(SumoVersionError, match="libsumo is not installed"):
-        sumo.sumo_version()
-
-
-def test_importing_the_room_does_not_import_libsumo():
-    code = "import sys, dptse_env.traffic.library; sys.exit('libsumo' in sys.modules)"
-    environment = {name: value for name, value in os.environ.items() if name != "SUMO_HOME"}
-    subprocess.run([sys.executable, "-c", code], check=True, env=environment)
-
-
-@pytest.mark.parametrize(
-    "drivers",
-    [Drivers("Krauss", headway=1.5), Drivers("IDM"), Drivers(headway=2.0, speed_deviation=0.2)],
-    ids=str,
-)
-def test_drivers_shape_the_traffic(drivers, short_record):
+def test_drivers_shape_the_traffic(short_record):
     """The same departures, driven otherwise."""
-    corridor = dataclasses.replace(SHORT_HIGHWAY, drivers=drivers)
-    record = simulate_in_child(corridor, 0)
+    record = simulate(dataclasses.replace(SHORT_HIGHWAY, drivers=Drivers("IDM")), 0)
     assert record.n_steps == short_record.n_steps
     assert len(record.speed) > 0
     assert not np.array_equal(record.speed_sums, short_record.speed_sums)

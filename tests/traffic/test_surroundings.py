@@ -1,11 +1,9 @@
 """Surroundings of vehicles, in traffic placed by hand."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 
-from dptse_env.traffic import SHORT_HIGHWAY, DetailedRecord, Penetration, ReportRecord
+from dptse_env.traffic import SHORT_HIGHWAY, DetailedRecord, Penetration
 from dptse_env.traffic.surroundings import road_by_neighbours, road_by_spacing
 
 N = SHORT_HIGHWAY.n_mainline
@@ -40,10 +38,6 @@ def test_a_vehicle_has_the_way_to_the_one_ahead_in_its_lane_over_the_lanes():
     np.testing.assert_allclose(found, expected, atol=1e-7)
 
 
-def test_vehicles_that_overlap_are_a_metre_apart():
-    np.testing.assert_allclose(road((1, 0.15, 0), (1, 0.15, 0)).min(), 0.001 / LANES)
-
-
 def test_vehicles_ahead_are_seen_across_the_boundary_segments():
     found = road((UPSTREAM, -0.01, 0), (0, 0.01, 0), (N - 1, 0.59, 2), (DOWNSTREAM, 0.63, 2))
     lanes = np.array(SHORT_HIGHWAY.with_boundaries(SHORT_HIGHWAY.segment_lanes))
@@ -58,30 +52,9 @@ def test_a_ramp_and_the_mainline_beside_it_do_not_see_each_other():
     np.testing.assert_allclose(density(*beside), [10.0, 2 / 0.09, 2 / 0.07], rtol=1e-5)
 
 
-def test_seconds_do_not_see_each_other():
-    one = standing((1, 0.15, 0), (1, 0.13, 0))
-    later = dataclasses.replace(one, step=np.array([0, 1]), n_steps=2)
-    np.testing.assert_allclose(road_by_spacing(later, SHORT_HIGHWAY), 1.0 / LANES)
-    np.testing.assert_allclose(road_by_neighbours(later, SHORT_HIGHWAY, 0.05), 0.1)
-
-
 def test_neighbours_are_those_within_reach_and_the_vehicle_itself():
     found = density((1, 0.10, 0), (1, 0.13, 2), (1, 0.149, 1), (2, 0.26, 0), (3, 0.35, 0))
     np.testing.assert_allclose(found, [30.0, 30.0, 30.0, 10.0, 10.0], rtol=1e-5)
-
-
-def test_neighbours_are_counted_over_the_road_that_is_recorded():
-    lengths = np.array(SHORT_HIGHWAY.with_boundaries(SHORT_HIGHWAY.segment_lengths))
-    start = -lengths[UPSTREAM]
-    found = density((UPSTREAM, start + 0.01, 0), (UPSTREAM, start + 0.03, 0))
-    np.testing.assert_allclose(found, [2 / 0.06, 2 / 0.08], rtol=1e-4)
-
-
-def test_an_empty_record_reports_nothing():
-    n_columns = SHORT_HIGHWAY.n_segments + SHORT_HIGHWAY.n_boundaries
-    empty = DetailedRecord([], [], [], [], 2, n_columns, [], [], [], ("car",))
-    assert road_by_spacing(empty, SHORT_HIGHWAY).shape == (0,)
-    assert road_by_neighbours(empty, SHORT_HIGHWAY, 0.05).shape == (0,)
 
 
 @pytest.fixture(scope="module")
@@ -90,15 +63,6 @@ def evenly_spaced():
     positions = np.arange(0.0, 0.6, 1.0 / 30.0)
     vehicles = [(int(x / 0.1 + 1e-9), x, lane) for lane in range(LANES) for x in positions]
     return standing(*sorted(vehicles))
-
-
-def test_the_mean_of_even_spacings_is_the_density(evenly_spaced):
-    found = road_by_spacing(evenly_spaced, SHORT_HIGHWAY)
-    np.testing.assert_allclose(1.0 / found[evenly_spaced.position < 0.55], 60.0, rtol=1e-4)
-    reported = ReportRecord.of(evenly_spaced, found)
-    traffic = reported.traffic(np.full(reported.n_columns, 0.1), np.full(reported.n_columns, 90.0))
-    np.testing.assert_allclose(traffic[0, :5, 0], 60.0, rtol=1e-4)
-    assert not traffic[0, N:, 0].any()
 
 
 def test_neighbours_of_vehicles_at_random_give_the_density():

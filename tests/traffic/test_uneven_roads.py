@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 
-from dptse_env.traffic import PAPER_HIGHWAY, Demand, Incident, simulate
+from dptse_env.traffic import PAPER_HIGHWAY, Incident, simulate
 from dptse_env.traffic.sumo_network import edge_ids, network_xml
 from tests.model.roads import UNEVEN
 
@@ -79,20 +79,6 @@ def test_the_limit_after_an_incident_is_that_of_its_segment(uneven):
     assert 40.0 < speeds[after][seen[after]].mean() <= 1.2 * 80.0
 
 
-def test_a_lane_drop_lets_two_lanes_of_traffic_through():
-    demand = Demand(mainline=((0.0, 5500.0),))
-    road = dataclasses.replace(
-        PAPER_HIGHWAY, on_ramps=(), off_ramps=(), exit_shares=(), incident=None, demand=demand,
-        lanes=(3,) * 10 + (2,) * 5, fixed_sensors=(), duration=400,
-    )  # fmt: skip
-    record = simulate(road, 0)
-    gone = np.unique(record.vehicle[(record.segment == 14) & (record.step >= 200)])
-    flow = 3600.0 * len(gone) / 200.0
-    assert 2800.0 < flow < 4500.0
-    queue = record.counts[300:, 7:10].mean() / 0.1
-    assert queue > 60.0, "traffic queues ahead of the drop"
-
-
 def test_equal_values_are_the_same_road_as_one_value():
     same = dataclasses.replace(
         PAPER_HIGHWAY,
@@ -104,30 +90,3 @@ def test_equal_values_are_the_same_road_as_one_value():
     )
     assert same == PAPER_HIGHWAY
     assert same.digest == PAPER_HIGHWAY.digest
-
-
-def test_names_of_ramp_segments():
-    names = ROAD.segment_names
-    assert names[8:] == (
-        "on-ramp 1", "on-ramp 2.1", "on-ramp 2.2", "on-ramp 2.3",
-        "off-ramp 1.1", "off-ramp 1.2", "off-ramp 2",
-    )  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({"lanes": (3, 3)}, r"corridor\.lanes must be one value, or 8, one for each mainline"),
-        (
-            {"ramp_lanes": (1, 1)},
-            r"corridor\.ramp_lanes must be one value, or 4, one for each ramp",
-        ),
-        ({"segment_length": (0.1,) * 7 + (0.01,)}, r"corridor\.segment_length\[7\] must be"),
-        ({"ramp_segments": 0}, r"corridor\.ramp_segments must be an integer in 1\.\.100, got 0"),
-        ({"ramp_lanes": (1, 2, 2, 4)}, r"corridor\.ramp_lanes must be <= 3 lanes at face 6, got 4"),
-        ({"fixed_sensors": (15,)}, r"corridor\.fixed_sensors\[0\] must be .* 0\.\.14, got 15"),
-    ],
-)
-def test_impossible_geometry_is_refused_by_path(fields, message):
-    with pytest.raises(ValueError, match=message):
-        dataclasses.replace(ROAD, **fields)

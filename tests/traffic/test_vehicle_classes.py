@@ -70,17 +70,3 @@ def test_records_of_other_classes_are_other_records():
 def test_impossible_classes_are_refused(classes, message):
     with pytest.raises(ValueError, match=message):
         with_classes(classes=classes)
-
-
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({"name": "Big truck"}, r"vehicle_class\.name must be lower-case letters"),
-        ({"share": 0.0}, r"vehicle_class\.share must be"),
-        ({"length": 0.0}, r"vehicle_class\.length must be"),
-        ({"largest_speed": -1.0}, r"vehicle_class\.largest_speed must be"),
-    ],
-)
-def test_impossible_values_of_a_class_are_refused(fields, message):
-    with pytest.raises(ValueError, match=message):
-        VehicleClass(**{"name": "car", "share": 0.5, **fields})

@@ -11,14 +11,13 @@ import pytest
 from filelock import FileLock
 from numba.core.registry import CPUDispatcher
 
-from dptse_env.estimators import make_estimator
 from dptse_env.utils import compile_ahead, kernel_list, python_process
 from dptse_env.utils.kernels import compile_unless_busy
 from tests.kernel_list import ESTIMATORS, compiled_afresh
 
-from .test_kernels import MODULE, load
+from .test_kernels import MODULE, kept, load
 
-__all__ = ["load"]  # a fixture
+__all__ = ["kept", "load"]  # fixtures
 
 LOG = "dptse_env.utils.compile_ahead"
 
@@ -26,11 +25,8 @@ LOG = "dptse_env.utils.compile_ahead"
 # --- the list ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("estimator", ESTIMATORS)
-def test_every_entry_of_the_list_fits_its_function(estimator):
-    entries = kernel_list.listed(estimator)
-    assert len(entries) > 3
-    for path, signature in entries:
+def test_every_entry_of_the_list_fits_its_function():
+    for path, signature in (each for name in ESTIMATORS for each in kernel_list.listed(name)):
         function = resolve_name(path)
         assert isinstance(function, CPUDispatcher)
         assert len(signature) == len(inspect.signature(function.py_func).parameters), path
@@ -51,14 +47,6 @@ def test_a_list_survives_its_file():
     assert text == kernel_list.PATH.read_text(encoding="utf-8")
     assert kernel_list.read(text, "mhe") == tuple(lists["mhe"])
     assert kernel_list.read(text, "random_walk") == ()
-
-
-def test_an_estimator_is_expected_once(monkeypatch):
-    monkeypatch.setattr(compile_ahead, "_expected", [])
-    for estimator in ("ekf", "ukf", "ekf"):
-        compile_ahead.expect(estimator)
-    assert compile_ahead._expected == ["ekf", "ukf"]
-    assert "compile_ahead.expect" in inspect.getsource(make_estimator)
 
 
 # --- turns ------------------------------------------------------------------------------------
@@ -82,6 +70,7 @@ def hold(path, seconds):
     return process
 
 
+@pytest.mark.slow
 def test_a_function_that_another_process_compiles_is_waited_for(load, tmp_path, caplog):
     run = load().run
     path = tmp_path / "kernels_of_a_test.run.lock"
@@ -94,17 +83,7 @@ def test_a_function_that_another_process_compiles_is_waited_for(load, tmp_path, 
     assert not compile_ahead.is_taken(run.py_func, tmp_path)
 
 
-def test_a_process_that_hangs_is_not_waited_for_without_end(load, tmp_path, caplog):
-    run = load().run
-    with (
-        hold(tmp_path / "kernels_of_a_test.run.lock", 5.0) as other,
-        caplog.at_level(logging.WARNING, logger=LOG),
-    ):
-        compile_ahead.take_turn(run.py_func, tmp_path, wait=0.3).release()
-        other.kill()
-    assert "compiling kernels_of_a_test:run here too" in caplog.text
-
-
+@pytest.mark.slow
 def test_a_child_leaves_out_what_another_process_compiles(load):
     run = load().run
     signature = (kernel_list._read("float64", {}),)
@@ -124,10 +103,9 @@ def test_the_turn_ends_where_compiling_fails(load):
     assert not run._cache.is_busy()
 
 
-@pytest.mark.parametrize("error", [OSError(37, "No locks available"), NotImplementedError("flock")])
-def test_a_folder_without_locks_is_compiled_into_all_the_same(load, monkeypatch, caplog, error):
+def test_a_folder_without_locks_is_compiled_into_all_the_same(load, monkeypatch, caplog):
     def acquire(*_, **__):
-        raise error
+        raise OSError(37, "No locks available")
 
     monkeypatch.setattr(FileLock, "acquire", acquire)
     module = load()
@@ -163,6 +141,7 @@ def wait_for(condition):
         time.sleep(0.05)
 
 
+@pytest.mark.slow
 def test_a_child_that_fails_is_survived_and_reported(started, monkeypatch, caplog):
     monkeypatch.setattr(compile_ahead, "CHILD", "dptse_env.utils.no_such_module")
     with caplog.at_level(logging.WARNING, logger=LOG):
@@ -172,6 +151,7 @@ def test_a_child_that_fails_is_survived_and_reported(started, monkeypatch, caplo
     assert "no_such_module" in caplog.text
 
 
+@pytest.mark.slow
 def test_only_one_process_starts_children(started, caplog):
     lock = FileLock(f"{started._cache.cache_path}/compile_ahead.lock", thread_local=False)
     with (
@@ -183,20 +163,17 @@ def test_only_one_process_starts_children(started, caplog):
     assert not said(caplog)
 
 
-@pytest.mark.parametrize("asked", ["-1", "two", "1.5"])
-def test_a_bad_number_of_processes_is_refused(started, monkeypatch, asked):
-    monkeypatch.setenv(compile_ahead.PROCESSES_VARIABLE, asked)
+def test_no_child_is_started_where_none_is_asked_for(started, monkeypatch, caplog):
+    monkeypatch.setenv(compile_ahead.PROCESSES_VARIABLE, "1.5")
     with pytest.raises(ValueError, match="DPTSE_COMPILE_PROCESSES must be a whole number"):
         started(1.5)
-
-
-def test_no_child_is_started_where_none_is_asked_for(started, monkeypatch, caplog):
     monkeypatch.setenv(compile_ahead.PROCESSES_VARIABLE, "0")
     with caplog.at_level(logging.WARNING, logger=LOG):
         assert started(1.5) == 3.0
     assert not said(caplog)
 
 
+@pytest.mark.slow
 def test_a_child_ends_with_its_parent():
     child = subprocess.Popen(
         [*python_process.command(compile_ahead.CHILD), "mhe"],
@@ -205,11 +182,3 @@ def test_a_child_ends_with_its_parent():
     )
     child.stdin.close()
     child.wait(timeout=30.0)
-
-
-def test_a_child_of_an_unknown_estimator_has_nothing_to_do():
-    child = subprocess.run(
-        [*python_process.command(compile_ahead.CHILD), "nobody"],
-        stdin=subprocess.PIPE, env=python_process.environment(), check=False, timeout=60.0,
-    )  # fmt: skip
-    assert child.returncode == 0

@@ -3,15 +3,16 @@
 import gc
 import importlib
 import logging
+import os
 import sys
+import time
 from contextlib import suppress
 
 import pytest
-from numba.core import event
-from numba.core.caching import FunctionCache
+from numba.core import config, event
 from numba.core.errors import TypingError
 
-from dptse_env.utils.kernels import COLLECTED_EVERY, fingerprint
+from dptse_env.utils.kernels import COLLECTED_EVERY, KEPT_FOR, fingerprint
 
 MODULE = """
 from typing import NamedTuple
@@ -38,7 +39,14 @@ def run(x):
 
 
 @pytest.fixture
-def load(tmp_path, monkeypatch):
+def kept(tmp_path, monkeypatch):
+    """Return an empty folder in which machine code is kept."""
+    monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path / "kept"))
+    return tmp_path / "kept"
+
+
+@pytest.fixture
+def load(tmp_path, monkeypatch, kept):
     """Return a function that writes a module, imports it afresh and returns it."""
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
@@ -61,6 +69,8 @@ CHANGES = {
     "a number in a part": ("x * FACTOR", "x * 5.0 * FACTOR"),
     "the kernel": (".first", ".second"),
     "a named tuple": ("second: float", "other: float"),
+    "a default": ("def scaled(x)", "def scaled(x, y=1.0)"),
+    "how a part is compiled": ("@kernel_part", '@kernel_part(fastmath={"contract", "nnan"})'),
 }
 
 
@@ -85,6 +95,33 @@ def test_a_kernel_is_kept_on_disk_and_compiled_anew_when_a_part_changes(load):
     assert fresh(MODULE.replace("FACTOR = 2.0", "FACTOR = 4.0")) == (6.0, 0)
 
 
+def test_machine_code_is_found_wherever_the_module_lies(load, tmp_path, monkeypatch):
+    load().run(1.5)
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (tmp_path / "kernels_of_a_test.py").rename(elsewhere / "kernels_of_a_test.py")
+    os.utime(elsewhere / "kernels_of_a_test.py", (0, 0))
+    monkeypatch.syspath_prepend(elsewhere)
+    sys.modules.pop("kernels_of_a_test")
+    run = importlib.import_module("kernels_of_a_test").run
+    assert run(1.5) == 3.0
+    assert sum(run.stats.cache_hits.values()) == 1
+
+
+def test_what_nobody_has_loaded_for_long_is_removed_when_something_is_compiled(load, kept):
+    load().run(1.5)
+    files = {*kept.glob("*.nb?")}
+    for path in files:
+        os.utime(path, (time.time() - KEPT_FOR / 2,) * 2)
+    load().run(1.5)  # which is noted
+    assert min(path.stat().st_mtime for path in files) > time.time() - 60.0
+    for path in files:
+        os.utime(path, (time.time() - KEPT_FOR - 60.0,) * 2)
+    load(MODULE.replace("FACTOR = 2.0", "FACTOR = 4.0")).run(1.5)
+    assert len(files) == len({*kept.glob("*.nb?")}) == 2
+    assert not files & {*kept.glob("*.nb?")}
+
+
 def test_compiling_is_said_once_and_loading_is_not(load, caplog):
     with caplog.at_level(logging.WARNING, logger="dptse_env.utils.kernels"):
         run = load().run
@@ -97,8 +134,9 @@ def test_compiling_is_said_once_and_loading_is_not(load, caplog):
         assert not caplog.messages
 
 
-def test_a_kernel_runs_where_no_folder_can_keep_it_and_says_so(load, monkeypatch, caplog):
-    monkeypatch.setattr(FunctionCache._impl_class, "_locator_classes", [])
+def test_a_kernel_runs_where_no_folder_can_keep_it_and_says_so(load, tmp_path, monkeypatch, caplog):
+    (tmp_path / "file").touch()
+    monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path / "file" / "kept"))
     with caplog.at_level(logging.WARNING, logger="dptse_env.utils.kernels"):
         assert load().run(1.5) == 3.0
     assert "for this process only: set NUMBA_CACHE_DIR" in caplog.text

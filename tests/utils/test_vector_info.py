@@ -23,13 +23,6 @@ def test_a_row_is_a_copy():
     assert ROWS["queried"][0, 0]
 
 
-def test_objects_are_kept_as_they_are():
-    arrays = [np.zeros(2), np.ones(2)]
-    objects = object_array(arrays)
-    assert objects.shape == (2,)
-    assert objects[1] is arrays[1]
-
-
 def test_vector_form_marks_the_episodes_that_have_a_value():
     infos = in_vector_form(ROWS, np.array([3, 1]), 4)
     assert infos.keys() == {"error", "_error", "queried", "_queried", "truth", "_truth"}

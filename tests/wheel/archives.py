@@ -16,10 +16,11 @@ PACKAGES = {
     "dptse_env": "dptse_env",
     "agents": "dptse_env/_tools/agents",
     "scripts": "dptse_env/_tools/scripts",
+    "results/suite/rows.parquet": "dptse_env/_tools/results/suite/rows.parquet",
 }
-"""Folders of the repository that are in a wheel, and where."""
-IN_A_WHEEL = {"", ".json", ".npz", ".py", ".typed", ".xml", ".zip"}
-"""Kinds of files of the packages: code, templates, settings and cards, networks, policies."""
+"""Folders and files of the repository that are in a wheel, and where."""
+IN_A_WHEEL = {"", ".json", ".npz", ".parquet", ".py", ".typed", ".xml", ".zip"}
+"""Kinds of files of the packages: code, settings, networks, rows, policies."""
 
 FOLDERS = {*PACKAGES, "benchmarks", "docs", "examples", "tests"}
 """Folders of a source archive."""

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from dptse_env.traffic.importers import FORMATS, Labels, Points, Source, Split, recording, spill
+from tests.cases import fast_and_slow
 from tests.traffic.importers.data import run
 
 CHUNK = 2_000
@@ -35,7 +36,7 @@ class Stream:
             yield Points(row, 2.0 * vehicle + 0.1 * point, labels, x, None, 72.0 + 0.0 * x)
 
 
-@pytest.mark.parametrize("by_vehicle", [True, False])
+@pytest.mark.parametrize("by_vehicle", fast_and_slow([True, False], [False]))
 def test_four_times_the_points_need_no_more_memory(by_vehicle, tmp_path, monkeypatch):
     # Small buckets, so that a small file already has many of them.
     monkeypatch.setattr(recording, "BUCKET_BYTES", 2e5)

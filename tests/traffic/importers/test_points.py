@@ -11,12 +11,10 @@ from tests.traffic.importers.data import (
     PLAIN,
     ROAD,
     SPLITS,
-    STRAIGHT,
     first_file,
     plain,
     run,
     stream,
-    write_csv,
 )
 
 
@@ -48,18 +46,6 @@ def test_several_files_are_several_recordings(tmp_path):
     }  # fmt: skip
 
 
-def test_points_become_vehicles_at_whole_seconds(tmp_path):
-    # 3 points in 2 s, none at a whole second: positions and speeds are interpolated.
-    points = stream(headway=3.0, period=0.7)
-    points[:, 1] += 0.35
-    record = record_of(run(plain(tmp_path / "a.csv", points)))
-    assert np.allclose(record.speed, 72.0, atol=1e-3)
-    # A vehicle every 3 s at 20 m/s: 16.7 veh/km.
-    np.testing.assert_allclose(record.counts[:, :4].mean() / 0.1, 16.7, rtol=0.1)
-    first = record.vehicle == record.vehicle[0]
-    assert (np.diff(record.step[first]) == 1).all()
-
-
 def test_positions_and_speeds_are_interpolated_in_time(tmp_path):
     time = 0.3 + 0.7 * np.arange(40)
     x, speed = 5.0 * time + 0.25 * time**2, 5.0 + 0.5 * time
@@ -69,14 +55,6 @@ def test_positions_and_speeds_are_interpolated_in_time(tmp_path):
     np.testing.assert_allclose(record.speed, 3.6 * (5.0 + 0.5 * second), rtol=1e-5)
     place = 5.0 * second + 0.25 * second**2 + 0.03  # a chord is 0.03 m at most above the arc
     np.testing.assert_array_equal(record.segment, place // 100.0)
-
-
-def test_speeds_are_derived_where_none_are_given(tmp_path):
-    source = dataclasses.replace(PLAIN, columns={"time": "t", "vehicle": "id", "x": "s"})
-    noisy = stream()
-    noisy[:, 2] += np.random.default_rng(0).normal(0.0, 0.1, len(noisy))
-    record = record_of(run(plain(tmp_path / "a.csv", noisy), source))
-    np.testing.assert_allclose(record.speed, 72.0, atol=4.0)
 
 
 def test_a_detailed_import_keeps_positions_lanes_and_classes(tmp_path):
@@ -105,18 +83,6 @@ def test_a_detailed_import_keeps_positions_lanes_and_classes(tmp_path):
     bare = record_of(run(path.rename(folder / "a.csv"), source))
     for name in bare.COLUMNS:
         np.testing.assert_array_equal(getattr(record, name), getattr(bare, name))
-
-
-def test_vehicles_whose_class_is_not_given_are_of_one_class(tmp_path):
-    record = record_of(run(plain(tmp_path / "a.csv", stream()), detailed=True))
-    assert record.classes == ("vehicle",)
-    assert not record.vehicle_class.any()
-
-
-def test_demand_and_dwell_are_measured(tmp_path):
-    corridor = run(plain(tmp_path / "a.csv", stream(headway=2.0))).corridor
-    assert corridor.demand.mainline[0][1] == pytest.approx(1800.0, rel=0.1)
-    assert corridor.average_dwell == pytest.approx(4.5, abs=0.5)  # 5 s, less what a window cuts
 
 
 def test_ramps_are_told_by_lanes_or_lateral_positions(tmp_path):
@@ -220,18 +186,6 @@ def test_vehicles_are_conserved_in_the_report(tmp_path):
     assert file["rows"] == file["seconds"] * 10 + 4 or file["rows"] > 9 * file["seconds"]
 
 
-def test_an_id_that_is_used_again_is_another_vehicle(tmp_path):
-    points = stream(headway=4.0)
-    points[:, 0] %= 8  # a vehicle is there for 20 s, its id is free again after 12 s
-    imported = run(plain(tmp_path / "a.csv", points))
-    file = first_file(imported)
-    assert file["vehicles"] == 8
-    assert file["pieces"] == len(np.unique(stream(headway=4.0)[:, 0]))
-    record = record_of(imported, 1)
-    steps = [np.sort(record.step[record.vehicle == v]) for v in np.unique(record.vehicle)]
-    assert all((np.diff(each) == 1).all() for each in steps)
-
-
 def test_a_jump_to_another_place_cuts(tmp_path):
     points = stream()
     late = (points[:, 0] == 12) & (points[:, 1] > 34.0)
@@ -277,8 +231,6 @@ def test_rows_off_the_road_are_dropped_and_counted(tmp_path):
     ("change", "message"),
     [
         (lambda p: p * [1, 1, 1, 3.6], r"speeds 3\.6 times as large .*speed in km/h$"),
-        (lambda p: p * [1, 1, 1, 1 / 0.3048], r"speeds 3\.281 times .*speed in ft/s$"),
-        (lambda p: p * [1, 1, 1 / 0.3048, 1], r"speeds 0\.3048 times as large .*length in ft"),
         (lambda p: p * [1, 1, -1, 1] + [0, 0, 400, 0], r"layout\.reversed must be turned round"),
         (lambda p: p * [1, 1, 1, np.nan], r"row 2: v must be a finite number, got nan"),
         (lambda p: p * [1, 1, 1, 1] + [0, 0, 900, 0], r"rows must be on the road, got \d+ of \d+"),
@@ -332,23 +284,3 @@ def test_an_interruption_leaves_nothing(tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         run(path)
     assert [each.name for each in tmp_path.iterdir()] == ["a.csv"]
-
-
-def test_many_vehicles_with_names_are_numbered_in_each_window(tmp_path):
-    points = stream()
-    names = [f"car-{vehicle:.0f}" for vehicle in points[:, 0]]
-    record = record_of(run(plain(tmp_path / "a.csv", points, id=names)), 2000)
-    assert set(np.unique(record.vehicle)) == set(range(record.n_vehicles))
-
-
-def test_a_table_with_few_columns_says_which_are_wanted(tmp_path):
-    path = write_csv(tmp_path / "a.csv", {"t": [1], "id": [1]})
-    with pytest.raises(
-        TrajectoryError, match=r"source\.columns\.x must be a column .*; found t, id"
-    ):
-        run(path)
-    with pytest.raises(
-        TrajectoryError, match=r"columns must be one for x among others, found t, id"
-    ):
-        run(path, Source("table", {"time": "t", "vehicle": "id"}))
-    assert STRAIGHT.n_on_ramps == 0

@@ -11,7 +11,6 @@ import pytest
 from dptse_env.traffic import (
     MAINLINE,
     SHORT_HIGHWAY,
-    DemandDistribution,
     Drivers,
     Incident,
     RecordingError,
@@ -162,19 +161,6 @@ def test_a_warm_up_starts_the_record_with_traffic(files):
     np.testing.assert_array_equal(warm.record.counts[0], cold.record.counts[120])
 
 
-def test_traffic_seeds_change_the_driving(road):
-    again, other = (simulate(road.corridor, seed) for seed in (0, 1))
-    np.testing.assert_array_equal(again.speed, road.record.speed)
-    assert not np.array_equal(other.speed[:500], road.record.speed[:500])
-
-
-def test_a_demand_distribution_scales_the_vehicles_of_the_files(road):
-    demand = DemandDistribution(road.corridor.demand, (0.5, 0.5))
-    half = dataclasses.replace(road.corridor, demand=demand)
-    assert half.digest != road.corridor.digest
-    assert simulate(half, 0).n_vehicles == pytest.approx(0.5 * road.record.n_vehicles, rel=0.05)
-
-
 def test_an_incident_slows_the_vehicles_on_its_segment_alone(road):
     segment = road.corridor.n_mainline - 2
     incident = Incident(segment=segment, phases=((60.0, 120.0, 10.0),))
@@ -230,28 +216,12 @@ def test_a_road_file_moves_with_its_files(tmp_path):
     assert simulate(moved, 0).n_rows == simulate(moved, 0).n_rows > 0
 
 
-def test_additional_files_write_nothing(tmp_path, monkeypatch):
-    files = motorway(tmp_path)
-    detectors = tmp_path / "detectors.add.xml"
-    detectors.write_text(
-        '<additional><inductionLoop id="d" lane="out_0" pos="10" period="60" file="counts.xml"/>'
-        f'<edgeData id="e" file="{tmp_path}/edges.xml"/></additional>'
-    )
-    monkeypatch.chdir(tmp_path)
-    before = sorted(path.name for path in tmp_path.iterdir())
-    road = imported(dataclasses.replace(files, additional=(detectors,)))
-    assert road.record.n_vehicles > 0
-    assert sorted(path.name for path in tmp_path.iterdir()) == before
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"options": ("--fcd-output=all.xml",)}, "network.options must be free of outputs"),
-        ({"options": ("--seed=3",)}, "network.options must be free of outputs"),
         ({"options": ("-v",)}, "network.options must be --name=value each"),
         ({"step_length": 0.3}, "network.step_length must be a whole part of a second"),
-        ({"warm_up": 3}, "network.warm_up must be at most begin = 0 s"),
         ({"sha256": ()}, "network.sha256 must be one for each of 2 files"),
         ({"columns": ((("in", 5.0, 5.0),),)}, r"network.columns\[0\] must be stretches that end"),
         ({"columns": ((("in", 0.0, 5.0),), (("in", 4.0, 9.0),))}, "without overlap on edge 'in'"),

@@ -1,1 +1,0 @@
-"""Where a choice of queries pays: gains and saved bandwidth over roads, bandwidths and filters."""

@@ -1,1 +1,0 @@
-"""Learned query policies against every baseline: frozen, run on test traffic once, judged."""

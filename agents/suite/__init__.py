@@ -1,1 +1,0 @@
-"""Query suites: cells with fixed traffic and noise on which any query policy is scored."""

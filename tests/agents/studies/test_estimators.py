@@ -1,0 +1,143 @@
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import polars as pl
+import pytest
+
+from agents.executors import THIS_PROCESS
+from agents.play import corridor_of
+from agents.studies import estimators as study
+from agents.studies.estimators import STUDY, in_world, sensed
+from agents.study import Place, read_rows, run, write_report
+from agents.tables import below, pick
+from dptse_env.privacy import mu_of
+
+RECORDED = Path(__file__).parents[3] / "results" / "estimators"
+
+
+@pytest.fixture(scope="module")
+def recorded():
+    return read_rows("estimators", RECORDED)
+
+
+@pytest.fixture(scope="module")
+def some(recorded):
+    """Return the rows of two estimators, without those under a guarantee for a share."""
+    return recorded.filter(
+        pl.col("estimator").is_in(["ekf", "recurrent"]),
+        pl.col("release").is_null() | pl.col("release").eq("paper"),
+    )
+
+
+def test_nothing_is_left_to_play(recorded):
+    grouped = recorded.group_by("cell").agg("traffic_seed").iter_rows()
+    played = {cell: set(seeds) for cell, seeds in grouped}
+    assert all(set(STUDY.seeds_of(cell)) <= played.get(cell.id, set()) for cell in STUDY.cells)
+
+
+def test_tables_have_the_numbers_of_the_rows_and_dashes_for_the_rest(some):
+    times = pl.read_parquet(RECORDED / study.TIMES)
+    parts = [*study.world_tables(some, times), *study.sensed_tables(some)]
+    lines = "\n".join(parts).splitlines()
+    world = some.filter(world="PrivateHighway-v1", policy="round-robin", network=0)
+    ekf, network = (world.filter(estimator=name) for name in ("ekf", "recurrent"))
+    reward = network["reward"].mean()
+    error, gain = -1000.0 * reward, 100.0 * (1.0 - reward / ekf["reward"].mean())
+    (line,) = [x for x in lines if x.startswith(f"| recurrent | {error:.1f} [") and ";" in x]
+    assert f"] | {gain:.2f} [" in line
+    assert f" | {network['chi2_density'].mean():.2f}, {network['chi2_speed'].mean():.2f} | " in line
+    sums = network.select(pl.col(f"{name}_jam").sum() for name in ("density", "speed", "n")).row(0)
+    jam = " / ".join(f"{np.sqrt(squares / sums[2]):.1f}" for squares in sums[:2])
+    assert any(x.startswith(f"| PrivateHighway-v1, recurrent | {jam} | ") for x in lines)
+    assert "| UKF | - | - | - | - | - | - |" in lines
+    assert "| `paced`, EKF | - | - | - | - | - |" in lines
+
+
+def test_figures_show_what_there_is(some, tmp_path):
+    for draw in (study.draw_worlds, study.draw_elsewhere, study.draw_arms):
+        draw(some, tmp_path / f"{draw.__name__}.png")
+    assert len([path for path in tmp_path.iterdir() if path.stat().st_size > 10_000]) == 3
+
+
+def test_losses_are_those_of_the_mean_over_faults(recorded):
+    healthy = pick(recorded, sensed("paper", "ekf"))["reward"].to_numpy()
+    cells = study.miscounting("paper", "ekf", *study.FACTORS)
+    faulty = np.mean([pick(recorded, each)["reward"].to_numpy() for each in cells], axis=0)
+    found = study.loss(recorded, cells, sensed("paper", "ekf"))
+    assert len(cells) == 6
+    assert found.mean == pytest.approx(100.0 * (faulty.mean() / healthy.mean() - 1.0))
+    assert found.low < found.mean < found.high
+
+
+def test_another_row_is_another_difference(recorded):
+    pair = in_world("PrivateHighway-v1"), in_world("PrivateHighway-v1", "ekf")
+    of_cell = (pl.col("cell") == pick(recorded, pair[0])["cell"][0]) & (
+        pl.col("traffic_seed") < 2032
+    )
+    worse = pl.when(of_cell).then(pl.col("reward") - 0.01).otherwise(pl.col("reward"))
+    before, after = (below(rows, *pair) for rows in (recorded, recorded.with_columns(reward=worse)))
+    mean = -1000.0 * pick(recorded, pair[1])["reward"].mean()
+    assert before.mean - after.mean == pytest.approx(100.0 * 5.0 / mean)
+
+
+def test_sensors_alone_have_the_budget_that_they_are_said_to_have():
+    def release(labels):
+        cell = study.sensed_cell(labels)
+        return gym.make(cell.env, **cell.keywords).unwrapped.process.release
+
+    whole = mu_of(study.EPSILON, 0.05)
+    part = whole / np.sqrt(1.0 + 3.0 * np.sqrt(study.BASE_SHARE))
+    assert release(study.alone("paced", "ekf")).sensors.report().mu == pytest.approx(whole)
+    sensors = release(study.alone("paced", "ekf", study.PART)).sensors
+    assert sensors.report().mu == pytest.approx(part)
+    queries = release(sensed("paced", "ekf", sensors=study.QUERIES)).queries
+    assert queries.report().mu == pytest.approx(whole)
+    assert study.alone("paper", "ekf") == study.alone("paper", "ekf", study.PART)
+
+
+def test_faults_are_those_of_one_detector():
+    high, low, without = (
+        study.sensed_cell(study.miscounting("paper", "ekf", fault)[1])
+        for fault in ("high", "low", study.WITHOUT)
+    )
+    assert high.keywords["detectors"]["factor"] == pytest.approx([1.0, 4.0 / 3.0, 1.0])
+    assert low.keywords["detectors"]["factor"] == pytest.approx([1.0, 2.0 / 3.0, 1.0])
+    assert corridor_of(without).fixed_sensors == (3, 11)
+    assert (
+        corridor_of(study.sensed_cell(sensed("paper", "ekf", sensors=study.QUERIES))).fixed_sensors
+        == ()
+    )
+
+
+@pytest.mark.slow
+def test_the_recorded_tables_are_those_of_the_recorded_rows(tmp_path):
+    for name in ("rows.parquet", study.TIMES):
+        shutil.copy(RECORDED / name, tmp_path)
+    write_report(STUDY, tmp_path)
+    assert (tmp_path / "tables.md").read_text() == (RECORDED / "tables.md").read_text()
+
+
+@pytest.mark.slow
+def test_it_plays_and_times_and_reports(tmp_path, monkeypatch):
+    for name, value in {"SEEDS": (2000, 2001), "N_EPISODES": 2, "TURNS": 2, "STEPS": 1}.items():
+        monkeypatch.setattr(study, name, value)
+    found = (study.world_cell(in_world("ShortHighway-v0", name)) for name in study.MOVED[:2])
+    cells = [replace(each, keywords={**each.keywords, "horizon": 90}, seeds=None) for each in found]
+    small = replace(STUDY, cells=tuple(cells), seeds=study.SEEDS)
+    run(small, Place(tmp_path, THIS_PROCESS), progress=False)
+    rows = read_rows("estimators", tmp_path)
+    assert len(rows) == 4
+    squares, n = (
+        rows.select(pl.sum_horizontal(f"{kind}_{each}" for each in study.REGIMES)).to_series()
+        for kind in ("speed", "n")
+    )
+    errors = (squares / n).sqrt().to_list()
+    assert errors == pytest.approx(rows["rmse_speed"].to_list(), rel=1e-4)
+    times = pl.read_parquet(tmp_path / study.TIMES)
+    assert times["estimator"].to_list() == list(study.QUICK)
+    assert times.row(0) == ("ekf", 1.0, 1.0, 1.0)
+    error = -1000.0 * rows.filter(estimator="ekf")["reward"].mean()
+    assert f"| ShortHighway-v0 | {error:.1f} [" in (tmp_path / "tables.md").read_text()

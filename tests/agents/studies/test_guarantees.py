@@ -1,0 +1,184 @@
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import polars as pl
+import pytest
+
+from agents.environments import make_config
+from agents.executors import THIS_PROCESS
+from agents.play import play
+from agents.statistics import mean_interval
+from agents.studies import guarantees
+from agents.studies.guarantees import (
+    LEDGER,
+    STUDY,
+    EqualRates,
+    complete,
+    config_of,
+    crossing,
+    met_epsilon,
+    paid,
+    priced,
+    render,
+    report,
+)
+from agents.study import Place, read_rows, run
+from agents.tables import DENSITY, format_interval, values
+from dptse_env.parts import privacy_report
+from dptse_env.privacy import epsilon_of
+from dptse_env.release import PublicStep
+from dptse_env.release.pacing import PacingSetup, TracerPacing
+from dptse_env.schedules import make_schedule
+
+FOLDER = Path(__file__).parents[3] / "results" / "guarantees"
+SHORT = "dptse_env:dptse/ShortHighway-v0"
+PAPER = "`paper` noise"
+
+
+@pytest.fixture(scope="module")
+def rows():
+    return read_rows("guarantees", FOLDER)
+
+
+def line_of(text, start):
+    """Return the numbers of the first line of a table that begins so."""
+    line = next(line for line in text.splitlines() if line.startswith(f"| {start} |"))
+    return [each.strip() for each in line[1:-1].split("|")]
+
+
+def test_nothing_is_missing_in_the_recorded_rows(rows):
+    played = set(rows.select("cell", "traffic_seed").iter_rows())
+    asked = {(cell.id, seed) for cell in STUDY.cells for seed in STUDY.seeds_of(cell)}
+    assert played == asked
+    labels = {cell.id: cell.labels for cell in STUDY.cells}
+    for row in rows.unique("cell").iter_rows(named=True):
+        assert labels[row["cell"]].items() <= row.items()
+
+
+def test_the_tables_are_those_of_the_rows(rows, tmp_path, monkeypatch):
+    monkeypatch.setattr(guarantees, "FIGURES", {"claimed": guarantees.FIGURES["claimed"]})
+    text = report(rows, tmp_path)
+    assert text == (FOLDER / "tables.md").read_text().rpartition("\n\nPlayed by")[0]
+    assert [path.name for path in tmp_path.iterdir()] == ["fig_claimed.png"]
+    paced, capped = (
+        values(rows, paid(release=each).labels, DENSITY) for each in ("paced", "capped")
+    )
+    assert line_of(text, "difference")[4] == format_interval(mean_interval(paced - capped))
+    error = values(rows, priced("ekf", "event", epsilon=20.0).labels, DENSITY)
+    assert line_of(text, "event")[-1] == format_interval(mean_interval(error))
+    # For ε = 5: composed, met 64 times, in the longest trip and in every second, alone.
+    assert line_of(text, f"{PAPER} | 5")[2:] == ["348", "215", "787", "2120", "63300"]
+
+
+def test_a_cell_that_was_not_played_is_a_dash(rows, tmp_path):
+    ladder = render(complete(rows.filter(pl.col("cell") != paid().id)), LEDGER[0])
+    assert line_of(ladder, "5. `paced`, demand states, `round-robin`")[2:] == ["-"] * 5
+    assert line_of(ladder, "4. `paced`, demand states, `paper`")[2] != "-"
+    # Nor are labels of a part that was not played at all columns of the rows.
+    few = rows.filter(pl.col("cell") == priced("ekf").id)
+    few = few.select(name for name in few.columns if not few[name].null_count())
+    (tmp_path / "fig_ladder.png").touch()
+    text = report(few, tmp_path)
+    assert line_of(text, "1. `capped`, EKF, `paper`")[2:] == ["-"] * 5
+    assert line_of(text, "EKF | nominal")[2] == "26.54 [24.80, 28.29]"
+    assert not list(tmp_path.iterdir())
+
+
+def test_rows_that_change_change_the_differences(rows):
+    error = pl.col(DENSITY)
+    more = pl.when(pl.col("cell") == paid().id).then(error + 1.0).otherwise(error)
+    old, new = (
+        float(line_of(render(complete(each), LEDGER[2]), "difference")[4].split(" ")[0])
+        for each in (rows, rows.with_columns(more))
+    )
+    assert new == pytest.approx(old + 1.0, abs=0.011)
+
+
+@pytest.mark.parametrize(
+    ("values", "place"),
+    [((2.0, 1.0, -1.0), 20.0), ((-1.0, -2.0, -3.0), 0.0), ((3.0, 2.0, 1.0), math.inf)],
+)
+def test_a_crossing_is_found_in_the_logarithm(values, place):
+    assert crossing((1.0, 4.0, 100.0), values) == pytest.approx(place)
+
+
+def test_a_vehicle_is_worth_more_the_more_often_it_is_met(rows):
+    config = config_of(rows, priced("ekf", PAPER, epsilon=1.0).labels)
+    density_std, speed_std = (each.noise_std for each in privacy_report(config).releases)
+    # sqrt(2 C) vehicles on 100 m, by hand, and sqrt(2 C) speed limits.
+    density, speed = math.sqrt(128) / 0.1 / density_std, math.sqrt(128) * 102.0 / speed_std
+    assert met_epsilon(config, 64) == pytest.approx(epsilon_of(density, 0.05))
+    alone = epsilon_of(math.hypot(density, speed), 0.05)
+    assert met_epsilon(config, 64, alone=True) == pytest.approx(alone)
+    assert met_epsilon(config, 64) < met_epsilon(config, 252) < alone
+
+
+def test_one_open_loop_stands_for_all_noise_and_bandwidths():
+    cells = [
+        replace(
+            each, env=SHORT, keywords={**each.keywords, "estimator": "open_loop", "horizon": 90}
+        )
+        for each in (priced("ekf"), priced("ekf", "event", epsilon=20.0, bandwidth=3))
+    ]
+    assert priced("open_loop", "event", epsilon=20.0, bandwidth=3) == priced("open_loop")
+    assert play(cells[0], (2000,)) == play(cells[1], (2000,))
+
+
+def test_exact_releases_the_true_densities_of_what_is_queried_and_claims_nothing():
+    keywords = {**paid(release="exact").keywords, "traffic_seeds": [2000], "truth_in_info": True}
+    env = gym.make(SHORT, disable_env_checker=True, **keywords)
+    schedule, n = make_schedule("round-robin", env), env.unwrapped.interface.n_mainline
+    observation, _ = env.reset(seed=2000, options={"traffic_seed": 2000})
+    state, largest = None, 0.0
+    for _ in range(120):
+        action, state = schedule.predict(observation, state)
+        observation, _, _, _, info = env.step(action)
+        truth = info["truth"]["density"][:n][info["queried"]]
+        released = env.unwrapped.process.released[0, :n, 0][info["queried"]]
+        np.testing.assert_allclose(released, truth, atol=0.1)
+        largest = max(largest, *truth)
+    assert largest > 10.0
+    assert math.isinf(info["epsilon"])
+    report = privacy_report(make_config(SHORT, paid(release="exact").keywords))
+    assert (report.guarantee, report.void_reasons) == ("none", ("not_stated",))
+
+
+def test_equal_rates_do_not_follow_the_queries():
+    """The last segment's price depends on its rate of querying alone, where nothing moves."""
+    corridor = make_config(SHORT, {}).corridor
+    n, last = corridor.n_segments, corridor.n_mainline - 1
+    setup = PacingSetup(
+        corridor=corridor, budget=2.0, pace=0.8, ratio=1.0, first=np.arange(n),
+        span=np.ones(n, dtype=np.int64), level=np.ones(n), always=np.zeros(0, dtype=np.int64),
+        coverage=1 / 3, n_places=n, n_episodes=1,
+    )  # fmt: skip
+    observed = np.arange(n)[None] == 0
+    step = PublicStep(np.arange(1), observed, np.full((1, n), 20.0), np.zeros((1, n)))
+    pacings = TracerPacing(setup), EqualRates(setup)
+    followed, equal = ([each.prices(step)[0, last] for _ in range(60)] for each in pacings)
+    assert followed[0] == equal[0] == equal[-1]
+    assert followed[-1] > 1.3 * followed[0]
+
+
+@pytest.mark.slow
+def test_tiny_cells_are_played_and_reported(tmp_path):
+    cells = tuple(
+        replace(cell, env=SHORT, keywords={**cell.keywords, "horizon": 90}, seeds=(2000, 2001))
+        for cell in (priced("ekf", PAPER), paid(), paid(pacing="equal-rates"))
+    )
+    run(replace(STUDY, cells=cells), Place(tmp_path, THIS_PROCESS), progress=False)
+    rows = read_rows("guarantees", tmp_path)
+    text = (tmp_path / "tables.md").read_text()
+    assert line_of(text, f"{PAPER} | 5")[2] != "-"
+    found = rows.filter(pl.col("cell") == cells[1].id)
+    share = mean_interval(100.0 * found["n_refused"].to_numpy() / found["n_met"].to_numpy())
+    assert line_of(text, "5. `paced`, demand states, `round-robin`")[6] == format_interval(share)
+
+
+@pytest.mark.slow
+def test_every_figure_is_drawn(rows, tmp_path):
+    report(rows, tmp_path)
+    assert len(list(tmp_path.glob("fig_*.png"))) == len(guarantees.FIGURES)

@@ -1,0 +1,123 @@
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+
+from agents.executors import THIS_PROCESS
+from agents.statistics import Interval
+from agents.studies import paper
+from agents.studies.paper import CELLS, SETTINGS, STUDY, Found, judge, tables_of
+from agents.study import Place, read_rows, read_table, run, write_report
+from agents.tables import format_interval, mean
+
+RESULTS = Path(__file__).parents[3] / "results" / "paper"
+
+
+@pytest.fixture(scope="module")
+def rows():
+    return read_rows("paper", RESULTS)
+
+
+@pytest.fixture(scope="module")
+def times():
+    return read_table(RESULTS / paper.RUN_TIME)
+
+
+def entries(text, first):
+    """Return the entries of the first table row that begins so."""
+    line = next(line for line in text.splitlines() if line.startswith(f"| {first}"))
+    return line.strip("| ").split(" | ")[1:]
+
+
+def test_the_recorded_rows_are_those_of_the_cells_and_the_tables_are_theirs(rows, times):
+    played = dict(rows.group_by("cell").agg("traffic_seed").iter_rows())
+    assert {cell.id for cell in CELLS} == played.keys()
+    assert all(set(STUDY.seeds_of(cell)) == set(played[cell.id]) for cell in CELLS)
+    text = tables_of(Found(rows, times))
+    assert (RESULTS / "tables.md").read_text().startswith(text)
+    for k, setting in enumerate(SETTINGS):
+        density = mean(rows, paper.labels_of("ukf", setting), "rmse_density")
+        assert entries(text, "UKF")[k].startswith(format_interval(density))
+
+
+def test_cells_suit():
+    for estimator in paper.ESTIMATORS:
+        cell = next(each for each in reversed(CELLS) if each.labels["estimator"] == estimator)
+        cell.check()
+        assert cell.keywords == cell.labels
+
+
+@pytest.mark.parametrize(
+    ("estimator", "column", "factor", "claim", "verdict"),
+    [
+        ("ukf", "rmse_density", 0.5, "P3.", "holds (3 of 3)"),
+        ("ukf", "rmse_density", 2.0, "P3.", "does not hold (0 of 3)"),
+        ("enkf", "rmse_speed", 2.0, "P6.", "holds (3 of 3)"),
+        ("ekf", "seconds", 1000.0, "P20.", "holds (3 of 3)"),
+    ],
+)
+def test_a_verdict_follows_what_was_measured(
+    rows, times, estimator, column, factor, claim, verdict
+):
+    changed = pl.when(pl.col("estimator") == estimator).then(factor).otherwise(1.0)
+    if column == "seconds":
+        times = times.with_columns(pl.col(column) * changed)
+    else:
+        rows = rows.with_columns(pl.col(column) * changed)
+    assert entries(tables_of(Found(rows, times)), claim) == [verdict] * 4
+
+
+@pytest.mark.parametrize("how", ["lacking", "of another version"])
+def test_what_cannot_be_compared_is_a_dash(rows, how):
+    mhe = (pl.col("estimator") == "mhe") & (pl.col("privacy") == "paper")
+    version = pl.when(mhe).then(pl.lit("0.2.0")).otherwise("version")
+    found = Found(rows.filter(~mhe) if how == "lacking" else rows.with_columns(version=version))
+    text = tables_of(found)
+    assert entries(text, "P10.") == ["-", "-", *["does not hold (0 of 2)"] * 2]
+    assert entries(text, "P16.")[3] == "holds (4 of 4)"
+    assert entries(text, "P20.") == ["-"] * 4
+
+
+def test_a_part_is_undecided_where_its_interval_has_an_end_of_the_range():
+    ends = [(-0.5, 0.5), (-1.5, 0.5), (0.5, 1.5), (1.1, 1.5), (-3.0, -1.2)]
+    verdicts = [judge(Interval(0.0, low, high, 5), -1.0, 1.0) for low, high in ends]
+    assert verdicts == [paper.HOLDS, paper.OPEN, paper.OPEN, paper.FAILS, paper.FAILS]
+
+
+def test_statistics_of_curves():
+    noise = np.random.default_rng(0).normal(scale=1e-3, size=(7, 6))
+    line = 20.0 - 0.5 * np.arange(7.0)[:, None] + noise
+    zigzag = line + np.array([1.0, -1.0] * 3 + [1.0])[:, None]
+    assert paper.slope(line).mean == pytest.approx(-0.5, abs=1e-3)
+    assert paper.gap(line + 2.0, line).mean == pytest.approx(2.0)
+    assert paper.excess(1.2 * line, line).mean == pytest.approx(20.0)
+    assert paper.roughness_gap(zigzag, line).mean == pytest.approx(4.0, abs=0.01)
+    assert paper.fall_gap(2.0 * line, line).mean == pytest.approx(3.0, abs=0.01)
+    assert paper.correlation(line, 3.0 * line + 1.0).mean == pytest.approx(1.0)
+
+
+@pytest.mark.slow
+def test_the_report_of_the_recorded_rows_needs_no_playing(tmp_path):
+    for path in RESULTS.glob("*.parquet"):
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    write_report(STUDY, tmp_path)
+    assert (tmp_path / "tables.md").read_text() == (RESULTS / "tables.md").read_text()
+    sizes = [path.stat().st_size for path in tmp_path.glob("fig*.png")]
+    assert len(sizes) == 5
+    assert max(sizes) < 200_000
+
+
+@pytest.mark.slow
+def test_two_cells_are_played_measured_and_reported(tmp_path, monkeypatch):
+    monkeypatch.setattr(paper, "PAIRS", [("random_walk", SETTINGS[0])])
+    monkeypatch.setattr(paper, "N_TIMED", 2)
+    base = [paper.labels_of("random_walk", setting) for setting in SETTINGS[:2]]
+    cells = tuple(cell for cell in CELLS if cell.labels in base)
+    place, times = Place(tmp_path, THIS_PROCESS), {paper.RUN_TIME: paper.measure_run_time}
+    assert np.shape(paper.measure_space_time(place)["estimate"].to_list()) == (1, 141, 15)
+    run(replace(STUDY, cells=cells, seeds=(2000, 2001), measures=times), place, progress=False)
+    text = (tmp_path / "tables.md").read_text()
+    assert ["[" in each for each in entries(text, "random walk")] == [True, True, False, False]
+    assert 0.0 < read_table(tmp_path / paper.RUN_TIME)["seconds"].min() < 0.1

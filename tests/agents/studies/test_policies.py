@@ -1,0 +1,168 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+
+from agents.executors import THIS_PROCESS
+from agents.statistics import bootstrap, percent_below
+from agents.studies import policies
+from agents.study import Place, read_rows, run, write_report, write_table
+from agents.tables import UnmeasuredError
+from tests.agents.policies import SHORT, save
+
+RECORDED = Path(__file__).parents[3] / "results" / "policies"
+VALIDATION, TEST, PRIMARY = policies.VALIDATION, policies.TEST, policies.PRIMARY
+
+
+@pytest.fixture(scope="module")
+def recorded():
+    if not RECORDED.is_dir():
+        pytest.skip("a source archive has no results")
+    return read_rows("policies", RECORDED)
+
+
+def errors(rows, **labels):
+    """Return errors x 1000, training seeds by traffic seeds."""
+    found = rows.filter(**labels).sort("training_seed", "traffic_seed")
+    return -1000.0 * found["reward"].to_numpy().reshape(-1, found["traffic_seed"].n_unique())
+
+
+def line(text, start):
+    """Return the entries of the first line of a table that starts so."""
+    found = next(each for each in text.splitlines() if each.startswith(f"| {start}"))
+    return [each.strip() for each in found.strip("|").split("|")]
+
+
+def test_the_report_is_that_of_the_rows_and_dashes_stand_for_what_is_missing(recorded, tmp_path):
+    names = ["paper", "oldest-first", "plackett-luce"]
+    setting = recorded.filter(pl.col("policy").is_in(names), setting="paper")
+    world = {"part": "choices", **policies.WORLDS[0]._asdict(), "bandwidth": 2}
+    place = recorded.filter(pl.col("policy") != "oracle-gain", **world)
+    write_table(tmp_path / "rows.parquet", pl.concat([setting, place]))
+    write_report(policies.STUDY, tmp_path)
+    text = (tmp_path / "tables.md").read_text()
+    own = errors(setting, part=TEST, kind="learned", mode="deterministic")
+    assert own.shape == (5, 64)
+    below = bootstrap(percent_below, own, errors(setting, part=TEST, policy="oldest-first"))
+    entry = f"{below.mean:.2f} [{below.low:.2f}, {below.high:.2f}]"
+    assert line(text, "paper | plackett-luce")[2:5] == ["5", "oldest-first", entry]
+    assert line(text, "**plackett-luce**")[3] == entry
+    base = errors(place, policy="round-robin")
+    gain = bootstrap(percent_below, errors(place, policy="learned"), base)
+    entry = f"{gain.mean:.1f} [{gain.low:.1f}, {gain.high:.1f}]"
+    assert line(text, "2 (13 %)")[2::2] == [f"{base.mean():.1f}", entry, line(text, "2 (13 %)")[6]]
+    assert line(text, "2 (13 %)")[7] == "-"
+    assert set(line(text, "5 (33 %)")[1:]) == {"-"}
+
+
+@pytest.mark.slow
+def test_the_recorded_report_is_that_of_its_rows_and_every_figure_is_drawn(recorded, tmp_path):
+    write_table(tmp_path / "rows.parquet", recorded)
+    write_report(policies.STUDY, tmp_path)
+    assert (tmp_path / "tables.md").read_text() == (RECORDED / "tables.md").read_text()
+    drawn = {path.name: path.stat().st_size for path in tmp_path.glob("*.png")}
+    assert drawn.keys() == {path.name for path in RECORDED.glob("*.png")}
+    assert max(drawn.values()) < 200_000
+
+
+def test_no_cell_of_a_schedule_is_missing_in_the_recorded_rows(recorded, tmp_path):
+    cells = [*policies.STUDY.cells, *policies.STUDY.follow(recorded, tmp_path)]
+    grouped = recorded.group_by("cell").agg("traffic_seed")
+    played = {cell: set(seeds) for cell, seeds in grouped.iter_rows()}
+    assert all(set(policies.STUDY.seeds_of(cell)) <= played[cell.id] for cell in cells)
+    assert (tmp_path / "chosen.json").read_text() == (RECORDED / "chosen.json").read_text()
+
+
+def test_validation_traffic_alone_decides(recorded, tmp_path):
+    rows = recorded.filter(setting="paper")
+
+    def choice(**labels):
+        best = pl.all_horizontal(pl.col(name) == value for name, value in labels.items())
+        changed = rows.with_columns(reward=pl.when(best).then(0.0).otherwise("reward"))
+        return policies.choose(changed)["paper"][:3]
+
+    assert choice(part=TEST, policy="static") == ("oldest-first", "plackett-luce", "deterministic")
+    assert choice(part=VALIDATION, policy="static")[0] == "static"
+    assert choice(part=VALIDATION, mode="stochastic")[2] == "stochastic"
+    with pytest.raises(ValueError, match="got seed 2064"):
+        policies.STUDY.follow(rows.with_columns(part=pl.lit(VALIDATION)), tmp_path)
+
+
+def test_the_recipe_that_was_chosen_is_moved_in_the_mode_that_was(recorded):
+    chosen = policies.choose(recorded)
+    chosen[PRIMARY] = chosen[PRIMARY]._replace(recipe="b", mode="stochastic")
+    given = [policies.Trained(PRIMARY, recipe, 0, f"{recipe}.zip") for recipe in "ab"]
+    cells = [each for each in policies.test_cells(chosen, given) if each.policy.endswith(".zip")]
+    moved = [each for each in cells if each.transferred]
+    assert {each.labels["setting"] for each in cells if each not in moved} == {PRIMARY}
+    assert len(cells) == 4 + len(moved) == 4 + len(policies.SETTINGS) - 2
+    assert {(each.policy, each.deterministic) for each in moved} == {("b.zip", False)}
+
+
+def test_tables_are_paired_within_one_version(recorded):
+    rows = recorded.filter(setting="paper", part=TEST)
+    halved = rows.filter(policy="paper").with_columns(
+        pl.col("reward") / 2, version=pl.lit("0.10.0")
+    )
+    own, other = policies.rule("paper", "paper"), policies.rule("paper", "static")
+    (newest,) = policies.tables(pl.concat([rows, halved]), "error", own)
+    np.testing.assert_array_equal(2 * newest, errors(rows, policy="paper"))
+    paired, _ = policies.tables(pl.concat([rows, halved]), "error", own, other)
+    np.testing.assert_array_equal(paired, errors(rows, policy="paper"))
+    with pytest.raises(UnmeasuredError):
+        policies.tables(halved, "error", own, other)
+
+
+@pytest.mark.parametrize(
+    ("given", "error"),
+    [("nowhere=a.zip", ValueError), ("paper", ValueError), ("paper=missing", FileNotFoundError)],
+)
+def test_policies_that_cannot_be_found_are_refused(given, error):
+    with pytest.raises(error, match=given.partition("=")[2] or given):
+        policies.study([given])
+
+
+@pytest.mark.slow
+def test_a_small_study_plays_validation_then_test_traffic(tmp_path, monkeypatch):
+    keywords = {"estimator": "random_walk", "bandwidth": 2, "horizon": 80}
+    calm, world = (
+        {**keywords, "incident": "none"},
+        policies.World("highway", "paced", "random_walk"),
+    )
+    small = {
+        "SETTINGS": {
+            PRIMARY: policies.Setting("a short road", keywords, SHORT, is_moved_to=False),
+            "moved": policies.Setting("calm", calm, SHORT),
+        },
+        "RULES": ("paper", "round-robin"), "WORLDS": (world,), "TOGETHER": (), "EPSILONS": (5.0,),
+        "VALIDATION_TRAFFIC": (1000, 1001), "TEST_TRAFFIC": (2000, 2001),
+        "ENVS": {("highway", "paced"): SHORT}, "BANDWIDTHS": {"highway": (1, 2)},
+        "CHOICE_TRAFFIC": {"highway": (2000, 2001)},
+        "TRAFFIC": {"own": {"horizon": 80}, "krauss-two-peaks": {"horizon": 90}},
+    }  # fmt: skip
+    for name, value in small.items():
+        monkeypatch.setattr(policies, name, value)
+    runs = tmp_path / "runs"
+    for seed in range(2):
+        save(runs / f"pl-{seed}" / "best.zip", seed=seed)
+    with pytest.raises(ValueError, match="both plackett-luce of training seed 0"):
+        policies.study([f"primary={runs}", f"primary={runs}/pl-0"])
+    study, place = (
+        policies.study([f"primary={runs}", f"paced={runs}"]),
+        Place(tmp_path, THIS_PROCESS),
+    )
+    run(study, place, progress=False)
+    rows = read_rows("policies", tmp_path)
+    test = rows.filter(part=TEST)
+    assert set(rows.filter(part=VALIDATION)["traffic_seed"]) == {1000, 1001}
+    assert rows.filter(part=VALIDATION)["cell"].n_unique() == 2 + 2 + 2 * 2  # both modes of both
+    assert test["cell"].n_unique() == 2 + 2 + 2 * 2 + 2 * 1 + 2  # and both oracles, and moved ones
+    assert rows.filter(policy="learned")["cell"].n_unique() == 2 * (2 + 1)
+    (mode,) = test.filter(setting="moved", kind="learned")["mode"].unique()
+    assert mode == json.loads((tmp_path / "chosen.json").read_text())[PRIMARY]["mode"]
+    assert (
+        line((tmp_path / "tables.md").read_text(), "**plackett-luce")[1]
+        == "learned, 2 training seed(s)"
+    )
