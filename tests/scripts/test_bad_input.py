@@ -11,6 +11,7 @@ pytest.importorskip("tyro")
 
 from dptse_env.traffic import RecordingError
 from scripts import dptse, info
+from tests.cases import fast_and_slow
 from tests.scripts.commands import ROOT, refused, run_script
 
 SHORT = "dptse_env:dptse/ShortHighway-v0"
@@ -78,9 +79,7 @@ FAST = [
 ALL = [(kind, how) for kind in FILES for how in ("missing", "folder", "noise", "truncated")]
 
 
-@pytest.mark.parametrize(
-    ("kind", "how"), [*FAST, *(pytest.param(*each, marks=pytest.mark.slow) for each in ALL)]
-)
+@pytest.mark.parametrize(("kind", "how"), fast_and_slow(ALL, FAST))
 def test_a_file_that_cannot_be_read_is_named(kind, how, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     name, content, (script, *words) = FILES[kind]

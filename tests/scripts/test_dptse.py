@@ -16,6 +16,7 @@ from dptse_env import command_line
 from dptse_env.utils.extras import EXTRAS
 from scripts import dptse
 from scripts.dptse import COMMANDS, as_commands
+from tests.cases import fast_and_slow
 
 SCRIPTS = Path(dptse.__file__).parent
 LIBRARIES = {"cli", "dptse", "document_configuration", "training_bar", "__init__"}
@@ -28,11 +29,10 @@ def test_every_script_is_a_command():
 
 HELP = ["train", "import network", "evaluate"]
 """Commands with arguments in groups, of two words, and the longest one; the others are slow."""
-REST = [name for name in COMMANDS if name not in (*HELP, "completion")]
 
 
 @pytest.mark.parametrize(
-    "name", [*HELP, *(pytest.param(name, marks=pytest.mark.slow) for name in REST)]
+    "name", fast_and_slow([name for name in COMMANDS if name != "completion"], HELP)
 )
 def test_every_command_has_a_page_of_help(name, capsys):
     with pytest.raises(SystemExit) as ended:

@@ -19,6 +19,7 @@ from dptse_env.privacy import epsilon_of
 from dptse_env.privacy.audit_statistics import Claim, audit
 from dptse_env.release import CappedSettings
 from tests.agents.elsewhere import Elsewhere
+from tests.cases import fast_and_slow
 
 from .small import HORIZON, ROAD, assert_runs_do_not_depend_on_the_batch, config
 
@@ -46,7 +47,7 @@ MORE = [
     {"cap": 1},
     {"cap": 500},
 ]
-ALL_PRIVACY = [*FEW, *(pytest.param(privacy, marks=pytest.mark.slow) for privacy in MORE)]
+ALL_PRIVACY = fast_and_slow([*FEW, *MORE], FEW)
 
 
 def test_worlds_differ_in_one_vehicle(record):

@@ -20,6 +20,7 @@ from dptse_env.config import resolve
 from dptse_env.parts import make_release, privacy_report
 from dptse_env.privacy.audit_statistics import Claim, audit
 from dptse_env.release import ReleaseModel, ReleaseRequest, TrafficTable
+from tests.cases import fast_and_slow
 
 from .small import (
     HORIZON,
@@ -93,14 +94,12 @@ ALL = [
     (kind, privacy, "hunter")
     for kind in TARGET_KINDS
     for privacy in ALL_PRIVACY
+    if (kind, privacy, "hunter") not in FEW
     if "adjacency" not in privacy or kind not in ("replaced", "opposite")
 ]
 
 
-@pytest.mark.parametrize(
-    ("kind", "privacy", "policy"),
-    [*FEW, *(pytest.param(*case, marks=pytest.mark.slow) for case in ALL)],
-)
+@pytest.mark.parametrize(("kind", "privacy", "policy"), fast_and_slow([*FEW, *ALL], FEW))
 def test_no_target_exceeds_mu(kind, privacy, policy, record):
     setting = paced("random_walk", **privacy)
     worlds = choose_target(setting, record, kind, policy)
