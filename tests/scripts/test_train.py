@@ -21,7 +21,7 @@ from scripts.train import Args, make_plan
 
 ROOT = Path(__file__).parents[2]
 SMALL = [
-    "--env", "dptse_env:dptse/ShortHighway-v0", "--traffic", "0:2", "--validation", "1000:1002",
+    "--env", "dptse_env:dptse/ShortHighway-v0", "--traffic", "0:2", "--validation", "1000:1001",
     "--keywords", '{"horizon": 64}', "--no-tensorboard",
 ]  # fmt: skip
 ROUNDS = [

@@ -8,7 +8,6 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from agents.environments import make_vector  # noqa: E402
-from agents.executors import THIS_PROCESS  # noqa: E402
 from agents.filters.batches import draw_batch, make_batch  # noqa: E402
 from agents.filters.collecting import collect  # noqa: E402
 from agents.filters.plan import OWN, Round  # noqa: E402
@@ -98,13 +97,22 @@ def test_the_loss_is_the_environments_error():
     assert second_loss(batch.road, wide, batch.truth, 1.0) > honest
 
 
-def test_a_network_comes_out_the_same_wherever_scenarios_are_played(tmp_path):
-    trained = {}
-    for name, executor in {"here": THIS_PROCESS, "there": Elsewhere()}.items():
-        training = FilterTraining(PLAN, tmp_path / name, executor=executor)
-        training.run()
-        trained[name] = training.network.state_dict()
-    assert all(torch.equal(trained["there"][key], value) for key, value in trained["here"].items())
+WHOLE = dataclasses.replace(PLAN, rounds=(Round("ekf", 1, 1), Round(OWN, 2, 3)))
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A training to the end of `WHOLE`; leave it alone."""
+    training = FilterTraining(WHOLE, tmp_path_factory.mktemp("whole"))
+    training.run()
+    return training
+
+
+def test_a_network_comes_out_the_same_wherever_scenarios_are_played(whole, tmp_path):
+    training = FilterTraining(WHOLE, tmp_path, executor=Elsewhere())
+    training.run()
+    there = training.network.state_dict()
+    assert all(torch.equal(there[key], value) for key, value in whole.network.state_dict().items())
 
 
 def test_a_batch_mixes_the_scenarios_of_a_road():
@@ -157,27 +165,25 @@ def rows_of(training):
     return [{k: v for k, v in row.items() if k not in timed} for row in training.rows]
 
 
-def test_a_training_that_was_killed_comes_out_as_one_that_was_not(tmp_path):
-    whole = FilterTraining(PLAN, tmp_path / "whole")
-    whole.run()
-    assert whole.done == 6
-    assert [row["round"] for row in whole.rows] == [1, 1, 1, 2, 2, 2]
+def test_a_training_that_was_killed_comes_out_as_one_that_was_not(whole, tmp_path):
+    assert whole.done == 4
+    assert [row["round"] for row in whole.rows] == [1, 2, 2, 2]
 
     def kill(row):
-        if row["update"] == 5:
+        if row["update"] == 3:
             raise KilledError
 
     with pytest.raises(KilledError):
-        FilterTraining(PLAN, tmp_path / "parts", watchers=[kill]).run()
-    resumed = FilterTraining(PLAN, tmp_path / "parts")
-    assert resumed.done == 4
+        FilterTraining(WHOLE, tmp_path, watchers=[kill]).run()
+    resumed = FilterTraining(WHOLE, tmp_path)
+    assert resumed.done == 2
     resumed.run()
     assert rows_of(resumed) == rows_of(whole)
-    one, other = (read_network(str(tmp_path / name / "network.npz")) for name in ("whole", "parts"))
+    one, other = (read_network(str(each / "network.npz")) for each in (whole.folder, tmp_path))
     for name, array in one.network._asdict().items():
         np.testing.assert_array_equal(array, getattr(other.network, name))
-    assert len(read_progress(tmp_path / "parts")) == 6
-    again = FilterTraining(PLAN, tmp_path / "parts")
+    assert len(read_progress(tmp_path)) == 4
+    again = FilterTraining(WHOLE, tmp_path)
     again.run()
     assert rows_of(again) == rows_of(whole)
 

@@ -66,6 +66,7 @@ def test_the_policy_acts_in_both_environments_and_its_card_names_them(joint):
     assert len(set(plan["corridors"])) == 2
 
 
+@pytest.mark.slow
 def test_a_killed_training_continues_to_the_same_curve(joint, tmp_path):
     broken = Training(make_plan(also=(OTHER,)), tmp_path, watchers=(stop_at(2),))
     with pytest.raises(StopError):

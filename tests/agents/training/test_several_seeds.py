@@ -28,19 +28,23 @@ def equal(one, other):
     return one.keys() == other.keys() and all(torch.equal(one[k], other[k]) for k in one)
 
 
-def in_parts(parts):
+def one_round(parts=1, seed=1):
     recipe = make_recipe("plackett-luce")
-    swaps = dataclasses.replace(recipe.swaps, parts=parts)
-    return make_plan(recipe=dataclasses.replace(recipe, swaps=swaps))
+    swaps = dataclasses.replace(recipe.swaps, parts=parts, rounds=1)
+    regression = dataclasses.replace(recipe.regression, rounds=0)
+    return make_plan(
+        recipe=dataclasses.replace(recipe, regression=regression, swaps=swaps), seed=seed
+    )
 
 
 def train(plans, executor=THIS_PROCESS):
     train_all(plans, executor, records=None, progress=False)
 
 
-def test_trainings_at_once_come_out_as_alone(tmp_path, trained):
-    train({tmp_path / str(seed): make_plan(seed=seed) for seed in (1, 2)}, Elsewhere())
-    alone = trained()
+def test_trainings_at_once_come_out_as_alone(tmp_path):
+    train({tmp_path / str(seed): one_round(seed=seed) for seed in (1, 2)}, Elsewhere())
+    alone = Training(one_round(), tmp_path / "alone")
+    alone.run()
     assert without_time(read_progress(tmp_path / "1")) == without_time(alone.rows)
     for name in (BEST, POLICY):
         assert (tmp_path / "1" / name).read_bytes() == (alone.folder / name).read_bytes()
@@ -81,17 +85,18 @@ def test_a_folder_that_workers_do_not_share_is_an_error(tmp_path):
         train({tmp_path / "0": make_plan()}, Apart())
 
 
-def test_parts_of_a_round_come_out_the_same_wherever_they_run(tmp_path, trained):
+def test_parts_of_a_round_come_out_the_same_wherever_they_run(tmp_path):
     kept = {}
     for name, executor in {"here": THIS_PROCESS, "there": Elsewhere()}.items():
-        Training(in_parts(2), tmp_path / name, executor=executor).run()
+        Training(one_round(2), tmp_path / name, executor=executor).run()
         kept[name] = weights(tmp_path / name)
     assert equal(kept["here"], kept["there"])
     # Draws of a part are its own.
-    assert not equal(kept["here"], weights(trained().folder))
+    Training(one_round(1), tmp_path / "whole").run()
+    assert not equal(kept["here"], weights(tmp_path / "whole"))
 
 
-def test_a_round_has_as_many_episodes_in_parts():
+def test_a_round_has_as_many_episodes_one_round():
     assert split(7, 3) == [range(2), range(2, 4), range(4, 7)]
     assert split(2, 5) == [range(1), range(1, 2)]
     assert np.concatenate(split(480, 7)).tolist() == list(range(480))
