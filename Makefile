@@ -44,7 +44,6 @@ audit: setup  ## Attack the privacy presets, 5,000 runs in each of two worlds; r
 	$(BIN)/python scripts/audit.py --force
 	$(BIN)/python scripts/audit.py --force --target replaced
 	$(BIN)/python scripts/audit.py --force --target opposite
-	$(BIN)/python scripts/audit.py --force --target pairs --traffic-seed 2000 --runs 2000
 
 test: setup  ## Run the tests, without the slow ones.
 	$(BIN)/python -m pytest -m 'not slow' -n 2 --dist loadfile

@@ -3,5 +3,4 @@
 from dptse_env.utils.extras import needed_for
 
 with needed_for("agents"):
-    import jinja2  # noqa: F401
     import rich  # noqa: F401

@@ -7,7 +7,7 @@ import csv
 import io
 import json
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -81,3 +81,15 @@ def write_json(path: Path, content: Any, sort_keys: bool = False) -> None:
     write_atomically(
         path, json.dumps(content, indent=2, sort_keys=sort_keys, allow_nan=False) + "\n"
     )
+
+
+def first_difference(kept: Any, now: Any, path: str = "") -> str | None:
+    """Return in words the first value in which two plain contents differ; None if they agree."""
+    if isinstance(kept, Mapping) and isinstance(now, Mapping):
+        for key in {**now, **kept}:
+            below = f"{path}.{key}" if path else str(key)
+            found = first_difference(kept.get(key), now.get(key), below)
+            if found is not None:
+                return found
+        return None
+    return None if kept == now else f"{path} is {kept!r} there and {now!r} now"

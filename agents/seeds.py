@@ -14,8 +14,6 @@ EVALUATION = range(1_000_000)
 """``scripts/evaluate.py``, and the studies of estimators, of privacy and of ledgers."""
 TUNING = range(1_000_000, 2_000_000)
 """The search of estimator settings."""
-PLAN_SEARCH = range(3_000_000, 4_000_000)
-"""The search of open-loop plans."""
 TRAINING_VALIDATION = range(4_000_000, 5_000_000)
 """The learning curve of a training, by which its best policy is kept."""
 STUDY_VALIDATION = range(5_000_000, 6_000_000)
@@ -34,6 +32,20 @@ TRAININGS = 1_000
 def training_seed(seed: int) -> int:
     """Return the seed of the first episode of a training, a million apart from the next one's."""
     return TRAINING.start + seed * (len(TRAINING) // TRAININGS)
+
+
+def require_seeds(path: str, seeds: Sequence[int], allowed: range) -> None:
+    """Refuse traffic seeds out of a range, and none at all.
+
+    Raises:
+        ValueError: A seed is outside, or there is none.
+    """
+    outside = [seed for seed in seeds if seed not in allowed]
+    if outside or not seeds:
+        raise ValueError(
+            f"{path} must be traffic seeds in {allowed[0]}..{allowed[-1]}, got "
+            f"{outside[0] if outside else 'none'}"
+        )
 
 
 def seed_kind(seeds: Sequence[int]) -> str:

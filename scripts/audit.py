@@ -3,7 +3,6 @@
 python scripts/audit.py --env dptse_env:dptse/PrivateHighway-v1 --runs 5000
 python scripts/audit.py --env dptse_env:dptse/PaperHighway-v0 --target replaced
 python scripts/audit.py --env dptse_env:dptse/PrivateHighway-v0 --noise-factor 0.709
-python scripts/audit.py --target pairs --traffic-seed 2000 --runs 2000
 """
 
 from __future__ import annotations
@@ -13,18 +12,13 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+from agents.audit.attack import attack
+from agents.audit.planner import TARGET_KINDS, choose_target, make_planner, make_policy
+from agents.audit.report import Finding
+from agents.audit.strategies import STRATEGIES
 from agents.environments import make_config
 from agents.files import refuse_to_replace
-from agents.studies.audit.attack import attack
-from agents.studies.audit.pairs import PairsFinding, study_pairs
-from agents.studies.audit.report import Finding
-from agents.studies.audit.strategies import PUBLIC_SCHEDULES, STRATEGIES
-from agents.studies.audit.targets import (
-    TARGET_KINDS,
-    choose_target,
-    make_planner,
-    make_policy,
-)
+from agents.play import Cell
 from dptse_env.config import EnvConfig
 from dptse_env.parts import privacy_report
 from dptse_env.privacy import mu_of
@@ -33,9 +27,6 @@ from dptse_env.release import PrivacyReport
 from dptse_env.traffic import with_vehicles
 from dptse_env.utils.validation import inside, integer, positive, require
 from scripts.cli import Road, run
-
-PAIRS = "pairs"
-"""Target of a replay of many pairs of trips instead of an attack."""
 
 
 @dataclass(frozen=True)
@@ -48,18 +39,15 @@ class Args(Road):
     """Vehicle that differs: 'worst-case', an added one; 'replaced' or 'deleted', of the record;
     for preset 'paced' also 'opposite', two added ones that deviate in opposite directions, and of
     the record 'runs-out', which is refused most, 'jam', which stands longest, and 'late', which
-    enters in the second half. 'pairs' replays pairs of trips of several records instead."""
+    enters in the second half."""
     policy: str = "hunter"
-    """Queries: 'hunter', 'adaptive', or a public schedule: 'paper', 'static', 'round-robin'. Pairs
-    take public schedules; others stand for 'round-robin' there."""
+    """Queries: 'hunter', 'adaptive', or a public schedule: 'paper', 'static', 'round-robin'."""
     runs: int = 5000
-    """Runs in each of the two worlds, or pairs of each record."""
+    """Runs in each of the two worlds."""
     noise_factor: float = 1.0
     """Multiplies the real noise, not the declared one; below 1 shows that the audit can reject."""
     traffic_seed: int = 0
-    """Traffic seed of the record, for pairs of the first one."""
-    n_records: int = 20
-    """Records whose pairs are replayed."""
+    """Traffic seed of the record."""
     estimator: str | None = None
     """Estimator that the prices of 'paced' follow; the environment's own if not given, as all
     below."""
@@ -107,7 +95,8 @@ def attacked_config(args: Args) -> EnvConfig:
     """Return the configuration of the environment under attack.
 
     Raises:
-        ValueError: A setting of the release model is given twice, or another value is bad.
+        ValueError: A setting of the release model is given twice, another value is bad, or the
+            estimator does not suit the road.
     """
     keywords = args.given_keywords()
     privacy = {name: getattr(args, name) for name in PRIVACY} | {"preset": args.privacy}
@@ -122,6 +111,7 @@ def attacked_config(args: Args) -> EnvConfig:
     for name in ("bandwidth", "estimator"):
         if getattr(args, name) is not None:
             keywords[name] = getattr(args, name)
+    Cell(args.env, "none", keywords).check()
     return make_config(args.env, keywords)
 
 
@@ -138,12 +128,11 @@ def check(args: Args) -> None:
     Raises:
         ValueError: An argument is out of range.
     """
-    kinds = [*TARGET_KINDS, PAIRS]
+    kinds = list(TARGET_KINDS)
     require(args.target in kinds, "target", f"one of {kinds}", args.target)
     require(args.policy in STRATEGIES, "policy", f"one of {list(STRATEGIES)}", args.policy)
     integer("runs", args.runs, 2)
     integer("traffic_seed", args.traffic_seed, 0)
-    integer("n_records", args.n_records, 1)
     integer("seed", args.seed, 0)
     positive("noise_factor", args.noise_factor)
     inside("confidence", args.confidence, 0.0, 1.0)
@@ -156,13 +145,11 @@ def make_title(args: Args, config: EnvConfig) -> str:
     return f"{args.env.rpartition('/')[2]}, preset {privacy.preset} at {claim}"
 
 
-def run_audit(args: Args) -> Finding:
+def run_audit(args: Args, config: EnvConfig) -> Finding:
     """Choose two worlds, play them, and test the claim."""
-    config = attacked_config(args)
-    make_planner(config, args.policy).require_kind(args.target)
-    place = args.workplace(args.output)
-    place.record(config.corridor, [args.traffic_seed])
-    record = with_vehicles(place.records.get(config.corridor, args.traffic_seed), "an audit")
+    executor = args.start_executor()
+    library = args.library(config.corridor, [args.traffic_seed])
+    record = with_vehicles(library.get(config.corridor, args.traffic_seed), "an audit")
     worlds = choose_target(config, record, args.target, args.policy)
     policy = make_policy(config, args.policy, worlds)
     start = time.perf_counter()
@@ -173,7 +160,7 @@ def run_audit(args: Args) -> Finding:
         args.runs,
         noise_factor=args.noise_factor,
         seed=args.seed,
-        engine=place.engine,
+        executor=executor,
     )
     seconds = time.perf_counter() - start
     report = privacy_report(config)
@@ -190,46 +177,21 @@ def run_audit(args: Args) -> Finding:
     )
 
 
-def run_pairs(args: Args) -> PairsFinding:
-    """Replay pairs of trips of several records."""
-    config = attacked_config(args)
-    seeds = range(args.traffic_seed, args.traffic_seed + args.n_records)
-    place = args.workplace(args.output)
-    place.record(config.corridor, seeds)
-    records = [
-        with_vehicles(place.records.get(config.corridor, seed), "an audit") for seed in seeds
-    ]
-    title = make_title(args, config)
-    return study_pairs(
-        config,
-        records,
-        args.runs,
-        title=title,
-        policy=played_policy(args),
-        seed=args.seed,
-        engine=place.engine,
-    )
-
-
-def result_path(args: Args) -> Path:
+def result_path(args: Args, config: EnvConfig) -> Path:
     """Return the file of the result."""
-    preset, noise = attacked_config(args).privacy.preset, args.noise_factor
+    noise = args.noise_factor
     ending = "" if noise == 1.0 else f"-noise-{noise:g}"
-    return args.output / f"{preset}-{args.target}-{played_policy(args)}{ending}.json"
-
-
-def played_policy(args: Args) -> str:
-    """Return the policy that is played: pairs take public schedules alone."""
-    is_played = args.target != PAIRS or args.policy in PUBLIC_SCHEDULES
-    return args.policy if is_played else "round-robin"
+    return args.output / f"{config.privacy.preset}-{args.target}-{args.policy}{ending}.json"
 
 
 def main(args: Args) -> None:
-    """Attack or replay, and leave table and file."""
+    """Attack, and leave table and file."""
     check(args)
-    path = result_path(args)
+    config = attacked_config(args)
+    make_planner(config, args.policy).require_kind(args.target)
+    path = result_path(args, config)
     refuse_to_replace([path], args.force)
-    finding = run_pairs(args) if args.target == PAIRS else run_audit(args)
+    finding = run_audit(args, config)
     finding.write(path, dataclasses.asdict(args))
     if args.json:
         print(path.read_text(encoding="utf-8"), end="")

@@ -43,7 +43,6 @@ COMMANDS: Mapping[str, Command] = {
     "tune": Command("tune", "Tune the estimators' settings."),
     "train": Command("train", "Train a query policy."),
     "train-estimator": Command("train_estimator", "Train a recurrent network as an estimator."),
-    "search-plan": Command("search_plan", "Search an open-loop query plan."),
     "evaluate": Command("evaluate", "Evaluate schedules and policies on the same traffic."),
     "suite": Command("suite", "Score policies in the tasks of the query suite."),
     "audit": Command("audit", "Attack the privacy of an environment."),

@@ -24,8 +24,8 @@ from scripts.cli import run
 PACKAGES = (
     "gymnasium", "libsumo", "sumolib", "eclipse-sumo", "numpy", "scipy", "numba", "filterpy",
     "qpsolvers", "piqp", "matplotlib", "platformdirs", "tomli-w", "tqdm", "torch",
-    "stable-baselines3", "sb3-contrib", "optuna", "plotly", "jinja2", "rich", "tyro", "pyarrow",
-    "ijson", "ray", "filelock", "moviepy", "pygame",
+    "stable-baselines3", "sb3-contrib", "optuna", "plotly", "polars", "loky", "rich", "tyro",
+    "pyarrow", "ijson", "ray", "filelock", "moviepy", "pygame",
 )  # fmt: skip
 
 

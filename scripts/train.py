@@ -4,7 +4,7 @@ python scripts/train.py --seed 0 --output results/training/pl-0
 python scripts/train.py --seeds 0:5 --workers 2 --output results/training/pl
 python scripts/train.py --steps 2000000 --output results/training/maskable-0 recipe:maskable
 
-The folder gets run.json (the settings), progress.csv (the learning curve), checkpoint.pt,
+The folder gets plan.json (the settings), progress.csv (the learning curve), checkpoint.pt,
 best.zip and policy.zip (the policy best in validation, and the last). After an interruption, or a
 kill, the same command continues from the last checkpoint to the same numbers; other arguments
 need another folder.
@@ -12,24 +12,18 @@ need another folder.
 
 from __future__ import annotations
 
-import subprocess
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
 import torch
 import tyro
-from tqdm import tqdm
 
-from agents.experiments.provenance import check_folder
-from agents.experiments.runner import Workplace
 from agents.training.plan import TrainingPlan
 from agents.training.recipes import MaskablePPORecipe, MaskRecipe, PlackettLuceRecipe, ScoresRecipe
-from agents.training.run_files import Row, read_progress
+from agents.training.run_files import Row, check_plan, read_progress
 from agents.training.several_seeds import train_all
 from agents.training.training import BEST, POLICY, Training
-from dptse_env.command_line import TOOLS
 from dptse_env.config import parse_seeds
 from dptse_env.utils.validation import integer
 from scripts.cli import Road, resumable, run
@@ -52,7 +46,7 @@ class Args(Road):
     seed: int = 0
     """Training seed."""
     seeds: str | None = None
-    """Training seeds, first:stop, in place of one: trainings run at once on the engine, each in a
+    """Training seeds, first:stop, in place of one: trainings run at once, each in a
     folder of its own in the output, named by its seed."""
     steps: int | None = None
     """Seconds of traffic to train for by PPO, all episodes together, each with one decision;
@@ -99,46 +93,6 @@ def make_plan(args: Args, seed: int) -> TrainingPlan:
     )
 
 
-def commit() -> str | None:
-    """Return the git commit of the sources, with "+" appended where files differ; None if none."""
-    sources = Path(__file__).parent
-    if TOOLS in sources.parents:
-        return None  # a repository around an installation is somebody else's
-    try:
-        head = subprocess.run(
-            ["git", "describe", "--always", "--abbrev=40", "--exclude=*", "--dirty=+"],
-            cwd=sources, capture_output=True, text=True, check=False,
-        )  # fmt: skip
-    except FileNotFoundError:
-        return None
-    return head.stdout.strip() or None
-
-
-def train_several(args: Args, seeds: Sequence[int], place: Workplace) -> None:
-    """Train with several seeds at once, with one bar over all of them."""
-    plans = {args.output / str(seed): make_plan(args, seed) for seed in seeds}
-    plan = plans[args.output / str(seeds[0])]
-    done = dict.fromkeys(plans, 0)
-    total = len(plans) * plan.steps_at(plan.n_updates)
-    with tqdm(total=total, desc="training", unit="step", unit_scale=True) as bar:
-
-        def on_rows(folder: Path, rows: list[Row]) -> None:
-            steps = int(rows[-1]["steps"])
-            bar.update(steps - done[folder])
-            done[folder] = steps
-
-        train_all(
-            plans,
-            place.engine,
-            records=place.records,
-            commit=commit(),
-            threads=args.threads,
-            on_rows=on_rows,
-        )
-    for folder in plans:
-        print(f"{folder}: {summary(read_progress(folder)[-1])}")
-
-
 def summary(row: Row) -> str:
     """Return the errors in validation of a row of the learning curve, in words."""
     errors = row["validation"], row["validation_drawn"]
@@ -148,32 +102,32 @@ def summary(row: Row) -> str:
 @resumable()
 def main(args: Args) -> None:
     """Record missing traffic, train, and leave the policy."""
-    seeds = (args.seed,) if args.seeds is None else parse_seeds(args.seeds)
-    plan = make_plan(args, seeds[0])
     torch.set_num_threads(integer("threads", args.threads, 1))
-    place = args.workplace(args.output)
-    folders = [args.output] if args.seeds is None else [args.output / str(each) for each in seeds]
-    for folder, each in zip(folders, seeds, strict=True):
-        check_folder(folder, make_plan(args, each).provenance(None))
+    if args.seeds is None:
+        plans = {args.output: make_plan(args, args.seed)}
+    else:
+        plans = {args.output / str(each): make_plan(args, each) for each in parse_seeds(args.seeds)}
+    plan = next(iter(plans.values()))
+    plan.check()
+    for folder, each in plans.items():
+        check_plan(folder, each.content())
+    executor = args.start_executor()
     for world in plan.worlds:
-        place.record(world.config.corridor, (*plan.traffic_seeds, *plan.validation_seeds))
+        seeds = (*plan.traffic_seeds, *plan.validation_seeds)
+        args.library(world.config.corridor, seeds)
     if args.seeds is not None:
-        train_several(args, seeds, place)
+        train_all(plans, executor, records=args.records, threads=args.threads)
+        for folder in plans:
+            print(f"{folder}: {summary(read_progress(folder)[-1])}")
         return
-    bar = Bar(
-        "steps",
-        ("error", "validation"),
-        plan.steps_at(plan.n_updates),
-        unit="step",
-        unit_scale=True,
-    )
+    total = plan.steps_at(plan.n_updates)
+    bar = Bar("steps", ("error", "validation"), total, unit="step", unit_scale=True)
     with watched(bar, args.output, args.tensorboard) as watchers:
         training = Training(
             plan,
             args.output,
-            records=place.records,
-            commit=commit(),
-            engine=place.engine,
+            records=args.records,
+            executor=executor,
             watchers=watchers,
             progress=bar.show,
         )

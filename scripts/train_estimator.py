@@ -2,7 +2,7 @@
 
 python scripts/train_estimator.py --seed 0 --output results/filters/0
 
-The folder gets run.json (the plan), progress.csv (the learning curve), checkpoint.pt and
+The folder gets plan.json, progress.csv (the learning curve), checkpoint.pt and
 network.npz, which ``estimator_settings={"recurrent": {"weights": "<folder>/network.npz"}}`` takes.
 After an interruption, or a kill, the same command continues from the last checkpoint to the same
 numbers; other arguments need another folder.
@@ -16,10 +16,10 @@ from pathlib import Path
 import torch
 
 from agents.environments import make_config, parse_env
-from agents.experiments.provenance import check_folder
 from agents.filters.plan import FilterPlan, Round
 from agents.filters.scenarios import ScenarioRanges
 from agents.filters.training import FilterTraining
+from agents.training.run_files import check_plan
 from dptse_env.config import parse_seeds
 from dptse_env.estimators.learned.weights import read_network
 from dptse_env.utils.validation import integer
@@ -111,23 +111,24 @@ def main(args: Args) -> None:
     """Record missing traffic, train, and leave the network."""
     plan = make_plan(args)
     torch.set_num_threads(integer("threads", args.threads, 1))
-    check_folder(args.output, plan.provenance())
-    place = args.workplace(args.output)
+    plan.check()
+    check_plan(args.output, plan.settings())
+    executor = args.start_executor()
     for envs, seeds in (
         (plan.ranges.envs, plan.traffic_seeds), (plan.validation_envs, plan.validation_seeds)
     ):  # fmt: skip
         for env in envs:
-            place.record(make_config(*parse_env(env)).corridor, seeds)
+            args.library(make_config(*parse_env(env)).corridor, seeds)
     bar = Bar("update", ("error", "validation", "chi2"), plan.n_passes, unit="pass")
     with watched(bar, args.output, args.tensorboard) as watchers:
         training = FilterTraining(
             plan,
             args.output,
-            records=place.records,
+            records=args.records,
             watchers=watchers,
             progress=bar.show,
             compiled=args.compiled,
-            engine=place.engine,
+            executor=executor,
         )
         training.run()
     print(f"the network is in {args.output / 'network.npz'}")

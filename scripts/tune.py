@@ -20,8 +20,8 @@ import optuna
 from rich.table import Table
 from tqdm import tqdm
 
-from agents.engines.engine import Workers
 from agents.environments import given_keywords
+from agents.executors import AnyExecutor
 from agents.files import refuse_to_replace
 from agents.search.space import SPACE
 from agents.search.tuning import TuningStudy, journal_path, locked_study, scores_of
@@ -90,6 +90,7 @@ def make_tasks(args: Args) -> list[TuningTask]:
     """Return one task per configuration, all of them checked.
 
     Raises:
+        FileNotFoundError: There is no such saved policy.
         ValueError: An argument is out of range.
     """
     keywords = {
@@ -123,7 +124,7 @@ def make_tasks(args: Args) -> list[TuningTask]:
             variant=args.variant,
             keywords=keywords,
         )
-        task.config()
+        task.cell().check()
         if task.name in tasks:
             raise ValueError(f"{task.name} must be given once")
         tasks[task.name] = task
@@ -132,7 +133,7 @@ def make_tasks(args: Args) -> list[TuningTask]:
     return list(tasks.values())
 
 
-def tune(study: TuningStudy, args: Args, workers: Workers) -> None:
+def tune(study: TuningStudy, args: Args, executor: AnyExecutor) -> None:
     """Run the trials that a study lacks, with a progress bar."""
     done = study.n_finished()
     with tqdm(
@@ -146,7 +147,7 @@ def tune(study: TuningStudy, args: Args, workers: Workers) -> None:
             bar.update(study.n_finished() - bar.n)
 
         show()
-        study.run(args.trials, workers, args.trials_at_once, show)
+        study.run(args.trials, executor, args.trials_at_once, show)
 
 
 def add_rows(table: Table, study: TuningStudy) -> None:
@@ -170,19 +171,17 @@ def main(args: Args) -> None:
     tasks = make_tasks(args)
     foreign = [task for task in tasks if not journal_path(task, args.output).exists()]
     refuse_to_replace([args.output / f"{task.name}.json" for task in foreign], args.force)
-    corridor = tasks[0].config().corridor
-    place = args.workplace(args.output)
-    place.record(corridor, tasks[0].traffic_seeds)
-    tasks = [dataclasses.replace(task, records=place.records) for task in tasks]
+    executor = args.start_executor()
+    args.library(tasks[0].config().corridor, tasks[0].traffic_seeds)
+    tasks = [dataclasses.replace(task, records=args.records) for task in tasks]
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     errors = "density RMSE\n[veh/km]", "speed RMSE\n[km/h]"
     table = make_table("scores on the tuning traffic", "set", "settings", "reward", *errors, left=2)
-    with place.engine.open() as workers:
-        for task in tasks:
-            with locked_study(task, args.output, args.sampler_seed) as study:
-                tune(study, args, workers)
-                study.write(args.output / f"{task.name}.json")
-                add_rows(table, study)
+    for task in tasks:
+        with locked_study(task, args.output, args.sampler_seed) as study:
+            tune(study, args, executor)
+            study.write(args.output / f"{task.name}.json")
+            add_rows(table, study)
     print_table(table)
     print(
         f"tuned sets are in {args.output}/: take one as estimator_settings, or name it in the "

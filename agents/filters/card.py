@@ -6,7 +6,6 @@ from importlib.metadata import version
 from typing import Any
 
 from agents.environments import make_config, parse_env
-from agents.experiments.provenance import source_digest
 from agents.filters.plan import FilterPlan
 from dptse_env.estimators.learned.channels import CHANNELS
 from dptse_env.estimators.learned.weights import FORMAT
@@ -39,7 +38,6 @@ def make_card(plan: FilterPlan, done: int, name: str) -> dict[str, Any]:
         "training": {
             "plan": plan.settings(),
             "passes": done,
-            "sources": source_digest(),
             "versions": {each: version(each) for each in ("dptse-env", "torch", "numpy")},
         },
     }

@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.environments import make_vector
-from agents.evaluation.episodes import run_episodes
 from agents.filters.scenarios import Scenario
+from agents.play import record
 from dptse_env.estimators.batch import checked_measurements
 from dptse_env.estimators.learned.cells import Cells, input_channels, make_cells
 from dptse_env.estimators.learned.channels import Released, Rows, make_released, make_rows
+from dptse_env.evaluation import Row, evaluate
 from dptse_env.process import QueryProcess
-from dptse_env.schedules import make_schedule
 from dptse_env.traffic import Corridor, Records
 
 Float32Array = NDArray[np.float32]
@@ -73,6 +73,26 @@ class _Recorder:
         self._estimator.update(*arguments)
 
 
+class _Watcher:
+    """Writes down the prior, and the truth of every second; adds no columns to rows."""
+
+    def __init__(self, process: QueryProcess) -> None:
+        self._process = process
+        self.seen: list[Float32Array] = []
+
+    def __call__(self) -> None:
+        process = self._process
+        if self.seen:
+            self.seen.append(_single(process.truth(np.arange(process.n_episodes))))
+        else:
+            said = process.estimate
+            table = said.density, said.speed, said.density_std, said.speed_std
+            self.seen.append(_single(np.stack(table, -1)))
+
+    def rows(self) -> list[Row]:
+        return [{}] * self._process.n_episodes
+
+
 def collect(scenario: Scenario, estimator: Mapping[str, Any], records: Records) -> Collected:
     """Play a scenario with an estimator.
 
@@ -86,30 +106,18 @@ def collect(scenario: Scenario, estimator: Mapping[str, Any], records: Records) 
     # One thread, so that the estimator is given all episodes in one call.
     keywords |= {"action": "scores", "threads": 1}
     env = make_vector(scenario.env, len(seeds), keywords)
-    process, n = env.process, len(seeds)
-    recorder = _Recorder(process)
+    process = env.process
+    record(env.config.corridor, seeds, records)
+    recorder, watcher = _Recorder(process), _Watcher(process)
     process.estimator = recorder  # type: ignore[assignment]
-    truths: list[Float32Array] = []
-    starts: list[Float32Array] = []
-    corridor = process.config.corridor
-
-    def on_second() -> None:
-        if not starts:
-            said = process.estimate
-            table = said.density, said.speed, said.density_std, said.speed_std
-            starts.append(_single(np.stack(table, -1)))
-            return
-        truths.append(_single(process.truth(np.arange(n))))
-
-    policy = make_schedule(scenario.schedule, env)
-    noise = [scenario.noise_seed + seed for seed in seeds]
-    run_episodes(env, policy, traffic_seeds=seeds, seeds=noise, on_second=on_second)
+    evaluate(env, scenario.schedule, seeds, scenario.noise_seed, watchers=[lambda _: watcher])
     env.close()
+    start, *truths = watcher.seen
     return Collected(
-        corridor=corridor,
+        corridor=process.config.corridor,
         cells=recorder.cells,
         rows=make_rows(process.model.rows),
-        start=starts[0],
+        start=start,
         released=Released(*(np.stack(arrays) for arrays in zip(*recorder.released, strict=True))),
         outside=np.stack(recorder.outside),
         truth=np.stack(truths),

@@ -5,16 +5,16 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import warnings
 from dataclasses import dataclass, field
-from importlib.metadata import version
 from typing import Any
 
 import numpy as np
 
-from agents.evaluation.episodes import require_seeds
-from agents.experiments.provenance import machine, source_digest
+from agents.environments import parse_env
 from agents.filters.scenarios import Scenario, ScenarioRanges
-from agents.seeds import TUNING
+from agents.play import Cell
+from agents.seeds import TUNING, require_seeds
 from dptse_env.config import TRAINING_SEEDS, VALIDATION_SEEDS
 from dptse_env.estimators.learned.weights import read_network
 from dptse_env.utils.validation import inside, integer, positive, require
@@ -155,13 +155,44 @@ class FilterPlan:
             plain["initial_sha256"] = read_network(self.initial).sha256
         return plain
 
-    def provenance(self) -> dict[str, Any]:
-        """Return what `take_folder` compares and keeps, as plain JSON."""
-        libraries = ("gymnasium", "numba", "numpy", "torch")
-        versions = {name: version(name) for name in ("dptse-env", "libsumo")}
-        return {
-            "made_with": {"versions": versions, "plan": self.settings(), "settings": {}},
-            "tuned": [],
-            "sources": [source_digest()],
-            "machine": machine(libraries),
-        }
+    def validation_cells(self, weights: str | None = None) -> list[Cell]:
+        """Return the cells of a validation, of a network or else of the environments' estimators.
+
+        Args:
+            weights: File of the network.
+        """
+        own: dict[str, Any] = {}
+        if weights is not None:
+            settings = {"recurrent": {"weights": weights, "outside": True}}
+            own = {"estimator": "recurrent", "estimator_settings": settings}
+        return [
+            Cell(
+                env,
+                "round-robin",
+                {**keywords, **own},
+                noise_seed=TUNING.start,
+                watchers=("honesty",),
+            )
+            for env, keywords in map(parse_env, self.validation_envs)
+        ]
+
+    def check(self) -> None:
+        """Check environments, schedules and estimators without playing, recording or compiling.
+
+        Raises:
+            ValueError: One is unknown, or does not suit a road.
+        """
+        estimators = [each.estimator for each in self.rounds if each.estimator != OWN]
+        with warnings.catch_warnings():
+            # They come again from the environments in which it trains.
+            warnings.simplefilter("ignore", UserWarning)
+            for text in self.ranges.envs:
+                env, keywords = parse_env(text)
+                for schedule in self.ranges.schedules:
+                    Cell(env, schedule, keywords).check()
+                for mechanism in self.ranges.mechanisms:
+                    for estimator in estimators:
+                        chosen = {"privacy": mechanism, "estimator": estimator}
+                        Cell(env, "none", {**keywords, **chosen}).check()
+            for cell in self.validation_cells():
+                cell.check()

@@ -10,18 +10,17 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from agents.engines.engine import Engine, run_in_order
-from agents.engines.local import THIS_PROCESS
-from agents.experiments.provenance import take_folder
+from agents.executors import THIS_PROCESS, AnyExecutor, run_in_order
 from agents.files import replacing
 from agents.filters.batches import Batch, draw_batch
 from agents.filters.card import make_card
 from agents.filters.collecting import Collected, CollectTask, run_collect
 from agents.filters.plan import OWN, FilterPlan
 from agents.filters.torch_network import RecurrentNetwork, State, second_loss
-from agents.filters.validation import validate
+from agents.play import play
 from agents.training.run_files import (
     Row,
+    keep_plan,
     read_checkpoint,
     read_progress,
     write_checkpoint,
@@ -60,7 +59,7 @@ class FilterTraining:
         watchers: Sequence[Watcher] = (),
         progress: Callable[[str, float], None] = lambda stage, fraction: None,
         compiled: bool = False,
-        engine: Engine = THIS_PROCESS,
+        executor: AnyExecutor = THIS_PROCESS,
     ) -> None:
         """Take the folder and restore its state.
 
@@ -72,17 +71,17 @@ class FilterTraining:
             progress: Called with the name of a stage and the fraction of it that is done.
             compiled: Whether torch compiles the step, which takes a C++ compiler and half a minute
                 and makes passes some 1.6 times as fast; the last digits of numbers depend on it.
-            engine: Plays the scenarios.
+            executor: Plays the scenarios.
 
         Raises:
             ValueError: The folder belongs to another plan, or its checkpoint is damaged.
             OSError: The folder cannot be written.
         """
         self.plan, self.folder, self._records = plan, folder, records
-        self._engine = engine
+        self._executor = executor
         self._watchers, self._progress = watchers, progress
         checkpoint = read_checkpoint(folder)
-        take_folder(folder, plan.provenance())
+        keep_plan(folder, plan.settings())
         torch.manual_seed(plan.seed)
         self.network = RecurrentNetwork(plan.width)
         if plan.initial is not None:
@@ -120,7 +119,7 @@ class FilterTraining:
             for scenario in self.plan.scenarios(index)
         ]
         on_done = partial(self._progress, f"round {index + 1}, collecting")
-        return run_in_order(self._engine, run_collect, tasks, on_done, progress=False)
+        return run_in_order(self._executor, run_collect, tasks, on_done, progress=False)
 
     def _pass(self, index: int, collected: Sequence[Collected]) -> None:
         """Pass over some episodes, drawn from all scenarios on a road."""
@@ -176,11 +175,12 @@ class FilterTraining:
 
     def _validate(self) -> Row:
         self._save(WEIGHTS)
-        plan, weights = self.plan, str(self.folder / WEIGHTS)
-        scores = validate(weights, plan.validation_envs, plan.validation_seeds, self._records)
+        plan, cells = self.plan, self.plan.validation_cells(str(self.folder / WEIGHTS))
+        played = [play(cell, plan.validation_seeds, self._records, threads=None) for cell in cells]
+        rows = [row for each in played for row in each]
         return {
-            "validation": float(np.mean([each.error for each in scores.values()])),
-            "chi2": float(np.mean([each.chi2_density for each in scores.values()])),
+            "validation": -float(np.mean([row["reward"] for row in rows])),
+            "chi2": float(np.mean([row["chi2_density"] for row in rows])),
         }
 
     def _save(self, name: str) -> None:

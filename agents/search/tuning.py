@@ -1,6 +1,6 @@
 """Tune an estimator's settings on training traffic with Optuna, in a journal that can be resumed.
 
-One process proposes trials and writes the journal; episodes run on the workers of an engine.
+One process proposes trials and writes the journal; episodes run on an executor.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ import optuna
 from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock, JournalStorage
 from optuna.trial import FrozenTrial, TrialState
 
-from agents.engines.engine import Workers
-from agents.evaluation.episodes import WARM_UP, EpisodeScore
-from agents.files import replacing
+from agents.executors import AnyExecutor
+from agents.files import first_difference, replacing
 from agents.search.space import DEMAND_START, at_bound, holds, nested, rounded, values_of
 from agents.search.tuning_task import TuningTask, score_episodes
 from dptse_env.estimators import EstimatorSettings
 from dptse_env.estimators.tuned_settings import write_settings
+from dptse_env.evaluation import WARM_UP, Row
 from dptse_env.utils.fields import from_mapping
 
 _FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
@@ -37,8 +37,8 @@ _COUNTED = (*_FINISHED, TrialState.RUNNING)
 
 logger = logging.getLogger(__name__)
 
-Score = Callable[[TuningTask, EstimatorSettings, Sequence[int]], list[EpisodeScore]]
-"""Scores settings on traffic seeds; a function of a module, so that workers can import it."""
+Score = Callable[[TuningTask, EstimatorSettings, Sequence[int]], list[Row]]
+"""Plays settings on traffic seeds; a function of a module, so that workers can import it."""
 
 BATCH = 8
 """Episodes that run at once; a trial may stop early after each batch."""
@@ -50,7 +50,7 @@ class _Running:
 
     trial: optuna.Trial
     settings: EstimatorSettings
-    scores: list[EpisodeScore] = field(default_factory=list)
+    rows: list[Row] = field(default_factory=list)
 
 
 class TuningStudy:
@@ -91,12 +91,12 @@ class TuningStudy:
         kept = self.study.user_attrs.get("identity")
         if kept is None:
             self.study.set_user_attr("identity", identity)
-        elif kept != identity:
-            keys = [key for key in {**kept, **identity} if kept.get(key) != identity.get(key)]
-            ours, theirs = ({key: each.get(key) for key in keys} for each in (identity, kept))
+            return
+        difference = first_difference(kept, identity)
+        if difference is not None:
             raise ValueError(
-                f"{self.path} belongs to a study with {theirs}, this one has {ours}; "
-                "choose another output folder"
+                f"{self.path} has the trials of another search: {difference}. Choose another "
+                "--output"
             )
 
     def _enqueue(self, label: str, settings: EstimatorSettings) -> None:
@@ -134,7 +134,7 @@ class TuningStudy:
     def run(
         self,
         n_trials: int,
-        workers: Workers,
+        executor: AnyExecutor,
         n_parallel: int = 1,
         on_trial: Callable[[], None] | None = None,
     ) -> None:
@@ -143,23 +143,24 @@ class TuningStudy:
         With one trial at a time, a study that was interrupted comes out as one that was not.
         ``on_trial`` is called after every finished trial.
         """
-        running: dict[Future[list[EpisodeScore]], _Running] = {}
+        running: dict[Future[list[Row]], _Running] = {}
         try:
             while True:
                 while len(running) < n_parallel and self._n_counted() < n_trials:
-                    self._submit(self._propose(), workers, running)
+                    self._submit(self._propose(), executor, running)
                 if not running:
                     return
                 for future in wait(running, return_when=FIRST_COMPLETED).done:
                     trial = running[future]
-                    trial.scores.extend(future.result())
+                    trial.rows.extend(future.result())
                     finished = self._tell(trial)
                     del running[future]
                     if not finished:
-                        self._submit(trial, workers, running)
+                        self._submit(trial, executor, running)
                     elif on_trial is not None:
                         on_trial()
         except BaseException:
+            executor.shutdown(cancel_futures=True)
             for trial in running.values():
                 self.study.tell(trial.trial, state=TrialState.FAIL, skip_if_finished=True)
             raise
@@ -179,25 +180,25 @@ class TuningStudy:
     def _submit(
         self,
         trial: _Running,
-        workers: Workers,
-        running: dict[Future[list[EpisodeScore]], _Running],
+        executor: AnyExecutor,
+        running: dict[Future[list[Row]], _Running],
     ) -> None:
-        done = len(trial.scores)
+        done = len(trial.rows)
         seeds = self.task.traffic_seeds[done : done + BATCH]
-        running[workers.submit(self._score, self.task, trial.settings, seeds)] = trial
+        running[executor.submit(self._score, self.task, trial.settings, seeds)] = trial
 
     def _tell(self, running: _Running) -> bool:
         """Report the latest batch; return whether the trial is finished."""
-        trial, scores = running.trial, running.scores
-        reward = float(np.mean([score.reward for score in scores]))
+        trial, rows = running.trial, running.rows
+        reward = float(np.mean([row["reward"] for row in rows]))
         if not math.isfinite(reward):
-            bad = [score.traffic_seed for score in scores if not math.isfinite(score.reward)]
+            bad = [row["traffic_seed"] for row in rows if not math.isfinite(row["reward"])]
             trial.set_user_attr("not_finite", bad)
             self.study.tell(trial, state=TrialState.PRUNED)
             return True
-        trial.report(reward, len(scores))
-        if len(scores) == len(self.task.traffic_seeds):
-            for key, value in _summary(scores).items():
+        trial.report(reward, len(rows))
+        if len(rows) == len(self.task.traffic_seeds):
+            for key, value in _summary(rows).items():
                 trial.set_user_attr(key, value)
             self.study.tell(trial, reward)
             return True
@@ -293,12 +294,12 @@ def _value(trial: FrozenTrial) -> float:
     return trial.value
 
 
-def _summary(scores: list[EpisodeScore]) -> dict[str, float]:
+def _summary(rows: list[Row]) -> dict[str, float]:
     """Return errors as means over traffic seeds, divergences as sums."""
     return {
-        "rmse_density": float(np.mean([score.rmse_density for score in scores])),
-        "rmse_speed": float(np.mean([score.rmse_speed for score in scores])),
-        "n_diverged": float(sum(score.n_diverged for score in scores)),
+        "rmse_density": float(np.mean([row["rmse_density"] for row in rows])),
+        "rmse_speed": float(np.mean([row["rmse_speed"] for row in rows])),
+        "n_diverged": float(sum(row["n_diverged"] for row in rows)),
     }
 
 

@@ -6,23 +6,22 @@ The score is the mean reward of a second after the warm-up, as the environment g
 from __future__ import annotations
 
 import dataclasses
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
-
-from agents.environments import make_vector, unwrap
-from agents.evaluation.episodes import WARM_UP, EpisodeScore, run_episodes
-from agents.policies import PolicySource, find_policy
+from agents.environments import make_config, quietly
+from agents.play import Cell, play
+from agents.policies import find_policy
 from agents.search.space import Knob, search_space
 from agents.seeds import TUNING
 from dptse_env.config import TRAINING_SEEDS, EnvConfig, parse_seeds
 from dptse_env.estimators import EstimatorSettings
 from dptse_env.estimators.tuned_settings import settings_name
+from dptse_env.evaluation import WARM_UP, Row
 from dptse_env.model import ARZParameters
 from dptse_env.traffic import Records
 from dptse_env.utils.validation import integer, require
@@ -73,7 +72,7 @@ class TuningTask:
 
     def __post_init__(self) -> None:
         """Check what needs no environment."""
-        _ = self.space, self.source
+        _ = self.space, find_policy(self.schedule)
         for name in ("estimator", "parameters", "traffic_seeds", "records", "action"):
             require(name not in self.keywords, f"keywords.{name}", "left out", name)
         privacy = self.keywords.get("privacy", {})
@@ -87,11 +86,6 @@ class TuningTask:
         integer("noise_seed", self.noise_seed, first, last)
         if Path(self.name).name != self.name:
             raise ValueError(f"the ARZ parameters' name must be part of a file name: {self.name!r}")
-
-    @cached_property
-    def source(self) -> PolicySource:
-        """The schedule or the saved policy that queries."""
-        return find_policy(self.schedule)
 
     @property
     def space(self) -> dict[str, Knob]:
@@ -120,51 +114,40 @@ class TuningTask:
         name = settings_name(self.estimator, self.parameters_name, self.privacy)
         return f"{name}-{self.variant}" if self.variant else name
 
-    def arguments(self, settings: EstimatorSettings | None = None) -> dict[str, Any]:
-        """Return keywords that make the environment; with its default settings if None."""
+    def cell(self, settings: EstimatorSettings | None = None) -> Cell:
+        """Return what a trial plays; the environment's default settings if None."""
         keywords: dict[str, Any] = {
             **self.keywords,
-            **self.source.keywords,
             "estimator": self.estimator,
             "parameters": self.parameters,
             "privacy": {**self.keywords.get("privacy", {}), "preset": self.privacy},
-            "traffic_seeds": self.seeds,
-            "records": self.records,
         }
         if isinstance(self.parameters, ARZParameters):
             keywords["parameters"] = dataclasses.asdict(self.parameters)
         if settings is not None:
             keywords["estimator_settings"] = dataclasses.asdict(settings)
-        return keywords
-
-    def make(self, settings: EstimatorSettings | None = None) -> gym.Env[Any, Any]:
-        """Make the environment; with its default settings if None."""
-        return gym.make(self.env, **self.arguments(settings))
+        return Cell(self.env, self.schedule, keywords, noise_seed=self.noise_seed)
 
     def config(self) -> EnvConfig:
         """Return the configuration of the environment, with its default settings.
 
         Raises:
-            ValueError: A value is out of range, or the policy does not suit the environment.
+            ValueError: A value is out of range.
         """
-        env = self.make()
-        self.source.load(env)
-        return unwrap(env).config
+        with quietly():
+            return make_config(self.env, self.cell().all_keywords)
 
     def identity(self) -> dict[str, Any]:
-        """Return everything that two studies must share for their scores to be comparable."""
+        """Return everything that two searches must share for their scores to be comparable."""
         config = self.config()
+        cell: dict[str, Any] = json.loads(self.cell().id)
         return {
-            "env": self.env,
+            **cell,
             "corridor": config.corridor.digest,
-            "estimator": self.estimator,
             "parameters": dataclasses.asdict(config.arz_parameters),
             "privacy": dataclasses.asdict(config.privacy),
             "bandwidth": config.bandwidth,
-            "keywords": dict(self.keywords),
-            "schedule": self.source.identity,
             "seeds": self.seeds,
-            "noise_seed": self.noise_seed,
             "warm_up": WARM_UP,
             "dptse-env": version("dptse-env"),
             "space": {path: repr(knob) for path, knob in self.space.items()},
@@ -173,8 +156,6 @@ class TuningTask:
 
 def score_episodes(
     task: TuningTask, settings: EstimatorSettings, traffic_seeds: Sequence[int]
-) -> list[EpisodeScore]:
-    """Run an episode of a task on each traffic seed with given settings, as one batch."""
-    env = make_vector(task.env, len(traffic_seeds), task.arguments(settings))
-    noise = [task.noise_seed + seed for seed in traffic_seeds]
-    return run_episodes(env, task.source.load(env), traffic_seeds=traffic_seeds, seeds=noise)
+) -> list[Row]:
+    """Play an episode of a task on each traffic seed with given settings, as one batch."""
+    return play(task.cell(settings), traffic_seeds, task.records)

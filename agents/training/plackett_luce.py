@@ -9,8 +9,8 @@ from typing import Any
 
 import torch
 
-from agents.engines.engine import Engine
 from agents.environments import make_vector
+from agents.executors import AnyExecutor
 from agents.seeds import training_seed
 from agents.training.episodes import make_episodes
 from agents.training.learner import Record
@@ -35,11 +35,11 @@ class PlackettLuceLearner:
         recipe: PlackettLuceRecipe,
         keywords: Mapping[str, Any],
         progress: Callable[[str, float], None],
-        engine: Engine,
+        executor: AnyExecutor,
     ) -> None:
         """Make an untrained policy; ``keywords`` are further ones of all environments."""
         self._plan, self._recipe, self._keywords = plan, recipe, keywords
-        self._progress, self._engine = progress, engine
+        self._progress, self._executor = progress, executor
         self._rounds, self._is_begun = 0, False
         torch.manual_seed(plan.seed)
         self.policy = untrained(plan.worlds[0], recipe)
@@ -110,7 +110,7 @@ class PlackettLuceLearner:
         ]
 
     def _try(self, environments: Sequence[SensorQueryVectorEnv]) -> list[Swaps]:
-        """Return the swaps of a round in each world: tried here, or in parts on the engine."""
+        """Return the swaps of a round in each world: tried here, or in parts on the executor."""
         plan, recipe = self._plan, self._recipe
         if recipe.swaps.parts == 1:
             return [
@@ -124,7 +124,7 @@ class PlackettLuceLearner:
             self._keywords,
             seed=plan.seed,
             index=self._rounds,
-            engine=self._engine,
+            executor=self._executor,
             progress=partial(self._progress, "swaps"),
         )
 

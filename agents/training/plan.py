@@ -7,13 +7,11 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from importlib.metadata import version
 from typing import Any
 
 from agents.environments import make_config, parse_env
-from agents.evaluation.episodes import WARM_UP
-from agents.experiments.provenance import machine, source_digest
-from agents.seeds import TRAINING_VALIDATION, TRAININGS
+from agents.play import Cell
+from agents.seeds import TRAININGS, require_seeds
 from agents.training.recipes import Recipe
 from agents.training.worlds import World
 from dptse_env.config import TRAINING_SEEDS, VALIDATION_SEEDS, EnvConfig
@@ -65,11 +63,7 @@ class TrainingPlan:
             ("traffic", self.traffic_seeds, TRAINING_SEEDS),
             ("validation", self.validation_seeds, VALIDATION_SEEDS),
         ):
-            outside = [seed for seed in seeds if seed not in allowed]
-            if outside:
-                raise ValueError(
-                    f"{path} must hold seeds in {allowed[0]}..{allowed[-1]}, got {outside[0]}"
-                )
+            require_seeds(path, seeds, allowed)
         for _, keywords in self._environments:
             for key in ("action", "traffic_seeds", "autoreset_mode"):
                 if key in keywords:
@@ -130,33 +124,21 @@ class TrainingPlan:
             worlds.append(World(env, keywords, config, share))
         return tuple(worlds)
 
-    def provenance(self, commit: str | None) -> dict[str, Any]:
-        """Return what `take_folder` compares and keeps, as plain JSON."""
-        libraries = ("gymnasium", "numba", "numpy", "stable-baselines3", "torch")
-        content = {
-            "made_with": {
-                "versions": {name: version(name) for name in ("dptse-env", "libsumo")},
-                "env": self.env,
-                "keywords": dict(self.keywords),
-                "also": self.also,
-                "corridor": [world.config.corridor.digest for world in self.worlds],
-                "learner": self.recipe.learner,
-                "recipe": dataclasses.asdict(self.recipe),
-                "seed": self.seed,
-                "steps": self.steps,
-                "traffic_seeds": self.traffic_seeds,
-                "validation_seeds": self.validation_seeds,
-                "validation_noise": TRAINING_VALIDATION.start,
-                "validate_every": self.validate_every,
-                "warm_up": WARM_UP,
-                "settings": {
-                    str(world): dataclasses.asdict(world.config.settings()) for world in self.worlds
-                },
-            },
-            "tuned": [],
-            "sources": [source_digest()],
-            "commit": commit,
-            "machine": machine(libraries),
-        }
+    def check(self) -> None:
+        """Check the environments without playing, recording or compiling.
+
+        Raises:
+            ValueError: As `worlds`, or an estimator does not suit its road.
+        """
+        for world in self.worlds:
+            Cell(world.env, "none", {**world.keywords, "action": self.recipe.action}).check()
+
+    def content(self) -> dict[str, Any]:
+        """Return what the numbers of the training depend on, as plain JSON."""
+        content = dataclasses.asdict(self)
+        del content["checkpoint_every"]
+        content["learner"] = self.recipe.learner
+        content["corridors"] = [world.config.corridor.digest for world in self.worlds]
+        content["settings"] = [dataclasses.asdict(world.config.settings()) for world in self.worlds]
         plain: dict[str, Any] = json.loads(json.dumps(content))
         return plain

@@ -1,19 +1,19 @@
-"""Files that a training leaves on disk: checkpoint and learning curve, each written atomically."""
+"""Files that a training leaves on disk: plan, checkpoint and learning curve, each atomically."""
 
 from __future__ import annotations
 
 import csv
 import io
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from agents.files import write_atomically
+from agents.files import first_difference, write_atomically, write_json
 
-CHECKPOINT, PROGRESS = "checkpoint.pt", "progress.csv"
+PLAN, CHECKPOINT, PROGRESS = "plan.json", "checkpoint.pt", "progress.csv"
 
 FORMAT = 3
 """Format of checkpoints; raise it whenever their content changes its meaning."""
@@ -26,6 +26,43 @@ COLUMNS = (
 and on validation traffic with deterministic and with drawn actions."""
 
 Row = dict[str, float]
+
+
+def keep_plan(folder: Path, plan: Mapping[str, Any]) -> None:
+    """Keep the plan of a training in its folder, which is made if it is missing.
+
+    Raises:
+        ValueError: As `check_plan`.
+        OSError: The folder cannot be written.
+    """
+    check_plan(folder, plan)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_json(folder / PLAN, plan)
+
+
+def check_plan(folder: Path, plan: Mapping[str, Any]) -> None:
+    """Check that a training can begin in a folder, or go on there.
+
+    Raises:
+        ValueError: The folder has the training of another plan, or something else.
+    """
+    path = folder / PLAN
+    if not path.exists():
+        if folder.exists() and any(folder.iterdir()):
+            raise ValueError(f"{folder} is not empty and has no {PLAN}: choose another --output")
+        return
+    try:
+        kept = json.loads(path.read_bytes())
+    except ValueError as problem:
+        raise ValueError(f"{path} is damaged: {problem}") from problem
+    if not isinstance(kept, dict):
+        raise ValueError(f"{path} is damaged: it has no plan")
+    difference = first_difference(kept, plan)
+    if difference is not None:
+        raise ValueError(
+            f"{folder} has the training of another plan: {difference}. Choose another --output, "
+            "or remove the folder to start over"
+        )
 
 
 def write_progress(folder: Path, rows: Sequence[Row], columns: Sequence[str] = COLUMNS) -> None:

@@ -9,8 +9,9 @@ from typing import Any
 
 import torch
 
-from agents.engines.engine import Engine, run_in_order
 from agents.environments import make_vector
+from agents.executors import AnyExecutor, run_in_order
+from agents.play import record
 from agents.training.policy_iteration import collect_swaps, first_seed
 from agents.training.recipes import PlackettLuceRecipe
 from agents.training.swaps import Swaps
@@ -43,6 +44,7 @@ class SwapPart:
 def collect_part(part: SwapPart) -> Swaps:
     """Try the swaps of a part; its draws do not depend on the other parts."""
     env = make_vector(part.world.env, len(part.episodes), dict(part.keywords))
+    record(env.config.corridor, env.config.traffic_seeds, part.keywords.get("records"))
     with torch.random.fork_rng(devices=[]):
         policy = untrained(part.world, part.recipe)
         policy.load_state_dict(part.weights)
@@ -60,10 +62,10 @@ def collect_parts(
     *,
     seed: int,
     index: int,
-    engine: Engine,
+    executor: AnyExecutor,
     progress: Callable[[float], None],
 ) -> list[Swaps]:
-    """Return the swaps of a round in each of the worlds, tried in parts on an engine.
+    """Return the swaps of a round in each of the worlds, tried in parts on an executor.
 
     Args:
         worlds: The worlds.
@@ -72,7 +74,7 @@ def collect_parts(
         keywords: Further keywords of all environments.
         seed: Training seed.
         index: Number of the round, counted from 0.
-        engine: Runs the parts.
+        executor: Runs the parts.
         progress: Called with the fraction of the parts that are done.
     """
     parts = [
@@ -88,7 +90,7 @@ def collect_parts(
         for world, policy in zip(worlds, policies, strict=True)
         for episodes in split(world.part(recipe.swaps.episodes), recipe.swaps.parts)
     ]
-    tried = run_in_order(engine, collect_part, parts, progress, progress=False)
+    tried = run_in_order(executor, collect_part, parts, progress, progress=False)
     return [
         Swaps.from_parts(
             [swaps for part, swaps in zip(parts, tried, strict=True) if part.world is world]

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from agents.evaluation.episodes import WARM_UP, Policy
+from dptse_env.evaluation import WARM_UP, Policy
 from dptse_env.process import QueryProcess
 from dptse_env.utils.arrays import Action, AnyArray, FloatArray, IntArray, Observation
 from dptse_env.vector_env import SensorQueryVectorEnv

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import math
-import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from agents.engines.engine import Engine
-from agents.engines.local import THIS_PROCESS
-from agents.experiments.provenance import take_folder
+from agents.executors import THIS_PROCESS, AnyExecutor
 from agents.training.learner import Learner
 from agents.training.plackett_luce import PlackettLuceLearner
 from agents.training.plan import TrainingPlan
@@ -20,6 +16,7 @@ from agents.training.ppo import PPOLearner
 from agents.training.recipes import PlackettLuceRecipe, PPORecipe
 from agents.training.run_files import (
     Row,
+    keep_plan,
     read_checkpoint,
     read_progress,
     write_checkpoint,
@@ -35,10 +32,6 @@ POLICY, BEST = "policy.zip", "best.zip"
 
 Watcher = Callable[[Row], None]
 """Receives every row of the learning curve as it comes."""
-
-
-class _PausedError(Exception):
-    """Ends an update of a training that is to pause; the checkpoint has been written."""
 
 
 class Training:
@@ -61,8 +54,7 @@ class Training:
         folder: Path,
         *,
         records: Records = None,
-        commit: str | None = None,
-        engine: Engine = THIS_PROCESS,
+        executor: AnyExecutor = THIS_PROCESS,
         watchers: tuple[Watcher, ...] = (),
         progress: Callable[[str, float], None] = lambda stage, fraction: None,
     ) -> None:
@@ -72,8 +64,7 @@ class Training:
             plan: The plan.
             folder: The folder; made if it is missing.
             records: Library of records, or its folder; None for the user's cache.
-            commit: State of the sources, for the record.
-            engine: Runs the parts of a round of swaps, where there are several.
+            executor: Runs the parts of a round of swaps, where there are several.
             watchers: Receive every row, those read from the folder first.
             progress: Called between two rows with the name of a stage and the fraction of it that
                 is done.
@@ -84,9 +75,9 @@ class Training:
         """
         self.plan, self.folder, self._watchers = plan, folder, watchers
         checkpoint = read_checkpoint(folder)  # may refuse the folder, which then stays as it is
-        take_folder(folder, plan.provenance(commit))
+        keep_plan(folder, plan.content())
         training = {"records": records, "traffic_seeds": list(plan.traffic_seeds)}
-        self.learner = _make_learner(plan, training, progress, engine)
+        self.learner = _make_learner(plan, training, progress, executor)
         chosen = {"records": records, "action": plan.recipe.action}
         self._validations = [
             (
@@ -98,7 +89,6 @@ class Training:
         ]
         self.rows: list[Row] = []
         self._seconds, self._best = 0.0, float("inf")
-        self._deadline = math.inf
         self._errors: dict[str, dict[str, float]] = {}
         if checkpoint is not None:
             self._resume(checkpoint)
@@ -113,25 +103,14 @@ class Training:
         """True if all updates are done."""
         return self.update >= self.plan.n_updates
 
-    def run(self, seconds: float = math.inf) -> bool:
+    def run(self) -> None:
         """Train until the end of the plan; leave the policy beside the checkpoint.
-
-        Args:
-            seconds: Time after which the training pauses at the next checkpoint.
-
-        Returns:
-            Whether the training is finished.
 
         Raises:
             OSError: The disk is full or cannot be written; the last checkpoint stays.
         """
-        self._deadline = time.monotonic() + seconds
-        try:
-            self.learner.train(self._record)
-        except _PausedError:
-            return False
+        self.learner.train(self._record)
         self._save(POLICY, self.rows[-1])
-        return True
 
     def _record(self, seconds: float, values: Row) -> None:
         """Record a finished round or update."""
@@ -146,8 +125,6 @@ class Training:
             watcher(row)
         if plan.is_due(update, plan.checkpoint_every):
             self._keep()
-            if time.monotonic() > self._deadline and not self.is_finished:
-                raise _PausedError
 
     def _validate(self, row: Row) -> None:
         for name, deterministic in (("validation", True), ("validation_drawn", False)):
@@ -210,12 +187,12 @@ def _make_learner(
     plan: TrainingPlan,
     keywords: Mapping[str, Any],
     progress: Callable[[str, float], None],
-    engine: Engine,
+    executor: AnyExecutor,
 ) -> Learner:
     """Make the learner of the plan's recipe; ``keywords`` are further ones of its environments."""
     recipe = plan.recipe
     if isinstance(recipe, PlackettLuceRecipe):
-        return PlackettLuceLearner(plan, recipe, keywords, progress, engine)
+        return PlackettLuceLearner(plan, recipe, keywords, progress, executor)
     assert isinstance(recipe, PPORecipe)
     return PPOLearner(plan, recipe, keywords)
 

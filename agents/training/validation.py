@@ -9,9 +9,9 @@ import numpy as np
 import torch
 
 from agents.environments import make_vector
-from agents.evaluation.episodes import Policy, require_seeds, run_episodes
-from agents.seeds import TRAINING_VALIDATION
+from agents.seeds import TRAINING_VALIDATION, require_seeds
 from dptse_env.config import VALIDATION_SEEDS
+from dptse_env.evaluation import Policy, evaluate
 from dptse_env.utils.arrays import FloatArray
 
 
@@ -37,11 +37,11 @@ class Validation:
         """
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(TRAINING_VALIDATION.start)
-            scores = run_episodes(
+            rows = evaluate(
                 self.env,
                 policy,
-                traffic_seeds=self.seeds,
-                seeds=[TRAINING_VALIDATION.start + seed for seed in self.seeds],
+                self.seeds,
+                TRAINING_VALIDATION.start,
                 deterministic=deterministic,
             )
-        return np.array([-score.reward for score in scores])
+        return np.array([-row["reward"] for row in rows])

@@ -86,8 +86,8 @@ def find_plan(kind: str, context: PlanContext) -> Plan:
             return plan
     known = "; ".join(str(plan.context) for plan in of_kind) or "none at all"
     raise ValueError(
-        f"no plan {kind!r} ships for {context}; plans exist for: {known}. "
-        "scripts/search_plan.py makes plans; pass its file as the schedule"
+        f"no plan {kind!r} ships for {context}; plans exist for: {known}. The file of another plan "
+        "can be passed as the schedule"
     )
 
 

@@ -7,8 +7,8 @@ from contextlib import contextmanager
 
 EXTRAS: Mapping[str, tuple[str, ...]] = {
     "train": (
-        "jinja2", "loky", "optuna", "plotly", "polars", "rich", "sb3_contrib",
-        "stable_baselines3", "torch", "tyro",
+        "loky", "optuna", "plotly", "polars", "rich", "sb3_contrib", "stable_baselines3", "torch",
+        "tyro",
     ),
     "corridors": ("ijson", "pyarrow", "sumo"),
     "ray": ("ray",),

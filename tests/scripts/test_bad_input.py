@@ -1,41 +1,20 @@
-"""Bad input and failed runs of every command: one sentence, a status, and nothing is replaced."""
+"""Bad input and failed runs: one line, a status, and nothing is played, recorded or replaced."""
 
 import errno
 import json
+import re
 from pathlib import Path
 
 import pytest
 
 pytest.importorskip("tyro")
 
-from dptse_env import __version__
 from dptse_env.traffic import RecordingError
 from scripts import dptse, info
+from tests.cases import fast_and_slow
+from tests.scripts.commands import ROOT, refused, run_script
 
-ROOT = Path(__file__).parents[2]
-SHORT = ["--env", "dptse_env:dptse/ShortHighway-v0"]
-FCD = b"<fcd-export><timestep time='0'><vehicle id='a' x='0' y='0' speed='3' lane='e_0'/>"
-NETWORK = b"<configuration><input><net-file value='n.net.xml'/></input></configuration>"
-
-
-def run(capsys, *words):
-    """Run a command; return its status, standard output and lines on standard error."""
-    try:
-        dptse.main(list(map(str, words)))
-        status = 0
-    except SystemExit as ended:
-        status = ended.code or 0
-    printed = capsys.readouterr()
-    return status, printed.out, printed.err.splitlines()
-
-
-def refused(capsys, *words, status=2):
-    """Run a command that must be refused; return its one line."""
-    got, out, lines = run(capsys, *words)
-    assert (got, out) == (status, "")
-    (line,) = lines
-    assert line.startswith("error: ")
-    return line
+SHORT = "dptse_env:dptse/ShortHighway-v0"
 
 
 def shipped(pattern):
@@ -44,244 +23,213 @@ def shipped(pattern):
 
 
 PARAMETERS = shipped("dptse_env/model/sets/*.json")
-PLAN = shipped("dptse_env/schedules/plans/*.json")
-SETTINGS = shipped("dptse_env/estimators/tuned/*.json")
-NETWORK_WEIGHTS = shipped("dptse_env/estimators/learned/shipped/*.npz")
 POLICY = shipped("dptse_env/policies/*.zip")
-
+FCD = b"<fcd-export><timestep time='0'><vehicle id='a' x='0' y='0' speed='3' lane='e_0'/>"
+NETWORK = b"<configuration><input><net-file value='n.net.xml'/></input></configuration>"
 FIELD = ["--source.cell", "0.1", "--source.interval", "5"]
 ROAD = [
     "--road.name", "x", "--road.segments", "6", "--road.lanes", "2", "--road.speed-limit", "100",
 ]  # fmt: skip
-
 FILES = {
-    "road": ("r.toml", b"n_mainline = 'six'\n", lambda path: ["record", "--corridor", path]),
-    "parameters": ("p.json", PARAMETERS, lambda path: ["evaluate", "--parameters", path]),
-    "tuned parameters": ("p.json", PARAMETERS, lambda path: ["tune", "--parameters", path]),
+    "road": ("r.toml", b"n_mainline = 'six'\n", ["record", "--corridor"]),
+    "parameters": ("p.json", PARAMETERS, ["tune", "--parameters"]),
     "settings": (
-        "s.json", SETTINGS,
-        lambda path: ["evaluate", "--keywords", json.dumps({"estimator_settings": str(path)})],
+        "s.json", shipped("dptse_env/estimators/tuned/*.json"),
+        ["evaluate", "--keywords", '{{"estimator_settings": "{path}"}}'],
     ),
-    "plan": ("p.json", PLAN, lambda path: ["evaluate", "--schedules", path]),
-    "policy": ("p.zip", POLICY, lambda path: ["evaluate", "--policies", path]),
-    "model": (
-        "m.zip", POLICY, lambda path: ["suite", "--policies", f"stable_baselines3:PPO={path}"]
-    ),
-    "first network": (
-        "n.npz", NETWORK_WEIGHTS, lambda path: ["train-estimator", "--initial", path]
-    ),
-    "frozen policy": (
-        "p.zip", POLICY, lambda path: ["study", "policies", "freeze", "--policies", f"paper={path}"]
-    ),
-    "frozen settings": (
-        "s.json", SETTINGS, lambda path: ["study", "policies", "freeze", "--settings", f"a={path}"]
+    "plan": ("p.json", shipped("dptse_env/schedules/plans/*.json"), ["evaluate", "--schedules"]),
+    "policy": ("p.zip", POLICY, ["tune", "--schedule"]),
+    "model": ("m.zip", POLICY, ["evaluate", "--policies", "stable_baselines3:PPO={path}"]),
+    "network": (
+        "n.npz", shipped("dptse_env/estimators/learned/shipped/*.npz"),
+        ["train_estimator", "--initial"],
     ),
     "trajectories": (
         "t.xml", FCD,
-        lambda path: [
-            "import", "trajectories", "--format", "fcd", "--corridor", "short-highway", "--files",
-            path,
-        ],
+        ["import_trajectories", "--format", "fcd", "--corridor", "short-highway", "--files"],
     ),
     "mapping": (
         "m.toml", b'format = "fcd"\n',
-        lambda path: [
-            "import", "trajectories", "--corridor", "short-highway", "--files", "x", "--mapping",
-            path,
-        ],
+        ["import_trajectories", "--corridor", "short-highway", "--files", "x", "--mapping"],
     ),
     "field": (
         "d.txt", b"1 2 3\n4 5 6\n",
-        lambda path: [
-            "import", "field", "--source.density", path, "--source.speed", path, *FIELD, *ROAD
-        ],
+        ["import_field", *FIELD, *ROAD, "--source.density", "{path}", "--source.speed"],
     ),
     "replayed field": (
         "d.txt", b"1 2 3\n4 5 6\n",
-        lambda path: [
-            "replay-field", "--source.density", path, "--source.speed", path, *FIELD,
-            "--segments", "6",
-        ],
+        ["replay_field", *FIELD, "--segments", "6", "--source.density", "{path}", "--source.speed"],
     ),
     "configuration": (
-        "a.sumocfg", NETWORK,
-        lambda path: ["import", "network", "--path", "a b c", "--configuration", path],
+        "a.sumocfg", NETWORK, ["import_network", "--path", "a b c", "--configuration"]
     ),
     "net": (
-        "a.net.xml", b"<net version='1.9'></net>",
-        lambda path: ["import", "network", "--path", "a b c", "--net", path],
+        "a.net.xml", b"<net version='1.9'></net>", ["import_network", "--path", "a b c", "--net"]
     ),
 }  # fmt: skip
-"""Files that commands read: a name, a content, and the command."""
+"""Files that commands read: a name, a content, and the command; the path comes last or inside."""
+
+OUTPUTS = {
+    "replay_field": [], "record": ["--records", "cache"], "import_network": ["--output", "o.toml"],
+}  # fmt: skip
+FAST = [
+    ("road", "missing"), ("policy", "truncated"), ("network", "noise"), ("net", "folder"),
+    ("trajectories", "truncated"), ("replayed field", "folder"),
+]  # fmt: skip
+ALL = [(kind, how) for kind in FILES for how in ("missing", "folder", "noise", "truncated")]
 
 
-@pytest.mark.parametrize("how", ["missing", "folder", "noise", "truncated"])
-@pytest.mark.parametrize("kind", FILES)
-def test_a_file_that_cannot_be_read_is_named(kind, how, tmp_path, capsys, monkeypatch):
+@pytest.mark.parametrize(("kind", "how"), fast_and_slow(ALL, FAST))
+def test_a_file_that_cannot_be_read_is_named(kind, how, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    name, content, words = FILES[kind]
+    name, content, (script, *words) = FILES[kind]
     path = tmp_path / name
     if how == "folder":
         path.mkdir()
     elif how != "missing":
         path.write_bytes(bytes(range(256)) if how == "noise" else content[: len(content) * 2 // 3])
-    command = words(path)
-    output = [] if command[0] == "replay-field" else ["--output", "out"]
-    if command[:2] == ["import", "network"]:
-        output = ["--output", "out.toml"]
-    if command[0] == "record":
-        output = ["--records", tmp_path / "cache"]
-    line = refused(capsys, *command, *output)
+    given = [word.format(path=path) for word in words]
+    if given == words or "density" in " ".join(words):
+        given.append(path)
+    line = refused(script, *given, *OUTPUTS.get(script, ["--output", "out"]))
     assert name in line
     assert "[Errno" not in line
     assert {entry.name for entry in tmp_path.iterdir()} <= {name}
 
 
-ANOTHER = {"made_with": {"versions": {"dptse-env": "0.0.1"}, "settings": {}}}
-FOLDERS = {
-    "train": ["train", "--no-tensorboard"],
-    "several": ["train", "--seeds", "0:2"],
-    "train-estimator": ["train-estimator", "--no-tensorboard"],
-    **{name: ["study", name, "--quick"] for name in ("paper", "privacy", "ledger", "choices")},
-}
-"""Commands that go on in a folder with ``run.json``."""
+def recurrent(weights):
+    settings = {"recurrent": {"weights": weights}}
+    return json.dumps({"estimator": "recurrent", "estimator_settings": settings})
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (
-            json.dumps({**ANOTHER, "tuned": [], "sources": []}),
-            "versions.dptse-env is '0.0.1' there",
-        ),
-        (json.dumps(ANOTHER), "run.json is not as this program writes it"),
-        ('{"made_with": {', "run.json is not as this program writes it"),
-        ("[]", "run.json is not as this program writes it"),
-        (None, "is not empty and has no run.json: choose another --output"),
-    ],
-    ids=["version", "lacking", "truncated", "list", "foreign"],
-)
-@pytest.mark.parametrize("name", FOLDERS)
-def test_a_folder_of_something_else_stays_as_it_is(name, content, message, tmp_path, capsys):
+REFUSED = {
+    "unknown schedule": (
+        ["tune", "--env", SHORT, "--schedule", "best"], "schedule must be one of .*, got 'best'",
+    ),
+    "unfit policy": (
+        ["tune", "--env", SHORT, "--schedule", "{policy}"], "bandwidth is 3 for the policy and 2",
+    ),
+    "refused estimator": (
+        ["train", "--env", SHORT, "--keywords", recurrent("highway-flows"), "--traffic", "0:1"],
+        "were trained on flows in",
+    ),
+    "unknown estimator of a round": (
+        ["train_estimator", "--ranges.envs", SHORT, "--rounds", "kf:1:1"],
+        "estimator must be one of .*, got 'kf'",
+    ),
+    "unknown schedule of scenarios": (
+        ["train_estimator", "--ranges.envs", SHORT, "--ranges.schedules", "best"],
+        "schedule must be one of .*, got 'best'",
+    ),
+    "refused estimator of an audit": (
+        ["audit", "--env", SHORT, "--privacy", "paced", "--keywords", recurrent("highway-speeds")],
+        "were trained on flows in",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_does_not_fit_is_found_before_anything_is_recorded(case, tmp_path):
     pytest.importorskip("sb3_contrib")
-    folder = tmp_path / "0" if name == "several" else tmp_path
-    folder.mkdir(exist_ok=True)
-    kept = folder / ("notes.txt" if content is None else "run.json")
+    from tests.agents.policies import save
+
+    policy = save(tmp_path / "policy.zip", bandwidth=3)
+    (script, *words), message = REFUSED[case]
+    given = [word.replace("{policy}", str(policy)) for word in words]
+    folders = "--output", tmp_path / "out", "--records", tmp_path / "cache"
+    assert re.search(message, refused(script, *given, *folders))
+    assert list(tmp_path.iterdir()) == [policy]
+
+
+FOLDERS = {
+    "another plan": ("train", '{"env": "mine"}', "env is 'mine' there and 'dptse_env:"),
+    "damaged": ("train", '{"env": ', "plan.json is damaged"),
+    "foreign": ("train", None, "is not empty and has no plan.json: choose another --output"),
+    "several": ("train", '{"env": "mine"}', "env is 'mine' there and 'dptse_env:"),
+    "no plan": ("train_estimator", "[]", "plan.json is damaged: it has no plan"),
+    "another estimator": ("train_estimator", '{"seed": 7}', "seed is 7 there and 0 now"),
+}
+
+
+@pytest.mark.parametrize("case", FOLDERS)
+def test_a_folder_of_something_else_stays_as_it_is(case, tmp_path):
+    pytest.importorskip("sb3_contrib")
+    script, content, message = FOLDERS[case]
+    folder = tmp_path / "out" / "0" if case == "several" else tmp_path / "out"
+    folder.mkdir(parents=True)
+    kept = folder / ("notes.txt" if content is None else "plan.json")
     kept.write_text(content or "mine")
-    line = refused(capsys, *FOLDERS[name], "--output", tmp_path)
-    assert message in line
+    words = ["--seeds", "0:2"] if case == "several" else []
+    if script == "train_estimator":
+        words = ["--ranges.envs", SHORT]
+    folders = "--output", tmp_path / "out", "--records", tmp_path / "cache"
+    assert message in refused(script, *words, *folders)
     assert kept.read_text() == (content or "mine")
     assert list(folder.iterdir()) == [kept]
-
-
-def test_a_folder_of_another_study_is_refused(tmp_path, capsys):
-    kept = tmp_path / "run.json"
-    made_with = {"versions": {"dptse-env": __version__}, "settings": {}}
-    kept.write_text(json.dumps({"made_with": made_with, "tuned": [], "sources": []}))
-    line = refused(capsys, "study", "choices", "--quick", "--output", tmp_path)
-    assert "cells is missing there" in line
-    assert list(tmp_path.iterdir()) == [kept]
-
-
-def written(folder, name):
-    path = folder / name
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text("mine")
-    return path
+    assert not (tmp_path / "cache").exists()
 
 
 REPLACED = {
-    "evaluate": ["evaluate", *SHORT],
-    "calibrate": ["calibrate"],
-    "audit": ["audit"],
-    "tune": ["tune", "--estimators", "ekf", "--parameters", "w99-3lane"],
-    "import network": ["import", "network"],
-}
-NAMES = {
-    "evaluate": "episodes.csv",
-    "calibrate": "fitted.json",
-    "audit": "paced-worst-case-hunter.json",
-    "tune": "ekf-w99-3lane-paper.json",
-    "import network": "road.toml",
+    "evaluate": (["--env", SHORT], "rows.parquet"),
+    "calibrate": ([], "fitted.json"),
+    "audit": ([], "paced-worst-case-hunter.json"),
+    "tune": (["--estimators", "ekf", "--parameters", "w99-3lane"], "ekf-w99-3lane-paper.json"),
+    "import_network": ([], "road.toml"),
 }
 
 
-@pytest.mark.parametrize("name", REPLACED)
-def test_results_are_not_replaced_without_force(name, tmp_path, capsys):
-    path = written(tmp_path, NAMES[name])
-    output = path if name == "import network" else tmp_path
-    line = refused(capsys, *REPLACED[name], "--output", output)
-    assert line == (f"error: {path} would be replaced: choose another --output, or give --force")
+@pytest.mark.parametrize("script", REPLACED)
+def test_results_are_not_replaced_without_force(script, tmp_path):
+    words, name = REPLACED[script]
+    path = tmp_path / name
+    path.write_text("mine")
+    output = path if script == "import_network" else tmp_path
+    line = refused(script, *words, "--output", output)
+    assert line == f"error: {path} would be replaced: choose another --output, or give --force"
     assert path.read_text() == "mine"
 
 
-def test_a_folder_of_records_is_never_replaced(tmp_path, capsys):
-    file, content, words = FILES["trajectories"]
-    (tmp_path / file).write_bytes(content)
-    kept = written(tmp_path / "out", "road.toml")
-    line = refused(capsys, *words(tmp_path / file), "--output", tmp_path / "out")
+def test_a_folder_of_records_is_never_replaced(tmp_path):
+    name, content, (script, *words) = FILES["trajectories"]
+    (tmp_path / name).write_bytes(content)
+    kept = tmp_path / "out" / "road.toml"
+    kept.parent.mkdir()
+    kept.write_text("mine")
+    line = refused(script, *words, tmp_path / name, "--output", kept.parent)
     assert "output must be a folder that does not exist yet" in line
     assert kept.read_text() == "mine"
-
-
-def test_with_force_they_are_replaced_and_standard_output_is_json(tmp_path, capsys):
-    path = written(tmp_path, "summary.json")
-    words = [
-        "evaluate", *SHORT, "--schedules", "paper", "--estimators", "random_walk", "--seeds",
-        "2000:2002", "--workers", "1", "--output", tmp_path, "--json",
-    ]  # fmt: skip
-    refused(capsys, *words)
-    status, out, _ = run(capsys, *words, "--force")
-    assert status == 0
-    assert json.loads(out) == json.loads(path.read_text())
 
 
 @pytest.mark.parametrize(
     ("problem", "status", "said"),
     [
-        (ValueError("seeds must be"), 2, ["error: seeds must be"]),
-        (
-            FileNotFoundError(errno.ENOENT, "No such file", "a.toml"),
-            2,
-            ["error: a.toml: No such file"],
-        ),
-        (
-            PermissionError(errno.EACCES, "Permission denied", "a"),
-            2,
-            ["error: a: Permission denied"],
-        ),
-        (
-            OSError(errno.ENOSPC, "No space left on device", "a"),
-            1,
-            ["error: a: No space left on device"],
-        ),
-        (RecordingError("seed 3: SUMO"), 1, ["error: seed 3: SUMO"]),
-        (KeyboardInterrupt(), 130, ["interrupted"]),
+        (ValueError("seeds must be"), 2, "error: seeds must be"),
+        (FileNotFoundError(errno.ENOENT, "No such file", "a.toml"), 2,
+         "error: a.toml: No such file"),
+        (PermissionError(errno.EACCES, "Permission denied", "a"), 2,
+         "error: a: Permission denied"),
+        (OSError(errno.ENOSPC, "No space left on device", "a"), 1,
+         "error: a: No space left on device"),
+        (RecordingError("seed 3: SUMO"), 1, "error: seed 3: SUMO"),
+        (KeyboardInterrupt(), 130, "interrupted"),
     ],
     ids=lambda value: type(value).__name__ if isinstance(value, BaseException) else "",
-)
-def test_the_status_says_what_happened(problem, status, said, capsys, monkeypatch):
+)  # fmt: skip
+def test_the_status_says_what_happened(problem, status, said, monkeypatch):
     def collect():
         raise problem
 
     monkeypatch.setattr(info, "collect", collect)
-    assert run(capsys, "info") == (status, "", said)
+    assert run_script("info") == (status, "", f"{said}\n")
 
 
-def test_a_mistake_of_the_program_keeps_its_traceback(capsys, monkeypatch):
+def test_a_mistake_of_the_program_keeps_its_traceback(monkeypatch):
     monkeypatch.setattr(info, "collect", lambda: 1 / 0)
     with pytest.raises(ZeroDivisionError):
-        run(capsys, "info")
-
-
-@pytest.mark.parametrize("name", [name for name in dptse.COMMANDS if name != "completion"])
-def test_an_unknown_option_is_refused(name, capsys):
-    status, out, lines = run(capsys, *name.split(), "--no-such-option", "1")
-    assert (status, out) == (2, "")
-    assert any("--no-such-option" in line for line in lines)
+        run_script("info")
 
 
 def test_the_page_of_commands_has_them_all():
-    text = (ROOT / "docs" / "commands.md").read_text(encoding="utf-8")
-    for name, command in dptse.COMMANDS.items():
-        assert f"| `{name}` | {command.meaning} |" in text
+    text = Path(ROOT / "docs" / "commands.md").read_text(encoding="utf-8")
+    for name in dptse.COMMANDS:
+        assert f"| `{name}` |" in text

@@ -16,6 +16,7 @@ from dptse_env import command_line
 from dptse_env.utils.extras import EXTRAS
 from scripts import dptse
 from scripts.dptse import COMMANDS, as_commands
+from tests.cases import fast_and_slow
 
 SCRIPTS = Path(dptse.__file__).parent
 LIBRARIES = {"cli", "dptse", "document_configuration", "training_bar", "__init__"}
@@ -26,7 +27,13 @@ def test_every_script_is_a_command():
     assert {command.module for command in COMMANDS.values()} == modules
 
 
-@pytest.mark.parametrize("name", [name for name in COMMANDS if name != "completion"])
+HELP = ["train", "import network", "evaluate"]
+"""Commands with arguments in groups, of two words, and the longest one; the others are slow."""
+
+
+@pytest.mark.parametrize(
+    "name", fast_and_slow([name for name in COMMANDS if name != "completion"], HELP)
+)
 def test_every_command_has_a_page_of_help(name, capsys):
     with pytest.raises(SystemExit) as ended:
         dptse.main([*name.split(), "--help"])

@@ -19,8 +19,8 @@ PACKAGES = {
     "results/suite/rows.parquet": "dptse_env/_tools/results/suite/rows.parquet",
 }
 """Folders and files of the repository that are in a wheel, and where."""
-IN_A_WHEEL = {"", ".j2", ".json", ".npz", ".parquet", ".py", ".typed", ".xml", ".zip"}
-"""Kinds of files of the packages: code, templates, settings, networks, rows, policies."""
+IN_A_WHEEL = {"", ".json", ".npz", ".parquet", ".py", ".typed", ".xml", ".zip"}
+"""Kinds of files of the packages: code, settings, networks, rows, policies."""
 
 FOLDERS = {*PACKAGES, "benchmarks", "docs", "examples", "tests"}
 """Folders of a source archive."""

@@ -7,9 +7,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from agents.engines.local import THIS_PROCESS, LocalProcesses  # noqa: E402
 from agents.environments import make_vector  # noqa: E402
-from agents.evaluation.episodes import run_episodes  # noqa: E402
 from agents.filters.batches import draw_batch, make_batch  # noqa: E402
 from agents.filters.collecting import collect  # noqa: E402
 from agents.filters.plan import OWN, Round  # noqa: E402
@@ -17,10 +15,28 @@ from agents.filters.torch_network import RecurrentNetwork, second_loss  # noqa: 
 from agents.filters.training import FilterTraining  # noqa: E402
 from agents.training.run_files import read_progress  # noqa: E402
 from dptse_env.estimators.learned.weights import read_network, write_network  # noqa: E402
-from dptse_env.schedules import make_schedule  # noqa: E402
+from dptse_env.evaluation import evaluate  # noqa: E402
+from tests.agents.elsewhere import Elsewhere  # noqa: E402
 from tests.estimators.learned.networks import card  # noqa: E402
 
 from .plans import PLAN, SHORT  # noqa: E402
+
+
+class Seen:
+    """A watcher that keeps what a function finds in every second, the reset first."""
+
+    def __init__(self, look):
+        self.look, self.values = look, []
+
+    def begin(self, process):
+        self.process = process
+        return self
+
+    def __call__(self):
+        self.values.append(self.look(self.process))
+
+    def rows(self):
+        return [{}] * self.process.n_episodes
 
 
 @pytest.fixture(autouse=True)
@@ -42,14 +58,11 @@ def test_the_network_with_gradients_is_the_estimator(tmp_path):
         batch = make_batch([(collect(scenario, own, None), np.arange(2))])
         keywords = {**scenario.keywords, **own, "traffic_seeds": list(scenario.traffic_seeds)}
         env = make_vector(SHORT, 2, {**keywords, "action": "scores"})
-        estimates = []
-        run_episodes(
-            env, make_schedule(scenario.schedule, env), traffic_seeds=scenario.traffic_seeds,
-            seeds=[scenario.noise_seed + seed for seed in scenario.traffic_seeds],
-            on_second=lambda env=env, kept=estimates: kept.append(env.process.estimate),
-        )  # fmt: skip
+        seen = Seen(lambda process: process.estimate)
+        seeds, noise = scenario.traffic_seeds, scenario.noise_seed
+        evaluate(env, scenario.schedule, seeds, noise, watchers=[seen.begin])
         state = network.begin(batch.start)
-        for t, estimate in enumerate(estimates[1:]):
+        for t, estimate in enumerate(seen.values[1:]):
             state = network(batch.road, batch.second(t), batch.outside[t], state)
             present = network.read(batch.road, state.hidden)[0].detach().numpy()
             np.testing.assert_allclose(present[..., 0], estimate.density, rtol=2e-4, atol=2e-3)
@@ -59,15 +72,13 @@ def test_the_network_with_gradients_is_the_estimator(tmp_path):
 def test_the_collected_truth_is_that_of_the_environment():
     scenario = PLAN.scenarios(0)[0]
     collected = collect(scenario, {"estimator": "ekf"}, None)
-    corridor, table = collected.corridor, []
+    corridor = collected.corridor
     assert collected.outside.shape == (corridor.duration, 2, corridor.n_segments, 2)
     keywords = {**scenario.keywords, "traffic_seeds": list(scenario.traffic_seeds)}
     env = make_vector(SHORT, 2, {**keywords, "estimator": "ekf", "action": "scores"})
-    run_episodes(
-        env, make_schedule(scenario.schedule, env), traffic_seeds=scenario.traffic_seeds,
-        seeds=[0, 1], on_second=lambda: table.append(env.process.truth(np.arange(2))),
-    )  # fmt: skip
-    np.testing.assert_allclose(collected.truth, np.array(table[1:]), rtol=1e-6)
+    seen = Seen(lambda process: process.truth(np.arange(2)))
+    evaluate(env, scenario.schedule, scenario.traffic_seeds, watchers=[seen.begin])
+    np.testing.assert_allclose(collected.truth, np.array(seen.values[1:]), rtol=1e-6)
 
 
 def test_the_loss_is_the_environments_error():
@@ -86,13 +97,22 @@ def test_the_loss_is_the_environments_error():
     assert second_loss(batch.road, wide, batch.truth, 1.0) > honest
 
 
-def test_a_network_comes_out_the_same_wherever_scenarios_are_played(tmp_path):
-    trained = {}
-    for name, engine in {"here": THIS_PROCESS, "there": LocalProcesses(2)}.items():
-        training = FilterTraining(PLAN, tmp_path / name, engine=engine)
-        training.run()
-        trained[name] = training.network.state_dict()
-    assert all(torch.equal(trained["there"][key], value) for key, value in trained["here"].items())
+WHOLE = dataclasses.replace(PLAN, rounds=(Round("ekf", 1, 1), Round(OWN, 2, 3)))
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A training to the end of `WHOLE`; leave it alone."""
+    training = FilterTraining(WHOLE, tmp_path_factory.mktemp("whole"))
+    training.run()
+    return training
+
+
+def test_a_network_comes_out_the_same_wherever_scenarios_are_played(whole, tmp_path):
+    training = FilterTraining(WHOLE, tmp_path, executor=Elsewhere())
+    training.run()
+    there = training.network.state_dict()
+    assert all(torch.equal(there[key], value) for key, value in whole.network.state_dict().items())
 
 
 def test_a_batch_mixes_the_scenarios_of_a_road():
@@ -145,27 +165,25 @@ def rows_of(training):
     return [{k: v for k, v in row.items() if k not in timed} for row in training.rows]
 
 
-def test_a_training_that_was_killed_comes_out_as_one_that_was_not(tmp_path):
-    whole = FilterTraining(PLAN, tmp_path / "whole")
-    whole.run()
-    assert whole.done == 6
-    assert [row["round"] for row in whole.rows] == [1, 1, 1, 2, 2, 2]
+def test_a_training_that_was_killed_comes_out_as_one_that_was_not(whole, tmp_path):
+    assert whole.done == 4
+    assert [row["round"] for row in whole.rows] == [1, 2, 2, 2]
 
     def kill(row):
-        if row["update"] == 5:
+        if row["update"] == 3:
             raise KilledError
 
     with pytest.raises(KilledError):
-        FilterTraining(PLAN, tmp_path / "parts", watchers=[kill]).run()
-    resumed = FilterTraining(PLAN, tmp_path / "parts")
-    assert resumed.done == 4
+        FilterTraining(WHOLE, tmp_path, watchers=[kill]).run()
+    resumed = FilterTraining(WHOLE, tmp_path)
+    assert resumed.done == 2
     resumed.run()
     assert rows_of(resumed) == rows_of(whole)
-    one, other = (read_network(str(tmp_path / name / "network.npz")) for name in ("whole", "parts"))
+    one, other = (read_network(str(each / "network.npz")) for each in (whole.folder, tmp_path))
     for name, array in one.network._asdict().items():
         np.testing.assert_array_equal(array, getattr(other.network, name))
-    assert len(read_progress(tmp_path / "parts")) == 6
-    again = FilterTraining(PLAN, tmp_path / "parts")
+    assert len(read_progress(tmp_path)) == 4
+    again = FilterTraining(WHOLE, tmp_path)
     again.run()
     assert rows_of(again) == rows_of(whole)
 

@@ -1,24 +1,25 @@
 import dataclasses
 
+import gymnasium as gym
 import pytest
 
-from agents.evaluation.episodes import run_episode
 from agents.search.tuning_task import score_episodes
 from dptse_env.estimators import EstimatorSettings
+from dptse_env.evaluation import evaluate
 from dptse_env.model import ARZParameters
-from dptse_env.schedules import make_schedule
 from tests.agents.policies import save
 from tests.agents.search.tasks import TASK
 
 
+def make(cell):
+    return gym.make(cell.env, traffic_seeds="0:3", **cell.all_keywords)
+
+
 def test_episodes_are_what_an_evaluation_runs_with_other_noise_seeds():
     settings = EstimatorSettings(process_noise=(0.02, 0.03))
-    env = TASK.make(settings)
+    env = make(TASK.cell(settings))
     assert env.unwrapped.config.settings() == settings
-    schedule = make_schedule("paper", env)
-    expected = [
-        run_episode(env, schedule, traffic_seed=seed, seed=1_000_000 + seed) for seed in (1, 0)
-    ]
+    expected = evaluate(env, "paper", (1, 0), 1_000_000)
     assert score_episodes(TASK, settings, (1, 0)) == expected
     assert score_episodes(TASK, EstimatorSettings(), (1, 0)) != expected
 
@@ -60,7 +61,7 @@ def test_a_task_takes_parameters_of_its_own():
     assert task.config().settings() == EstimatorSettings()
     assert task.identity()["bandwidth"] == 2
     with pytest.raises(ValueError, match=r"schedule must be one of .*, got 'best'"):
-        dataclasses.replace(TASK, schedule="best").config()
+        dataclasses.replace(TASK, schedule="best").cell().check()
 
 
 def test_settings_can_be_tuned_for_a_saved_policy(tmp_path):
@@ -68,14 +69,14 @@ def test_settings_can_be_tuned_for_a_saved_policy(tmp_path):
     path = save(tmp_path / "policy.zip", seed=1)
     task = dataclasses.replace(TASK, schedule=str(path))
     settings = EstimatorSettings(process_noise=(0.02, 0.03))
-    env = task.make(settings)
+    env = make(task.cell(settings))
     assert env.unwrapped.config.action == "slots"
-    expected = run_episode(env, task.source.load(env), traffic_seed=1, seed=1_000_001)
-    assert score_episodes(task, settings, (1,)) == [expected]
-    assert score_episodes(TASK, settings, (1,)) != [expected]
+    expected = evaluate(env, task.cell().load_policy(env), (1,), 1_000_000)
+    assert score_episodes(task, settings, (1,)) == expected
+    assert score_episodes(TASK, settings, (1,)) != expected
     other = dataclasses.replace(TASK, schedule=str(save(tmp_path / "other.zip", seed=2)))
-    assert task.identity()["schedule"] != other.identity()["schedule"]  # by content, not by name
+    assert task.identity()["policy"] != other.identity()["policy"]  # by content, not by name
     with pytest.raises(ValueError, match="bandwidth is 2 for the policy and 3"):
-        dataclasses.replace(task, keywords={"bandwidth": 3}).config()
+        dataclasses.replace(task, keywords={"bandwidth": 3}).cell().check()
     with pytest.raises(FileNotFoundError, match=r"none\.zip"):
         dataclasses.replace(task, schedule="none.zip")

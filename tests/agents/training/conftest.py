@@ -14,7 +14,7 @@ def trained(tmp_path_factory):
     def train(learner="plackett-luce"):
         reports = []
         training = Training(
-            make_plan(learner), tmp_path_factory.mktemp(learner), commit="abc",
+            make_plan(learner), tmp_path_factory.mktemp(learner),
             progress=lambda *report: reports.append(report),
         )  # fmt: skip
         training.run()

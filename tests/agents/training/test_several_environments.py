@@ -61,11 +61,12 @@ def test_the_policy_acts_in_both_environments_and_its_card_names_them(joint):
     policy = load_policy(joint.folder / BEST, env, allow=("corridor", "bandwidth"))
     observation, _ = env.reset(seed=0)
     assert env.action_space.contains(policy.predict(observation)[0])
-    made_with = json.loads((joint.folder / "run.json").read_text())["made_with"]
-    assert made_with["also"] == [OTHER]
-    assert len(set(made_with["corridor"])) == 2
+    plan = json.loads((joint.folder / "plan.json").read_text())
+    assert plan["also"] == [OTHER]
+    assert len(set(plan["corridors"])) == 2
 
 
+@pytest.mark.slow
 def test_a_killed_training_continues_to_the_same_curve(joint, tmp_path):
     broken = Training(make_plan(also=(OTHER,)), tmp_path, watchers=(stop_at(2),))
     with pytest.raises(StopError):

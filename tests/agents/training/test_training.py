@@ -10,9 +10,10 @@ pytest.importorskip("sb3_contrib")
 
 import torch
 
+import dptse_env
 from agents.files import write_atomically
 from agents.training.recipes import RECIPES, RegressionRounds
-from agents.training.run_files import CHECKPOINT, PROGRESS, read_progress
+from agents.training.run_files import CHECKPOINT, PLAN, PROGRESS, read_progress
 from agents.training.training import BEST, POLICY, Training
 from dptse_env.sb3 import load_policy
 from tests.agents.training.plans import (
@@ -81,7 +82,7 @@ def test_every_update_compares_replicas(trained):
 def test_a_finished_training_is_left_alone(trained, tmp_path):
     folder = shutil.copytree(trained().folder, tmp_path / "run")
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
-    again = Training(make_plan(), folder, commit="abc")
+    again = Training(make_plan(), folder)
     again.run()
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
 
@@ -89,19 +90,17 @@ def test_a_finished_training_is_left_alone(trained, tmp_path):
 def test_the_folder_describes_the_training(trained):
     folder = trained().folder
     assert {path.name for path in folder.iterdir()} == {
-        "run.json", PROGRESS, CHECKPOINT, POLICY, BEST,
+        PLAN, PROGRESS, CHECKPOINT, POLICY, BEST,
     }  # fmt: skip
-    record = json.loads((folder / "run.json").read_text())
-    assert record["commit"] == "abc"
-    made_with = record["made_with"]
-    assert made_with["seed"] == 1
-    assert made_with["traffic_seeds"] == [0, 1, 2]
-    assert made_with["recipe"]["n_envs"] == 4
-    assert made_with["learner"] == "plackett-luce"
-    assert set(record["machine"]) >= {"torch", "stable-baselines3", "numpy", "python"}
+    plan = json.loads((folder / PLAN).read_text())
+    assert plan["seed"] == 1
+    assert plan["traffic_seeds"] == [0, 1, 2]
+    assert plan["recipe"]["n_envs"] == 4
+    assert plan["learner"] == "plackett-luce"
     policy = load_policy(folder / POLICY, _env())
     assert policy.card["training"]["steps"] == 36 + 2 * 3 * 80 * 7
     assert policy.card["training"]["traffic seeds"] == "0..2"
+    assert policy.card["versions"]["dptse-env"] == dptse_env.__version__
 
 
 def _env():
@@ -157,7 +156,7 @@ def test_a_checkpoint_of_a_former_version_is_refused(tmp_path):
 
 def test_a_folder_with_other_things_is_refused(tmp_path):
     (tmp_path / "thesis.tex").write_text("")
-    with pytest.raises(ValueError, match=r"is not empty and has no run\.json"):
+    with pytest.raises(ValueError, match=r"is not empty and has no plan\.json"):
         Training(make_plan(), tmp_path)
 
 
@@ -214,10 +213,12 @@ def test_the_regression_moves_the_scorer_and_counts_as_no_update(trained, tmp_pa
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"traffic_seeds": (0, 2000)}, r"traffic must hold seeds in 0\.\.999, got 2000"),
-        ({"validation_seeds": (2000,)}, r"validation must hold seeds in 1000\.\.1999, got 2000"),
+        ({"traffic_seeds": (0, 2000)}, r"traffic must be traffic seeds in 0\.\.999, got 2000"),
+        (
+            {"validation_seeds": (2000,)},
+            r"validation must be .* 1000\.\.1999, got 2000",
+        ),
         ({"seed": -1}, r"seed must be an integer in 0\.\.999"),
-        ({"steps": -1}, "steps must be an integer >= 0"),
         ({"steps": 0, "recipe": RECIPES["mask"]()}, "steps must be an integer >= 1"),
         ({"steps": 240}, "steps must be 0 for plackett-luce, which is trained in rounds, got 240"),
         ({"keywords": {"action": "mask"}}, r"keywords\.action is chosen by the training"),

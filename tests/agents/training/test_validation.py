@@ -6,9 +6,9 @@ pytest.importorskip("torch")
 
 import torch
 
-from agents.evaluation.episodes import run_episode
 from agents.seeds import TRAINING_VALIDATION
 from agents.training.validation import Validation
+from dptse_env.evaluation import evaluate
 from dptse_env.schedules import make_schedule
 from dptse_env.spaces.actions import ACTION_ENCODINGS
 
@@ -35,16 +35,8 @@ def test_errors_are_those_of_single_episodes(action):
     policy = make_schedule("round-robin", validation.env)
     errors = validation.errors(policy, deterministic=True)
     env = gym.make(SHORT, traffic_seeds=list(SEEDS), **keywords)
-    expected = [
-        -run_episode(
-            env,
-            make_schedule("round-robin", env),
-            traffic_seed=seed,
-            seed=TRAINING_VALIDATION.start + seed,
-        ).reward
-        for seed in SEEDS
-    ]
-    np.testing.assert_allclose(errors, expected, rtol=1e-9)
+    rows = evaluate(env, "round-robin", SEEDS, TRAINING_VALIDATION.start)
+    np.testing.assert_allclose(errors, [-row["reward"] for row in rows], rtol=1e-9)
     np.testing.assert_array_equal(validation.errors(policy, deterministic=True), errors)
 
 

@@ -4,8 +4,8 @@ import dataclasses
 
 import numpy as np
 
-from agents.studies.audit.attack import attack
-from agents.studies.audit.targets import choose_target, make_policy
+from agents.audit.attack import attack
+from agents.audit.planner import choose_target, make_policy
 from dptse_env.config import EnvConfig
 from dptse_env.estimators.open_loop import OpenLoop
 from dptse_env.release import RELEASE_MODELS

@@ -3,43 +3,51 @@ import dataclasses
 import numpy as np
 import pytest
 
-from agents.engines.local import LocalProcesses
-from agents.studies.audit.attack import Adversary, attack
-from agents.studies.audit.distances import ReleaseDistances, plan_contributions
-from agents.studies.audit.gaussian_planner import planned_distance
-from agents.studies.audit.releases import Terms
-from agents.studies.audit.strategies import (
+from agents.audit.attack import Adversary, attack
+from agents.audit.distances import ReleaseDistances, plan_contributions
+from agents.audit.planner import choose_target, make_policy
+from agents.audit.releases import Terms
+from agents.audit.strategies import (
     DECISION_THRESHOLD,
     AdaptiveQueries,
     FixedQueries,
     public_plan,
 )
-from agents.studies.audit.targets import choose_target, make_policy
-from agents.studies.audit.worlds import AdjacentWorlds, Trajectory
+from agents.audit.worlds import AdjacentWorlds, Trajectory
 from dptse_env.parts import privacy_report
 from dptse_env.privacy import epsilon_of
 from dptse_env.privacy.audit_statistics import Claim, audit
 from dptse_env.release import CappedSettings
+from tests.agents.elsewhere import Elsewhere
+from tests.cases import fast_and_slow
 
 from .small import HORIZON, ROAD, assert_runs_do_not_depend_on_the_batch, config
 
 
+def distance_of(setting, worlds, plan):
+    return attack(setting, worlds, FixedQueries(plan), 1, progress=False).distances.max()
+
+
 def reached(setting, worlds, policy="hunter"):
-    return planned_distance(setting, worlds, make_policy(setting, policy, worlds).plan)
+    return distance_of(setting, worlds, make_policy(setting, policy, worlds).plan)
 
 
-ALL_PRIVACY = [
+FEW = [
     {},
+    {"adjacency": "add_remove", "unit": "event"},
+    {"boundary_inputs": "private", "cap": 1},
+]
+MORE = [
     {"adjacency": "add_remove"},
     {"share": 0.2},
     {"share": 0.8},
     {"unit": "horizon"},
     {"unit": "event"},
-    {"unit": "event", "adjacency": "add_remove"},
     {"boundary_inputs": "private"},
     {"cap": 1},
     {"cap": 500},
 ]
+ALL_PRIVACY = fast_and_slow([*FEW, *MORE], FEW)
 
 
 def test_worlds_differ_in_one_vehicle(record):
@@ -62,7 +70,7 @@ def test_worlds_differ_in_one_vehicle(record):
 def test_the_closed_form_is_the_distance_of_a_second(preset, record):
     setting = config(preset=preset)
     distances = ReleaseDistances.from_config(setting)
-    rows = np.linspace(0, record.n_rows - 1, 25).astype(int)
+    rows = np.linspace(0, record.n_rows - 1, 8).astype(int)
     squares = distances.by_row(record)
     for row in rows:
         step, segment, vehicle = (
@@ -74,7 +82,7 @@ def test_the_closed_form_is_the_distance_of_a_second(preset, record):
         worlds = AdjacentWorlds(rest, (moved, Trajectory.absent()))
         plan = np.zeros((HORIZON, ROAD.n_mainline), dtype=bool)
         plan[step - 1, segment] = True
-        distance = planned_distance(setting, worlds, plan)
+        distance = distance_of(setting, worlds, plan)
         assert distance**2 == pytest.approx(squares[row], rel=1e-9)
         assert distance**2 == pytest.approx(distances.by_second(rest, moved)[0], rel=1e-9)
 
@@ -87,7 +95,7 @@ def test_where_paths_meet_speeds_alone_tell(preset, record):
     worlds = AdjacentWorlds(record, paths)
     plan = np.zeros((HORIZON, ROAD.n_mainline), dtype=bool)
     plan[19, 2] = True
-    distance = planned_distance(setting, worlds, plan)
+    distance = distance_of(setting, worlds, plan)
     assert record.counts[20, 2] > 0
     assert distance**2 == pytest.approx(distances.where_equal(record, paths)[0], rel=1e-9)
     assert distance > 0.0
@@ -105,23 +113,20 @@ def test_the_worst_case_is_the_whole_of_mu(privacy, policy, record):
         assert distance == pytest.approx(mu, rel=1e-9)
 
 
-@pytest.mark.parametrize("policy", ["hunter", "paper", "round-robin"])
-@pytest.mark.parametrize(
-    ("privacy", "kind"),
-    [
-        *((privacy, "deleted") for privacy in ALL_PRIVACY),
-        *((privacy, "replaced") for privacy in ALL_PRIVACY if "adjacency" not in privacy),
-    ],
-)
+@pytest.mark.parametrize("policy", ["hunter", "round-robin"])
+@pytest.mark.parametrize("privacy", ALL_PRIVACY)
+@pytest.mark.parametrize("kind", ["deleted", pytest.param("replaced", marks=pytest.mark.slow)])
 def test_no_vehicle_of_the_record_exceeds_mu(privacy, kind, policy, record):
+    if kind == "replaced" and "adjacency" in privacy:
+        pytest.skip("two vehicles are no neighbours there")
     setting = config(**privacy)
     worlds = choose_target(setting, record, kind, policy)
     distance = reached(setting, worlds, policy)
     assert 0.0 < distance <= privacy_report(setting).mu * (1.0 + 1e-9)
 
 
-@pytest.mark.parametrize("policy", ["hunter", "paper", "static", "round-robin"])
-@pytest.mark.parametrize("privacy", [{"preset": "corrected"}, {}, {"cap": 2}])
+@pytest.mark.parametrize("policy", ["hunter", "static"])
+@pytest.mark.parametrize("privacy", [{"preset": "corrected"}, {"cap": 2}])
 def test_the_vehicle_that_is_deleted_tells_most(privacy, policy, record):
     setting = config(**privacy)
     chosen = reached(setting, choose_target(setting, record, "deleted", policy), policy)
@@ -240,7 +245,7 @@ def test_the_score_is_the_log_likelihood_ratio_of_the_transcript(preset, record)
     plan = make_policy(setting, "paper", worlds).plan
     sigma = ReleaseDistances.from_config(setting).sigma
     terms = Terms(np.tile(sigma, (2, ROAD.n_segments, 1)), np.empty((2, 0)), np.empty((2, 0)))
-    square = planned_distance(setting, worlds, plan) ** 2
+    square = distance_of(setting, worlds, plan) ** 2
     answers, adversary = (Adversary(setting, worlds, 2) for _ in range(2))
     answers.reset(2)
     adversary.reset(2)
@@ -299,7 +304,7 @@ def test_runs_come_out_the_same_wherever_they_are_played(record):
     worlds = choose_target(setting, record, "worst-case", "hunter")
     policy = make_policy(setting, "adaptive", worlds)
     here = attack(setting, worlds, policy, 5, batch=2, progress=False)
-    there = attack(setting, worlds, policy, 5, batch=2, engine=LocalProcesses(2), progress=False)
+    there = attack(setting, worlds, policy, 5, batch=2, executor=Elsewhere(), progress=False)
     np.testing.assert_array_equal(here.scores, there.scores)
     np.testing.assert_array_equal(here.distances, there.distances)
 

@@ -7,15 +7,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from agents.engines.engine import Engine, run_in_order
-from agents.engines.local import THIS_PROCESS
-from agents.studies.audit.releases import Overheard, Terms, attacked
-from agents.studies.audit.strategies import FixedQueries
-from agents.studies.audit.worlds import AdjacentWorlds, audited
+from agents.audit.releases import AttackedRelease, Overheard, Terms, attacked
+from agents.audit.strategies import FixedQueries
+from agents.audit.worlds import AdjacentWorlds, Trajectory, audited
+from agents.executors import THIS_PROCESS, AnyExecutor, run_in_order
 from dptse_env.config import EnvConfig
 from dptse_env.parts import make_parts, make_release
 from dptse_env.process import QueryProcess
 from dptse_env.release import ReleaseRequest, TrafficTable
+from dptse_env.traffic import Record
 from dptse_env.utils.arrays import BoolArray, FloatArray
 
 BATCH = 250
@@ -104,7 +104,7 @@ def attack(
     noise_factor: float = 1.0,
     seed: int = 0,
     batch: int = BATCH,
-    engine: Engine = THIS_PROCESS,
+    executor: AnyExecutor = THIS_PROCESS,
     progress: bool = True,
 ) -> Runs:
     """Play both worlds and score every transcript.
@@ -121,7 +121,7 @@ def attack(
         noise_factor: Multiplies the noise that the configuration declares.
         seed: Seeds the noise, >= 0.
         batch: Runs per world that are played at once; results do not depend on it.
-        engine: Plays the batches.
+        executor: Plays the batches.
         progress: Whether to show a progress bar.
     """
     config = audited(attacked_form(config), worlds)
@@ -130,7 +130,7 @@ def attack(
         for first in range(0, n_runs, batch)
     ]
     played = run_in_order(
-        engine,
+        executor,
         play,
         batches,
         size=lambda each: 2 * len(each.runs),
@@ -147,10 +147,7 @@ def attack(
 def play(batch: Batch) -> Runs:
     """Play a batch of runs in both worlds."""
     config, n = batch.config, 2 * len(batch.runs)
-    traffic = TrafficTable(config.corridor, (0, 1), batch.worlds)
-    release = Overheard(make_release(config, n, traffic))
-    process = QueryProcess(make_parts(config, n, traffic=traffic, release=release))
-    played = attacked(release.model)
+    process, release, played = _make_process(config, batch.worlds, n)
     played.scale_noise(batch.noise_factor)
     adversary = Adversary(config, batch.worlds, n)
     for world in (0, 1):
@@ -165,6 +162,35 @@ def play(batch: Batch) -> Runs:
         terms = played.terms(release.last)
         adversary.update(step + 1, process.queried, release.last.values, terms)
     return Runs(adversary.score.reshape(2, -1), np.sqrt(adversary.square).reshape(2, -1))
+
+
+def _make_process(
+    config: EnvConfig, worlds: AdjacentWorlds, n: int
+) -> tuple[QueryProcess, Overheard, AttackedRelease]:
+    """Return a process of n episodes in either world, and its release model, overheard."""
+    traffic = TrafficTable(config.corridor, (0, 1), worlds)
+    release = Overheard(make_release(config, n, traffic))
+    process = QueryProcess(make_parts(config, n, traffic=traffic, release=release))
+    return process, release, attacked(release.model)
+
+
+def public_terms(config: EnvConfig, record: Record, plan: BoolArray, seed: int = 0) -> Terms:
+    """Play an episode over a record, and return the terms of its releases, with T rows.
+
+    Args:
+        config: The configuration.
+        record: The traffic.
+        plan: Queries, shape (T, n_mainline).
+        seed: Seeds noise and estimator.
+    """
+    alike = AdjacentWorlds(record, (Trajectory.absent(), Trajectory.absent()))
+    process, release, played = _make_process(attacked_form(config), alike, 1)
+    one, terms = np.arange(1), []
+    process.reset(one, [np.random.default_rng(seed)], {"traffic_seed": 0, "start": 0})
+    for queried in plan:
+        process.step(one, queried[None].astype(np.int8))
+        terms.append(played.terms(release.last))
+    return Terms(*(np.concatenate(rows) for rows in zip(*terms, strict=True)))
 
 
 def attacked_form(config: EnvConfig) -> EnvConfig:

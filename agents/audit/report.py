@@ -1,4 +1,4 @@
-"""The finding of an audit: its numbers, a table, sentences and a file."""
+"""The finding of an audit, as a table and as a file."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from agents.experiments.reports import fill
 from agents.files import write_json
 from agents.terminal import make_table, print_table, print_text
 from dptse_env.privacy import epsilon_of
@@ -59,7 +58,7 @@ class Finding:
         return detectable_mu(self.result.claim.mu, self.n_runs, self.result.confidence)
 
     def print(self) -> None:
-        """Print the table, and the sentences that end with the verdict."""
+        """Print the bounds and what they rest on; the verdict is the last line."""
         columns = "claimed", "lower\nbound", "threshold", "false +", "false -"
         table = make_table(self.title, "", *columns)
         claim, bounds = self.result.claim, (self.result.mu, self.result.epsilon)
@@ -69,17 +68,27 @@ class Finding:
             row = f"{claimed:.3f}", f"{bound.value:.3f}", f"{bound.threshold:.2f}", *rates
             table.add_row(name, *row)
         print_table(table)
-        print_text(fill(Path(__file__).parent, self._sentences(), "report.txt.j2").rstrip())
-
-    def _sentences(self) -> dict[str, Any]:
-        """Return the numbers of the sentences."""
-        return {
-            "finding": self,
-            "violation": VIOLATION,
-            "is_detectable": math.isfinite(self.detectable),
-            "reachable_factor": self.noise_factor * self.distance / self.detectable,
-            "has_true_boundary": "boundary_inputs" in self.privacy.void_reasons,
-        }
+        print_text(
+            f"worlds: {self.target}; queries: {self.policy}; noise x {self.noise_factor:g}\n"
+            f"distance: {self.distance:.3f} sigma at most, in {self.n_runs} runs per world "
+            f"({self.seconds:.0f} s)\n"
+            f"epsilon of a Gaussian release with the bound on mu: {self.gaussian_epsilon:.3f}\n"
+            f"power against a mu of {VIOLATION:.2f} times the claim: {self.power:.4f}"
+        )
+        if math.isfinite(self.detectable):
+            factor = self.noise_factor * self.distance / self.detectable
+            print_text(
+                f"rejected with probability 95 %: a mu of {self.detectable:.3f} or more, reached "
+                f"here up to {factor:.3f} times the declared noise"
+            )
+        else:
+            print_text("too few runs to reject this claim, however much leaks")
+        if "boundary_inputs" in self.privacy.void_reasons:
+            print_text(
+                "the estimates see the true traffic at the boundary, which makes their epsilon "
+                "infinite; only the releases were attacked"
+            )
+        print_text(f"verdict: {self.result.verdict}, at confidence {self.result.confidence:.0%}")
 
     def write(self, path: Path, arguments: Mapping[str, Any]) -> None:
         """Write the finding to a JSON file, with its origin."""

@@ -5,10 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from agents.studies.audit.attack import attack
-from agents.studies.audit.strategies import FixedQueries
-from agents.studies.audit.targets import choose_target, make_policy
-from agents.studies.audit.worlds import AdjacentWorlds, AuditedPenetration, Trajectory, audited
+from agents.audit.attack import attack
+from agents.audit.planner import choose_target, make_policy
+from agents.audit.strategies import FixedQueries
+from agents.audit.worlds import AdjacentWorlds, AuditedPenetration, Trajectory, audited
 from dptse_env.config import resolve
 from dptse_env.parts import privacy_report
 from dptse_env.privacy.audit_statistics import Claim, audit

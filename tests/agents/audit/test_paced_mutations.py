@@ -9,16 +9,16 @@ import dataclasses
 import numpy as np
 import pytest
 
-from agents.studies.audit.attack import attack
-from agents.studies.audit.targets import make_policy
-from agents.studies.audit.worlds import AdjacentWorlds, Trajectory
+from agents.audit.attack import attack
+from agents.audit.planner import make_policy
+from agents.audit.worlds import AdjacentWorlds, Trajectory
 from dptse_env.privacy import mu_of
 from dptse_env.privacy.audit_statistics import Claim, audit
 from dptse_env.release import Paced
 from dptse_env.release.ledgers import Ledgers, Sums
+from tests.release.paced_worlds import PlainLedgers
+from tests.release.test_paced_mutations import ReleasedUnclipped
 
-from ....release.paced_worlds import PlainLedgers
-from ....release.test_paced_mutations import ReleasedUnclipped
 from .small import HORIZON, ROAD, HalfTheLimit, paced
 
 CLAIM = Claim(mu_of(5.0, 0.05), 5.0, 0.05)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agents.studies.audit.worlds import Trajectory
+from agents.audit.worlds import Trajectory
 from dptse_env.config import EnvConfig
 from dptse_env.parts import flow_centre, make_release
 from dptse_env.release import CappedSettings, SpeedRelease

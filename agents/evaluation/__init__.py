@@ -1,1 +1,0 @@
-"""Evaluation of query policies: episodes, statistics, saved policies, tables and figures."""

@@ -1,1 +1,0 @@
-"""Shared parts of studies and searches: seeds, designs, engines, ledgers, tables, plots."""
