@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from dptse_env.estimators import EstimatorSettings
-
 from tests.cases import pairwise
 
 from .episodes import RELEASES, SIGMA, run, scale_of, simulate, started

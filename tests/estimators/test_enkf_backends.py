@@ -9,7 +9,6 @@ from dptse_env.estimators import (
     EstimatorSettings,
     make_estimator,
 )
-
 from tests.cases import pairwise
 
 from .draws import draw_alike

@@ -8,7 +8,6 @@ from dptse_env.estimators import EstimatorSettings, HorizonSettings
 from dptse_env.estimators import horizon as horizon_module
 from dptse_env.estimators.compiled import mhe_kernels
 from dptse_env.estimators.horizon import natural_residual, solve
-
 from tests.cases import pairwise
 
 from .episodes import SIGMA, run, simulate, started

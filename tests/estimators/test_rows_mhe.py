@@ -7,7 +7,6 @@ import pytest
 
 from dptse_env.estimators import BACKENDS, HorizonSettings
 from dptse_env.estimators.horizon import assemble
-
 from tests.cases import pairwise
 
 from .conftest import ORDERS

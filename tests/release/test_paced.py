@@ -5,6 +5,7 @@ import pytest
 
 from dptse_env.privacy import epsilon_of, mu_of
 from dptse_env.release import PacedSettings, Pacing
+from tests.cases import pairwise
 
 from .paced_worlds import (
     COLUMNS,
@@ -40,8 +41,10 @@ def crowd(n_vehicles=40, seed=0):
 # --- what is released ------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("wish", [{}, {"clip": 10.0, "ratio": 0.25}, {"unit": "event"}])
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(
+    ("wish", "seed"),
+    pairwise([{}, {"clip": 10.0, "ratio": 0.25}, {"unit": "event"}], range(3), n=3),
+)
 def test_residuals_are_white_and_of_the_stated_size(wish, seed):
     worlds = Worlds(crowd(seed=seed))
     assert residual_faults(*standardised(worlds, PacedSettings(**wish), seed=seed), 1.0) == []
