@@ -127,8 +127,9 @@ def test_the_last_prices_are_those_of_the_noise():
     assert not release.centres.any()
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize("quantity", ["density", "speed"])
+@pytest.mark.parametrize(
+    ("bad", "quantity"), [(np.nan, "density"), (np.inf, "speed"), (-np.inf, "density")]
+)
 def test_without_a_finite_prediction_centres_fall_back_and_releases_go_on(bad, quantity):
     release = started()
     values = {"density": np.full(SEGMENTS, 20.0), "speed": np.full(SEGMENTS, 40.0)}
