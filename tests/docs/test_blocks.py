@@ -14,10 +14,12 @@ import pytest
 import tyro
 
 from scripts.dptse import COMMANDS, split
+from tests.cases import fast_and_slow
 
 from .blocks import BLOCKS, PAGES, ROOT
 
 RUN_ELSEWHERE = {"tutorial.md", "README.md", "extending.md"}
+RUN = {block.page for block in BLOCKS if block.language == "python"} - RUN_ELSEWHERE
 NAMES = {command.module: name for name, command in COMMANDS.items()}
 
 
@@ -33,10 +35,7 @@ def test_blocks_are_of_languages_that_are_tested_here_and_can_be_parsed():
                 check(line.strip())
 
 
-@pytest.mark.parametrize(
-    "page",
-    sorted({block.page for block in BLOCKS if block.language == "python"} - RUN_ELSEWHERE),
-)
+@pytest.mark.parametrize("page", fast_and_slow(sorted(RUN), RUN - {"pictures.md"}))
 def test_the_python_of_a_page_runs_from_top_to_bottom(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names = {"__name__": "documentation"}

@@ -29,9 +29,9 @@ WIDTH = 104
 everywhere = pytest.mark.parametrize(
     ("corridor", "parameters"),
     [
-        (corridor, load_parameters(name))
-        for corridor in (PAPER_HIGHWAY, SHORT_HIGHWAY, UNEVEN)
-        for name in ("paper", "w99-3lane")
+        (PAPER_HIGHWAY, load_parameters("w99-3lane")),
+        (SHORT_HIGHWAY, load_parameters("paper")),
+        (UNEVEN, load_parameters("w99-3lane")),
     ],
     ids=lambda value: value.name,
 )

@@ -41,11 +41,12 @@ def uniform(model: ARZModel, density: float, w: float):
 
 
 @both_sets
-@pytest.mark.parametrize("filling", [0.01, 0.1, 0.3, 0.6, 0.9, 1.0])
-def test_uniform_equilibrium_is_a_fixed_point(parameters, filling):
+def test_uniform_equilibrium_is_a_fixed_point(parameters):
     model = model_of(STRAIGHT, parameters)
-    states, inputs = uniform(model, filling * parameters.jam_density, parameters.free_flow_speed)
-    np.testing.assert_allclose(model.step(states, inputs), states, rtol=1e-12, atol=1e-9)
+    for filling in (0.01, 0.1, 0.3, 0.6, 0.9, 1.0):
+        density = filling * parameters.jam_density
+        states, inputs = uniform(model, density, parameters.free_flow_speed)
+        np.testing.assert_allclose(model.step(states, inputs), states, rtol=1e-12, atol=1e-9)
 
 
 @both_sets

@@ -7,6 +7,7 @@ from dptse_env.model.arz import ARZModel
 from dptse_env.model.compiled import CompiledARZModel
 from dptse_env.model.kernels import advance, make_scratch
 from dptse_env.model.road_arrays import make_road_arrays
+from tests.cases import pairwise
 from tests.estimators.parts import compiled
 
 from .roads import (
@@ -33,8 +34,9 @@ ROADS = {
 }
 
 
-@pytest.mark.parametrize("parameters", [PAPER, W99, NO_RELAXATION], ids=lambda p: p.name)
-@pytest.mark.parametrize("road", ROADS.values(), ids=ROADS.keys())
+@pytest.mark.parametrize(
+    ("road", "parameters"), pairwise(ROADS.values(), [PAPER, W99, NO_RELAXATION])
+)
 @example(seed=405074828)  # a gap w - v of one rounding, whose power has a steep derivative
 @given(seed=st.integers(0, 2**32 - 1))
 def test_equals_numpy(road, parameters, seed):

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from dptse_env.model.compiled import CompiledARZModel
+from tests.cases import pairwise
 
 from .roads import (
     HIGHWAY,
@@ -26,8 +27,7 @@ ROADS = {
 }
 
 
-@pytest.mark.parametrize("parameters", [PAPER, W99], ids=lambda p: p.name)
-@pytest.mark.parametrize("road", ROADS.values(), ids=ROADS.keys())
+@pytest.mark.parametrize(("road", "parameters"), pairwise(ROADS.values(), [PAPER, W99], n=5))
 def test_equals_central_differences_away_from_kinks(road, parameters):
     model = model_of(road, parameters)
     rng = np.random.default_rng(11)

@@ -5,6 +5,7 @@ import pytest
 
 from dptse_env.release import PacedSettings
 from dptse_env.release.ledgers import Columns
+from tests.cases import pairwise
 
 from .paced_worlds import (
     COLUMNS,
@@ -41,9 +42,9 @@ def at_random(columns, seed, budget):
     return Public(generator.random(shape) < 0.6, prices, centres)
 
 
-@pytest.mark.parametrize("columns", [SINGLE, OVERLAPPING], ids=["single", "overlapping"])
-@pytest.mark.parametrize("seed", range(5))
-@pytest.mark.parametrize("ratio", [0.3, 1.0])
+@pytest.mark.parametrize(
+    ("columns", "seed", "ratio"), pairwise([SINGLE, OVERLAPPING], range(5), [0.3, 1.0])
+)
 def test_ledgers_count_as_they_do_when_written_out(columns, seed, ratio):
     asked = PacedSettings(clip=25.0, ratio=ratio)
     records, episodes = [crowd(10 * seed + k) for k in range(3)], np.arange(3)

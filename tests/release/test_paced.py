@@ -5,6 +5,7 @@ import pytest
 
 from dptse_env.privacy import epsilon_of, mu_of
 from dptse_env.release import PacedSettings, Pacing
+from tests.cases import pairwise
 
 from .paced_worlds import (
     COLUMNS,
@@ -40,8 +41,10 @@ def crowd(n_vehicles=40, seed=0):
 # --- what is released ------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("wish", [{}, {"clip": 10.0, "ratio": 0.25}, {"unit": "event"}])
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(
+    ("wish", "seed"),
+    pairwise([{}, {"clip": 10.0, "ratio": 0.25}, {"unit": "event"}], range(3), n=3),
+)
 def test_residuals_are_white_and_of_the_stated_size(wish, seed):
     worlds = Worlds(crowd(seed=seed))
     assert residual_faults(*standardised(worlds, PacedSettings(**wish), seed=seed), 1.0) == []
@@ -124,8 +127,9 @@ def test_the_last_prices_are_those_of_the_noise():
     assert not release.centres.any()
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize("quantity", ["density", "speed"])
+@pytest.mark.parametrize(
+    ("bad", "quantity"), [(np.nan, "density"), (np.inf, "speed"), (-np.inf, "density")]
+)
 def test_without_a_finite_prediction_centres_fall_back_and_releases_go_on(bad, quantity):
     release = started()
     values = {"density": np.full(SEGMENTS, 20.0), "speed": np.full(SEGMENTS, 40.0)}

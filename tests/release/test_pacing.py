@@ -6,6 +6,7 @@ import pytest
 from dptse_env.release import PACINGS, PacingSetup, PublicStep
 from dptse_env.release.pacing import EventPacing, TracerPacing, check_prices
 from dptse_env.traffic import SHORT_HIGHWAY
+from tests.cases import pairwise
 
 from .paced_worlds import OVERLAPPING
 
@@ -56,8 +57,9 @@ NOTHING = []
 # --- the tracer ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("speed", [2.0, 8.0, 50.0, 102.0, 110.0])
-@pytest.mark.parametrize("coverage", [0.2, 1.0])
+@pytest.mark.parametrize(
+    ("speed", "coverage"), pairwise([2.0, 8.0, 50.0, 102.0, 110.0], [0.2, 1.0], rest=False)
+)
 def test_a_price_spends_the_offer_over_the_queried_rest_of_a_trip(speed, coverage):
     prices = started(coverage=coverage).prices(step(NOTHING, 10.0, speed))[0]
     ahead = N - np.arange(N)
@@ -233,7 +235,7 @@ def test_nothing_moves_where_predictions_have_no_traffic():
 # --- seconds with a budget of their own ------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_second_s_budget_covers_all_queries_of_a_segment(seed):
     generator = np.random.default_rng(seed)
     level = generator.uniform(0.2, 3.0, 9)

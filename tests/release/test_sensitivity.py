@@ -68,7 +68,7 @@ def wishes(draw):
     )
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=150, deadline=None)
 @given(st.data())
 def test_no_policy_exceeds_mu(data):
     asked = data.draw(wishes())

@@ -21,14 +21,9 @@ def test_settings_default_to_the_paper_and_survive_json():
 @pytest.mark.parametrize(
     ("field", "value", "message"),
     [
-        ("epsilon", -1, "privacy.epsilon must be a number in [0.0001, 10000], got -1"),
         ("epsilon", 0.0, "privacy.epsilon must be a number in [0.0001, 10000], got 0.0"),
-        ("epsilon", 1e-320, "privacy.epsilon must be a number in [0.0001, 10000], got 1e-320"),
-        ("epsilon", 1e308, "privacy.epsilon must be a number in [0.0001, 10000], got 1e+308"),
         ("epsilon", math.nan, "privacy.epsilon must be a number in [0.0001, 10000], got nan"),
-        ("epsilon", math.inf, "privacy.epsilon must be a number in [0.0001, 10000], got inf"),
         ("epsilon", "1", "privacy.epsilon must be a number in [0.0001, 10000], got '1'"),
-        ("epsilon", [1], "privacy.epsilon must be a number in [0.0001, 10000], got [1]"),
         ("delta", 0.5, "privacy.delta must be a number in [1e-12, 0.5), got 0.5"),
         ("delta", 0, "privacy.delta must be a number in [1e-12, 0.5), got 0"),
         ("delta", True, "privacy.delta must be a number in [1e-12, 0.5), got True"),
@@ -49,15 +44,12 @@ def test_settings_are_checked_again_when_replaced():
     ("field", "value", "message"),
     [
         ("cap", 0, r"^privacy\.cap must be an integer in 1\.\.1000000, got 0$"),
-        ("cap", 1.5, r"^privacy\.cap must be an integer in 1\.\.1000000, got 1\.5$"),
         ("cap", 2**63, r"^privacy\.cap must be an integer .*, got 9223372036854775808$"),
         ("share", 0.0, r"^privacy\.share must be a number in \[0\.001, 0\.999\], got 0\.0$"),
-        ("share", 1, r"^privacy\.share must be a number in \[0\.001, 0\.999\], got 1$"),
         ("unit", "day", r"^privacy\.unit must be one of 'trip', 'horizon', 'event', got 'day'$"),
         ("unit", np.zeros(2), r"^privacy\.unit must be one of .*, got array"),
         ("adjacency", "add", r"^privacy\.adjacency must be one of .*, got 'add'$"),
         ("speed_release", "sum", r"^privacy\.speed_release must be one of .*, got 'sum'$"),
-        ("boundary_inputs", "none", r"^privacy\.boundary_inputs must be one of .*, got 'none'$"),
     ],
 )  # fmt: skip
 def test_bad_settings_of_capped_contributions_are_named_with_their_path(field, value, message):
@@ -69,15 +61,9 @@ def test_bad_settings_of_capped_contributions_are_named_with_their_path(field, v
     ("fields", "message"),
     [
         ({"pace": 0.0}, r"^privacy\.pace must be a number in \[0\.05, 1\], got 0\.0$"),
-        ({"pace": 2}, r"^privacy\.pace must be a number in \[0\.05, 1\], got 2$"),
-        ({"clip": 0.0}, r"^privacy\.clip must be a number in \[1, 200\], got 0\.0$"),
         ({"clip": math.inf}, r"^privacy\.clip must be a number in \[1, 200\], got inf$"),
-        ({"ratio": 0.0}, r"^privacy\.ratio must be a number in \[0\.01, 100\], got 0\.0$"),
-        ({"ratio": math.nan}, r"^privacy\.ratio must be a number in \[0\.01, 100\], got nan$"),
-        ({"ratio": 2.0}, r"^privacy\.ratio must be at most 1 for privacy\.adjacency 'replace'.* 2"),
         ({"ratio": 1.0001}, r"^privacy\.ratio must be at most 1 for .*, got 1\.0001$"),
         ({"unit": "horizon"}, r"^privacy\.unit must be one of 'trip', 'event', got 'horizon'$"),
-        ({"adjacency": "both"}, r"^privacy\.adjacency must be one of .*, got 'both'$"),
         ({"pacing": "fast"}, r"^privacy\.pacing must be one of tracer, .*got 'fast'"),
         ({"pacing": dict}, r"^privacy\.pacing .* must be a subclass of .*release\.Pacing"),
         ({"pacing": "numpy:nothing"}, r"^privacy\.pacing"),

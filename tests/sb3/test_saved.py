@@ -172,6 +172,42 @@ def test_a_perceptron_stays_on_its_road(tmp_path):
         assert "on purpose" not in str(refused.value)  # there is no way to do it
 
 
+def test_the_shipped_policy_moves_to_the_short_road():
+    env = make_env(privacy={"preset": "capped", "cap": 64})
+    with pytest.raises(ValueError, match="allow bandwidth and corridor"):
+        load_policy("private-highway", env)
+    policy = load_policy("private-highway", env, allow=("corridor", "bandwidth"))
+    assert str(policy.trained_on) == "paper-highway (15 mainline segments of 0.1 km, 3 lanes)"
+    observation, _ = env.reset(seed=0)
+    for _ in range(30):
+        action, _ = policy.predict(observation, deterministic=True)
+        observation, _, _, _, info = env.step(action)
+        assert info["queried"].sum() == 2
+    with pytest.raises(ValueError, match=r"\['released_flow'\] are of .*\['released_speed'\]"):
+        load_policy("private-highway", make_env(), allow=("corridor", "bandwidth"))
+
+
+def test_cards_of_version_0_1_name_the_road_as_far_as_they_can(stored):
+    def former(card):
+        del card["trained_on"], card["fits"]["channels"]
+        card["fits"]["corridor"] = "0" * 64
+
+    edit_card(stored, former)
+    loaded = load_policy(stored, make_env(), allow=("corridor",))
+    assert loaded.trained_on == TrainedOn("short-highway", 6, None, None)
+    assert str(loaded.trained_on) == "short-highway (6 mainline segments)"
+
+
+def test_policies_of_version_0_1_query_segments_with_sensors(tmp_path):
+    policy, config = make_policy("slots")
+    path = tmp_path / "one.zip"
+    save_policy(path, policy, config, **ABOUT)
+    env = make_env()
+    assert load_policy(path, env)._policy.skips_sensors
+    edit_card(path, lambda card: _arguments(card).pop("skips_sensors"))
+    assert not load_policy(path, env)._policy.skips_sensors
+
+
 def test_files_that_are_not_there_or_damaged(stored, tmp_path):
     with pytest.raises(FileNotFoundError, match=r"no saved policy '.*absent.zip': neither a file"):
         load_policy(tmp_path / "absent.zip", make_env())

@@ -58,15 +58,3 @@ def test_records_of_other_classes_are_other_records():
     assert with_classes(classes=()).digest == SHORT_HIGHWAY.digest
     assert with_classes().class_names == ("car", "truck")
     assert SHORT_HIGHWAY.class_names == ("car",)
-
-
-@pytest.mark.parametrize(
-    ("classes", "message"),
-    [
-        (CLASSES[:1], r"corridor\.vehicle_classes must be classes whose shares add up to 1, got 0"),
-        ((VehicleClass("car", 0.5),) * 2, r"vehicle_classes must be classes of different names"),
-    ],
-)
-def test_impossible_classes_are_refused(classes, message):
-    with pytest.raises(ValueError, match=message):
-        with_classes(classes=classes)

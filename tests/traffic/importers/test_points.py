@@ -186,6 +186,18 @@ def test_vehicles_are_conserved_in_the_report(tmp_path):
     assert file["rows"] == file["seconds"] * 10 + 4 or file["rows"] > 9 * file["seconds"]
 
 
+def test_an_id_that_is_used_again_is_another_vehicle(tmp_path):
+    points = stream(headway=4.0)
+    points[:, 0] %= 8  # a vehicle is there for 20 s, its id is free again after 12 s
+    imported = run(plain(tmp_path / "a.csv", points))
+    file = first_file(imported)
+    assert file["vehicles"] == 8
+    assert file["pieces"] == len(np.unique(stream(headway=4.0)[:, 0]))
+    record = record_of(imported, 1)
+    steps = [np.sort(record.step[record.vehicle == v]) for v in np.unique(record.vehicle)]
+    assert all((np.diff(each) == 1).all() for each in steps)
+
+
 def test_a_jump_to_another_place_cuts(tmp_path):
     points = stream()
     late = (points[:, 0] == 12) & (points[:, 1] > 34.0)
