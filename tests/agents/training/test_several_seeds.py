@@ -88,6 +88,7 @@ def test_a_folder_that_workers_do_not_share_is_an_error(tmp_path):
         train({tmp_path / "0": make_plan()}, Apart())
 
 
+@pytest.mark.slow
 def test_parts_of_a_round_come_out_the_same_wherever_they_run(tmp_path, alone):
     kept = {}
     for name, executor in {"here": THIS_PROCESS, "there": Elsewhere()}.items():
