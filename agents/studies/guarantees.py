@@ -9,7 +9,6 @@ budget. All cells have the same traffic; a number of one part is never held agai
 from __future__ import annotations
 
 import contextlib
-import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
@@ -54,7 +53,7 @@ from agents.tables import (
 from agents.watchers import LENGTHS
 from dptse_env.config import EnvConfig
 from dptse_env.parts import privacy_report
-from dptse_env.privacy import contribution_sensitivity, epsilon_of
+from dptse_env.privacy import epsilon_of
 from dptse_env.release import PrivacyReport, PublicStep, ReleaseModel, ReleaseSetup
 from dptse_env.release.paced import Paced
 from dptse_env.release.pacing import Pacing, TracerPacing
@@ -139,24 +138,16 @@ PROTECTIONS: dict[str, dict[str, Any]] = {
 PRINTED = (PAPER, CORRECTED)
 
 
-def priced(
-    estimator: str,
-    protection: str = TRIP,
-    *,
-    epsilon: float = 5.0,
-    boundary: str | None = None,
-    bandwidth: int = 5,
-) -> Cell:
+def priced(estimator: str, protection: str = TRIP, **changes: Any) -> Cell:
     """Return a cell of the price of a guarantee; the boundary is by default the preset's own."""
-    boundary = boundary or ("true" if protection in PRINTED else "nominal")
-    privacy = {"epsilon": epsilon, "delta": DELTA, "boundary_inputs": boundary}
+    given = {
+        "estimator": estimator, "protection": protection, "epsilon": 5.0, "bandwidth": 5,
+        "boundary": "true" if protection in PRINTED else "nominal",
+    } | changes  # fmt: skip
+    privacy = {"epsilon": given["epsilon"], "delta": DELTA, "boundary_inputs": given["boundary"]}
     privacy |= PROTECTIONS[protection]
-    labels = {
-        "part": "privacy", "estimator": estimator, "protection": protection, "epsilon": epsilon,
-        "boundary": boundary, "bandwidth": bandwidth,
-    }  # fmt: skip
-    keywords = {"estimator": estimator, "bandwidth": bandwidth, "privacy": privacy}
-    return Cell(ENV, "paper", keywords, labels)
+    keywords = {"estimator": estimator, "bandwidth": given["bandwidth"], "privacy": privacy}
+    return Cell(ENV, "paper", keywords, {"part": "privacy", **given})
 
 
 # Cells of the part "ledger"
@@ -193,13 +184,14 @@ SCHEDULES = (
     "stale-variance", "greedy-trace",
 )  # fmt: skip
 CURVE = (0.5, 1.0, 2.0, 5.0, 10.0)
-VALUES = {
-    "pace": (0.6, 0.7, 0.8, 0.85, 0.9, 1.0),
-    "clip": (18.0, 25.0, 35.0, 51.0, 102.0),
-    "ratio": (0.25, 0.5, 1.0),
+PACES = (0.6, 0.7, 0.8, 0.85, 0.9, 1.0)
+VARIED = {
+    ("pace", DELTA): PACES,
+    ("pace", STRICT): PACES,
+    ("clip", DELTA): (18.0, 25.0, 35.0, 51.0, 102.0),
+    ("ratio", DELTA): (0.25, 0.5, 1.0),
 }
-VARIED = (("pace", DELTA), ("pace", STRICT), ("clip", DELTA), ("ratio", DELTA))
-"""Settings of ``paced``, and delta."""
+"""Values of the settings of ``paced``, by delta."""
 VARIANTS: dict[str, dict[str, Any]] = {
     "a trip, replaced": {},
     "added or removed": {"adjacency": "add_remove"},
@@ -250,19 +242,6 @@ def paid(**changes: Any) -> Cell:
 # What noise is worth
 
 
-def config_of(rows: pl.DataFrame, labels: Mapping[str, Any]) -> EnvConfig:
-    """Return the configuration that a cell was played with.
-
-    Raises:
-        UnmeasuredError: It was not, or on a road of a file, of which rows know the digest alone.
-    """
-    content = json.loads(pick(rows, labels)["cell"][0])
-    if str(content["keywords"].get("corridor")).startswith("sha256:"):
-        raise UnmeasuredError(labels)
-    with quietly():
-        return make_config(content["env"], content["keywords"])
-
-
 def met_epsilon(config: EnvConfig, *, alone: bool = False) -> float:
     """Return epsilon of the paper's noise for a vehicle that is met `CAP` times and replaced.
 
@@ -276,16 +255,27 @@ def met_epsilon(config: EnvConfig, *, alone: bool = False) -> float:
             bounds epsilon from below whatever the vehicle does.
     """
     density_std, speed_std = (each.noise_std for each in privacy_report(config).releases)
-    largest = config.corridor.largest_speed_limit
-    density = contribution_sensitivity(
-        contributions=CAP,
-        adjacency="replace",
-        segment_length=min(config.corridor.segment_lengths),
-        largest_speed=largest,
-    ).releases[0]
-    speed = math.sqrt(2.0 * CAP) * largest if alone else 0.0
-    mu = math.hypot(density.bound / density_std, speed / speed_std)
-    return epsilon_of(mu, config.privacy.delta)
+    norm = math.sqrt(2.0 * CAP)  # of the numbers of two vehicles, each at its own places
+    density = norm / min(config.corridor.segment_lengths) / density_std
+    speed = norm * config.corridor.largest_speed_limit / speed_std if alone else 0.0
+    return epsilon_of(math.hypot(density, speed), config.privacy.delta)
+
+
+CLAIMS: dict[str, Callable[[EnvConfig], float]] = {
+    "composed": lambda config: privacy_report(config).epsilon,
+    f"met {CAP} times, at least": met_epsilon,
+    f"met {CAP} times, alone, standing": partial(met_epsilon, alone=True),
+}
+"""What the paper's noise is worth, by assumption."""
+CLAIMED = [f"{noise}: {claim}" for noise, claim in product(PRINTED, CLAIMS)]
+
+
+def true_epsilon(line: str, claimed: float) -> float:
+    """Return epsilon of a kind of noise under an assumption, given as ``noise: assumption``."""
+    noise, claim = line.split(": ")
+    own = priced("ekf", noise, epsilon=claimed)
+    with quietly():
+        return CLAIMS[claim](make_config(own.env, own.keywords))
 
 
 # Tables, which ask for numbers of cells and so say which ones are played
@@ -301,9 +291,9 @@ Columns = Mapping[str, Mapping[str, Any]]
 """Headers, and what is varied below them."""
 
 
-def along(epsilons: Iterable[float]) -> Columns:
+def along(epsilons: Iterable[float], **fixed: Any) -> Columns:
     """Return a column for each epsilon."""
-    return {f"ε = {value:g}": {"epsilon": value} for value in epsilons}
+    return {f"ε = {value:g}": {"epsilon": value, **fixed} for value in epsilons}
 
 
 def sweep(ask: Ask, corner: str, columns: Columns, lines: Mapping[str, Line]) -> str:
@@ -374,8 +364,8 @@ def ledger_tables(ask: Ask) -> Iterator[str]:
     yield "## Settings, `paced`"
     settings = {
         f"{name} {value:g}, δ = {delta:g}": (paid(**{name: value}, delta=delta), paid(delta=delta))
-        for name, delta in VARIED
-        for value in VALUES[name]
+        for (name, delta), values in VARIED.items()
+        for value in values
     }
     yield compared(ask, "base", settings, REFUSED)
     capped, equal = partial(paid, **CAPPED), partial(paid, **EQUAL)
@@ -385,9 +375,8 @@ def ledger_tables(ask: Ask) -> Iterator[str]:
         lines[f"{name}: `paced`"] = column, paid
         lines[f"{name}: `paced` − `capped`"] = column, paid, capped
     for delta in (DELTA, STRICT):
-        yield f"## Both against ε, δ = {delta:g}"
-        columns = {head: {**each, "delta": delta} for head, each in along(CURVE).items()}
-        yield sweep(ask, "", columns, lines)
+        yield f"## Errors against ε, δ = {delta:g}"
+        yield sweep(ask, "", along(CURVE, delta=delta), lines)
     yield "## What is protected"
     yield sweep(ask, "", VARIANTS, lines)
     yield "## Schedules"
@@ -414,30 +403,12 @@ def number(rows: pl.DataFrame, column: str, own: Cell, base: Cell | None = None)
     return format_interval(difference(rows, own.labels, base.labels, column))
 
 
-def claimed_table(rows: pl.DataFrame) -> str:
-    """Return epsilon claimed against epsilon true, for the paper's noise."""
-    claims: dict[str, Callable[[EnvConfig], float]] = {
-        "composed": lambda config: privacy_report(config).epsilon,
-        f"met {CAP} times, at least": met_epsilon,
-        f"met {CAP} times, alone, standing": partial(met_epsilon, alone=True),
-    }
-
-    def entry(line: str, head: str) -> str:
-        noise, claim = line.split(": ")
-        config = config_of(rows, priced("ekf", noise, **columns[head]).labels)
-        return format_number(claims[claim](config))
-
-    columns = along(EPSILONS)
-    lines = [f"{noise}: {claim}" for noise, claim in product(PRINTED, claims)]
-    return grid("claimed", lines, list(columns), entry)
-
-
 def equal_errors(rows: pl.DataFrame) -> str:
     """Return the epsilons at which ``paced`` has the density error of ``capped`` at 5.
 
     The interval holds every epsilon at which the paired difference may be zero.
     """
-    references = {
+    references: dict[str, Callable[..., Cell]] = {
         "demand states, `round-robin`": paid,
         "EKF, `paper`": partial(paid, estimator="ekf", schedule="paper"),
     }
@@ -447,8 +418,11 @@ def equal_errors(rows: pl.DataFrame) -> str:
         reference = references[line](**CAPPED, **columns[head]).labels
         own = [paid(epsilon=each, **columns[head]).labels for each in CURVE]
         excess = [difference(rows, each, reference, DENSITY) for each in own]
-        ends = ([getattr(each, end) for each in excess] for end in ("mean", "low", "high"))
-        return format_interval(Interval(*(crossing(CURVE, end) for end in ends), excess[0].n))
+        middle, low, high = (
+            crossing(CURVE, [getattr(each, end) for each in excess])
+            for end in ("mean", "low", "high")
+        )
+        return format_interval(Interval(middle, low, high, excess[0].n))
 
     return grid("`capped` at ε = 5", list(references), list(columns), entry)
 
@@ -470,9 +444,10 @@ PRICE_NOTE = (
     "Intervals are Student's t at 95 % over traffic seeds, differences paired by traffic and noise."
 )
 CLAIMED_NOTE = (
-    f"*Composed*: of both releases, if the preset's own sensitivities held. *Met {CAP} times*: of "
-    "the densities alone. *Alone, standing*: of both, for a vehicle that is the mean speed of its "
-    "segment. Boundary inputs are left out: with true ones no finite ε holds."
+    "On the road of PrivateHighway. *Composed*: of both releases, if the preset's own "
+    f"sensitivities held. *Met {CAP} times*: of the densities alone. *Alone, standing*: of both, "
+    "for a vehicle that is the mean speed of its segment. Boundary inputs are left out: with true "
+    "ones no finite ε holds."
 )
 LEDGER_NOTE = (
     f"Where a table does not say otherwise: (ε, δ) = (5, {DELTA:g}) for a whole trip that is "
@@ -512,22 +487,20 @@ def draw_price(rows: pl.DataFrame, path: Path) -> None:
     save_figure(finish_figure(figure), path, f"Errors against the claimed ε, δ = {DELTA:g}")
 
 
-def draw_claimed(rows: pl.DataFrame, path: Path) -> None:
+def draw_claimed(_: pl.DataFrame, path: Path) -> None:
     """Draw epsilon claimed against epsilon true."""
     figure = make_figure(6.4, 4.4, dpi=120)
     axis = figure.subplots()
     axis.plot(EPSILONS, EPSILONS, color=LOOKS[TRIP].colour, label="as claimed")
-    for noise, alone in product(PRINTED, (False, True)):
-        configs = [config_of(rows, priced("ekf", noise, epsilon=e).labels) for e in EPSILONS]
-        true = [met_epsilon(each, alone=alone) for each in configs]
-        label = f"{noise}, {'alone and standing' if alone else 'at least'}".replace("`", "")
-        axis.plot(EPSILONS, true, "-" if alone else ":", color=LOOKS[noise].colour, label=label)
+    for line, style in zip(CLAIMED, 2 * ("--", ":", "-"), strict=True):
+        true = [true_epsilon(line, each) for each in EPSILONS]
+        colour = LOOKS[line.split(": ")[0]].colour
+        axis.plot(EPSILONS, true, style, color=colour, label=line.replace("`", ""))
     set_log_axes(axis, EPSILONS)
     set_log_ticks(axis.yaxis, [10.0**k for k in range(-1, 7)])
     axis.set_xlabel("ε claimed")
     axis.set_ylabel("ε true")
-    title = f"ε of a vehicle met {CAP} times, δ = {DELTA:g}"
-    save_figure(finish_figure(figure, columns=2), path, title)
+    save_figure(finish_figure(figure, columns=2), path, f"ε claimed and true, δ = {DELTA:g}")
 
 
 def draw_ladder(rows: pl.DataFrame, path: Path) -> None:
@@ -582,12 +555,7 @@ def refused_shares(rows: pl.DataFrame, suffix: str) -> dict[int, Interval]:
     }
 
 
-FIGURES = {
-    "price": draw_price,
-    "claimed": draw_claimed,
-    "ladder": draw_ladder,
-    "budgets": draw_budgets,
-}
+FIGURES = (draw_price, draw_claimed, draw_ladder, draw_budgets)
 
 
 def report(rows: pl.DataFrame, folder: Path) -> str:
@@ -597,9 +565,9 @@ def report(rows: pl.DataFrame, folder: Path) -> str:
     rows = rows.with_columns(pl.lit(None).alias(name) for name in names.keys() - {*rows.columns})
     met = pl.col("n_met").cast(pl.Float64).clip(1.0)
     rows = rows.with_columns((100.0 * pl.col("n_refused") / met).alias(REFUSED))
-    for name, draw in FIGURES.items():
+    for draw in FIGURES:
         with contextlib.suppress(UnmeasuredError):
-            draw(rows, folder / f"fig_{name}.png")
+            draw(rows, folder / f"{draw.__name__.replace('draw', 'fig')}.png")
     lost = rows.group_by("part", "estimator").agg(
         pl.len().alias("episodes"),
         pl.col("n_diverged").sum().cast(int).alias("started over [s]"),
@@ -614,7 +582,7 @@ def report(rows: pl.DataFrame, folder: Path) -> str:
             PRICE_NOTE,
             "## ε claimed against ε true",
             CLAIMED_NOTE,
-            claimed_table(rows),
+            grid("claimed", CLAIMED, EPSILONS, lambda *at: format_number(true_epsilon(*at))),
             *price_tables(ask),
             "# What paced ledgers save",
             LEDGER_NOTE,
