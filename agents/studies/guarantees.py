@@ -54,11 +54,10 @@ from agents.watchers import LENGTHS
 from dptse_env.config import EnvConfig
 from dptse_env.parts import privacy_report
 from dptse_env.privacy import epsilon_of
-from dptse_env.release import PrivacyReport, PublicStep, ReleaseModel, ReleaseSetup
+from dptse_env.release import PublicStep, ReleaseModel, ReleaseSetup
 from dptse_env.release.paced import Paced
 from dptse_env.release.pacing import Pacing, TracerPacing
-from dptse_env.utils.arrays import FloatArray, IntArray
-from dptse_env.utils.vector_info import Rows
+from dptse_env.utils.arrays import FloatArray
 
 ENV = "dptse_env:dptse/PrivateHighway-v0"
 SEEDS = tuple(range(2000, 2020))
@@ -87,24 +86,15 @@ class Exact(Paced):
     """
 
     claims_guarantee: ClassVar[bool] = False
+    # What is known of a release without a guarantee, and without budgets.
+    spent, report = ReleaseModel.spent, ReleaseModel.report
+    private_info = ReleaseModel.private_info
 
     def __init__(self, setup: ReleaseSetup) -> None:
         """Make ledgers without a limit."""
         super().__init__(setup)
         self.ledgers.budget = math.inf
         self.pacing = AnyPrice(self.pacing.setup)
-
-    def spent(self, episodes: IntArray, steps: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Return infinite losses, which is what is known of a release without a guarantee."""
-        return ReleaseModel.spent(self, episodes, steps)
-
-    def report(self) -> PrivacyReport:
-        """Return the report of a model that states no guarantee."""
-        return ReleaseModel.report(self)
-
-    def private_info(self, episodes: IntArray, traffic: IntArray) -> Rows:
-        """Return nothing: no vehicle has a budget."""
-        return {}
 
 
 class EqualRates(TracerPacing):
