@@ -59,6 +59,7 @@ from agents.tables import (
     SPEED,
     Labels,
     UnmeasuredError,
+    cell,
     format_interval,
     grid,
     pick_paired,
@@ -413,7 +414,7 @@ def measure(
 
 
 def rank(rows: pl.DataFrame, part: str, setting: str) -> list[tuple[float, Labels]]:
-    """Return mean errors and labels of all policies that a part played in a setting, in order."""
+    """Return the mean errors and labels of what a part played in a setting, least error first."""
     names = list(group(setting, REFERENCE))
     found = rows.filter(part=part, setting=setting).select(names).unique(maintain_order=True)
     errors = [
@@ -450,33 +451,37 @@ def results_table(
     """Return errors of groups by name, and how they compare with references in their settings."""
 
     def entry(name: str, column: str) -> str:
-        (statistic, metric, references), setting = COLUMNS[column], groups[name]["setting"]
-        names = [chosen[setting].rule if each == BEST else each for each in references]
-        others = [group(setting, each) for each in names]
+        statistic, metric, references = COLUMNS[column]
+        setting = groups[name]["setting"]
+        best = chosen[setting].rule
+        others = [group(setting, best if each == BEST else each) for each in references]
         return format_interval(measure(rows, statistic, groups[name], *others, metric=metric))
 
     return grid(corner, list(groups), list(COLUMNS), entry)
 
 
 def learned_tables(rows: pl.DataFrame, chosen: Mapping[str, Chosen]) -> Iterator[str]:
-    """Yield the chosen and moved policies of all settings, and the first of them by seed."""
-    groups, p_values = {}, {}
-    for setting, choice in chosen.items():
-        for labels in learners(chosen, setting):
-            name = f"{setting}: {name_of(labels)}"
-            try:
-                errors, best = tables(rows, ERROR, labels, group(setting, choice.rule))
-            except UnmeasuredError:
-                continue
-            groups[name] = labels
-            _, p_values[name] = crossed_t(best - errors)
+    """Yield the chosen and moved policies of all settings, and that of the primary one by seed."""
+    groups = {
+        f"{setting}: {name_of(labels)}": labels
+        for setting in chosen
+        for labels in learners(chosen, setting)
+    }
+
+    def largest_p() -> str:
+        p_values = {}
+        for name, labels in groups.items():
+            best = group(labels["setting"], chosen[labels["setting"]].rule)
+            errors, reference = tables(rows, ERROR, labels, best)
+            _, p_values[name] = crossed_t(reference - errors)
+        return f"{max(holm(p_values).values(), default=1.0):.2g}"
+
     yield results_table(rows, chosen, "setting: policy", groups)
-    for name, labels in list(groups.items())[:1]:
-        largest = max(holm(p_values).values())
-        yield f"p of no difference to {BEST}, by crossed t and Holm: {largest:.2g} at most. {name}:"
+    yield f"Largest p of no difference to {BEST} (crossed t, Holm): {cell(largest_p)}"
+    for labels in learners(chosen, PRIMARY):
         seeds = rows.filter(**labels)["training_seed"].unique().sort()
         by_seed = {str(seed): {**labels, "training_seed": seed} for seed in seeds}
-        yield results_table(rows, chosen, "training seed", by_seed)
+        yield results_table(rows, chosen, f"{PRIMARY}: training seed", by_seed)
 
 
 def ranking_table(rows: pl.DataFrame, chosen: Mapping[str, Chosen], setting: str) -> str:

@@ -325,7 +325,7 @@ def _policy_table(rows: pl.DataFrame, task: Task) -> str:
     for policy in rows.filter(task=task.name)["policy"].unique().sort():
         own = pick(rows, _labels(policy, task.name))
         error = values_of(own, ERROR).mean()
-        met, refused = own["n_met"].sum(), own["n_refused"].sum()
+        met, refused = (float(own[name].sum()) for name in ("n_met", "n_refused"))
         numbers = [f"{values_of(own, name).mean():.2f}" for name in _COLUMNS]
         share = f"{100.0 * refused / met:.1f}" if met else "-"
         lines.append((error, [f"`{policy}`", f"{error:.1f}", *numbers, share]))
