@@ -108,7 +108,10 @@ RULES = (
     "largest-density-variance", "stale-variance", "greedy-trace", "inflated-trace",
 )  # fmt: skip
 """Policies that need no training."""
-VALIDATION_TRAFFIC, TEST_TRAFFIC = tuple(range(1000, 1064)), tuple(range(2064, 2128))
+RECORDED_TRAFFIC, VALIDATION_TRAFFIC = tuple(range(1000, 1064)), tuple(range(1100, 1164))
+"""Validation traffic of the recorded choices, on which trainings keep their best policy, too; and
+that of choices among policies that are given."""
+TEST_TRAFFIC = tuple(range(2064, 2128))
 VALIDATION, TEST, CHOICES = "validation", "test", "choices"
 """Parts of the study, in the column ``part`` of its rows."""
 LIKELIEST, DRAWN = "deterministic", "stochastic"
@@ -196,7 +199,7 @@ def _cell(labels: Labels, policy: str, seed: int = -1) -> Cell:
         deterministic=labels["mode"] == LIKELIEST,
         transferred=labels["trained_in"] not in ("", labels["setting"]),
         watchers=("queries",) if watched else (),
-        seeds=TEST_TRAFFIC if is_test else VALIDATION_TRAFFIC,
+        seeds=TEST_TRAFFIC,
     )
 
 
@@ -697,8 +700,10 @@ def study(policies: Sequence[str]) -> Study:
         write_json(folder / "chosen.json", {name: each._asdict() for name, each in chosen.items()})
         return list(test_cells(chosen, trained))
 
-    first = (_played_in(setting, trained, VALIDATION) for setting in SETTINGS)
-    cells = (*chain.from_iterable(first), *choice_cells(trained))
+    first = chain.from_iterable(_played_in(setting, trained, VALIDATION) for setting in SETTINGS)
+    seeds = VALIDATION_TRAFFIC if trained else RECORDED_TRAFFIC
+    validated = (dataclasses.replace(each, seeds=seeds) for each in first)
+    cells = (*validated, *choice_cells(trained))
     return Study("policies", cells, TEST_TRAFFIC, report, follow)
 
 

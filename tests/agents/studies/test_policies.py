@@ -87,7 +87,8 @@ def test_validation_traffic_alone_decides(recorded):
     assert choice(part=TEST, policy="static") == ("oldest-first", "plackett-luce", "deterministic")
     assert choice(part=VALIDATION, policy="static")[0] == "static"
     assert choice(part=VALIDATION, mode="stochastic")[2] == "stochastic"
-    assert set(policies.VALIDATION_TRAFFIC) <= set(VALIDATION_SEEDS)
+    traffic = {*policies.RECORDED_TRAFFIC, *policies.VALIDATION_TRAFFIC}
+    assert traffic <= set(VALIDATION_SEEDS)
 
 
 def test_the_recipe_that_was_chosen_is_moved_in_the_mode_that_was(recorded):
