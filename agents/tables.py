@@ -31,7 +31,7 @@ def pick(rows: pl.DataFrame, labels: Labels) -> pl.DataFrame:
         UnmeasuredError: There are none.
         ValueError: The labels are those of several cells.
     """
-    found = rows.filter(*(pl.col(name) == value for name, value in labels.items()))
+    found = _with_labels(rows, labels)
     if found.is_empty():
         raise UnmeasuredError(dict(labels))
     return _one_cell(found.filter(pl.col("version") == _last(found)), labels)
@@ -46,9 +46,7 @@ def pick_pair(
         UnmeasuredError: No version has played both on two traffic seeds.
         ValueError: Labels are those of several cells.
     """
-    pair = []
-    for each in (labels, reference):
-        pair.append(rows.filter(*(pl.col(name) == value for name, value in each.items())))
+    pair = [_with_labels(rows, each) for each in (labels, reference)]
     both = pair[0].join(pair[1], on=["version", "traffic_seed"], how="semi")
     if both.is_empty():
         raise UnmeasuredError(dict(labels), dict(reference))
@@ -64,6 +62,13 @@ def pick_pair(
         for each, name in zip(pair, (labels, reference), strict=True)
     )
     return first, second
+
+
+def _with_labels(rows: pl.DataFrame, labels: Labels) -> pl.DataFrame:
+    """Return the rows that have some labels, of which a part that was not played has no column."""
+    if not labels.keys() <= set(rows.columns):
+        return rows.clear()
+    return rows.filter(*(pl.col(name) == value for name, value in labels.items()))
 
 
 def _last(rows: pl.DataFrame) -> str:

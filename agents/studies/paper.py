@@ -257,12 +257,6 @@ def correlations(a: FloatArray, b: FloatArray) -> FloatArray:
     return found
 
 
-def roughness(curve: FloatArray) -> FloatArray:
-    """Return the mean size of second differences along a curve for each seed."""
-    found: FloatArray = np.abs(np.diff(curve, n=2, axis=0)).mean(axis=0)
-    return found
-
-
 LEVEL = Statistic("mean RMSE", lambda y: y.mean(0))
 SLOPE = Statistic(
     "slope of the RMSE [veh/km or km/h]", lambda y: np.polyfit(SWEEPS["bandwidth"], y, 1)[0]
@@ -277,7 +271,7 @@ EXCESS = Statistic(
 )
 ROUGHNESS = Statistic(
     "mean size of second differences of the RMSE, first minus second [veh/km]",
-    lambda a, b: roughness(a) - roughness(b),
+    lambda a, b: np.subtract(*(np.abs(np.diff(y, n=2, axis=0)).mean(0) for y in (a, b))),
 )
 FALL = Statistic(
     "fall of the RMSE from end to end, first minus second [veh/km]",
