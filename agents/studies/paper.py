@@ -18,7 +18,7 @@ import itertools
 import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -221,7 +221,7 @@ def curves_of(played: Played, setting: str, *wanted: Curve) -> list[FloatArray]:
             if rows is None:
                 raise UnmeasuredError(labels)
             rows = rows.drop_nulls(metric)
-            origins.add((*rows["version"].unique(), *rows["traffic_seed"]))
+            origins.add((*rows["version"].head(1), *rows["traffic_seed"]))
             found[-1].append(rows[metric].to_numpy())
     if len(origins) > 1 or len(found[0][0]) < 2:
         raise UnmeasuredError(wanted)
@@ -389,12 +389,15 @@ def tables_of(played: Played) -> str:
     def table(corner: str, lines: Mapping[str, Any], entry: Callable[[Any, str], str]) -> str:
         return grid(corner, list(lines), list(SETTINGS), lambda name, k: entry(lines[name], k))
 
-    def measure(claim: Claim, part: Part, setting: str) -> tuple[Interval, str]:
-        interval = claim.statistic.measure(*curves_of(played, setting, *part))
-        return interval, judge(interval, claim.low, claim.high)
+    @cache
+    def measure(statistic: Statistic, part: Part, setting: str) -> Interval:
+        return statistic.measure(*curves_of(played, setting, *part))
+
+    def verdict_of(claim: Claim, part: Part, setting: str) -> str:
+        return judge(measure(claim.statistic, part, setting), claim.low, claim.high)
 
     def verdict(claim: Claim, setting: str) -> str:
-        verdicts = [measure(claim, part, setting)[1] for part in claim.parts]
+        verdicts = [verdict_of(claim, part, setting) for part in claim.parts]
         worst = next((each for each in (FAILS, OPEN) if each in verdicts), HOLDS)
         return f"{worst} ({verdicts.count(HOLDS)} of {len(verdicts)})"
 
@@ -410,8 +413,8 @@ def tables_of(played: Played) -> str:
         return format_interval(time_of(played, name, setting))
 
     def number(claim: Claim, part: Part, setting: str) -> str:
-        interval, verdict = measure(claim, part, setting)
-        return f"{format_interval(interval)} {SIGNS[verdict]}"
+        text = format_interval(measure(claim.statistic, part, setting))
+        return f"{text} {SIGNS[verdict_of(claim, part, setting)]}"
 
     names = {LABELS[name]: name for name in ESTIMATORS}
     text = [
