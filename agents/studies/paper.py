@@ -47,7 +47,7 @@ from agents.figures import (
 )
 from agents.page import watch
 from agents.play import Cell, corridor_of, record
-from agents.statistics import Interval, geometric_mean_interval, mean_interval
+from agents.statistics import Interval, mean_interval
 from agents.study import Place, Study, read_table
 from agents.tables import (
     DENSITY,
@@ -278,6 +278,7 @@ FALL = Statistic(
     lambda a, b: (a[0] - a[-1]) - (b[0] - b[-1]),
 )
 CORRELATION = Statistic("correlation of both RMSE", correlations, math.tanh)
+TIME = Statistic("time of a step [ms]", lambda y: np.log(1e3 * y[0]), math.exp)
 RATIO = Statistic("first over second", lambda a, b: np.log(a[0] / b[0]), math.exp)
 
 
@@ -402,15 +403,15 @@ def tables_of(played: Played) -> str:
         return f"{worst} ({verdicts.count(HOLDS)} of {len(verdicts)})"
 
     def error(metric: str, name: str, setting: str) -> str:
-        own, walk = curves_of(played, setting, Curve(name, metric), Curve("random_walk", metric))
-        above = EXCESS.measure(own, walk)
-        text = format_interval(LEVEL.measure(own))
-        if name != "random_walk":
-            text += f"; {above.mean:+.1f} ± {above.half_width:.1f} %"
-        return text
+        own, walk = Curve(name, metric), Curve("random_walk", metric)
+        text = format_interval(measure(LEVEL, (own,), setting))
+        if own == walk:
+            return text
+        above = measure(EXCESS, (own, walk), setting)
+        return f"{text}; {above.mean:+.1f} ± {above.half_width:.1f} %"
 
     def milliseconds(name: str, setting: str) -> str:
-        return format_interval(time_of(played, name, setting))
+        return format_interval(measure(TIME, (Curve(name, SECONDS),), setting))
 
     def number(claim: Claim, part: Part, setting: str) -> str:
         text = format_interval(measure(claim.statistic, part, setting))
@@ -445,12 +446,6 @@ def tables_of(played: Played) -> str:
             table("part", {name_of(part): part for part in claim.parts}, partial(number, claim)),
         ]
     return "\n\n".join(text)
-
-
-def time_of(played: Played, estimator: str, setting: str) -> Interval:
-    """Return the time of a step [ms]."""
-    (seconds,) = curves_of(played, setting, Curve(estimator, SECONDS))
-    return geometric_mean_interval(1e3 * seconds[0])
 
 
 def draw_sweep(played: Played, field: str, metrics: Sequence[str], columns: int) -> Figure:
@@ -503,7 +498,9 @@ def draw_times(played: Played) -> Figure:
     axis = figure.subplots()
     places = np.arange(len(ESTIMATORS))
     for k, setting in enumerate(SETTINGS):
-        times = [time_of(played, name, setting) for name in ESTIMATORS]
+        times = [
+            TIME.measure(*curves_of(played, setting, Curve(name, SECONDS))) for name in ESTIMATORS
+        ]
         look = Look(COLOURS[k], "o", "none")
         draw_curve(axis, places + 0.16 * (k - 1.5), times, look, f"here, {setting}")
     for place, name in enumerate(PAPER_SECONDS):
