@@ -91,7 +91,7 @@ def make_config(env: str, keywords: Mapping[str, Any]) -> EnvConfig:
 
 
 def make_vector(env: str, n_episodes: int, keywords: Mapping[str, Any]) -> SensorQueryVectorEnv:
-    """Make a vector environment of whole episodes, as `run_episodes` takes it.
+    """Make a vector environment of whole episodes, which do not begin anew.
 
     Raises:
         ValueError: A keyword is unknown or out of range, or the decisions of a second may take

@@ -92,17 +92,6 @@ def mean(table: FloatArray) -> FloatArray:
     return means
 
 
-def iqm(table: FloatArray) -> FloatArray:
-    """Return the interquartile mean over the last two axes.
-
-    The mean of the middle half of all runs on all traffic seeds together, as in Agarwal et al.
-    (2021), "Deep reinforcement learning at the edge of the statistical precipice".
-    """
-    pooled = table.reshape(*table.shape[:-2], -1)
-    middle: FloatArray = stats.trim_mean(pooled, 0.25, axis=-1)
-    return middle
-
-
 def percent_below(table: FloatArray, reference: FloatArray) -> FloatArray:
     """Return by how much the mean of ``table`` lies below that of ``reference`` [%].
 

@@ -37,31 +37,30 @@ def pick(rows: pl.DataFrame, labels: Labels) -> pl.DataFrame:
     return _one_cell(found.filter(pl.col("version") == _last(found)), labels)
 
 
-def pick_pair(
-    rows: pl.DataFrame, labels: Labels, reference: Labels
-) -> tuple[pl.DataFrame, pl.DataFrame]:
-    """Return the rows of two cells on the same traffic seeds, played by one version.
+def pick_paired(rows: pl.DataFrame, *cells: Labels) -> list[pl.DataFrame]:
+    """Return the rows of cells on the traffic seeds that they share, played by one version.
+
+    It is the last version that played all of them.
 
     Raises:
-        UnmeasuredError: No version has played both on two traffic seeds.
+        UnmeasuredError: None has played all of them on two traffic seeds.
         ValueError: Labels are those of several cells.
     """
-    pair = [_with_labels(rows, each) for each in (labels, reference)]
-    both = pair[0].join(pair[1], on=["version", "traffic_seed"], how="semi")
-    if both.is_empty():
-        raise UnmeasuredError(dict(labels), dict(reference))
-    version = _last(both)
-    seeds = both.filter(pl.col("version") == version)["traffic_seed"].unique()
-    first, second = (
-        _one_cell(
-            each.filter(
-                pl.col("version") == version, pl.col("traffic_seed").is_in(seeds.implode())
-            ),
-            name,
-        )
-        for each, name in zip(pair, (labels, reference), strict=True)
-    )
-    return first, second
+    found = [_with_labels(rows, each) for each in cells]
+    shared = found[0].select(*_PAIRED).unique()
+    for each in found[1:]:
+        shared = shared.join(each, on=_PAIRED, how="semi")
+    if not shared.is_empty():
+        shared = shared.filter(pl.col("version") == _last(shared))
+    if len(shared) < 2:
+        raise UnmeasuredError(*map(dict, cells))
+    return [
+        _one_cell(each.join(shared, on=_PAIRED, how="semi"), labels)
+        for each, labels in zip(found, cells, strict=True)
+    ]
+
+
+_PAIRED = ("version", "traffic_seed")
 
 
 def _with_labels(rows: pl.DataFrame, labels: Labels) -> pl.DataFrame:
@@ -101,7 +100,7 @@ def mean(rows: pl.DataFrame, labels: Labels, metric: str) -> Interval:
 
 def difference(rows: pl.DataFrame, labels: Labels, reference: Labels, metric: str) -> Interval:
     """Return by how much a cell exceeds a reference, paired by traffic and noise."""
-    pair = pick_pair(rows, labels, reference)
+    pair = pick_paired(rows, labels, reference)
     return paired_difference(*(values_of(each, metric) for each in pair))
 
 
@@ -110,7 +109,7 @@ def below(rows: pl.DataFrame, labels: Labels, reference: Labels, metric: str = E
 
     The interval is that of the difference over the mean of the reference.
     """
-    own, other = (values_of(each, metric) for each in pick_pair(rows, labels, reference))
+    own, other = (values_of(each, metric) for each in pick_paired(rows, labels, reference))
     scale, found = 100.0 / float(other.mean()), mean_interval(other - own)
     return Interval(scale * found.mean, scale * found.low, scale * found.high, found.n)
 

@@ -1,11 +1,10 @@
-"""Watchers that add columns to the rows of episodes: payments, honesty, queries.
+"""Watchers that add columns to the rows of episodes: contributions, honesty, queries.
 
 All look at the true traffic, for evaluation only.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -13,23 +12,19 @@ from scipy import stats
 
 from dptse_env.evaluation import WARM_UP, Row, WatcherFactory
 from dptse_env.process import QueryProcess
-from dptse_env.release import Capped, CappedSettings, PacedSettings, ReleaseModel, TwoMechanisms
+from dptse_env.release import Capped, PacedSettings, ReleaseModel, TwoMechanisms
 from dptse_env.release.paced import Paced
 from dptse_env.release.vehicle_table import VehicleTable
 from dptse_env.traffic import draw_scenario
 from dptse_env.traffic.incident import Incident
 from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray
 
-NEARLY_SPENT = 0.95
-"""Part of the budget above which a vehicle has run out of it."""
-QUANTILES = (0.1, 0.25, 0.5, 0.75, 0.9)
-"""Quantiles of what is spent at the end of a trip."""
 LENGTHS = (0, 30, 60, 90, 120, 150, 180)
 """Lengths of trips [s] at which their bins begin; the last has no end."""
 
 
 class Contributions:
-    """Payments of the vehicles of a batch of episodes, by place and by length of trip.
+    """Contributions of the vehicles of a batch of episodes, by place and by length of trip.
 
     A contribution is counted once for each second in which a query covers a vehicle. Where queries
     and fixed sensors are two mechanisms, it is those that answer queries. Episodes begin at second
@@ -40,13 +35,9 @@ class Contributions:
 
     - ``n_met``: contributions that queries called for;
     - ``n_refused``: those that a ledger or a cap refused;
-    - ``n_vehicles``: vehicles that were on the mainline;
-    - ``n_exhausted``: those that had spent more than `NEARLY_SPENT` of their budget at the end;
-    - ``longest``: seconds that the one that stayed longest was on the mainline;
-    - ``quantiles``: `QUANTILES` of the part of the budget that vehicles had spent;
-    - ``met``, ``refused``: contributions by mainline segment;
-    - ``vehicles``: vehicles by the seconds that they were on the mainline, in bins of `LENGTHS`;
-    - ``spent``, ``met_of``, ``refused_of``: parts of the budget spent, and contributions, by bin.
+    - ``met``, ``refused``: both by mainline segment;
+    - ``met_of``, ``refused_of``: both by the seconds that the vehicle was on the mainline, in bins
+      of `LENGTHS`.
 
     Raises:
         ValueError: The release model keeps no account of single vehicles.
@@ -55,28 +46,29 @@ class Contributions:
     def __init__(self, process: QueryProcess) -> None:
         """Prepare for the episodes of a process."""
         self._process, self._release = process, of_queries(process.release)
-        self._table = vehicle_table(self._release)
-        self._n_mainline = process.interface.n_mainline
-        shape = (process.n_episodes, self._n_mainline)
+        _, self._table = accounts(self._release)
+        settings = self._release.setup.settings
+        self._is_cleared = isinstance(settings, PacedSettings) and settings.unit == "event"
+        shape = (process.n_episodes, process.interface.n_mainline)
         self._met, self._refused = np.zeros((2, *shape), dtype=np.int64)
         self._before: AnyArray | None = None
 
     def __call__(self) -> None:
         """Count the contributions of the second that has passed."""
-        release = self._release
-        paid, _ = payments(release)
+        paid, _ = accounts(self._release)
         if self._before is None:  # the call after the reset, before any query
             self._seconds, self._met_of, self._refused_of = np.zeros((3, *paid.shape), dtype=int)
         else:
-            covered = covered_places(release, self._process.queried)
-            pays = paid > (0.0 if _is_cleared(release) else self._before)
+            covered = covered_places(self._release, self._process.queried)
+            # Ledgers that are cleared every second begin at zero.
+            pays = paid > (0.0 if self._is_cleared else self._before)
             for k in range(len(paid)):
                 self._follow(k, covered[k], pays[k])
         self._before = paid.copy()
 
     def _follow(self, k: int, covered: BoolArray, pays: BoolArray) -> None:
         """Count the contributions of one episode: covered places, and who has paid."""
-        table, n = self._table, self._n_mainline
+        table, n = self._table, self._met.shape[1]
         slot, time = self._process.traffic_index[k], self._process.time[k]
         rows = slice(table.start[slot, time], table.start[slot, time + 1])
         vehicle, place = table.vehicle[rows], table.segment[rows]
@@ -91,29 +83,22 @@ class Contributions:
 
     def rows(self) -> list[Row]:
         """See `dptse_env.evaluation.Watcher.rows`."""
-        paid, budget = payments(self._release)
-        return [self._row(k, paid[k] / budget) for k in range(len(paid))]
+        return [self._row(k) for k in range(len(self._met))]
 
-    def _row(self, k: int, spent: FloatArray) -> Row:
+    def _row(self, k: int) -> Row:
         on_road = self._seconds[k] > 0
         length = np.digitize(self._seconds[k, on_road], LENGTHS) - 1
 
-        def by_length(values: AnyArray | None = None) -> list[float]:
-            return list(map(float, np.bincount(length, values, minlength=len(LENGTHS))))
+        def by_length(counts: AnyArray) -> list[float]:
+            return list(map(float, np.bincount(length, counts[k, on_road], len(LENGTHS))))
 
         return {
             "n_met": int(self._met_of[k].sum()),
             "n_refused": int(self._refused_of[k].sum()),
-            "n_vehicles": int(on_road.sum()),
-            "n_exhausted": int((spent[on_road] > NEARLY_SPENT).sum()),
-            "longest": int(self._seconds[k].max()),
-            "quantiles": np.quantile(spent[on_road], QUANTILES).tolist(),
             "met": self._met[k].tolist(),
             "refused": self._refused[k].tolist(),
-            "vehicles": by_length(),
-            "spent": by_length(spent[on_road]),
-            "met_of": by_length(self._met_of[k, on_road]),
-            "refused_of": by_length(self._refused_of[k, on_road]),
+            "met_of": by_length(self._met_of),
+            "refused_of": by_length(self._refused_of),
         }
 
 
@@ -122,34 +107,17 @@ def of_queries(release: ReleaseModel) -> ReleaseModel:
     return release.queries if isinstance(release, TwoMechanisms) else release
 
 
-def payments(release: ReleaseModel) -> tuple[AnyArray, float]:
-    """Return what vehicles have paid, shape (n_episodes, n_vehicles), and the budget of a trip.
-
-    The budget is infinite where a trip has none.
+def accounts(release: ReleaseModel) -> tuple[AnyArray, VehicleTable]:
+    """Return what vehicles have paid, shape (n_episodes, n_vehicles), and the true vehicles.
 
     Raises:
         ValueError: The release model keeps no account of single vehicles.
     """
-    settings = release.setup.settings
-    if isinstance(release, Paced) and isinstance(settings, PacedSettings):
-        budget = release.ledgers.budget if settings.unit == "trip" else math.inf
-        return release.ledgers.paid, budget
-    if isinstance(release, Capped) and isinstance(settings, CappedSettings):
-        return release.contributions.exposures, settings.contribution_cap or math.inf
-    raise ValueError(f"privacy.preset must keep account of vehicles, got {release.setup.name!r}")
-
-
-def vehicle_table(release: ReleaseModel) -> VehicleTable:
-    """Return the vehicles of the true traffic that a release model reads.
-
-    Raises:
-        ValueError: The release model keeps no account of single vehicles.
-    """
-    payments(release)
     if isinstance(release, Paced):
-        return release.ledgers.vehicles
-    assert isinstance(release, Capped)
-    return release.contributions.vehicles
+        return release.ledgers.paid, release.ledgers.vehicles
+    if isinstance(release, Capped):
+        return release.contributions.exposures, release.contributions.vehicles
+    raise ValueError(f"privacy.preset must keep account of vehicles, got {release.setup.name!r}")
 
 
 def covered_places(release: ReleaseModel, queried: BoolArray) -> BoolArray:
@@ -159,12 +127,6 @@ def covered_places(release: ReleaseModel, queried: BoolArray) -> BoolArray:
         return observed
     covered: BoolArray = observed @ release.ledgers.covers > 0.0
     return covered
-
-
-def _is_cleared(release: ReleaseModel) -> bool:
-    """Return whether every second has ledgers of its own, which begin at zero."""
-    settings = release.setup.settings
-    return isinstance(settings, PacedSettings) and settings.unit == "event"
 
 
 LEVELS = (50, 90, 95)
@@ -224,18 +186,15 @@ class Honesty:
         """See `dptse_env.evaluation.Watcher.rows`."""
         totals = np.stack([self._cells, np.maximum(self._occupied, 1.0)], axis=-1)
         chi2, inside = self._chi2 / totals, 100.0 * self._inside / totals[..., None]
-        kinds = ("density", "speed")
-        rows = []
-        for k in range(len(totals)):
-            row: Row = {f"chi2_{kind}": float(chi2[k, i]) for i, kind in enumerate(kinds)}
-            for i, kind in enumerate(kinds):
-                row |= {f"{kind}_{level}": float(inside[k, i, j]) for j, level in enumerate(LEVELS)}
+        columns = {f"n_{regime}": self._counts[:, j] for j, regime in enumerate(REGIMES)}
+        for i, kind in enumerate(("density", "speed")):
+            columns[f"chi2_{kind}"] = chi2[:, i]
+            for j, level in enumerate(LEVELS):
+                columns[f"{kind}_{level}"] = inside[:, i, j]
             for j, regime in enumerate(REGIMES):
-                row[f"n_{regime}"] = float(self._counts[k, j])
-                for i, kind in enumerate(kinds):
-                    row[f"{kind}_{regime}"] = float(self._squares[k, j, i])
-            rows.append(row)
-        return rows
+                columns[f"{kind}_{regime}"] = self._squares[:, j, i]
+        names, values = columns.keys(), np.stack([*columns.values()], axis=-1)
+        return [dict(zip(names, row, strict=True)) for row in values.tolist()]
 
 
 def regimes(speed: FloatArray, occupied: BoolArray) -> tuple[BoolArray, BoolArray, BoolArray]:
@@ -288,14 +247,12 @@ class Queries:
         self._counts = np.zeros((n, len(PHASES), n_mainline), dtype=np.int64)
         self._seconds = np.zeros((n, len(PHASES)), dtype=np.int64)
         self._near_counts = np.zeros((n, -(-config.horizon_steps // BIN)), dtype=np.int64)
-        self._begun = False
 
     def __call__(self) -> None:
         """Count the queries of the second that has passed."""
-        if not self._begun:  # the call after the reset, before any query
-            self._begun = True
-            return
         process = self._process
+        if process.elapsed[0] == 0:  # the call after the reset, before any query
+            return
         episodes, time = np.arange(process.n_episodes), process.time
         phase = (time > self._start).astype(np.int64) + (time > self._end)
         queried = process.interface.queries.covered(process.queried)
@@ -393,32 +350,29 @@ class Summary:
         has_accounts = isinstance(of_queries(process.release), Capped | Paced)
         self._contributions = Contributions(process) if has_accounts else None
         self._queries, self._seconds = np.zeros(process.n_episodes), 0
-        self._begun = False
 
     def __call__(self) -> None:
         """Follow the second that has passed."""
         self._honesty()
         if self._contributions is not None:
             self._contributions()
-        if self._begun:  # the first call is that after the reset, before any query
+        if self._process.elapsed[0] > 0:  # not at the call after the reset, before any query
             self._queries += self._process.queried.sum(axis=1)
             self._seconds += 1
-        self._begun = True
 
     def rows(self) -> list[Row]:
         """See `dptse_env.evaluation.Watcher.rows`."""
         counted: list[Row] = [{}] * len(self._queries)
         if self._contributions is not None:
             counted = self._contributions.rows()
+        rows = zip(self._honesty.rows(), counted, self._queries, strict=True)
         return [
             {
                 **{name: chi2[name] for name in ("chi2_density", "chi2_speed")},
                 **{name: counts.get(name) for name in ("n_met", "n_refused")},
                 "queries_a_second": float(queries / self._seconds),
             }
-            for chi2, counts, queries in zip(
-                self._honesty.rows(), counted, self._queries, strict=True
-            )
+            for chi2, counts, queries in rows
         ]
 
 

@@ -26,11 +26,11 @@ from dptse_env.privacy.audit_statistics import Claim, audit
 from dptse_env.release import PrivacyReport
 from dptse_env.traffic import with_vehicles
 from dptse_env.utils.validation import inside, integer, positive, require
-from scripts.cli import Road, run
+from scripts.cli import Machines, Road, run
 
 
 @dataclass(frozen=True)
-class Args(Road):
+class Args(Road, Machines):
     """Audit the privacy of an environment."""
 
     env: str = "dptse_env:dptse/PrivateHighway-v1"

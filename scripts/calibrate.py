@@ -30,13 +30,13 @@ from dptse_env.model.prediction import (
 )
 from dptse_env.release.traffic_table import TrafficTable
 from dptse_env.traffic import Corridor, RecordLibrary, average_dwell
-from scripts.cli import Road, make_corridor, run
+from scripts.cli import Recording, Road, make_corridor, run
 
 logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Args(Road):
+class Args(Road, Recording):
     """Fit the ARZ parameters."""
 
     train: str = "0:16"

@@ -32,18 +32,30 @@ from dptse_env.utils.threads import n_cores
 
 
 @dataclass(frozen=True)
-class Machines:
-    """Machines that run tasks, and the folder of records. Results depend on none of it."""
+class Recording:
+    """Processes of this machine, and the folder of records. Results depend on neither."""
+
+    workers: int | None = None
+    """Processes of this machine; one for each core if not given."""
+    records: Path | None = None
+    """Folder of the record cache; the user's cache if not given."""
+
+    def library(self, corridor: Corridor, seeds: Sequence[int]) -> RecordLibrary:
+        """Return the library of records, after recording what is missing."""
+        library = RecordLibrary(self.records)
+        record(corridor, seeds, library, progress=True, workers=self.workers)
+        return library
+
+
+@dataclass(frozen=True)
+class Machines(Recording):
+    """Machines that run tasks. Results do not depend on them."""
 
     executor: ExecutorName = "local"
     """Where tasks run: in processes of this machine (local), or on a Ray cluster (ray)."""
     address: str | None = None
     """Address of the Ray cluster, host:port of its head node, or auto for the one on this machine;
     RAY_ADDRESS if not given, or else a new one on this machine."""
-    workers: int | None = None
-    """Processes of this machine; one for each core if not given."""
-    records: Path | None = None
-    """Folder of the record cache; the user's cache if not given."""
 
     def start_executor(self) -> AnyExecutor:
         """Return what runs the tasks.
@@ -60,15 +72,9 @@ class Machines:
         """Return a folder with the executor that works for it."""
         return Place(folder, self.start_executor(), self.records)
 
-    def library(self, corridor: Corridor, seeds: Sequence[int]) -> RecordLibrary:
-        """Return the library of records, after recording what is missing."""
-        library = RecordLibrary(self.records)
-        record(corridor, seeds, library, progress=True, workers=self.workers)
-        return library
-
 
 @dataclass(frozen=True)
-class Road(Machines):
+class Road:
     """An environment and its road."""
 
     corridor: str | None = None

@@ -39,7 +39,7 @@ from dptse_env.config import EnvConfig, parse_seeds
 from dptse_env.schedules import OBSERVATION_SCHEDULES
 from dptse_env.traffic import is_road_file
 from dptse_env.utils.validation import require
-from scripts.cli import Road, resumable, run
+from scripts.cli import Machines, Road, resumable, run
 
 ALL = "all"
 """The schedule that runs with a bandwidth that covers the road."""
@@ -49,7 +49,7 @@ ERRORS, MAPS, PAGE = "schedules.png", "space_time.png", "page.html"
 
 
 @dataclass(frozen=True)
-class Args(Road):
+class Args(Road, Machines):
     """Evaluate query schedules and trained policies."""
 
     schedules: tuple[str, ...] = tuple(OBSERVATION_SCHEDULES)

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 
 from dptse_env.config import parse_seeds
 from dptse_env.traffic import average_dwell
-from scripts.cli import Road, make_corridor, run
+from scripts.cli import Recording, Road, make_corridor, run
 
 
 @dataclass(frozen=True)
-class Args(Road):
+class Args(Road, Recording):
     """Record traffic."""
 
     seeds: str = "0:16"

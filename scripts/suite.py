@@ -6,7 +6,7 @@ python scripts/suite.py --policies results/training/primary/pl-0/best.zip --outp
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,11 +21,12 @@ from agents.studies.suite import (
     Scores,
     beside_recorded,
     entry,
+    format_scores,
     make_cell,
+    score_all,
 )
 from agents.study import read_rows
 from agents.study import run as run_study
-from agents.tables import cell
 from agents.terminal import make_table, print_table
 from dptse_env.utils.validation import require
 from scripts.cli import Machines, resumable, run, suitable
@@ -56,22 +57,26 @@ def main(args: Args) -> None:
     study = entry(cells, TASKS)
     run_study(study, args.place(args.output))
     rows = beside_recorded(read_rows(study.name, args.output), study.cells)
-    print_scores(Scores(rows, TASKS), named)
+    print_scores(score_all(rows, TASKS), list(named))
     print(f"tables and the figure are in {args.output}/")
 
 
-def print_scores(scores: Scores, policies: Iterable[str]) -> None:
+def print_scores(scores: Scores, names: Sequence[str]) -> None:
     """Print the scores of policies by task, beside the best of those that come with the package."""
-    names, recorded = list(policies), [*RULES, *LEARNED]
-    others = [name for name in recorded if name not in (*names, ZERO, ONE)]
+    others = [name for name in (*RULES, *LEARNED) if name not in (*names, ZERO, ONE)]
+
+    def best(task: str) -> str:
+        known = {name: scores[name][task] for name in others if task in scores.get(name, {})}
+        if not known:
+            return "-"
+        name = max(known, key=lambda name: known[name].mean)
+        return f"{name} {known[name].mean:.2f} ± {known[name].half_width:.2f}"
+
+    tasks = [task.name for task in TASKS]
     table = make_table(f"{NAME}: scores", "task", *names, "best that comes with it")
-    for task in TASKS:
-        best = scores.best(task.name, others)
-        shown = [cell(scores.shown, name, task.name) for name in names]
-        best_shown = "-" if best is None else f"{best} {scores.shown(best, task.name)}"
-        table.add_row(task.name, *shown, best_shown)
-    means = {name: scores.mean(name) for name in names}
-    table.add_row("mean", *("-" if each is None else f"{each:.2f}" for each in means.values()), "")
+    columns = [format_scores(scores[name], TASKS) for name in names]
+    for line in zip(["mean", *tasks], *columns, ["", *map(best, tasks)], strict=True):
+        table.add_row(*line)
     print_table(table)
 
 

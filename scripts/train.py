@@ -26,7 +26,7 @@ from agents.training.several_seeds import train_all
 from agents.training.training import BEST, POLICY, Training
 from dptse_env.config import parse_seeds
 from dptse_env.utils.validation import integer
-from scripts.cli import Road, resumable, run
+from scripts.cli import Machines, Road, resumable, run
 from scripts.training_bar import Bar, watched
 
 AnyRecipe = (
@@ -38,7 +38,7 @@ AnyRecipe = (
 
 
 @dataclass(frozen=True)
-class Args(Road):
+class Args(Road, Machines):
     """Train a query policy."""
 
     env: str = "dptse_env:dptse/PrivateHighway-v0"

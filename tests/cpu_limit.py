@@ -1,16 +1,18 @@
 """pytest plugin: a fast test that takes more CPU time than the limit fails.
 
 Counted is what a test and its own fixtures use, in this process and in children that have ended.
-Fixtures that several tests share are left out, and so is compiling: children do not count where
-machine code was written while the test ran.
+Left out is what several tests share: their fixtures, machine code that is compiled or loaded, and
+records of traffic. Children do not count where machine code was written while the test ran.
 """
 
 import os
+from unittest import mock
 
 import numpy as np
 import pytest
-from numba.core import event
+from numba.core.registry import CPUDispatcher
 
+from dptse_env.traffic import RecordLibrary
 from dptse_env.utils.kernels import default_folder
 
 LIMIT = 3.0
@@ -30,7 +32,7 @@ def pytest_configure(config):
     config.pluginmanager.register(CpuLimit(config.getoption("cpu_limit")))
 
 
-class CpuLimit(event.Listener):
+class CpuLimit:
     """Adds up the CPU seconds of a test, without what is left out."""
 
     def __init__(self, limit):
@@ -38,11 +40,29 @@ class CpuLimit(event.Listener):
         self._seconds = 0.0
         self._left_out = self._left_out_since = np.zeros(2)
         self._depth = 0
-        event.register("numba:compile", self)
+        self._patches = [
+            mock.patch.object(owner, name, self._outside(getattr(owner, name)))
+            for owner, name in ((CPUDispatcher, "compile"), (RecordLibrary, "ensure"))
+        ]
+        for patch in self._patches:
+            patch.start()
 
     def pytest_unconfigure(self):
         """Measure no longer."""
-        event.unregister("numba:compile", self)
+        for patch in self._patches:
+            patch.stop()
+
+    def _outside(self, method):
+        """Return a method whose time is left out."""
+
+        def wrapper(*args, **keywords):
+            self._pause()
+            try:
+                return method(*args, **keywords)
+            finally:
+                self._resume()
+
+        return wrapper
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_setup(self):
@@ -60,11 +80,11 @@ class CpuLimit(event.Listener):
         """Leave fixtures out that several tests share."""
         if fixturedef.scope == "function":
             return (yield)
-        self.on_start()
+        self._pause()
         try:
             return (yield)
         finally:
-            self.on_end()
+            self._resume()
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_makereport(self, item, call):
@@ -79,13 +99,13 @@ class CpuLimit(event.Listener):
             )
         return report
 
-    def on_start(self, happened=None):
+    def _pause(self):
         """Leave out what follows."""
         if self._depth == 0:
             self._left_out_since = _used()
         self._depth += 1
 
-    def on_end(self, happened=None):
+    def _resume(self):
         """Go on counting."""
         self._depth -= 1
         if self._depth == 0:

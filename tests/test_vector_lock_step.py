@@ -30,7 +30,10 @@ def test_a_batch_is_so_many_scalar_environments(estimator, action, privacy):
     lock_step({**keywords, "truth_in_info": True}, n_steps=17)
 
 
-@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+LONG = [name for name in ENVIRONMENTS if "Long" in name]
+
+
+@pytest.mark.parametrize("env_id", fast_and_slow(ENVIRONMENTS, set(ENVIRONMENTS) - set(LONG)))
 def test_every_id_is_so_many_scalar_environments(env_id):
     lock_step({"traffic_seeds": "0:2", **briefly(env_id)}, n_steps=8, env_id=f"dptse_env:{env_id}")
 

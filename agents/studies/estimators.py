@@ -47,7 +47,7 @@ from agents.tables import (
     format_range,
     grid,
     mean,
-    pick_pair,
+    pick_paired,
     values,
     values_of,
 )
@@ -408,7 +408,8 @@ def world_tables(rows: pl.DataFrame, times: pl.DataFrame) -> list[str]:
 def loss(rows: pl.DataFrame, cells: Sequence[Labels], reference: Labels) -> Interval:
     """Return by how much the mean error of cells lies above that of a reference [%], paired."""
     pairs = [
-        [values_of(each, ERROR) for each in pick_pair(rows, labels, reference)] for labels in cells
+        [values_of(each, ERROR) for each in pick_paired(rows, labels, reference)]
+        for labels in cells
     ]
     change = np.mean([own - base for own, base in pairs], axis=0)
     return mean_interval(100.0 * change / pairs[0][1].mean())

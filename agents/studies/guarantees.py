@@ -8,31 +8,27 @@ budget. All cells have the same traffic; a number of one part is never held agai
 
 from __future__ import annotations
 
-import itertools
-import json
+import contextlib
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
+from itertools import chain, pairwise, product
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 import polars as pl
-from matplotlib.figure import Figure
 
 from agents.environments import make_config, quietly
 from agents.figures import (
-    ERROR_TICKS,
-    GREY,
     LABELS,
     Look,
-    add_frame,
     draw_curve,
-    draw_dot,
     draw_level,
     error_label,
     finish_figure,
     make_figure,
+    save_errors,
     save_figure,
     set_log_axes,
     set_log_ticks,
@@ -49,6 +45,7 @@ from agents.tables import (
     difference,
     format_interval,
     format_number,
+    grid,
     markdown,
     mean,
     pick,
@@ -56,17 +53,15 @@ from agents.tables import (
 from agents.watchers import LENGTHS
 from dptse_env.config import EnvConfig
 from dptse_env.parts import privacy_report
-from dptse_env.privacy import contribution_sensitivity, epsilon_of
-from dptse_env.release import PrivacyReport, PublicStep, ReleaseModel, ReleaseSetup
+from dptse_env.privacy import epsilon_of
+from dptse_env.release import PublicStep, ReleaseModel, ReleaseSetup
 from dptse_env.release.paced import Paced
 from dptse_env.release.pacing import Pacing, TracerPacing
-from dptse_env.utils.arrays import FloatArray, IntArray
-from dptse_env.utils.vector_info import Rows
+from dptse_env.utils.arrays import FloatArray
 
 ENV = "dptse_env:dptse/PrivateHighway-v0"
 SEEDS = tuple(range(2000, 2020))
 DELTA, STRICT, CAP = 0.05, 0.001, 64
-DECADES = [10.0**k for k in range(-1, 7)]
 
 # What the ledgers are held against: no noise, and prices that do not follow the queries
 
@@ -91,24 +86,15 @@ class Exact(Paced):
     """
 
     claims_guarantee: ClassVar[bool] = False
+    # What is known of a release without a guarantee, and without budgets.
+    spent, report = ReleaseModel.spent, ReleaseModel.report
+    private_info = ReleaseModel.private_info
 
     def __init__(self, setup: ReleaseSetup) -> None:
         """Make ledgers without a limit."""
         super().__init__(setup)
         self.ledgers.budget = math.inf
         self.pacing = AnyPrice(self.pacing.setup)
-
-    def spent(self, episodes: IntArray, steps: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Return infinite losses, which is what is known of a release without a guarantee."""
-        return ReleaseModel.spent(self, episodes, steps)
-
-    def report(self) -> PrivacyReport:
-        """Return the report of a model that states no guarantee."""
-        return ReleaseModel.report(self)
-
-    def private_info(self, episodes: IntArray, traffic: IntArray) -> Rows:
-        """Return nothing: no vehicle has a budget."""
-        return {}
 
 
 class EqualRates(TracerPacing):
@@ -142,46 +128,37 @@ PROTECTIONS: dict[str, dict[str, Any]] = {
 PRINTED = (PAPER, CORRECTED)
 
 
-def priced(
-    estimator: str,
-    protection: str = TRIP,
-    *,
-    epsilon: float = 5.0,
-    boundary: str | None = None,
-    bandwidth: int = 5,
-) -> Cell:
-    """Return a cell of the price of a guarantee; the boundary is by default the preset's own.
-
-    The open loop uses the boundary inputs and nothing else. Where these are not released, one cell
-    stands for all noise and bandwidths.
-    """
-    boundary = boundary or ("true" if protection in PRINTED else "nominal")
-    if estimator == "open_loop" and boundary != "private":
-        protection, epsilon, bandwidth = TRIP, 5.0, 5
-    privacy = {"epsilon": epsilon, "delta": DELTA, "boundary_inputs": boundary}
+def priced(estimator: str, protection: str = TRIP, **changes: Any) -> Cell:
+    """Return a cell of the price of a guarantee; the boundary is by default the preset's own."""
+    given = {
+        "estimator": estimator, "protection": protection, "epsilon": 5.0, "bandwidth": 5,
+        "boundary": "true" if protection in PRINTED else "nominal",
+    } | changes  # fmt: skip
+    privacy = {"epsilon": given["epsilon"], "delta": DELTA, "boundary_inputs": given["boundary"]}
     privacy |= PROTECTIONS[protection]
-    labels = {
-        "part": "privacy", "estimator": estimator, "protection": protection, "epsilon": epsilon,
-        "boundary": boundary, "bandwidth": bandwidth,
-    }  # fmt: skip
-    keywords = {"estimator": estimator, "bandwidth": bandwidth, "privacy": privacy}
-    return Cell(ENV, "paper", keywords, labels)
+    keywords = {"estimator": estimator, "bandwidth": given["bandwidth"], "privacy": privacy}
+    return Cell(ENV, "paper", keywords, {"part": "privacy", **given})
 
 
 # Cells of the part "ledger"
 
-BASE: dict[str, Any] = {
-    "release": "paced", "estimator": "ekf-demand", "schedule": "round-robin", "epsilon": 5.0,
-    "delta": DELTA, "adjacency": "replace", "unit": "trip", "boundary": "nominal",
-    "queries": "5 segments", "pace": 0.85, "clip": 25.0, "ratio": 1.0, "pacing": "tracer",
+SETTINGS: dict[str, Any] = {
+    "epsilon": 5.0, "delta": DELTA, "adjacency": "replace", "unit": "trip",
+    "pace": 0.85, "clip": 25.0, "ratio": 1.0, "pacing": "tracer",
 }  # fmt: skip
-"""A cell of the ledgers, but for what it varies."""
+"""Privacy settings of a cell of the ledgers, but for what it varies."""
+BASE = SETTINGS | {
+    "release": "paced", "estimator": "ekf-demand", "schedule": "round-robin",
+    "boundary": "nominal", "queries": "5 segments",
+}  # fmt: skip
 LACKS = {
     "paced": (),
     "capped": ("pace", "clip", "ratio", "pacing"),
     "exact": ("epsilon", "delta", "adjacency", "unit", "pace", "ratio", "pacing"),
 }
 """What a release model has no setting for."""
+OWN = {"exact": f"{__name__}:Exact", "equal-rates": f"{__name__}:EqualRates"}
+"""Classes of this file by their labels."""
 QUERIES: dict[str, dict[str, Any]] = {
     "5 segments": {"bandwidth": 5},
     "10 segments": {"bandwidth": 10},
@@ -191,49 +168,45 @@ QUERIES: dict[str, dict[str, Any]] = {
 }
 """Queries of a second; a sum is over neighbouring segments."""
 SAME_COST = ("5 segments", "5 sums of 2")
-FILTERS = {
-    "ekf-demand": "EKF with demand states",
-    "ukf-demand": "UKF with demand states",
-    "enkf-demand": "EnKF with demand states",
-    "mhe-demand": "MHE with demand states",
-    "random_walk": "random walk",
-}
+FILTERS = ("ekf-demand", "ukf-demand", "enkf-demand", "mhe-demand", "random_walk")
 SCHEDULES = (
     "static", "paper", "round-robin", "random", "oldest-first", "largest-variance",
     "stale-variance", "greedy-trace",
 )  # fmt: skip
 CURVE = (0.5, 1.0, 2.0, 5.0, 10.0)
-VALUES = {
-    "pace": (0.6, 0.7, 0.8, 0.85, 0.9, 1.0),
-    "clip": (18.0, 25.0, 35.0, 51.0, 102.0),
-    "ratio": (0.25, 0.5, 1.0),
+PACES = (0.6, 0.7, 0.8, 0.85, 0.9, 1.0)
+VARIED = {
+    ("pace", DELTA): PACES,
+    ("pace", STRICT): PACES,
+    ("clip", DELTA): (18.0, 25.0, 35.0, 51.0, 102.0),
+    ("ratio", DELTA): (0.25, 0.5, 1.0),
 }
-"""Values of the settings of ``paced``."""
+"""Values of the settings of ``paced``, by delta."""
 VARIANTS: dict[str, dict[str, Any]] = {
-    "a trip, replaced, with nominal boundary inputs": {},
-    "added or removed in place of replaced": {"adjacency": "add_remove"},
-    "a second in place of a trip": {"unit": "event"},
-    "private boundary inputs in place of nominal ones": {"boundary": "private"},
+    "a trip, replaced": {},
+    "added or removed": {"adjacency": "add_remove"},
+    "a second": {"unit": "event"},
+    "private boundary inputs": {"boundary": "private"},
 }
 GUARANTEES = ((5.0, DELTA), (1.0, DELTA), (5.0, STRICT))
 CAPPED, EQUAL = {"release": "capped"}, {"pacing": "equal-rates"}
 LADDER: tuple[tuple[str, dict[str, Any], int], ...] = (
-    ("`capped`, EKF, `paper`", {"estimator": "ekf", "schedule": "paper", **CAPPED}, 0),
-    ("`capped`, demand states, `paper`", {"schedule": "paper", **CAPPED}, 1),
-    ("`paced`, EKF, `paper`", {"estimator": "ekf", "schedule": "paper"}, 1),
-    ("`paced`, demand states, `paper`", {"schedule": "paper"}, 2),
-    ("`paced`, demand states, `round-robin`", {}, 4),
-    ("`capped`, demand states, `round-robin`", CAPPED, 2),
-    ("`paced`, 10 segments a second", {"queries": "10 segments"}, 5),
-    ("`paced`, 5 sums of 2", {"queries": "5 sums of 2"}, 5),
-    ("`paced`, 2 sums of 2, 4 segments", {"queries": "2 sums of 2"}, 5),
-    ("`paced`, 3 sums of 2, 6 segments", {"queries": "3 sums of 2"}, 5),
-    ("`capped`, random walk, `round-robin`", {"estimator": "random_walk", **CAPPED}, 0),
-    ("`paced`, random walk, `round-robin`", {"estimator": "random_walk"}, 11),
-    ("no noise, demand states, `round-robin`", {"release": "exact"}, 5),
-    ("no noise, 5 sums of 2", {"release": "exact", "queries": "5 sums of 2"}, 8),
+    ("1. `capped`, EKF, `paper`", {"estimator": "ekf", "schedule": "paper", **CAPPED}, 1),
+    ("2. `capped`, demand states, `paper`", {"schedule": "paper", **CAPPED}, 1),
+    ("3. `paced`, EKF, `paper`", {"estimator": "ekf", "schedule": "paper"}, 1),
+    ("4. `paced`, demand states, `paper`", {"schedule": "paper"}, 2),
+    ("5. `paced`, demand states, `round-robin`", {}, 4),
+    ("6. `capped`, demand states, `round-robin`", CAPPED, 2),
+    ("7. `paced`, 10 segments a second", {"queries": "10 segments"}, 5),
+    ("8. `paced`, 5 sums of 2", {"queries": "5 sums of 2"}, 5),
+    ("9. `paced`, 2 sums of 2, 4 segments", {"queries": "2 sums of 2"}, 5),
+    ("10. `paced`, 3 sums of 2, 6 segments", {"queries": "3 sums of 2"}, 5),
+    ("11. `capped`, random walk, `round-robin`", {"estimator": "random_walk", **CAPPED}, 11),
+    ("12. `paced`, random walk, `round-robin`", {"estimator": "random_walk"}, 11),
+    ("13. no noise, demand states, `round-robin`", {"release": "exact"}, 5),
+    ("14. no noise, 5 sums of 2", {"release": "exact", "queries": "5 sums of 2"}, 8),
 )
-"""Rungs: a label, what differs from `BASE`, and the number of the rung that it rests on, if any."""
+"""Rungs: a label, what differs from `BASE`, and the number of the rung that it is held against."""
 
 
 def paid(**changes: Any) -> Cell:
@@ -244,15 +217,8 @@ def paid(**changes: Any) -> Cell:
     estimator, _, demand = name.partition("-")
     settings = "capped" if release == "capped" or name == "ekf" else "paced"
     settings += "-demand" if release == "capped" and demand else ""
-    privacy: dict[str, Any] = {
-        key: given[key]
-        for key in ("epsilon", "delta", "adjacency", "unit", "pace", "clip", "ratio", "pacing")
-        if key in given
-    }
-    privacy["preset"] = f"{__name__}:Exact" if release == "exact" else release
-    privacy["boundary_inputs"] = given["boundary"]
-    if privacy.get("pacing") == "equal-rates":
-        privacy["pacing"] = f"{__name__}:EqualRates"
+    privacy = {key: OWN.get(value, value) for key, value in given.items() if key in SETTINGS}
+    privacy |= {"preset": OWN.get(release, release), "boundary_inputs": given["boundary"]}
     keywords = {
         "estimator": estimator,
         "estimator_settings": f"{estimator}-w99-3lane-{settings}",
@@ -266,230 +232,165 @@ def paid(**changes: Any) -> Cell:
 # What noise is worth
 
 
-def config_of(rows: pl.DataFrame, labels: Mapping[str, Any]) -> EnvConfig:
-    """Return the configuration that a cell was played with.
-
-    Raises:
-        UnmeasuredError: It was not, or on a road of a file, of which rows know the digest alone.
-    """
-    content = json.loads(pick(rows, labels)["cell"][0])
-    if str(content["keywords"].get("corridor")).startswith("sha256:"):
-        raise UnmeasuredError(labels)
-    with quietly():
-        return make_config(content["env"], content["keywords"])
-
-
-def met_epsilon(config: EnvConfig, times: int, *, alone: bool = False) -> float:
-    """Return epsilon of the paper's noise for a vehicle that is met in some steps and replaced.
+def met_epsilon(config: EnvConfig, *, alone: bool = False) -> float:
+    """Return epsilon of the paper's noise for a vehicle that is met `CAP` times and replaced.
 
     The vehicle that replaces it is met as often, elsewhere. Boundary inputs are left out; with true
     ones no finite epsilon holds.
 
     Args:
         config: Its configuration.
-        times: Steps in which either vehicle is queried.
         alone: Whether it stands and is alone on its segment, so that it is the mean speed there,
             and an empty segment releases the speed limit. Otherwise only densities count, which
             bounds epsilon from below whatever the vehicle does.
     """
     density_std, speed_std = (each.noise_std for each in privacy_report(config).releases)
-    largest = config.corridor.largest_speed_limit
-    density = contribution_sensitivity(
-        contributions=times,
-        adjacency="replace",
-        segment_length=min(config.corridor.segment_lengths),
-        largest_speed=largest,
-    ).releases[0]
-    speed = math.sqrt(2.0 * times) * largest if alone else 0.0
-    mu = math.hypot(density.bound / density_std, speed / speed_std)
-    return epsilon_of(mu, config.privacy.delta)
+    norm = math.sqrt(2.0 * CAP)  # of the numbers of two vehicles, each at its own places
+    density = norm / min(config.corridor.segment_lengths) / density_std
+    speed = norm * config.corridor.largest_speed_limit / speed_std if alone else 0.0
+    return epsilon_of(math.hypot(density, speed), config.privacy.delta)
 
 
-# Tables, whose numbers say which cells are played
-
-REFUSED, SPENT = "refused [%]", "spent above 95 % [%]"
-SHARES = {REFUSED: ("n_refused", "n_met"), SPENT: ("n_exhausted", "n_vehicles")}
-"""Shares of the rows, by what they are a part of, see `complete`."""
-ERRORS = {metric: f"{name} RMSE [{unit}]" for metric, (name, unit) in METRICS.items()}
-
-
-class Number(NamedTuple):
-    """The mean of a column of a cell, or by how much it exceeds that of another, paired."""
-
-    column: str
-    own: Cell
-    base: Cell | None = None
+CLAIMS: dict[str, Callable[[EnvConfig], float]] = {
+    "composed": lambda config: privacy_report(config).epsilon,
+    f"met {CAP} times, at least": met_epsilon,
+    f"met {CAP} times, alone, standing": partial(met_epsilon, alone=True),
+}
+"""What the paper's noise is worth, by assumption."""
+CLAIMED = [f"{noise}: {claim}" for noise, claim in product(PRINTED, CLAIMS)]
 
 
-class Table(NamedTuple):
-    """A table of texts and numbers of the rows."""
-
-    title: str
-    header: list[str]
-    lines: list[list[str | Number]]
-
-
-Make = Callable[..., Cell]
-"""Makes a cell of what a column of a table varies."""
-Line = tuple[str, Make] | tuple[str, Make, Make]
-"""What is measured, and in which cell, or in which more than in another."""
+def true_epsilon(line: str, claimed: float) -> float:
+    """Return epsilon of a kind of noise under an assumption, given as ``noise: assumption``."""
+    noise, claim = line.split(": ")
+    own = priced("ekf", noise, epsilon=claimed)
+    with quietly():
+        return CLAIMS[claim](make_config(own.env, own.keywords))
 
 
-def sweep(
-    title: str,
-    corner: str,
-    columns: Mapping[str, Mapping[str, Any]],
-    lines: Mapping[str, Line],
-) -> Table:
+# Tables, which ask for numbers of cells and so say which ones are played
+
+REFUSED = "refused [%]"
+ERRORS = {metric: error_label(metric) for metric in METRICS}
+
+Ask = Callable[..., str]
+"""Returns the mean of a column of a cell, or by how much it exceeds that of another one."""
+Line = tuple[str, Callable[..., Cell]] | tuple[str, Callable[..., Cell], Callable[..., Cell]]
+"""A column of the rows, and what makes the cell, or the two cells, of what a table varies."""
+Columns = Mapping[str, Mapping[str, Any]]
+"""Headers, and what is varied below them."""
+
+
+def along(epsilons: Iterable[float], **fixed: Any) -> Columns:
+    """Return a column for each epsilon."""
+    return {f"ε = {value:g}": {"epsilon": value, **fixed} for value in epsilons}
+
+
+def sweep(ask: Ask, corner: str, columns: Columns, lines: Mapping[str, Line]) -> str:
     """Return a table whose columns vary something in every line."""
-    table = Table(title, [corner, *columns], [])
-    for name, (metric, *makes) in lines.items():
-        cells = [[make(**varied) for make in makes] for varied in columns.values()]
-        table.lines.append([name, *(Number(metric, *each) for each in cells)])
-    return table
+
+    def entry(line: str, head: str) -> str:
+        column, *makers = lines[line]
+        return ask(column, *(make(**columns[head]) for make in makers))
+
+    return grid(corner, list(lines), list(columns), entry)
 
 
-def compared(
-    title: str,
-    header: Sequence[str],
-    reference: str,
-    lines: Iterable[tuple[list[str], Cell, Cell | None]],
-    *shares: str,
-) -> Table:
-    """Return a table of both errors of some cells, each against another one, and of shares."""
-    table = Table(title, [*header, *compared_header(reference), *shares], [])
-    for names, own, base in lines:
-        line: list[str | Number] = list(names)
+def compared(ask: Ask, reference: str, lines: Mapping[str, tuple[Cell, Cell]], *more: str) -> str:
+    """Return a table of both errors of cells, each against another cell, and of more columns."""
+    found = []
+    for name, (own, base) in lines.items():
+        line = [name]
         for metric in METRICS:
-            line.append(Number(metric, own))
-            line.append("-" if base in (None, own) else Number(metric, own, base))
-        table.lines.append([*line, *(Number(share, own) for share in shares)])
-    return table
+            line += [ask(metric, own), "-" if own == base else ask(metric, own, base)]
+        found.append([*line, *(ask(column, own) for column in more)])
+    return markdown(["", *compared_header(reference), *more], found)
 
 
-def price_tables() -> Iterator[Table]:
-    """Yield the tables of the part ``privacy``."""
-    along = {f"ε = {value:g}": {"epsilon": value} for value in EPSILONS}
-    for name in ESTIMATORS:
-        more: dict[str, Line] = {
-            f"{error} over {noise}": (metric, partial(priced, name), partial(priced, name, noise))
-            for noise in PRINTED
-            for metric, error in ERRORS.items()
-        }
-        yield sweep(f"{LABELS[name]}: what {TRIP} costs", "", along, more)
-    for name, (metric, error) in itertools.product(ESTIMATORS, ERRORS.items()):
-        lines: dict[str, Line] = {
-            protection: (metric, partial(priced, name, protection)) for protection in PROTECTIONS
-        }
-        yield sweep(f"{LABELS[name]}: {error} against ε", "protection", along, lines)
-    boundaries = [
-        ([LABELS[name], each], priced(name, boundary=each), priced(name))
-        for name, each in itertools.product((*ESTIMATORS, "open_loop"), BOUNDARIES)
-    ]
-    yield compared("Boundary inputs, ε = 5", ["", "boundary inputs"], "nominal", boundaries)
-    bandwidths = [
-        ([LABELS[name], str(each)], priced(name, bandwidth=each), priced(name))
-        for name, each in itertools.product(ESTIMATORS, BANDWIDTHS)
-    ]
-    yield compared("Bandwidth, ε = 5", ["", "queried a second"], "5", bandwidths)
+def price_tables(ask: Ask) -> Iterator[str]:
+    """Yield the tables of the part ``privacy``, each below its title."""
+    for name, (metric, error) in product(ESTIMATORS, ERRORS.items()):
+        yield f"## {LABELS[name]}: {error} against ε"
+        makers = {each: partial(priced, name, each) for each in PROTECTIONS}
+        lines: dict[str, Line] = {each: (metric, make) for each, make in makers.items()}
+        for noise in PRINTED:
+            lines[f"{TRIP} − {noise}"] = metric, makers[TRIP], makers[noise]
+        yield sweep(ask, "protection", along(EPSILONS), lines)
+    yield "## Boundary inputs, ε = 5"
+    boundaries = {
+        f"{LABELS[name]}, {each}": (priced(name, boundary=each), priced(name))
+        for name, each in product((*ESTIMATORS, "open_loop"), BOUNDARIES)
+    }
+    yield compared(ask, "nominal", boundaries)
+    yield "## Bandwidth, ε = 5"
+    bandwidths = {
+        f"{LABELS[name]}, {each} a second": (priced(name, bandwidth=each), priced(name))
+        for name, each in product(ESTIMATORS, BANDWIDTHS)
+    }
+    yield compared(ask, "5", bandwidths)
 
 
-def ledger_tables() -> Iterator[Table]:
-    """Yield the tables of the part ``ledger``."""
-    rungs = [paid(**changes) for _, changes, _ in LADDER]
-    ladder = [
-        ([f"{k}. {label}", f"{base or '-'}"], rungs[k - 1], rungs[base - 1] if base else None)
-        for k, (label, _, base) in enumerate(LADDER, start=1)
-    ]
-    yield compared("Ladder", ["rung", "base"], "base", ladder, REFUSED)
+def ledger_tables(ask: Ask) -> Iterator[str]:
+    """Yield the tables of the part ``ledger``, each below its title."""
+    yield "## Ladder"
+    ladder = {
+        f"{name} ({base})": (paid(**changes), paid(**LADDER[base - 1][1]))
+        for name, changes, base in LADDER
+    }
+    yield compared(ask, "(rung)", ladder, REFUSED)
+    yield f"## Ladder at other (ε, δ): {ERRORS[DENSITY]}"
     at = {f"({e:g}, {d:g})": {"epsilon": e, "delta": d} for e, d in GUARANTEES}
-    again: dict[str, Line] = {
-        names[0]: (DENSITY, partial(paid, **changes))
-        for (names, _, _), (_, changes, _) in zip(ladder, LADDER, strict=True)
+    again = {name: (DENSITY, partial(paid, **changes)) for name, changes, _ in LADDER}
+    yield sweep(ask, "rung", at, again)
+    yield "## Filters with demand states, and the random walk, `paced`"
+    filters = {
+        f"{queries}, {LABELS[each.partition('-')[0]]}": (
+            paid(estimator=each, queries=queries),
+            paid(queries=queries),
+        )
+        for queries, each in product(SAME_COST, FILTERS)
     }
-    yield sweep(f"Ladder at other (ε, δ): {ERRORS[DENSITY]}", "rung", at, again)
-    along = {f"ε = {value:g}": {"epsilon": value} for value in CURVE}
-    for metric, delta in itertools.product(METRICS, (DELTA, STRICT)):
-        capped, paced = partial(paid, delta=delta, **CAPPED), partial(paid, delta=delta)
-        lines: dict[str, Line] = {
-            "`capped`": (metric, capped),
-            "`paced`": (metric, paced),
-            "difference": (metric, paced, capped),
-        }
-        yield sweep(f"{ERRORS[metric]} against ε, δ = {delta:g}", "", along, lines)
-    filters = [
-        ([queries, label], paid(estimator=name, queries=queries), paid(queries=queries))
-        for queries, (name, label) in itertools.product(SAME_COST, FILTERS.items())
-    ]
-    yield compared("Filters, `paced`", ["queries", "filter"], "the first", filters, REFUSED)
-    variants = [
-        ([f"`{release}`", label], paid(release=release, **changes), paid(release=release))
-        for release, (label, changes) in itertools.product(("capped", "paced"), VARIANTS.items())
-    ]
-    yield compared("What is protected", ["", "protected"], "the first", variants, REFUSED)
-    settings = [
-        ([f"{name} {value:g}", f"{delta:g}"], paid(**{name: value}, delta=delta), paid(delta=delta))
-        for name, delta in (("pace", DELTA), ("pace", STRICT), ("clip", DELTA), ("ratio", DELTA))
-        for value in VALUES[name]
-    ]
-    yield compared("Settings, `paced`", ["setting", "δ"], "base", settings, REFUSED, SPENT)
-    schedules: dict[str, Line] = {
-        f"{name}, {label}": (column, partial(paid, **changes))
-        for column, name in {**ERRORS, REFUSED: REFUSED, SPENT: SPENT}.items()
-        for label, changes in (("`capped`", CAPPED), ("`paced`", {}), ("equal rates", EQUAL))
+    yield compared(ask, "EKF", filters, REFUSED)
+    yield "## Settings, `paced`"
+    settings = {
+        f"{name} {value:g}, δ = {delta:g}": (paid(**{name: value}, delta=delta), paid(delta=delta))
+        for (name, delta), values in VARIED.items()
+        for value in values
     }
-    schedules["density RMSE, `paced` − `capped`"] = DENSITY, paid, partial(paid, **CAPPED)
-    schedules["density RMSE, equal rates − `paced`"] = DENSITY, partial(paid, **EQUAL), paid
-    yield sweep("Schedules", "", {f"`{name}`": {"schedule": name} for name in SCHEDULES}, schedules)
-
-
-PRICE, LEDGER = list(price_tables()), list(ledger_tables())
+    yield compared(ask, "base", settings, REFUSED)
+    capped, equal = partial(paid, **CAPPED), partial(paid, **EQUAL)
+    lines: dict[str, Line] = {}
+    for column, name in (ERRORS | {REFUSED: REFUSED}).items():
+        lines[f"{name}: `capped`"] = column, capped
+        lines[f"{name}: `paced`"] = column, paid
+        lines[f"{name}: `paced` − `capped`"] = column, paid, capped
+    for delta in (DELTA, STRICT):
+        yield f"## Errors against ε, δ = {delta:g}"
+        yield sweep(ask, "", along(CURVE, delta=delta), lines)
+    yield "## What is protected"
+    yield sweep(ask, "", VARIANTS, lines)
+    yield "## Schedules"
+    lines[f"{ERRORS[DENSITY]}: equal rates − `paced`"] = DENSITY, equal, paid
+    yield sweep(ask, "", {f"`{name}`": {"schedule": name} for name in SCHEDULES}, lines)
 
 
 def all_cells() -> tuple[Cell, ...]:
     """Return the cells that the tables ask for."""
     found: dict[str, Cell] = {}
-    for line in itertools.chain(*(table.lines for table in (*PRICE, *LEDGER))):
-        for each in line:
-            if isinstance(each, Number):
-                found |= {str(own.labels): own for own in (each.own, each.base) if own is not None}
+
+    def note(_: str, *cells: Cell) -> str:
+        found.update({str(each.labels): each for each in cells})
+        return ""
+
+    list(chain(price_tables(note), ledger_tables(note)))
     return tuple(found.values())
 
 
-def number(rows: pl.DataFrame, asked: Number) -> str:
-    """Return a number of a table."""
-    if asked.base is None:
-        return format_interval(mean(rows, asked.own.labels, asked.column))
-    return format_interval(difference(rows, asked.own.labels, asked.base.labels, asked.column))
-
-
-def render(rows: pl.DataFrame, table: Table) -> str:
-    """Return a table below its title."""
-    lines = [
-        [each if isinstance(each, str) else cell(number, rows, each) for each in line]
-        for line in table.lines
-    ]
-    return f"## {table.title}\n\n{markdown(table.header, lines)}"
-
-
-def claimed_table(rows: pl.DataFrame) -> str:
-    """Return epsilon claimed against epsilon true, for the paper's noise."""
-    longest = rows["longest"].drop_nulls().to_list()
-    met = [CAP, max(longest)] if longest else [CAP]
-    header = ["composed", *(f"met {times} times, at least" for times in met)]
-    header += ["met every second, at least", f"met {CAP} times, alone, standing"]
-    lines = []
-    for noise, epsilon in itertools.product(PRINTED, EPSILONS):
-        try:
-            config = config_of(rows, priced("ekf", noise, epsilon=epsilon).labels)
-        except UnmeasuredError:
-            lines.append([noise, f"{epsilon:g}", *["-"] * len(header)])
-            continue
-        found = [privacy_report(config).epsilon]
-        found += [met_epsilon(config, times) for times in (*met, config.horizon_steps)]
-        found += [met_epsilon(config, CAP, alone=True)]
-        lines.append([noise, f"{epsilon:g}", *map(format_number, found)])
-    return markdown(["noise", "claimed", *header], lines)
+def number(rows: pl.DataFrame, column: str, own: Cell, base: Cell | None = None) -> str:
+    """Return the mean of a column of a cell, or by how much it exceeds that of another, paired."""
+    if base is None:
+        return format_interval(mean(rows, own.labels, column))
+    return format_interval(difference(rows, own.labels, base.labels, column))
 
 
 def equal_errors(rows: pl.DataFrame) -> str:
@@ -497,25 +398,23 @@ def equal_errors(rows: pl.DataFrame) -> str:
 
     The interval holds every epsilon at which the paired difference may be zero.
     """
+    references: dict[str, Callable[..., Cell]] = {
+        "demand states, `round-robin`": paid,
+        "EKF, `paper`": partial(paid, estimator="ekf", schedule="paper"),
+    }
+    columns = {f"δ = {delta:g}": {"delta": delta} for delta in (DELTA, STRICT)}
 
-    def equal(reference: Cell, delta: float) -> str:
-        excess = [
-            difference(rows, paid(epsilon=each, delta=delta).labels, reference.labels, DENSITY)
-            for each in CURVE
-        ]
+    def entry(line: str, head: str) -> str:
+        reference = references[line](**CAPPED, **columns[head]).labels
+        own = [paid(epsilon=each, **columns[head]).labels for each in CURVE]
+        excess = [difference(rows, each, reference, DENSITY) for each in own]
         middle, low, high = (
             crossing(CURVE, [getattr(each, end) for each in excess])
             for end in ("mean", "low", "high")
         )
         return format_interval(Interval(middle, low, high, excess[0].n))
 
-    matched = [
-        ("demand states, `round-robin`", paid(**CAPPED), DELTA),
-        ("demand states, `round-robin`", paid(delta=STRICT, **CAPPED), STRICT),
-        ("EKF, `paper`", paid(estimator="ekf", schedule="paper", **CAPPED), DELTA),
-    ]
-    lines = [[name, f"{delta:g}", cell(equal, own, delta)] for name, own, delta in matched]
-    return markdown(["`capped` at ε = 5", "δ", "ε of `paced`"], lines)
+    return grid("`capped` at ε = 5", list(references), list(columns), entry)
 
 
 def crossing(places: Sequence[float], values: Sequence[float]) -> float:
@@ -524,58 +423,9 @@ def crossing(places: Sequence[float], values: Sequence[float]) -> float:
     Returns:
         0 if all values are below zero, infinity if none is.
     """
-    k = next((k for k, value in enumerate(values) if value <= 0.0), None)
-    if not k:
-        return math.inf if k is None else 0.0
-    share = values[k - 1] / (values[k - 1] - values[k])
-    return math.exp(math.log(places[k - 1]) + share * math.log(places[k] / places[k - 1]))
-
-
-def complete(rows: pl.DataFrame) -> pl.DataFrame:
-    """Return rows with `SHARES`, and with empty columns for a part that was not played yet."""
-    names = {**priced("ekf").labels, **paid().labels}.keys() | {"longest"}.union(*SHARES.values())
-    rows = rows.with_columns(pl.lit(None).alias(name) for name in names if name not in rows.columns)
-    return rows.with_columns(
-        (100.0 * pl.col(part) / pl.col(whole).cast(pl.Float64).clip(1.0)).alias(name)
-        for name, (part, whole) in SHARES.items()
-    )
-
-
-def report(rows: pl.DataFrame, folder: Path) -> str:
-    """Return the tables, and draw the figures."""
-    rows = complete(rows)
-    for name, (draw, title) in FIGURES.items():
-        path = folder / f"fig_{name}.png"
-        try:
-            save_figure(draw(rows), path, title)
-        except UnmeasuredError:
-            path.unlink(missing_ok=True)
-    lost = {
-        "n_diverged": "started over [s]",
-        "n_fallback": "kept the prediction [s]",
-        "n_dropped": "dropped requests",
-    }
-    sums = rows.group_by("part", "estimator").agg(pl.col(*lost).sum().cast(int), pl.len())
-    return "\n\n".join(
-        [
-            "# What a guarantee costs",
-            PRICE_NOTE,
-            "## ε claimed against ε true",
-            CLAIMED_NOTE,
-            claimed_table(rows),
-            *(render(rows, table) for table in PRICE),
-            "# What paced ledgers save",
-            LEDGER_NOTE,
-            *(render(rows, table) for table in LEDGER),
-            "## Equal density errors",
-            equal_errors(rows),
-            "# What estimators lost",
-            markdown(
-                ["part", "estimator", *lost.values(), "episodes"],
-                [list(map(str, line)) for line in sums.sort("part", "estimator").iter_rows()],
-            ),
-        ]
-    )
+    falling = np.minimum.accumulate(values)[::-1]
+    where = np.interp(0.0, falling, np.log(places)[::-1], left=math.inf, right=-math.inf)
+    return float(np.exp(where))
 
 
 PRICE_NOTE = (
@@ -584,22 +434,21 @@ PRICE_NOTE = (
     "Intervals are Student's t at 95 % over traffic seeds, differences paired by traffic and noise."
 )
 CLAIMED_NOTE = (
-    "*Composed*: of both releases, if the preset's own sensitivities held. *Met n times*: of the "
-    "densities alone, for a vehicle that is queried in n seconds: those of the cap, of the longest "
-    "trip, of an episode. *Alone, standing*: of both, for a vehicle that is the mean speed of its "
-    "segment. Boundary inputs are left out: with true ones no finite ε holds."
+    "On the road of PrivateHighway. *Composed*: of both releases, if the preset's own "
+    f"sensitivities held. *Met {CAP} times*: of the densities alone. *Alone, standing*: of both, "
+    "for a vehicle that is the mean speed of its segment. Boundary inputs are left out: with true "
+    "ones no finite ε holds."
 )
 LEDGER_NOTE = (
     f"Where a table does not say otherwise: (ε, δ) = (5, {DELTA:g}) for a whole trip that is "
     "replaced by another, nominal boundary inputs, 5 segments a second, schedule `round-robin`, "
     "the EKF with demand states, and for `paced` a pace of 0.85, a clip of 25 km/h and a ratio of "
-    "1. *Refused*: contributions that a cap or a ledger did not cover; *spent*: vehicles that end "
-    "above 95 % of their budget. Both are known from the true traffic and serve evaluation alone."
+    "1. *Refused*: contributions that a cap or a ledger did not cover, known from the true traffic "
+    "and for evaluation alone."
 )
 
 # Figures, each drawn where all of its cells were played
 
-COLOURS = {"capped": "#d55e00", "paced": "#0072b2", "exact": GREY}
 LOOKS = {
     "event": Look("#009e73", "s"),
     "trip, C = 4": Look("#92c5de", "o"),
@@ -609,21 +458,13 @@ LOOKS = {
     PAPER: Look("#cc79a7", "D"),
     CORRECTED: Look("#7d5ba6", "v"),
 }
-WATCHED: dict[str, tuple[dict[str, Any], Look]] = {
-    "capped, round-robin": (CAPPED, Look("#d55e00", "v")),
-    "capped, paper": ({"schedule": "paper", **CAPPED}, Look("#e69f00", "x")),
-    "paced, round-robin": ({}, Look("#0072b2", "o")),
-    "paced, paper": ({"schedule": "paper"}, Look("#56b4e9", "s")),
-    "paced, largest-variance": ({"schedule": "largest-variance"}, Look("#009e73", "^")),
-    "paced, round-robin, pace 1": ({"pace": 1.0}, Look("#cc79a7", "D")),
-}
 
 
-def draw_price(rows: pl.DataFrame) -> Figure:
+def draw_price(rows: pl.DataFrame, path: Path) -> None:
     """Draw errors against epsilon for every protection and estimator."""
     figure = make_figure(9.4, 7.0, dpi=120)
     axes = figure.subplots(2, 2, sharex=True, sharey="row")
-    for axis, (metric, name) in zip(axes.flat, itertools.product(METRICS, ESTIMATORS), strict=True):
+    for axis, (metric, name) in zip(axes.flat, product(METRICS, ESTIMATORS), strict=True):
         for protection, look in LOOKS.items():
             cells = [priced(name, protection, epsilon=value) for value in EPSILONS]
             means = [mean(rows, each.labels, metric) for each in cells]
@@ -633,94 +474,115 @@ def draw_price(rows: pl.DataFrame) -> Figure:
         axis.set_title(LABELS[name], fontsize=9, loc="left")
         axis.set_xlabel("ε claimed")
         axis.set_ylabel(error_label(metric))
-    return finish_figure(figure)
+    save_figure(finish_figure(figure), path, f"Errors against the claimed ε, δ = {DELTA:g}")
 
 
-def draw_claimed(rows: pl.DataFrame) -> Figure:
-    """Draw epsilon claimed against epsilon true, and the density error over the true one."""
-    figure = make_figure(9.8, 4.4, dpi=120)
-    left, right = figure.subplots(1, 2)
-    left.plot(EPSILONS, EPSILONS, color=LOOKS[TRIP].colour)
-    for protection in (TRIP, *PRINTED):
-        cells = [priced("ekf", protection, epsilon=value) for value in EPSILONS]
-        true, look = list(EPSILONS), LOOKS[protection]
-        if protection in PRINTED:
-            configs = [config_of(rows, each.labels) for each in cells]
-            true = [met_epsilon(each, CAP, alone=True) for each in configs]
-            least = [met_epsilon(each, CAP) for each in configs]
-            left.plot(EPSILONS, true, color=look.colour)
-            left.plot(EPSILONS, least, ":", color=look.colour)
-        means = [mean(rows, each.labels, DENSITY) for each in cells]
-        draw_curve(right, true, means, look, protection.replace("`", ""))
-    set_log_axes(left, EPSILONS)
-    set_log_axes(right, DECADES)
-    set_log_ticks(left.yaxis, DECADES)
-    left.set_xlabel("ε claimed")
-    left.set_ylabel("ε true (dotted: of densities alone)")
-    right.set_xlabel("ε true")
-    right.set_ylabel(f"EKF: {error_label(DENSITY)}")
-    return finish_figure(figure)
+def draw_claimed(_: pl.DataFrame, path: Path) -> None:
+    """Draw epsilon claimed against epsilon true."""
+    figure = make_figure(6.4, 4.4, dpi=120)
+    axis = figure.subplots()
+    axis.plot(EPSILONS, EPSILONS, color=LOOKS[TRIP].colour, label="as claimed")
+    for line, style in zip(CLAIMED, 2 * ("--", ":", "-"), strict=True):
+        true = [true_epsilon(line, each) for each in EPSILONS]
+        colour = LOOKS[line.split(": ")[0]].colour
+        axis.plot(EPSILONS, true, style, color=colour, label=line.replace("`", ""))
+    set_log_axes(axis, EPSILONS)
+    set_log_ticks(axis.yaxis, [10.0**k for k in range(-1, 7)])
+    axis.set_xlabel("ε claimed")
+    axis.set_ylabel("ε true")
+    save_figure(finish_figure(figure, columns=2), path, f"ε claimed and true, δ = {DELTA:g}")
 
 
-def draw_ladder(rows: pl.DataFrame) -> Figure:
-    """Draw the errors of every rung, coloured by release model, from top to bottom."""
-    figure = make_figure(9.8, 1.4 + 0.34 * len(LADDER))
-    axes = figure.subplots(1, 2, sharey=True)
-    for axis, metric in zip(axes, METRICS, strict=True):
-        for k, (_, changes, _) in enumerate(LADDER):
-            colour = COLOURS[changes.get("release", "paced")]
-            draw_dot(axis, mean(rows, paid(**changes).labels, metric), -k, colour, None)
-        axis.set_xscale("log")
-        set_log_ticks(axis.xaxis, ERROR_TICKS)
-        axis.margins(x=0.12)
-        axis.set_xlabel(error_label(metric))
-        add_frame(axis, "x")
-    labels = [f"{k}. {label}".replace("`", "") for k, (label, _, _) in enumerate(LADDER, start=1)]
-    axes[0].set_yticks([-k for k in range(len(LADDER))], labels)
-    return figure
+def draw_ladder(rows: pl.DataFrame, path: Path) -> None:
+    """Draw the errors of every rung, from top to bottom."""
+    rungs = {
+        label.replace("`", ""): {each: mean(rows, paid(**changes).labels, each) for each in METRICS}
+        for label, changes, _ in LADDER
+    }
+    title = f"(ε, δ) = (5, {DELTA:g}) for a whole trip, replaced"
+    save_errors(path, list(rungs), {"": rungs}, title)
 
 
-def draw_budgets(rows: pl.DataFrame) -> Figure:
+def draw_budgets(rows: pl.DataFrame, path: Path) -> None:
     """Draw the contributions that were refused, by length of trip and by place."""
     figure = make_figure(9.8, 4.4, dpi=120)
     axes = figure.subplots(1, 2)
+    looks = {"capped": Look("#d55e00", "v"), "paced": Look("#0072b2", "o")}
     for axis, suffix in zip(axes, ("_of", ""), strict=True):
-        for k, (name, (changes, look)) in enumerate(WATCHED.items()):
-            found = pick(rows, paid(**changes).labels)
-            shares = refused_shares(found, f"refused{suffix}", f"met{suffix}")
-            places = [place + 0.09 * (k - 2.5) for place in shares]
-            draw_curve(axis, places, list(shares.values()), look, name)
+        for k, (release, schedule) in enumerate(product(looks, ("round-robin", "paper"))):
+            look = looks[release]._replace(line="-" if schedule == "round-robin" else "--")
+            found = pick(rows, paid(release=release, schedule=schedule).labels)
+            shares = refused_shares(found, suffix)
+            places = [place + 0.09 * (k - 1.5) for place in shares]
+            draw_curve(axis, places, list(shares.values()), look, f"{release}, {schedule}")
         axis.set_ylim(bottom=0.0)
-    bins = [*(f"{a}–{b}" for a, b in itertools.pairwise(LENGTHS)), f"{LENGTHS[-1]}+"]
+    bins = [*(f"{a}–{b}" for a, b in pairwise(LENGTHS)), f"{LENGTHS[-1]}+"]
     axes[0].set_xticks(range(len(bins)), bins)
     axes[0].set_xlabel("time on the mainline [s]")
     axes[1].set_xlabel("mainline segment")
     axes[0].set_ylabel("contributions refused [%]")
-    return finish_figure(figure, axes[:1], columns=3)
+    title = "Who runs out (true traffic, for evaluation alone)"
+    save_figure(finish_figure(figure), path, title)
 
 
-def refused_shares(rows: pl.DataFrame, part: str, whole: str) -> dict[int, Interval]:
-    """Return the mean ratio [%] of two columns of lists by place in the list.
+def refused_shares(rows: pl.DataFrame, suffix: str) -> dict[int, Interval]:
+    """Return the mean share of contributions that were refused [%], by place in the lists.
 
-    Seeds with nothing of the whole are left out, and so are places where fewer than two are left.
+    Seeds without any contribution are left out, and so are places with fewer than two seeds.
 
-    Raises:
-        UnmeasuredError: Vehicles were not followed.
+    Args:
+        rows: Rows of a cell.
+        suffix: ``_of`` by length of trip, nothing by segment.
     """
-    if part not in rows.columns or rows[part].null_count():
-        raise UnmeasuredError(part)
-    parts, wholes = (np.array(rows[name].to_list(), dtype=np.float64).T for name in (part, whole))
+    refused, met = (
+        np.array(rows[f"{name}{suffix}"].to_list(), dtype=np.float64).T
+        for name in ("refused", "met")
+    )
     return {
-        place: mean_interval(100.0 * a[b > 0.0] / b[b > 0.0])
-        for place, (a, b) in enumerate(zip(parts, wholes, strict=True))
-        if (b > 0.0).sum() > 1
+        place: mean_interval(100.0 * part[whole > 0.0] / whole[whole > 0.0])
+        for place, (part, whole) in enumerate(zip(refused, met, strict=True))
+        if (whole > 0.0).sum() > 1
     }
 
 
-FIGURES = {
-    "price": (draw_price, "Errors against the claimed ε, δ = 0.05"),
-    "claimed": (draw_claimed, "ε of a vehicle met 64 times, alone and standing, δ = 0.05"),
-    "ladder": (draw_ladder, "(ε, δ) = (5, 0.05) for a whole trip, replaced"),
-    "budgets": (draw_budgets, "Who runs out (true traffic, for evaluation alone)"),
-}
+FIGURES = (draw_price, draw_claimed, draw_ladder, draw_budgets)
+
+
+def report(rows: pl.DataFrame, folder: Path) -> str:
+    """Return the tables, and draw the figures."""
+    # An interrupted run may have the rows, and so the columns, of one part alone.
+    names = {**priced("ekf").labels, **paid().labels, "n_met": 0, "n_refused": 0}
+    rows = rows.with_columns(pl.lit(None).alias(name) for name in names.keys() - {*rows.columns})
+    met = pl.col("n_met").cast(pl.Float64).clip(1.0)
+    rows = rows.with_columns((100.0 * pl.col("n_refused") / met).alias(REFUSED))
+    for draw in FIGURES:
+        with contextlib.suppress(UnmeasuredError):
+            draw(rows, folder / f"{draw.__name__.replace('draw', 'fig')}.png")
+    lost = rows.group_by("part", "estimator").agg(
+        pl.len().alias("episodes"),
+        pl.col("n_diverged").sum().cast(int).alias("started over [s]"),
+        pl.col("n_fallback").sum().cast(int).alias("kept the prediction [s]"),
+        pl.col("n_dropped").sum().cast(int).alias("dropped requests"),
+    )
+    lost = lost.sort("part", "estimator")
+    ask = partial(cell, number, rows)
+    return "\n\n".join(
+        [
+            "# What a guarantee costs",
+            PRICE_NOTE,
+            "## ε claimed against ε true",
+            CLAIMED_NOTE,
+            grid("claimed", CLAIMED, EPSILONS, lambda *at: format_number(true_epsilon(*at))),
+            *price_tables(ask),
+            "# What paced ledgers save",
+            LEDGER_NOTE,
+            *ledger_tables(ask),
+            "## Equal density errors",
+            equal_errors(rows),
+            "# What estimators lost",
+            markdown(lost.columns, [list(map(str, line)) for line in lost.iter_rows()]),
+        ]
+    )
+
+
 STUDY = Study("guarantees", all_cells(), SEEDS, report)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from scipy import stats
 
 import dptse_env
 from agents.environments import make_config, quietly
-from agents.figures import GREY, add_frame, add_legend, make_figure, save_figure
+from agents.figures import GREY, finish_figure, make_figure, save_figure
 from agents.play import Cell
 from agents.seeds import SUITE
 from agents.statistics import Interval
@@ -29,11 +30,10 @@ from agents.tables import (
     SPEED,
     Labels,
     UnmeasuredError,
-    cell,
     format_range,
     markdown,
     pick,
-    pick_pair,
+    pick_paired,
     values_of,
 )
 from dptse_env.config import parse_seeds
@@ -83,12 +83,16 @@ class Task:
         return f"none: {pair}" if report.void_reasons else pair
 
 
-_TWO_PEAKS = {
-    "base": {
-        "mainline": [[0.0, 5000.0], [120.0, 2000.0], [300.0, 5600.0], [420.0, 3000.0]],
-        "on_ramps": [150.0, 600.0],
-    }
+OTHER_DRIVERS: dict[str, Any] = {
+    "corridor": {"drivers": {"model": "Krauss"}},
+    "demand": {
+        "base": {
+            "mainline": [[0.0, 5000.0], [120.0, 2000.0], [300.0, 5600.0], [420.0, 3000.0]],
+            "on_ramps": [150.0, 600.0],
+        }
+    },
 }
+"""Keywords of drivers and demand that no policy was trained on."""
 
 
 def _task(name: str, meaning: str, env: str, estimator: str, bandwidth: int, **more: Any) -> Task:
@@ -105,7 +109,7 @@ TASKS = (
     _task("paced-recurrent-5", "PrivateHighway-v1, recurrent, B = 5", PACED, "recurrent", 5),
     _task(
         "other-drivers", "paced-recurrent-2 with drivers by Krauss and two peaks of demand",
-        PACED, "recurrent", 2, demand=_TWO_PEAKS, corridor={"drivers": {"model": "Krauss"}},
+        PACED, "recurrent", 2, **OTHER_DRIVERS,
     ),
     _task(
         "short", "ShortHighway-v0, paced, recurrent, B = 1", SHORT, "recurrent", 1,
@@ -200,11 +204,12 @@ def beside_recorded(rows: pl.DataFrame, cells: Sequence[Cell]) -> pl.DataFrame:
 
 def report(rows: pl.DataFrame, folder: Path, tasks: Sequence[Task] = TASKS) -> str:
     """Return the tables, and draw the scores."""
-    scores = Scores(rows, tasks)
-    scores.draw(folder / FIGURE)
-    parts = [f"# {NAME}", "## Scores", scores.table(), "## Tasks", _task_table(rows, tasks)]
+    scores = score_all(rows, tasks)
+    draw_scores(scores, tasks, folder / FIGURE)
+    parts = [f"# {NAME}", "## Scores", _score_table(scores, tasks)]
+    parts += ["## Tasks", _task_table(tasks)]
     for task in tasks:
-        parts += [f"## `{task.name}`", _policy_table(rows, task, scores.policies)]
+        parts += [f"## `{task.name}`", _policy_table(rows, task)]
     return "\n\n".join(parts)
 
 
@@ -218,10 +223,9 @@ def score(rows: pl.DataFrame, policy: str, task: str) -> Interval:
         UnmeasuredError: No version has played the policy and both references, or the oracle is no
             better than the paper's schedule, so that there is no scale.
     """
-    own, zero = pick_pair(rows, _labels(policy, task), _labels(ZERO, task))
-    again, one = pick_pair(rows, _labels(policy, task), _labels(ONE, task))
-    base, reached, best = (values_of(each, ERROR) for each in (zero, own, one))
-    if not own.equals(again) or base.mean() <= best.mean():
+    paired = pick_paired(rows, *(_labels(name, task) for name in (ZERO, policy, ONE)))
+    base, reached, best = (values_of(each, ERROR) for each in paired)
+    if base.mean() <= best.mean():
         raise UnmeasuredError(policy, task)
     span = float((base - best).mean())
     value = float((base - reached).mean()) / span
@@ -234,141 +238,98 @@ def _labels(policy: str, task: str) -> Labels:
     return {"policy": policy, "task": task}
 
 
-class Scores:
-    """Scores of all policies in some rows.
+Scores = dict[str, dict[str, Interval]]
+"""Scores by policy and task."""
 
-    Attributes:
-        by_task: By policy and task; what was not measured is left out.
-        policies: Policies, the best mean first, and then those that have none.
+
+def score_all(rows: pl.DataFrame, tasks: Sequence[Task] = TASKS) -> Scores:
+    """Return the scores of all policies in some rows, the best mean first.
+
+    What was not measured is left out, and who has no mean comes last.
     """
+    found: Scores = {policy: {} for policy in rows["policy"].unique().sort()}
+    for policy, task in product(found, tasks):
+        try:
+            found[policy][task.name] = score(rows, policy, task.name)
+        except UnmeasuredError:
+            continue
 
-    def __init__(self, rows: pl.DataFrame, tasks: Sequence[Task] = TASKS) -> None:
-        """Score them."""
-        self._tasks = [task.name for task in tasks]
-        self.by_task: dict[tuple[str, str], Interval] = {}
-        policies: list[str] = rows["policy"].unique().sort().to_list()
-        for policy in policies:
-            for task in self._tasks:
-                try:
-                    self.by_task[policy, task] = score(rows, policy, task)
-                except UnmeasuredError:
-                    continue
-        self.policies = sorted(policies, key=self._order)
+    def place(policy: str) -> float:
+        mean = mean_score(found[policy], tasks)
+        return np.inf if mean is None else -mean
 
-    def _order(self, policy: str) -> tuple[bool, float]:
-        mean = self.mean(policy)
-        return mean is None, 0.0 if mean is None else -mean
-
-    def mean(self, policy: str) -> float | None:
-        """Return the mean over all tasks; None where one is missing."""
-        found = [self.by_task.get((policy, task)) for task in self._tasks]
-        means = [each.mean for each in found if each is not None]
-        return float(np.mean(means)) if len(means) == len(found) else None
-
-    def best(self, task: str, among: Sequence[str]) -> str | None:
-        """Return the policy with the best score in a task, if any has one."""
-        known = [policy for policy in among if (policy, task) in self.by_task]
-        return max(known, key=lambda policy: self.by_task[policy, task].mean, default=None)
-
-    def shown(self, policy: str, task: str) -> str:
-        """Return a score with half of its interval.
-
-        Raises:
-            UnmeasuredError: There is none.
-        """
-        if (policy, task) not in self.by_task:
-            raise UnmeasuredError(policy, task)
-        found = self.by_task[policy, task]
-        return f"{found.mean:.2f} ± {found.half_width:.2f}"
-
-    def table(self) -> str:
-        """Return the scores as Markdown, the best mean first."""
-        lines = []
-        for policy in self.policies:
-            mean = self.mean(policy)
-            shown = [cell(self.shown, policy, task) for task in self._tasks]
-            lines.append([f"`{policy}`", "-" if mean is None else f"{mean:.2f}", *shown])
-        return markdown(["policy", "mean", *(f"`{task}`" for task in self._tasks)], lines)
-
-    def draw(self, path: Path) -> None:
-        """Save the scores of all policies but the references, one panel of dots by task."""
-        shown = [policy for policy in self.policies if policy not in (ZERO, ONE)]
-        figure = make_figure(8.4, 1.7 + 0.34 * len(self._tasks))
-        axis = figure.subplots()
-        places = np.arange(len(self._tasks))[::-1]
-        for k, policy in enumerate(shown):
-            marker = _MARKERS[k // 10 % len(_MARKERS)]
-            found = [
-                (self.by_task[policy, task].mean, place)
-                for task, place in zip(self._tasks, places, strict=True)
-                if (policy, task) in self.by_task
-            ]
-            scores, heights = np.array(found).reshape(-1, 2).T
-            axis.plot(scores, heights, marker, color=f"C{k % 10}", label=policy)
-        axis.axvline(0.0, color=GREY, linewidth=0.8)
-        axis.set_xlim(-0.5, 1.05)
-        axis.set_xlabel("score, those below -0.5 left out")
-        axis.set_yticks(places, self._tasks)
-        add_frame(axis)
-        add_legend(figure, [axis])
-        save_figure(figure, path, f"{NAME}: 0 is the paper's schedule, 1 the error oracle")
+    return {policy: found[policy] for policy in sorted(found, key=place)}
 
 
-_MARKERS = ("o", "^", "s")
+def mean_score(by_task: Mapping[str, Interval], tasks: Sequence[Task] = TASKS) -> float | None:
+    """Return the mean of a policy's scores over all tasks; None where one is missing."""
+    if len(by_task) < len(tasks):
+        return None
+    return float(np.mean([each.mean for each in by_task.values()]))
 
 
-def _task_table(rows: pl.DataFrame, tasks: Sequence[Task]) -> str:
-    """Return the tasks with their traffic, guarantees, and the errors of both references."""
+def format_scores(by_task: Mapping[str, Interval], tasks: Sequence[Task]) -> list[str]:
+    """Return a policy's mean and its scores with half of their intervals, dashes for none."""
+    mean, found = mean_score(by_task, tasks), [by_task.get(task.name) for task in tasks]
+    return [
+        "-" if mean is None else f"{mean:.2f}",
+        *("-" if each is None else f"{each.mean:.2f} ± {each.half_width:.2f}" for each in found),
+    ]
 
-    def reference(name: str, task: str) -> str:
-        return f"{values_of(pick(rows, _labels(name, task)), ERROR).mean():.1f}"
 
-    def seeds(task: str) -> str:
-        return format_range(pick(rows, _labels(ZERO, task))["traffic_seed"].to_list())
+def _score_table(scores: Scores, tasks: Sequence[Task]) -> str:
+    lines = [[f"`{policy}`", *format_scores(each, tasks)] for policy, each in scores.items()]
+    return markdown(["policy", "mean", *(f"`{task.name}`" for task in tasks)], lines)
 
-    header = ["task", "what it is", "traffic seeds", "guarantee", f"`{ZERO}`: 0", f"`{ONE}`: 1"]
+
+def draw_scores(scores: Scores, tasks: Sequence[Task], path: Path) -> None:
+    """Save the scores of all policies but the references, one panel of dots by task."""
+    heights = {task.name: -k for k, task in enumerate(tasks)}
+    figure = make_figure(8.4, 1.7 + 0.34 * len(tasks))
+    axis = figure.subplots()
+    for k, policy in enumerate(name for name in scores if name not in (ZERO, ONE)):
+        means = [each.mean for each in scores[policy].values()]
+        marker = "o^s"[k // 10 % 3]
+        places = [heights[task] for task in scores[policy]]
+        axis.plot(means, places, marker, color=f"C{k % 10}", label=policy)
+    axis.axvline(0.0, color=GREY, linewidth=0.8)
+    axis.set_xlim(-0.5, 1.05)
+    axis.set_xlabel("score, those below -0.5 left out")
+    axis.set_yticks(list(heights.values()), list(heights))
+    title = f"{NAME}: 0 is the paper's schedule, 1 the error oracle"
+    save_figure(finish_figure(figure), path, title)
+
+
+def _task_table(tasks: Sequence[Task]) -> str:
+    header = ["task", "what it is", "traffic seeds", "guarantee"]
     return markdown(
         header,
         [
-            [
-                f"`{task.name}`",
-                task.meaning,
-                cell(seeds, task.name),
-                task.guarantee,
-                cell(reference, ZERO, task.name),
-                cell(reference, ONE, task.name),
-            ]
+            [f"`{task.name}`", task.meaning, format_range(task.seeds), task.guarantee]
             for task in tasks
         ],
     )
 
 
-def _policy_table(rows: pl.DataFrame, task: Task, policies: Sequence[str]) -> str:
-    """Return errors, honesty and queries of the policies in a task, the least error first."""
+_COLUMNS = {
+    DENSITY: "density [veh/km]",
+    SPEED: "speed [km/h]",
+    "chi2_density": "χ² of density",
+    "chi2_speed": "χ² of speed",
+}
+
+
+def _policy_table(rows: pl.DataFrame, task: Task) -> str:
+    """Return errors, honesty and refusals of the policies in a task, the least error first."""
     lines = []
-    for policy in policies:
-        try:
-            own = pick(rows, _labels(policy, task.name))
-        except UnmeasuredError:
-            continue
-        error, density, speed, chi2_density, chi2_speed, queries = (
-            float(values_of(own, metric).mean())
-            for metric in (ERROR, DENSITY, SPEED, "chi2_density", "chi2_speed", "queries_a_second")
-        )
+    for policy in rows.filter(task=task.name)["policy"].unique().sort():
+        own = pick(rows, _labels(policy, task.name))
+        error = values_of(own, ERROR).mean()
         met, refused = (float(own[name].sum()) for name in ("n_met", "n_refused"))
-        numbers = [
-            f"{error:.1f}",
-            f"{density:.2f}",
-            f"{speed:.2f}",
-            f"{chi2_density:.2f}, {chi2_speed:.2f}",
-            f"{100.0 * refused / met:.1f}" if met else "-",
-            f"{queries:.1f}",
-        ]
-        lines.append((error, [f"`{policy}`", *numbers]))
-    header = [
-        "policy", "error x 1000", "density [veh/km]", "speed [km/h]", "χ²", "refused [%]",
-        "queries a second",
-    ]  # fmt: skip
+        numbers = [f"{values_of(own, name).mean():.2f}" for name in _COLUMNS]
+        share = f"{100.0 * refused / met:.1f}" if met else "-"
+        lines.append((error, [f"`{policy}`", f"{error:.1f}", *numbers, share]))
+    header = ["policy", "error x 1000", *_COLUMNS.values(), "refused [%]"]
     return markdown(header, [line for _, line in sorted(lines)])
 
 

@@ -159,14 +159,7 @@ class RecordLibrary:
         folder = f"records-v{RECORD_VERSION}-sumo-{sumo_version()}"
         return self.path / folder / corridor.digest[:32] / f"{seed:08d}"
 
-    def bring(self, corridor: Corridor, seed: int) -> None:
-        """Do nothing; a subclass may copy a record from another machine into the library.
-
-        It is called before a record is opened or made.
-        """
-
     def _load_or_record(self, corridor: Corridor, seed: int) -> AnyRecord:
-        self.bring(corridor, seed)
         if corridor.recordings is not None:
             return corridor.recordings.load(seed, corridor.record_layout)
         path, source = self.record_path(corridor, seed), _source(corridor, seed)

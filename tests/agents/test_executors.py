@@ -63,9 +63,14 @@ def dies_once(task):
     return number
 
 
-def test_a_task_whose_worker_died_runs_again_up_to_three_times(processes, tmp_path):
+@pytest.mark.slow
+def test_a_task_whose_worker_died_runs_again(processes, tmp_path):
     tasks = [(number, tmp_path / "trace") for number in range(8)]
     assert sorted(number for _, number in run_tasks(processes, dies_once, tasks)) == list(range(8))
+
+
+@pytest.mark.slow
+def test_a_task_is_given_up_when_four_workers_died(processes):
     with pytest.raises(ExecutorError, match="a task was lost 4 times"):
         list(run_tasks(processes, dies, range(8)))
     assert dict(run_tasks(processes, abs, [-1])) == {-1: 1}

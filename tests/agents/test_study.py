@@ -175,6 +175,7 @@ def traces(tmp_path, monkeypatch):
     return folder
 
 
+@pytest.mark.slow
 def test_a_killed_worker_loses_nothing(tmp_path, traces, expected):
     run(study(), Place(tmp_path, LocalProcesses(2)), progress=False)
     assert (traces / "killed").exists()

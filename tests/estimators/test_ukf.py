@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
+from filterpy.kalman import MerweScaledSigmaPoints
 
 from dptse_env.estimators import EstimatorSettings, SigmaPointSettings
 from dptse_env.estimators.compiled.dense import eliminate
@@ -131,65 +131,3 @@ def test_a_broken_covariance_is_found(backend, poison):
     filters.update(episodes.everyone, episodes.observed[4], episodes.values[4], SIGMA)
     assert filters.diverged.tolist() == [True]
     np.testing.assert_array_equal(filters.covariances[0], 1e-3 * np.eye(38))
-
-
-# filterpy as it is --------------------------------------------------------------------------------
-
-
-class AsItIs:
-    """filterpy's filter, which draws points anew at the end of `predict`, on projected traffic."""
-
-    def __init__(self, episodes, clipped):
-        self.episodes, self.model, self.clipped, self.k = episodes, episodes.model, clipped, 0
-        self.scale = scale_of(self.model)
-        self.unit = np.array([self.model.density_scale, self.model.speed_scale])
-        points = MerweScaledSigmaPoints(38, alpha=0.1, beta=2.0, kappa=-4.0)
-        self.own = UnscentedKalmanFilter(38, 38, 1.0, self.measure, self.move, points)
-        self.own.x = self.model.project(episodes.start)[0] / self.scale
-        self.own.P, self.own.Q = 1e-3 * np.eye(38), 1e-4 * np.eye(38)
-
-    def project(self, points):
-        return self.model.project(points * self.scale) / self.scale
-
-    def move(self, x, dt):
-        after = self.model.step((x * self.scale)[None], self.episodes.inputs[self.k])
-        return self.model.project(after)[0] / self.scale
-
-    def measure(self, x):
-        outputs = self.model.measure((x * self.scale)[None])[0] / self.unit
-        return outputs[self.episodes.observed[self.k, 0]].ravel()
-
-    def step(self, k):
-        """Take step k; returns the least eigenvalue of P."""
-        self.k, seen = k, self.episodes.observed[k, 0]
-        self.own.predict()
-        if self.clipped == "points":
-            self.own.sigmas_f = self.project(self.own.sigmas_f)
-        else:
-            self.own.x = self.project(self.own.x[None])[0]
-        noise = np.diag(np.tile(np.square(SIGMA / self.unit), int(seen.sum())))
-        self.own.update((self.episodes.values[k, 0, seen] / self.unit).ravel(), R=noise)
-        return np.linalg.eigvalsh(0.5 * (self.own.P + self.own.P.T)).min()
-
-
-@pytest.mark.parametrize("clipped", ["mean", "points"])
-def test_points_drawn_again_lose_definiteness_where_those_drawn_once_keep_it(clipped, recorded):
-    trapped, least = AsItIs(recorded, clipped), np.inf
-    for k in range(8):
-        least = min(least, trapped.step(k))
-        if least < -1e-6:
-            break
-    assert least < -1e-6
-    for backend in BACKENDS:
-        sound = started("ukf", backend, recorded)
-        for k in range(60):
-            run(sound, recorded, [k])
-            assert np.linalg.eigvalsh(sound.covariances[0]).min() > 0.0
-            assert not sound.diverged.any()
-
-
-def test_a_scalar_noise_has_the_number_of_outputs_that_filterpy_was_built_with(recorded):
-    one = AsItIs(recorded, "mean").own
-    one.predict()
-    with pytest.raises(ValueError, match="broadcast"):
-        one.update(np.zeros(int(2 * recorded.observed[0].sum())), R=0.01)

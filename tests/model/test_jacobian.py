@@ -27,9 +27,9 @@ ROADS = {
 }
 
 
-@pytest.mark.parametrize(("road", "parameters"), pairwise(ROADS.values(), [PAPER, W99], n=5))
+@pytest.mark.parametrize(("road", "parameters"), pairwise(ROADS, [PAPER, W99], n=5))
 def test_equals_central_differences_away_from_kinks(road, parameters):
-    model = model_of(road, parameters)
+    model = model_of(ROADS[road], parameters)
     rng = np.random.default_rng(11)
     # Occupied, moving traffic: vacuum and standing cells are kinks themselves.
     density = rng.uniform(0.02, 0.9, (400, model.n_segments)) * model.jam_density

@@ -29,8 +29,8 @@ WITH_TRAIN = {
         [*IMPORT, "--format", "i24", "--files", "points.json"],
     ],
     "ray": [
-        ["record", "--corridor", "short-highway", "--seeds", "0:1", "--engine", "ray"],
-        ["evaluate", "--engine", "ray", "--seeds", "2000:2002", "--output", "ladder"],
+        ["suite", "--policies", "static", "--executor", "ray"],
+        ["evaluate", "--executor", "ray", "--seeds", "2000:2002", "--output", "ladder"],
     ],
 }
 """Commands by the extra that they lack, where the extra `train` is installed."""

@@ -142,7 +142,7 @@ def use_tools(installed: Installed, wheel: Path) -> None:
     for words in COMMANDS:
         installed.run(installed.python.with_name("dptse"), *words, cwd=empty)
     assert (empty / "trained" / "policy.zip").is_file()
-    assert (empty / "ladder" / "summary.json").is_file()
+    assert (empty / "ladder" / "tables.md").is_file()
     installed.run(installed.python, HERE / "extras.py", "train", cwd=installed.folder)
 
 

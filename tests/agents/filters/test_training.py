@@ -108,6 +108,7 @@ def whole(tmp_path_factory):
     return training
 
 
+@pytest.mark.slow
 def test_a_network_comes_out_the_same_wherever_scenarios_are_played(whole, tmp_path):
     training = FilterTraining(WHOLE, tmp_path, executor=Elsewhere())
     training.run()

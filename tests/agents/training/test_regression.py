@@ -35,7 +35,7 @@ def queried_variance(process):
 
 def test_scores_become_the_logarithms_of_expected_squared_errors():
     settings, episodes, policy = make(
-        age_bonus=0.0, seconds=239, interval=1, batches=600, rate=1e-2
+        age_bonus=0.0, seconds=119, interval=1, batches=200, rate=2e-2
     )
     generator = np.random.default_rng(0)
 

@@ -28,6 +28,7 @@ SEED = 1
 KEYWORDS = {"horizon": 80, "privacy": "capped", "action": "slots", "traffic_seeds": "0:3"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stopped", [0, 1, 2])
 def test_a_training_killed_between_rounds_continues_alike(stopped, trained, tmp_path):
     plan, complete = make_plan(), trained()

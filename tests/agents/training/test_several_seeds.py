@@ -1,6 +1,5 @@
 """Trainings at once, and rounds that workers share."""
 
-import dataclasses
 from concurrent.futures import Future
 
 import pytest
@@ -11,12 +10,13 @@ import numpy as np
 import torch
 
 from agents.executors import THIS_PROCESS, ExecutorError, ThisProcess
+from agents.training.recipes import PlackettLuceRecipe, RegressionRounds, SwapRounds
 from agents.training.run_files import PROGRESS, read_checkpoint, read_progress
 from agents.training.several_seeds import train_all
 from agents.training.swap_parts import split
 from agents.training.training import BEST, POLICY, Training
 from tests.agents.elsewhere import Elsewhere
-from tests.agents.training.plans import StopError, make_plan, make_recipe, stop_at, without_time
+from tests.agents.training.plans import StopError, make_plan, stop_at, without_time
 
 
 def weights(folder):
@@ -29,38 +29,41 @@ def equal(one, other):
 
 
 def one_round(parts=1, seed=1):
-    recipe = make_recipe("plackett-luce")
-    swaps = dataclasses.replace(recipe.swaps, parts=parts, rounds=1)
-    regression = dataclasses.replace(recipe.regression, rounds=0)
-    return make_plan(
-        recipe=dataclasses.replace(recipe, regression=regression, swaps=swaps), seed=seed
-    )
+    swaps = SwapRounds(rounds=1, episodes=2, seconds=10, trials=1, batches=5, parts=parts)
+    recipe = PlackettLuceRecipe(regression=RegressionRounds(rounds=0), swaps=swaps, width=8)
+    return make_plan(recipe=recipe, seed=seed, validation_seeds=(1000,))
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory):
+    """A training by itself; leave it alone."""
+    training = Training(one_round(), tmp_path_factory.mktemp("alone"))
+    training.run()
+    return training
 
 
 def train(plans, executor=THIS_PROCESS):
     train_all(plans, executor, records=None, progress=False)
 
 
-def test_trainings_at_once_come_out_as_alone(tmp_path):
+def test_trainings_at_once_come_out_as_alone(tmp_path, alone):
     train({tmp_path / str(seed): one_round(seed=seed) for seed in (1, 2)}, Elsewhere())
-    alone = Training(one_round(), tmp_path / "alone")
-    alone.run()
     assert without_time(read_progress(tmp_path / "1")) == without_time(alone.rows)
     for name in (BEST, POLICY):
         assert (tmp_path / "1" / name).read_bytes() == (alone.folder / name).read_bytes()
     assert not equal(weights(tmp_path / "1"), weights(tmp_path / "2"))
 
 
-def test_a_training_goes_on_where_its_folder_stands(tmp_path, trained):
+def test_a_training_goes_on_where_its_folder_stands(tmp_path, alone):
     """As after the loss of a worker, whose task is run again."""
-    broken = Training(make_plan(), tmp_path / "0", watchers=(stop_at(2),))
+    broken = Training(one_round(), tmp_path / "0", watchers=(stop_at(1),))
     with pytest.raises(StopError):
         broken.run()
     rows = read_progress(tmp_path / "0")
-    assert [row["update"] for row in rows] == [0, 1]
-    train({tmp_path / "0": make_plan()})
-    assert read_progress(tmp_path / "0")[:2] == rows
-    assert equal(weights(tmp_path / "0"), weights(trained().folder))
+    assert [row["update"] for row in rows] == [0]
+    train({tmp_path / "0": one_round()})
+    assert read_progress(tmp_path / "0")[:1] == rows
+    assert equal(weights(tmp_path / "0"), weights(alone.folder))
 
 
 def test_a_folder_of_another_plan_is_refused_before_anything_runs(tmp_path):
@@ -85,15 +88,15 @@ def test_a_folder_that_workers_do_not_share_is_an_error(tmp_path):
         train({tmp_path / "0": make_plan()}, Apart())
 
 
-def test_parts_of_a_round_come_out_the_same_wherever_they_run(tmp_path):
+@pytest.mark.slow
+def test_parts_of_a_round_come_out_the_same_wherever_they_run(tmp_path, alone):
     kept = {}
     for name, executor in {"here": THIS_PROCESS, "there": Elsewhere()}.items():
         Training(one_round(2), tmp_path / name, executor=executor).run()
         kept[name] = weights(tmp_path / name)
     assert equal(kept["here"], kept["there"])
     # Draws of a part are its own.
-    Training(one_round(1), tmp_path / "whole").run()
-    assert not equal(kept["here"], weights(tmp_path / "whole"))
+    assert not equal(kept["here"], weights(alone.folder))
 
 
 def test_a_round_has_as_many_episodes_one_round():

@@ -23,8 +23,9 @@ from tests.agents.training.plans import (
     stop_at,
     without_time,
 )
+from tests.cases import fast_and_slow
 
-PPO_LEARNERS = ["scores", "mask", pytest.param("maskable", marks=pytest.mark.slow)]
+PPO_LEARNERS = fast_and_slow(["scores", "mask", "maskable"], ["mask"])
 
 
 @pytest.mark.parametrize("learner", PPO_LEARNERS)
