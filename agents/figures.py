@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from agents.files import replacing
 from agents.statistics import Interval
-from agents.tables import METRICS
+from agents.tables import METRICS, UnmeasuredError
 from dptse_env.rendering import DENSITY_MAP, QUERY_COLOUR, History
 from dptse_env.utils.arrays import FloatArray
 
@@ -39,6 +39,14 @@ def save_figure(figure: Figure, path: Path, title: str) -> None:
     FigureCanvasAgg(figure)
     with replacing(path) as temporary:
         figure.savefig(temporary, format="png")
+
+
+def save_measured(path: Path, title: str, draw: Callable[..., Figure], *arguments: Any) -> None:
+    """Draw and save a figure if all that it shows was measured; an old one goes if not."""
+    try:
+        save_figure(draw(*arguments), path, title)
+    except UnmeasuredError:
+        path.unlink(missing_ok=True)
 
 
 def add_frame(axis: Axes, lines: Literal["both", "x", "y"] = "both") -> None:
@@ -147,11 +155,13 @@ class RoadMap:
     Attributes:
         seconds: Densities [veh/km] or flags of queried segments by second, (n_mainline,) each.
         history: The episode, for its scales.
+        step: Seconds from one of ``seconds`` to the next.
     """
 
     title: str
-    seconds: Sequence[NDArray[Any]]
+    seconds: Sequence[NDArray[Any]] | FloatArray
     history: History
+    step: int = 1
 
     @property
     def is_flags(self) -> bool:
@@ -165,14 +175,15 @@ def estimate_map(history: History, rmse: float, title: str) -> RoadMap:
     return RoadMap(title, history.estimate, history)
 
 
-def draw_maps(columns: Sequence[Sequence[RoadMap]], width: float) -> Figure:
+def draw_maps(columns: Sequence[Sequence[RoadMap]], width: float, height: float = 1.25) -> Figure:
     """Draw panels over space and time with one colour bar for all densities.
 
     Args:
         columns: Panels of each column from top to bottom; rows have one kind of panel.
         width: Width of the figure [inches].
+        height: Height of a panel of densities [inches].
     """
-    ratios = [0.75 if panel.is_flags else 1.25 for panel in columns[0]]
+    ratios = [height * (0.6 if panel.is_flags else 1.0) for panel in columns[0]]
     figure = make_figure(width, sum(ratios) + 1.2)
     axes = figure.subplots(
         len(ratios), len(columns), squeeze=False, sharex=True, sharey=True,
@@ -202,7 +213,13 @@ def _draw_map(axis: Axes, panel: RoadMap) -> AxesImage:
         values,
         origin="lower",
         aspect="auto",
-        extent=(-0.5, values.shape[1] - 0.5, 0.0, panel.history.road_length),
+        interpolation="nearest",
+        extent=(
+            -0.5 * panel.step,
+            (values.shape[1] - 0.5) * panel.step,
+            0.0,
+            panel.history.road_length,
+        ),
         cmap="Greys" if panel.is_flags else DENSITY_MAP,
         vmin=0.0,
         vmax=1.0 if panel.is_flags else panel.history.density_scale,

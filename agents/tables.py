@@ -31,7 +31,7 @@ def pick(rows: pl.DataFrame, labels: Labels) -> pl.DataFrame:
         UnmeasuredError: There are none.
         ValueError: The labels are those of several cells.
     """
-    found = rows.filter(*(pl.col(name) == value for name, value in labels.items()))
+    found = _with_labels(rows, labels)
     if found.is_empty():
         raise UnmeasuredError(dict(labels))
     return _one_cell(found.filter(pl.col("version") == _last(found)), labels)
@@ -46,9 +46,7 @@ def pick_paired(rows: pl.DataFrame, *cells: Labels) -> list[pl.DataFrame]:
         UnmeasuredError: None has played all of them on two traffic seeds.
         ValueError: Labels are those of several cells.
     """
-    found = [
-        rows.filter(*(pl.col(name) == value for name, value in each.items())) for each in cells
-    ]
+    found = [_with_labels(rows, each) for each in cells]
     shared = found[0].select(*_PAIRED).unique()
     for each in found[1:]:
         shared = shared.join(each, on=_PAIRED, how="semi")
@@ -63,6 +61,13 @@ def pick_paired(rows: pl.DataFrame, *cells: Labels) -> list[pl.DataFrame]:
 
 
 _PAIRED = ("version", "traffic_seed")
+
+
+def _with_labels(rows: pl.DataFrame, labels: Labels) -> pl.DataFrame:
+    """Return the rows that have some labels, of which a part that was not played has no column."""
+    if not labels.keys() <= set(rows.columns):
+        return rows.clear()
+    return rows.filter(*(pl.col(name) == value for name, value in labels.items()))
 
 
 def _last(rows: pl.DataFrame) -> str:

@@ -8,19 +8,20 @@ queries, beside three detectors on the mainline that count every vehicle.
 
 from __future__ import annotations
 
-import itertools
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import polars as pl
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from agents.environments import make_vector
 from agents.figures import (
-    ERROR_TICKS,
     ESTIMATOR_LOOKS,
     LABELS,
     Look,
@@ -30,9 +31,8 @@ from agents.figures import (
     draw_level,
     finish_figure,
     make_figure,
-    save_figure,
+    save_measured,
     set_log_axes,
-    set_log_ticks,
 )
 from agents.play import Cell, corridor_of, record
 from agents.statistics import Interval, geometric_mean_interval, mean_interval
@@ -42,7 +42,6 @@ from agents.tables import (
     ERROR,
     SPEED,
     Labels,
-    UnmeasuredError,
     below,
     format_interval,
     format_range,
@@ -63,23 +62,25 @@ ROUND_ROBIN = "round-robin"
 # ---- The first part: every vehicle answers. ----
 
 QUICK, SLOW_FILTERS = (EKF, WALK, "blend", LEARNED), ("ukf", "enkf", "mhe")
+EVERYONE = (*QUICK, *SLOW_FILTERS)
 POLICIES = ("paper", ROUND_ROBIN, "oldest-first", "stale-variance", "largest-deviation")
 SHIPPED = "private-highway"
 """A learned query policy for the world `CAPPED`, trained with the EKF."""
 CAPPED = "PrivateHighway-v0"
-MAIN: dict[str, tuple[str, dict[str, Any]]] = {
+World = tuple[str, dict[str, Any]]
+"""An environment and its keywords."""
+_SUMS = {"query_spans": [2], "bandwidth_unit": "sums"}
+WORLDS: dict[str, World] = {
     "PaperHighway-v0": (PAPER, {}),
     "PaperHighway-v0, corrected": (PAPER, {"privacy": "corrected"}),
     CAPPED: (PRIVATE, {}),
     "PrivateHighway-v1": (PACED, {}),
-}
-"""Environment and keywords of the worlds in which estimators meet query policies."""
-_SUMS = {"query_spans": [2], "bandwidth_unit": "sums"}
-GUARANTEES: dict[str, tuple[str, dict[str, Any]]] = {
     "PrivateHighway-v1, five sums": (PACED, _SUMS),
     "PrivateHighway-v1, ε = 1": (PACED, {"epsilon": 1.0}),
     "PrivateHighway-v1, ε = 1, five sums": (PACED, {"epsilon": 1.0, **_SUMS}),
 }
+MAIN = tuple(WORLDS)[:4]
+"""Worlds in which estimators meet query policies."""
 _LONG_ROAD = {
     "n_mainline": 60,
     "on_ramps": [9, 29, 49],
@@ -108,7 +109,7 @@ _DRIVERS = {
     "headways of 0.6 s, mixed speeds": {"headway": 0.6, "speed_deviation": 0.2},
     "headways of 2 s": {"headway": 2.0},
 }
-ELSEWHERE: dict[str, tuple[str, dict[str, Any]]] = {
+ELSEWHERE: dict[str, World] = {
     **{name: (PACED, {"corridor": {"drivers": drivers}}) for name, drivers in _DRIVERS.items()},
     "no incident": (PACED, {"incident": "none"}),
     "the paper's incident": (PACED, {"incident": _INCIDENT}),
@@ -133,36 +134,33 @@ def in_world(
     return {"part": "estimators", **labels}
 
 
-def world_cell(labels: Labels) -> Cell:
-    """Return the cell of `in_world` labels, with the network that comes with the package."""
-    world, policy = labels["world"], labels["policy"]
-    env, changes = {**MAIN, **GUARANTEES, **ELSEWHERE}[world]
-    keywords = {**changes, "estimator": labels["estimator"]}
-    if labels["estimator"] == LEARNED:
+def world_cell(world: str, estimator: str, policy: str = ROUND_ROBIN) -> Cell:
+    """Return the cell of an estimator in a world, with the network that the package has."""
+    env, changes = {**WORLDS, **ELSEWHERE}[world]
+    keywords = {**changes, "estimator": estimator}
+    if estimator == LEARNED:
         keywords["estimator_settings"] = {"recurrent": {"weights": "highway", "outside": True}}
-    seeds = MOVED_SEEDS if world in ELSEWHERE else None
-    transferred = policy == SHIPPED
     return Cell(
-        env, policy, keywords, labels, transferred=transferred, watchers=("honesty",), seeds=seeds
+        env,
+        policy,
+        keywords,
+        in_world(world, estimator, policy),
+        transferred=policy == SHIPPED,
+        watchers=("honesty",),
+        seeds=MOVED_SEEDS if world in ELSEWHERE else None,
     )
 
 
-def policies_of(world: str) -> tuple[str, ...]:
-    """Return the query policies that are compared in a main world."""
-    return (*POLICIES, SHIPPED) if world == CAPPED else POLICIES
-
-
-def world_cells() -> list[Cell]:
-    """Return the cells of the first part."""
-    found = []
-    for world in MAIN:
-        found += [in_world(world, *pair) for pair in itertools.product(QUICK, policies_of(world))]
-        some = itertools.product(SLOW_FILTERS, ("paper", ROUND_ROBIN))
-        found += [in_world(world, *pair) for pair in some]
-    found += [in_world(*p) for p in itertools.product(GUARANTEES, (*QUICK, *SLOW_FILTERS))]
-    found += [in_world(*pair) for pair in itertools.product(ELSEWHERE, MOVED)]
-    return [world_cell(labels) for labels in found]
-
+WORLD_CELLS = [
+    world_cell(*each)
+    for each in (
+        *product(MAIN, QUICK, POLICIES),
+        *product([CAPPED], QUICK, [SHIPPED]),
+        *product(MAIN, SLOW_FILTERS, ["paper", ROUND_ROBIN]),
+        *product(tuple(WORLDS)[4:], EVERYONE),
+        *product(ELSEWHERE, MOVED),
+    )
+]
 
 # ---- The second part: a share of the vehicles answers, beside detectors. ----
 
@@ -182,6 +180,7 @@ UNKNOWN, MISREPORTING, WITHOUT = ("unknown share", "misreporting", "without")
 FACTORS = {"high": 4.0 / 3.0, "low": 2.0 / 3.0}
 """Factor on the counts of a detector that miscounts."""
 FAULTY_RELEASES = ("paper", "paced")
+FAULTY = list(product(FAULTY_RELEASES, ESTIMATORS[:-1]))
 RANKED = (ROUND_ROBIN, "paper", "oldest-first", "largest-variance", "static")
 RANKED_SHARES = ("100 %", "30 %", "10 %", "3 %")
 SENSED_SEEDS = SEEDS[:20]
@@ -212,16 +211,17 @@ def unknown(release: str, estimator: str) -> Labels:
 
 def miscounting(release: str, estimator: str, *faults: str) -> list[Labels]:
     """Return the labels of faults of each detector in turn."""
-    pairs = itertools.product(faults, range(len(DETECTORS)))
+    pairs = product(faults, range(len(DETECTORS)))
     return [sensed(release, estimator, fault=fault, detector=k) for fault, k in pairs]
 
 
 def sensed_cell(labels: Labels) -> Cell:
     """Return the cell of `sensed` labels."""
     fault, sensors = labels["fault"], labels["sensors"]
+    at_fault = [k == labels["detector"] for k in range(len(DETECTORS))]
     places = [] if sensors == QUERIES else list(DETECTORS)
     if fault == WITHOUT:
-        del places[labels["detector"]]
+        places = [place for place, bad in zip(places, at_fault, strict=True) if not bad]
     penetration = {"share": UNKNOWN_SHARES if fault == UNKNOWN else labels["share"]}
     if fault == MISREPORTING:
         penetration |= {"misreporting": 0.3, "misreport_factor": 0.5}
@@ -234,29 +234,27 @@ def sensed_cell(labels: Labels) -> Cell:
         "corridor": {"fixed_sensors": places},
     }
     if fault in FACTORS:
-        factors = [1.0] * len(places)
-        factors[labels["detector"]] = FACTORS[fault]
-        keywords["detectors"] = {"factor": factors}
+        keywords["detectors"] = {"factor": [FACTORS[fault] if bad else 1.0 for bad in at_fault]}
     if labels["estimator"] == LEARNED:  # its deviations are honest, filters do better without
         keywords["fusion"] = {"dwell_factor": 1.0}
     return Cell(PACED, labels["policy"], keywords, labels, seeds=SENSED_SEEDS)
 
 
-def sensed_cells() -> list[Cell]:
-    """Return the cells of the second part."""
-    found = []
-    for pair in itertools.product(RELEASES, ESTIMATORS):
-        for share in SHARES.values():
-            found += [sensed(*pair, share), sensed(*pair, share, QUERIES)]
-        found += [alone(*pair, PART)] + [alone(*pair)] * (pair[0] in GUARANTEED)
-    for estimator, name, policy in itertools.product((EKF, LEARNED), RANKED_SHARES, RANKED[1:]):
-        found.append(sensed("paced", estimator, SHARES[name], policy=policy))
-    for pair in itertools.product(FAULTY_RELEASES, ESTIMATORS):
-        found.append(unknown(*pair))
-        if pair[1] != WALK:
-            found += [*miscounting(*pair, *FACTORS, WITHOUT), sensed(*pair, fault=MISREPORTING)]
-    return [sensed_cell(labels) for labels in found]
-
+SENSED_CELLS = [
+    sensed_cell(labels)
+    for labels in (
+        *(sensed(*e) for e in product(RELEASES, ESTIMATORS, SHARES.values(), [BOTH, QUERIES])),
+        *(alone(*each) for each in product(RELEASES, ESTIMATORS, [PART])),
+        *(alone(*each) for each in product(GUARANTEED, ESTIMATORS)),
+        *(
+            sensed("paced", name, SHARES[share], policy=policy)
+            for name, share, policy in product((EKF, LEARNED), RANKED_SHARES, RANKED[1:])
+        ),
+        *(unknown(*pair) for pair in product(FAULTY_RELEASES, ESTIMATORS)),
+        *(sensed(*pair, fault=MISREPORTING) for pair in FAULTY),
+        *(labels for pair in FAULTY for labels in miscounting(*pair, *FACTORS, WITHOUT)),
+    )
+]
 
 # ---- Times of a step. ----
 
@@ -272,7 +270,7 @@ def measure_times(place: Place) -> pl.DataFrame:
     """
     envs = {}
     for estimator in QUICK:
-        cell, seeds = world_cell(in_world(CAPPED, estimator)), SEEDS[:32]
+        cell, seeds = world_cell(CAPPED, estimator), SEEDS[:32]
         record(corridor_of(cell), seeds, place.records)
         more = {"records": place.records, "traffic_seeds": list(seeds), "threads": 1}
         keywords = {**cell.keywords, **more, "action": "scores"}
@@ -289,29 +287,29 @@ def measure_times(place: Place) -> pl.DataFrame:
             if turn > 0:  # the first turn compiles
                 seconds[estimator].append(time.perf_counter() - started)
     found = []
-    for estimator, own in seconds.items():
+    for name, own in seconds.items():
         ratio = geometric_mean_interval(np.array(own) / np.array(seconds[EKF]))
-        found.append((estimator, ratio.mean, ratio.low, ratio.high))
-    return pl.DataFrame(found, schema=["estimator", "ratio", "low", "high"], orient="row")
+        found.append({"estimator": name, "ratio": ratio.mean, "low": ratio.low, "high": ratio.high})
+    return pl.DataFrame(found)
 
 
 # ---- Tables. ----
 
-Columns = Mapping[str, Callable[[Any], str]]
-"""Headers, and what stands under them for what a line is about."""
 
-Pair = tuple[str, str]
-"""A release model and an estimator."""
-
-
-def table(corner: str, lines: Mapping[str, Any], columns: Columns) -> str:
+def table(
+    corner: str, lines: Mapping[str, Any], columns: Mapping[str, Callable[[Any], str]]
+) -> str:
     """Return a table of the columns for what each named line is about; dashes where unmeasured."""
     return grid(corner, list(lines), list(columns), lambda name, head: columns[head](lines[name]))
 
 
-def named(estimators: Sequence[str]) -> dict[str, str]:
-    """Return estimators by their names in tables."""
-    return {LABELS[estimator]: estimator for estimator in estimators}
+def lines_of(
+    groups: Iterable[str], estimators: Iterable[str], make: Callable[[str, str], Any]
+) -> dict[str, Any]:
+    """Return a line for each world or release model and estimator."""
+    return {
+        f"{each}, {LABELS[name]}": make(each, name) for each, name in product(groups, estimators)
+    }
 
 
 def tenths(interval: Interval) -> str:
@@ -348,12 +346,6 @@ def in_regime(rows: pl.DataFrame, regime: str, labels: Labels) -> str:
     return " / ".join(f"{np.sqrt(each / n):.1f}" for each in squares)
 
 
-def regime_shares(rows: pl.DataFrame, labels: Labels) -> str:
-    """Return the shares of segments in the regimes [%]."""
-    counts = np.array([values(rows, labels, f"n_{regime}").sum() for regime in REGIMES])
-    return " / ".join(f"{100.0 * share:.0f}" for share in counts / counts.sum())
-
-
 WORLD_NOTES = f"""Round robin, traffic seeds {format_range(SEEDS)}. *Error*: minus the reward after
 the warm-up. *χ²*: mean square of errors over reported deviations, of densities and of speeds.
 *Covered*: errors within intervals of {format_range(LEVELS)} %, of densities; of speeds."""
@@ -366,53 +358,51 @@ MOVED_NOTES = f"Error x 1000, traffic seeds {format_range(MOVED_SEEDS)}."
 def world_tables(rows: pl.DataFrame, times: pl.DataFrame) -> list[str]:
     """Return the tables of the first part."""
 
-    def error(policy: str, world: str, estimator: str) -> str:
-        return tenths(mean(rows, in_world(world, estimator, policy), ERROR))
+    def error(labels: Labels, **changes: Any) -> str:
+        return tenths(mean(rows, {**labels, **changes}, ERROR))
 
-    def moved(estimator: str, world: str) -> str:
-        return error(ROUND_ROBIN, world, estimator)
+    def gain(labels: Labels) -> str:
+        return "-" if labels["estimator"] == EKF else format_interval(below_ekf(rows, labels))
 
-    everyone = named((*QUICK, *SLOW_FILTERS))
-    columns: dict[str, Callable[[Any], str]] = {
-        "error x 1000": lambda c: tenths(mean(rows, c, ERROR)),
-        "below EKF [%]": lambda c: (
-            "-" if c["estimator"] == EKF else format_interval(below_ekf(rows, c))
-        ),
-        "density [veh/km]": lambda c: format_interval(mean(rows, c, DENSITY)),
-        "speed [km/h]": lambda c: format_interval(mean(rows, c, SPEED)),
-        "χ²": lambda c: chi2(rows, c),
-        "covered [%]": lambda c: coverage(rows, c),
-    }
-    parts = ["# Every vehicle answers", WORLD_NOTES, "![Errors](fig_estimators.png)"]
-    for world in (*MAIN, *GUARANTEES):
-        lines = {name: in_world(world, each) for name, each in everyone.items()}
-        parts += [f"## {world}", table("estimator", lines, columns)]
-    parts += ["## Query policies", "Error x 1000."]
-    for world in MAIN:
-        columns = {f"`{each}`": partial(error, each, world) for each in policies_of(world)}
-        parts.append(table(world, everyone, columns))
-    columns = {regime: partial(in_regime, rows, regime) for regime in REGIMES}
-    columns["share of segments [%]"] = lambda c: regime_shares(rows, c)
-    lines = {f"{w}, {LABELS[e]}": in_world(w, e) for w, e in itertools.product(MAIN, QUICK)}
-    parts += ["## By regime of traffic", REGIME_NOTES, table("", lines, columns)]
-    columns = {name: partial(moved, each) for name, each in named(MOVED).items()}
-    columns["recurrent below EKF [%]"] = lambda w: format_interval(below_ekf(rows, in_world(w)))
-    columns["χ² of recurrent"] = lambda w: chi2(rows, in_world(w))
-    parts += ["## Away from the training", MOVED_NOTES, "![Gains](fig_elsewhere.png)"]
-    parts.append(table("PrivateHighway-v1 but for", {each: each for each in ELSEWHERE}, columns))
-
-    def network(world: str, k: str) -> str:
-        labels = in_world(world, network=int(k))
+    def network(labels: Labels, **changes: int) -> str:
+        labels = {**labels, **changes}
         return f"{mean(rows, labels, ERROR).mean:.1f} ({chi2(rows, labels)})"
 
-    numbers = [str(k) for k in range(N_NETWORKS)]
+    parts = ["# Every vehicle answers", WORLD_NOTES, "![Errors](fig_estimators.png)"]
+    columns: dict[str, Callable[[Any], str]] = {
+        "error x 1000": error,
+        "below EKF [%]": gain,
+        "density [veh/km]": lambda c: format_interval(mean(rows, c, DENSITY)),
+        "speed [km/h]": lambda c: format_interval(mean(rows, c, SPEED)),
+        "χ²": partial(chi2, rows),
+        "covered [%]": partial(coverage, rows),
+    }
+    parts.append(table("", lines_of(WORLDS, EVERYONE, in_world), columns))
+    columns = {f"`{each}`": partial(error, policy=each) for each in (*POLICIES, SHIPPED)}
+    parts += [
+        "## Query policies",
+        "Error x 1000.",
+        table("", lines_of(MAIN, EVERYONE, in_world), columns),
+    ]
+    columns = {regime: partial(in_regime, rows, regime) for regime in REGIMES}
+    parts += [
+        "## By regime of traffic",
+        REGIME_NOTES,
+        table("", lines_of(MAIN, QUICK, in_world), columns),
+    ]
+    columns = {LABELS[each]: partial(error, estimator=each) for each in MOVED}
+    columns |= {"recurrent below EKF [%]": gain, "χ² of recurrent": partial(chi2, rows)}
+    moved = {world: in_world(world) for world in ELSEWHERE}
+    parts += ["## Away from the training", MOVED_NOTES, "![Gains](fig_elsewhere.png)"]
+    parts.append(table("PrivateHighway-v1 but for", moved, columns))
+    columns = {str(k): partial(network, network=k) for k in range(N_NETWORKS)}
+    worlds = {world: in_world(world) for world in WORLDS}
     parts += ["## Training seeds of the network", "Error x 1000 (χ²). Only 0 is in the package."]
-    parts.append(grid("", [*MAIN, *GUARANTEES], numbers, network))
-    lines = {LABELS[each["estimator"]]: each for each in times.iter_rows(named=True)}
-    text = "{ratio:.2f} [{low:.2f}, {high:.2f}]"
+    parts.append(table("", worlds, columns))
+    measured = {LABELS[each["estimator"]]: each for each in times.iter_rows(named=True)}
+    columns = {"over the EKF": lambda each: "{ratio:.2f} [{low:.2f}, {high:.2f}]".format(**each)}
     parts += ["## Time", f"A step of {CAPPED}, {N_EPISODES:,} episodes on one core."]
-    parts.append(table("estimator", lines, {"over the EKF": lambda each: text.format(**each)}))
-    return parts
+    return [*parts, table("estimator", measured, columns)]
 
 
 def loss(rows: pl.DataFrame, cells: Sequence[Labels], reference: Labels) -> Interval:
@@ -436,6 +426,9 @@ FAULT_NOTES = f"""p = {BASE_SHARE:g}, errors above those of healthy sensors [%].
 detector counts a third too many or too few, the mean over all cases. *Misreported*: three of ten
 connected vehicles report half their speed."""
 
+Pair = tuple[str, str]
+"""A release model and an estimator."""
+
 
 def sensed_tables(rows: pl.DataFrame) -> list[str]:
     """Return the tables of the second part, most of a line for each release and estimator."""
@@ -450,14 +443,10 @@ def sensed_tables(rows: pl.DataFrame) -> list[str]:
         found = below(rows, labels, reference)
         return f"**{tenths(found)}**" if found.low > 0.0 else tenths(found)
 
-    def lines(releases: Sequence[str], estimators: Sequence[str]) -> dict[str, Pair]:
-        pairs = itertools.product(releases, estimators)
-        return {f"`{release}`, {LABELS[each]}": (release, each) for release, each in pairs}
-
     def by_share(entry: Callable[[float, Pair], str]) -> dict[str, Callable[[Pair], str]]:
         return {name: partial(entry, share) for name, share in SHARES.items()}
 
-    everyone = lines(RELEASES, ESTIMATORS)
+    everyone = lines_of(RELEASES, ESTIMATORS, lambda *pair: pair)
     columns: dict[str, Callable[[Pair], str]] = {
         "both, error x 1000": lambda c: error(sensed(*c)),
         "below queries alone": lambda c: gain(sensed(*c), sensed(*c, sensors=QUERIES)),
@@ -495,7 +484,7 @@ def sensed_tables(rows: pl.DataFrame) -> list[str]:
         "that detector left out": lambda c: above(c, miscounting(*c, WITHOUT)),
         "speeds misreported": lambda c: above(c, [sensed(*c, fault=MISREPORTING)]),
     }
-    faulty = lines(FAULTY_RELEASES, ESTIMATORS[:-1])
+    faulty = lines_of(FAULTY_RELEASES, ESTIMATORS[:-1], lambda *pair: pair)
     return [*parts, "## Faulty sensors", FAULT_NOTES, table("", faulty, columns)]
 
 
@@ -504,92 +493,80 @@ def sensed_tables(rows: pl.DataFrame) -> list[str]:
 LOOKS = {**ESTIMATOR_LOOKS, LEARNED: Look("#000000", "*")}
 
 
-def measured(cells: Mapping[Any, Any], entry: Callable[[Any], Interval]) -> dict[Any, Interval]:
-    """Return what ``entry`` gives for cells, by their keys, without those that are unmeasured."""
-    found = {}
-    for place, labels in cells.items():
-        try:
-            found[place] = entry(labels)
-        except UnmeasuredError:
-            continue
-    return found
+def draw_dots(axis: Axes, intervals: Mapping[str, Interval], colours: Sequence[str]) -> None:
+    """Draw means with their intervals, from top to bottom."""
+    for place, (interval, colour) in enumerate(zip(intervals.values(), colours, strict=True)):
+        draw_dot(axis, interval, -place, colour, None)
+    axis.set_yticks([-place for place in range(len(intervals))], list(intervals))
+    axis.set_xlim(0.0, 1.15 * axis.get_xlim()[1])  # room for the numbers
+    add_frame(axis, "x")
 
 
-def draw_worlds(rows: pl.DataFrame, path: Path) -> None:
+def draw_worlds(rows: pl.DataFrame) -> Figure:
     """Draw the error of every estimator in each main world."""
     figure = make_figure(11.0, 3.4, dpi=100)
-    names = (*QUICK, *SLOW_FILTERS)
+    colours = [LOOKS[name].colour for name in EVERYONE]
     for axis, world in zip(figure.subplots(1, len(MAIN), sharey=True), MAIN, strict=True):
-        cells = {name: in_world(world, name) for name in names}
-        for name, interval in measured(cells, lambda c: mean(rows, c, ERROR)).items():
-            draw_dot(axis, interval, names.index(name), LOOKS[name].colour, None)
+        errors = {LABELS[name]: mean(rows, in_world(world, name), ERROR) for name in EVERYONE}
+        draw_dots(axis, errors, colours)
         axis.set_title(world, fontsize=9)
         axis.set_xlabel("error x 1000", fontsize=8)
-        axis.set_yticks(range(len(names)), [LABELS[name] for name in names])
-        add_frame(axis, "x")
-        axis.set_xlim(0.0, 1.15 * axis.get_xlim()[1])  # room for the numbers
-    axis.invert_yaxis()  # shared by all
-    save_figure(figure, path, "Error of the estimate under a round robin, 95 % intervals")
+    return figure
 
 
-def draw_elsewhere(rows: pl.DataFrame, path: Path) -> None:
+def draw_elsewhere(rows: pl.DataFrame) -> Figure:
     """Draw by how much the network's error lies below the EKF's away from the training."""
-    figure, worlds = make_figure(7.4, 5.0, dpi=100), tuple(ELSEWHERE)
+    figure = make_figure(7.4, 5.0, dpi=100)
     axis = figure.subplots()
-    cells = {world: in_world(world) for world in worlds}
-    for world, gain in measured(cells, lambda c: below_ekf(rows, c)).items():
-        draw_dot(axis, gain, worlds.index(world), LOOKS[LEARNED].colour, None)
-    axis.set_yticks(range(len(worlds)), worlds)
-    axis.axvline(0.0, color="#333333", linewidth=1.0)
-    axis.invert_yaxis()
-    axis.margins(x=0.12)
+    gains = {world: below_ekf(rows, in_world(world)) for world in ELSEWHERE}
+    draw_dots(axis, gains, [LOOKS[LEARNED].colour] * len(gains))
     axis.set_xlabel("error of the network below that of the EKF [%]", fontsize=8)
-    add_frame(axis, "x")
-    save_figure(figure, path, "The recurrent network away from PrivateHighway-v1, 95 % intervals")
+    return figure
 
 
-def draw_arms(rows: pl.DataFrame, path: Path) -> None:
+def draw_arms(rows: pl.DataFrame) -> Figure:
     """Draw the error of both kinds of sensors, and of either alone, against the share."""
     figure = make_figure(11.0, 6.0, dpi=100)
-    looks = {BOTH: Look("#d55e00", "s"), QUERIES: Look("#0072b2", "o", "--")}
-    names = {BOTH: "queries and detectors", QUERIES: "queries alone"}
-    axes = figure.subplots(2, len(RELEASES), sharex=True, sharey="row").ravel()
-    for axis, pair in zip(axes, itertools.product((EKF, LEARNED), RELEASES), strict=True):
+    axes = figure.subplots(2, len(RELEASES), sharex=True, sharey="row")
+    percent = [100.0 * share for share in SHARES.values()]
+    arms = {
+        "queries and detectors": (BOTH, Look("#d55e00", "s")),
+        "queries alone": (QUERIES, Look("#0072b2", "o", "--")),
+    }
+    for axis, pair in zip(axes.flat, product((EKF, LEARNED), RELEASES), strict=True):
         estimator, release = pair
-        level = {"detectors alone, with the whole budget": alone(release, estimator)}
-        for name, interval in measured(level, lambda c: mean(rows, c, ERROR)).items():
-            draw_level(axis, interval, label=name)
-        for arm, look in looks.items():
-            cells = {100.0 * p: sensed(release, estimator, p, arm) for p in SHARES.values()}
-            means = measured(cells, lambda c: mean(rows, c, ERROR))
-            if means:
-                draw_curve(axis, list(means), list(means.values()), look, names[arm])
-        set_log_axes(axis, [100.0 * share for share in SHARES.values()])
-        set_log_ticks(axis.yaxis, ERROR_TICKS)
+        level = mean(rows, alone(release, estimator), ERROR)
+        draw_level(axis, level, label="detectors alone, with the whole budget")
+        for name, (arm, look) in arms.items():
+            cells = [sensed(release, estimator, share, arm) for share in SHARES.values()]
+            draw_curve(axis, percent, [mean(rows, each, ERROR) for each in cells], look, name)
+        set_log_axes(axis, percent)
         axis.set_title(f"{release}, {LABELS[estimator]}", fontsize=9)
-    for axis in axes[len(RELEASES) :]:
+    for axis in axes[-1]:
         axis.set_xlabel("connected vehicles [%]", fontsize=8)
-    for axis in axes[:: len(RELEASES)]:
+    for axis in axes[:, 0]:
         axis.set_ylabel("error x 1000", fontsize=8)
-    title = "Queries and detectors together, and either alone, 95 % intervals"
-    save_figure(finish_figure(figure), path, title)
+    return finish_figure(figure)
+
+
+FIGURES = {
+    "fig_estimators.png": (draw_worlds, "Error of the estimate under a round robin"),
+    "fig_elsewhere.png": (draw_elsewhere, "The recurrent network away from PrivateHighway-v1"),
+    "fig_arms.png": (draw_arms, "Queries and detectors together, and either alone"),
+}
 
 
 def report(rows: pl.DataFrame, folder: Path) -> str:
     """Return the tables of both parts, and draw their figures."""
-    # An interrupted run may have the rows, and so the labels, of one part alone.
-    lacking = {*in_world(""), *sensed("", "")} - {*rows.columns}
-    rows = rows.with_columns(pl.lit(None).alias(name) for name in lacking)
-    draw_worlds(rows, folder / "fig_estimators.png")
-    draw_elsewhere(rows, folder / "fig_elsewhere.png")
-    draw_arms(rows, folder / "fig_arms.png")
+    for name, (draw, title) in FIGURES.items():
+        save_measured(folder / name, f"{title}, 95 % intervals", draw, rows)
     times = read_table(folder / TIMES, ("estimator", "ratio", "low", "high"))
     return "\n\n".join([*world_tables(rows, times), *sensed_tables(rows)])
 
 
 STUDY = Study(
     "estimators",
-    (*world_cells(), *sensed_cells()),
+    (*WORLD_CELLS, *SENSED_CELLS),
     SEEDS,
     report,
     measures={TIMES: measure_times},

@@ -38,7 +38,7 @@ def test_maps_stand_in_columns_with_one_bar(watched, tmp_path):
     rmse, history = watched
     column = [
         RoadMap("truth", history.truth, history), estimate_map(history, rmse, "estimate"),
-        RoadMap("queried", history.queried, history),
+        RoadMap("queried", history.queried[::5], history, step=5),
     ]  # fmt: skip
     figure = draw_maps([column, column], width=8.0)
     assert len(figure.axes) == 2 * 3 + 1
@@ -48,6 +48,8 @@ def test_maps_stand_in_columns_with_one_bar(watched, tmp_path):
     np.testing.assert_array_equal(image.get_array(), np.array(history.truth).T)
     assert image.get_clim() == (0.0, history.density_scale)
     assert figure.axes[4].images[0].get_clim() == (0.0, 1.0)
+    assert image.get_extent()[:2] == [-0.5, len(history.truth) - 0.5]
+    assert figure.axes[4].images[0].get_extent()[0] == -2.5
     save_figure(figure, tmp_path / "deep" / "maps.png", "title")
     with Image.open(tmp_path / "deep" / "maps.png") as saved:
         assert saved.format == "PNG"
