@@ -175,16 +175,19 @@ def estimate_map(history: History, rmse: float, title: str) -> RoadMap:
     return RoadMap(title, history.estimate, history)
 
 
-def draw_maps(columns: Sequence[Sequence[RoadMap]], width: float, height: float = 1.25) -> Figure:
+def draw_maps(
+    columns: Sequence[Sequence[RoadMap]], width: float, height: float = 1.25, dpi: int = 140
+) -> Figure:
     """Draw panels over space and time with one colour bar for all densities.
 
     Args:
         columns: Panels of each column from top to bottom; rows have one kind of panel.
         width: Width of the figure [inches].
         height: Height of a panel of densities [inches].
+        dpi: Points for an inch.
     """
     ratios = [height * (0.6 if panel.is_flags else 1.0) for panel in columns[0]]
-    figure = make_figure(width, sum(ratios) + 1.2)
+    figure = make_figure(width, sum(ratios) + 1.2, dpi)
     axes = figure.subplots(
         len(ratios), len(columns), squeeze=False, sharex=True, sharey=True,
         gridspec_kw={"height_ratios": ratios},

@@ -1,5 +1,9 @@
 import gc
 import os
+
+# Before anything imports numpy: threads of its libraries would count as CPU time of a test.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 from pathlib import Path
 
 import pytest

@@ -489,7 +489,7 @@ def draw_space_time(table: pl.DataFrame) -> Figure:
             for title, content in maps.items():
                 column.append(RoadMap(title, np.array(row[content]), history, MAP_STEP))
         columns.append(column)
-    return draw_maps(columns, width=10.4, height=0.8)
+    return draw_maps(columns, width=10.4, height=0.7, dpi=90)
 
 
 def draw_times(played: Played) -> Figure:

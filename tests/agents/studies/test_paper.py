@@ -111,7 +111,7 @@ def test_the_report_of_the_recorded_rows_needs_no_playing(tmp_path):
     assert (tmp_path / "tables.md").read_text() == (RESULTS / "tables.md").read_text()
     sizes = [path.stat().st_size for path in tmp_path.glob("fig*.png")]
     assert len(sizes) == 5
-    assert max(sizes) < 300_000
+    assert max(sizes) < 200_000
 
 
 @pytest.mark.slow
