@@ -105,6 +105,7 @@ def test_a_name_is_looked_up_in_the_package(tmp_path, monkeypatch):
     assert read_saved_policy("shipped").training_seed == 4
 
 
+@pytest.mark.slow
 def test_a_card_is_read_without_torch(tmp_path):
     path = save(tmp_path / "policy.zip")
     code = (

@@ -21,16 +21,16 @@ def rows_of(folder, policy=None):
 
 def test_it_writes_tables_rows_and_figures(tmp_path, capsys):
     args = Args(
-        env=SHORT, schedules=("round-robin", "none"), estimators=("random_walk",),
+        env=SHORT, schedules=("none",), estimators=("random_walk",),
         seeds="2000:2002", output=tmp_path / "out", workers=1, html=True,
     )  # fmt: skip
     main(args)
     printed = capsys.readouterr().out
-    for word in ("random_walk", "round-robin", "none", "paper", "±", "page.html"):
+    for word in ("random_walk", "none", "paper", "±", "page.html"):
         assert word in printed
     rows = rows_of(tmp_path / "out")
     assert set(rows.select("policy", "traffic_seed").iter_rows()) == {
-        (name, seed) for name in ("round-robin", "none", "paper") for seed in (2000, 2001)
+        (name, seed) for name in ("none", "paper") for seed in (2000, 2001)
     }
     tables = (tmp_path / "out" / "tables.md").read_text()
     assert f"| none | {rows_of(tmp_path / 'out', 'none')['rmse_density'].mean():.2f} [" in tables

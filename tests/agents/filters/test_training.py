@@ -166,6 +166,7 @@ def rows_of(training):
     return [{k: v for k, v in row.items() if k not in timed} for row in training.rows]
 
 
+@pytest.mark.slow
 def test_a_training_that_was_killed_comes_out_as_one_that_was_not(whole, tmp_path):
     assert whole.done == 4
     assert [row["round"] for row in whole.rows] == [1, 2, 2, 2]

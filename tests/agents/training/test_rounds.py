@@ -82,6 +82,7 @@ def weights_after(settings, index):
     return torch.nn.utils.parameters_to_vector(policy.parameters()).detach().numpy()
 
 
+@pytest.mark.slow
 def test_steps_fall_from_round_to_round():
     settings = dataclasses.replace(FEW_SWAPS, step=9.0, final_step=1.0)
     first, last = (weights_after(settings, index) for index in (0, 1))
