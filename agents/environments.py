@@ -16,6 +16,17 @@ from dptse_env.env import SensorQueryEnv
 from dptse_env.traffic import CORRIDORS, is_road_file
 from dptse_env.vector_env import SensorQueryVectorEnv
 
+OTHER_DRIVERS: dict[str, Any] = {
+    "corridor": {"drivers": {"model": "Krauss"}},
+    "demand": {
+        "base": {
+            "mainline": [[0.0, 5000.0], [120.0, 2000.0], [300.0, 5600.0], [420.0, 3000.0]],
+            "on_ramps": [150.0, 600.0],
+        }
+    },
+}
+"""Keywords of drivers and demand that no policy was trained on."""
+
 
 def unwrap(env: gym.Env[Any, Any]) -> SensorQueryEnv:
     """Return the environment of this package under its wrappers.

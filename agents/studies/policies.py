@@ -24,6 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import polars as pl
 
+from agents.environments import OTHER_DRIVERS
 from agents.figures import (
     COLOURS,
     GREY,
@@ -51,7 +52,6 @@ from agents.statistics import (
     percent_below,
     percent_of_way,
 )
-from agents.studies.suite import OTHER_DRIVERS
 from agents.study import Study
 from agents.tables import (
     DENSITY,

@@ -18,7 +18,7 @@ import polars as pl
 from scipy import stats
 
 import dptse_env
-from agents.environments import make_config, quietly
+from agents.environments import OTHER_DRIVERS, make_config, quietly
 from agents.figures import GREY, finish_figure, make_figure, save_figure
 from agents.play import Cell
 from agents.seeds import SUITE
@@ -81,18 +81,6 @@ class Task:
             report = privacy_report(make_config(self.env, self.keywords))
         pair = f"({report.epsilon:.4g}, {report.claimed_delta:g})"
         return f"none: {pair}" if report.void_reasons else pair
-
-
-OTHER_DRIVERS: dict[str, Any] = {
-    "corridor": {"drivers": {"model": "Krauss"}},
-    "demand": {
-        "base": {
-            "mainline": [[0.0, 5000.0], [120.0, 2000.0], [300.0, 5600.0], [420.0, 3000.0]],
-            "on_ramps": [150.0, 600.0],
-        }
-    },
-}
-"""Keywords of drivers and demand that no policy was trained on."""
 
 
 def _task(name: str, meaning: str, env: str, estimator: str, bandwidth: int, **more: Any) -> Task:
