@@ -30,4 +30,4 @@ def test_the_notebook_runs_in_a_kernel(tmp_path, monkeypatch):
     assert "error:" not in text
     assert (tmp_path / "results/learned/page.html").is_file()
     assert (tmp_path / "results/learned/space_time.png").is_file()
-    assert "mine:Fastest" in (tmp_path / "results/fastest/summary.json").read_text()
+    assert "mine:Fastest" in (tmp_path / "results/fastest/tables.md").read_text()
