@@ -1,6 +1,5 @@
 """Every example runs with a few steps, and leaves a policy that can be evaluated."""
 
-import csv
 import math
 import os
 import re
@@ -11,6 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
+from agents.study import read_rows
 
 ROOT = Path(__file__).resolve().parents[2]
 ENV = "dptse_env:dptse/ShortHighway-v0"
@@ -54,13 +55,12 @@ def ladder(folder, *policies):
         "--seeds", "2000:2002", "--estimators", "random_walk", "--workers", 2,
         "--output", folder, "--policies", *policies,
     )  # fmt: skip
-    with (folder / "episodes.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    names = dict.fromkeys(row["schedule"] for row in rows)
-    assert len(names) == len(policies) + 2  # those, the round robin and the reference
-    assert all(math.isfinite(float(row["rmse_density"])) for row in rows)
+    rows = read_rows("evaluation", folder)
+    assert rows["policy"].n_unique() == len(policies) + 2  # those, the round robin, the reference
+    assert all(math.isfinite(error) for error in rows["rmse_density"])
     return {
-        name: [row["rmse_density"] for row in rows if row["schedule"] == name] for name in names
+        name: own["rmse_density"].to_list()
+        for (name,), own in rows.sort("traffic_seed").partition_by("policy", as_dict=True).items()
     }
 
 
