@@ -1,4 +1,4 @@
-"""Where tasks run: in this process, in processes of this machine, or on a Ray cluster.
+"""Executors of tasks: in this process, in processes of this machine, or on a Ray cluster.
 
 All three are `concurrent.futures.Executor`, and results do not depend on which one it is. Their
 ``ahead`` is the number of tasks to submit ahead of results, so that no worker waits for one.

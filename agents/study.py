@@ -38,7 +38,7 @@ Follow = Callable[[pl.DataFrame, Path], Sequence[Cell]]
 
 
 class Place(NamedTuple):
-    """Where a study works.
+    """The folder, executor and records that a study works with.
 
     Attributes:
         folder: Its results.

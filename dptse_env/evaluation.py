@@ -23,7 +23,7 @@ WARM_UP = 60
 """Seconds at the start of an episode that do not count: the road fills, the estimator settles."""
 
 Row = dict[str, Any]
-"""What was measured in an episode, by name; see `evaluate`."""
+"""Measurements of an episode, by name; see `evaluate`."""
 
 
 class Policy(Protocol):

@@ -1,4 +1,4 @@
-"""What `tests.cases` leaves in the fast set."""
+"""`tests.cases` leaves the right cases in the fast set."""
 
 from tests.cases import fast_and_slow, pairwise
 

@@ -1,4 +1,4 @@
-"""What a guarantee of privacy costs, and what paced ledgers save of it.
+"""The cost of a privacy guarantee, and what paced ledgers save of it.
 
 The part ``privacy`` plays one query schedule under the paper's noise and under capped
 contributions, whose guarantee holds, for every epsilon, cap and protected unit. The part ``ledger``
@@ -156,7 +156,7 @@ LACKS = {
     "capped": ("pace", "clip", "ratio", "pacing"),
     "exact": ("epsilon", "delta", "adjacency", "unit", "pace", "ratio", "pacing"),
 }
-"""What a release model has no setting for."""
+"""Value of a setting that a release model does not have."""
 OWN = {"exact": f"{__name__}:Exact", "equal-rates": f"{__name__}:EqualRates"}
 """Classes of this file by their labels."""
 QUERIES: dict[str, dict[str, Any]] = {
@@ -256,7 +256,7 @@ CLAIMS: dict[str, Callable[[EnvConfig], float]] = {
     f"met {CAP} times, at least": met_epsilon,
     f"met {CAP} times, alone, standing": partial(met_epsilon, alone=True),
 }
-"""What the paper's noise is worth, by assumption."""
+"""Accounts of the paper's noise, by assumption."""
 CLAIMED = [f"{noise}: {claim}" for noise, claim in product(PRINTED, CLAIMS)]
 
 

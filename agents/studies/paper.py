@@ -229,7 +229,7 @@ def curves_of(played: Played, setting: str, *wanted: Curve) -> list[FloatArray]:
 
 
 class Statistic(NamedTuple):
-    """What is measured of curves (n_points, n_seeds).
+    """A number taken of curves (n_points, n_seeds).
 
     Attributes:
         quantity: What it is.

@@ -288,7 +288,7 @@ LEARNED, WORST = "learned", "worst training seed"
 
 
 class World(NamedTuple):
-    """What a curve over bandwidths is about."""
+    """The subject of a curve over bandwidths."""
 
     road: str
     release: str

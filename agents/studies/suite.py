@@ -76,7 +76,7 @@ class Task:
 
     @cached_property
     def guarantee(self) -> str:
-        """What the release model guarantees to a trip, as (epsilon, delta), or that it does not."""
+        """The guarantee for a trip, as (epsilon, delta), or that there is none."""
         with quietly():
             report = privacy_report(make_config(self.env, self.keywords))
         pair = f"({report.epsilon:.4g}, {report.claimed_delta:g})"

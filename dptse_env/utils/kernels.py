@@ -180,7 +180,7 @@ def _is_writable(folder: Path) -> bool:
 
 
 class _Locator(_CacheLocator):
-    """Where numba keeps a function: in one folder for all."""
+    """Leads numba to one folder for all functions."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
