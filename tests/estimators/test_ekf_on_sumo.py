@@ -33,6 +33,7 @@ def test_backends_agree_and_the_filter_beats_walk_and_model(release, recordings)
     assert compiled_error < 0.7 * errors("open_loop", "compiled", recorded)[0]
 
 
+@pytest.mark.slow
 def test_the_least_w_keeps_the_filter_sound(recorded, monkeypatch):
     """Without it, nearly empty and standing cells blow the covariance up."""
     error, _, peak = errors("ekf", "reference", recorded)

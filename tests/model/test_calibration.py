@@ -25,6 +25,7 @@ def test_equilibrium_traffic_gives_its_own_parameters_back():
     assert start.gamma == pytest.approx(1.2, rel=0.05)
 
 
+@pytest.mark.slow
 def test_calibration_finds_a_model_that_predicts_well(data):
     found = calibrate(
         HIGHWAY, data, "fit", start=PAPER, horizons=(5, 15), stride=10, max_evaluations=150

@@ -134,7 +134,8 @@ def test_faults_are_rejected_after_five_thousand_runs(case, record):
     assert attacked(case, record, 5000).verdict == "rejected"
 
 
-@pytest.mark.parametrize("n_runs", [250, pytest.param(5000, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("n_runs", [250, 5000])
 def test_correct_ledgers_are_not_rejected(n_runs, record):
     kind = keeping(PlainLedgers) if n_runs == 250 else keeping(Ledgers)
     case = kind, (staying(1), staying(3)), {}, 0.97
