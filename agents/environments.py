@@ -13,6 +13,7 @@ from gymnasium.vector import AutoresetMode
 
 from dptse_env.config import EnvConfig
 from dptse_env.env import SensorQueryEnv
+from dptse_env.evaluation import require_in_step
 from dptse_env.traffic import CORRIDORS, is_road_file
 from dptse_env.vector_env import SensorQueryVectorEnv
 
@@ -112,13 +113,7 @@ def make_vector(env: str, n_episodes: int, keywords: Mapping[str, Any]) -> Senso
         env, num_envs=n_episodes, **{**keywords, "autoreset_mode": AutoresetMode.DISABLED}
     )
     assert isinstance(made, SensorQueryVectorEnv)
-    actions = made.interface.actions
-    if n_episodes > 1 and actions.picks_one_by_one and actions.costs is not None:
-        raise ValueError(
-            f"action {made.config.action!r} takes different numbers of actions for a second where "
-            f"queries cost different amounts ({made.config.queries}): episodes cannot be run as a "
-            "batch; use another encoding, or one episode at a time"
-        )
+    require_in_step(made)
     return made
 
 

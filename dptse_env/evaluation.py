@@ -125,6 +125,21 @@ def evaluate(
     return rows
 
 
+def require_in_step(env: SensorQueryVectorEnv) -> None:
+    """Check that the episodes of a batch stay in step, with as many actions for a second.
+
+    Raises:
+        ValueError: The decisions of a second may take different numbers of actions.
+    """
+    actions = env.interface.actions
+    if env.num_envs > 1 and actions.picks_one_by_one and actions.costs is not None:
+        raise ValueError(
+            f"action {env.config.action!r} takes different numbers of actions for a second where "
+            f"queries cost different amounts ({env.config.queries}): episodes cannot be played as "
+            "a batch; use another encoding, or one episode at a time"
+        )
+
+
 class _Single:
     """One episode at a time, of a scalar environment with all its wrappers."""
 
@@ -152,13 +167,7 @@ class _Batch:
                 "env must be made with another autoreset_mode than 'SameStep', which resets "
                 "episodes before their last second is read"
             )
-        actions = env.interface.actions
-        if env.num_envs > 1 and actions.picks_one_by_one and actions.costs is not None:
-            raise ValueError(
-                f"action {env.config.action!r} takes different numbers of actions for a second "
-                f"where queries cost different amounts ({env.config.queries}): episodes cannot be "
-                "played as a batch; use another encoding, or one episode at a time"
-            )
+        require_in_step(env)
         self._env, self.process, self.size = env, env.process, env.num_envs
 
     def reset(self, seeds: list[int], noise_seed: int) -> Any:
