@@ -30,10 +30,6 @@ class Interval:
         """Half of the interval's length."""
         return (self.high - self.low) / 2
 
-    def excludes_zero(self) -> bool:
-        """Return true if zero lies outside the interval."""
-        return self.low > 0.0 or self.high < 0.0
-
 
 def mean_interval(values: ArrayLike, confidence: float = 0.95) -> Interval:
     """Return the mean of independent values with Student's t interval.

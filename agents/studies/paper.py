@@ -81,7 +81,7 @@ AXES = {"bandwidth": "CV segments", "epsilon": "ε", "delta": "δ"}
 PAPER_SECONDS = {"ekf": 0.06, "ukf": 0.026, "enkf": 0.040, "mhe": 0.045}
 """The paper's seconds a step: MATLAB R2019b, a 3.6 GHz i7-7700."""
 CLOSE, SMALL, SIMILAR = 5.0, 10.0, 0.9
-"""Where the paper gives no number, fixed before the full run after a look at three traffic seeds:
+"""Bounds that the paper leaves open, fixed before the full run after a look at three traffic seeds:
 errors are close within this [%], a variation is small below this [%], and curves are similar if
 their correlation along the grid exceeds this."""
 SECONDS = "seconds"
