@@ -16,8 +16,13 @@ from scipy.sparse.linalg import splu
 from dptse_env.estimators.noise import initial_variance
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel, Bounds
-from dptse_env.model.arz import LARGEST_FACTOR, LEAST_DENSITY, LEAST_FACTOR, LEAST_W
-from dptse_env.model.parameters import LARGEST_W
+from dptse_env.model.parameters import (
+    LARGEST_FACTOR,
+    LARGEST_W,
+    LEAST_DENSITY,
+    LEAST_FACTOR,
+    LEAST_W,
+)
 from dptse_env.utils.arrays import BoolArray, FloatArray
 from dptse_env.utils.validation import positive, require
 

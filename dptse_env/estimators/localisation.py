@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dptse_env.model import ARZModel
-from dptse_env.model.layout import RoadNetwork
+from dptse_env.model.network import RoadNetwork
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 
 WHITENING = 1e-6

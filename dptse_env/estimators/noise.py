@@ -4,7 +4,7 @@ import numpy as np
 
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
-from dptse_env.model.arz import LEAST_DENSITY
+from dptse_env.model.parameters import LEAST_DENSITY
 from dptse_env.utils.arrays import FloatArray
 
 

@@ -9,7 +9,7 @@ from dptse_env.estimators.batch import BatchEstimator, Measurements
 from dptse_env.estimators.open_loop import estimated_traffic
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
-from dptse_env.model.arz import MEASUREMENT_FLOOR
+from dptse_env.model.parameters import MEASUREMENT_FLOOR
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 
 

@@ -22,7 +22,7 @@ class Backends(NamedTuple):
     reference: str
 
 
-_MODELS = Backends("dptse_env.model.compiled:CompiledARZModel", "dptse_env.model.arz:ARZModel")
+_MODELS = Backends("dptse_env.model.compiled:CompiledARZModel", "dptse_env.model.model:ARZModel")
 
 
 def _filter(name: str, cls: str) -> Backends:

@@ -1,9 +1,8 @@
 """The ARZ traffic model with junctions: a road, its parameters and its dynamics."""
 
-from dptse_env.model.arz import ARZModel, Bounds
-from dptse_env.model.layout import RoadNetwork
-from dptse_env.model.parameters import ARZParameters, available_parameters, load_parameters
-from dptse_env.model.rows import MeasurementRows
+from dptse_env.model.model import ARZModel
+from dptse_env.model.network import MeasurementRows, RoadNetwork
+from dptse_env.model.parameters import ARZParameters, Bounds, available_parameters, load_parameters
 
 __all__ = [
     "ARZModel",

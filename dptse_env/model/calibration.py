@@ -12,7 +12,7 @@ import numpy as np
 from scipy import optimize
 
 from dptse_env.model.compiled import CompiledARZModel
-from dptse_env.model.layout import RoadNetwork
+from dptse_env.model.network import RoadNetwork
 from dptse_env.model.parameters import ARZParameters
 from dptse_env.model.prediction import (
     HORIZONS,

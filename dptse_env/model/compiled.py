@@ -4,9 +4,9 @@ from functools import cached_property
 
 import numpy as np
 
-from dptse_env.model.arz import ARZModel
-from dptse_env.model.kernels import advance, make_scratch
-from dptse_env.model.road_arrays import RoadArrays, make_road_arrays
+from dptse_env.model.model import ARZModel, make_road_arrays
+from dptse_env.model.network import RoadArrays
+from dptse_env.model.step import advance, make_scratch
 from dptse_env.utils.arrays import FloatArray
 from dptse_env.utils.kernels import kernel
 
@@ -16,7 +16,7 @@ class CompiledARZModel(ARZModel):
 
     @cached_property
     def road(self) -> RoadArrays:
-        """The model as arrays, for the kernels of `dptse_env.model.kernels`."""
+        """The model as arrays, for the kernels of `dptse_env.model.step`."""
         return make_road_arrays(self)
 
     def step(self, states: FloatArray, inputs: FloatArray) -> FloatArray:

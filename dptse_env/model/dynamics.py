@@ -13,9 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dptse_env.model.layout import Layout, RoadNetwork, make_layout
-from dptse_env.model.parameters import LARGEST_W, SECONDS_PER_HOUR, ARZParameters
-from dptse_env.model.relations import VACUUM, Relations
+from dptse_env.model.network import Layout, RoadNetwork, make_layout
+from dptse_env.model.parameters import LARGEST_W, SECONDS_PER_HOUR, VACUUM, ARZParameters
+from dptse_env.model.relations import Relations
 from dptse_env.utils.arrays import FloatArray
 
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dptse_env.model.dynamics import ARZDynamics, Cells
-from dptse_env.model.relations import STANDING, VACUUM
+from dptse_env.model.parameters import STANDING, VACUUM
 from dptse_env.utils.arrays import BoolArray, FloatArray
 
 

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from dptse_env.utils.fields import Interval, checked_fields, from_mapping
 from dptse_env.utils.json_object import parse_object, shipped_texts
@@ -16,6 +16,25 @@ from dptse_env.utils.json_object import parse_object, shipped_texts
 SECONDS_PER_HOUR = 3600.0
 LARGEST_W = 1.1
 """Largest w of a physical state, in units of v_f."""
+
+Bounds = Literal["cone", "box"]
+
+# The cone of physical states: 1 veh/km <= rho <= rho_m, v >= 0 and 0.4 v_f <= w <= 1.1 v_f. The
+# lower bound on w excludes standing traffic in nearly empty cells, where the supply depends on the
+# state as w / rho, which makes filters diverge.
+LEAST_DENSITY = 1.0
+LEAST_W = 0.4
+# Share of the jam density below which a measurement treats the density as constant: dv/drho grows
+# as psi / rho^2, which makes filters diverge.
+MEASUREMENT_FLOOR = 0.01
+# Bounds on the factors of demand states.
+LEAST_FACTOR, LARGEST_FACTOR = 0.1, 3.0
+# Below this share of its jam density a cell is a vacuum: its demand is zero and its w is v_f.
+VACUUM = 1e-12
+# A speed of zero is a kink, and projected states may lie on it. Within this share of v_f the
+# derivative of moving traffic is used (and that of the mainline where both branches of a diverge
+# stand), so that it does not depend on rounding.
+STANDING = 1e-9
 
 
 @dataclass(frozen=True)

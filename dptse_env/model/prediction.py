@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dptse_env.model.arz import ARZModel
+from dptse_env.model.model import ARZModel
 from dptse_env.utils.arrays import FloatArray, IntArray
 
 HORIZONS = (5, 10, 15, 20, 25, 30)

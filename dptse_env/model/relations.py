@@ -10,13 +10,6 @@ import numpy as np
 
 from dptse_env.utils.arrays import FloatArray
 
-# Below this share of its jam density a cell is a vacuum: its demand is zero and its w is v_f.
-VACUUM = 1e-12
-# A speed of zero is a kink, and projected states may lie on it. Within this share of v_f the
-# derivative of moving traffic is used (and that of the mainline where both branches of a diverge
-# stand), so that it does not depend on rounding.
-STANDING = 1e-9
-
 
 @dataclass(frozen=True)
 class Relations:

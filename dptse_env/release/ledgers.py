@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dptse_env.model.rows import covered
+from dptse_env.model.network import covered
 from dptse_env.release.density import COUNTS, DeviationTerms, deviation_of
 from dptse_env.release.vehicle_table import VehicleTable, widened
 from dptse_env.traffic import Record

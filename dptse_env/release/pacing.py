@@ -11,7 +11,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from dptse_env.model.layout import Layout, make_layout
+from dptse_env.model.network import Layout, make_layout
 from dptse_env.model.parameters import SECONDS_PER_HOUR
 from dptse_env.release import pacing_kernels as kernels
 from dptse_env.traffic import Corridor

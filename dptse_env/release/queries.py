@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 
 from dptse_env.model import MeasurementRows
-from dptse_env.model.rows import covered
+from dptse_env.model.network import covered
 from dptse_env.traffic import Corridor
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 

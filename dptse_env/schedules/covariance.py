@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar, Protocol, cast
 import numpy as np
 
 from dptse_env.estimators.settings import Deviation
-from dptse_env.model.road_arrays import make_road_arrays
+from dptse_env.model.model import make_road_arrays
 from dptse_env.process import QueryProcess
 from dptse_env.schedules import greedy_kernels as kernels
 from dptse_env.schedules.base import ProcessSchedule, require_plain

@@ -3,8 +3,8 @@
 import numpy as np
 
 from dptse_env.estimators.compiled.ekf_kernels import Packed
-from dptse_env.model.kernels import make_scratch
-from dptse_env.model.road_arrays import RoadArrays
+from dptse_env.model.network import RoadArrays
+from dptse_env.model.step import make_scratch
 from dptse_env.schedules.covariance_kernels import (
     Problem,
     Work,

@@ -10,8 +10,8 @@ import numpy as np
 
 from dptse_env.estimators import EstimatorSettings, make_estimator
 from dptse_env.estimators.base import Estimator
-from dptse_env.model.arz import ARZModel
 from dptse_env.model.compiled import CompiledARZModel
+from dptse_env.model.model import ARZModel
 from dptse_env.model.parameters import load_parameters
 from dptse_env.traffic import PAPER_HIGHWAY
 from dptse_env.traffic.record import Record

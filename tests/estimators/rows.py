@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from dptse_env.estimators import DemandSettings, EstimatorSettings
-from dptse_env.model.arz import ARZModel
 from dptse_env.model.compiled import CompiledARZModel
-from dptse_env.model.rows import MeasurementRows
+from dptse_env.model.model import ARZModel
+from dptse_env.model.network import MeasurementRows
 from dptse_env.utils.arrays import FloatArray
 
 from .episodes import SIGMAS, Episodes, simulate

@@ -9,8 +9,8 @@ from dptse_env.estimators import BACKENDS, DemandSettings, EstimatorSettings, ma
 from dptse_env.estimators.localisation import Places, state_places
 from dptse_env.estimators.reference.band import DenseBand
 from dptse_env.model.compiled import CompiledARZModel
+from dptse_env.model.network import MeasurementRows
 from dptse_env.model.parameters import load_parameters
-from dptse_env.model.rows import MeasurementRows
 
 from ..cases import pairwise
 from ..model.roads import STRAIGHT, UNEVEN

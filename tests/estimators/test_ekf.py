@@ -97,6 +97,6 @@ def test_the_speed_of_a_nearly_empty_segment_tells_nothing_of_its_density(backen
 
 
 def test_without_the_floor_a_filter_is_sure_of_what_it_cannot_know(monkeypatch):
-    monkeypatch.setattr("dptse_env.model.arz.MEASUREMENT_FLOOR", 1e-9)
+    monkeypatch.setattr("dptse_env.model.model.MEASUREMENT_FLOOR", 1e-9)
     _, deviations = update_of_a_nearly_empty_road("reference", 1e-3)
     assert deviations.max() < 0.02 * ONCE_MEASURED

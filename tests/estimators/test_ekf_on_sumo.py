@@ -38,7 +38,7 @@ def test_the_least_w_keeps_the_filter_sound(recorded, monkeypatch):
     """Without it, nearly empty and standing cells blow the covariance up."""
     error, _, peak = errors("ekf", "reference", recorded)
     assert peak < 100.0
-    monkeypatch.setattr("dptse_env.model.arz.LEAST_W", 0.0)
+    monkeypatch.setattr("dptse_env.model.model.LEAST_W", 0.0)
     unsound_error, _, unsound_peak = errors("ekf", "reference", recorded)
     assert unsound_peak > 1e4
     assert unsound_error > error

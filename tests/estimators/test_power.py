@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numba import njit
 
-from dptse_env.estimators.compiled.power import LARGEST_BASE, LEAST_BASE, power
+from dptse_env.model.power import LARGEST_BASE, LEAST_BASE, power
 
 EXPONENTS = st.floats(0.05, 10.0)
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from dptse_env.estimators import EstimatorSettings, make_estimator
-from dptse_env.model.rows import MeasurementRows
+from dptse_env.model.network import MeasurementRows
 from tests.cases import pairwise
 
 from . import episodes as shared

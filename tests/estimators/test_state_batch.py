@@ -5,15 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dptse_env.estimators.compiled.state_batch import (
+from dptse_env.model import ARZModel, load_parameters
+from dptse_env.model.columns import (
     advance_states,
     make_batch_scratch,
     measured_speeds,
     project_states,
     released_by_states,
 )
-from dptse_env.model import ARZModel, load_parameters
-from dptse_env.model.road_arrays import make_road_arrays
+from dptse_env.model.model import make_road_arrays
 from dptse_env.traffic import PAPER_HIGHWAY, SHORT_HIGHWAY
 from tests.estimators.parts import compiled
 from tests.model.roads import UNEVEN

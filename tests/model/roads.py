@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dptse_env.model.arz import ARZModel
+from dptse_env.model.model import ARZModel
 from dptse_env.model.parameters import ARZParameters, load_parameters
 from dptse_env.traffic import Corridor, Demand
 from dptse_env.utils.arrays import FloatArray

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dptse_env.model.arz import ARZModel
+from dptse_env.model.model import ARZModel
 from dptse_env.model.parameters import ARZParameters
 
 from .roads import (

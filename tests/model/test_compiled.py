@@ -3,10 +3,9 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from dptse_env.model.arz import ARZModel
 from dptse_env.model.compiled import CompiledARZModel
-from dptse_env.model.kernels import advance, make_scratch
-from dptse_env.model.road_arrays import make_road_arrays
+from dptse_env.model.model import ARZModel, make_road_arrays
+from dptse_env.model.step import advance, make_scratch
 from tests.cases import pairwise
 from tests.estimators.parts import compiled
 

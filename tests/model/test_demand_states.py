@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from dptse_env.model.arz import ARZModel
 from dptse_env.model.compiled import CompiledARZModel
+from dptse_env.model.model import ARZModel
 
 from .roads import HIGHWAY, PAPER, W99, random_inputs, random_states
 

@@ -3,7 +3,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from dptse_env.model.layout import make_layout
+from dptse_env.model.network import make_layout
 
 from .roads import HIGHWAY, Road
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dptse_env.model.arz import MEASUREMENT_FLOOR
+from dptse_env.model.parameters import MEASUREMENT_FLOOR
 
 from .roads import HIGHWAY, PAPER, W99, model_of, random_states
 

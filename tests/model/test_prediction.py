@@ -3,8 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dptse_env.model.arz import ARZModel
 from dptse_env.model.compiled import CompiledARZModel
+from dptse_env.model.model import ARZModel
 from dptse_env.model.prediction import TrafficSeries, persistence_error, prediction_error
 
 from .roads import HIGHWAY, PAPER

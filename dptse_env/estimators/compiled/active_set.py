@@ -15,7 +15,7 @@ from dptse_env.estimators.compiled.chain import Chain, WindowScratch
 from dptse_env.estimators.compiled.stages import UNSOLVED
 from dptse_env.estimators.compiled.window import gradient, natural_residual, solve
 from dptse_env.estimators.horizon import AT_BOUND
-from dptse_env.model.road_arrays import RoadArrays
+from dptse_env.model.network import RoadArrays
 from dptse_env.utils.arrays import FloatArray, IntArray
 from dptse_env.utils.kernel_loops import copy_matrix
 from dptse_env.utils.kernels import kernel_part

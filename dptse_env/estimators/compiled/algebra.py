@@ -7,7 +7,7 @@ multiply-adds and, unlike other options, keeps NaNs, by which divergence is dete
 
 import numpy as np
 
-from dptse_env.model.road_arrays import RoadArrays
+from dptse_env.model.network import RoadArrays
 from dptse_env.utils.arrays import FloatArray
 from dptse_env.utils.kernels import kernel_part
 
@@ -72,7 +72,7 @@ def propagate(
 
     Args:
         road: The road, for the cells of the blocks.
-        blocks: `(S, K, 4)` blocks of F, as written by `dptse_env.model.kernels.advance`.
+        blocks: `(S, K, 4)` blocks of F, as written by `dptse_env.model.step.advance`.
         by_factor: `(1 + I, 2)` derivatives of the entries' cells by the demand factors, if the
             states have them.
         noise: `(n_x,)` variances that Q adds.

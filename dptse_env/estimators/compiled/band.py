@@ -13,7 +13,7 @@ import numpy as np
 
 from dptse_env.estimators.localisation import in_road_order, state_places
 from dptse_env.model import ARZModel
-from dptse_env.model.road_arrays import make_road_arrays
+from dptse_env.model.model import make_road_arrays
 from dptse_env.utils.arrays import FloatArray, IntArray
 
 

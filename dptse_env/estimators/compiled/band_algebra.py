@@ -13,7 +13,7 @@ import numpy as np
 
 from dptse_env.estimators.compiled.band import Band
 from dptse_env.estimators.localisation import WHITENING
-from dptse_env.model.road_arrays import RoadArrays
+from dptse_env.model.network import RoadArrays
 from dptse_env.utils.arrays import FloatArray, IntArray
 from dptse_env.utils.kernels import kernel_part
 
@@ -107,7 +107,7 @@ def propagate(
     Args:
         road: The road.
         band: Its band.
-        blocks: `(S, K, 4)` blocks of F, as written by `dptse_env.model.kernels.advance`.
+        blocks: `(S, K, 4)` blocks of F, as written by `dptse_env.model.step.advance`.
         by_factor: `(1 + I, 2)` derivatives of the entries' cells by the demand factors.
         covariance: `(n_x, H + 1)`, replaced.
         tables: From `make_tables`.

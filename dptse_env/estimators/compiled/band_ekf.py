@@ -27,8 +27,8 @@ from dptse_env.estimators.compiled.ekf_kernels import (
     summarise_segment,
 )
 from dptse_env.estimators.compiled.ekf_rows import Rows, linearise, make_rows
-from dptse_env.model.kernels import advance, make_scratch
-from dptse_env.model.road_arrays import RoadArrays
+from dptse_env.model.network import RoadArrays
+from dptse_env.model.step import advance, make_scratch
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.kernel_loops import all_finite, any_of
 from dptse_env.utils.kernels import kernel, kernel_part

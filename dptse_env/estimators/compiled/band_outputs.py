@@ -23,8 +23,8 @@ from dptse_env.estimators.compiled.band_points import (
     n_columns,
 )
 from dptse_env.estimators.compiled.sigma_points import Points
-from dptse_env.estimators.compiled.state_batch import released_by_states
-from dptse_env.model.road_arrays import RoadArrays
+from dptse_env.model.columns import released_by_states
+from dptse_env.model.network import RoadArrays
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.kernels import kernel_part
 

@@ -23,13 +23,13 @@ from dptse_env.estimators.compiled.band_updates import (
 from dptse_env.estimators.compiled.driver_noise import couple
 from dptse_env.estimators.compiled.ekf_kernels import Filters, Packed, process_noise, project
 from dptse_env.estimators.compiled.sigma_points import Points
-from dptse_env.estimators.compiled.state_batch import (
+from dptse_env.estimators.compiled.ukf_outputs import row_noise
+from dptse_env.model.columns import (
     advance_states,
     make_batch_scratch,
     project_states,
 )
-from dptse_env.estimators.compiled.ukf_outputs import row_noise
-from dptse_env.model.road_arrays import RoadArrays
+from dptse_env.model.network import RoadArrays
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.kernel_loops import all_finite, copy_matrix, copy_vector
 from dptse_env.utils.kernels import kernel, kernel_part

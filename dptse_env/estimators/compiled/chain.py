@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dptse_env.model.road_arrays import RoadArrays
+from dptse_env.model.network import RoadArrays
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.kernels import kernel_part
 

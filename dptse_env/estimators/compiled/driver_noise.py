@@ -7,10 +7,8 @@ With `psi = rho w`, independent deviations of rho and w are to first order devia
 
 from dptse_env.estimators.compiled.moments import mean_of
 from dptse_env.estimators.compiled.normals import Draws
-from dptse_env.model.arz import LEAST_DENSITY
-from dptse_env.model.parameters import LARGEST_W
-from dptse_env.model.relations import VACUUM
-from dptse_env.model.road_arrays import RoadArrays
+from dptse_env.model.network import RoadArrays
+from dptse_env.model.parameters import LARGEST_W, LEAST_DENSITY, VACUUM
 from dptse_env.utils.arrays import FloatArray
 from dptse_env.utils.kernels import kernel_part
 

@@ -24,16 +24,16 @@ from dptse_env.estimators.compiled.ekf_rows import (
     update_wide,
     variance_along,
 )
-from dptse_env.model.arz import (
+from dptse_env.model.network import RoadArrays
+from dptse_env.model.parameters import (
     LARGEST_FACTOR,
+    LARGEST_W,
     LEAST_DENSITY,
     LEAST_FACTOR,
     LEAST_W,
+    VACUUM,
 )
-from dptse_env.model.kernels import advance, make_scratch, pressure
-from dptse_env.model.parameters import LARGEST_W
-from dptse_env.model.relations import VACUUM
-from dptse_env.model.road_arrays import RoadArrays
+from dptse_env.model.step import advance, make_scratch, pressure
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.kernel_loops import all_finite, any_of, copy_vector
 from dptse_env.utils.kernels import kernel, kernel_part

@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from dptse_env.estimators.compiled.algebra import sum_update
-from dptse_env.model.arz import MEASUREMENT_FLOOR
-from dptse_env.model.kernels import pressure
-from dptse_env.model.road_arrays import RoadArrays
+from dptse_env.model.network import RoadArrays
+from dptse_env.model.parameters import MEASUREMENT_FLOOR
+from dptse_env.model.step import pressure
 from dptse_env.utils.arrays import BoolArray, FloatArray
 from dptse_env.utils.kernels import kernel_part
 

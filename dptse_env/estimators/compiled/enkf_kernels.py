@@ -23,15 +23,15 @@ from dptse_env.estimators.compiled.enkf_local import (
 from dptse_env.estimators.compiled.moments import centre_row, is_finite, mean_of, moments_of
 from dptse_env.estimators.compiled.normals import Bits, Draws, fill, make_bits
 from dptse_env.estimators.compiled.row_outputs import average_outputs
-from dptse_env.estimators.compiled.state_batch import (
+from dptse_env.model.columns import (
     advance_states,
     make_batch_scratch,
     measured_speeds,
     project_states,
     released_by_states,
 )
+from dptse_env.model.network import RoadArrays
 from dptse_env.model.parameters import LARGEST_W
-from dptse_env.model.road_arrays import RoadArrays
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.kernel_loops import copy_vector
 from dptse_env.utils.kernels import kernel, kernel_part

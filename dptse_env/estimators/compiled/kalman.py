@@ -12,7 +12,7 @@ from dptse_env.estimators.compiled.algebra import padded
 from dptse_env.estimators.noise import count_variance, initial_variance, process_variance
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
-from dptse_env.model.road_arrays import make_road_arrays
+from dptse_env.model.model import make_road_arrays
 from dptse_env.utils.arrays import FloatArray, IntArray
 
 

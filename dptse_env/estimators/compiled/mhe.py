@@ -20,7 +20,8 @@ from dptse_env.estimators.horizon import (
 )
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
-from dptse_env.model.road_arrays import RoadArrays, make_road_arrays
+from dptse_env.model.model import make_road_arrays
+from dptse_env.model.network import RoadArrays
 from dptse_env.utils.arrays import FloatArray, IntArray
 
 # Variables of the longest window up to which it is factorised in the order of time: that is faster

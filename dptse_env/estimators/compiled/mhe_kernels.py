@@ -20,8 +20,8 @@ from dptse_env.estimators.compiled.stages import (
     shift,
 )
 from dptse_env.estimators.compiled.window import factorise
-from dptse_env.model.kernels import advance, make_scratch
-from dptse_env.model.road_arrays import RoadArrays
+from dptse_env.model.network import RoadArrays
+from dptse_env.model.step import advance, make_scratch
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.kernel_loops import all_finite, any_of, copy_matrix, copy_vector
 from dptse_env.utils.kernels import kernel, kernel_part

@@ -21,7 +21,7 @@ from dptse_env.estimators.compiled.road_matrix import add_rows, assemble
 from dptse_env.estimators.compiled.road_order import Order, Space, place
 from dptse_env.estimators.compiled.road_program import minimise
 from dptse_env.estimators.compiled.stages import UNSOLVED, Windows, chain_of
-from dptse_env.model.road_arrays import RoadArrays
+from dptse_env.model.network import RoadArrays
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.kernel_loops import any_of
 from dptse_env.utils.kernels import kernel, kernel_part

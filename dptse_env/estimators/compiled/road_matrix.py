@@ -10,7 +10,7 @@ import numpy as np
 from dptse_env.estimators.compiled.chain import Chain
 from dptse_env.estimators.compiled.envelope import close_envelope
 from dptse_env.estimators.compiled.road_order import Order, Space, place
-from dptse_env.model.road_arrays import RoadArrays
+from dptse_env.model.network import RoadArrays
 from dptse_env.utils.arrays import FloatArray, IntArray
 from dptse_env.utils.kernels import kernel_part
 

@@ -16,7 +16,7 @@ import numpy as np
 from dptse_env.estimators.compiled.envelope import SPARE
 from dptse_env.estimators.localisation import positions
 from dptse_env.model import ARZModel
-from dptse_env.model.road_arrays import RoadArrays
+from dptse_env.model.network import RoadArrays
 from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from dptse_env.utils.kernels import kernel, kernel_part
 

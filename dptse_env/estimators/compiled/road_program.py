@@ -17,7 +17,7 @@ from dptse_env.estimators.compiled.road_order import Order, Space, read_line, wr
 from dptse_env.estimators.compiled.stages import UNSOLVED
 from dptse_env.estimators.compiled.window import gradient
 from dptse_env.estimators.horizon import AT_BOUND
-from dptse_env.model.road_arrays import RoadArrays
+from dptse_env.model.network import RoadArrays
 from dptse_env.utils.arrays import BoolArray, FloatArray
 from dptse_env.utils.kernels import kernel_part
 

@@ -1,7 +1,7 @@
 """Compiled outputs of many states: averages over neighbouring segments, as rows measure them."""
 
-from dptse_env.estimators.compiled.state_batch import released_by_states
-from dptse_env.model.road_arrays import RoadArrays
+from dptse_env.model.columns import released_by_states
+from dptse_env.model.network import RoadArrays
 from dptse_env.utils.arrays import FloatArray
 from dptse_env.utils.kernels import kernel_part
 

@@ -20,11 +20,6 @@ from dptse_env.estimators.compiled.ekf_kernels import (
     restart,
 )
 from dptse_env.estimators.compiled.sigma_points import Points, draw, gather
-from dptse_env.estimators.compiled.state_batch import (
-    advance_states,
-    make_batch_scratch,
-    project_states,
-)
 from dptse_env.estimators.compiled.ukf_outputs import (
     Outputs,
     first_column,
@@ -32,7 +27,12 @@ from dptse_env.estimators.compiled.ukf_outputs import (
     measure,
     row_noise,
 )
-from dptse_env.model.road_arrays import RoadArrays
+from dptse_env.model.columns import (
+    advance_states,
+    make_batch_scratch,
+    project_states,
+)
+from dptse_env.model.network import RoadArrays
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.kernel_loops import all_finite, copy_matrix, copy_vector
 from dptse_env.utils.kernels import kernel, kernel_part

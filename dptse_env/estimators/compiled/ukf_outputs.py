@@ -10,8 +10,8 @@ import numpy as np
 from dptse_env.estimators.compiled.dense import products
 from dptse_env.estimators.compiled.ekf_kernels import Filters
 from dptse_env.estimators.compiled.sigma_points import Points, distances_from_first
-from dptse_env.estimators.compiled.state_batch import released_by_states
-from dptse_env.model.road_arrays import RoadArrays
+from dptse_env.model.columns import released_by_states
+from dptse_env.model.network import RoadArrays
 from dptse_env.utils.arrays import FloatArray, IntArray
 from dptse_env.utils.kernels import kernel_part
 

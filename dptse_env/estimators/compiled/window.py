@@ -23,7 +23,7 @@ from dptse_env.estimators.compiled.window_rows import (
     weigh,
     weigh_wide,
 )
-from dptse_env.model.road_arrays import RoadArrays
+from dptse_env.model.network import RoadArrays
 from dptse_env.utils.arrays import FloatArray
 from dptse_env.utils.kernel_loops import copy_matrix, copy_vector
 from dptse_env.utils.kernels import kernel_part

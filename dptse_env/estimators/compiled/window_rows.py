@@ -5,7 +5,7 @@ adds a block that couples all of them; it is applied as a product of vectors ins
 """
 
 from dptse_env.estimators.compiled.chain import Chain, WindowScratch
-from dptse_env.model.road_arrays import RoadArrays
+from dptse_env.model.network import RoadArrays
 from dptse_env.utils.arrays import FloatArray
 from dptse_env.utils.kernel_loops import copy_vector
 from dptse_env.utils.kernels import kernel_part

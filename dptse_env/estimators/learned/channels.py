@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dptse_env.estimators.batch import Measurements
-from dptse_env.model.rows import MeasurementRows
+from dptse_env.model.network import MeasurementRows
 
 CHANNELS = (
     "queried", "share", "log_density_sigma", "log_second_sigma", "predicted_density",

@@ -7,7 +7,7 @@ import pytest
 
 from dptse_env.estimators import BACKENDS, make_estimator
 from dptse_env.estimators.learned.network import LOWEST_SPREAD
-from dptse_env.model.rows import MeasurementRows
+from dptse_env.model.network import MeasurementRows
 
 from ..episodes import RELEASES, random_streams, run, simulate
 from ..rows import averaged, update, with_rows

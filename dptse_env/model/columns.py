@@ -1,6 +1,6 @@
 """The ARZ model for a batch of states of a road: sigma points, or members of an ensemble.
 
-The equations are those of `dptse_env.model.kernels` without derivatives. States are stored by
+The equations are those of `dptse_env.model.step` without derivatives. States are stored by
 component, `(n_x, width)`, a column each, so that every inner loop runs over contiguous memory
 without a branch and compiles to vector instructions. Padding columns must also be states.
 """
@@ -9,17 +9,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dptse_env.estimators.compiled.power import power
-from dptse_env.model.arz import (
+from dptse_env.model.network import EXIT, LINK, MERGE, RoadArrays
+from dptse_env.model.parameters import (
     LARGEST_FACTOR,
+    LARGEST_W,
     LEAST_DENSITY,
     LEAST_FACTOR,
     LEAST_W,
     MEASUREMENT_FLOOR,
+    VACUUM,
 )
-from dptse_env.model.parameters import LARGEST_W
-from dptse_env.model.relations import VACUUM
-from dptse_env.model.road_arrays import EXIT, LINK, MERGE, RoadArrays
+from dptse_env.model.power import power
 from dptse_env.utils.arrays import FloatArray
 from dptse_env.utils.kernels import kernel_part
 

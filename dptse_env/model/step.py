@@ -1,6 +1,6 @@
 """Compiled kernels of the ARZ model: the next state of a state vector, and the sparse Jacobian.
 
-The equations are those of `dptse_env.model.arz`, written for one cell at a time. A cell's outflow
+The equations are those of `dptse_env.model.model`, written for one cell at a time. A cell's outflow
 depends on at most three cells, its parties: itself and those at its downstream face. A step's
 Jacobian is a weighted sum of the outflows' gradients, by a table of the road.
 
@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dptse_env.model.relations import STANDING, VACUUM
-from dptse_env.model.road_arrays import EXIT, LINK, MERGE, RoadArrays
+from dptse_env.model.network import EXIT, LINK, MERGE, RoadArrays
+from dptse_env.model.parameters import MEASUREMENT_FLOOR, STANDING, VACUUM
 from dptse_env.utils.arrays import FloatArray
 from dptse_env.utils.kernels import kernel_part
 
@@ -299,3 +299,48 @@ def advance(
         start, party = road.terms[m, 2], road.terms[m, 3]
         for k in range(4):
             blocks[row, slot, k] += road.term_weight[m] * gradient[start, party, k]
+
+
+@kernel_part
+def write_row(
+    road: RoadArrays,
+    units: FloatArray,
+    state: FloatArray,
+    centre: FloatArray,
+    m: int,
+    weights: FloatArray,
+    constants: FloatArray,
+) -> None:
+    """Write both numbers of a row as weights'x + constant, at a state and normalised.
+
+    They are the mean density of the row's segments, and the mean of their flows centred on a
+    speed, or of their speeds where the centre is NaN.
+
+    Args:
+        road: The road, with the rows' segments.
+        units: `(n_x,)` units of normalised states [veh/km, veh/h].
+        state: `(n_x,)` where the row is linearised [veh/km, veh/h].
+        centre: `(S,)` v_0 [km/h] or NaN.
+        m: Index of the row.
+        weights: `(2, >= 2 span)`, written, of the components from 2 `row_first[m]` on.
+        constants: `(2,)`, written.
+    """
+    first, span, v_f, gamma = road.row_first[m], road.row_span[m], road.free_flow_speed, road.gamma
+    constants[:] = 0.0
+    for i in range(span):
+        s = first + i
+        rho, psi, jam = state[2 * s], state[2 * s + 1], road.jam[s]
+        if np.isnan(centre[s]):
+            floored = max(rho, MEASUREMENT_FLOOR * jam)
+            p = pressure(floored, jam, v_f, gamma)
+            second, by_psi = psi / floored - p, 1.0 / floored
+            by_rho = -(psi / floored + gamma * p) / floored if rho == floored else 0.0
+        else:
+            p = pressure(rho, jam, v_f, gamma)
+            second, by_psi = psi - rho * (p + centre[s]), 1.0
+            by_rho = -(1.0 + gamma) * p - centre[s]
+        part = 1.0 / (span * road.second_scale)
+        weights[0, 2 * i], weights[0, 2 * i + 1] = 1.0 / span, 0.0
+        weights[1, 2 * i] = part * by_rho * units[2 * s]
+        weights[1, 2 * i + 1] = part * by_psi * units[2 * s + 1]
+        constants[1] += part * (second - by_rho * rho - by_psi * psi)

@@ -1,29 +1,29 @@
 """The ARZ traffic model for estimators: dynamics, measurements, derivatives and bounds."""
 
-from typing import Literal
-
 import numpy as np
 
 from dptse_env.model.dynamics import ARZDynamics
 from dptse_env.model.jacobian import step_jacobian
-from dptse_env.model.layout import RoadNetwork
-from dptse_env.model.parameters import ARZParameters
-from dptse_env.model.rows import MeasurementRows
-from dptse_env.utils.arrays import FloatArray
+from dptse_env.model.network import (
+    DIVERGE,
+    EXIT,
+    LINK,
+    MERGE,
+    MeasurementRows,
+    RoadArrays,
+    RoadNetwork,
+)
+from dptse_env.model.parameters import (
+    LARGEST_FACTOR,
+    LEAST_DENSITY,
+    LEAST_FACTOR,
+    LEAST_W,
+    MEASUREMENT_FLOOR,
+    ARZParameters,
+    Bounds,
+)
+from dptse_env.utils.arrays import FloatArray, IntArray
 from dptse_env.utils.validation import non_negative
-
-Bounds = Literal["cone", "box"]
-
-# The cone of physical states: 1 veh/km <= rho <= rho_m, v >= 0 and 0.4 v_f <= w <= 1.1 v_f. The
-# lower bound on w excludes standing traffic in nearly empty cells, where the supply depends on the
-# state as w / rho, which makes filters diverge.
-LEAST_DENSITY = 1.0
-LEAST_W = 0.4
-# Share of the jam density below which a measurement treats the density as constant: dv/drho grows
-# as psi / rho^2, which makes filters diverge.
-MEASUREMENT_FLOOR = 0.01
-# Bounds on the factors of demand states.
-LEAST_FACTOR, LARGEST_FACTOR = 0.1, 3.0
 
 
 class ARZModel(ARZDynamics):
@@ -152,3 +152,80 @@ class ARZModel(ARZDynamics):
             raise ValueError(f"bounds must be 'cone' or 'box', got {bounds!r}")
         factors = np.clip(self.demand_factors(states), LEAST_FACTOR, LARGEST_FACTOR)
         return self.compose(rho, np.clip(psi, low, high), factors)
+
+
+def make_road_arrays(model: ARZModel) -> RoadArrays:
+    """Return a model as arrays and numbers."""
+    layout, n = model.layout, model.n_segments
+    kind = np.full(n, EXIT, dtype=np.int64)
+    parties = np.full((n, 3), -1, dtype=np.int64)
+    parties[:, 0] = np.arange(n)
+    share = np.zeros(n)
+    for up, down in layout.links.T:
+        kind[up], parties[up, 1] = LINK, down
+    for main, ramp, down in layout.merges.T:
+        kind[[main, ramp]] = MERGE
+        parties[main, 1:] = down, ramp
+        parties[ramp, 1:] = down, main
+    for (up, main, off), exit_share in zip(layout.diverges.T, layout.exit_shares, strict=True):
+        kind[up], share[up] = DIVERGE, exit_share
+        parties[up, 1:] = main, off
+
+    entry, leave = np.full((2, n), -1, dtype=np.int64)
+    entry[layout.entries] = layout.entry_inputs
+    leave[layout.exits] = layout.exit_inputs
+    outside_jam = np.zeros(n)
+    outside_jam[layout.exits] = model.exit_jam_density
+
+    edges, edge_share = layout.edges, layout.edge_shares
+    neighbours, degree = _neighbours(model)
+    terms, weights = _terms(parties, edges, edge_share, neighbours)
+    return RoadArrays(
+        free_flow_speed=float(model.parameters.free_flow_speed),
+        gamma=float(model.parameters.gamma),
+        step_ratio=model.step_ratio,
+        relaxation=float(model.relaxation),
+        jam=model.jam_density,
+        outside_jam=outside_jam,
+        kind=kind,
+        parties=parties,
+        share=share,
+        entry=entry,
+        entries=layout.entries,
+        exit=leave,
+        edges=edges,
+        edge_share=edge_share,
+        neighbours=neighbours,
+        degree=degree,
+        terms=terms,
+        term_weight=model.step_ratio[terms[:, 0]] * weights,
+        second_scale=float(model.measurement_scale[1]),
+        row_first=model.rows.first,
+        row_span=model.rows.span,
+    )
+
+
+def _neighbours(model: ARZModel) -> tuple[IntArray, IntArray]:
+    sparsity = model.layout.sparsity()
+    degree = sparsity.sum(axis=1).astype(np.int64)
+    neighbours = np.full((model.n_segments, int(degree.max())), -1, dtype=np.int64)
+    for cell, row in enumerate(sparsity):
+        cells = np.flatnonzero(row)
+        neighbours[cell, : degree[cell]] = [cell, *cells[cells != cell]]
+    return neighbours, degree
+
+
+def _terms(
+    parties: IntArray, edges: IntArray, edge_share: FloatArray, neighbours: IntArray
+) -> tuple[IntArray, FloatArray]:
+    """List the rows of the Jacobian that each outflow's gradient enters, with its weights."""
+    flows = [(cell, cell, -1.0) for cell in range(len(parties))]
+    flows += [(start, end, part) for (start, end), part in zip(edges, edge_share, strict=True)]
+    terms, weights = [], []
+    for start, row, weight in flows:
+        for party, cell in enumerate(parties[start]):
+            if cell >= 0:
+                slot = int(np.flatnonzero(neighbours[row] == cell)[0])
+                terms.append((row, slot, start, party))
+                weights.append(weight)
+    return np.array(terms, dtype=np.int64), np.array(weights)

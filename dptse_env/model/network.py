@@ -1,9 +1,15 @@
-"""Layout of a road in the model: connections of cells, and the lanes of each cell."""
+"""Geometry of a road as arrays: cells and their connections, rows, and what kernels take of it.
+
+`Layout` is derived of a `RoadNetwork`, and `RoadArrays` of a model on it.
+"""
+
+from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from functools import cached_property
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -213,3 +219,103 @@ def _check(network: RoadNetwork) -> None:
         for i, value in enumerate(values):
             if not (np.isfinite(value) and value > 0.0):
                 raise ValueError(f"network.{field}[{i}] must be finite and > 0, got {value}")
+
+
+def covered(first: IntArray, span: IntArray, n: int) -> BoolArray:
+    """Return flags of n neighbours in a row: True for `span` of them from `first` on.
+
+    Shape (M, n), for `first` and `span` of shape (M,).
+    """
+    place = np.arange(n) - first[:, None]
+    inside: BoolArray = (place >= 0) & (place < span[:, None])
+    return inside
+
+
+@dataclass(frozen=True, eq=False)
+class MeasurementRows:
+    """The M rows that a measurement may have, each an average over neighbouring segments.
+
+    A row has two numbers: the average density, and the average centred flow, of its segments.
+
+    Attributes:
+        first: The first segment of each row, shape (M,).
+        span: The number of segments of each row, shape (M,).
+        n_segments: Segments S of the road.
+
+    Raises:
+        ValueError: A row is empty or leaves the road.
+    """
+
+    first: IntArray
+    span: IntArray
+    n_segments: int
+
+    def __post_init__(self) -> None:
+        """Check that every row lies on the road."""
+        for row, (first, span) in enumerate(zip(self.first, self.span, strict=True)):
+            if not (span >= 1 and first >= 0 and first + span <= self.n_segments):
+                raise ValueError(
+                    f"rows[{row}] must cover segments in 0..{self.n_segments - 1}, got "
+                    f"{span} from {first} on"
+                )
+
+    @classmethod
+    def single(cls, n_segments: int) -> MeasurementRows:
+        """Return the rows of a road whose segments are measured one by one."""
+        return cls(np.arange(n_segments), np.ones(n_segments, dtype=np.int64), n_segments)
+
+    @property
+    def n_rows(self) -> int:
+        """Number of rows M."""
+        return self.first.size
+
+    @cached_property
+    def are_single(self) -> bool:
+        """True if row s is segment s, for all segments."""
+        every = np.arange(self.n_segments)
+        return bool((self.span == 1).all()) and np.array_equal(self.first, every)
+
+    @cached_property
+    def weights(self) -> FloatArray:
+        """Weights of the segments in each row, shape (M, S): 1 / span of those it covers."""
+        inside = covered(self.first, self.span, self.n_segments)
+        return np.where(inside, 1.0 / self.span[:, None], 0.0)
+
+    def averages(self, values: FloatArray) -> FloatArray:
+        """Return the rows' averages, shape (n, M, 2), of values of shape (n, S, 2)."""
+        if self.are_single:
+            return values
+        averages: FloatArray = np.einsum("ms,nsk->nmk", self.weights, values)
+        return averages
+
+
+LINK, MERGE, DIVERGE, EXIT = 0, 1, 2, 3
+
+
+class RoadArrays(NamedTuple):
+    """A model of S segments as arrays and numbers, for compiled code."""
+
+    free_flow_speed: float  # v_f [km/h]
+    gamma: float  # Exponent of the pressure
+    step_ratio: FloatArray  # (S,) T / l [h/km]
+    relaxation: float  # T / tau
+    jam: FloatArray  # (S,) jam densities [veh/km]
+    outside_jam: FloatArray  # (S,) jam density behind an exit [veh/km]; unused elsewhere
+    kind: IntArray  # (S,) LINK, MERGE, DIVERGE or EXIT: the face a cell flows out through
+    # (S, 3) the cell, the cell it flows into, and the third one at a junction (the other
+    # branch of a merge, the off-ramp of a diverge), -1 where there is none
+    parties: IntArray
+    share: FloatArray  # (S,) exit share of a diverge
+    entry: IntArray  # (S,) input column of the demand from outside, -1 for an inner cell
+    entries: IntArray  # (1 + I,) cells with inflow from outside
+    exit: IntArray  # (S,) input column of the density outside, -1 for an inner cell
+    edges: IntArray  # (E, 2) cells (from, to) between which vehicles pass
+    edge_share: FloatArray  # (E,) share of the outflow that passes
+    # (S, K) cells that a cell's next state depends on, itself first, -1 padded
+    neighbours: IntArray
+    degree: IntArray  # (S,) how many neighbours there are
+    terms: IntArray  # (M, 4) (row cell, slot of its neighbour, outflow's cell, its party)
+    term_weight: FloatArray  # (M,) weight of the outflow's gradient in the Jacobian [h/km]
+    second_scale: float  # unit of the second number that sensors release [km/h or veh/h]
+    row_first: IntArray  # (M,) first segment of each row of a measurement
+    row_span: IntArray  # (M,) segments of each row

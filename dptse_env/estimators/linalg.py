@@ -1,0 +1,317 @@
+"""Linear algebra that the filters share: transitions by blocks, scalar updates, small solves.
+
+Vectors and rows of matrices are padded with zeros to a multiple of eight numbers, so that inner
+loops run over full vector registers. `contract` allows fused multiply-adds and keeps NaNs, by which
+divergence is detected. All quantities are normalised.
+"""
+
+import numpy as np
+
+from dptse_env.model.network import RoadArrays
+from dptse_env.utils.arrays import FloatArray
+from dptse_env.utils.kernels import kernel_part
+
+VECTOR_WIDTH = 8  # numbers in a register
+
+
+def padded(n: int) -> int:
+    """Length of a padded row of n numbers."""
+    return -(-n // VECTOR_WIDTH) * VECTOR_WIDTH
+
+
+@kernel_part(fastmath={"contract"})
+def multiply(
+    road: RoadArrays,
+    blocks: FloatArray,
+    by_factor: FloatArray,
+    right: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Write A right to `out`; demand factors, the last components, stay.
+
+    Args:
+        road: The road, for the cells of the blocks.
+        blocks: `(S, K, 4)` 2x2 blocks of A, of each segment by its neighbours.
+        by_factor: `(E, 2)` derivatives of the entries' segments by the demand factors.
+        right: `(n_x, width)`.
+        out: `(n_x, width)`, another matrix.
+    """
+    n, width = 2 * road.jam.size, right.shape[1]
+    for c in range(road.jam.size):
+        upper, lower = out[2 * c], out[2 * c + 1]
+        for slot in range(road.degree[c]):
+            a, b = blocks[c, slot, 0], blocks[c, slot, 1]
+            d, e = blocks[c, slot, 2], blocks[c, slot, 3]
+            if slot > 0 and a == 0.0 and b == 0.0 and d == 0.0 and e == 0.0:
+                continue  # a flow depends on either demand or supply
+            neighbour = road.neighbours[c, slot]
+            first, second = right[2 * neighbour], right[2 * neighbour + 1]
+            if slot == 0:
+                for j in range(width):
+                    upper[j] = a * first[j] + b * second[j]
+                    lower[j] = d * first[j] + e * second[j]
+            else:
+                for j in range(width):
+                    upper[j] += a * first[j] + b * second[j]
+                    lower[j] += d * first[j] + e * second[j]
+    for k in range(right.shape[0] - n):
+        upper, lower, factor = out[2 * road.entries[k]], out[2 * road.entries[k] + 1], right[n + k]
+        a, b, kept = by_factor[k, 0], by_factor[k, 1], out[n + k]
+        for j in range(width):
+            upper[j] += a * factor[j]
+            lower[j] += b * factor[j]
+            kept[j] = factor[j]
+
+
+@kernel_part
+def move(
+    road: RoadArrays,
+    blocks: FloatArray,
+    by_factor: FloatArray,
+    n_factors: int,
+    x: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Write A x `(>= n_x,)` to `out`, another vector; see `multiply`."""
+    n = 2 * road.jam.size
+    for c in range(road.jam.size):
+        first, second = 0.0, 0.0
+        for slot in range(road.degree[c]):
+            b, block = road.neighbours[c, slot], blocks[c, slot]
+            first += block[0] * x[2 * b] + block[1] * x[2 * b + 1]
+            second += block[2] * x[2 * b] + block[3] * x[2 * b + 1]
+        out[2 * c], out[2 * c + 1] = first, second
+    for e in range(n_factors):
+        c = road.entries[e]
+        out[2 * c] += by_factor[e, 0] * x[n + e]
+        out[2 * c + 1] += by_factor[e, 1] * x[n + e]
+        out[n + e] = x[n + e]
+
+
+@kernel_part
+def move_back(
+    road: RoadArrays,
+    blocks: FloatArray,
+    by_factor: FloatArray,
+    n_factors: int,
+    x: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Write A' x `(>= n_x,)` to `out`, another vector; see `multiply`."""
+    n = 2 * road.jam.size
+    out[:] = 0.0
+    for c in range(road.jam.size):
+        first, second = x[2 * c], x[2 * c + 1]
+        for slot in range(road.degree[c]):
+            b, block = road.neighbours[c, slot], blocks[c, slot]
+            out[2 * b] += block[0] * first + block[2] * second
+            out[2 * b + 1] += block[1] * first + block[3] * second
+    for e in range(n_factors):
+        c = road.entries[e]
+        out[n + e] = x[n + e] + by_factor[e, 0] * x[2 * c] + by_factor[e, 1] * x[2 * c + 1]
+
+
+@kernel_part(fastmath={"contract"})
+def propagate(
+    road: RoadArrays,
+    blocks: FloatArray,
+    by_factor: FloatArray,
+    noise: FloatArray,
+    covariance: FloatArray,
+    scratch: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Write A P A' + Q to `out`, which may be P.
+
+    Args:
+        road: The road, for the cells of the blocks.
+        blocks: `(S, K, 4)` blocks of A.
+        by_factor: `(E, 2)` derivatives by the demand factors.
+        noise: `(n_x,)` variances that Q adds.
+        covariance: `(n_x, padded)` P.
+        scratch: `(2, n_x, padded)`.
+        out: `(n_x, padded)`.
+    """
+    n, product, transposed = covariance.shape[0], scratch[0], scratch[1]
+    multiply(road, blocks, by_factor, covariance, product)
+    for i in range(n):
+        for j in range(n):
+            transposed[i, j] = product[j, i]
+        transposed[i, n:] = 0.0
+    multiply(road, blocks, by_factor, transposed, out)
+    for i in range(n):
+        for j in range(i):
+            out[j, i] = out[i, j]
+        out[i, i] += noise[i]
+
+
+@kernel_part(fastmath={"contract"})
+def scalar_update(
+    covariance: FloatArray,
+    first: int,
+    row: FloatArray,
+    noise: float,
+    column: FloatArray,
+    gain: FloatArray,
+) -> float:
+    """Update a covariance by one number h'x + e, in Joseph form; return the number's variance.
+
+    With c = P h, s = h'c + r and K = c / s, `(I - K h') P (I - K h')' + K r K'` is
+    `P - K c' - (c - s K) K'`; the last factor is the rounding error that Joseph's form corrects.
+    A mean moves by K times the residual.
+
+    Args:
+        covariance: `(n_x, padded)` P, symmetric; not replaced where the variance is not sound.
+        first: First component that the number depends on.
+        row: Derivatives by that component and the following ones.
+        noise: Variance r of e; 0 for a component that is known.
+        column: `(padded,)`, written with c.
+        gain: `(padded,)`, written with K.
+
+    Returns:
+        s, or NaN where it is not finite, not positive or less than r.
+    """
+    _project_row(covariance, first, row, column)
+    total = _gain(first, row, noise, column, gain)
+    if total > 0.0:
+        for i in range(covariance.shape[0]):
+            k, rest, line = gain[i], column[i] - total * gain[i], covariance[i]
+            for j in range(column.size):
+                line[j] -= k * column[j] + rest * gain[j]
+    return total
+
+
+@kernel_part(fastmath={"contract"})
+def pair_update(
+    covariance: FloatArray,
+    first: int,
+    rows: FloatArray,
+    noise: FloatArray,
+    columns: FloatArray,
+    gains: FloatArray,
+) -> bool:
+    """Update a covariance by both numbers of a row: two `scalar_update`, P traversed once.
+
+    Args:
+        covariance: `(n_x, padded)` P, symmetric.
+        first: First component that the numbers depend on.
+        rows: `(2, size)` derivatives by that component and the following ones.
+        noise: `(2,)` variances.
+        columns: `(2, padded)` scratch.
+        gains: `(2, padded)`, written; the second number's is that after the first update.
+
+    Returns:
+        Whether both variances are sound.
+    """
+    c, d, k, g = columns[0], columns[1], gains[0], gains[1]
+    _project_row(covariance, first, rows[0], c)
+    _project_row(covariance, first, rows[1], d)
+    first_total = _gain(first, rows[0], noise[0], c, k)
+    by_column, by_gain = 0.0, 0.0
+    for i in range(rows.shape[1]):
+        by_column += rows[1, i] * c[first + i]
+        by_gain += rows[1, i] * k[first + i]
+    for j in range(d.size):
+        d[j] -= by_column * k[j] + by_gain * (c[j] - first_total * k[j])
+    second_total = _gain(first, rows[1], noise[1], d, g)
+    if not (first_total > 0.0 and second_total > 0.0):
+        return False
+    for i in range(covariance.shape[0]):
+        x, y, line = k[i], g[i], covariance[i]
+        rest_x, rest_y = c[i] - first_total * x, d[i] - second_total * y
+        for j in range(c.size):
+            line[j] -= x * c[j] + rest_x * k[j] + (y * d[j] + rest_y * g[j])
+    return True
+
+
+@kernel_part(fastmath={"contract"})
+def _project_row(covariance: FloatArray, first: int, row: FloatArray, out: FloatArray) -> None:
+    """Write P h."""
+    out[:] = 0.0
+    for i in range(row.size):
+        h, line = row[i], covariance[first + i]
+        if h != 0.0:
+            for j in range(out.size):
+                out[j] += h * line[j]
+
+
+@kernel_part(fastmath={"contract"})
+def _gain(first: int, row: FloatArray, noise: float, column: FloatArray, gain: FloatArray) -> float:
+    """Write the gain and return the number's variance, NaN where it is not sound."""
+    total = noise
+    for i in range(row.size):
+        total += row[i] * column[first + i]
+    if not (0.0 < total < np.inf and total >= noise * (1.0 - 1e-9)):
+        return np.nan
+    inverse = 1.0 / total
+    for j in range(column.size):
+        gain[j] = column[j] * inverse
+    return total
+
+
+@kernel_part(fastmath={"contract"})
+def add_product(matrix: FloatArray, x: FloatArray, out: FloatArray) -> None:
+    """Add P x to `out` `(padded,)`, P `(n_x, padded)` symmetric."""
+    n = matrix.shape[0]
+    if n % 2 == 1:
+        for j in range(out.size):
+            out[j] += x[n - 1] * matrix[n - 1, j]
+    for i in range(0, n - 1, 2):
+        a, b, upper, lower = x[i], x[i + 1], matrix[i], matrix[i + 1]
+        if a == 0.0 and b == 0.0:
+            continue
+        for j in range(out.size):
+            out[j] += a * upper[j] + b * lower[j]
+
+
+@kernel_part(fastmath={"contract", "reassoc"})
+def factor(matrix: FloatArray) -> bool:
+    """Replace the lower half of a symmetric matrix by L, L L' = matrix, with its diagonal inverted.
+
+    Returns whether all pivots were positive and finite.
+    """
+    for i in range(matrix.shape[0]):
+        row = matrix[i]
+        for j in range(i + 1):
+            other, total = matrix[j], row[j]
+            for k in range(j):
+                total -= row[k] * other[k]
+            if j < i:
+                row[j] = total * other[j]
+            elif 0.0 < total < np.inf:
+                row[i] = 1.0 / np.sqrt(total)
+            else:
+                return False
+    return True
+
+
+@kernel_part(fastmath={"contract", "reassoc"})
+def solve(lower: FloatArray, right: FloatArray) -> None:
+    """Replace `right` `(n,)` by (L L')^-1 right, L from `factor`."""
+    for i in range(right.size):
+        total = right[i]
+        for k in range(i):
+            total -= lower[i, k] * right[k]
+        right[i] = total * lower[i, i]
+    for i in range(right.size - 1, -1, -1):
+        right[i] *= lower[i, i]
+        for k in range(i):
+            right[k] -= lower[i, k] * right[i]
+
+
+@kernel_part(fastmath={"contract"})
+def solve_many(lower: FloatArray, right: FloatArray) -> None:
+    """Replace `right` `(n, width)` by (L L')^-1 right, L from `factor`."""
+    n, width = right.shape
+    for i in range(n):
+        for k in range(i):
+            for j in range(width):
+                right[i, j] -= lower[i, k] * right[k, j]
+        for j in range(width):
+            right[i, j] *= lower[i, i]
+    for i in range(n - 1, -1, -1):
+        for j in range(width):
+            right[i, j] *= lower[i, i]
+        for k in range(i):
+            for j in range(width):
+                right[k, j] -= lower[i, k] * right[i, j]
