@@ -312,6 +312,7 @@ def fingerprint(function: FunctionType) -> str:
         if following in seen:
             continue
         seen.add(following)
+        digest.update(following.__module__.encode())  # which machine code imports
         for code in _codes(following.__code__):
             constants = [c for c in code.co_consts if not isinstance(c, CodeType)]
             digest.update(repr((code.co_code, code.co_names, code.co_varnames, constants)).encode())
@@ -340,7 +341,8 @@ def _used(function: FunctionType, code: CodeType) -> Iterator[Any]:
     for value in values:
         if callable(value):
             inside = inspect.unwrap(value)
-            yield inside if isinstance(inside, FunctionType) else getattr(inside, "_fields", None)
+            fields = getattr(inside, "_fields", None), inside.__module__
+            yield inside if isinstance(inside, FunctionType) else fields
             yield _written(getattr(value, "targetoptions", {}))
         elif isinstance(value, np.ndarray):
             yield value.dtype, value.tolist()  # its `repr` leaves digits and elements out
