@@ -133,12 +133,11 @@ def recorded_steps(road: str) -> Numbers:
     for observed, values, sigma, centre in witness.measured:
         rows = np.where(observed[0][:, None], values[0], 0.0)
         spread = np.broadcast_to(sigma, values.shape)[0]
-        if centre is None:
-            centre = np.nan if model.reference_speed is None else model.reference_speed
-        around = np.broadcast_to(centre, (1, model.n_segments))[0]
-        full.append((observed[0], rows, spread, around))
-    for part, arrays in zip(("observed", "values", "sigma", "centre"), zip(*full), strict=True):
-        found[part] = np.array(arrays)
+        common = np.nan if model.reference_speed is None else model.reference_speed
+        around = np.full((1, model.n_segments), common) if centre is None else centre
+        full.append((observed[0], rows, spread, np.broadcast_to(around, (1, model.n_segments))[0]))
+    for index, part in enumerate(("observed", "values", "sigma", "centre")):
+        found[part] = np.array([arrays[index] for arrays in full])
     return {k: v if v.dtype == bool else v.astype(np.float32) for k, v in found.items()}
 
 

@@ -22,7 +22,7 @@ def compare(case, found, kept, share):
     """Compare arrays of a case, with shares of the largest number of each array."""
     for key, value in found.items():
         before = kept[f"{case}/{key}"]
-        if value.dtype == np.uint8 or value.dtype == bool:
+        if value.dtype in (np.uint8, bool):
             np.testing.assert_array_equal(value, before, err_msg=f"{case}/{key}")
         else:
             allowed = max(share, 1e-6 if value.dtype == np.float32 else share)
