@@ -74,8 +74,6 @@ class Args(Machines):
     """Search demand states, too, and the noise that goes with them."""
     repairs: bool = False
     """Search the cap of reported speeds and whether process noise is of psi or of w, too."""
-    band: int | None = None
-    """Band of the covariances of EKF, UKF and blend [segments]; "None" for the whole road."""
     variant: str = ""
     """Ending of the names of the sets; empty for default sets."""
     sampler_seed: int = 0
@@ -120,7 +118,6 @@ def make_tasks(args: Args) -> list[TuningTask]:
             with_noise_scale=args.noise_scale,
             with_demand=args.demand,
             with_repairs=args.repairs,
-            band=args.band,
             variant=args.variant,
             keywords=keywords,
         )

@@ -113,9 +113,6 @@ SPACE: dict[str, Mapping[str, Knob]] = {
 """By estimator: paths into `EstimatorSettings` and where their values are searched."""
 
 
-WITH_BAND = ("ekf", "ukf", "blend")
-"""Estimators whose covariances may reach a band."""
-
 NOT_TUNED = {
     "open_loop": "it takes no measurements and follows the model alone",
     "recurrent": "its weights are trained by scripts/train_estimator.py",
@@ -128,7 +125,6 @@ def search_space(
     with_noise_scale: bool = False,
     with_demand: bool = False,
     with_repairs: bool = False,
-    band: int | None = None,
 ) -> dict[str, Knob]:
     """Return the search space of an estimator.
 
@@ -138,11 +134,9 @@ def search_space(
         with_demand: Whether to search demand states and the noise that goes with them.
         with_repairs: Whether to search the cap of reported speeds and, for the Kalman filters,
             what the process noise is of.
-        band: Band of the covariances, the same in all trials; None for the whole road.
 
     Raises:
-        ValueError: There is nothing to tune, no such estimator, or it has no demand states or no
-            band.
+        ValueError: There is nothing to tune, no such estimator, or it has no demand states.
     """
     if estimator in NOT_TUNED:
         raise ValueError(
@@ -153,13 +147,7 @@ def search_space(
         raise ValueError(f"estimator must be one of {', '.join(SPACE)}, got {estimator!r}")
     if with_demand and estimator == "random_walk":
         raise ValueError("demand must be left out for 'random_walk', which has no traffic model")
-    if band is not None and estimator not in WITH_BAND:
-        raise ValueError(
-            f"band must be left out for {estimator!r}, only {', '.join(WITH_BAND)} have one"
-        )
     added = {**(NOISE_SCALE if with_noise_scale else {}), **(DEMAND if with_demand else {})}
-    if band is not None:
-        added["band"] = CategoricalDistribution((band,))
     space = {**SPACE[estimator], **added}
     return _with_repairs(estimator, space) if with_repairs else space
 

@@ -45,7 +45,6 @@ class TuningTask:
         with_demand: Whether to search demand states and the noise that goes with them, too.
         with_repairs: Whether to search the cap of reported speeds and what the process noise is of,
             too.
-        band: Band of the covariances, the same in all trials; None for the whole road.
         variant: Ending of the set's name; empty for the set that is the default of its privacy
             preset.
 
@@ -67,7 +66,6 @@ class TuningTask:
     with_noise_scale: bool = False
     with_demand: bool = False
     with_repairs: bool = False
-    band: int | None = None
     variant: str = ""
 
     def __post_init__(self) -> None:
@@ -95,7 +93,6 @@ class TuningTask:
             self.with_noise_scale,
             self.with_demand,
             self.with_repairs,
-            self.band,
         )
 
     @property

@@ -199,9 +199,6 @@ class EstimatorSettings:
         initial_variance: Variance of each normalised component of the prior.
         bounds: Set into which means are projected: the `cone` of physical states or the paper's
             `box`.
-        band: Number of segments along the road that a covariance reaches on either side; None for
-            the whole road. A ramp lies at the face where it joins or leaves. Time and memory of a
-            filter grow with the length of the road times the band, not with the length's powers.
         ukf: Further settings of the unscented Kalman filter.
         enkf: Further settings of the ensemble Kalman filter.
         mhe: Further settings of the moving horizon estimator, with separate bounds.
@@ -223,7 +220,6 @@ class EstimatorSettings:
     noise_scale: tuple[NoiseScale, NoiseScale] = (1.0, 1.0)
     initial_variance: Annotated[float, Interval(0, 100, open_low=True)] = 1e-3
     bounds: Bounds = "cone"
-    band: Annotated[int, Interval(1, 1000)] | None = None
     ukf: SigmaPointSettings = field(default_factory=SigmaPointSettings)
     enkf: EnsembleSettings = field(default_factory=EnsembleSettings)
     mhe: HorizonSettings = field(default_factory=HorizonSettings)

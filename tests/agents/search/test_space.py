@@ -50,7 +50,6 @@ def test_the_search_holds_the_defaults_and_the_shipped_sets(estimator):
             estimator,
             with_noise_scale=has_demand,
             with_demand=has_demand,
-            band=settings.band,
         )
         values = values_of(settings, space)
         assert list(values) == list(space)
@@ -72,13 +71,6 @@ def test_repairs_are_searched_where_they_are_asked_for():
     for name in ("mhe", "random_walk"):
         added = {*search_space(name, with_repairs=True)} - {*search_space(name)}
         assert added == {"speed_cap"}
-
-
-def test_a_band_is_that_of_all_trials():
-    (choice,) = search_space("ekf", band=10)["band"].choices
-    assert choice == 10
-    with pytest.raises(ValueError, match=r"^band must be left out for 'mhe', only ekf, ukf, blend"):
-        search_space("mhe", band=10)
 
 
 def test_paths_become_nested_settings():
