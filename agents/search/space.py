@@ -82,11 +82,6 @@ NOISE_SCALE: Mapping[str, Knob] = {
 
 SPEED_CAP: Mapping[str, Knob] = {"speed_cap": CategoricalDistribution((None, 0.95, 1.0, 1.05))}
 
-# A deviation of w over v_f is one of psi over rho v_f: ten times as large where the road is a tenth
-# full.
-NOISE_IN: Mapping[str, Knob] = {"process_noise_in": CategoricalDistribution(("psi", "w"))}
-LARGEST_W_NOISE = 0.5
-
 SPACE: dict[str, Mapping[str, Knob]] = {
     "ekf": _PROCESS_NOISE,
     "ukf": {**_PROCESS_NOISE, "ukf.alpha": evenly(0.1, 1.0)},
@@ -124,7 +119,7 @@ def search_space(
     estimator: str,
     with_noise_scale: bool = False,
     with_demand: bool = False,
-    with_repairs: bool = False,
+    with_speed_cap: bool = False,
 ) -> dict[str, Knob]:
     """Return the search space of an estimator.
 
@@ -132,8 +127,7 @@ def search_space(
         estimator: Its name.
         with_noise_scale: Whether to search the scale of the noise of flows or speeds.
         with_demand: Whether to search demand states and the noise that goes with them.
-        with_repairs: Whether to search the cap of reported speeds and, for the Kalman filters,
-            what the process noise is of.
+        with_speed_cap: Whether to search the cap of reported speeds.
 
     Raises:
         ValueError: There is nothing to tune, no such estimator, or it has no demand states.
@@ -147,19 +141,12 @@ def search_space(
         raise ValueError(f"estimator must be one of {', '.join(SPACE)}, got {estimator!r}")
     if with_demand and estimator == "random_walk":
         raise ValueError("demand must be left out for 'random_walk', which has no traffic model")
-    added = {**(NOISE_SCALE if with_noise_scale else {}), **(DEMAND if with_demand else {})}
-    space = {**SPACE[estimator], **added}
-    return _with_repairs(estimator, space) if with_repairs else space
-
-
-def _with_repairs(estimator: str, space: dict[str, Knob]) -> dict[str, Knob]:
-    """Return a search space with the cap of speeds and, where there is one, noise in w."""
-    if estimator in ("random_walk", "mhe"):
-        return {**space, **SPEED_CAP}
-    noise = space["process_noise.1"]
-    if isinstance(noise, FloatDistribution):
-        noise = evenly(noise.low, LARGEST_W_NOISE)
-    return {**space, "process_noise.1": noise, **NOISE_IN, **SPEED_CAP}
+    return {
+        **SPACE[estimator],
+        **(NOISE_SCALE if with_noise_scale else {}),
+        **(DEMAND if with_demand else {}),
+        **(SPEED_CAP if with_speed_cap else {}),
+    }
 
 
 def nested(values: Mapping[str, Any]) -> dict[str, Any]:

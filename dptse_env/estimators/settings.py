@@ -7,7 +7,6 @@ from dptse_env.model import Bounds
 from dptse_env.utils.fields import Interval, checked_fields
 
 Linearisation = Literal["paper", "trajectory"]
-NoiseComponent = Literal["psi", "w"]
 
 # Solvers of qpsolvers that report false optima of these programs as found.
 REFUSED_SOLVERS = ("highs",)
@@ -177,12 +176,7 @@ class EstimatorSettings:
 
     Attributes:
         process_noise: Standard deviations of the process noise of one step: of rho over rho_m, of
-            psi over rho_m v_f, or of w over v_f (`process_noise_in`).
-        process_noise_in: What the second number of `process_noise` belongs to: `psi`, or `w`, what
-            drivers carry with them. With `w`, vehicles that the noise adds drive like those that
-            are there, and an empty segment's psi is known: the noise of a segment has the
-            covariance [[a, w a], [w a, w^2 a + rho^2 b]] with a and b the variances of rho and w,
-            and rho and w those of the predicted mean. Not for the MHE, whose weights are separate.
+            psi over rho_m v_f.
         density_growth: Standard deviation, over rho_m, of a further process noise of rho at jam
             density; its variance is in proportion to rho.
         count_noise: Variance of a measured density beside the mechanism's noise, as a share of
@@ -211,7 +205,6 @@ class EstimatorSettings:
     """
 
     process_noise: tuple[Deviation, Deviation] = (0.01, 0.01)
-    process_noise_in: NoiseComponent = "psi"
     density_growth: Deviation = 0.0
     count_noise: Annotated[float, Interval(0, 100)] = 0.0
     demand: DemandSettings | None = None

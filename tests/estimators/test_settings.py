@@ -49,7 +49,6 @@ def test_settings_survive_json():
     settings = EstimatorSettings(
         process_noise=(0.1, 0.2),
         walk_noise=(0.3, 0.4),
-        process_noise_in="w",
         speed_cap=1.05,
         noise_scale=(1.5, 2.5),
         bounds="box",

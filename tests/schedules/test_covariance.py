@@ -214,10 +214,3 @@ def test_bad_inflations_are_named():
         CovarianceInflation(process_noise=(0.1, -0.1))
     with pytest.raises(ValueError, match=r"schedule\.horizon must be"):
         Rollout(make_batch().unwrapped.process, horizon=0)
-
-
-def test_noise_in_w_is_refused_where_the_schedule_would_need_it():
-    env = make_batch(estimator_settings={"process_noise_in": "w"})
-    with pytest.raises(ValueError, match=r"^estimator_settings\.process_noise_in must be 'psi'"):
-        make_schedule("greedy-trace", env)
-    make_schedule("inflated-trace", env)  # which has a process noise of its own

@@ -15,7 +15,6 @@ from dptse_env.estimators.compiled.algebra import (
     scratch_vectors,
     segment_update,
 )
-from dptse_env.estimators.compiled.driver_noise import add_coupling, couple
 from dptse_env.estimators.compiled.ekf_rows import (
     innovate,
     linearise,
@@ -51,8 +50,7 @@ class Filters(NamedTuple):
     priors: FloatArray  # (n, n_x) prior means
     innovations: FloatArray  # (n, M, 2)
     diverged: BoolArray  # (n,)
-    process_variance: FloatArray  # (n_x,) normalised; of psi, or of w
-    noise_in_w: bool  # whether it is of w
+    process_variance: FloatArray  # (n_x,) normalised
     growth_variance: float  # variance that rho / rho_m = 1 adds to the process noise of rho
     count_variance: FloatArray  # (M,) variance of densities beside the noise, over rho, normalised
     initial_variance: FloatArray  # (n_x,) normalised
@@ -68,7 +66,7 @@ def predict(road_: Packed, filters_: Packed, episodes: IntArray, inputs: FloatAr
     blocks, by_factor = np.empty((*road.neighbours.shape, 4)), scratch.by_factor
     size = filters.covariances.shape[1:]
     product, transposed = np.empty(size), np.empty(size)  # not one array: layouts stay known
-    noise, coupling = np.empty(filters.process_variance.size), np.empty(road.jam.size)
+    noise = np.empty(filters.process_variance.size)
     for k in range(episodes.size):
         mean = filters.means[episodes[k]]
         process_noise(road, filters, mean, noise)
@@ -76,21 +74,14 @@ def predict(road_: Packed, filters_: Packed, episodes: IntArray, inputs: FloatAr
         project(road, mean, filters.is_box)
         normalise(road, filters.density_scale, blocks, by_factor)
         covariance = filters.covariances[episodes[k]]
-        if filters.noise_in_w:
-            couple(road, filters.density_scale, mean, noise, coupling)
         propagate(road, blocks, by_factor, noise, covariance, product, transposed)
-        if filters.noise_in_w:
-            add_coupling(covariance, coupling)
 
 
 @kernel_part
 def process_noise(
     road: RoadArrays, filters: Filters, mean: FloatArray, variance: FloatArray
 ) -> None:
-    """Write the variances of the process noise of a step that leaves a mean `(n_x,)`.
-
-    Its second components are those of `process_variance`, psi or w.
-    """
+    """Write the variances of the process noise of a step that leaves a mean `(n_x,)`."""
     copy_vector(filters.process_variance, variance)
     if filters.growth_variance == 0.0:
         return

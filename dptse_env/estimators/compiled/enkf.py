@@ -57,7 +57,6 @@ class CompiledEnKF(BatchEstimator):
             innovations=self.innovations,
             diverged=self.diverged,
             process_deviation=np.sqrt(process_variance(model, settings)) * model.state_scale,
-            noise_in_w=settings.process_noise_in == "w",
             density_growth=float(settings.density_growth),
             count_variance=count_variance(model, settings),
             initial_deviation=np.sqrt(initial_variance(model, settings)) * model.state_scale,

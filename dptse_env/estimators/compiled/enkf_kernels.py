@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dptse_env.estimators.compiled.cholesky import solve
-from dptse_env.estimators.compiled.driver_noise import couple_members
 from dptse_env.estimators.compiled.ekf_kernels import Packed
 from dptse_env.estimators.compiled.enkf_local import (
     Near,
@@ -48,8 +47,7 @@ class Ensembles(NamedTuple):
     streams: NDArray[np.uint64]  # (n, 2, 4, STREAM_WIDTH) of process noise and of measurement noise
     innovations: FloatArray  # (n, M, 2)
     diverged: BoolArray  # (n,)
-    process_deviation: FloatArray  # (n_x,) of a step [veh/km, veh/h, 1]; of psi, or of rho_m w
-    noise_in_w: bool  # whether it is of w
+    process_deviation: FloatArray  # (n_x,) of a step [veh/km, veh/h, 1]
     density_growth: float  # deviation over rho_m that rho = rho_m adds to the noise of rho
     count_variance: FloatArray  # (M,) variance of densities beside the noise, over rho, normalised
     initial_deviation: FloatArray  # (n_x,) of the members around a prior [veh/km, veh/h, 1]
@@ -119,8 +117,6 @@ def predict(road_: Packed, ensembles_: Packed, episodes: IntArray, inputs: Float
         _process_deviation(road, ensembles, members, deviation)
         advance_states(road, members, inputs[k], scratch)
         fill(ensembles.streams[episodes[k], 0], draws, bits)
-        if ensembles.noise_in_w:
-            couple_members(road, ensembles.density_scale, members, n, deviation, draws)
         _perturb(members, n, deviation, draws)
         project_states(road, members, ensembles.is_box)
 

@@ -33,7 +33,6 @@ class CompiledFilter(BatchEstimator):
             innovations=self.innovations,
             diverged=self.diverged,
             process_variance=process_variance(model, settings),
-            noise_in_w=settings.process_noise_in == "w",
             growth_variance=float(settings.density_growth) ** 2,
             count_variance=count_variance(model, settings),
             initial_variance=initial_variance(model, settings),

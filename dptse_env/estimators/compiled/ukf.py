@@ -33,7 +33,6 @@ class CompiledUKF(CompiledFilter):
             states=np.zeros((n_episodes, n_states, padded(2 * n_states + 1))),
             centres=np.zeros((n_episodes, n_states)),
             noise=np.zeros((n_episodes, n_states)),
-            coupling=np.zeros((n_episodes, model.n_segments)),
             moved=np.zeros(n_episodes, dtype=np.bool_),
             scale=model.state_scale,
             weight=0.5 / spread,

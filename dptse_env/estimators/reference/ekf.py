@@ -10,7 +10,6 @@ from dptse_env.estimators.reference.kalman import (
     configure,
     linearise,
     measurement_covariance,
-    process_covariance,
     step_variance,
 )
 from dptse_env.estimators.settings import EstimatorSettings
@@ -44,7 +43,7 @@ class _Filter(ExtendedKalmanFilter):  # type: ignore[misc]
         jacobian = self.model.jacobian(before, inputs)[0]
         self.F = jacobian * self.scale[None] / self.scale[:, None]
         self.state = self.model.step(before, inputs)
-        self.Q = process_covariance(self, variance)
+        self.Q = np.diag(variance)
 
     def advance(self, u: FloatArray) -> None:
         self.predict(u)

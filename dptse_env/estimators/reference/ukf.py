@@ -9,7 +9,6 @@ from dptse_env.estimators.reference.kalman import (
     ReferenceFilter,
     configure,
     measurement_covariance,
-    process_covariance,
     step_variance,
 )
 from dptse_env.estimators.settings import EstimatorSettings
@@ -80,7 +79,7 @@ class _Filter(UnscentedKalmanFilter):  # type: ignore[misc]
     def advance(self, inputs: FloatArray) -> None:
         variance = step_variance(self)
         self.predict(inputs=inputs)
-        self.P += process_covariance(self, variance)
+        self.P += np.diag(variance)
         self.has_moved = True
 
     def assimilate(self, measured: EpisodeMeasurements) -> FloatArray:
