@@ -19,20 +19,12 @@ from dptse_env.estimators.compiled.ekf_rows import (
     innovate,
     linearise,
     make_rows,
-    measured,
     update_wide,
     variance_along,
 )
 from dptse_env.model.network import RoadArrays
-from dptse_env.model.parameters import (
-    LARGEST_FACTOR,
-    LARGEST_W,
-    LEAST_DENSITY,
-    LEAST_FACTOR,
-    LEAST_W,
-    VACUUM,
-)
-from dptse_env.model.step import advance, make_scratch, pressure
+from dptse_env.model.parameters import LARGEST_W, VACUUM
+from dptse_env.model.step import advance, clip, make_scratch, measured, normalise, pressure, project
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.kernel_loops import all_finite, any_of, copy_vector
 from dptse_env.utils.kernels import kernel, kernel_part
@@ -87,21 +79,6 @@ def process_noise(
         return
     for s in range(road.jam.size):
         variance[2 * s] += filters.growth_variance * mean[2 * s] / filters.density_scale
-
-
-@kernel_part
-def normalise(
-    road: RoadArrays, density_scale: float, blocks: FloatArray, by_factor: FloatArray
-) -> None:
-    """Normalise a step's derivatives: rho by rho_m, psi by rho_m v_f."""
-    v_f = road.free_flow_speed
-    for s in range(blocks.shape[0]):
-        for slot in range(blocks.shape[1]):
-            blocks[s, slot, 1] *= v_f
-            blocks[s, slot, 2] /= v_f
-    for e in range(by_factor.shape[0]):
-        by_factor[e, 0] /= density_scale
-        by_factor[e, 1] /= density_scale * v_f
 
 
 @kernel
@@ -172,24 +149,6 @@ def restart(filters: Filters, episode: int) -> None:
         covariance[i, i] = filters.initial_variance[i]
 
 
-@kernel_part
-def project(road: RoadArrays, mean: FloatArray, is_box: bool) -> None:
-    """Project a mean into its bounds, as `ARZModel.project`; a NaN stays NaN."""
-    v_f = road.free_flow_speed
-    for c in range(road.jam.size):
-        rho, psi, jam = mean[2 * c], mean[2 * c + 1], road.jam[c]
-        if is_box:
-            rho = _clip(rho, 0.0, jam)
-            low, high = 0.0, jam * v_f
-        else:
-            rho = _clip(rho, LEAST_DENSITY, jam)
-            least_w = max(pressure(rho, jam, v_f, road.gamma), LEAST_W * v_f)
-            low, high = least_w * rho, LARGEST_W * v_f * rho
-        mean[2 * c], mean[2 * c + 1] = rho, _clip(psi, low, high)
-    for i in range(2 * road.jam.size, mean.size):
-        mean[i] = _clip(mean[i], LEAST_FACTOR, LARGEST_FACTOR)
-
-
 @kernel
 def summarise(road_: Packed, filters_: Packed, out: FloatArray) -> None:
     """Write density, speed and their standard deviations to `out` `(4, n, S)`, physical units."""
@@ -217,15 +176,6 @@ def summarise_segment(
     _, by_rho, by_psi = measured(rho, psi, jam, v_f, road.gamma)
     variance = variance_along(covariance, at, by_rho * scale, by_psi * scale * v_f)
     out[0, e, s] = rho
-    out[1, e, s] = _clip(w - p, 0.0, LARGEST_W * v_f)
+    out[1, e, s] = clip(w - p, 0.0, LARGEST_W * v_f)
     out[2, e, s] = scale * np.sqrt(max(covariance[2 * at, 2 * at], 0.0))
     out[3, e, s] = np.sqrt(max(variance, 0.0))
-
-
-@kernel_part
-def _clip(value: float, low: float, high: float) -> float:
-    if value < low:
-        return low
-    if value > high:
-        return high
-    return value

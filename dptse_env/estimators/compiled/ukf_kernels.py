@@ -15,7 +15,6 @@ from dptse_env.estimators.compiled.ekf_kernels import (
     Filters,
     Packed,
     process_noise,
-    project,
     restart,
 )
 from dptse_env.estimators.compiled.sigma_points import Points, draw, gather
@@ -32,6 +31,7 @@ from dptse_env.model.columns import (
     project_states,
 )
 from dptse_env.model.network import RoadArrays
+from dptse_env.model.step import project
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.kernel_loops import all_finite, copy_matrix, copy_vector
 from dptse_env.utils.kernels import kernel, kernel_part
