@@ -50,7 +50,7 @@ def drivers(model: ARZModel, states: FloatArray) -> tuple[FloatArray, FloatArray
     v_f; elsewhere w is held to [0, 1.1 v_f].
     """
     rho, _ = model.components(states)
-    w = np.clip(model.cells(states).w, 0.0, model.largest_speed)
+    w = np.clip(model.w(states), 0.0, model.largest_speed)
     return np.maximum(rho, LEAST_DENSITY) / model.density_scale, w / model.speed_scale
 
 

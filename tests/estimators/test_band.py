@@ -8,7 +8,7 @@ import pytest
 from dptse_env.estimators import BACKENDS, DemandSettings, EstimatorSettings, make_estimator
 from dptse_env.estimators.localisation import Places, state_places
 from dptse_env.estimators.reference.band import DenseBand
-from dptse_env.model.compiled import CompiledARZModel
+from dptse_env.model import ARZModel
 from dptse_env.model.network import MeasurementRows
 from dptse_env.model.parameters import load_parameters
 
@@ -236,7 +236,7 @@ def rows_episodes(spans=(1, 3, 2, 1, 8)):
 
 def disturbed(road, rows=None):
     """Sixty steps of flows on a road, with noise in the state and the measurements."""
-    model = CompiledARZModel(
+    model = ARZModel(
         road, load_parameters("w99-3lane"), reference_speed=REFERENCE_SPEED, rows=rows
     )
     rng, n_steps, s = np.random.default_rng(0), 60, model.n_segments
