@@ -1,11 +1,18 @@
-"""Compiled kernels of the ARZ model: the next state of a state vector, and the sparse Jacobian.
+"""Compiled kernels of the ARZ model for one state: the next state, and the step's Jacobian.
 
-The equations are those of `dptse_env.model.model`, written for one cell at a time. A cell's outflow
-depends on at most three cells, its parties: itself and those at its downstream face. A step's
-Jacobian is a weighted sum of the outflows' gradients, by a table of the road.
+The pressure is p(rho) = v_f (rho / rho_m)^gamma (Aw-Rascle 2000, Zhang 2002). Along drivers of one
+w the flow is q_w(rho) = rho (w - p(rho)), largest at the critical density sigma(w) =
+rho_m (w / ((1 + gamma) v_f))^(1 / gamma): q_max(w) = sigma(w) w gamma / (1 + gamma). The demand of
+a cell is what it can send: q_w(rho) up to sigma(w), q_max(w) beyond. Its supply is what it can take
+in of drivers w: they reach the density rho_M = p^-1(w - v) at the cell's speed v, and rho_M v
+enters, unless rho_M is below sigma(w): then q_max(w).
 
-Kernels do not allocate: callers pass scratch space (`make_scratch`), so that a kernel can run
-inside another, once per step and episode.
+A cell's outflow depends on at most three cells, its parties: itself and those at its downstream
+face. A step's Jacobian is a weighted sum of the outflows' gradients, by a table of the road. At a
+kink, demand = supply, it takes the side of the demand.
+
+Parts do not allocate: callers pass scratch space (`make_scratch`), so that a part can run inside a
+kernel, once per step and episode.
 """
 
 from typing import NamedTuple
@@ -24,7 +31,7 @@ from dptse_env.model.parameters import (
     VACUUM,
 )
 from dptse_env.utils.arrays import FloatArray
-from dptse_env.utils.kernels import kernel_part
+from dptse_env.utils.kernels import kernel, kernel_part
 
 # Columns of the table of cells: values, then partial derivatives by the cell's rho and psi.
 _W, _V, _D, _W_RHO, _W_PSI, _V_RHO, _V_PSI, _D_RHO, _D_PSI = range(9)
@@ -308,6 +315,39 @@ def advance(
         start, party = road.terms[m, 2], road.terms[m, 3]
         for k in range(4):
             blocks[row, slot, k] += road.term_weight[m] * gradient[start, party, k]
+
+
+@kernel
+def next_states(
+    road: RoadArrays, states: FloatArray, inputs: FloatArray, after: FloatArray
+) -> None:
+    """Write the states (n, n_x) one step after `states` (n, n_x) under `inputs` (n, n_u)."""
+    scratch = make_scratch(road)
+    blocks = np.empty((*road.neighbours.shape, 4))
+    for i in range(states.shape[0]):
+        advance(road, states[i], inputs[i], after[i], blocks, scratch)
+
+
+@kernel
+def jacobians(
+    road: RoadArrays, states: FloatArray, inputs: FloatArray, derivatives: FloatArray
+) -> None:
+    """Write the derivatives of a step of `states` into zeros, shape (n, n_x, n_x)."""
+    scratch = make_scratch(road)
+    blocks = np.empty((*road.neighbours.shape, 4))
+    after = np.empty(states.shape[1])
+    for i in range(states.shape[0]):
+        advance(road, states[i], inputs[i], after, blocks, scratch)
+        for c in range(road.jam.size):
+            for slot in range(road.degree[c]):
+                b = road.neighbours[c, slot]
+                for k in range(4):
+                    derivatives[i, 2 * c + k // 2, 2 * b + k % 2] = blocks[c, slot, k]
+        for j in range(2 * road.jam.size, after.size):
+            e = j - 2 * road.jam.size
+            derivatives[i, j, j] = 1.0
+            for k in range(2):
+                derivatives[i, 2 * road.entries[e] + k, j] = scratch.by_factor[e, k]
 
 
 @kernel_part
