@@ -28,7 +28,7 @@ from dptse_env.utils.arrays import FloatArray
 from scripts.cli import run
 
 WARM_UP = 300  # [s] of the record, while the road fills
-EXPONENTS = {"ekf": 1.15, "ukf": 1.3, "enkf": 1.15, "mhe": 1.3, "recurrent": 1.15}
+EXPONENTS = {"ekf": 1.15, "ukf": 1.3, "enkf": 1.25, "mhe": 1.3, "recurrent": 1.15}
 """Largest exponent that is aimed at, of estimators whose covariances reach a band."""
 
 
@@ -42,8 +42,6 @@ class Args:
     """Mainline segments of the roads, ascending."""
     band: int | None = 10
     """Band of the covariances [segments]; "None" for all of the road."""
-    taper: float | None = 1.0
-    """Reach of the EnKF's taper [km]; "None" for all of the road."""
     parameters: str = "w99-3lane"
     """ARZ parameter set."""
     steps: int = 100
@@ -69,7 +67,6 @@ def measure(args: Args) -> dict[str, FloatArray]:
         settings = replace(
             replay.settings,
             band=args.band,
-            enkf=replace(replay.settings.enkf, taper=args.taper),
             recurrent=replace(replay.settings.recurrent, outside=True),
         )
         for name in args.estimators:

@@ -9,7 +9,6 @@ from dptse_env.estimators.base import Estimate
 from dptse_env.estimators.batch import BatchEstimator, Measurements
 from dptse_env.estimators.compiled import enkf_kernels as kernels
 from dptse_env.estimators.compiled.algebra import padded
-from dptse_env.estimators.compiled.enkf_local import make_near
 from dptse_env.estimators.compiled.normals import STREAM_WIDTH, make_stream
 from dptse_env.estimators.localisation import RowTapers, row_tapers
 from dptse_env.estimators.noise import count_variance, initial_variance, process_variance
@@ -30,8 +29,7 @@ class CompiledEnKF(BatchEstimator):
     Options, off by default (`EnsembleSettings`): `inflation` moves members away from their mean
     before every update that has measurements, and projects them; `taper` weighs the sampled
     covariances by distance, those of outputs with states and those among outputs. An S with
-    covariances that the gain neglects would give the measurements too little weight. On a road more
-    than twice as long as the taper's reach only what it leaves is computed.
+    covariances that the gain neglects would give the measurements too little weight.
 
     The noise that depends on the density (`EstimatorSettings.density_growth` and `count_noise`)
     has the variance at the ensemble's mean for all members.
@@ -46,7 +44,6 @@ class CompiledEnKF(BatchEstimator):
         priors = model.project(model.compose(nothing, nothing), settings.bounds)
         taper, none = settings.enkf.taper, np.empty((0, 0))
         weights = RowTapers(none, none) if taper is None else row_tapers(model, taper)
-        reach = np.inf if taper is None else taper
         self.n_members = settings.enkf.n_members
         self._road = tuple(make_road_arrays(model))
         self._ensembles = kernels.Ensembles(
@@ -65,7 +62,6 @@ class CompiledEnKF(BatchEstimator):
             inflation=settings.enkf.inflation,
             tapers=weights.with_states,
             row_tapers=weights.among_rows,
-            near=make_near(model, weights, reach),
             is_box=settings.bounds == "box",
         )
         self._packed = tuple(self._ensembles)

@@ -14,12 +14,6 @@ from numpy.typing import NDArray
 from dptse_env.estimators.compiled.cholesky import solve
 from dptse_env.estimators.compiled.driver_noise import couple_members
 from dptse_env.estimators.compiled.ekf_kernels import Packed
-from dptse_env.estimators.compiled.enkf_local import (
-    Near,
-    joint_band,
-    move_members,
-    solve_band,
-)
 from dptse_env.estimators.compiled.moments import centre_row, is_finite, mean_of, moments_of
 from dptse_env.estimators.compiled.normals import Bits, Draws, fill, make_bits
 from dptse_env.estimators.compiled.row_outputs import average_outputs
@@ -57,7 +51,6 @@ class Ensembles(NamedTuple):
     inflation: float  # factor on distances from the mean before an update
     tapers: FloatArray  # (M, n_x) weights of covariances of rows with states; (0, 0) for none
     row_tapers: FloatArray  # (M, M) weights of covariances among rows; (0, 0) for none
-    near: Near  # what the tapers leave of a long road; empty where they leave most of it
     is_box: bool  # whether members are projected into the paper's box, not the cone
 
 
@@ -210,10 +203,6 @@ def _update_members(
     states = np.zeros(((members.shape[0] + 7) // 8 * 8, width))
     for i in range(members.shape[0]):
         centre_row(members[i], n, 1.0, states[i])
-    if ensembles.near.rank.size > 0:
-        return _update_locally(
-            ensembles, e, measured.rows, distances, states, differences, noise, residuals
-        )
     joint, gain = np.dot(distances, distances.T), np.dot(distances, states.T)
     if ensembles.tapers.size > 0:
         _taper(ensembles, measured.rows, joint, gain)
@@ -231,29 +220,6 @@ def _update_members(
         row, step = members[i], shift[i]
         for j in range(width):
             row[j] += inverse * step[j]
-    return is_finite(members)
-
-
-@kernel_part(kept=True)
-def _update_locally(
-    ensembles: Ensembles,
-    e: int,
-    rows: IntArray,
-    distances: FloatArray,
-    states: FloatArray,
-    differences: FloatArray,
-    noise: FloatArray,
-    residuals: FloatArray,
-) -> bool:
-    """Do as `_update_members` with what the tapers leave of a long road."""
-    near, members, inverse = ensembles.near, ensembles.members[e], 1.0 / (ensembles.n_members - 1)
-    outputs, first, band = joint_band(near, ensembles.row_tapers, rows, distances, noise, inverse)
-    for i in range(outputs.size):
-        r, deviation = outputs[i], np.sqrt(band[i, band.shape[1] - 1])
-        ensembles.innovations[e, rows[r // 2], r % 2] = differences[r] / deviation
-    if not solve_band(outputs, first, band, residuals):
-        return False
-    move_members(near, ensembles.tapers, rows, distances, states, residuals, inverse, members)
     return is_finite(members)
 
 
