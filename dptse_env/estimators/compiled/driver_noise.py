@@ -6,7 +6,7 @@ With `psi = rho w`, independent deviations of rho and w are to first order devia
 """
 
 from dptse_env.estimators.compiled.moments import mean_of
-from dptse_env.estimators.compiled.normals import Draws
+from dptse_env.estimators.normals import Draws
 from dptse_env.model.network import RoadArrays
 from dptse_env.model.parameters import LARGEST_W, LEAST_DENSITY, VACUUM
 from dptse_env.utils.arrays import FloatArray
