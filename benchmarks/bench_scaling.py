@@ -39,8 +39,6 @@ class Args:
     """Estimators to measure."""
     lengths: tuple[int, ...] = (30, 60, 120, 200)
     """Mainline segments of the roads, ascending."""
-    taper: float | None = 1.0
-    """Reach of the EnKF's taper [km]; "None" for all of the road."""
     parameters: str = "w99-3lane"
     """ARZ parameter set."""
     steps: int = 100
@@ -65,7 +63,6 @@ def measure(args: Args) -> dict[str, FloatArray]:
         replay = replay_of(config, 1, args.steps, WARM_UP)
         settings = replace(
             replay.settings,
-            enkf=replace(replay.settings.enkf, taper=args.taper),
             recurrent=replace(replay.settings.recurrent, outside=True),
         )
         for name in args.estimators:

@@ -45,7 +45,9 @@ ESTIMATORS = Registry(
     {
         "ekf": _filter("ekf", "EKF"),
         "ukf": _filter("ukf", "UKF"),
-        "enkf": _filter("enkf", "EnKF"),
+        "enkf": Backends(
+            "dptse_env.estimators.enkf:EnKF", "dptse_env.estimators.reference.enkf:ReferenceEnKF"
+        ),
         "mhe": _filter("mhe", "MHE"),
         "random_walk": Backends(_WALK, _WALK),
         "blend": _filter("blend", "Blend"),

@@ -252,7 +252,11 @@ class _KernelCache(FunctionCache):
     def _loaded(self, signature: Any, context: Any) -> Any:
         if self._cache_file is None:
             self._cache_file = IndexDataCacheFile(self._cache_path, self._file_name, self._digest)
-        kept = super().load_overload(signature, context)
+        try:
+            kept = super().load_overload(signature, context)
+        except (ImportError, AttributeError):  # kept for a type that has moved or is no more
+            self._cache_file.flush()
+            return None
         if kept is not None:
             _touch(Path(self.cache_path), self._file_name)
         return kept

@@ -34,7 +34,7 @@ class _Streams(NamedTuple):
 class ReferenceEnKF(BatchEstimator):
     """Ensemble Kalman filter with perturbed observations (Evensen, 2003; Burgers et al., 1998).
 
-    Equal to `CompiledEnKF` in distribution; its random numbers differ.
+    Equal to `EnKF` in distribution; its random numbers differ.
 
     Attributes:
         members: `(n, n_members, n_x)` [veh/km, veh/h], then demand factors if there are any.
