@@ -8,7 +8,6 @@ import numpy as np
 from dptse_env.estimators.base import Backend, Estimate, Estimator
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
-from dptse_env.utils import compile_ahead
 from dptse_env.utils.registry import Registry, is_foreign, missing_methods, name_of_class
 
 
@@ -106,8 +105,6 @@ def make_estimator(
             model.network, model.parameters, model.time_step, model.reference_speed, model.rows,
             has_demand,
         )  # fmt: skip
-    if isinstance(estimator, str):
-        compile_ahead.expect(estimator)
     factory = resolve_name(getattr(part, backend)) if isinstance(part, Backends) else part
     made: Estimator = factory(model, n_episodes, settings)
     if is_foreign(made):

@@ -30,7 +30,6 @@ from dptse_env.schedules.fixed import (
 from dptse_env.schedules.front import SpeedFront
 from dptse_env.schedules.oracles import OracleBruteForce, OracleError, OracleGain, OracleGreedy
 from dptse_env.schedules.plans import (
-    PLAN_ALIASES,
     PLANS,
     Plan,
     PlanContext,
@@ -136,7 +135,6 @@ SCHEDULES = Registry(
         **ORACLES,
     },
     check=_expected,
-    aliases={"wary-trace": "inflated-trace", **PLAN_ALIASES},
 )
 """All schedules by name."""
 

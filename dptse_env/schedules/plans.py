@@ -22,9 +22,6 @@ from dptse_env.utils.json_object import parse_object, shipped_texts
 PLANS = ("best-static", "optimised-plan")
 """Kinds of plans: a single set, or a periodic sequence of sets."""
 
-PLAN_ALIASES = {"offline": "optimised-plan"}
-"""Former names of kinds."""
-
 
 @dataclass(frozen=True)
 class PlanContext:
@@ -164,7 +161,7 @@ def _first_with(plan: Plan, segment: int) -> int:
 
 def _parse(text: str | bytes, path: str) -> Plan:
     content = parse_object(text, path, _KEYS)
-    kind = PLAN_ALIASES.get(content["kind"], content["kind"])
+    kind = content["kind"]
     if kind not in PLANS:
         raise ValueError(f"{path}: kind must be one of {', '.join(PLANS)}, got {kind!r}")
     keys = ("corridor", "digest", "estimator", "bandwidth")
