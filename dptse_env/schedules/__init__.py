@@ -39,7 +39,6 @@ from dptse_env.schedules.plans import (
     read_plan,
 )
 from dptse_env.schedules.reduction import ExpectedReduction
-from dptse_env.schedules.rollout import Rollout
 from dptse_env.utils.registry import Registry, name_of_class
 
 __all__ = [
@@ -70,7 +69,6 @@ __all__ = [
     "Planned",
     "ProcessSchedule",
     "Random",
-    "Rollout",
     "Schedule",
     "ScheduleState",
     "Shifting",
@@ -104,10 +102,9 @@ COVARIANCE_SCHEDULES: dict[str, type[ProcessSchedule]] = {
     "greedy-trace": GreedyTrace,
     "greedy-logdet": GreedyLogdet,
     "inflated-trace": InflatedTrace,
-    "rollout": Rollout,
 }
 """Schedules that use the estimator's covariance, each made of (process, seed); a step costs one or
-two steps of the EKF, of ``rollout`` some hundred."""
+two steps of the EKF."""
 
 ORACLES: dict[str, type[ProcessSchedule]] = {
     "oracle-error": OracleError,

@@ -13,11 +13,10 @@ from dptse_env.schedules.covariance_kernels import (
     hold_speeds,
     look_ahead,
     make_work,
-    step,
     to_traffic,
 )
 from dptse_env.utils.arrays import BoolArray, FloatArray
-from dptse_env.utils.kernel_loops import copy_matrix, copy_vector
+from dptse_env.utils.kernel_loops import copy_matrix
 from dptse_env.utils.kernels import kernel, kernel_part
 
 TRACE, LOGDET = 0, 1
@@ -139,93 +138,3 @@ def _gain(
     g22 = a * a * xx + 2.0 * a * b * xy + b * b * yy
     ratio = s12 / s11
     return float(g11 / s11 + (g22 - 2.0 * ratio * g12 + ratio * ratio * g11) / left)
-
-
-@kernel
-def choose_by_swaps(
-    road_: Packed,
-    problem_: Packed,
-    horizon: int,
-    means: FloatArray,
-    covariances: FloatArray,
-    inputs: FloatArray,
-    queried: BoolArray,
-) -> None:
-    """Pick greedily by the trace, then choose the best of all single swaps over a horizon.
-
-    Arguments are those of `choose_greedily`, and the horizon in steps, including the coming one.
-    `covariances` are always replaced by those after the coming step.
-    """
-    road, problem = RoadArrays(*road_), Problem(*problem_)
-    work, after = make_work(road, problem), np.empty(covariances.shape[1:])
-    scratch, ahead, best = make_scratch(road), np.empty_like(after), np.empty_like(after)
-    for k in range(means.shape[0]):
-        look_ahead(road, problem, means[k], covariances[k], inputs[k], work, scratch)
-        condition(problem, problem.always, work.covariance, work)
-        copy_matrix(work.covariance, ahead)
-        to_traffic(problem, ahead, work)
-        hold_speeds(problem, work)
-        pick(problem, TRACE, work, queried[k])
-        base = queried[k].copy()
-        least = _roll_out(road, problem, horizon, base, ahead, after, best, work)
-        for out in np.flatnonzero(base):
-            for s in problem.can_query:
-                if base[s]:
-                    continue
-                tried = base.copy()
-                tried[out], tried[s] = False, True
-                value = _roll_out(
-                    road, problem, horizon, tried, ahead, after, work.covariance, work
-                )
-                if value < least:
-                    least = value
-                    copy_vector(tried, queried[k])
-                    copy_matrix(work.covariance, best)
-        copy_matrix(best, covariances[k])
-
-
-@kernel_part
-def _roll_out(
-    road: RoadArrays,
-    problem: Problem,
-    horizon: int,
-    queried: BoolArray,
-    ahead: FloatArray,
-    after: FloatArray,
-    first: FloatArray,
-    work: Work,
-) -> float:
-    """Return the sum of weighted traces over the horizon; write the coming step's P to `first`."""
-    copy_matrix(ahead, after)
-    condition(problem, np.flatnonzero(queried), after, work)
-    copy_matrix(after, first)
-    total = _spread(problem, after, work)
-    for _ in range(horizon - 1):
-        step(road, problem, after, work)
-        condition(problem, problem.always, after, work)
-        _spread(problem, after, work)
-        # Afterwards segments are queried by the largest weighted variance.
-        for _ in range(min(problem.bandwidth, problem.can_query.size)):
-            best, largest = -1, -np.inf
-            for s in problem.can_query:
-                if work.sums[0, s] > largest:
-                    best, largest = s, work.sums[0, s]
-            work.sums[0, best] = -np.inf
-            work.sums[1, best] = 1.0
-        condition(problem, np.flatnonzero(work.sums[1]), after, work)
-        total += _spread(problem, after, work)
-    return total
-
-
-@kernel_part
-def _spread(problem: Problem, covariance: FloatArray, work: Work) -> float:
-    """Return the weighted trace; write each segment's share of it, and zeros, to `work.sums`."""
-    n, d, total = problem.n_mainline, 1.0 / problem.units[0], 0.0
-    for s in range(n):
-        p, q = work.to_speed[s, 0], work.to_speed[s, 1]
-        x, y = covariance[2 * s, 2 * s], covariance[2 * s, 2 * s + 1]
-        speed = p * p * x + 2.0 * p * q * y + q * q * covariance[2 * s + 1, 2 * s + 1]
-        work.sums[0, s] = work.weights[s] * d * d * x + work.weights[n + s] * speed
-        work.sums[1, s] = 0.0
-        total += work.sums[0, s]
-    return total

@@ -1,4 +1,4 @@
-"""Greedy and rollout against plain numpy: explicit Kalman updates of the whole state."""
+"""Greedy designs against plain numpy: explicit Kalman updates of the whole state."""
 
 import itertools
 
@@ -13,7 +13,6 @@ from dptse_env.schedules.covariance import (
     GreedyTrace,
     InflatedTrace,
 )
-from dptse_env.schedules.rollout import Rollout
 from tests.cases import fast_and_slow
 
 from .playing import begin, make_batch
@@ -100,17 +99,6 @@ class Plain:
             queried.append(min(left, key=lambda s: cost([*queried, s])))
         return sorted(queried)
 
-    def rolled_out(self, queried, horizon):
-        P = self.after(queried)
-        total = self.shares(P).sum()
-        for _ in range(horizon - 1):
-            P = self.F @ P @ self.F.T + self.Q
-            value = self.shares(self.after([], P))
-            value[[s for s in self.fixed if s < self.n]] = -np.inf
-            P = self.after(np.argsort(-value)[: len(queried)].tolist(), P)
-            total += self.shares(P).sum()
-        return total
-
 
 def states(env, n_steps=12):
     """Yield the observations of an episode under a random schedule, second by second."""
@@ -180,26 +168,6 @@ def test_what_is_left_is_the_explicit_posterior():
         observation = env.step(action)[0]
 
 
-def test_rollout_takes_the_best_single_swap():
-    env = make_batch()
-    inflation, improved = INFLATIONS["noisy"], 0
-    for observation in states(env):
-        schedule = Rollout(env.unwrapped.process, inflation=inflation, horizon=4)
-        for episode, queried in enumerate(chosen(schedule, observation)):
-            plain = Plain(env, episode, inflation)
-            base = plain.greedy(2, plain.trace)
-            swaps = [
-                sorted({*base} - {out} | {into})
-                for out in base
-                for into in range(plain.n)
-                if into not in {*base, *plain.fixed}
-            ]
-            best = min([base, *swaps], key=lambda one: plain.rolled_out(one, 4))
-            assert queried == best
-            improved += queried != base
-    assert improved > 0
-
-
 def test_an_estimator_without_a_covariance_is_refused():
     env = make_batch(estimator="open_loop")
     for name in COVARIANCE_SCHEDULES:
@@ -212,8 +180,6 @@ def test_bad_inflations_are_named():
         CovarianceInflation(speed_cap=0.0)
     with pytest.raises(ValueError, match=r"inflation\.process_noise\[1\] must be"):
         CovarianceInflation(process_noise=(0.1, -0.1))
-    with pytest.raises(ValueError, match=r"schedule\.horizon must be"):
-        Rollout(make_batch().unwrapped.process, horizon=0)
 
 
 def test_noise_in_w_is_refused_where_the_schedule_would_need_it():
