@@ -46,7 +46,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
 }
 SCHEDULES = (
     "static", "paper", "round-robin", "random", "oldest-first", "largest-variance",
-    "largest-density-variance", "stale-variance", "none", "greedy-trace", "greedy-logdet",
+    "largest-density-variance", "stale-variance", "none", "greedy-trace",
     "inflated-trace", "oracle-error", "oracle-greedy", "oracle-brute-force",
 )  # fmt: skip
 SECONDS = 60

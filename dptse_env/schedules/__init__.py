@@ -12,8 +12,6 @@ from dptse_env.schedules.base import ProcessSchedule, Schedule, ScheduleState
 from dptse_env.schedules.covariance import (
     CovarianceInflation,
     CovarianceSchedule,
-    Greedy,
-    GreedyLogdet,
     GreedyTrace,
     InflatedTrace,
 )
@@ -52,8 +50,6 @@ __all__ = [
     "CovarianceSchedule",
     "Everything",
     "ExpectedReduction",
-    "Greedy",
-    "GreedyLogdet",
     "GreedyTrace",
     "InflatedTrace",
     "LargestDeviation",
@@ -100,7 +96,6 @@ DEVIATION_SCHEDULES: dict[str, type[ProcessSchedule]] = {"expected-reduction": E
 
 COVARIANCE_SCHEDULES: dict[str, type[ProcessSchedule]] = {
     "greedy-trace": GreedyTrace,
-    "greedy-logdet": GreedyLogdet,
     "inflated-trace": InflatedTrace,
 }
 """Schedules that use the estimator's covariance, each made of (process, seed); a step costs one or

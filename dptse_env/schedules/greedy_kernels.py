@@ -19,14 +19,11 @@ from dptse_env.utils.arrays import BoolArray, FloatArray
 from dptse_env.utils.kernel_loops import copy_matrix
 from dptse_env.utils.kernels import kernel, kernel_part
 
-TRACE, LOGDET = 0, 1
-
 
 @kernel
 def choose_greedily(
     road_: Packed,
     problem_: Packed,
-    criterion: int,
     keeps: bool,
     means: FloatArray,
     covariances: FloatArray,
@@ -38,7 +35,6 @@ def choose_greedily(
     Args:
         road_: The `RoadArrays`.
         problem_: The `Problem`.
-        criterion: TRACE or LOGDET.
         keeps: Whether to replace `covariances` by those after the coming step.
         means: Present states, shape (k, 2 S) [veh/km, veh/h].
         covariances: Their normalised covariances, shape (k, 2 S, 2 S).
@@ -53,14 +49,14 @@ def choose_greedily(
         condition(problem, problem.always, work.covariance, work)
         to_traffic(problem, work.covariance, work)
         hold_speeds(problem, work)
-        pick(problem, criterion, work, queried[k])
+        pick(problem, work, queried[k])
         if keeps:
             condition(problem, np.flatnonzero(queried[k]), work.covariance, work)
             copy_matrix(work.covariance, covariances[k])
 
 
 @kernel_part
-def pick(problem: Problem, criterion: int, work: Work, queried: BoolArray) -> None:
+def pick(problem: Problem, work: Work, queried: BoolArray) -> None:
     """Pick B segments, each with the largest gain given those before."""
     n, bandwidth, can_query, noise = (
         problem.n_mainline, problem.bandwidth, problem.can_query, problem.noise,
@@ -77,7 +73,7 @@ def pick(problem: Problem, criterion: int, work: Work, queried: BoolArray) -> No
         for j in range(can_query.size):
             s = can_query[j]
             if not queried[s]:
-                gain = _gain(n, criterion, s, traffic, rows, weights, noise)
+                gain = _gain(n, s, traffic, rows, weights, noise)
                 if gain > largest or best < 0:
                     best, largest = s, gain
         queried[best] = True
@@ -113,14 +109,13 @@ def _products(
 @kernel_part
 def _gain(
     n: int,
-    criterion: int,
     s: int,
     traffic: FloatArray,
     rows: FloatArray,
     weights: FloatArray,
     noise: FloatArray,
 ) -> float:
-    """Reduction of the weighted trace, or of the log determinant, by querying a segment.
+    """Return by how much a query of a segment reduces the weighted trace.
 
     Arrays are separate arguments: reference counts of a tuple would take more time than the
     arithmetic.
@@ -131,8 +126,6 @@ def _gain(
     s12 = f * (a * x + b * y)
     s22 = a * a * x + 2.0 * a * b * y + b * b * z + noise[1]
     left = s22 - s12 * s12 / s11
-    if criterion == LOGDET:
-        return float(np.log(s11 * left / (noise[0] * noise[1])))
     xx, xy, yy = _products(n, s, traffic, weights)
     g11, g12 = f * f * xx, f * (a * xx + b * xy)
     g22 = a * a * xx + 2.0 * a * b * xy + b * b * yy
