@@ -27,15 +27,6 @@ from dptse_env.schedules.fixed import (
 )
 from dptse_env.schedules.front import SpeedFront
 from dptse_env.schedules.oracles import OracleBruteForce, OracleError, OracleGain, OracleGreedy
-from dptse_env.schedules.plans import (
-    PLAN_ALIASES,
-    PLANS,
-    Plan,
-    PlanContext,
-    Planned,
-    find_plan,
-    read_plan,
-)
 from dptse_env.schedules.reduction import ExpectedReduction
 from dptse_env.utils.registry import Registry, name_of_class
 
@@ -44,7 +35,6 @@ __all__ = [
     "DEVIATION_SCHEDULES",
     "OBSERVATION_SCHEDULES",
     "ORACLES",
-    "PLANS",
     "SCHEDULES",
     "CovarianceInflation",
     "CovarianceSchedule",
@@ -60,9 +50,6 @@ __all__ = [
     "OracleError",
     "OracleGain",
     "OracleGreedy",
-    "Plan",
-    "PlanContext",
-    "Planned",
     "ProcessSchedule",
     "Random",
     "Schedule",
@@ -124,11 +111,10 @@ SCHEDULES = Registry(
         **OBSERVATION_SCHEDULES,
         **DEVIATION_SCHEDULES,
         **COVARIANCE_SCHEDULES,
-        **dict.fromkeys(PLANS),
         **ORACLES,
     },
     check=_expected,
-    aliases={"wary-trace": "inflated-trace", **PLAN_ALIASES},
+    aliases={"wary-trace": "inflated-trace"},
 )
 """All schedules by name."""
 
@@ -137,9 +123,8 @@ def make_schedule(schedule: Any, env: Any, seed: int | None = None) -> Any:
     """Return a schedule for an environment.
 
     Args:
-        schedule: A name in `SCHEDULES`, the path of a plan, a file whose name ends in ``.json``,
-            ``"package.module:Class"``, a subclass of `Schedule`, or an object with ``predict``,
-            which is returned as it is.
+        schedule: A name in `SCHEDULES`, ``"package.module:Class"``, a subclass of `Schedule`, or
+            an object with ``predict``, which is returned as it is.
         env: An environment of this package, scalar or vector, wrapped or not.
         seed: Seed of the schedule's random choices.
 
@@ -147,11 +132,6 @@ def make_schedule(schedule: Any, env: Any, seed: int | None = None) -> Any:
         ValueError: The name is unknown or the schedule does not suit the environment.
     """
     env = env.unwrapped
-    if isinstance(schedule, str) and schedule.endswith(".json"):
-        return Planned(env.process, read_plan(schedule), seed)
-    name = SCHEDULES.name_of(schedule)
-    if name in PLANS:
-        return Planned(env.process, find_plan(name, PlanContext.from_config(env.config)), seed)
     part = SCHEDULES.find(schedule)
     if not isinstance(part, type | partial):
         return part

@@ -8,7 +8,6 @@ from dptse_env.schedules import (
     DEVIATION_SCHEDULES,
     OBSERVATION_SCHEDULES,
     ORACLES,
-    PLANS,
     ProcessSchedule,
     make_schedule,
 )
@@ -99,4 +98,4 @@ def test_only_oracles_use_the_truth():
     names = [*sorted(set(OBSERVATION_SCHEDULES) - {"all"}), *BOUND[: -len(ORACLES)]]
     assert not any(make_schedule(name, env).uses_truth for name in names)
     assert all(make_schedule(name, env).uses_truth for name in ORACLES)
-    assert not set(ORACLES) & {*OBSERVATION_SCHEDULES, *COVARIANCE_SCHEDULES, *PLANS}
+    assert not set(ORACLES) & {*OBSERVATION_SCHEDULES, *COVARIANCE_SCHEDULES}
