@@ -26,7 +26,7 @@ from dptse_env.schedules.fixed import (
     StaleVariance,
 )
 from dptse_env.schedules.front import SpeedFront
-from dptse_env.schedules.oracles import OracleBruteForce, OracleError, OracleGain, OracleGreedy
+from dptse_env.schedules.oracles import OracleError, OracleGain
 from dptse_env.schedules.reduction import ExpectedReduction
 from dptse_env.utils.registry import Registry, name_of_class
 
@@ -46,10 +46,8 @@ __all__ = [
     "LargestVariance",
     "Nothing",
     "OldestFirst",
-    "OracleBruteForce",
     "OracleError",
     "OracleGain",
-    "OracleGreedy",
     "ProcessSchedule",
     "Random",
     "Schedule",
@@ -91,8 +89,6 @@ two steps of the EKF."""
 ORACLES: dict[str, type[ProcessSchedule]] = {
     "oracle-error": OracleError,
     "oracle-gain": OracleGain,
-    "oracle-greedy": OracleGreedy,
-    "oracle-brute-force": OracleBruteForce,
 }
 """Bounds that use the truth, each made of (process, seed); they are not policies."""
 

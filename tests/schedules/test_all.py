@@ -20,7 +20,7 @@ BOUND = [*DEVIATION_SCHEDULES, *COVARIANCE_SCHEDULES, *ORACLES]
 NAMES = [*sorted(set(OBSERVATION_SCHEDULES) - {"none", "all"}), *BOUND]
 KINDS = (
     "round-robin", "oldest-first", "speed-front", "expected-reduction", "inflated-trace",
-    "oracle-greedy",
+    "oracle-gain",
 )  # fmt: skip
 """One for each way to choose: by the clock, by observations, by a memory, and by the process."""
 
