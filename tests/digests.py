@@ -47,7 +47,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
 SCHEDULES = (
     "static", "paper", "round-robin", "random", "oldest-first", "largest-variance",
     "largest-density-variance", "stale-variance", "none", "greedy-trace",
-    "inflated-trace", "oracle-error",
+    "oracle-error",
 )  # fmt: skip
 SECONDS = 60
 EPISODES = 3

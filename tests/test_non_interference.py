@@ -144,7 +144,7 @@ def test_traffic_does_not_show(estimator, action):
 
 SCHEDULES = [
     ("round-robin", "private"), ("stale-variance", "nominal"), ("speed-front", "private"),
-    ("expected-reduction", "nominal"), ("inflated-trace", "private"),
+    ("expected-reduction", "nominal"), ("greedy-trace", "private"),
 ]  # fmt: skip
 EVERY_SCHEDULE = list(itertools.product(BLIND_SCHEDULES, ["nominal", "private"]))
 

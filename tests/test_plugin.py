@@ -179,8 +179,6 @@ def test_former_names_serve_with_a_warning():
     with pytest.warns(DeprecationWarning, match="'guaranteed' is now called 'capped'"):
         env = gym.make(SHORT, privacy="guaranteed")
     assert env.unwrapped.config.privacy.preset == "capped"
-    with pytest.warns(DeprecationWarning, match="'wary-trace' is now called 'inflated-trace'"):
-        make_schedule("wary-trace", env)
     with pytest.warns(DeprecationWarning, match="now called 'ekf-w99-3lane-capped'"):
         gym.make(SHORT, estimator_settings="ekf-w99-3lane-guaranteed")
 

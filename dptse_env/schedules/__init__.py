@@ -13,7 +13,6 @@ from dptse_env.schedules.covariance import (
     CovarianceInflation,
     CovarianceSchedule,
     GreedyTrace,
-    InflatedTrace,
 )
 from dptse_env.schedules.fixed import (
     Everything,
@@ -41,7 +40,6 @@ __all__ = [
     "Everything",
     "ExpectedReduction",
     "GreedyTrace",
-    "InflatedTrace",
     "LargestDeviation",
     "LargestVariance",
     "Nothing",
@@ -81,7 +79,6 @@ DEVIATION_SCHEDULES: dict[str, type[ProcessSchedule]] = {"expected-reduction": E
 
 COVARIANCE_SCHEDULES: dict[str, type[ProcessSchedule]] = {
     "greedy-trace": GreedyTrace,
-    "inflated-trace": InflatedTrace,
 }
 """Schedules that use the estimator's covariance, each made of (process, seed); a step costs one or
 two steps of the EKF."""
@@ -110,7 +107,6 @@ SCHEDULES = Registry(
         **ORACLES,
     },
     check=_expected,
-    aliases={"wary-trace": "inflated-trace"},
 )
 """All schedules by name."""
 

@@ -78,7 +78,7 @@ class CovarianceSchedule(ProcessSchedule):
         process: QueryProcess,
         seed: int | None = None,
         *,
-        inflation: CovarianceInflation = NO_INFLATION,
+        inflation: CovarianceInflation = INFLATED,
     ) -> None:
         """Bind the schedule to a process (``env.unwrapped.process``).
 
@@ -151,8 +151,12 @@ class GreedyTrace(CovarianceSchedule):
     has the largest trace of that reduction, weighted as in `CovarianceInflation`. The full trace is
     the squared error that the estimator expects in the reward's metric.
 
+    By default the covariance is inflated (`INFLATED`): an estimator that is overconfident about
+    segments without recent measurements keeps its errors there. The larger process noise lets
+    variances grow within seconds; the cap limits the weight of the speeds of nearly empty segments.
+
     The cost is a rank-2 downdate of C per pick, O(B n^2), after a prediction that costs as much as
-    the EKF's: about 1.2 EKF steps at n = 15, B = 5, or 1.5 with an inflated covariance.
+    the EKF's: about 1.5 EKF steps at n = 15, B = 5.
     """
 
     name: ClassVar[str] = "greedy-trace"
@@ -164,27 +168,6 @@ class GreedyTrace(CovarianceSchedule):
         kernels.choose_greedily(
             self._road, self._problem, keeps, means, covariances, inputs, queried
         )
-
-
-class InflatedTrace(GreedyTrace):
-    """`GreedyTrace` with an inflated covariance, `INFLATED` by default.
-
-    An estimator that is overconfident about segments without recent measurements keeps its errors
-    there. The larger process noise lets variances grow within seconds; the cap limits the weight of
-    the speeds of nearly empty segments.
-    """
-
-    name: ClassVar[str] = "inflated-trace"
-
-    def __init__(
-        self,
-        process: QueryProcess,
-        seed: int | None = None,
-        *,
-        inflation: CovarianceInflation = INFLATED,
-    ) -> None:
-        """See `CovarianceSchedule`."""
-        super().__init__(process, seed, inflation=inflation)
 
 
 def _problem(process: QueryProcess, inflation: CovarianceInflation) -> Problem:

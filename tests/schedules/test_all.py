@@ -19,7 +19,7 @@ from .playing import begin, make_batch, make_single, play
 BOUND = [*DEVIATION_SCHEDULES, *COVARIANCE_SCHEDULES, *ORACLES]
 NAMES = [*sorted(set(OBSERVATION_SCHEDULES) - {"none", "all"}), *BOUND]
 KINDS = (
-    "round-robin", "oldest-first", "speed-front", "expected-reduction", "inflated-trace",
+    "round-robin", "oldest-first", "speed-front", "expected-reduction", "greedy-trace",
     "oracle-gain",
 )  # fmt: skip
 """One for each way to choose: by the clock, by observations, by a memory, and by the process."""
@@ -84,7 +84,7 @@ SKIPS_SENSORS = (
 @pytest.mark.parametrize(
     "name",
     fast_and_slow(
-        SKIPS_SENSORS, ("oldest-first", "stale-variance", "inflated-trace", "oracle-error")
+        SKIPS_SENSORS, ("oldest-first", "stale-variance", "greedy-trace", "oracle-error")
     ),
 )
 def test_a_segment_with_a_fixed_sensor_is_queried_last(name):

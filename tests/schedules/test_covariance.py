@@ -10,7 +10,6 @@ from dptse_env.schedules.covariance import (
     NO_INFLATION,
     CovarianceInflation,
     GreedyTrace,
-    InflatedTrace,
 )
 from tests.cases import fast_and_slow
 
@@ -138,7 +137,8 @@ def test_greedy_trace_is_that_of_explicit_updates(inflation, reward):
 def test_greedy_works_on_every_covariance(keywords):
     env = make_batch(bandwidth=3, **keywords)
     for observation in states(env, 5):
-        for episode, queried in enumerate(chosen(GreedyTrace(env.unwrapped.process), observation)):
+        schedule = GreedyTrace(env.unwrapped.process, inflation=NO_INFLATION)
+        for episode, queried in enumerate(chosen(schedule, observation)):
             plain = Plain(env, episode, NO_INFLATION)
             # The segments of a walk can tie: sets may differ, what they cost may not.
             assert plain.trace(queried) == pytest.approx(plain.trace(plain.greedy(3)), rel=1e-9)
@@ -148,7 +148,7 @@ def test_what_is_left_is_the_explicit_posterior():
     """A covariance of its own follows its own queries through several seconds."""
     env = make_batch(bandwidth=2)
     inflation = CovarianceInflation(process_noise=(0.05, 0.02), occupied=True, speed_cap=0.1)
-    schedule, observation = InflatedTrace(env.unwrapped.process, inflation=inflation), begin(env)
+    schedule, observation = GreedyTrace(env.unwrapped.process, inflation=inflation), begin(env)
     state, own = None, [None] * 3
     for _ in range(6):
         plains = [Plain(env, episode, inflation, own[episode]) for episode in range(3)]
@@ -174,10 +174,3 @@ def test_bad_inflations_are_named():
         CovarianceInflation(speed_cap=0.0)
     with pytest.raises(ValueError, match=r"inflation\.process_noise\[1\] must be"):
         CovarianceInflation(process_noise=(0.1, -0.1))
-
-
-def test_noise_in_w_is_refused_where_the_schedule_would_need_it():
-    env = make_batch(estimator_settings={"process_noise_in": "w"})
-    with pytest.raises(ValueError, match=r"^estimator_settings\.process_noise_in must be 'psi'"):
-        make_schedule("greedy-trace", env)
-    make_schedule("inflated-trace", env)  # which has a process noise of its own
