@@ -18,7 +18,6 @@ from dptse_env.release import (
     RELEASE_MODELS,
     VOID_REASONS,
     BoundaryModel,
-    DensityRelease,
     PrivacyReport,
     QueryOptions,
     ReleaseModel,
@@ -218,8 +217,6 @@ def make_fusion(config: EnvConfig, model: ARZModel, n_episodes: int = 1) -> Fusi
         lengths=np.array(corridor.segment_lengths)[rows.first] * rows.span,
         share=config.penetration.published_share(corridor),
         limits=np.array(corridor.speed_limits)[rows.first],
-        density=DensityRelease.of(config.penetration, corridor),
-        density_is_mean=RELEASE_MODELS.find(config.privacy.preset).density_reports == "mean",
         releases_flow=flow_centre(config) is not None,
         n_episodes=n_episodes,
     )

@@ -65,8 +65,7 @@ class Args:
     pause: int = Options.pause
     """Seconds left out between two windows."""
     detailed: bool = Options.detailed
-    """Keep positions, lanes and classes of the vehicles, which `penetration.by_class` and
-    `penetration.density_from` need."""
+    """Keep positions, lanes and classes of the vehicles, which `penetration.by_class` needs."""
 
 
 def main(args: Args) -> None:

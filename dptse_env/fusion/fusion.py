@@ -17,11 +17,8 @@ from dptse_env.fusion.settings import FusionSettings
 from dptse_env.fusion.share_filter import ShareFilter
 from dptse_env.model import MeasurementRows
 from dptse_env.model.parameters import SECONDS_PER_HOUR
-from dptse_env.release import COUNTED, DensityRelease, MeasuredRows
+from dptse_env.release import MeasuredRows
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
-
-REPORT_SPREADS = {"spacing": 0.6, "neighbours": 0.3}
-"""Deviation of a vehicle's report of the density, over the density, on the shipped roads."""
 
 LEAST_SPEED = 5.0
 """Speed from which on the time on a segment does not grow any more [km/h]."""
@@ -40,8 +37,6 @@ class FusionSetup:
         limits: Speed limit of each row [km/h], shape (M,).
         releases_flow: Whether flows are released, else mean speeds.
         n_episodes: Size n of the batch.
-        density: What connected vehicles tell of the density.
-        density_is_mean: Whether their reports of it are released as a mean, else as a centred sum.
     """
 
     settings: FusionSettings
@@ -52,8 +47,6 @@ class FusionSetup:
     limits: FloatArray
     releases_flow: bool
     n_episodes: int
-    density: DensityRelease = COUNTED
-    density_is_mean: bool = False
 
 
 class Fusion:
@@ -63,9 +56,8 @@ class Fusion:
     ``n_c / p`` estimates n with a variance of ``n (1 - p) / p`` beside the mechanism's. So it is
     with the sum of ``v - c`` over them, whose variance is ``n (1 - p) / p`` times the mean of
     ``(v - c)^2``. The mean speed of n_c of n vehicles has the variance ``s^2 (1/n_c - 1/n)``, with
-    s the spread of speeds. Reports of the density around a vehicle (`dptse_env.release.density`)
-    need no count: each errs by a known part of the density. For n and the mean speed the
-    estimator's prediction is taken, of one vehicle at least.
+    s the spread of speeds. For n and the mean speed the estimator's prediction is taken, of one
+    vehicle at least.
 
     Attributes:
         share: Estimated share of each episode; None where the published one is taken.
@@ -97,14 +89,8 @@ class Fusion:
     def scaled(self, sigma: FloatArray) -> FloatArray:
         """Return deviations (2,) of a query's noise, scaled by the published share."""
         setup, p = self.setup, self.setup.share
-        density = self._report_scale if setup.density.has_reports else 1.0 / p
-        scaled: FloatArray = sigma * np.array([density, 1.0 / p if setup.releases_flow else 1.0])
+        scaled: FloatArray = sigma * np.array([1.0 / p, 1.0 / p if setup.releases_flow else 1.0])
         return scaled
-
-    @property
-    def _report_scale(self) -> float:
-        """Factor on released reports that makes densities of them."""
-        return 1.0 if self.setup.density_is_mean else self.setup.density.clip / self.setup.share
 
     def read(
         self,
@@ -153,13 +139,10 @@ class Fusion:
         sampling = alike * count * (1.0 - p) / p / length**2
         spread = setup.settings.speed_spread
         doubt = p_variance / p**2
-        if setup.density.has_reports:
-            self._read_reports(values[:, queries, 0], sigma[:, queries, 0], expected, alike)
-        else:
-            values[:, queries, 0] /= p
-            sigma[:, queries, 0] = np.sqrt(
-                (sigma[:, queries, 0] / p) ** 2 + sampling + density**2 * doubt
-            )
+        values[:, queries, 0] /= p
+        sigma[:, queries, 0] = np.sqrt(
+            (sigma[:, queries, 0] / p) ** 2 + sampling + density**2 * doubt
+        )
         if setup.releases_flow:
             square = expected.offset[:, queries] ** 2 + spread**2
             values[:, queries, 1] /= p
@@ -175,36 +158,6 @@ class Fusion:
                 sigma[:, queries, 1] ** 2 + alike * (spread**2 * (1.0 - p) / answering + none)
             )
 
-    def _read_reports(
-        self,
-        values: FloatArray,
-        sigma: FloatArray,
-        expected: _Expected,
-        alike: FloatArray | float,
-    ) -> None:
-        """Write densities of all vehicles from what connected ones report of those around them.
-
-        Args:
-            values: Released reports, shape (k, G), which become densities [veh/km].
-            sigma: Their deviations, shape (k, G), likewise.
-            expected: The prediction.
-            alike: Seconds for which answers count as one, (k, G) or 1.
-        """
-        setup, queries = self.setup, slice(0, self.setup.n_options)
-        density, length = expected.density[:, queries], setup.lengths[queries]
-        answering = setup.share * np.maximum(density * length, 1.0)
-        relative = setup.settings.report_spread
-        if relative is None:
-            relative = REPORT_SPREADS[setup.density.source]
-        sampling = (relative * density) ** 2 / answering
-        if setup.density_is_mean:
-            # Without a connected vehicle a density of 0 is released.
-            sampling = sampling + np.exp(-answering) * density**2
-        else:
-            values *= self._report_scale
-            values += setup.density.centres(expected.state) @ self._weights[:, queries]
-        sigma[:] = np.sqrt((sigma * self._report_scale) ** 2 + alike * sampling)
-
     def _seconds_alike(self, speed: FloatArray, length: FloatArray) -> FloatArray | float:
         """Return the seconds for which answers count as one, shape (k, G), 1 at least."""
         factor = self.setup.settings.dwell_factor
@@ -218,7 +171,6 @@ class _Expected:
     """A prediction of M rows.
 
     Attributes:
-        state: Densities of the segments [veh/km], shape (k, S).
         density: Densities [veh/km], at least 0, shape (k, M).
         speed: Speeds [km/h], shape (k, M).
     """
@@ -234,7 +186,6 @@ class _Expected:
             centre: Speeds that flows are centred on [km/h], (k, S); None for mean speeds.
         """
         self._prediction, self._weights, self._centre = prediction, weights, centre
-        self.state: FloatArray = prediction.density
         self.density: FloatArray = np.maximum(prediction.density @ weights, 0.0)
         self.speed: FloatArray = prediction.speed @ weights
 

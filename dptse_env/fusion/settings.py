@@ -21,8 +21,6 @@ class FusionSettings:
         share_walk: Standard deviation of a second of its random walk, over the published one.
         speed_spread: Standard deviation of the vehicles' speeds on a segment [km/h], for the
             sampling error of speeds.
-        report_spread: Standard deviation of what vehicles report of the density, over the density,
-            where densities come from spacings or neighbours; None for 0.6 and 0.3.
         dwell_factor: Allowance for answers of a segment that have the same sampling error, since
             the same vehicles are there: the variance of sampling is multiplied by this factor times
             the seconds that a vehicle spends on the segment, where the product is more than one. It
@@ -42,7 +40,6 @@ class FusionSettings:
     share_deviation: Annotated[float, Interval(0.01, 10)] = 0.5
     share_walk: Annotated[float, Interval(0, 1)] = 0.002
     speed_spread: Annotated[float, Interval(0, 100)] = 12.0
-    report_spread: Annotated[float, Interval(0, 10)] | None = None
     dwell_factor: Annotated[float, Interval(0, 100)] = 0.0
     innovation_test: bool = False
     threshold: Annotated[float, Interval(0.1, 100)] = 1.5

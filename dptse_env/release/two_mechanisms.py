@@ -13,7 +13,6 @@ import numpy as np
 from dptse_env.model import MeasurementRows
 from dptse_env.privacy import EpsilonTable, epsilon_of
 from dptse_env.release.base import Released, ReleaseModel, ReleaseRequest, ReleaseSetup
-from dptse_env.release.density import COUNTED, DensityRelease
 from dptse_env.release.detectors import DetectorErrors, Detectors
 from dptse_env.release.queries import NO_OPTIONS
 from dptse_env.release.report import PrivacyReport, in_order
@@ -75,7 +74,7 @@ class ConnectedTraffic(TrafficTable):
     def record(self, index: int) -> AnyRecord:
         """Return the rows of the connected vehicles in the record of ``traffic_seeds[index]``."""
         record = with_vehicles(super().record(index), "the keyword penetration")
-        return self._penetration.reports(self.traffic_seeds[index], record, self.corridor)
+        return self._penetration.reports(self.traffic_seeds[index], record)
 
 
 class TwoMechanisms(ReleaseModel):
@@ -111,7 +110,6 @@ class TwoMechanisms(ReleaseModel):
         self._connected = ConnectedTraffic(setup.traffic, penetration)
         self._split = split if has_sensors else setup.n_columns
 
-        reports = DensityRelease.of(penetration, setup.corridor)
         no_options = replace(NO_OPTIONS, n_mainline=setup.corridor.n_mainline)
 
         def part(start: int, stop: int, traffic: TrafficTable, share: float) -> ReleaseModel:
@@ -123,7 +121,6 @@ class TwoMechanisms(ReleaseModel):
                     horizon=setup.horizon, n_episodes=setup.n_episodes,
                     queries=no_options if is_sensors else setup.queries,
                     budget_share=share if self._claims else 1.0,
-                    density=COUNTED if is_sensors else reports,
                     whole=setup, start=start, stop=stop,
                 )
             )  # fmt: skip

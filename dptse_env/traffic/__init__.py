@@ -11,7 +11,7 @@ from dptse_env.traffic.dwell import average_dwell
 from dptse_env.traffic.field_record import AnyRecord, FieldRecord, with_vehicles
 from dptse_env.traffic.incident import Incident, IncidentDistribution
 from dptse_env.traffic.library import RecordLibrary, Records, open_library
-from dptse_env.traffic.penetration import ClassShare, DensitySource, Penetration
+from dptse_env.traffic.penetration import ClassShare, Penetration
 from dptse_env.traffic.presets import (
     CORRIDORS,
     PAPER_HIGHWAY,
@@ -33,7 +33,6 @@ from dptse_env.traffic.stored_arrays import InvalidRecordError
 from dptse_env.traffic.sumo import RecordingError, SumoVersionError, simulate
 from dptse_env.traffic.sumo_network import NetworkError
 from dptse_env.traffic.sumo_scenario import SumoScenario
-from dptse_env.traffic.surroundings import ReportRecord
 from dptse_env.traffic.worker import simulate_in_child
 
 __all__ = [
@@ -46,7 +45,6 @@ __all__ = [
     "Corridor",
     "Demand",
     "DemandDistribution",
-    "DensitySource",
     "DetailedRecord",
     "Drivers",
     "FieldRecord",
@@ -60,7 +58,6 @@ __all__ = [
     "RecordingError",
     "Recordings",
     "Records",
-    "ReportRecord",
     "RoadFile",
     "Scenario",
     "SumoScenario",

@@ -2,23 +2,18 @@
 
 import math
 from dataclasses import dataclass, replace
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 
 from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.detailed_record import DetailedRecord
 from dptse_env.traffic.record import Record
-from dptse_env.traffic.surroundings import ReportRecord, road_by_neighbours, road_by_spacing
 from dptse_env.utils.arrays import BoolArray, FloatArray
 from dptse_env.utils.fields import Interval, checked_fields
 
 ConnectedShare = Annotated[float, Interval(0, 1, open_low=True)]
 """A share of connected vehicles."""
-
-DensitySource = Literal["count", "spacing", "neighbours"]
-"""Source of estimated densities: the number of connected vehicles, their spacings to the vehicles
-ahead of them, or the numbers of vehicles around them."""
 
 
 @dataclass(frozen=True)
@@ -57,12 +52,6 @@ class Penetration:
         seed: Penetration seed.
         misreporting: Share of the connected vehicles that report a wrong speed.
         misreport_factor: Factor on the speed that these report.
-        density_from: What densities are estimated from: ``count``, the number of connected
-            vehicles; ``spacing``, the distance of each to the vehicle ahead in its lane;
-            ``neighbours``, the number of vehicles around each.
-        neighbour_range: Distance ahead and behind to which a vehicle counts its neighbours [m].
-        report_clip: Largest relative deviation of the reported road per vehicle from what the
-            estimator predicts; larger ones are clipped where a guarantee is given.
 
     Raises:
         ValueError: A value is out of range, or a class is named twice.
@@ -73,9 +62,6 @@ class Penetration:
     misreporting: Annotated[float, Interval(0, 1)] = 0.0
     misreport_factor: Annotated[float, Interval(0, 10)] = 1.0
     by_class: tuple[ClassShare, ...] = ()
-    density_from: DensitySource = "count"
-    neighbour_range: Annotated[float, Interval(10, 1000)] = 50.0
-    report_clip: Annotated[float, Interval(0.1, 10)] = 1.0
 
     def __post_init__(self) -> None:
         """Check values."""
@@ -97,9 +83,8 @@ class Penetration:
 
     @property
     def is_complete(self) -> bool:
-        """True if every vehicle is connected and counts, and reports its own speed."""
-        everyone = self.share == 1.0 and not self.by_class
-        return everyone and not self.misreports and self.density_from == "count"
+        """True if every vehicle is connected, and reports its own speed."""
+        return self.share == 1.0 and not self.by_class and not self.misreports
 
     @property
     def misreports(self) -> bool:
@@ -109,7 +94,7 @@ class Penetration:
     @property
     def needs_details(self) -> bool:
         """True if records must hold positions, lanes and classes."""
-        return bool(self.by_class) or self.density_from != "count"
+        return bool(self.by_class)
 
     @property
     def _class_shares(self) -> dict[str, float]:
@@ -173,33 +158,21 @@ class Penetration:
         connected: BoolArray = self._uniform(traffic_seed, 0, record.n_vehicles) < share
         return connected
 
-    def reports(self, traffic_seed: int, record: Record, corridor: Corridor) -> Record:
+    def reports(self, traffic_seed: int, record: Record) -> Record:
         """Return what the connected vehicles of a record report: their rows, with their speeds.
 
-        Vehicles keep their indices. Where densities come from spacings or neighbours the result is
-        a `ReportRecord`; these are of all vehicles, connected or not.
+        Vehicles keep their indices.
 
         Raises:
             ValueError: The record has no positions, lanes and classes, and they are needed; or it
                 has not the classes that are named.
         """
-        keep = self.connected(traffic_seed, record)[record.vehicle]
-        reported = self._surroundings(record, corridor).where(keep)
+        reported = record.where(self.connected(traffic_seed, record)[record.vehicle])
         if not self.misreports:
             return reported
         wrong = self._uniform(traffic_seed, 2, record.n_vehicles) < self.misreporting
         factor = np.where(wrong, self.misreport_factor, 1.0)[reported.vehicle]
         return replace(reported, speed=(reported.speed * factor).astype(np.float32))
-
-    def _surroundings(self, record: Record, corridor: Corridor) -> Record:
-        """Return a record with what every vehicle sees of others around it."""
-        if self.density_from == "count":
-            return record
-        details = _with_details(record)
-        if self.density_from == "spacing":
-            return ReportRecord.of(details, road_by_spacing(details, corridor))
-        reach = self.neighbour_range / 1000.0
-        return ReportRecord.of(details, road_by_neighbours(details, corridor, reach))
 
     def _uniform(self, traffic_seed: int, stream: int, n: int) -> FloatArray:
         """Return the uniform numbers of n vehicles in one of several streams, shape (n,).
@@ -219,7 +192,7 @@ def _with_details(record: Record) -> DetailedRecord:
     """
     if not isinstance(record, DetailedRecord):
         raise ValueError(
-            "penetration.by_class and penetration.density_from need records with positions, lanes "
-            "and classes, which this traffic was imported without: import it again with --detailed"
+            "penetration.by_class needs records with positions, lanes and classes, which this "
+            "traffic was imported without: import it again with --detailed"
         )
     return record

@@ -8,21 +8,17 @@ from dptse_env.fusion import Fusion, FusionSettings, FusionSetup
 from dptse_env.fusion.innovation_test import InnovationTest
 from dptse_env.fusion.share_filter import ShareFilter
 from dptse_env.model import MeasurementRows
-from dptse_env.release import COUNTED, DensityRelease, MeasuredRows
+from dptse_env.release import MeasuredRows
 
 LENGTH, LIMIT, SPREAD = 0.1, 100.0, 12.0
 N_SEGMENTS = 4
 
 
-def make(
-    n_episodes=1, share=0.2, *, flow=True, n_options=3, density=COUNTED, mean=False, **settings
-):
+def make(n_episodes=1, share=0.2, *, flow=True, n_options=3, **settings):
     rows = MeasurementRows.single(N_SEGMENTS)
     lengths, limits = np.full(N_SEGMENTS, LENGTH), np.full(N_SEGMENTS, LIMIT)
     given = FusionSettings(speed_spread=SPREAD, **settings)
-    fusion = Fusion(
-        FusionSetup(given, rows, n_options, lengths, share, limits, flow, n_episodes, density, mean)
-    )
+    fusion = Fusion(FusionSetup(given, rows, n_options, lengths, share, limits, flow, n_episodes))
     fusion.reset(np.arange(n_episodes))
     return fusion
 
@@ -111,65 +107,10 @@ def test_answers_count_as_one_while_a_vehicle_is_on_the_segment(flow):
     np.testing.assert_allclose(read(0.05).sigma[0, :3], once)  # never less than a second
 
 
-@pytest.mark.parametrize("source", ["spacing", "neighbours"])
-@pytest.mark.parametrize("predicted_density", [160.0, 200.0, 260.0])
-def test_a_centred_sum_of_reports_gives_the_density(source, predicted_density):
-    """Each vehicle errs by itself; the prediction that deviations are taken from is wrong too."""
-    generator = np.random.default_rng(0)
-    n, episodes, share, spread = 20, 4_000, 0.3, 0.3
-    connected = generator.random((episodes, N_SEGMENTS, n)) < share
-    density = n / LENGTH
-    noise = generator.normal(0.0, spread, connected.shape)
-    clip = 10.0  # nothing is clipped
-    release = DensityRelease(source, clip, 400.0)
-    terms = release.terms(np.full((1, N_SEGMENTS), predicted_density))
-    reports = (1.0 + noise) / density
-    deviations = np.clip(terms.slope[0][:, None] * reports + terms.offset, -1.0, 1.0)
-    released = np.zeros((episodes, N_SEGMENTS, 2))
-    released[..., 0] = (connected * deviations).sum(axis=2) / LENGTH
-    fusion = make(episodes, share, n_options=N_SEGMENTS, density=release)
-    found = fusion.read(
-        np.arange(episodes),
-        np.ones(connected.shape[:2], dtype=bool),
-        measured(released, 1e-9, 0.0),
-        predicted(predicted_density, 60.0, episodes),
-    )
-    errors = found.values[..., 0] - density
-    assert errors.mean() == pytest.approx(0.0, abs=1.5)
-
-
-@pytest.mark.parametrize("share", [0.1, 0.5])
-def test_the_error_of_a_mean_of_reports_is_as_large_as_it_says(share):
-    generator = np.random.default_rng(0)
-    n, episodes, spread = 60, 4_000, 0.3
-    density = n / LENGTH
-    connected = generator.random((episodes, N_SEGMENTS, n)) < share
-    reports = density * (1.0 + generator.normal(0.0, spread, connected.shape))
-    counts = connected.sum(axis=2)
-    released = np.zeros((episodes, N_SEGMENTS, 2))
-    released[..., 0] = (connected * reports).sum(axis=2) / np.maximum(counts, 1)
-    fusion = make(
-        episodes, share, flow=False, n_options=N_SEGMENTS,
-        density=DensityRelease("neighbours", 1.0, 1e3), mean=True, report_spread=spread,
-    )  # fmt: skip
-    found = fusion.read(
-        np.arange(episodes),
-        np.ones(counts.shape, dtype=bool),
-        measured(released, 1e-9, np.nan),
-        predicted(density, 70.0, episodes),
-    )
-    np.testing.assert_array_equal(found.values[..., 0], released[..., 0])
-    errors = (found.values[..., 0] - density) / found.sigma[..., 0]
-    assert 0.85 < errors.std() < 1.2
-
-
-def test_noise_of_reports_is_scaled_by_clip_and_share():
+def test_deviations_of_noise_are_scaled_by_the_share():
     sigma = np.array([2.0, 3.0])
-    centred = make(share=0.1, density=DensityRelease("spacing", 2.0))
-    np.testing.assert_allclose(centred.scaled(sigma), [40.0, 30.0])
-    mean = make(share=0.1, flow=False, density=DensityRelease("spacing", 2.0), mean=True)
-    np.testing.assert_allclose(mean.scaled(sigma), [2.0, 3.0])
     np.testing.assert_allclose(make(share=0.1).scaled(sigma), [20.0, 30.0])
+    np.testing.assert_allclose(make(share=0.1, flow=False).scaled(sigma), [20.0, 3.0])
 
 
 def test_where_all_vehicles_are_connected_nothing_changes():

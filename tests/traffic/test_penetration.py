@@ -56,7 +56,7 @@ def test_a_share_of_a_range_is_drawn_for_each_traffic_seed():
 def test_the_connected_vehicles_report_and_some_misreport_their_speed():
     record = road_of(2_000, n_steps=1)
     penetration = Penetration(0.5, misreporting=0.25, misreport_factor=2.0)
-    reported = penetration.reports(7, record, SHORT_HIGHWAY)
+    reported = penetration.reports(7, record)
     np.testing.assert_array_equal(
         reported.vehicle, np.flatnonzero(penetration.connected(7, record))
     )
@@ -120,7 +120,6 @@ IMPOSSIBLE = [
     ({"by_class": TRUCKS, "share": 0.3}, "share must be left out"),
     ({"by_class": TRUCKS * 2}, "by_class must name each class once"),
     ({"by_class": TRUCKS, "share": [0.1, 0.2]}, "share must be one number"),
-    ({"density_from": "radar"}, "density_from must be"),
 ]
 
 
