@@ -215,7 +215,7 @@ def make_fusion(config: EnvConfig, model: ARZModel, n_episodes: int = 1) -> Fusi
         rows,
         n_options=config.queries.n_options,
         lengths=np.array(corridor.segment_lengths)[rows.first] * rows.span,
-        share=config.penetration.published_share(corridor),
+        share=config.penetration.published_share,
         limits=np.array(corridor.speed_limits)[rows.first],
         releases_flow=flow_centre(config) is not None,
         n_episodes=n_episodes,

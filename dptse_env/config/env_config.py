@@ -199,7 +199,6 @@ class EnvConfig:
             raise ValueError(
                 f"detectors must be left out on a road without fixed sensors, got {self.detectors}"
             )
-        self.penetration.check_classes(corridor)
         recordings = corridor.recordings
         if self.has_separate_sensors and recordings is not None and not recordings.has_vehicles:
             raise ValueError(

@@ -65,10 +65,7 @@ class ConnectedTraffic(TrafficTable):
 
     def __init__(self, traffic: TrafficTable, penetration: Penetration) -> None:
         """Prepare a table for the traffic seeds of another; nothing is loaded."""
-        corridor = traffic.corridor
-        if penetration.needs_details:
-            corridor = replace(corridor, detailed=True)
-        super().__init__(corridor, traffic.traffic_seeds, traffic.library)
+        super().__init__(traffic.corridor, traffic.traffic_seeds, traffic.library)
         self._penetration = penetration
 
     def record(self, index: int) -> AnyRecord:
@@ -125,7 +122,7 @@ class TwoMechanisms(ReleaseModel):
                 )
             )  # fmt: skip
 
-        published = penetration.published_share(setup.corridor)
+        published = penetration.published_share
         share = detectors.part_of_budget(published) if has_sensors else 0.0
         self.queries = part(0, self._split, self._connected, 1.0 - share)
         self.sensors = None

@@ -5,13 +5,12 @@ Importing this package does not import libsumo; only making a record does.
 
 from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.demand import Demand, DemandDistribution
-from dptse_env.traffic.detailed_record import DetailedRecord
 from dptse_env.traffic.drivers import Drivers, VehicleClass
 from dptse_env.traffic.dwell import average_dwell
 from dptse_env.traffic.field_record import AnyRecord, FieldRecord, with_vehicles
 from dptse_env.traffic.incident import Incident, IncidentDistribution
 from dptse_env.traffic.library import RecordLibrary, Records, open_library
-from dptse_env.traffic.penetration import ClassShare, Penetration
+from dptse_env.traffic.penetration import Penetration
 from dptse_env.traffic.presets import (
     CORRIDORS,
     PAPER_HIGHWAY,
@@ -41,11 +40,9 @@ __all__ = [
     "PAPER_HIGHWAY",
     "SHORT_HIGHWAY",
     "AnyRecord",
-    "ClassShare",
     "Corridor",
     "Demand",
     "DemandDistribution",
-    "DetailedRecord",
     "Drivers",
     "FieldRecord",
     "Incident",

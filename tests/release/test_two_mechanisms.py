@@ -291,26 +291,3 @@ def test_the_environment_keeps_gymnasiums_rules(preset):
     )
     check_env(env.unwrapped, skip_render_check=True)
     env.close()
-
-
-# --- connected classes -------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("preset", ["capped", "paced"])
-def test_connected_classes_answer_and_others_do_not(preset):
-    classes = [{"name": "car", "share": 0.7}, {"name": "truck", "share": 0.3, "length": 12.0}]
-    process = make(
-        privacy=preset,
-        corridor={"fixed_sensors": SENSORS, "vehicle_classes": classes},
-        penetration={"by_class": [{"name": "truck", "share": 1.0}]},
-    )
-    begin(process)
-    record = process.release._connected.record(1)
-    details = process.release._connected.library.get(process.release._connected.corridor, 1)
-    trucks = np.flatnonzero(details.class_of_vehicles() == 1)
-    assert 0 < len(trucks) < 0.5 * details.n_vehicles
-    assert set(record.vehicle.tolist()) == set(trucks.tolist())
-    play(process, 20)
-    assert process.release.queries.report().mu == pytest.approx(
-        mu_of(1.0, 0.05) * math.sqrt(1.0 - 1.0 / (1.0 + 3.0 * math.sqrt(0.3)))
-    )
