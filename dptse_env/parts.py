@@ -207,7 +207,7 @@ def make_traffic(config: EnvConfig, library: RecordLibrary | None = None) -> Tra
 
 def make_fusion(config: EnvConfig, model: ARZModel, n_episodes: int = 1) -> Fusion | None:
     """Make what turns releases into measurements of all vehicles; None where they are."""
-    if not (config.has_separate_sensors or config.fusion.innovation_test):
+    if not config.has_separate_sensors:
         return None
     corridor, rows = config.corridor, model.rows
     setup = FusionSetup(

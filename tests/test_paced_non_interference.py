@@ -109,7 +109,7 @@ def test_vehicles_do_pay_and_run_out_meanwhile():
 
 PARTLY = {
     "penetration": [0.05, 0.4],
-    "fusion": {"share": "estimated", "innovation_test": True},
+    "fusion": {"share": "estimated"},
     "detectors": {"dropout": 0.2, "absolute": 0.5},
 }
 

@@ -12,7 +12,6 @@ from functools import cached_property
 import numpy as np
 
 from dptse_env.estimators import Estimate
-from dptse_env.fusion.innovation_test import InnovationTest
 from dptse_env.fusion.settings import FusionSettings
 from dptse_env.fusion.share_filter import ShareFilter
 from dptse_env.model import MeasurementRows
@@ -61,7 +60,6 @@ class Fusion:
 
     Attributes:
         share: Estimated share of each episode; None where the published one is taken.
-        test: The innovation test; None without one.
     """
 
     def __init__(self, setup: FusionSetup) -> None:
@@ -73,18 +71,11 @@ class Fusion:
             if settings.share == "estimated"
             else None
         )
-        self.test = (
-            InnovationTest(settings, setup.n_episodes, setup.rows.n_rows)
-            if settings.innovation_test
-            else None
-        )
 
     def reset(self, episodes: IntArray) -> None:
         """Begin new episodes, shape (k,)."""
         if self.share is not None:
             self.share.reset(episodes)
-        if self.test is not None:
-            self.test.reset(episodes)
 
     def scaled(self, sigma: FloatArray) -> FloatArray:
         """Return deviations (2,) of a query's noise, scaled by the published share."""
@@ -111,10 +102,6 @@ class Fusion:
         expected = _Expected(prediction, self._weights, centre)
         values, sigma = measured.values.copy(), measured.sigma.copy()
         self._scale_queries(episodes, observed, values, sigma, expected)
-        if self.test is not None:
-            sigma = self.test.weigh(
-                episodes, observed, values - expected.mean, sigma, expected.deviation
-            )
         return MeasuredRows(values, sigma, measured.centre)
 
     def _scale_queries(
@@ -201,17 +188,3 @@ class _Expected:
         """Standard deviations of the densities [veh/km], shape (k, M)."""
         deviation: FloatArray = self._prediction.density_std @ self._weights
         return deviation
-
-    @property
-    def mean(self) -> FloatArray:
-        """The measurements that are expected, shape (k, M, 2)."""
-        second = self.speed if self._centre is None else self.density * self.offset
-        return np.stack([self.density, second], axis=-1)
-
-    @property
-    def deviation(self) -> FloatArray:
-        """Standard deviations of these, as predicted, shape (k, M, 2)."""
-        second = self._prediction.speed_std @ self._weights
-        if self._centre is not None:
-            second = np.hypot(self.density_std * self.offset, self.density * second)
-        return np.stack([self.density_std, second], axis=-1)

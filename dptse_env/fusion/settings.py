@@ -26,11 +26,6 @@ class FusionSettings:
             the seconds that a vehicle spends on the segment, where the product is more than one. It
             suits `recurrent`, whose deviations are honest; filters on the ARZ model trust their
             prediction too much, and err more where answers weigh less.
-        innovation_test: Whether measurements that keep disagreeing with the prediction are given
-            less weight.
-        threshold: Mean normalised innovation, in its own standard deviations, from which a
-            measurement has less weight.
-        memory: Time constant of these means [s].
 
     Raises:
         ValueError: A value is out of range.
@@ -41,9 +36,6 @@ class FusionSettings:
     share_walk: Annotated[float, Interval(0, 1)] = 0.002
     speed_spread: Annotated[float, Interval(0, 100)] = 12.0
     dwell_factor: Annotated[float, Interval(0, 100)] = 0.0
-    innovation_test: bool = False
-    threshold: Annotated[float, Interval(0.1, 100)] = 1.5
-    memory: Annotated[float, Interval(1, 10_000)] = 60.0
 
     def __post_init__(self) -> None:
         """Check values."""

@@ -1,11 +1,10 @@
-"""Fusion: what answers of connected vehicles say of all vehicles, and which sensors to believe."""
+"""Fusion: what answers of connected vehicles say of all vehicles."""
 
 import numpy as np
 import pytest
 
 from dptse_env.estimators import Estimate
 from dptse_env.fusion import Fusion, FusionSettings, FusionSetup
-from dptse_env.fusion.innovation_test import InnovationTest
 from dptse_env.fusion.share_filter import ShareFilter
 from dptse_env.model import MeasurementRows
 from dptse_env.release import MeasuredRows
@@ -169,40 +168,3 @@ def test_a_reset_forgets_the_share():
     share_filter.reset(np.array([1]))
     assert share_filter.mean[0] > 0.7
     assert share_filter.mean[1] == 0.3
-
-
-# --- the innovation test ----------------------------------------------------------------------
-
-
-def weighed(bias, n_seconds=400, sigma=2.0, deviation=1.0):
-    """Play a sensor with a bias; return the mean factor on its deviation at the end."""
-    test = InnovationTest(FusionSettings(innovation_test=True), 200, 1)
-    generator, episodes = np.random.default_rng(2), np.arange(200)
-    shape, spread = (200, 1, 2), np.hypot(sigma, deviation)
-    for _ in range(n_seconds):
-        innovation = generator.normal(bias, spread, shape)
-        found = test.weigh(
-            episodes,
-            np.ones((200, 1), dtype=bool),
-            innovation,
-            np.full(shape, sigma),
-            np.full(shape, deviation),
-        )
-    return float((found / sigma).mean())
-
-
-def test_a_sensor_that_agrees_keeps_its_weight_and_a_biased_one_loses_it():
-    assert weighed(0.0) < 1.02
-    assert weighed(4.0) > 1.7
-    assert weighed(-4.0) > 1.7
-
-
-def test_rows_without_a_measurement_keep_their_mean():
-    test = InnovationTest(FusionSettings(innovation_test=True), 1, 2)
-    observed = np.array([[True, False]])
-    innovation = np.full((1, 2, 2), 5.0)
-    test.weigh(np.arange(1), observed, innovation, np.ones((1, 2, 2)), np.ones((1, 2, 2)))
-    assert (test.mean[0, 0] > 0.0).all()
-    assert not test.mean[0, 1].any()
-    test.reset(np.arange(1))
-    assert not test.mean.any()

@@ -266,7 +266,7 @@ def test_a_known_error_is_in_the_deviation_of_the_release():
             {"detectors": {"dropout": 0.1}, "corridor": {"fixed_sensors": []}},
             "detectors must be left out on a road without fixed sensors",
         ),
-        ({"fusion": {"threshold": 0.0}}, "fusion.threshold must be"),
+        ({"fusion": {"dwell_factor": -1.0}}, "fusion.dwell_factor must be"),
         ({"fusion": {"share": "guessed"}}, "fusion.share must be one of"),
     ],
 )
@@ -287,7 +287,7 @@ def test_the_environment_keeps_gymnasiums_rules(preset):
         penetration=0.2,
         privacy={"preset": preset},
         detectors={"dropout": 0.1},
-        fusion={"share": "estimated", "innovation_test": True},
+        fusion={"share": "estimated"},
     )
     check_env(env.unwrapped, skip_render_check=True)
     env.close()
