@@ -32,7 +32,6 @@ BASE = "all vehicles"
 ARMS: Mapping[str, dict[str, Any]] = {
     BASE: {},
     "a tenth": {"penetration": 0.1},
-    "a tenth, share estimated": {"penetration": 0.1, "fusion": {"share": "estimated"}},
 }
 """Keywords of what is measured."""
 

@@ -179,7 +179,7 @@ def test_only_connected_vehicles_have_ledgers_of_queries():
     pairwise(PRESETS, [{}, {"detectors": {"dropout": 0.3, "absolute": 0.5}}], n=4),
 )
 def test_a_fork_gives_the_bits_of_its_origin_and_leaves_it_alone(preset, keywords):
-    process = make(privacy={"preset": preset}, fusion={"share": "estimated"}, **keywords)
+    process = make(privacy={"preset": preset}, **keywords)
     begin(process)
     play(process, 5)
     fork = process.fork()
@@ -187,7 +187,6 @@ def test_a_fork_gives_the_bits_of_its_origin_and_leaves_it_alone(preset, keyword
     again = [released.values for released, _ in play(process, 5)]
     np.testing.assert_array_equal(ahead, again)
     np.testing.assert_array_equal(fork.estimate.density, process.estimate.density)
-    np.testing.assert_array_equal(fork.fusion.share.mean, process.fusion.share.mean)
     assert fork.release.queries.setup is process.release.queries.setup
 
 
@@ -267,7 +266,6 @@ def test_a_known_error_is_in_the_deviation_of_the_release():
             "detectors must be left out on a road without fixed sensors",
         ),
         ({"fusion": {"dwell_factor": -1.0}}, "fusion.dwell_factor must be"),
-        ({"fusion": {"share": "guessed"}}, "fusion.share must be one of"),
     ],
 )
 def test_bad_sensors_are_refused_by_path(keywords, message):
@@ -287,7 +285,6 @@ def test_the_environment_keeps_gymnasiums_rules(preset):
         penetration=0.2,
         privacy={"preset": preset},
         detectors={"dropout": 0.1},
-        fusion={"share": "estimated"},
     )
     check_env(env.unwrapped, skip_render_check=True)
     env.close()

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from dptse_env.estimators import Estimate
-from dptse_env.fusion import Fusion, FusionSettings, FusionSetup
-from dptse_env.fusion.share_filter import ShareFilter
+from dptse_env.fusion import Fusion, FusionSettings
 from dptse_env.model import MeasurementRows
 from dptse_env.release import MeasuredRows
 
@@ -13,13 +12,11 @@ LENGTH, LIMIT, SPREAD = 0.1, 100.0, 12.0
 N_SEGMENTS = 4
 
 
-def make(n_episodes=1, share=0.2, *, flow=True, n_options=3, **settings):
+def make(share=0.2, *, flow=True, n_options=3, **settings):
     rows = MeasurementRows.single(N_SEGMENTS)
     lengths, limits = np.full(N_SEGMENTS, LENGTH), np.full(N_SEGMENTS, LIMIT)
     given = FusionSettings(speed_spread=SPREAD, **settings)
-    fusion = Fusion(FusionSetup(given, rows, n_options, lengths, share, limits, flow, n_episodes))
-    fusion.reset(np.arange(n_episodes))
-    return fusion
+    return Fusion(given, rows, n_options, lengths, share, limits, flow)
 
 
 def predicted(density, speed, n_episodes=1, density_std=5.0, speed_std=3.0):
@@ -46,13 +43,8 @@ def test_the_error_of_a_scaled_count_and_flow_is_as_large_as_it_says(share):
     counts, flows = connected.sum(axis=2), (connected * (speeds - centre)).sum(axis=2)
     truth = np.stack([np.full(counts.shape, n), (speeds - centre).sum(axis=2)], axis=-1) / LENGTH
     released = np.stack([counts, flows], axis=-1) / LENGTH
-    fusion = make(episodes, share, n_options=N_SEGMENTS)
-    found = fusion.read(
-        np.arange(episodes),
-        np.ones(counts.shape, dtype=bool),
-        measured(released, 1e-9, centre),
-        predicted(n / LENGTH, speed, episodes),
-    )
+    fusion = make(share, n_options=N_SEGMENTS)
+    found = fusion.read(measured(released, 1e-9, centre), predicted(n / LENGTH, speed, episodes))
     errors = (found.values - truth) / found.sigma
     np.testing.assert_allclose(errors.mean(axis=(0, 1)), 0.0, atol=0.03)
     np.testing.assert_allclose(errors.std(axis=(0, 1)), 1.0, atol=0.04)
@@ -67,13 +59,8 @@ def test_the_error_of_a_mean_speed_is_as_large_as_it_says(share):
     counts = connected.sum(axis=2)
     means = (connected * speeds).sum(axis=2) / np.maximum(counts, 1)
     released = np.stack([counts / LENGTH, np.where(counts > 0, means, LIMIT)], axis=-1)
-    fusion = make(episodes, share, flow=False, n_options=N_SEGMENTS)
-    found = fusion.read(
-        np.arange(episodes),
-        np.ones(counts.shape, dtype=bool),
-        measured(released, 1e-9, np.nan),
-        predicted(n / LENGTH, speed, episodes),
-    )
+    fusion = make(share, flow=False, n_options=N_SEGMENTS)
+    found = fusion.read(measured(released, 1e-9, np.nan), predicted(n / LENGTH, speed, episodes))
     errors = (found.values[..., 1] - speeds.mean(axis=2)) / found.sigma[..., 1]
     assert 0.9 < errors.std() < 1.15
 
@@ -81,9 +68,7 @@ def test_the_error_of_a_mean_speed_is_as_large_as_it_says(share):
 def test_sampling_error_grows_as_the_share_falls():
     values, before = np.ones((1, N_SEGMENTS, 2)), np.zeros(2)
     for share in (0.9, 0.3, 0.1, 0.01):
-        found = make(share=share).read(
-            np.arange(1), np.ones((1, N_SEGMENTS), dtype=bool), measured(values), predicted(50, 60)
-        )
+        found = make(share).read(measured(values), predicted(50, 60))
         assert (found.sigma[0, :3] > before).all()
         before = found.sigma[0, 0]
         np.testing.assert_allclose(found.values[0, :3], 1.0 / share)
@@ -94,12 +79,12 @@ def test_sampling_error_grows_as_the_share_falls():
 
 @pytest.mark.parametrize("flow", [True, False])
 def test_answers_count_as_one_while_a_vehicle_is_on_the_segment(flow):
-    values, every = np.ones((1, N_SEGMENTS, 2)), np.ones((1, N_SEGMENTS), dtype=bool)
+    values = np.ones((1, N_SEGMENTS, 2))
     speed = 36.0  # a segment of 0.1 km in 10 s
 
     def read(factor, sigma=1e-9):
         fusion = make(share=0.2, flow=flow, dwell_factor=factor)
-        return fusion.read(np.arange(1), every, measured(values, sigma), predicted(50, speed))
+        return fusion.read(measured(values, sigma), predicted(50, speed))
 
     once, alike = read(0.0).sigma[0, :3], read(1.0).sigma[0, :3]
     np.testing.assert_allclose((alike / once) ** 2, 10.0, rtol=1e-6)
@@ -115,56 +100,6 @@ def test_deviations_of_noise_are_scaled_by_the_share():
 def test_where_all_vehicles_are_connected_nothing_changes():
     values = np.random.default_rng(0).normal(50.0, 10.0, (2, N_SEGMENTS, 2))
     given = measured(values, 3.0)
-    found = make(2, share=1.0).read(
-        np.arange(2), np.ones((2, N_SEGMENTS), dtype=bool), given, predicted(50, 60, 2)
-    )
+    found = make(share=1.0).read(given, predicted(50, 60, 2))
     np.testing.assert_array_equal(found.values, given.values)
     np.testing.assert_allclose(found.sigma, given.sigma, rtol=1e-15)
-
-
-# --- the share as a state ---------------------------------------------------------------------
-
-
-def feed(share_filter, share, n_seconds, density=60.0, n_episodes=1):
-    generator, length = np.random.default_rng(1), np.full(3, LENGTH)
-    episodes, shape = np.arange(n_episodes), (n_episodes, 3)
-    n = int(density * LENGTH)
-    for _ in range(n_seconds):
-        values = generator.binomial(n, share, shape) / LENGTH + generator.normal(0.0, 2.0, shape)
-        share_filter.update(
-            episodes,
-            np.ones(shape, dtype=bool),
-            values,
-            np.full(shape, 2.0),
-            np.full(shape, density),
-            np.full(shape, 1.0),
-            length,
-        )
-
-
-def test_a_share_is_found_from_counts_and_its_error_is_as_large_as_it_says():
-    share_filter = ShareFilter(FusionSettings(share_walk=0.0), 0.3, 300)
-    feed(share_filter, 0.15, 200, n_episodes=300)
-    errors = (share_filter.mean - 0.15) / np.sqrt(share_filter.variance)
-    assert abs(share_filter.mean.mean() - 0.15) < 0.005
-    assert 0.8 < errors.std() < 1.25
-
-
-def test_without_answers_a_share_stays_as_published_and_grows_uncertain():
-    share_filter = ShareFilter(FusionSettings(), 0.3, 1)
-    before = share_filter.variance.copy()
-    nothing = np.zeros((1, 3), dtype=bool)
-    values = np.full((1, 3), np.inf)  # of rows that nobody asked for
-    share_filter.update(
-        np.arange(1), nothing, values, np.ones((1, 3)), np.ones((1, 3)), np.ones((1, 3)), np.ones(3)
-    )
-    assert share_filter.mean[0] == 0.3
-    assert share_filter.variance[0] > before[0]
-
-
-def test_a_reset_forgets_the_share():
-    share_filter = ShareFilter(FusionSettings(), 0.3, 2)
-    feed(share_filter, 0.9, 50, n_episodes=2)
-    share_filter.reset(np.array([1]))
-    assert share_filter.mean[0] > 0.7
-    assert share_filter.mean[1] == 0.3
