@@ -233,10 +233,10 @@ def _observe(libsumo: ModuleType, corridor: Corridor, scenario: Scenario) -> Rec
     # simulation.
     cells = np.repeat(np.arange(len(n_on)), n_on)
     return Record(
-        step=cells // len(edges),
+        step=(cells // len(edges)).astype(np.int32),
         vehicle=np.fromstring(" ".join(names), dtype=np.int32, sep=" "),
-        segment=cells % len(edges),
-        speed=KMH * np.array(speed, dtype=np.float64),
+        segment=(cells % len(edges)).astype(np.int16),
+        speed=(KMH * np.array(speed, dtype=np.float64)).astype(np.float32),
         n_steps=corridor.duration + 1,
         n_columns=len(edges),
     )
