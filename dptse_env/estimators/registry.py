@@ -49,7 +49,9 @@ ESTIMATORS = Registry(
         "ekf": _filter("ekf", "EKF"),
         "ukf": _filter("ukf", "UKF"),
         "enkf": _filter("enkf", "EnKF"),
-        "mhe": _filter("mhe", "MHE"),
+        "mhe": Backends(
+            "dptse_env.estimators.mhe:MHE", "dptse_env.estimators.reference.mhe:ReferenceMHE"
+        ),
         "random_walk": Backends(_WALK, _WALK),
         "blend": _filter("blend", "Blend"),
         "open_loop": Backends(_OPEN, _OPEN),
