@@ -236,9 +236,7 @@ def rows_episodes(spans=(1, 3, 2, 1, 8)):
 
 def disturbed(road, rows=None):
     """Sixty steps of flows on a road, with noise in the state and the measurements."""
-    model = ARZModel(
-        road, load_parameters("w99-3lane"), reference_speed=REFERENCE_SPEED, rows=rows
-    )
+    model = ARZModel(road, load_parameters("w99-3lane"), reference_speed=REFERENCE_SPEED, rows=rows)
     rng, n_steps, s = np.random.default_rng(0), 60, model.n_segments
     density = 0.1 * model.jam_density * (1.0 + 0.25 * rng.normal(size=(1, s)))
     start = model.states(density, np.full((1, s), 60.0))
