@@ -8,7 +8,6 @@ import numpy as np
 from dptse_env.estimators.base import Backend, Estimate, Estimator
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
-from dptse_env.utils import compile_ahead
 from dptse_env.utils.registry import Registry, is_foreign, missing_methods, name_of_class
 
 
@@ -45,7 +44,9 @@ ESTIMATORS = Registry(
     {
         "ekf": _filter("ekf", "EKF"),
         "ukf": _filter("ukf", "UKF"),
-        "enkf": _filter("enkf", "EnKF"),
+        "enkf": Backends(
+            "dptse_env.estimators.enkf:EnKF", "dptse_env.estimators.reference.enkf:ReferenceEnKF"
+        ),
         "mhe": _filter("mhe", "MHE"),
         "random_walk": Backends(_WALK, _WALK),
         "blend": _filter("blend", "Blend"),
@@ -104,8 +105,6 @@ def make_estimator(
             model.network, model.parameters, model.time_step, model.reference_speed, model.rows,
             has_demand,
         )  # fmt: skip
-    if isinstance(estimator, str):
-        compile_ahead.expect(estimator)
     factory = resolve_name(getattr(part, backend)) if isinstance(part, Backends) else part
     made: Estimator = factory(model, n_episodes, settings)
     if is_foreign(made):

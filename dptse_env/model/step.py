@@ -20,7 +20,16 @@ from typing import NamedTuple
 import numpy as np
 
 from dptse_env.model.network import EXIT, LINK, MERGE, RoadArrays
-from dptse_env.model.parameters import MEASUREMENT_FLOOR, STANDING, VACUUM
+from dptse_env.model.parameters import (
+    LARGEST_FACTOR,
+    LARGEST_W,
+    LEAST_DENSITY,
+    LEAST_FACTOR,
+    LEAST_W,
+    MEASUREMENT_FLOOR,
+    STANDING,
+    VACUUM,
+)
 from dptse_env.utils.arrays import FloatArray
 from dptse_env.utils.kernels import kernel, kernel_part
 
@@ -342,6 +351,77 @@ def jacobians(
 
 
 @kernel_part
+def normalise(
+    road: RoadArrays, density_scale: float, blocks: FloatArray, by_factor: FloatArray
+) -> None:
+    """Normalise a step's derivatives: rho by rho_m, psi by rho_m v_f."""
+    v_f = road.free_flow_speed
+    for s in range(blocks.shape[0]):
+        for slot in range(blocks.shape[1]):
+            blocks[s, slot, 1] *= v_f
+            blocks[s, slot, 2] /= v_f
+    for e in range(by_factor.shape[0]):
+        by_factor[e, 0] /= density_scale
+        by_factor[e, 1] /= density_scale * v_f
+
+
+@kernel_part
+def project(road: RoadArrays, state: FloatArray, is_box: bool) -> None:
+    """Project a state into its bounds, as `ARZModel.project`; a NaN stays NaN."""
+    v_f = road.free_flow_speed
+    for c in range(road.jam.size):
+        rho, psi, jam = state[2 * c], state[2 * c + 1], road.jam[c]
+        if is_box:
+            rho = clip(rho, 0.0, jam)
+            low, high = 0.0, jam * v_f
+        else:
+            rho = clip(rho, LEAST_DENSITY, jam)
+            least_w = max(pressure(rho, jam, v_f, road.gamma), LEAST_W * v_f)
+            low, high = least_w * rho, LARGEST_W * v_f * rho
+        state[2 * c], state[2 * c + 1] = rho, clip(psi, low, high)
+    for i in range(2 * road.jam.size, state.size):
+        state[i] = clip(state[i], LEAST_FACTOR, LARGEST_FACTOR)
+
+
+@kernel_part
+def clip(value: float, low: float, high: float) -> float:
+    """Return a value held between two others; a NaN stays NaN."""
+    if value < low:
+        return low
+    if value > high:
+        return high
+    return value
+
+
+@kernel_part
+def measured(
+    rho: float, psi: float, jam: float, v_f: float, gamma: float
+) -> tuple[float, float, float]:
+    """Return a speed [km/h], its density floored, and its derivatives by rho and psi."""
+    floor = MEASUREMENT_FLOOR * jam
+    floored = max(rho, floor)
+    p = pressure(floored, jam, v_f, gamma)
+    slope = -(psi / floored + gamma * p) / floored if rho > floor else 0.0
+    return psi / floored - p, slope, 1.0 / floored
+
+
+@kernel_part
+def released(
+    road: RoadArrays, s: int, rho: float, psi: float, centre: float
+) -> tuple[float, float, float]:
+    """Return a segment's released second number, and its derivatives by rho and psi.
+
+    That is the flow [veh/h] centred on a speed [km/h], or the speed where the centre is NaN.
+    """
+    jam, v_f, gamma = road.jam[s], road.free_flow_speed, road.gamma
+    if np.isnan(centre):
+        return measured(rho, psi, jam, v_f, gamma)
+    p = pressure(rho, jam, v_f, gamma)
+    flow = psi - rho * (p + centre)
+    return flow, -(1.0 + gamma) * p - centre, 1.0
+
+
+@kernel_part
 def write_row(
     road: RoadArrays,
     units: FloatArray,
@@ -365,20 +445,12 @@ def write_row(
         weights: `(2, >= 2 span)`, written, of the components from 2 `row_first[m]` on.
         constants: `(2,)`, written.
     """
-    first, span, v_f, gamma = road.row_first[m], road.row_span[m], road.free_flow_speed, road.gamma
+    first, span = road.row_first[m], road.row_span[m]
     constants[:] = 0.0
     for i in range(span):
         s = first + i
-        rho, psi, jam = state[2 * s], state[2 * s + 1], road.jam[s]
-        if np.isnan(centre[s]):
-            floored = max(rho, MEASUREMENT_FLOOR * jam)
-            p = pressure(floored, jam, v_f, gamma)
-            second, by_psi = psi / floored - p, 1.0 / floored
-            by_rho = -(psi / floored + gamma * p) / floored if rho == floored else 0.0
-        else:
-            p = pressure(rho, jam, v_f, gamma)
-            second, by_psi = psi - rho * (p + centre[s]), 1.0
-            by_rho = -(1.0 + gamma) * p - centre[s]
+        rho, psi = state[2 * s], state[2 * s + 1]
+        second, by_rho, by_psi = released(road, s, rho, psi, centre[s])
         part = 1.0 / (span * road.second_scale)
         weights[0, 2 * i], weights[0, 2 * i + 1] = 1.0 / span, 0.0
         weights[1, 2 * i] = part * by_rho * units[2 * s]

@@ -10,7 +10,6 @@ from dptse_env.release.base import (
 )
 from dptse_env.release.boundary import BOUNDARIES, BoundaryModel
 from dptse_env.release.checks import check_released
-from dptse_env.release.density import COUNTED, DensityRelease
 from dptse_env.release.detectors import Detectors
 from dptse_env.release.gaussian import Capped, Corrected, GaussianRelease, Paper, require_gaussian
 from dptse_env.release.mechanism import GaussianMechanism, Mechanism
@@ -39,7 +38,6 @@ RELEASE_MODELS = Registry(
         if isinstance(part, type) and issubclass(part, ReleaseModel)
         else "be a subclass of dptse_env.release.ReleaseModel"
     ),
-    aliases={"guaranteed": "capped"},
 )
 """Release models by name: with the noise as printed in the paper, with the noise that its cited
 theorem needs, with capped contributions, and with paced ledgers; the last two give a guarantee for
@@ -47,7 +45,6 @@ every query policy."""
 
 __all__ = [
     "BOUNDARIES",
-    "COUNTED",
     "MOST_OPTIONS",
     "PACINGS",
     "RELEASE_MODELS",
@@ -58,7 +55,6 @@ __all__ = [
     "Capped",
     "CappedSettings",
     "Corrected",
-    "DensityRelease",
     "Detectors",
     "GaussianMechanism",
     "GaussianRelease",

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from dptse_env.estimators import EstimatorSettings
-from dptse_env.estimators.compiled.ekf_rows import released
 from dptse_env.estimators.open_loop import estimated_traffic
 from dptse_env.model.model import make_road_arrays
 from dptse_env.model.parameters import VACUUM
+from dptse_env.model.step import released
 from tests.estimators.parts import compiled
 
 from .episodes import RELEASES, model_of, scale_of, simulate, started
