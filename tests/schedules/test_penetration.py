@@ -8,7 +8,7 @@ from dptse_env.parts import make_parts
 from dptse_env.process import QueryProcess
 from dptse_env.schedules import SCHEDULES
 
-NAMES = ("expected-reduction", "greedy-trace", "oracle-error", "oracle-gain", "oracle-greedy")
+NAMES = ("expected-reduction", "greedy-trace", "oracle-error", "oracle-gain")
 
 
 def make(n_episodes=2, **keywords):
