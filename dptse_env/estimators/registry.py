@@ -8,7 +8,6 @@ import numpy as np
 from dptse_env.estimators.base import Backend, Estimate, Estimator
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
-from dptse_env.utils import compile_ahead
 from dptse_env.utils.registry import Registry, is_foreign, missing_methods, name_of_class
 
 
@@ -20,9 +19,6 @@ class Backends(NamedTuple):
 
     compiled: str
     reference: str
-
-
-_MODELS = Backends("dptse_env.model.compiled:CompiledARZModel", "dptse_env.model.model:ARZModel")
 
 
 def _filter(name: str, cls: str) -> Backends:
@@ -48,7 +44,9 @@ ESTIMATORS = Registry(
     {
         "ekf": _filter("ekf", "EKF"),
         "ukf": _filter("ukf", "UKF"),
-        "enkf": _filter("enkf", "EnKF"),
+        "enkf": Backends(
+            "dptse_env.estimators.enkf:EnKF", "dptse_env.estimators.reference.enkf:ReferenceEnKF"
+        ),
         "mhe": _filter("mhe", "MHE"),
         "random_walk": Backends(_WALK, _WALK),
         "blend": _filter("blend", "Blend"),
@@ -86,7 +84,7 @@ def make_estimator(
             of EKF and random walk), `open_loop` (no measurements), `recurrent` (a network), a
             registered name, ``"package.module:Class"`` or a class.
         backend: `compiled` (numba) or `reference` (numpy, filterpy, qpsolvers); the random walk
-            is plain numpy under both. For a class of another package it selects the model alone.
+            is plain numpy under both.
         model: The traffic model.
         n_episodes: Number of episodes, >= 1.
         settings: Settings; None for the defaults.
@@ -102,14 +100,13 @@ def make_estimator(
     settings = settings_type(estimator)() if settings is None else settings
     check_demand(estimator, settings)
     has_demand = getattr(settings, "demand", None) is not None
-    model_of_backend = resolve_name(getattr(_MODELS, backend))(
-        model.network, model.parameters, model.time_step, model.reference_speed, model.rows,
-        has_demand,
-    )  # fmt: skip
-    if isinstance(estimator, str):
-        compile_ahead.expect(estimator)
+    if has_demand != (model.n_demand_states > 0):
+        model = ARZModel(
+            model.network, model.parameters, model.time_step, model.reference_speed, model.rows,
+            has_demand,
+        )  # fmt: skip
     factory = resolve_name(getattr(part, backend)) if isinstance(part, Backends) else part
-    made: Estimator = factory(model_of_backend, n_episodes, settings)
+    made: Estimator = factory(model, n_episodes, settings)
     if is_foreign(made):
         _check_attributes(made, model, n_episodes)
     return made

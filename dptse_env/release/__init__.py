@@ -39,7 +39,6 @@ RELEASE_MODELS = Registry(
         if isinstance(part, type) and issubclass(part, ReleaseModel)
         else "be a subclass of dptse_env.release.ReleaseModel"
     ),
-    aliases={"guaranteed": "capped"},
 )
 """Release models by name: with the noise as printed in the paper, with the noise that its cited
 theorem needs, with capped contributions, and with paced ledgers; the last two give a guarantee for

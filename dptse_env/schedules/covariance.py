@@ -14,7 +14,6 @@ from dptse_env.schedules.base import ProcessSchedule, require_plain
 from dptse_env.schedules.covariance_kernels import Problem
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray, Observation
 from dptse_env.utils.fields import POSITIVE, checked_fields
-from dptse_env.utils.validation import require
 
 
 @dataclass(frozen=True)
@@ -83,8 +82,7 @@ class CovarianceSchedule(ProcessSchedule):
         """Bind the schedule to a process (``env.unwrapped.process``).
 
         Raises:
-            ValueError: The estimator has no covariance, or a process noise in (rho, w) that the
-                schedule would need, or options are not the mainline segments.
+            ValueError: The estimator has no covariance, or options are not the mainline segments.
         """
         super().__init__(process, seed)
         require_plain(process.interface, self.name)
@@ -176,10 +174,6 @@ def _problem(process: QueryProcess, inflation: CovarianceInflation) -> Problem:
     n, rho_m, v_f = corridor.n_mainline, model.density_scale, model.speed_scale
     sigma = np.array(settings.noise_scale) * process.expected_sigma / model.measurement_scale
     is_walk = config.estimator == "random_walk"
-    if inflation.process_noise is None and not is_walk:
-        given = settings.process_noise_in
-        allowed = "'psi' for a schedule that predicts the covariance"
-        require(given == "psi", "estimator_settings.process_noise_in", allowed, given)
     noise = settings.walk_noise if is_walk else settings.process_noise
     always = np.array(sorted(corridor.fixed_sensors), dtype=np.int64)
     return Problem(

@@ -11,10 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dptse_env.estimators.compiled.algebra import propagate
-from dptse_env.estimators.compiled.ekf_kernels import project
-from dptse_env.estimators.compiled.ekf_rows import measured, released
 from dptse_env.model.network import RoadArrays
-from dptse_env.model.step import advance
+from dptse_env.model.step import advance, measured, project, released
 from dptse_env.utils.arrays import FloatArray, IntArray
 from dptse_env.utils.kernel_loops import copy_matrix, copy_vector
 from dptse_env.utils.kernels import kernel_part

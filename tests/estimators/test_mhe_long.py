@@ -13,7 +13,7 @@ from dptse_env.estimators import (
     make_estimator,
 )
 from dptse_env.estimators.horizon import assemble, natural_residual, normalised_bounds, solve
-from dptse_env.model.compiled import CompiledARZModel
+from dptse_env.model import ARZModel
 from dptse_env.model.parameters import load_parameters
 
 from ..model.roads import UNEVEN, Road
@@ -37,7 +37,7 @@ def hostile(n_mainline, release, wildness, n_steps, seed=0, **settings):
     """
     rng = np.random.default_rng(seed)
     road, parameters = long_road(n_mainline), load_parameters("w99-3lane")
-    model = CompiledARZModel(road, parameters, reference_speed=REFERENCE_SPEEDS[release])
+    model = ARZModel(road, parameters, reference_speed=REFERENCE_SPEEDS[release])
     demand = DemandSettings() if release == "flow" else None
     settings = EstimatorSettings(demand=demand, **settings)
     mhe = make_estimator("mhe", "compiled", model, 1, settings)
@@ -154,7 +154,7 @@ def test_two_predictions_without_an_update_move_a_full_window_twice():
 @pytest.mark.usefixtures("order")
 def test_a_road_of_segments_of_many_kinds_is_estimated_alike():
     """Lengths, lanes and limits vary, ramps have several segments."""
-    model = CompiledARZModel(UNEVEN, load_parameters("w99-3lane"))
+    model = ARZModel(UNEVEN, load_parameters("w99-3lane"))
     rng, s, v_f = np.random.default_rng(0), model.n_segments, model.speed_scale
     start = model.states(0.2 * model.jam_density[None], np.full((1, s), 0.5 * v_f))
     settings = EstimatorSettings(mhe=HorizonSettings(horizon=4))

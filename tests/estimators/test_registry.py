@@ -64,7 +64,7 @@ def test_unknown_names_say_what_is_allowed():
 @pytest.mark.parametrize(
     ("modules", "absent"),
     [
-        pytest.param(("estimators.compiled.ekf", "estimators.compiled.enkf"), "filterpy"),
+        pytest.param(("estimators.compiled.ekf", "estimators.enkf"), "filterpy"),
         pytest.param(
             ("estimators.reference.enkf", "estimators.reference.ekf"),
             "numba",

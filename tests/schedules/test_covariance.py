@@ -48,7 +48,8 @@ class Plain:
             q = inflation.process_noise or settings.process_noise
             self.Q = np.diag(np.tile(np.square(q), model.n_segments))
             self.mean = model.project(model.step(mean, inputs), settings.bounds)
-        self.H = self.whole(model.measurement_jacobian(self.mean)[0], model.measurement_scale)
+        H = model.measurement_matrix(self.mean)[0] / model.measurement_scale[:, None]
+        self.H = H.reshape(-1, self.scale.size) * self.scale
         sigma = np.array(settings.noise_scale) * process.release.sigma / model.measurement_scale
         self.R = np.tile(sigma**2, model.n_segments)
         units = [config.corridor.density_scale, config.corridor.speed_scale]

@@ -7,8 +7,8 @@ import numpy as np
 from dptse_env.estimators.compiled import ekf_kernels as kernels
 from dptse_env.estimators.compiled.active_set import make_active_set, minimise
 from dptse_env.estimators.compiled.chain import make_window_scratch
-from dptse_env.estimators.compiled.ekf_kernels import Filters, Packed, process_noise, project
-from dptse_env.estimators.compiled.ekf_rows import released, row_variances
+from dptse_env.estimators.compiled.ekf_kernels import Filters, Packed, process_noise
+from dptse_env.estimators.compiled.ekf_rows import row_variances
 from dptse_env.estimators.compiled.moments import is_finite
 from dptse_env.estimators.compiled.stages import (
     UNSOLVED,
@@ -21,7 +21,7 @@ from dptse_env.estimators.compiled.stages import (
 )
 from dptse_env.estimators.compiled.window import factorise
 from dptse_env.model.network import RoadArrays
-from dptse_env.model.step import advance, make_scratch
+from dptse_env.model.step import advance, make_scratch, project, released
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.kernel_loops import all_finite, any_of, copy_matrix, copy_vector
 from dptse_env.utils.kernels import kernel, kernel_part

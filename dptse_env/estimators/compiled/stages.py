@@ -5,10 +5,9 @@ from typing import NamedTuple
 import numpy as np
 
 from dptse_env.estimators.compiled.chain import Chain
-from dptse_env.estimators.compiled.ekf_kernels import Filters, normalise, project
-from dptse_env.estimators.compiled.ekf_rows import released
+from dptse_env.estimators.compiled.ekf_kernels import Filters
 from dptse_env.model.network import RoadArrays
-from dptse_env.model.step import advance, make_scratch
+from dptse_env.model.step import advance, make_scratch, normalise, project, released
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.kernel_loops import copy_blocks, copy_matrix, copy_vector
 from dptse_env.utils.kernels import kernel_part
