@@ -10,7 +10,6 @@ from dptse_env.release.base import (
 )
 from dptse_env.release.boundary import BOUNDARIES, BoundaryModel
 from dptse_env.release.checks import check_released
-from dptse_env.release.density import COUNTED, DensityRelease
 from dptse_env.release.detectors import Detectors
 from dptse_env.release.gaussian import Capped, Corrected, GaussianRelease, Paper, require_gaussian
 from dptse_env.release.mechanism import GaussianMechanism, Mechanism
@@ -46,7 +45,6 @@ every query policy."""
 
 __all__ = [
     "BOUNDARIES",
-    "COUNTED",
     "MOST_OPTIONS",
     "PACINGS",
     "RELEASE_MODELS",
@@ -57,7 +55,6 @@ __all__ = [
     "Capped",
     "CappedSettings",
     "Corrected",
-    "DensityRelease",
     "Detectors",
     "GaussianMechanism",
     "GaussianRelease",
