@@ -14,6 +14,7 @@ from dptse_env.utils.kernels import kernel_part
 VECTOR_WIDTH = 8  # numbers in a register
 
 
+@kernel_part
 def padded(n: int) -> int:
     """Length of a padded row of n numbers."""
     return -(-n // VECTOR_WIDTH) * VECTOR_WIDTH

@@ -6,11 +6,7 @@ import numpy as np
 
 from dptse_env.model import ARZModel
 from dptse_env.model.network import RoadNetwork
-from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
-
-WHITENING = 1e-6
-"""Share by which variances are enlarged where a segment's covariance is inverted, as it may be
-singular: in an almost empty segment psi follows from rho."""
+from dptse_env.utils.arrays import FloatArray
 
 
 def positions(network: RoadNetwork) -> FloatArray:
@@ -18,11 +14,7 @@ def positions(network: RoadNetwork) -> FloatArray:
 
     Mainline segments lie at their centres, ramps at the face where they join or leave.
     """
-    return _along(network, np.array(network.segment_lengths[: network.n_mainline]))
-
-
-def _along(network: RoadNetwork, lengths: FloatArray) -> FloatArray:
-    """Return the positions of segments where the mainline segments have lengths `(N,)`."""
+    lengths = np.array(network.segment_lengths[: network.n_mainline])
     faces = np.concatenate([[0.0], np.cumsum(lengths)])
     along = np.empty(len(network.segment_lengths))
     along[: network.n_mainline] = faces[:-1] + 0.5 * lengths
@@ -84,37 +76,3 @@ def row_tapers(model: ARZModel, reach: float) -> RowTapers:
         with_states=np.ascontiguousarray(by_segment[:, segments]),
         among_rows=by_segment @ weights.T,
     )
-
-
-class Places(NamedTuple):
-    """Places of n numbers along a road: components of a state, or released values."""
-
-    segment: IntArray  # (n,)
-    position: FloatArray  # (n,) counted in mainline segments of any length, multiples of a half
-
-
-def places_of(model: ARZModel, segments: IntArray) -> Places:
-    """Return the places of segments, for which `positions` holds but for its unit."""
-    along = _along(model.network, np.ones(model.network.n_mainline))
-    return Places(segments, along[segments])
-
-
-def state_places(model: ARZModel) -> Places:
-    """Return the places of the components of a state; a demand factor is that of its entry."""
-    entries = model.layout.entries[: model.n_demand_states]
-    return places_of(model, np.concatenate([np.repeat(np.arange(model.n_segments), 2), entries]))
-
-
-def in_road_order(places: Places) -> IntArray:
-    """Return the components in the order of the road, those of a segment next to one another."""
-    return np.lexsort((places.segment, places.position))
-
-
-def band_in_force(model: ARZModel, band: int | None) -> int | None:
-    """Return the band of a filter on a road, None where it would cover all of the road."""
-    return None if band is None or band >= model.network.n_mainline - 1 else band
-
-
-def within(distance: FloatArray, band: int) -> BoolArray:
-    """Return whether distances in segments lie within a band, rounding errors aside."""
-    return np.asarray(distance <= band + 1e-6, dtype=np.bool_)

@@ -21,9 +21,6 @@ class Backends(NamedTuple):
     reference: str
 
 
-_MODELS = Backends("dptse_env.model.compiled:CompiledARZModel", "dptse_env.model.model:ARZModel")
-
-
 def _filter(name: str, cls: str) -> Backends:
     package = "dptse_env.estimators"
     return Backends(
@@ -47,8 +44,12 @@ ESTIMATORS = Registry(
     {
         "ekf": _filter("ekf", "EKF"),
         "ukf": _filter("ukf", "UKF"),
-        "enkf": _filter("enkf", "EnKF"),
-        "mhe": _filter("mhe", "MHE"),
+        "enkf": Backends(
+            "dptse_env.estimators.enkf:EnKF", "dptse_env.estimators.reference.enkf:ReferenceEnKF"
+        ),
+        "mhe": Backends(
+            "dptse_env.estimators.mhe:MHE", "dptse_env.estimators.reference.mhe:ReferenceMHE"
+        ),
         "random_walk": Backends(_WALK, _WALK),
         "blend": _filter("blend", "Blend"),
         "open_loop": Backends(_OPEN, _OPEN),
@@ -85,7 +86,7 @@ def make_estimator(
             of EKF and random walk), `open_loop` (no measurements), `recurrent` (a network), a
             registered name, ``"package.module:Class"`` or a class.
         backend: `compiled` (numba) or `reference` (numpy, filterpy, qpsolvers); the random walk
-            is plain numpy under both. For a class of another package it selects the model alone.
+            is plain numpy under both.
         model: The traffic model.
         n_episodes: Number of episodes, >= 1.
         settings: Settings; None for the defaults.
@@ -101,12 +102,13 @@ def make_estimator(
     settings = settings_type(estimator)() if settings is None else settings
     check_demand(estimator, settings)
     has_demand = getattr(settings, "demand", None) is not None
-    model_of_backend = resolve_name(getattr(_MODELS, backend))(
-        model.network, model.parameters, model.time_step, model.reference_speed, model.rows,
-        has_demand,
-    )  # fmt: skip
+    if has_demand != (model.n_demand_states > 0):
+        model = ARZModel(
+            model.network, model.parameters, model.time_step, model.reference_speed, model.rows,
+            has_demand,
+        )  # fmt: skip
     factory = resolve_name(getattr(part, backend)) if isinstance(part, Backends) else part
-    made: Estimator = factory(model_of_backend, n_episodes, settings)
+    made: Estimator = factory(model, n_episodes, settings)
     if is_foreign(made):
         _check_attributes(made, model, n_episodes)
     return made

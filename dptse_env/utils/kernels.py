@@ -228,7 +228,13 @@ def _loaded(path: Path, context: Any) -> Any:
         return None
     with contextlib.suppress(OSError):  # another user's, or removed meanwhile
         os.utime(path)  # in use
-    return CompileResult._rebuild(context, *pickle.loads(kept))
+    try:
+        return CompileResult._rebuild(context, *pickle.loads(kept))
+    except (ImportError, AttributeError):  # kept for a type that has moved or is no more
+        return None
+    except (pickle.UnpicklingError, EOFError):
+        logger.warning("%s is damaged and made again", path)
+        return None
 
 
 def _turn(function: FunctionType, folder: Path) -> Any:

@@ -2,13 +2,7 @@
 
 from types import SimpleNamespace
 
-import numpy as np
-
-from dptse_env.estimators.compiled.normals import fill, make_bits
-from tests.estimators.parts import compiled
-
-fill = compiled(fill)
-make_bits = compiled(make_bits)
+from dptse_env.estimators.normals import draw
 
 
 class Replay:
@@ -18,10 +12,8 @@ class Replay:
         self.stream = stream.copy()
 
     def standard_normal(self, shape):
-        size = shape[0] * shape[1]
-        out = np.empty(size + size % 2, dtype=np.float32)  # a stream draws pairs
-        fill(self.stream, out, make_bits(out.size))
-        return out[:size].reshape(shape[1], shape[0]).T.astype(float)
+        drawn = draw(self.stream, shape[0] * shape[1])
+        return drawn.reshape(shape[1], shape[0]).T.astype(float)
 
 
 def draw_alike(compiled, reference) -> None:

@@ -8,14 +8,14 @@ import pytest
 from filterpy.kalman import EnsembleKalmanFilter
 
 from dptse_env.estimators import EnsembleSettings, EstimatorSettings
-from dptse_env.estimators.compiled.enkf import CompiledEnKF
+from dptse_env.estimators.enkf import EnKF
 from dptse_env.estimators.reference.enkf import ReferenceEnKF
 from dptse_env.model import ARZModel, load_parameters
 from tests.model.roads import Road
 
 from .episodes import random_streams
 
-both_backends = pytest.mark.parametrize("backend", [CompiledEnKF, ReferenceEnKF])
+both_backends = pytest.mark.parametrize("backend", [EnKF, ReferenceEnKF])
 
 
 def linear_system(n_steps=20):
@@ -92,7 +92,7 @@ def test_mean_over_seeds_is_the_kalman_filters(backend):
 
 def test_means_are_spread_over_seeds_as_filterpys_where_all_is_linear():
     system, n_members, n_seeds = linear_system(8), 50, 150
-    ours = run_linear(system, CompiledEnKF, n_members, n_seeds).states
+    ours = run_linear(system, EnKF, n_members, n_seeds).states
     theirs = np.empty_like(ours)
     np.random.seed(0)  # noqa: NPY002, filterpy's draws
     for seed in range(n_seeds):

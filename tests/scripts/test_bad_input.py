@@ -38,7 +38,6 @@ FILES = {
         "s.json", SETTINGS,
         ["evaluate", "--keywords", '{{"estimator_settings": "{path}"}}'],
     ),
-    "plan": ("p.json", shipped("dptse_env/schedules/plans/*.json"), ["evaluate", "--schedules"]),
     "policy": ("p.zip", POLICY, ["tune", "--schedule"]),
     "model": ("m.zip", POLICY, ["evaluate", "--policies", "stable_baselines3:PPO={path}"]),
     "network": (

@@ -118,6 +118,15 @@ def test_a_kernel_is_kept_on_disk_and_compiled_anew_when_a_part_changes(load):
     assert fresh(MODULE.replace("FACTOR = 2.0", "FACTOR = 4.0")) == (6.0, 0)
 
 
+def test_machine_code_for_a_type_that_is_no_more_is_compiled_anew(load):
+    """The code of the kernel does not name the types of its arguments."""
+    text = MODULE.replace("Pair(scaled(x), x).first", "x.first")
+    for name, expected in (("Pair", 0), ("Two", 0), ("Two", 1)):
+        module = load(text.replace("Pair", name))
+        assert module.run(getattr(module, name)(1.5, 2.0)) == 1.5
+        assert sum(module.run.stats.cache_hits.values()) == expected
+
+
 def test_machine_code_is_found_wherever_the_module_lies(load, tmp_path, monkeypatch):
     load().run(1.5)
     elsewhere = tmp_path / "elsewhere"

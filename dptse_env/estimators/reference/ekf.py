@@ -4,15 +4,12 @@ import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 
 from dptse_env.estimators.batch import EpisodeMeasurements
-from dptse_env.estimators.localisation import band_in_force, state_places
-from dptse_env.estimators.reference.band import DenseBand, Scalars
 from dptse_env.estimators.reference.kalman import (
     EpisodeFilter,
     ReferenceFilter,
     configure,
     linearise,
     measurement_covariance,
-    process_covariance,
     step_variance,
 )
 from dptse_env.estimators.settings import EstimatorSettings
@@ -46,7 +43,7 @@ class _Filter(ExtendedKalmanFilter):  # type: ignore[misc]
         jacobian = self.model.jacobian(before, inputs)[0]
         self.F = jacobian * self.scale[None] / self.scale[:, None]
         self.state = self.model.step(before, inputs)
-        self.Q = process_covariance(self, variance)
+        self.Q = np.diag(variance)
 
     def advance(self, u: FloatArray) -> None:
         self.predict(u)
@@ -65,37 +62,8 @@ class _Filter(ExtendedKalmanFilter):  # type: ignore[misc]
         return np.asarray((self.y / np.sqrt(np.diag(self.S))).reshape(-1, 2))
 
 
-class _BandFilter(_Filter):
-    """Filter whose covariances reach a band along the road."""
-
-    def __init__(self, model: ARZModel, settings: EstimatorSettings, band: int) -> None:
-        self._band = DenseBand(state_places(model), band)
-        super().__init__(model, settings)
-
-    def advance(self, u: FloatArray) -> None:
-        super().advance(u)
-        self.P = self._band.confine(self.P - self.Q) + self.Q
-
-    def assimilate(self, measured: EpisodeMeasurements) -> FloatArray:
-        """See `EpisodeFilter.assimilate`; numbers are taken in one after the other."""
-        observed = measured.observed
-        if not observed.any():
-            return np.zeros((0, 2))
-        predicted = self.model.measure(self.state, measured.centre)[0]
-        residuals = (measured.values - predicted) / self.measurement_scale
-        noise = np.diag(measurement_covariance(self, measured))
-        slopes = linearise(self.model, self, measured)
-        scalars = Scalars(slopes, residuals[observed].ravel(), noise)
-        shift, self.P, innovations = self._band.take_in(self.P, scalars)
-        self.state = (self.x + shift)[None] * self.scale
-        return innovations.reshape(-1, 2)
-
-
 class ReferenceEKF(ReferenceFilter):
     """Extended Kalman filter on the ARZ model by filterpy, a filter per episode."""
 
     def _filter(self) -> EpisodeFilter:
-        band = band_in_force(self.model, self.settings.band)
-        if band is None:
-            return _Filter(self.model, self.settings)
-        return _BandFilter(self.model, self.settings, band)
+        return _Filter(self.model, self.settings)

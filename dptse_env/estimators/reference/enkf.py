@@ -16,7 +16,6 @@ from dptse_env.estimators.localisation import RowTapers, row_tapers
 from dptse_env.estimators.noise import (
     count_variance,
     density_growth,
-    drivers,
     initial_variance,
     process_variance,
 )
@@ -35,7 +34,7 @@ class _Streams(NamedTuple):
 class ReferenceEnKF(BatchEstimator):
     """Ensemble Kalman filter with perturbed observations (Evensen, 2003; Burgers et al., 1998).
 
-    Equal to `CompiledEnKF` in distribution; its random numbers differ.
+    Equal to `EnKF` in distribution; its random numbers differ.
 
     Attributes:
         members: `(n, n_members, n_x)` [veh/km, veh/h], then demand factors if there are any.
@@ -106,18 +105,7 @@ class ReferenceEnKF(BatchEstimator):
             moved = self.model.step(states, np.repeat(inputs, self.n_members, axis=0))
             moved = moved.reshape(-1, self.n_members, self.model.n_states)
             for episode, *parts in zip(episodes.tolist(), moved, deviations, strict=True):
-                self.members[episode] = self._disturbed(episode, *parts)
-
-    def _disturbed(self, episode: int, members: FloatArray, deviation: FloatArray) -> FloatArray:
-        """Add process noise of rho and psi, or of rho and w, to members and project them."""
-        if self.settings.process_noise_in == "psi":
-            return self._perturbed(episode, members, deviation)
-        noise = deviation * self._streams[episode].process.standard_normal(members.shape)
-        of_rho, of_psi = self.model.components(noise)
-        rho, w = drivers(self.model, members.mean(axis=0)[None])
-        of_psi *= rho  # a view into the noise
-        of_psi += w * self.model.speed_scale * of_rho
-        return self._projected(members + noise)
+                self.members[episode] = self._perturbed(episode, *parts)
 
     def _update(self, measured: Measurements) -> None:
         with np.errstate(all="ignore"):

@@ -12,7 +12,6 @@ from dptse_env.estimators.base import Estimate
 from dptse_env.estimators.batch import BatchEstimator, EpisodeMeasurements, Measurements
 from dptse_env.estimators.noise import (
     count_variance,
-    coupled_covariance,
     density_growth,
     initial_variance,
     process_variance,
@@ -94,13 +93,6 @@ def step_variance(episode_filter: Any) -> FloatArray:
     model, settings = episode_filter.model, episode_filter.settings
     density = model.density(episode_filter.state)[0]
     return process_variance(model, settings) + density_growth(model, settings, density)
-
-
-def process_covariance(episode_filter: Any, variance: FloatArray) -> FloatArray:
-    """Return Q of a step that leads to a filter's present mean, of its `step_variance`."""
-    if episode_filter.settings.process_noise_in == "psi":
-        return np.diag(variance)
-    return coupled_covariance(episode_filter.model, variance, episode_filter.state[0])
 
 
 def measurement_covariance(episode_filter: Any, measured: EpisodeMeasurements) -> FloatArray:

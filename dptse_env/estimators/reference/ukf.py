@@ -4,20 +4,11 @@ import numpy as np
 from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter, unscented_transform
 
 from dptse_env.estimators.batch import EpisodeMeasurements
-from dptse_env.estimators.localisation import (
-    Places,
-    band_in_force,
-    in_road_order,
-    places_of,
-    state_places,
-)
-from dptse_env.estimators.reference.band import DenseBand, Scalars
 from dptse_env.estimators.reference.kalman import (
     EpisodeFilter,
     ReferenceFilter,
     configure,
     measurement_covariance,
-    process_covariance,
     step_variance,
 )
 from dptse_env.estimators.settings import EstimatorSettings
@@ -88,7 +79,7 @@ class _Filter(UnscentedKalmanFilter):  # type: ignore[misc]
     def advance(self, inputs: FloatArray) -> None:
         variance = step_variance(self)
         self.predict(inputs=inputs)
-        self.P += process_covariance(self, variance)
+        self.P += np.diag(variance)
         self.has_moved = True
 
     def assimilate(self, measured: EpisodeMeasurements) -> FloatArray:
@@ -110,90 +101,8 @@ class _Filter(UnscentedKalmanFilter):  # type: ignore[misc]
         return np.asarray((self.y / np.sqrt(np.diag(self.S))).reshape(-1, 2))
 
 
-class _BandFilter(_Filter):
-    """Filter whose covariances reach a band along the road.
-
-    Points are all evaluated along the whole road, and their covariances cut to the band, in which
-    the measured segments' speeds or flows join the state.
-    """
-
-    def __init__(self, model: ARZModel, settings: EstimatorSettings, band: int) -> None:
-        self._places, self._reach = state_places(model), band
-        self._plain = ARZModel(
-            model.network,
-            model.parameters,
-            model.time_step,
-            model.reference_speed,
-            demand_states=model.n_demand_states > 0,
-        )
-        self._noise = np.zeros((model.n_states, model.n_states))
-        ukf = settings.ukf
-        spread = ukf.alpha**2 * (model.n_states + ukf.kappa)
-        self._spread, self._weight = np.sqrt(spread), 0.5 / spread
-        self._surplus = ukf.beta - ukf.alpha**2
-        super().__init__(model, settings)
-
-    def _move(self, inputs: FloatArray | None) -> None:
-        """Make points, predict them if there are inputs, and project them."""
-        order = in_road_order(self._places)
-        root = np.zeros_like(self.P)
-        root[order] = np.linalg.cholesky(self.P[np.ix_(order, order)])
-        mean = self.state[0] / self.scale
-        steps = self._spread * root.T
-        points = np.concatenate([mean[None], mean + steps, mean - steps]) * self.scale
-        if inputs is not None:
-            points = self.model.step(points, np.repeat(inputs[None], len(points), axis=0))
-        self.sigmas_f = self.model.project(points, self.bounds) / self.scale
-
-    def _moments(self, points: FloatArray, places: Places) -> tuple[FloatArray, FloatArray]:
-        """Return mean and covariance of points `(2 n_x + 1, n)` at n places."""
-        band, distance = DenseBand(places, self._reach), points - points[0]
-        shift = self._weight * distance.sum(axis=0)
-        covariance = self._weight * distance.T @ distance + self._surplus * np.outer(shift, shift)
-        return points[0] + shift, band.confine(covariance)
-
-    def advance(self, inputs: FloatArray) -> None:
-        variance = step_variance(self)
-        self._move(inputs)
-        self.x, self.P = self._moments(self.sigmas_f, self._places)
-        self._noise = process_covariance(self, variance)
-        self.P += self._noise
-        self.has_moved = True
-
-    def assimilate(self, measured: EpisodeMeasurements) -> FloatArray:
-        """See `EpisodeFilter.assimilate`; numbers are taken in one after the other."""
-        observed, rows, n = measured.observed, self.model.rows, self.model.n_states
-        if not observed.any():
-            return np.zeros((0, 2))
-        noise = np.diag(measurement_covariance(self, measured))
-        if not self.has_moved:
-            self._move(None)
-            self._noise = np.zeros_like(self.P)
-        weights = rows.weights[observed]
-        seen = np.flatnonzero(weights.any(axis=0))
-        outputs = self._plain.measure(self.sigmas_f * self.scale, measured.centre)[:, seen, 1]
-        points = np.concatenate([self.sigmas_f, outputs / self.measurement_scale[1]], axis=1)
-        segments = np.concatenate([self._places.segment, seen])
-        places = places_of(self.model, segments)
-        mean, covariance = self._moments(points, places)
-        slopes = np.zeros((2 * len(weights), len(segments)))
-        slopes[0::2, 0 : 2 * self.model.n_segments : 2] = weights
-        slopes[1::2, n:] = weights[:, seen]
-        values = (measured.values[observed] / self.measurement_scale).ravel()
-        scalars = Scalars(slopes, values - slopes @ mean, noise)
-        shift, covariance, innovations = DenseBand(places, self._reach).take_in(covariance, scalars)
-        self.P = covariance[:n, :n] + self._noise
-        self.x = (mean + shift)[:n]
-        self.x = self.state[0] / self.scale
-        self.has_moved = False
-        return innovations.reshape(-1, 2)
-
-
 class ReferenceUKF(ReferenceFilter):
     """Unscented Kalman filter on the ARZ model by filterpy, a filter per episode."""
 
     def _filter(self) -> EpisodeFilter:
-        band = band_in_force(self.model, self.settings.band)
-        if band is None:
-            return _Filter(self.model, self.settings)
-        return _BandFilter(self.model, self.settings, band)
+        return _Filter(self.model, self.settings)

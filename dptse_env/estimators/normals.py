@@ -16,7 +16,7 @@ from numba import types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from dptse_env.utils.kernels import kernel_part
+from dptse_env.utils.kernels import kernel, kernel_part
 
 Stream = NDArray[np.uint64]  # (4, STREAM_WIDTH)
 Bits = NDArray[np.uint64]
@@ -42,12 +42,6 @@ def make_stream(generator: np.random.Generator) -> Stream:
     return generator.integers(0, 2**64 - 1, size=(4, STREAM_WIDTH), dtype=np.uint64, endpoint=True)
 
 
-@kernel_part
-def make_bits(n: int) -> Bits:
-    """Allocate the scratch space of `fill` for up to n numbers."""
-    return np.empty(-(-n // (2 * STREAM_WIDTH)) * STREAM_WIDTH, dtype=np.uint64)
-
-
 def _split_of(context: Any, x: Any) -> Any:
     """Split a float32 `x = 2^k z` with z in [sqrt(1/2), sqrt(2)): (z, k)."""
     del context, x
@@ -69,7 +63,7 @@ _split: Any = intrinsic(_split_of)
 
 
 @kernel_part
-def _draw_bits(stream: Stream, out: Bits) -> None:
+def draw_bits(stream: Stream, out: Bits) -> None:
     """Fill `out`, in complete blocks of STREAM_WIDTH, by xoshiro256++."""
     first, second, third, fourth = stream[0], stream[1], stream[2], stream[3]
     for start in range(0, out.size, STREAM_WIDTH):
@@ -109,15 +103,17 @@ def _transform(bits: Bits, first: Draws, second: Draws) -> None:
         second[i] = radius * (sine * a + a)
 
 
-@kernel_part
-def fill(stream: Stream, out: Draws, bits: Bits) -> None:
-    """Fill `out` with standard normal numbers and advance the stream.
+@kernel
+def draw(stream: Stream, n: int) -> Draws:
+    """Return standard normal numbers `(n,)` and advance the stream.
 
     Args:
         stream: From `make_stream`.
-        out: `(n,)`, n even.
-        bits: From `make_bits`, for n or more numbers.
+        n: How many; an odd number takes as much of the stream as the next even one.
     """
-    half = out.size // 2
-    _draw_bits(stream, bits[: (half + STREAM_WIDTH - 1) // STREAM_WIDTH * STREAM_WIDTH])
+    half = (n + 1) // 2
+    out = np.empty(2 * half, dtype=np.float32)
+    bits = np.empty(-(-half // STREAM_WIDTH) * STREAM_WIDTH, dtype=np.uint64)
+    draw_bits(stream, bits)
     _transform(bits[:half], out[:half], out[half:])
+    return out[:n]
