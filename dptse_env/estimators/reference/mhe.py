@@ -11,7 +11,6 @@ from dptse_env.estimators.horizon import (
     assemble,
     moving_variance,
     normalised_bounds,
-    require_process_noise,
     settings_of_mhe,
     solve,
 )
@@ -199,7 +198,6 @@ class ReferenceMHE(ReferenceFilter):
 
     def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
         """See `make_estimator`."""
-        require_process_noise(settings)
         self._windows: list[_EpisodeWindow] = []
         super().__init__(model, n_episodes, settings_of_mhe(settings))
 
