@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from dptse_env.config import TIME_STEP, EnvConfig
-from dptse_env.estimators import Estimator, check_settings, make_estimator
+from dptse_env.estimators import Estimator, make_estimator
 from dptse_env.fusion import Fusion
 from dptse_env.model import ARZModel
 from dptse_env.release import (
@@ -172,15 +172,6 @@ def make_model(config: EnvConfig) -> ARZModel:
         reference_speed=flow_centre(config),
         rows=config.queries.rows(config.corridor),
     )
-
-
-def check_estimator(config: EnvConfig) -> None:
-    """Refuse settings that the estimator cannot have on this road, before it is made.
-
-    Raises:
-        ValueError: A setting is out of range; the message starts with its path.
-    """
-    check_settings(config.estimator, make_model(config), config.settings())
 
 
 def make_release(
