@@ -7,13 +7,7 @@ import numpy as np
 
 from dptse_env.estimators.batch import Measurements
 from dptse_env.estimators.compiled import ekf_kernels
-from dptse_env.estimators.compiled.ekf_kernels import (
-    Filters,
-    Packed,
-    normalise,
-    process_noise,
-    project,
-)
+from dptse_env.estimators.compiled.ekf_kernels import Filters, Packed, process_noise
 from dptse_env.estimators.compiled.kalman import CompiledFilter
 from dptse_env.estimators.horizon import (
     LEAST_DEVIATION,
@@ -36,7 +30,7 @@ from dptse_env.estimators.window import (
 from dptse_env.model import ARZModel
 from dptse_env.model.model import make_road_arrays
 from dptse_env.model.network import RoadArrays
-from dptse_env.model.step import advance, make_scratch, write_row
+from dptse_env.model.step import advance, make_scratch, normalise, project, write_row
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.kernels import kernel, kernel_part
 
