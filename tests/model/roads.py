@@ -103,6 +103,13 @@ def random_states(model: ARZModel, n: int, rng: np.random.Generator) -> FloatArr
     return states
 
 
+def scattered_states(model: ARZModel, n: int, rng: np.random.Generator) -> FloatArray:
+    """States within bounds and beyond, with negative components among them."""
+    states = random_states(model, n, rng)
+    states *= 1.0 + 0.5 * rng.normal(size=states.shape)
+    return states + 0.1 * model.state_scale * rng.normal(size=states.shape)
+
+
 def random_inputs(model: ARZModel, n: int, rng: np.random.Generator) -> FloatArray:
     """Inputs of boundary cells all over the cone."""
     per_lane = model.parameters.jam_density / model.parameters.lanes
