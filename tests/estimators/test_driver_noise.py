@@ -60,7 +60,7 @@ def test_backends_agree(name, bounds, settings):
     episodes = averaged(30)
     settings = replace(settings, bounds=bounds)
     compiled, reference = (started(name, kind, episodes, settings) for kind in BACKENDS)
-    one, scale = reference._filters[0], compiled.model.state_scale
+    one, scale = reference.filters[0], compiled.model.state_scale
     for k in range(30):
         one.x, one.P = compiled.states[0] / scale, compiled.covariances[0]
         for estimator in (compiled, reference):

@@ -5,7 +5,7 @@ import pytest
 
 from dptse_env.estimators import EstimatorSettings
 from dptse_env.estimators.compiled.ekf_rows import released
-from dptse_env.estimators.open_loop import estimated_traffic
+from dptse_env.estimators.simple import estimated_traffic
 from dptse_env.model.model import make_road_arrays
 from dptse_env.model.parameters import VACUUM
 from tests.estimators.parts import compiled
