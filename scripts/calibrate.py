@@ -18,16 +18,15 @@ import numpy as np
 from agents.files import refuse_to_replace, replacing
 from agents.terminal import make_table, print_table
 from dptse_env.config import parse_seeds
-from dptse_env.model import ARZParameters, available_parameters, load_parameters
-from dptse_env.model.calibration import calibrate
-from dptse_env.model.compiled import CompiledARZModel
-from dptse_env.model.parameters import write_parameters
-from dptse_env.model.prediction import (
+from dptse_env.model import ARZModel, ARZParameters, available_parameters, load_parameters
+from dptse_env.model.calibration import (
     PredictionError,
     TrafficSeries,
+    calibrate,
     persistence_error,
     prediction_error,
 )
+from dptse_env.model.parameters import write_parameters
 from dptse_env.release.traffic_table import TrafficTable
 from dptse_env.traffic import Corridor, RecordLibrary, average_dwell
 from scripts.cli import Recording, Road, make_corridor, run
@@ -73,7 +72,7 @@ def shipped_parameters(corridor: Corridor) -> list[ARZParameters]:
     known = []
     for name in available_parameters():
         try:
-            CompiledARZModel(corridor, load_parameters(name))
+            ARZModel(corridor, load_parameters(name))
         except ValueError as problem:
             logger.info("without %s: %s", name, problem)
         else:
@@ -87,7 +86,7 @@ def compare(
     """Return the prediction errors of persistence and of every candidate on ``data``."""
     errors = {"persistence": persistence_error(data, corridor.n_mainline)}
     for parameters in candidates:
-        errors[parameters.name] = prediction_error(CompiledARZModel(corridor, parameters), data)
+        errors[parameters.name] = prediction_error(ARZModel(corridor, parameters), data)
     return errors
 
 

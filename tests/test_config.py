@@ -82,7 +82,6 @@ def test_demand_states_without_a_traffic_model_are_refused_by_the_configuration(
 def test_a_set_for_the_corridor_comes_before_that_for_any():
     config = resolve("long-highway", {})
     assert config.settings_name == "ekf-w99-3lane-paced-long-highway"
-    assert config.settings().band is not None
     assert resolve("long-highway", {"estimator": "mhe"}).settings_name == "mhe-w99-3lane-paced"
     assert resolve("private-highway-v1", {}).settings_name == "ekf-w99-3lane-paced"
 

@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from datetime import date
 from importlib.metadata import version
 from pathlib import Path
@@ -103,7 +103,7 @@ class TuningStudy:
         """Queue a labelled trial, unless one with its label was run or waits."""
         if self.task.with_demand and settings.demand is None:
             return
-        values = values_of(replace(settings, band=self.task.band), self.space)
+        values = values_of(settings, self.space)
         states = (*_FINISHED, TrialState.WAITING)
         for trial in self.study.get_trials(deepcopy=False, states=states):
             if label == trial.user_attrs.get("label"):

@@ -199,18 +199,6 @@ class EnvConfig:
             raise ValueError(
                 f"detectors must be left out on a road without fixed sensors, got {self.detectors}"
             )
-        self.penetration.check_classes(corridor)
-        source, model = self.penetration.density_from, RELEASE_MODELS.find(self.privacy.preset)
-        if source != "count" and not model.density_reports:
-            raise ValueError(
-                f"penetration.density_from must be 'count' with the release model "
-                f"{RELEASE_MODELS.name_of(model)!r}, which releases no reports, got {source!r}"
-            )
-        if source != "count" and self.fusion.share == "estimated":
-            raise ValueError(
-                "fusion.share must be 'published' where penetration.density_from is not 'count': "
-                f"only counts say what the share is, got {self.fusion.share!r}"
-            )
         recordings = corridor.recordings
         if self.has_separate_sensors and recordings is not None and not recordings.has_vehicles:
             raise ValueError(

@@ -24,7 +24,7 @@ from dptse_env.model.parameters import (
     LEAST_W,
 )
 from dptse_env.utils.arrays import BoolArray, FloatArray
-from dptse_env.utils.validation import positive, require
+from dptse_env.utils.validation import positive
 
 # Largest natural residual of an optimum, in normalised states.
 RESIDUAL = 1e-8
@@ -40,9 +40,7 @@ LEAST_DEVIATION = 1e-3
 
 
 def require_process_noise(settings: EstimatorSettings) -> None:
-    """Refuse a process noise of zero, whose weight w_2 would be infinite, and one in (rho, w)."""
-    given = settings.process_noise_in
-    require(given == "psi", "estimator_settings.process_noise_in", "'psi' for the MHE", given)
+    """Refuse a process noise of zero, whose weight w_2 would be infinite."""
     for i, value in enumerate(settings.process_noise):
         positive(f"estimator_settings.process_noise[{i}]", value)
 

@@ -34,10 +34,10 @@ from dptse_env.estimators.horizon import (
 )
 from dptse_env.estimators.noise import count_variance, initial_variance, process_variance
 from dptse_env.estimators.normals import draw, make_stream
-from dptse_env.estimators.simple import estimated_traffic
 from dptse_env.estimators.settings import EstimatorSettings
+from dptse_env.estimators.simple import estimated_traffic
 from dptse_env.model import ARZModel
-from dptse_env.model.model import Bounds
+from dptse_env.model.parameters import Bounds
 from dptse_env.utils.arrays import FloatArray, IntArray
 
 
@@ -290,7 +290,7 @@ class _UnscentedFilter(EpisodeFilter, UnscentedKalmanFilter):  # type: ignore[mi
         self.P += np.diag(variance)
 
     def _draw(self, u: FloatArray | None) -> None:
-        """Draw points, move them by f where there are inputs, and take their mean and covariance."""
+        """Draw points, move them by f where there are inputs, and take their moments."""
         points = self.points_fn.sigma_points(self.problem.project(self.x[None])[0], self.P)
         if u is not None:
             points = self.problem.f(points, u)

@@ -34,7 +34,7 @@ ESTIMATORS = Registry(
         "ekf": Shipped("compiled.ekf", "CompiledEKF"),
         "ukf": Shipped("compiled.ukf", "CompiledUKF"),
         "enkf": Shipped("enkf", "EnKF"),
-        "mhe": Shipped("compiled.mhe", "CompiledMHE"),
+        "mhe": Shipped("mhe", "MHE"),
         "random_walk": Shipped("simple", "RandomWalk"),
         "blend": Shipped("simple", "Blend"),
         "open_loop": Shipped("simple", "OpenLoop"),
@@ -54,10 +54,6 @@ REFERENCES = {
 WITHOUT_DEMAND = ("random_walk", "open_loop", "recurrent")
 """Estimators without demand states."""
 BACKENDS = get_args(Backend)
-_MODELS = {
-    "compiled": "dptse_env.model.compiled:CompiledARZModel",
-    "reference": "dptse_env.model.model:ARZModel",
-}
 
 
 def check_demand(estimator: Any, settings: Any) -> None:
@@ -97,13 +93,14 @@ def make_estimator(
     settings = settings_type(estimator)() if settings is None else settings
     check_demand(estimator, settings)
     has_demand = getattr(settings, "demand", None) is not None
-    model_of_backend = resolve_name(_MODELS[backend])(
-        model.network, model.parameters, model.time_step, model.reference_speed, model.rows,
-        has_demand,
-    )  # fmt: skip
+    if has_demand != (model.n_demand_states > 0):
+        model = ARZModel(
+            model.network, model.parameters, model.time_step, model.reference_speed, model.rows,
+            has_demand,
+        )  # fmt: skip
     part = REFERENCES[estimator] if backend == "reference" else ESTIMATORS.find(estimator)
     factory = part.load() if isinstance(part, Shipped) else part
-    made: Estimator = factory(model_of_backend, n_episodes, settings)
+    made: Estimator = factory(model, n_episodes, settings)
     if is_foreign(made):
         _check_attributes(made, model, n_episodes)
     return made

@@ -7,7 +7,6 @@ from dptse_env.model import Bounds
 from dptse_env.utils.fields import Interval, checked_fields
 
 Linearisation = Literal["paper", "trajectory"]
-NoiseComponent = Literal["psi", "w"]
 
 # Solvers of qpsolvers that report false optima of these programs as found.
 REFUSED_SOLVERS = ("highs",)
@@ -177,12 +176,7 @@ class EstimatorSettings:
 
     Attributes:
         process_noise: Standard deviations of the process noise of one step: of rho over rho_m, of
-            psi over rho_m v_f, or of w over v_f (`process_noise_in`).
-        process_noise_in: What the second number of `process_noise` belongs to: `psi`, or `w`, what
-            drivers carry with them. With `w`, vehicles that the noise adds drive like those that
-            are there, and an empty segment's psi is known: the noise of a segment has the
-            covariance [[a, w a], [w a, w^2 a + rho^2 b]] with a and b the variances of rho and w,
-            and rho and w those of the predicted mean. Not for the MHE, whose weights are separate.
+            psi over rho_m v_f.
         density_growth: Standard deviation, over rho_m, of a further process noise of rho at jam
             density; its variance is in proportion to rho.
         count_noise: Variance of a measured density beside the mechanism's noise, as a share of
@@ -199,9 +193,6 @@ class EstimatorSettings:
         initial_variance: Variance of each normalised component of the prior.
         bounds: Set into which means are projected: the `cone` of physical states or the paper's
             `box`.
-        band: Number of segments along the road that a covariance reaches on either side; None for
-            the whole road. A ramp lies at the face where it joins or leaves. Time and memory of a
-            filter grow with the length of the road times the band, not with the length's powers.
         ukf: Further settings of the unscented Kalman filter.
         enkf: Further settings of the ensemble Kalman filter.
         mhe: Further settings of the moving horizon estimator, with separate bounds.
@@ -214,7 +205,6 @@ class EstimatorSettings:
     """
 
     process_noise: tuple[Deviation, Deviation] = (0.01, 0.01)
-    process_noise_in: NoiseComponent = "psi"
     density_growth: Deviation = 0.0
     count_noise: Annotated[float, Interval(0, 100)] = 0.0
     demand: DemandSettings | None = None
@@ -223,7 +213,6 @@ class EstimatorSettings:
     noise_scale: tuple[NoiseScale, NoiseScale] = (1.0, 1.0)
     initial_variance: Annotated[float, Interval(0, 100, open_low=True)] = 1e-3
     bounds: Bounds = "cone"
-    band: Annotated[int, Interval(1, 1000)] | None = None
     ukf: SigmaPointSettings = field(default_factory=SigmaPointSettings)
     enkf: EnsembleSettings = field(default_factory=EnsembleSettings)
     mhe: HorizonSettings = field(default_factory=HorizonSettings)

@@ -12,10 +12,7 @@ from dptse_env.schedules.base import ProcessSchedule, Schedule, ScheduleState
 from dptse_env.schedules.covariance import (
     CovarianceInflation,
     CovarianceSchedule,
-    Greedy,
-    GreedyLogdet,
     GreedyTrace,
-    InflatedTrace,
 )
 from dptse_env.schedules.fixed import (
     Everything,
@@ -28,18 +25,8 @@ from dptse_env.schedules.fixed import (
     StaleVariance,
 )
 from dptse_env.schedules.front import SpeedFront
-from dptse_env.schedules.oracles import OracleBruteForce, OracleError, OracleGain, OracleGreedy
-from dptse_env.schedules.plans import (
-    PLAN_ALIASES,
-    PLANS,
-    Plan,
-    PlanContext,
-    Planned,
-    find_plan,
-    read_plan,
-)
+from dptse_env.schedules.oracles import OracleError, OracleGain
 from dptse_env.schedules.reduction import ExpectedReduction
-from dptse_env.schedules.rollout import Rollout
 from dptse_env.utils.registry import Registry, name_of_class
 
 __all__ = [
@@ -47,30 +34,20 @@ __all__ = [
     "DEVIATION_SCHEDULES",
     "OBSERVATION_SCHEDULES",
     "ORACLES",
-    "PLANS",
     "SCHEDULES",
     "CovarianceInflation",
     "CovarianceSchedule",
     "Everything",
     "ExpectedReduction",
-    "Greedy",
-    "GreedyLogdet",
     "GreedyTrace",
-    "InflatedTrace",
     "LargestDeviation",
     "LargestVariance",
     "Nothing",
     "OldestFirst",
-    "OracleBruteForce",
     "OracleError",
     "OracleGain",
-    "OracleGreedy",
-    "Plan",
-    "PlanContext",
-    "Planned",
     "ProcessSchedule",
     "Random",
-    "Rollout",
     "Schedule",
     "ScheduleState",
     "Shifting",
@@ -102,18 +79,13 @@ DEVIATION_SCHEDULES: dict[str, type[ProcessSchedule]] = {"expected-reduction": E
 
 COVARIANCE_SCHEDULES: dict[str, type[ProcessSchedule]] = {
     "greedy-trace": GreedyTrace,
-    "greedy-logdet": GreedyLogdet,
-    "inflated-trace": InflatedTrace,
-    "rollout": Rollout,
 }
 """Schedules that use the estimator's covariance, each made of (process, seed); a step costs one or
-two steps of the EKF, of ``rollout`` some hundred."""
+two steps of the EKF."""
 
 ORACLES: dict[str, type[ProcessSchedule]] = {
     "oracle-error": OracleError,
     "oracle-gain": OracleGain,
-    "oracle-greedy": OracleGreedy,
-    "oracle-brute-force": OracleBruteForce,
 }
 """Bounds that use the truth, each made of (process, seed); they are not policies."""
 
@@ -132,11 +104,9 @@ SCHEDULES = Registry(
         **OBSERVATION_SCHEDULES,
         **DEVIATION_SCHEDULES,
         **COVARIANCE_SCHEDULES,
-        **dict.fromkeys(PLANS),
         **ORACLES,
     },
     check=_expected,
-    aliases={"wary-trace": "inflated-trace", **PLAN_ALIASES},
 )
 """All schedules by name."""
 
@@ -145,9 +115,8 @@ def make_schedule(schedule: Any, env: Any, seed: int | None = None) -> Any:
     """Return a schedule for an environment.
 
     Args:
-        schedule: A name in `SCHEDULES`, the path of a plan, a file whose name ends in ``.json``,
-            ``"package.module:Class"``, a subclass of `Schedule`, or an object with ``predict``,
-            which is returned as it is.
+        schedule: A name in `SCHEDULES`, ``"package.module:Class"``, a subclass of `Schedule`, or
+            an object with ``predict``, which is returned as it is.
         env: An environment of this package, scalar or vector, wrapped or not.
         seed: Seed of the schedule's random choices.
 
@@ -155,11 +124,6 @@ def make_schedule(schedule: Any, env: Any, seed: int | None = None) -> Any:
         ValueError: The name is unknown or the schedule does not suit the environment.
     """
     env = env.unwrapped
-    if isinstance(schedule, str) and schedule.endswith(".json"):
-        return Planned(env.process, read_plan(schedule), seed)
-    name = SCHEDULES.name_of(schedule)
-    if name in PLANS:
-        return Planned(env.process, find_plan(name, PlanContext.from_config(env.config)), seed)
     part = SCHEDULES.find(schedule)
     if not isinstance(part, type | partial):
         return part

@@ -14,7 +14,6 @@ from dptse_env.schedules.base import ProcessSchedule, require_plain
 from dptse_env.schedules.covariance_kernels import Problem
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray, Observation
 from dptse_env.utils.fields import POSITIVE, checked_fields
-from dptse_env.utils.validation import require
 
 
 @dataclass(frozen=True)
@@ -78,13 +77,12 @@ class CovarianceSchedule(ProcessSchedule):
         process: QueryProcess,
         seed: int | None = None,
         *,
-        inflation: CovarianceInflation = NO_INFLATION,
+        inflation: CovarianceInflation = INFLATED,
     ) -> None:
         """Bind the schedule to a process (``env.unwrapped.process``).
 
         Raises:
-            ValueError: The estimator has no covariance, or a process noise in (rho, w) that the
-                schedule would need, or options are not the mainline segments.
+            ValueError: The estimator has no covariance, or options are not the mainline segments.
         """
         super().__init__(process, seed)
         require_plain(process.interface, self.name)
@@ -142,67 +140,32 @@ class CovarianceSchedule(ProcessSchedule):
         return inflated
 
 
-class Greedy(CovarianceSchedule):
+class GreedyTrace(CovarianceSchedule):
     """Greedy design: segments are chosen in turn, each the most informative given those before.
 
     C is the predicted covariance of density and speed over the mainline, in the reward's units,
     after an update by the fixed sensors. A query of segment s, with its two rows H_s and the noise
-    R, reduces C by ``C H_s' (H_s C H_s' + R)^-1 H_s C``. Criteria:
+    R, reduces C by ``C H_s' (H_s C H_s' + R)^-1 H_s C``. The most informative segment
+    has the largest trace of that reduction, weighted as in `CovarianceInflation`. The full trace is
+    the squared error that the estimator expects in the reward's metric.
 
-    - ``trace`` (A-optimal): the trace of that reduction, weighted as in `CovarianceInflation`. The
-      full trace is the squared error that the estimator expects in the reward's metric.
-    - ``logdet`` (D-optimal): ``log det(H_s C H_s' + R) - log det R``, the reduction of the log
-      determinant of the covariance of the full state. It is the same in all units, so it does not
-      depend on the reward. The gain is submodular: greedy reaches 63 % of the best set's.
+    By default the covariance is inflated (`INFLATED`): an estimator that is overconfident about
+    segments without recent measurements keeps its errors there. The larger process noise lets
+    variances grow within seconds; the cap limits the weight of the speeds of nearly empty segments.
 
     The cost is a rank-2 downdate of C per pick, O(B n^2), after a prediction that costs as much as
-    the EKF's: about 1.2 EKF steps at n = 15, B = 5, or 1.5 with an inflated covariance.
+    the EKF's: about 1.5 EKF steps at n = 15, B = 5.
     """
 
-    criterion: ClassVar[int]
+    name: ClassVar[str] = "greedy-trace"
 
     def _select(
         self, means: FloatArray, covariances: FloatArray, inputs: FloatArray, queried: BoolArray
     ) -> None:
         keeps = self.inflation.process_noise is not None
         kernels.choose_greedily(
-            self._road, self._problem, self.criterion, keeps, means, covariances, inputs, queried
+            self._road, self._problem, keeps, means, covariances, inputs, queried
         )
-
-
-class GreedyTrace(Greedy):
-    """`Greedy` by the trace (A-optimal)."""
-
-    name: ClassVar[str] = "greedy-trace"
-    criterion: ClassVar[int] = kernels.TRACE
-
-
-class GreedyLogdet(Greedy):
-    """`Greedy` by the log determinant (D-optimal)."""
-
-    name: ClassVar[str] = "greedy-logdet"
-    criterion: ClassVar[int] = kernels.LOGDET
-
-
-class InflatedTrace(GreedyTrace):
-    """`GreedyTrace` with an inflated covariance, `INFLATED` by default.
-
-    An estimator that is overconfident about segments without recent measurements keeps its errors
-    there. The larger process noise lets variances grow within seconds; the cap limits the weight of
-    the speeds of nearly empty segments.
-    """
-
-    name: ClassVar[str] = "inflated-trace"
-
-    def __init__(
-        self,
-        process: QueryProcess,
-        seed: int | None = None,
-        *,
-        inflation: CovarianceInflation = INFLATED,
-    ) -> None:
-        """See `CovarianceSchedule`."""
-        super().__init__(process, seed, inflation=inflation)
 
 
 def _problem(process: QueryProcess, inflation: CovarianceInflation) -> Problem:
@@ -211,10 +174,6 @@ def _problem(process: QueryProcess, inflation: CovarianceInflation) -> Problem:
     n, rho_m, v_f = corridor.n_mainline, model.density_scale, model.speed_scale
     sigma = np.array(settings.noise_scale) * process.expected_sigma / model.measurement_scale
     is_walk = config.estimator == "random_walk"
-    if inflation.process_noise is None and not is_walk:
-        given = settings.process_noise_in
-        allowed = "'psi' for a schedule that predicts the covariance"
-        require(given == "psi", "estimator_settings.process_noise_in", allowed, given)
     noise = settings.walk_noise if is_walk else settings.process_noise
     always = np.array(sorted(corridor.fixed_sensors), dtype=np.int64)
     return Problem(

@@ -11,10 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dptse_env.estimators.compiled.algebra import propagate
-from dptse_env.estimators.compiled.ekf_kernels import project
-from dptse_env.estimators.compiled.ekf_rows import measured, released
 from dptse_env.model.network import RoadArrays
-from dptse_env.model.step import advance
+from dptse_env.model.step import advance, measured, project, released
 from dptse_env.utils.arrays import FloatArray, IntArray
 from dptse_env.utils.kernel_loops import copy_matrix, copy_vector
 from dptse_env.utils.kernels import kernel_part
@@ -58,7 +56,6 @@ class Work(NamedTuple):
     # in the reward's units
     traffic_rows: FloatArray
     vectors: FloatArray  # (2, 2 S)
-    sums: FloatArray  # (2, n) each segment's share of a trace, then whether it is queried
 
 
 @kernel_part
@@ -69,7 +66,7 @@ def make_work(road: RoadArrays, problem: Problem) -> Work:
     return Work(
         np.empty(2 * s), np.zeros((*road.neighbours.shape, 4)), square[0], square[1], square[2],
         np.empty((s, 2)), np.empty((2 * n, 2 * n)), np.empty(2 * n), np.empty((s, 2)),
-        np.empty((n, 3)), np.empty((2, 2 * s)), np.empty((2, n)),
+        np.empty((n, 3)), np.empty((2, 2 * s)),
     )  # fmt: skip
 
 
@@ -97,19 +94,11 @@ def look_ahead(
             for slot in range(work.blocks.shape[1]):
                 work.blocks[s, slot, 1] *= road.free_flow_speed
                 work.blocks[s, slot, 2] /= road.free_flow_speed
-        step(road, problem, work.covariance, work)
+        noise, no_factors = problem.process_variance, np.empty((0, 2))
+        propagate(
+            road, work.blocks, no_factors, noise, work.covariance, work.product, work.transposed
+        )
         _linearise(road, problem, work)
-
-
-@kernel_part
-def step(road: RoadArrays, problem: Problem, covariance: FloatArray, work: Work) -> None:
-    """Replace a covariance by that of the next second, with the same F."""
-    if problem.is_walk:
-        drift(problem, covariance, work)
-    else:
-        noise = problem.process_variance
-        no_factors = np.empty((0, 2))
-        propagate(road, work.blocks, no_factors, noise, covariance, work.product, work.transposed)
 
 
 @kernel_part

@@ -6,8 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dptse_env.model.model import ARZModel
-from dptse_env.model.parameters import ARZParameters, load_parameters
+from dptse_env.model import ARZModel, ARZParameters, load_parameters
 from dptse_env.traffic import Corridor, Demand
 from dptse_env.utils.arrays import FloatArray
 
@@ -80,34 +79,40 @@ UNEVEN = Corridor(
 
 HIGHWAY = Road(on_ramps=(3, 9), off_ramps=(6, 12), exit_shares=(0.1, 0.1))
 STRAIGHT = Road()
+# Every kind of face beside every other, and an off-ramp that nobody takes.
+CROWDED = Road(on_ramps=(3, 5), off_ramps=(4, 6), exit_shares=(0.0, 0.5), ramp_lanes=3)
+ROADS = {
+    "highway": HIGHWAY,
+    "uneven": UNEVEN,
+    "crowded": CROWDED,
+    "straight": STRAIGHT,
+    "one cell": Road(n_mainline=1),
+}
 
 
 def random_states(model: ARZModel, n: int, rng: np.random.Generator) -> FloatArray:
     """States all over the cone, with empty, jammed and standing cells among them."""
-    jam = model.jam_density
+    jam, v_f = model.jam_density, model.speed_scale
     density = rng.uniform(0.0, 1.0, (n, model.n_segments)) ** rng.choice([0.5, 2.0], (n, 1)) * jam
-    density[rng.random(density.shape) < 0.05] = 0.0
-    v_f = model.parameters.free_flow_speed
-    largest = np.maximum(1.1 * v_f - model.relations.pressure(density, jam), 0.0)
+    kind = rng.random(density.shape)
+    density = np.where(kind < 0.05, 0.0, np.where(kind < 0.1, jam, density))
+    largest = np.maximum(1.1 * v_f - model.pressure(density), 0.0)
     speed = largest * rng.uniform(0.0, 1.0, density.shape)
-    speed[rng.random(density.shape) < 0.05] = 0.0
-    return model.states(density, speed)
+    states = model.states(density, np.where(kind > 0.95, 0.0, speed))
+    model.demand_factors(states)[:] = rng.uniform(0.1, 3.0, (n, model.n_demand_states))
+    return states
 
 
 def random_inputs(model: ARZModel, n: int, rng: np.random.Generator) -> FloatArray:
     """Inputs of boundary cells all over the cone."""
     per_lane = model.parameters.jam_density / model.parameters.lanes
     density = rng.uniform(0.0, 1.2, (n, model.n_boundaries)) * per_lane
-    density[:, :2] *= 3.0
+    density *= np.array(model.network.boundary_lanes)
     density[rng.random(density.shape) < 0.1] = 0.0
-    speed = rng.uniform(0.0, 1.0, density.shape) * model.parameters.free_flow_speed
-    return model.boundary_inputs(density, speed)
+    return model.boundary_inputs(density, rng.uniform(0.0, model.speed_scale, density.shape))
 
 
 def model_of(
-    road: Road | Corridor,
-    parameters: ARZParameters = PAPER,
-    time_step: float = 1.0,
-    reference_speed: float | None = None,
+    road: Road | Corridor, parameters: ARZParameters = PAPER, time_step: float = 1.0, **keywords
 ) -> ARZModel:
-    return ARZModel(road, parameters, time_step, reference_speed)
+    return ARZModel(road, parameters, time_step, **keywords)

@@ -8,7 +8,6 @@ from dptse_env.schedules import (
     DEVIATION_SCHEDULES,
     OBSERVATION_SCHEDULES,
     ORACLES,
-    PLANS,
     ProcessSchedule,
     make_schedule,
 )
@@ -20,8 +19,8 @@ from .playing import begin, make_batch, make_single, play
 BOUND = [*DEVIATION_SCHEDULES, *COVARIANCE_SCHEDULES, *ORACLES]
 NAMES = [*sorted(set(OBSERVATION_SCHEDULES) - {"none", "all"}), *BOUND]
 KINDS = (
-    "round-robin", "oldest-first", "speed-front", "expected-reduction", "inflated-trace",
-    "oracle-greedy",
+    "round-robin", "oldest-first", "speed-front", "expected-reduction", "greedy-trace",
+    "oracle-gain",
 )  # fmt: skip
 """One for each way to choose: by the clock, by observations, by a memory, and by the process."""
 
@@ -85,7 +84,7 @@ SKIPS_SENSORS = (
 @pytest.mark.parametrize(
     "name",
     fast_and_slow(
-        SKIPS_SENSORS, ("oldest-first", "stale-variance", "inflated-trace", "oracle-error")
+        SKIPS_SENSORS, ("oldest-first", "stale-variance", "greedy-trace", "oracle-error")
     ),
 )
 def test_a_segment_with_a_fixed_sensor_is_queried_last(name):
@@ -99,4 +98,4 @@ def test_only_oracles_use_the_truth():
     names = [*sorted(set(OBSERVATION_SCHEDULES) - {"all"}), *BOUND[: -len(ORACLES)]]
     assert not any(make_schedule(name, env).uses_truth for name in names)
     assert all(make_schedule(name, env).uses_truth for name in ORACLES)
-    assert not set(ORACLES) & {*OBSERVATION_SCHEDULES, *COVARIANCE_SCHEDULES, *PLANS}
+    assert not set(ORACLES) & {*OBSERVATION_SCHEDULES, *COVARIANCE_SCHEDULES}

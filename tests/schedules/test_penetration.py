@@ -8,7 +8,7 @@ from dptse_env.parts import make_parts
 from dptse_env.process import QueryProcess
 from dptse_env.schedules import SCHEDULES
 
-NAMES = ("expected-reduction", "greedy-trace", "oracle-error", "oracle-gain", "oracle-greedy")
+NAMES = ("expected-reduction", "greedy-trace", "oracle-error", "oracle-gain")
 
 
 def make(n_episodes=2, **keywords):
@@ -17,7 +17,6 @@ def make(n_episodes=2, **keywords):
         "traffic_seeds": "0:2",
         "horizon": 40,
         "random_start": True,
-        "fusion": {"share": "estimated"},
         "detectors": {"dropout": 0.5},
         **keywords,
     }
@@ -43,5 +42,5 @@ def test_schedules_choose_within_the_bandwidth_and_leave_the_process_alone(name)
 def test_schedules_count_on_noise_that_is_scaled_to_all_vehicles():
     process, _ = make()
     np.testing.assert_allclose(process.expected_sigma[0], process.release.sigma[0] / 0.3)
-    whole, _ = make(penetration=1.0, fusion={}, detectors={})
+    whole, _ = make(penetration=1.0, detectors={})
     np.testing.assert_array_equal(whole.expected_sigma, whole.release.sigma)

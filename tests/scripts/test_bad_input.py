@@ -37,7 +37,6 @@ FILES = {
         "s.json", shipped("dptse_env/estimators/tuned/*.json"),
         ["evaluate", "--keywords", '{{"estimator_settings": "{path}"}}'],
     ),
-    "plan": ("p.json", shipped("dptse_env/schedules/plans/*.json"), ["evaluate", "--schedules"]),
     "policy": ("p.zip", POLICY, ["tune", "--schedule"]),
     "model": ("m.zip", POLICY, ["evaluate", "--policies", "stable_baselines3:PPO={path}"]),
     "network": (
