@@ -7,7 +7,6 @@ from typing import Annotated, ClassVar, Protocol, cast
 import numpy as np
 
 from dptse_env.estimators.settings import Deviation
-from dptse_env.model.model import make_road_arrays
 from dptse_env.process import QueryProcess
 from dptse_env.schedules import greedy_kernels as kernels
 from dptse_env.schedules.base import ProcessSchedule, require_plain
@@ -93,7 +92,7 @@ class CovarianceSchedule(ProcessSchedule):
             )
         self.inflation = inflation
         self._estimator = cast(HasCovariance, process.estimator)
-        self._road = tuple(make_road_arrays(process.model))
+        self._road = tuple(process.model.road)
         self._problem = tuple(_problem(process, inflation))
         self._n_traffic = 2 * process.model.n_segments
         self._covariances: FloatArray = self._traffic_covariances
