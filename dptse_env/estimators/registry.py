@@ -47,7 +47,9 @@ ESTIMATORS = Registry(
         "enkf": Backends(
             "dptse_env.estimators.enkf:EnKF", "dptse_env.estimators.reference.enkf:ReferenceEnKF"
         ),
-        "mhe": _filter("mhe", "MHE"),
+        "mhe": Backends(
+            "dptse_env.estimators.mhe:MHE", "dptse_env.estimators.reference.mhe:ReferenceMHE"
+        ),
         "random_walk": Backends(_WALK, _WALK),
         "blend": _filter("blend", "Blend"),
         "open_loop": Backends(_OPEN, _OPEN),

@@ -182,15 +182,12 @@ class ARZModel:
         """Density `(n, S)` [veh/km]."""
         return self.components(states)[0].copy()
 
-    def w(self, states: FloatArray) -> FloatArray:
-        """Speed w = psi / rho `(n, S)` [km/h] that drivers carry; the free speed in a vacuum."""
+    def speed(self, states: FloatArray) -> FloatArray:
+        """Speed `(n, S)` [km/h], `max(w - p(rho), 0)`; the free speed v_f in a vacuum."""
         rho, psi = (np.maximum(part, 0.0) for part in self.components(states))
         empty = rho <= VACUUM * self.jam_density
-        return np.where(empty, self.parameters.free_flow_speed, psi / np.where(empty, 1.0, rho))
-
-    def speed(self, states: FloatArray) -> FloatArray:
-        """Speed `(n, S)` [km/h], `max(w - p(rho), 0)`."""
-        return np.maximum(self.w(states) - self.pressure(self.components(states)[0]), 0.0)
+        w = np.where(empty, self.parameters.free_flow_speed, psi / np.where(empty, 1.0, rho))
+        return np.maximum(w - self.pressure(rho), 0.0)
 
     def project(self, states: FloatArray, bounds: Bounds = "cone") -> FloatArray:
         """Nearest component-wise states within bounds.

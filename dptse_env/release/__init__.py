@@ -16,7 +16,7 @@ from dptse_env.release.mechanism import GaussianMechanism, Mechanism
 from dptse_env.release.paced import Paced
 from dptse_env.release.pacing import PACINGS, Pacing, PacingSetup, PublicStep
 from dptse_env.release.queries import MOST_OPTIONS, BandwidthUnit, QueryOptions
-from dptse_env.release.report import PrivacyReport, QuantityReport
+from dptse_env.release.report import VOID_REASONS, PrivacyReport, QuantityReport
 from dptse_env.release.settings import (
     BoundaryInputs,
     CappedSettings,
@@ -27,7 +27,6 @@ from dptse_env.release.settings import (
 )
 from dptse_env.release.traffic_table import TrafficTable
 from dptse_env.release.two_mechanisms import TwoMechanisms
-from dptse_env.release.void_reasons import VOID_REASONS
 from dptse_env.utils.registry import Registry
 
 RELEASE_MODELS = Registry(

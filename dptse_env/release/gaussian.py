@@ -297,7 +297,7 @@ class Capped(GaussianRelease):
             speeds -= 0.5 * corridor.largest_speed_limit * counts
             np.divide(speeds, setup.lengths, out=values[..., 1])
         else:
-            empty, limits = counts == 0.0, setup.traffic.limits[: setup.n_columns]
+            empty, limits = counts == 0.0, setup.traffic.limits[setup.places]
             values[..., 1] = np.where(empty, limits, speeds / np.where(empty, 1.0, counts))
         return values
 

@@ -1,11 +1,8 @@
 import pytest
 
-from dptse_env.estimators.compiled import mhe
 from dptse_env.traffic import PAPER_HIGHWAY, RecordLibrary
 
 from .episodes import RELEASES, Episodes, replay
-
-ORDERS = ("in time", "along the road")
 
 
 @pytest.fixture(scope="session")
@@ -19,15 +16,3 @@ def recordings(record_cache) -> dict[str, Episodes]:
 def recorded(recordings) -> Episodes:
     """The one that releases speeds."""
     return recordings["speed"]
-
-
-@pytest.fixture(params=ORDERS)
-def order(request, monkeypatch):
-    """Both orders in which the compiled MHE factorises a window, whatever the road's length."""
-    monkeypatch.setattr(mhe, "MOST_IN_TIME", 10**9 if request.param == "in time" else 0)
-
-
-@pytest.fixture
-def along_the_road(monkeypatch):
-    """Treat short roads as long ones."""
-    monkeypatch.setattr(mhe, "MOST_IN_TIME", 0)

@@ -61,27 +61,15 @@ def test_unknown_names_say_what_is_allowed():
         make_estimator("ekf", "compiled", MODEL, 0)
 
 
-@pytest.mark.parametrize(
-    ("modules", "absent"),
-    [
-        pytest.param(("estimators.compiled.ekf", "estimators.enkf"), "filterpy"),
-        pytest.param(
-            ("estimators.reference.enkf", "estimators.reference.ekf"),
-            "numba",
-            marks=pytest.mark.slow,
-        ),
-    ],
-    ids=["compiled", "reference"],
-)
-def test_a_backend_is_imported_when_it_is_asked_for_without_the_library_of_the_other(
-    modules, absent
-):
-    code = f"""
-import importlib, sys
-import dptse_env.estimators
-assert not {{"numba", "filterpy"}} & sys.modules.keys()
-for module in {modules}:
-    importlib.import_module("dptse_env." + module)
-assert {absent!r} not in sys.modules
+def test_the_library_of_reference_filters_is_imported_for_these_alone():
+    code = """
+import sys
+from dptse_env.estimators import make_estimator
+from dptse_env.model import ARZModel, load_parameters
+from dptse_env.traffic import PAPER_HIGHWAY
+make_estimator("ekf", "compiled", ARZModel(PAPER_HIGHWAY, load_parameters("paper")), 1)
+assert "filterpy" not in sys.modules
+make_estimator("ekf", "reference", ARZModel(PAPER_HIGHWAY, load_parameters("paper")), 1)
+assert "filterpy" in sys.modules
 """
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -5,25 +5,36 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dptse_env.model import ARZModel
+from dptse_env.model import ARZModel, MeasurementRows
 from dptse_env.model.columns import (
     advance_states,
     make_batch_scratch,
+    measure_row,
     measured_speeds,
     project_states,
-    released_by_states,
 )
+from dptse_env.model.step import project
 from tests.cases import pairwise
 from tests.estimators.parts import compiled
 
 from .oracle import Oracle
-from .roads import HIGHWAY, PAPER, ROADS, UNEVEN, W99, random_inputs, random_states
+from .roads import (
+    HIGHWAY,
+    PAPER,
+    ROADS,
+    UNEVEN,
+    W99,
+    random_inputs,
+    random_states,
+    scattered_states,
+)
 
 advance_states = compiled(advance_states)
 make_batch_scratch = compiled(make_batch_scratch)
 measured_speeds = compiled(measured_speeds)
+measure_row = compiled(measure_row)
+project = compiled(project)
 project_states = compiled(project_states)
-released_by_states = compiled(released_by_states)
 
 WIDTH = 104
 everywhere = pytest.mark.parametrize(
@@ -35,13 +46,6 @@ def advanced(model, states, inputs):
     columns = states.T.copy()
     advance_states(model.road, columns, inputs, make_batch_scratch(model.road, len(states)))
     return columns.T
-
-
-def scattered(model, rng):
-    """States within bounds and beyond."""
-    states = random_states(model, WIDTH, rng)
-    states *= 1.0 + 0.5 * rng.normal(size=states.shape)
-    return states + 0.1 * model.state_scale * rng.normal(size=states.shape)
 
 
 @pytest.mark.parametrize(
@@ -63,38 +67,48 @@ def test_advances_as_the_oracle(road, parameters, demand):
 
 @everywhere
 @pytest.mark.parametrize("bounds", ["cone", "box"])
-def test_projects_as_the_model_does(road, parameters, bounds):
+def test_kernels_project_one_state_and_many_as_the_model_does(road, parameters, bounds):
     model, rng = ARZModel(road, parameters, demand_states=True), np.random.default_rng(0)
     for _ in range(10):
-        states = scattered(model, rng)
+        states = scattered_states(model, WIDTH, rng)
         columns, expected = states.T.copy(), model.project(states, bounds)
         project_states(model.road, columns, bounds == "box")
+        assert (model.demand_factors(expected) != model.demand_factors(states)).any()
+        for state in states:
+            project(model.road, state, bounds == "box")
         scale = model.state_scale
         np.testing.assert_allclose(columns.T / scale, expected / scale, atol=1e-13)
-        assert (model.demand_factors(expected) != model.demand_factors(states)).any()
+        np.testing.assert_allclose(states / scale, expected / scale, atol=1e-15)
 
 
 @everywhere
 @pytest.mark.parametrize("reference_speed", [None, 51.0])
-def test_releases_what_the_model_measures(road, parameters, reference_speed):
+def test_a_row_of_many_states_is_what_the_model_measures(road, parameters, reference_speed):
     """States with negative components among them, as those of members ahead of a projection."""
-    model, rng = (
-        ARZModel(road, parameters, reference_speed=reference_speed),
-        np.random.default_rng(0),
-    )
-    states, out, v_f = scattered(model, rng), np.empty(WIDTH), parameters.free_flow_speed
-    centre = rng.uniform(0.0, 100.0, model.n_segments)
-    released, speeds = model.measure(states, centre)[..., 1], model.traffic(states)[..., 1]
-    for s, jam in enumerate(model.jam_density):
-        pair = (np.ascontiguousarray(states[:, 2 * s + i]) for i in range(2))
-        rho, psi = pair
-        v_0 = np.nan if reference_speed is None else centre[s]
-        released_by_states(model.road, s, rho, psi, v_0, out)
-        atol = 1e-9 * model.measurement_scale[1]
-        np.testing.assert_allclose(out, released[:, s], rtol=0.0, atol=atol)
-        measured_speeds(rho, psi, jam, v_f, parameters.gamma, out)
-        np.testing.assert_allclose(out, speeds[:, s], rtol=1e-12, atol=1e-9 * v_f)
+    span = np.array([1, 1, 1] if reference_speed is None else [1, 2, 3])
+    n = len(road.segment_lengths)
+    rows = MeasurementRows(np.array([n - 1, 0, 2]), span, n)
+    model = ARZModel(road, parameters, reference_speed=reference_speed, rows=rows)
+    rng, width = np.random.default_rng(0), np.empty((3, WIDTH))
+    states = scattered_states(model, WIDTH, rng)
+    centre = rng.uniform(0.0, 100.0, n)
+    expected = model.measure(states, centre)
+    nowhere = np.full(n, np.nan)
+    for m in range(3):
+        given = nowhere if reference_speed is None else centre
+        measure_row(model.road, m, states.T.copy(), given, *width)
+        found = width[:2].T / model.measurement_scale
+        np.testing.assert_allclose(found, expected[:, m] / model.measurement_scale, atol=1e-9)
     assert (states[:, 0::2] < 0.0).any()
+
+
+def test_measured_speeds_are_the_models():
+    model, rng = ARZModel(HIGHWAY, W99), np.random.default_rng(0)
+    states, out = scattered_states(model, WIDTH, rng), np.empty(WIDTH)
+    for s, jam in enumerate(model.jam_density):
+        rho, psi = states[:, 2 * s].copy(), states[:, 2 * s + 1].copy()
+        measured_speeds(rho, psi, jam, W99.free_flow_speed, W99.gamma, out)
+        np.testing.assert_allclose(out, model.traffic(states)[:, s, 1], rtol=1e-12, atol=1e-7)
 
 
 @everywhere

@@ -9,7 +9,7 @@ from dptse_env.model.step import write_row
 from tests.cases import pairwise
 from tests.estimators.parts import compiled
 
-from .roads import HIGHWAY, PAPER, UNEVEN, W99, model_of, random_states
+from .roads import HIGHWAY, PAPER, UNEVEN, W99, model_of, random_states, scattered_states
 
 write_row = compiled(write_row)
 
@@ -89,8 +89,8 @@ def test_a_kernels_row_is_the_models_measurement_linearised(road, release, deman
     speed = None if release == "speeds" else 51.0
     model = ARZModel(network, W99, reference_speed=speed, rows=rows, demand_states=demand)
     rng = np.random.default_rng(2)
-    states = random_states(model, 20, rng)
-    states -= 0.01 * model.state_scale * (rng.random(states.shape) < 0.1)
+    states = scattered_states(model, 20, rng)
+    assert (model.components(states)[0] < 0.0).any(axis=0).mean() > 0.8
     nowhere = np.full((20, model.n_segments), np.nan)
     centre = nowhere if speed is None else rng.uniform(0.0, 100.0, nowhere.shape)
     values = model.measure(states, centre) / model.measurement_scale
@@ -132,14 +132,16 @@ def test_mean_speeds_have_no_rows_of_several_segments():
 def test_the_cone_holds_speed_and_w_and_leaves_what_is_inside_alone(parameters):
     model, rng = model_of(HIGHWAY, parameters), np.random.default_rng(2)
     states = model.project(rng.normal(0.0, 3.0, (200, 38)) * model.state_scale)
-    density, w = model.density(states), model.w(states)
+    density, psi = model.components(states)
+    w = psi / density
     assert np.all((density >= 1.0) & (density <= model.jam_density))
     assert np.all(model.pressure(density) - w <= 1e-9)
     assert np.all(w <= 1.1 * parameters.free_flow_speed * (1.0 + 1e-12))
     assert np.all(w >= 0.4 * parameters.free_flow_speed * (1.0 - 1e-12))
     np.testing.assert_array_equal(model.project(states), states)
     states = random_states(model, 50, rng)
-    inside = (model.density(states) >= 1.0) & (model.w(states) >= 0.4 * model.speed_scale)
+    density, psi = model.components(states)
+    inside = (density >= 1.0) & (psi >= 0.4 * model.speed_scale * density)
     assert 0.5 < inside.mean() < 1.0
     moved = np.abs(model.project(states) - states).reshape(50, 19, 2)[inside]
     assert moved.max() < 1e-9

@@ -9,7 +9,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from dptse_env.model import ARZModel
-from dptse_env.model.step import advance, make_scratch
+from dptse_env.model.step import advance, make_scratch, normalise
 from tests.cases import pairwise
 from tests.estimators.parts import compiled
 
@@ -18,6 +18,7 @@ from .roads import HIGHWAY, NO_RELAXATION, PAPER, ROADS, STRAIGHT, W99, random_i
 
 advance = compiled(advance)
 make_scratch = compiled(make_scratch)
+normalise = compiled(normalise)
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """Queries that connected vehicles answer, and fixed sensors that see all vehicles."""
 
+import dataclasses
 import math
 
 import gymnasium as gym
@@ -11,8 +12,21 @@ from dptse_env.config import resolve
 from dptse_env.parts import make_parts, make_release, privacy_report
 from dptse_env.privacy import mu_of
 from dptse_env.process import QueryProcess
-from dptse_env.release import RELEASE_MODELS, Detectors, TwoMechanisms
+from dptse_env.release import (
+    RELEASE_MODELS,
+    Capped,
+    CappedSettings,
+    Detectors,
+    QueryOptions,
+    ReleaseRequest,
+    ReleaseSetup,
+    TrafficTable,
+    TwoMechanisms,
+)
+from dptse_env.traffic import Penetration
 from tests.cases import pairwise
+
+from .worlds import AWAY, Worlds, corridor, record
 
 SHARE = 0.3
 N, SENSORS, S = 6, (3, 5, 7), 8
@@ -201,6 +215,26 @@ def test_given_noise_reaches_both_mechanisms():
     np.testing.assert_allclose(
         released.values[0, [7, 8, 9], 0] * length, record.counts[t, [7, 3, 5]], atol=0.05
     )
+
+
+@pytest.mark.parametrize("sensors", [SENSORS, (7,)])
+def test_an_empty_sensor_releases_the_speed_limit_of_its_own_segment(sensors):
+    road = dataclasses.replace(corridor(1), fixed_sensors=sensors, ramp_speed_limit=60.0)
+    empty = record(np.full((1, 2), AWAY), np.zeros((1, 2)), S + road.n_boundaries)
+    traffic, settings = (
+        TrafficTable(road, (0,), Worlds(empty)),
+        CappedSettings(speed_release="mean"),
+    )
+    options = QueryOptions.make(N, 2, separate_sensors=True)
+    setup = ReleaseSetup("capped", settings, traffic, 2, 1, 1, options)
+    release = TwoMechanisms(Capped, setup, Penetration(SHARE), Detectors())
+    release.load(0, empty)
+    release.reset(ONE, [np.random.default_rng(0)])
+    release.give_noise(np.zeros((1, setup.n_columns, 2)))
+    request = ReleaseRequest(ONE, ONE, ONE + 1, setup.observed(np.zeros((1, N), dtype=bool)))
+    speeds = release.release(request).values[0, :, 1]
+    np.testing.assert_allclose(speeds, np.array(road.speed_limits)[setup.places], atol=0.5)
+    assert speeds[7] == pytest.approx(60.0, abs=0.5)
 
 
 # --- errors of detectors ---------------------------------------------------------------------

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from dptse_env.traffic.branches import OFF
 from dptse_env.traffic.corridor import Corridor
+from dptse_env.traffic.importers.branches import OFF
 from dptse_env.traffic.importers.checks import Checks
 from dptse_env.traffic.importers.placing import Placer, part_in_words
 from dptse_env.traffic.importers.points import Format, Labels, Points, TrajectoryError

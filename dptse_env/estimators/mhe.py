@@ -1,0 +1,441 @@
+"""Moving horizon estimation (paper, eq. 14 to 17)."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from dptse_env.estimators.batch import Measurements
+from dptse_env.estimators.compiled import ekf_kernels
+from dptse_env.estimators.compiled.ekf_kernels import Filters, Packed, process_noise
+from dptse_env.estimators.compiled.kalman import CompiledFilter
+from dptse_env.estimators.horizon import (
+    LEAST_DEVIATION,
+    moving_variance,
+    normalised_bounds,
+    require_process_noise,
+    settings_of_mhe,
+    solve,
+)
+from dptse_env.estimators.linalg import move, padded
+from dptse_env.estimators.settings import EstimatorSettings
+from dptse_env.estimators.window import (
+    UNSOLVED,
+    Window,
+    factorise,
+    make_work,
+    minimise,
+    write_force,
+)
+from dptse_env.model import ARZModel
+from dptse_env.model.model import make_road_arrays
+from dptse_env.model.network import RoadArrays
+from dptse_env.model.step import advance, make_scratch, normalise, project, write_row
+from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+from dptse_env.utils.kernels import kernel, kernel_part
+
+GENERAL_SOLVER, FALLBACK = 3, 4  # how a program was solved, beside those of `window`
+
+
+class Windows(NamedTuple):
+    """Windows of n episodes, up to L = horizon + 2 stages each; normalised but for inputs.
+
+    A prediction makes a full window one stage longer, until the update drops the oldest one.
+    """
+
+    length: IntArray  # (n,) stages in use
+    arrival_variance: FloatArray  # (n, n_x) in use
+    predicted: FloatArray  # (n, L, n_x) predictions of stages; the first is the arrival's mean
+    inputs: FloatArray  # (n, L, n_u) of the step that leaves each stage
+    process_variance: FloatArray  # (n, L, n_x) likewise
+    blocks: FloatArray  # (n, L, S, K, 4) likewise
+    by_factor: FloatArray  # (n, L, E, 2) likewise, of the demand factors; E = 0 without
+    offsets: FloatArray  # (n, L, n_x) likewise
+    observed: BoolArray  # (n, L, M)
+    values: FloatArray  # (n, L, M, 2)
+    noise: FloatArray  # (n, L, M, 2)
+    centre: FloatArray  # (n, L, S) v_0 [km/h] of each stage's flows, NaN where they are speeds
+    weights: FloatArray  # (n, L, M, 2, 2 x largest span) of linearised rows
+    targets: FloatArray  # (n, L, M, 2) values less the constants of these
+    solution: FloatArray  # (n, L, padded)
+    side: IntArray  # (n, L, padded) bounds that the last solution is at, -1, 0 or 1
+    point: FloatArray  # (n, padded) where the last stage is linearised, unless along the solution
+    solved: IntArray  # (n,) how the last program was solved; 0 for none, or not yet
+    moving_variance: FloatArray  # (n_x,) arrival variance of a window that moves
+    lower: FloatArray  # (n_x,)
+    upper: FloatArray  # (n_x,)
+    units: FloatArray  # (n_x,) of normalised states
+    along: bool  # whether to linearise along the last solution
+
+
+@kernel
+def restart(filters_: Packed, windows_: Packed, e: int) -> None:
+    """Reset an episode to a window of a single stage, its prior."""
+    filters, windows = Filters(*filters_), Windows(*windows_)
+    ekf_kernels.restart(filters, e)
+    windows.length[e], windows.solved[e] = 1, UNSOLVED
+    windows.arrival_variance[e] = filters.initial_variance
+    _enter(filters, windows, e, 0)
+    windows.point[e] = windows.solution[e, 0]
+
+
+@kernel_part
+def _enter(filters: Filters, windows: Windows, e: int, t: int) -> None:
+    """Add the mean as a stage without measurements."""
+    for i in range(windows.units.size):
+        windows.predicted[e, t, i] = filters.means[e, i] / windows.units[i]
+        windows.solution[e, t, i] = windows.predicted[e, t, i]
+    windows.observed[e, t] = False
+    windows.side[e, t] = 0
+    windows.noise[e, t] = 1.0
+
+
+@kernel_part
+def _shift(windows: Windows, e: int) -> None:
+    """Drop the oldest stage of a full window."""
+    if windows.length[e] < windows.solution.shape[1]:
+        return
+    windows.length[e] -= 1
+    windows.arrival_variance[e] = windows.moving_variance
+    n_stages = windows.solution.shape[1]
+    _drop(windows.predicted[e].reshape(n_stages, -1))
+    _drop(windows.inputs[e].reshape(n_stages, -1))
+    _drop(windows.process_variance[e].reshape(n_stages, -1))
+    _drop(windows.blocks[e].reshape(n_stages, -1))
+    _drop(windows.by_factor[e].reshape(n_stages, -1))
+    _drop(windows.offsets[e].reshape(n_stages, -1))
+    _drop(windows.observed[e].reshape(n_stages, -1))
+    _drop(windows.values[e].reshape(n_stages, -1))
+    _drop(windows.noise[e].reshape(n_stages, -1))
+    _drop(windows.centre[e].reshape(n_stages, -1))
+    _drop(windows.weights[e].reshape(n_stages, -1))
+    _drop(windows.targets[e].reshape(n_stages, -1))
+    _drop(windows.solution[e].reshape(n_stages, -1))
+    _drop(windows.side[e].reshape(n_stages, -1))
+
+
+@kernel_part
+def _drop(stages: FloatArray) -> None:
+    for t in range(stages.shape[0] - 1):
+        for i in range(stages.shape[1]):
+            stages[t, i] = stages[t + 1, i]
+
+
+@kernel
+def predict(
+    road_: Packed, filters_: Packed, windows_: Packed, episodes: IntArray, inputs: FloatArray
+) -> None:
+    """Append the model's prediction, under inputs `(k, n_u)`, to each window."""
+    road, filters, windows = RoadArrays(*road_), Filters(*filters_), Windows(*windows_)
+    scratch, state = make_scratch(road), np.empty(filters.means.shape[1])
+    blocks = np.empty((*road.neighbours.shape, 4))
+    for k in range(episodes.size):
+        e = episodes[k]
+        _shift(windows, e)  # where there was no update
+        length, point = windows.length[e], windows.point[e]
+        point[:] = 0.0
+        for t in range(length):
+            for i in range(point.size):
+                point[i] += windows.solution[e, t, i] / length
+        state[:] = filters.means[e]
+        process_noise(road, filters, state, windows.process_variance[e, length - 1])
+        project(road, state, False)
+        advance(road, state, inputs[k], state, blocks, scratch)
+        project(road, state, filters.is_box)
+        filters.means[e] = state
+        windows.inputs[e, length - 1] = inputs[k]
+        if not windows.along:
+            _linearise_step(road, filters, windows, e, length - 1, point)
+        windows.length[e] = length + 1
+        _enter(filters, windows, e, length)
+
+
+@kernel_part
+def _physical(road: RoadArrays, windows: Windows, point: FloatArray) -> FloatArray:
+    """Return the state in the cone nearest to a normalised point [veh/km, veh/h]."""
+    state = np.empty(windows.units.size)
+    for i in range(state.size):
+        state[i] = point[i] * windows.units[i]
+    project(road, state, False)
+    return state
+
+
+@kernel_part
+def _linearise_step(
+    road: RoadArrays, filters: Filters, windows: Windows, e: int, t: int, point: FloatArray
+) -> None:
+    """Linearise the step that leaves a stage, at the physical state nearest to a point."""
+    state, scratch = _physical(road, windows, point), make_scratch(road)
+    blocks, after, product = windows.blocks[e, t], state.copy(), np.empty(state.size)
+    advance(road, state, windows.inputs[e, t], after, blocks, scratch)
+    normalise(road, filters.density_scale, blocks, scratch.by_factor)
+    n_factors = windows.by_factor.shape[2]
+    windows.by_factor[e, t] = scratch.by_factor[:n_factors]
+    for i in range(state.size):
+        state[i] /= windows.units[i]
+    move(road, blocks, scratch.by_factor, n_factors, state, product)
+    for i in range(state.size - n_factors):
+        windows.offsets[e, t, i] = after[i] / windows.units[i] - product[i]
+
+
+@kernel_part
+def _linearise_rows(road: RoadArrays, windows: Windows, e: int, t: int, point: FloatArray) -> None:
+    """Linearise the rows of a stage, at the physical state nearest to a point."""
+    state, constants = _physical(road, windows, point), np.empty(2)
+    for m in range(road.row_first.size):
+        if windows.observed[e, t, m]:
+            weights, centre = windows.weights[e, t, m], windows.centre[e, t]
+            write_row(road, windows.units, state, centre, m, weights, constants)
+            for q in range(2):
+                windows.targets[e, t, m, q] = windows.values[e, t, m, q] - constants[q]
+
+
+@kernel
+def update(
+    road_: Packed,
+    filters_: Packed,
+    windows_: Packed,
+    episodes: IntArray,
+    observed: BoolArray,
+    values: FloatArray,
+    sigma: FloatArray,
+    centre: FloatArray,
+) -> None:
+    """Update by measurements, `sigma` no less than allowed; see `Estimator.update`."""
+    road, filters, windows = RoadArrays(*road_), Filters(*filters_), Windows(*windows_)
+    capacity, width = windows.solution.shape[1:]
+    n_rows, size = windows.weights.shape[2], windows.weights.shape[4]
+    work = make_work(capacity - 1, windows.units.size, n_rows, size, width)
+    free = np.zeros((capacity - 1, width), np.int64)
+    for k in range(episodes.size):
+        e = episodes[k]
+        _shift(windows, e)
+        windows.observed[e, windows.length[e] - 1] = observed[k]
+        windows.centre[e, windows.length[e] - 1] = centre[k]
+        windows.solved[e] = UNSOLVED
+        sound = _measure(road, filters, windows, e, values[k], sigma[k])
+        n_stages, window = windows.length[e], window_of(windows, e)
+        work.length[0] = 0
+        sound = sound and factorise(road, window, n_stages, free, work)
+        if sound:
+            filters.covariances[e] = work.covariances[n_stages - 1]
+            _innovate(road, filters, windows, e, work.before)
+            sound = bool(np.isfinite(np.sum(filters.covariances[e])))
+        if sound and np.any(observed[k]):
+            z, side = windows.solution[e].copy(), windows.side[e]
+            windows.solved[e] = minimise(road, window, n_stages, work, side, z)
+            if windows.solved[e] != UNSOLVED:
+                accept(road, filters, windows, e, z)
+        filters.diverged[e] = not sound
+        if not sound:
+            restart(filters_, windows_, e)
+
+
+@kernel_part
+def _measure(
+    road: RoadArrays,
+    filters: Filters,
+    windows: Windows,
+    e: int,
+    values: FloatArray,
+    sigma: FloatArray,
+) -> bool:
+    """Add values and noise to the last stage, and linearise; return whether all is finite."""
+    last, mean, sound = windows.length[e] - 1, filters.means[e], True
+    for i in range(mean.size):
+        sound = sound and math.isfinite(mean[i])
+    for m in range(road.row_first.size):
+        first, span, density = road.row_first[m], road.row_span[m], 0.0
+        for q in range(2):
+            unit = filters.density_scale if q == 0 else road.second_scale
+            value = values[m, q] / unit if windows.observed[e, last, m] else 0.0
+            windows.values[e, last, m, q] = value
+            windows.noise[e, last, m, q] = (sigma[m, q] / unit) ** 2
+            sound = sound and math.isfinite(value)
+        for s in range(first, first + span):
+            density += mean[2 * s]
+        windows.noise[e, last, m, 0] += filters.count_variance[m] * density / span**2
+    if windows.along:
+        for t in range(last + 1):
+            _linearise_rows(road, windows, e, t, windows.solution[e, t])
+            if t < last:
+                _linearise_step(road, filters, windows, e, t, windows.solution[e, t])
+    else:
+        _linearise_rows(road, windows, e, last, windows.point[e])
+    return sound
+
+
+@kernel_part
+def _innovate(
+    road: RoadArrays, filters: Filters, windows: Windows, e: int, before: FloatArray
+) -> None:
+    """Write residuals at the prediction over the deviations that the window expects.
+
+    `before` is the covariance before the measurements.
+    """
+    last, weights, constants = windows.length[e] - 1, windows.weights[e], np.empty(2)
+    at_mean = np.empty(weights.shape[2:])
+    filters.innovations[e] = 0.0
+    for m in range(road.row_first.size):
+        if not windows.observed[e, last, m]:
+            continue
+        first, size = 2 * road.row_first[m], 2 * road.row_span[m]
+        mean, centre = filters.means[e], windows.centre[e, last]
+        write_row(road, windows.units, mean, centre, m, at_mean, constants)
+        for q in range(2):
+            gap, variance = windows.values[e, last, m, q] - constants[q], 0.0
+            for i in range(size):
+                gap -= at_mean[q, i] * mean[first + i] / windows.units[first + i]
+                for j in range(size):
+                    weight = weights[last, m, q, i] * weights[last, m, q, j]
+                    variance += weight * before[first + i, first + j]
+            deviation = np.sqrt(variance + windows.noise[e, last, m, q])
+            filters.innovations[e, m, q] = gap / deviation
+
+
+@kernel
+def accept(road: RoadArrays, filters: Filters, windows: Windows, e: int, z: FloatArray) -> None:
+    """Accept a solution `(L, padded)`, whose last state is the estimate."""
+    windows.solution[e] = z
+    for t in range(windows.length[e]):
+        for i in range(windows.units.size):
+            at_lower, at_upper = z[t, i] <= windows.lower[i], z[t, i] >= windows.upper[i]
+            windows.side[e, t, i] = int(at_upper) - int(at_lower)
+    for i in range(windows.units.size):
+        filters.means[e, i] = z[windows.length[e] - 1, i] * windows.units[i]
+    project(road, filters.means[e], filters.is_box)
+
+
+@kernel_part
+def window_of(windows: Windows, e: int) -> Window:
+    """Return the linearised window of an episode; its arrays are views."""
+    return Window(
+        windows.predicted[e, 0],
+        windows.arrival_variance[e],
+        windows.blocks[e],
+        windows.by_factor[e],
+        windows.offsets[e],
+        windows.process_variance[e],
+        windows.observed[e],
+        windows.weights[e],
+        windows.targets[e],
+        windows.noise[e],
+        windows.lower,
+        windows.upper,
+    )
+
+
+@kernel
+def write_program(road_: Packed, windows_: Packed, e: int, H: FloatArray, q: FloatArray) -> None:
+    """Write H `(L, n_x, L, n_x)` and q `(L, n_x)` of an episode: z' H z + q' z."""
+    road, windows = RoadArrays(*road_), Windows(*windows_)
+    length, n, width = windows.length[e], windows.units.size, windows.solution.shape[2]
+    n_rows, size = windows.weights.shape[2], windows.weights.shape[4]
+    work = make_work(length, n, n_rows, size, width)
+    z, start, force = np.zeros((3, length, width))
+    write_force(road, window_of(windows, e), length, z, work, start)
+    q[:] = -2.0 * start[:, :n]
+    for t in range(length):
+        for i in range(n):
+            z[t, i] = 1.0
+            write_force(road, window_of(windows, e), length, z, work, force)
+            z[t, i] = 0.0
+            H[t, i] = start[:, :n] - force[:, :n]
+
+
+class MHE(CompiledFilter):
+    """Moving horizon estimation (paper, eq. 14 to 17).
+
+    The program is solved exactly by `window.minimise`, started from the last step's solution, where
+    that finds no optimum by a general solver, and where that fails the prediction stays. Deviations
+    are those of the last state given the window, without bounds.
+    """
+
+    def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
+        """See `make_estimator`."""
+        require_process_noise(settings)
+        super().__init__(model, n_episodes, settings_of_mhe(settings))
+        self._road = make_road_arrays(model)
+        self._windows = _allocate(model, n_episodes, settings, self._road)
+        self._all_packed = (*self._packed, tuple(self._windows))
+        self._restart(np.arange(n_episodes))
+
+    @property
+    def solved(self) -> IntArray:
+        """How each episode's last program was solved `(n,)`, a copy.
+
+        `UNSOLVED` where there was none, `ACTIVE_SET`, `NEWTON`, `GENERAL_SOLVER` or `FALLBACK`.
+        """
+        return self._windows.solved.copy()
+
+    def program(self, episode: int) -> tuple[FloatArray, FloatArray]:
+        """Return H `(L n_x, L n_x)` and q `(L n_x,)` of an episode's last update, normalised.
+
+        Of its L states z' H z + q' z is minimised (paper, eq. 17).
+        """
+        n, length = self.model.n_states, int(self._windows.length[episode])
+        H, q = np.empty((length, n, length, n)), np.empty((length, n))
+        write_program(self._packed[0], self._all_packed[2], episode, H, q)
+        return H.reshape(length * n, length * n), q.ravel()
+
+    def _predict(self, episodes: IntArray, inputs: FloatArray) -> None:
+        predict(*self._all_packed, episodes, inputs)
+
+    def _update(self, measured: Measurements) -> None:
+        least = LEAST_DEVIATION * self.model.measurement_scale
+        episodes, observed, values, sigma, centre = measured
+        update(*self._all_packed, episodes, observed, values, np.maximum(sigma, least), centre)
+        unsolved = self._windows.solved[episodes] == UNSOLVED
+        unsolved &= observed.any(axis=1) & ~self.diverged[episodes]
+        for episode in episodes[unsolved].tolist():
+            self._pass_on(episode)
+
+    def _pass_on(self, episode: int) -> None:
+        """Pass a program that remains unsolved on to a general solver."""
+        windows, length = self._windows, int(self._windows.length[episode])
+        lower, upper = np.tile(windows.lower, length), np.tile(windows.upper, length)
+        z = solve(*self.program(episode), lower, upper, self.settings.mhe.solver)
+        self.fallback[episode], windows.side[episode] = z is None, 0
+        windows.solved[episode] = FALLBACK if z is None else GENERAL_SOLVER
+        if z is not None:
+            solution = windows.solution[episode].copy()
+            solution[:length, : self.model.n_states] = z.reshape(length, -1)
+            accept(self._road, self._filters, windows, episode, solution)
+
+    def _restart(self, episodes: IntArray) -> None:
+        for episode in episodes.tolist():
+            restart(*self._all_packed[1:], episode)
+
+
+def _allocate(
+    model: ARZModel, n_episodes: int, settings: EstimatorSettings, road: RoadArrays
+) -> Windows:
+    """Return empty windows."""
+    n, s, n_rows = model.n_states, model.n_segments, model.rows.n_rows
+    width, shape = padded(n), (n_episodes, settings.mhe.horizon + 2)
+    lower, upper = normalised_bounds(model, settings.mhe.bounds)
+    return Windows(
+        length=np.ones(n_episodes, dtype=np.int64),
+        arrival_variance=np.ones((n_episodes, n)),
+        predicted=np.zeros((*shape, n)),
+        inputs=np.zeros((*shape, model.n_inputs)),
+        process_variance=np.ones((*shape, n)),
+        blocks=np.zeros((*shape, *road.neighbours.shape, 4)),
+        by_factor=np.zeros((*shape, model.n_demand_states, 2)),
+        offsets=np.zeros((*shape, n)),
+        observed=np.zeros((*shape, n_rows), dtype=np.bool_),
+        values=np.zeros((*shape, n_rows, 2)),
+        noise=np.ones((*shape, n_rows, 2)),
+        centre=np.zeros((*shape, s)),
+        weights=np.zeros((*shape, n_rows, 2, 2 * int(model.rows.span.max()))),
+        targets=np.zeros((*shape, n_rows, 2)),
+        solution=np.zeros((*shape, width)),
+        side=np.zeros((*shape, width), dtype=np.int64),
+        point=np.zeros((n_episodes, width)),
+        solved=np.zeros(n_episodes, dtype=np.int64),
+        moving_variance=moving_variance(model, settings),
+        lower=lower,
+        upper=upper,
+        units=model.state_scale,
+        along=settings.mhe.linearisation == "trajectory",
+    )
