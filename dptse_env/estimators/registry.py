@@ -42,7 +42,9 @@ _WITHOUT_DEMAND = (Backends(_WALK, _WALK), Backends(_OPEN, _OPEN), _RECURRENT)
 ESTIMATORS = Registry(
     "estimator",
     {
-        "ekf": _filter("ekf", "EKF"),
+        "ekf": Backends(
+            "dptse_env.estimators.ekf:EKF", "dptse_env.estimators.reference.ekf:ReferenceEKF"
+        ),
         "ukf": _filter("ukf", "UKF"),
         "enkf": Backends(
             "dptse_env.estimators.enkf:EnKF", "dptse_env.estimators.reference.enkf:ReferenceEnKF"

@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from dptse_env.estimators.compiled.ekf_kernels import Packed
 from dptse_env.model.network import RoadArrays
 from dptse_env.model.step import make_scratch
 from dptse_env.schedules.covariance_kernels import (
@@ -17,7 +16,7 @@ from dptse_env.schedules.covariance_kernels import (
 )
 from dptse_env.utils.arrays import BoolArray, FloatArray
 from dptse_env.utils.kernel_loops import copy_matrix
-from dptse_env.utils.kernels import kernel, kernel_part
+from dptse_env.utils.kernels import Packed, kernel, kernel_part
 
 
 @kernel
