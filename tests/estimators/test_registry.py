@@ -1,6 +1,7 @@
 import subprocess
 import sys
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -9,11 +10,12 @@ from dptse_env.model import ARZModel, load_parameters
 from dptse_env.traffic import PAPER_HIGHWAY
 
 MODEL = ARZModel(PAPER_HIGHWAY, load_parameters("paper"))
+NAMES = {"compiled": tuple(ESTIMATORS), "reference": ("ekf", "ukf", "enkf", "mhe")}
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_every_name_and_backend_follows_the_protocol(backend):
-    for name in ESTIMATORS:
+    for name in NAMES[backend]:
         follows_the_protocol(name, backend)
 
 
@@ -42,7 +44,7 @@ def test_every_estimator_measures_as_its_model_does(backend, reference_speed):
     model = ARZModel(PAPER_HIGHWAY, load_parameters("paper"), 0.5, reference_speed)
     states = MODEL.states(np.full((1, 19), 30.0), np.full((1, 19), 80.0))
     second = 80.0 if reference_speed is None else 30.0 * (80.0 - 40.0)
-    for name in ESTIMATORS:
+    for name in NAMES[backend]:
         own = make_estimator(name, backend, model, 1).model
         assert own.reference_speed == reference_speed
         assert own.time_step == 0.5
@@ -57,6 +59,8 @@ def test_unknown_names_say_what_is_allowed():
         make_estimator("kf", "compiled", MODEL, 1)
     with pytest.raises(ValueError, match="backend must be one of compiled, reference, got 'torch'"):
         make_estimator("ekf", "torch", MODEL, 1)
+    with pytest.raises(ValueError, match="backend must be 'compiled' for 'blend', only ekf, ukf"):
+        gym.make("dptse_env:dptse/ShortHighway-v0", estimator="blend", backend="reference")
     with pytest.raises(ValueError, match="n_episodes must be >= 1, got 0"):
         make_estimator("ekf", "compiled", MODEL, 0)
 
