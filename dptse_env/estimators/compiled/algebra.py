@@ -58,7 +58,7 @@ def _multiply_factors(
             kept[j] = factor[j]
 
 
-@kernel_part(kept=True, fastmath={"contract"})
+@kernel_part(fastmath={"contract"})
 def propagate(
     road: RoadArrays,
     blocks: FloatArray,
@@ -112,7 +112,7 @@ def scratch_vectors(width: int) -> tuple[FloatArray, ...]:
     return work[0], work[1], work[2], work[3], work[4], work[5], work[6], work[7]
 
 
-@kernel_part(kept=True, fastmath={"contract"})
+@kernel_part(fastmath={"contract"})
 def segment_update(
     covariance: FloatArray,
     segment: int,
@@ -164,7 +164,7 @@ def segment_update(
     return True
 
 
-@kernel_part(kept=True, fastmath={"contract"})
+@kernel_part(fastmath={"contract"})
 def sum_update(
     covariance: FloatArray,
     first: int,

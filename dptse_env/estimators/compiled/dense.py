@@ -41,7 +41,7 @@ def eliminate(matrix: FloatArray, n: int, width: int) -> bool:
     return True
 
 
-@kernel_part(kept=True, fastmath={"contract", "reassoc"})
+@kernel_part(fastmath={"contract", "reassoc"})
 def products(
     left: FloatArray, n_left: int, right: FloatArray, n_right: int, is_lower: bool, out: FloatArray
 ) -> None:

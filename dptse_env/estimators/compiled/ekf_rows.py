@@ -66,7 +66,7 @@ def linearise(
         rows.noise[m, 1] = (sigma[m, 1] / unit) ** 2
 
 
-@kernel_part(kept=True)
+@kernel_part
 def innovate(
     road: RoadArrays,
     covariance: FloatArray,
@@ -111,7 +111,7 @@ def variance_along(covariance: FloatArray, s: int, by_rho: float, by_psi: float)
     return float(by_rho * by_rho * a + 2.0 * by_rho * by_psi * b + by_psi * by_psi * c)
 
 
-@kernel_part(kept=True)
+@kernel_part
 def update_wide(
     road: RoadArrays,
     covariance: FloatArray,

@@ -53,7 +53,7 @@ def distances_from_first(row: FloatArray, scale: float, weight: float, out: Floa
     return weight * total
 
 
-@kernel_part(kept=True, fastmath={"contract"})
+@kernel_part(fastmath={"contract"})
 def gather(
     points: Points,
     e: int,

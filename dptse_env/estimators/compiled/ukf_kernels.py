@@ -107,7 +107,7 @@ def update(
             points.moved[e] = False
 
 
-@kernel_part(kept=True)
+@kernel_part
 def _stay(road: RoadArrays, filters: Filters, points: Points, e: int, work: Outputs) -> bool:
     """Make points without a prediction, after another update in the same step."""
     covariance = filters.covariances[e]
@@ -121,7 +121,7 @@ def _stay(road: RoadArrays, filters: Filters, points: Points, e: int, work: Outp
     return True
 
 
-@kernel_part(kept=True, fastmath={"contract"})
+@kernel_part(fastmath={"contract"})
 def _update_episode(
     road: RoadArrays,
     filters: Filters,

@@ -69,7 +69,7 @@ def row_noise(
             noise[i, 0] += filters.count_variance[r] * density / road.row_span[r]
 
 
-@kernel_part(kept=True, fastmath={"contract"})
+@kernel_part(fastmath={"contract"})
 def measure(
     road: RoadArrays,
     filters: Filters,
