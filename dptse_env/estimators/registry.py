@@ -45,7 +45,9 @@ ESTIMATORS = Registry(
         "ekf": Backends(
             "dptse_env.estimators.ekf:EKF", "dptse_env.estimators.reference.ekf:ReferenceEKF"
         ),
-        "ukf": _filter("ukf", "UKF"),
+        "ukf": Backends(
+            "dptse_env.estimators.ukf:UKF", "dptse_env.estimators.reference.ukf:ReferenceUKF"
+        ),
         "enkf": Backends(
             "dptse_env.estimators.enkf:EnKF", "dptse_env.estimators.reference.enkf:ReferenceEnKF"
         ),
