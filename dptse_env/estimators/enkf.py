@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from dptse_env.estimators.base import Estimate
 from dptse_env.estimators.batch import BatchEstimator, Measurements
-from dptse_env.estimators.compiled.ekf_kernels import Packed
 from dptse_env.estimators.linalg import factor, padded, solve_many
 from dptse_env.estimators.noise import count_variance, initial_variance, process_variance
 from dptse_env.estimators.normals import STREAM_WIDTH, Draws, draw, make_stream
@@ -27,12 +26,11 @@ from dptse_env.model.columns import (
     measured_speeds,
     project_states,
 )
-from dptse_env.model.model import make_road_arrays
 from dptse_env.model.network import RoadArrays, RoadNetwork
 from dptse_env.model.parameters import LARGEST_W
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.kernel_loops import copy_vector
-from dptse_env.utils.kernels import kernel, kernel_part
+from dptse_env.utils.kernels import Packed, kernel, kernel_part
 
 
 class Ensembles(NamedTuple):
@@ -84,7 +82,7 @@ class EnKF(BatchEstimator):
         taper, none = settings.enkf.taper, np.empty((0, 0))
         weights = Tapers(none, none) if taper is None else make_tapers(model, taper)
         self.n_members = settings.enkf.n_members
-        self._road = tuple(make_road_arrays(model))
+        self._road = tuple(model.road)
         self._ensembles = Ensembles(
             members=np.repeat(priors[:, :, None], padded(self.n_members), axis=2),
             n_members=self.n_members,
