@@ -8,6 +8,7 @@ from dptse_env.estimators.registry import (
     check_demand,
     check_estimate,
     check_estimator,
+    check_settings,
     make_estimator,
     settings_type,
 )
@@ -37,6 +38,7 @@ __all__ = [
     "check_demand",
     "check_estimate",
     "check_estimator",
+    "check_settings",
     "make_estimator",
     "settings_type",
 ]

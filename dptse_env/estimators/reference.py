@@ -28,7 +28,6 @@ from dptse_env.estimators.horizon import (
     LEAST_DEVIATION,
     moving_variance,
     normalised_bounds,
-    require_process_noise,
     settings_of_mhe,
     solve,
 )
@@ -465,8 +464,8 @@ class _Window(EpisodeFilter):
         self.P = np.asarray(np.linalg.solve(H, np.eye(len(H))[:, -n:])[-n:], dtype=np.float64)
         innovations = self._innovations()
         if seen.observed.any():  # else the prediction stands
-            bounds = (np.tile(bound, len(self.stages)) for bound in self.bounds)
-            solution = solve(H, q, *bounds, self.mhe.solver)
+            lower, upper = (np.tile(bound, len(self.stages)) for bound in self.bounds)
+            solution = solve(H, q, lower, upper, self.mhe.solver)
             self.has_failed = solution is None
             if solution is not None:
                 for each, x in zip(self.stages, solution.reshape(-1, n), strict=True):
@@ -536,7 +535,6 @@ class ReferenceMHE(ReferenceFilter):
 
     def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
         """See `make_estimator`."""
-        require_process_noise(settings)
         super().__init__(model, n_episodes, settings_of_mhe(settings))
 
     def program(self, episode: int) -> tuple[FloatArray, FloatArray]:

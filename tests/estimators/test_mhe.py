@@ -15,7 +15,7 @@ from dptse_env.estimators import (
 )
 from dptse_env.estimators import horizon as horizon_module
 from dptse_env.estimators import mhe as mhe_module
-from dptse_env.estimators.compiled.ekf_kernels import Filters
+from dptse_env.estimators.ekf import Filters
 from dptse_env.estimators.horizon import natural_residual, normalised_bounds, solve
 from dptse_env.estimators.mhe import GENERAL_SOLVER, Windows
 from dptse_env.estimators.mhe import update as solve_and_update
