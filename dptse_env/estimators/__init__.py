@@ -4,6 +4,7 @@ from dptse_env.estimators.base import Estimate, Estimator
 from dptse_env.estimators.registry import (
     BACKENDS,
     ESTIMATORS,
+    REFERENCES,
     check_demand,
     check_estimate,
     check_estimator,
@@ -24,6 +25,7 @@ from dptse_env.estimators.settings import (
 __all__ = [
     "BACKENDS",
     "ESTIMATORS",
+    "REFERENCES",
     "BlendSettings",
     "DemandSettings",
     "EnsembleSettings",

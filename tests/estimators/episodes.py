@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dptse_env.estimators import EstimatorSettings, make_estimator
+from dptse_env.estimators import ESTIMATORS, REFERENCES, EstimatorSettings, make_estimator
 from dptse_env.estimators.base import Estimator
 from dptse_env.model import ARZModel
 from dptse_env.model.parameters import load_parameters
@@ -23,6 +23,7 @@ REFERENCE_SPEED = 51.0
 REFERENCE_SPEEDS = {"speed": None, "flow": REFERENCE_SPEED}
 SIGMAS = {"speed": SIGMA, "flow": SIGMA[0] * np.array([1.0, REFERENCE_SPEED])}  # [.., veh/h]
 RELEASES = tuple(SIGMAS)
+EVERY = [(name, "compiled") for name in ESTIMATORS] + [(name, "reference") for name in REFERENCES]
 FIXED_SENSORS = (14, 17, 18)
 
 
