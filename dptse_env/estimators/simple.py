@@ -79,8 +79,10 @@ class RandomWalk(BatchEstimator):
 
     def _update(self, measured: Measurements) -> None:
         rows = self.model.rows
-        arrays = self.means, self.variances, self.innovations, self.diverged
-        _correct(rows.first, rows.span, self._largest, *arrays, *measured)
+        _correct(
+            rows.first, rows.span, self._largest, self.means, self.variances, self.innovations,
+            self.diverged, *measured,
+        )  # fmt: skip
         lost = measured.episodes[self.diverged[measured.episodes]]
         if lost.size > 0:
             self._restart(lost)
