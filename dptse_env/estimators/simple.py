@@ -28,8 +28,6 @@ class RandomWalk(BatchEstimator):
         variances: Of these, `(n, S, 2)`.
     """
 
-    is_compiled: ClassVar[bool] = True
-
     def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
         """See `make_estimator`."""
         super().__init__(model, n_episodes, settings)
