@@ -9,6 +9,7 @@ normalised units: rho by rho_m, psi by rho_m v_f, released numbers by their unit
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from copy import deepcopy
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -59,16 +60,17 @@ class Problem:
     def project(self, x: FloatArray, bounds: Bounds | None = None) -> FloatArray:
         """Return the states within bounds, by default the filter's."""
         bounds = self.settings.bounds if bounds is None else bounds
-        return self.model.project(x * self.unit, bounds) / self.unit
+        return np.asarray(self.model.project(x * self.unit, bounds) / self.unit)
 
     def f(self, x: FloatArray, u: FloatArray) -> FloatArray:
         """Return the states one step later."""
-        return self.model.step(x * self.unit, np.repeat(u[None], len(x), axis=0)) / self.unit
+        inputs = np.repeat(u[None], len(x), axis=0)
+        return np.asarray(self.model.step(x * self.unit, inputs) / self.unit)
 
     def F(self, x: FloatArray, u: FloatArray) -> FloatArray:  # noqa: N802
         """Return the derivative of f at a mean, `(n_x, n_x)`."""
         jacobian = self.model.jacobian((x * self.unit)[None], u[None])[0]
-        return jacobian * self.unit / self.unit[:, None]
+        return np.asarray(jacobian * self.unit / self.unit[:, None])
 
     def Q(self, x: FloatArray) -> FloatArray:  # noqa: N802
         """Return the variances `(n_x,)` of the noise of a step that leaves a mean."""
@@ -79,18 +81,18 @@ class Problem:
 
     def z(self, seen: EpisodeMeasurements) -> FloatArray:
         """Return the observed numbers `(2 m,)`."""
-        return (seen.values[seen.observed] / self.release_unit).ravel()
+        return np.asarray((seen.values[seen.observed] / self.release_unit).ravel())
 
     def h(self, x: FloatArray, seen: EpisodeMeasurements) -> FloatArray:
         """Return the numbers that states would give, `(k, 2 m)`."""
         released = self.model.measure(x * self.unit, seen.centre)[:, seen.observed]
-        return (released / self.release_unit).reshape(len(x), -1)
+        return np.asarray((released / self.release_unit).reshape(len(x), -1))
 
     def H(self, x: FloatArray, seen: EpisodeMeasurements) -> FloatArray:  # noqa: N802
         """Return the derivative of h at a mean, `(2 m, n_x)`."""
         matrix = self.model.measurement_matrix((x * self.unit)[None], seen.centre)[0]
         matrix = matrix[seen.observed] * self.unit / self.release_unit[:, None]
-        return matrix.reshape(-1, self.n_states)
+        return np.asarray(matrix.reshape(-1, self.n_states))
 
     def R(self, x: FloatArray, seen: EpisodeMeasurements, least: float = 0.0) -> FloatArray:  # noqa: N802
         """Return the variances `(2 m,)` of the noise of a measurement at a mean.
@@ -103,7 +105,7 @@ class Problem:
 
     def _density(self, x: FloatArray) -> FloatArray:
         """Return the densities `(S,)` of a mean within bounds [veh/km]."""
-        return self.model.density(self.project(x[None]) * self.unit)[0]
+        return np.asarray(self.model.density(self.project(x[None]) * self.unit)[0])
 
 
 class EpisodeFilter(ABC):
@@ -385,7 +387,9 @@ class ReferenceEnKF(ReferenceFilter):
     @property
     def members(self) -> FloatArray:
         """Members `(n, n_members, n_x)` [veh/km, veh/h], then demand factors; a copy."""
-        return np.stack([each.members for each in self.filters]) * self.model.state_scale
+        return np.asarray(
+            np.stack([each.members for each in self.filters]) * self.model.state_scale
+        )
 
     @property
     def states(self) -> FloatArray:
@@ -450,8 +454,7 @@ class _Window(EpisodeFilter):
     def assimilate(self, seen: EpisodeMeasurements) -> FloatArray:
         """Update by measurements of the last stage, and solve for the window."""
         stage, n = self.stages[-1], self.problem.n_states
-        kept = [array.copy() for array in seen]  # callers may reuse their arrays
-        stage.seen, self.has_failed = EpisodeMeasurements(*kept), False
+        stage.seen, self.has_failed = deepcopy(seen), False  # callers may reuse their arrays
         stage.R = self.problem.R(self.x, seen, LEAST_DEVIATION)
         if self.mhe.linearisation == "paper":
             self._linearise_measurement(stage, stage.point)

@@ -28,8 +28,6 @@ class RandomWalk(BatchEstimator):
         variances: Of these, `(n, S, 2)`.
     """
 
-    is_compiled: ClassVar[bool] = True
-
     def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
         """See `make_estimator`."""
         super().__init__(model, n_episodes, settings)
@@ -79,8 +77,10 @@ class RandomWalk(BatchEstimator):
 
     def _update(self, measured: Measurements) -> None:
         rows = self.model.rows
-        arrays = self.means, self.variances, self.innovations, self.diverged
-        _correct(rows.first, rows.span, self._largest, *arrays, *measured)
+        _correct(
+            rows.first, rows.span, self._largest, self.means, self.variances, self.innovations,
+            self.diverged, *measured,
+        )  # fmt: skip
         lost = measured.episodes[self.diverged[measured.episodes]]
         if lost.size > 0:
             self._restart(lost)
