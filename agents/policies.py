@@ -25,7 +25,7 @@ from dptse_env.utils.digests import file_digest
 
 @dataclass(frozen=True)
 class NamedSchedule:
-    """A query schedule by its name or the file of its plan."""
+    """A query schedule by its name, or its class as ``"module:Class"``."""
 
     source: str
 
@@ -36,14 +36,11 @@ class NamedSchedule:
 
     @property
     def identity(self) -> str:
-        """The name; of a plan the digest of its file, of a class that of its module, too.
+        """The name; of a class the digest of its module, too.
 
         Raises:
-            FileNotFoundError: There is no such plan.
             ValueError: The module cannot be imported.
         """
-        if self.source.endswith(".json"):
-            return file_digest(self.source)
         if ":" not in self.source:
             return self.source
         file = _imported(self.source).__file__
@@ -251,9 +248,9 @@ def find_policy(source: str) -> PolicySource:
 
     Args:
         source: The ``.zip`` file of a saved policy, the name of one that comes with the package, a
-            model of stable-baselines3 as ``"module:Class=file.zip"``, or else a schedule: its name,
-            the ``.json`` file of a plan, or ``"module:Class"``. Whether a schedule or a model
-            exists and suits an environment is checked when it is loaded.
+            model of stable-baselines3 as ``"module:Class=file.zip"``, or else a schedule: its name
+            or ``"module:Class"``. Whether a schedule or a model exists and suits an environment is
+            checked when it is loaded.
 
     Raises:
         FileNotFoundError: There is no such saved policy.

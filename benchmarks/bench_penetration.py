@@ -32,10 +32,6 @@ BASE = "all vehicles"
 ARMS: Mapping[str, dict[str, Any]] = {
     BASE: {},
     "a tenth": {"penetration": 0.1},
-    "a tenth, share estimated, innovation test": {
-        "penetration": 0.1,
-        "fusion": {"share": "estimated", "innovation_test": True},
-    },
 }
 """Keywords of what is measured."""
 

@@ -18,7 +18,7 @@ from filterpy.kalman import (
 
 from benchmarks.replay import Replay
 from dptse_env.estimators import make_estimator
-from dptse_env.model.compiled import CompiledARZModel
+from dptse_env.model import ARZModel
 from dptse_env.utils.arrays import BoolArray, FloatArray
 
 FILTERS = ("ekf", "ukf", "enkf")
@@ -36,7 +36,7 @@ class NormalisedModel:
     def __init__(self, replay: Replay) -> None:
         """Take the model of a replay and the inputs of its first step."""
         model = replay.model
-        self._model = CompiledARZModel(model.network, model.parameters, model.time_step)
+        self._model = ARZModel(model.network, model.parameters, model.time_step)
         density, speed = model.density_scale, model.speed_scale
         self.scale = np.tile([density, density * speed], model.n_segments)
         self.measured_scale = np.array([density, speed])
@@ -59,12 +59,8 @@ class NormalisedModel:
 
     def output_jacobian(self, x: FloatArray) -> FloatArray:
         """Return the Jacobian H of `h`."""
-        blocks = self._model.measurement_jacobian((x * self.scale)[None])[0]
-        blocks = blocks * self.scale[:2] / self.measured_scale[:, None]
-        segments = np.flatnonzero(self.observed)
-        jacobian = np.zeros((segments.size, 2, x.size))
-        for i, segment in enumerate(segments):
-            jacobian[i, :, 2 * segment : 2 * segment + 2] = blocks[segment]
+        matrix = self._model.measurement_matrix((x * self.scale)[None])[0, self.observed]
+        jacobian: FloatArray = matrix * self.scale / self.measured_scale[:, None]
         return jacobian.reshape(-1, x.size)
 
 

@@ -11,14 +11,13 @@ import numpy as np
 
 from dptse_env.config import TIME_STEP, EnvConfig
 from dptse_env.estimators import Estimator, make_estimator
-from dptse_env.fusion import Fusion, FusionSetup
+from dptse_env.fusion import Fusion
 from dptse_env.model import ARZModel
 from dptse_env.release import (
     BOUNDARIES,
     RELEASE_MODELS,
     VOID_REASONS,
     BoundaryModel,
-    DensityRelease,
     PrivacyReport,
     QueryOptions,
     ReleaseModel,
@@ -206,24 +205,20 @@ def make_traffic(config: EnvConfig, library: RecordLibrary | None = None) -> Tra
     return TrafficTable(config.corridor, config.traffic_seeds, library or RecordLibrary())
 
 
-def make_fusion(config: EnvConfig, model: ARZModel, n_episodes: int = 1) -> Fusion | None:
+def make_fusion(config: EnvConfig, model: ARZModel) -> Fusion | None:
     """Make what turns releases into measurements of all vehicles; None where they are."""
-    if not (config.has_separate_sensors or config.fusion.innovation_test):
+    if not config.has_separate_sensors:
         return None
     corridor, rows = config.corridor, model.rows
-    setup = FusionSetup(
+    return Fusion(
         config.fusion,
         rows,
         n_options=config.queries.n_options,
         lengths=np.array(corridor.segment_lengths)[rows.first] * rows.span,
-        share=config.penetration.published_share(corridor),
+        share=config.penetration.published_share,
         limits=np.array(corridor.speed_limits)[rows.first],
-        density=DensityRelease.of(config.penetration, corridor),
-        density_is_mean=RELEASE_MODELS.find(config.privacy.preset).density_reports == "mean",
         releases_flow=flow_centre(config) is not None,
-        n_episodes=n_episodes,
     )
-    return Fusion(setup)
 
 
 def privacy_report(config: EnvConfig) -> PrivacyReport:
@@ -296,5 +291,5 @@ def make_parts(
     estimator = estimator or make_estimator(
         config.estimator, config.backend, model, n_episodes, config.settings()
     )
-    fusion = make_fusion(config, model, n_episodes)
+    fusion = make_fusion(config, model)
     return Parts(config, interface, traffic, release, model, boundary, estimator, fusion)

@@ -147,8 +147,6 @@ class QueryProcess:
         self.pending.reset(episodes)
         self.release.reset(episodes, [noise for _, noise, _ in streams])
         self.boundary.reset(episodes)
-        if self.fusion is not None:
-            self.fusion.reset(episodes)
         prior = nominal_state(self.config.corridor, self.model, self.time[episodes])
         self.estimator.reset(episodes, prior, [draws for _, _, draws in streams])
         self.queried[episodes] = False
@@ -230,7 +228,7 @@ class QueryProcess:
             observed = observed & ~released.missing
         observed = observed[:, : self.model.rows.n_rows]
         if self.fusion is not None:
-            measured = self.fusion.read(request.episodes, observed, measured, request.prediction())
+            measured = self.fusion.read(measured, request.prediction())
         return observed, measured, at_boundary
 
     @property

@@ -18,16 +18,15 @@ import numpy as np
 from agents.files import refuse_to_replace, replacing
 from agents.terminal import make_table, print_table
 from dptse_env.config import parse_seeds
-from dptse_env.model import ARZParameters, available_parameters, load_parameters
-from dptse_env.model.calibration import calibrate
-from dptse_env.model.compiled import CompiledARZModel
-from dptse_env.model.parameters import write_parameters
-from dptse_env.model.prediction import (
+from dptse_env.model import ARZModel, ARZParameters, available_parameters, load_parameters
+from dptse_env.model.calibration import (
     PredictionError,
     TrafficSeries,
+    calibrate,
     persistence_error,
     prediction_error,
 )
+from dptse_env.model.parameters import write_parameters
 from dptse_env.release.traffic_table import TrafficTable
 from dptse_env.traffic import Corridor, RecordLibrary, average_dwell
 from scripts.cli import Recording, Road, make_corridor, run
@@ -73,7 +72,7 @@ def shipped_parameters(corridor: Corridor) -> list[ARZParameters]:
     known = []
     for name in available_parameters():
         try:
-            CompiledARZModel(corridor, load_parameters(name))
+            ARZModel(corridor, load_parameters(name))
         except ValueError as problem:
             logger.info("without %s: %s", name, problem)
         else:
@@ -87,8 +86,23 @@ def compare(
     """Return the prediction errors of persistence and of every candidate on ``data``."""
     errors = {"persistence": persistence_error(data, corridor.n_mainline)}
     for parameters in candidates:
-        errors[parameters.name] = prediction_error(CompiledARZModel(corridor, parameters), data)
+        errors[parameters.name] = prediction_error(ARZModel(corridor, parameters), data)
     return errors
+
+
+def nearest(shipped: list[ARZParameters], errors: dict[str, PredictionError]) -> str | None:
+    """Return the name of the shipped set that predicts best; None without any on this road.
+
+    Estimators with the fitted set take its tuned settings: process noise stands for the errors of
+    predictions.
+    """
+
+    def error(parameters: ARZParameters) -> float:
+        found, reference = errors[parameters.name], errors["persistence"]
+        density = np.divide(found.density, reference.density)
+        return float(np.mean([density, np.divide(found.speed, reference.speed)]))
+
+    return min(shipped, key=error).name if shipped else None
 
 
 def print_errors(errors: dict[str, PredictionError], title: str) -> None:
@@ -120,8 +134,10 @@ def main(args: Args) -> None:
         corridor, load_series(corridor, train, library), args.name,
         max_evaluations=args.max_evaluations,
     )  # fmt: skip
-    candidates = [*shipped_parameters(corridor), fit.parameters]
+    shipped = shipped_parameters(corridor)
+    candidates = [*shipped, fit.parameters]
     errors = compare(corridor, candidates, load_series(corridor, held_out, library))
+    fitted = dataclasses.replace(fit.parameters, derived_from=nearest(shipped, errors))
     provenance = {
         "corridor": corridor.name,
         "train": args.train,
@@ -136,12 +152,12 @@ def main(args: Args) -> None:
     }
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as temporary:
-        write_parameters(temporary, fit.parameters, provenance)
+        write_parameters(temporary, fitted, provenance)
     if args.json:
         print(path.read_text(encoding="utf-8"), end="")
         return
     print_errors(errors, f"{corridor.name}, held-out seeds {args.held_out}")
-    print(f"fitted: {fit.parameters}")
+    print(f"fitted: {fitted}")
     if fit.at_bounds:
         print(f"at the bounds of the search: {', '.join(fit.at_bounds)}")
     print(f"mean time on a mainline segment: {dwell:.2f} s")

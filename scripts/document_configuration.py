@@ -34,7 +34,6 @@ from dptse_env.model import ARZParameters
 from dptse_env.registration import ENVIRONMENTS
 from dptse_env.release import CappedSettings, Detectors, PrivacySettings
 from dptse_env.traffic import (
-    ClassShare,
     Corridor,
     Demand,
     DemandDistribution,
@@ -56,7 +55,6 @@ SECTIONS: Mapping[type, str] = {
     PrivacySettings: "`privacy`, for every release model",
     CappedSettings: "`privacy`, for the release model `capped`",
     Penetration: "`penetration`",
-    ClassShare: "`penetration.by_class`",
     Detectors: "`detectors`",
     FusionSettings: "`fusion`",
     Corridor: "`corridor`",

@@ -48,8 +48,8 @@ class Args:
     mapping: Path | None = None
     """TOML file that says what the data means and where the road lies in it."""
     columns: tuple[str, ...] = ()
-    """Columns of the file by role, as role=column (time, vehicle, x, y, speed, lane, edge, group,
-    vehicle_class)."""
+    """Columns of the file by role, as role=column (time, vehicle, x, y, speed, lane, edge,
+    group)."""
     units: tuple[str, ...] = ()
     """Units by quantity, as quantity=unit: time, length, speed."""
     where: tuple[str, ...] = ()
@@ -64,9 +64,6 @@ class Args:
     """Seconds left out at the end of each file."""
     pause: int = Options.pause
     """Seconds left out between two windows."""
-    detailed: bool = Options.detailed
-    """Keep positions, lanes and classes of the vehicles, which `penetration.by_class` and
-    `penetration.density_from` need."""
 
 
 def main(args: Args) -> None:
@@ -86,7 +83,7 @@ def main(args: Args) -> None:
             corridor,
             args.output,
             [Split(*part) for part in parts],
-            Options(args.longest_gap, args.skip_start, args.skip_end, args.pause, args.detailed),
+            Options(args.longest_gap, args.skip_start, args.skip_end, args.pause),
             {key: value for key, value in environment.items() if key != "traffic_seeds"},
         )
     except KeyboardInterrupt:

@@ -72,10 +72,8 @@ class Args(Machines):
     """Search the scale of the noise of flows or speeds, too, although the mechanism's is known."""
     demand: bool = False
     """Search demand states, too, and the noise that goes with them."""
-    repairs: bool = False
-    """Search the cap of reported speeds and whether process noise is of psi or of w, too."""
-    band: int | None = None
-    """Band of the covariances of EKF, UKF and blend [segments]; "None" for the whole road."""
+    speed_cap: bool = False
+    """Search the cap of reported speeds, too."""
     variant: str = ""
     """Ending of the names of the sets; empty for default sets."""
     sampler_seed: int = 0
@@ -119,8 +117,7 @@ def make_tasks(args: Args) -> list[TuningTask]:
             noise_seed=args.noise_seed,
             with_noise_scale=args.noise_scale,
             with_demand=args.demand,
-            with_repairs=args.repairs,
-            band=args.band,
+            with_speed_cap=args.speed_cap,
             variant=args.variant,
             keywords=keywords,
         )

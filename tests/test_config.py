@@ -14,7 +14,7 @@ from dptse_env.config import (
     resolve,
 )
 from dptse_env.estimators import EstimatorSettings, HorizonSettings
-from dptse_env.estimators.tuned_settings import available_settings, load_settings
+from dptse_env.estimators.settings import available_settings, load_settings
 from dptse_env.parts import flow_centre, make_release, privacy_report, warn_where_void
 from dptse_env.release import CappedSettings, PrivacySettings
 from dptse_env.traffic import PAPER_HIGHWAY, SHORT_HIGHWAY, DemandDistribution, IncidentDistribution
@@ -65,9 +65,6 @@ def test_tuned_settings_are_found_by_estimator_parameters_and_privacy():
         known = name in available_settings()
         assert settings == (load_settings(name) if known else EstimatorSettings())
     assert "ekf-w99-3lane-paper" in available_settings()
-    own = {"name": "mine", "free_flow_speed": 100.0, "jam_density": 350.0, "gamma": 1.0,
-           "relaxation_time": 40.0}  # fmt: skip
-    assert resolve("paper-highway", {"parameters": own}).settings() == EstimatorSettings()
 
 
 @pytest.mark.parametrize("estimator", ["random_walk", "open_loop", "recurrent"])
@@ -79,10 +76,27 @@ def test_demand_states_without_a_traffic_model_are_refused_by_the_configuration(
         resolve("paper-highway", keywords)
 
 
+@pytest.mark.parametrize("make", [gym.make, gym.make_vec])
+@pytest.mark.parametrize(
+    ("estimator", "settings", "message"),
+    [
+        ("mhe", {"process_noise": [0.01, 0.0]}, r"process_noise\[1\] must be a finite number > 0"),
+        ("mhe", {"mhe": {"horizon": 1000}}, r"mhe\.horizon must be an integer in 1\.\.624"),
+        ("ukf", {"ukf": {"kappa": -16.0}}, r"ukf\.kappa must be > -16, got -16"),
+        ("ukf", {"ukf": {"kappa": -18.0}, "demand": {}}, r"ukf\.kappa must be > -18, got -18"),
+        ("recurrent", {"recurrent": {"weights": "x"}}, "recurrent.weights must be a file or one"),
+    ],
+)
+def test_settings_that_an_estimator_cannot_have_are_refused_when_it_is_made(
+    make, estimator, settings, message
+):
+    with pytest.raises(ValueError, match=f"^estimator_settings.{message}"):
+        make("dptse_env:dptse/ShortHighway-v0", estimator=estimator, estimator_settings=settings)
+
+
 def test_a_set_for_the_corridor_comes_before_that_for_any():
     config = resolve("long-highway", {})
     assert config.settings_name == "ekf-w99-3lane-paced-long-highway"
-    assert config.settings().band is not None
     assert resolve("long-highway", {"estimator": "mhe"}).settings_name == "mhe-w99-3lane-paced"
     assert resolve("private-highway-v1", {}).settings_name == "ekf-w99-3lane-paced"
 

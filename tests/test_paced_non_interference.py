@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from dptse_env.estimators import ESTIMATORS
+from dptse_env.fusion import Fusion
 from dptse_env.release import Paced, Pacing
 from tests.cases import fast_and_slow
 
@@ -109,7 +110,6 @@ def test_vehicles_do_pay_and_run_out_meanwhile():
 
 PARTLY = {
     "penetration": [0.05, 0.4],
-    "fusion": {"share": "estimated", "innovation_test": True},
     "detectors": {"dropout": 0.2, "absolute": 0.5},
 }
 
@@ -128,18 +128,16 @@ def test_neither_traffic_nor_who_is_connected_shows(estimator, boundary):
     assert not np.array_equal(first[1]["observation"], first[-1]["observation"])
 
 
-def test_a_share_that_only_the_truth_shows_would_be_noticed():
+def test_a_share_that_only_the_truth_shows_would_be_noticed(monkeypatch):
     env = make(**PARTLY)
     process = env.unwrapped.process
-    read = process.fusion.read
+    read = Fusion.read
 
-    def knowing(episodes, observed, measured, prediction):
-        seeds = [SEEDS[index] for index in process.traffic_index[episodes]]
-        shares = np.array([process.config.penetration.share_of(seed) for seed in seeds])
-        measured = measured._replace(values=measured.values / shares[:, None, None])
-        return read(episodes, observed, measured, prediction)
+    def knowing(self, measured, prediction):
+        share = process.config.penetration.share_of(SEEDS[process.traffic_index[0]])
+        return read(self, measured._replace(values=measured.values / share), prediction)
 
-    process.fusion.read = knowing
+    monkeypatch.setattr(Fusion, "read", knowing)
     assert unlike(env)
 
 

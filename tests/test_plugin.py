@@ -158,7 +158,7 @@ def test_a_schedule_of_another_package():
     ("arguments", "message"),
     [
         (("estimator", "ekf", parts.Smoothed), "estimator: 'ekf' ships with dptse_env"),
-        (("privacy", "guaranteed", parts.LaplaceRelease), "'guaranteed' ships with dptse_env"),
+        (("privacy", "capped", parts.LaplaceRelease), "'capped' ships with dptse_env"),
         (("estimator", "My Filter", parts.Smoothed), "a name must be lower-case letters"),
         (("estimators", "mine", parts.Smoothed), "keyword must be one of action, corridor, est"),
     ],
@@ -173,16 +173,6 @@ def test_a_name_stands_for_one_part():
     register_part("reward", "cheap", parts.cheap_queries)
     with pytest.raises(ValueError, match="reward: 'cheap' is registered already, for another part"):
         register_part("reward", "cheap", lambda second: second.error.density)
-
-
-def test_former_names_serve_with_a_warning():
-    with pytest.warns(DeprecationWarning, match="'guaranteed' is now called 'capped'"):
-        env = gym.make(SHORT, privacy="guaranteed")
-    assert env.unwrapped.config.privacy.preset == "capped"
-    with pytest.warns(DeprecationWarning, match="'wary-trace' is now called 'inflated-trace'"):
-        make_schedule("wary-trace", env)
-    with pytest.warns(DeprecationWarning, match="now called 'ekf-w99-3lane-capped'"):
-        gym.make(SHORT, estimator_settings="ekf-w99-3lane-guaranteed")
 
 
 # --- bad parts --------------------------------------------------------------------------------

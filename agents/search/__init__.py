@@ -1,1 +1,1 @@
-"""Search of estimator settings and of open-loop plans on training traffic."""
+"""Search of estimator settings on training traffic."""

@@ -82,11 +82,6 @@ NOISE_SCALE: Mapping[str, Knob] = {
 
 SPEED_CAP: Mapping[str, Knob] = {"speed_cap": CategoricalDistribution((None, 0.95, 1.0, 1.05))}
 
-# A deviation of w over v_f is one of psi over rho v_f: ten times as large where the road is a tenth
-# full.
-NOISE_IN: Mapping[str, Knob] = {"process_noise_in": CategoricalDistribution(("psi", "w"))}
-LARGEST_W_NOISE = 0.5
-
 SPACE: dict[str, Mapping[str, Knob]] = {
     "ekf": _PROCESS_NOISE,
     "ukf": {**_PROCESS_NOISE, "ukf.alpha": evenly(0.1, 1.0)},
@@ -113,9 +108,6 @@ SPACE: dict[str, Mapping[str, Knob]] = {
 """By estimator: paths into `EstimatorSettings` and where their values are searched."""
 
 
-WITH_BAND = ("ekf", "ukf", "blend")
-"""Estimators whose covariances may reach a band."""
-
 NOT_TUNED = {
     "open_loop": "it takes no measurements and follows the model alone",
     "recurrent": "its weights are trained by scripts/train_estimator.py",
@@ -127,8 +119,7 @@ def search_space(
     estimator: str,
     with_noise_scale: bool = False,
     with_demand: bool = False,
-    with_repairs: bool = False,
-    band: int | None = None,
+    with_speed_cap: bool = False,
 ) -> dict[str, Knob]:
     """Return the search space of an estimator.
 
@@ -136,13 +127,10 @@ def search_space(
         estimator: Its name.
         with_noise_scale: Whether to search the scale of the noise of flows or speeds.
         with_demand: Whether to search demand states and the noise that goes with them.
-        with_repairs: Whether to search the cap of reported speeds and, for the Kalman filters,
-            what the process noise is of.
-        band: Band of the covariances, the same in all trials; None for the whole road.
+        with_speed_cap: Whether to search the cap of reported speeds.
 
     Raises:
-        ValueError: There is nothing to tune, no such estimator, or it has no demand states or no
-            band.
+        ValueError: There is nothing to tune, no such estimator, or it has no demand states.
     """
     if estimator in NOT_TUNED:
         raise ValueError(
@@ -153,25 +141,12 @@ def search_space(
         raise ValueError(f"estimator must be one of {', '.join(SPACE)}, got {estimator!r}")
     if with_demand and estimator == "random_walk":
         raise ValueError("demand must be left out for 'random_walk', which has no traffic model")
-    if band is not None and estimator not in WITH_BAND:
-        raise ValueError(
-            f"band must be left out for {estimator!r}, only {', '.join(WITH_BAND)} have one"
-        )
-    added = {**(NOISE_SCALE if with_noise_scale else {}), **(DEMAND if with_demand else {})}
-    if band is not None:
-        added["band"] = CategoricalDistribution((band,))
-    space = {**SPACE[estimator], **added}
-    return _with_repairs(estimator, space) if with_repairs else space
-
-
-def _with_repairs(estimator: str, space: dict[str, Knob]) -> dict[str, Knob]:
-    """Return a search space with the cap of speeds and, where there is one, noise in w."""
-    if estimator in ("random_walk", "mhe"):
-        return {**space, **SPEED_CAP}
-    noise = space["process_noise.1"]
-    if isinstance(noise, FloatDistribution):
-        noise = evenly(noise.low, LARGEST_W_NOISE)
-    return {**space, "process_noise.1": noise, **NOISE_IN, **SPEED_CAP}
+    return {
+        **SPACE[estimator],
+        **(NOISE_SCALE if with_noise_scale else {}),
+        **(DEMAND if with_demand else {}),
+        **(SPEED_CAP if with_speed_cap else {}),
+    }
 
 
 def nested(values: Mapping[str, Any]) -> dict[str, Any]:

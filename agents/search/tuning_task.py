@@ -20,7 +20,7 @@ from agents.search.space import Knob, search_space
 from agents.seeds import TUNING
 from dptse_env.config import TRAINING_SEEDS, EnvConfig, parse_seeds
 from dptse_env.estimators import EstimatorSettings
-from dptse_env.estimators.tuned_settings import settings_name
+from dptse_env.estimators.settings import settings_name
 from dptse_env.evaluation import WARM_UP, Row
 from dptse_env.model import ARZParameters
 from dptse_env.traffic import Records
@@ -43,9 +43,7 @@ class TuningTask:
         records: Library of records, or its folder; None for the user's cache.
         with_noise_scale: Whether to search the scale of the noise of flows or speeds, too.
         with_demand: Whether to search demand states and the noise that goes with them, too.
-        with_repairs: Whether to search the cap of reported speeds and what the process noise is of,
-            too.
-        band: Band of the covariances, the same in all trials; None for the whole road.
+        with_speed_cap: Whether to search the cap of reported speeds, too.
         variant: Ending of the set's name; empty for the set that is the default of its privacy
             preset.
 
@@ -66,8 +64,7 @@ class TuningTask:
     records: Records = None
     with_noise_scale: bool = False
     with_demand: bool = False
-    with_repairs: bool = False
-    band: int | None = None
+    with_speed_cap: bool = False
     variant: str = ""
 
     def __post_init__(self) -> None:
@@ -94,8 +91,7 @@ class TuningTask:
             self.estimator,
             self.with_noise_scale,
             self.with_demand,
-            self.with_repairs,
-            self.band,
+            self.with_speed_cap,
         )
 
     @property
@@ -111,8 +107,7 @@ class TuningTask:
     @property
     def name(self) -> str:
         """Name of the set."""
-        name = settings_name(self.estimator, self.parameters_name, self.privacy)
-        return f"{name}-{self.variant}" if self.variant else name
+        return settings_name(self.estimator, self.parameters_name, self.privacy, self.variant)
 
     def cell(self, settings: EstimatorSettings | None = None) -> Cell:
         """Return what a trial plays; the environment's default settings if None."""

@@ -105,7 +105,7 @@ SETTINGS = {
 REFERENCE, ROUND_ROBIN, ORACLE, GAIN = "paper", "round-robin", "oracle-error", "oracle-gain"
 RULES = (
     "static", REFERENCE, ROUND_ROBIN, "random", "oldest-first", "largest-variance",
-    "largest-density-variance", "stale-variance", "greedy-trace", "inflated-trace",
+    "largest-density-variance", "stale-variance", "greedy-trace",
 )  # fmt: skip
 """Policies that need no training."""
 RECORDED_TRAFFIC, VALIDATION_TRAFFIC = tuple(range(1000, 1064)), tuple(range(1100, 1164))

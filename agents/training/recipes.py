@@ -5,20 +5,13 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Annotated, ClassVar
-
-import tyro
+from typing import ClassVar
 
 from agents.training.worlds import World
 from dptse_env.config import EnvConfig
 from dptse_env.release import RELEASE_MODELS
 from dptse_env.sb3.policy import RULE
 from dptse_env.utils.validation import inside, integer, non_negative, positive, require
-
-
-def _formerly(option: str) -> object:
-    """Keep the former name of a command-line option as an alias."""
-    return tyro.conf.arg(aliases=(f"--recipe.{option}",))
 
 
 @dataclass(frozen=True)
@@ -29,23 +22,23 @@ class RegressionRounds:
         ValueError: A value is out of range; the message names it.
     """
 
-    rounds: Annotated[int, _formerly("pretraining-rounds")] = 3
+    rounds: int = 3
     """Number of rounds; 0 for none."""
-    seconds: Annotated[int, _formerly("pretraining-seconds")] = 700
+    seconds: int = 700
     """Seconds simulated in every episode of a round."""
-    interval: Annotated[int, _formerly("pretraining-every")] = 2
+    interval: int = 2
     """Seconds between two samples of an episode."""
-    batches: Annotated[int, _formerly("pretraining-batches")] = 2000
+    batches: int = 2000
     """Minibatches of a round."""
-    batch_size: Annotated[int, _formerly("pretraining-batch-size")] = 1024
+    batch_size: int = 1024
     """Samples in a minibatch."""
-    rate: Annotated[float, _formerly("pretraining-rate")] = 1e-3
+    rate: float = 1e-3
     """Initial learning rate; it falls linearly to a twentieth."""
-    max_grad_norm: Annotated[float, _formerly("max-grad-norm")] = 0.5
+    max_grad_norm: float = 0.5
     """Norm to which longer gradients are clipped."""
-    sharpness: Annotated[float, _formerly("sharpness")] = 4.0
+    sharpness: float = 4.0
     """Factor from the logarithm of the expected squared error to the score."""
-    age_bonus: Annotated[float, _formerly("age-bonus")] = 0.3
+    age_bonus: float = 0.3
     """Bonus on that logarithm for every unit of the age channel, 6 s."""
 
     def __post_init__(self) -> None:
@@ -131,7 +124,7 @@ class Recipe(ABC):
 
     n_envs: int = 128
     """Episodes simulated at once."""
-    replicas: Annotated[int, _formerly("twins")] = 4
+    replicas: int = 4
     """Episodes in a group that shares traffic and noise (common random numbers)."""
 
     def __post_init__(self) -> None:

@@ -4,9 +4,11 @@ from dptse_env.estimators.base import Estimate, Estimator
 from dptse_env.estimators.registry import (
     BACKENDS,
     ESTIMATORS,
+    REFERENCES,
     check_demand,
     check_estimate,
     check_estimator,
+    check_settings,
     make_estimator,
     settings_type,
 )
@@ -23,6 +25,7 @@ from dptse_env.estimators.settings import (
 __all__ = [
     "BACKENDS",
     "ESTIMATORS",
+    "REFERENCES",
     "BlendSettings",
     "DemandSettings",
     "EnsembleSettings",
@@ -35,6 +38,7 @@ __all__ = [
     "check_demand",
     "check_estimate",
     "check_estimator",
+    "check_settings",
     "make_estimator",
     "settings_type",
 ]

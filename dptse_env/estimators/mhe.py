@@ -5,21 +5,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from dptse_env.estimators import ekf
 from dptse_env.estimators.batch import Measurements
-from dptse_env.estimators.compiled import ekf_kernels
-from dptse_env.estimators.compiled.ekf_kernels import (
-    Filters,
-    Packed,
-    normalise,
-    process_noise,
-    project,
-)
-from dptse_env.estimators.compiled.kalman import CompiledFilter
+from dptse_env.estimators.ekf import CovarianceFilter, Filters, process_noise
 from dptse_env.estimators.horizon import (
     LEAST_DEVIATION,
     moving_variance,
     normalised_bounds,
-    require_process_noise,
     settings_of_mhe,
     solve,
 )
@@ -35,14 +27,18 @@ from dptse_env.estimators.window import (
     minimise,
 )
 from dptse_env.model import ARZModel
-from dptse_env.model.model import make_road_arrays
 from dptse_env.model.network import RoadArrays
-from dptse_env.model.step import advance, make_scratch, write_row
+from dptse_env.model.step import advance, make_scratch, normalise, project, write_row
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.kernel_loops import all_finite, any_of, copy_matrix, copy_vector
-from dptse_env.utils.kernels import kernel, kernel_part
+from dptse_env.utils.kernels import Packed, kernel, kernel_part
+from dptse_env.utils.validation import integer, positive
 
 GENERAL_SOLVER, FALLBACK = 3, 4  # how a program was solved, beside those of `window`
+
+
+MOST_VARIABLES = 10_000
+"""Variables of the longest window; most steps with it end within a tenth of a second."""
 
 
 class Windows(NamedTuple):
@@ -80,7 +76,7 @@ class Windows(NamedTuple):
 def restart(filters_: Packed, windows_: Packed, e: int) -> None:
     """Reset an episode to a window of a single stage, its prior."""
     filters, windows = Filters(*filters_), Windows(*windows_)
-    ekf_kernels.restart(filters, e)
+    ekf.restart(filters, e)
     windows.length[e], windows.solved[e] = 1, UNSOLVED
     windows.arrival_variance[e] = filters.initial_variance
     _enter(filters, windows, e, 0)
@@ -176,7 +172,7 @@ def _linearise_step(
     state, scratch = _physical(road, windows, point), make_scratch(road)
     blocks, after, product = windows.blocks[e, t], state.copy(), np.empty(state.size)
     advance(road, state, windows.inputs[e, t], after, blocks, scratch)
-    normalise(road, filters.density_scale, blocks, scratch.by_factor)
+    normalise(road, filters.units[0], blocks, scratch.by_factor)
     n_factors = windows.by_factor.shape[2]
     windows.by_factor[e, t] = scratch.by_factor[:n_factors]
     for i in range(state.size):
@@ -253,7 +249,7 @@ def _measure(
     for m in range(road.row_first.size):
         first, span, density = road.row_first[m], road.row_span[m], 0.0
         for q in range(2):
-            unit = filters.density_scale if q == 0 else road.second_scale
+            unit = filters.units[0] if q == 0 else road.second_scale
             value = values[m, q] / unit if windows.observed[e, last, m] else 0.0
             windows.values[e, last, m, q] = value
             windows.noise[e, last, m, q] = (sigma[m, q] / unit) ** 2
@@ -349,7 +345,7 @@ def write_program(road_: Packed, windows_: Packed, e: int, H: FloatArray, q: Flo
             H[t, i] = start[:, :n] - point.force[:, :n]
 
 
-class MHE(CompiledFilter):
+class MHE(CovarianceFilter):
     """Moving horizon estimation (paper, eq. 14 to 17).
 
     The program is solved exactly by `window.minimise`, started from the last step's solution, where
@@ -359,12 +355,19 @@ class MHE(CompiledFilter):
 
     def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
         """See `make_estimator`."""
-        require_process_noise(settings)
         super().__init__(model, n_episodes, settings_of_mhe(settings))
-        self._road = make_road_arrays(model)
+        self._road = model.road
         self._windows = _allocate(model, n_episodes, settings, self._road)
         self._all_packed = (*self._packed, tuple(self._windows))
         self._restart(np.arange(n_episodes))
+
+    @staticmethod
+    def check_settings(model: ARZModel, settings: EstimatorSettings) -> None:
+        """Refuse a process noise of zero, whose weight w_2 would be infinite, and long windows."""
+        for i, value in enumerate(settings.process_noise):
+            positive(f"estimator_settings.process_noise[{i}]", value)
+        most = MOST_VARIABLES // model.n_states - 1
+        integer("estimator_settings.mhe.horizon", settings.mhe.horizon, 1, most)
 
     @property
     def solved(self) -> IntArray:

@@ -19,6 +19,7 @@ import numpy as np
 
 from dptse_env.estimators.linalg import (
     add_product,
+    mirror,
     move,
     move_back,
     pair_update,
@@ -123,7 +124,7 @@ def make_factor(window: Window, width: int) -> Factor:
     return Factor(
         np.zeros(1, np.int64),
         np.zeros((n_stages, n), np.int64),
-        np.empty((n_stages, n, width)),
+        np.zeros((n_stages, n, width)),
         np.empty((n, width)),
         np.zeros(n_stages, np.int64),
         np.zeros(n_stages, np.int64),
@@ -187,21 +188,23 @@ def _fix(factor: Factor, t: int, side: IntArray) -> bool:
 @kernel_part
 def _take_rows(road: RoadArrays, window: Window, factor: Factor, t: int) -> bool:
     """Update a stage's covariance by its observed rows; return success."""
-    P, columns, u = factor.covariances[t], factor.vectors[:2], factor.n_fixed[t]
+    P, work, u = factor.covariances[t], factor.vectors, factor.n_fixed[t]
     for m in range(road.row_first.size):
         if not window.observed[t, m]:
             continue
         first, size, noise = 2 * road.row_first[m], 2 * road.row_span[m], window.noise[t, m]
         rows = window.weights[t, m, :, :size]
-        if not pair_update(P, first, rows, noise, columns, factor.gains[t, u : u + 2]):
+        if not pair_update(P, first, rows, noise, work):
             return False
         for q in range(2):
             factor.first[t, u], factor.size[t, u] = first, size
             factor.totals[t, u] = noise[q]
             for i in range(size):
                 factor.rows[t, u, i] = rows[q, i]
-                factor.totals[t, u] += rows[q, i] * columns[q, first + i]
+                factor.totals[t, u] += rows[q, i] * work[q, first + i]
+            copy_vector(work[2 + q], factor.gains[t, u])
             u += 1
+    mirror(P)
     factor.n_updates[t] = u
     return True
 

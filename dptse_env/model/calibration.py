@@ -1,27 +1,25 @@
-"""Fit the ARZ parameters to recorded traffic.
+"""Errors of a model's predictions of recorded traffic, and parameters fitted for small ones.
 
-Two stages. Densities are binned and the equilibrium speed `V_e = v_f (1 - (rho/rho_m)^gamma)` is
-fitted to the bins as a start. Then (v_f, rho_m, gamma, tau) are optimised for the predictions of
-the next 5 to 30 s by the model, started from the true state.
+The fit has two stages. Densities are binned and the equilibrium speed
+`V_e = v_f (1 - (rho/rho_m)^gamma)` is fitted to the bins as a start. Then (v_f, rho_m, gamma, tau)
+are optimised for the predictions of the next 5 to 30 s by the model, started from the true state.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy import optimize
 
-from dptse_env.model.compiled import CompiledARZModel
+from dptse_env.model.model import ARZModel
 from dptse_env.model.network import RoadNetwork
 from dptse_env.model.parameters import ARZParameters
-from dptse_env.model.prediction import (
-    HORIZONS,
-    PredictionError,
-    TrafficSeries,
-    persistence_error,
-    prediction_error,
-)
-from dptse_env.utils.arrays import FloatArray
+from dptse_env.utils.arrays import FloatArray, IntArray
+
+Traffic = tuple[FloatArray, FloatArray]  # densities and speeds (k, S)
+
+HORIZONS = (5, 10, 15, 20, 25, 30)
+"""Steps ahead whose errors count by default."""
 
 # Bounds of the search: v_f [km/h], rho_m as a multiple of the least admissible one, gamma, tau [s].
 # Beyond 150 km/h a higher v_f still improves predictions a little, but not filters.
@@ -29,6 +27,144 @@ _LOWEST = np.array([30.0, 1.0, 0.1, 5.0])
 _HIGHEST = np.array([150.0, 4.0, 5.0, 500.0])
 _WIDTH = 0.2  # first steps of the search, as shares of the values
 _REFUSED = 1e3  # loss of parameters that violate the CFL condition; persistence has 1
+
+
+@dataclass(frozen=True)
+class TrafficSeries:
+    """Traffic of a run over K steps.
+
+    Attributes:
+        density: `(K, S)` density of each segment [veh/km].
+        speed: `(K, S)` mean speed of each segment [km/h]; ignored where there is no vehicle.
+        boundary_density: `(K, R)` density of the boundary cells [veh/km].
+        boundary_speed: `(K, R)` mean speed of the boundary cells [km/h]; ignored where empty.
+
+    Raises:
+        ValueError: Shapes disagree, or a density or an occupied segment's speed is no
+            non-negative number.
+    """
+
+    density: FloatArray
+    speed: FloatArray
+    boundary_density: FloatArray
+    boundary_speed: FloatArray
+
+    def __post_init__(self) -> None:
+        """Check shapes and values."""
+        for density, speed in (("density", "speed"), ("boundary_density", "boundary_speed")):
+            rho, v = getattr(self, density), getattr(self, speed)
+            if rho.ndim != 2 or v.shape != rho.shape or len(rho) != len(self.density):
+                raise ValueError(
+                    f"series.{density} and series.{speed} must share a shape of "
+                    f"{len(self.density)} steps by cells, got {rho.shape} and {v.shape}"
+                )
+            if not np.all((rho >= 0.0) & np.isfinite(rho)):
+                raise ValueError(f"series.{density} must be finite and >= 0 everywhere")
+            occupied = v[rho > 0.0]
+            if not np.all((occupied >= 0.0) & np.isfinite(occupied)):
+                raise ValueError(f"series.{speed} must be finite and >= 0 wherever vehicles are")
+
+    def __len__(self) -> int:
+        """Number of steps."""
+        return len(self.density)
+
+
+@dataclass(frozen=True)
+class PredictionError:
+    """Root mean square errors over the mainline, an entry per horizon.
+
+    Attributes:
+        horizons: Steps ahead.
+        density: Errors of the density [veh/km].
+        speed: Errors of the speed [km/h], over segments with a vehicle at the predicted time.
+    """
+
+    horizons: tuple[int, ...]
+    density: tuple[float, ...]
+    speed: tuple[float, ...]
+
+
+def prediction_error(
+    model: ARZModel,
+    data: Sequence[TrafficSeries],
+    horizons: Sequence[int] = HORIZONS,
+    stride: int = 5,
+) -> PredictionError:
+    """Error of the model alone, started from the true state at every `stride`-th step.
+
+    The true boundary cells drive the model. Horizons are numbers of steps, ascending.
+
+    Raises:
+        ValueError: The horizons do not ascend, or no run is longer than the longest of them.
+    """
+
+    def predicted(series: TrafficSeries, starts: IntArray) -> Iterator[Traffic]:
+        inputs = model.boundary_inputs(series.boundary_density, series.boundary_speed)
+        v_f = model.parameters.free_flow_speed  # the speed of empty segments
+        speed = np.where(series.density > 0.0, series.speed, v_f)
+        states = model.project(model.states(series.density, speed))[starts]
+        for ahead in range(1, horizons[-1] + 1):
+            states = model.step(states, inputs[starts + ahead - 1])
+            if ahead in horizons:
+                yield model.density(states), model.speed(states)
+
+    return _error_of(predicted, data, model.network.n_mainline, horizons, stride)
+
+
+def persistence_error(
+    data: Sequence[TrafficSeries],
+    n_mainline: int,
+    horizons: Sequence[int] = HORIZONS,
+    stride: int = 5,
+) -> PredictionError:
+    """Error of predicting no change, for the same times as `prediction_error`.
+
+    A segment that is empty at the start has no speed and is left out of the speed's error.
+    """
+
+    def predicted(series: TrafficSeries, starts: IntArray) -> Iterator[Traffic]:
+        speed = np.where(series.density > 0.0, series.speed, np.nan)[starts]
+        for _ in horizons:
+            yield series.density[starts], speed
+
+    return _error_of(predicted, data, n_mainline, horizons, stride)
+
+
+def _error_of(
+    predicted: Callable[[TrafficSeries, IntArray], Iterator[Traffic]],
+    data: Sequence[TrafficSeries],
+    n: int,
+    horizons: Sequence[int],
+    stride: int,
+) -> PredictionError:
+    """Return the error of what is predicted for each horizon, from the starts of each run on."""
+    _check_horizons(data, horizons, stride)
+    sums, counts = np.zeros((2, len(horizons), 2))
+    for series in data:
+        starts = np.arange(0, len(series) - horizons[-1], stride)
+        pairs = zip(horizons, predicted(series, starts), strict=True)
+        for row, (ahead, (density, speed)) in enumerate(pairs):
+            there = series.density[starts + ahead, :n]
+            seen = (there > 0.0) & ~np.isnan(speed[:, :n])
+            of_speed = (speed[:, :n] - series.speed[starts + ahead, :n])[seen]
+            for quantity, errors in enumerate((density[:, :n] - there, of_speed)):
+                sums[row, quantity] += np.sum(errors**2)
+                counts[row, quantity] += errors.size
+    density_error, speed_error = np.sqrt(sums / np.maximum(counts, 1.0)).T.tolist()
+    return PredictionError(tuple(horizons), tuple(density_error), tuple(speed_error))
+
+
+def _check_horizons(data: Sequence[TrafficSeries], horizons: Sequence[int], stride: int) -> None:
+    if not horizons or horizons[0] < 1 or list(horizons) != sorted(set(horizons)):
+        raise ValueError(f"horizons must be ascending steps >= 1, got {tuple(horizons)}")
+    if stride < 1:
+        raise ValueError(f"stride must be >= 1, got {stride}")
+    longest = max((len(series) for series in data), default=0)
+    if longest <= horizons[-1]:
+        raise ValueError(
+            f"data must hold a run longer than the longest horizon of {horizons[-1]} steps, "
+            f"got {longest}"
+        )
 
 
 @dataclass(frozen=True)
@@ -125,7 +261,7 @@ def calibrate(
 
     def loss(values: FloatArray) -> float:
         try:
-            model = CompiledARZModel(network, parameters_at(values), time_step)
+            model = ARZModel(network, parameters_at(values), time_step)
         except ValueError:  # violates the CFL condition
             return _REFUSED
         return _relative(prediction_error(model, data, horizons, stride), persistence)
@@ -146,9 +282,7 @@ def calibrate(
         },
     )
     parameters = parameters_at(found.x)
-    error = prediction_error(
-        CompiledARZModel(network, parameters, time_step), data, horizons, stride
-    )
+    error = prediction_error(ARZModel(network, parameters, time_step), data, horizons, stride)
     names = ("free_flow_speed", "jam_density", "gamma", "relaxation_time")
     distance = np.minimum(found.x - np.log(_LOWEST), np.log(_HIGHEST) - found.x)
     return Calibration(

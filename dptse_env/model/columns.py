@@ -288,3 +288,38 @@ def released_by_states(
         rho = rho_row[j]
         held = 0.0 if rho < 0.0 else rho
         out[j] = psi_row[j] - rho * (v_f * power(held * by_jam, road.gamma) + v_0)
+
+
+@kernel_part(fastmath={"contract"})
+def measure_row(
+    road: RoadArrays,
+    m: int,
+    states: FloatArray,
+    centre: FloatArray,
+    density: FloatArray,
+    second: FloatArray,
+    work: FloatArray,
+) -> None:
+    """Write both numbers of row m of a measurement for each state, as `ARZModel.measure`.
+
+    Args:
+        road: The road.
+        m: Index of the row.
+        states: `(n_x, width)`, a state per column.
+        centre: `(S,)` speeds that flows are centred on [km/h]; NaN where speeds are measured.
+        density: `(width,)` output, the mean density of the row's segments [veh/km].
+        second: `(width,)` output, the mean of their centred flows [veh/h] or speeds [km/h].
+        work: `(width,)` scratch.
+    """
+    first, span = road.row_first[m], road.row_span[m]
+    part = 1.0 / span
+    for s in range(first, first + span):
+        rho, psi = states[2 * s], states[2 * s + 1]
+        released_by_states(road, s, rho, psi, centre[s], work)
+        if s == first:
+            for j in range(rho.size):
+                density[j], second[j] = part * rho[j], part * work[j]
+        else:
+            for j in range(rho.size):
+                density[j] += part * rho[j]
+                second[j] += part * work[j]

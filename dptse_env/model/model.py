@@ -1,33 +1,38 @@
-"""The ARZ traffic model for estimators: dynamics, measurements, derivatives and bounds."""
+"""The ARZ traffic model of a road for estimators: dynamics, measurements and bounds.
+
+State `x = [rho_0, psi_0, rho_1, psi_1, ...]` over the S segments, with density rho [veh/km] and
+relative flow psi = rho w [veh/h], where w = v + p(rho) [km/h] is what drivers carry with them.
+Inputs `u = [D_in, w_in, rho_out, D_on1, w_on1, ..., rho_off1, ...]`: demands at the entries [veh/h]
+with their w [km/h], and densities behind the exits [veh/km]. Arrays have a leading batch axis n.
+
+With demand states the state has a further component for each entry at its end: a factor on the
+demand that the inputs give there, which a step leaves as it is.
+"""
+
+from functools import cached_property
 
 import numpy as np
 
-from dptse_env.model.dynamics import ARZDynamics
-from dptse_env.model.jacobian import step_jacobian
-from dptse_env.model.network import (
-    DIVERGE,
-    EXIT,
-    LINK,
-    MERGE,
-    MeasurementRows,
-    RoadArrays,
-    RoadNetwork,
-)
+from dptse_env.model.network import MeasurementRows, RoadArrays, RoadNetwork, make_layout
 from dptse_env.model.parameters import (
     LARGEST_FACTOR,
+    LARGEST_W,
     LEAST_DENSITY,
     LEAST_FACTOR,
     LEAST_W,
     MEASUREMENT_FLOOR,
+    SECONDS_PER_HOUR,
+    VACUUM,
     ARZParameters,
     Bounds,
 )
-from dptse_env.utils.arrays import FloatArray, IntArray
+from dptse_env.model.step import jacobians, next_states
+from dptse_env.utils.arrays import FloatArray
 from dptse_env.utils.validation import non_negative
 
 
-class ARZModel(ARZDynamics):
-    """`ARZDynamics` with the measurement of eq. 3, derivatives by the state, and bounds on it.
+class ARZModel:
+    """Second-order macroscopic traffic flow, Godunov scheme, proportional merge, FIFO diverge.
 
     Args:
         network: The road.
@@ -38,6 +43,22 @@ class ARZModel(ARZDynamics):
             segment in its place.
         rows: What a measurement may cover; None for single segments.
         demand_states: Whether the state has a factor on the demand of each entry.
+
+    Attributes:
+        layout: Cells of the road and their connections.
+        n_segments: Segments S.
+        n_demand_states: Demand factors E in the state: 1 + I or 0.
+        n_states: Components n_x of a state, 2 S + E.
+        n_inputs: Components n_u of the inputs, 3 + 2 I + O.
+        n_boundaries: Boundary cells R.
+        jam_density: Jam density of each segment, shape (S,) [veh/km].
+        entry_jam_density: That of the boundary cells before the entries, shape (1 + I,).
+        exit_jam_density: That of the boundary cells after the exits, shape (1 + O,).
+        largest_speed: Largest speed and w of a physical state, 1.1 v_f [km/h].
+        density_scale: rho_m of the mainline, the unit of every normalised density [veh/km].
+        speed_scale: v_f, the unit of speeds [km/h].
+        state_scale: Units of normalised states: rho_m, rho_m v_f, 1 for demand factors, (n_x,).
+        measurement_scale: Units of the two numbers of a row of a measurement.
 
     Raises:
         ValueError: The network is impossible, the time step violates the CFL condition, the
@@ -54,21 +75,180 @@ class ARZModel(ARZDynamics):
         rows: MeasurementRows | None = None,
         demand_states: bool = False,
     ) -> None:
-        """Prepare the dynamics and the scale of measurements."""
-        super().__init__(network, parameters, time_step, demand_states)
+        """Derive what the equations need and check the time step."""
+        self.network, self.parameters, self.time_step = network, parameters, time_step
+        self.layout = layout = make_layout(network)
+        parameters.require_time_step(time_step, min(network.segment_lengths))
+        self.n_segments = layout.n_segments
+        self.n_demand_states = layout.entries.size if demand_states else 0
+        self.n_states = 2 * self.n_segments + self.n_demand_states
+        self.n_inputs, self.n_boundaries = layout.n_inputs, layout.n_boundaries
+        per_lane = parameters.jam_density / parameters.lanes
+        self.jam_density = per_lane * layout.lanes
+        self.entry_jam_density = per_lane * layout.entry_lanes
+        self.exit_jam_density = per_lane * layout.exit_lanes
+        self.largest_speed = LARGEST_W * parameters.free_flow_speed
+        # The scale of the mainline for all cells, so that equal numbers have an equal meaning.
+        self.density_scale = per_lane * max(network.segment_lanes[: network.n_mainline])
+        self.speed_scale = parameters.free_flow_speed
+        pair = [self.density_scale, self.density_scale * self.speed_scale]
+        self.state_scale = np.append(np.tile(pair, self.n_segments), np.ones(self.n_demand_states))
+
         self.rows = rows or MeasurementRows.single(self.n_segments)
         if reference_speed is None and not (self.rows.span == 1).all():
             raise ValueError("model.rows must be single segments where mean speeds are released")
         self.reference_speed: float | None = None
-        second = 1.0
+        second = self.speed_scale
         if reference_speed is not None:
             self.reference_speed = non_negative("model.reference_speed", reference_speed)
-            second = self.density_scale
-        self.measurement_scale = np.array([self.density_scale, second * self.speed_scale])
+            second = self.density_scale * self.speed_scale
+        self.measurement_scale = np.array([self.density_scale, second])
+
+    @cached_property
+    def road(self) -> RoadArrays:
+        """The model as arrays and numbers, for kernels."""
+        layout, n = self.layout, self.n_segments
+        entry, leave = np.full((2, n), -1, dtype=np.int64)
+        entry[layout.entries] = layout.entry_inputs
+        leave[layout.exits] = layout.exit_inputs
+        outside_jam = np.zeros(n)
+        outside_jam[layout.exits] = self.exit_jam_density
+        step_ratio = self.time_step / SECONDS_PER_HOUR / layout.lengths
+        neighbours, (terms, weights) = layout.neighbours(), layout.terms()
+        return RoadArrays(
+            free_flow_speed=float(self.parameters.free_flow_speed),
+            gamma=float(self.parameters.gamma),
+            step_ratio=step_ratio,
+            relaxation=float(self.time_step / self.parameters.relaxation_time),
+            jam=self.jam_density,
+            outside_jam=outside_jam,
+            kind=layout.kind,
+            parties=layout.parties,
+            share=layout.share,
+            entry=entry,
+            entries=layout.entries,
+            exit=leave,
+            edges=layout.edges,
+            edge_share=layout.edge_shares,
+            neighbours=neighbours,
+            degree=(neighbours >= 0).sum(axis=1, dtype=np.int64),
+            terms=terms,
+            term_weight=step_ratio[terms[:, 0]] * weights,
+            second_scale=float(self.measurement_scale[1]),
+            row_first=self.rows.first,
+            row_span=self.rows.span,
+        )
+
+    # States -------------------------------------------------------------------------------------
+
+    def pressure(self, density: FloatArray, jam: FloatArray | None = None) -> FloatArray:
+        """Pressure v_f (rho / rho_m)^gamma [km/h], the only one with V_e + p = v_f for eq. (1b).
+
+        Jam densities [veh/km] are by default those of the segments.
+        """
+        jam = self.jam_density if jam is None else jam
+        v_f, gamma = self.parameters.free_flow_speed, self.parameters.gamma
+        pressure: FloatArray = v_f * (np.maximum(density, 0.0) / jam) ** gamma
+        return pressure
+
+    def states(self, density: FloatArray, speed: FloatArray) -> FloatArray:
+        """State `(n, n_x)` of densities [veh/km] and speeds [km/h] `(n, S)`; psi = rho (v + p).
+
+        Demand factors are 1.
+        """
+        return self.compose(density, density * (speed + self.pressure(density)))
+
+    def components(self, states: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Views of rho [veh/km] and psi [veh/h] `(n, S)` of states."""
+        end = 2 * self.n_segments
+        return states[..., 0:end:2], states[..., 1:end:2]
+
+    def demand_factors(self, states: FloatArray) -> FloatArray:
+        """View of the factors on the demands `(n, E)`, E = 0 without demand states."""
+        return states[..., 2 * self.n_segments :]
+
+    def compose(
+        self, density: FloatArray, psi: FloatArray, factors: FloatArray | None = None
+    ) -> FloatArray:
+        """State `(n, n_x)` of rho and psi `(n, S)` and demand factors `(n, E)`, 1 by default."""
+        pairs = np.stack([density, psi], axis=-1).reshape(*density.shape[:-1], -1)
+        if self.n_demand_states == 0:
+            return pairs
+        if factors is None:
+            factors = np.ones((*density.shape[:-1], self.n_demand_states))
+        return np.concatenate([pairs, factors], axis=-1)
+
+    def density(self, states: FloatArray) -> FloatArray:
+        """Density `(n, S)` [veh/km]."""
+        return self.components(states)[0].copy()
+
+    def speed(self, states: FloatArray) -> FloatArray:
+        """Speed `(n, S)` [km/h], `max(w - p(rho), 0)`; the free speed v_f in a vacuum."""
+        rho, psi = (np.maximum(part, 0.0) for part in self.components(states))
+        empty = rho <= VACUUM * self.jam_density
+        w = np.where(empty, self.parameters.free_flow_speed, psi / np.where(empty, 1.0, rho))
+        return np.maximum(w - self.pressure(rho), 0.0)
+
+    def project(self, states: FloatArray, bounds: Bounds = "cone") -> FloatArray:
+        """Nearest component-wise states within bounds.
+
+        `cone`: rho in [1 veh/km, rho_m], v >= 0 and w in [0.4 v_f, 1.1 v_f].
+        `box`: rho in [0, rho_m], psi in [0, rho_m v_f], the paper's, which leaves w unbounded.
+        Demand factors lie in [0.1, 3] in both.
+        """
+        v_f, jam = self.parameters.free_flow_speed, self.jam_density
+        density, psi = self.components(states)
+        if bounds == "cone":
+            rho = np.clip(density, LEAST_DENSITY, jam)
+            least_w = np.maximum(self.pressure(rho), LEAST_W * v_f)
+            low, high = least_w * rho, self.largest_speed * rho
+        elif bounds == "box":
+            rho = np.clip(density, 0.0, jam)
+            low, high = np.zeros_like(rho), np.broadcast_to(jam * v_f, rho.shape)
+        else:
+            raise ValueError(f"bounds must be 'cone' or 'box', got {bounds!r}")
+        factors = np.clip(self.demand_factors(states), LEAST_FACTOR, LARGEST_FACTOR)
+        return self.compose(rho, np.clip(psi, low, high), factors)
+
+    # Dynamics -----------------------------------------------------------------------------------
+
+    def step(self, states: FloatArray, inputs: FloatArray) -> FloatArray:
+        """States `(n, n_x)` one time step later under inputs `(n, n_u)` (paper, eq. 1a and 1b)."""
+        after = np.empty(states.shape)
+        next_states(self.road, np.ascontiguousarray(states), np.ascontiguousarray(inputs), after)
+        return after
 
     def jacobian(self, states: FloatArray, inputs: FloatArray) -> FloatArray:
         """Analytic derivative of `step` by the state, `(n, n_x, n_x)`."""
-        return step_jacobian(self, states, inputs)
+        derivatives = np.zeros((*states.shape, self.n_states))
+        states, inputs = np.ascontiguousarray(states), np.ascontiguousarray(inputs)
+        jacobians(self.road, states, inputs, derivatives)
+        return derivatives
+
+    def boundary_inputs(self, density: FloatArray, speed: FloatArray) -> FloatArray:
+        """Inputs `(n, n_u)` of the boundary cells' densities and speeds `(n, R)`.
+
+        Boundary cells: upstream, downstream, before each on-ramp, after each off-ramp. The demand
+        of an empty cell is zero for any speed, NaN included. w is clipped to [0, 1.1 v_f], so that
+        no input violates the CFL condition.
+        """
+        layout, jam = self.layout, self.entry_jam_density
+        v_f, gamma = self.parameters.free_flow_speed, self.parameters.gamma
+        inputs = np.empty((density.shape[0], self.n_inputs))
+        rho = density[:, layout.entry_boundaries]
+        occupied = rho > VACUUM * jam
+        v, p = np.where(occupied, speed[:, layout.entry_boundaries], 0.0), self.pressure(rho, jam)
+        w = np.where(occupied, np.clip(v + p, 0.0, self.largest_speed), v_f)
+        # Up to the critical density a cell sends what it holds, beyond the capacity q_max(w).
+        critical = jam * (w / (1.0 + gamma) / v_f) ** (1.0 / gamma)
+        capacity = critical * w * (gamma / (1.0 + gamma))
+        demand = np.where((1.0 + gamma) * p <= w, rho * (w - p), capacity)
+        inputs[:, layout.entry_inputs] = np.where(occupied, demand, 0.0)
+        inputs[:, layout.entry_inputs + 1] = w
+        inputs[:, layout.exit_inputs] = density[:, layout.exit_boundaries]
+        return inputs
+
+    # Measurements -------------------------------------------------------------------------------
 
     def measure(self, states: FloatArray, centre: FloatArray | None = None) -> FloatArray:
         """Density and speed of each row `(n, M, 2)` (paper, eq. 3), density floored in v.
@@ -84,28 +264,20 @@ class ARZModel(ARZDynamics):
             return self.traffic(states)[:, self.rows.first]
         rho, psi = self.components(states)
         v_0 = self.reference_speed if centre is None else centre
-        carried = self.relations.pressure(rho, self.jam_density) + v_0
-        return self.rows.averages(np.stack([rho, psi - rho * carried], axis=-1))
-
-    def measurement_jacobian(
-        self, states: FloatArray, centre: FloatArray | None = None
-    ) -> FloatArray:
-        """Derivative, `(n, S, 2, 2)`, of a row of a single segment by the segment's (rho, psi)."""
-        if self.reference_speed is None:
-            return self.traffic_jacobian(states)
-        pressure = self.relations.pressure(self.components(states)[0], self.jam_density)
-        v_0 = self.reference_speed if centre is None else centre
-        jacobian = np.zeros((*pressure.shape, 2, 2))
-        jacobian[..., 0, 0] = 1.0
-        jacobian[..., 1, 0] = -(1.0 + self.parameters.gamma) * pressure - v_0
-        jacobian[..., 1, 1] = 1.0
-        return jacobian
+        flow = psi - rho * (self.pressure(rho) + v_0)
+        return self.rows.averages(np.stack([rho, flow], axis=-1))
 
     def measurement_matrix(
         self, states: FloatArray, centre: FloatArray | None = None
     ) -> FloatArray:
         """Derivative of `measure` by the state, `(n, M, 2, n_x)`."""
-        blocks = self.measurement_jacobian(states, centre)
+        if self.reference_speed is None:
+            blocks = self.traffic_jacobian(states)
+        else:
+            rho, _ = self.components(states)
+            v_0 = self.reference_speed if centre is None else centre
+            by_rho = -(1.0 + self.parameters.gamma) * self.pressure(rho) - v_0
+            blocks = _blocks(by_rho, np.ones_like(rho))
         n, S = blocks.shape[:2]
         matrix = np.zeros((n, self.rows.n_rows, 2, self.n_states))
         by_segment = np.einsum("ms,nsij->nmisj", self.rows.weights, blocks)
@@ -116,116 +288,24 @@ class ARZModel(ARZDynamics):
         """Density and speed of each segment `(n, S, 2)`, the density floored in the speed."""
         rho, psi = self.components(states)
         floored = np.maximum(rho, MEASUREMENT_FLOOR * self.jam_density)
-        speed = psi / floored - self.relations.pressure(floored, self.jam_density)
-        return np.stack([rho, speed], axis=-1)
+        return np.stack([rho, psi / floored - self.pressure(floored)], axis=-1)
 
     def traffic_jacobian(self, states: FloatArray) -> FloatArray:
         """Derivative of `traffic`, `(n, S, 2, 2)`, by the segment's (rho, psi)."""
         rho, psi = self.components(states)
         floor = MEASUREMENT_FLOOR * self.jam_density
         floored = np.maximum(rho, floor)
-        pressure = self.relations.pressure(floored, self.jam_density)
-        slope = -(psi / floored + self.parameters.gamma * pressure) / floored
-        jacobian = np.zeros((*rho.shape, 2, 2))
-        jacobian[..., 0, 0] = 1.0
-        jacobian[..., 1, 0] = np.where(rho > floor, slope, 0.0)
-        jacobian[..., 1, 1] = 1.0 / floored
-        return jacobian
+        slope = -(psi / floored + self.parameters.gamma * self.pressure(floored)) / floored
+        return _blocks(np.where(rho > floor, slope, 0.0), 1.0 / floored)
 
-    def project(self, states: FloatArray, bounds: Bounds = "cone") -> FloatArray:
-        """Nearest component-wise states within bounds.
 
-        `cone`: rho in [1 veh/km, rho_m], v >= 0 and w in [0.4 v_f, 1.1 v_f].
-        `box`: rho in [0, rho_m], psi in [0, rho_m v_f], the paper's, which leaves w unbounded.
-        Demand factors lie in [0.1, 3] in both.
-        """
-        v_f, jam = self.parameters.free_flow_speed, self.jam_density
-        density, psi = self.components(states)
-        if bounds == "cone":
-            rho = np.clip(density, LEAST_DENSITY, jam)
-            least_w = np.maximum(self.relations.pressure(rho, jam), LEAST_W * v_f)
-            low, high = least_w * rho, self.largest_speed * rho
-        elif bounds == "box":
-            rho = np.clip(density, 0.0, jam)
-            low, high = np.zeros_like(rho), np.broadcast_to(jam * v_f, rho.shape)
-        else:
-            raise ValueError(f"bounds must be 'cone' or 'box', got {bounds!r}")
-        factors = np.clip(self.demand_factors(states), LEAST_FACTOR, LARGEST_FACTOR)
-        return self.compose(rho, np.clip(psi, low, high), factors)
+def _blocks(by_rho: FloatArray, by_psi: FloatArray) -> FloatArray:
+    """Return the derivatives (n, S, 2, 2) of a density and a second number by (rho, psi)."""
+    blocks = np.zeros((*by_rho.shape, 2, 2))
+    blocks[..., 0, 0], blocks[..., 1, 0], blocks[..., 1, 1] = 1.0, by_rho, by_psi
+    return blocks
 
 
 def make_road_arrays(model: ARZModel) -> RoadArrays:
     """Return a model as arrays and numbers."""
-    layout, n = model.layout, model.n_segments
-    kind = np.full(n, EXIT, dtype=np.int64)
-    parties = np.full((n, 3), -1, dtype=np.int64)
-    parties[:, 0] = np.arange(n)
-    share = np.zeros(n)
-    for up, down in layout.links.T:
-        kind[up], parties[up, 1] = LINK, down
-    for main, ramp, down in layout.merges.T:
-        kind[[main, ramp]] = MERGE
-        parties[main, 1:] = down, ramp
-        parties[ramp, 1:] = down, main
-    for (up, main, off), exit_share in zip(layout.diverges.T, layout.exit_shares, strict=True):
-        kind[up], share[up] = DIVERGE, exit_share
-        parties[up, 1:] = main, off
-
-    entry, leave = np.full((2, n), -1, dtype=np.int64)
-    entry[layout.entries] = layout.entry_inputs
-    leave[layout.exits] = layout.exit_inputs
-    outside_jam = np.zeros(n)
-    outside_jam[layout.exits] = model.exit_jam_density
-
-    edges, edge_share = layout.edges, layout.edge_shares
-    neighbours, degree = _neighbours(model)
-    terms, weights = _terms(parties, edges, edge_share, neighbours)
-    return RoadArrays(
-        free_flow_speed=float(model.parameters.free_flow_speed),
-        gamma=float(model.parameters.gamma),
-        step_ratio=model.step_ratio,
-        relaxation=float(model.relaxation),
-        jam=model.jam_density,
-        outside_jam=outside_jam,
-        kind=kind,
-        parties=parties,
-        share=share,
-        entry=entry,
-        entries=layout.entries,
-        exit=leave,
-        edges=edges,
-        edge_share=edge_share,
-        neighbours=neighbours,
-        degree=degree,
-        terms=terms,
-        term_weight=model.step_ratio[terms[:, 0]] * weights,
-        second_scale=float(model.measurement_scale[1]),
-        row_first=model.rows.first,
-        row_span=model.rows.span,
-    )
-
-
-def _neighbours(model: ARZModel) -> tuple[IntArray, IntArray]:
-    sparsity = model.layout.sparsity()
-    degree = sparsity.sum(axis=1).astype(np.int64)
-    neighbours = np.full((model.n_segments, int(degree.max())), -1, dtype=np.int64)
-    for cell, row in enumerate(sparsity):
-        cells = np.flatnonzero(row)
-        neighbours[cell, : degree[cell]] = [cell, *cells[cells != cell]]
-    return neighbours, degree
-
-
-def _terms(
-    parties: IntArray, edges: IntArray, edge_share: FloatArray, neighbours: IntArray
-) -> tuple[IntArray, FloatArray]:
-    """List the rows of the Jacobian that each outflow's gradient enters, with its weights."""
-    flows = [(cell, cell, -1.0) for cell in range(len(parties))]
-    flows += [(start, end, part) for (start, end), part in zip(edges, edge_share, strict=True)]
-    terms, weights = [], []
-    for start, row, weight in flows:
-        for party, cell in enumerate(parties[start]):
-            if cell >= 0:
-                slot = int(np.flatnonzero(neighbours[row] == cell)[0])
-                terms.append((row, slot, start, party))
-                weights.append(weight)
-    return np.array(terms, dtype=np.int64), np.array(weights)
+    return model.road

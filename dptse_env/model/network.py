@@ -1,6 +1,7 @@
-"""Geometry of a road as arrays: cells and their connections, rows, and what kernels take of it.
+"""Geometry of a road as arrays: cells and their connections, and the rows of a measurement.
 
-`Layout` is derived of a `RoadNetwork`, and `RoadArrays` of a model on it.
+`Layout` is derived of a `RoadNetwork` alone. Kernels take `RoadArrays`, which have the numbers of a
+model on it as well; see `ARZModel.road`.
 """
 
 from __future__ import annotations
@@ -66,23 +67,34 @@ class RoadNetwork(Protocol):
         """Lanes of each of the R boundary cells: both ends of the mainline, then the ramps'."""
 
 
+LINK, MERGE, DIVERGE, EXIT = 0, 1, 2, 3
+
+
 @dataclass(frozen=True)
 class Layout:
-    """Index arrays of a road network, each face in exactly one group."""
+    """The cells of a road, one per segment, and the faces through which traffic passes.
 
-    links: IntArray  # (2, L) cells (upstream, downstream) of 1-to-1 faces
-    merges: IntArray  # (3, I) cells (mainline, on-ramp, downstream)
-    diverges: IntArray  # (3, O) cells (upstream, mainline, off-ramp)
-    exit_shares: FloatArray  # (O,) share of the flow that leaves at each diverge
+    A cell flows out through one face: into one cell (LINK), into one that another cell flows into
+    as well (MERGE), into two cells (DIVERGE), or out of the road (EXIT).
+    """
+
+    lanes: FloatArray  # (S,)
+    lengths: FloatArray  # (S,) [km]
+    kind: IntArray  # (S,) LINK, MERGE, DIVERGE or EXIT: the face a cell flows out through
+    # (S, 3) the cell, the cell it flows into, and the third one at a junction (the other
+    # branch of a merge, the off-ramp of a diverge), -1 where there is none
+    parties: IntArray
+    share: FloatArray  # (S,) exit share of a diverge, 0 elsewhere
+    edges: IntArray  # (E, 2) cells (from, to) between which vehicles pass
+    edge_shares: FloatArray  # (E,) share of the outflow that passes along each edge
     entries: IntArray  # (1 + I,) cells with inflow from outside: segment 0, then the on-ramps
     entry_inputs: IntArray  # (1 + I,) input column of each entry's demand; its w follows
+    entry_boundaries: IntArray  # (1 + I,) boundary cell before each entry
+    entry_lanes: FloatArray  # (1 + I,) lanes of these
     exits: IntArray  # (1 + O,) cells with outflow to outside: segment N-1, then the off-ramps
     exit_inputs: IntArray  # (1 + O,) input column of each exit's downstream density
-    routing: FloatArray  # (S, S) share of the outflow of a column's cell into a row's cell
-    lanes: FloatArray  # (S,) lanes of the segments
-    lengths: FloatArray  # (S,) lengths of the segments [km]
-    entry_lanes: FloatArray  # (1 + I,) lanes of the boundary cells before the entries
-    exit_lanes: FloatArray  # (1 + O,) lanes of the boundary cells after the exits
+    exit_boundaries: IntArray  # (1 + O,) boundary cell after each exit
+    exit_lanes: FloatArray  # (1 + O,) lanes of these
 
     @property
     def n_segments(self) -> int:
@@ -99,43 +111,37 @@ class Layout:
         """Number of boundary cells R."""
         return self.entries.size + self.exits.size
 
-    @property
-    def entry_boundaries(self) -> IntArray:
-        """`(1 + I,)` boundary cell before each entry, in the order of a record."""
-        return np.array([0, *range(2, 1 + self.entries.size)], dtype=np.int64)
+    def neighbours(self) -> IntArray:
+        """Cells that a cell's next state depends on, itself first, shape (S, K), -1 padded."""
+        # An outflow depends on the cells at its face, and a cell on what flows out of it and into.
+        needed = [set(cells) for cells in self.parties.tolist()]
+        for start, end in self.edges.tolist():
+            needed[end] |= set(self.parties[start].tolist())
+        lists = [[c, *sorted(cells - {c, -1})] for c, cells in enumerate(needed)]
+        return np.array(list(itertools.zip_longest(*lists, fillvalue=-1)), dtype=np.int64).T.copy()
 
-    @property
-    def exit_boundaries(self) -> IntArray:
-        """`(1 + O,)` boundary cell after each exit, in the order of a record."""
-        first = 1 + self.entries.size
-        return np.array([1, *range(first, self.n_boundaries)], dtype=np.int64)
+    def terms(self) -> tuple[IntArray, FloatArray]:
+        """Terms of a step's Jacobian: each outflow's gradient in the rows of the cells it moves.
 
-    @property
-    def edges(self) -> IntArray:
-        """`(E, 2)` cells (from, to) between which vehicles pass."""
-        ends, starts = np.nonzero(self.routing)
-        return np.stack([starts, ends], axis=1).astype(np.int64)
-
-    @property
-    def edge_shares(self) -> FloatArray:
-        """`(E,)` share of the outflow that passes along each edge."""
-        shares: FloatArray = self.routing[self.edges[:, 1], self.edges[:, 0]]
-        return shares
-
-    def sparsity(self) -> BoolArray:
-        """`(S, S)` flags: the cell of a row after a step depends on that of a column before it."""
-        # The outflow of a cell depends on every cell at its downstream face.
-        outflow = np.eye(self.n_segments, dtype=bool)
-        for cells in (*self.links.T, *self.diverges.T):
-            outflow[cells[0], cells] = True
-        for main, ramp, down in self.merges.T:
-            outflow[[[main], [ramp]], [main, ramp, down]] = True
-        inflow = (self.routing > 0) @ outflow
-        return np.asarray(inflow | outflow, dtype=np.bool_)
+        Returns:
+            The terms (M, 4): the row's cell, the slot among its `neighbours` of the cell by which
+            is derived, the outflow's cell, and the place of the former among its `parties`; and
+            their weights (M,), -1 in the row of the outflow's cell and the edge's share else.
+        """
+        flows = [(c, c, -1.0) for c in range(self.n_segments)]
+        edges = zip(self.edges.tolist(), self.edge_shares.tolist(), strict=True)
+        flows += [(start, end, share) for (start, end), share in edges]
+        neighbours, terms, weights = self.neighbours().tolist(), [], []
+        for start, row, weight in flows:
+            for party, cell in enumerate(self.parties[start].tolist()):
+                if cell >= 0:
+                    terms.append((row, neighbours[row].index(cell), start, party))
+                    weights.append(weight)
+        return np.array(terms, dtype=np.int64), np.array(weights)
 
 
 def make_layout(network: RoadNetwork) -> Layout:
-    """Derive the index arrays of a network.
+    """Derive the arrays of a network.
 
     Raises:
         ValueError: The model does not cover the geometry; the message names the field.
@@ -143,46 +149,49 @@ def make_layout(network: RoadNetwork) -> Layout:
     _check(network)
     n, n_on, n_off = network.n_mainline, len(network.on_ramps), len(network.off_ramps)
     on, off = network.on_ramp_segments, network.off_ramp_segments
-    shares = np.asarray(network.exit_shares, dtype=np.float64)
     lanes = np.asarray(network.segment_lanes, dtype=np.float64)
+    S = lanes.size
+
+    kind, share = np.full(S, EXIT, dtype=np.int64), np.zeros(S)
+    parties = np.full((S, 3), -1, dtype=np.int64)
+    parties[:, 0] = np.arange(S)
+    for path in (range(n), *on, *off):
+        for up, down in itertools.pairwise(path):
+            kind[up], parties[up, 1] = LINK, down
+    for face, ramp in zip(network.on_ramps, on, strict=True):
+        main, joining = face - 1, ramp[-1]
+        kind[[main, joining]] = MERGE
+        parties[main, 1:] = face, joining
+        parties[joining, 1:] = face, main
+    ramps = zip(network.off_ramps, off, network.exit_shares, strict=True)
+    for face, ramp, exit_share in ramps:
+        kind[face - 1], share[face - 1] = DIVERGE, exit_share
+        parties[face - 1, 1:] = face, ramp[0]
+
+    passing = [(parties[c, 1], c, 1.0 - share[c]) for c in range(S) if kind[c] != EXIT]
+    passing += [(parties[c, 2], c, share[c]) for c in range(S) if share[c] > 0.0]
+    passing.sort()
+
+    entry_boundaries = np.array([0, *range(2, 2 + n_on)], dtype=np.int64)
+    exit_boundaries = np.array([1, *range(2 + n_on, 2 + n_on + n_off)], dtype=np.int64)
     boundary_lanes = np.asarray(network.boundary_lanes, dtype=np.float64)
-
-    merges = [(face - 1, ramp[-1], face) for face, ramp in zip(network.on_ramps, on, strict=True)]
-    diverges = [
-        (face - 1, face, ramp[0]) for face, ramp in zip(network.off_ramps, off, strict=True)
-    ]
-    junctions = {*network.on_ramps, *network.off_ramps}
-    links = [(j - 1, j) for j in range(1, n) if j not in junctions]
-    for ramp in (*on, *off):
-        links += itertools.pairwise(ramp)
-
-    routing = np.zeros((lanes.size,) * 2)
-    for up, down in links:
-        routing[down, up] = 1.0
-    for main, joining, down in merges:
-        routing[down, [main, joining]] = 1.0
-    for (up, main, leaving), share in zip(diverges, shares, strict=True):
-        routing[[main, leaving], up] = 1.0 - share, share
-
     return Layout(
-        links=_columns(links, 2),
-        merges=_columns(merges, 3),
-        diverges=_columns(diverges, 3),
-        exit_shares=shares,
-        entries=np.array([0, *(ramp[0] for ramp in on)], dtype=np.int64),
-        entry_inputs=np.array([0, *range(3, 3 + 2 * n_on, 2)], dtype=np.int64),
-        exits=np.array([n - 1, *(ramp[-1] for ramp in off)], dtype=np.int64),
-        exit_inputs=np.array([2, *range(3 + 2 * n_on, 3 + 2 * n_on + n_off)], dtype=np.int64),
-        routing=routing,
         lanes=lanes,
         lengths=np.asarray(network.segment_lengths, dtype=np.float64),
-        entry_lanes=boundary_lanes[[0, *range(2, 2 + n_on)]],
-        exit_lanes=boundary_lanes[[1, *range(2 + n_on, 2 + n_on + n_off)]],
+        kind=kind,
+        parties=parties,
+        share=share,
+        edges=np.array([(c, end) for end, c, _ in passing], dtype=np.int64).reshape(-1, 2),
+        edge_shares=np.array([part for _, _, part in passing]),
+        entries=np.array([0, *(ramp[0] for ramp in on)], dtype=np.int64),
+        entry_inputs=np.array([0, *range(3, 3 + 2 * n_on, 2)], dtype=np.int64),
+        entry_boundaries=entry_boundaries,
+        entry_lanes=boundary_lanes[entry_boundaries],
+        exits=np.array([n - 1, *(ramp[-1] for ramp in off)], dtype=np.int64),
+        exit_inputs=np.array([2, *range(3 + 2 * n_on, 3 + 2 * n_on + n_off)], dtype=np.int64),
+        exit_boundaries=exit_boundaries,
+        exit_lanes=boundary_lanes[exit_boundaries],
     )
-
-
-def _columns(rows: Sequence[tuple[int, ...]], width: int) -> IntArray:
-    return np.array(rows, dtype=np.int64).reshape(-1, width).T
 
 
 def _check(network: RoadNetwork) -> None:
@@ -289,9 +298,6 @@ class MeasurementRows:
         return averages
 
 
-LINK, MERGE, DIVERGE, EXIT = 0, 1, 2, 3
-
-
 class RoadArrays(NamedTuple):
     """A model of S segments as arrays and numbers, for compiled code."""
 
@@ -301,20 +307,17 @@ class RoadArrays(NamedTuple):
     relaxation: float  # T / tau
     jam: FloatArray  # (S,) jam densities [veh/km]
     outside_jam: FloatArray  # (S,) jam density behind an exit [veh/km]; unused elsewhere
-    kind: IntArray  # (S,) LINK, MERGE, DIVERGE or EXIT: the face a cell flows out through
-    # (S, 3) the cell, the cell it flows into, and the third one at a junction (the other
-    # branch of a merge, the off-ramp of a diverge), -1 where there is none
-    parties: IntArray
-    share: FloatArray  # (S,) exit share of a diverge
+    kind: IntArray  # (S,) of `Layout`
+    parties: IntArray  # (S, 3) of `Layout`
+    share: FloatArray  # (S,) of `Layout`
     entry: IntArray  # (S,) input column of the demand from outside, -1 for an inner cell
     entries: IntArray  # (1 + I,) cells with inflow from outside
     exit: IntArray  # (S,) input column of the density outside, -1 for an inner cell
-    edges: IntArray  # (E, 2) cells (from, to) between which vehicles pass
+    edges: IntArray  # (E, 2) of `Layout`
     edge_share: FloatArray  # (E,) share of the outflow that passes
-    # (S, K) cells that a cell's next state depends on, itself first, -1 padded
-    neighbours: IntArray
+    neighbours: IntArray  # (S, K) of `Layout`
     degree: IntArray  # (S,) how many neighbours there are
-    terms: IntArray  # (M, 4) (row cell, slot of its neighbour, outflow's cell, its party)
+    terms: IntArray  # (M, 4) of `Layout`
     term_weight: FloatArray  # (M,) weight of the outflow's gradient in the Jacobian [h/km]
     second_scale: float  # unit of the second number that sensors release [km/h or veh/h]
     row_first: IntArray  # (M,) first segment of each row of a measurement

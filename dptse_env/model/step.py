@@ -1,11 +1,18 @@
-"""Compiled kernels of the ARZ model: the next state of a state vector, and the sparse Jacobian.
+"""Compiled kernels of the ARZ model for one state: the next state, and the step's Jacobian.
 
-The equations are those of `dptse_env.model.model`, written for one cell at a time. A cell's outflow
-depends on at most three cells, its parties: itself and those at its downstream face. A step's
-Jacobian is a weighted sum of the outflows' gradients, by a table of the road.
+The pressure is p(rho) = v_f (rho / rho_m)^gamma (Aw-Rascle 2000, Zhang 2002). Along drivers of one
+w the flow is q_w(rho) = rho (w - p(rho)), largest at the critical density sigma(w) =
+rho_m (w / ((1 + gamma) v_f))^(1 / gamma): q_max(w) = sigma(w) w gamma / (1 + gamma). The demand of
+a cell is what it can send: q_w(rho) up to sigma(w), q_max(w) beyond. Its supply is what it can take
+in of drivers w: they reach the density rho_M = p^-1(w - v) at the cell's speed v, and rho_M v
+enters, unless rho_M is below sigma(w): then q_max(w).
 
-Kernels do not allocate: callers pass scratch space (`make_scratch`), so that a kernel can run
-inside another, once per step and episode.
+A cell's outflow depends on at most three cells, its parties: itself and those at its downstream
+face. A step's Jacobian is a weighted sum of the outflows' gradients, by a table of the road. At a
+kink, demand = supply, it takes the side of the demand.
+
+Parts do not allocate: callers pass scratch space (`make_scratch`), so that a part can run inside a
+kernel, once per step and episode.
 """
 
 from typing import NamedTuple
@@ -13,9 +20,18 @@ from typing import NamedTuple
 import numpy as np
 
 from dptse_env.model.network import EXIT, LINK, MERGE, RoadArrays
-from dptse_env.model.parameters import MEASUREMENT_FLOOR, STANDING, VACUUM
+from dptse_env.model.parameters import (
+    LARGEST_FACTOR,
+    LARGEST_W,
+    LEAST_DENSITY,
+    LEAST_FACTOR,
+    LEAST_W,
+    MEASUREMENT_FLOOR,
+    STANDING,
+    VACUUM,
+)
 from dptse_env.utils.arrays import FloatArray
-from dptse_env.utils.kernels import kernel_part
+from dptse_env.utils.kernels import kernel, kernel_part
 
 # Columns of the table of cells: values, then partial derivatives by the cell's rho and psi.
 _W, _V, _D, _W_RHO, _W_PSI, _V_RHO, _V_PSI, _D_RHO, _D_PSI = range(9)
@@ -301,6 +317,110 @@ def advance(
             blocks[row, slot, k] += road.term_weight[m] * gradient[start, party, k]
 
 
+@kernel
+def next_states(
+    road: RoadArrays, states: FloatArray, inputs: FloatArray, after: FloatArray
+) -> None:
+    """Write the states (n, n_x) one step after `states` (n, n_x) under `inputs` (n, n_u)."""
+    scratch = make_scratch(road)
+    blocks = np.empty((*road.neighbours.shape, 4))
+    for i in range(states.shape[0]):
+        advance(road, states[i], inputs[i], after[i], blocks, scratch)
+
+
+@kernel
+def jacobians(
+    road: RoadArrays, states: FloatArray, inputs: FloatArray, derivatives: FloatArray
+) -> None:
+    """Write the derivatives of a step of `states` into zeros, shape (n, n_x, n_x)."""
+    scratch = make_scratch(road)
+    blocks = np.empty((*road.neighbours.shape, 4))
+    after = np.empty(states.shape[1])
+    for i in range(states.shape[0]):
+        advance(road, states[i], inputs[i], after, blocks, scratch)
+        for c in range(road.jam.size):
+            for slot in range(road.degree[c]):
+                b = road.neighbours[c, slot]
+                for k in range(4):
+                    derivatives[i, 2 * c + k // 2, 2 * b + k % 2] = blocks[c, slot, k]
+        for j in range(2 * road.jam.size, after.size):
+            e = j - 2 * road.jam.size
+            derivatives[i, j, j] = 1.0
+            for k in range(2):
+                derivatives[i, 2 * road.entries[e] + k, j] = scratch.by_factor[e, k]
+
+
+@kernel_part
+def normalise(
+    road: RoadArrays, density_scale: float, blocks: FloatArray, by_factor: FloatArray
+) -> None:
+    """Normalise a step's derivatives: rho by rho_m, psi by rho_m v_f."""
+    v_f = road.free_flow_speed
+    for s in range(blocks.shape[0]):
+        for slot in range(blocks.shape[1]):
+            blocks[s, slot, 1] *= v_f
+            blocks[s, slot, 2] /= v_f
+    for e in range(by_factor.shape[0]):
+        by_factor[e, 0] /= density_scale
+        by_factor[e, 1] /= density_scale * v_f
+
+
+@kernel_part
+def project(road: RoadArrays, state: FloatArray, is_box: bool) -> None:
+    """Project a state into its bounds, as `ARZModel.project`; a NaN stays NaN."""
+    v_f = road.free_flow_speed
+    for c in range(road.jam.size):
+        rho, psi, jam = state[2 * c], state[2 * c + 1], road.jam[c]
+        if is_box:
+            rho = clip(rho, 0.0, jam)
+            low, high = 0.0, jam * v_f
+        else:
+            rho = clip(rho, LEAST_DENSITY, jam)
+            least_w = max(pressure(rho, jam, v_f, road.gamma), LEAST_W * v_f)
+            low, high = least_w * rho, LARGEST_W * v_f * rho
+        state[2 * c], state[2 * c + 1] = rho, clip(psi, low, high)
+    for i in range(2 * road.jam.size, state.size):
+        state[i] = clip(state[i], LEAST_FACTOR, LARGEST_FACTOR)
+
+
+@kernel_part
+def clip(value: float, low: float, high: float) -> float:
+    """Return a value held between two others; a NaN stays NaN."""
+    if value < low:
+        return low
+    if value > high:
+        return high
+    return value
+
+
+@kernel_part
+def measured(
+    rho: float, psi: float, jam: float, v_f: float, gamma: float
+) -> tuple[float, float, float]:
+    """Return a speed [km/h], its density floored, and its derivatives by rho and psi."""
+    floor = MEASUREMENT_FLOOR * jam
+    floored = max(rho, floor)
+    p = pressure(floored, jam, v_f, gamma)
+    slope = -(psi / floored + gamma * p) / floored if rho > floor else 0.0
+    return psi / floored - p, slope, 1.0 / floored
+
+
+@kernel_part
+def released(
+    road: RoadArrays, s: int, rho: float, psi: float, centre: float
+) -> tuple[float, float, float]:
+    """Return a segment's released second number, and its derivatives by rho and psi.
+
+    That is the flow [veh/h] centred on a speed [km/h], or the speed where the centre is NaN.
+    """
+    jam, v_f, gamma = road.jam[s], road.free_flow_speed, road.gamma
+    if np.isnan(centre):
+        return measured(rho, psi, jam, v_f, gamma)
+    p = pressure(rho, jam, v_f, gamma)
+    flow = psi - rho * (p + centre)
+    return flow, -(1.0 + gamma) * p - centre, 1.0
+
+
 @kernel_part
 def write_row(
     road: RoadArrays,
@@ -325,20 +445,12 @@ def write_row(
         weights: `(2, >= 2 span)`, written, of the components from 2 `row_first[m]` on.
         constants: `(2,)`, written.
     """
-    first, span, v_f, gamma = road.row_first[m], road.row_span[m], road.free_flow_speed, road.gamma
+    first, span = road.row_first[m], road.row_span[m]
     constants[:] = 0.0
     for i in range(span):
         s = first + i
-        rho, psi, jam = state[2 * s], state[2 * s + 1], road.jam[s]
-        if np.isnan(centre[s]):
-            floored = max(rho, MEASUREMENT_FLOOR * jam)
-            p = pressure(floored, jam, v_f, gamma)
-            second, by_psi = psi / floored - p, 1.0 / floored
-            by_rho = -(psi / floored + gamma * p) / floored if rho == floored else 0.0
-        else:
-            p = pressure(rho, jam, v_f, gamma)
-            second, by_psi = psi - rho * (p + centre[s]), 1.0
-            by_rho = -(1.0 + gamma) * p - centre[s]
+        rho, psi = state[2 * s], state[2 * s + 1]
+        second, by_rho, by_psi = released(road, s, rho, psi, centre[s])
         part = 1.0 / (span * road.second_scale)
         weights[0, 2 * i], weights[0, 2 * i + 1] = 1.0 / span, 0.0
         weights[1, 2 * i] = part * by_rho * units[2 * s]

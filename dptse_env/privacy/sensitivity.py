@@ -112,7 +112,6 @@ def contribution_sensitivity(
     segment_length: float,
     largest_speed: float,
     mean_speed_slope: float | None = None,
-    signed_counts: bool = False,
 ) -> Sensitivity:
     """Sensitivities of density and centred flow for vehicles with bounded contributions.
 
@@ -125,10 +124,6 @@ def contribution_sensitivity(
     different segments, which gives sqrt(2 C) times that in both quantities; or on the same segments
     at opposite speeds: densities agree and flows differ by v_max / l, in all 2 sqrt(C) v_0 / l.
 
-    With `signed_counts` a vehicle adds a number in [-1 / l, 1 / l] to the density, a deviation that
-    it reports. Two vehicles on the same segments may then be opposite in both quantities, which
-    gives 2 sqrt(C) times the size of a contribution.
-
     Args:
         contributions: C, released steps that a vehicle's data can enter, >= 1.
         adjacency: difference of adjacent records.
@@ -136,7 +131,6 @@ def contribution_sensitivity(
         largest_speed: v_max [km/h], a public constant that recorded speeds are clipped to.
         mean_speed_slope: the paper's relation Delta_v / Delta_rho [km/h per veh/km], which does
             not hold, where mean speeds are released in place of flows; else None.
-        signed_counts: whether deviations are released in place of counts.
 
     Raises:
         ValueError: A number is out of range.
@@ -148,8 +142,7 @@ def contribution_sensitivity(
     same_segment = 0.0
     if adjacency == "replace":
         same_segment = 2.0 * flow
-        factor = 2.0 if signed_counts else math.sqrt(2.0)
-        density, flow = factor * density, factor * flow
+        density, flow = math.sqrt(2.0) * density, math.sqrt(2.0) * flow
     extremes: tuple[tuple[float, ...], ...] = ((density, flow), (0.0, same_segment))
     second = ReleaseSensitivity("flow", "veh/h", max(flow, same_segment))
     if mean_speed_slope is not None:

@@ -10,14 +10,13 @@ from dptse_env.release.base import (
 )
 from dptse_env.release.boundary import BOUNDARIES, BoundaryModel
 from dptse_env.release.checks import check_released
-from dptse_env.release.density import COUNTED, DensityRelease
 from dptse_env.release.detectors import Detectors
 from dptse_env.release.gaussian import Capped, Corrected, GaussianRelease, Paper, require_gaussian
 from dptse_env.release.mechanism import GaussianMechanism, Mechanism
 from dptse_env.release.paced import Paced
 from dptse_env.release.pacing import PACINGS, Pacing, PacingSetup, PublicStep
 from dptse_env.release.queries import MOST_OPTIONS, BandwidthUnit, QueryOptions
-from dptse_env.release.report import PrivacyReport, QuantityReport
+from dptse_env.release.report import VOID_REASONS, PrivacyReport, QuantityReport
 from dptse_env.release.settings import (
     BoundaryInputs,
     CappedSettings,
@@ -28,7 +27,6 @@ from dptse_env.release.settings import (
 )
 from dptse_env.release.traffic_table import TrafficTable
 from dptse_env.release.two_mechanisms import TwoMechanisms
-from dptse_env.release.void_reasons import VOID_REASONS
 from dptse_env.utils.registry import Registry
 
 RELEASE_MODELS = Registry(
@@ -39,7 +37,6 @@ RELEASE_MODELS = Registry(
         if isinstance(part, type) and issubclass(part, ReleaseModel)
         else "be a subclass of dptse_env.release.ReleaseModel"
     ),
-    aliases={"guaranteed": "capped"},
 )
 """Release models by name: with the noise as printed in the paper, with the noise that its cited
 theorem needs, with capped contributions, and with paced ledgers; the last two give a guarantee for
@@ -47,7 +44,6 @@ every query policy."""
 
 __all__ = [
     "BOUNDARIES",
-    "COUNTED",
     "MOST_OPTIONS",
     "PACINGS",
     "RELEASE_MODELS",
@@ -58,7 +54,6 @@ __all__ = [
     "Capped",
     "CappedSettings",
     "Corrected",
-    "DensityRelease",
     "Detectors",
     "GaussianMechanism",
     "GaussianRelease",

@@ -12,13 +12,6 @@ from numpy.typing import NDArray
 
 from dptse_env.estimators import Estimate
 from dptse_env.model import ARZModel, MeasurementRows
-from dptse_env.release.density import (
-    COUNTED,
-    COUNTS,
-    DensityRelease,
-    DensityReports,
-    DeviationTerms,
-)
 from dptse_env.release.queries import NO_OPTIONS, QueryOptions
 from dptse_env.release.report import PrivacyReport
 from dptse_env.release.settings import PrivacySettings
@@ -42,7 +35,6 @@ class ReleaseSetup:
         n_episodes: Size n of the batch.
         queries: The G options that can be queried; the mainline segments where they are not given.
         budget_share: Part of the privacy budget mu^2 that the releases may spend.
-        density: What vehicles tell of the density.
     """
 
     name: str
@@ -53,7 +45,6 @@ class ReleaseSetup:
     n_episodes: int
     queries: QueryOptions = NO_OPTIONS
     budget_share: float = 1.0
-    density: DensityRelease = COUNTED
 
     def __post_init__(self) -> None:
         """Fill in the options."""
@@ -123,12 +114,6 @@ class ReleaseSetup:
             return observed[:, :n]
         covered: BoolArray = observed[:, : self.rows.n_rows].astype(np.float32) @ self._covers > 0.0
         return covered
-
-    def density_terms(self, prediction: Callable[[], Estimate]) -> DeviationTerms:
-        """Return the terms by which vehicles tell of the density; counts need no prediction."""
-        if not self.density.has_reports:
-            return COUNTS
-        return self.density.terms(self.at_places(prediction().density))
 
     def at_places(self, values: FloatArray) -> FloatArray:
         """Return predictions of the segments, shape (k, S), for all record columns: (k, n_places).
@@ -242,8 +227,6 @@ class ReleaseModel(ABC):
     """True where the model reads the vehicles of a record, which measured fields have not."""
     has_prices: ClassVar[bool] = False
     """True where queries have prices, which `public_state` gives."""
-    density_reports: ClassVar[DensityReports] = ""
-    """Form in which the model releases what vehicles report of the density around them."""
     takes_noise: bool = False
     """True where `give_noise` works, which trainings by swaps need."""
 

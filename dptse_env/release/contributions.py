@@ -1,7 +1,6 @@
 """Bounded contributions of vehicles to the releases of queried segments.
 
-A vehicle adds its speed and 1, or a deviation in [-1, 1] of what it reports
-(`dptse_env.release.density`), to the sums of its segment. It counts in the first C steps in which
+A vehicle adds 1 and its speed to the sums of its segment. It counts in the first C steps in which
 its segment is queried, and in no later one. Whether it counts depends on its trajectory and on the
 queries, which are public, and never on other vehicles: removing a vehicle from a record does not
 change the contributions of the others.
@@ -10,7 +9,6 @@ change the contributions of the others.
 import numpy as np
 from numpy.typing import NDArray
 
-from dptse_env.release.density import COUNTS, DeviationTerms, deviation_of
 from dptse_env.release.vehicle_table import VehicleTable, widened
 from dptse_env.traffic import Record
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
@@ -64,13 +62,8 @@ class Contributions:
         return self.exposures[episode, : self.vehicles.n_vehicles[slot]].copy()
 
     def collect(
-        self,
-        episodes: IntArray,
-        slots: IntArray,
-        times: IntArray,
-        observed: BoolArray,
-        terms: DeviationTerms = COUNTS,
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        self, episodes: IntArray, slots: IntArray, times: IntArray, observed: BoolArray
+    ) -> tuple[FloatArray, FloatArray]:
         """Count the vehicles of a step in the observed record columns, and charge them.
 
         Args:
@@ -78,21 +71,18 @@ class Contributions:
             slots: Slots of their records, shape (k,).
             times: Seconds of the records, shape (k,).
             observed: Shape (k, n_columns).
-            terms: How reports become deviations.
 
         Returns:
-            The number of vehicles that count, the sums of their deviations, which are the numbers
-            themselves for `COUNTS`, and the sums of their clipped speeds [km/h]; all of shape
-            (k, n_columns) and zero in columns that are not observed.
+            The number of vehicles that count, and the sum of their clipped speeds [km/h], both of
+            shape (k, n_columns) and zero in columns that are not observed.
         """
-        counts, deviations, speeds = np.zeros((3, *observed.shape))
+        counts, speeds = np.zeros((2, *observed.shape))
         table = self.vehicles
         _collect(
-            table.start, table.vehicle, table.segment, table.speed, table.report, terms.slope,
-            terms.offset, episodes, slots, times, self._column, observed, self._limit,
-            self.exposures, counts, deviations, speeds,
+            table.start, table.vehicle, table.segment, table.speed, episodes, slots, times,
+            self._column, observed, self._limit, self.exposures, counts, speeds,
         )  # fmt: skip
-        return counts, deviations, speeds
+        return counts, speeds
 
 
 @kernel
@@ -101,9 +91,6 @@ def _collect(
     vehicle: NDArray[np.int32],
     segment: NDArray[np.int16],
     speed: NDArray[np.float32],
-    report: NDArray[np.float32],
-    slope: FloatArray,
-    offset: float,
     episodes: IntArray,
     slots: IntArray,
     times: IntArray,
@@ -112,7 +99,6 @@ def _collect(
     limit: int,
     exposures: NDArray[np.int32],
     counts: FloatArray,
-    deviations: FloatArray,
     speeds: FloatArray,
 ) -> None:
     for k in range(episodes.size):
@@ -123,5 +109,4 @@ def _collect(
             if c >= 0 and observed[k, c] and spent[v] < limit:
                 spent[v] += 1
                 counts[k, c] += 1.0
-                deviations[k, c] += deviation_of(report, slope, offset, row, k, s)
                 speeds[k, c] += speed[row]

@@ -20,7 +20,6 @@ from dptse_env.privacy import (
 )
 from dptse_env.release.base import Released, ReleaseModel, ReleaseRequest, ReleaseSetup
 from dptse_env.release.contributions import Contributions
-from dptse_env.release.density import DensityReports
 from dptse_env.release.mechanism import GaussianMechanism, Mechanism
 from dptse_env.release.noise import NoiseStreams
 from dptse_env.release.report import STRICT_DELTA, PrivacyReport, QuantityReport, in_order
@@ -167,8 +166,6 @@ def require_gaussian(release: ReleaseModel, user: str) -> GaussianRelease:
 class Paper(GaussianRelease):
     """True density and mean speed of all vehicles, with the noise as printed in the paper."""
 
-    density_reports: ClassVar[DensityReports] = "mean"
-
     def __init__(self, setup: ReleaseSetup) -> None:
         """See `GaussianRelease`."""
         super().__init__(setup)
@@ -221,7 +218,6 @@ class Capped(GaussianRelease):
     settings_type: ClassVar[type[PrivacySettings]] = CappedSettings
     claims_guarantee: ClassVar[bool] = True
     needs_vehicles: ClassVar[bool] = True
-    density_reports: ClassVar[DensityReports] = "centred"
 
     @classmethod
     def flow_centre(cls, corridor: Corridor, settings: CappedSettings) -> float | None:
@@ -252,7 +248,6 @@ class Capped(GaussianRelease):
             segment_length=min(corridor.segment_lengths),
             largest_speed=corridor.largest_speed_limit,
             mean_speed_slope=slope if settings.speed_release == "mean" else None,
-            signed_counts=self.setup.density.has_reports,
         )
 
     def _noise_std(self) -> tuple[float, ...]:
@@ -271,8 +266,9 @@ class Capped(GaussianRelease):
     def _details(self) -> Mapping[str, Any]:
         settings = self._settings
         cap = {"cap": settings.cap} if settings.unit == "trip" else {}
-        shared = {"adjacency": settings.adjacency, "share": settings.share}
-        return {"unit": settings.unit, **cap, **shared, **self.setup.density.details}
+        return {
+            "unit": settings.unit, **cap, "adjacency": settings.adjacency, "share": settings.share,
+        }  # fmt: skip
 
     @property
     def shared(self) -> tuple[AnyArray, ...]:
@@ -292,17 +288,16 @@ class Capped(GaussianRelease):
     def true_values(self, request: ReleaseRequest) -> FloatArray:
         """See `GaussianRelease.true_values`; unobserved columns hold zeros."""
         setup, corridor = self.setup, self.setup.corridor
-        counts, deviations, speeds = self.contributions.collect(
-            request.episodes, request.traffic, request.times, request.observed,
-            setup.density_terms(request.prediction),
-        )  # fmt: skip
+        counts, speeds = self.contributions.collect(
+            request.episodes, request.traffic, request.times, request.observed
+        )
         values = np.empty((*counts.shape, 2))
-        np.divide(deviations, setup.lengths, out=values[..., 0])
+        np.divide(counts, setup.lengths, out=values[..., 0])
         if self._settings.speed_release == "flow":
             speeds -= 0.5 * corridor.largest_speed_limit * counts
             np.divide(speeds, setup.lengths, out=values[..., 1])
         else:
-            empty, limits = counts == 0.0, setup.traffic.limits[: setup.n_columns]
+            empty, limits = counts == 0.0, setup.traffic.limits[setup.places]
             values[..., 1] = np.where(empty, limits, speeds / np.where(empty, 1.0, counts))
         return values
 

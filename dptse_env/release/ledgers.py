@@ -1,11 +1,9 @@
 """Ledgers of vehicles: what each has paid of its privacy budget, contribution by contribution.
 
-A vehicle on a queried segment contributes (u, d) to the sums of the query, with d its speed less
-the segment's centre, clipped to [-D, D], and pays ``a (u^2 + r d^2 / D^2)`` for it, with the price
-a of the query and the ratio r. Where vehicles are counted, u is 1; otherwise it is the deviation of
-what the vehicle reports, in [-1, 1] (`dptse_env.release.density`). A vehicle contributes if its
-ledger covers the charge, and otherwise neither contributes nor pays. Whether it does depends on its
-own trip and reports and on public numbers alone.
+A vehicle on a queried segment contributes (1, d) to the sums of the query, with d its speed less
+the segment's centre, clipped to [-D, D], and pays ``a (1 + r d^2 / D^2)`` for it, with the price a
+of the query and the ratio r. It contributes if its ledger covers the charge, and otherwise neither
+contributes nor pays. Whether it does depends on its own trip and on public numbers alone.
 """
 
 from typing import NamedTuple
@@ -14,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dptse_env.model.network import covered
-from dptse_env.release.density import COUNTS, DeviationTerms, deviation_of
 from dptse_env.release.vehicle_table import VehicleTable, widened
 from dptse_env.traffic import Record
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
@@ -39,8 +36,7 @@ class Sums(NamedTuple):
     """True sums of a second, before noise.
 
     Attributes:
-        counts: Sums of their u, the numbers of vehicles that contribute or the sums of their
-            deviations, shape (k, C).
+        counts: Numbers of vehicles that contribute, shape (k, C).
         deviations: Sums of their d [km/h], shape (k, C).
         refused: Contributions that ledgers did not cover, shape (k,).
     """
@@ -105,7 +101,6 @@ class Ledgers:
         observed: BoolArray,
         prices: FloatArray,
         centre: FloatArray,
-        terms: DeviationTerms = COUNTS,
     ) -> Sums:
         """Sum the contributions of a step to the observed columns, and charge the vehicles.
 
@@ -116,16 +111,14 @@ class Ledgers:
             observed: Shape (k, C).
             prices: Price a of each column, shape (k, C).
             centre: Centre of each record column [km/h], shape (k, n_places).
-            terms: How reports become deviations.
         """
         counts, deviations = np.zeros((2, *observed.shape))
         refused = np.zeros(len(episodes), dtype=np.int64)
         table, columns = self.vehicles, self._columns
         _collect(
             columns.first, columns.span, columns.n_places, table.start, table.vehicle,
-            table.segment, table.speed, table.report, terms.slope, terms.offset, episodes,
-            slots, times, observed, prices, centre, self.clip, self.ratio, self.budget,
-            self.paid, counts, deviations, refused,
+            table.segment, table.speed, episodes, slots, times, observed, prices, centre,
+            self.clip, self.ratio, self.budget, self.paid, counts, deviations, refused,
         )  # fmt: skip
         return Sums(counts, deviations, refused)
 
@@ -139,9 +132,6 @@ def _collect(
     vehicle: NDArray[np.int32],
     segment: NDArray[np.int16],
     speed: NDArray[np.float32],
-    report: NDArray[np.float32],
-    slope: FloatArray,
-    offset: float,
     episodes: IntArray,
     slots: IntArray,
     times: IntArray,
@@ -175,11 +165,10 @@ def _collect(
             for i in range(n_covering[s]):
                 c = covering[s, i]
                 d = min(max(speed[row] - centre[k, s], -clip), clip)
-                u = deviation_of(report, slope, offset, row, k, s)
-                cost = prices[k, c] * (u * u + ratio * d * d / (clip * clip))
+                cost = prices[k, c] * (1.0 + ratio * d * d / (clip * clip))
                 if ledger[v] + cost <= budget:
                     ledger[v] += cost
-                    counts[k, c] += u
+                    counts[k, c] += 1.0
                     deviations[k, c] += d
                 else:
                     refused[k] += 1

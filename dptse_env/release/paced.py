@@ -10,7 +10,6 @@ import numpy as np
 
 from dptse_env.privacy import EpsilonTable, epsilon_of, mu_of
 from dptse_env.release.base import Released, ReleaseModel, ReleaseRequest, ReleaseSetup
-from dptse_env.release.density import DensityReports
 from dptse_env.release.ledgers import Columns, Ledgers, Sums
 from dptse_env.release.noise import NoiseStreams, grid_of
 from dptse_env.release.pacing import (
@@ -38,8 +37,7 @@ class Paced(ReleaseModel):
     A vehicle on a queried segment pays for its own deviation from the speed that the estimator
     predicts there, as in `dptse_env.release.ledgers`; prices are those of a pacing
     (`dptse_env.release.pacing`). With mu the parameter of the guarantee, a vehicle has a budget of
-    mu^2 / 2 against its replacement by another, and of mu^2 against being added or removed; where
-    vehicles report deviations of densities in place of being counted, the first is mu^2 / 4. The
+    mu^2 / 2 against its replacement by another, and of mu^2 against being added or removed. The
     guarantee holds for any query policy, any estimator and any pacing: ``docs/privacy.md`` has the
     proof.
 
@@ -59,7 +57,6 @@ class Paced(ReleaseModel):
     needs_vehicles: ClassVar[bool] = True
     releases_sums: ClassVar[bool] = True
     has_prices: ClassVar[bool] = True
-    density_reports: ClassVar[DensityReports] = "centred"
     takes_noise: bool = True
 
     @classmethod
@@ -75,9 +72,7 @@ class Paced(ReleaseModel):
         corridor, n = setup.corridor, setup.n_episodes
         self.mu = mu_of(settings.epsilon, settings.delta) * math.sqrt(setup.budget_share)
         self._epsilons = EpsilonTable(self.mu, settings.delta)
-        # The counts of two vehicles on one segment cancel; deviations may be opposite.
-        replaced = 4.0 if setup.density.has_reports else 2.0
-        self._squares = replaced if settings.adjacency == "replace" else 1.0
+        self._squares = 2.0 if settings.adjacency == "replace" else 1.0
         self.budget = self.mu**2 / self._squares
         first, span, places = setup.places, setup.spans, setup.n_places
         level = np.ones(setup.n_columns)
@@ -98,7 +93,7 @@ class Paced(ReleaseModel):
         offered = (1.0 - 2.0 * ROUNDING) * self.budget
         made_for = PacingSetup(
             corridor, offered, settings.pace, settings.ratio, first, span, level,
-            setup.always_observed, _coverage(setup.queries), places, n, setup.density.mean_square,
+            setup.always_observed, _coverage(setup.queries), places, n,
         )  # fmt: skip
         pacing = EventPacing if settings.unit == "event" else PACINGS.find(settings.pacing)
         self.pacing = pacing(made_for)
@@ -188,9 +183,8 @@ class Paced(ReleaseModel):
         if self._settings.unit == "event":
             self.ledgers.reset(request.episodes)
         return self.ledgers.collect(
-            request.episodes, request.traffic, request.times, request.observed, prices, centre,
-            self.setup.density_terms(request.prediction),
-        )  # fmt: skip
+            request.episodes, request.traffic, request.times, request.observed, prices, centre
+        )
 
     def _published(
         self, episodes: IntArray, sums: Sums, prices: FloatArray, centre: FloatArray
@@ -223,10 +217,10 @@ class Paced(ReleaseModel):
 
     def report(self) -> PrivacyReport:
         """See `ReleaseModel.report`."""
-        settings, mu, density = self._settings, self.mu, self.setup.density
+        settings, mu = self._settings, self.mu
         return replace(
             super().report(),
-            guarantee=settings.guarantee(f"{density.quantity} and flow", settings.protected),
+            guarantee=settings.guarantee("count and flow", settings.protected),
             void_reasons=(),
             protects=settings.protected,
             mu=mu,
@@ -239,7 +233,6 @@ class Paced(ReleaseModel):
                 "pace": settings.pace,
                 "clip": settings.clip,
                 "ratio": settings.ratio,
-                **density.details,
             },
         )
 

@@ -41,7 +41,6 @@ class PacingSetup:
         coverage: Expected share of the mainline's segments that a step's queries cover.
         n_places: Record columns: the segments, and the boundary segments if they are released.
         n_episodes: Size n of the batch.
-        mean_square: Expected square of what a vehicle contributes to the first sum: 1 for counts.
     """
 
     corridor: Corridor
@@ -55,7 +54,6 @@ class PacingSetup:
     coverage: float
     n_places: int
     n_episodes: int
-    mean_square: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -167,8 +165,6 @@ class TracerPacing(Pacing):
         self._rates = np.tile(self._first_rates, (n, 1))
         self._tracer = np.zeros((n, setup.n_places))
         self._offer = setup.pace * setup.budget, LEAST_SHARE * setup.budget
-        speeds = MEAN_SQUARE * setup.ratio
-        self._relative_charge = (setup.mean_square + speeds) / (1.0 + speeds)
 
     def reset(self, episodes: IntArray) -> None:
         """See `Pacing.reset`."""
@@ -183,7 +179,7 @@ class TracerPacing(Pacing):
             1.0 + MEAN_SQUARE * self.setup.ratio, self._rates,
             self._tracer, prices,
         )  # fmt: skip
-        return prices / self._relative_charge
+        return prices
 
     def expected_price(self, speed: FloatArray) -> float:
         """Return the price at the upstream end, at these speeds and the rates of the beginning."""
@@ -191,7 +187,7 @@ class TracerPacing(Pacing):
         n, length = corridor.n_mainline, np.array(corridor.segment_lengths[: corridor.n_mainline])
         seconds = SECONDS_PER_HOUR * length / np.clip(speed[:n], kernels.SLOWEST, kernels.FASTEST)
         queried = float((self._first_rates[:n] * seconds).sum()) + kernels.MARGIN
-        return self._offer[0] / queried / self._relative_charge
+        return self._offer[0] / queried
 
     def tracer(self, episodes: IntArray) -> FloatArray:
         """See `Pacing.tracer`."""

@@ -13,7 +13,6 @@ import numpy as np
 from dptse_env.model import MeasurementRows
 from dptse_env.privacy import EpsilonTable, epsilon_of
 from dptse_env.release.base import Released, ReleaseModel, ReleaseRequest, ReleaseSetup
-from dptse_env.release.density import COUNTED, DensityRelease
 from dptse_env.release.detectors import DetectorErrors, Detectors
 from dptse_env.release.queries import NO_OPTIONS
 from dptse_env.release.report import PrivacyReport, in_order
@@ -66,16 +65,13 @@ class ConnectedTraffic(TrafficTable):
 
     def __init__(self, traffic: TrafficTable, penetration: Penetration) -> None:
         """Prepare a table for the traffic seeds of another; nothing is loaded."""
-        corridor = traffic.corridor
-        if penetration.needs_details:
-            corridor = replace(corridor, detailed=True)
-        super().__init__(corridor, traffic.traffic_seeds, traffic.library)
+        super().__init__(traffic.corridor, traffic.traffic_seeds, traffic.library)
         self._penetration = penetration
 
     def record(self, index: int) -> AnyRecord:
         """Return the rows of the connected vehicles in the record of ``traffic_seeds[index]``."""
         record = with_vehicles(super().record(index), "the keyword penetration")
-        return self._penetration.reports(self.traffic_seeds[index], record, self.corridor)
+        return self._penetration.reports(self.traffic_seeds[index], record)
 
 
 class TwoMechanisms(ReleaseModel):
@@ -111,7 +107,6 @@ class TwoMechanisms(ReleaseModel):
         self._connected = ConnectedTraffic(setup.traffic, penetration)
         self._split = split if has_sensors else setup.n_columns
 
-        reports = DensityRelease.of(penetration, setup.corridor)
         no_options = replace(NO_OPTIONS, n_mainline=setup.corridor.n_mainline)
 
         def part(start: int, stop: int, traffic: TrafficTable, share: float) -> ReleaseModel:
@@ -123,12 +118,11 @@ class TwoMechanisms(ReleaseModel):
                     horizon=setup.horizon, n_episodes=setup.n_episodes,
                     queries=no_options if is_sensors else setup.queries,
                     budget_share=share if self._claims else 1.0,
-                    density=COUNTED if is_sensors else reports,
                     whole=setup, start=start, stop=stop,
                 )
             )  # fmt: skip
 
-        published = penetration.published_share(setup.corridor)
+        published = penetration.published_share
         share = detectors.part_of_budget(published) if has_sensors else 0.0
         self.queries = part(0, self._split, self._connected, 1.0 - share)
         self.sensors = None

@@ -5,7 +5,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from dptse_env.traffic import Record, ReportRecord
+from dptse_env.traffic import Record
 from dptse_env.utils.arrays import AnyArray, IntArray
 
 NumberT = TypeVar("NumberT", bound=np.generic)
@@ -22,8 +22,6 @@ class VehicleTable:
         vehicle: Index of the row's vehicle in its record.
         segment: Column of the record that it is on.
         speed: Its speed [km/h], clipped to `largest_speed`.
-        report: What it reports of the traffic around it (`dptse_env.traffic.ReportRecord`); empty
-            where vehicles report nothing.
     """
 
     def __init__(self, n_slots: int, n_steps: int, largest_speed: float) -> None:
@@ -34,13 +32,12 @@ class VehicleTable:
         self.vehicle: NDArray[np.int32] = np.empty(0, dtype=np.int32)
         self.segment: NDArray[np.int16] = np.empty(0, dtype=np.int16)
         self.speed: NDArray[np.float32] = np.empty(0, dtype=np.float32)
-        self.report: NDArray[np.float32] = np.empty(0, dtype=np.float32)
         self._rows = 0
 
     @property
     def arrays(self) -> tuple[AnyArray, ...]:
         """All arrays, which no episode changes."""
-        return self.start, self.n_vehicles, self.vehicle, self.segment, self.speed, self.report
+        return self.start, self.n_vehicles, self.vehicle, self.segment, self.speed
 
     def load(self, slot: int, record: Record) -> None:
         """Append the vehicles of a record."""
@@ -50,13 +47,9 @@ class VehicleTable:
             self.vehicle = _grown(self.vehicle, size)
             self.segment = _grown(self.segment, size)
             self.speed = _grown(self.speed, size)
-            if isinstance(record, ReportRecord):
-                self.report = _grown(self.report, size)
         self.vehicle[self._rows : end] = record.vehicle
         self.segment[self._rows : end] = record.segment
         self.speed[self._rows : end] = np.clip(record.speed, 0.0, self.largest_speed)
-        if isinstance(record, ReportRecord):
-            self.report[self._rows : end] = record.report
         self.start[slot] = self._rows + record.offsets
         self.n_vehicles[slot] = record.n_vehicles
         self._rows = end

@@ -9,68 +9,38 @@ from functools import partial
 from typing import Any
 
 from dptse_env.schedules.base import ProcessSchedule, Schedule, ScheduleState
-from dptse_env.schedules.covariance import (
-    CovarianceInflation,
-    CovarianceSchedule,
-    Greedy,
-    GreedyLogdet,
-    GreedyTrace,
-    InflatedTrace,
-)
-from dptse_env.schedules.fixed import (
+from dptse_env.schedules.greedy import GreedyTrace
+from dptse_env.schedules.oracles import OracleError, OracleGain
+from dptse_env.schedules.rules import (
     Everything,
+    ExpectedReduction,
     LargestDeviation,
     LargestVariance,
     Nothing,
     OldestFirst,
     Random,
     Shifting,
+    SpeedFront,
     StaleVariance,
 )
-from dptse_env.schedules.front import SpeedFront
-from dptse_env.schedules.oracles import OracleBruteForce, OracleError, OracleGain, OracleGreedy
-from dptse_env.schedules.plans import (
-    PLAN_ALIASES,
-    PLANS,
-    Plan,
-    PlanContext,
-    Planned,
-    find_plan,
-    read_plan,
-)
-from dptse_env.schedules.reduction import ExpectedReduction
-from dptse_env.schedules.rollout import Rollout
 from dptse_env.utils.registry import Registry, name_of_class
 
 __all__ = [
-    "COVARIANCE_SCHEDULES",
-    "DEVIATION_SCHEDULES",
     "OBSERVATION_SCHEDULES",
     "ORACLES",
-    "PLANS",
+    "PROCESS_SCHEDULES",
     "SCHEDULES",
-    "CovarianceInflation",
-    "CovarianceSchedule",
     "Everything",
     "ExpectedReduction",
-    "Greedy",
-    "GreedyLogdet",
     "GreedyTrace",
-    "InflatedTrace",
     "LargestDeviation",
     "LargestVariance",
     "Nothing",
     "OldestFirst",
-    "OracleBruteForce",
     "OracleError",
     "OracleGain",
-    "OracleGreedy",
-    "Plan",
-    "PlanContext",
-    "Planned",
     "ProcessSchedule",
     "Random",
-    "Rollout",
     "Schedule",
     "ScheduleState",
     "Shifting",
@@ -96,24 +66,17 @@ OBSERVATION_SCHEDULES: dict[str, Any] = {
 """Schedules that use the observation alone, each made of (interface, seed); a step costs at most a
 sort."""
 
-DEVIATION_SCHEDULES: dict[str, type[ProcessSchedule]] = {"expected-reduction": ExpectedReduction}
-"""Schedules that use the estimator's deviations and the release model's noise, each made of
-(process, seed); a step costs a sort."""
-
-COVARIANCE_SCHEDULES: dict[str, type[ProcessSchedule]] = {
+PROCESS_SCHEDULES: dict[str, type[ProcessSchedule]] = {
+    "expected-reduction": ExpectedReduction,
     "greedy-trace": GreedyTrace,
-    "greedy-logdet": GreedyLogdet,
-    "inflated-trace": InflatedTrace,
-    "rollout": Rollout,
 }
-"""Schedules that use the estimator's covariance, each made of (process, seed); a step costs one or
-two steps of the EKF, of ``rollout`` some hundred."""
+"""Schedules that use the process, but not the truth: the noise to expect, and the estimator's
+deviations or covariance. Each is made of (process, seed); a step costs a sort, or some two steps of
+the EKF."""
 
 ORACLES: dict[str, type[ProcessSchedule]] = {
     "oracle-error": OracleError,
     "oracle-gain": OracleGain,
-    "oracle-greedy": OracleGreedy,
-    "oracle-brute-force": OracleBruteForce,
 }
 """Bounds that use the truth, each made of (process, seed); they are not policies."""
 
@@ -128,15 +91,8 @@ def _expected(part: Any) -> str | None:
 
 SCHEDULES = Registry(
     "schedule",
-    {
-        **OBSERVATION_SCHEDULES,
-        **DEVIATION_SCHEDULES,
-        **COVARIANCE_SCHEDULES,
-        **dict.fromkeys(PLANS),
-        **ORACLES,
-    },
+    {**OBSERVATION_SCHEDULES, **PROCESS_SCHEDULES, **ORACLES},
     check=_expected,
-    aliases={"wary-trace": "inflated-trace", **PLAN_ALIASES},
 )
 """All schedules by name."""
 
@@ -145,9 +101,8 @@ def make_schedule(schedule: Any, env: Any, seed: int | None = None) -> Any:
     """Return a schedule for an environment.
 
     Args:
-        schedule: A name in `SCHEDULES`, the path of a plan, a file whose name ends in ``.json``,
-            ``"package.module:Class"``, a subclass of `Schedule`, or an object with ``predict``,
-            which is returned as it is.
+        schedule: A name in `SCHEDULES`, ``"package.module:Class"``, a subclass of `Schedule`, or
+            an object with ``predict``, which is returned as it is.
         env: An environment of this package, scalar or vector, wrapped or not.
         seed: Seed of the schedule's random choices.
 
@@ -155,11 +110,6 @@ def make_schedule(schedule: Any, env: Any, seed: int | None = None) -> Any:
         ValueError: The name is unknown or the schedule does not suit the environment.
     """
     env = env.unwrapped
-    if isinstance(schedule, str) and schedule.endswith(".json"):
-        return Planned(env.process, read_plan(schedule), seed)
-    name = SCHEDULES.name_of(schedule)
-    if name in PLANS:
-        return Planned(env.process, find_plan(name, PlanContext.from_config(env.config)), seed)
     part = SCHEDULES.find(schedule)
     if not isinstance(part, type | partial):
         return part

@@ -5,13 +5,12 @@ Importing this package does not import libsumo; only making a record does.
 
 from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.demand import Demand, DemandDistribution
-from dptse_env.traffic.detailed_record import DetailedRecord
 from dptse_env.traffic.drivers import Drivers, VehicleClass
 from dptse_env.traffic.dwell import average_dwell
 from dptse_env.traffic.field_record import AnyRecord, FieldRecord, with_vehicles
 from dptse_env.traffic.incident import Incident, IncidentDistribution
 from dptse_env.traffic.library import RecordLibrary, Records, open_library
-from dptse_env.traffic.penetration import ClassShare, DensitySource, Penetration
+from dptse_env.traffic.penetration import Penetration
 from dptse_env.traffic.presets import (
     CORRIDORS,
     PAPER_HIGHWAY,
@@ -33,7 +32,6 @@ from dptse_env.traffic.stored_arrays import InvalidRecordError
 from dptse_env.traffic.sumo import RecordingError, SumoVersionError, simulate
 from dptse_env.traffic.sumo_network import NetworkError
 from dptse_env.traffic.sumo_scenario import SumoScenario
-from dptse_env.traffic.surroundings import ReportRecord
 from dptse_env.traffic.worker import simulate_in_child
 
 __all__ = [
@@ -42,12 +40,9 @@ __all__ = [
     "PAPER_HIGHWAY",
     "SHORT_HIGHWAY",
     "AnyRecord",
-    "ClassShare",
     "Corridor",
     "Demand",
     "DemandDistribution",
-    "DensitySource",
-    "DetailedRecord",
     "Drivers",
     "FieldRecord",
     "Incident",
@@ -60,7 +55,6 @@ __all__ = [
     "RecordingError",
     "Recordings",
     "Records",
-    "ReportRecord",
     "RoadFile",
     "Scenario",
     "SumoScenario",

@@ -17,7 +17,7 @@ from functools import cached_property
 from typing import Annotated, Any
 
 from dptse_env.traffic.demand import Demand, DemandDistribution, Share
-from dptse_env.traffic.drivers import ANY_CLASS, Drivers, VehicleClass
+from dptse_env.traffic.drivers import Drivers, VehicleClass
 from dptse_env.traffic.incident import Incident, IncidentDistribution
 from dptse_env.traffic.recordings import Recordings
 from dptse_env.traffic.road_segments import RoadSegments
@@ -84,8 +84,6 @@ class Corridor(RoadSegments):
             on its segment, and `drivers` must be left at its default.
         vehicle_classes: classes of vehicles, whose shares add up to 1; none where all vehicles are
             alike.
-        detailed: whether records hold each vehicle's position, lane and class too, as
-            `dptse_env.traffic.DetailedRecord` does. The vehicles move alike.
         recordings: imported traffic that episodes replay; None where SUMO simulates the traffic.
             With recordings the demand is a description of them, and there is no incident.
 
@@ -116,7 +114,6 @@ class Corridor(RoadSegments):
     network: SumoScenario | None = None
     recordings: Recordings | None = None
     vehicle_classes: tuple[VehicleClass, ...] = ()
-    detailed: bool = False
 
     def __post_init__(self) -> None:
         """Check the fields and bring them to their declared types."""
@@ -233,11 +230,6 @@ class Corridor(RoadSegments):
         return self.incident if isinstance(self.incident, tuple) else (self.incident,)
 
     @property
-    def class_names(self) -> tuple[str, ...]:
-        """Names of the vehicle classes of simulated traffic; one where all vehicles are alike."""
-        return tuple(each.name for each in self.vehicle_classes) or (ANY_CLASS,)
-
-    @property
     def record_layout(self) -> dict[str, Any]:
         """The fields that the columns and the length of a record depend on, as plain JSON."""
         return {
@@ -264,8 +256,6 @@ class Corridor(RoadSegments):
             del content["drivers"]  # as in digests from before drivers could be chosen
         if not self.vehicle_classes:
             del content["vehicle_classes"]  # likewise
-        if not self.detailed:
-            del content["detailed"]  # likewise
         for name, value in UNIFORM.items():
             if content[name] == value:
                 del content[name]  # as before ramps could differ
@@ -284,7 +274,6 @@ class Corridor(RoadSegments):
                 "scale": scale,
                 "incident": content["incident"],
                 "duration": self.duration,
-                **({"detailed": True} if self.detailed else {}),
             }
         kinds = [type(each).__name__ for each in self.incidents] or ["NoneType"]
         content["kinds"] = [type(self.demand).__name__, *kinds]

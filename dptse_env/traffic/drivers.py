@@ -16,9 +16,6 @@ Rate = Annotated[float, Interval(0.1, 20)]
 Share = Annotated[float, Interval(0, 1)]
 """Part of a whole."""
 
-ANY_CLASS = "car"
-"""Name of the class of all vehicles where a corridor has no classes."""
-
 
 @dataclass(frozen=True)
 class Drivers:

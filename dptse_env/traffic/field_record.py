@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dptse_env.traffic.detailed_record import DetailedRecord
 from dptse_env.traffic.record import Record
 from dptse_env.traffic.stored_arrays import (
     MANIFEST,
@@ -100,9 +99,7 @@ def load_record(path: Path, source: Mapping[str, object]) -> AnyRecord:
         found = json.loads((path / MANIFEST).read_text(encoding="utf-8")).get("format")
     except (OSError, ValueError, AttributeError, RecursionError):
         found = None  # what is wrong with it is found below
-    kinds = {FIELD_FORMAT: FieldRecord, DetailedRecord.FORMAT: DetailedRecord}
-    kind: type[AnyRecord] = kinds.get(found, Record)
-    return kind.load(path, source)
+    return (FieldRecord if found == FIELD_FORMAT else Record).load(path, source)
 
 
 def with_vehicles(record: AnyRecord, user: str) -> Record:

@@ -1,44 +1,16 @@
 """Penetration: which of the vehicles of a record are connected, and what they report."""
 
-import math
 from dataclasses import dataclass, replace
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 
-from dptse_env.traffic.corridor import Corridor
-from dptse_env.traffic.detailed_record import DetailedRecord
 from dptse_env.traffic.record import Record
-from dptse_env.traffic.surroundings import ReportRecord, road_by_neighbours, road_by_spacing
 from dptse_env.utils.arrays import BoolArray, FloatArray
 from dptse_env.utils.fields import Interval, checked_fields
 
 ConnectedShare = Annotated[float, Interval(0, 1, open_low=True)]
 """A share of connected vehicles."""
-
-DensitySource = Literal["count", "spacing", "neighbours"]
-"""Source of estimated densities: the number of connected vehicles, their spacings to the vehicles
-ahead of them, or the numbers of vehicles around them."""
-
-
-@dataclass(frozen=True)
-class ClassShare:
-    """The share of connected vehicles in a vehicle class.
-
-    Attributes:
-        name: Name of the class.
-        share: Share of its vehicles that are connected.
-
-    Raises:
-        ValueError: The share is out of range.
-    """
-
-    name: str
-    share: ConnectedShare
-
-    def __post_init__(self) -> None:
-        """Check values."""
-        checked_fields(self, "penetration.by_class")
 
 
 @dataclass(frozen=True)
@@ -51,43 +23,23 @@ class Penetration:
 
     Attributes:
         share: Share p of connected vehicles; a pair (low, high) for a share that is drawn for each
-            traffic seed, uniformly between the two. With ``by_class`` it is left out, or is the
-            share of all vehicles where the traffic does not say how many are of which class.
-        by_class: Shares by vehicle class, in place of one share; other classes are not connected.
+            traffic seed, uniformly between the two.
         seed: Penetration seed.
         misreporting: Share of the connected vehicles that report a wrong speed.
         misreport_factor: Factor on the speed that these report.
-        density_from: What densities are estimated from: ``count``, the number of connected
-            vehicles; ``spacing``, the distance of each to the vehicle ahead in its lane;
-            ``neighbours``, the number of vehicles around each.
-        neighbour_range: Distance ahead and behind to which a vehicle counts its neighbours [m].
-        report_clip: Largest relative deviation of the reported road per vehicle from what the
-            estimator predicts; larger ones are clipped where a guarantee is given.
 
     Raises:
-        ValueError: A value is out of range, or a class is named twice.
+        ValueError: A value is out of range.
     """
 
     share: ConnectedShare | tuple[ConnectedShare, ConnectedShare] = 1.0
     seed: Annotated[int, Interval(0, 2**31 - 1)] = 0
     misreporting: Annotated[float, Interval(0, 1)] = 0.0
     misreport_factor: Annotated[float, Interval(0, 10)] = 1.0
-    by_class: tuple[ClassShare, ...] = ()
-    density_from: DensitySource = "count"
-    neighbour_range: Annotated[float, Interval(10, 1000)] = 50.0
-    report_clip: Annotated[float, Interval(0.1, 10)] = 1.0
 
     def __post_init__(self) -> None:
         """Check values."""
         checked_fields(self, "penetration")
-        names = [each.name for each in self.by_class]
-        if len(set(names)) < len(names):
-            raise ValueError(f"penetration.by_class must name each class once, got {names}")
-        if self.by_class and isinstance(self.share, tuple):
-            raise ValueError(
-                f"penetration.share must be one number beside penetration.by_class, got "
-                f"{self.share}"
-            )
         if isinstance(self.share, tuple):
             low, high = self.share
             if low > high:
@@ -97,9 +49,8 @@ class Penetration:
 
     @property
     def is_complete(self) -> bool:
-        """True if every vehicle is connected and counts, and reports its own speed."""
-        everyone = self.share == 1.0 and not self.by_class
-        return everyone and not self.misreports and self.density_from == "count"
+        """True if every vehicle is connected, and reports its own speed."""
+        return self.share == 1.0 and not self.misreports
 
     @property
     def misreports(self) -> bool:
@@ -107,55 +58,12 @@ class Penetration:
         return self.misreporting > 0.0 and self.misreport_factor != 1.0
 
     @property
-    def needs_details(self) -> bool:
-        """True if records must hold positions, lanes and classes."""
-        return bool(self.by_class) or self.density_from != "count"
-
-    @property
-    def _class_shares(self) -> dict[str, float]:
-        return {each.name: each.share for each in self.by_class}
-
-    def published_share(self, corridor: Corridor) -> float:
-        """Return the public share of all vehicles: p, the middle of its range, or from classes."""
-        if self.by_class and corridor.vehicle_classes:
-            shares = self._class_shares
-            return sum(each.share * shares.get(each.name, 0.0) for each in corridor.vehicle_classes)
+    def published_share(self) -> float:
+        """The public share of connected vehicles: p, or the middle of its range."""
         return sum(self.share) / 2.0 if isinstance(self.share, tuple) else self.share
 
-    def check_classes(self, corridor: Corridor) -> None:
-        """Check that a corridor has the classes of ``by_class``.
-
-        Raises:
-            ValueError: It has not, or shares do not add up to that of all vehicles.
-        """
-        if not self.by_class:
-            return
-        if corridor.network is not None or corridor.recordings is not None:
-            if self.share == 1.0:
-                raise ValueError(
-                    "penetration.share must be the share of all vehicles that are connected, below "
-                    "1, where classes come with the traffic, got 1"
-                )
-            return  # the classes are those of the records, which are looked up when these are read
-        self._require_classes(corridor.class_names)
-        total = self.published_share(corridor)
-        assert isinstance(self.share, float)
-        if self.share != 1.0 and not math.isclose(self.share, total, abs_tol=1e-9):
-            raise ValueError(
-                f"penetration.share must be left out, or be what penetration.by_class adds up to, "
-                f"{total:g}, got {self.share:g}"
-            )
-
-    def _require_classes(self, known: tuple[str, ...]) -> None:
-        for i, each in enumerate(self.by_class):
-            if each.name not in known:
-                raise ValueError(
-                    f"penetration.by_class[{i}].name must be a class of the traffic, "
-                    f"{', '.join(known)}, got {each.name!r}"
-                )
-
     def share_of(self, traffic_seed: int) -> float:
-        """Return the share of connected vehicles in the traffic of a seed, without classes."""
+        """Return the share of connected vehicles in the traffic of a seed."""
         if not isinstance(self.share, tuple):
             return self.share
         low, high = self.share
@@ -163,43 +71,21 @@ class Penetration:
 
     def connected(self, traffic_seed: int, record: Record) -> BoolArray:
         """Return flags of the connected vehicles of a seed's record, shape (n_vehicles,)."""
-        share: FloatArray | float = self.share_of(traffic_seed)
-        if self.by_class:
-            details = _with_details(record)
-            self._require_classes(details.classes)
-            shares = self._class_shares
-            of_class = np.array([shares.get(name, 0.0) for name in details.classes])
-            share = of_class[details.class_of_vehicles()]
-        connected: BoolArray = self._uniform(traffic_seed, 0, record.n_vehicles) < share
+        uniform = self._uniform(traffic_seed, 0, record.n_vehicles)
+        connected: BoolArray = uniform < self.share_of(traffic_seed)
         return connected
 
-    def reports(self, traffic_seed: int, record: Record, corridor: Corridor) -> Record:
+    def reports(self, traffic_seed: int, record: Record) -> Record:
         """Return what the connected vehicles of a record report: their rows, with their speeds.
 
-        Vehicles keep their indices. Where densities come from spacings or neighbours the result is
-        a `ReportRecord`; these are of all vehicles, connected or not.
-
-        Raises:
-            ValueError: The record has no positions, lanes and classes, and they are needed; or it
-                has not the classes that are named.
+        Vehicles keep their indices.
         """
-        keep = self.connected(traffic_seed, record)[record.vehicle]
-        reported = self._surroundings(record, corridor).where(keep)
+        reported = record.where(self.connected(traffic_seed, record)[record.vehicle])
         if not self.misreports:
             return reported
         wrong = self._uniform(traffic_seed, 2, record.n_vehicles) < self.misreporting
         factor = np.where(wrong, self.misreport_factor, 1.0)[reported.vehicle]
         return replace(reported, speed=(reported.speed * factor).astype(np.float32))
-
-    def _surroundings(self, record: Record, corridor: Corridor) -> Record:
-        """Return a record with what every vehicle sees of others around it."""
-        if self.density_from == "count":
-            return record
-        details = _with_details(record)
-        if self.density_from == "spacing":
-            return ReportRecord.of(details, road_by_spacing(details, corridor))
-        reach = self.neighbour_range / 1000.0
-        return ReportRecord.of(details, road_by_neighbours(details, corridor, reach))
 
     def _uniform(self, traffic_seed: int, stream: int, n: int) -> FloatArray:
         """Return the uniform numbers of n vehicles in one of several streams, shape (n,).
@@ -209,17 +95,3 @@ class Penetration:
         key = np.array([self.seed, traffic_seed], dtype=np.uint64)
         generator = np.random.Generator(np.random.Philox(key=key).jumped(stream))
         return generator.random(n)
-
-
-def _with_details(record: Record) -> DetailedRecord:
-    """Return a record that has positions, lanes and classes.
-
-    Raises:
-        ValueError: It has none.
-    """
-    if not isinstance(record, DetailedRecord):
-        raise ValueError(
-            "penetration.by_class and penetration.density_from need records with positions, lanes "
-            "and classes, which this traffic was imported without: import it again with --detailed"
-        )
-    return record

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from dptse_env.traffic.stored_arrays import InvalidRecordError, load_arrays, sav
 from dptse_env.utils.arrays import BoolArray
 from dptse_env.utils.validation import integer, require
 
+RECORD_FORMAT = "dptse-record"
 RECORD_VERSION = 1
 """Version of the format, raised when content or layout change: older records are made again."""
 
@@ -37,7 +38,6 @@ class Record:
             have a vehicle twice in one step.
     """
 
-    FORMAT: ClassVar[str] = "dptse-record"
     COLUMNS: ClassVar[Mapping[str, np.dtype[Any]]] = {
         "step": np.dtype("<i4"),
         "vehicle": np.dtype("<i4"),
@@ -130,14 +130,14 @@ class Record:
         integer("step", step, 0, self.n_steps - 1)
         return slice(int(self.offsets[step]), int(self.offsets[step + 1]))
 
-    def without(self, vehicle: int) -> Self:
+    def without(self, vehicle: int) -> "Record":
         """Return the adjacent record, in the sense of differential privacy, without a vehicle.
 
         The other vehicles move as before; they are not simulated again.
         """
         return self.where(self.vehicle != vehicle)
 
-    def where(self, keep: BoolArray) -> Self:
+    def where(self, keep: BoolArray) -> "Record":
         """Return the record of some rows, given by flags of shape (rows,).
 
         Vehicles keep their indices.
@@ -145,7 +145,7 @@ class Record:
         columns: dict[str, Any] = {name: getattr(self, name)[keep] for name in self.COLUMNS}
         return replace(self, **columns)
 
-    def in_memory(self) -> Self:
+    def in_memory(self) -> "Record":
         """Return the same record, independent of the files it was mapped from."""
         columns: dict[str, Any] = {name: np.array(getattr(self, name)) for name in self.COLUMNS}
         return replace(self, **columns)
@@ -163,19 +163,16 @@ class Record:
             OSError: It cannot be written; `path` is then unchanged.
         """
         header = {
-            "format": self.FORMAT,
+            "format": RECORD_FORMAT,
             "version": RECORD_VERSION,
-            **self._properties(),
+            "n_steps": self.n_steps,
+            "n_columns": self.n_columns,
             "source": dict(source),
         }
         save_arrays(path, {name: getattr(self, name) for name in self.COLUMNS}, header)
 
-    def _properties(self) -> dict[str, Any]:
-        """Return the fields that are no columns, as plain JSON."""
-        return {"n_steps": self.n_steps, "n_columns": self.n_columns}
-
     @classmethod
-    def load(cls, path: Path, source: Mapping[str, object]) -> Self:
+    def load(cls, path: Path, source: Mapping[str, object]) -> "Record":
         """Open a stored record; its columns are mapped into memory, read-only.
 
         Args:
@@ -187,7 +184,7 @@ class Record:
             InvalidRecordError: The record is damaged, incomplete, of another format version, or of
                 another source.
         """
-        wanted = {"format": cls.FORMAT, "version": RECORD_VERSION, "source": dict(source)}
+        wanted = {"format": RECORD_FORMAT, "version": RECORD_VERSION, "source": dict(source)}
         columns, header = load_arrays(path, list(cls.COLUMNS), wanted)
         try:
             fields: dict[str, Any] = {**columns, **header}

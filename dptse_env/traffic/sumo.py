@@ -20,14 +20,12 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 
 from dptse_env.traffic import sumo_files
-from dptse_env.traffic.branches import Road
 from dptse_env.traffic.corridor import Corridor
-from dptse_env.traffic.detailed_record import DetailedRecord
 from dptse_env.traffic.incident import limit_changes
 from dptse_env.traffic.record import Record
 from dptse_env.traffic.scenario import Scenario, draw_scenario
@@ -220,42 +218,25 @@ def _command(folder: Path, network: str, corridor: Corridor, scenario: Scenario)
 
 def _observe(libsumo: ModuleType, corridor: Corridor, scenario: Scenario) -> Record:
     """Run the loaded simulation to its end and collect the vehicle table."""
-    edges, details = edge_ids(corridor), corridor.detailed
+    edges = edge_ids(corridor)
     vehicles_on, speed_of = libsumo.edge.getLastStepVehicleIDs, libsumo.vehicle.getSpeed
-    position_of, lane_of = libsumo.vehicle.getLanePosition, libsumo.vehicle.getLaneIndex
     n_on: list[int] = []
     names: list[str] = []
     speed: list[float] = []
-    position: list[float] = []
-    lane: list[int] = []
     for _ in seconds(libsumo, corridor, scenario):
         for edge in edges:
             here = vehicles_on(edge)
             n_on.append(len(here))
             names += here
             speed += map(speed_of, here)
-            if details:
-                position += map(position_of, here)
-                lane += map(lane_of, here)
     # The other columns are made once at the end: this loop is all that recording adds to a bare
     # simulation.
     cells = np.repeat(np.arange(len(n_on)), n_on)
-    vehicle = np.fromstring(" ".join(names), dtype=np.int32, sep=" ")
-    columns: dict[str, Any] = {
-        "step": cells // len(edges),
-        "vehicle": vehicle,
-        "segment": cells % len(edges),
-        "speed": KMH * np.array(speed, dtype=np.float64),
-        "n_steps": corridor.duration + 1,
-        "n_columns": len(edges),
-    }
-    if not details:
-        return Record(**columns)
-    start = Road(corridor).column_starts[1]
-    return DetailedRecord(
-        **columns,
-        position=start[columns["segment"]] + np.array(position, dtype=np.float64) / 1000.0,
-        lane=np.array(lane),
-        vehicle_class=scenario.classes[vehicle].astype(np.int16),
-        classes=corridor.class_names,
+    return Record(
+        step=(cells // len(edges)).astype(np.int32),
+        vehicle=np.fromstring(" ".join(names), dtype=np.int32, sep=" "),
+        segment=(cells % len(edges)).astype(np.int16),
+        speed=(KMH * np.array(speed, dtype=np.float64)).astype(np.float32),
+        n_steps=corridor.duration + 1,
+        n_columns=len(edges),
     )

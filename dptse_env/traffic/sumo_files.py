@@ -9,14 +9,11 @@ import gzip
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
-from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 
-from dptse_env.traffic.branches import Road
 from dptse_env.traffic.corridor import Corridor
-from dptse_env.traffic.detailed_record import DetailedRecord
 from dptse_env.traffic.incident import Incident
 from dptse_env.traffic.record import Record
 from dptse_env.traffic.scenario import Scenario
@@ -88,53 +85,33 @@ def seconds(libsumo: ModuleType, network: SumoScenario, duration: int) -> Iterat
 def observe(libsumo: ModuleType, corridor: Corridor, scenario: Scenario) -> Record:
     """Run the loaded simulation to its end and collect the vehicle table.
 
-    Vehicles are numbered in the order in which they appear on the road. Their classes are the types
-    of the files, in the same order.
+    Vehicles are numbered in the order in which they appear on the road.
     """
-    network, details = corridor.network, corridor.detailed
+    network = corridor.network
     assert network is not None
     places, vehicle = Places(network.columns), libsumo.vehicle
     vehicles_on, position_of = libsumo.edge.getLastStepVehicleIDs, vehicle.getLanePosition
     limits = VehicleLimits(libsumo, scenario.incidents)
     numbers: dict[str, int] = {}
-    types: dict[str, int] = {}
-    rows: list[tuple[float, ...]] = []
+    rows: list[tuple[float, float, float, float]] = []
     for second in seconds(libsumo, network, corridor.duration):
         affected: dict[str, int] = {}
         for edge in places:
             for name in vehicles_on(edge):
-                place = places.find(edge, position_of(name))
-                if place is None:
+                column = places.find(edge, position_of(name))
+                if column is None:
                     continue
-                column, way = place
                 number = numbers.setdefault(name, len(numbers))
-                row: tuple[float, ...] = second, number, column, KMH * vehicle.getSpeed(name)
-                if details:
-                    kind = types.setdefault(vehicle.getTypeID(name), len(types))
-                    row = *row, way / 1000.0, vehicle.getLaneIndex(name), kind
-                rows.append(row)
+                rows.append((second, number, column, KMH * vehicle.getSpeed(name)))
                 if column in limits.segments:
                     affected[name] = column
         limits.update(second, affected)
-    table = np.array(rows, dtype=np.float64).reshape(len(rows), 7 if details else 4).T
-    table = table[:, np.lexsort((table[2], table[0]))]
-    columns: dict[str, Any] = dict(zip(Record.COLUMNS, table, strict=False))
-    columns |= {"n_steps": corridor.duration + 1, "n_columns": len(network.columns)}
-    if not details:
-        return Record(**columns)
-    column = table[2].astype(np.int64)
-    # An edge within a junction, where an off-ramp leaves, may be longer than what is left of the
-    # segment.
-    ways = np.minimum(
-        table[4], np.array(corridor.with_boundaries(corridor.segment_lengths))[column]
-    )
-    return DetailedRecord(
-        **columns,
-        position=Road(corridor).column_starts[1][column] + ways,
-        lane=table[5],
-        vehicle_class=table[6],
-        classes=tuple(types),
-    )
+    table = np.array(rows, dtype=np.float64).reshape(len(rows), 4).T
+    step, number, column, speed = table[:, np.lexsort((table[2], table[0]))]
+    return Record(
+        step, number, column, speed,
+        n_steps=corridor.duration + 1, n_columns=len(network.columns),
+    )  # fmt: skip
 
 
 class VehicleLimits:

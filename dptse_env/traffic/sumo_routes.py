@@ -10,12 +10,11 @@ from dptse_env.traffic.sumo_network import ramp_edges
 def routes_xml(corridor: Corridor, scenario: Scenario) -> bytes:
     """Return SUMO's route file of a scenario, on the network that is made for its corridor."""
     root = ElementTree.Element("routes")
-    for each in corridor.vehicle_classes:
-        attributes = each.attributes(corridor.drivers)
-        ElementTree.SubElement(root, "vType", {"id": each.name, **attributes})
-    names = corridor.class_names
-    if not corridor.vehicle_classes:
-        ElementTree.SubElement(root, "vType", {"id": names[0], **corridor.drivers.attributes()})
+    classes = {each.name: each.attributes(corridor.drivers) for each in corridor.vehicle_classes}
+    classes = classes or {"car": corridor.drivers.attributes()}
+    for name, attributes in classes.items():
+        ElementTree.SubElement(root, "vType", {"id": name, **attributes})
+    names = list(classes)
     for origin in range(MAINLINE, corridor.n_on_ramps):
         for end in range(MAINLINE, corridor.n_off_ramps):
             first = 0 if origin == MAINLINE else corridor.on_ramps[origin]

@@ -168,26 +168,20 @@ class Places:
 
     def __init__(self, columns: tuple[tuple[Stretch, ...], ...]) -> None:
         """Sort the stretches by edge."""
-        parts: dict[str, list[tuple[float, float, int, float]]] = {}
+        parts: dict[str, list[tuple[float, float, int]]] = {}
         for column, stretches in enumerate(columns):
-            before = 0.0
             for edge, start, end in stretches:
-                parts.setdefault(edge, []).append((start, end, column, before - start))
-                before += end - start
+                parts.setdefault(edge, []).append((start, end, column))
         self._parts = {edge: sorted(of_edge) for edge, of_edge in parts.items()}
 
     def __iter__(self) -> Iterator[str]:
         """Iterate over the edges, by the first column that each is a part of."""
         return iter(self._parts)
 
-    def find(self, edge: str, position: float) -> tuple[int, float] | None:
-        """Return the column of a position [m] on an edge, and the way from the column's start [m].
-
-        None where nothing is recorded.
-        """
+    def find(self, edge: str, position: float) -> int | None:
+        """Return the column of a position [m] on an edge; None where nothing is recorded."""
         parts = self._parts[edge]
         index = bisect_right(parts, position + TOLERANCE, key=itemgetter(0)) - 1
         if index < 0 or position > parts[index][1] + TOLERANCE:
             return None
-        _, _, column, shift = parts[index]
-        return column, position + shift
+        return parts[index][2]

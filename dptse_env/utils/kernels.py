@@ -6,9 +6,7 @@ wherever the code lies and however old its files are: another environment or che
 first one has compiled. What was not used for `KEPT_FOR` is removed when something is compiled.
 Parts are compiled into the kernels that call them; called from Python they run as Python.
 
-Processes take turns: one compiles a function, and the others load what it has kept. At the first
-function that is not on disk a process starts others, which compile those that will be needed next;
-see `dptse_env.utils.compile_ahead`.
+Processes take turns: one compiles a function, and the others load what it has kept.
 """
 
 from __future__ import annotations
@@ -19,6 +17,7 @@ import hashlib
 import inspect
 import logging
 import os
+import pickle
 import sys
 import tempfile
 import time
@@ -32,17 +31,11 @@ import numba
 import numpy as np
 import platformdirs
 from numba import config, njit, types
-from numba.core.caching import (
-    CompileResultCacheImpl,
-    FunctionCache,
-    IndexDataCacheFile,
-    NullCache,
-    _CacheLocator,
-)
+from numba.core import serialize
+from numba.core.caching import NullCache
+from numba.core.compiler import CompileResult
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.registry import CPUDispatcher
-
-from dptse_env.utils import compile_ahead
 
 logger = logging.getLogger(__name__)
 
@@ -50,6 +43,7 @@ _PACKAGE = __name__.partition(".")[0]
 
 _OPTIONS: dict[str, Any] = {"error_model": "numpy", "nogil": True, "no_cfunc_wrapper": True}
 _WITHOUT_PYTHON = {"nopython": True, "no_cpython_wrapper": True}
+_ENDING = "machine-code"
 
 COLLECTED_EVERY = 100_000
 """Objects after which Python looks for garbage while a kernel is compiled."""
@@ -57,8 +51,15 @@ COLLECTED_EVERY = 100_000
 KEPT_FOR = 30 * 24 * 3600.0
 """Seconds for which machine code that no process loads is kept on disk."""
 
-TOUCHED_EVERY = 24 * 3600.0
-"""Seconds after which loading machine code is noted, by the time of its files."""
+LONGEST_WAIT = 180.0
+"""Seconds to wait for a function that another process compiles; none takes more than 25 s."""
+
+SILENT_WAIT = 1.0
+"""Seconds to wait before saying so."""
+
+Packed = tuple[Any, ...]
+"""A named tuple of arrays as a plain one, which kernels that Python calls take: to pass a named
+tuple costs 2 us more, a tenth of a filter's step."""
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -72,8 +73,7 @@ def kernel(function: Function) -> Function:
     if config.DISABLE_JIT:
         return function
     compiled: Any = _Dispatcher(function, targetoptions={**_OPTIONS, "nopython": True})
-    writable = _is_writable(default_folder())
-    compiled._cache = _KernelCache(compiled) if writable else _NoCache(function)
+    compiled._cache = _Kept(compiled)
     return cast("Function", compiled)
 
 
@@ -88,16 +88,15 @@ def kernel_part(function: Any = None, /, *, kept: bool = False, **options: Any) 
 
     Args:
         function: The function.
-        kept: Keep its machine code on disk as that of a kernel. Another process can then compile
-            it, and each kernel that calls it does not have to. It pays where compiling takes some
-            half a second or more.
+        kept: Keep its machine code on disk as that of a kernel, for the kernels of other
+            processes that call it. It pays where compiling takes some half a second or more.
         options: Options of numba, such as `fastmath`.
     """
 
     def decorate(function: Any) -> Any:
         part: Any = _Part(function, targetoptions={**_OPTIONS, **_WITHOUT_PYTHON, **options})
-        if kept and _is_writable(default_folder()):
-            part._cache = _KernelCache(part)
+        if kept:
+            part._cache = _Kept(part)
         return part
 
     return decorate if function is None else decorate(function)
@@ -106,12 +105,6 @@ def kernel_part(function: Any = None, /, *, kept: bool = False, **options: Any) 
 def inline_part(function: Function) -> Function:
     """Let kernels call a function whose body takes the place of each call."""
     return cast("Function", njit(error_model="numpy", inline="always")(function))
-
-
-def compile_unless_busy(function: Any, signature: tuple[Any, ...]) -> None:
-    """Compile a kernel or a kept part, or load it; do nothing while another process compiles it."""
-    if not function._cache.is_busy():
-        function.compile(signature)
 
 
 @contextlib.contextmanager
@@ -140,7 +133,7 @@ class _Dispatcher(CPUDispatcher):
             with global_compiler_lock, _collecting_seldom():
                 return super().compile(sig)
         finally:
-            if isinstance(self._cache, _KernelCache):
+            if isinstance(self._cache, _Kept):
                 self._cache.end_turn()
 
 
@@ -168,6 +161,117 @@ def default_folder() -> Path:
     return platformdirs.user_cache_path("dptse-env") / "kernels"
 
 
+class _Kept(NullCache):
+    """The machine code of a function on disk, a file for each signature."""
+
+    _turn: Any = None
+
+    def __init__(self, dispatcher: CPUDispatcher) -> None:
+        self._function: Any = dispatcher.py_func
+        self._options, self._folder = dispatcher.targetoptions, default_folder()
+
+    # At the first use: before that, functions that are defined further down are missing.
+    @cached_property
+    def _digest(self) -> str:
+        return fingerprint(self._function)
+
+    def _path(self, signature: tuple[Any, ...], codegen: Any) -> Path:
+        about = (
+            self._digest, _written(self._options), [_spelled(kind) for kind in signature],
+            codegen.magic_tuple(), sys.implementation.cache_tag, numba.__version__,
+        )  # fmt: skip
+        digest = hashlib.sha256(repr(about).encode()).hexdigest()
+        return self._folder / f"{_name(self._function)}-{digest[:32]}.{_ENDING}"
+
+    def load_overload(self, signature: tuple[Any, ...], context: Any) -> Any:
+        """Return kept machine code; where there is none, say that compiling begins.
+
+        Another process may be compiling the function: then wait, and return what it has kept.
+        """
+        context.refresh()
+        path = self._path(signature, context.codegen())
+        loaded = _loaded(path, context)
+        if loaded is None and _is_writable(self._folder):
+            self._turn = _turn(self._function, self._folder)
+            loaded = _loaded(path, context)
+        if loaded is None:
+            _remove_unused(self._folder)
+            _announce(self._function, self._folder)
+        return loaded
+
+    def save_overload(self, signature: tuple[Any, ...], compiled: Any) -> None:
+        """Keep machine code.
+
+        Raises:
+            TypeError: It holds addresses of this process.
+        """
+        if compiled.library.has_dynamic_globals:
+            raise TypeError(f"the machine code of {_name(self._function)} holds addresses")
+        if not _is_writable(self._folder):
+            return
+        path = self._path(signature, compiled.codegen)
+        unfinished = path.with_name(f"{path.name}-{os.urandom(8).hex()}")
+        try:
+            unfinished.write_bytes(serialize.dumps(compiled._reduce()))
+            unfinished.replace(path)
+        except OSError as error:
+            logger.warning("Could not keep %s: %s", path, error)
+
+    def end_turn(self) -> None:
+        """Let other processes load the function, or compile it where this one has failed."""
+        if self._turn is not None:
+            self._turn.release()
+            self._turn = None
+
+
+def _loaded(path: Path, context: Any) -> Any:
+    """Return the machine code of a file, None where there is none that can be read."""
+    try:
+        kept = path.read_bytes()
+    except OSError:
+        return None
+    with contextlib.suppress(OSError):  # another user's, or removed meanwhile
+        os.utime(path)  # in use
+    try:
+        return CompileResult._rebuild(context, *pickle.loads(kept))
+    except (ImportError, AttributeError):  # kept for a type that has moved or is no more
+        return None
+    except (pickle.UnpicklingError, EOFError):
+        logger.warning("%s is damaged and made again", path)
+        return None
+
+
+def _turn(function: FunctionType, folder: Path) -> Any:
+    """Return the lock of a function once no other process has it.
+
+    After `LONGEST_WAIT` it is returned all the same, not taken, since compiling a function twice
+    loses time only; so it is where the file system has no locks.
+    """
+    from filelock import FileLock, Timeout  # noqa: PLC0415  (slow to import)
+
+    lock = FileLock(folder / f"{_name(function)}.lock", thread_local=False)
+    for wait, news in (
+        (SILENT_WAIT, "Waiting for another process, which compiles %s"),
+        (LONGEST_WAIT, "It has not ended; compiling %s here too"),
+    ):
+        try:
+            lock.acquire(timeout=wait)
+            break
+        except Timeout:
+            logger.warning(news, _name(function))
+        except (OSError, NotImplementedError) as error:
+            _say_unlocked(folder, str(error))
+            break
+    return lock
+
+
+@cache
+def _say_unlocked(folder: Path, problem: str) -> None:
+    """Say once that a folder takes no locks."""
+    message = "%s takes no locks (%s); processes may compile the same function there"
+    logger.warning(message, folder, problem)
+
+
 @cache
 def _is_writable(folder: Path) -> bool:
     """Try once in a process whether files can be kept in a folder; make it."""
@@ -179,128 +283,34 @@ def _is_writable(folder: Path) -> bool:
     return True
 
 
-class _Locator(_CacheLocator):
-    """Leads numba to one folder for all functions."""
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-
-    def get_cache_path(self) -> str:
-        """Return the folder."""
-        return str(self._folder)
-
-    def get_source_stamp(self) -> str:
-        """Return nothing: the fingerprint says what has changed."""
-        return ""
-
-    def get_disambiguator(self) -> str:
-        """Return nothing: the fingerprint tells functions of one name apart."""
-        return ""
-
-
-class _Files(CompileResultCacheImpl):
-    """numba's conversion of machine code to files and back, for one folder."""
-
-    def __init__(self, function: FunctionType, folder: Path) -> None:
-        self._locator: Any = _Locator(folder)
-        self._locator._py_file = inspect.getfile(function)  # for numba's warnings
-        self._lineno = function.__code__.co_firstlineno
-
-
-class _KernelCache(FunctionCache):
-    """numba's cache of a function, whose files are named by the fingerprint."""
-
-    _cache_file: Any = None
-    _turn: Any = None
-
-    def __init__(self, compiled: CPUDispatcher) -> None:
-        self._py_func, self._name = compiled.py_func, repr(compiled.py_func)
-        self._options = compiled.targetoptions
-        folder = default_folder()
-        self._impl: Any = _Files(self._py_func, folder)
-        self._cache_path = str(folder)
-        self.enable()
-
-    # At the first use: before that, functions that are defined further down are missing.
-    @cached_property
-    def _digest(self) -> str:
-        text = f"{fingerprint(self._py_func)} {_written(self._options)}"
-        return hashlib.sha256(text.encode()).hexdigest()
-
-    @cached_property
-    def _file_name(self) -> str:
-        path = f"{self._py_func.__module__}.{self._py_func.__qualname__}".replace("<locals>.", "")
-        versions = f"{sys.implementation.cache_tag}-{numba.__version__}"
-        return f"{path}-{self._digest[:16]}-{versions}"
-
-    def load_overload(self, signature: Any, context: Any) -> Any:
-        """Return kept machine code; where there is none, say that compiling begins.
-
-        Another process may be compiling the function: then wait, and return what it has kept.
-        """
-        kept = self._loaded(signature, context)
-        if kept is None:
-            folder = Path(self.cache_path)
-            self._turn = compile_ahead.take_turn(self._py_func, folder)
-            kept = self._loaded(signature, context)
-            if kept is None:
-                _remove_unused(folder)
-                _announce(self._py_func, f"kept in {folder}")
-                compile_ahead.start(self._py_func, signature, folder)
-        return kept
-
-    def _loaded(self, signature: Any, context: Any) -> Any:
-        if self._cache_file is None:
-            self._cache_file = IndexDataCacheFile(self._cache_path, self._file_name, self._digest)
-        kept = super().load_overload(signature, context)
-        if kept is not None:
-            _touch(Path(self.cache_path), self._file_name)
-        return kept
-
-    def is_busy(self) -> bool:
-        """Return whether another process is compiling the function."""
-        return compile_ahead.is_taken(self._py_func, Path(self.cache_path))
-
-    def end_turn(self) -> None:
-        """Let other processes load the function, or compile it where this one has failed."""
-        if self._turn is not None:
-            self._turn.release()
-            self._turn = None
-
-
-class _NoCache(NullCache):
-    """The cache of a kernel where no folder can keep it."""
-
-    def __init__(self, function: Callable[..., Any]) -> None:
-        self._function = function
-
-    def load_overload(self, signature: Any, context: Any) -> None:
-        """Say that compiling begins, and how to have it once only."""
-        _announce(self._function, "for this process only: set NUMBA_CACHE_DIR to keep it")
-
-
-def _touch(folder: Path, name: str) -> None:
-    """Note that machine code is in use, by the time of its files."""
-    index, now = folder / f"{name}.nbi", time.time()
-    with contextlib.suppress(OSError):  # another user's, or removed meanwhile
-        if now - index.stat().st_mtime > TOUCHED_EVERY:
-            for path in folder.glob(f"{name}.*"):
-                os.utime(path)
-
-
 def _remove_unused(folder: Path) -> None:
     """Remove machine code that was not loaded for a long time."""
-    for path in folder.glob("*.nb[ci]*"):
+    for path in folder.glob(f"*.{_ENDING}*"):
         with contextlib.suppress(OSError):  # another user's, or removed meanwhile
             if time.time() - path.stat().st_mtime > KEPT_FOR:
                 path.unlink()
 
 
 @cache
-def _announce(function: Callable[..., Any], fate: str) -> None:
+def _announce(function: FunctionType, folder: Path) -> None:
     """Say once in a process that a kernel is being compiled, since that takes seconds."""
-    module = function.__module__.removeprefix(f"{_PACKAGE}.")
-    logger.warning("Compiling %s.%s (%s)", module, function.__name__, fate)
+    fate = f"kept in {folder}"
+    if not _is_writable(folder):
+        fate = "for this process only: set NUMBA_CACHE_DIR to keep it"
+    logger.warning("Compiling %s (%s)", _name(function).removeprefix(f"{_PACKAGE}."), fate)
+
+
+def _name(function: FunctionType) -> str:
+    return f"{function.__module__}.{function.__qualname__}".replace("<locals>.", "")
+
+
+def _spelled(kind: Any) -> str:
+    """Write a type of numba; the name of a named tuple's leaves out its module and fields."""
+    if not isinstance(kind, types.BaseTuple):
+        return str(kind)
+    cls, names = getattr(kind, "instance_class", tuple), getattr(kind, "fields", ())
+    elements = [_spelled(element) for element in cast("Any", kind)]
+    return f"{cls.__module__}.{cls.__qualname__}{names}({', '.join(elements)})"
 
 
 @cache

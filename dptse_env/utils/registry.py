@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import re
-import warnings
 from collections.abc import Callable, Iterator, Mapping
 from importlib.metadata import entry_points
 from typing import Any
@@ -33,7 +32,6 @@ class Registry(Mapping[str, Any]):
         keyword: str,
         shipped: Mapping[str, Any],
         check: Callable[[Any], str | None],
-        aliases: Mapping[str, str] | None = None,
     ) -> None:
         """Hold the parts that ship with the package.
 
@@ -42,12 +40,10 @@ class Registry(Mapping[str, Any]):
             shipped: Parts by name; a string ``"module:Name"`` is imported when it is looked up.
             check: Returns the requirement that a part of another package misses, worded to follow
                 "must", or None.
-            aliases: Former names, which still work with a ``DeprecationWarning``.
         """
         self.keyword, self._check = keyword, check
         self._parts = dict(shipped)
         self._shipped = frozenset(shipped)
-        self._aliases = dict(aliases or {})
 
     def __getitem__(self, name: str) -> Any:
         """Return the part of a name."""
@@ -76,7 +72,7 @@ class Registry(Mapping[str, Any]):
                 f"{self.keyword}: a name must be lower-case letters, digits, '-' and '_', got "
                 f"{name!r}"
             )
-        if name in self._shipped or name in self._aliases:
+        if name in self._shipped:
             raise ValueError(f"{self.keyword}: {name!r} ships with {_PACKAGE}, choose another name")
         if self._parts.get(name, part) != part:
             raise ValueError(f"{self.keyword}: {name!r} is registered already, for another part")
@@ -113,14 +109,6 @@ class Registry(Mapping[str, Any]):
             return next((n for n, part in self._parts.items() if part is value), None) or (
                 name_of_class(value)
             )
-        if value in self._aliases:
-            name = self._aliases[value]
-            warnings.warn(
-                f"{self.keyword}: {value!r} is now called {name!r}",
-                DeprecationWarning,
-                stacklevel=2,
-            )
-            return name
         if value not in self._parts and ":" not in value:
             load_plugins()
         if value not in self._parts and ":" not in value:

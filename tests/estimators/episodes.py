@@ -8,10 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dptse_env.estimators import EstimatorSettings, make_estimator
+from dptse_env.estimators import ESTIMATORS, REFERENCES, EstimatorSettings, make_estimator
 from dptse_env.estimators.base import Estimator
-from dptse_env.model.compiled import CompiledARZModel
-from dptse_env.model.model import ARZModel
+from dptse_env.model import ARZModel
 from dptse_env.model.parameters import load_parameters
 from dptse_env.traffic import PAPER_HIGHWAY
 from dptse_env.traffic.record import Record
@@ -24,6 +23,7 @@ REFERENCE_SPEED = 51.0
 REFERENCE_SPEEDS = {"speed": None, "flow": REFERENCE_SPEED}
 SIGMAS = {"speed": SIGMA, "flow": SIGMA[0] * np.array([1.0, REFERENCE_SPEED])}  # [.., veh/h]
 RELEASES = tuple(SIGMAS)
+EVERY = [(name, "compiled") for name in ESTIMATORS] + [(name, "reference") for name in REFERENCES]
 FIXED_SENSORS = (14, 17, 18)
 
 
@@ -82,10 +82,10 @@ def simulate(
     return Episodes(model, start, inputs, observed, values, truth, sigma)
 
 
-def model_of(parameters: str, release: str) -> CompiledARZModel:
+def model_of(parameters: str, release: str) -> ARZModel:
     """The paper's highway, as its sensors release speeds or flows."""
     speed = REFERENCE_SPEEDS[release]
-    return CompiledARZModel(PAPER_HIGHWAY, load_parameters(parameters), reference_speed=speed)
+    return ARZModel(PAPER_HIGHWAY, load_parameters(parameters), reference_speed=speed)
 
 
 def replay(record: Record, release: str = "speed") -> Episodes:

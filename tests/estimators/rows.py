@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dptse_env.estimators import DemandSettings, EstimatorSettings
-from dptse_env.model.compiled import CompiledARZModel
-from dptse_env.model.model import ARZModel
+from dptse_env.model import ARZModel
 from dptse_env.model.network import MeasurementRows
 from dptse_env.utils.arrays import FloatArray
 
@@ -32,8 +31,8 @@ def every_row(n_segments: int, n_mainline: int) -> MeasurementRows:
     return MeasurementRows(first.copy(), span.copy(), n_segments)
 
 
-def with_rows(model: ARZModel, rows: MeasurementRows) -> CompiledARZModel:
-    return CompiledARZModel(
+def with_rows(model: ARZModel, rows: MeasurementRows) -> ARZModel:
+    return ARZModel(
         model.network, model.parameters, reference_speed=model.reference_speed, rows=rows
     )
 

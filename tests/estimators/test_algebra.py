@@ -12,7 +12,7 @@ from dptse_env.estimators.compiled.algebra import (
     segment_update,
     sum_update,
 )
-from dptse_env.model.compiled import CompiledARZModel
+from dptse_env.model import ARZModel
 from dptse_env.model.parameters import load_parameters
 from dptse_env.traffic import PAPER_HIGHWAY
 from tests.estimators.parts import compiled
@@ -24,7 +24,7 @@ scratch_vectors = compiled(scratch_vectors)
 segment_update = compiled(segment_update)
 sum_update = compiled(sum_update)
 
-MODEL = CompiledARZModel(PAPER_HIGHWAY, load_parameters("paper"))
+MODEL = ARZModel(PAPER_HIGHWAY, load_parameters("paper"))
 N = MODEL.n_states
 
 

@@ -1,13 +1,10 @@
-from itertools import product
-
 import numpy as np
 import pytest
 
-from dptse_env.estimators import BACKENDS, ESTIMATORS
 from dptse_env.estimators.batch import checked_episodes, checked_measurements
 from tests.model.roads import Road, model_of
 
-from .episodes import random_streams, simulate, started
+from .episodes import EVERY, random_streams, simulate, started
 
 
 def test_episodes_out_of_range_are_refused():
@@ -63,7 +60,7 @@ def test_what_measurements_leave_out_is_filled_in():
     assert np.isnan(given.centre).all()  # speeds have no centre
 
 
-@pytest.mark.parametrize(("name", "backend"), [*product(ESTIMATORS, BACKENDS)][::3])
+@pytest.mark.parametrize(("name", "backend"), EVERY[::2])
 def test_an_estimator_checks_what_it_is_given(name, backend):
     estimator, one = started(name, backend, simulate(n_steps=1)), np.arange(1)
     with pytest.raises(ValueError, match=r"states must have shape \(1, 38\), got \(1, 37\)"):

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from dptse_env.estimators import EstimatorSettings
-from dptse_env.estimators.compiled.ekf_rows import released
-from dptse_env.estimators.open_loop import estimated_traffic
+from dptse_env.estimators.simple import estimated_traffic
 from dptse_env.model.model import make_road_arrays
 from dptse_env.model.parameters import VACUUM
+from dptse_env.model.step import released
 from tests.estimators.parts import compiled
 
 from .episodes import RELEASES, model_of, scale_of, simulate, started
@@ -54,5 +54,7 @@ def test_a_release_and_its_derivatives_are_the_models(parameters, release):
     )
     atol = 1e-12 * road.second_scale
     np.testing.assert_allclose(found[..., 0], model.measure(states)[..., 1], rtol=0.0, atol=atol)
-    by_state = model.measurement_jacobian(states)[..., 1, :]
+    n, S = shape
+    matrix = model.measurement_matrix(states)[:, :, 1].reshape(n, S, S, 2)
+    by_state = matrix[:, np.arange(S), np.arange(S)]
     np.testing.assert_allclose(found[..., 1:], by_state, rtol=1e-12, atol=1e-12)

@@ -15,13 +15,12 @@ from dptse_env.estimators import (
 )
 from dptse_env.estimators import horizon as horizon_module
 from dptse_env.estimators import mhe as mhe_module
-from dptse_env.estimators.compiled.ekf_kernels import Filters
-from dptse_env.estimators.horizon import assemble, natural_residual, normalised_bounds, solve
+from dptse_env.estimators.ekf import Filters
+from dptse_env.estimators.horizon import natural_residual, normalised_bounds, solve
 from dptse_env.estimators.mhe import GENERAL_SOLVER, Windows
 from dptse_env.estimators.mhe import update as solve_and_update
 from dptse_env.estimators.window import ACTIVE_SET, NEWTON, UNSOLVED
-from dptse_env.model.compiled import CompiledARZModel
-from dptse_env.model.parameters import load_parameters
+from dptse_env.model import ARZModel, load_parameters
 from tests.cases import pairwise
 from tests.model.roads import UNEVEN
 
@@ -60,7 +59,7 @@ def assert_minimal(mhe, tolerance=1e-9):
 
 def agree(compiled, reference, tolerance):
     """Compare programs, states, covariances, innovations and flags of both after a step."""
-    for ours, theirs in zip(compiled.program(0), assemble(reference.window(0)), strict=True):
+    for ours, theirs in zip(compiled.program(0), reference.program(0), strict=True):
         np.testing.assert_allclose(
             ours, theirs, rtol=0, atol=1e3 * tolerance * np.abs(theirs).max()
         )
@@ -125,7 +124,7 @@ def test_backends_agree_on_rows_that_overlap(settings, linearisation, bounds):
 
 def test_a_road_of_segments_of_many_kinds_is_estimated_alike():
     """Lengths, lanes and limits vary, ramps have several segments; predictions come in pairs."""
-    model, one = CompiledARZModel(UNEVEN, load_parameters("w99-3lane")), np.array([0])
+    model, one = ARZModel(UNEVEN, load_parameters("w99-3lane")), np.array([0])
     rng, s, v_f = np.random.default_rng(0), model.n_segments, model.speed_scale
     start = model.states(0.2 * model.jam_density[None], np.full((1, s), 0.5 * v_f))
     settings = EstimatorSettings(mhe=HorizonSettings(horizon=4))

@@ -4,31 +4,21 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from dptse_env.estimators.compiled.normals import (
-    STREAM_WIDTH,
-    _draw_bits,
-    fill,
-    make_bits,
-    make_stream,
-)
+from dptse_env.estimators.normals import STREAM_WIDTH, draw, draw_bits, make_stream
 from tests.estimators.parts import compiled
 
-_draw_bits = compiled(_draw_bits)
-fill = compiled(fill)
-make_bits = compiled(make_bits)
+draw_bits = compiled(draw_bits)
 
 
 def drawn(n, seed=0):
-    stream, out = make_stream(np.random.default_rng(seed)), np.empty(n, dtype=np.float32)
-    fill(stream, out, make_bits(n))
-    return out.astype(float)
+    return draw(make_stream(np.random.default_rng(seed)), n).astype(float)
 
 
 def test_bits_are_those_of_xoshiro256_plus_plus():
     """Against the recurrence in Python's integers, lane by lane."""
     stream = make_stream(np.random.default_rng(0))
     states, out = stream.T.tolist(), np.empty(3 * STREAM_WIDTH, dtype=np.uint64)
-    _draw_bits(stream, out)
+    draw_bits(stream, out)
 
     def rotated(x, k):
         return ((x << k) | (x >> (64 - k))) % 2**64
@@ -84,15 +74,13 @@ def test_seeds_decide_and_streams_differ():
 
 def test_a_stream_goes_on_where_it_stopped():
     stream = make_stream(np.random.default_rng(0))
-    chunks = np.empty((4, 100), dtype=np.float32)
-    for chunk in chunks:
-        fill(stream, chunk, make_bits(100))
-    assert len(np.unique(chunks)) == chunks.size
+    assert len(np.unique([draw(stream, 100) for _ in range(4)])) == 400
 
 
-@pytest.mark.parametrize("n", [2, 62, 64, 66, 2800, 3800])
-def test_any_even_length_is_filled_and_no_more(n):
-    stream, out = make_stream(np.random.default_rng(0)), np.full(n + 8, np.nan, dtype=np.float32)
-    fill(stream, out[:n], make_bits(n))
-    assert np.isfinite(out[:n]).all()
-    assert np.isnan(out[n:]).all()
+@pytest.mark.parametrize("n", [1, 2, 63, 64, 66, 2801])
+def test_any_number_is_drawn_and_what_follows_does_not_repeat_it(n):
+    stream = make_stream(np.random.default_rng(0))
+    first, second = draw(stream, n), draw(stream, n)
+    assert first.shape == second.shape == (n,)
+    assert np.abs(first).max() < 7.0
+    assert not np.isin(first, second).any()

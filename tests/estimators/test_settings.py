@@ -20,7 +20,6 @@ from dptse_env.estimators.settings import (
         ("process_noise", (0.1,), r"process_noise must have 2 items, got 1: \(0\.1,\)"),
         ("walk_noise", (float("nan"), 0.0), r"walk_noise\[0\] must be .*, got nan"),
         ("bounds", "ball", r"bounds must be one of 'cone', 'box', got 'ball'"),
-        ("band", 0, r"band must be an integer in 1\.\.1000( or None)?, got 0"),
         ("mhe", {"arrival_noise": [0.1, 0.0]}, r"mhe\.arrival_noise\[1\] must be .*, got 0\.0"),
     ],
 )
@@ -50,11 +49,9 @@ def test_settings_survive_json():
     settings = EstimatorSettings(
         process_noise=(0.1, 0.2),
         walk_noise=(0.3, 0.4),
-        process_noise_in="w",
         speed_cap=1.05,
         noise_scale=(1.5, 2.5),
         bounds="box",
-        band=12,
         ukf=SigmaPointSettings(alpha=0.5),
         enkf=EnsembleSettings(inflation=1.1),
         mhe=HorizonSettings(horizon=4, arrival_noise=(0.1, 0.2), solver="quadprog"),

@@ -1,17 +1,98 @@
+"""Errors of predictions, and parameters that are fitted to runs of traffic of a known model."""
+
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from dptse_env.model.calibration import calibrate, starting_parameters
-from dptse_env.model.compiled import CompiledARZModel
-from dptse_env.model.prediction import TrafficSeries, persistence_error, prediction_error
+from dptse_env.model import ARZModel
+from dptse_env.model.calibration import (
+    TrafficSeries,
+    calibrate,
+    persistence_error,
+    prediction_error,
+    starting_parameters,
+)
 
 from .roads import HIGHWAY, PAPER
-from .series import simulated
+
+TRUTH = replace(PAPER, name="truth", free_flow_speed=110.0, gamma=1.2, relaxation_time=30.0)
+
+
+def simulated(seed: int, n_steps: int = 240) -> TrafficSeries:
+    """Waves of demand and a passing queue at the exit, by the model itself."""
+    model = ARZModel(HIGHWAY, TRUTH)
+    rng = np.random.default_rng(seed)
+    t = np.arange(n_steps)[:, None]
+    phase, slow = rng.uniform(0.0, 2 * np.pi, 6), rng.uniform(40.0, 80.0, 6)
+    share = 0.25 + 0.2 * np.sin(2 * np.pi * t / slow + phase)
+    share[n_steps // 3 : n_steps // 2, 1] = 0.9
+    jam = TRUTH.jam_density * np.array([3, 3, 1, 1, 1, 1]) / 3.0
+    density = share * jam
+    speed = TRUTH.free_flow_speed * (1.0 - share**TRUTH.gamma)
+    inputs = model.boundary_inputs(density, speed)
+    states = model.states(np.full((1, 19), 30.0), np.full((1, 19), 80.0))
+    rows = [states]
+    for k in range(n_steps - 1):
+        rows.append(model.step(rows[-1], inputs[k : k + 1]))
+    history = np.concatenate(rows)
+    return TrafficSeries(model.density(history), model.speed(history), density, speed)
 
 
 @pytest.fixture(scope="module")
 def data():
     return [simulated(0), simulated(1)]
+
+
+def test_the_true_model_predicts_without_error(data):
+    error = prediction_error(ARZModel(HIGHWAY, TRUTH), data)
+    assert error.horizons == (5, 10, 15, 20, 25, 30)
+    assert max(error.density) < 1e-6
+    assert max(error.speed) < 1e-6
+
+
+def test_a_wrong_model_errs_more_the_further_it_looks(data):
+    error = prediction_error(ARZModel(HIGHWAY, PAPER), data, (1, 7))
+    assert error.density[1] > error.density[0] > 0.0
+    assert error.speed[1] > error.speed[0] > 0.0
+
+
+def test_persistence_is_the_root_mean_square_of_the_change(data):
+    error = persistence_error(data[:1], 15, horizons=(20,), stride=1)
+    rho, v = data[0].density[:, :15], data[0].speed[:, :15]
+    assert error.density[0] == pytest.approx(np.sqrt(np.mean((rho[20:] - rho[:-20]) ** 2)))
+    assert error.speed[0] == pytest.approx(np.sqrt(np.mean((v[20:] - v[:-20]) ** 2)))
+
+
+def test_empty_segments_have_no_speed_and_do_no_harm():
+    density = np.zeros((40, 19))
+    density[:, 3] = 10.0
+    speed = np.where(density > 0.0, 90.0, np.nan)
+    boundary = np.zeros((40, 6))
+    series = TrafficSeries(density, speed, boundary, np.full((40, 6), np.nan))
+    error = prediction_error(ARZModel(HIGHWAY, PAPER), [series], (5,))
+    assert np.isfinite([*error.density, *error.speed]).all()
+    assert persistence_error([series], 15, (5,)).speed == (0.0,)
+
+
+def test_bad_series_are_named(data):
+    good = data[0]
+    with pytest.raises(ValueError, match=r"series\.density and series\.speed must share a shape"):
+        replace(good, speed=good.speed[:-1])
+    with pytest.raises(ValueError, match=r"series\.boundary_density must be finite and >= 0"):
+        replace(good, boundary_density=-good.boundary_density)
+    with pytest.raises(ValueError, match=r"series\.speed must be finite and >= 0 wherever"):
+        replace(good, speed=good.speed * np.nan)
+
+
+def test_bad_horizons_are_named(data):
+    model = ARZModel(HIGHWAY, PAPER)
+    with pytest.raises(ValueError, match=r"horizons must be ascending steps >= 1, got \(5, 5\)"):
+        prediction_error(model, data, (5, 5))
+    with pytest.raises(ValueError, match="longer than the longest horizon of 500 steps, got 240"):
+        prediction_error(model, data, (500,))
+    with pytest.raises(ValueError, match="stride must be >= 1, got 0"):
+        persistence_error(data, 15, (5,), 0)
 
 
 def test_equilibrium_traffic_gives_its_own_parameters_back():
@@ -30,7 +111,7 @@ def test_calibration_finds_a_model_that_predicts_well(data):
     found = calibrate(
         HIGHWAY, data, "fit", start=PAPER, horizons=(5, 15), stride=10, max_evaluations=150
     )
-    wrong = prediction_error(CompiledARZModel(HIGHWAY, PAPER), data, (5, 15), 10)
+    wrong = prediction_error(ARZModel(HIGHWAY, PAPER), data, (5, 15), 10)
     assert found.parameters.name == "fit"
     assert found.loss < 0.25
     assert found.error.density[1] < 0.3 * wrong.density[1]

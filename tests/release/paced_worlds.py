@@ -6,7 +6,6 @@ import numpy as np
 
 from dptse_env.estimators import Estimate
 from dptse_env.release import ReleaseRequest
-from dptse_env.release.density import COUNTS
 from dptse_env.release.ledgers import Columns, Ledgers, Sums
 from dptse_env.release.vehicle_table import VehicleTable
 
@@ -122,7 +121,7 @@ class PlainLedgers(Ledgers):
         n_vehicles = int(self.vehicles.n_vehicles[slot])
         return np.array([self.accounts.get((episode, v), 0.0) for v in range(n_vehicles)])
 
-    def collect(self, episodes, slots, times, observed, prices, centre, terms=COUNTS):
+    def collect(self, episodes, slots, times, observed, prices, centre):
         counts, deviations = np.zeros((2, *observed.shape))
         refused = np.zeros(len(episodes), dtype=np.int64)
         for k, (slot, time) in enumerate(zip(slots, times, strict=True)):

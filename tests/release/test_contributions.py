@@ -55,7 +55,7 @@ def test_counts_of_a_batch_are_those_by_hand(some, masks, cap, n_columns):
     episodes = np.array([2, 0])
     expected = [by_hand(some[slot], masks[k], cap, n_columns) for k, slot in enumerate(slots)]
     for t in range(1, T + 1):
-        counts, _, speeds = contributions.collect(episodes, slots, np.full(2, t), masks[:, t - 1])
+        counts, speeds = contributions.collect(episodes, slots, np.full(2, t), masks[:, t - 1])
         for k in range(2):
             np.testing.assert_array_equal(counts[k], expected[k][0][t - 1][0])
             np.testing.assert_allclose(speeds[k], expected[k][0][t - 1][1], rtol=1e-12)
@@ -78,9 +78,7 @@ def test_taking_one_vehicle_out_leaves_what_others_contribute(one, masks, cap, d
     contributions = loaded([one, one.without(gone)], 2, cap)
     both = np.arange(2)
     for t in range(1, T + 1):
-        counts, _, _ = contributions.collect(
-            both, both, np.full(2, t), np.stack([masks[t - 1]] * 2)
-        )
+        counts, _ = contributions.collect(both, both, np.full(2, t), np.stack([masks[t - 1]] * 2))
         fewer = counts[0] - counts[1]
         assert fewer.sum() in (0.0, 1.0)
         assert (fewer >= 0.0).all()
@@ -98,7 +96,7 @@ def test_a_vehicle_counts_in_its_first_queried_steps_and_in_no_later_one():
     seen = []
     for t in range(1, T + 1):
         asked[0, 0] = t != 2  # not asked, not charged
-        counts, _, _ = contributions.collect(one, one, np.array([t]), asked)
+        counts, _ = contributions.collect(one, one, np.array([t]), asked)
         seen.append(int(counts[0, 0]))
     assert seen == [1, 0, 1, 1, 0, 0, 0, 0]
 

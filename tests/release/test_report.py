@@ -11,8 +11,8 @@ from dp_accounting import get_epsilon_gaussian
 from dptse_env.config import resolve
 from dptse_env.parts import make_release, privacy_report
 from dptse_env.privacy import epsilon_of, mu_of
-from dptse_env.release import GaussianMechanism
-from dptse_env.release.report import STRICT_DELTA
+from dptse_env.release import VOID_REASONS, GaussianMechanism
+from dptse_env.release.report import STRICT_DELTA, in_order
 from tests.cases import pairwise
 
 SENSITIVITY_REASONS = ("average_dwell", "adaptive_queries", "speed_sensitivity")
@@ -231,3 +231,8 @@ def test_the_report_describes_the_mechanism_in_force():
     assert [quantity.noise_std for quantity in found.releases] == weaker.tolist()
     assert found.epsilon > 5.0
     assert release.spent(np.array([0]), np.array([100]))[0][0] == pytest.approx(found.mu)
+
+
+def test_reasons_come_in_the_order_of_the_table_and_unknown_ones_last():
+    names = list(VOID_REASONS)
+    assert in_order(["z", names[3], "a", names[0]]) == (names[0], names[3], "a", "z")

@@ -1,5 +1,6 @@
 """Queries that connected vehicles answer, and fixed sensors that see all vehicles."""
 
+import dataclasses
 import math
 
 import gymnasium as gym
@@ -11,8 +12,21 @@ from dptse_env.config import resolve
 from dptse_env.parts import make_parts, make_release, privacy_report
 from dptse_env.privacy import mu_of
 from dptse_env.process import QueryProcess
-from dptse_env.release import RELEASE_MODELS, Detectors, TwoMechanisms
+from dptse_env.release import (
+    RELEASE_MODELS,
+    Capped,
+    CappedSettings,
+    Detectors,
+    QueryOptions,
+    ReleaseRequest,
+    ReleaseSetup,
+    TrafficTable,
+    TwoMechanisms,
+)
+from dptse_env.traffic import Penetration
 from tests.cases import pairwise
+
+from .worlds import AWAY, Worlds, corridor, record
 
 SHARE = 0.3
 N, SENSORS, S = 6, (3, 5, 7), 8
@@ -70,9 +84,7 @@ def test_queries_count_connected_vehicles_and_sensors_all(preset):
     process = make(privacy={"preset": preset, "epsilon": 10_000.0, **OWN_NOISE[preset]})
     begin(process)
     record = process.traffic.record(1)
-    connected = process.config.penetration.reports(
-        process.config.traffic_seeds[1], record, process.config.corridor
-    )
+    connected = process.config.penetration.reports(process.config.traffic_seeds[1], record)
     length = process.config.corridor.segment_lengths[0]
     for released, request in play(process, 20):
         t = int(request.times[0])
@@ -181,7 +193,7 @@ def test_only_connected_vehicles_have_ledgers_of_queries():
     pairwise(PRESETS, [{}, {"detectors": {"dropout": 0.3, "absolute": 0.5}}], n=4),
 )
 def test_a_fork_gives_the_bits_of_its_origin_and_leaves_it_alone(preset, keywords):
-    process = make(privacy={"preset": preset}, fusion={"share": "estimated"}, **keywords)
+    process = make(privacy={"preset": preset}, **keywords)
     begin(process)
     play(process, 5)
     fork = process.fork()
@@ -189,7 +201,6 @@ def test_a_fork_gives_the_bits_of_its_origin_and_leaves_it_alone(preset, keyword
     again = [released.values for released, _ in play(process, 5)]
     np.testing.assert_array_equal(ahead, again)
     np.testing.assert_array_equal(fork.estimate.density, process.estimate.density)
-    np.testing.assert_array_equal(fork.fusion.share.mean, process.fusion.share.mean)
     assert fork.release.queries.setup is process.release.queries.setup
 
 
@@ -204,6 +215,26 @@ def test_given_noise_reaches_both_mechanisms():
     np.testing.assert_allclose(
         released.values[0, [7, 8, 9], 0] * length, record.counts[t, [7, 3, 5]], atol=0.05
     )
+
+
+@pytest.mark.parametrize("sensors", [SENSORS, (7,)])
+def test_an_empty_sensor_releases_the_speed_limit_of_its_own_segment(sensors):
+    road = dataclasses.replace(corridor(1), fixed_sensors=sensors, ramp_speed_limit=60.0)
+    empty = record(np.full((1, 2), AWAY), np.zeros((1, 2)), S + road.n_boundaries)
+    traffic, settings = (
+        TrafficTable(road, (0,), Worlds(empty)),
+        CappedSettings(speed_release="mean"),
+    )
+    options = QueryOptions.make(N, 2, separate_sensors=True)
+    setup = ReleaseSetup("capped", settings, traffic, 2, 1, 1, options)
+    release = TwoMechanisms(Capped, setup, Penetration(SHARE), Detectors())
+    release.load(0, empty)
+    release.reset(ONE, [np.random.default_rng(0)])
+    release.give_noise(np.zeros((1, setup.n_columns, 2)))
+    request = ReleaseRequest(ONE, ONE, ONE + 1, setup.observed(np.zeros((1, N), dtype=bool)))
+    speeds = release.release(request).values[0, :, 1]
+    np.testing.assert_allclose(speeds, np.array(road.speed_limits)[setup.places], atol=0.5)
+    assert speeds[7] == pytest.approx(60.0, abs=0.5)
 
 
 # --- errors of detectors ---------------------------------------------------------------------
@@ -268,8 +299,7 @@ def test_a_known_error_is_in_the_deviation_of_the_release():
             {"detectors": {"dropout": 0.1}, "corridor": {"fixed_sensors": []}},
             "detectors must be left out on a road without fixed sensors",
         ),
-        ({"fusion": {"threshold": 0.0}}, "fusion.threshold must be"),
-        ({"fusion": {"share": "guessed"}}, "fusion.share must be one of"),
+        ({"fusion": {"dwell_factor": -1.0}}, "fusion.dwell_factor must be"),
     ],
 )
 def test_bad_sensors_are_refused_by_path(keywords, message):
@@ -289,54 +319,6 @@ def test_the_environment_keeps_gymnasiums_rules(preset):
         penetration=0.2,
         privacy={"preset": preset},
         detectors={"dropout": 0.1},
-        fusion={"share": "estimated", "innovation_test": True},
     )
     check_env(env.unwrapped, skip_render_check=True)
     env.close()
-
-
-# --- densities from reports, and connected classes --------------------------------------------
-
-
-@pytest.mark.parametrize(("preset", "source"), pairwise(PRESETS, ["spacing", "neighbours"], n=4))
-def test_reports_give_the_density_of_all_vehicles(preset, source):
-    """Nearly without noise, what the estimator is given is near the truth on average."""
-    penetration = {"share": SHARE, "density_from": source, "report_clip": 3.0}
-    # Every vehicle counts in every second, and noise is next to nothing.
-    own = {"cap": 1_000} if preset == "capped" else {}
-    privacy = {"preset": preset, "epsilon": 1e4, **own}
-    process = make(privacy=privacy, penetration=penetration, estimator="random_walk", horizon=200)
-    begin(process, start=0)
-    errors, total, read = [], [], process.fusion.read
-
-    def spy(episodes, observed, measured, prediction):
-        found = read(episodes, observed, measured, prediction)
-        truth = process.truth(episodes)[0, 1, 0]
-        errors.append(found.values[0, 1, 0] - truth)
-        total.append(truth)
-        return found
-
-    process.fusion.read = spy
-    play(process, 200, queried=(1, 2))
-    assert abs(np.mean(errors)) < 0.2 * np.mean(total)
-    assert np.corrcoef(np.array(errors) + total, total)[0, 1] > 0.5
-
-
-@pytest.mark.parametrize("preset", ["capped", "paced"])
-def test_connected_classes_answer_and_others_do_not(preset):
-    classes = [{"name": "car", "share": 0.7}, {"name": "truck", "share": 0.3, "length": 12.0}]
-    process = make(
-        privacy=preset,
-        corridor={"fixed_sensors": SENSORS, "vehicle_classes": classes},
-        penetration={"by_class": [{"name": "truck", "share": 1.0}]},
-    )
-    begin(process)
-    record = process.release._connected.record(1)
-    details = process.release._connected.library.get(process.release._connected.corridor, 1)
-    trucks = np.flatnonzero(details.class_of_vehicles() == 1)
-    assert 0 < len(trucks) < 0.5 * details.n_vehicles
-    assert set(record.vehicle.tolist()) == set(trucks.tolist())
-    play(process, 20)
-    assert process.release.queries.report().mu == pytest.approx(
-        mu_of(1.0, 0.05) * math.sqrt(1.0 - 1.0 / (1.0 + 3.0 * math.sqrt(0.3)))
-    )

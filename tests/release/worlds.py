@@ -4,13 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from dptse_env.release import (
-    COUNTED,
-    RELEASE_MODELS,
-    ReleaseRequest,
-    ReleaseSetup,
-    TrafficTable,
-)
+from dptse_env.release import RELEASE_MODELS, ReleaseRequest, ReleaseSetup, TrafficTable
 from dptse_env.release.contributions import Contributions
 from dptse_env.traffic import SHORT_HIGHWAY, Demand, Record
 
@@ -45,18 +39,15 @@ class Worlds:
     def ensure(self, corridor, seeds):
         """All vehicles are present."""
 
-    def release(self, settings, counted=None, horizon=None, kind=None, density=COUNTED):
+    def release(self, settings, counted=None, horizon=None, kind=None):
         """A release model of all record columns, with other contributions if any are given.
 
-        It is of another class than that of the settings if one is given. Vehicles are counted, or
-        report densities.
+        It is of another class than that of the settings if one is given.
         """
         n, duration = len(self.records), self.records[0].n_steps - 1
         traffic = TrafficTable(corridor(duration), tuple(range(n)), self)
         settings = dataclasses.replace(settings, boundary_inputs="private")
-        setup = ReleaseSetup(
-            settings.preset, settings, traffic, 2, horizon or duration, n, density=density
-        )
+        setup = ReleaseSetup(settings.preset, settings, traffic, 2, horizon or duration, n)
         release = (kind or RELEASE_MODELS[settings.preset])(setup)
         if counted is not None:
             release.contributions = counted
@@ -101,7 +92,7 @@ class Mutant(Contributions):
         super().reset(episodes)
         self.spent = {}
 
-    def collect(self, episodes, slots, times, observed, terms):
+    def collect(self, episodes, slots, times, observed):
         counts, speeds = np.zeros((2, *observed.shape))
         for k, (slot, time) in enumerate(zip(slots, times, strict=True)):
             whole = self.records[slot]
@@ -114,4 +105,4 @@ class Mutant(Contributions):
                 self.spent[account] = self.spent.get(account, 0) + charged
                 counts[k, segment] += 1
                 speeds[k, segment] += min(whole.speed[row], self.vehicles.largest_speed)
-        return counts, counts, speeds
+        return counts, speeds

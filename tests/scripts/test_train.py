@@ -126,13 +126,6 @@ def test_every_recipe_is_on_the_command_line():
     assert tyro.cli(Args, args=[]).recipe == RECIPES["plackett-luce"]()
 
 
-def test_former_names_of_options_are_kept():
-    former = ["--recipe.twins", "2", "--recipe.pretraining-rounds", "1", "--recipe.sharpness", "3"]
-    recipe = tyro.cli(Args, args=["recipe:plackett-luce", *former]).recipe
-    assert (recipe.replicas, recipe.regression.rounds, recipe.regression.sharpness) == (2, 1, 3.0)
-    assert tyro.cli(Args, args=["recipe:mask", "--recipe.twins", "8"]).recipe.replicas == 8
-
-
 def test_arguments_become_the_plan():
     args = Args(seed=3, traffic="4:6", validation="1000", keywords='{"bandwidth": 3}')
     plan = make_plan(args, 3)

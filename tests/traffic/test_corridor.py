@@ -87,7 +87,6 @@ def test_the_digest_covers_what_shapes_the_traffic_and_nothing_else():
             folder=".",
         ),
         "vehicle_classes": (VehicleClass("car", 0.9), VehicleClass("truck", 0.1, length=12.0)),
-        "detailed": True,
     }
     observed = {
         "name": "other",

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dptse_env.config import resolve
-from dptse_env.traffic import SHORT_HIGHWAY, ClassShare, DetailedRecord, Penetration, Record
+from dptse_env.traffic import Penetration, Record
 
 SHARES = (0.01, 0.1, 0.3, 0.9, 1.0)
 
@@ -48,7 +48,7 @@ def test_a_share_of_a_range_is_drawn_for_each_traffic_seed():
     assert abs(shares.mean() - 0.25) < 0.03
     assert len(set(shares.tolist())) == 200
     assert shares[3] == penetration.share_of(3)
-    assert penetration.published_share(SHORT_HIGHWAY) == pytest.approx(0.25)
+    assert penetration.published_share == pytest.approx(0.25)
     connected = [penetration.connected(seed, road_of(4_000, 1)).mean() for seed in range(5)]
     np.testing.assert_allclose(connected, shares[:5], atol=0.03)
 
@@ -56,7 +56,7 @@ def test_a_share_of_a_range_is_drawn_for_each_traffic_seed():
 def test_the_connected_vehicles_report_and_some_misreport_their_speed():
     record = road_of(2_000, n_steps=1)
     penetration = Penetration(0.5, misreporting=0.25, misreport_factor=2.0)
-    reported = penetration.reports(7, record, SHORT_HIGHWAY)
+    reported = penetration.reports(7, record)
     np.testing.assert_array_equal(
         reported.vehicle, np.flatnonzero(penetration.connected(7, record))
     )
@@ -71,69 +71,16 @@ def test_a_number_a_pair_and_a_mapping_are_taken(value):
     assert config.has_separate_sensors == (value != {"seed": 3})
 
 
-# --- by class ---------------------------------------------------------------------------------
-
-CLASSES = [{"name": "car", "share": 0.8}, {"name": "truck", "share": 0.2, "length": 12.0}]
-TRUCKS = [{"name": "truck", "share": 0.5}]
-
-
-def of_two_classes(n_vehicles):
-    """A record in which every third vehicle is a truck."""
-    plain = road_of(n_vehicles, n_steps=1)
-    columns = {name: getattr(plain, name) for name in Record.COLUMNS}
-    return DetailedRecord(
-        **columns, n_steps=1, n_columns=3,
-        position=np.zeros(n_vehicles), lane=np.zeros(n_vehicles),
-        vehicle_class=np.arange(n_vehicles) % 3 == 0, classes=("car", "truck"),
-    )  # fmt: skip
-
-
-def test_a_share_of_each_class_is_connected_and_no_vehicle_of_others():
-    record = of_two_classes(6_000)
-    trucks = record.vehicle_class == 1
-    connected = Penetration(by_class=(ClassShare("truck", 0.5),)).connected(7, record)
-    assert not connected[~trucks].any()
-    assert connected[trucks].mean() == pytest.approx(0.5, abs=0.05)
-    both = Penetration(by_class=(ClassShare("truck", 0.5), ClassShare("car", 0.1)))
-    assert both.connected(7, record)[~trucks].mean() == pytest.approx(0.1, abs=0.02)
-    # The same vehicles as under one share.
-    np.testing.assert_array_equal(connected[trucks], Penetration(0.5).connected(7, record)[trucks])
-
-
-def test_the_published_share_adds_up_those_of_the_classes():
-    config = resolve(
-        "short-highway",
-        {"corridor": {"vehicle_classes": CLASSES}, "penetration": {"by_class": TRUCKS}},
-    )
-    assert config.penetration.published_share(config.corridor) == pytest.approx(0.1)
-    assert config.has_separate_sensors
-    assert config.penetration.needs_details
-
-
 IMPOSSIBLE = [
     (0.0, "share must be"),
     (1.2, "share must be"),
     ([0.4, 0.1], "share must be"),
     ([0.0, 0.1], r"share\[0\] must be"),
     ({"share": 0.1, "class": "car"}, "class is unknown"),
-    ({"by_class": [{"name": "bus", "share": 0.5}]}, r"by_class\[0\]\.name must be"),
-    ({"by_class": TRUCKS, "share": 0.3}, "share must be left out"),
-    ({"by_class": TRUCKS * 2}, "by_class must name each class once"),
-    ({"by_class": TRUCKS, "share": [0.1, 0.2]}, "share must be one number"),
-    ({"density_from": "radar"}, "density_from must be"),
 ]
 
 
 def test_what_is_impossible_is_refused_by_path():
-    corridor = {"vehicle_classes": CLASSES}
     for penetration, message in IMPOSSIBLE:
         with pytest.raises(ValueError, match=rf"^penetration\.{message}"):
-            resolve("short-highway", {"corridor": corridor, "penetration": penetration})
-
-
-def test_records_without_details_cannot_say_which_classes_are_connected():
-    penetration = Penetration(by_class=(ClassShare("car", 0.5),))
-    with pytest.raises(ValueError, match="import it again with --detailed"):
-        penetration.connected(0, road_of(3))
-    with pytest.raises(ValueError, match=r"by_class\[0\]\.name must be a class of the traffic"):
-        Penetration(by_class=(ClassShare("bus", 0.5),)).connected(0, of_two_classes(3))
+            resolve("short-highway", {"penetration": penetration})

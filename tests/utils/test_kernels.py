@@ -4,11 +4,13 @@ import gc
 import importlib
 import logging
 import os
+import subprocess
 import sys
 import time
 from contextlib import suppress
 
 import pytest
+from filelock import FileLock
 from numba.core import config, event
 from numba.core.errors import TypingError
 
@@ -35,7 +37,13 @@ def scaled(x):
 @kernel
 def run(x):
     return Pair(scaled(x), x).first
+
+
+@kernel
+def second(pair):
+    return pair.second
 """
+LOG = "dptse_env.utils.kernels"
 
 
 @pytest.fixture
@@ -51,16 +59,15 @@ def load(tmp_path, monkeypatch, kept):
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
 
-    def load(text=MODULE):
-        path = tmp_path / "kernels_of_a_test.py"
+    def load(text=MODULE, name="kernels_of_a_test"):
+        path = tmp_path / f"{name}.py"
         if not path.exists() or path.read_text(encoding="utf-8") != text:
             path.write_text(text, encoding="utf-8")  # else the file stays as old as it is
-        sys.modules.pop("kernels_of_a_test", None)
+        monkeypatch.delitem(sys.modules, name, raising=False)
         importlib.invalidate_caches()
-        return importlib.import_module("kernels_of_a_test")
+        return importlib.import_module(name)
 
-    yield load
-    sys.modules.pop("kernels_of_a_test", None)
+    return load
 
 
 CHANGES = {
@@ -80,6 +87,22 @@ def test_a_change_of_anything_that_a_kernel_reaches_changes_its_fingerprint(load
     assert fingerprint(load(MODULE.replace(*CHANGES[change])).run.py_func) != before
 
 
+def test_equal_code_of_another_module_has_another_fingerprint(load):
+    # Machine code imports the modules of what it was made from, one of which may be gone.
+    before = fingerprint(load().run.py_func)
+    assert fingerprint(load(name="elsewhere").run.py_func) != before
+
+
+def test_a_named_tuple_with_its_fields_in_another_order_is_compiled_for(load):
+    fields = "first: float\n    second: float"
+    for text, expected in (
+        (MODULE, 2.5),
+        (MODULE.replace(fields, "second: float\n    first: float"), 1.5),
+    ):
+        module = load(text)
+        assert module.second(module.Pair(1.5, 2.5)) == expected
+
+
 def test_the_fingerprint_is_that_of_the_code_and_not_of_the_process(load):
     before = fingerprint(load().run.py_func)
     assert fingerprint(load("# A comment\n" + MODULE).run.py_func) == before
@@ -93,6 +116,15 @@ def test_a_kernel_is_kept_on_disk_and_compiled_anew_when_a_part_changes(load):
     assert fresh() == (3.0, 0)
     assert fresh() == (3.0, 1)
     assert fresh(MODULE.replace("FACTOR = 2.0", "FACTOR = 4.0")) == (6.0, 0)
+
+
+def test_machine_code_for_a_type_that_is_no_more_is_compiled_anew(load):
+    """The code of the kernel does not name the types of its arguments."""
+    text = MODULE.replace("Pair(scaled(x), x).first", "x.first")
+    for name, expected in (("Pair", 0), ("Two", 0), ("Two", 1)):
+        module = load(text.replace("Pair", name))
+        assert module.run(getattr(module, name)(1.5, 2.0)) == 1.5
+        assert sum(module.run.stats.cache_hits.values()) == expected
 
 
 def test_machine_code_is_found_wherever_the_module_lies(load, tmp_path, monkeypatch):
@@ -110,7 +142,7 @@ def test_machine_code_is_found_wherever_the_module_lies(load, tmp_path, monkeypa
 
 def test_what_nobody_has_loaded_for_long_is_removed_when_something_is_compiled(load, kept):
     load().run(1.5)
-    files = {*kept.glob("*.nb?")}
+    files = {*kept.glob("*.machine-code")}
     for path in files:
         os.utime(path, (time.time() - KEPT_FOR / 2,) * 2)
     load().run(1.5)  # which is noted
@@ -118,12 +150,12 @@ def test_what_nobody_has_loaded_for_long_is_removed_when_something_is_compiled(l
     for path in files:
         os.utime(path, (time.time() - KEPT_FOR - 60.0,) * 2)
     load(MODULE.replace("FACTOR = 2.0", "FACTOR = 4.0")).run(1.5)
-    assert len(files) == len({*kept.glob("*.nb?")}) == 2
-    assert not files & {*kept.glob("*.nb?")}
+    assert len(files) == len({*kept.glob("*.machine-code")}) == 1
+    assert not files & {*kept.glob("*.machine-code")}
 
 
 def test_compiling_is_said_once_and_loading_is_not(load, caplog):
-    with caplog.at_level(logging.WARNING, logger="dptse_env.utils.kernels"):
+    with caplog.at_level(logging.WARNING, logger=LOG):
         run = load().run
         run(1.5)
         run(2)
@@ -137,9 +169,48 @@ def test_compiling_is_said_once_and_loading_is_not(load, caplog):
 def test_a_kernel_runs_where_no_folder_can_keep_it_and_says_so(load, tmp_path, monkeypatch, caplog):
     (tmp_path / "file").touch()
     monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path / "file" / "kept"))
-    with caplog.at_level(logging.WARNING, logger="dptse_env.utils.kernels"):
+    with caplog.at_level(logging.WARNING, logger=LOG):
         assert load().run(1.5) == 3.0
     assert "for this process only: set NUMBA_CACHE_DIR" in caplog.text
+
+
+HOLD = """
+import sys, time
+from filelock import FileLock
+with FileLock(sys.argv[1]):
+    print("held", flush=True)
+    time.sleep(2.5)
+"""
+
+
+def test_a_function_that_another_process_compiles_is_waited_for(load, kept, caplog):
+    kept.mkdir()
+    command = [sys.executable, "-c", HOLD, str(kept / "kernels_of_a_test.run.lock")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE) as other:
+        assert other.stdout.readline() == b"held\n"
+        with caplog.at_level(logging.WARNING, logger=LOG):
+            assert load().run(1.5) == 3.0
+    assert "Waiting for another process, which compiles kernels_of_a_test.run" in caplog.text
+
+
+def test_the_turn_ends_where_compiling_fails(load, kept):
+    run = load(MODULE.replace("x * FACTOR", "x.nothing")).run
+    for _ in range(2):
+        with pytest.raises(TypingError, match="nothing"):
+            run(1.5)
+    FileLock(kept / "kernels_of_a_test.run.lock").acquire(timeout=0.0).lock.release()
+
+
+def test_a_folder_without_locks_is_compiled_into_all_the_same(load, monkeypatch, caplog):
+    def acquire(*_, **__):
+        raise OSError(37, "No locks available")
+
+    monkeypatch.setattr(FileLock, "acquire", acquire)
+    module = load()
+    with caplog.at_level(logging.WARNING, logger=LOG):
+        assert module.run(1.5) == 3.0
+        assert module.run(1) == 2.0
+    assert caplog.text.count("takes no locks") == 1
 
 
 def test_a_part_runs_as_python_when_python_calls_it(load):

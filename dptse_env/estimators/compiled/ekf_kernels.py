@@ -15,25 +15,16 @@ from dptse_env.estimators.compiled.algebra import (
     scratch_vectors,
     segment_update,
 )
-from dptse_env.estimators.compiled.driver_noise import add_coupling, couple
 from dptse_env.estimators.compiled.ekf_rows import (
     innovate,
     linearise,
     make_rows,
-    measured,
     update_wide,
     variance_along,
 )
 from dptse_env.model.network import RoadArrays
-from dptse_env.model.parameters import (
-    LARGEST_FACTOR,
-    LARGEST_W,
-    LEAST_DENSITY,
-    LEAST_FACTOR,
-    LEAST_W,
-    VACUUM,
-)
-from dptse_env.model.step import advance, make_scratch, pressure
+from dptse_env.model.parameters import LARGEST_W, VACUUM
+from dptse_env.model.step import advance, clip, make_scratch, measured, normalise, pressure, project
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.kernel_loops import all_finite, any_of, copy_vector
 from dptse_env.utils.kernels import kernel, kernel_part
@@ -51,8 +42,7 @@ class Filters(NamedTuple):
     priors: FloatArray  # (n, n_x) prior means
     innovations: FloatArray  # (n, M, 2)
     diverged: BoolArray  # (n,)
-    process_variance: FloatArray  # (n_x,) normalised; of psi, or of w
-    noise_in_w: bool  # whether it is of w
+    process_variance: FloatArray  # (n_x,) normalised
     growth_variance: float  # variance that rho / rho_m = 1 adds to the process noise of rho
     count_variance: FloatArray  # (M,) variance of densities beside the noise, over rho, normalised
     initial_variance: FloatArray  # (n_x,) normalised
@@ -68,7 +58,7 @@ def predict(road_: Packed, filters_: Packed, episodes: IntArray, inputs: FloatAr
     blocks, by_factor = np.empty((*road.neighbours.shape, 4)), scratch.by_factor
     size = filters.covariances.shape[1:]
     product, transposed = np.empty(size), np.empty(size)  # not one array: layouts stay known
-    noise, coupling = np.empty(filters.process_variance.size), np.empty(road.jam.size)
+    noise = np.empty(filters.process_variance.size)
     for k in range(episodes.size):
         mean = filters.means[episodes[k]]
         process_noise(road, filters, mean, noise)
@@ -76,41 +66,19 @@ def predict(road_: Packed, filters_: Packed, episodes: IntArray, inputs: FloatAr
         project(road, mean, filters.is_box)
         normalise(road, filters.density_scale, blocks, by_factor)
         covariance = filters.covariances[episodes[k]]
-        if filters.noise_in_w:
-            couple(road, filters.density_scale, mean, noise, coupling)
         propagate(road, blocks, by_factor, noise, covariance, product, transposed)
-        if filters.noise_in_w:
-            add_coupling(covariance, coupling)
 
 
 @kernel_part
 def process_noise(
     road: RoadArrays, filters: Filters, mean: FloatArray, variance: FloatArray
 ) -> None:
-    """Write the variances of the process noise of a step that leaves a mean `(n_x,)`.
-
-    Its second components are those of `process_variance`, psi or w.
-    """
+    """Write the variances of the process noise of a step that leaves a mean `(n_x,)`."""
     copy_vector(filters.process_variance, variance)
     if filters.growth_variance == 0.0:
         return
     for s in range(road.jam.size):
         variance[2 * s] += filters.growth_variance * mean[2 * s] / filters.density_scale
-
-
-@kernel_part
-def normalise(
-    road: RoadArrays, density_scale: float, blocks: FloatArray, by_factor: FloatArray
-) -> None:
-    """Normalise a step's derivatives: rho by rho_m, psi by rho_m v_f."""
-    v_f = road.free_flow_speed
-    for s in range(blocks.shape[0]):
-        for slot in range(blocks.shape[1]):
-            blocks[s, slot, 1] *= v_f
-            blocks[s, slot, 2] /= v_f
-    for e in range(by_factor.shape[0]):
-        by_factor[e, 0] /= density_scale
-        by_factor[e, 1] /= density_scale * v_f
 
 
 @kernel
@@ -181,24 +149,6 @@ def restart(filters: Filters, episode: int) -> None:
         covariance[i, i] = filters.initial_variance[i]
 
 
-@kernel_part
-def project(road: RoadArrays, mean: FloatArray, is_box: bool) -> None:
-    """Project a mean into its bounds, as `ARZModel.project`; a NaN stays NaN."""
-    v_f = road.free_flow_speed
-    for c in range(road.jam.size):
-        rho, psi, jam = mean[2 * c], mean[2 * c + 1], road.jam[c]
-        if is_box:
-            rho = _clip(rho, 0.0, jam)
-            low, high = 0.0, jam * v_f
-        else:
-            rho = _clip(rho, LEAST_DENSITY, jam)
-            least_w = max(pressure(rho, jam, v_f, road.gamma), LEAST_W * v_f)
-            low, high = least_w * rho, LARGEST_W * v_f * rho
-        mean[2 * c], mean[2 * c + 1] = rho, _clip(psi, low, high)
-    for i in range(2 * road.jam.size, mean.size):
-        mean[i] = _clip(mean[i], LEAST_FACTOR, LARGEST_FACTOR)
-
-
 @kernel
 def summarise(road_: Packed, filters_: Packed, out: FloatArray) -> None:
     """Write density, speed and their standard deviations to `out` `(4, n, S)`, physical units."""
@@ -226,15 +176,6 @@ def summarise_segment(
     _, by_rho, by_psi = measured(rho, psi, jam, v_f, road.gamma)
     variance = variance_along(covariance, at, by_rho * scale, by_psi * scale * v_f)
     out[0, e, s] = rho
-    out[1, e, s] = _clip(w - p, 0.0, LARGEST_W * v_f)
+    out[1, e, s] = clip(w - p, 0.0, LARGEST_W * v_f)
     out[2, e, s] = scale * np.sqrt(max(covariance[2 * at, 2 * at], 0.0))
     out[3, e, s] = np.sqrt(max(variance, 0.0))
-
-
-@kernel_part
-def _clip(value: float, low: float, high: float) -> float:
-    if value < low:
-        return low
-    if value > high:
-        return high
-    return value

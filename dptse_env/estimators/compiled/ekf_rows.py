@@ -9,8 +9,7 @@ import numpy as np
 
 from dptse_env.estimators.compiled.algebra import sum_update
 from dptse_env.model.network import RoadArrays
-from dptse_env.model.parameters import MEASUREMENT_FLOOR
-from dptse_env.model.step import pressure
+from dptse_env.model.step import released
 from dptse_env.utils.arrays import BoolArray, FloatArray
 from dptse_env.utils.kernels import kernel_part
 
@@ -30,34 +29,6 @@ def make_rows(road: RoadArrays) -> Rows:
     """Allocate the rows of a measurement."""
     n_rows, n_segments = road.row_first.size, road.jam.size
     return Rows(np.empty((n_rows, 4)), np.empty((n_rows, 2)), np.zeros((n_segments, 2)))
-
-
-@kernel_part
-def measured(
-    rho: float, psi: float, jam: float, v_f: float, gamma: float
-) -> tuple[float, float, float]:
-    """Return the measured speed [km/h], density floored, and its derivatives by rho and psi."""
-    floor = MEASUREMENT_FLOOR * jam
-    floored = max(rho, floor)
-    p = pressure(floored, jam, v_f, gamma)
-    slope = -(psi / floored + gamma * p) / floored if rho > floor else 0.0
-    return psi / floored - p, slope, 1.0 / floored
-
-
-@kernel_part
-def released(
-    road: RoadArrays, s: int, rho: float, psi: float, centre: float
-) -> tuple[float, float, float]:
-    """Return a segment's released second number, and its derivatives by rho and psi.
-
-    That is the flow [veh/h] centred on a speed [km/h], or the speed where the centre is NaN.
-    """
-    jam, v_f, gamma = road.jam[s], road.free_flow_speed, road.gamma
-    if np.isnan(centre):
-        return measured(rho, psi, jam, v_f, gamma)
-    p = pressure(rho, jam, v_f, gamma)
-    flow = psi - rho * (p + centre)
-    return flow, -(1.0 + gamma) * p - centre, 1.0
 
 
 @kernel_part

@@ -28,12 +28,11 @@ class CompiledFilter(BatchEstimator):
         start = model.project(np.zeros((n_episodes, n_states)), settings.bounds)
         self._filters = kernels.Filters(
             means=start,
-            covariances=np.zeros((n_episodes, n_states, self._width(n_states))),
+            covariances=np.zeros((n_episodes, n_states, padded(n_states))),
             priors=start.copy(),
             innovations=self.innovations,
             diverged=self.diverged,
             process_variance=process_variance(model, settings),
-            noise_in_w=settings.process_noise_in == "w",
             growth_variance=float(settings.density_growth) ** 2,
             count_variance=count_variance(model, settings),
             initial_variance=initial_variance(model, settings),
@@ -42,7 +41,7 @@ class CompiledFilter(BatchEstimator):
         )
         self._packed = tuple(make_road_arrays(model)), tuple(self._filters)
         for episode in range(n_episodes):
-            self._restart_one(episode)
+            kernels.restart(self._filters, episode)
 
     @property
     def states(self) -> FloatArray:
@@ -67,11 +66,4 @@ class CompiledFilter(BatchEstimator):
 
     def _restart(self, episodes: IntArray) -> None:
         for episode in episodes.tolist():
-            self._restart_one(episode)
-
-    def _restart_one(self, episode: int) -> None:
-        kernels.restart(self._filters, episode)
-
-    def _width(self, n_states: int) -> int:
-        """Return the length of a row of a covariance."""
-        return padded(n_states)
+            kernels.restart(self._filters, episode)

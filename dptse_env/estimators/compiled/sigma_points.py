@@ -22,7 +22,6 @@ class Points(NamedTuple):
     states: FloatArray
     centres: FloatArray  # (n, n_x) their weighted means, before any projection
     noise: FloatArray  # (n, n_x) variances of P beyond the points': the last step's process noise
-    coupling: FloatArray  # (n, S) covariances of each segment's rho and psi in that noise
     moved: BoolArray  # (n,) whether they were predicted since their last update
     scale: FloatArray  # (n_x,) units of the normalised components
     weight: float  # W of every point but the first

@@ -3,10 +3,9 @@
 import numpy as np
 
 from dptse_env.estimators.batch import Measurements
-from dptse_env.estimators.compiled import band_ukf, ukf_kernels
+from dptse_env.estimators.compiled import ukf_kernels
 from dptse_env.estimators.compiled.algebra import padded
-from dptse_env.estimators.compiled.band_filter import CompiledBandFilter
-from dptse_env.estimators.compiled.band_points import n_columns
+from dptse_env.estimators.compiled.kalman import CompiledFilter
 from dptse_env.estimators.compiled.sigma_points import Points
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
@@ -14,16 +13,13 @@ from dptse_env.utils.arrays import FloatArray, IntArray
 from dptse_env.utils.validation import require
 
 
-class CompiledUKF(CompiledBandFilter):
+class CompiledUKF(CompiledFilter):
     """Unscented Kalman filter on the ARZ model (Wan and van der Merwe, 2000), paper's weights.
 
     Points are made once per step, predicted and projected; mean, covariance and measurements are
     all computed from these points, without new ones for the update. The step's process noise is
     added to P after the prediction, so it affects the points of the next step. Means are also
     projected after predict and update.
-
-    With a `band` the root that makes the points is that of the states in their order along the
-    road, and each point differs from the mean on a stretch of it.
     """
 
     def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
@@ -31,14 +27,11 @@ class CompiledUKF(CompiledBandFilter):
         super().__init__(model, n_episodes, settings)
         n_states = model.n_states
         alpha, beta, kappa = settings.ukf.alpha, settings.ukf.beta, settings.ukf.kappa
-        require(n_states + kappa > 0.0, "estimator_settings.ukf.kappa", f"> -{n_states}", kappa)
-        n_points = 2 * n_states if self._band is None else 2 * n_columns(self._band)
         spread = alpha**2 * (n_states + kappa)
         self._points = Points(
-            states=np.zeros((n_episodes, n_states, padded(n_points + 1))),
+            states=np.zeros((n_episodes, n_states, padded(2 * n_states + 1))),
             centres=np.zeros((n_episodes, n_states)),
             noise=np.zeros((n_episodes, n_states)),
-            coupling=np.zeros((n_episodes, model.n_segments)),
             moved=np.zeros(n_episodes, dtype=np.bool_),
             scale=model.state_scale,
             weight=0.5 / spread,
@@ -47,19 +40,19 @@ class CompiledUKF(CompiledBandFilter):
         )
         self._points_packed = tuple(self._points)
 
+    @staticmethod
+    def check_settings(model: ARZModel, settings: EstimatorSettings) -> None:
+        """Refuse a kappa at or below minus the number of states, where points have no spread."""
+        n_states, kappa = model.n_states, settings.ukf.kappa
+        require(n_states + kappa > 0.0, "estimator_settings.ukf.kappa", f"> -{n_states}", kappa)
+
     def _predict(self, episodes: IntArray, inputs: FloatArray) -> None:
-        if self._band is None:
-            ukf_kernels.predict(*self._packed, self._points_packed, episodes, inputs)
-        else:
-            band_ukf.predict(*self._band_packed, self._points_packed, episodes, inputs)
+        ukf_kernels.predict(*self._packed, self._points_packed, episodes, inputs)
 
     def _update(self, measured: Measurements) -> None:
         episodes, observed, values, sigma, centre = measured
         points = self._points_packed
-        if self._band is None:
-            ukf_kernels.update(*self._packed, points, episodes, observed, values, sigma, centre)
-        else:
-            band_ukf.update(*self._band_packed, points, episodes, observed, values, sigma, centre)
+        ukf_kernels.update(*self._packed, points, episodes, observed, values, sigma, centre)
 
     def _restart(self, episodes: IntArray) -> None:
         self._points.moved[episodes] = False

@@ -11,12 +11,10 @@ import numpy as np
 
 from dptse_env.estimators.compiled.algebra import is_covariance, mirror
 from dptse_env.estimators.compiled.dense import eliminate
-from dptse_env.estimators.compiled.driver_noise import add_coupling, couple
 from dptse_env.estimators.compiled.ekf_kernels import (
     Filters,
     Packed,
     process_noise,
-    project,
     restart,
 )
 from dptse_env.estimators.compiled.sigma_points import Points, draw, gather
@@ -33,6 +31,7 @@ from dptse_env.model.columns import (
     project_states,
 )
 from dptse_env.model.network import RoadArrays
+from dptse_env.model.step import project
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.kernel_loops import all_finite, copy_matrix, copy_vector
 from dptse_env.utils.kernels import kernel, kernel_part
@@ -60,9 +59,6 @@ def predict(
         gather(points, e, distances, shift, covariance)
         copy_vector(points.centres[e], mean)
         project(road, mean, filters.is_box)
-        if filters.noise_in_w:
-            couple(road, filters.density_scale, mean, points.noise[e], points.coupling[e])
-            add_coupling(covariance, points.coupling[e])
         for i in range(n):
             covariance[i, i] += points.noise[e, i]
         points.moved[e] = True
@@ -121,7 +117,7 @@ def _stay(road: RoadArrays, filters: Filters, points: Points, e: int, work: Outp
     draw(points, e, filters.means[e], root)
     project_states(road, points.states[e], filters.is_box)
     gather(points, e, work.distances, work.shift, covariance)
-    points.noise[e], points.coupling[e] = 0.0, 0.0
+    points.noise[e] = 0.0
     return True
 
 

@@ -170,18 +170,16 @@ def _density_row(
 
     That is P less the step's process noise, which the points do not have.
     """
-    n, noise, coupling = covariance.shape[0], points.noise[e], points.coupling[e]
+    n, noise = covariance.shape[0], points.noise[e]
     for j in range(n):
         out[j] = covariance[2 * first, j]
     out[2 * first] -= noise[2 * first]
-    out[2 * first + 1] -= coupling[first]
     if span == 1:
         return
     for s in range(first + 1, first + span):
         for j in range(n):
             out[j] += covariance[2 * s, j]
         out[2 * s] -= noise[2 * s]
-        out[2 * s + 1] -= coupling[s]
     for j in range(n):
         out[j] /= span
 

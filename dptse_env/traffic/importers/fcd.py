@@ -16,7 +16,6 @@ import numpy as np
 from dptse_env.traffic.importers.formats import TableFormat
 from dptse_env.traffic.importers.points import (
     KMH,
-    UNNAMED,
     Labels,
     Points,
     TrajectoryError,
@@ -33,7 +32,7 @@ BLOCK_BYTES = 1 << 20
 _ON_EDGES = TableFormat(
     columns={
         "time": ("timestep_time",), "vehicle": ("vehicle_id",), "x": ("vehicle_pos",),
-        "speed": ("vehicle_speed",), "lane": ("vehicle_lane",), "vehicle_class": ("vehicle_type",),
+        "speed": ("vehicle_speed",), "lane": ("vehicle_lane",),
     },
     units={"time": "s", "length": "m", "speed": "m/s"},
     required=("time", "vehicle", "x", "speed", "lane"),
@@ -104,18 +103,17 @@ class _Collected:
         self.clear()
 
     def clear(self) -> None:
-        self.columns = [[] for _ in range(6 + len(self.places))]
+        self.columns = [[] for _ in range(5 + len(self.places))]
 
     def take(self, row: int, attributes: dict[str, str]) -> None:
         values = (attributes[name] for name in ("id", "lane", "speed", *self.places))
-        kind = attributes.get("type", UNNAMED)
-        for column, value in zip(self.columns, (row, self.time, kind, *values), strict=True):
+        for column, value in zip(self.columns, (row, self.time, *values), strict=True):
             column.append(value)
 
     def take_time(self, row: int, attributes: dict[str, str]) -> None:
         self.time = float(attributes["time"])
         empty = ("", "", "nan", *("nan" for _ in self.places))
-        for column, value in zip(self.columns, (row, self.time, "", *empty), strict=True):
+        for column, value in zip(self.columns, (row, self.time, *empty), strict=True):
             column.append(value)
 
 
@@ -154,7 +152,7 @@ def _read_xml(path: Path, places: tuple[str, ...]) -> Iterator[Points]:
 
 def _points(path: Path, collected: _Collected) -> Points:
     """Return the collected points, and forget them."""
-    row, time, kind, vehicle, lane, speed, *places = collected.columns
+    row, time, vehicle, lane, speed, *places = collected.columns
     names = collected.places
     collected.clear()
     rows = np.array(row, dtype=np.int64)
@@ -177,7 +175,6 @@ def _points(path: Path, collected: _Collected) -> Points:
         y=LENGTHS["m"] * numbers["y"] if "y" in names else None,
         speed=KMH * numbers["speed"],
         lane=lanes,
-        vehicle_class=_labels(kind),
     )
 
 

@@ -21,7 +21,7 @@ from dptse_env.traffic.importers.tables import Chunk, column_names, normalised, 
 from dptse_env.utils.arrays import BoolArray
 
 NUMBERS = ("time", "x", "y", "speed", "extent")
-LABELS = ("vehicle", "lane", "edge", "group", "vehicle_class")
+LABELS = ("vehicle", "lane", "edge", "group")
 
 
 @dataclass(frozen=True)
@@ -155,7 +155,7 @@ NGSIM_COLUMNS = (
 NGSIM = TableFormat(
     columns={
         "time": ("Global_Time",), "vehicle": ("Vehicle_ID",), "x": ("Local_Y",), "y": ("Local_X",),
-        "speed": ("v_Vel",), "lane": ("Lane_ID",), "vehicle_class": ("v_Class",),
+        "speed": ("v_Vel",), "lane": ("Lane_ID",),
     },
     units={"time": "ms", "length": "ft", "speed": "ft/s"},
     required=("time", "vehicle", "x", "y", "speed", "lane"),

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from dptse_env.traffic.branches import OFF, Road
 from dptse_env.traffic.corridor import Corridor
+from dptse_env.traffic.importers.branches import OFF, Road
 from dptse_env.traffic.importers.points import Labels, Points
 from dptse_env.traffic.importers.source import Layout, Part
 from dptse_env.traffic.sumo_network import edge_ids

@@ -15,9 +15,6 @@ from numpy.typing import NDArray
 from dptse_env.traffic.importers.source import Source
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 
-UNNAMED = "vehicle"
-"""Name of the class of vehicles whose class is not given."""
-
 KMH = 3.6
 """Factor from m/s to km/h."""
 
@@ -36,10 +33,6 @@ class Labels(NamedTuple):
 
     codes: NDArray[np.int32]
     names: tuple[str, ...]
-
-    def lookup(self, values: NDArray[np.generic]) -> NDArray[np.generic]:
-        """Return the value of each row, given that of each name."""
-        return values[self.codes]
 
     def mapped(self, function: Callable[[str], str]) -> Labels:
         """Return labels with other names."""
@@ -60,7 +53,6 @@ class Points:
         lane: Names of the lanes, or None.
         edge: Names of the edges of a network that `x` counts from the start of, or None.
         group: Names of separate roads in one file, such as driving directions, or None.
-        vehicle_class: Names of the classes of the vehicles, or None.
     """
 
     row: IntArray
@@ -72,7 +64,6 @@ class Points:
     lane: Labels | None = None
     edge: Labels | None = None
     group: Labels | None = None
-    vehicle_class: Labels | None = None
 
     def __len__(self) -> int:
         """Return the number of points."""

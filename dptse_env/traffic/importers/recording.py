@@ -4,22 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from dptse_env.traffic.branches import OFF
 from dptse_env.traffic.corridor import Corridor
-from dptse_env.traffic.detailed_record import DetailedRecord
+from dptse_env.traffic.importers.branches import OFF
 from dptse_env.traffic.importers.checks import Checks
 from dptse_env.traffic.importers.placing import Placer, part_in_words
-from dptse_env.traffic.importers.points import (
-    UNNAMED,
-    Format,
-    Labels,
-    Points,
-    TrajectoryError,
-)
+from dptse_env.traffic.importers.points import Format, Labels, Points, TrajectoryError
 from dptse_env.traffic.importers.resampling import (
     ROW,
     SECOND,
@@ -50,14 +42,12 @@ class Options:
         skip_start: Seconds left out at the start of each file.
         skip_end: Seconds left out at its end.
         pause: Seconds left out between two windows.
-        detailed: Whether records hold positions, lanes and classes, too.
     """
 
     longest_gap: float = 3.0
     skip_start: float = 0.0
     skip_end: float = 0.0
     pause: int = 0
-    detailed: bool = False
 
 
 @dataclass(frozen=True)
@@ -101,7 +91,6 @@ class Recording:
     groups: dict[str, int] = field(default_factory=dict)
     points: Rows = field(default_factory=lambda: np.empty(0, dtype=ROW))
     _vehicles: dict[tuple[int, str], int] = field(default_factory=dict)
-    _classes: dict[int, str] = field(default_factory=dict)
     _coverage: list[list[float]] = field(default_factory=list)
     _off_names: set[str] = field(default_factory=set)
     _stride: int = 1
@@ -140,34 +129,18 @@ class Recording:
         self.speed_ratio = self.checks.speed_ratio(self.path, self._unit)
 
     def record(self, window: Window) -> Record:
-        """Return the record of a window, which can be taken once.
-
-        It is a `DetailedRecord` if the options say so; classes are in alphabetical order.
-        """
+        """Return the record of a window, which can be taken once."""
         rows = self._seconds.take(window.number)
         step = rows["second"] - round(window.start - (self.base or 0.0))
         order = np.lexsort((rows["position"], rows["lane"], rows["column"], step))
         corridor = self.corridor
-        columns: dict[str, Any] = {
-            "step": step[order],
-            "vehicle": self._numbers(rows)[order].astype(np.int32),
-            "segment": rows["column"][order],
-            "speed": rows["speed"][order].astype(np.float32),
-            "n_steps": corridor.duration + 1,
-            "n_columns": corridor.n_segments + corridor.n_boundaries,
-        }
-        if not self.options.detailed:
-            return Record(**columns)
-        names = sorted(set(self._classes.values())) or [UNNAMED]
-        of_vehicle = np.array(
-            [names.index(self._classes.get(v, names[0])) for v in range(len(self._vehicles))]
-        )
-        return DetailedRecord(
-            **columns,
-            position=rows["position"][order].astype(np.float32),
-            lane=rows["lane"][order].astype(np.int16),
-            vehicle_class=of_vehicle[rows["vehicle"][order]].astype(np.int16),
-            classes=tuple(names),
+        return Record(
+            step=step[order],
+            vehicle=self._numbers(rows)[order].astype(np.int32),
+            segment=rows["column"][order],
+            speed=rows["speed"][order].astype(np.float32),
+            n_steps=corridor.duration + 1,
+            n_columns=corridor.n_segments + corridor.n_boundaries,
         )
 
     def _take(self, points: Points) -> Rows:
@@ -199,18 +172,8 @@ class Recording:
         rows["position"], rows["lane"] = placed.position[on], placed.lane[on]
         rows["branch"], rows["column"] = placed.branch[on], placed.column[on]
         rows["speed"] = np.nan if points.speed is None else points.speed[on]
-        rows["vehicle"] = vehicles = self._vehicle_codes(points.vehicle, group)[on]
-        if self.options.detailed:
-            self._remember_classes(points.vehicle_class, vehicles, on)
+        rows["vehicle"] = self._vehicle_codes(points.vehicle, group)[on]
         return rows
-
-    def _remember_classes(self, labels: Labels | None, vehicles: IntArray, on: BoolArray) -> None:
-        """Keep the class in which each vehicle appears first."""
-        found, first = np.unique(vehicles, return_index=True)
-        for vehicle, row in zip(found.tolist(), first.tolist(), strict=True):
-            if vehicle not in self._classes:
-                name = UNNAMED if labels is None else labels.names[labels.codes[on][row]]
-                self._classes[vehicle] = name
 
     def _group_codes(self, points: Points) -> IntArray:
         """Return the number of each point's group, or `OFF` if it is not wanted."""

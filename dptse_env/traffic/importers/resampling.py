@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dptse_env.traffic.branches import Road
+from dptse_env.traffic.importers.branches import Road
 from dptse_env.traffic.importers.checks import Checks
 from dptse_env.traffic.importers.points import TrajectoryError
 from dptse_env.traffic.importers.spill import Rows

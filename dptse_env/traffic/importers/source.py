@@ -23,7 +23,7 @@ SPEEDS = {"m/s": 3.6, "km/h": 1.0, "ft/s": 1.09728, "mi/h": 1.609344}
 """Units of speeds in km/h."""
 UNITS = {"time": TIMES, "length": LENGTHS, "speed": SPEEDS}
 
-ROLES = ("time", "vehicle", "x", "y", "speed", "lane", "edge", "group", "vehicle_class", "extent")
+ROLES = ("time", "vehicle", "x", "y", "speed", "lane", "edge", "group", "extent")
 """Roles of columns: see `dptse_env.traffic.importers.points.Points`; ``extent`` is the length of a
 vehicle along `x`, for data in which `x` is a corner of its box."""
 

@@ -3,7 +3,6 @@ import pytest
 from optuna.distributions import CategoricalDistribution, FloatDistribution
 
 from agents.search.space import (
-    DEMAND,
     DEMAND_START,
     SPACE,
     at_bound,
@@ -23,7 +22,7 @@ from dptse_env.estimators import (
     HorizonSettings,
     SigmaPointSettings,
 )
-from dptse_env.estimators.tuned_settings import available_settings, load_settings
+from dptse_env.estimators.settings import available_settings, load_settings
 from dptse_env.utils.fields import from_mapping
 
 
@@ -50,7 +49,6 @@ def test_the_search_holds_the_defaults_and_the_shipped_sets(estimator):
             estimator,
             with_noise_scale=has_demand,
             with_demand=has_demand,
-            band=settings.band,
         )
         values = values_of(settings, space)
         assert list(values) == list(space)
@@ -58,27 +56,17 @@ def test_the_search_holds_the_defaults_and_the_shipped_sets(estimator):
         assert from_mapping(EstimatorSettings, nested(values), "settings") == settings
 
 
-def test_repairs_are_searched_where_they_are_asked_for():
-    space = search_space("ekf", with_demand=True, with_repairs=True)
-    assert space["process_noise.1"].low == DEMAND["process_noise.1"].low
+def test_demand_states_and_the_speed_cap_are_searched_where_they_are_asked_for():
+    space = search_space("ekf", with_demand=True, with_speed_cap=True)
     settings = EstimatorSettings(
-        process_noise=(0.02, 0.3), process_noise_in="w", speed_cap=1.0, demand=DemandSettings(),
+        process_noise=(0.02, 0.03), speed_cap=1.0, demand=DemandSettings(),
         density_growth=0.01, count_noise=0.1,
     )  # fmt: skip
     for one in (settings, DEMAND_START):
         values = values_of(one, space)
         assert all(holds(knob, values[path]) for path, knob in space.items())
-    assert not any(path in search_space("ekf") for path in ("process_noise_in", "speed_cap"))
-    for name in ("mhe", "random_walk"):
-        added = {*search_space(name, with_repairs=True)} - {*search_space(name)}
-        assert added == {"speed_cap"}
-
-
-def test_a_band_is_that_of_all_trials():
-    (choice,) = search_space("ekf", band=10)["band"].choices
-    assert choice == 10
-    with pytest.raises(ValueError, match=r"^band must be left out for 'mhe', only ekf, ukf, blend"):
-        search_space("mhe", band=10)
+    for name in SPACE:
+        assert {*search_space(name, with_speed_cap=True)} - {*search_space(name)} == {"speed_cap"}
 
 
 def test_paths_become_nested_settings():

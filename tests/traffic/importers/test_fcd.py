@@ -6,17 +6,9 @@ import gzip
 import numpy as np
 import pytest
 
-from dptse_env.traffic import (
-    SHORT_HIGHWAY,
-    DetailedRecord,
-    Record,
-    RecordLibrary,
-    simulate,
-    sumo,
-)
+from dptse_env.traffic import SHORT_HIGHWAY, Record, RecordLibrary, simulate, sumo
 from dptse_env.traffic.importers import (
     Layout,
-    Options,
     Source,
     Split,
     TrajectoryError,
@@ -34,35 +26,30 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def recorded(folder):
-    """Record a seed with its details once for each kind of FCD file; return the record."""
+    """Record a seed once for each kind of FCD file; return the record."""
     options = sumo.OPTIONS
     try:
         for suffix in ("xml", "csv", "parquet"):
             output = "--fcd-output", str(folder / f"fcd.{suffix}"), "--precision", "17"
             sumo.OPTIONS = (*options, *output)
-            record = simulate(dataclasses.replace(SHORT_HIGHWAY, detailed=True), 3)
+            record = simulate(SHORT_HIGHWAY, 3)
     finally:
         sumo.OPTIONS = options
     (folder / "fcd.xml.gz").write_bytes(gzip.compress((folder / "fcd.xml").read_bytes()))
     return record
 
 
-def run(folder, name, tmp_path, source=Source("fcd"), **options):  # noqa: B008
-    return import_trajectories(
-        [folder / name], source, SHORT_HIGHWAY, tmp_path / "new", TRAINING, Options(**options)
-    )
+def run(folder, name, tmp_path, source=Source("fcd")):  # noqa: B008
+    return import_trajectories([folder / name], source, SHORT_HIGHWAY, tmp_path / "new", TRAINING)
 
 
 @pytest.mark.parametrize("suffix", ["xml.gz", "csv", "parquet"])
 def test_imported_fcd_is_the_record_number_for_number(suffix, folder, recorded, tmp_path):
-    imported = run(folder, f"fcd.{suffix}", tmp_path, detailed=True)
+    imported = run(folder, f"fcd.{suffix}", tmp_path)
     record = RecordLibrary(tmp_path).get(imported.corridor, 0)
-    assert isinstance(record, DetailedRecord)
-    for name in (*Record.COLUMNS, "lane", "vehicle_class"):
+    for name in Record.COLUMNS:
         np.testing.assert_array_equal(getattr(record, name), getattr(recorded, name))
-    np.testing.assert_allclose(record.position, recorded.position, atol=1e-6)
     assert (record.n_steps, record.n_columns) == (recorded.n_steps, recorded.n_columns)
-    assert record.classes == recorded.classes == ("car",)
 
 
 def cut(folder, name, size, tmp_path):

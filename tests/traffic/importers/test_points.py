@@ -57,34 +57,6 @@ def test_positions_and_speeds_are_interpolated_in_time(tmp_path):
     np.testing.assert_array_equal(record.segment, place // 100.0)
 
 
-def test_a_detailed_import_keeps_positions_lanes_and_classes(tmp_path):
-    points = stream(headway=4.0)
-    vehicle = points[:, 0].astype(int)
-    kind = np.where(vehicle % 3 == 0, "truck", "car")
-    path = plain(tmp_path / "a.csv", points, lane=2 + vehicle % 2, kind=kind)
-    columns = {**PLAIN.columns, "lane": "lane", "vehicle_class": "kind"}
-    source = dataclasses.replace(PLAIN, columns=columns)
-    record = record_of(run(path, source, detailed=True))
-    assert record.classes == ("car", "truck")
-    every_third = np.flatnonzero(record.class_of_vehicles() == 1)
-    assert set(np.diff(every_third).tolist()) == {3}
-    assert set(record.lane.tolist()) == {2, 3}
-    assert (np.diff(record.lane[np.argsort(record.vehicle, kind="stable")]) != 0).sum() > 5
-    lanes = [set(record.lane[record.vehicle == v].tolist()) for v in range(record.n_vehicles)]
-    assert all(len(each) <= 1 for each in lanes)
-    on_segment = record.position - 0.1 * record.segment
-    assert on_segment[record.segment < 4].min() >= 0.0
-    assert on_segment[record.segment < 4].max() <= 0.1
-    first = record.vehicle == record.vehicle[0]
-    np.testing.assert_allclose(np.diff(record.position[first]), 0.02, atol=1e-5)
-    # Nothing else changes.
-    folder = tmp_path / "plain"
-    folder.mkdir()
-    bare = record_of(run(path.rename(folder / "a.csv"), source))
-    for name in bare.COLUMNS:
-        np.testing.assert_array_equal(getattr(record, name), getattr(bare, name))
-
-
 def test_ramps_are_told_by_lanes_or_lateral_positions(tmp_path):
     def branch(vehicle, x):
         on, off = (vehicle % 3 == 1) & (x < 150), (vehicle % 3 == 2) & (x > 250)

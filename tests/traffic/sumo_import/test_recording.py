@@ -19,7 +19,6 @@ from dptse_env.traffic import (
     simulate,
     write_corridor,
 )
-from dptse_env.traffic.branches import Road
 from dptse_env.traffic.sumo import running, seconds
 from dptse_env.traffic.sumo_import import Files, find_layout, import_road
 from dptse_env.traffic.sumo_network import packaged_network
@@ -58,24 +57,6 @@ def test_every_vehicle_on_the_path_and_its_ramps_is_counted_once(road):
             counts.append(len(places))
     np.testing.assert_array_equal(road.record.counts.sum(axis=1), counts)
     assert max(counts) > 30
-
-
-def test_a_detailed_record_has_the_same_vehicles_with_their_places_and_types(road):
-    corridor = dataclasses.replace(road.corridor, detailed=True)
-    record = simulate(corridor, 0)
-    for name in road.record.COLUMNS:
-        np.testing.assert_array_equal(getattr(record, name), getattr(road.record, name))
-    start = Road(corridor).column_starts[1]
-    lengths = np.array(corridor.with_boundaries(corridor.segment_lengths))
-    along = record.position - start[record.segment]
-    assert along.min() >= -1e-6
-    assert np.all(along <= lengths[record.segment] + 1e-6)
-    types = set()
-    with running(corridor, draw_scenario(corridor, 0)) as libsumo:
-        for _ in seconds(libsumo, corridor, draw_scenario(corridor, 0)):
-            types |= {libsumo.vehicle.getTypeID(name) for name in libsumo.vehicle.getIDList()}
-    assert set(record.classes) == types
-    assert record.lane.min() == 0
 
 
 def test_vehicles_pass_from_segment_to_segment_without_gaps(road):

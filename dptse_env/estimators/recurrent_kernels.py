@@ -1,0 +1,392 @@
+"""The step of a recurrent network, compiled, for blocks of episodes: its inputs and its weights.
+
+A release is read as a Kalman filter would read it that takes the errors of different cells, and of
+density and speed, as independent. A row m of a measurement averages over its cells two numbers:
+densities rho, and y = rho (v - centre) where flows are released, or y = v where speeds are. The
+prediction of a cell has the variances P_rho, P_v and hence P_y. With the variance V_m of the row's
+innovation e_m, the measured less the predicted average, noise included, a cell's gain and
+correction are, over the rows that cover it,
+
+    K_ms = P_s / (span_m V_m)      d_s = sum_m K_ms e_m
+
+The network gets innovations over their deviations, corrections and gains. So the deviation of the
+noise, which ranges over three orders of magnitude between mechanisms and budgets, is weighed before
+the network sees a release.
+
+A gated recurrent unit (Cho et al., 2014) in every cell of a road, with the same weights, reads the
+cell's channels x and the sums u and d of the messages of the cells upstream and downstream: the
+first 16 numbers of their hidden states.
+
+    z = sigma(W_z [x, u, d] + b_z + V_z h + c_z)
+    r = sigma(W_r [x, u, d] + b_r + V_r h + c_r)
+    n = tanh(W_n [x, u, d] + b_n + r * (V_n h + c_n))
+    h <- z * h + (1 - z) * n
+
+Eight linear heads read h: density, speed and the logarithms of their deviations, for this second
+and for the next one before its release.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dptse_env.model import ARZModel
+from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+from dptse_env.utils.kernels import inline_part, kernel, kernel_part
+
+Float32Array = NDArray[np.float32]
+
+CHANNELS = (
+    "queried", "share", "log_density_sigma", "log_second_sigma", "predicted_density",
+    "predicted_speed", "log_density_deviation", "log_speed_deviation", "density_innovation",
+    "second_innovation", "density_correction", "density_correction_by_flow", "speed_correction",
+    "density_gain", "speed_gain", "slip", "flows", "log_age", "inflow", "outside_density",
+    "on_ramp", "off_ramp", "entry", "exit", "lanes", "log_length", "log_limit",
+)  # fmt: skip
+"""The inputs of the network for each cell."""
+N_CHANNELS = len(CHANNELS)
+
+LONGEST_AGE = 300.0
+"""Seconds since a measurement after which a cell counts as never measured."""
+LEAST_SIGMA, LARGEST_SIGMA = 0.1, 1e6
+"""Range of deviations whose logarithms the network sees [veh/km, km/h or veh/h]."""
+LEAST_VARIANCE = 1e-12
+LARGEST_INNOVATION = 6.0
+"""Largest innovation, in deviations, that the network sees."""
+LARGEST_CORRECTION = 2.0
+"""Largest correction that the network sees, in units of density or speed limits."""
+
+DENSITY_UNIT = 40.0
+"""Unit of densities [veh/km] for each lane, between free flow and a jam."""
+DENSITY_RANGE = 4.0
+"""Largest density that is estimated, in its unit: vehicles that stand, 6.25 m each."""
+SPEED_RANGE = 1.1
+"""Largest speed that is estimated, in speed limits."""
+
+N_FIXED = 7
+"""Numbers of a cell that never change."""
+
+N_HEADS = 8
+MESSAGE = 16
+"""Numbers of a hidden state that the cells next to it read, or all where there are fewer."""
+LOWEST_SPREAD, HIGHEST_SPREAD = -7.0, 0.5
+"""Range of the logarithms of reported deviations, in units of density and of the speed limit."""
+
+_ONE, _TWO, _HALF = np.float32(1.0), np.float32(2.0), np.float32(0.5)
+
+
+class Cells(NamedTuple):
+    """The cells of a road."""
+
+    edges: IntArray  # (E, 2) cells (from, to) between which vehicles pass
+    entries: IntArray  # (1 + I,) cells with inflow from outside
+    entry_inputs: IntArray  # (1 + I,) column of the model's inputs with the inflow [veh/h]
+    exits: IntArray  # (1 + O,) cells with outflow to outside
+    exit_inputs: IntArray  # (1 + O,) column of the model's inputs with the density there [veh/km]
+    exit_units: FloatArray  # (1 + O,) unit of that density [veh/km]
+    lanes: FloatArray  # (S,)
+    unit: FloatArray  # (S,) unit of densities [veh/km]
+    limit: float  # largest speed limit [km/h], the unit of speeds
+    flows: bool  # whether flows are released, otherwise speeds
+    row_first: IntArray  # (M,) first cell of each row of a measurement
+    row_span: IntArray  # (M,) number of cells of each row
+    fixed: FloatArray  # (S, N_FIXED) numbers that never change
+
+
+def make_cells(model: ARZModel) -> Cells:
+    """Return the cells of a model's road, and of the measurements that it may get."""
+    network, layout = model.network, model.layout
+    marks = np.zeros((layout.n_segments, 4))
+    for kind, ramps in enumerate((network.on_ramp_segments, network.off_ramp_segments)):
+        for segments in ramps:
+            marks[list(segments), kind] = 1.0
+    marks[layout.entries, 2] = 1.0
+    marks[layout.exits, 3] = 1.0
+    limits = np.array(network.speed_limits)
+    scales = np.stack([np.log(layout.lengths / 0.1), np.log(limits / 100.0)], axis=1)
+    return Cells(
+        edges=layout.edges,
+        entries=layout.entries,
+        entry_inputs=layout.entry_inputs,
+        exits=layout.exits,
+        exit_inputs=layout.exit_inputs,
+        exit_units=DENSITY_UNIT * layout.exit_lanes,
+        lanes=layout.lanes,
+        unit=DENSITY_UNIT * layout.lanes,
+        limit=float(limits.max()),
+        flows=model.reference_speed is not None,
+        row_first=model.rows.first,
+        row_span=model.rows.span,
+        fixed=np.concatenate([marks, layout.lanes[:, None] / 3.0, scales], axis=1),
+    )
+
+
+class Network(NamedTuple):
+    """Weights of a network of width H with C channels and messages of M numbers, float32."""
+
+    inputs: Float32Array  # W, (C + 2 M, 3 H)
+    inputs_bias: Float32Array  # b, (3 H,)
+    hidden: Float32Array  # V, (H, 3 H)
+    hidden_bias: Float32Array  # c, (3 H,)
+    heads: Float32Array  # (H, 8)
+    heads_bias: Float32Array  # (8,)
+
+    @property
+    def width(self) -> int:
+        """Width H of the hidden state."""
+        return len(self.hidden)
+
+
+def message_width(width: int) -> int:
+    """Return the numbers M of a message in a network of some width."""
+    return min(width, MESSAGE)
+
+
+def shapes(width: int) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of the weights of a network by name."""
+    n_inputs = N_CHANNELS + 2 * message_width(width)
+    return {
+        "inputs": (n_inputs, 3 * width),
+        "inputs_bias": (3 * width,),
+        "hidden": (width, 3 * width),
+        "hidden_bias": (3 * width,),
+        "heads": (width, N_HEADS),
+        "heads_bias": (N_HEADS,),
+    }
+
+
+@kernel
+def read(
+    cells: Cells,
+    episodes: IntArray,
+    observed: BoolArray,
+    values: FloatArray,
+    sigma: FloatArray,
+    centre: FloatArray,
+    inputs: FloatArray,
+    present: FloatArray,
+    age: FloatArray,
+    innovations: FloatArray,
+    x: Float32Array,
+) -> None:
+    """Write the channels of all cells, and innovations; count the age of measurements on.
+
+    Args:
+        cells: The road.
+        episodes: Shape (k,).
+        observed: Shape (k, M).
+        values: Shape (k, M, 2).
+        sigma: Shape (k, M, 2).
+        centre: Shape (k, S).
+        inputs: Inputs of the last prediction, shape (n, n_u).
+        present: Predictions and their deviations, shape (n, S, 4).
+        age: Seconds since the last measurement, shape (n, S), updated.
+        innovations: Shape (n, M, 2), updated.
+        x: Output, shape (k, S, C or more).
+    """
+    S = cells.lanes.size
+    sums, second = np.empty((S, 10)), np.empty((S, 4))
+    outside = np.empty((S, 2))
+    for i in range(episodes.size):
+        episode = episodes[i]
+        prior = present[episode]
+        sums[:], outside[:] = 0.0, 0.0
+        innovations[episode] = 0.0
+        for s in range(S):
+            _predict_second(cells.flows, centre[i, s], prior[s], second[s])
+        for m in range(cells.row_first.size):
+            if observed[i, m]:
+                first, span = cells.row_first[m], cells.row_span[m]
+                covered = slice(first, first + span)
+                _read_row(
+                    values[i, m], sigma[i, m], prior[covered], second[covered], sums[covered],
+                    innovations[episode, m],
+                )  # fmt: skip
+        for e in range(cells.entries.size):
+            s = cells.entries[e]
+            outside[s, 0] = inputs[episode, cells.entry_inputs[e]] / (2000.0 * cells.lanes[s])
+        for e in range(cells.exits.size):
+            outside[cells.exits[e], 1] = inputs[episode, cells.exit_inputs[e]] / cells.exit_units[e]
+        for s in range(S):
+            row = x[i, s]
+            _write(cells, s, prior[s], second[s], sums[s], age[episode, s], row)
+            row[18], row[19] = outside[s, 0], outside[s, 1]
+            for j in range(N_FIXED):
+                row[20 + j] = cells.fixed[s, j]
+            age[episode, s] = 0.0 if sums[s, 0] > 0.0 else age[episode, s] + 1.0
+
+
+@inline_part
+def _predict_second(flows: bool, centre: float, prior: FloatArray, second: FloatArray) -> None:
+    """Write the second number of a cell, its variance, and its derivatives by speed and density."""
+    rho, v = prior[0], prior[1]
+    by_speed, slip = (rho, v - centre) if flows else (1.0, 0.0)
+    second[0] = rho * slip if flows else v
+    second[1] = (by_speed * prior[3]) ** 2 + (slip * prior[2]) ** 2
+    second[2], second[3] = by_speed, slip
+
+
+@inline_part
+def _read_row(
+    values: FloatArray,
+    sigma: FloatArray,
+    prior: FloatArray,
+    second: FloatArray,
+    sums: FloatArray,
+    innovation: FloatArray,
+) -> None:
+    """Write the innovation of a row, and add what it says to the sums of the cells it covers."""
+    span = len(prior)
+    share = 1.0 / span
+    for j in range(2):
+        mean, variance = 0.0, 0.0
+        for s in range(span):
+            mean += prior[s, 0] if j == 0 else second[s, 0]
+            variance += prior[s, 2] ** 2 if j == 0 else second[s, 1]
+        variance = max(variance * share**2 + sigma[j] ** 2, LEAST_VARIANCE)
+        error = values[j] - mean * share
+        innovation[j] = error / np.sqrt(variance)
+        for s in range(span):
+            sums[s, 2 + j] += np.log(_held(sigma[j], LEAST_SIGMA, LARGEST_SIGMA))
+            sums[s, 4 + j] += innovation[j]
+            sums[s, 6 + j] += share / variance * error
+            sums[s, 8 + j] += share**2 / variance
+    for s in range(span):
+        sums[s, 0] += 1.0
+        sums[s, 1] += share
+
+
+@inline_part
+def _write(
+    cells: Cells,
+    s: int,
+    prior: FloatArray,
+    second: FloatArray,
+    sums: FloatArray,
+    age: float,
+    row: Float32Array,
+) -> None:
+    """Write the channels of a cell that `channels.read_rows` gives."""
+    unit, limit, flows = cells.unit[s], cells.limit, 1.0 if cells.flows else 0.0
+    by_speed, slip = second[2], second[3]
+    density_variance, speed_variance = prior[2] ** 2, prior[3] ** 2
+    count = sums[0]
+    queried, each = min(count, 1.0), 1.0 / max(count, 1.0)
+    log_unit = np.log(unit)
+    row[0], row[1] = queried, sums[1]
+    row[2] = 0.2 * (sums[2] * each - queried * log_unit)
+    row[3] = 0.2 * (sums[3] * each - queried * (flows * log_unit + np.log(limit)))
+    row[4], row[5] = prior[0] / unit, prior[1] / limit
+    row[6], row[7] = 0.25 * np.log(prior[2] / unit), 0.25 * np.log(prior[3] / limit)
+    for j in range(2):
+        row[8 + j] = 0.5 * _held(sums[4 + j], -LARGEST_INNOVATION, LARGEST_INNOVATION)
+    row[10] = 4.0 * _correction(density_variance * sums[6] / unit)
+    row[11] = 4.0 * _correction(slip * density_variance * sums[7] / unit)
+    row[12] = 4.0 * _correction(by_speed * speed_variance * sums[7] / limit)
+    row[13] = min(density_variance * sums[8], 1.0)
+    row[14] = min(by_speed**2 * speed_variance * sums[9], 1.0)
+    row[15], row[16] = slip / limit, flows
+    row[17] = 0.25 * np.log(1.0 + min(age, LONGEST_AGE))
+
+
+@inline_part
+def _correction(value: float) -> float:
+    held: float = _held(value, -LARGEST_CORRECTION, LARGEST_CORRECTION)
+    return held
+
+
+@kernel
+def advance(
+    cells: Cells,
+    network: Network,
+    episodes: IntArray,
+    x: Float32Array,
+    hidden: Float32Array,
+    present: FloatArray,
+    ahead: FloatArray,
+) -> None:
+    """Advance the hidden states, and write what the heads read from them.
+
+    Args:
+        cells: The road.
+        network: The weights.
+        episodes: Shape (k,).
+        x: Shape (k, S, C + 2 M): the channels, and space for sums of messages.
+        hidden: Hidden states, shape (n, S, H), updated.
+        present: Estimates and deviations of this second, shape (n, S, 4), updated.
+        ahead: Those of the next second before its release, shape (n, S, 4), updated.
+    """
+    S, H = cells.lanes.size, network.hidden.shape[0]
+    M = (network.inputs.shape[0] - N_CHANNELS) // 2
+    g, q = np.empty((S, 3 * H), dtype=np.float32), np.empty((S, 3 * H), dtype=np.float32)
+    raw = np.empty((S, network.heads.shape[1]), dtype=np.float32)
+    # One product for each episode: its bits then do not depend on the batch that it is in.
+    for i in range(episodes.size):
+        h = hidden[episodes[i]]
+        x[i, :, N_CHANNELS:] = 0.0
+        for e in range(cells.edges.shape[0]):
+            start, end = cells.edges[e, 0], cells.edges[e, 1]
+            for j in range(M):
+                x[i, end, N_CHANNELS + j] += h[start, j]
+                x[i, start, N_CHANNELS + M + j] += h[end, j]
+        np.dot(x[i], network.inputs, g)
+        np.dot(h, network.hidden, q)
+        for s in range(S):
+            _gate(g[s], q[s], network.inputs_bias, network.hidden_bias, h[s])
+        np.dot(h, network.heads, raw)
+        for s in range(S):
+            row = raw[s]
+            unit, limit = cells.unit[s], cells.limit
+            _read_heads(row[0:4], network.heads_bias[0:4], unit, limit, present[episodes[i], s])
+            _read_heads(row[4:8], network.heads_bias[4:8], unit, limit, ahead[episodes[i], s])
+
+
+@kernel_part(fastmath={"contract"})
+def _gate(
+    g: Float32Array, q: Float32Array, g_bias: Float32Array, q_bias: Float32Array, h: Float32Array
+) -> None:
+    """Move the hidden state of a cell."""
+    H = h.size
+    for j in range(H):
+        z = _HALF + _HALF * _tanh(_HALF * (g[j] + g_bias[j] + q[j] + q_bias[j]))
+        reset = g[H + j] + g_bias[H + j] + q[H + j] + q_bias[H + j]
+        r = _HALF + _HALF * _tanh(_HALF * reset)
+        memory = q[2 * H + j] + q_bias[2 * H + j]
+        candidate = _tanh(g[2 * H + j] + g_bias[2 * H + j] + r * memory)
+        h[j] = z * h[j] + (_ONE - z) * candidate
+
+
+@inline_part
+def _tanh(x: np.float32) -> np.float32:
+    """Return tanh to some 1e-7, as an expression that compiles to vector instructions.
+
+    Lambert's continued fraction at a quarter of the argument, and twice the formula of the double
+    argument.
+    """
+    y = np.float32(0.25) * min(max(x, np.float32(-9.0)), np.float32(9.0))
+    s = y * y
+    upper = np.float32(10395.0) + s * (np.float32(1260.0) + np.float32(21.0) * s)
+    lower = np.float32(10395.0) + s * (np.float32(4725.0) + s * (np.float32(210.0) + s))
+    t = y * upper / lower
+    t = _TWO * t / (_ONE + t * t)
+    return _TWO * t / (_ONE + t * t)
+
+
+@kernel_part
+def _read_heads(
+    raw: Float32Array, bias: Float32Array, unit: float, limit: float, out: FloatArray
+) -> None:
+    """Write density, speed and their deviations."""
+    out[0] = DENSITY_RANGE * unit * (0.5 + 0.5 * np.tanh(0.5 * float(raw[0] + bias[0])))
+    out[1] = SPEED_RANGE * limit * (0.5 + 0.5 * np.tanh(0.5 * float(raw[1] + bias[1])))
+    out[2] = unit * np.exp(_held(float(raw[2] + bias[2]), LOWEST_SPREAD, HIGHEST_SPREAD))
+    out[3] = limit * np.exp(_held(float(raw[3] + bias[3]), LOWEST_SPREAD, HIGHEST_SPREAD))
+
+
+@inline_part
+def _held(x: float, low: float, high: float) -> float:
+    held: float = min(max(x, low), high)
+    return held

@@ -1,0 +1,121 @@
+"""Fusion: what an estimator is told of answers of connected vehicles beside those of detectors.
+
+It comes ahead of the estimator and is alike for every estimator. It reads public numbers alone, the
+releases and the estimator's prediction, so that no guarantee depends on it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+
+from dptse_env.estimators import Estimate
+from dptse_env.model import MeasurementRows
+from dptse_env.model.parameters import SECONDS_PER_HOUR
+from dptse_env.release import MeasuredRows
+from dptse_env.utils.arrays import FloatArray
+from dptse_env.utils.fields import Interval, checked_fields
+
+LEAST_SPEED = 5.0
+"""Speed from which on the time on a segment does not grow any more [km/h]."""
+
+
+@dataclass(frozen=True)
+class FusionSettings:
+    """Settings by which answers of both kinds of sensors become measurements of all vehicles.
+
+    Attributes:
+        speed_spread: Standard deviation of the vehicles' speeds on a segment [km/h], for the
+            sampling error of speeds.
+        dwell_factor: Allowance for answers of a segment that have the same sampling error, since
+            the same vehicles are there: the variance of sampling is multiplied by this factor times
+            the seconds that a vehicle spends on the segment, where the product is more than one. It
+            suits `recurrent`, whose deviations are honest; filters on the ARZ model trust their
+            prediction too much, and err more where answers weigh less.
+
+    Raises:
+        ValueError: A value is out of range.
+    """
+
+    speed_spread: Annotated[float, Interval(0, 100)] = 12.0
+    dwell_factor: Annotated[float, Interval(0, 100)] = 0.0
+
+    def __post_init__(self) -> None:
+        """Check values."""
+        checked_fields(self, "fusion")
+
+
+@dataclass(frozen=True, eq=False)
+class Fusion:
+    """Turns answers of connected vehicles into measurements of all vehicles, with their errors.
+
+    A query counts n_c connected vehicles of n, of which every one is connected with probability p:
+    ``n_c / p`` estimates n with a variance of ``n (1 - p) / p`` beside the mechanism's. So it is
+    with the sum of ``v - c`` over them, whose variance is ``n (1 - p) / p`` times the mean of
+    ``(v - c)^2``. The mean speed of n_c of n vehicles has the variance ``s^2 (1/n_c - 1/n)``, with
+    s the spread of speeds. For n and the mean speed the estimator's prediction is taken, of one
+    vehicle at least.
+
+    Attributes:
+        settings: Its settings.
+        rows: The M rows of a measurement.
+        n_options: How many of them are queries, which come first.
+        lengths: Length of each row [km], shape (M,).
+        share: Published share p of connected vehicles.
+        limits: Speed limit of each row [km/h], shape (M,).
+        releases_flow: Whether flows are released, else mean speeds.
+    """
+
+    settings: FusionSettings
+    rows: MeasurementRows
+    n_options: int
+    lengths: FloatArray
+    share: float
+    limits: FloatArray
+    releases_flow: bool
+
+    def scaled(self, sigma: FloatArray) -> FloatArray:
+        """Return deviations (2,) of a query's noise, scaled to all vehicles."""
+        p = self.share
+        scaled: FloatArray = sigma * np.array([1.0 / p, 1.0 / p if self.releases_flow else 1.0])
+        return scaled
+
+    def read(self, measured: MeasuredRows, prediction: Estimate) -> MeasuredRows:
+        """Return the measurements of a second that the estimator is given.
+
+        Args:
+            measured: The released rows of k episodes.
+            prediction: The estimator's prediction for this second, rows of shape (k, S).
+        """
+        queries, weights, p = slice(0, self.n_options), self.rows.weights.T, self.share
+        length, spread = self.lengths[queries], self.settings.speed_spread
+        density = np.maximum(prediction.density @ weights, 0.0)[:, queries]
+        speed = (prediction.speed @ weights)[:, queries]
+        count, alike = np.maximum(density * length, 1.0), self._seconds_alike(speed, length)
+        sampling = alike * count * (1.0 - p) / p / length**2
+        values, sigma = measured.values.copy(), measured.sigma.copy()
+        values[:, queries, 0] /= p
+        sigma[:, queries, 0] = np.sqrt((sigma[:, queries, 0] / p) ** 2 + sampling)
+        if self.releases_flow:
+            offset = speed - (measured.centre @ weights)[:, queries]
+            square = offset**2 + spread**2
+            values[:, queries, 1] /= p
+            sigma[:, queries, 1] = np.sqrt((sigma[:, queries, 1] / p) ** 2 + sampling * square)
+        else:
+            answering = p * count
+            # Without a connected vehicle the speed limit is released.
+            none = np.exp(-answering) * (self.limits[queries] - speed) ** 2
+            sigma[:, queries, 1] = np.sqrt(
+                sigma[:, queries, 1] ** 2 + alike * (spread**2 * (1.0 - p) / answering + none)
+            )
+        return MeasuredRows(values, sigma, measured.centre)
+
+    def _seconds_alike(self, speed: FloatArray, length: FloatArray) -> FloatArray | float:
+        """Return the seconds for which answers count as one, shape (k, G), 1 at least."""
+        factor = self.settings.dwell_factor
+        if factor == 0.0:
+            return 1.0
+        dwell = SECONDS_PER_HOUR * length / np.maximum(speed, LEAST_SPEED)
+        return np.maximum(factor * dwell, 1.0)

@@ -1,0 +1,147 @@
+"""The model of many states at once beside the oracle, and beside `ARZModel`."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dptse_env.model import ARZModel, MeasurementRows
+from dptse_env.model.columns import (
+    advance_states,
+    make_batch_scratch,
+    measure_row,
+    measured_speeds,
+    project_states,
+)
+from dptse_env.model.step import project
+from tests.cases import pairwise
+from tests.estimators.parts import compiled
+
+from .oracle import Oracle
+from .roads import (
+    HIGHWAY,
+    PAPER,
+    ROADS,
+    UNEVEN,
+    W99,
+    random_inputs,
+    random_states,
+    scattered_states,
+)
+
+advance_states = compiled(advance_states)
+make_batch_scratch = compiled(make_batch_scratch)
+measured_speeds = compiled(measured_speeds)
+measure_row = compiled(measure_row)
+project = compiled(project)
+project_states = compiled(project_states)
+
+WIDTH = 104
+everywhere = pytest.mark.parametrize(
+    ("road", "parameters"), [(HIGHWAY, PAPER), (UNEVEN, W99)], ids=["highway", "uneven"]
+)
+
+
+def advanced(model, states, inputs):
+    columns = states.T.copy()
+    advance_states(model.road, columns, inputs, make_batch_scratch(model.road, len(states)))
+    return columns.T
+
+
+@pytest.mark.parametrize(
+    ("road", "parameters", "demand"), pairwise(ROADS, [PAPER, W99], [False, True])
+)
+def test_advances_as_the_oracle(road, parameters, demand):
+    model = ARZModel(ROADS[road], parameters, demand_states=demand)
+    oracle, rng, scale = (
+        Oracle(model.network, parameters),
+        np.random.default_rng(0),
+        model.state_scale,
+    )
+    for _ in range(50):
+        states, inputs = random_states(model, WIDTH, rng), random_inputs(model, 1, rng)
+        expected = oracle.step(states, np.repeat(inputs, WIDTH, axis=0))
+        actual = advanced(model, states, inputs[0])
+        np.testing.assert_allclose(actual / scale, expected / scale, atol=1e-12)
+
+
+@everywhere
+@pytest.mark.parametrize("bounds", ["cone", "box"])
+def test_kernels_project_one_state_and_many_as_the_model_does(road, parameters, bounds):
+    model, rng = ARZModel(road, parameters, demand_states=True), np.random.default_rng(0)
+    for _ in range(10):
+        states = scattered_states(model, WIDTH, rng)
+        columns, expected = states.T.copy(), model.project(states, bounds)
+        project_states(model.road, columns, bounds == "box")
+        assert (model.demand_factors(expected) != model.demand_factors(states)).any()
+        for state in states:
+            project(model.road, state, bounds == "box")
+        scale = model.state_scale
+        np.testing.assert_allclose(columns.T / scale, expected / scale, atol=1e-13)
+        np.testing.assert_allclose(states / scale, expected / scale, atol=1e-15)
+
+
+@everywhere
+@pytest.mark.parametrize("reference_speed", [None, 51.0])
+def test_a_row_of_many_states_is_what_the_model_measures(road, parameters, reference_speed):
+    """States with negative components among them, as those of members ahead of a projection."""
+    span = np.array([1, 1, 1] if reference_speed is None else [1, 2, 3])
+    n = len(road.segment_lengths)
+    rows = MeasurementRows(np.array([n - 1, 0, 2]), span, n)
+    model = ARZModel(road, parameters, reference_speed=reference_speed, rows=rows)
+    rng, width = np.random.default_rng(0), np.empty((3, WIDTH))
+    states = scattered_states(model, WIDTH, rng)
+    centre = rng.uniform(0.0, 100.0, n)
+    expected = model.measure(states, centre)
+    nowhere = np.full(n, np.nan)
+    for m in range(3):
+        given = nowhere if reference_speed is None else centre
+        measure_row(model.road, m, states.T.copy(), given, *width)
+        found = width[:2].T / model.measurement_scale
+        np.testing.assert_allclose(found, expected[:, m] / model.measurement_scale, atol=1e-9)
+    assert (states[:, 0::2] < 0.0).any()
+
+
+def test_measured_speeds_are_the_models():
+    model, rng = ARZModel(HIGHWAY, W99), np.random.default_rng(0)
+    states, out = scattered_states(model, WIDTH, rng), np.empty(WIDTH)
+    for s, jam in enumerate(model.jam_density):
+        rho, psi = states[:, 2 * s].copy(), states[:, 2 * s + 1].copy()
+        measured_speeds(rho, psi, jam, W99.free_flow_speed, W99.gamma, out)
+        np.testing.assert_allclose(out, model.traffic(states)[:, s, 1], rtol=1e-12, atol=1e-7)
+
+
+@everywhere
+def test_what_is_not_finite_stays_so_in_its_column(road, parameters):
+    model, rng = ARZModel(road, parameters), np.random.default_rng(0)
+    states, inputs = random_states(model, WIDTH, rng), random_inputs(model, 1, rng)[0]
+    clean, rows = advanced(model, states, inputs), np.arange(model.n_states)
+    states[rows, rows] = np.nan
+    after = advanced(model, states, inputs)
+    assert np.isnan(after[: rows.size]).any(axis=1).all()
+    np.testing.assert_array_equal(after[rows.size :], clean[rows.size :])
+    for is_box in (False, True):
+        columns = states.T.copy()
+        project_states(model.road, columns, is_box)
+        assert np.isnan(columns[rows, rows]).all()
+
+
+@everywhere
+def test_inputs_that_are_not_finite_reach_every_column(road, parameters):
+    """Demand, w, the density behind the exit, and an on-ramp's: NaN in, NaN out."""
+    model, rng = ARZModel(road, parameters), np.random.default_rng(0)
+    for column in range(5):
+        inputs = random_inputs(model, 1, rng)[0]
+        inputs[column] = np.nan
+        after = advanced(model, random_states(model, WIDTH, rng), inputs)
+        assert np.isnan(after).any(axis=1).mean() > 0.5
+
+
+def test_widths_that_are_no_whole_vector_agree():
+    model = ARZModel(HIGHWAY, replace(PAPER, name="other", gamma=1.7))
+    rng, scale = np.random.default_rng(0), model.state_scale
+    states, inputs = random_states(model, WIDTH, rng), random_inputs(model, 1, rng)[0]
+    whole = advanced(model, states, inputs)
+    for width in (1, 3, 7, 77):
+        part = advanced(model, states[:width], inputs)
+        np.testing.assert_allclose(part / scale, whole[:width] / scale, atol=1e-13)
