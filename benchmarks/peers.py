@@ -6,6 +6,8 @@ fifty times as much. Their noise is given as a matrix.
 
 from __future__ import annotations
 
+from dptse_env.estimators import Measurement
+
 from typing import Any
 
 import numpy as np
@@ -136,5 +138,5 @@ def ekf_states(
         if k % block == 0:
             starts[k] = ekf.states[0] / scale, ekf.covariances[0].copy()
         ekf.predict(episode, replay.inputs[k, :1])
-        ekf.update(episode, replay.observed[k, :1], replay.values[k, :1], replay.sigma)
+        ekf.update(episode, Measurement.of(ekf.model, replay.observed[k, :1], replay.values[k, :1], replay.sigma))
     return starts

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dptse_env.estimators import Measurement
+
 from collections.abc import Mapping
 from typing import Any, Protocol
 
@@ -48,7 +50,7 @@ class Steps:
         episodes, replay = self._episodes, self._replay
         for k in self._block:
             self._estimator.predict(episodes, replay.inputs[k])
-            self._estimator.update(episodes, replay.observed[k], replay.values[k], replay.sigma)
+            self._estimator.update(episodes, Measurement.of(self._estimator.model, replay.observed[k], replay.values[k], replay.sigma))
         return len(self._block) * len(episodes)
 
 

@@ -1,6 +1,6 @@
 """Traffic state estimators with a common protocol."""
 
-from dptse_env.estimators.base import Estimate, Estimator
+from dptse_env.estimators.base import Estimate, Estimator, Measurement
 from dptse_env.estimators.registry import (
     BACKENDS,
     ESTIMATORS,
@@ -30,6 +30,7 @@ __all__ = [
     "Estimator",
     "EstimatorSettings",
     "HorizonSettings",
+    "Measurement",
     "RecurrentSettings",
     "SigmaPointSettings",
     "check_demand",

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dptse_env.estimators import Measurement
+
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -141,7 +143,7 @@ def run(
     sigma = episodes.sigma if sigma is None else sigma
     for k in steps:
         estimator.predict(episodes.everyone, episodes.inputs[k])
-        estimator.update(episodes.everyone, episodes.observed[k], episodes.values[k], sigma)
+        estimator.update(episodes.everyone, Measurement.of(estimator.model, episodes.observed[k], episodes.values[k], sigma))
         watch(k)
 
 

@@ -56,4 +56,4 @@ def averaged(n_steps: int = N_STEPS) -> RowEpisodes:
 def update(estimator, episodes, k, observed=None):
     seen = episodes.observed[k] if observed is None else observed
     given = episodes.values[k], episodes.sigma[k], episodes.centre[k]
-    estimator.update(episodes.everyone, seen, *given)
+    estimator.update(episodes.everyone, Measurement.of(estimator.model, seen, *given))

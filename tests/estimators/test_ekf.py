@@ -1,5 +1,6 @@
 """Both backends of the extended Kalman filter, and each against the other."""
 
+from dptse_env.estimators import Measurement
 import numpy as np
 import pytest
 
@@ -65,7 +66,7 @@ def test_a_broken_covariance_is_found(backend, poison):
         kept[0, 20, 4] = kept[0, 4, 20] = 10.0
     else:
         kept[0, 20, 20] = poison
-    ekf.update(episodes.everyone, episodes.observed[4], episodes.values[4], SIGMA)
+    ekf.update(episodes.everyone, Measurement.of(ekf.model, episodes.observed[4], episodes.values[4], SIGMA))
     assert ekf.diverged.tolist() == [True]
     np.testing.assert_array_equal(ekf.covariances[0], 1e-3 * np.eye(38))
 
@@ -78,7 +79,7 @@ def update_of_a_nearly_empty_road(backend, filling):
     settings = EstimatorSettings(bounds="box")
     ekf = started("ekf", backend, episodes, settings, start)
     values = np.tile([0.4, 60.0], (1, 19, 1))
-    ekf.update(episodes.everyone, np.ones((1, 19), bool), values, SIGMA)
+    ekf.update(episodes.everyone, Measurement.of(ekf.model, np.ones((1, 19), bool), values, SIGMA))
     return ekf, ekf.estimate().density_std[0]
 
 

@@ -1,5 +1,6 @@
 """The ensemble Kalman filter's options, members and draws."""
 
+from dptse_env.estimators import Measurement
 import numpy as np
 import pytest
 
@@ -41,7 +42,7 @@ def test_inflation_waits_for_measurements_and_keeps_members_within_bounds():
     for k in range(10):
         for filters in (plain, wide):
             filters.predict(episodes.everyone, episodes.inputs[k])
-            filters.update(episodes.everyone, nothing, episodes.values[k], SIGMA)
+            filters.update(episodes.everyone, Measurement.of(filters.model, nothing, episodes.values[k], SIGMA))
     np.testing.assert_array_equal(plain.members, wide.members)
     run(wide, episodes, range(10, 20))
     members = wide.members[0]
@@ -55,7 +56,7 @@ def test_inflation_alone_scales_distances_from_the_mean():
         episodes, initial_variance=1e-8, bounds="box", enkf=EnsembleSettings(inflation=1.5)
     )
     before, covariances = filters.states, filters.covariances
-    filters.update(episodes.everyone, episodes.observed[0], episodes.values[0], 1e12 * SIGMA)
+    filters.update(episodes.everyone, Measurement.of(filters.model, episodes.observed[0], episodes.values[0], 1e12 * SIGMA))
     np.testing.assert_allclose(filters.states, before, rtol=1e-9)
     np.testing.assert_allclose(filters.covariances, 1.5**2 * covariances, rtol=1e-6)
 
@@ -68,7 +69,7 @@ def test_a_taper_keeps_measurements_from_acting_far_away(backend):
     filters.predict(episodes.everyone, episodes.inputs[19])
     before = filters.members.copy()
     only = np.arange(19)[None] == 5
-    filters.update(episodes.everyone, only, episodes.values[19], SIGMA)
+    filters.update(episodes.everyone, Measurement.of(filters.model, only, episodes.values[19], SIGMA))
     moved = np.abs(filters.members - before).max(axis=(0, 1)).reshape(19, 2).max(axis=1) > 1e-6
     # Segments of 0.1 km; face 6, where the first off-ramp leaves, is half of one away.
     near = [3, 4, 5, 6, 7, 17]
@@ -100,7 +101,7 @@ def test_a_member_that_is_not_finite_is_found_and_its_episode_drawn_anew(backend
         filters.members[1, 3, 4] = np.nan
     observed = episodes.observed[10] & measured
     for each in (filters, healthy):
-        each.update(episodes.everyone, observed, episodes.values[10], SIGMA)
+        each.update(episodes.everyone, Measurement.of(each.model, observed, episodes.values[10], SIGMA))
     assert filters.diverged.tolist() == [False, True, False]
     np.testing.assert_array_equal(filters.innovations[1], 0.0)
     np.testing.assert_allclose(filters.members[1].mean(axis=0), episodes.start[1], rtol=0.3)
@@ -119,7 +120,7 @@ def test_a_measurement_that_is_not_finite_is_not_projected_away(backend, bounds,
     filters.predict(episodes.everyone, episodes.inputs[0])
     values = episodes.values[0].copy()
     values[0, 14, 0] = bad
-    filters.update(episodes.everyone, np.arange(19)[None] == 14, values, SIGMA)
+    filters.update(episodes.everyone, Measurement.of(filters.model, np.arange(19)[None] == 14, values, SIGMA))
     assert filters.diverged.all()
     np.testing.assert_array_equal(filters.innovations, 0.0)
 
@@ -131,7 +132,7 @@ def test_outputs_that_are_known_exactly_and_twice_over_diverge(backend):
     filters = started(episodes, backend=backend, enkf=EnsembleSettings(n_members=4))
     filters.predict(episodes.everyone, episodes.inputs[0])
     everything = np.ones((1, 19), bool)
-    filters.update(episodes.everyone, everything, episodes.values[0], np.zeros(2))
+    filters.update(episodes.everyone, Measurement.of(filters.model, everything, episodes.values[0], np.zeros(2)))
     assert filters.diverged.all()
     assert np.isfinite(filters.members).all()
 
@@ -149,7 +150,7 @@ def test_seeds_differ_by_what_an_ensemble_leaves_open():
     for k in range(40):
         filters.predict(everyone, np.repeat(one.inputs[k], n, axis=0))
         observed, values = (np.repeat(a[k], n, axis=0) for a in (one.observed, one.values))
-        filters.update(everyone, observed, values, SIGMA)
+        filters.update(everyone, Measurement.of(filters.model, observed, values, SIGMA))
     estimate = filters.estimate()
     scatter, claimed = estimate.density.std(axis=0), estimate.density_std.mean(axis=0)
     assert (scatter > 0.02 * claimed).all()
@@ -164,7 +165,7 @@ def test_what_is_measured_does_not_change_how_members_are_disturbed(backend):
     for k in range(11):
         for filters, observed in ((seeing, episodes.observed[k]), (blind, nothing)):
             filters.predict(episodes.everyone, episodes.inputs[k])
-            filters.update(episodes.everyone, observed, episodes.values[k], SIGMA)
+            filters.update(episodes.everyone, Measurement.of(filters.model, observed, episodes.values[k], SIGMA))
     assert not np.array_equal(seeing.members, blind.members)
     for filters in (seeing, blind):  # from the same members
         if backend == "compiled":

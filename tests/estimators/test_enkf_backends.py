@@ -1,5 +1,6 @@
 """Both backends of the ensemble Kalman filter, each against the other."""
 
+from dptse_env.estimators import Measurement
 import numpy as np
 import pytest
 
@@ -60,7 +61,7 @@ def test_backends_are_equal_in_distribution():
         for k in range(10):
             filters.predict(everyone, np.repeat(one.inputs[k], n, axis=0))
             observed, values = (np.repeat(a[k], n, axis=0) for a in (one.observed, one.values))
-            filters.update(everyone, observed, values, SIGMA)
+            filters.update(everyone, Measurement.of(filters.model, observed, values, SIGMA))
             if k in (0, 4, 9):
                 estimate = filters.estimate()
                 drawn[backend].append([getattr(estimate, field) for field in FIELDS])

@@ -1,5 +1,6 @@
 """The ensemble Kalman filter against the Kalman filter where all is linear, by statistics."""
 
+from dptse_env.estimators import Measurement
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -47,7 +48,7 @@ def run_linear(system, backend, n_members, n_seeds):
     for z in system.z:
         filters.predict(everyone, np.tile(system.inputs, (n_seeds, 1)))
         values = np.broadcast_to(z, (n_seeds, 1, 2))
-        filters.update(everyone, np.ones((n_seeds, 1), bool), values, system.sigma)
+        filters.update(everyone, Measurement.of(filters.model, np.ones((n_seeds, 1), bool), values, system.sigma))
     return filters
 
 

@@ -1,5 +1,6 @@
 """The moving horizon estimator beside the reference, and what it leaves to other solvers."""
 
+from dptse_env.estimators import Measurement
 from dataclasses import replace
 
 import numpy as np
@@ -141,7 +142,7 @@ def test_a_road_of_segments_of_many_kinds_is_estimated_alike():
         for mhe in both:
             for _ in range(1 + k % 2):
                 mhe.predict(one, inputs)
-            mhe.update(one, observed, values, SIGMAS["speed"])
+            mhe.update(one, Measurement.of(mhe.model, observed, values, SIGMAS["speed"]))
         agree(*both, 1e-8)
 
 
@@ -229,7 +230,7 @@ def test_what_is_not_solved_leaves_the_prediction_and_a_flag(backend, solver, mo
     monkeypatch.setattr(mhe_module, "update", unsolved)
     mhe.predict(episodes.everyone, episodes.inputs[8])
     predicted = mhe.states
-    mhe.update(episodes.everyone, episodes.observed[8], episodes.values[8], SIGMA)
+    mhe.update(episodes.everyone, Measurement.of(mhe.model, episodes.observed[8], episodes.values[8], SIGMA))
     assert mhe.fallback.tolist() == [True, True]
     assert mhe.diverged.tolist() == [False, False]
     np.testing.assert_array_equal(mhe.states, predicted)

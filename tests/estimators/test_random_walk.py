@@ -68,7 +68,7 @@ def test_a_flow_of_a_segment_found_empty_is_read_at_the_least_density():
     prior = walk.estimate()
     assert (prior.density == 0.0).all()
     values = np.tile([-500.0, 20.0], (1, 19, 1))  # the density stays at zero
-    walk.update(episodes.everyone, np.ones((1, 19), bool), values, episodes.sigma)
+    walk.update(episodes.everyone, Measurement.of(walk.model, np.ones((1, 19), bool), values, episodes.sigma))
     estimate = walk.estimate()
     np.testing.assert_array_equal(estimate.density, 0.0)
     floor = 0.01 * episodes.model.jam_density
@@ -89,7 +89,7 @@ def test_noiseless_measurements_of_a_certain_state_are_no_division_by_zero(relea
     everywhere = np.ones((1, 19), bool)
     for _ in range(2):
         walk.predict(episodes.everyone, episodes.inputs[0])
-        walk.update(episodes.everyone, everywhere, np.full((1, 19, 2), 20.0), np.zeros(2))
+        walk.update(episodes.everyone, Measurement.of(walk.model, everywhere, np.full((1, 19, 2), 20.0), np.zeros(2)))
     np.testing.assert_allclose(walk.estimate().density, 20.0)
     speed = 20.0 if release == "speed" else REFERENCE_SPEED + 20.0 / 20.0
     np.testing.assert_allclose(walk.estimate().speed, speed)
@@ -110,10 +110,10 @@ def test_no_infinity_is_clipped_into_bounds(release, bad, which):
         seen = np.ones((2, 19), bool)
         if exact:
             values = np.full((2, 19, 2), 20.0)
-            walk.update(episodes.everyone, seen, values, np.zeros(2))
+            walk.update(episodes.everyone, Measurement.of(walk.model, seen, values, np.zeros(2)))
         values = episodes.values[1].copy()
         values[1, 14, which] = bad
-        walk.update(episodes.everyone, seen, values, episodes.sigma)
+        walk.update(episodes.everyone, Measurement.of(walk.model, seen, values, episodes.sigma))
         assert walk.diverged.tolist() == [False, True]
         estimate = walk.estimate()
         for field in ("density", "speed", "density_std", "speed_std"):
@@ -136,7 +136,7 @@ def test_a_row_of_one_segment_is_read_alike_wherever_it_stands(release):
         for each, at in ((walk, np.arange(n)), (other, order)):
             each.predict(plain.everyone, plain.inputs[k])
             values, observed = plain.values[k][:, at], plain.observed[k][:, at]
-            each.update(plain.everyone, observed, values, plain.sigma)
+            each.update(plain.everyone, Measurement.of(each.model, observed, values, plain.sigma))
         np.testing.assert_allclose(other.means, walk.means, rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(other.variances, walk.variances, rtol=1e-9)
         np.testing.assert_allclose(other.innovations, walk.innovations[:, order], atol=1e-9)
@@ -176,7 +176,7 @@ def test_a_sum_that_is_not_finite_resets_the_episode():
     values = episodes.values[0].copy()
     values[0, -1, 1] = np.nan
     args = episodes.sigma[0], episodes.centre[0]
-    walk.update(episodes.everyone, np.ones_like(episodes.observed[0]), values, *args)
+    walk.update(episodes.everyone, Measurement.of(walk.model, np.ones_like(episodes.observed[0]), values, *args))
     assert walk.diverged[0]
     np.testing.assert_array_equal(walk.means, walk._prior)
     assert np.all(walk.innovations == 0.0)

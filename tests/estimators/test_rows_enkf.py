@@ -85,7 +85,7 @@ def take(filters, episodes, k):
     everyone = np.arange(len(episodes.start))
     filters.predict(everyone, episodes.inputs[k])
     parts = (episodes.observed, episodes.values, episodes.sigma, episodes.centre)
-    filters.update(everyone, *(part[k] for part in parts))
+    filters.update(everyone, Measurement.of(filters.model, *(part[k] for part in parts)))
 
 
 # Backends -----------------------------------------------------------------------------------------
@@ -229,7 +229,7 @@ def test_single_rows_among_others_that_nobody_measures_change_nothing(backend, t
     everyone = np.arange(2)
     for k in range(12):
         default.predict(everyone, alone.inputs[k])
-        default.update(everyone, alone.observed[k], alone.values[k], np.array([5.0, 250.0]))
+        default.update(everyone, Measurement.of(default.model, alone.observed[k], alone.values[k], np.array([5.0, 250.0])))
         for filters, episodes in zip(others, (alone, among), strict=True):
             take(filters, episodes, k)
             np.testing.assert_array_equal(filters.members, default.members)
@@ -260,7 +260,7 @@ def test_a_tapered_row_acts_near_any_of_its_segments_and_on_the_factor_of_a_near
     filters.predict(everyone, episodes.inputs[9])
     before = filters.members.copy()
     only = np.repeat(np.arange(len(ROWS[0]))[None] == 2, 5, axis=0)  # segments 1, 2 and 3
-    filters.update(everyone, only, episodes.values[9], episodes.sigma[9], episodes.centre[9])
+    filters.update(everyone, Measurement.of(filters.model, only, episodes.values[9], episodes.sigma[9], episodes.centre[9]))
     moved = np.abs(filters.members - before).max(axis=(0, 1)) > 1e-6
     near, factors = moved[:38].reshape(19, 2).any(axis=1), moved[38:]
     x = segment_positions(PAPER_HIGHWAY)
