@@ -90,6 +90,21 @@ def compare(
     return errors
 
 
+def nearest(shipped: list[ARZParameters], errors: dict[str, PredictionError]) -> str | None:
+    """Return the name of the shipped set that predicts best; None without any on this road.
+
+    Estimators with the fitted set take its tuned settings: process noise stands for the errors of
+    predictions.
+    """
+
+    def error(parameters: ARZParameters) -> float:
+        found, reference = errors[parameters.name], errors["persistence"]
+        density = np.divide(found.density, reference.density)
+        return float(np.mean([density, np.divide(found.speed, reference.speed)]))
+
+    return min(shipped, key=error).name if shipped else None
+
+
 def print_errors(errors: dict[str, PredictionError], title: str) -> None:
     """Print density and speed errors by horizon."""
     horizons = next(iter(errors.values())).horizons
@@ -119,8 +134,10 @@ def main(args: Args) -> None:
         corridor, load_series(corridor, train, library), args.name,
         max_evaluations=args.max_evaluations,
     )  # fmt: skip
-    candidates = [*shipped_parameters(corridor), fit.parameters]
+    shipped = shipped_parameters(corridor)
+    candidates = [*shipped, fit.parameters]
     errors = compare(corridor, candidates, load_series(corridor, held_out, library))
+    fitted = dataclasses.replace(fit.parameters, derived_from=nearest(shipped, errors))
     provenance = {
         "corridor": corridor.name,
         "train": args.train,
@@ -135,12 +152,12 @@ def main(args: Args) -> None:
     }
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as temporary:
-        write_parameters(temporary, fit.parameters, provenance)
+        write_parameters(temporary, fitted, provenance)
     if args.json:
         print(path.read_text(encoding="utf-8"), end="")
         return
     print_errors(errors, f"{corridor.name}, held-out seeds {args.held_out}")
-    print(f"fitted: {fit.parameters}")
+    print(f"fitted: {fitted}")
     if fit.at_bounds:
         print(f"at the bounds of the search: {', '.join(fit.at_bounds)}")
     print(f"mean time on a mainline segment: {dwell:.2f} s")

@@ -14,7 +14,7 @@ from dptse_env.config import (
     resolve,
 )
 from dptse_env.estimators import EstimatorSettings, HorizonSettings
-from dptse_env.estimators.tuned_settings import available_settings, load_settings
+from dptse_env.estimators.settings import available_settings, load_settings
 from dptse_env.parts import flow_centre, make_release, privacy_report, warn_where_void
 from dptse_env.release import CappedSettings, PrivacySettings
 from dptse_env.traffic import PAPER_HIGHWAY, SHORT_HIGHWAY, DemandDistribution, IncidentDistribution
@@ -65,9 +65,6 @@ def test_tuned_settings_are_found_by_estimator_parameters_and_privacy():
         known = name in available_settings()
         assert settings == (load_settings(name) if known else EstimatorSettings())
     assert "ekf-w99-3lane-paper" in available_settings()
-    own = {"name": "mine", "free_flow_speed": 100.0, "jam_density": 350.0, "gamma": 1.0,
-           "relaxation_time": 40.0}  # fmt: skip
-    assert resolve("paper-highway", {"parameters": own}).settings() == EstimatorSettings()
 
 
 @pytest.mark.parametrize("estimator", ["random_walk", "open_loop", "recurrent"])

@@ -5,10 +5,9 @@ import pytest
 import dptse_env
 from dptse_env.evaluation import evaluate
 from dptse_env.schedules import (
-    COVARIANCE_SCHEDULES,
-    DEVIATION_SCHEDULES,
     OBSERVATION_SCHEDULES,
     ORACLES,
+    PROCESS_SCHEDULES,
     make_schedule,
 )
 from dptse_env.spaces.actions import ACTION_ENCODINGS
@@ -86,7 +85,7 @@ def assert_same(batch, singles):
     assert len({row["rmse_density"] for row in batch}) == len(batch)
 
 
-SCHEDULES = [*OBSERVATION_SCHEDULES, *DEVIATION_SCHEDULES, *COVARIANCE_SCHEDULES, *ORACLES]
+SCHEDULES = [*OBSERVATION_SCHEDULES, *PROCESS_SCHEDULES, *ORACLES]
 FAST = ("paper", "speed-front", "greedy-trace", "oracle-error")
 
 

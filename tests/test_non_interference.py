@@ -18,10 +18,9 @@ from dptse_env.process import TRUTH_INFO
 from dptse_env.release.boundary import NominalBoundary
 from dptse_env.release.noise import NoiseStreams
 from dptse_env.schedules import (
-    COVARIANCE_SCHEDULES,
-    DEVIATION_SCHEDULES,
     OBSERVATION_SCHEDULES,
     ORACLES,
+    PROCESS_SCHEDULES,
     make_schedule,
 )
 from dptse_env.spaces.actions import ACTION_ENCODINGS
@@ -29,9 +28,7 @@ from tests.cases import fast_and_slow
 
 SEEDS = (0, 1)
 START, STEPS = 250, 30
-BLIND_SCHEDULES = sorted(
-    {*OBSERVATION_SCHEDULES, *DEVIATION_SCHEDULES, *COVARIANCE_SCHEDULES} - {"all"}
-)
+BLIND_SCHEDULES = sorted({*OBSERVATION_SCHEDULES, *PROCESS_SCHEDULES} - {"all"})
 
 
 class ConstantMechanism(NoiseStreams):

@@ -10,7 +10,7 @@ import pytest
 
 from dptse_env.estimators import ESTIMATORS, EstimatorSettings
 from dptse_env.estimators.noise import count_variance
-from dptse_env.estimators.tuned_settings import write_settings
+from dptse_env.estimators.settings import load_settings, write_settings
 from dptse_env.model import ARZModel, load_parameters
 from dptse_env.release import RELEASE_MODELS
 from dptse_env.schedules import make_schedule
@@ -122,6 +122,39 @@ def test_a_reset_names_what_is_not_of_the_road(tmp_path):
         "corridor.average_dwell", "parameters", "estimator_settings",
     }  # fmt: skip
     assert json.dumps(info["inherited"])
+
+
+MINE = {
+    "name": "mine", "free_flow_speed": 130.0, "jam_density": 380.0, "gamma": 0.5,
+    "relaxation_time": 40.0,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("keywords", "name"),
+    [
+        ({}, "ekf-w99-3lane-paced"),
+        ({"estimator": "random_walk", "privacy": "paper"}, "random_walk-w99-3lane-paper"),
+        ({"derived_from": "paper", "privacy": "corrected"}, "ekf-paper-corrected"),
+    ],
+)
+def test_parameters_of_ones_own_keep_the_settings_of_those_they_come_from(keywords, name):
+    mine = {**MINE, "derived_from": keywords.pop("derived_from", None)}
+    with pytest.warns(UserWarning, match="^estimator_settings: .*or with other parameters"):
+        env = gym.make(ID, parameters=mine, traffic_seeds=[0], **keywords)
+    assert env.unwrapped.config.settings() == load_settings(name)
+    assert env.reset(seed=0)[1]["inherited"] == ["estimator_settings"]
+
+
+def test_parameters_of_ones_own_warn_of_nothing_where_settings_are_given_or_none_ship():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        given = gym.make(ID, parameters=MINE, estimator_settings={"count_noise": 0.5})
+        gym.make(ID, parameters=MINE, estimator="open_loop")
+    tuned = load_settings("ekf-w99-3lane-paced")
+    assert given.unwrapped.config.settings() == dataclasses.replace(tuned, count_noise=0.5)
+    with pytest.raises(ValueError, match="derived_from must be one of paper, w99-3lane, got 'x'"):
+        gym.make(ID, parameters={**MINE, "derived_from": "x"})
 
 
 def test_settings_of_a_road_hold_for_the_estimator_that_they_were_tuned_for(tmp_path):

@@ -28,8 +28,8 @@ from agents.files import first_difference, replacing
 from agents.search.space import DEMAND_START, at_bound, holds, nested, rounded, values_of
 from agents.search.tuning_task import TuningTask, score_episodes
 from dptse_env.estimators import EstimatorSettings
-from dptse_env.estimators.tuned_settings import write_settings
-from dptse_env.evaluation import WARM_UP, Row
+from dptse_env.estimators.settings import write_settings
+from dptse_env.evaluation import Row
 from dptse_env.utils.fields import from_mapping
 
 _FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
@@ -213,7 +213,7 @@ class TuningStudy:
         Raises:
             ValueError: No trial ran to its end.
         """
-        best, defaults = self.best(), self.labelled("defaults")
+        best = self.best()
         if best is None:
             raise ValueError(f"{self.task.name}: no trial ran to its end with a finite score")
         with replacing(path) as temporary:
@@ -223,36 +223,29 @@ class TuningStudy:
                 parameters=self.task.parameters_name,
                 privacy=self.task.privacy,
                 settings=best.user_attrs["settings"],
-                provenance=self._provenance(best, defaults),
+                provenance=self._provenance(best),
                 variant=self.task.variant,
             )
 
-    def _provenance(self, best: FrozenTrial, defaults: FrozenTrial | None) -> dict[str, Any]:
+    def _provenance(self, best: FrozenTrial) -> dict[str, Any]:
         task, config = self.task, self.task.config()
         settings = from_mapping(EstimatorSettings, best.user_attrs["settings"], "settings")
         values = values_of(settings, self.space)
-        trials = self.study.get_trials(deepcopy=False, states=(TrialState.PRUNED,))
-        packages = ("dptse-env", "libsumo", "numba", "numpy", "optuna")
         return {
-            "method": "tree-structured Parzen estimator on the mean reward of a second",
             "corridor": config.corridor.name,
             "schedule": task.schedule,
             "bandwidth": config.bandwidth,
             "epsilon": config.privacy.epsilon,
             "delta": config.privacy.delta,
             "seeds": task.seeds,
-            "noise_seed": task.noise_seed,
-            "sampler_seed": self.seed,
-            "warm_up": WARM_UP,
             "n_trials": self.n_finished(),
-            "n_stopped_early": len(trials),
-            **scores_of(best),
-            "defaults": None if defaults is None else scores_of(defaults),
+            "rmse_density": round(best.user_attrs["rmse_density"], 2),
+            "rmse_speed": round(best.user_attrs["rmse_speed"], 2),
             "at_bounds": [
                 path for path, knob in self.space.items() if at_bound(knob, values[path])
             ],
             "date": date.today().isoformat(),
-            "versions": {name: version(name) for name in packages},
+            "version": version("dptse-env"),
         }
 
 

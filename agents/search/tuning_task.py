@@ -20,7 +20,7 @@ from agents.search.space import Knob, search_space
 from agents.seeds import TUNING
 from dptse_env.config import TRAINING_SEEDS, EnvConfig, parse_seeds
 from dptse_env.estimators import EstimatorSettings
-from dptse_env.estimators.tuned_settings import settings_name
+from dptse_env.estimators.settings import settings_name
 from dptse_env.evaluation import WARM_UP, Row
 from dptse_env.model import ARZParameters
 from dptse_env.traffic import Records
@@ -107,8 +107,7 @@ class TuningTask:
     @property
     def name(self) -> str:
         """Name of the set."""
-        name = settings_name(self.estimator, self.parameters_name, self.privacy)
-        return f"{name}-{self.variant}" if self.variant else name
+        return settings_name(self.estimator, self.parameters_name, self.privacy, self.variant)
 
     def cell(self, settings: EstimatorSettings | None = None) -> Cell:
         """Return what a trial plays; the environment's default settings if None."""

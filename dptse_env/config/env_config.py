@@ -11,12 +11,7 @@ from functools import cached_property
 from typing import Annotated, Any
 
 from dptse_env.estimators import check_demand, check_estimator, settings_type
-from dptse_env.estimators.tuned_settings import (
-    available_settings,
-    known_settings,
-    load_settings,
-    settings_name,
-)
+from dptse_env.estimators.settings import load_settings, tuned_settings
 from dptse_env.fusion import FusionSettings
 from dptse_env.model import ARZParameters, available_parameters, load_parameters
 from dptse_env.release import (
@@ -64,9 +59,10 @@ class EnvConfig:
         backend: ``compiled`` or ``reference``.
         parameters: ARZ parameters, or the name of a set.
         estimator_settings: Tuning of the estimator, or the name of a shipped set
-            (`dptse_env.estimators.tuned_settings`), whichever estimator it was tuned for. None for
-            the set ``<estimator>-<ARZ parameters>-<privacy preset>-<corridor>``, or that without
-            the corridor's name, if one ships, else the estimator's defaults.
+            (`dptse_env.estimators.settings`), whichever estimator it was tuned for. None for the
+            set ``<estimator>-<ARZ parameters>-<privacy preset>-<corridor>``, or that without the
+            corridor's name, if one ships, else the estimator's defaults. Parameters of one's own
+            take those of the shipped ones that they were derived from.
         bandwidth: Largest total cost of the queries of a step, in ``bandwidth_unit``; by default a
             number of mainline segments.
         query_spans: Numbers of neighbouring mainline segments that one query may cover, ascending.
@@ -92,8 +88,8 @@ class EnvConfig:
         traffic_seeds: Traffic seeds to draw episodes from; on a road with recordings `resolve` puts
             the recorded training seeds in place of this default.
         truth_in_info: Whether ``info`` shows the true traffic.
-        inherited: Keywords whose values were measured or tuned on another road than this one, and
-            that nobody gave; filled in by `resolve`.
+        inherited: Keywords whose values were measured or tuned on another road than this one, or
+            with other ARZ parameters, and that nobody gave; filled in by `resolve`.
 
     Raises:
         ValueError: A value is out of range, or the parameters violate the CFL condition.
@@ -209,7 +205,7 @@ class EnvConfig:
     def _check_settings(self) -> None:
         settings, expected = self.estimator_settings, settings_type(self.estimator)
         if isinstance(settings, str):
-            known_settings(settings)
+            load_settings(settings)
         elif settings is not None and not isinstance(settings, expected):
             raise ValueError(
                 f"estimator_settings must be a mapping, the name of a set, or a "
@@ -251,13 +247,9 @@ class EnvConfig:
         given = self.estimator_settings
         if given is not None:
             return given if isinstance(given, str) else None
-        if not isinstance(self.estimator, str) or not isinstance(self.privacy.preset, str):
-            return None
-        name = settings_name(self.estimator, self.arz_parameters.name, self.privacy.preset)
-        for_road = f"{name}-{self.corridor.name}"
-        if self.corridor.name in CORRIDORS and for_road in available_settings():
-            return for_road
-        return name if name in available_settings() else None
+        # A road of one's own takes no variant that happens to have its name.
+        road = self.corridor.name if self.corridor.name in CORRIDORS else ""
+        return tuned_settings(self.estimator, self.arz_parameters, self.privacy.preset, road)
 
     def settings(self) -> Any:
         """Return the estimator's settings in force, of its settings' type."""

@@ -9,7 +9,7 @@ from typing import Any
 
 from dptse_env.config.env_config import MOST_SEEDS, PRESETS, TRAINING_SEEDS, EnvConfig
 from dptse_env.estimators import ESTIMATORS, settings_type
-from dptse_env.estimators.tuned_settings import read_settings, tuned_estimator
+from dptse_env.estimators.settings import read_settings, tuned_estimator, tuned_with
 from dptse_env.model.parameters import read_parameters
 from dptse_env.release import RELEASE_MODELS, PrivacySettings
 from dptse_env.traffic import (
@@ -63,8 +63,8 @@ def resolve(preset: str, overrides: Mapping[str, Any]) -> EnvConfig:
         ValueError: A value is out of range; the message starts with its path.
 
     Warns:
-        UserWarning: The corridor is another road, and values that were measured or tuned on the
-            preset's road, or assumed, are used on it.
+        UserWarning: The corridor is another road, or the ARZ parameters are of one's own, and
+            values that were measured or tuned for others, or assumed, are used.
     """
     require_name("preset", preset, PRESETS)
     road = _road_file(overrides)
@@ -89,7 +89,7 @@ def resolve(preset: str, overrides: Mapping[str, Any]) -> EnvConfig:
         config = replace(config, inherited=inherited)
         warnings.warn(
             f"{', '.join(inherited)}: values measured or tuned on {base.corridor.name}, or "
-            "assumed, are used on another road; give them to use others",
+            "assumed, are used on another road or with other parameters; give them to use others",
             UserWarning,
             stacklevel=3,
         )
@@ -216,18 +216,21 @@ def _with_scales(base: Corridor, fields: Mapping[str, Any]) -> dict[str, Any]:
 def _inherited(
     corridor: Corridor, config: EnvConfig, overrides: Mapping[str, Any], assumed: tuple[str, ...]
 ) -> tuple[str, ...]:
-    """Return the keywords that another road left as they are for the preset's, or assumed."""
+    """Return the keywords whose values are of another road or parameter set, or assumed."""
     geometry = [getattr(corridor, name) for name in GEOMETRY]
     shipped = [preset.corridor for preset in PRESETS.values()]
-    if any(geometry == [getattr(road, name) for name in GEOMETRY] for road in shipped):
-        return ()
-    found = [f"corridor.{name}" for name in assumed]
-    given = overrides.get("corridor")
-    if isinstance(given, Mapping) and "average_dwell" not in given:
-        found.append("corridor.average_dwell")
-    if isinstance(config.parameters, str) and "parameters" not in overrides:
-        found.append("parameters")
-    if config.settings_name is not None and "estimator_settings" not in overrides:
+    is_other_road = all(geometry != [getattr(road, name) for name in GEOMETRY] for road in shipped)
+    found = []
+    if is_other_road:
+        found = [f"corridor.{name}" for name in assumed]
+        given = overrides.get("corridor")
+        if isinstance(given, Mapping) and "average_dwell" not in given:
+            found.append("corridor.average_dwell")
+        if isinstance(config.parameters, str) and "parameters" not in overrides:
+            found.append("parameters")
+    parameters = config.arz_parameters
+    is_other = is_other_road or tuned_with(parameters) != parameters.name
+    if is_other and config.settings_name is not None and "estimator_settings" not in overrides:
         found.append("estimator_settings")
     return tuple(found)
 

@@ -27,7 +27,6 @@ from dptse_env.model.columns import (
     measured_speeds,
     project_states,
 )
-from dptse_env.model.model import make_road_arrays
 from dptse_env.model.network import RoadArrays, RoadNetwork
 from dptse_env.model.parameters import LARGEST_W
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
@@ -84,7 +83,7 @@ class EnKF(BatchEstimator):
         taper, none = settings.enkf.taper, np.empty((0, 0))
         weights = Tapers(none, none) if taper is None else make_tapers(model, taper)
         self.n_members = settings.enkf.n_members
-        self._road = tuple(make_road_arrays(model))
+        self._road = tuple(model.road)
         self._ensembles = Ensembles(
             members=np.repeat(priors[:, :, None], padded(self.n_members), axis=2),
             n_members=self.n_members,

@@ -28,7 +28,6 @@ from dptse_env.estimators.window import (
     write_force,
 )
 from dptse_env.model import ARZModel
-from dptse_env.model.model import make_road_arrays
 from dptse_env.model.network import RoadArrays
 from dptse_env.model.step import advance, make_scratch, normalise, project, write_row
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
@@ -355,7 +354,7 @@ class MHE(CompiledFilter):
         """See `make_estimator`."""
         require_process_noise(settings)
         super().__init__(model, n_episodes, settings_of_mhe(settings))
-        self._road = make_road_arrays(model)
+        self._road = model.road
         self._windows = _allocate(model, n_episodes, settings, self._road)
         self._all_packed = (*self._packed, tuple(self._windows))
         self._restart(np.arange(n_episodes))

@@ -29,11 +29,3 @@ def count_variance(model: ARZModel, settings: EstimatorSettings) -> FloatArray:
     lengths = model.layout.lengths[model.rows.first]
     variance: FloatArray = settings.count_noise / lengths / model.density_scale**2
     return variance
-
-
-def density_growth(model: ARZModel, settings: EstimatorSettings, density: FloatArray) -> FloatArray:
-    """Return the variances, shape (..., n_x), that densities (..., S) [veh/km] add to a step's."""
-    growth = np.zeros((*density.shape[:-1], model.n_states))
-    grown = settings.density_growth**2 * density / model.density_scale
-    growth[..., 0 : 2 * model.n_segments : 2] = grown
-    return growth

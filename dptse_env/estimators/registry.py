@@ -11,21 +11,15 @@ from dptse_env.model import ARZModel
 from dptse_env.utils.registry import Registry, is_foreign, missing_methods, name_of_class
 
 
-class Backends(NamedTuple):
-    """The classes of an estimator that ships with the package, as ``"module:Class"``.
+class Shipped(NamedTuple):
+    """A class of this package, imported when an estimator is made: not all libraries are needed."""
 
-    Modules are imported on demand, since the backends need different libraries.
-    """
+    module: str
+    name: str
 
-    compiled: str
-    reference: str
-
-
-def _filter(name: str, cls: str) -> Backends:
-    package = "dptse_env.estimators"
-    return Backends(
-        f"{package}.compiled.{name}:Compiled{cls}", f"{package}.reference.{name}:Reference{cls}"
-    )
+    def load(self) -> Any:
+        """Import the class."""
+        return resolve_name(f"dptse_env.estimators.{self.module}:{self.name}")
 
 
 def _expected(part: Any) -> str | None:
@@ -34,31 +28,31 @@ def _expected(part: Any) -> str | None:
     return None if callable(part) else "be a class, or callable with (model, n_episodes, settings)"
 
 
-_WALK = "dptse_env.estimators.random_walk:RandomWalk"
-_OPEN = "dptse_env.estimators.open_loop:OpenLoop"
-_LEARNED = "dptse_env.estimators.learned.recurrent"
-_RECURRENT = Backends(f"{_LEARNED}:CompiledRecurrent", f"{_LEARNED}:ReferenceRecurrent")
-_WITHOUT_DEMAND = (Backends(_WALK, _WALK), Backends(_OPEN, _OPEN), _RECURRENT)
 ESTIMATORS = Registry(
     "estimator",
     {
-        "ekf": _filter("ekf", "EKF"),
-        "ukf": _filter("ukf", "UKF"),
-        "enkf": Backends(
-            "dptse_env.estimators.enkf:EnKF", "dptse_env.estimators.reference.enkf:ReferenceEnKF"
-        ),
-        "mhe": Backends(
-            "dptse_env.estimators.mhe:MHE", "dptse_env.estimators.reference.mhe:ReferenceMHE"
-        ),
-        "random_walk": Backends(_WALK, _WALK),
-        "blend": _filter("blend", "Blend"),
-        "open_loop": Backends(_OPEN, _OPEN),
-        "recurrent": _RECURRENT,
+        "ekf": Shipped("compiled.ekf", "CompiledEKF"),
+        "ukf": Shipped("compiled.ukf", "CompiledUKF"),
+        "enkf": Shipped("enkf", "EnKF"),
+        "mhe": Shipped("mhe", "MHE"),
+        "random_walk": Shipped("simple", "RandomWalk"),
+        "blend": Shipped("simple", "Blend"),
+        "open_loop": Shipped("simple", "OpenLoop"),
+        "recurrent": Shipped("learned.recurrent", "CompiledRecurrent"),
     },
     check=_expected,
 )
 """Estimators by name. Those of other packages are classes or functions of (model, n_episodes,
 settings); their attribute ``settings_type`` may be a dataclass of other settings."""
+REFERENCES = {
+    "ekf": Shipped("reference", "ReferenceEKF"),
+    "ukf": Shipped("reference", "ReferenceUKF"),
+    "enkf": Shipped("reference", "ReferenceEnKF"),
+    "mhe": Shipped("reference", "ReferenceMHE"),
+}
+"""The backend ``reference`` of the estimators that have one."""
+WITHOUT_DEMAND = ("random_walk", "open_loop", "recurrent")
+"""Estimators without demand states."""
 BACKENDS = get_args(Backend)
 
 
@@ -66,13 +60,11 @@ def check_demand(estimator: Any, settings: Any) -> None:
     """Check that an estimator has the demand states that its settings ask for.
 
     Raises:
-        ValueError: It has no traffic model.
+        ValueError: It has none.
     """
-    if getattr(settings, "demand", None) is None:
-        return
-    if ESTIMATORS.find(estimator) in _WITHOUT_DEMAND:
+    if estimator in WITHOUT_DEMAND and settings.demand is not None:
         raise ValueError(
-            f"estimator_settings.demand must be None for {estimator!r}, which has no traffic model"
+            f"estimator_settings.demand must be None for {estimator!r}, which has no demand states"
         )
 
 
@@ -85,20 +77,19 @@ def make_estimator(
         estimator: `ekf`, `ukf`, `enkf`, `mhe`, `random_walk` (no traffic model), `blend` (a mean
             of EKF and random walk), `open_loop` (no measurements), `recurrent` (a network), a
             registered name, ``"package.module:Class"`` or a class.
-        backend: `compiled` (numba) or `reference` (numpy, filterpy, qpsolvers); the random walk
-            is plain numpy under both.
+        backend: `compiled` (numba), or `reference` (filterpy, qpsolvers, numpy), which EKF, UKF,
+            EnKF and MHE have.
         model: The traffic model.
         n_episodes: Number of episodes, >= 1.
         settings: Settings; None for the defaults.
 
     Raises:
-        ValueError: Name or backend is unknown, there are no episodes, or the estimator lacks a
-            method or an attribute.
+        ValueError: Name or backend is unknown, the estimator does not have the backend, there are
+            no episodes, or the estimator lacks a method or an attribute.
     """
     if n_episodes < 1:
         raise ValueError(f"n_episodes must be >= 1, got {n_episodes}")
     check_estimator(estimator, backend)
-    part = ESTIMATORS.find(estimator)
     settings = settings_type(estimator)() if settings is None else settings
     check_demand(estimator, settings)
     has_demand = getattr(settings, "demand", None) is not None
@@ -107,7 +98,8 @@ def make_estimator(
             model.network, model.parameters, model.time_step, model.reference_speed, model.rows,
             has_demand,
         )  # fmt: skip
-    factory = resolve_name(getattr(part, backend)) if isinstance(part, Backends) else part
+    part = REFERENCES[estimator] if backend == "reference" else ESTIMATORS.find(estimator)
+    factory = part.load() if isinstance(part, Shipped) else part
     made: Estimator = factory(model, n_episodes, settings)
     if is_foreign(made):
         _check_attributes(made, model, n_episodes)
@@ -121,10 +113,18 @@ def settings_type(estimator: Any) -> type:
 
 
 def check_estimator(estimator: Any, backend: str) -> None:
-    """Refuse an unknown estimator or backend; no estimator of this package is imported."""
+    """Refuse an unknown estimator or backend, or a backend that an estimator does not have.
+
+    No estimator of this package is imported.
+    """
     ESTIMATORS.find(estimator)
     if backend not in BACKENDS:
         raise ValueError(f"backend must be one of {', '.join(BACKENDS)}, got {backend!r}")
+    if backend == "reference" and not (isinstance(estimator, str) and estimator in REFERENCES):
+        raise ValueError(
+            f"backend must be 'compiled' for {ESTIMATORS.name_of(estimator)!r}, only "
+            f"{', '.join(REFERENCES)} have a reference; got 'reference'"
+        )
 
 
 def check_estimate(estimator: Estimator, estimate: Estimate, n_segments: int) -> None:

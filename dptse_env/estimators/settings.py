@@ -1,10 +1,22 @@
-"""Settings of the estimators: frozen dataclasses, reachable from plain JSON."""
+"""Settings of the estimators: frozen dataclasses, the tuned ones, and which an environment gets.
 
+``tuned.json`` has a table by name: ``<estimator>-<ARZ parameters>-<privacy preset>``, and for those
+of a road or another variant that with its name at the end. ``scripts/tune.py`` writes a file with
+one such entry, which the keyword ``estimator_settings`` takes. What an entry leaves out has the
+value of `EstimatorSettings`.
+"""
+
+import json
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Literal
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
-from dptse_env.model import Bounds
-from dptse_env.utils.fields import Interval, checked_fields
+from dptse_env.model import ARZParameters, Bounds, available_parameters
+from dptse_env.utils.fields import Interval, checked_fields, from_mapping
+from dptse_env.utils.json_object import check_object, parse_json
 
 Linearisation = Literal["paper", "trajectory"]
 
@@ -12,6 +24,11 @@ Linearisation = Literal["paper", "trajectory"]
 REFUSED_SOLVERS = ("highs",)
 
 _PATH = "estimator_settings"
+_KEYS = {"estimator": str, "settings": dict, "provenance": dict}
+
+DEFAULT_PARAMETERS = "w99-3lane"
+"""ARZ parameters whose tuned settings hold for parameters that do not say what they come from:
+those fitted to simulated traffic, which predict it about as well as others that are fitted."""
 
 Deviation = Annotated[float, Interval(0, 10)]
 """A standard deviation in units of rho_m or v_f."""
@@ -222,3 +239,123 @@ class EstimatorSettings:
     def __post_init__(self) -> None:
         """Check values; lists become tuples."""
         checked_fields(self, _PATH)
+
+
+def tuned_settings(
+    estimator: Any, parameters: ARZParameters, preset: Any, variant: str = ""
+) -> str | None:
+    """Return the name of the shipped settings that an environment gets unless it names others.
+
+    Those of a variant come before those without. Parameters of one's own get those of the shipped
+    set that `tuned_with` names.
+
+    Args:
+        estimator: Name of the estimator, or a part of another package, which has none.
+        parameters: The ARZ parameters of its model.
+        preset: The privacy preset, or a part of another package, which has none.
+        variant: Name of the road, where there may be settings for it alone.
+
+    Returns:
+        The name; None where none ship, so that the defaults of the estimator's settings hold.
+    """
+    if not isinstance(estimator, str) or not isinstance(preset, str):
+        return None
+    names = [settings_name(estimator, tuned_with(parameters), preset, v) for v in (variant, "")]
+    return next((name for name in names if name in _table()), None)
+
+
+def tuned_with(parameters: ARZParameters) -> str:
+    """Return the name of the shipped ARZ parameters whose tuned settings hold for these."""
+    if parameters.name in available_parameters():
+        return parameters.name
+    return parameters.derived_from or DEFAULT_PARAMETERS
+
+
+def settings_name(estimator: str, parameters: str, privacy: str, variant: str = "") -> str:
+    """Return the name of tuned settings."""
+    return "-".join((estimator, parameters, privacy, *((variant,) if variant else ())))
+
+
+def available_settings() -> tuple[str, ...]:
+    """Names of the tuned settings that ship with the package, sorted."""
+    return tuple(sorted(_table()))
+
+
+@cache
+def load_settings(name: str) -> EstimatorSettings:
+    """Load tuned settings that ship with the package.
+
+    Raises:
+        ValueError: There are none of this name; the message lists the available ones.
+    """
+    if name not in _table():
+        raise ValueError(f"{_PATH} must be one of {', '.join(available_settings())}, got {name!r}")
+    return _parse(_table()[name], name)
+
+
+def read_settings(path: str | Path) -> EstimatorSettings:
+    """Read tuned settings from a JSON file, as written by `write_settings`.
+
+    Raises:
+        ValueError: The file has another format, or a setting is out of range; the message starts
+            with the path of the file.
+    """
+    return _parse(_entry(Path(path).read_bytes(), str(path)), str(path))
+
+
+def tuned_estimator(path: str | Path) -> str:
+    """Return the estimator that the settings in a JSON file were tuned for.
+
+    Raises:
+        ValueError: The file has another format.
+    """
+    return str(_entry(Path(path).read_bytes(), str(path))["estimator"])
+
+
+def write_settings(
+    path: str | Path,
+    *,
+    estimator: str,
+    parameters: str,
+    privacy: str,
+    settings: Mapping[str, Any],
+    provenance: Mapping[str, Any],
+    variant: str = "",
+) -> None:
+    """Write tuned fields of `EstimatorSettings` and how they were tuned as JSON.
+
+    Raises:
+        ValueError: A setting is unknown or out of range; nothing is written then.
+    """
+    entry = {
+        "estimator": estimator, "settings": dict(settings), "provenance": dict(provenance),
+    }  # fmt: skip
+    name = settings_name(estimator, parameters, privacy, variant)
+    text = json.dumps({name: entry}, indent=2) + "\n"
+    _parse(_entry(text, str(path)), str(path))
+    Path(path).write_text(text, encoding="utf-8")
+
+
+@cache
+def _table() -> dict[str, dict[str, Any]]:
+    text = (files(__package__) / "tuned.json").read_text(encoding="utf-8")
+    table: dict[str, dict[str, Any]] = json.loads(text)
+    return table
+
+
+def _entry(text: str | bytes, path: str) -> dict[str, Any]:
+    """Return the entry of a file that has one."""
+    content = parse_json(text, path)
+    if not isinstance(content, dict) or len(content) != 1:
+        raise ValueError(
+            f"{path} must be a mapping with one name of settings, got {content!r:.200}"
+        )
+    ((name, entry),) = content.items()
+    return check_object(entry, f"{path}: {name}", _KEYS)
+
+
+def _parse(entry: Mapping[str, Any], path: str) -> EstimatorSettings:
+    try:
+        return from_mapping(EstimatorSettings, entry["settings"], _PATH)
+    except ValueError as problem:
+        raise ValueError(f"{path}: {problem}") from problem

@@ -1,7 +1,7 @@
 """The ARZ traffic model with junctions: a road, its parameters and its dynamics."""
 
 from dptse_env.model.model import ARZModel
-from dptse_env.model.network import MeasurementRows, RoadNetwork
+from dptse_env.model.network import MeasurementRows
 from dptse_env.model.parameters import ARZParameters, Bounds, available_parameters, load_parameters
 
 __all__ = [
@@ -9,7 +9,6 @@ __all__ = [
     "ARZParameters",
     "Bounds",
     "MeasurementRows",
-    "RoadNetwork",
     "available_parameters",
     "load_parameters",
 ]

@@ -5,7 +5,7 @@ The fit has two stages. Densities are binned and the equilibrium speed
 are optimised for the predictions of the next 5 to 30 s by the model, started from the true state.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +15,8 @@ from dptse_env.model.model import ARZModel
 from dptse_env.model.network import RoadNetwork
 from dptse_env.model.parameters import ARZParameters
 from dptse_env.utils.arrays import FloatArray, IntArray
+
+Traffic = tuple[FloatArray, FloatArray]  # densities and speeds (k, S)
 
 HORIZONS = (5, 10, 15, 20, 25, 30)
 """Steps ahead whose errors count by default."""
@@ -95,19 +97,18 @@ def prediction_error(
     Raises:
         ValueError: The horizons do not ascend, or no run is longer than the longest of them.
     """
-    _check_horizons(data, horizons, stride)
-    errors = _Errors(horizons, model.network.n_mainline)
-    for series in data:
-        starts = np.arange(0, len(series) - horizons[-1], stride)
+
+    def predicted(series: TrafficSeries, starts: IntArray) -> Iterator[Traffic]:
         inputs = model.boundary_inputs(series.boundary_density, series.boundary_speed)
-        states = _true_states(model, series)[starts]
+        v_f = model.parameters.free_flow_speed  # the speed of empty segments
+        speed = np.where(series.density > 0.0, series.speed, v_f)
+        states = model.project(model.states(series.density, speed))[starts]
         for ahead in range(1, horizons[-1] + 1):
             states = model.step(states, inputs[starts + ahead - 1])
             if ahead in horizons:
-                errors.add(
-                    ahead, model.density(states), model.speed(states), series, starts + ahead
-                )
-    return errors.summary()
+                yield model.density(states), model.speed(states)
+
+    return _error_of(predicted, data, model.network.n_mainline, horizons, stride)
 
 
 def persistence_error(
@@ -120,55 +121,37 @@ def persistence_error(
 
     A segment that is empty at the start has no speed and is left out of the speed's error.
     """
+
+    def predicted(series: TrafficSeries, starts: IntArray) -> Iterator[Traffic]:
+        speed = np.where(series.density > 0.0, series.speed, np.nan)[starts]
+        for _ in horizons:
+            yield series.density[starts], speed
+
+    return _error_of(predicted, data, n_mainline, horizons, stride)
+
+
+def _error_of(
+    predicted: Callable[[TrafficSeries, IntArray], Iterator[Traffic]],
+    data: Sequence[TrafficSeries],
+    n: int,
+    horizons: Sequence[int],
+    stride: int,
+) -> PredictionError:
+    """Return the error of what is predicted for each horizon, from the starts of each run on."""
     _check_horizons(data, horizons, stride)
-    errors = _Errors(horizons, n_mainline)
+    sums, counts = np.zeros((2, len(horizons), 2))
     for series in data:
         starts = np.arange(0, len(series) - horizons[-1], stride)
-        speed = np.where(series.density > 0.0, series.speed, np.nan)[starts]
-        for ahead in horizons:
-            errors.add(ahead, series.density[starts], speed, series, starts + ahead)
-    return errors.summary()
-
-
-class _Errors:
-    """Sums of squared errors by horizon."""
-
-    def __init__(self, horizons: Sequence[int], n_mainline: int) -> None:
-        self.horizons = tuple(horizons)
-        self.n_mainline = n_mainline
-        self.sums = np.zeros((len(self.horizons), 2))
-        self.counts = np.zeros((len(self.horizons), 2))
-
-    def add(
-        self,
-        ahead: int,
-        density: FloatArray,
-        speed: FloatArray,
-        series: TrafficSeries,
-        steps: IntArray,
-    ) -> None:
-        row, n = self.horizons.index(ahead), self.n_mainline
-        true_density = series.density[steps, :n]
-        errors = density[:, :n] - true_density
-        self.sums[row, 0] += np.sum(errors**2)
-        self.counts[row, 0] += errors.size
-        seen = (true_density > 0.0) & ~np.isnan(speed[:, :n])
-        errors = (speed[:, :n] - series.speed[steps, :n])[seen]
-        self.sums[row, 1] += np.sum(errors**2)
-        self.counts[row, 1] += errors.size
-
-    def summary(self) -> PredictionError:
-        rmse = np.sqrt(self.sums / np.maximum(self.counts, 1.0))
-        return PredictionError(
-            self.horizons, tuple(rmse[:, 0].tolist()), tuple(rmse[:, 1].tolist())
-        )
-
-
-def _true_states(model: ARZModel, series: TrafficSeries) -> FloatArray:
-    """Return the states of the recorded traffic, with the free speed on empty segments."""
-    v_f = model.parameters.free_flow_speed
-    speed = np.where(series.density > 0.0, series.speed, v_f)
-    return model.project(model.states(series.density, speed))
+        pairs = zip(horizons, predicted(series, starts), strict=True)
+        for row, (ahead, (density, speed)) in enumerate(pairs):
+            there = series.density[starts + ahead, :n]
+            seen = (there > 0.0) & ~np.isnan(speed[:, :n])
+            of_speed = (speed[:, :n] - series.speed[starts + ahead, :n])[seen]
+            for quantity, errors in enumerate((density[:, :n] - there, of_speed)):
+                sums[row, quantity] += np.sum(errors**2)
+                counts[row, quantity] += errors.size
+    density_error, speed_error = np.sqrt(sums / np.maximum(counts, 1.0)).T.tolist()
+    return PredictionError(tuple(horizons), tuple(density_error), tuple(speed_error))
 
 
 def _check_horizons(data: Sequence[TrafficSeries], horizons: Sequence[int], stride: int) -> None:

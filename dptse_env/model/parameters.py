@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 
 from dptse_env.utils.fields import Interval, checked_fields, from_mapping
 from dptse_env.utils.json_object import parse_object, shipped_texts
+from dptse_env.utils.validation import require_name
 
 SECONDS_PER_HOUR = 3600.0
 LARGEST_W = 1.1
@@ -48,9 +49,11 @@ class ARZParameters:
         gamma: Exponent of the pressure [-]; fits of real traffic may be as low as 0.4.
         relaxation_time: tau [s]; infinite for no relaxation.
         lanes: Lanes of the road to which `jam_density` applies.
+        derived_from: Shipped set whose tuned estimator settings a set of one's own takes
+            (`dptse_env.estimators.settings.tuned_with`); None for the default one.
 
     Raises:
-        ValueError: A value is out of range.
+        ValueError: A value is out of range, or there is no such shipped set.
     """
 
     name: str
@@ -59,10 +62,13 @@ class ARZParameters:
     gamma: Annotated[float, Interval(0.01, 100)]
     relaxation_time: Annotated[float, Interval(0, math.inf, open_low=True)]
     lanes: Annotated[int, Interval(1, 16)] = 3
+    derived_from: str | None = None
 
     def __post_init__(self) -> None:
         """Check values."""
         checked_fields(self, "parameters")
+        if self.derived_from is not None:
+            require_name("parameters.derived_from", self.derived_from, available_parameters())
 
     @classmethod
     def from_mapping(cls, mapping: Mapping[str, Any]) -> ARZParameters:
@@ -108,10 +114,7 @@ def load_parameters(name: str) -> ARZParameters:
     Raises:
         ValueError: There is no such set; the message lists the available ones.
     """
-    if name not in available_parameters():
-        raise ValueError(
-            f"parameters must be one of {', '.join(available_parameters())}, got {name!r}"
-        )
+    require_name("parameters", name, available_parameters())
     return _parse(_shipped()[name], name)
 
 

@@ -9,34 +9,27 @@ from functools import partial
 from typing import Any
 
 from dptse_env.schedules.base import ProcessSchedule, Schedule, ScheduleState
-from dptse_env.schedules.covariance import (
-    CovarianceInflation,
-    CovarianceSchedule,
-    GreedyTrace,
-)
-from dptse_env.schedules.fixed import (
+from dptse_env.schedules.greedy import GreedyTrace
+from dptse_env.schedules.oracles import OracleError, OracleGain
+from dptse_env.schedules.rules import (
     Everything,
+    ExpectedReduction,
     LargestDeviation,
     LargestVariance,
     Nothing,
     OldestFirst,
     Random,
     Shifting,
+    SpeedFront,
     StaleVariance,
 )
-from dptse_env.schedules.front import SpeedFront
-from dptse_env.schedules.oracles import OracleError, OracleGain
-from dptse_env.schedules.reduction import ExpectedReduction
 from dptse_env.utils.registry import Registry, name_of_class
 
 __all__ = [
-    "COVARIANCE_SCHEDULES",
-    "DEVIATION_SCHEDULES",
     "OBSERVATION_SCHEDULES",
     "ORACLES",
+    "PROCESS_SCHEDULES",
     "SCHEDULES",
-    "CovarianceInflation",
-    "CovarianceSchedule",
     "Everything",
     "ExpectedReduction",
     "GreedyTrace",
@@ -73,15 +66,13 @@ OBSERVATION_SCHEDULES: dict[str, Any] = {
 """Schedules that use the observation alone, each made of (interface, seed); a step costs at most a
 sort."""
 
-DEVIATION_SCHEDULES: dict[str, type[ProcessSchedule]] = {"expected-reduction": ExpectedReduction}
-"""Schedules that use the estimator's deviations and the release model's noise, each made of
-(process, seed); a step costs a sort."""
-
-COVARIANCE_SCHEDULES: dict[str, type[ProcessSchedule]] = {
+PROCESS_SCHEDULES: dict[str, type[ProcessSchedule]] = {
+    "expected-reduction": ExpectedReduction,
     "greedy-trace": GreedyTrace,
 }
-"""Schedules that use the estimator's covariance, each made of (process, seed); a step costs one or
-two steps of the EKF."""
+"""Schedules that use the process, but not the truth: the noise to expect, and the estimator's
+deviations or covariance. Each is made of (process, seed); a step costs a sort, or some two steps of
+the EKF."""
 
 ORACLES: dict[str, type[ProcessSchedule]] = {
     "oracle-error": OracleError,
@@ -100,12 +91,7 @@ def _expected(part: Any) -> str | None:
 
 SCHEDULES = Registry(
     "schedule",
-    {
-        **OBSERVATION_SCHEDULES,
-        **DEVIATION_SCHEDULES,
-        **COVARIANCE_SCHEDULES,
-        **ORACLES,
-    },
+    {**OBSERVATION_SCHEDULES, **PROCESS_SCHEDULES, **ORACLES},
     check=_expected,
 )
 """All schedules by name."""

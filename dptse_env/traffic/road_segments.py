@@ -125,14 +125,3 @@ class RoadSegments:
             of_ramps = tuple(mainline[beside] for _, beside, _ in self.ramps())
         ramps = zip(self._per_ramp(of_ramps), self._ramp_segments, strict=True)
         return (*mainline, *(value for value, segments in ramps for _ in segments))
-
-    @property
-    def segment_names(self) -> tuple[str, ...]:
-        """Names of the S segments, counted from 1 as in the paper."""
-        names = [f"mainline {i + 1}" for i in range(self.n_mainline)]
-        kinds = (("on-ramp", self.on_ramp_segments), ("off-ramp", self.off_ramp_segments))
-        for kind, ramps in kinds:
-            for i, segments in enumerate(ramps):
-                parts = [f".{k + 1}" for k in range(len(segments))] if len(segments) > 1 else [""]
-                names += [f"{kind} {i + 1}{part}" for part in parts]
-        return tuple(names)

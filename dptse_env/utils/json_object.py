@@ -28,10 +28,27 @@ def parse_object(text: str | bytes, path: str, keys: Mapping[str, type]) -> dict
         ValueError: It is no JSON, no object, or has other keys or types; the message starts with
             ``path``.
     """
+    return check_object(parse_json(text, path), path, keys)
+
+
+def parse_json(text: str | bytes, path: str) -> Any:
+    """Parse JSON.
+
+    Raises:
+        ValueError: It is no JSON; the message starts with ``path``.
+    """
     try:
-        content = json.loads(text)
+        return json.loads(text)
     except (ValueError, RecursionError) as problem:
         raise ValueError(f"{path} must be JSON: {problem}") from problem
+
+
+def check_object(content: Any, path: str, keys: Mapping[str, type]) -> dict[str, Any]:
+    """Return parsed JSON where it is an object that has exactly the given keys.
+
+    Raises:
+        ValueError: It is no object, or has other keys or types; the message starts with ``path``.
+    """
     if not isinstance(content, dict) or set(content) != set(keys):
         got = str(sorted(content) if isinstance(content, dict) else content)[:200]
         raise ValueError(f"{path} must be a mapping with the keys {', '.join(keys)}, got {got}")

@@ -26,7 +26,7 @@ def test_backends_agree_over_an_episode(parameters, bounds, release):
         if bounds == "box":
             # There w has no bound, and states that break the CFL condition blow up rounding: both
             # take each step from the same state, and P, near 100 on the way, keeps fewer digits.
-            one = reference._filters[0]
+            one = reference.filters[0]
             one.x, one.P = compiled.states[0] / scale, compiled.covariances[0]
         run(compiled, episodes, [k])
         run(reference, episodes, [k])
@@ -45,7 +45,8 @@ def test_measurements_help(backend):
     episodes = simulate(n=2, n_steps=200)
     model, errors = episodes.model, {}
     for name in ("ekf", "open_loop"):
-        filters, gaps = started(name, backend, episodes), []
+        own = "compiled" if name == "open_loop" else backend
+        filters, gaps = started(name, own, episodes), []
         for k in range(200):
             run(filters, episodes, [k])
             gaps.append(filters.estimate().density - model.density(episodes.truth[k]))
@@ -61,7 +62,7 @@ def test_a_broken_covariance_is_found(backend, poison):
     episodes = simulate(n_steps=5)
     ekf = started("ekf", backend, episodes)
     run(ekf, episodes, range(3))
-    kept = ekf._filters.covariances if backend == "compiled" else ekf._filters[0].P[None]
+    kept = ekf._filters.covariances if backend == "compiled" else ekf.filters[0].P[None]
     if poison == "indefinite":
         kept[0, 20, 4] = kept[0, 4, 20] = 10.0
     else:

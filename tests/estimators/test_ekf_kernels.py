@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dptse_env.estimators import EstimatorSettings
-from dptse_env.estimators.open_loop import estimated_traffic
+from dptse_env.estimators.simple import estimated_traffic
 from dptse_env.model.model import make_road_arrays
 from dptse_env.model.parameters import VACUUM
 from dptse_env.model.step import released

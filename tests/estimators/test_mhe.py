@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import qpsolvers
-from dptse_env.model.compiled import CompiledARZModel
 
 from dptse_env.estimators import (
     BACKENDS,
@@ -22,7 +21,7 @@ from dptse_env.estimators.horizon import assemble, natural_residual, normalised_
 from dptse_env.estimators.mhe import GENERAL_SOLVER, Windows
 from dptse_env.estimators.mhe import update as solve_and_update
 from dptse_env.estimators.window import ACTIVE_SET, NEWTON, UNSOLVED
-from dptse_env.model.parameters import load_parameters
+from dptse_env.model import ARZModel, load_parameters
 from tests.cases import pairwise
 from tests.model.roads import UNEVEN
 
@@ -126,7 +125,7 @@ def test_backends_agree_on_rows_that_overlap(settings, linearisation, bounds):
 
 def test_a_road_of_segments_of_many_kinds_is_estimated_alike():
     """Lengths, lanes and limits vary, ramps have several segments; predictions come in pairs."""
-    model, one = CompiledARZModel(UNEVEN, load_parameters("w99-3lane")), np.array([0])
+    model, one = ARZModel(UNEVEN, load_parameters("w99-3lane")), np.array([0])
     rng, s, v_f = np.random.default_rng(0), model.n_segments, model.speed_scale
     start = model.states(0.2 * model.jam_density[None], np.full((1, s), 0.5 * v_f))
     settings = EstimatorSettings(mhe=HorizonSettings(horizon=4))

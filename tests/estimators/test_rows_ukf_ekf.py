@@ -31,7 +31,7 @@ def test_backends_agree_on_rows_that_overlap(name, settings):
     episodes = averaged()
     compiled, reference = (started(name, kind, episodes, settings) for kind in BACKENDS)
     assert compiled.model.n_demand_states == (3 if settings is RICH else 0)
-    one, scale = reference._filters[0], compiled.model.state_scale
+    one, scale = reference.filters[0], compiled.model.state_scale
     for k in range(N_STEPS):
         if name == "ukf":
             one.x, one.P = compiled.states[0] / scale, compiled.covariances[0]

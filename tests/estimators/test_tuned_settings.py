@@ -1,18 +1,20 @@
+import itertools
 import json
 
 import pytest
 
 from dptse_env.estimators import ESTIMATORS, EstimatorSettings, HorizonSettings
-from dptse_env.estimators.tuned_settings import (
+from dptse_env.estimators.settings import (
     available_settings,
     load_settings,
     read_settings,
     settings_name,
+    tuned_estimator,
     write_settings,
 )
 from dptse_env.model import available_parameters
 from dptse_env.release import RELEASE_MODELS
-from dptse_env.utils.json_object import shipped_texts
+from dptse_env.traffic import CORRIDORS
 
 GOOD = {
     "estimator": "mhe",
@@ -21,17 +23,16 @@ GOOD = {
     "settings": {"process_noise": [0.01, 0.02], "mhe": {"arrival_noise": [0.1, 0.2]}},
     "provenance": {"source": "a test"},
 }
+ENTRY = {key: GOOD[key] for key in ("estimator", "settings", "provenance")}
+FILE = {"mhe-paper-corrected": ENTRY}
 
 
 def test_shipped_sets_are_named_after_what_they_are_for():
+    cells = itertools.product(ESTIMATORS, available_parameters(), RELEASE_MODELS)
+    names = {settings_name(*cell, v) for cell in cells for v in ("", "demand", *CORRIDORS)}
     assert "ekf-w99-3lane-paper" in available_settings()
-    for name, text in shipped_texts("dptse_env.estimators", "tuned").items():
-        content = json.loads(text)
-        assert content["name"] == name
-        assert content["estimator"] in ESTIMATORS
-        assert content["parameters"] in available_parameters()
-        assert content["privacy"] in RELEASE_MODELS
-        assert content["provenance"]["method"]
+    assert set(available_settings()) <= names
+    for name in available_settings():
         assert load_settings(name) != EstimatorSettings()
 
 
@@ -48,9 +49,8 @@ def test_a_written_set_reads_back_over_the_defaults(tmp_path):
     assert read_settings(path) == EstimatorSettings(
         process_noise=(0.01, 0.02), mhe=HorizonSettings(arrival_noise=(0.1, 0.2))
     )
-    content = json.loads(path.read_text())
-    assert content == {"name": "mhe-paper-corrected", **GOOD}
-    assert content["name"] == settings_name("mhe", "paper", "corrected")
+    assert json.loads(path.read_text()) == FILE
+    assert tuned_estimator(path) == "mhe"
 
 
 @pytest.mark.parametrize(
@@ -68,7 +68,7 @@ def test_bad_settings_are_neither_written_nor_read(settings, message, tmp_path):
     with pytest.raises(ValueError, match=rf"^{path}: {message}"):
         write_settings(path, **{**GOOD, "settings": settings})
     assert not path.exists()
-    path.write_text(json.dumps({"name": "mhe-paper-corrected", **GOOD, "settings": settings}))
+    path.write_text(json.dumps({"mhe-paper-corrected": {**ENTRY, "settings": settings}}))
     with pytest.raises(ValueError, match=rf"^{path}: {message}"):
         read_settings(path)
 
@@ -78,16 +78,10 @@ def test_bad_settings_are_neither_written_nor_read(settings, message, tmp_path):
     [
         ("{", " must be JSON: "),
         ("[" * 100_000, " must be JSON: "),
-        ("[]", r" must be a mapping with the keys name, .*, provenance, got \[\]"),
-        (json.dumps(GOOD), r" must be a mapping with the keys name, .*, got \['estimator', "),
-        (
-            json.dumps({"name": "x", **GOOD, "settings": 1}),
-            ": settings must be of type dict, got 1",
-        ),
-        (
-            json.dumps({"name": "x", **GOOD}),
-            ": name must be 'mhe-paper-corrected' or begin with .*, got 'x'",
-        ),
+        ("[]", r" must be a mapping with one name of settings, got \[\]"),
+        (json.dumps({**FILE, "x": ENTRY}), " must be a mapping with one name of settings, got {"),
+        ('{"x": 1}', ": x must be a mapping with the keys estimator, settings, provenance, got 1"),
+        (json.dumps({"x": {**ENTRY, "settings": 1}}), ": x: settings must be of type dict, got 1"),
     ],
 )
 def test_a_file_of_another_shape_is_refused_by_its_path(text, message, tmp_path):

@@ -29,7 +29,7 @@ def step_together(episodes, settings, **tolerance):
     compiled, reference = (
         started("ukf", kind, episodes, settings) for kind in ("compiled", "reference")
     )
-    one, scale = reference._filters[0], scale_of(episodes.model)
+    one, scale = reference.filters[0], scale_of(episodes.model)
     for k in range(len(episodes.inputs)):
         one.x, one.P = compiled.states[0] / scale, compiled.covariances[0]
         run(compiled, episodes, [k])
@@ -124,7 +124,7 @@ def test_a_broken_covariance_is_found(backend, poison):
     episodes = simulate(n_steps=5)
     filters = started("ukf", backend, episodes)
     run(filters, episodes, range(3))
-    kept = filters._filters.covariances if backend == "compiled" else filters._filters[0].P[None]
+    kept = filters._filters.covariances if backend == "compiled" else filters.filters[0].P[None]
     if poison == "indefinite":
         kept[0, 20, 4] = kept[0, 4, 20] = 10.0
     else:

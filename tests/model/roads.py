@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dptse_env.model import ARZModel, ARZParameters, load_parameters
+from dptse_env.model.parameters import VACUUM
 from dptse_env.traffic import Corridor, Demand
 from dptse_env.utils.arrays import FloatArray
 
@@ -91,16 +92,24 @@ ROADS = {
 
 
 def random_states(model: ARZModel, n: int, rng: np.random.Generator) -> FloatArray:
-    """States all over the cone, with empty, jammed and standing cells among them."""
+    """States all over the cone, with empty, jammed and standing cells, and a vacuum of some psi."""
     jam, v_f = model.jam_density, model.speed_scale
     density = rng.uniform(0.0, 1.0, (n, model.n_segments)) ** rng.choice([0.5, 2.0], (n, 1)) * jam
     kind = rng.random(density.shape)
-    density = np.where(kind < 0.05, 0.0, np.where(kind < 0.1, jam, density))
+    held = [kind < 0.05, kind < 0.1, kind < 0.15]
+    density = np.select(held, [0.0, 0.5 * VACUUM * jam, jam], density)
     largest = np.maximum(1.1 * v_f - model.pressure(density), 0.0)
     speed = largest * rng.uniform(0.0, 1.0, density.shape)
     states = model.states(density, np.where(kind > 0.95, 0.0, speed))
     model.demand_factors(states)[:] = rng.uniform(0.1, 3.0, (n, model.n_demand_states))
     return states
+
+
+def scattered_states(model: ARZModel, n: int, rng: np.random.Generator) -> FloatArray:
+    """States within bounds and beyond, with negative components among them."""
+    states = random_states(model, n, rng)
+    states *= 1.0 + 0.5 * rng.normal(size=states.shape)
+    return states + 0.1 * model.state_scale * rng.normal(size=states.shape)
 
 
 def random_inputs(model: ARZModel, n: int, rng: np.random.Generator) -> FloatArray:

@@ -18,7 +18,16 @@ from tests.cases import pairwise
 from tests.estimators.parts import compiled
 
 from .oracle import Oracle
-from .roads import HIGHWAY, PAPER, ROADS, UNEVEN, W99, random_inputs, random_states
+from .roads import (
+    HIGHWAY,
+    PAPER,
+    ROADS,
+    UNEVEN,
+    W99,
+    random_inputs,
+    random_states,
+    scattered_states,
+)
 
 advance_states = compiled(advance_states)
 make_batch_scratch = compiled(make_batch_scratch)
@@ -37,13 +46,6 @@ def advanced(model, states, inputs):
     columns = states.T.copy()
     advance_states(model.road, columns, inputs, make_batch_scratch(model.road, len(states)))
     return columns.T
-
-
-def scattered(model, rng):
-    """States within bounds and beyond."""
-    states = random_states(model, WIDTH, rng)
-    states *= 1.0 + 0.5 * rng.normal(size=states.shape)
-    return states + 0.1 * model.state_scale * rng.normal(size=states.shape)
 
 
 @pytest.mark.parametrize(
@@ -68,7 +70,7 @@ def test_advances_as_the_oracle(road, parameters, demand):
 def test_kernels_project_one_state_and_many_as_the_model_does(road, parameters, bounds):
     model, rng = ARZModel(road, parameters, demand_states=True), np.random.default_rng(0)
     for _ in range(10):
-        states = scattered(model, rng)
+        states = scattered_states(model, WIDTH, rng)
         columns, expected = states.T.copy(), model.project(states, bounds)
         project_states(model.road, columns, bounds == "box")
         assert (model.demand_factors(expected) != model.demand_factors(states)).any()
@@ -88,7 +90,7 @@ def test_a_row_of_many_states_is_what_the_model_measures(road, parameters, refer
     rows = MeasurementRows(np.array([n - 1, 0, 2]), span, n)
     model = ARZModel(road, parameters, reference_speed=reference_speed, rows=rows)
     rng, width = np.random.default_rng(0), np.empty((3, WIDTH))
-    states = scattered(model, rng)
+    states = scattered_states(model, WIDTH, rng)
     centre = rng.uniform(0.0, 100.0, n)
     expected = model.measure(states, centre)
     nowhere = np.full(n, np.nan)
@@ -102,7 +104,7 @@ def test_a_row_of_many_states_is_what_the_model_measures(road, parameters, refer
 
 def test_measured_speeds_are_the_models():
     model, rng = ARZModel(HIGHWAY, W99), np.random.default_rng(0)
-    states, out = scattered(model, rng), np.empty(WIDTH)
+    states, out = scattered_states(model, WIDTH, rng), np.empty(WIDTH)
     for s, jam in enumerate(model.jam_density):
         rho, psi = states[:, 2 * s].copy(), states[:, 2 * s + 1].copy()
         measured_speeds(rho, psi, jam, W99.free_flow_speed, W99.gamma, out)

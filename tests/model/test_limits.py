@@ -301,30 +301,15 @@ def test_metres_and_seconds_give_the_same_trajectory():
     np.testing.assert_allclose(states_si / to_si, states, rtol=1e-9, atol=1e-9)
 
 
-def test_smaller_steps_approach_the_same_motion():
-    coarse, fine = model_of(HIGHWAY, time_step=0.1), model_of(HIGHWAY, time_step=0.01)
-    slow = fast = random_states(coarse, 1, np.random.default_rng(5))
-    inputs = random_inputs(coarse, 1, np.random.default_rng(6))
-    for _ in range(10):
-        fast = coarse.step(fast, inputs)
-    for _ in range(100):
-        slow = fine.step(slow, inputs)
-    assert np.abs(fast - slow)[:, 0::2].max() < 0.01 * PAPER.jam_density
-
-
-@pytest.mark.parametrize("time_step", [1.77, 2.0, 0.0, -1.0, float("nan")])
+@pytest.mark.parametrize("time_step", [1.77, 0.0, -1.0, float("nan")])
 def test_a_step_too_long_names_the_longest_admissible(time_step):
     with pytest.raises(ValueError, match=r"model.time_step must be > 0 and at most 1.76 s \(CFL"):
         model_of(HIGHWAY, PAPER, time_step)
     assert model_of(HIGHWAY, PAPER, 1.76).time_step == 1.76
 
 
-def test_strong_relaxation_bounds_the_step_too():
+def test_strong_relaxation_and_the_shortest_segment_bound_the_step_too():
     with pytest.raises(ValueError, match=r"at most 0.43 s"):
         model_of(HIGHWAY, replace(PAPER, relaxation_time=0.5))
-
-
-def test_one_cell_is_a_road():
-    model = model_of(Road(n_mainline=1), PAPER)
-    states = model.step(np.zeros((1, 2)), np.array([[1000.0, 102.0, 0.0]]))
-    assert states[0, 0] == pytest.approx(1000.0 / 3600.0 / 0.1)
+    with pytest.raises(ValueError, match=r"on a segment of 0.08 km"):
+        model_of(UNEVEN, PAPER, 1.6)

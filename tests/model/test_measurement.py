@@ -9,7 +9,7 @@ from dptse_env.model.step import write_row
 from tests.cases import pairwise
 from tests.estimators.parts import compiled
 
-from .roads import HIGHWAY, PAPER, UNEVEN, W99, model_of, random_states
+from .roads import HIGHWAY, PAPER, UNEVEN, W99, model_of, random_states, scattered_states
 
 write_row = compiled(write_row)
 
@@ -89,8 +89,8 @@ def test_a_kernels_row_is_the_models_measurement_linearised(road, release, deman
     speed = None if release == "speeds" else 51.0
     model = ARZModel(network, W99, reference_speed=speed, rows=rows, demand_states=demand)
     rng = np.random.default_rng(2)
-    states = random_states(model, 20, rng)
-    states -= 0.01 * model.state_scale * (rng.random(states.shape) < 0.1)
+    states = scattered_states(model, 20, rng)
+    assert (model.components(states)[0] < 0.0).any(axis=0).mean() > 0.8
     nowhere = np.full((20, model.n_segments), np.nan)
     centre = nowhere if speed is None else rng.uniform(0.0, 100.0, nowhere.shape)
     values = model.measure(states, centre) / model.measurement_scale

@@ -1,55 +1,80 @@
-"""Properties of every schedule."""
+"""Properties of every schedule, where queries are segments, sums of them, and at several prices."""
+
+import itertools
 
 import numpy as np
 import pytest
 
 from dptse_env.schedules import (
-    COVARIANCE_SCHEDULES,
-    DEVIATION_SCHEDULES,
     OBSERVATION_SCHEDULES,
     ORACLES,
+    PROCESS_SCHEDULES,
     ProcessSchedule,
     make_schedule,
 )
 from dptse_env.spaces.actions import ACTION_ENCODINGS
 from tests.cases import fast_and_slow
 
+from ..release.sums import SumRelease
 from .playing import begin, make_batch, make_single, play
 
-BOUND = [*DEVIATION_SCHEDULES, *COVARIANCE_SCHEDULES, *ORACLES]
+BOUND = [*PROCESS_SCHEDULES, *ORACLES]
 NAMES = [*sorted(set(OBSERVATION_SCHEDULES) - {"none", "all"}), *BOUND]
-KINDS = (
-    "round-robin", "oldest-first", "speed-front", "expected-reduction", "greedy-trace",
-    "oracle-gain",
-)  # fmt: skip
+OF_SEGMENTS = ("greedy-trace", "oracle-gain")
+ROADS = {
+    "segments": {},
+    "spans": {"query_spans": (1, 2, 3), "bandwidth": 4},
+    "sums": {"query_spans": (1, 2, 3), "bandwidth": 2, "bandwidth_unit": "sums"},
+    "only sums": {"query_spans": (2,), "bandwidth": 5},
+    "levels": {"price_levels": (2.0, 0.9, 0.5), "bandwidth": 3},
+    "both": {"query_spans": (2, 3), "price_levels": (0.5, 1.0), "bandwidth": 5},
+}
+for keywords in ROADS.values():
+    if keywords:
+        keywords["privacy"] = SumRelease
+CASES = [
+    (name, road)
+    for name, road in itertools.product(NAMES, ROADS)
+    if road == "segments" or name not in OF_SEGMENTS
+]
+FAST = [
+    ("round-robin", "both"), ("oldest-first", "sums"), ("speed-front", "levels"),
+    ("expected-reduction", "spans"), ("greedy-trace", "segments"), ("oracle-gain", "segments"),
+]  # fmt: skip
 """One for each way to choose: by the clock, by observations, by a memory, and by the process."""
+WITHOUT_DRAWS = [case for case in CASES if case[0] != "random"]
 
 
-@pytest.mark.parametrize("name", fast_and_slow(NAMES, KINDS))
-def test_every_encoding_asks_the_same_full_set(name):
-    expected, rewards = play(make_batch(), name, 8)
-    assert (expected.sum(axis=2) == 2).all()
+@pytest.mark.parametrize(("name", "road"), fast_and_slow(CASES, FAST))
+def test_every_encoding_asks_the_same_and_for_as_much_as_it_may(name, road):
+    env = make_single(**ROADS[road])
+    options = env.unwrapped.config.queries
+    expected, rewards = play(env, name, 6)
+    cost = expected @ options.cost
+    left = options.bandwidth - cost[..., None]
+    assert (left >= 0).all()
+    assert ((options.cost > left) | expected).all()
     for action in ACTION_ENCODINGS:
-        queries, own = play(make_batch(action=action), name, 8)
+        queries, own = play(make_single(action=action, **ROADS[road]), name, 6)
         np.testing.assert_array_equal(queries, expected)
         np.testing.assert_array_equal(own, rewards)
 
 
-@pytest.mark.parametrize("name", fast_and_slow(sorted(set(NAMES) - {"random"}), KINDS))
-def test_a_batch_asks_what_its_episodes_ask_alone(name):
-    queries, rewards = play(make_batch(), name, 8)
+@pytest.mark.parametrize(("name", "road"), fast_and_slow(WITHOUT_DRAWS, FAST))
+def test_a_batch_asks_what_its_episodes_ask_alone(name, road):
+    queries, rewards = play(make_batch(**ROADS[road]), name, 8)
     for episode in range(3):
-        env = make_single()
+        env = make_single(**ROADS[road])
         alone, own = play(env, name, 8, begin(env, seed=5 + episode))
         np.testing.assert_array_equal(alone[:, 0], queries[:, episode])
         np.testing.assert_array_equal(own[:, 0], rewards[:, episode])
 
 
-@pytest.mark.parametrize("name", fast_and_slow(sorted(set(NAMES) - {"random"}), KINDS))
-def test_a_schedule_begins_anew_with_the_episode_and_may_be_asked_twice(name):
-    env = make_batch()
+@pytest.mark.parametrize(("name", "road"), fast_and_slow(WITHOUT_DRAWS, FAST))
+def test_a_schedule_begins_anew_with_the_episode_and_may_be_asked_twice(name, road):
+    env = make_batch(**ROADS[road])
     schedule = make_schedule(name, env)
-    first, rewards = play(env, schedule, 8)
+    _, rewards = play(env, schedule, 8)
     observation, state = begin(env), None
     for _ in range(3):
         action, state = schedule.predict(observation, state)
@@ -57,15 +82,62 @@ def test_a_schedule_begins_anew_with_the_episode_and_may_be_asked_twice(name):
     observation = begin(env)
     for step in range(8):
         starts = np.full(3, step == 0)
+        kept = [part.copy() for part in state]
         once, _ = schedule.predict(observation, state, starts)
-        twice, state = schedule.predict(observation, state, starts)
-        np.testing.assert_array_equal(once, twice)
-        np.testing.assert_array_equal(twice, first[step])
-        observation, reward, *_ = env.step(twice)
+        for part, copy in zip(state, kept, strict=True):
+            np.testing.assert_array_equal(part, copy)
+        action, state = schedule.predict(observation, state, starts)
+        np.testing.assert_array_equal(once, action)
+        observation, reward, *_ = env.step(action)
         np.testing.assert_array_equal(reward, rewards[step])
 
 
-def test_a_bound_schedule_refuses_another_batch():
+@pytest.mark.parametrize("name", ["oldest-first", "expected-reduction", "oracle-error"])
+def test_sums_do_not_overlap_and_have_the_standard_level(name):
+    options = make_single(**ROADS["spans"]).unwrapped.config.queries
+    queries, _ = play(make_batch(**ROADS["spans"]), name, 8)
+    assert (queries.astype(int) @ options.covers <= 1).all()
+    levels = make_single(**ROADS["levels"]).unwrapped.config.queries.level
+    queries, _ = play(make_batch(**ROADS["levels"]), name, 4)
+    assert (levels[np.nonzero(queries)[2]] == 0.9).all()
+
+
+@pytest.mark.parametrize(
+    "name",
+    fast_and_slow(
+        ["oldest-first", "largest-variance", "stale-variance", "largest-deviation", "speed-front",
+         *PROCESS_SCHEDULES, "oracle-error"],
+        ["oldest-first", "speed-front", "greedy-trace", "oracle-error"],
+    ),
+)  # fmt: skip
+def test_a_segment_with_a_fixed_sensor_is_queried_last(name):
+    queries, _ = play(make_batch(bandwidth=5), name, 6)
+    assert not queries[..., 5].any()  # the fixed one of six
+    assert play(make_batch(bandwidth=6), name, 2)[0].all()
+
+
+@pytest.mark.parametrize("name", BOUND)
+def test_where_some_vehicles_are_connected_the_process_is_left_alone(name):
+    """Fixed sensors have rows of their own there, and noise is scaled to all vehicles."""
+    keywords = {"penetration": 0.3, "detectors": {"dropout": 0.5}}
+    env, other = make_batch(**keywords), make_batch(**keywords)
+    queries, rewards = play(env, name, 8)
+    assert (queries.sum(axis=2) == 2).all()
+    begin(other)
+    for query, reward in zip(queries, rewards, strict=True):
+        observation, own, *_ = other.step(query.astype(np.int8))
+        np.testing.assert_array_equal(own, reward)
+    np.testing.assert_array_equal(observation, env.unwrapped.process.observe(np.arange(3)))
+
+
+def test_only_oracles_use_the_truth():
+    env = make_batch()
+    blind = [*sorted(set(OBSERVATION_SCHEDULES) - {"all"}), *PROCESS_SCHEDULES]
+    assert not any(make_schedule(name, env).uses_truth for name in blind)
+    assert all(make_schedule(name, env).uses_truth for name in ORACLES)
+
+
+def test_a_schedule_that_does_not_suit_is_refused():
     env = make_batch()
     observation = begin(env)
     for name in BOUND:
@@ -73,29 +145,10 @@ def test_a_bound_schedule_refuses_another_batch():
         assert isinstance(schedule, ProcessSchedule)
         with pytest.raises(ValueError, match=rf"'{name}' follows the 3 episodes"):
             schedule.predict(observation[:2])
-
-
-SKIPS_SENSORS = (
-    "oldest-first", "largest-variance", "stale-variance", "largest-deviation", "oracle-error",
-    *DEVIATION_SCHEDULES, *COVARIANCE_SCHEDULES,
-)  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    "name",
-    fast_and_slow(
-        SKIPS_SENSORS, ("oldest-first", "stale-variance", "greedy-trace", "oracle-error")
-    ),
-)
-def test_a_segment_with_a_fixed_sensor_is_queried_last(name):
-    queries, _ = play(make_batch(bandwidth=5), name, 6)
-    assert not queries[..., 5].any()  # the fixed one of six
-    assert play(make_batch(bandwidth=6), name, 2)[0].all()
-
-
-def test_only_oracles_use_the_truth():
-    env = make_batch()
-    names = [*sorted(set(OBSERVATION_SCHEDULES) - {"all"}), *BOUND[: -len(ORACLES)]]
-    assert not any(make_schedule(name, env).uses_truth for name in names)
-    assert all(make_schedule(name, env).uses_truth for name in ORACLES)
-    assert not set(ORACLES) & {*OBSERVATION_SCHEDULES, *COVARIANCE_SCHEDULES}
+    for name, road in itertools.product(OF_SEGMENTS, ["spans", "levels"]):
+        with pytest.raises(ValueError, match=rf"schedule '{name}' queries single segments"):
+            make_schedule(name, make_single(**ROADS[road]))
+    with pytest.raises(ValueError, match=r"'greedy-trace' needs .* covariance"):
+        make_schedule("greedy-trace", make_batch(estimator="open_loop"))
+    with pytest.raises(ValueError, match=r"schedule must be one of none, .*oracle-.*, got 'best'"):
+        make_schedule("best", env)

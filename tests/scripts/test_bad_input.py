@@ -23,6 +23,7 @@ def shipped(pattern):
 
 
 PARAMETERS = shipped("dptse_env/model/sets/*.json")
+SETTINGS = b'{"x": {"estimator": "ekf", "settings": {"count_noise": 1}, "provenance": {}}}'
 POLICY = shipped("dptse_env/policies/*.zip")
 FCD = b"<fcd-export><timestep time='0'><vehicle id='a' x='0' y='0' speed='3' lane='e_0'/>"
 NETWORK = b"<configuration><input><net-file value='n.net.xml'/></input></configuration>"
@@ -34,7 +35,7 @@ FILES = {
     "road": ("r.toml", b"n_mainline = 'six'\n", ["record", "--corridor"]),
     "parameters": ("p.json", PARAMETERS, ["tune", "--parameters"]),
     "settings": (
-        "s.json", shipped("dptse_env/estimators/tuned/*.json"),
+        "s.json", SETTINGS,
         ["evaluate", "--keywords", '{{"estimator_settings": "{path}"}}'],
     ),
     "policy": ("p.zip", POLICY, ["tune", "--schedule"]),

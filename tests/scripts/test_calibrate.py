@@ -14,7 +14,8 @@ def test_it_fits_on_some_seeds_and_reports_on_others(tmp_path, capsys):
         )
     )  # fmt: skip
     printed = capsys.readouterr().out
-    assert read_parameters(tmp_path / "fitted.json").lanes == 2
+    parameters = read_parameters(tmp_path / "fitted.json")
+    assert (parameters.lanes, parameters.derived_from) == (2, "w99-3lane")
     provenance = json.loads((tmp_path / "fitted.json").read_text())["provenance"]
     errors = provenance["held_out_errors"]
     for name in ("persistence", "paper", "w99-3lane", "fitted"):

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from dptse_env.estimators.tuned_settings import read_settings
+from dptse_env.estimators.settings import read_settings
 from scripts.tune import Args, main
 
 SHORT = "dptse_env:dptse/ShortHighway-v0"
@@ -24,13 +24,10 @@ def test_it_leaves_a_set_per_configuration(tmp_path, capsys):
     printed = capsys.readouterr().out
     for privacy in args.privacy:
         name = f"random_walk-paper-{privacy}"
-        content = json.loads((args.output / f"{name}.json").read_text())
+        content = json.loads((args.output / f"{name}.json").read_text())[name]
         assert name in printed
-        assert content["name"] == name
         assert set(content["settings"]) == {"walk_noise"}
-        provenance = content["provenance"]
-        assert provenance["n_trials"] == 4
-        assert provenance["score"] >= provenance["defaults"]["score"]
+        assert content["provenance"]["n_trials"] == 4
         assert read_settings(args.output / f"{name}.json").walk_noise[0] > 0
     before = {path.name: path.read_text() for path in args.output.glob("*.json*")}
     main(args)  # finished: scored no more
@@ -64,8 +61,8 @@ def test_a_killed_run_leaves_nobody_behind_and_goes_on(tmp_path):
     assert not (tmp_path / "ekf-paper-paper.json").exists()
     subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
     assert finished(journal) == 40
-    provenance = json.loads((tmp_path / "ekf-paper-paper.json").read_text())["provenance"]
-    assert provenance["n_trials"] == 40
+    (content,) = json.loads((tmp_path / "ekf-paper-paper.json").read_text()).values()
+    assert content["provenance"]["n_trials"] == 40
 
 
 def finished(journal):

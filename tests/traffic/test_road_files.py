@@ -130,7 +130,7 @@ def test_the_keywords_of_a_file_come_after_the_callers(road):
 
 
 def test_a_complete_file_warns_of_nothing(road):
-    from dptse_env.estimators.tuned_settings import load_settings, write_settings
+    from dptse_env.estimators.settings import load_settings, write_settings
     from dptse_env.model import load_parameters
     from dptse_env.model.parameters import write_parameters
 

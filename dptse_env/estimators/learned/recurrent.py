@@ -19,8 +19,8 @@ from dptse_env.estimators.learned.channels import (
     read_rows,
 )
 from dptse_env.estimators.learned.weights import SavedNetwork, member_for, read_network
-from dptse_env.estimators.open_loop import estimated_traffic
 from dptse_env.estimators.settings import EstimatorSettings
+from dptse_env.estimators.simple import estimated_traffic
 from dptse_env.model import ARZModel
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 

@@ -34,10 +34,6 @@ class Labels(NamedTuple):
     codes: NDArray[np.int32]
     names: tuple[str, ...]
 
-    def lookup(self, values: NDArray[np.generic]) -> NDArray[np.generic]:
-        """Return the value of each row, given that of each name."""
-        return values[self.codes]
-
     def mapped(self, function: Callable[[str], str]) -> Labels:
         """Return labels with other names."""
         return Labels(self.codes, tuple(map(function, self.names)))

@@ -103,11 +103,6 @@ class Chain:
         """Return the speed limit between two distances [m]: the speed of a free crossing [km/h]."""
         return 3.6 / sum(share / _limit(edge) for edge, share in self._shares(start, end))
 
-    def edge_at(self, place: float) -> str:
-        """Return the id of the edge at a distance [m]."""
-        index = int(np.searchsorted(self.ends, place, side="right"))
-        return str(self.edges[min(index, len(self.edges) - 1)].getID())
-
     def _shares(self, start: float, end: float) -> Iterator[tuple[Any, float]]:
         for edge, (low, high) in zip(self.edges, self._ranges, strict=True):
             shared = min(end, high) - max(start, low)

@@ -7,7 +7,7 @@ import numpy as np
 from agents.audit.attack import attack
 from agents.audit.planner import choose_target, make_policy
 from dptse_env.config import EnvConfig
-from dptse_env.estimators.open_loop import OpenLoop
+from dptse_env.estimators.simple import OpenLoop
 from dptse_env.release import RELEASE_MODELS
 from dptse_env.traffic import SHORT_HIGHWAY, Demand
 

@@ -22,7 +22,7 @@ from dptse_env.estimators import (
     HorizonSettings,
     SigmaPointSettings,
 )
-from dptse_env.estimators.tuned_settings import available_settings, load_settings
+from dptse_env.estimators.settings import available_settings, load_settings
 from dptse_env.utils.fields import from_mapping
 
 

@@ -12,7 +12,7 @@ from agents.executors import THIS_PROCESS
 from agents.search.tuning import BATCH, journal_path, locked_study, scores_of
 from agents.search.tuning_task import score_episodes
 from dptse_env.estimators import EstimatorSettings
-from dptse_env.estimators.tuned_settings import load_settings, read_settings
+from dptse_env.estimators.settings import load_settings, read_settings
 from tests.agents.search.tasks import TASK
 
 MADE_UP = dataclasses.replace(TASK, seeds=f"0:{3 * BATCH}")
@@ -84,15 +84,12 @@ def test_it_finds_the_best_settings(tmp_path, fake):
     path = tmp_path / "x.json"
     study.write(path)
     assert read_settings(path).process_noise == pytest.approx((0.02, 0.005), rel=0.5)
-    provenance = json.loads(path.read_text())["provenance"]
-    assert provenance["score"] == study.study.best_value > provenance["defaults"]["score"]
-    assert provenance["defaults"]["score"] == scores_of(study.labelled("defaults"))["score"]
-    assert provenance["n_trials"] == 60 > provenance["n_stopped_early"] > 0
+    assert study.study.best_value > scores_of(study.labelled("defaults"))["score"]
+    provenance = json.loads(path.read_text())[MADE_UP.name]["provenance"]
+    assert provenance["n_trials"] == 60
     assert (provenance["seeds"], provenance["bandwidth"]) == (MADE_UP.seeds, 2)
-    assert provenance["n_diverged"] == 3.0 * BATCH
     assert provenance["at_bounds"] == []
     assert len({tuple(t.params.values()) for t in study.study.get_trials()}) == 60
-    assert set(provenance["versions"]) >= {"dptse-env", "optuna", "libsumo"}
 
 
 def test_the_defaults_and_the_present_set_are_tried_first_and_to_the_end(tmp_path, fake):

@@ -5,6 +5,7 @@ import pytest
 
 from agents.search.tuning_task import score_episodes
 from dptse_env.estimators import EstimatorSettings
+from dptse_env.estimators.settings import load_settings
 from dptse_env.evaluation import evaluate
 from dptse_env.model import ARZParameters
 from tests.agents.policies import save
@@ -58,7 +59,7 @@ def test_a_task_takes_parameters_of_its_own():
     task = dataclasses.replace(TASK, parameters=parameters, keywords={})
     assert task.name == "ekf-mine-paper"
     assert task.config().parameters == parameters
-    assert task.config().settings() == EstimatorSettings()
+    assert task.config().settings() == load_settings("ekf-w99-3lane-paper")
     assert task.identity()["bandwidth"] == 2
     with pytest.raises(ValueError, match=r"schedule must be one of .*, got 'best'"):
         dataclasses.replace(TASK, schedule="best").cell().check()

@@ -1,1 +1,0 @@
-"""Reference estimators by filterpy, numpy and qpsolvers, which follow the equations closely."""

@@ -1,0 +1,277 @@
+"""Baselines of estimators: a random walk, its blend with an EKF, and the traffic model alone."""
+
+from collections.abc import Sequence
+from typing import ClassVar
+
+import numpy as np
+
+from dptse_env.estimators.base import Estimate
+from dptse_env.estimators.batch import BatchEstimator, Measurements
+from dptse_env.estimators.compiled.ekf import CompiledEKF
+from dptse_env.estimators.settings import EstimatorSettings
+from dptse_env.model import ARZModel
+from dptse_env.model.parameters import MEASUREMENT_FLOOR
+from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+from dptse_env.utils.kernels import kernel
+
+
+class RandomWalk(BatchEstimator):
+    """Independent scalar Kalman filters on (rho, v) of each segment, without a traffic model.
+
+    Means are clipped to [0, rho_m] and [0, 1.1 v_f]. A released flow rho (v - v_0) is converted to
+    a speed by the density just estimated, which is treated as exact and at least a hundredth of
+    rho_m. A row of several segments corrects each of them by its share of the uncertainty; what it
+    says of their errors together, their covariance, is dropped.
+
+    Attributes:
+        means: Densities [veh/km] and speeds [km/h], `(n, S, 2)`.
+        variances: Of these, `(n, S, 2)`.
+    """
+
+    is_compiled: ClassVar[bool] = True
+
+    def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
+        """See `make_estimator`."""
+        super().__init__(model, n_episodes, settings)
+        scale = np.array([model.density_scale, model.speed_scale])
+        self._process_variance = (np.array(settings.walk_noise) * scale) ** 2
+        self._initial_variance = settings.initial_variance * scale**2
+        speeds = np.full(model.n_segments, model.largest_speed)
+        self._largest = np.stack([model.jam_density, speeds], axis=-1)
+        shape = (n_episodes, model.n_segments, 2)
+        self.means, self._priors = np.zeros(shape), np.zeros(shape)
+        self.variances = np.broadcast_to(self._initial_variance, shape).copy()
+
+    @property
+    def states(self) -> FloatArray:
+        """Means `(n, 2 S)` [veh/km, veh/h]."""
+        return self.model.states(self.means[..., 0], self.means[..., 1])
+
+    @property
+    def covariances(self) -> FloatArray:
+        """Covariances `(n, 2 S, 2 S)`, rho normalised by rho_m and psi by rho_m v_f.
+
+        To first order: `traffic_jacobian` turns them into the variances of density and speed.
+        """
+        inverse = np.linalg.inv(self.model.traffic_jacobian(self.states))
+        inverse /= self.model.state_scale[:2, None]
+        blocks = inverse * self.variances[..., None, :] @ inverse.swapaxes(-1, -2)
+        n_episodes, n_segments = self.means.shape[:2]
+        joint = np.zeros((n_episodes, n_segments, 2, n_segments, 2))
+        every = np.arange(n_segments)
+        joint[:, every, :, every] = blocks.swapaxes(0, 1)
+        return joint.reshape(n_episodes, 2 * n_segments, 2 * n_segments)
+
+    def _reset(
+        self, episodes: IntArray, states: FloatArray, generators: Sequence[np.random.Generator]
+    ) -> None:
+        traffic = np.stack(estimated_traffic(self.model, states), axis=-1)
+        self._priors[episodes] = np.clip(traffic, 0.0, self._largest)
+        self._restart(episodes)
+
+    def _restart(self, episodes: IntArray) -> None:
+        self.means[episodes] = self._priors[episodes]
+        self.variances[episodes] = self._initial_variance
+        self.innovations[episodes] = 0.0
+
+    def _predict(self, episodes: IntArray, inputs: FloatArray) -> None:
+        self.variances[episodes] += self._process_variance
+
+    def _update(self, measured: Measurements) -> None:
+        rows = self.model.rows
+        arrays = self.means, self.variances, self.innovations, self.diverged
+        _correct(rows.first, rows.span, self._largest, *arrays, *measured)
+        lost = measured.episodes[self.diverged[measured.episodes]]
+        if lost.size > 0:
+            self._restart(lost)
+
+    def _estimate(self) -> Estimate:
+        deviations = np.sqrt(self.variances)
+        columns = [table[..., i].copy() for table in (self.means, deviations) for i in range(2)]
+        return Estimate(*columns)
+
+
+@kernel
+def _correct(
+    first: IntArray,
+    span: IntArray,
+    largest: FloatArray,
+    means: FloatArray,
+    variances: FloatArray,
+    innovations: FloatArray,
+    diverged: BoolArray,
+    episodes: IntArray,
+    observed: BoolArray,
+    values: FloatArray,
+    sigma: FloatArray,
+    centre: FloatArray,
+) -> None:
+    """Update by one row after the other, by its density and then by its other number.
+
+    Either is a sum of its segments' densities or speeds, of known weights. The variances are in
+    Joseph form, in which no nearly equal numbers are subtracted.
+
+    Args:
+        first: `(M,)` first segments of the rows.
+        span: `(M,)` numbers of their segments.
+        largest: `(S, 2)` largest means.
+        means: `(n, S, 2)`, updated.
+        variances: `(n, S, 2)`, updated.
+        innovations: `(n, M, 2)`, written.
+        diverged: `(n,)`, written with whether a residual is not finite.
+        episodes: See `Measurements`, as the others below.
+        observed: `(k, M)`.
+        values: `(k, M, 2)`.
+        sigma: `(k, M, 2)`.
+        centre: `(k, S)`.
+    """
+    weights = np.empty(largest.shape[0])
+    for k in range(episodes.size):
+        mean, variance = means[episodes[k]], variances[episodes[k]]
+        innovations[episodes[k]] = 0.0
+        diverged[episodes[k]] = False
+        for m in range(first.size):
+            if not observed[k, m]:
+                continue
+            for i in range(2):
+                residual, noise, spread = values[k, m, i], sigma[k, m, i] ** 2, 0.0
+                for s in range(first[m], first[m] + span[m]):
+                    weights[s] = 1.0 / span[m]
+                    if i == 1 and not np.isnan(centre[k, s]):
+                        weights[s] *= max(mean[s, 0], MEASUREMENT_FLOOR * largest[s, 0])
+                        residual += weights[s] * centre[k, s]
+                    residual -= weights[s] * mean[s, i]
+                    spread += weights[s] ** 2 * variance[s, i]
+                total = spread + noise
+                diverged[episodes[k]] |= not np.isfinite(residual)
+                if not 0.0 < total < np.inf:
+                    continue
+                innovations[episodes[k], m, i] = residual / np.sqrt(total)
+                for s in range(first[m], first[m] + span[m]):
+                    h, before = weights[s], variance[s, i]
+                    gain = h * before / total
+                    others = noise + (spread - h**2 * before)
+                    mean[s, i] = min(max(mean[s, i] + gain * residual, 0.0), largest[s, i])
+                    variance[s, i] = (1.0 - gain * h) ** 2 * before + gain**2 * others
+
+
+class Blend(BatchEstimator):
+    """An EKF and a random walk on the same measurements, and the weighted mean of what they report.
+
+    With x_1 the EKF's density (or speed), x_2 the walk's and c the weight of `BlendSettings`, the
+    estimate is `c x_1 + (1 - c) x_2` and its standard deviation `c s_1 + (1 - c) s_2`: that of
+    perfectly correlated errors, the largest for errors of deviations s_1 and s_2. Both parts read
+    the same releases, so that their errors are far from independent.
+
+    A ``speed_cap`` holds the speeds of each part. `innovations` are the weighted means of the
+    parts' own. Where a part diverges, both are reset to their prior.
+
+    Attributes:
+        ekf: The EKF.
+        walk: The random walk.
+    """
+
+    is_compiled: ClassVar[bool] = True
+
+    def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
+        """See `make_estimator`."""
+        super().__init__(model, n_episodes, settings)
+        self.ekf = CompiledEKF(model, n_episodes, settings)
+        self.walk = RandomWalk(model, n_episodes, settings)
+        self._priors = np.zeros((n_episodes, 2 * model.n_segments))
+        self._weights = np.array([settings.blend.density_weight, settings.blend.speed_weight])
+
+    @property
+    def states(self) -> FloatArray:
+        """The EKF's means `(n, n_x)` [veh/km, veh/h], then demand factors if there are any."""
+        return self.ekf.states
+
+    @property
+    def covariances(self) -> FloatArray:
+        """The EKF's covariances `(n, n_x, n_x)`, rho normalised by rho_m and psi by rho_m v_f."""
+        return self.ekf.covariances
+
+    def _reset(
+        self, episodes: IntArray, states: FloatArray, generators: Sequence[np.random.Generator]
+    ) -> None:
+        self._priors[episodes] = states[:, : self._priors.shape[1]]
+        self._restart(episodes)
+
+    def _restart(self, episodes: IntArray) -> None:
+        for part in (self.ekf, self.walk):
+            part.reset(episodes, self._priors[episodes], ())  # neither part draws
+
+    def _predict(self, episodes: IntArray, inputs: FloatArray) -> None:
+        for part in (self.ekf, self.walk):
+            part._predict(episodes, inputs)
+
+    def _update(self, measured: Measurements) -> None:
+        for part in (self.ekf, self.walk):
+            part._update(measured)
+        episodes, c = measured.episodes, self._weights
+        first, second = self.ekf.innovations[episodes], self.walk.innovations[episodes]
+        self.innovations[episodes] = c * first + (1.0 - c) * second
+        self.diverged[episodes] = self.ekf.diverged[episodes] | self.walk.diverged[episodes]
+        lost = episodes[self.diverged[episodes]]
+        if lost.size > 0:
+            self.innovations[lost] = 0.0
+            self._restart(lost)
+
+    def _estimate(self) -> Estimate:
+        one, other = self.ekf.estimate(), self.walk.estimate()
+        of_density, of_speed = self._weights.tolist()
+        return Estimate(
+            _mean(of_density, one.density, other.density),
+            _mean(of_speed, one.speed, other.speed),
+            _mean(of_density, one.density_std, other.density_std),
+            _mean(of_speed, one.speed_std, other.speed_std),
+        )
+
+
+def _mean(weight: float, one: FloatArray, other: FloatArray) -> FloatArray:
+    return weight * one + (1.0 - weight) * other
+
+
+class OpenLoop(BatchEstimator):
+    """Predictions of the model from the prior; measurements are ignored.
+
+    Standard deviations and innovations are zero. An episode whose state has become non-finite is
+    reset to its prior at the next update.
+
+    Attributes:
+        states: `(n, 2 S)` [veh/km, veh/h].
+    """
+
+    def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
+        """See `make_estimator`."""
+        super().__init__(model, n_episodes, settings)
+        self.states = model.project(np.zeros((n_episodes, model.n_states)), settings.bounds)
+        self._priors = self.states.copy()
+
+    def _reset(
+        self, episodes: IntArray, states: FloatArray, generators: Sequence[np.random.Generator]
+    ) -> None:
+        self._priors[episodes] = self.model.project(states, self.settings.bounds)
+        self.states[episodes] = self._priors[episodes]
+
+    def _predict(self, episodes: IntArray, inputs: FloatArray) -> None:
+        after = self.model.step(self.states[episodes], inputs)
+        self.states[episodes] = self.model.project(after, self.settings.bounds)
+
+    def _update(self, measured: Measurements) -> None:
+        episodes = measured.episodes
+        self.diverged[episodes] = ~np.all(np.isfinite(self.states[episodes]), axis=1)
+        lost = episodes[self.diverged[episodes]]
+        self.states[lost] = self._priors[lost]
+
+    def _estimate(self) -> Estimate:
+        density, speed = estimated_traffic(self.model, self.states)
+        return Estimate(density, speed, np.zeros_like(density), np.zeros_like(speed))
+
+
+def estimated_traffic(model: ARZModel, states: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return density [veh/km] and speed [km/h] of states, the speed at most 1.1 v_f.
+
+    In the cone it never exceeds that; in the paper's box w = psi / rho has no bound.
+    """
+    return model.density(states), np.minimum(model.speed(states), model.largest_speed)

@@ -1,0 +1,221 @@
+"""Rules against their definitions, on observations that are made up."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from stable_baselines3.common.evaluation import evaluate_policy
+
+from dptse_env.config import resolve
+from dptse_env.estimators import Estimate
+from dptse_env.parts import make_interface
+from dptse_env.release import QueryOptions
+from dptse_env.schedules import Shifting, make_schedule
+from dptse_env.schedules.base import best_options, option_values
+
+from ..release.sums import SumRelease
+from .playing import begin, make_batch
+
+
+class Bare:
+    """As much of an environment as a schedule of observations needs."""
+
+    def __init__(self, **keywords):
+        self.unwrapped = self
+        config = resolve("paper-highway", keywords)
+        self.queries, self.interface = config.queries, make_interface(config)
+
+    def observation(self, k=1, **blocks):
+        """Return observations whose blocks are zero, or begin with values of the mainline."""
+        observations = self.interface.observations
+        flat = np.zeros((k, observations.space.shape[0]), dtype=np.float32)
+        for name, values in blocks.items():
+            flat[:, observations.slices[name]][:, : len(values)] = values
+        return flat
+
+
+def queried(name, n_steps, **keywords):
+    """Return the options that a schedule asks for over some steps without any news."""
+    env = Bare(**keywords)
+    schedule, state, sets = make_schedule(name, env, seed=0), None, []
+    for _ in range(n_steps):
+        action, state = schedule.predict(env.observation()[0], state)
+        sets.append(np.flatnonzero(action).tolist())
+    return sets
+
+
+def test_shifting_sets_start_far_apart_and_move_downstream():
+    for bandwidth in (5, 7, 11):
+        (start,) = queried("static", 1, bandwidth=bandwidth)
+        assert start == [15 * i // bandwidth for i in range(bandwidth)]
+    assert queried("static", 9) == [[0, 3, 6, 9, 12]] * 9
+    assert queried("round-robin", 3) == [[0, 3, 6, 9, 12], [1, 4, 7, 10, 13], [2, 5, 8, 11, 14]]
+    sets = queried("paper", 61)
+    assert sets[:8] == [[0, 3, 6, 9, 12]] * 4 + [[1, 4, 7, 10, 13]] * 4
+    assert sets[8] == [2, 5, 8, 11, 14]
+    assert sets[60] == sets[12] == sets[0]
+    with pytest.raises(ValueError, match=r"schedule\.period must be"):
+        Shifting(Bare().interface, period=0)
+
+
+def test_a_shifting_set_keeps_to_one_span_and_level():
+    env = Bare(query_spans=(2, 3), price_levels=(0.5, 1.0), bandwidth=6, privacy=SumRelease)
+    size = env.interface.observations.space.shape[0]
+    steps = np.arange(14)
+    asked = make_schedule("round-robin", env).select(steps, np.zeros((14, size), np.float32))
+    assert (env.queries.span[np.nonzero(asked)[1]] == 2).all()
+    assert (env.queries.level[np.nonzero(asked)[1]] == 1.0).all()
+    first = [env.queries.first[row].tolist() for row in asked]
+    assert (first[0], first[1], first[5]) == ([0, 4, 9], [1, 5, 10], [0, 5, 9])
+    assert (asked.sum(axis=0)[asked.any(axis=0)] == 3).all()  # each of them equally often
+
+
+def test_random_draws_different_sets_of_full_size():
+    sets = queried("random", 200)
+    assert all(len(chosen) == 5 for chosen in sets)
+    assert len({tuple(chosen) for chosen in sets}) > 150
+    assert np.bincount(np.concatenate(sets), minlength=15).min() > 40
+    assert queried("random", 5) == sets[:5]
+
+
+def test_none_and_all():
+    assert queried("none", 1) == [[]]
+    assert queried("all", 1, bandwidth=15) == [list(range(15))]
+    spans = {"query_spans": (1, 2), "price_levels": (0.5, 1.0), "privacy": SumRelease}
+    (asked,), options = queried("all", 1, bandwidth=15, **spans), Bare(**spans).queries
+    assert sorted(options.first[asked]) == list(range(15))
+    assert set(zip(options.span[asked], options.level[asked], strict=True)) == {(1, 1.0)}
+    with pytest.raises(ValueError, match="'all' needs bandwidth 15, the environment has 5"):
+        queried("all", 1)
+    with pytest.raises(ValueError, match=r"'all' needs query_spans with 1, got query_spa"):
+        queried("all", 1, query_spans=(2,), bandwidth=15, privacy=SumRelease)
+
+
+def test_oldest_first_asks_the_oldest_and_breaks_ties_in_turn():
+    env = Bare()
+    age = np.linspace(0, 1, 15)[[3, 1, 14, 0, 2, 5, 4, 13, 12, 6, 7, 8, 11, 10, 9]]
+    schedule = make_schedule("oldest-first", env)
+    action, _ = schedule.predict(env.observation(age=age)[0])
+    assert np.flatnonzero(action).tolist() == [2, 7, 8, 12, 13]
+    counts, state = np.zeros(15), None
+    for _ in range(140):
+        action, state = schedule.predict(env.observation()[0], state)
+        counts += action
+    assert counts[14] == 0  # it has a fixed sensor
+    assert counts[:14].min() > 40
+
+
+def test_a_batch_keeps_one_clock_per_episode():
+    env = Bare()
+    schedule = make_schedule("round-robin", env)
+    _, state = schedule.predict(env.observation(2))
+    action, _ = schedule.predict(env.observation(2), state, np.array([True, False]))
+    assert [np.flatnonzero(row)[0] for row in action] == [0, 1]
+
+
+def test_stable_baselines3_evaluates_a_schedule():
+    env = gym.make("dptse_env:dptse/ShortHighway-v0", horizon=20, traffic_seeds="0:1")
+    mean, _ = evaluate_policy(make_schedule("paper", env), env, n_eval_episodes=2, warn=False)
+    assert mean < 0
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("largest-variance", [1, 5, 12]), ("largest-density-variance", [1, 8, 12]),
+        ("stale-variance", [1, 2, 12]), ("largest-deviation", [1, 5, 12]),
+    ],
+)  # fmt: skip
+def test_deviations_are_weighed_by_age(name, expected):
+    """Scores are (age + 1)^a (s_rho^2 + min(s_v, cap)^2), a = 2 with a cap of 0.1, or 0 or 1."""
+    env = Bare(bandwidth=3)
+    age = np.zeros(15)
+    density, speed = np.full(15, 0.01), np.full(15, 0.01)
+    age[1], density[1] = 8 / 60, 0.3  # far ahead under all
+    age[2], density[2] = 24 / 60, 0.05  # 1.6 with the square of the age, 0.06 with the age
+    density[12], speed[12] = 0.5, 0.1
+    density[8] = 0.28  # between these two
+    speed[5] = 1.5  # held to 0.1 under a cap
+    observation = env.observation(
+        age=age, density_log_std=np.log(density), speed_log_std=np.log(speed)
+    )
+    action, _ = make_schedule(name, env).predict(observation[0])
+    assert np.flatnonzero(action).tolist() == expected
+
+
+def test_fronts_are_queried_where_answers_surprised():
+    """Scores are (age + 1)^1.5 (|v_before - v_after| + 0.02) q (v + 0.3) (2 - x)."""
+    env = Bare(bandwidth=2)
+    speed = np.full(15, 1.0)
+    speed[8:] = 0.4  # a front at 7 and 8, faster and upstream at 7
+    blocks = {"speed": speed, "age": np.full(15, 0.1)}
+    flags, surprise = np.zeros(15), np.zeros(15)
+    flags[[2, 8]], surprise[2] = 1.0, 10.0
+    answers = {"queried": flags, "density_innovation": surprise, "speed_innovation": surprise}
+    schedule = make_schedule("speed-front", env)
+    action, state = schedule.predict(env.observation(**blocks)[0])
+    assert np.flatnonzero(action).tolist() == [7, 8]
+    for _ in range(3):  # surprised by 2, not by 8, of which no more is expected
+        action, state = schedule.predict(env.observation(**blocks, **answers)[0], state)
+    np.testing.assert_allclose(state.surprise[0, [2, 7, 8]], [0.512 + 48.8, 1.0, 0.512])
+    assert np.flatnonzero(action).tolist() == [2, 7]
+    action, state = schedule.predict(env.observation(**blocks)[0], state, episode_start=[True])
+    assert (state.surprise == 1.0).all()
+    assert np.flatnonzero(action).tolist() == [7, 8]
+
+
+@pytest.mark.parametrize("privacy", ["paper", "capped"])
+@pytest.mark.parametrize("term", ["joint", "speed"])
+def test_the_expected_reduction_is_that_of_independent_updates(privacy, term):
+    env = make_batch(privacy=privacy, reward=term, bandwidth=1)
+    observation = begin(env)
+    process, rng = env.unwrapped.process, np.random.default_rng(0)
+    corridor, sigma = process.config.corridor, process.release.sigma
+    shape = process.n_episodes, process.model.n_segments
+    density, speed = rng.uniform(10.0, 90.0, shape), rng.uniform(20.0, 90.0, shape)
+    spread = rng.uniform(1.0, 40.0, (2, *shape))
+    process.estimate = Estimate(density, speed, spread[0], spread[1])
+    process.age = rng.integers(0, 20, process.age.shape)
+    action, _ = make_schedule("expected-reduction", env).predict(observation)
+
+    P, Q = spread[:, :, : corridor.n_mainline] ** 2
+    noise = sigma[1] / density[:, : corridor.n_mainline] if privacy == "capped" else sigma[1]
+    value = (Q - 1.0 / (1.0 / Q + 1.0 / noise**2)) / corridor.speed_scale**2
+    if term == "joint":
+        value += (P - 1.0 / (1.0 / P + 1.0 / sigma[0] ** 2)) / corridor.density_scale**2
+    value *= process.age + 1.0
+    value[:, 5] = -1.0  # it has a fixed sensor
+    np.testing.assert_array_equal(np.argmax(action, axis=1), np.argmax(value, axis=1))
+
+
+def test_an_option_is_worth_the_mean_of_its_segments_for_its_cost():
+    free = np.zeros(0, dtype=np.int64)
+    value = np.array([[1.0, 2.0, 3.0, 0.0]])
+    sums = QueryOptions.make(4, 2, (1, 2), unit="sums")
+    assert option_values(sums, value, free).tolist() == [[1, 2, 3, 0, 1.5, 2.5, 1.5]]
+    segments = QueryOptions.make(4, 2, (1, 2))
+    assert option_values(segments, value, free).tolist() == [[1, 2, 3, 0, 0.75, 1.25, 0.75]]
+    # A fixed sensor makes a segment worth the least of the others.
+    value, sensors = np.array([[4.0, 2.0, 9.0, 9.0]]), np.array([2, 3])
+    expected = [4, 2, -np.inf, -np.inf, 3, 2, -np.inf]
+    assert option_values(sums, value, sensors).tolist() == [expected]
+
+
+@pytest.mark.parametrize(
+    ("options", "value", "expected"),
+    [
+        (QueryOptions.make(6, 2, (3,), unit="sums"), [1, 1, 1, 1, 1, 0.5], [(0, 1), (3, 1)]),
+        # None is left apart from the best.
+        (QueryOptions.make(6, 2, (3,), unit="sums"), [0, 1, 1, 1, 0, 0], [(0, 1), (1, 1)]),
+        (QueryOptions.make(6, 3, (1, 2)), [0, 0, 1, 5, 5, 0], [(2, 1), (3, 1), (4, 1)]),
+        # What is left goes to overlapping options, then to other levels.
+        (
+            QueryOptions.make(4, 4, (2,), (4.0, 1.0), unit="sums"),
+            [0, 1, 1, 2], [(2, 4), (0, 1), (1, 1), (2, 1)],
+        ),
+    ],
+)  # fmt: skip
+def test_the_best_options_are_apart_while_there_are_such(options, value, expected):
+    none, step = np.zeros(0, dtype=np.int64), np.zeros(1, dtype=np.int64)
+    (best,) = best_options(options, np.array([value], dtype=float), none, step)
+    taken = np.flatnonzero(best)
+    assert list(zip(options.first[taken], options.level[taken], strict=True)) == expected
