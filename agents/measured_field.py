@@ -6,14 +6,12 @@ A field has no vehicles. What a release would say is the field itself plus the n
 
 from __future__ import annotations
 
-from dptse_env.estimators import Measurement
-
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from dptse_env.estimators import make_estimator
+from dptse_env.estimators import Measurement, make_estimator
 from dptse_env.evaluation import WARM_UP
 from dptse_env.model import ARZModel, ARZParameters
 from dptse_env.privacy import paper_sensitivity, single_noise_std
@@ -145,7 +143,12 @@ class Replay:
             observed = np.zeros((k, n), dtype=bool)
             observed[:, (t * self.bandwidth + np.arange(self.bandwidth)) % n] = True
             now = truth[:, t, 1:-1]
-            made.update(everyone, Measurement.of(made.model, observed, now + sigma * rng.normal(size=now.shape), sigma))
+            made.update(
+                everyone,
+                Measurement.of(
+                    made.model, observed, now + sigma * rng.normal(size=now.shape), sigma
+                ),
+            )
             if t > WARM_UP:
                 said = made.estimate()
                 error = np.stack([said.density, said.speed], -1) - now

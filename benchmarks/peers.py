@@ -6,8 +6,6 @@ fifty times as much. Their noise is given as a matrix.
 
 from __future__ import annotations
 
-from dptse_env.estimators import Measurement
-
 from typing import Any
 
 import numpy as np
@@ -19,7 +17,7 @@ from filterpy.kalman import (
 )
 
 from benchmarks.replay import Replay
-from dptse_env.estimators import make_estimator
+from dptse_env.estimators import Measurement, make_estimator
 from dptse_env.model import ARZModel
 from dptse_env.utils.arrays import BoolArray, FloatArray
 
@@ -138,5 +136,8 @@ def ekf_states(
         if k % block == 0:
             starts[k] = ekf.states[0] / scale, ekf.covariances[0].copy()
         ekf.predict(episode, replay.inputs[k, :1])
-        ekf.update(episode, Measurement.of(ekf.model, replay.observed[k, :1], replay.values[k, :1], replay.sigma))
+        ekf.update(
+            episode,
+            Measurement.of(ekf.model, replay.observed[k, :1], replay.values[k, :1], replay.sigma),
+        )
     return starts

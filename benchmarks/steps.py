@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dptse_env.estimators import Measurement
-
 from collections.abc import Mapping
 from typing import Any, Protocol
 
@@ -11,7 +9,7 @@ import numpy as np
 
 from benchmarks.replay import Replay
 from benchmarks.throughput.measure import take_turns
-from dptse_env.estimators import make_estimator
+from dptse_env.estimators import Measurement, make_estimator
 from dptse_env.utils.arrays import FloatArray
 
 REFERENCES = ("ekf", "ukf", "mhe")
@@ -50,7 +48,12 @@ class Steps:
         episodes, replay = self._episodes, self._replay
         for k in self._block:
             self._estimator.predict(episodes, replay.inputs[k])
-            self._estimator.update(episodes, Measurement.of(self._estimator.model, replay.observed[k], replay.values[k], replay.sigma))
+            self._estimator.update(
+                episodes,
+                Measurement.of(
+                    self._estimator.model, replay.observed[k], replay.values[k], replay.sigma
+                ),
+            )
         return len(self._block) * len(episodes)
 
 

@@ -29,9 +29,7 @@ def measured(values, sigma=1.0, centre=50.0):
     values = np.asarray(values, dtype=np.float64)
     everywhere = np.ones(values.shape[:2], dtype=bool)
     deviations = np.full(values.shape, sigma)
-    return Measurement(
-        everywhere, values, deviations, np.full((len(values), N_SEGMENTS), centre)
-    )
+    return Measurement(everywhere, values, deviations, np.full((len(values), N_SEGMENTS), centre))
 
 
 @pytest.mark.parametrize("share", [0.05, 0.3, 0.9])

@@ -90,9 +90,7 @@ class Measurement(NamedTuple):
         """
         seen = np.ascontiguousarray(observed, dtype=np.bool_)
         if seen.ndim != 2 or seen.shape[1] != model.rows.n_rows:
-            raise ValueError(
-                f"observed must have shape (k, {model.rows.n_rows}), got {seen.shape}"
-            )
+            raise ValueError(f"observed must have shape (k, {model.rows.n_rows}), got {seen.shape}")
         given = np.ascontiguousarray(values, dtype=np.float64)
         if given.shape != (*seen.shape, 2):
             raise ValueError(f"values must have shape {(*seen.shape, 2)}, got {given.shape}")
@@ -107,8 +105,8 @@ class Measurement(NamedTuple):
             raise ValueError("centre must be finite")
         return cls(seen, given, deviations, around)
 
-    def at(self, episodes: slice | IntArray) -> Measurement:
-        """Return the rows of some of the k episodes."""
+    def at(self, episodes: slice | int) -> Measurement:
+        """Return the rows of a block of the k episodes, or those of one without the axis."""
         return Measurement(*(array[episodes] for array in self))
 
     def on_road(self, n_rows: int, n_segments: int) -> Measurement:

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from dptse_env.estimators import Measurement
-
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from dptse_env.estimators import EstimatorSettings, make_estimator
+from dptse_env.estimators import EstimatorSettings, Measurement, make_estimator
 from dptse_env.estimators.base import Estimator
 from dptse_env.model import ARZModel
 from dptse_env.model.parameters import load_parameters
@@ -143,7 +141,10 @@ def run(
     sigma = episodes.sigma if sigma is None else sigma
     for k in steps:
         estimator.predict(episodes.everyone, episodes.inputs[k])
-        estimator.update(episodes.everyone, Measurement.of(estimator.model, episodes.observed[k], episodes.values[k], sigma))
+        estimator.update(
+            episodes.everyone,
+            Measurement.of(estimator.model, episodes.observed[k], episodes.values[k], sigma),
+        )
         watch(k)
 
 

@@ -1,13 +1,18 @@
 """The blend of an EKF and a random walk."""
 
-from dptse_env.estimators import Measurement
 import copy
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from dptse_env.estimators import BACKENDS, BlendSettings, DemandSettings, EstimatorSettings
+from dptse_env.estimators import (
+    BACKENDS,
+    BlendSettings,
+    DemandSettings,
+    EstimatorSettings,
+    Measurement,
+)
 
 from .episodes import RELEASES, assert_same, run, show, simulate, started
 from .rows import averaged, update
@@ -92,7 +97,10 @@ def test_both_parts_are_reset_where_one_diverges(backend):
     poisoned = episodes.inputs[5].copy()
     poisoned[1] = np.nan
     blend.predict(episodes.everyone, poisoned)
-    blend.update(episodes.everyone, Measurement.of(blend.model, episodes.observed[5], episodes.values[5], episodes.sigma))
+    blend.update(
+        episodes.everyone,
+        Measurement.of(blend.model, episodes.observed[5], episodes.values[5], episodes.sigma),
+    )
     assert blend.diverged.tolist() == [False, True]
     estimate = blend.estimate()
     for field in FIELDS:

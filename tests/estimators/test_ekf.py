@@ -1,10 +1,9 @@
 """Both backends of the extended Kalman filter, and each against the other."""
 
-from dptse_env.estimators import Measurement
 import numpy as np
 import pytest
 
-from dptse_env.estimators import EstimatorSettings
+from dptse_env.estimators import EstimatorSettings, Measurement
 from tests.cases import pairwise
 
 from .episodes import RELEASES, SIGMA, run, scale_of, simulate, started
@@ -67,7 +66,10 @@ def test_a_broken_covariance_is_found(backend, poison):
         kept[0, 20, 4] = kept[0, 4, 20] = 10.0
     else:
         kept[0, 20, 20] = poison
-    ekf.update(episodes.everyone, Measurement.of(ekf.model, episodes.observed[4], episodes.values[4], SIGMA))
+    ekf.update(
+        episodes.everyone,
+        Measurement.of(ekf.model, episodes.observed[4], episodes.values[4], SIGMA),
+    )
     assert ekf.diverged.tolist() == [True]
     np.testing.assert_array_equal(ekf.covariances[0], 1e-3 * np.eye(38))
 

@@ -1,6 +1,5 @@
 """On linear and Gaussian problems every filter equals the Kalman filter."""
 
-from dptse_env.estimators import Measurement
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -11,6 +10,7 @@ from dptse_env.estimators import (
     BACKENDS,
     EstimatorSettings,
     HorizonSettings,
+    Measurement,
     SigmaPointSettings,
     make_estimator,
 )
@@ -97,7 +97,9 @@ def of_estimator(name, backend, sensor, values, **settings):
     estimator.reset(EVERYONE, START[None], random_streams(1))
     for z in values:
         estimator.predict(EVERYONE, INPUTS)
-        estimator.update(EVERYONE, Measurement.of(estimator.model, np.ones((1, 1), bool), z, sensor.sigma))
+        estimator.update(
+            EVERYONE, Measurement.of(estimator.model, np.ones((1, 1), bool), z, sensor.sigma)
+        )
         covariance = estimator.covariances[0] * np.outer(UNIT, UNIT)
         yield Step(estimator.states[0], covariance, estimator.innovations[0, 0].copy())
 

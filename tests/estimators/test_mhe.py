@@ -1,6 +1,5 @@
 """The moving horizon estimator beside the reference, and what it leaves to other solvers."""
 
-from dptse_env.estimators import Measurement
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +11,7 @@ from dptse_env.estimators import (
     DemandSettings,
     EstimatorSettings,
     HorizonSettings,
+    Measurement,
     make_estimator,
 )
 from dptse_env.estimators import horizon as horizon_module
@@ -229,7 +229,10 @@ def test_what_is_not_solved_leaves_the_prediction_and_a_flag(backend, solver, mo
     monkeypatch.setattr(mhe_module, "update", unsolved)
     mhe.predict(episodes.everyone, episodes.inputs[8])
     predicted = mhe.states
-    mhe.update(episodes.everyone, Measurement.of(mhe.model, episodes.observed[8], episodes.values[8], SIGMA))
+    mhe.update(
+        episodes.everyone,
+        Measurement.of(mhe.model, episodes.observed[8], episodes.values[8], SIGMA),
+    )
     assert mhe.fallback.tolist() == [True, True]
     assert mhe.diverged.tolist() == [False, False]
     np.testing.assert_array_equal(mhe.states, predicted)

@@ -68,7 +68,10 @@ def test_a_flow_of_a_segment_found_empty_is_read_at_the_least_density():
     prior = walk.estimate()
     assert (prior.density == 0.0).all()
     values = np.tile([-500.0, 20.0], (1, 19, 1))  # the density stays at zero
-    walk.update(episodes.everyone, Measurement.of(walk.model, np.ones((1, 19), bool), values, episodes.sigma))
+    walk.update(
+        episodes.everyone,
+        Measurement.of(walk.model, np.ones((1, 19), bool), values, episodes.sigma),
+    )
     estimate = walk.estimate()
     np.testing.assert_array_equal(estimate.density, 0.0)
     floor = 0.01 * episodes.model.jam_density
@@ -89,7 +92,10 @@ def test_noiseless_measurements_of_a_certain_state_are_no_division_by_zero(relea
     everywhere = np.ones((1, 19), bool)
     for _ in range(2):
         walk.predict(episodes.everyone, episodes.inputs[0])
-        walk.update(episodes.everyone, Measurement.of(walk.model, everywhere, np.full((1, 19, 2), 20.0), np.zeros(2)))
+        walk.update(
+            episodes.everyone,
+            Measurement.of(walk.model, everywhere, np.full((1, 19, 2), 20.0), np.zeros(2)),
+        )
     np.testing.assert_allclose(walk.estimate().density, 20.0)
     speed = 20.0 if release == "speed" else REFERENCE_SPEED + 20.0 / 20.0
     np.testing.assert_allclose(walk.estimate().speed, speed)
@@ -176,7 +182,10 @@ def test_a_sum_that_is_not_finite_resets_the_episode():
     values = episodes.values[0].copy()
     values[0, -1, 1] = np.nan
     args = episodes.sigma[0], episodes.centre[0]
-    walk.update(episodes.everyone, Measurement.of(walk.model, np.ones_like(episodes.observed[0]), values, *args))
+    walk.update(
+        episodes.everyone,
+        Measurement.of(walk.model, np.ones_like(episodes.observed[0]), values, *args),
+    )
     assert walk.diverged[0]
     np.testing.assert_array_equal(walk.means, walk._prior)
     assert np.all(walk.innovations == 0.0)

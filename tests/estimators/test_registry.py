@@ -1,11 +1,10 @@
-from dptse_env.estimators import Measurement
 import subprocess
 import sys
 
 import numpy as np
 import pytest
 
-from dptse_env.estimators import BACKENDS, ESTIMATORS, make_estimator
+from dptse_env.estimators import BACKENDS, ESTIMATORS, Measurement, make_estimator
 from dptse_env.model import ARZModel, load_parameters
 from dptse_env.traffic import PAPER_HIGHWAY
 
@@ -24,7 +23,10 @@ def follows_the_protocol(name, backend):
     states = MODEL.states(np.full((3, 19), 30.0), np.full((3, 19), 80.0))
     estimator.reset(everyone, states, [np.random.default_rng(i) for i in everyone])
     estimator.predict(everyone, np.zeros((3, 9)))
-    estimator.update(everyone, Measurement.of(estimator.model, np.ones((3, 19), bool), MODEL.measure(states), np.ones(2)))
+    estimator.update(
+        everyone,
+        Measurement.of(estimator.model, np.ones((3, 19), bool), MODEL.measure(states), np.ones(2)),
+    )
     assert estimator.n_episodes == 3
     assert estimator.innovations.shape == (3, 19, 2)
     assert estimator.diverged.tolist() == [False] * 3

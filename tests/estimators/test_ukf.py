@@ -1,11 +1,10 @@
 """Both backends of the unscented Kalman filter, and each against the other."""
 
-from dptse_env.estimators import Measurement
 import numpy as np
 import pytest
 from filterpy.kalman import MerweScaledSigmaPoints
 
-from dptse_env.estimators import EstimatorSettings, SigmaPointSettings
+from dptse_env.estimators import EstimatorSettings, Measurement, SigmaPointSettings
 from dptse_env.estimators.compiled.dense import eliminate
 from dptse_env.estimators.compiled.ukf import CompiledUKF
 from dptse_env.model import ARZModel, load_parameters
@@ -129,6 +128,9 @@ def test_a_broken_covariance_is_found(backend, poison):
         kept[0, 20, 4] = kept[0, 4, 20] = 10.0
     else:
         kept[0, 20, 20] = poison
-    filters.update(episodes.everyone, Measurement.of(filters.model, episodes.observed[4], episodes.values[4], SIGMA))
+    filters.update(
+        episodes.everyone,
+        Measurement.of(filters.model, episodes.observed[4], episodes.values[4], SIGMA),
+    )
     assert filters.diverged.tolist() == [True]
     np.testing.assert_array_equal(filters.covariances[0], 1e-3 * np.eye(38))

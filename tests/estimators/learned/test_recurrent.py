@@ -46,7 +46,10 @@ def test_backends_agree(release, width, tmp_path):
         assert_agree(*pair)
         for estimator in pair:
             estimator.update(
-                episodes.everyone, Measurement.of(estimator.model, episodes.observed[k], episodes.values[k], episodes.sigma)
+                episodes.everyone,
+                Measurement.of(
+                    estimator.model, episodes.observed[k], episodes.values[k], episodes.sigma
+                ),
             )
         assert_agree(*pair)
     assert np.abs(pair[0].hidden).max() > 0.5
@@ -133,7 +136,10 @@ def test_news_travel_from_cell_to_cell(backend, tmp_path):
             estimator.predict(episodes.everyone, episodes.inputs[0])
             observed[:] = False
             observed[0, 8] = second == 0
-            estimator.update(episodes.everyone, Measurement.of(estimator.model, observed, values + shift, episodes.sigma))
+            estimator.update(
+                episodes.everyone,
+                Measurement.of(estimator.model, observed, values + shift, episodes.sigma),
+            )
         a, b = (estimator.estimate().density[0] for estimator in pair)
         np.testing.assert_array_equal(np.abs(a - b) > 1e-9, reached)
         reached = sparsity @ reached
@@ -175,7 +181,10 @@ def test_releases_that_are_not_finite_reset_their_episode_alone(backend, bad, tm
     values = episodes.values[5].copy()
     values[1, 14, 0] = bad
     estimator.predict(episodes.everyone, episodes.inputs[5])
-    estimator.update(episodes.everyone, Measurement.of(estimator.model, episodes.observed[5], values, episodes.sigma))
+    estimator.update(
+        episodes.everyone,
+        Measurement.of(estimator.model, episodes.observed[5], values, episodes.sigma),
+    )
     assert estimator.diverged.tolist() == [False, True]
     assert not estimator.hidden[1].any()
     assert not estimator.innovations[1].any()
