@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dptse_env.estimators.base import BatchEstimator, Estimate, Measurement
-from dptse_env.estimators.compiled.ekf_kernels import Packed
 from dptse_env.estimators.linalg import factor, padded, solve_many
 from dptse_env.estimators.noise import count_variance, initial_variance, process_variance
 from dptse_env.estimators.normals import STREAM_WIDTH, Draws, draw, make_stream
@@ -30,7 +29,7 @@ from dptse_env.model.network import RoadArrays, RoadNetwork
 from dptse_env.model.parameters import LARGEST_W
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.kernel_loops import copy_vector
-from dptse_env.utils.kernels import kernel, kernel_part
+from dptse_env.utils.kernels import Packed, kernel, kernel_part
 
 
 class Ensembles(NamedTuple):

@@ -20,6 +20,12 @@ def padded(n: int) -> int:
     return -(-n // VECTOR_WIDTH) * VECTOR_WIDTH
 
 
+@kernel_part
+def to_diagonal(i: int) -> int:
+    """Length of row i of the lower half of a matrix, its last register whole."""
+    return (i // VECTOR_WIDTH + 1) * VECTOR_WIDTH
+
+
 @kernel_part(fastmath={"contract"})
 def multiply(
     road: RoadArrays,
@@ -27,6 +33,7 @@ def multiply(
     by_factor: FloatArray,
     right: FloatArray,
     out: FloatArray,
+    is_lower: bool = False,
 ) -> None:
     """Write A right to `out`; demand factors, the last components, stay.
 
@@ -36,10 +43,13 @@ def multiply(
         by_factor: `(E, 2)` derivatives of the entries' segments by the demand factors.
         right: `(n_x, width)`.
         out: `(n_x, width)`, another matrix.
+        is_lower: Whether to write only the lower half and what is left of the diagonal's register.
     """
     n, width = 2 * road.jam.size, right.shape[1]
     for c in range(road.jam.size):
         upper, lower = out[2 * c], out[2 * c + 1]
+        if is_lower:
+            width = to_diagonal(2 * c)
         for slot in range(road.degree[c]):
             a, b = blocks[c, slot, 0], blocks[c, slot, 1]
             d, e = blocks[c, slot, 2], blocks[c, slot, 3]
@@ -58,9 +68,12 @@ def multiply(
     for k in range(right.shape[0] - n):
         upper, lower, factor = out[2 * road.entries[k]], out[2 * road.entries[k] + 1], right[n + k]
         a, b, kept = by_factor[k, 0], by_factor[k, 1], out[n + k]
+        if is_lower:
+            width = to_diagonal(2 * road.entries[k])
         for j in range(width):
             upper[j] += a * factor[j]
             lower[j] += b * factor[j]
+        for j in range(right.shape[1]):
             kept[j] = factor[j]
 
 
@@ -139,10 +152,9 @@ def propagate(
         for j in range(n):
             transposed[i, j] = product[j, i]
         transposed[i, n:] = 0.0
-    multiply(road, blocks, by_factor, transposed, out)
+    multiply(road, blocks, by_factor, transposed, out, is_lower=True)
+    mirror(out)
     for i in range(n):
-        for j in range(i):
-            out[j, i] = out[i, j]
         out[i, i] += noise[i]
 
 
@@ -184,29 +196,26 @@ def scalar_update(
 
 @kernel_part(fastmath={"contract"})
 def pair_update(
-    covariance: FloatArray,
-    first: int,
-    rows: FloatArray,
-    noise: FloatArray,
-    columns: FloatArray,
-    gains: FloatArray,
+    covariance: FloatArray, first: int, rows: FloatArray, noise: FloatArray, work: FloatArray
 ) -> bool:
     """Update a covariance by both numbers of a row: two `scalar_update`, P traversed once.
 
+    Only the lower half of P, and the rest of the registers on its diagonal, is read and replaced,
+    which is half the work; after the last row `mirror` makes it whole.
+
     Args:
-        covariance: `(n_x, padded)` P, symmetric.
+        covariance: `(n_x, padded)` P.
         first: First component that the numbers depend on.
         rows: `(2, size)` derivatives by that component and the following ones.
         noise: `(2,)` variances.
-        columns: `(2, padded)` scratch.
-        gains: `(2, padded)`, written; the second number's is that after the first update.
+        work: `(4, padded)`, its last two written with the gains; the second number's is that after
+            the first update.
 
     Returns:
         Whether both variances are sound.
     """
-    c, d, k, g = columns[0], columns[1], gains[0], gains[1]
-    _project_row(covariance, first, rows[0], c)
-    _project_row(covariance, first, rows[1], d)
+    c, d, k, g = work[0], work[1], work[2], work[3]
+    _project_pair(covariance, first, rows, c, d)
     first_total = _gain(first, rows[0], noise[0], c, k)
     by_column, by_gain = 0.0, 0.0
     for i in range(rows.shape[1]):
@@ -220,9 +229,34 @@ def pair_update(
     for i in range(covariance.shape[0]):
         x, y, line = k[i], g[i], covariance[i]
         rest_x, rest_y = c[i] - first_total * x, d[i] - second_total * y
-        for j in range(c.size):
+        for j in range(to_diagonal(i)):
             line[j] -= x * c[j] + rest_x * k[j] + (y * d[j] + rest_y * g[j])
     return True
+
+
+@kernel_part(fastmath={"contract"})
+def _project_pair(
+    covariance: FloatArray, first: int, rows: FloatArray, one: FloatArray, other: FloatArray
+) -> None:
+    """Write P h of two rows h, P by its lower half."""
+    one[:], other[:] = 0.0, 0.0
+    for i in range(rows.shape[1]):
+        a, b, line, end = rows[0, i], rows[1, i], covariance[first + i], to_diagonal(first + i)
+        for j in range(end):
+            one[j] += a * line[j]
+            other[j] += b * line[j]
+        for j in range(end, covariance.shape[0]):
+            x = covariance[j, first + i]
+            one[j] += a * x
+            other[j] += b * x
+
+
+@kernel_part
+def mirror(matrix: FloatArray) -> None:
+    """Copy the lower half of a square matrix, or of one with padded rows, to the upper one."""
+    for i in range(matrix.shape[0]):
+        for j in range(i):
+            matrix[j, i] = matrix[i, j]
 
 
 @kernel_part(fastmath={"contract"})
@@ -248,6 +282,32 @@ def _gain(first: int, row: FloatArray, noise: float, column: FloatArray, gain: F
     for j in range(column.size):
         gain[j] = column[j] * inverse
     return total
+
+
+@kernel_part(fastmath={"contract"})
+def is_covariance(matrix: FloatArray, variances: FloatArray) -> bool:
+    """Return whether variances are finite and not negative and no correlation exceeds one.
+
+    It is cheaper than a factorisation and detects a diverged filter: a matrix with a correlation
+    above one is indefinite.
+
+    Args:
+        matrix: `(n_x, padded)`.
+        variances: `(padded,)`, written with the diagonal.
+    """
+    n = matrix.shape[0]
+    for i in range(n):
+        variances[i] = matrix[i, i]
+        if not 0.0 <= variances[i] < np.inf:
+            return False
+    possible = 0
+    for i in range(n):
+        allowed, line = (1.0 + 1e-9) * variances[i], matrix[i]
+        for j in range(i + 1):
+            # A NaN is not counted.
+            if line[j] * line[j] <= allowed * variances[j] + 1e-24:
+                possible += 1
+    return possible == n * (n + 1) // 2
 
 
 @kernel_part(fastmath={"contract"})

@@ -5,10 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from dptse_env.estimators import ekf
 from dptse_env.estimators.base import Measurement
-from dptse_env.estimators.compiled import ekf_kernels
-from dptse_env.estimators.compiled.ekf_kernels import Filters, Packed, process_noise
-from dptse_env.estimators.compiled.kalman import CompiledFilter
+from dptse_env.estimators.ekf import CovarianceFilter, Filters, process_noise
 from dptse_env.estimators.horizon import (
     LEAST_DEVIATION,
     moving_variance,
@@ -31,7 +30,7 @@ from dptse_env.model import ARZModel
 from dptse_env.model.network import RoadArrays
 from dptse_env.model.step import advance, make_scratch, normalise, project, write_row
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
-from dptse_env.utils.kernels import kernel, kernel_part
+from dptse_env.utils.kernels import Packed, kernel, kernel_part
 
 GENERAL_SOLVER, FALLBACK = 3, 4  # how a program was solved, beside those of `window`
 
@@ -71,7 +70,7 @@ class Windows(NamedTuple):
 def restart(filters_: Packed, windows_: Packed, e: int) -> None:
     """Reset an episode to a window of a single stage, its prior."""
     filters, windows = Filters(*filters_), Windows(*windows_)
-    ekf_kernels.restart(filters, e)
+    ekf.restart(filters, e)
     windows.length[e], windows.solved[e] = 1, UNSOLVED
     windows.arrival_variance[e] = filters.initial_variance
     _enter(filters, windows, e, 0)
@@ -167,7 +166,7 @@ def _linearise_step(
     state, scratch = _physical(road, windows, point), make_scratch(road)
     blocks, after, product = windows.blocks[e, t], state.copy(), np.empty(state.size)
     advance(road, state, windows.inputs[e, t], after, blocks, scratch)
-    normalise(road, filters.density_scale, blocks, scratch.by_factor)
+    normalise(road, filters.units[0], blocks, scratch.by_factor)
     n_factors = windows.by_factor.shape[2]
     windows.by_factor[e, t] = scratch.by_factor[:n_factors]
     for i in range(state.size):
@@ -246,7 +245,7 @@ def _measure(
     for m in range(road.row_first.size):
         first, span, density = road.row_first[m], road.row_span[m], 0.0
         for q in range(2):
-            unit = filters.density_scale if q == 0 else road.second_scale
+            unit = filters.units[0] if q == 0 else road.second_scale
             value = values[m, q] / unit if windows.observed[e, last, m] else 0.0
             windows.values[e, last, m, q] = value
             windows.noise[e, last, m, q] = (sigma[m, q] / unit) ** 2
@@ -342,7 +341,7 @@ def write_program(road_: Packed, windows_: Packed, e: int, H: FloatArray, q: Flo
             H[t, i] = start[:, :n] - force[:, :n]
 
 
-class MHE(CompiledFilter):
+class MHE(CovarianceFilter):
     """Moving horizon estimation (paper, eq. 14 to 17).
 
     The program is solved exactly by `window.minimise`, started from the last step's solution, where

@@ -424,7 +424,7 @@ class _Window(EpisodeFilter):
 
     def __init__(self, problem: Problem) -> None:
         self.problem, self.mhe = problem, problem.settings.mhe
-        self.lower, self.upper = normalised_bounds(problem.model, self.mhe.bounds)
+        self.bounds = normalised_bounds(problem.model, self.mhe.bounds)
 
     def restart(self) -> None:
         """Return to a window of a single stage, the prior."""
@@ -461,10 +461,11 @@ class _Window(EpisodeFilter):
                 self._linearise_measurement(each, each.solution)
                 if each is not stage:
                     self._linearise_step(each, each.solution)
-        H, q, lower, upper = self.program()
+        H, q = self.program()
         self.P = np.asarray(np.linalg.solve(H, np.eye(len(H))[:, -n:])[-n:], dtype=np.float64)
         innovations = self._innovations()
         if seen.observed.any():  # else the prediction stands
+            lower, upper = (np.tile(bound, len(self.stages)) for bound in self.bounds)
             solution = solve(H, q, lower, upper, self.mhe.solver)
             self.has_failed = solution is None
             if solution is not None:
@@ -473,8 +474,8 @@ class _Window(EpisodeFilter):
                 self.x = self.problem.project(solution[None, -n:])[0]
         return innovations
 
-    def program(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return H, q and bounds of `minimise z' H z + q' z`, z the stages' states (eq. 17).
+    def program(self) -> tuple[FloatArray, FloatArray]:
+        """Return H and q of `minimise z' H z + q' z`, z the stages' states (eq. 17).
 
         It is the paper's eq. 14: the sum, weighted by inverse variances, of squared distances
         between the first state and its prediction, the measurements and C x + e, and the states
@@ -498,7 +499,7 @@ class _Window(EpisodeFilter):
                 H[after, here] -= weighted.T
                 q[here] += 2.0 * weighted @ stage.c
                 q[after] -= 2.0 * stage.c / stage.Q
-        return H, q, np.tile(self.lower, L), np.tile(self.upper, L)
+        return H, q
 
     def _innovations(self) -> FloatArray:
         """Return residuals `(2 m,)` at the prediction over their predicted deviations."""
@@ -537,3 +538,8 @@ class ReferenceMHE(ReferenceFilter):
         """See `make_estimator`."""
         require_process_noise(settings)
         super().__init__(model, n_episodes, settings_of_mhe(settings))
+
+    def program(self, episode: int) -> tuple[FloatArray, FloatArray]:
+        """Return H `(L n_x, L n_x)` and q `(L n_x,)` of an episode, as `MHE.program`."""
+        program: tuple[FloatArray, FloatArray] = self.filters[episode].program()
+        return program

@@ -31,7 +31,7 @@ def _expected(part: Any) -> str | None:
 ESTIMATORS = Registry(
     "estimator",
     {
-        "ekf": Shipped("compiled.ekf", "CompiledEKF"),
+        "ekf": Shipped("ekf", "EKF"),
         "ukf": Shipped("compiled.ukf", "CompiledUKF"),
         "enkf": Shipped("enkf", "EnKF"),
         "mhe": Shipped("mhe", "MHE"),

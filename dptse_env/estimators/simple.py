@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 
 from dptse_env.estimators.base import BatchEstimator, Estimate, Measurement
-from dptse_env.estimators.compiled.ekf import CompiledEKF
+from dptse_env.estimators.ekf import EKF
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
 from dptse_env.model.parameters import MEASUREMENT_FLOOR
@@ -175,7 +175,7 @@ class Blend(BatchEstimator):
     def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
         """See `make_estimator`."""
         super().__init__(model, n_episodes, settings)
-        self.ekf = CompiledEKF(model, n_episodes, settings)
+        self.ekf = EKF(model, n_episodes, settings)
         self.walk = RandomWalk(model, n_episodes, settings)
         self._priors = np.zeros((n_episodes, 2 * model.n_segments))
         self._weights = np.array([settings.blend.density_weight, settings.blend.speed_weight])

@@ -20,6 +20,7 @@ import numpy as np
 from dptse_env.estimators.linalg import (
     add_product,
     factor,
+    mirror,
     move,
     move_back,
     pair_update,
@@ -118,7 +119,6 @@ def make_work(n_stages: int, n_states: int, n_rows: int, size: int, width: int) 
 def factorise(road: RoadArrays, window: Window, n_stages: int, side: IntArray, work: Work) -> bool:
     """Filter covariances from the first stage whose set of bounds changed; return success."""
     n, start, known = window.lower.size, 0, np.ones(1)
-    columns, gains = work.columns[:2], work.columns[2:]
     while start < work.length[0] and _is_same(side[start], work.side[start], n):
         start += 1
     for t in range(start, n_stages):
@@ -139,7 +139,7 @@ def factorise(road: RoadArrays, window: Window, n_stages: int, side: IntArray, w
             work.side[t, i] = side[t, i]
             if side[t, i] != 0:
                 work.n_fixed[t] += 1
-                total = scalar_update(P, i, known, 0.0, columns[0], work.gains[t, i])
+                total = scalar_update(P, i, known, 0.0, work.columns[0], work.gains[t, i])
                 work.totals[t, i] = total
                 if not total > 0.0:
                     return False
@@ -148,8 +148,9 @@ def factorise(road: RoadArrays, window: Window, n_stages: int, side: IntArray, w
         for m in range(road.row_first.size):
             if window.observed[t, m]:
                 first, rows = 2 * road.row_first[m], window.weights[t, m, :, : 2 * road.row_span[m]]
-                if not pair_update(P, first, rows, window.noise[t, m], columns, gains):
+                if not pair_update(P, first, rows, window.noise[t, m], work.columns):
                     return False
+        mirror(P)
     work.length[0] = n_stages
     return True
 

@@ -86,6 +86,23 @@ def test_a_kernel_may_overwrite_its_state():
     np.testing.assert_array_equal(state, model.step(states, inputs)[0])
 
 
+def test_normalised_derivatives_are_those_between_normalised_states():
+    model, rng = ARZModel(HIGHWAY, W99, demand_states=True), np.random.default_rng(12)
+    states, inputs = random_states(model, 1, rng), random_inputs(model, 1, rng)
+    expected = model.jacobian(states, inputs)[0] * model.state_scale / model.state_scale[:, None]
+    road, scratch = model.road, make_scratch(model.road)
+    blocks, after = np.empty((*road.neighbours.shape, 4)), np.empty(model.n_states)
+    advance(road, states[0], inputs[0], after, blocks, scratch)
+    normalise(road, model.density_scale, blocks, scratch.by_factor)
+    pairs = expected[:38, :38].reshape(19, 2, 19, 2)
+    for c, slot in np.argwhere(road.neighbours >= 0):
+        block = pairs[c, :, road.neighbours[c, slot]]
+        np.testing.assert_allclose(blocks[c, slot].reshape(2, 2), block, rtol=1e-12, atol=1e-15)
+    for e, c in enumerate(road.entries):
+        by_factor = expected[2 * c : 2 * c + 2, 38 + e]
+        np.testing.assert_allclose(scratch.by_factor[e], by_factor, rtol=1e-12)
+
+
 @pytest.mark.parametrize(
     "duplicate", [copy.deepcopy, lambda model: pickle.loads(pickle.dumps(model))]
 )

@@ -1,0 +1,296 @@
+"""The extended Kalman filter, the default estimator, and what all filters with a covariance share.
+
+Means are in physical units, as the model takes them; covariances are normalised, rho by rho_m and
+psi by rho_m v_f, so that variances of all components are of one order. Episodes are treated one by
+one inside compiled code.
+"""
+
+from collections.abc import Sequence
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+
+from dptse_env.estimators.base import Estimate
+from dptse_env.estimators.batch import BatchEstimator, Measurements
+from dptse_env.estimators.linalg import is_covariance, mirror, padded, pair_update, propagate
+from dptse_env.estimators.noise import count_variance, initial_variance, process_variance
+from dptse_env.estimators.settings import EstimatorSettings
+from dptse_env.model import ARZModel
+from dptse_env.model.model import make_road_arrays
+from dptse_env.model.network import RoadArrays
+from dptse_env.model.parameters import LARGEST_W, VACUUM
+from dptse_env.model.step import (
+    advance,
+    clip,
+    make_scratch,
+    measured,
+    normalise,
+    pressure,
+    project,
+    write_row,
+)
+from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+from dptse_env.utils.kernel_loops import all_finite, any_of, copy_vector
+from dptse_env.utils.kernels import Packed, kernel, kernel_part
+
+
+class Filters(NamedTuple):
+    """State of the filters of n episodes."""
+
+    means: FloatArray  # (n, n_x) [veh/km, veh/h], then demand factors if there are any
+    covariances: FloatArray  # (n, n_x, padded) normalised, the padding zero
+    priors: FloatArray  # (n, n_x) prior means
+    innovations: FloatArray  # (n, M, 2)
+    diverged: BoolArray  # (n,)
+    units: FloatArray  # (n_x,) of normalised components [veh/km, veh/h, 1]
+    initial_variance: FloatArray  # (n_x,) normalised
+    process_variance: FloatArray  # (n_x,) normalised, of a step
+    growth_variance: float  # variance that rho / rho_m = 1 adds to the process noise of rho
+    count_variance: FloatArray  # (M,) variance of densities beside the noise, over rho, normalised
+    is_box: bool  # whether means are projected into the paper's box, not the cone
+
+
+class CovarianceFilter(BatchEstimator):
+    """Means and covariances of all episodes as arrays for kernels."""
+
+    is_compiled: ClassVar[bool] = True
+
+    def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
+        """See `make_estimator`."""
+        super().__init__(model, n_episodes, settings)
+        n_states = model.n_states
+        start = model.project(np.zeros((n_episodes, n_states)), settings.bounds)
+        self._filters = Filters(
+            means=start,
+            covariances=np.zeros((n_episodes, n_states, padded(n_states))),
+            priors=start.copy(),
+            innovations=self.innovations,
+            diverged=self.diverged,
+            units=model.state_scale,
+            initial_variance=initial_variance(model, settings),
+            process_variance=process_variance(model, settings),
+            growth_variance=float(settings.density_growth) ** 2,
+            count_variance=count_variance(model, settings),
+            is_box=settings.bounds == "box",
+        )
+        self._packed = tuple(make_road_arrays(model)), tuple(self._filters)
+        for episode in range(n_episodes):
+            restart(self._filters, episode)
+
+    @property
+    def states(self) -> FloatArray:
+        """Means `(n, n_x)` [veh/km, veh/h], then demand factors if there are any; a copy."""
+        return self._filters.means.copy()
+
+    @property
+    def covariances(self) -> FloatArray:
+        """Covariances `(n, n_x, n_x)`, rho normalised by rho_m and psi by rho_m v_f, a copy."""
+        return self._filters.covariances[:, :, : self.model.n_states].copy()
+
+    def _estimate(self) -> Estimate:
+        out = np.empty((4, self.n_episodes, self.model.n_segments))
+        summarise(*self._packed, out)
+        return Estimate(*out)
+
+    def _reset(
+        self, episodes: IntArray, states: FloatArray, generators: Sequence[np.random.Generator]
+    ) -> None:
+        self._filters.priors[episodes] = self.model.project(states, self.settings.bounds)
+        self._restart(episodes)
+
+    def _restart(self, episodes: IntArray) -> None:
+        """Reset episodes to their priors."""
+        for episode in episodes.tolist():
+            restart(self._filters, episode)
+
+
+class EKF(CovarianceFilter):
+    """Extended Kalman filter on the ARZ model: analytic Jacobians, sequential Joseph updates.
+
+    All rows of a step are linearised at its prediction, so that updating by one after the other
+    equals the joint update by all, in whichever order. Means are projected after predict and
+    update; covariances are not.
+    """
+
+    def _predict(self, episodes: IntArray, inputs: FloatArray) -> None:
+        predict(*self._packed, episodes, inputs)
+
+    def _update(self, measured: Measurements) -> None:
+        update(*self._packed, *measured)
+
+
+class Rows(NamedTuple):
+    """Rows of a measurement, linearised at a prediction and normalised."""
+
+    weights: FloatArray  # (M, 2, 2 x largest span) of the components from 2 `row_first` on
+    residuals: FloatArray  # (M, 2)
+    noise: FloatArray  # (M, 2) variances
+
+
+@kernel
+def predict(road_: Packed, filters_: Packed, episodes: IntArray, inputs: FloatArray) -> None:
+    """Predict one step ahead under inputs `(k, n_u)`: x = f(x, u), P = F P F' + Q."""
+    road, filters = RoadArrays(*road_), Filters(*filters_)
+    scratch, noise = make_scratch(road), np.empty(filters.units.size)
+    blocks = np.empty((*road.neighbours.shape, 4))
+    work = np.empty((2, *filters.covariances.shape[1:]))
+    for k in range(episodes.size):
+        mean, covariance = filters.means[episodes[k]], filters.covariances[episodes[k]]
+        process_noise(road, filters, mean, noise)
+        advance(road, mean, inputs[k], mean, blocks, scratch)
+        project(road, mean, filters.is_box)
+        normalise(road, filters.units[0], blocks, scratch.by_factor)
+        propagate(road, blocks, scratch.by_factor, noise, covariance, work, covariance)
+
+
+@kernel_part
+def process_noise(
+    road: RoadArrays, filters: Filters, mean: FloatArray, variance: FloatArray
+) -> None:
+    """Write the variances `(n_x,)` of the process noise of a step that leaves a mean `(n_x,)`."""
+    copy_vector(filters.process_variance, variance)
+    for s in range(road.jam.size):
+        variance[2 * s] += filters.growth_variance * mean[2 * s] / filters.units[2 * s]
+
+
+@kernel
+def update(
+    road_: Packed,
+    filters_: Packed,
+    episodes: IntArray,
+    observed: BoolArray,
+    values: FloatArray,
+    sigma: FloatArray,
+    centre: FloatArray,
+) -> None:
+    """Update by measurements; see `Estimator.update`."""
+    road, filters = RoadArrays(*road_), Filters(*filters_)
+    n_rows, width = road.row_first.size, filters.covariances.shape[2]
+    weights = np.empty((n_rows, 2, 2 * np.max(road.row_span)))
+    rows = Rows(weights, np.empty((n_rows, 2)), np.empty((n_rows, 2)))
+    shift, work = np.empty(width), np.empty((4, width))
+    for k in range(episodes.size):
+        e = episodes[k]
+        mean, covariance = filters.means[e], filters.covariances[e]
+        for m in range(n_rows):
+            if observed[k, m]:
+                _linearise(road, filters, e, m, values[k, m], sigma[k, m], centre[k], rows)
+        _innovate(road, filters, e, observed[k], rows)
+        sound = True
+        if any_of(observed[k]):
+            sound = _assimilate(road, covariance, observed[k], rows, shift, work)
+            for i in range(mean.size):
+                mean[i] += shift[i] * filters.units[i]
+            project(road, mean, filters.is_box)
+        filters.diverged[e] = not (sound and all_finite(mean) and is_covariance(covariance, shift))
+        if filters.diverged[e]:
+            restart(filters, e)
+
+
+@kernel_part
+def _linearise(
+    road: RoadArrays,
+    filters: Filters,
+    e: int,
+    m: int,
+    values: FloatArray,
+    sigma: FloatArray,
+    centre: FloatArray,
+    rows: Rows,
+) -> None:
+    """Write the weights, residuals and noise of a row at an episode's mean."""
+    mean, weights, residuals = filters.means[e], rows.weights[m], rows.residuals[m]
+    first, span = 2 * road.row_first[m], road.row_span[m]
+    write_row(road, filters.units, mean, centre, m, weights, residuals)
+    density = 0.0
+    for i in range(2 * span):
+        x = mean[first + i] / filters.units[first + i]
+        density += weights[0, i] * x
+        residuals[1] += weights[1, i] * x
+    residuals[0] = values[0] / filters.units[0] - density
+    residuals[1] = values[1] / road.second_scale - residuals[1]
+    rows.noise[m, 0] = (sigma[0] / filters.units[0]) ** 2
+    rows.noise[m, 0] += filters.count_variance[m] * density * filters.units[0] / span
+    rows.noise[m, 1] = (sigma[1] / road.second_scale) ** 2
+
+
+@kernel_part
+def _innovate(road: RoadArrays, filters: Filters, e: int, observed: BoolArray, rows: Rows) -> None:
+    """Write residuals over their predicted deviations."""
+    covariance, innovations = filters.covariances[e], filters.innovations[e]
+    innovations[:] = 0.0
+    for m in range(observed.size):
+        if not observed[m]:
+            continue
+        first, size = 2 * road.row_first[m], 2 * road.row_span[m]
+        for q in range(2):
+            variance = rows.noise[m, q]
+            for i in range(size):
+                for j in range(size):
+                    weight = rows.weights[m, q, i] * rows.weights[m, q, j]
+                    variance += weight * covariance[first + i, first + j]
+            innovations[m, q] = rows.residuals[m, q] / np.sqrt(variance)
+
+
+@kernel_part(fastmath={"contract"})
+def _assimilate(
+    road: RoadArrays,
+    covariance: FloatArray,
+    observed: BoolArray,
+    rows: Rows,
+    shift: FloatArray,
+    work: FloatArray,
+) -> bool:
+    """Update a covariance by the observed rows, and write the normalised change of the mean.
+
+    Returns:
+        Whether all variances of the measured numbers are sound.
+    """
+    shift[:] = 0.0
+    for m in range(observed.size):
+        if not observed[m]:
+            continue
+        first, size = 2 * road.row_first[m], 2 * road.row_span[m]
+        weights = rows.weights[m, :, :size]
+        if not pair_update(covariance, first, weights, rows.noise[m], work):
+            return False
+        for q in range(2):
+            residual = rows.residuals[m, q]
+            for i in range(size):
+                residual -= weights[q, i] * shift[first + i]
+            for j in range(shift.size):
+                shift[j] += residual * work[2 + q, j]
+    mirror(covariance)
+    return True
+
+
+@kernel
+def restart(filters: Filters, episode: int) -> None:
+    """Reset an episode's filter to its prior."""
+    copy_vector(filters.priors[episode], filters.means[episode])
+    filters.innovations[episode] = 0.0
+    covariance = filters.covariances[episode]
+    covariance[:] = 0.0
+    for i in range(covariance.shape[0]):
+        covariance[i, i] = filters.initial_variance[i]
+
+
+@kernel
+def summarise(road_: Packed, filters_: Packed, out: FloatArray) -> None:
+    """Write density, speed and their standard deviations to `out` `(4, n, S)`, physical units."""
+    road, filters = RoadArrays(*road_), Filters(*filters_)
+    v_f, gamma = road.free_flow_speed, road.gamma
+    for e in range(filters.means.shape[0]):
+        covariance = filters.covariances[e]
+        for s in range(road.jam.size):
+            i, j, jam = 2 * s, 2 * s + 1, road.jam[s]
+            rho, psi = filters.means[e, i], filters.means[e, j]
+            w = psi / rho if rho > VACUUM * jam else v_f
+            _, by_rho, by_psi = measured(rho, psi, jam, v_f, gamma)
+            a, b = by_rho * filters.units[i], by_psi * filters.units[j]
+            variance = a * (a * covariance[i, i] + 2.0 * b * covariance[i, j])
+            variance += b * b * covariance[j, j]
+            out[0, e, s] = rho
+            out[1, e, s] = clip(w - pressure(rho, jam, v_f, gamma), 0.0, LARGEST_W * v_f)
+            out[2, e, s] = filters.units[i] * np.sqrt(max(covariance[i, i], 0.0))
+            out[3, e, s] = np.sqrt(max(variance, 0.0))
