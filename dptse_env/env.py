@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dptse_env.config import resolve
-from dptse_env.parts import make_interface, make_parts, warn_where_void
+from dptse_env.estimators import check_settings
+from dptse_env.parts import make_interface, make_model, make_parts, warn_where_void
 from dptse_env.process import QueryProcess
 from dptse_env.rendering import History, Picture
 from dptse_env.traffic import Records, open_library
@@ -151,6 +152,8 @@ class SensorQueryEnv(gym.Env[Observation, Any]):
         self.config = resolve(preset, overrides)
         warn_where_void(self.config)
         self.interface = make_interface(self.config)
+        config = self.config
+        check_settings(config.estimator, make_model(config), config.settings())
         self.action_space = self.interface.actions.space
         self.observation_space = self.interface.observations.space
         self._library = open_library(records)

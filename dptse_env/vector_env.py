@@ -15,7 +15,8 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from dptse_env.config import resolve
-from dptse_env.parts import make_interface, make_parts, warn_where_void
+from dptse_env.estimators import check_settings
+from dptse_env.parts import make_interface, make_model, make_parts, warn_where_void
 from dptse_env.process import QueryProcess
 from dptse_env.rendering import History, Picture
 from dptse_env.reset_options import per_episode
@@ -130,6 +131,8 @@ class SensorQueryVectorEnv(VectorEnv[Observation, Action, Any]):
         self.config = resolve(preset, overrides)
         warn_where_void(self.config)
         self.interface = make_interface(self.config)
+        config = self.config
+        check_settings(config.estimator, make_model(config), config.settings())
         self.single_action_space = self.interface.actions.space
         self.single_observation_space = self.interface.observations.space
         self.action_space = batch_space(self.single_action_space, self.num_envs)

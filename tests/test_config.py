@@ -76,6 +76,24 @@ def test_demand_states_without_a_traffic_model_are_refused_by_the_configuration(
         resolve("paper-highway", keywords)
 
 
+@pytest.mark.parametrize("make", [gym.make, gym.make_vec])
+@pytest.mark.parametrize(
+    ("estimator", "settings", "message"),
+    [
+        ("mhe", {"process_noise": [0.01, 0.0]}, r"process_noise\[1\] must be a finite number > 0"),
+        ("mhe", {"mhe": {"horizon": 1000}}, r"mhe\.horizon must be an integer in 1\.\.624"),
+        ("ukf", {"ukf": {"kappa": -16.0}}, r"ukf\.kappa must be > -16, got -16"),
+        ("ukf", {"ukf": {"kappa": -18.0}, "demand": {}}, r"ukf\.kappa must be > -18, got -18"),
+        ("recurrent", {"recurrent": {"weights": "x"}}, "recurrent.weights must be a file or one"),
+    ],
+)
+def test_settings_that_an_estimator_cannot_have_are_refused_when_it_is_made(
+    make, estimator, settings, message
+):
+    with pytest.raises(ValueError, match=f"^estimator_settings.{message}"):
+        make("dptse_env:dptse/ShortHighway-v0", estimator=estimator, estimator_settings=settings)
+
+
 def test_a_set_for_the_corridor_comes_before_that_for_any():
     config = resolve("long-highway", {})
     assert config.settings_name == "ekf-w99-3lane-paced-long-highway"

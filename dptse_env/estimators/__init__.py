@@ -7,6 +7,7 @@ from dptse_env.estimators.registry import (
     check_demand,
     check_estimate,
     check_estimator,
+    check_settings,
     make_estimator,
     settings_type,
 )
@@ -36,6 +37,7 @@ __all__ = [
     "check_demand",
     "check_estimate",
     "check_estimator",
+    "check_settings",
     "make_estimator",
     "settings_type",
 ]

@@ -24,7 +24,6 @@ from dptse_env.model.parameters import (
     LEAST_W,
 )
 from dptse_env.utils.arrays import FloatArray
-from dptse_env.utils.validation import positive
 
 # Largest natural residual of an optimum, in normalised states.
 RESIDUAL = 1e-8
@@ -37,12 +36,6 @@ ROUGH = 0.05
 POLISHES = 10
 # Least deviation of a measurement, normalised: an exact one would have an infinite weight.
 LEAST_DEVIATION = 1e-3
-
-
-def require_process_noise(settings: EstimatorSettings) -> None:
-    """Refuse a process noise of zero, whose weight w_2 would be infinite."""
-    for i, value in enumerate(settings.process_noise):
-        positive(f"estimator_settings.process_noise[{i}]", value)
 
 
 def moving_variance(model: ARZModel, settings: EstimatorSettings) -> FloatArray:

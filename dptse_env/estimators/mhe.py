@@ -12,7 +12,6 @@ from dptse_env.estimators.horizon import (
     LEAST_DEVIATION,
     moving_variance,
     normalised_bounds,
-    require_process_noise,
     settings_of_mhe,
     solve,
 )
@@ -31,8 +30,13 @@ from dptse_env.model.network import RoadArrays
 from dptse_env.model.step import advance, make_scratch, normalise, project, write_row
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.kernels import Packed, kernel, kernel_part
+from dptse_env.utils.validation import integer, positive
 
 GENERAL_SOLVER, FALLBACK = 3, 4  # how a program was solved, beside those of `window`
+
+
+MOST_VARIABLES = 10_000
+"""Variables of the longest window; most steps with it end within a tenth of a second."""
 
 
 class Windows(NamedTuple):
@@ -351,12 +355,19 @@ class MHE(CovarianceFilter):
 
     def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
         """See `make_estimator`."""
-        require_process_noise(settings)
         super().__init__(model, n_episodes, settings_of_mhe(settings))
         self._road = model.road
         self._windows = _allocate(model, n_episodes, settings, self._road)
         self._all_packed = (*self._packed, tuple(self._windows))
         self._restart(np.arange(n_episodes))
+
+    @staticmethod
+    def check_settings(model: ARZModel, settings: EstimatorSettings) -> None:
+        """Refuse a process noise of zero, whose weight w_2 would be infinite, and long windows."""
+        for i, value in enumerate(settings.process_noise):
+            positive(f"estimator_settings.process_noise[{i}]", value)
+        most = MOST_VARIABLES // model.n_states - 1
+        integer("estimator_settings.mhe.horizon", settings.mhe.horizon, 1, most)
 
     @property
     def solved(self) -> IntArray:

@@ -27,7 +27,6 @@ from dptse_env.estimators.horizon import (
     LEAST_DEVIATION,
     moving_variance,
     normalised_bounds,
-    require_process_noise,
     settings_of_mhe,
     solve,
 )
@@ -536,7 +535,6 @@ class ReferenceMHE(ReferenceFilter):
 
     def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
         """See `make_estimator`."""
-        require_process_noise(settings)
         super().__init__(model, n_episodes, settings_of_mhe(settings))
 
     def program(self, episode: int) -> tuple[FloatArray, FloatArray]:

@@ -68,6 +68,38 @@ def check_demand(estimator: Any, settings: Any) -> None:
         )
 
 
+def check_settings(estimator: Any, model: ARZModel, settings: Any) -> None:
+    """Refuse settings that an estimator cannot have on a road; it is imported, but not made.
+
+    A class may have a static method ``check_settings(model, settings)``, which raises
+    ``ValueError``. The model has the demand states that the settings ask for.
+
+    Raises:
+        ValueError: A setting is out of range on this road, or the estimator has no demand states.
+    """
+    check_demand(estimator, settings)
+    check = getattr(_found(estimator, "compiled"), "check_settings", None)
+    if check is not None:
+        check(with_demand(model, settings), settings)
+
+
+def with_demand(model: ARZModel, settings: Any) -> ARZModel:
+    """Return a model that has demand states where the settings ask for them, and only there."""
+    has_demand = getattr(settings, "demand", None) is not None
+    if has_demand == (model.n_demand_states > 0):
+        return model
+    return ARZModel(
+        model.network, model.parameters, model.time_step, model.reference_speed, model.rows,
+        has_demand,
+    )  # fmt: skip
+
+
+def _found(estimator: Any, backend: str) -> Any:
+    """Return the class of an estimator, or what a part of another package is made by."""
+    part = REFERENCES[estimator] if backend == "reference" else ESTIMATORS.find(estimator)
+    return part.load() if isinstance(part, Shipped) else part
+
+
 def make_estimator(
     estimator: Any, backend: str, model: ARZModel, n_episodes: int, settings: Any = None
 ) -> Estimator:
@@ -85,22 +117,16 @@ def make_estimator(
 
     Raises:
         ValueError: Name or backend is unknown, the estimator does not have the backend, there are
-            no episodes, or the estimator lacks a method or an attribute.
+            no episodes, a setting is out of range on this road, or the estimator lacks a method or
+            an attribute.
     """
     if n_episodes < 1:
         raise ValueError(f"n_episodes must be >= 1, got {n_episodes}")
     check_estimator(estimator, backend)
     settings = settings_type(estimator)() if settings is None else settings
-    check_demand(estimator, settings)
-    has_demand = getattr(settings, "demand", None) is not None
-    if has_demand != (model.n_demand_states > 0):
-        model = ARZModel(
-            model.network, model.parameters, model.time_step, model.reference_speed, model.rows,
-            has_demand,
-        )  # fmt: skip
-    part = REFERENCES[estimator] if backend == "reference" else ESTIMATORS.find(estimator)
-    factory = part.load() if isinstance(part, Shipped) else part
-    made: Estimator = factory(model, n_episodes, settings)
+    check_settings(estimator, model, settings)
+    model = with_demand(model, settings)
+    made: Estimator = _found(estimator, backend)(model, n_episodes, settings)
     if is_foreign(made):
         _check_attributes(made, model, n_episodes)
     return made

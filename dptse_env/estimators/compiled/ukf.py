@@ -27,7 +27,6 @@ class CompiledUKF(CompiledFilter):
         super().__init__(model, n_episodes, settings)
         n_states = model.n_states
         alpha, beta, kappa = settings.ukf.alpha, settings.ukf.beta, settings.ukf.kappa
-        require(n_states + kappa > 0.0, "estimator_settings.ukf.kappa", f"> -{n_states}", kappa)
         spread = alpha**2 * (n_states + kappa)
         self._points = Points(
             states=np.zeros((n_episodes, n_states, padded(2 * n_states + 1))),
@@ -40,6 +39,12 @@ class CompiledUKF(CompiledFilter):
             spread=float(np.sqrt(spread)),
         )
         self._points_packed = tuple(self._points)
+
+    @staticmethod
+    def check_settings(model: ARZModel, settings: EstimatorSettings) -> None:
+        """Refuse a kappa at or below minus the number of states, where points have no spread."""
+        n_states, kappa = model.n_states, settings.ukf.kappa
+        require(n_states + kappa > 0.0, "estimator_settings.ukf.kappa", f"> -{n_states}", kappa)
 
     def _predict(self, episodes: IntArray, inputs: FloatArray) -> None:
         ukf_kernels.predict(*self._packed, self._points_packed, episodes, inputs)

@@ -36,10 +36,6 @@ class Recurrent(BatchEstimator):
     Attributes:
         saved: The network in force, with its card.
         hidden: Hidden states, shape (n, S, H).
-
-    Raises:
-        ValueError: There are no such weights, or the road lies outside what they were trained on
-            and ``estimator_settings.recurrent.outside`` is false.
     """
 
     def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
@@ -47,8 +43,6 @@ class Recurrent(BatchEstimator):
         super().__init__(model, n_episodes, settings)
         flows = model.reference_speed is not None
         self.saved = read_network(member_for(settings.recurrent.weights, flows))
-        if not settings.recurrent.outside:
-            check_ranges(self.saved, model)
         self.cells = make_cells(model)
         S, n = model.n_segments, n_episodes
         self.hidden = np.zeros((n, S, self.saved.network.width), dtype=np.float32)
@@ -60,6 +54,14 @@ class Recurrent(BatchEstimator):
         deviation = np.sqrt(settings.initial_variance)
         spread = deviation * np.array([model.density_scale, model.speed_scale])
         self._present[..., 2:] = self._prior[..., 2:] = spread
+
+    @staticmethod
+    def check_settings(model: ARZModel, settings: EstimatorSettings) -> None:
+        """Refuse weights that are missing, and roads and releases that they do not know."""
+        flows = model.reference_speed is not None
+        saved = read_network(member_for(settings.recurrent.weights, flows))
+        if not settings.recurrent.outside:
+            check_ranges(saved, model)
 
     @property
     def means(self) -> FloatArray:
