@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 
 from dptse_env.estimators import Estimate, Measurement
-from dptse_env.estimators.batch import BatchEstimator
+from dptse_env.estimators.base import BatchEstimator
 from dptse_env.release import PrivacyReport, PrivacySettings, ReleaseModel
 from dptse_env.schedules import Schedule
 from dptse_env.spaces.actions import ActionEncoding, Decision
