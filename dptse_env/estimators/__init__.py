@@ -1,9 +1,10 @@
 """Traffic state estimators with a common protocol."""
 
-from dptse_env.estimators.base import Estimate, Estimator, Measurement
+from dptse_env.estimators.base import BatchEstimator, Estimate, Estimator, Measurement
 from dptse_env.estimators.registry import (
     BACKENDS,
     ESTIMATORS,
+    REFERENCES,
     check_demand,
     check_estimate,
     check_estimator,
@@ -24,6 +25,8 @@ from dptse_env.estimators.settings import (
 __all__ = [
     "BACKENDS",
     "ESTIMATORS",
+    "REFERENCES",
+    "BatchEstimator",
     "BlendSettings",
     "DemandSettings",
     "EnsembleSettings",

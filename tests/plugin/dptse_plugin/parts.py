@@ -9,8 +9,7 @@ from typing import Annotated, Any
 import numpy as np
 from gymnasium import spaces
 
-from dptse_env.estimators import Estimate, Measurement
-from dptse_env.estimators.base import BatchEstimator
+from dptse_env.estimators import BatchEstimator, Estimate, Measurement
 from dptse_env.release import PrivacyReport, PrivacySettings, ReleaseModel
 from dptse_env.schedules import Schedule
 from dptse_env.spaces.actions import ActionEncoding, Decision
@@ -48,10 +47,10 @@ class Smoothed(BatchEstimator):
     def _predict(self, episodes: Any, inputs: Any) -> None:
         pass
 
-    def _update(self, given: Any) -> None:
-        weight, before = self.settings.weight, self.traffic[given.episodes]
-        after = (1.0 - weight) * before + weight * given.values
-        self.traffic[given.episodes] = np.where(given.observed[:, :, None], after, before)
+    def _update(self, episodes: Any, measured: Measurement) -> None:
+        weight, before = self.settings.weight, self.traffic[episodes]
+        after = (1.0 - weight) * before + weight * measured.values
+        self.traffic[episodes] = np.where(measured.observed[:, :, None], after, before)
 
     def estimate(self) -> Estimate:
         """See `BatchEstimator`."""
