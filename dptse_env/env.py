@@ -149,10 +149,9 @@ class SensorQueryEnv(gym.Env[Observation, Any]):
         if render_mode == "human":
             self._window = Window("dptse-env", self.metadata["render_fps"])
         self.render_every = integer("render_every", render_every, 1)
-        self.config = resolve(preset, overrides)
-        warn_where_void(self.config)
-        self.interface = make_interface(self.config)
-        config = self.config
+        self.config = config = resolve(preset, overrides)
+        warn_where_void(config)
+        self.interface = make_interface(config)
         check_settings(config.estimator, make_model(config), config.settings())
         self.action_space = self.interface.actions.space
         self.observation_space = self.interface.observations.space

@@ -128,10 +128,9 @@ class SensorQueryVectorEnv(VectorEnv[Observation, Action, Any]):
         self._picture: Picture | None = None
         self.autoreset_mode = _mode(autoreset_mode)
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
-        self.config = resolve(preset, overrides)
-        warn_where_void(self.config)
-        self.interface = make_interface(self.config)
-        config = self.config
+        self.config = config = resolve(preset, overrides)
+        warn_where_void(config)
+        self.interface = make_interface(config)
         check_settings(config.estimator, make_model(config), config.settings())
         self.single_action_space = self.interface.actions.space
         self.single_observation_space = self.interface.observations.space

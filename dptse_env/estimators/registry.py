@@ -78,7 +78,7 @@ def check_settings(estimator: Any, model: ARZModel, settings: Any) -> None:
         ValueError: A setting is out of range on this road, or the estimator has no demand states.
     """
     check_demand(estimator, settings)
-    check = getattr(_found(estimator, "compiled"), "check_settings", None)
+    check = getattr(_loaded(ESTIMATORS.find(estimator)), "check_settings", None)
     if check is not None:
         check(with_demand(model, settings), settings)
 
@@ -94,9 +94,7 @@ def with_demand(model: ARZModel, settings: Any) -> ARZModel:
     )  # fmt: skip
 
 
-def _found(estimator: Any, backend: str) -> Any:
-    """Return the class of an estimator, or what a part of another package is made by."""
-    part = REFERENCES[estimator] if backend == "reference" else ESTIMATORS.find(estimator)
+def _loaded(part: Any) -> Any:
     return part.load() if isinstance(part, Shipped) else part
 
 
@@ -125,8 +123,8 @@ def make_estimator(
     check_estimator(estimator, backend)
     settings = settings_type(estimator)() if settings is None else settings
     check_settings(estimator, model, settings)
-    model = with_demand(model, settings)
-    made: Estimator = _found(estimator, backend)(model, n_episodes, settings)
+    part = REFERENCES[estimator] if backend == "reference" else ESTIMATORS.find(estimator)
+    made: Estimator = _loaded(part)(with_demand(model, settings), n_episodes, settings)
     if is_foreign(made):
         _check_attributes(made, model, n_episodes)
     return made
