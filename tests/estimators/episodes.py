@@ -148,10 +148,7 @@ def run(
     sigma = episodes.sigma if sigma is None else sigma
     for k in steps:
         estimator.predict(episodes.everyone, episodes.inputs[k])
-        estimator.update(
-            episodes.everyone,
-            Measurement.of(estimator.model, episodes.observed[k], episodes.values[k], sigma),
-        )
+        tell(estimator, episodes.everyone, episodes.observed[k], episodes.values[k], sigma)
         watch(k)
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from filterpy.kalman import MerweScaledSigmaPoints
 
-from dptse_env.estimators import EstimatorSettings, Measurement, SigmaPointSettings
+from dptse_env.estimators import EstimatorSettings, SigmaPointSettings
 from dptse_env.estimators.compiled.dense import eliminate
 from dptse_env.estimators.compiled.ukf import CompiledUKF
 from dptse_env.model import ARZModel, load_parameters
@@ -12,7 +12,7 @@ from dptse_env.traffic import PAPER_HIGHWAY
 from tests.cases import pairwise
 from tests.estimators.parts import compiled
 
-from .episodes import RELEASES, SIGMA, run, scale_of, simulate, started
+from .episodes import RELEASES, SIGMA, run, scale_of, simulate, started, tell
 
 eliminate = compiled(eliminate)
 
@@ -128,9 +128,6 @@ def test_a_broken_covariance_is_found(backend, poison):
         kept[0, 20, 4] = kept[0, 4, 20] = 10.0
     else:
         kept[0, 20, 20] = poison
-    filters.update(
-        episodes.everyone,
-        Measurement.of(filters.model, episodes.observed[4], episodes.values[4], SIGMA),
-    )
+    tell(filters, episodes.everyone, episodes.observed[4], episodes.values[4], SIGMA)
     assert filters.diverged.tolist() == [True]
     np.testing.assert_array_equal(filters.covariances[0], 1e-3 * np.eye(38))

@@ -9,7 +9,7 @@ from dptse_env.estimators import BACKENDS, make_estimator
 from dptse_env.estimators.learned.network import LOWEST_SPREAD
 from dptse_env.model.network import MeasurementRows
 
-from ..episodes import RELEASES, random_streams, run, simulate
+from ..episodes import RELEASES, random_streams, run, simulate, tell
 from ..rows import averaged, update, with_rows
 from .networks import random_network, settings
 
@@ -45,11 +45,12 @@ def test_backends_agree(release, width, tmp_path):
             estimator.predict(episodes.everyone, episodes.inputs[k])
         assert_agree(*pair)
         for estimator in pair:
-            estimator.update(
+            tell(
+                estimator,
                 episodes.everyone,
-                Measurement.of(
-                    estimator.model, episodes.observed[k], episodes.values[k], episodes.sigma
-                ),
+                episodes.observed[k],
+                episodes.values[k],
+                episodes.sigma,
             )
         assert_agree(*pair)
     assert np.abs(pair[0].hidden).max() > 0.5
@@ -76,7 +77,7 @@ def test_episodes_do_not_depend_on_their_batch(tmp_path):
             rows = np.array(block)
             alone.predict(rows, episodes.inputs[k][rows])
             observed, values = episodes.observed[k][rows], episodes.values[k][rows]
-            alone.update(rows, Measurement.of(alone.model, observed, values, episodes.sigma))
+            tell(alone, rows, observed, values, episodes.sigma)
     np.testing.assert_allclose(alone.hidden, together.hidden, atol=1e-6)
     np.testing.assert_allclose(alone.estimate().density, together.estimate().density, rtol=1e-5)
 
@@ -90,7 +91,7 @@ def test_a_prediction_is_what_was_said_of_the_next_second(backend, tmp_path):
     estimator.predict(episodes.everyone, episodes.inputs[0])
     np.testing.assert_array_equal(estimator.estimate().density, prior)
     args = episodes.observed[0], episodes.values[0], episodes.sigma
-    estimator.update(episodes.everyone, Measurement.of(estimator.model, *args))
+    tell(estimator, episodes.everyone, *args)
     after = estimator.estimate()
     assert np.abs(after.density - prior).min() > 0.0
     estimator.predict(episodes.everyone, episodes.inputs[1])
@@ -107,10 +108,14 @@ def test_every_part_of_a_measurement_is_read(backend, tmp_path):
         estimator.predict(episodes.everyone, inputs * episodes.inputs[0])
         observed = np.zeros_like(episodes.observed[0])
         observed[0, 3] = observed[0, 25] = True
-        estimator.update(
-            episodes.everyone, Measurement.of(estimator.model, observed, episodes.values[0] + values, sigma * episodes.sigma[0],
-            episodes.centre[0] + centre),
-        )  # fmt: skip
+        tell(
+            estimator,
+            episodes.everyone,
+            observed,
+            episodes.values[0] + values,
+            sigma * episodes.sigma[0],
+            episodes.centre[0] + centre,
+        )
         return estimator.estimate().density
 
     base = estimated()
@@ -136,10 +141,7 @@ def test_news_travel_from_cell_to_cell(backend, tmp_path):
             estimator.predict(episodes.everyone, episodes.inputs[0])
             observed[:] = False
             observed[0, 8] = second == 0
-            estimator.update(
-                episodes.everyone,
-                Measurement.of(estimator.model, observed, values + shift, episodes.sigma),
-            )
+            tell(estimator, episodes.everyone, observed, values + shift, episodes.sigma)
         a, b = (estimator.estimate().density[0] for estimator in pair)
         np.testing.assert_array_equal(np.abs(a - b) > 1e-9, reached)
         reached = sparsity @ reached
@@ -181,10 +183,7 @@ def test_releases_that_are_not_finite_reset_their_episode_alone(backend, bad, tm
     values = episodes.values[5].copy()
     values[1, 14, 0] = bad
     estimator.predict(episodes.everyone, episodes.inputs[5])
-    estimator.update(
-        episodes.everyone,
-        Measurement.of(estimator.model, episodes.observed[5], values, episodes.sigma),
-    )
+    tell(estimator, episodes.everyone, episodes.observed[5], values, episodes.sigma)
     assert estimator.diverged.tolist() == [False, True]
     assert not estimator.hidden[1].any()
     assert not estimator.innovations[1].any()
