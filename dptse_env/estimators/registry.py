@@ -32,7 +32,7 @@ ESTIMATORS = Registry(
     "estimator",
     {
         "ekf": Shipped("ekf", "EKF"),
-        "ukf": Shipped("compiled.ukf", "CompiledUKF"),
+        "ukf": Shipped("ukf", "UKF"),
         "enkf": Shipped("enkf", "EnKF"),
         "mhe": Shipped("mhe", "MHE"),
         "random_walk": Shipped("simple", "RandomWalk"),
