@@ -107,15 +107,19 @@ class Measurement(NamedTuple):
 
     def at(self, episodes: slice | int) -> Measurement:
         """Return the rows of a block of the k episodes, or those of one without the axis."""
-        return Measurement(*(array[episodes] for array in self))
+        observed, values, sigma, centre = self
+        return Measurement(observed[episodes], values[episodes], sigma[episodes], centre[episodes])
 
     def on_road(self, n_rows: int, n_segments: int) -> Measurement:
         """Return the columns of the road alone, without those of boundary segments."""
         if self.observed.shape[1] == n_rows and self.centre.shape[1] == n_segments:
             return self
-        own = (array[:, :n_rows] for array in (self.observed, self.values, self.sigma))
-        parts = (*own, self.centre[:, :n_segments])
-        return Measurement(*(np.ascontiguousarray(part) for part in parts))
+        return Measurement(
+            np.ascontiguousarray(self.observed[:, :n_rows]),
+            np.ascontiguousarray(self.values[:, :n_rows]),
+            np.ascontiguousarray(self.sigma[:, :n_rows]),
+            np.ascontiguousarray(self.centre[:, :n_segments]),
+        )
 
 
 def _full(name: str, values: Any, shape: tuple[int, ...]) -> FloatArray:

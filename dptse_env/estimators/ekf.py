@@ -115,7 +115,8 @@ class EKF(CovarianceFilter):
         predict(*self._packed, episodes, inputs)
 
     def _update(self, episodes: IntArray, measured: Measurement) -> None:
-        update(*self._packed, episodes, *measured)
+        observed, values, sigma, centre = measured
+        update(*self._packed, episodes, observed, values, sigma, centre)
 
 
 class Rows(NamedTuple):

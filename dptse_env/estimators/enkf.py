@@ -142,7 +142,8 @@ class EnKF(BatchEstimator):
         predict(self._road, self._packed, episodes, inputs)
 
     def _update(self, episodes: IntArray, measured: Measurement) -> None:
-        update(self._road, self._packed, episodes, *measured)
+        observed, values, sigma, centre = measured
+        update(self._road, self._packed, episodes, observed, values, sigma, centre)
 
     def _estimate(self) -> Estimate:
         out = np.empty((4, self.n_episodes, self.model.n_segments))

@@ -58,7 +58,7 @@ class Problem:
     def project(self, x: FloatArray, bounds: Bounds | None = None) -> FloatArray:
         """Return the states within bounds, by default the filter's."""
         bounds = self.settings.bounds if bounds is None else bounds
-        return self.model.project(x * self.unit, bounds) / self.unit
+        return np.asarray(self.model.project(x * self.unit, bounds) / self.unit)
 
     def f(self, x: FloatArray, u: FloatArray) -> FloatArray:
         """Return the states one step later."""
@@ -450,7 +450,8 @@ class _Window(EpisodeFilter):
         """Update by measurements of the last stage, and solve for the window."""
         stage, n = self.stages[-1], self.problem.n_states
         # Callers may reuse their arrays.
-        stage.seen = Measurement(*(array.copy() for array in seen))
+        observed, values, sigma, centre = seen
+        stage.seen = Measurement(observed.copy(), values.copy(), sigma.copy(), centre.copy())
         self.has_failed = False
         stage.R = self.problem.R(self.x, seen, LEAST_DEVIATION)
         if self.mhe.linearisation == "paper":

@@ -79,7 +79,11 @@ class RandomWalk(BatchEstimator):
     def _update(self, episodes: IntArray, measured: Measurement) -> None:
         rows = self.model.rows
         arrays = self.means, self.variances, self.innovations, self.diverged
-        _correct(rows.first, rows.span, self._largest, *arrays, episodes, *measured)
+        observed, values, sigma, centre = measured
+        _correct(
+            rows.first, rows.span, self._largest, *arrays,
+            episodes, observed, values, sigma, centre,
+        )  # fmt: skip
         lost = episodes[self.diverged[episodes]]
         if lost.size > 0:
             self._restart(lost)

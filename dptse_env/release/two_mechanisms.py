@@ -190,8 +190,12 @@ class TwoMechanisms(ReleaseModel):
         if self._errors is not None:
             flows = self.sensors.releases_flow
             sensed = self._errors.apply(request.episodes, sensed, releases_flow=flows)
-        both = zip(queried[:3], sensed[:3], strict=True)
-        return Measurement(*(np.concatenate(pair, axis=1) for pair in both), sensed.centre)
+        return Measurement(
+            np.concatenate([queried.observed, sensed.observed], axis=1),
+            np.concatenate([queried.values, sensed.values], axis=1),
+            np.concatenate([queried.sigma, sensed.sigma], axis=1),
+            sensed.centre,
+        )
 
     def spent(self, episodes: IntArray, steps: IntArray) -> tuple[FloatArray, FloatArray]:
         """See `ReleaseModel.spent`: that of a connected vehicle, under both mechanisms."""
