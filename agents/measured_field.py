@@ -143,12 +143,8 @@ class Replay:
             observed = np.zeros((k, n), dtype=bool)
             observed[:, (t * self.bandwidth + np.arange(self.bandwidth)) % n] = True
             now = truth[:, t, 1:-1]
-            made.update(
-                everyone,
-                Measurement.of(
-                    made.model, observed, now + sigma * rng.normal(size=now.shape), sigma
-                ),
-            )
+            values = now + sigma * rng.normal(size=now.shape)
+            made.update(everyone, Measurement.of(model, observed, values, sigma))
             if t > WARM_UP:
                 said = made.estimate()
                 error = np.stack([said.density, said.speed], -1) - now

@@ -136,8 +136,6 @@ def ekf_states(
         if k % block == 0:
             starts[k] = ekf.states[0] / scale, ekf.covariances[0].copy()
         ekf.predict(episode, replay.inputs[k, :1])
-        ekf.update(
-            episode,
-            Measurement.of(ekf.model, replay.observed[k, :1], replay.values[k, :1], replay.sigma),
-        )
+        seen, values = replay.observed[k, :1], replay.values[k, :1]
+        ekf.update(episode, Measurement.of(replay.model, seen, values, replay.sigma))
     return starts

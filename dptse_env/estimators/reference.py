@@ -58,7 +58,7 @@ class Problem:
     def project(self, x: FloatArray, bounds: Bounds | None = None) -> FloatArray:
         """Return the states within bounds, by default the filter's."""
         bounds = self.settings.bounds if bounds is None else bounds
-        return np.asarray(self.model.project(x * self.unit, bounds) / self.unit)
+        return self.model.project(x * self.unit, bounds) / self.unit
 
     def f(self, x: FloatArray, u: FloatArray) -> FloatArray:
         """Return the states one step later."""
