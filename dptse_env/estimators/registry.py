@@ -38,7 +38,7 @@ ESTIMATORS = Registry(
         "random_walk": Shipped("simple", "RandomWalk"),
         "blend": Shipped("simple", "Blend"),
         "open_loop": Shipped("simple", "OpenLoop"),
-        "recurrent": Shipped("learned.recurrent", "CompiledRecurrent"),
+        "recurrent": Shipped("recurrent", "Recurrent"),
     },
     check=_expected,
 )
