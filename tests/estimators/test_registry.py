@@ -54,6 +54,8 @@ def test_unknown_names_say_what_is_allowed():
         make_estimator("kf", "compiled", MODEL, 1)
     with pytest.raises(ValueError, match="backend must be one of compiled, reference, got 'torch'"):
         make_estimator("ekf", "torch", MODEL, 1)
+    with pytest.raises(ValueError, match="backend must be 'compiled' for 'blend', only ekf, ukf"):
+        gym.make("dptse_env:dptse/ShortHighway-v0", estimator="blend", backend="reference")
     with pytest.raises(ValueError, match="n_episodes must be >= 1, got 0"):
         make_estimator("ekf", "compiled", MODEL, 0)
 
