@@ -67,7 +67,8 @@ class Problem:
     def F(self, x: FloatArray, u: FloatArray) -> FloatArray:  # noqa: N802
         """Return the derivative of f at a mean, `(n_x, n_x)`."""
         jacobian = self.model.jacobian((x * self.unit)[None], u[None])[0]
-        return jacobian * self.unit / self.unit[:, None]
+        normalised: FloatArray = jacobian * self.unit / self.unit[:, None]
+        return normalised
 
     def Q(self, x: FloatArray) -> FloatArray:  # noqa: N802
         """Return the variances `(n_x,)` of the noise of a step that leaves a mean."""
@@ -89,7 +90,8 @@ class Problem:
         """Return the derivative of h at a mean, `(2 m, n_x)`."""
         matrix = self.model.measurement_matrix((x * self.unit)[None], seen.centre)[0]
         matrix = matrix[seen.observed] * self.unit / self.release_unit[:, None]
-        return matrix.reshape(-1, self.n_states)
+        rows: FloatArray = matrix.reshape(-1, self.n_states)
+        return rows
 
     def R(self, x: FloatArray, seen: Measurement, least: float = 0.0) -> FloatArray:  # noqa: N802
         """Return the variances `(2 m,)` of the noise of a measurement at a mean.
@@ -102,7 +104,8 @@ class Problem:
 
     def _density(self, x: FloatArray) -> FloatArray:
         """Return the densities `(S,)` of a mean within bounds [veh/km]."""
-        return self.model.density(self.project(x[None]) * self.unit)[0]
+        density: FloatArray = self.model.density(self.project(x[None]) * self.unit)[0]
+        return density
 
 
 class EpisodeFilter(ABC):

@@ -103,7 +103,7 @@ class ARZModel:
         if reference_speed is not None:
             self.reference_speed = non_negative("model.reference_speed", reference_speed)
             second = self.density_scale * self.speed_scale
-        self.measurement_scale = np.array([self.density_scale, second])
+        self.measurement_scale: FloatArray = np.array([self.density_scale, second])
 
     @cached_property
     def road(self) -> RoadArrays:
