@@ -15,7 +15,6 @@ from dptse_env.estimators.linalg import is_covariance, mirror, padded, pair_upda
 from dptse_env.estimators.noise import count_variance, initial_variance, process_variance
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
-from dptse_env.model.model import make_road_arrays
 from dptse_env.model.network import RoadArrays
 from dptse_env.model.parameters import LARGEST_W, VACUUM
 from dptse_env.model.step import (
@@ -72,7 +71,7 @@ class CovarianceFilter(BatchEstimator):
             count_variance=count_variance(model, settings),
             is_box=settings.bounds == "box",
         )
-        self._packed = tuple(make_road_arrays(model)), tuple(self._filters)
+        self._packed = tuple(model.road), tuple(self._filters)
         for episode in range(n_episodes):
             restart(self._filters, episode)
 

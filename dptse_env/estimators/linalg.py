@@ -144,7 +144,7 @@ def propagate(
         noise: `(n_x,)` variances that Q adds.
         covariance: `(n_x, padded)` P.
         scratch: `(2, n_x, padded)`.
-        out: `(n_x, padded)`.
+        out: `(n_x, padded)`, its padding zero.
     """
     n, product, transposed = covariance.shape[0], scratch[0], scratch[1]
     multiply(road, blocks, by_factor, covariance, product)

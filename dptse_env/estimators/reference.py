@@ -58,17 +58,17 @@ class Problem:
     def project(self, x: FloatArray, bounds: Bounds | None = None) -> FloatArray:
         """Return the states within bounds, by default the filter's."""
         bounds = self.settings.bounds if bounds is None else bounds
-        return self.model.project(x * self.unit, bounds) / self.unit
+        return np.asarray(self.model.project(x * self.unit, bounds) / self.unit)
 
     def f(self, x: FloatArray, u: FloatArray) -> FloatArray:
         """Return the states one step later."""
-        return self.model.step(x * self.unit, np.repeat(u[None], len(x), axis=0)) / self.unit
+        inputs = np.repeat(u[None], len(x), axis=0)
+        return np.asarray(self.model.step(x * self.unit, inputs) / self.unit)
 
     def F(self, x: FloatArray, u: FloatArray) -> FloatArray:  # noqa: N802
         """Return the derivative of f at a mean, `(n_x, n_x)`."""
         jacobian = self.model.jacobian((x * self.unit)[None], u[None])[0]
-        normalised: FloatArray = jacobian * self.unit / self.unit[:, None]
-        return normalised
+        return np.asarray(jacobian * self.unit / self.unit[:, None])
 
     def Q(self, x: FloatArray) -> FloatArray:  # noqa: N802
         """Return the variances `(n_x,)` of the noise of a step that leaves a mean."""
@@ -79,19 +79,18 @@ class Problem:
 
     def z(self, seen: Measurement) -> FloatArray:
         """Return the observed numbers `(2 m,)`."""
-        return (seen.values[seen.observed] / self.release_unit).ravel()
+        return np.asarray((seen.values[seen.observed] / self.release_unit).ravel())
 
     def h(self, x: FloatArray, seen: Measurement) -> FloatArray:
         """Return the numbers that states would give, `(k, 2 m)`."""
         released = self.model.measure(x * self.unit, seen.centre)[:, seen.observed]
-        return (released / self.release_unit).reshape(len(x), -1)
+        return np.asarray((released / self.release_unit).reshape(len(x), -1))
 
     def H(self, x: FloatArray, seen: Measurement) -> FloatArray:  # noqa: N802
         """Return the derivative of h at a mean, `(2 m, n_x)`."""
         matrix = self.model.measurement_matrix((x * self.unit)[None], seen.centre)[0]
         matrix = matrix[seen.observed] * self.unit / self.release_unit[:, None]
-        rows: FloatArray = matrix.reshape(-1, self.n_states)
-        return rows
+        return np.asarray(matrix.reshape(-1, self.n_states))
 
     def R(self, x: FloatArray, seen: Measurement, least: float = 0.0) -> FloatArray:  # noqa: N802
         """Return the variances `(2 m,)` of the noise of a measurement at a mean.
@@ -104,8 +103,7 @@ class Problem:
 
     def _density(self, x: FloatArray) -> FloatArray:
         """Return the densities `(S,)` of a mean within bounds [veh/km]."""
-        density: FloatArray = self.model.density(self.project(x[None]) * self.unit)[0]
-        return density
+        return np.asarray(self.model.density(self.project(x[None]) * self.unit)[0])
 
 
 class EpisodeFilter(ABC):
@@ -387,7 +385,9 @@ class ReferenceEnKF(ReferenceFilter):
     @property
     def members(self) -> FloatArray:
         """Members `(n, n_members, n_x)` [veh/km, veh/h], then demand factors; a copy."""
-        return np.stack([each.members for each in self.filters]) * self.model.state_scale
+        return np.asarray(
+            np.stack([each.members for each in self.filters]) * self.model.state_scale
+        )
 
     @property
     def states(self) -> FloatArray:

@@ -27,8 +27,6 @@ class RandomWalk(BatchEstimator):
         variances: Of these, `(n, S, 2)`.
     """
 
-    is_compiled: ClassVar[bool] = True
-
     def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
         """See `make_estimator`."""
         super().__init__(model, n_episodes, settings)
@@ -78,11 +76,10 @@ class RandomWalk(BatchEstimator):
 
     def _update(self, episodes: IntArray, measured: Measurement) -> None:
         rows = self.model.rows
-        arrays = self.means, self.variances, self.innovations, self.diverged
         observed, values, sigma, centre = measured
         _correct(
-            rows.first, rows.span, self._largest, *arrays,
-            episodes, observed, values, sigma, centre,
+            rows.first, rows.span, self._largest, self.means, self.variances, self.innovations,
+            self.diverged, episodes, observed, values, sigma, centre,
         )  # fmt: skip
         lost = episodes[self.diverged[episodes]]
         if lost.size > 0:

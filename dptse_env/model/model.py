@@ -305,8 +305,3 @@ def _blocks(by_rho: FloatArray, by_psi: FloatArray) -> FloatArray:
     blocks = np.zeros((*by_rho.shape, 2, 2))
     blocks[..., 0, 0], blocks[..., 1, 0], blocks[..., 1, 1] = 1.0, by_rho, by_psi
     return blocks
-
-
-def make_road_arrays(model: ARZModel) -> RoadArrays:
-    """Return a model as arrays and numbers."""
-    return model.road
