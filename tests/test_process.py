@@ -6,7 +6,7 @@ import qpsolvers
 from scipy import stats
 
 from dptse_env.config import resolve
-from dptse_env.estimators import ESTIMATORS
+from dptse_env.estimators import ESTIMATORS, REFERENCES
 from dptse_env.parts import make_parts
 from dptse_env.process import QueryProcess
 from dptse_env.spaces.actions import ACTION_ENCODINGS
@@ -76,7 +76,12 @@ FORKS = [
 @pytest.mark.parametrize(
     ("estimator", "privacy", "backend"),
     fast_and_slow(
-        itertools.product(ESTIMATORS, ["paper", COUNTED, PAID], ["compiled", "reference"]), FORKS
+        [
+            (name, privacy, backend)
+            for backend, names in (("compiled", ESTIMATORS), ("reference", REFERENCES))
+            for name, privacy in itertools.product(names, ["paper", COUNTED, PAID])
+        ],
+        FORKS,
     ),
 )
 def test_a_fork_goes_on_as_its_origin_would_have(estimator, privacy, backend):

@@ -10,10 +10,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from agents.filters.collecting import Collected
+from agents.filters.collecting import Collected, Released, Rows
 from agents.filters.torch_network import Road
 from dptse_env.config.keywords import GEOMETRY
-from dptse_env.estimators.learned.channels import Released, Rows
 from dptse_env.utils.arrays import IntArray
 
 Picks = Sequence[tuple[Collected, IntArray]]

@@ -6,7 +6,7 @@ import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,14 +14,56 @@ from numpy.typing import NDArray
 from agents.environments import make_vector
 from agents.filters.scenarios import Scenario
 from agents.play import record
-from dptse_env.estimators.batch import checked_measurements
-from dptse_env.estimators.learned.cells import Cells, input_channels, make_cells
-from dptse_env.estimators.learned.channels import Released, Rows, make_released, make_rows
+from dptse_env.estimators import Measurement
+from dptse_env.estimators.recurrent_kernels import Cells, make_cells
 from dptse_env.evaluation import Row, evaluate
+from dptse_env.model import MeasurementRows
 from dptse_env.process import QueryProcess
 from dptse_env.traffic import Corridor, Records
+from dptse_env.utils.arrays import FloatArray
 
 Float32Array = NDArray[np.float32]
+
+
+class Rows(NamedTuple):
+    """The rows of a measurement; for k episodes of different roads with a leading axis."""
+
+    covers: Any  # (M, S) flags of the cells that each row covers
+    share: Any  # (M,) 1 / number of these cells
+
+
+class Released(NamedTuple):
+    """Measurements of a second in k episodes; values and sigma are 0 where there is none."""
+
+    observed: Any  # (k, M), 1 or 0
+    values: Any  # (k, M, 2)
+    sigma: Any  # (k, M, 2)
+    centre: Any  # (k, S), 0 where speeds are released
+
+
+def make_rows(rows: MeasurementRows) -> Rows:
+    """Return a model's rows as `agents.filters.torch_network` takes them."""
+    return Rows((rows.weights > 0.0).astype(float), 1.0 / rows.span)
+
+
+def make_released(measured: Measurement) -> Released:
+    """Return measurements as `agents.filters.torch_network` takes them."""
+    seen = measured.observed[..., None]
+    return Released(
+        measured.observed.astype(float),
+        np.where(seen, measured.values, 0.0),
+        np.where(seen, measured.sigma, 0.0),
+        np.nan_to_num(measured.centre),
+    )
+
+
+def input_channels(cells: Cells, inputs: FloatArray) -> FloatArray:
+    """Return inflow and density outside, shape (k, S, 2), of the model's inputs (k, n_u)."""
+    table = np.zeros((len(inputs), cells.lanes.size, 2))
+    lanes = cells.lanes[cells.entries]
+    table[:, cells.entries, 0] = inputs[:, cells.entry_inputs] / (2000.0 * lanes)
+    table[:, cells.exits, 1] = inputs[:, cells.exit_inputs] / cells.exit_units
+    return table
 
 
 @dataclass(frozen=True)
@@ -65,12 +107,12 @@ class _Recorder:
         self.outside.append(_single(input_channels(self.cells, inputs)))
         self._estimator.predict(episodes, inputs)
 
-    def update(self, *arguments: Any) -> None:
+    def update(self, episodes: Any, measured: Measurement) -> None:
         """Write down the measurements, and update."""
-        n, model = self._process.n_episodes, self._process.model
-        measured = checked_measurements(n, model, *arguments)
-        self.released.append(Released(*(_single(array) for array in make_released(measured))))
-        self._estimator.update(*arguments)
+        model = self._process.model
+        own = make_released(measured.on_road(model.rows.n_rows, model.n_segments))
+        self.released.append(Released(*(_single(array) for array in own)))
+        self._estimator.update(episodes, measured)
 
 
 class _Watcher:

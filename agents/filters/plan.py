@@ -16,7 +16,7 @@ from agents.filters.scenarios import Scenario, ScenarioRanges
 from agents.play import Cell
 from agents.seeds import TUNING, require_seeds
 from dptse_env.config import TRAINING_SEEDS, VALIDATION_SEEDS
-from dptse_env.estimators.learned.weights import read_network
+from dptse_env.estimators.recurrent_weights import read_network
 from dptse_env.utils.validation import inside, integer, positive, require
 
 

@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from dptse_env.estimators.learned.cells import DENSITY_RANGE, SPEED_RANGE
-from dptse_env.estimators.learned.channels import LONGEST_AGE, Released, Rows, read_rows
-from dptse_env.estimators.learned.network import (
+from agents.filters.collecting import Released, Rows
+from dptse_env.estimators.recurrent_kernels import (
+    DENSITY_RANGE,
     HIGHEST_SPREAD,
+    LARGEST_CORRECTION,
+    LARGEST_INNOVATION,
+    LARGEST_SIGMA,
+    LEAST_SIGMA,
+    LEAST_VARIANCE,
+    LONGEST_AGE,
     LOWEST_SPREAD,
+    SPEED_RANGE,
     Network,
     message_width,
     shapes,
@@ -41,7 +49,7 @@ class State(NamedTuple):
 
 
 class RecurrentNetwork(nn.Module):
-    """The network of `dptse_env.estimators.learned.network`, with gradients."""
+    """The network of `dptse_env.estimators.recurrent_kernels`, with gradients."""
 
     inputs: Tensor
     inputs_bias: Tensor
@@ -78,7 +86,7 @@ class RecurrentNetwork(nn.Module):
     def forward(self, road: Road, released: Released, outside: Tensor, state: State) -> State:
         """Return the state after a second, of its measurements and the inputs (k, S, 2)."""
         with torch.no_grad():
-            x, _ = read_rows(torch, road, road.rows, released, state.predicted, state.age)
+            x, _ = read_rows(road, road.rows, released, state.predicted, state.age)
             age = (state.age + 1.0) * (1.0 - x[..., 0])
             x = torch.cat([x, outside, road.fixed], -1)
         h, H = state.hidden, self.width
@@ -124,6 +132,87 @@ class RecurrentNetwork(nn.Module):
             for name, parameter in self.named_parameters()
         }
         return Network(**arrays)
+
+
+def read_rows(
+    cells: Any, rows: Rows, released: Released, predicted: Tensor, age: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return the channels that come of releases, (k, S, 18), and the innovations (k, M, 2).
+
+    The equations are those of `dptse_env.estimators.recurrent_kernels`, over batches of roads.
+
+    Args:
+        cells: Has ``unit`` (S,), ``limit`` and ``flows`` (1 or 0, or (k, 1) of them).
+        rows: The rows of the measurement.
+        released: The measurement.
+        predicted: Predicted density [veh/km], speed [km/h] and their deviations, shape (k, S, 4).
+        age: Seconds since the last measurement before this one, shape (k, S).
+    """
+    flows, unit, limit = cells.flows, cells.unit, cells.limit
+    density, speed = predicted[..., 0], predicted[..., 1]
+    density_variance, speed_variance = predicted[..., 2] ** 2, predicted[..., 3] ** 2
+    slip = flows * (speed - released.centre)  # derivative of y by the density
+    by_speed = flows * density + (1.0 - flows)  # derivative of y by the speed
+    second = flows * density * slip + (1.0 - flows) * speed
+    second_variance = by_speed**2 * speed_variance + slip**2 * density_variance
+    innovations, sums = _weigh(
+        rows, released, [density, second], [density_variance, second_variance]
+    )
+    count = sums[..., 0]
+    queried, each = torch.clip(count, None, 1.0), 1.0 / torch.clip(count, 1.0, None)
+    log_unit = torch.log(unit)
+    table = [
+        queried,
+        sums[..., 1],
+        0.2 * (sums[..., 2] * each - queried * log_unit),
+        0.2 * (sums[..., 3] * each - queried * (flows * log_unit + math.log(limit))),
+        density / unit,
+        speed / limit,
+        0.25 * torch.log(predicted[..., 2] / unit),
+        0.25 * torch.log(predicted[..., 3] / limit),
+        0.5 * _held(sums[..., 4], LARGEST_INNOVATION),
+        0.5 * _held(sums[..., 5], LARGEST_INNOVATION),
+        4.0 * _held(density_variance * sums[..., 6] / unit, LARGEST_CORRECTION),
+        4.0 * _held(slip * density_variance * sums[..., 7] / unit, LARGEST_CORRECTION),
+        4.0 * _held(by_speed * speed_variance * sums[..., 7] / limit, LARGEST_CORRECTION),
+        torch.clip(density_variance * sums[..., 8], None, 1.0),
+        torch.clip(by_speed**2 * speed_variance * sums[..., 9], None, 1.0),
+        slip / limit,
+        queried * 0.0 + flows,
+        0.25 * torch.log(1.0 + torch.clip(age, 0.0, LONGEST_AGE)),
+    ]
+    return torch.stack(table, -1), innovations
+
+
+def _weigh(
+    rows: Rows, released: Released, values: list[Tensor], variances: list[Tensor]
+) -> tuple[Tensor, Tensor]:
+    """Return innovations over their deviations (k, M, 2), and sums over rows for each cell.
+
+    The sums (k, S, 10) are over the rows that cover a cell: their number, their shares, logarithms
+    of sigma, innovations, then e_m / (span_m V_m) and 1 / (span_m^2 V_m); the last four have a
+    column for densities and one for the second number.
+    """
+    observed, share = released.observed, rows.share
+    means = _sums(rows.covers, values) * share[..., None]
+    total = _sums(rows.covers, variances) * share[..., None] ** 2 + released.sigma**2
+    total = torch.clip(total, LEAST_VARIANCE, None)
+    errors = observed[..., None] * (released.values - means)
+    innovations = errors / torch.sqrt(total)
+    weights = (observed * share)[..., None] / total
+    sigma = observed[..., None] * torch.log(torch.clip(released.sigma, LEAST_SIGMA, LARGEST_SIGMA))
+    tables = [sigma, innovations, weights * errors, share[..., None] * weights]
+    columns = [table[..., j] for table in tables for j in range(2)]
+    back = torch.swapaxes(rows.covers, -1, -2)
+    return innovations, _sums(back, [observed, observed * share, *columns])
+
+
+def _sums(weights: Tensor, columns: list[Tensor]) -> Tensor:
+    return torch.matmul(weights, torch.stack(columns, -1))
+
+
+def _held(values: Tensor, largest: float) -> Tensor:
+    return torch.clip(values, -largest, largest)
 
 
 def second_loss(road: Road, estimated: Tensor, truth: Tensor, likelihood: float) -> Tensor:

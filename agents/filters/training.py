@@ -26,7 +26,7 @@ from agents.training.run_files import (
     write_checkpoint,
     write_progress,
 )
-from dptse_env.estimators.learned.weights import read_network, write_network
+from dptse_env.estimators.recurrent_weights import read_network, write_network
 from dptse_env.traffic import Records
 
 WEIGHTS, PLAYED = "network.npz", "played.npz"

@@ -56,7 +56,7 @@ class EnvConfig:
         estimator: The estimator: ``ekf``, ``ukf``, ``enkf``, ``mhe``, ``random_walk``,
             ``blend``, ``open_loop``, ``recurrent``, a registered name, ``"package.module:Class"``,
             or a class.
-        backend: ``compiled`` or ``reference``.
+        backend: ``compiled``, or ``reference``, which EKF, UKF, EnKF and MHE have.
         parameters: ARZ parameters, or the name of a set.
         estimator_settings: Tuning of the estimator, or the name of a shipped set
             (`dptse_env.estimators.settings`), whichever estimator it was tuned for. None for the

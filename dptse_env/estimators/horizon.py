@@ -7,7 +7,7 @@ The program is the paper's, eq. 17: `minimise z' H z + q' z with lower <= z <= u
 
 import warnings
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -23,7 +23,7 @@ from dptse_env.model.parameters import (
     LEAST_FACTOR,
     LEAST_W,
 )
-from dptse_env.utils.arrays import BoolArray, FloatArray
+from dptse_env.utils.arrays import FloatArray
 
 # Largest natural residual of an optimum, in normalised states.
 RESIDUAL = 1e-8
@@ -82,46 +82,6 @@ def normalised_bounds(model: ARZModel, bounds: Bounds) -> tuple[FloatArray, Floa
         np.concatenate([lower, LEAST_FACTOR * factors]),
         np.concatenate([upper, LARGEST_FACTOR * factors]),
     )
-
-
-class Window(NamedTuple):
-    """A window's linearised problem: L stages of n_x components, M rows, normalised."""
-
-    arrival: FloatArray  # (n_x,) mean of the first state
-    arrival_variance: FloatArray  # (n_x,) its variances
-    transitions: FloatArray  # (L - 1, n_x, n_x) A of each step
-    offsets: FloatArray  # (L - 1, n_x) B u + c_1 of each step
-    process_variance: FloatArray  # (L - 1, n_x) of each step
-    observed: BoolArray  # (L, M)
-    rows: FloatArray  # (L, M, 2, n_x) derivatives of both numbers of each row by the state
-    targets: FloatArray  # (L, M, 2) density, and the other less the linearisation's constant c_2
-    noise: FloatArray  # (L, M, 2) variances of both
-
-
-def assemble(window: Window) -> tuple[FloatArray, FloatArray]:
-    """Return H `(L n_x, L n_x)` and q `(L n_x,)` of the paper's eq. 17."""
-    n_stages, n = len(window.observed), window.arrival.size
-    H, q = np.zeros((n_stages * n, n_stages * n)), np.zeros(n_stages * n)
-    mu = 1.0 / window.arrival_variance
-    H[:n, :n] += np.diag(mu)
-    q[:n] -= 2.0 * mu * window.arrival
-    for i, observed in enumerate(window.observed):
-        here = slice(i * n, (i + 1) * n)
-        C = window.rows[i][observed].reshape(-1, n)
-        w_1 = 1.0 / window.noise[i][observed].ravel()
-        H[here, here] += C.T @ (w_1[:, None] * C)
-        q[here] -= 2.0 * C.T @ (w_1 * window.targets[i][observed].ravel())
-    steps = zip(window.transitions, window.offsets, window.process_variance, strict=True)
-    for i, (A, c, variance) in enumerate(steps):
-        w_2 = 1.0 / variance
-        here, after = slice(i * n, (i + 1) * n), slice((i + 1) * n, (i + 2) * n)
-        H[here, here] += A.T @ (w_2[:, None] * A)
-        H[after, after] += np.diag(w_2)
-        H[after, here] -= w_2[:, None] * A
-        H[here, after] -= A.T * w_2
-        q[here] += 2.0 * A.T @ (w_2 * c)
-        q[after] -= 2.0 * w_2 * c
-    return H, q
 
 
 def natural_residual(

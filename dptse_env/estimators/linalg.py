@@ -144,7 +144,7 @@ def propagate(
         noise: `(n_x,)` variances that Q adds.
         covariance: `(n_x, padded)` P.
         scratch: `(2, n_x, padded)`.
-        out: `(n_x, padded)`.
+        out: `(n_x, padded)`, its padding zero.
     """
     n, product, transposed = covariance.shape[0], scratch[0], scratch[1]
     multiply(road, blocks, by_factor, covariance, product)
@@ -307,7 +307,7 @@ def is_covariance(matrix: FloatArray, variances: FloatArray) -> bool:
             # A NaN is not counted.
             if line[j] * line[j] <= allowed * variances[j] + 1e-24:
                 possible += 1
-    return possible == n * (n + 1) // 2
+    return bool(possible == n * (n + 1) // 2)
 
 
 @kernel_part(fastmath={"contract"})
@@ -361,18 +361,55 @@ def solve(lower: FloatArray, right: FloatArray) -> None:
 
 
 @kernel_part(fastmath={"contract"})
+def forward(lower: FloatArray, right: FloatArray) -> None:
+    """Replace `right` `(n, width)` by L^-1 right, L from `factor`."""
+    for i in range(right.shape[0]):
+        row = right[i]
+        for k in range(i):
+            weight, other = lower[i, k], right[k]
+            for j in range(row.size):
+                row[j] -= weight * other[j]
+        row *= lower[i, i]
+
+
+@kernel_part(fastmath={"contract"})
 def solve_many(lower: FloatArray, right: FloatArray) -> None:
     """Replace `right` `(n, width)` by (L L')^-1 right, L from `factor`."""
-    n, width = right.shape
-    for i in range(n):
+    forward(lower, right)
+    for i in range(right.shape[0] - 1, -1, -1):
+        row = right[i]
+        row *= lower[i, i]
         for k in range(i):
-            for j in range(width):
-                right[i, j] -= lower[i, k] * right[k, j]
-        for j in range(width):
-            right[i, j] *= lower[i, i]
-    for i in range(n - 1, -1, -1):
-        for j in range(width):
-            right[i, j] *= lower[i, i]
-        for k in range(i):
-            for j in range(width):
-                right[k, j] -= lower[i, k] * right[i, j]
+            weight, other = lower[i, k], right[k]
+            for j in range(row.size):
+                other[j] -= weight * row[j]
+
+
+@kernel_part(fastmath={"contract", "reassoc"})
+def products(left: FloatArray, right: FloatArray, is_lower: bool, out: FloatArray) -> None:
+    """Write the inner products of rows, left right', two rows of each at a time.
+
+    Args:
+        left: `(n_left, width)`.
+        right: `(n_right, width)`.
+        is_lower: Whether to leave out those right of the diagonal, but for one.
+        out: `(>= n_left, >= n_right)`.
+    """
+    n_left, n_right = left.shape[0], right.shape[0]
+    for i in range(0, n_left, 2):
+        a, b = left[i], left[min(i + 1, n_left - 1)]
+        for j in range(0, min(i + 2, n_right) if is_lower else n_right, 2):
+            c, d = right[j], right[min(j + 1, n_right - 1)]
+            ac = ad = bc = bd = 0.0
+            for k in range(left.shape[1]):
+                ac += a[k] * c[k]
+                ad += a[k] * d[k]
+                bc += b[k] * c[k]
+                bd += b[k] * d[k]
+            out[i, j] = ac
+            if j + 1 < n_right:
+                out[i, j + 1] = ad
+            if i + 1 < n_left:
+                out[i + 1, j] = bc
+                if j + 1 < n_right:
+                    out[i + 1, j + 1] = bd

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dptse_env.estimators import ekf
-from dptse_env.estimators.batch import Measurements
+from dptse_env.estimators.base import Measurement
 from dptse_env.estimators.ekf import CovarianceFilter, Filters, process_noise
 from dptse_env.estimators.horizon import (
     LEAST_DEVIATION,
@@ -21,14 +21,16 @@ from dptse_env.estimators.window import (
     UNSOLVED,
     Window,
     factorise,
-    make_work,
+    look,
+    make_factor,
+    make_point,
     minimise,
-    write_force,
 )
 from dptse_env.model import ARZModel
 from dptse_env.model.network import RoadArrays
 from dptse_env.model.step import advance, make_scratch, normalise, project, write_row
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+from dptse_env.utils.kernel_loops import all_finite, any_of, copy_matrix, copy_vector
 from dptse_env.utils.kernels import Packed, kernel, kernel_part
 from dptse_env.utils.validation import integer, positive
 
@@ -205,27 +207,25 @@ def update(
 ) -> None:
     """Update by measurements, `sigma` no less than allowed; see `Estimator.update`."""
     road, filters, windows = RoadArrays(*road_), Filters(*filters_), Windows(*windows_)
-    capacity, width = windows.solution.shape[1:]
-    n_rows, size = windows.weights.shape[2], windows.weights.shape[4]
-    work = make_work(capacity - 1, windows.units.size, n_rows, size, width)
-    free = np.zeros((capacity - 1, width), np.int64)
     for k in range(episodes.size):
         e = episodes[k]
         _shift(windows, e)
-        windows.observed[e, windows.length[e] - 1] = observed[k]
-        windows.centre[e, windows.length[e] - 1] = centre[k]
+        last = windows.length[e] - 1
+        copy_vector(observed[k], windows.observed[e, last])
+        copy_vector(centre[k], windows.centre[e, last])
         windows.solved[e] = UNSOLVED
         sound = _measure(road, filters, windows, e, values[k], sigma[k])
-        n_stages, window = windows.length[e], window_of(windows, e)
-        work.length[0] = 0
-        sound = sound and factorise(road, window, n_stages, free, work)
+        window = window_of(windows, e)
+        side, z = windows.side[e, : last + 1], windows.solution[e, : last + 1].copy()
+        factor = make_factor(window, z.shape[1])
+        sound = sound and factorise(road, window, factor.side, factor)
         if sound:
-            filters.covariances[e] = work.covariances[n_stages - 1]
-            _innovate(road, filters, windows, e, work.before)
-            sound = bool(np.isfinite(np.sum(filters.covariances[e])))
-        if sound and np.any(observed[k]):
-            z, side = windows.solution[e].copy(), windows.side[e]
-            windows.solved[e] = minimise(road, window, n_stages, work, side, z)
+            copy_matrix(factor.covariances[last], filters.covariances[e])
+            _innovate(road, filters, windows, e, factor.before)
+            for i in range(windows.units.size):
+                sound = sound and all_finite(filters.covariances[e, i])
+        if sound and any_of(observed[k]):
+            windows.solved[e] = minimise(road, window, factor, side, z)
             if windows.solved[e] != UNSOLVED:
                 accept(road, filters, windows, e, z)
         filters.diverged[e] = not sound
@@ -297,10 +297,10 @@ def _innovate(
 
 @kernel
 def accept(road: RoadArrays, filters: Filters, windows: Windows, e: int, z: FloatArray) -> None:
-    """Accept a solution `(L, padded)`, whose last state is the estimate."""
-    windows.solution[e] = z
+    """Accept a solution `(>= L, padded)`, whose last state is the estimate."""
     for t in range(windows.length[e]):
         for i in range(windows.units.size):
+            windows.solution[e, t, i] = z[t, i]
             at_lower, at_upper = z[t, i] <= windows.lower[i], z[t, i] >= windows.upper[i]
             windows.side[e, t, i] = int(at_upper) - int(at_lower)
     for i in range(windows.units.size):
@@ -311,17 +311,18 @@ def accept(road: RoadArrays, filters: Filters, windows: Windows, e: int, z: Floa
 @kernel_part
 def window_of(windows: Windows, e: int) -> Window:
     """Return the linearised window of an episode; its arrays are views."""
+    length = windows.length[e]
     return Window(
         windows.predicted[e, 0],
         windows.arrival_variance[e],
-        windows.blocks[e],
-        windows.by_factor[e],
-        windows.offsets[e],
-        windows.process_variance[e],
-        windows.observed[e],
-        windows.weights[e],
-        windows.targets[e],
-        windows.noise[e],
+        windows.blocks[e, :length],
+        windows.by_factor[e, :length],
+        windows.offsets[e, :length],
+        windows.process_variance[e, :length],
+        windows.observed[e, :length],
+        windows.weights[e, :length],
+        windows.targets[e, :length],
+        windows.noise[e, :length],
         windows.lower,
         windows.upper,
     )
@@ -331,18 +332,17 @@ def window_of(windows: Windows, e: int) -> Window:
 def write_program(road_: Packed, windows_: Packed, e: int, H: FloatArray, q: FloatArray) -> None:
     """Write H `(L, n_x, L, n_x)` and q `(L, n_x)` of an episode: z' H z + q' z."""
     road, windows = RoadArrays(*road_), Windows(*windows_)
-    length, n, width = windows.length[e], windows.units.size, windows.solution.shape[2]
-    n_rows, size = windows.weights.shape[2], windows.weights.shape[4]
-    work = make_work(length, n, n_rows, size, width)
-    z, start, force = np.zeros((3, length, width))
-    write_force(road, window_of(windows, e), length, z, work, start)
+    window, length, n = window_of(windows, e), windows.length[e], windows.units.size
+    point = make_point(length, windows.solution.shape[2], windows.observed.shape[2])
+    look(road, window, point)
+    start = point.force.copy()
     q[:] = -2.0 * start[:, :n]
     for t in range(length):
         for i in range(n):
-            z[t, i] = 1.0
-            write_force(road, window_of(windows, e), length, z, work, force)
-            z[t, i] = 0.0
-            H[t, i] = start[:, :n] - force[:, :n]
+            point.z[t, i] = 1.0
+            look(road, window, point)
+            point.z[t, i] = 0.0
+            H[t, i] = start[:, :n] - point.force[:, :n]
 
 
 class MHE(CovarianceFilter):
@@ -390,9 +390,9 @@ class MHE(CovarianceFilter):
     def _predict(self, episodes: IntArray, inputs: FloatArray) -> None:
         predict(*self._all_packed, episodes, inputs)
 
-    def _update(self, measured: Measurements) -> None:
+    def _update(self, episodes: IntArray, measured: Measurement) -> None:
         least = LEAST_DEVIATION * self.model.measurement_scale
-        episodes, observed, values, sigma, centre = measured
+        observed, values, sigma, centre = measured
         update(*self._all_packed, episodes, observed, values, np.maximum(sigma, least), centre)
         unsolved = self._windows.solved[episodes] == UNSOLVED
         unsolved &= observed.any(axis=1) & ~self.diverged[episodes]
@@ -407,9 +407,7 @@ class MHE(CovarianceFilter):
         self.fallback[episode], windows.side[episode] = z is None, 0
         windows.solved[episode] = FALLBACK if z is None else GENERAL_SOLVER
         if z is not None:
-            solution = windows.solution[episode].copy()
-            solution[:length, : self.model.n_states] = z.reshape(length, -1)
-            accept(self._road, self._filters, windows, episode, solution)
+            accept(self._road, self._filters, windows, episode, z.reshape(length, -1))
 
     def _restart(self, episodes: IntArray) -> None:
         for episode in episodes.tolist():

@@ -267,7 +267,7 @@ def measured_speeds(
 
 
 @kernel_part(fastmath={"contract"})
-def released_by_states(
+def _released(
     road: RoadArrays,
     s: int,
     rho_row: FloatArray,
@@ -275,10 +275,7 @@ def released_by_states(
     v_0: float,
     out: FloatArray,
 ) -> None:
-    """Write the measured speeds [km/h] or centred flows [veh/h], as `ARZModel.measure`.
-
-    Flows are centred on v_0 [km/h]; it is NaN where speeds are measured.
-    """
+    """Write flows centred on v_0 [km/h], or measured speeds [km/h] where it is NaN."""
     jam, v_f = road.jam[s], road.free_flow_speed
     if np.isnan(v_0):
         measured_speeds(rho_row, psi_row, jam, v_f, road.gamma, out)
@@ -315,7 +312,7 @@ def measure_row(
     part = 1.0 / span
     for s in range(first, first + span):
         rho, psi = states[2 * s], states[2 * s + 1]
-        released_by_states(road, s, rho, psi, centre[s], work)
+        _released(road, s, rho, psi, centre[s], work)
         if s == first:
             for j in range(rho.size):
                 density[j], second[j] = part * rho[j], part * work[j]

@@ -406,7 +406,7 @@ def measured(
 
 
 @kernel_part
-def released(
+def _released(
     road: RoadArrays, s: int, rho: float, psi: float, centre: float
 ) -> tuple[float, float, float]:
     """Return a segment's released second number, and its derivatives by rho and psi.
@@ -450,7 +450,7 @@ def write_row(
     for i in range(span):
         s = first + i
         rho, psi = state[2 * s], state[2 * s + 1]
-        second, by_rho, by_psi = released(road, s, rho, psi, centre[s])
+        second, by_rho, by_psi = _released(road, s, rho, psi, centre[s])
         part = 1.0 / (span * road.second_scale)
         weights[0, 2 * i], weights[0, 2 * i + 1] = 1.0 / span, 0.0
         weights[1, 2 * i] = part * by_rho * units[2 * s]

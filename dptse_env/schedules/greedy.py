@@ -7,7 +7,7 @@ from typing import Any, ClassVar, NamedTuple, Protocol, cast
 
 import numpy as np
 
-from dptse_env.estimators.linalg import padded, pair_update, propagate
+from dptse_env.estimators.linalg import mirror, padded, pair_update, propagate
 from dptse_env.model.network import RoadArrays
 from dptse_env.model.step import advance, make_scratch, measured, normalise, project, write_row
 from dptse_env.process import QueryProcess
@@ -166,8 +166,7 @@ class Work(NamedTuple):
     # (n, 3) a segment's weights of the variance of rho, of the covariance of rho and psi, and of
     # the variance of psi in the trace
     weights: FloatArray
-    columns: FloatArray  # (2, padded)
-    gains: FloatArray  # (2, padded)
+    columns: FloatArray  # (4, padded)
     constants: FloatArray  # (2,)
 
 
@@ -197,10 +196,10 @@ def choose(
     road, design = RoadArrays(*road_), Design(*design_)
     s, width = road.jam.size, before.shape[2]
     scratch, square = make_scratch(road), np.empty((2, 2 * s, width))
-    columns, gains = np.empty((2, width)), np.empty((2, width))
+    columns = np.empty((4, width))
     work = Work(
         np.empty(2 * s), np.empty((*road.neighbours.shape, 4)), square, np.empty((s, 2, 2)),
-        np.empty((s, 2)), np.empty((queried.shape[1], 3)), columns, gains, np.empty(2),
+        np.empty((s, 2)), np.empty((queried.shape[1], 3)), columns, np.empty(2),
     )  # fmt: skip
     for k in range(means.shape[0]):
         covariance = after[episodes[k]]
@@ -254,7 +253,8 @@ def _drift(design: Design, covariance: FloatArray, to_speed: FloatArray) -> None
 @kernel_part
 def _update(design: Design, covariance: FloatArray, s: int, work: Work) -> None:
     """Update a covariance by a segment's release; one that is not sound is left as it is."""
-    pair_update(covariance, 2 * s, work.rows[s], design.noise, work.columns, work.gains)
+    if pair_update(covariance, 2 * s, work.rows[s], design.noise, work.columns):
+        mirror(covariance)
 
 
 @kernel_part

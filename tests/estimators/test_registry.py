@@ -5,27 +5,23 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from dptse_env.estimators import BACKENDS, ESTIMATORS, make_estimator
+from dptse_env.estimators import REFERENCES, make_estimator
 from dptse_env.model import ARZModel, load_parameters
 from dptse_env.traffic import PAPER_HIGHWAY
 
+from .episodes import EVERY, tell
+
 MODEL = ARZModel(PAPER_HIGHWAY, load_parameters("paper"))
-NAMES = {"compiled": tuple(ESTIMATORS), "reference": ("ekf", "ukf", "enkf", "mhe")}
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_every_name_and_backend_follows_the_protocol(backend):
-    for name in NAMES[backend]:
-        follows_the_protocol(name, backend)
-
-
-def follows_the_protocol(name, backend):
+@pytest.mark.parametrize(("name", "backend"), EVERY)
+def test_every_name_and_backend_follows_the_protocol(name, backend):
     estimator = make_estimator(name, backend, MODEL, 3)
     everyone = np.arange(3)
     states = MODEL.states(np.full((3, 19), 30.0), np.full((3, 19), 80.0))
     estimator.reset(everyone, states, [np.random.default_rng(i) for i in everyone])
     estimator.predict(everyone, np.zeros((3, 9)))
-    estimator.update(everyone, np.ones((3, 19), bool), MODEL.measure(states), np.ones(2))
+    tell(estimator, everyone, np.ones((3, 19), bool), MODEL.measure(states), np.ones(2))
     assert estimator.n_episodes == 3
     assert estimator.innovations.shape == (3, 19, 2)
     assert estimator.diverged.tolist() == [False] * 3
@@ -38,13 +34,12 @@ def follows_the_protocol(name, backend):
         assert (a >= 0.0).all()
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("reference_speed", [None, 40.0])
-def test_every_estimator_measures_as_its_model_does(backend, reference_speed):
+def test_every_estimator_measures_as_its_model_does(reference_speed):
     model = ARZModel(PAPER_HIGHWAY, load_parameters("paper"), 0.5, reference_speed)
     states = MODEL.states(np.full((1, 19), 30.0), np.full((1, 19), 80.0))
     second = 80.0 if reference_speed is None else 30.0 * (80.0 - 40.0)
-    for name in NAMES[backend]:
+    for name, backend in EVERY:
         own = make_estimator(name, backend, model, 1).model
         assert own.reference_speed == reference_speed
         assert own.time_step == 0.5
@@ -63,6 +58,15 @@ def test_unknown_names_say_what_is_allowed():
         gym.make("dptse_env:dptse/ShortHighway-v0", estimator="blend", backend="reference")
     with pytest.raises(ValueError, match="n_episodes must be >= 1, got 0"):
         make_estimator("ekf", "compiled", MODEL, 0)
+
+
+@pytest.mark.parametrize("name", ["blend", "recurrent", "random_walk", "open_loop"])
+def test_only_textbook_filters_have_a_reference(name):
+    message = rf"must be 'compiled' for '{name}', only {', '.join(REFERENCES)} have a reference"
+    with pytest.raises(ValueError, match=message):
+        make_estimator(name, "reference", MODEL, 1)
+    with pytest.raises(ValueError, match=message):
+        gym.make("dptse_env:dptse/ShortHighway-v0", estimator=name, backend="reference")
 
 
 def test_the_library_of_reference_filters_is_imported_for_these_alone():

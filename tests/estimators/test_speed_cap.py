@@ -5,21 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dptse_env.estimators import BACKENDS, ESTIMATORS, EstimatorSettings
+from dptse_env.estimators import EstimatorSettings
 from dptse_env.traffic import PAPER_HIGHWAY
 from tests.cases import fast_and_slow
 from tests.model.roads import Road
 
-from .episodes import assert_same, model_of, run, show, simulate, started
+from .episodes import EVERY, assert_same, model_of, run, show, simulate, started
 
 CAP = 0.7
-
-
-ALL = [(name, backend) for name in ESTIMATORS for backend in BACKENDS]
 FAST = [(name, "compiled") for name in ("ekf", "ukf", "enkf", "mhe", "blend", "recurrent")]
 
 
-@pytest.mark.parametrize(("name", "backend"), fast_and_slow(ALL, FAST))
+@pytest.mark.parametrize(("name", "backend"), fast_and_slow(EVERY, FAST))
 def test_a_cap_holds_the_reported_speeds_and_nothing_else(name, backend):
     episodes = simulate(n=2, n_steps=4)
     speeds = np.tile(np.linspace(20.0, 95.0, 19), (2, 1))

@@ -28,6 +28,7 @@ class Road:
     speed_limit: float = 102.0
     lanes: int = 3
     ramp_lanes: int = 1
+    more_outside: int = 0
 
     @property
     def n_ramps(self) -> int:
@@ -56,7 +57,8 @@ class Road:
 
     @property
     def boundary_lanes(self) -> tuple[int, ...]:
-        return (self.lanes,) * 2 + (self.ramp_lanes,) * self.n_ramps
+        lanes = (self.lanes,) * 2 + (self.ramp_lanes,) * self.n_ramps
+        return tuple(each + self.more_outside for each in lanes)
 
 
 UNEVEN = Corridor(
@@ -80,8 +82,10 @@ UNEVEN = Corridor(
 
 HIGHWAY = Road(on_ramps=(3, 9), off_ramps=(6, 12), exit_shares=(0.1, 0.1))
 STRAIGHT = Road()
-# Every kind of face beside every other, and an off-ramp that nobody takes.
-CROWDED = Road(on_ramps=(3, 5), off_ramps=(4, 6), exit_shares=(0.0, 0.5), ramp_lanes=3)
+# Every kind of face beside every other, an off-ramp that nobody takes, and wider roads outside.
+CROWDED = Road(
+    on_ramps=(3, 5), off_ramps=(4, 6), exit_shares=(0.0, 0.5), ramp_lanes=3, more_outside=1
+)
 ROADS = {
     "highway": HIGHWAY,
     "uneven": UNEVEN,

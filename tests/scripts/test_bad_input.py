@@ -41,7 +41,7 @@ FILES = {
     "policy": ("p.zip", POLICY, ["tune", "--schedule"]),
     "model": ("m.zip", POLICY, ["evaluate", "--policies", "stable_baselines3:PPO={path}"]),
     "network": (
-        "n.npz", shipped("dptse_env/estimators/learned/shipped/*.npz"),
+        "n.npz", shipped("dptse_env/estimators/networks/*.npz"),
         ["train_estimator", "--initial"],
     ),
     "trajectories": (

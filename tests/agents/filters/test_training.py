@@ -14,10 +14,10 @@ from agents.filters.plan import OWN, Round  # noqa: E402
 from agents.filters.torch_network import RecurrentNetwork, second_loss  # noqa: E402
 from agents.filters.training import FilterTraining  # noqa: E402
 from agents.training.run_files import read_progress  # noqa: E402
-from dptse_env.estimators.learned.weights import read_network, write_network  # noqa: E402
+from dptse_env.estimators.recurrent_weights import read_network, write_network  # noqa: E402
 from dptse_env.evaluation import evaluate  # noqa: E402
 from tests.agents.elsewhere import Elsewhere  # noqa: E402
-from tests.estimators.learned.networks import card  # noqa: E402
+from tests.estimators.networks import card  # noqa: E402
 
 from .plans import PLAN, SHORT  # noqa: E402
 

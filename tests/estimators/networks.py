@@ -3,9 +3,8 @@
 import numpy as np
 
 from dptse_env.estimators import EstimatorSettings, RecurrentSettings
-from dptse_env.estimators.learned.channels import CHANNELS
-from dptse_env.estimators.learned.network import Network, shapes
-from dptse_env.estimators.learned.weights import FORMAT, write_network
+from dptse_env.estimators.recurrent_kernels import CHANNELS, Network, shapes
+from dptse_env.estimators.recurrent_weights import FORMAT, write_network
 
 RANGES = {
     "n_mainline": [2, 30],

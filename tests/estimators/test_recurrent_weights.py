@@ -7,7 +7,7 @@ import zipfile
 import numpy as np
 import pytest
 
-from dptse_env.estimators.learned.weights import (
+from dptse_env.estimators.recurrent_weights import (
     member_for,
     parse_network,
     read_network,

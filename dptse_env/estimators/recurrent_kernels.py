@@ -1,28 +1,161 @@
-"""The step of a recurrent network, compiled, for blocks of episodes."""
+"""The step of a recurrent network, compiled, for blocks of episodes: its inputs and its weights.
+
+A release is read as a Kalman filter would read it that takes the errors of different cells, and of
+density and speed, as independent. A row m of a measurement averages over its cells two numbers:
+densities rho, and y = rho (v - centre) where flows are released, or y = v where speeds are. The
+prediction of a cell has the variances P_rho, P_v and hence P_y. With the variance V_m of the row's
+innovation e_m, the measured less the predicted average, noise included, a cell's gain and
+correction are, over the rows that cover it,
+
+    K_ms = P_s / (span_m V_m)      d_s = sum_m K_ms e_m
+
+The network gets innovations over their deviations, corrections and gains. So the deviation of the
+noise, which ranges over three orders of magnitude between mechanisms and budgets, is weighed before
+the network sees a release.
+
+A gated recurrent unit (Cho et al., 2014) in every cell of a road, with the same weights, reads the
+cell's channels x and the sums u and d of the messages of the cells upstream and downstream: the
+first 16 numbers of their hidden states.
+
+    z = sigma(W_z [x, u, d] + b_z + V_z h + c_z)
+    r = sigma(W_r [x, u, d] + b_r + V_r h + c_r)
+    n = tanh(W_n [x, u, d] + b_n + r * (V_n h + c_n))
+    h <- z * h + (1 - z) * n
+
+Eight linear heads read h: density, speed and the logarithms of their deviations, for this second
+and for the next one before its release.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from dptse_env.estimators.learned.cells import DENSITY_RANGE, N_FIXED, SPEED_RANGE, Cells
-from dptse_env.estimators.learned.channels import (
-    CHANNELS,
-    LARGEST_CORRECTION,
-    LARGEST_INNOVATION,
-    LARGEST_SIGMA,
-    LEAST_SIGMA,
-    LEAST_VARIANCE,
-    LONGEST_AGE,
-)
-from dptse_env.estimators.learned.network import (
-    HIGHEST_SPREAD,
-    LOWEST_SPREAD,
-    Float32Array,
-    Network,
-)
+from dptse_env.model import ARZModel
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.kernels import inline_part, kernel, kernel_part
 
+Float32Array = NDArray[np.float32]
+
+CHANNELS = (
+    "queried", "share", "log_density_sigma", "log_second_sigma", "predicted_density",
+    "predicted_speed", "log_density_deviation", "log_speed_deviation", "density_innovation",
+    "second_innovation", "density_correction", "density_correction_by_flow", "speed_correction",
+    "density_gain", "speed_gain", "slip", "flows", "log_age", "inflow", "outside_density",
+    "on_ramp", "off_ramp", "entry", "exit", "lanes", "log_length", "log_limit",
+)  # fmt: skip
+"""The inputs of the network for each cell."""
 N_CHANNELS = len(CHANNELS)
+
+LONGEST_AGE = 300.0
+"""Seconds since a measurement after which a cell counts as never measured."""
+LEAST_SIGMA, LARGEST_SIGMA = 0.1, 1e6
+"""Range of deviations whose logarithms the network sees [veh/km, km/h or veh/h]."""
+LEAST_VARIANCE = 1e-12
+LARGEST_INNOVATION = 6.0
+"""Largest innovation, in deviations, that the network sees."""
+LARGEST_CORRECTION = 2.0
+"""Largest correction that the network sees, in units of density or speed limits."""
+
+DENSITY_UNIT = 40.0
+"""Unit of densities [veh/km] for each lane, between free flow and a jam."""
+DENSITY_RANGE = 4.0
+"""Largest density that is estimated, in its unit: vehicles that stand, 6.25 m each."""
+SPEED_RANGE = 1.1
+"""Largest speed that is estimated, in speed limits."""
+
+N_FIXED = 7
+"""Numbers of a cell that never change."""
+
+N_HEADS = 8
+MESSAGE = 16
+"""Numbers of a hidden state that the cells next to it read, or all where there are fewer."""
+LOWEST_SPREAD, HIGHEST_SPREAD = -7.0, 0.5
+"""Range of the logarithms of reported deviations, in units of density and of the speed limit."""
+
 _ONE, _TWO, _HALF = np.float32(1.0), np.float32(2.0), np.float32(0.5)
+
+
+class Cells(NamedTuple):
+    """The cells of a road."""
+
+    edges: IntArray  # (E, 2) cells (from, to) between which vehicles pass
+    entries: IntArray  # (1 + I,) cells with inflow from outside
+    entry_inputs: IntArray  # (1 + I,) column of the model's inputs with the inflow [veh/h]
+    exits: IntArray  # (1 + O,) cells with outflow to outside
+    exit_inputs: IntArray  # (1 + O,) column of the model's inputs with the density there [veh/km]
+    exit_units: FloatArray  # (1 + O,) unit of that density [veh/km]
+    lanes: FloatArray  # (S,)
+    unit: FloatArray  # (S,) unit of densities [veh/km]
+    limit: float  # largest speed limit [km/h], the unit of speeds
+    flows: bool  # whether flows are released, otherwise speeds
+    row_first: IntArray  # (M,) first cell of each row of a measurement
+    row_span: IntArray  # (M,) number of cells of each row
+    fixed: FloatArray  # (S, N_FIXED) numbers that never change
+
+
+def make_cells(model: ARZModel) -> Cells:
+    """Return the cells of a model's road, and of the measurements that it may get."""
+    network, layout = model.network, model.layout
+    marks = np.zeros((layout.n_segments, 4))
+    for kind, ramps in enumerate((network.on_ramp_segments, network.off_ramp_segments)):
+        for segments in ramps:
+            marks[list(segments), kind] = 1.0
+    marks[layout.entries, 2] = 1.0
+    marks[layout.exits, 3] = 1.0
+    limits = np.array(network.speed_limits)
+    scales = np.stack([np.log(layout.lengths / 0.1), np.log(limits / 100.0)], axis=1)
+    return Cells(
+        edges=layout.edges,
+        entries=layout.entries,
+        entry_inputs=layout.entry_inputs,
+        exits=layout.exits,
+        exit_inputs=layout.exit_inputs,
+        exit_units=DENSITY_UNIT * layout.exit_lanes,
+        lanes=layout.lanes,
+        unit=DENSITY_UNIT * layout.lanes,
+        limit=float(limits.max()),
+        flows=model.reference_speed is not None,
+        row_first=model.rows.first,
+        row_span=model.rows.span,
+        fixed=np.concatenate([marks, layout.lanes[:, None] / 3.0, scales], axis=1),
+    )
+
+
+class Network(NamedTuple):
+    """Weights of a network of width H with C channels and messages of M numbers, float32."""
+
+    inputs: Float32Array  # W, (C + 2 M, 3 H)
+    inputs_bias: Float32Array  # b, (3 H,)
+    hidden: Float32Array  # V, (H, 3 H)
+    hidden_bias: Float32Array  # c, (3 H,)
+    heads: Float32Array  # (H, 8)
+    heads_bias: Float32Array  # (8,)
+
+    @property
+    def width(self) -> int:
+        """Width H of the hidden state."""
+        return len(self.hidden)
+
+
+def message_width(width: int) -> int:
+    """Return the numbers M of a message in a network of some width."""
+    return min(width, MESSAGE)
+
+
+def shapes(width: int) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of the weights of a network by name."""
+    n_inputs = N_CHANNELS + 2 * message_width(width)
+    return {
+        "inputs": (n_inputs, 3 * width),
+        "inputs_bias": (3 * width,),
+        "hidden": (width, 3 * width),
+        "hidden_bias": (3 * width,),
+        "heads": (width, N_HEADS),
+        "heads_bias": (N_HEADS,),
+    }
 
 
 @kernel

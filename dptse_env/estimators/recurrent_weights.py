@@ -23,8 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from dptse_env.estimators.learned.channels import CHANNELS
-from dptse_env.estimators.learned.network import Network, shapes
+from dptse_env.estimators.recurrent_kernels import CHANNELS, Network, shapes
 from dptse_env.utils.archive import open_archive, read_entry
 from dptse_env.utils.json_object import parse_object
 
@@ -42,7 +41,7 @@ _CARD = {
     "ranges": dict,
     "training": dict,
 }
-_FOLDER = "shipped"
+_FOLDER = "networks"
 
 
 @dataclass(frozen=True)
@@ -64,7 +63,7 @@ class SavedNetwork:
 
 def shipped_networks() -> tuple[str, ...]:
     """Names of the networks that come with the package, sorted."""
-    folder = files("dptse_env.estimators.learned") / _FOLDER
+    folder = files("dptse_env.estimators") / _FOLDER
     names = [entry.name for entry in folder.iterdir()]
     return tuple(sorted(name.removesuffix(".npz") for name in names if name.endswith(".npz")))
 
@@ -101,7 +100,7 @@ def read_network(source: str) -> SavedNetwork:
 
 @cache
 def _shipped(name: str) -> SavedNetwork:
-    path = files("dptse_env.estimators.learned") / _FOLDER / f"{name}.npz"
+    path = files("dptse_env.estimators") / _FOLDER / f"{name}.npz"
     return parse_network(path.read_bytes(), name)
 
 

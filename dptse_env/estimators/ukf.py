@@ -1,0 +1,305 @@
+"""The unscented Kalman filter on the ARZ model.
+
+With d_i the distances of the points from the first one, d = W sum d_i and W the weight of all
+points but the first, the weighted covariance is `W sum d_i d_i' + (beta - alpha^2) d d'`: the large
+negative weights of the first point cancel without rounding errors, and the joint covariance of
+states and measurements is positive semidefinite by construction, also of projected points.
+
+The points of a step have the process noise of earlier steps only: Q is added to P after their
+prediction, and the next points are made from that. On a linear system this is the Kalman filter of
+x' = F (x + w), with noise before the motion. Adding the derivative's `H Q H'` to the covariance of
+measurements would place it after the motion; on recorded traffic that filter is no better, and much
+worse at small alpha.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from dptse_env.estimators.base import Measurement
+from dptse_env.estimators.ekf import CovarianceFilter, Filters, process_noise, restart
+from dptse_env.estimators.linalg import (
+    factor,
+    forward,
+    is_covariance,
+    mirror,
+    padded,
+    products,
+    to_diagonal,
+)
+from dptse_env.estimators.settings import EstimatorSettings
+from dptse_env.model import ARZModel
+from dptse_env.model.columns import (
+    advance_states,
+    make_batch_scratch,
+    measure_row,
+    project_states,
+)
+from dptse_env.model.network import RoadArrays
+from dptse_env.model.step import project
+from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+from dptse_env.utils.kernel_loops import all_finite, copy_matrix
+from dptse_env.utils.kernels import Packed, kernel, kernel_part
+from dptse_env.utils.validation import require
+
+
+class Points(NamedTuple):
+    """Sigma points of n episodes."""
+
+    # (n, n_x, width) projected points after the last prediction [veh/km, veh/h, demand factors]:
+    # that of the mean, then pairs; columns beyond 2 n_x + 1 repeat the first
+    states: FloatArray
+    moved: BoolArray  # (n,) whether they were predicted since their last update
+    weight: float  # W of every point but the first
+    surplus: float  # beta - alpha^2
+    spread: float  # points are the mean plus and minus spread times columns of a root of P
+
+
+class UKF(CovarianceFilter):
+    """Unscented Kalman filter (Wan and van der Merwe, 2000), the paper's weights.
+
+    Points are made once per step, predicted and projected; mean, covariance and measurements are
+    all computed from these points, without new ones for the update. Means are also projected after
+    predict and update.
+    """
+
+    @staticmethod
+    def check_settings(model: ARZModel, settings: EstimatorSettings) -> None:
+        """Refuse points that the model's number of states does not allow."""
+        n, kappa = model.n_states, settings.ukf.kappa
+        require(n + kappa > 0.0, "estimator_settings.ukf.kappa", f"> -{n}", kappa)
+
+    def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
+        """See `make_estimator`."""
+        super().__init__(model, n_episodes, settings)
+        alpha, beta, n = settings.ukf.alpha, settings.ukf.beta, model.n_states
+        spread = alpha**2 * (n + settings.ukf.kappa)
+        self._points = Points(
+            states=np.zeros((n_episodes, n, padded(2 * n + 1))),
+            moved=np.zeros(n_episodes, dtype=np.bool_),
+            weight=0.5 / spread,
+            surplus=beta - alpha**2,
+            spread=float(np.sqrt(spread)),
+        )
+        self._all_packed = (*self._packed, tuple(self._points))
+
+    def _predict(self, episodes: IntArray, inputs: FloatArray) -> None:
+        predict(*self._all_packed, episodes, inputs)
+
+    def _update(self, episodes: IntArray, measured: Measurement) -> None:
+        observed, values, sigma, centre = measured
+        update(*self._all_packed, episodes, observed, values, sigma, centre)
+
+    def _restart(self, episodes: IntArray) -> None:
+        self._points.moved[episodes] = False
+        super()._restart(episodes)
+
+
+@kernel
+def predict(
+    road_: Packed, filters_: Packed, points_: Packed, episodes: IntArray, inputs: FloatArray
+) -> None:
+    """Predict one step ahead under inputs `(k, n_u)` by points that are made, moved, projected."""
+    road, filters, points = RoadArrays(*road_), Filters(*filters_), Points(*points_)
+    n, width = points.states.shape[1:]
+    scratch, noise, shift = make_batch_scratch(road, width), np.empty(n), np.empty(n)
+    root, distances = np.empty(filters.covariances.shape[1:]), np.empty((n, width))
+    for k in range(episodes.size):
+        e = episodes[k]
+        mean, covariance, states = filters.means[e], filters.covariances[e], points.states[e]
+        process_noise(road, filters, mean, noise)
+        if not _draw(filters, points, e, root):
+            mean[:] = np.nan  # detected by the update, which resets the filter
+        advance_states(road, states, inputs[k], scratch)
+        project_states(road, states, filters.is_box)
+        _gather(filters, points, e, distances, shift)
+        for i in range(n):
+            covariance[i, i] += noise[i]
+            mean[i] = states[i, 0] + shift[i] * filters.units[i]
+        project(road, mean, filters.is_box)
+        points.moved[e] = True
+
+
+@kernel_part
+def _draw(filters: Filters, points: Points, e: int, root: FloatArray) -> bool:
+    """Write an episode's points of its mean and covariance; return whether that is definite."""
+    states, n = points.states[e], root.shape[0]
+    copy_matrix(filters.covariances[e], root)
+    if not factor(root):
+        states[:] = np.nan
+        return False
+    for i in range(n):
+        row, step = states[i], points.spread * filters.units[i]
+        row[:] = filters.means[e, i]
+        root[i, i] = 1.0 / root[i, i]
+        for k in range(i + 1):
+            row[1 + k] += step * root[i, k]
+            row[1 + n + k] -= step * root[i, k]
+    return True
+
+
+@kernel_part(fastmath={"contract", "reassoc"})
+def _distances_from_first(row: FloatArray, unit: float, weight: float, out: FloatArray) -> float:
+    """Write normalised distances from the first point and return their weighted sum."""
+    first, inverse, total = row[0], 1.0 / unit, 0.0
+    for j in range(row.size):
+        out[j] = (row[j] - first) * inverse
+        total += out[j]
+    return weight * total
+
+
+@kernel_part(fastmath={"contract"})
+def _gather(
+    filters: Filters, points: Points, e: int, distances: FloatArray, shift: FloatArray
+) -> None:
+    """Write an episode's covariance, and the distances `(n_x, width)` of its points.
+
+    `shift` `(n_x,)` is written with the normalised distance of their mean from the first one.
+    """
+    covariance, states = filters.covariances[e], points.states[e]
+    for i in range(shift.size):
+        shift[i] = _distances_from_first(states[i], filters.units[i], points.weight, distances[i])
+    products(distances, distances, True, covariance)
+    for i in range(shift.size):
+        for j in range(i + 1):
+            covariance[i, j] = (
+                points.weight * covariance[i, j] + points.surplus * shift[i] * shift[j]
+            )
+    mirror(covariance)
+
+
+@kernel
+def update(
+    road_: Packed,
+    filters_: Packed,
+    points_: Packed,
+    episodes: IntArray,
+    observed: BoolArray,
+    values: FloatArray,
+    sigma: FloatArray,
+    centre: FloatArray,
+) -> None:
+    """Update by measurements; see `Estimator.update`."""
+    road, filters, points = RoadArrays(*road_), Filters(*filters_), Points(*points_)
+    rows, variances = (
+        np.empty(road.row_first.size, np.int64),
+        np.empty(filters.covariances.shape[2]),
+    )
+    for k in range(episodes.size):
+        e, n_seen = episodes[k], 0
+        for m in range(rows.size):
+            if observed[k, m]:
+                rows[n_seen] = m
+                n_seen += 1
+        filters.innovations[e] = 0.0
+        sound = True
+        if n_seen > 0:
+            seen = rows[:n_seen]
+            sound = _assimilate(road, filters, points, e, seen, values[k], sigma[k], centre[k])
+        mean, covariance = filters.means[e], filters.covariances[e]
+        filters.diverged[e] = not (
+            sound and all_finite(mean) and is_covariance(covariance, variances)
+        )
+        if filters.diverged[e]:
+            restart(filters, e)
+            points.moved[e] = False
+
+
+@kernel_part(fastmath={"contract"})
+def _assimilate(
+    road: RoadArrays,
+    filters: Filters,
+    points: Points,
+    e: int,
+    rows: IntArray,
+    values: FloatArray,
+    sigma: FloatArray,
+    centre: FloatArray,
+) -> bool:
+    """Update an episode by the m `rows` that are observed, and write innovations.
+
+    Returns:
+        Whether the covariances of the points and of the measurements are definite.
+    """
+    states, mean, covariance = points.states[e], filters.means[e], filters.covariances[e]
+    n, width = states.shape
+    size, residual = 2 * rows.size, padded(n)  # the column of residuals
+    distances, shift = np.empty((n, width)), np.empty(n)
+    if points.moved[e]:
+        for i in range(n):
+            shift[i] = _distances_from_first(
+                states[i], filters.units[i], points.weight, distances[i]
+            )
+    else:
+        if not _draw(filters, points, e, covariance.copy()):
+            return False
+        project_states(road, states, filters.is_box)
+        _gather(filters, points, e, distances, shift)
+    points.moved[e] = False
+    outputs, output_shift = np.empty((size, width)), np.empty(size)
+    joint, cross = np.empty((size, size)), np.zeros((size, residual + 8))
+    noise = _measure(
+        road, filters, points, e, rows, values, sigma, centre, outputs, output_shift, cross
+    )
+    products(outputs, outputs, True, joint)
+    products(outputs, distances, False, cross)
+    for i in range(size):
+        for j in range(i + 1):
+            joint[i, j] = points.weight * joint[i, j]
+            joint[i, j] += points.surplus * output_shift[i] * output_shift[j]
+        joint[i, i] += noise[i]
+        for j in range(n):
+            cross[i, j] = points.weight * cross[i, j] + points.surplus * output_shift[i] * shift[j]
+        filters.innovations[e, rows[i // 2], i % 2] = cross[i, residual] / np.sqrt(joint[i, i])
+        if not joint[i, i] >= noise[i] * (1.0 - 1e-9):
+            return False
+    if not factor(joint):
+        return False
+    # With L L' = S, rows of [C, r] become [V, z]: V' V = C' S^-1 C and V' z is the gain times r.
+    forward(joint, cross)
+    for i in range(n):
+        total, line = shift[i], covariance[i]
+        for r in range(0, size, 2):
+            one, other = cross[r], cross[r + 1]
+            a, b = one[i], other[i]
+            total += a * one[residual] + b * other[residual]
+            for j in range(to_diagonal(i)):
+                line[j] -= a * one[j] + b * other[j]
+        mean[i] = states[i, 0] + total * filters.units[i]
+    mirror(covariance)
+    project(road, mean, filters.is_box)
+    return True
+
+
+@kernel_part
+def _measure(
+    road: RoadArrays,
+    filters: Filters,
+    points: Points,
+    e: int,
+    rows: IntArray,
+    values: FloatArray,
+    sigma: FloatArray,
+    centre: FloatArray,
+    outputs: FloatArray,
+    shift: FloatArray,
+    cross: FloatArray,
+) -> FloatArray:
+    """Write distances of what points measure `(2 m, width)`, and residuals; return noise."""
+    units, noise = (filters.units[0], road.second_scale), np.empty(outputs.shape[0])
+    work, residual = np.empty(outputs.shape[1]), cross.shape[1] - 8
+    for r in range(rows.size):
+        m = rows[r]
+        density, second = outputs[2 * r], outputs[2 * r + 1]
+        measure_row(road, m, points.states[e], centre, density, second, work)
+        for q in range(2):
+            i, number = 2 * r + q, outputs[2 * r + q]
+            first = number[0]
+            shift[i] = _distances_from_first(number, units[q], points.weight, number)
+            cross[i, residual] = (values[m, q] - first) / units[q] - shift[i]
+            noise[i] = (sigma[m, q] / units[q]) ** 2
+        counted = 0.0
+        for s in range(road.row_first[m], road.row_first[m] + road.row_span[m]):
+            counted += filters.means[e, 2 * s]
+        noise[2 * r] += filters.count_variance[m] * counted / road.row_span[m] ** 2
+    return noise
