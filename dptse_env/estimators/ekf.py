@@ -165,8 +165,10 @@ def update(
     """Update by measurements; see `Estimator.update`."""
     road, filters = RoadArrays(*road_), Filters(*filters_)
     n_rows, width = road.row_first.size, filters.covariances.shape[2]
-    weights = np.empty((n_rows, 2, 2 * np.max(road.row_span)))
-    rows = Rows(weights, np.empty((n_rows, 2)), np.empty((n_rows, 2)))
+    largest = 1
+    for m in range(n_rows):
+        largest = max(largest, road.row_span[m])
+    rows = Rows(np.empty((n_rows, 2, 2 * largest)), np.empty((n_rows, 2)), np.empty((n_rows, 2)))
     shift, work = np.empty(width), np.empty((4, width))
     for k in range(episodes.size):
         e = episodes[k]

@@ -33,7 +33,7 @@ def multiply(
     by_factor: FloatArray,
     right: FloatArray,
     out: FloatArray,
-    is_lower: bool = False,
+    is_lower: bool,
 ) -> None:
     """Write A right to `out`; demand factors, the last components, stay.
 
@@ -147,12 +147,12 @@ def propagate(
         out: `(n_x, padded)`, its padding zero.
     """
     n, product, transposed = covariance.shape[0], scratch[0], scratch[1]
-    multiply(road, blocks, by_factor, covariance, product)
+    multiply(road, blocks, by_factor, covariance, product, False)
     for i in range(n):
         for j in range(n):
             transposed[i, j] = product[j, i]
         transposed[i, n:] = 0.0
-    multiply(road, blocks, by_factor, transposed, out, is_lower=True)
+    multiply(road, blocks, by_factor, transposed, out, True)
     mirror(out)
     for i in range(n):
         out[i, i] += noise[i]
