@@ -25,7 +25,7 @@ from scipy.linalg import LinAlgError, LinAlgWarning
 from dptse_env.estimators.base import Estimate
 from dptse_env.estimators.batch import BatchEstimator, EpisodeMeasurements, Measurements
 from dptse_env.estimators.enkf import make_tapers
-from dptse_env.estimators.horizon import (
+from dptse_env.estimators.mhe import (
     LEAST_DEVIATION,
     moving_variance,
     normalised_bounds,
