@@ -5,7 +5,7 @@ from typing import Any, NamedTuple, get_args
 
 import numpy as np
 
-from dptse_env.estimators.base import Backend, Estimate, Estimator
+from dptse_env.estimators.base import Backend, BatchEstimator, Estimate, Estimator, Measurement
 from dptse_env.estimators.settings import (
     BlendSettings,
     DemandSettings,
@@ -22,6 +22,7 @@ __all__ = [
     "BACKENDS",
     "ESTIMATORS",
     "REFERENCES",
+    "BatchEstimator",
     "BlendSettings",
     "DemandSettings",
     "EnsembleSettings",
@@ -29,6 +30,7 @@ __all__ = [
     "Estimator",
     "EstimatorSettings",
     "HorizonSettings",
+    "Measurement",
     "RecurrentSettings",
     "SigmaPointSettings",
     "check_demand",

@@ -307,7 +307,7 @@ def is_covariance(matrix: FloatArray, variances: FloatArray) -> bool:
             # A NaN is not counted.
             if line[j] * line[j] <= allowed * variances[j] + 1e-24:
                 possible += 1
-    return possible == n * (n + 1) // 2
+    return bool(possible == n * (n + 1) // 2)
 
 
 @kernel_part(fastmath={"contract"})

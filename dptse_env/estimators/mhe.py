@@ -16,7 +16,7 @@ import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
 from dptse_env.estimators import ekf
-from dptse_env.estimators.batch import Measurements
+from dptse_env.estimators.base import Measurement
 from dptse_env.estimators.ekf import CovarianceFilter, Filters, process_noise
 from dptse_env.estimators.linalg import move, padded
 from dptse_env.estimators.noise import initial_variance
@@ -413,9 +413,9 @@ class MHE(CovarianceFilter):
     def _predict(self, episodes: IntArray, inputs: FloatArray) -> None:
         predict(*self._all_packed, episodes, inputs)
 
-    def _update(self, measured: Measurements) -> None:
+    def _update(self, episodes: IntArray, measured: Measurement) -> None:
         least = LEAST_DEVIATION * self.model.measurement_scale
-        episodes, observed, values, sigma, centre = measured
+        observed, values, sigma, centre = measured
         update(*self._all_packed, episodes, observed, values, np.maximum(sigma, least), centre)
         unsolved = self._windows.solved[episodes] == UNSOLVED
         unsolved &= observed.any(axis=1) & ~self.diverged[episodes]

@@ -28,7 +28,7 @@ from dptse_env.model import ARZModel, load_parameters
 from tests.cases import pairwise
 from tests.model.roads import UNEVEN
 
-from .episodes import RELEASES, SIGMA, SIGMAS, random_streams, run, simulate, started
+from .episodes import RELEASES, SIGMA, SIGMAS, random_streams, run, simulate, started, tell
 from .rows import PLAIN, RICH, averaged, update
 
 both_backends = pytest.mark.parametrize("backend", BACKENDS)
@@ -144,7 +144,7 @@ def test_a_road_of_segments_of_many_kinds_is_estimated_alike():
         for mhe in both:
             for _ in range(1 + k % 2):
                 mhe.predict(one, inputs)
-            mhe.update(one, observed, values, SIGMAS["speed"])
+            tell(mhe, one, observed, values, SIGMAS["speed"])
         agree(*both, 1e-8)
 
 
@@ -232,7 +232,7 @@ def test_what_is_not_solved_leaves_the_prediction_and_a_flag(backend, solver, mo
     monkeypatch.setattr(mhe_module, "update", unsolved)
     mhe.predict(episodes.everyone, episodes.inputs[8])
     predicted = mhe.states
-    mhe.update(episodes.everyone, episodes.observed[8], episodes.values[8], SIGMA)
+    tell(mhe, episodes.everyone, episodes.observed[8], episodes.values[8], SIGMA)
     assert mhe.fallback.tolist() == [True, True]
     assert mhe.diverged.tolist() == [False, False]
     np.testing.assert_array_equal(mhe.states, predicted)

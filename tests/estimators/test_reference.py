@@ -5,7 +5,7 @@ import pytest
 
 from dptse_env.estimators import EstimatorSettings, HorizonSettings
 
-from .episodes import simulate, started
+from .episodes import simulate, started, tell
 from .rows import RICH, averaged, update
 
 
@@ -48,7 +48,7 @@ def test_an_arrival_is_what_was_predicted_not_what_later_measurements_make_of_it
     for k in range(9):
         mhe.predict(episodes.everyone, episodes.inputs[k])
         predicted.append(mhe.states[0])
-        mhe.update(episodes.everyone, episodes.observed[k], episodes.values[k], episodes.sigma)
+        tell(mhe, episodes.everyone, episodes.observed[k], episodes.values[k], episodes.sigma)
         oldest = mhe.filters[0].stages[0]
         np.testing.assert_allclose(oldest.predicted * unit, predicted[max(0, k - 3)], rtol=1e-12)
     assert np.abs(oldest.solution - oldest.predicted).max() > 1e-4
