@@ -13,11 +13,15 @@ from dptse_env.estimators import (
     HorizonSettings,
     make_estimator,
 )
-from dptse_env.estimators import horizon as horizon_module
 from dptse_env.estimators import mhe as mhe_module
 from dptse_env.estimators.ekf import Filters
-from dptse_env.estimators.horizon import natural_residual, normalised_bounds, solve
-from dptse_env.estimators.mhe import GENERAL_SOLVER, Windows
+from dptse_env.estimators.mhe import (
+    GENERAL_SOLVER,
+    Windows,
+    natural_residual,
+    normalised_bounds,
+    solve,
+)
 from dptse_env.estimators.mhe import update as solve_and_update
 from dptse_env.estimators.window import ACTIVE_SET, NEWTON, UNSOLVED
 from dptse_env.model import ARZModel, load_parameters
@@ -285,9 +289,9 @@ def test_what_lacks_digits_is_polished_and_what_is_false_is_refused(monkeypatch)
         z = solve(H, q, lower, upper, "piqp")
         if name == "rough":
             np.testing.assert_allclose(z, right, atol=1e-12)
-            monkeypatch.setattr(horizon_module, "POLISHES", 0)
+            monkeypatch.setattr(mhe_module, "POLISHES", 0)
             assert solve(H, q, lower, upper, "piqp") is None
-            monkeypatch.setattr(horizon_module, "POLISHES", 10)
+            monkeypatch.setattr(mhe_module, "POLISHES", 10)
         else:
             assert z is None
 
