@@ -14,18 +14,18 @@ def copy_vector(source: AnyArray, target: AnyArray) -> None:
 
 
 @kernel_part
+def fill_vector(target: AnyArray, value: float) -> None:
+    """Write a number into all of a vector."""
+    for i in range(target.size):
+        target[i] = value
+
+
+@kernel_part
 def copy_matrix(source: AnyArray, target: AnyArray) -> None:
     """Write a matrix into another of its shape."""
     for i in range(source.shape[0]):
         for j in range(source.shape[1]):
             target[i, j] = source[i, j]
-
-
-@kernel_part
-def copy_blocks(source: AnyArray, target: AnyArray) -> None:
-    """Write an array of three dimensions into another of its shape."""
-    for i in range(source.shape[0]):
-        copy_matrix(source[i], target[i])
 
 
 @kernel_part
