@@ -222,7 +222,7 @@ def restart(road_: Packed, ensembles_: Packed, episodes: IntArray) -> None:
         _restart(road, ensembles, e)
 
 
-@kernel_part(kept=True)
+@kernel_part
 def _restart(road: RoadArrays, ensembles: Ensembles, e: int) -> None:
     members, n = ensembles.members[e], ensembles.n_members
     for i in range(members.shape[0]):
@@ -303,7 +303,7 @@ def update(
             _restart(road, ensembles, e)
 
 
-@kernel_part(kept=True)
+@kernel_part
 def _assimilate(
     road: RoadArrays,
     ensembles: Ensembles,
@@ -360,7 +360,7 @@ def _inflate(members: FloatArray, n: int, factor: float) -> None:
             row[j] = mean + factor * (row[j] - mean)
 
 
-@kernel_part(kept=True, fastmath={"contract"})
+@kernel_part(fastmath={"contract"})
 def _compare(
     road: RoadArrays,
     ensembles: Ensembles,

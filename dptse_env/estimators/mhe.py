@@ -230,6 +230,13 @@ def update(
 ) -> None:
     """Update by measurements, `sigma` no less than allowed; see `Estimator.update`."""
     road, filters, windows = RoadArrays(*road_), Filters(*filters_), Windows(*windows_)
+    n, n_stages, width = (
+        windows.units.size,
+        windows.solution.shape[1] - 1,
+        windows.solution.shape[2],
+    )
+    n_rows, size = windows.weights.shape[2], windows.weights.shape[4]
+    factor, free = make_factor(n_stages, n, n_rows, size, width), np.zeros((n_stages, n), np.int64)
     for k in range(episodes.size):
         e = episodes[k]
         _shift(windows, e)
@@ -238,10 +245,9 @@ def update(
         copy_vector(centre[k], windows.centre[e, last])
         windows.solved[e] = UNSOLVED
         sound = _measure(road, filters, windows, e, values[k], sigma[k])
-        window = window_of(windows, e)
+        window, factor.length[0] = window_of(windows, e), 0
         side, z = windows.side[e, : last + 1], windows.solution[e, : last + 1].copy()
-        factor = make_factor(window, z.shape[1])
-        sound = sound and factorise(road, window, factor.side, factor)
+        sound = sound and factorise(road, window, free, factor)
         if sound:
             copy_matrix(factor.covariances[last], filters.covariances[e])
             _innovate(road, filters, windows, e, factor.before)

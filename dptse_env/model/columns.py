@@ -43,7 +43,7 @@ def make_batch_scratch(road: RoadArrays, width: int) -> BatchScratch:
     return BatchScratch(table[0], table[1], table[2], table[3], table[4], np.empty((4, width)))
 
 
-@kernel_part(kept=True, fastmath={"contract"})
+@kernel_part(fastmath={"contract"})
 def _tabulate(
     rho_row: FloatArray,
     psi_row: FloatArray,
@@ -116,7 +116,7 @@ def _merge(
         flow[j] = demand[j] if total <= supply[j] or total <= 0.0 else served
 
 
-@kernel_part(kept=True)
+@kernel_part
 def _flow_out(road: RoadArrays, scratch: BatchScratch, c: int, inputs: FloatArray) -> None:
     v_f, gamma = road.free_flow_speed, road.gamma
     kind, down, third = road.kind[c], road.parties[c, 1], road.parties[c, 2]
@@ -148,7 +148,7 @@ def _flow_out(road: RoadArrays, scratch: BatchScratch, c: int, inputs: FloatArra
         flow[j] = demand[j] if demand[j] <= supply[j] else supply[j]
 
 
-@kernel_part(kept=True)
+@kernel_part
 def _enter(
     road: RoadArrays, scratch: BatchScratch, e: int, inputs: FloatArray, states: FloatArray
 ) -> None:
@@ -191,7 +191,7 @@ def _arrive(
         psi[j] += come * w[j]
 
 
-@kernel_part(kept=True)
+@kernel_part
 def advance_states(
     road: RoadArrays, states: FloatArray, inputs: FloatArray, scratch: BatchScratch
 ) -> None:
@@ -237,7 +237,7 @@ def _into_box(row: FloatArray, largest: float) -> None:
         row[j] = largest if value > largest else value
 
 
-@kernel_part(kept=True)
+@kernel_part
 def project_states(road: RoadArrays, states: FloatArray, is_box: bool) -> None:
     """Project every column into its bounds, as `ARZModel.project`; a NaN stays NaN."""
     v_f, gamma = road.free_flow_speed, road.gamma

@@ -78,7 +78,7 @@ def supply(
     return settled * speed, speed * slope, settled - speed * slope
 
 
-@kernel_part(kept=True)
+@kernel_part
 def _tabulate(road: RoadArrays, state: FloatArray, cells: FloatArray) -> None:
     """Fill the table of cells: w, speed, demand and their derivatives."""
     v_f, gamma = road.free_flow_speed, road.gamma
@@ -205,7 +205,7 @@ def _exit(
     return s, slope * cells[a, _W_RHO], slope * cells[a, _W_PSI], 0.0, 0.0, 0.0, 0.0
 
 
-@kernel_part(kept=True)
+@kernel_part
 def _flows_out(
     road: RoadArrays,
     cells: FloatArray,
@@ -236,7 +236,7 @@ def _flows_out(
         gradient[c, 0, 3] += flow[0] * cells[c, _W_PSI]
 
 
-@kernel_part(kept=True)
+@kernel_part
 def _sources(
     road: RoadArrays,
     cells: FloatArray,
@@ -269,7 +269,7 @@ def _sources(
         after[2 * c + 1] += road.step_ratio[c] * source * w_in
 
 
-@kernel_part(kept=True)
+@kernel_part
 def advance(
     road: RoadArrays,
     state: FloatArray,
