@@ -10,13 +10,11 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from dptse_env.estimators.base import Estimate
-from dptse_env.estimators.batch import BatchEstimator, Measurements
+from dptse_env.estimators.base import BatchEstimator, Estimate, Measurement
 from dptse_env.estimators.linalg import is_covariance, mirror, padded, pair_update, propagate
 from dptse_env.estimators.noise import count_variance, initial_variance, process_variance
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
-from dptse_env.model.model import make_road_arrays
 from dptse_env.model.network import RoadArrays
 from dptse_env.model.parameters import LARGEST_W, VACUUM
 from dptse_env.model.step import (
@@ -73,7 +71,7 @@ class CovarianceFilter(BatchEstimator):
             count_variance=count_variance(model, settings),
             is_box=settings.bounds == "box",
         )
-        self._packed = tuple(make_road_arrays(model)), tuple(self._filters)
+        self._packed = tuple(model.road), tuple(self._filters)
         for episode in range(n_episodes):
             restart(self._filters, episode)
 
@@ -115,8 +113,9 @@ class EKF(CovarianceFilter):
     def _predict(self, episodes: IntArray, inputs: FloatArray) -> None:
         predict(*self._packed, episodes, inputs)
 
-    def _update(self, measured: Measurements) -> None:
-        update(*self._packed, *measured)
+    def _update(self, episodes: IntArray, measured: Measurement) -> None:
+        observed, values, sigma, centre = measured
+        update(*self._packed, episodes, observed, values, sigma, centre)
 
 
 class Rows(NamedTuple):

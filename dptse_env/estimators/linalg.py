@@ -144,7 +144,7 @@ def propagate(
         noise: `(n_x,)` variances that Q adds.
         covariance: `(n_x, padded)` P.
         scratch: `(2, n_x, padded)`.
-        out: `(n_x, padded)`.
+        out: `(n_x, padded)`, its padding zero.
     """
     n, product, transposed = covariance.shape[0], scratch[0], scratch[1]
     multiply(road, blocks, by_factor, covariance, product)
@@ -307,7 +307,7 @@ def is_covariance(matrix: FloatArray, variances: FloatArray) -> bool:
             # A NaN is not counted.
             if line[j] * line[j] <= allowed * variances[j] + 1e-24:
                 possible += 1
-    return possible == n * (n + 1) // 2
+    return bool(possible == n * (n + 1) // 2)
 
 
 @kernel_part(fastmath={"contract"})

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dptse_env.estimators.batch import Measurements
+from dptse_env.estimators.base import Measurement
 from dptse_env.estimators.ekf import CovarianceFilter, Filters, process_noise, restart
 from dptse_env.estimators.linalg import (
     factor,
@@ -43,16 +43,6 @@ from dptse_env.utils.kernels import Packed, kernel, kernel_part
 from dptse_env.utils.validation import require
 
 
-def check_settings(n_states: int, settings: EstimatorSettings) -> None:
-    """Refuse sigma points that a number of states does not allow.
-
-    Raises:
-        ValueError: `kappa` is at or below minus the number of states.
-    """
-    kappa = settings.ukf.kappa
-    require(n_states + kappa > 0.0, "estimator_settings.ukf.kappa", f"> -{n_states}", kappa)
-
-
 class Points(NamedTuple):
     """Sigma points of n episodes."""
 
@@ -73,10 +63,15 @@ class UKF(CovarianceFilter):
     predict and update.
     """
 
+    @staticmethod
+    def check_settings(model: ARZModel, settings: EstimatorSettings) -> None:
+        """Refuse points that the model's number of states does not allow."""
+        n, kappa = model.n_states, settings.ukf.kappa
+        require(n + kappa > 0.0, "estimator_settings.ukf.kappa", f"> -{n}", kappa)
+
     def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
         """See `make_estimator`."""
         super().__init__(model, n_episodes, settings)
-        check_settings(model.n_states, settings)
         alpha, beta, n = settings.ukf.alpha, settings.ukf.beta, model.n_states
         spread = alpha**2 * (n + settings.ukf.kappa)
         self._points = Points(
@@ -91,8 +86,9 @@ class UKF(CovarianceFilter):
     def _predict(self, episodes: IntArray, inputs: FloatArray) -> None:
         predict(*self._all_packed, episodes, inputs)
 
-    def _update(self, measured: Measurements) -> None:
-        update(*self._all_packed, *measured)
+    def _update(self, episodes: IntArray, measured: Measurement) -> None:
+        observed, values, sigma, centre = measured
+        update(*self._all_packed, episodes, observed, values, sigma, centre)
 
     def _restart(self, episodes: IntArray) -> None:
         self._points.moved[episodes] = False

@@ -146,7 +146,7 @@ def make_factor(n_stages: int, n: int, n_rows: int, size: int, width: int) -> Fa
     )
 
 
-@kernel_part(kept=True)
+@kernel_part
 def factorise(road: RoadArrays, window: Window, side: IntArray, factor: Factor) -> bool:
     """Filter covariances from the first stage whose set of bounds changed; return success."""
     n, n_stages, start = window.lower.size, window.targets.shape[0], 0
@@ -231,7 +231,7 @@ def _fill(value: float, out: FloatArray) -> None:
             out[i, j] = value
 
 
-@kernel_part(kept=True)
+@kernel_part
 def sweep(
     road: RoadArrays,
     window: Window,
@@ -323,7 +323,7 @@ def _come_back(
                 costate[factor.first[t, u] + i] += multiplier * factor.rows[t, u, i]
 
 
-@kernel_part(kept=True)
+@kernel_part
 def fix(
     road: RoadArrays,
     window: Window,
@@ -396,7 +396,7 @@ def _dot(x: FloatArray, y: FloatArray) -> float:
     return total
 
 
-@kernel_part(kept=True)
+@kernel_part
 def look(road: RoadArrays, window: Window, point: Point) -> None:
     """Write the gaps, misfits and force of a point's trajectory."""
     z, gaps, force, n = point.z, point.gaps, point.force, window.lower.size
@@ -428,7 +428,7 @@ def look(road: RoadArrays, window: Window, point: Point) -> None:
                     force[t, first + i] += row[i] * gap / window.noise[t, m, q]
 
 
-@kernel_part(kept=True)
+@kernel_part
 def write_diagonal(road: RoadArrays, window: Window, diagonal: FloatArray) -> None:
     """Write the diagonal `(L, padded)` of H, in whose units a residual is measured."""
     n, n_stages = 2 * road.jam.size, diagonal.shape[0]
@@ -456,7 +456,7 @@ def write_diagonal(road: RoadArrays, window: Window, diagonal: FloatArray) -> No
             out[n + e] += 1.0 / K[n + e]
 
 
-@kernel_part(kept=True)
+@kernel_part
 def minimise(
     road: RoadArrays, window: Window, factor: Factor, side: IntArray, z: FloatArray
 ) -> int:
@@ -485,7 +485,7 @@ def minimise(
     return UNSOLVED
 
 
-@kernel_part(kept=True)
+@kernel_part
 def _find_set(
     road: RoadArrays,
     window: Window,
@@ -559,7 +559,7 @@ def _revise(
     return changed
 
 
-@kernel_part(kept=True)
+@kernel_part
 def _descend(
     road: RoadArrays,
     window: Window,

@@ -22,13 +22,6 @@ def copy_matrix(source: AnyArray, target: AnyArray) -> None:
 
 
 @kernel_part
-def copy_blocks(source: AnyArray, target: AnyArray) -> None:
-    """Write an array of three dimensions into another of its shape."""
-    for i in range(source.shape[0]):
-        copy_matrix(source[i], target[i])
-
-
-@kernel_part
 def any_of(flags: BoolArray) -> bool:
     """Return whether any flag of a vector is set."""
     for i in range(flags.size):  # noqa: SIM110, a generator takes longer to compile

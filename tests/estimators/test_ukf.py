@@ -5,16 +5,12 @@ import pytest
 from filterpy.kalman import MerweScaledSigmaPoints
 
 from dptse_env.estimators import EstimatorSettings, SigmaPointSettings
-from dptse_env.estimators.compiled.dense import eliminate
-from dptse_env.estimators.compiled.ukf import CompiledUKF
+from dptse_env.estimators.ukf import UKF
 from dptse_env.model import ARZModel, load_parameters
 from dptse_env.traffic import PAPER_HIGHWAY
 from tests.cases import pairwise
-from tests.estimators.parts import compiled
 
-from .episodes import RELEASES, SIGMA, run, scale_of, simulate, started
-
-eliminate = compiled(eliminate)
+from .episodes import RELEASES, SIGMA, run, scale_of, simulate, started, tell
 
 BACKENDS = ("compiled", "reference")
 both_releases = pytest.mark.parametrize("release", RELEASES)
@@ -89,7 +85,7 @@ def test_the_number_of_outputs_may_change():
 
 
 def test_weights_are_the_papers():
-    ukf = CompiledUKF(ARZModel(PAPER_HIGHWAY, load_parameters("paper")), 1, EstimatorSettings())
+    ukf = UKF(ARZModel(PAPER_HIGHWAY, load_parameters("paper")), 1, EstimatorSettings())
     points = ukf._points
     peer = MerweScaledSigmaPoints(38, alpha=0.1, beta=2.0, kappa=-4.0)
     assert peer.Wm[0] == pytest.approx(-110.765, abs=1e-3)
@@ -98,21 +94,6 @@ def test_weights_are_the_papers():
     assert points.weight == pytest.approx(1.4706, abs=1e-4)
     # Sum d d' of all weights, written around the first point instead of the mean.
     assert points.surplus == pytest.approx(peer.Wc[0] - peer.Wm[0] - 1.0, rel=1e-12)
-
-
-def test_a_root_is_one_and_what_has_none_is_refused():
-    rng = np.random.default_rng(0)
-    root = rng.normal(size=(38, 38))
-    matrix = np.zeros((38, 40))
-    matrix[:, :38] = root @ root.T + np.eye(38)
-    upper = matrix.copy()
-    assert eliminate(upper, 38, upper.shape[1])
-    triangle = np.triu(upper[:, :38])
-    np.testing.assert_allclose(triangle.T @ triangle, matrix[:, :38], rtol=1e-11, atol=1e-11)
-    for bad in (np.nan, -1.0, np.inf):
-        broken = matrix.copy()
-        broken[20, 20] = bad
-        assert not eliminate(broken, 38, broken.shape[1])
 
 
 @pytest.mark.parametrize(
@@ -128,6 +109,6 @@ def test_a_broken_covariance_is_found(backend, poison):
         kept[0, 20, 4] = kept[0, 4, 20] = 10.0
     else:
         kept[0, 20, 20] = poison
-    filters.update(episodes.everyone, episodes.observed[4], episodes.values[4], SIGMA)
+    tell(filters, episodes.everyone, episodes.observed[4], episodes.values[4], SIGMA)
     assert filters.diverged.tolist() == [True]
     np.testing.assert_array_equal(filters.covariances[0], 1e-3 * np.eye(38))

@@ -1,1 +1,0 @@
-"""Estimators compiled with numba."""
