@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from dptse_env.estimators import window as parts
-from dptse_env.estimators.horizon import natural_residual, solve
 from dptse_env.estimators.linalg import padded
+from dptse_env.estimators.mhe import natural_residual, solve
 from dptse_env.estimators.window import ACTIVE_SET, NEWTON, REFINED, Point, Window
 from dptse_env.model import ARZModel, load_parameters
 from tests.model.roads import UNEVEN
