@@ -133,6 +133,7 @@ def factorise(road: RoadArrays, window: Window, n_stages: int, side: IntArray, w
             blocks, by_factor = window.blocks[t - 1], window.by_factor[t - 1]
             noise = window.process_variance[t - 1]
             propagate(road, blocks, by_factor, noise, work.covariances[t - 1], work.scratch, P)
+            mirror(P)
         if t == n_stages - 1:
             work.before[:] = P
         for i in range(n):
