@@ -135,14 +135,14 @@ def propagate(
     scratch: FloatArray,
     out: FloatArray,
 ) -> None:
-    """Write A P A' + Q to `out`, which may be P.
+    """Write the lower half of A P A' + Q to `out`, which may be P.
 
     Args:
         road: The road, for the cells of the blocks.
         blocks: `(S, K, 4)` blocks of A.
         by_factor: `(E, 2)` derivatives by the demand factors.
         noise: `(n_x,)` variances that Q adds.
-        covariance: `(n_x, padded)` P.
+        covariance: `(n_x, padded)` P, of which both halves are read.
         scratch: `(2, n_x, padded)`.
         out: `(n_x, padded)`, its padding zero.
     """
@@ -154,7 +154,6 @@ def propagate(
         for j in range(n, transposed.shape[1]):
             transposed[i, j] = 0.0
     multiply(road, blocks, by_factor, transposed, out, True)
-    mirror(out)
     for i in range(n):
         out[i, i] += noise[i]
 
@@ -202,7 +201,7 @@ def pair_update(
     """Update a covariance by both numbers of a row: two `scalar_update`, P traversed once.
 
     Only the lower half of P, and the rest of the registers on its diagonal, is read and replaced,
-    which is half the work; after the last row `mirror` makes it whole.
+    which is half the work; `mirror` makes it whole.
 
     Args:
         covariance: `(n_x, padded)` P.

@@ -23,7 +23,6 @@ from dptse_env.estimators.linalg import (
     factor,
     forward,
     is_covariance,
-    mirror,
     padded,
     products,
 )
@@ -153,9 +152,10 @@ def _distances_from_first(row: FloatArray, unit: float, weight: float, out: Floa
 def _gather(
     filters: Filters, points: Points, e: int, distances: FloatArray, shift: FloatArray
 ) -> None:
-    """Write an episode's covariance, and the distances `(n_x, width)` of its points.
+    """Write the lower half of an episode's covariance from its points.
 
-    `shift` `(n_x,)` is written with the normalised distance of their mean from the first one.
+    `distances` `(n_x, width)` are written with theirs from the first one, and `shift` `(n_x,)` with
+    that of their mean, normalised.
     """
     covariance, states = filters.covariances[e], points.states[e]
     for i in range(shift.size):
@@ -166,7 +166,6 @@ def _gather(
             covariance[i, j] = (
                 points.weight * covariance[i, j] + points.surplus * shift[i] * shift[j]
             )
-    mirror(covariance)
 
 
 @kernel
@@ -265,7 +264,6 @@ def _assimilate(
             total += cross[r, i] * cross[r, residual]
         mean[i] = states[i, 0] + total * filters.units[i]
     downdate(covariance, cross)
-    mirror(covariance)
     project(road, mean, filters.is_box)
     return True
 
