@@ -59,9 +59,12 @@ LEAST_DEVIATION = 1e-3
 
 GENERAL_SOLVER, FALLBACK = 3, 4  # how a program was solved, beside those of `window`
 
+MOST_VARIABLES = 3000
+"""Variables of the longest window.
 
-MOST_VARIABLES = 10_000
-"""Variables of the longest window; most steps with it end within a tenth of a second."""
+With as many a step takes 10 to 20 ms, and up to a second where most of them are at bounds and the
+model is trusted almost entirely, so that every bound moves the whole window.
+"""
 
 
 class Windows(NamedTuple):
