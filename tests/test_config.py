@@ -81,7 +81,7 @@ def test_demand_states_without_a_traffic_model_are_refused_by_the_configuration(
     ("estimator", "settings", "message"),
     [
         ("mhe", {"process_noise": [0.01, 0.0]}, r"process_noise\[1\] must be a finite number > 0"),
-        ("mhe", {"mhe": {"horizon": 1000}}, r"mhe\.horizon must be an integer in 1\.\.624"),
+        ("mhe", {"mhe": {"horizon": 1000}}, r"mhe\.horizon must be an integer in 1\.\.186"),
         ("ukf", {"ukf": {"kappa": -16.0}}, r"ukf\.kappa must be > -16, got -16"),
         ("ukf", {"ukf": {"kappa": -18.0}, "demand": {}}, r"ukf\.kappa must be > -18, got -18"),
         ("recurrent", {"recurrent": {"weights": "x"}}, "recurrent.weights must be a file or one"),

@@ -23,7 +23,7 @@ from scipy.linalg import LinAlgError, LinAlgWarning
 
 from dptse_env.estimators.base import BatchEstimator, Estimate, Measurement
 from dptse_env.estimators.enkf import make_tapers
-from dptse_env.estimators.horizon import (
+from dptse_env.estimators.mhe import (
     LEAST_DEVIATION,
     moving_variance,
     normalised_bounds,

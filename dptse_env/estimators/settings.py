@@ -95,7 +95,7 @@ class HorizonSettings:
 
     Attributes:
         horizon: N, length of the window in steps; N + 1 times the number of states is at most
-            10,000.
+            3,000.
         arrival_noise: Standard deviations of the predicted state at the window's start, of rho
             over rho_m and psi over rho_m v_f.
         linearisation: `paper`: each stage once, when it enters the window, at the mean of the last

@@ -117,10 +117,17 @@ def make_point(n_stages: int, width: int, n_rows: int) -> Point:
 
 
 @kernel_part
-def make_factor(window: Window, width: int) -> Factor:
-    """Allocate an empty factor and working space, with rows of a padded width."""
-    n_stages, n_rows, n = *window.observed.shape, window.lower.size
-    n_updates, size = n + 2 * n_rows, window.weights.shape[3]
+def make_factor(n_stages: int, n: int, n_rows: int, size: int, width: int) -> Factor:
+    """Allocate a factor for windows of up to L stages, and working space.
+
+    Args:
+        n_stages: L.
+        n: Components of a state.
+        n_rows: M.
+        size: Components that a row may depend on.
+        width: Length of padded rows.
+    """
+    n_updates = n + 2 * n_rows
     return Factor(
         np.zeros(1, np.int64),
         np.zeros((n_stages, n), np.int64),
@@ -155,6 +162,7 @@ def factorise(road: RoadArrays, window: Window, side: IntArray, factor: Factor) 
             blocks, by_factor = window.blocks[t - 1], window.by_factor[t - 1]
             noise, previous = window.process_variance[t - 1], factor.covariances[t - 1]
             propagate(road, blocks, by_factor, noise, previous, factor.scratch, P)
+            mirror(P)
         if t == n_stages - 1:
             copy_matrix(P, factor.before)
         factor.length[0], factor.n_updates[t] = t, 0
