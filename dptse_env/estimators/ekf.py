@@ -28,7 +28,7 @@ from dptse_env.model.step import (
     write_row,
 )
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
-from dptse_env.utils.kernel_loops import all_finite, any_of, copy_vector
+from dptse_env.utils.kernel_loops import all_finite, any_of, copy_vector, fill_vector
 from dptse_env.utils.kernels import Packed, kernel, kernel_part
 
 
@@ -164,8 +164,10 @@ def update(
 ) -> None:
     """Update by measurements; see `Estimator.update`."""
     road, filters = RoadArrays(*road_), Filters(*filters_)
-    n_rows, width = road.row_first.size, filters.covariances.shape[2]
-    weights = np.empty((n_rows, 2, 2 * np.max(road.row_span)))
+    n_rows, width, longest = road.row_first.size, filters.covariances.shape[2], 1
+    for m in range(n_rows):
+        longest = max(longest, road.row_span[m])
+    weights = np.empty((n_rows, 2, 2 * longest))
     rows = Rows(weights, np.empty((n_rows, 2)), np.empty((n_rows, 2)))
     shift, work = np.empty(width), np.empty((4, width))
     for k in range(episodes.size):
@@ -217,8 +219,8 @@ def _linearise(
 def _innovate(road: RoadArrays, filters: Filters, e: int, observed: BoolArray, rows: Rows) -> None:
     """Write residuals over their predicted deviations."""
     covariance, innovations = filters.covariances[e], filters.innovations[e]
-    innovations[:] = 0.0
     for m in range(observed.size):
+        fill_vector(innovations[m], 0.0)
         if not observed[m]:
             continue
         first, size = 2 * road.row_first[m], 2 * road.row_span[m]
@@ -245,7 +247,7 @@ def _assimilate(
     Returns:
         Whether all variances of the measured numbers are sound.
     """
-    shift[:] = 0.0
+    fill_vector(shift, 0.0)
     for m in range(observed.size):
         if not observed[m]:
             continue
@@ -267,10 +269,11 @@ def _assimilate(
 def restart(filters: Filters, episode: int) -> None:
     """Reset an episode's filter to its prior."""
     copy_vector(filters.priors[episode], filters.means[episode])
-    filters.innovations[episode] = 0.0
+    for innovations in filters.innovations[episode]:
+        fill_vector(innovations, 0.0)
     covariance = filters.covariances[episode]
-    covariance[:] = 0.0
     for i in range(covariance.shape[0]):
+        fill_vector(covariance[i], 0.0)
         covariance[i, i] = filters.initial_variance[i]
 
 

@@ -116,7 +116,7 @@ def make_point(n_stages: int, width: int, n_rows: int) -> Point:
     return Point(np.zeros(shape), np.zeros(shape), misfits, np.zeros(shape))
 
 
-@kernel_part(kept=True)
+@kernel_part
 def make_factor(n_stages: int, n: int, n_rows: int, size: int, width: int) -> Factor:
     """Allocate a factor for windows of up to L stages, and working space.
 
