@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dptse_env.estimators import make_estimator
+from dptse_env.estimators import Measurement, make_estimator
 from dptse_env.evaluation import WARM_UP
 from dptse_env.model import ARZModel, ARZParameters
 from dptse_env.privacy import paper_sensitivity, single_noise_std
@@ -143,7 +143,8 @@ class Replay:
             observed = np.zeros((k, n), dtype=bool)
             observed[:, (t * self.bandwidth + np.arange(self.bandwidth)) % n] = True
             now = truth[:, t, 1:-1]
-            made.update(everyone, observed, now + sigma * rng.normal(size=now.shape), sigma)
+            values = now + sigma * rng.normal(size=now.shape)
+            made.update(everyone, Measurement.of(model, observed, values, sigma))
             if t > WARM_UP:
                 said = made.estimate()
                 error = np.stack([said.density, said.speed], -1) - now

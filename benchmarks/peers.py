@@ -17,7 +17,7 @@ from filterpy.kalman import (
 )
 
 from benchmarks.replay import Replay
-from dptse_env.estimators import make_estimator
+from dptse_env.estimators import Measurement, make_estimator
 from dptse_env.model import ARZModel
 from dptse_env.utils.arrays import BoolArray, FloatArray
 
@@ -136,5 +136,6 @@ def ekf_states(
         if k % block == 0:
             starts[k] = ekf.states[0] / scale, ekf.covariances[0].copy()
         ekf.predict(episode, replay.inputs[k, :1])
-        ekf.update(episode, replay.observed[k, :1], replay.values[k, :1], replay.sigma)
+        seen, values = replay.observed[k, :1], replay.values[k, :1]
+        ekf.update(episode, Measurement.of(replay.model, seen, values, replay.sigma))
     return starts

@@ -9,7 +9,7 @@ import numpy as np
 
 from benchmarks.replay import Replay
 from benchmarks.throughput.measure import take_turns
-from dptse_env.estimators import make_estimator
+from dptse_env.estimators import Measurement, make_estimator
 from dptse_env.utils.arrays import FloatArray
 
 REFERENCES = ("ekf", "ukf", "mhe")
@@ -35,6 +35,10 @@ class Steps:
         self._estimator: Any = make_estimator(
             estimator, backend, replay.model, len(replay.start), replay.settings
         )
+        self._measured = [
+            Measurement.of(replay.model, observed, values, replay.sigma)
+            for observed, values in zip(replay.observed, replay.values, strict=True)
+        ]
 
     def begin(self, block: range) -> None:
         """See `Row.begin`; the first block starts over, with the same random streams each time."""
@@ -48,7 +52,7 @@ class Steps:
         episodes, replay = self._episodes, self._replay
         for k in self._block:
             self._estimator.predict(episodes, replay.inputs[k])
-            self._estimator.update(episodes, replay.observed[k], replay.values[k], replay.sigma)
+            self._estimator.update(episodes, self._measured[k])
         return len(self._block) * len(episodes)
 
 

@@ -11,10 +11,9 @@ from typing import Annotated
 
 import numpy as np
 
-from dptse_env.estimators import Estimate
+from dptse_env.estimators import Estimate, Measurement
 from dptse_env.model import MeasurementRows
 from dptse_env.model.parameters import SECONDS_PER_HOUR
-from dptse_env.release import MeasuredRows
 from dptse_env.utils.arrays import FloatArray
 from dptse_env.utils.fields import Interval, checked_fields
 
@@ -82,11 +81,11 @@ class Fusion:
         scaled: FloatArray = sigma * np.array([1.0 / p, 1.0 / p if self.releases_flow else 1.0])
         return scaled
 
-    def read(self, measured: MeasuredRows, prediction: Estimate) -> MeasuredRows:
+    def read(self, measured: Measurement, prediction: Estimate) -> Measurement:
         """Return the measurements of a second that the estimator is given.
 
         Args:
-            measured: The released rows of k episodes.
+            measured: The release of k episodes.
             prediction: The estimator's prediction for this second, rows of shape (k, S).
         """
         queries, weights, p = slice(0, self.n_options), self.rows.weights.T, self.share
@@ -99,7 +98,7 @@ class Fusion:
         values[:, queries, 0] /= p
         sigma[:, queries, 0] = np.sqrt((sigma[:, queries, 0] / p) ** 2 + sampling)
         if self.releases_flow:
-            offset = speed - (measured.centre @ weights)[:, queries]
+            offset = speed - (measured.centre[:, : len(weights)] @ weights)[:, queries]
             square = offset**2 + spread**2
             values[:, queries, 1] /= p
             sigma[:, queries, 1] = np.sqrt((sigma[:, queries, 1] / p) ** 2 + sampling * square)
@@ -110,7 +109,7 @@ class Fusion:
             sigma[:, queries, 1] = np.sqrt(
                 sigma[:, queries, 1] ** 2 + alike * (spread**2 * (1.0 - p) / answering + none)
             )
-        return MeasuredRows(values, sigma, measured.centre)
+        return measured._replace(values=values, sigma=sigma)
 
     def _seconds_alike(self, speed: FloatArray, length: FloatArray) -> FloatArray | float:
         """Return the seconds for which answers count as one, shape (k, G), 1 at least."""

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from dptse_env.estimators import Estimate, check_estimate
+from dptse_env.estimators import Estimate, Measurement, check_estimate
 from dptse_env.parts import Parts, complete_report
-from dptse_env.release import MeasuredRows, ReleaseRequest, check_released, split_release
+from dptse_env.release import ReleaseRequest, check_released
 from dptse_env.release.nominal import nominal_state
 from dptse_env.reset_options import ResetOptions
 from dptse_env.spaces.actions import PendingPicks, check_decision
@@ -196,40 +196,30 @@ class QueryProcess:
         """Advance one second: predict, release, update, and store the query."""
         traffic = self.traffic_index[episodes]
         inputs = self.boundary.inputs(episodes, traffic, self.time[episodes])
-        self._in_threads(episodes, self.estimator.predict, inputs)
+        predict, update = self.estimator.predict, self.estimator.update
+        self._threads.run(len(episodes), lambda block: predict(episodes[block], inputs[block]))
         self.time[episodes] += 1
         observed = self.release.setup.observed(queried)
         prediction = cache(lambda: self._predicted(episodes))
         request = ReleaseRequest(episodes, traffic, self.time[episodes], observed, prediction)
-        observed, measured, at_boundary = self.measure(request)
-        self.boundary.update(episodes, *at_boundary)
-        self._in_threads(episodes, self.estimator.update, observed, *measured)
+        measured = self.measure(request)
+        self.boundary.update(episodes, measured)
+        self._threads.run(len(episodes), lambda block: update(episodes[block], measured.at(block)))
         self.queried[episodes] = queried
-        values, before = measured.values, self.released[episodes]
-        self.released[episodes] = np.where(observed[:, :, None], values, before)
-        covered = self.release.setup.covered(observed)
+        rows = slice(self.model.rows.n_rows)
+        answered, before = measured.observed[:, rows, None], self.released[episodes]
+        self.released[episodes] = np.where(answered, measured.values[:, rows], before)
+        covered = self.release.setup.covered(measured.observed)
         self.age[episodes] = np.where(covered, 0, self.age[episodes] + 1)
 
-    def measure(
-        self, request: ReleaseRequest
-    ) -> tuple[BoolArray, MeasuredRows, tuple[FloatArray, FloatArray | None]]:
-        """Release a second, which charges its vehicles, and read the release.
-
-        Returns:
-            Rows that answered, shape (k, M), what the estimator is given of them, and the releases
-            of the boundary segments with their centres (`dptse_env.release.split_release`).
-        """
-        released = self.release.release(request)
+    def measure(self, request: ReleaseRequest) -> Measurement:
+        """Release a second, which charges its vehicles; return what the estimator is given."""
+        measured = self.release.release(request)
         if self._checks_releases:
-            check_released(self.release, released, request)
-        measured, at_boundary = split_release(released, self.model)
-        observed = request.observed
-        if released.missing is not None:
-            observed = observed & ~released.missing
-        observed = observed[:, : self.model.rows.n_rows]
+            check_released(self.release, measured, request)
         if self.fusion is not None:
             measured = self.fusion.read(measured, request.prediction())
-        return observed, measured, at_boundary
+        return measured
 
     @property
     def expected_sigma(self) -> FloatArray:
@@ -239,13 +229,6 @@ class QueryProcess:
         """
         sigma = self.release.sigma
         return sigma if self.fusion is None else self.fusion.scaled(sigma)
-
-    def _in_threads(self, episodes: IntArray, work: Any, *rows: Any) -> None:
-        """Call ``work`` on blocks of episodes and of their rows, in several threads."""
-        self._threads.run(
-            len(episodes),
-            lambda block: work(episodes[block], *(array[block] for array in rows)),
-        )
 
     def _predicted(self, episodes: IntArray) -> Estimate:
         """Return the estimator's output before it reads the release of this second."""

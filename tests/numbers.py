@@ -23,7 +23,7 @@ import numpy as np
 
 from agents.policies import read_saved_policy
 from dptse_env import evaluate
-from dptse_env.estimators import make_estimator
+from dptse_env.estimators import Measurement, make_estimator
 from dptse_env.policies import TRANSFERABLE
 from dptse_env.schedules import make_schedule
 from dptse_env.traffic import write_corridor
@@ -106,9 +106,9 @@ class _Witness:
         self.inputs.append(inputs[0].copy())
         self._estimator.predict(episodes, inputs)
 
-    def update(self, episodes: Any, *measured: Any) -> None:
-        self.measured.append(measured)
-        self._estimator.update(episodes, *measured)
+    def update(self, episodes: Any, measured: Measurement) -> None:
+        self.measured.append(measured.at(0))
+        self._estimator.update(episodes, measured)
 
 
 def recorded_steps(road: str) -> Numbers:
@@ -129,15 +129,9 @@ def recorded_steps(road: str) -> Numbers:
         action, state = schedule.predict(observation, state, np.array([state is None]), True)
         observation, *_ = env.step(action)
     found: Numbers = {"state": start, "inputs": np.array(witness.inputs)}
-    full = []
-    for observed, values, sigma, centre in witness.measured:
-        rows = np.where(observed[0][:, None], values[0], 0.0)
-        spread = np.broadcast_to(sigma, values.shape)[0]
-        common = np.nan if model.reference_speed is None else model.reference_speed
-        around = np.full((1, model.n_segments), common) if centre is None else centre
-        full.append((observed[0], rows, spread, np.broadcast_to(around, (1, model.n_segments))[0]))
-    for index, part in enumerate(("observed", "values", "sigma", "centre")):
-        found[part] = np.array([arrays[index] for arrays in full])
+    for part in Measurement._fields:
+        found[part] = np.array([getattr(measured, part) for measured in witness.measured])
+    found["values"] = np.where(found["observed"][..., None], found["values"], 0.0)
     return {k: v if v.dtype == bool else v.astype(np.float32) for k, v in found.items()}
 
 
@@ -152,9 +146,8 @@ def estimator_steps(road: str, estimator: str, given: Numbers) -> Numbers:
     estimates, others = [], []
     for step in range(STEPS):
         made.predict(only, given["inputs"][step][None])
-        centre = None if np.isnan(given["centre"][step]).any() else given["centre"][step][None]
-        observed = given["observed"][step][None] > 0
-        made.update(only, observed, given["values"][step][None], given["sigma"][step][None], centre)
+        parts = [given[part][step][None] for part in Measurement._fields]
+        made.update(only, Measurement(parts[0] > 0, *parts[1:]))
         if step in (0, STEPS - 1):
             shown = made.estimate()
             estimates += [shown.density, shown.speed]
@@ -214,13 +207,13 @@ def releases(case: str) -> Numbers:
     values, sigma, spent = [], [], []
     measure = process.measure
 
-    def watched(request: Any) -> Any:
-        observed, measured, at_boundary = measure(request)
-        seen = observed[0][:, None]
-        values.append(np.where(seen, measured.values[0], 0.0).ravel())
-        spread = np.broadcast_to(measured.sigma, measured.values.shape)[0]
-        sigma.append(np.where(seen, spread, 0.0).ravel())
-        return observed, measured, at_boundary
+    def watched(request: Any) -> Measurement:
+        measured: Measurement = measure(request)
+        own = measured.on_road(process.model.rows.n_rows, process.model.n_segments)
+        seen = own.observed[0][:, None]
+        values.append(np.where(seen, own.values[0], 0.0).ravel())
+        sigma.append(np.where(seen, own.sigma[0], 0.0).ravel())
+        return measured
 
     process.measure = watched
     _, info = env.reset(seed=7)

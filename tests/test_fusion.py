@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from dptse_env.estimators import Estimate
+from dptse_env.estimators import Estimate, Measurement
 from dptse_env.fusion import Fusion, FusionSettings
 from dptse_env.model import MeasurementRows
-from dptse_env.release import MeasuredRows
 
 LENGTH, LIMIT, SPREAD = 0.1, 100.0, 12.0
 N_SEGMENTS = 4
@@ -28,9 +27,9 @@ def predicted(density, speed, n_episodes=1, density_std=5.0, speed_std=3.0):
 
 def measured(values, sigma=1.0, centre=50.0):
     values = np.asarray(values, dtype=np.float64)
-    return MeasuredRows(
-        values, np.full(values.shape, sigma), np.full((len(values), N_SEGMENTS), centre)
-    )
+    everywhere = np.ones(values.shape[:2], dtype=bool)
+    deviations = np.full(values.shape, sigma)
+    return Measurement(everywhere, values, deviations, np.full((len(values), N_SEGMENTS), centre))
 
 
 @pytest.mark.parametrize("share", [0.05, 0.3, 0.9])

@@ -13,7 +13,6 @@ import pytest
 from dptse_env import register_part
 from dptse_env.estimators import Estimate
 from dptse_env.registration import REGISTRIES
-from dptse_env.release import Released
 from dptse_env.schedules import make_schedule
 
 SHORT = "dptse_env:dptse/ShortHighway-v0"
@@ -201,13 +200,13 @@ class Nan(parts.Smoothed):
 class Late(parts.Smoothed):
     """Sound until its first update."""
 
-    def _update(self, given):
-        self.traffic[given.episodes] = np.inf
+    def _update(self, episodes, measured):
+        self.traffic[episodes] = np.inf
 
 
 class WrongShape(parts.LaplaceRelease):
     def release(self, request):
-        return Released(np.zeros((1, 2)), self.sigma)
+        return super().release(request)._replace(values=np.zeros((1, 2)))
 
 
 class NanRelease(parts.LaplaceRelease):

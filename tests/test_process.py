@@ -12,7 +12,7 @@ from dptse_env.process import QueryProcess
 from dptse_env.spaces.actions import ACTION_ENCODINGS
 from tests.cases import fast_and_slow
 
-from .estimators.solvers import lying, missing, silent, stop_compiled_solvers
+from .estimators.test_mhe import lying, missing, silent, unsolved
 
 SEEDS = (11, 12, 13)
 ALL = np.arange(3)
@@ -243,7 +243,7 @@ def test_a_step_that_is_not_solved_for_keeps_the_prediction_and_says_so(
         process.step(ALL[:2], nobody)
     assert [process.info(e)["fallback"] for e in range(2)] == [0.0, 0.0]
     monkeypatch.setattr(qpsolvers, "solve_problem", solver)
-    stop_compiled_solvers(monkeypatch)
+    monkeypatch.setattr("dptse_env.estimators.mhe.update", unsolved)
     predicted, update = {}, process.estimator.update
 
     def spy(*given):

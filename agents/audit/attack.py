@@ -159,7 +159,7 @@ def play(batch: Batch) -> Runs:
     for step in range(config.horizon_steps):
         queries = batch.policy.queries(step, adversary.score)
         process.step(np.arange(n), queries.astype(np.int8))
-        terms = played.terms(release.last)
+        terms = played.terms(release.last.sigma)
         adversary.update(step + 1, process.queried, release.last.values, terms)
     return Runs(adversary.score.reshape(2, -1), np.sqrt(adversary.square).reshape(2, -1))
 
@@ -189,7 +189,7 @@ def public_terms(config: EnvConfig, record: Record, plan: BoolArray, seed: int =
     process.reset(one, [np.random.default_rng(seed)], {"traffic_seed": 0, "start": 0})
     for queried in plan:
         process.step(one, queried[None].astype(np.int8))
-        terms.append(played.terms(release.last))
+        terms.append(played.terms(release.last.sigma))
     return Terms(*(np.concatenate(rows) for rows in zip(*terms, strict=True)))
 
 

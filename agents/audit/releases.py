@@ -7,11 +7,11 @@ from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
 
+from dptse_env.estimators import Measurement
 from dptse_env.release import (
     GaussianMechanism,
     GaussianRelease,
     Paced,
-    Released,
     ReleaseModel,
     ReleaseRequest,
     TwoMechanisms,
@@ -57,10 +57,12 @@ class AttackedRelease(Protocol):
     def scale_noise(self, factor: float) -> None:
         """Multiply the noise, and leave what is declared of it as it is."""
 
-    def terms(self, released: Released) -> Terms:
+    def terms(self, sigma: FloatArray) -> Terms:
         """Return the terms of the last release, that of the batch's first k episodes.
 
-        Deviations are those of the real noise.
+        Args:
+            sigma: Deviations that the release declares, shape (k, C, 2); those of the terms are
+                the real noise's.
         """
 
     def sums(self, request: ReleaseRequest, terms: Terms) -> FloatArray:
@@ -86,10 +88,10 @@ class AttackedGaussian:
             factor * self.model.sigma, n_episodes=setup.n_episodes, n_segments=setup.n_columns
         )
 
-    def terms(self, released: Released) -> Terms:
+    def terms(self, sigma: FloatArray) -> Terms:
         """See `AttackedRelease.terms`."""
-        nothing = np.empty((len(released.values), 0))
-        return Terms(np.broadcast_to(released.sigma, released.values.shape), nothing, nothing)
+        nothing = np.empty((len(sigma), 0))
+        return Terms(sigma, nothing, nothing)
 
     def sums(self, request: ReleaseRequest, terms: Terms) -> FloatArray:
         """See `AttackedRelease.sums`."""
@@ -112,11 +114,11 @@ class AttackedPaced:
         self._factor = factor
         self.model.noise = NoiseStreams(setup.n_episodes, setup.n_columns, scale=factor)
 
-    def terms(self, released: Released) -> Terms:
+    def terms(self, sigma: FloatArray) -> Terms:
         """See `AttackedRelease.terms`."""
-        rows = slice(len(released.values))
-        sigma = self._factor * released.sigma
-        return Terms(sigma, self.model.prices[rows].copy(), self.model.centres[rows].copy())
+        rows = slice(len(sigma))
+        model = self.model
+        return Terms(self._factor * sigma, model.prices[rows].copy(), model.centres[rows].copy())
 
     def sums(self, request: ReleaseRequest, terms: Terms) -> FloatArray:
         """See `AttackedRelease.sums`."""
@@ -142,14 +144,10 @@ class AttackedPair:
         for part in self.parts:
             part.scale_noise(factor)
 
-    def terms(self, released: Released) -> Terms:
+    def terms(self, sigma: FloatArray) -> Terms:
         """See `AttackedRelease.terms`; those of the parts side by side."""
-        values = np.split(released.values, self._columns, axis=1)
-        sigma = np.split(np.broadcast_to(released.sigma, released.values.shape), self._columns, 1)
-        terms = [
-            part.terms(Released(value, deviation))
-            for part, value, deviation in zip(self.parts, values, sigma, strict=True)
-        ]
+        columns = np.split(sigma, self._columns, axis=1)
+        terms = [part.terms(own) for part, own in zip(self.parts, columns, strict=True)]
         return Terms(*(np.concatenate(arrays, axis=1) for arrays in zip(*terms, strict=True)))
 
     def sums(self, request: ReleaseRequest, terms: Terms) -> FloatArray:
@@ -196,7 +194,7 @@ class Overheard(ReleaseModel):
         last: Its last release.
     """
 
-    last: Released
+    last: Measurement
 
     def __init__(self, model: ReleaseModel) -> None:
         """Listen to this model."""
@@ -221,7 +219,7 @@ class Overheard(ReleaseModel):
         """See `ReleaseModel.reset`."""
         self.model.reset(episodes, generators)
 
-    def release(self, request: ReleaseRequest) -> Released:
+    def release(self, request: ReleaseRequest) -> Measurement:
         """See `ReleaseModel.release`."""
         self.last = self.model.release(request)
         return self.last

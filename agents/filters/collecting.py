@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from agents.environments import make_vector
 from agents.filters.scenarios import Scenario
 from agents.play import record
-from dptse_env.estimators.batch import Measurements, checked_measurements
+from dptse_env.estimators import Measurement
 from dptse_env.estimators.recurrent_kernels import Cells, make_cells
 from dptse_env.evaluation import Row, evaluate
 from dptse_env.model import MeasurementRows
@@ -46,7 +46,7 @@ def make_rows(rows: MeasurementRows) -> Rows:
     return Rows((rows.weights > 0.0).astype(float), 1.0 / rows.span)
 
 
-def make_released(measured: Measurements) -> Released:
+def make_released(measured: Measurement) -> Released:
     """Return measurements as `agents.filters.torch_network` takes them."""
     seen = measured.observed[..., None]
     return Released(
@@ -107,12 +107,12 @@ class _Recorder:
         self.outside.append(_single(input_channels(self.cells, inputs)))
         self._estimator.predict(episodes, inputs)
 
-    def update(self, *arguments: Any) -> None:
+    def update(self, episodes: Any, measured: Measurement) -> None:
         """Write down the measurements, and update."""
-        n, model = self._process.n_episodes, self._process.model
-        measured = checked_measurements(n, model, *arguments)
-        self.released.append(Released(*(_single(array) for array in make_released(measured))))
-        self._estimator.update(*arguments)
+        model = self._process.model
+        own = make_released(measured.on_road(model.rows.n_rows, model.n_segments))
+        self.released.append(Released(*(_single(array) for array in own)))
+        self._estimator.update(episodes, measured)
 
 
 class _Watcher:

@@ -1,17 +1,11 @@
-"""Traffic state estimators with a common protocol."""
+"""Traffic state estimators with a common protocol, by name and backend."""
 
-from dptse_env.estimators.base import Estimate, Estimator
-from dptse_env.estimators.registry import (
-    BACKENDS,
-    ESTIMATORS,
-    REFERENCES,
-    check_demand,
-    check_estimate,
-    check_estimator,
-    check_settings,
-    make_estimator,
-    settings_type,
-)
+from pkgutil import resolve_name
+from typing import Any, NamedTuple, get_args
+
+import numpy as np
+
+from dptse_env.estimators.base import Backend, BatchEstimator, Estimate, Estimator, Measurement
 from dptse_env.estimators.settings import (
     BlendSettings,
     DemandSettings,
@@ -21,11 +15,14 @@ from dptse_env.estimators.settings import (
     RecurrentSettings,
     SigmaPointSettings,
 )
+from dptse_env.model import ARZModel
+from dptse_env.utils.registry import Registry, is_foreign, missing_methods, name_of_class
 
 __all__ = [
     "BACKENDS",
     "ESTIMATORS",
     "REFERENCES",
+    "BatchEstimator",
     "BlendSettings",
     "DemandSettings",
     "EnsembleSettings",
@@ -33,6 +30,7 @@ __all__ = [
     "Estimator",
     "EstimatorSettings",
     "HorizonSettings",
+    "Measurement",
     "RecurrentSettings",
     "SigmaPointSettings",
     "check_demand",
@@ -42,3 +40,185 @@ __all__ = [
     "make_estimator",
     "settings_type",
 ]
+
+
+class Shipped(NamedTuple):
+    """A class of this package, imported when an estimator is made: not all libraries are needed."""
+
+    module: str
+    name: str
+
+    def load(self) -> Any:
+        """Import the class."""
+        return resolve_name(f"dptse_env.estimators.{self.module}:{self.name}")
+
+
+def _expected(part: Any) -> str | None:
+    if isinstance(part, type):
+        return missing_methods(part, ("reset", "predict", "update", "estimate"))
+    return None if callable(part) else "be a class, or callable with (model, n_episodes, settings)"
+
+
+ESTIMATORS = Registry(
+    "estimator",
+    {
+        "ekf": Shipped("ekf", "EKF"),
+        "ukf": Shipped("ukf", "UKF"),
+        "enkf": Shipped("enkf", "EnKF"),
+        "mhe": Shipped("mhe", "MHE"),
+        "random_walk": Shipped("simple", "RandomWalk"),
+        "blend": Shipped("simple", "Blend"),
+        "open_loop": Shipped("simple", "OpenLoop"),
+        "recurrent": Shipped("recurrent", "Recurrent"),
+    },
+    check=_expected,
+)
+"""Estimators by name. Those of other packages are classes or functions of (model, n_episodes,
+settings); their attribute ``settings_type`` may be a dataclass of other settings."""
+REFERENCES = {
+    "ekf": Shipped("reference", "ReferenceEKF"),
+    "ukf": Shipped("reference", "ReferenceUKF"),
+    "enkf": Shipped("reference", "ReferenceEnKF"),
+    "mhe": Shipped("reference", "ReferenceMHE"),
+}
+"""The backend ``reference`` of the estimators that have one."""
+WITHOUT_DEMAND = ("random_walk", "open_loop", "recurrent")
+"""Estimators without demand states."""
+BACKENDS = get_args(Backend)
+
+
+def check_demand(estimator: Any, settings: Any) -> None:
+    """Check that an estimator has the demand states that its settings ask for.
+
+    Raises:
+        ValueError: It has none.
+    """
+    if estimator in WITHOUT_DEMAND and settings.demand is not None:
+        raise ValueError(
+            f"estimator_settings.demand must be None for {estimator!r}, which has no demand states"
+        )
+
+
+def check_settings(estimator: Any, model: ARZModel, settings: Any) -> None:
+    """Refuse settings that an estimator cannot have on a road; it is imported, but not made.
+
+    A class may have a static method ``check_settings(model, settings)``, which raises
+    ``ValueError``. The model has the demand states that the settings ask for.
+
+    Raises:
+        ValueError: A setting is out of range on this road, or the estimator has no demand states.
+    """
+    check_demand(estimator, settings)
+    check = getattr(_loaded(ESTIMATORS.find(estimator)), "check_settings", None)
+    if check is not None:
+        check(with_demand(model, settings), settings)
+
+
+def with_demand(model: ARZModel, settings: Any) -> ARZModel:
+    """Return a model that has demand states where the settings ask for them, and only there."""
+    has_demand = getattr(settings, "demand", None) is not None
+    if has_demand == (model.n_demand_states > 0):
+        return model
+    return ARZModel(
+        model.network, model.parameters, model.time_step, model.reference_speed, model.rows,
+        has_demand,
+    )  # fmt: skip
+
+
+def _loaded(part: Any) -> Any:
+    return part.load() if isinstance(part, Shipped) else part
+
+
+def make_estimator(
+    estimator: Any, backend: str, model: ARZModel, n_episodes: int, settings: Any = None
+) -> Estimator:
+    """Build an estimator for a batch of episodes.
+
+    Args:
+        estimator: `ekf`, `ukf`, `enkf`, `mhe`, `random_walk` (no traffic model), `blend` (a mean
+            of EKF and random walk), `open_loop` (no measurements), `recurrent` (a network), a
+            registered name, ``"package.module:Class"`` or a class.
+        backend: `compiled` (numba), or `reference` (filterpy, qpsolvers, numpy), which EKF, UKF,
+            EnKF and MHE have.
+        model: The traffic model.
+        n_episodes: Number of episodes, >= 1.
+        settings: Settings; None for the defaults.
+
+    Raises:
+        ValueError: Name or backend is unknown, the estimator does not have the backend, there are
+            no episodes, a setting is out of range on this road, or the estimator lacks a method or
+            an attribute.
+    """
+    if n_episodes < 1:
+        raise ValueError(f"n_episodes must be >= 1, got {n_episodes}")
+    check_estimator(estimator, backend)
+    settings = settings_type(estimator)() if settings is None else settings
+    check_settings(estimator, model, settings)
+    part = REFERENCES[estimator] if backend == "reference" else ESTIMATORS.find(estimator)
+    made: Estimator = _loaded(part)(with_demand(model, settings), n_episodes, settings)
+    if is_foreign(made):
+        _check_attributes(made, model, n_episodes)
+    return made
+
+
+def settings_type(estimator: Any) -> type:
+    """Return the dataclass of an estimator's settings."""
+    cls: type = getattr(ESTIMATORS.find(estimator), "settings_type", EstimatorSettings)
+    return cls
+
+
+def check_estimator(estimator: Any, backend: str) -> None:
+    """Refuse an unknown estimator or backend, or a backend that an estimator does not have.
+
+    No estimator of this package is imported.
+    """
+    ESTIMATORS.find(estimator)
+    if backend not in BACKENDS:
+        raise ValueError(f"backend must be one of {', '.join(BACKENDS)}, got {backend!r}")
+    if backend == "reference" and not (isinstance(estimator, str) and estimator in REFERENCES):
+        raise ValueError(
+            f"backend must be 'compiled' for {ESTIMATORS.name_of(estimator)!r}, only "
+            f"{', '.join(REFERENCES)} have a reference; got 'reference'"
+        )
+
+
+def check_estimate(estimator: Estimator, estimate: Estimate, n_segments: int) -> None:
+    """Refuse an estimate that is not finite or not of shape (n, S).
+
+    Estimators of this package are reset when they diverge; those of other packages may not be.
+    """
+    shape = estimator.n_episodes, n_segments
+    for name in ("density", "speed", "density_std", "speed_std"):
+        values = np.asarray(getattr(estimate, name, None))
+        if values.shape != shape or values.dtype.kind != "f" or not np.isfinite(values).all():
+            raise ValueError(
+                f"estimator {name_of_class(estimator)}.estimate() must return finite floats "
+                f"{name!r} of shape {shape}, got {values.dtype} of shape {values.shape}"
+            )
+
+
+def _check_attributes(estimator: Estimator, model: ARZModel, n_episodes: int) -> None:
+    """Refuse an estimator whose methods, arrays or attributes do not follow the protocol."""
+    name = name_of_class(estimator)
+    missing = missing_methods(estimator, ("reset", "predict", "update", "estimate"))
+    if missing is not None:
+        raise ValueError(f"estimator {name} must {missing}")
+    shapes = {
+        "innovations": (n_episodes, model.rows.n_rows, 2),
+        "diverged": (n_episodes,),
+        "fallback": (n_episodes,),
+    }
+    for attribute, shape in shapes.items():
+        found = getattr(estimator, attribute, None)
+        if not isinstance(found, np.ndarray) or found.shape != shape:
+            got = "none" if found is None else f"shape {np.shape(found)}"
+            raise ValueError(
+                f"estimator {name} must have an array {attribute!r} of shape {shape}, got {got}"
+            )
+    found = getattr(estimator, "n_episodes", None)
+    if found != n_episodes:
+        message = f"estimator {name} must have 'n_episodes' equal to {n_episodes}, got {found!r}"
+        raise ValueError(message)
+    if getattr(estimator, "is_compiled", None) is None:
+        raise ValueError(f"estimator {name} must have 'is_compiled', got None")
+    check_estimate(estimator, estimator.estimate(), model.n_segments)

@@ -7,12 +7,14 @@ change.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal, Protocol
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol
 
 import numpy as np
 
+from dptse_env.model import ARZModel
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 
 Backend = Literal["compiled", "reference"]
@@ -42,6 +44,94 @@ class Estimate:
             self.density_std[episodes],
             self.speed_std[episodes],
         )
+
+
+class Measurement(NamedTuple):
+    """What is released of a second of k episodes, on its way from the mechanism to the estimator.
+
+    Its C columns are the M rows of ``model.rows``, then the R boundary segments where these are
+    released; estimators read the first M.
+
+    Attributes:
+        observed: Columns that were queried or are always observed, and answered, shape (k, C).
+        values: Average density [veh/km] of a column's segments and their average centred flow
+            [veh/h], or their mean speed [km/h]: shape (k, C, 2); ignored where not observed.
+        sigma: Standard deviations of their noise, in the same units, shape (k, C, 2).
+        centre: Speeds [km/h] that the flows are centred on, of the segments, and of the boundary
+            segments where these are released: shape (k, S) or (k, S + R); NaN for mean speeds.
+    """
+
+    observed: BoolArray
+    values: FloatArray
+    sigma: FloatArray
+    centre: FloatArray
+
+    @classmethod
+    def of(
+        cls,
+        model: ARZModel,
+        observed: BoolArray,
+        values: FloatArray,
+        sigma: FloatArray,
+        centre: FloatArray | None = None,
+    ) -> Measurement:
+        """Return a measurement of the rows of a road, for callers outside of the process.
+
+        Args:
+            model: The road and its rows.
+            observed: Shape (k, M).
+            values: Shape (k, M, 2).
+            sigma: Shape (k, M, 2), or one that broadcasts to it.
+            centre: Shape (k, S), or one that broadcasts to it; None for the model's reference
+                speed.
+
+        Raises:
+            ValueError: A shape is another, or a deviation or centre is negative or not finite.
+        """
+        seen = np.ascontiguousarray(observed, dtype=np.bool_)
+        if seen.ndim != 2 or seen.shape[1] != model.rows.n_rows:
+            raise ValueError(f"observed must have shape (k, {model.rows.n_rows}), got {seen.shape}")
+        given = np.ascontiguousarray(values, dtype=np.float64)
+        if given.shape != (*seen.shape, 2):
+            raise ValueError(f"values must have shape {(*seen.shape, 2)}, got {given.shape}")
+        deviations = _full("sigma", sigma, given.shape)
+        if not (np.isfinite(deviations) & (deviations >= 0.0)).all():
+            raise ValueError("sigma must be finite and >= 0")
+        places = len(seen), model.n_segments
+        if model.reference_speed is None:
+            return cls(seen, given, deviations, np.full(places, np.nan))
+        around = _full("centre", model.reference_speed if centre is None else centre, places)
+        if not np.isfinite(around).all():
+            raise ValueError("centre must be finite")
+        return cls(seen, given, deviations, around)
+
+    def at(self, episodes: slice | int) -> Measurement:
+        """Return the rows of a block of the k episodes, or those of one without the axis."""
+        observed, values, sigma, centre = self
+        return Measurement(observed[episodes], values[episodes], sigma[episodes], centre[episodes])
+
+    def on_road(self, n_rows: int, n_segments: int) -> Measurement:
+        """Return the columns of the road alone, without those of boundary segments."""
+        if self.observed.shape[1] == n_rows and self.centre.shape[1] == n_segments:
+            return self
+        return Measurement(
+            np.ascontiguousarray(self.observed[:, :n_rows]),
+            np.ascontiguousarray(self.values[:, :n_rows]),
+            np.ascontiguousarray(self.sigma[:, :n_rows]),
+            np.ascontiguousarray(self.centre[:, :n_segments]),
+        )
+
+
+def _full(name: str, values: Any, shape: tuple[int, ...]) -> FloatArray:
+    """Return numbers of full shape; the last axis is not broadcast."""
+    given = np.asarray(values, dtype=np.float64)
+    if given.ndim > 0 and given.shape[-1] != shape[-1]:
+        raise ValueError(f"{name} must have shape {shape} or broadcast to it, got {given.shape}")
+    try:
+        return np.array(np.broadcast_to(given, shape))
+    except ValueError as problem:
+        message = f"{name} must have shape {shape} or broadcast to it, got {given.shape}"
+        raise ValueError(message) from problem
 
 
 class Estimator(Protocol):
@@ -79,27 +169,81 @@ class Estimator(Protocol):
     def predict(self, episodes: IntArray, inputs: FloatArray) -> None:
         """Predict episodes `(k,)` one step ahead under the model's inputs `(k, n_u)`."""
 
-    def update(
-        self,
-        episodes: IntArray,
-        observed: BoolArray,
-        values: FloatArray,
-        sigma: FloatArray,
-        centre: FloatArray | None = None,
-    ) -> None:
-        """Update episodes by measurements, whose M rows are those of ``model.rows``.
-
-        Args:
-            episodes: `(k,)` distinct indices.
-            observed: `(k, M)` flags of the rows that are measured.
-            values: `(k, M, 2)` average density [veh/km] of a row's segments and, depending on the
-                model, their speed [km/h] or average centred flow [veh/h]; ignored where not
-                observed.
-            sigma: Standard deviations of their noise, in the same units, `(k, M, 2)` or of a shape
-                that broadcasts to it.
-            centre: Speeds v_0 [km/h] that the flows are centred on, `(k, S)` or of a shape that
-                broadcasts to it; None for the model's reference speed.
-        """
+    def update(self, episodes: IntArray, measured: Measurement) -> None:
+        """Update distinct episodes `(k,)` by what was released of them."""
 
     def estimate(self) -> Estimate:
         """Current estimate of all episodes."""
+
+
+class BatchEstimator(ABC):
+    """Base class of the package's estimators of a batch of episodes.
+
+    Public methods are documented in `Estimator`. A subclass writes `innovations` and `diverged` of
+    the episodes that it updates, and `fallback` where its update can fail. It has `_estimate`, or
+    `estimate` where its settings have no ``speed_cap``.
+    """
+
+    is_compiled: ClassVar[bool] = False
+
+    def __init__(self, model: ARZModel, n_episodes: int, settings: Any) -> None:
+        """See `make_estimator`."""
+        self.model = model
+        self.n_episodes = n_episodes
+        self.settings = settings
+        self._noise_scale = np.array(getattr(settings, "noise_scale", (1.0, 1.0)))
+        cap = getattr(settings, "speed_cap", None)
+        self._largest_speed = None if cap is None else cap * np.array(model.network.speed_limits)
+        self.innovations = np.zeros((n_episodes, model.rows.n_rows, 2))
+        self.diverged = np.zeros(n_episodes, dtype=np.bool_)
+        self.fallback = np.zeros(n_episodes, dtype=np.bool_)
+
+    def reset(
+        self, episodes: IntArray, states: FloatArray, generators: Sequence[np.random.Generator]
+    ) -> None:
+        """See `Estimator.reset`."""
+        shape = (len(episodes), 2 * self.model.n_segments)
+        if states.shape != shape:
+            raise ValueError(f"states must have shape {shape}, got {states.shape}")
+        if self.model.n_demand_states > 0:
+            factors = np.ones((len(episodes), self.model.n_demand_states))
+            states = np.concatenate([states, factors], axis=1)
+        self.innovations[episodes] = 0.0
+        self.diverged[episodes] = False
+        self.fallback[episodes] = False
+        self._reset(episodes, states, generators)
+
+    def predict(self, episodes: IntArray, inputs: FloatArray) -> None:
+        """See `Estimator.predict`."""
+        shape = (len(episodes), self.model.n_inputs)
+        if inputs.shape != shape:
+            raise ValueError(f"inputs must have shape {shape}, got {inputs.shape}")
+        self._predict(episodes, inputs)
+
+    def update(self, episodes: IntArray, measured: Measurement) -> None:
+        """See `Estimator.update`; observed values that are not finite make a filter diverge."""
+        model, self.fallback[episodes] = self.model, False
+        own = measured.on_road(model.rows.n_rows, model.n_segments)
+        self._update(episodes, own._replace(sigma=self._noise_scale * own.sigma))
+
+    def estimate(self) -> Estimate:
+        """Current estimate of all episodes, its speeds held to the settings' ``speed_cap``."""
+        estimate = self._estimate()
+        if self._largest_speed is not None:
+            np.minimum(estimate.speed, self._largest_speed, out=estimate.speed)
+        return estimate
+
+    def _estimate(self) -> Estimate:
+        """Return the estimate of all episodes in fresh arrays."""
+        raise NotImplementedError(f"{type(self).__name__} must have a method '_estimate'")
+
+    @abstractmethod
+    def _reset(
+        self, episodes: IntArray, states: FloatArray, generators: Sequence[np.random.Generator]
+    ) -> None: ...
+
+    @abstractmethod
+    def _predict(self, episodes: IntArray, inputs: FloatArray) -> None: ...
+
+    @abstractmethod
+    def _update(self, episodes: IntArray, measured: Measurement) -> None: ...

@@ -10,8 +10,7 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from dptse_env.estimators.base import Estimate
-from dptse_env.estimators.batch import BatchEstimator, Measurements
+from dptse_env.estimators.base import BatchEstimator, Estimate, Measurement
 from dptse_env.estimators.linalg import is_covariance, mirror, padded, pair_update, propagate
 from dptse_env.estimators.noise import count_variance, initial_variance, process_variance
 from dptse_env.estimators.settings import EstimatorSettings
@@ -115,8 +114,9 @@ class EKF(CovarianceFilter):
     def _predict(self, episodes: IntArray, inputs: FloatArray) -> None:
         predict(*self._packed, episodes, inputs)
 
-    def _update(self, measured: Measurements) -> None:
-        update(*self._packed, *measured)
+    def _update(self, episodes: IntArray, measured: Measurement) -> None:
+        observed, values, sigma, centre = measured
+        update(*self._packed, episodes, observed, values, sigma, centre)
 
 
 class Rows(NamedTuple):

@@ -12,8 +12,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dptse_env.estimators.base import Estimate
-from dptse_env.estimators.batch import BatchEstimator, Measurements
+from dptse_env.estimators.base import BatchEstimator, Estimate, Measurement
 from dptse_env.estimators.linalg import factor, padded, solve_many
 from dptse_env.estimators.noise import count_variance, initial_variance, process_variance
 from dptse_env.estimators.normals import STREAM_WIDTH, Draws, draw, make_stream
@@ -142,8 +141,9 @@ class EnKF(BatchEstimator):
     def _predict(self, episodes: IntArray, inputs: FloatArray) -> None:
         predict(self._road, self._packed, episodes, inputs)
 
-    def _update(self, measured: Measurements) -> None:
-        update(self._road, self._packed, *measured)
+    def _update(self, episodes: IntArray, measured: Measurement) -> None:
+        observed, values, sigma, centre = measured
+        update(self._road, self._packed, episodes, observed, values, sigma, centre)
 
     def _estimate(self) -> Estimate:
         out = np.empty((4, self.n_episodes, self.model.n_segments))
@@ -222,7 +222,7 @@ def restart(road_: Packed, ensembles_: Packed, episodes: IntArray) -> None:
         _restart(road, ensembles, e)
 
 
-@kernel_part(kept=True)
+@kernel_part
 def _restart(road: RoadArrays, ensembles: Ensembles, e: int) -> None:
     members, n = ensembles.members[e], ensembles.n_members
     for i in range(members.shape[0]):
@@ -303,7 +303,7 @@ def update(
             _restart(road, ensembles, e)
 
 
-@kernel_part(kept=True)
+@kernel_part
 def _assimilate(
     road: RoadArrays,
     ensembles: Ensembles,
@@ -360,7 +360,7 @@ def _inflate(members: FloatArray, n: int, factor: float) -> None:
             row[j] = mean + factor * (row[j] - mean)
 
 
-@kernel_part(kept=True, fastmath={"contract"})
+@kernel_part(fastmath={"contract"})
 def _compare(
     road: RoadArrays,
     ensembles: Ensembles,

@@ -1,36 +1,61 @@
-"""Moving horizon estimation (paper, eq. 14 to 17)."""
+"""Moving horizon estimation (paper, eq. 14 to 17).
+
+A window holds L = T + 1 stages; z stacks their normalised states, rho by rho_m and psi by
+rho_m v_f; a demand factor is a number without a unit. Its program is the paper's eq. 17,
+`minimise z' H z + q' z with lower <= z <= upper`. The reference shares its bounds, weights and
+general solver, which are at the end.
+"""
 
 import math
-from typing import NamedTuple
+import warnings
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
+import scipy.sparse as sp
+from scipy.sparse.linalg import splu
 
 from dptse_env.estimators import ekf
-from dptse_env.estimators.batch import Measurements
+from dptse_env.estimators.base import Measurement
 from dptse_env.estimators.ekf import CovarianceFilter, Filters, process_noise
-from dptse_env.estimators.horizon import (
-    LEAST_DEVIATION,
-    moving_variance,
-    normalised_bounds,
-    settings_of_mhe,
-    solve,
-)
 from dptse_env.estimators.linalg import move, padded
+from dptse_env.estimators.noise import initial_variance
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.estimators.window import (
     UNSOLVED,
     Window,
     factorise,
-    make_work,
+    look,
+    make_factor,
+    make_point,
     minimise,
-    write_force,
 )
-from dptse_env.model import ARZModel
+from dptse_env.model import ARZModel, Bounds
 from dptse_env.model.network import RoadArrays
+from dptse_env.model.parameters import (
+    LARGEST_FACTOR,
+    LARGEST_W,
+    LEAST_DENSITY,
+    LEAST_FACTOR,
+    LEAST_W,
+)
 from dptse_env.model.step import advance, make_scratch, normalise, project, write_row
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+from dptse_env.utils.kernel_loops import all_finite, any_of, copy_matrix, copy_vector
 from dptse_env.utils.kernels import Packed, kernel, kernel_part
 from dptse_env.utils.validation import integer, positive
+
+# Largest natural residual of an optimum, in normalised states.
+RESIDUAL = 1e-8
+# Components so near to a bound are set to it: a speed is a quotient of numbers that may vanish.
+AT_BOUND = 1e-13
+# Solutions with a larger residual are not inaccurate optima, but wrong. The largest one of piqp is
+# 4e-5, and 2e-2 where measurements are treated as exact.
+ROUGH = 0.05
+# Number of polishing steps; a second step mostly corrects what the first one missed.
+POLISHES = 10
+# Least deviation of a measurement, normalised: an exact one would have an infinite weight.
+LEAST_DEVIATION = 1e-3
 
 GENERAL_SOLVER, FALLBACK = 3, 4  # how a program was solved, beside those of `window`
 
@@ -205,27 +230,31 @@ def update(
 ) -> None:
     """Update by measurements, `sigma` no less than allowed; see `Estimator.update`."""
     road, filters, windows = RoadArrays(*road_), Filters(*filters_), Windows(*windows_)
-    capacity, width = windows.solution.shape[1:]
+    n, n_stages, width = (
+        windows.units.size,
+        windows.solution.shape[1] - 1,
+        windows.solution.shape[2],
+    )
     n_rows, size = windows.weights.shape[2], windows.weights.shape[4]
-    work = make_work(capacity - 1, windows.units.size, n_rows, size, width)
-    free = np.zeros((capacity - 1, width), np.int64)
+    factor, free = make_factor(n_stages, n, n_rows, size, width), np.zeros((n_stages, n), np.int64)
     for k in range(episodes.size):
         e = episodes[k]
         _shift(windows, e)
-        windows.observed[e, windows.length[e] - 1] = observed[k]
-        windows.centre[e, windows.length[e] - 1] = centre[k]
+        last = windows.length[e] - 1
+        copy_vector(observed[k], windows.observed[e, last])
+        copy_vector(centre[k], windows.centre[e, last])
         windows.solved[e] = UNSOLVED
         sound = _measure(road, filters, windows, e, values[k], sigma[k])
-        n_stages, window = windows.length[e], window_of(windows, e)
-        work.length[0] = 0
-        sound = sound and factorise(road, window, n_stages, free, work)
+        window, factor.length[0] = window_of(windows, e), 0
+        side, z = windows.side[e, : last + 1], windows.solution[e, : last + 1].copy()
+        sound = sound and factorise(road, window, free, factor)
         if sound:
-            filters.covariances[e] = work.covariances[n_stages - 1]
-            _innovate(road, filters, windows, e, work.before)
-            sound = bool(np.isfinite(np.sum(filters.covariances[e])))
-        if sound and np.any(observed[k]):
-            z, side = windows.solution[e].copy(), windows.side[e]
-            windows.solved[e] = minimise(road, window, n_stages, work, side, z)
+            copy_matrix(factor.covariances[last], filters.covariances[e])
+            _innovate(road, filters, windows, e, factor.before)
+            for i in range(windows.units.size):
+                sound = sound and all_finite(filters.covariances[e, i])
+        if sound and any_of(observed[k]):
+            windows.solved[e] = minimise(road, window, factor, side, z)
             if windows.solved[e] != UNSOLVED:
                 accept(road, filters, windows, e, z)
         filters.diverged[e] = not sound
@@ -297,10 +326,10 @@ def _innovate(
 
 @kernel
 def accept(road: RoadArrays, filters: Filters, windows: Windows, e: int, z: FloatArray) -> None:
-    """Accept a solution `(L, padded)`, whose last state is the estimate."""
-    windows.solution[e] = z
+    """Accept a solution `(>= L, padded)`, whose last state is the estimate."""
     for t in range(windows.length[e]):
         for i in range(windows.units.size):
+            windows.solution[e, t, i] = z[t, i]
             at_lower, at_upper = z[t, i] <= windows.lower[i], z[t, i] >= windows.upper[i]
             windows.side[e, t, i] = int(at_upper) - int(at_lower)
     for i in range(windows.units.size):
@@ -311,17 +340,18 @@ def accept(road: RoadArrays, filters: Filters, windows: Windows, e: int, z: Floa
 @kernel_part
 def window_of(windows: Windows, e: int) -> Window:
     """Return the linearised window of an episode; its arrays are views."""
+    length = windows.length[e]
     return Window(
         windows.predicted[e, 0],
         windows.arrival_variance[e],
-        windows.blocks[e],
-        windows.by_factor[e],
-        windows.offsets[e],
-        windows.process_variance[e],
-        windows.observed[e],
-        windows.weights[e],
-        windows.targets[e],
-        windows.noise[e],
+        windows.blocks[e, :length],
+        windows.by_factor[e, :length],
+        windows.offsets[e, :length],
+        windows.process_variance[e, :length],
+        windows.observed[e, :length],
+        windows.weights[e, :length],
+        windows.targets[e, :length],
+        windows.noise[e, :length],
         windows.lower,
         windows.upper,
     )
@@ -331,18 +361,17 @@ def window_of(windows: Windows, e: int) -> Window:
 def write_program(road_: Packed, windows_: Packed, e: int, H: FloatArray, q: FloatArray) -> None:
     """Write H `(L, n_x, L, n_x)` and q `(L, n_x)` of an episode: z' H z + q' z."""
     road, windows = RoadArrays(*road_), Windows(*windows_)
-    length, n, width = windows.length[e], windows.units.size, windows.solution.shape[2]
-    n_rows, size = windows.weights.shape[2], windows.weights.shape[4]
-    work = make_work(length, n, n_rows, size, width)
-    z, start, force = np.zeros((3, length, width))
-    write_force(road, window_of(windows, e), length, z, work, start)
+    window, length, n = window_of(windows, e), windows.length[e], windows.units.size
+    point = make_point(length, windows.solution.shape[2], windows.observed.shape[2])
+    look(road, window, point)
+    start = point.force.copy()
     q[:] = -2.0 * start[:, :n]
     for t in range(length):
         for i in range(n):
-            z[t, i] = 1.0
-            write_force(road, window_of(windows, e), length, z, work, force)
-            z[t, i] = 0.0
-            H[t, i] = start[:, :n] - force[:, :n]
+            point.z[t, i] = 1.0
+            look(road, window, point)
+            point.z[t, i] = 0.0
+            H[t, i] = start[:, :n] - point.force[:, :n]
 
 
 class MHE(CovarianceFilter):
@@ -390,9 +419,9 @@ class MHE(CovarianceFilter):
     def _predict(self, episodes: IntArray, inputs: FloatArray) -> None:
         predict(*self._all_packed, episodes, inputs)
 
-    def _update(self, measured: Measurements) -> None:
+    def _update(self, episodes: IntArray, measured: Measurement) -> None:
         least = LEAST_DEVIATION * self.model.measurement_scale
-        episodes, observed, values, sigma, centre = measured
+        observed, values, sigma, centre = measured
         update(*self._all_packed, episodes, observed, values, np.maximum(sigma, least), centre)
         unsolved = self._windows.solved[episodes] == UNSOLVED
         unsolved &= observed.any(axis=1) & ~self.diverged[episodes]
@@ -407,9 +436,7 @@ class MHE(CovarianceFilter):
         self.fallback[episode], windows.side[episode] = z is None, 0
         windows.solved[episode] = FALLBACK if z is None else GENERAL_SOLVER
         if z is not None:
-            solution = windows.solution[episode].copy()
-            solution[:length, : self.model.n_states] = z.reshape(length, -1)
-            accept(self._road, self._filters, windows, episode, solution)
+            accept(self._road, self._filters, windows, episode, z.reshape(length, -1))
 
     def _restart(self, episodes: IntArray) -> None:
         for episode in episodes.tolist():
@@ -448,3 +475,113 @@ def _allocate(
         units=model.state_scale,
         along=settings.mhe.linearisation == "trajectory",
     )
+
+
+# Shared with the reference ------------------------------------------------------------------------
+
+
+def moving_variance(model: ARZModel, settings: EstimatorSettings) -> FloatArray:
+    """Return the arrival variances `(n_x,)` of a window that moves.
+
+    They are those of `arrival_noise`, and for demand factors those of the prior: a window of the
+    default length says less about a factor than its random walk takes away, and an arrival that is
+    too sure of itself keeps a wrong factor for many windows.
+    """
+    variance = initial_variance(model, settings)
+    n = 2 * model.n_segments
+    variance[:n] = np.tile(np.square(settings.mhe.arrival_noise), model.n_segments)
+    return variance
+
+
+def settings_of_mhe(settings: EstimatorSettings) -> EstimatorSettings:
+    """Return the settings with the bounds of the MHE, which differ from those of other estimators.
+
+    Warns:
+        RuntimeWarning: The solver is not installed; steps that need it keep the prediction.
+    """
+    import qpsolvers  # noqa: PLC0415
+
+    solver, installed = settings.mhe.solver, qpsolvers.available_solvers
+    if solver not in installed:
+        warnings.warn(
+            f"estimator_settings.mhe.solver {solver!r} is not installed: steps that need it keep "
+            f"the prediction and set info['fallback']; installed: {', '.join(installed)}",
+            RuntimeWarning,
+            stacklevel=2,
+        )
+    return replace(settings, bounds=settings.mhe.bounds)
+
+
+def normalised_bounds(model: ARZModel, bounds: Bounds) -> tuple[FloatArray, FloatArray]:
+    """Return the least and the largest normalised state `(n_x,)` of the program."""
+    share = model.jam_density / model.density_scale
+    lower, upper = np.zeros(2 * model.n_segments), np.repeat(share, 2)
+    if bounds == "cone":
+        lower = np.tile([1.0, LEAST_W], model.n_segments) * LEAST_DENSITY / model.density_scale
+        upper[1::2] *= LARGEST_W
+    factors = np.ones(model.n_demand_states)
+    return (
+        np.concatenate([lower, LEAST_FACTOR * factors]),
+        np.concatenate([upper, LARGEST_FACTOR * factors]),
+    )
+
+
+def natural_residual(
+    H: FloatArray, q: FloatArray, lower: FloatArray, upper: FloatArray, z: FloatArray
+) -> float:
+    """Largest |z - clip(z - g / diag(2 H), lower, upper)|, g = 2 H z + q; 0 at the optimum only.
+
+    The gradient is scaled by the diagonal, so that the residual is in units of z for any weights.
+    It is NaN where z is.
+    """
+    step = (2.0 * H @ z + q) / (2.0 * np.diag(H))
+    return float(np.max(np.abs(z - np.clip(z - step, lower, upper))))
+
+
+def solve(
+    H: FloatArray, q: FloatArray, lower: FloatArray, upper: FloatArray, solver: str
+) -> FloatArray | None:
+    """Minimise z' H z + q' z within bounds by qpsolvers; None where it finds no optimum.
+
+    An interior point method stops short of the bounds, so its solution is polished several times:
+    components that are nearly at a bound and pressed against it are set to it, and the others are
+    solved for. The best solution is returned. The `natural_residual`, not the solver's status,
+    decides whether a solution is worth polishing and whether the result is an optimum.
+    """
+    import qpsolvers  # noqa: PLC0415  (rarely needed)
+
+    P = sp.csc_matrix(2.0 * H)  # qpsolvers minimises z' P z / 2 + q' z
+    problem = qpsolvers.Problem(P, q, lb=lower, ub=upper)
+    options: dict[str, Any] = {"eps_abs": 1e-9, "eps_rel": 1e-9} if solver == "piqp" else {}
+    try:
+        z = qpsolvers.solve_problem(problem, solver=solver, **options).x
+    except (qpsolvers.SolverNotFound, qpsolvers.SolverError):
+        return None
+    if z is None:
+        return None
+    best = z = np.clip(z, lower, upper)
+    if not natural_residual(H, q, lower, upper, z) <= ROUGH:  # a NaN is no optimum either
+        return None
+    for _ in range(POLISHES):
+        try:
+            z = _polish(P, q, lower, upper, z)
+        except RuntimeError:  # splu: the matrix is singular
+            break
+        pair = best, np.clip(z, lower, upper)
+        best = min(pair, key=lambda z: natural_residual(H, q, lower, upper, z))
+    best = np.where(best < lower + AT_BOUND, lower, np.where(best > upper - AT_BOUND, upper, best))
+    return best if natural_residual(H, q, lower, upper, best) <= RESIDUAL else None
+
+
+def _polish(
+    P: sp.csc_matrix, q: FloatArray, lower: FloatArray, upper: FloatArray, z: FloatArray
+) -> FloatArray:
+    """Set variables that are pressed against a bound to it, and solve for the others."""
+    step = (P @ z + q) / P.diagonal()
+    at_lower, at_upper = z - lower <= step, upper - z <= -step
+    free = ~(at_lower | at_upper)
+    exact: FloatArray = np.where(at_lower, lower, np.where(at_upper, upper, 0.0))
+    factors = splu(P[free][:, free].tocsc())
+    for _ in range(2):  # the second pass corrects rounding errors
+        exact[free] += factors.solve(-(q + P @ exact)[free])
+    return exact

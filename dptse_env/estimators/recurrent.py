@@ -7,8 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from dptse_env.estimators.base import Estimate
-from dptse_env.estimators.batch import BatchEstimator, Measurements
+from dptse_env.estimators.base import BatchEstimator, Estimate, Measurement
 from dptse_env.estimators.recurrent_kernels import LONGEST_AGE, advance, make_cells, read
 from dptse_env.estimators.recurrent_weights import SavedNetwork, member_for, read_network
 from dptse_env.estimators.settings import EstimatorSettings
@@ -78,12 +77,13 @@ class Recurrent(BatchEstimator):
         self._present[episodes] = self._ahead[episodes]
         self._inputs[episodes] = inputs
 
-    def _update(self, measured: Measurements) -> None:
-        episodes, network = measured.episodes, self.saved.network
+    def _update(self, episodes: IntArray, measured: Measurement) -> None:
+        network = self.saved.network
         shape = episodes.size, self.model.n_segments, len(network.inputs)
         x = np.empty(shape, dtype=np.float32)
         state = self._inputs, self._present, self._age, self.innovations
-        read(self.cells, *measured, *state, x)
+        observed, values, sigma, centre = measured
+        read(self.cells, episodes, observed, values, sigma, centre, *state, x)
         advance(self.cells, network, episodes, x, self.hidden, self._present, self._ahead)
         # Gates hold what is not finite to their range: the state does not show it.
         sound = np.all(np.isfinite(measured.values) | ~measured.observed[..., None], axis=(1, 2))

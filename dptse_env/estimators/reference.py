@@ -21,10 +21,9 @@ from filterpy.kalman import (
 )
 from scipy.linalg import LinAlgError, LinAlgWarning
 
-from dptse_env.estimators.base import Estimate
-from dptse_env.estimators.batch import BatchEstimator, EpisodeMeasurements, Measurements
+from dptse_env.estimators.base import BatchEstimator, Estimate, Measurement
 from dptse_env.estimators.enkf import make_tapers
-from dptse_env.estimators.horizon import (
+from dptse_env.estimators.mhe import (
     LEAST_DEVIATION,
     moving_variance,
     normalised_bounds,
@@ -59,16 +58,17 @@ class Problem:
     def project(self, x: FloatArray, bounds: Bounds | None = None) -> FloatArray:
         """Return the states within bounds, by default the filter's."""
         bounds = self.settings.bounds if bounds is None else bounds
-        return self.model.project(x * self.unit, bounds) / self.unit
+        return np.asarray(self.model.project(x * self.unit, bounds) / self.unit)
 
     def f(self, x: FloatArray, u: FloatArray) -> FloatArray:
         """Return the states one step later."""
-        return self.model.step(x * self.unit, np.repeat(u[None], len(x), axis=0)) / self.unit
+        inputs = np.repeat(u[None], len(x), axis=0)
+        return np.asarray(self.model.step(x * self.unit, inputs) / self.unit)
 
     def F(self, x: FloatArray, u: FloatArray) -> FloatArray:  # noqa: N802
         """Return the derivative of f at a mean, `(n_x, n_x)`."""
         jacobian = self.model.jacobian((x * self.unit)[None], u[None])[0]
-        return jacobian * self.unit / self.unit[:, None]
+        return np.asarray(jacobian * self.unit / self.unit[:, None])
 
     def Q(self, x: FloatArray) -> FloatArray:  # noqa: N802
         """Return the variances `(n_x,)` of the noise of a step that leaves a mean."""
@@ -77,22 +77,22 @@ class Problem:
         variance[0 : 2 * self.model.n_segments : 2] += grown
         return variance
 
-    def z(self, seen: EpisodeMeasurements) -> FloatArray:
+    def z(self, seen: Measurement) -> FloatArray:
         """Return the observed numbers `(2 m,)`."""
-        return (seen.values[seen.observed] / self.release_unit).ravel()
+        return np.asarray((seen.values[seen.observed] / self.release_unit).ravel())
 
-    def h(self, x: FloatArray, seen: EpisodeMeasurements) -> FloatArray:
+    def h(self, x: FloatArray, seen: Measurement) -> FloatArray:
         """Return the numbers that states would give, `(k, 2 m)`."""
         released = self.model.measure(x * self.unit, seen.centre)[:, seen.observed]
-        return (released / self.release_unit).reshape(len(x), -1)
+        return np.asarray((released / self.release_unit).reshape(len(x), -1))
 
-    def H(self, x: FloatArray, seen: EpisodeMeasurements) -> FloatArray:  # noqa: N802
+    def H(self, x: FloatArray, seen: Measurement) -> FloatArray:  # noqa: N802
         """Return the derivative of h at a mean, `(2 m, n_x)`."""
         matrix = self.model.measurement_matrix((x * self.unit)[None], seen.centre)[0]
         matrix = matrix[seen.observed] * self.unit / self.release_unit[:, None]
-        return matrix.reshape(-1, self.n_states)
+        return np.asarray(matrix.reshape(-1, self.n_states))
 
-    def R(self, x: FloatArray, seen: EpisodeMeasurements, least: float = 0.0) -> FloatArray:  # noqa: N802
+    def R(self, x: FloatArray, seen: Measurement, least: float = 0.0) -> FloatArray:  # noqa: N802
         """Return the variances `(2 m,)` of the noise of a measurement at a mean.
 
         Deviations are at least `least`, but for what counts add to them.
@@ -103,7 +103,7 @@ class Problem:
 
     def _density(self, x: FloatArray) -> FloatArray:
         """Return the densities `(S,)` of a mean within bounds [veh/km]."""
-        return self.model.density(self.project(x[None]) * self.unit)[0]
+        return np.asarray(self.model.density(self.project(x[None]) * self.unit)[0])
 
 
 class EpisodeFilter(ABC):
@@ -138,7 +138,7 @@ class EpisodeFilter(ABC):
         """Predict one step ahead under inputs `(n_u,)`."""
 
     @abstractmethod
-    def assimilate(self, seen: EpisodeMeasurements) -> FloatArray:
+    def assimilate(self, seen: Measurement) -> FloatArray:
         """Update by a measurement of any rows; return their normalised innovations `(2 m,)`."""
 
     def is_sound(self) -> bool:
@@ -203,13 +203,13 @@ class ReferenceFilter(BatchEstimator):
                 except LinAlgError:  # no root of P; the update resets the filter
                     self.filters[episode].x[:] = np.nan
 
-    def _update(self, measured: Measurements) -> None:
+    def _update(self, episodes: IntArray, measured: Measurement) -> None:
         with np.errstate(all="ignore"), warnings.catch_warnings():
             warnings.simplefilter("error", LinAlgWarning)
-            for episode, seen in measured.by_episode():
-                self._update_one(episode, seen)
+            for k, episode in enumerate(episodes.tolist()):
+                self._update_one(episode, measured.at(k))
 
-    def _update_one(self, episode: int, seen: EpisodeMeasurements) -> None:
+    def _update_one(self, episode: int, seen: Measurement) -> None:
         each, innovations = self.filters[episode], np.zeros_like(self.innovations[episode])
         sound = each.is_sound() and bool(np.isfinite(seen.values[seen.observed]).all())
         if sound:
@@ -240,7 +240,7 @@ class _ExtendedFilter(EpisodeFilter, ExtendedKalmanFilter):  # type: ignore[misc
     def advance(self, u: FloatArray) -> None:
         self.predict(u)
 
-    def assimilate(self, seen: EpisodeMeasurements) -> FloatArray:
+    def assimilate(self, seen: Measurement) -> FloatArray:
         if not seen.observed.any():
             return np.zeros(0)
         problem, noise = self.problem, np.diag(self.problem.R(self.x, seen))
@@ -303,7 +303,7 @@ class _UnscentedFilter(EpisodeFilter, UnscentedKalmanFilter):  # type: ignore[mi
         """Replace filterpy's loop over points by a product of matrices."""
         return np.asarray((sigmas_f - x).T @ (self.Wc[:, None] * (sigmas_h - z)))
 
-    def assimilate(self, seen: EpisodeMeasurements) -> FloatArray:
+    def assimilate(self, seen: Measurement) -> FloatArray:
         if not seen.observed.any():
             return np.zeros(0)
         noise = np.diag(self.problem.R(self.x, seen))
@@ -356,7 +356,7 @@ class _Ensemble(EpisodeFilter):
         variance = self.problem.Q(self.x)
         self.members = self._perturbed(self.problem.f(self.members, u), variance)
 
-    def assimilate(self, seen: EpisodeMeasurements) -> FloatArray:
+    def assimilate(self, seen: Measurement) -> FloatArray:
         if not seen.observed.any():
             return np.zeros(0)
         problem, row = self.problem, np.repeat(np.flatnonzero(seen.observed), 2)
@@ -385,7 +385,9 @@ class ReferenceEnKF(ReferenceFilter):
     @property
     def members(self) -> FloatArray:
         """Members `(n, n_members, n_x)` [veh/km, veh/h], then demand factors; a copy."""
-        return np.stack([each.members for each in self.filters]) * self.model.state_scale
+        return np.asarray(
+            np.stack([each.members for each in self.filters]) * self.model.state_scale
+        )
 
     @property
     def states(self) -> FloatArray:
@@ -408,7 +410,7 @@ class _Stage:
     predicted: FloatArray  # (n_x,)
     solution: FloatArray  # (n_x,)
     point: FloatArray  # (n_x,) where "paper" linearises the measurement
-    seen: EpisodeMeasurements | None = None
+    seen: Measurement | None = None
     R: FloatArray = field(default_factory=lambda: np.zeros(0))  # (2 m,)
     C: FloatArray = field(init=False)  # (2 m, n_x)
     e: FloatArray = field(init=False)  # (2 m,)
@@ -447,11 +449,13 @@ class _Window(EpisodeFilter):
             self.stages.pop(0)
             self.arrival_variance = moving_variance(problem.model, problem.settings)
 
-    def assimilate(self, seen: EpisodeMeasurements) -> FloatArray:
+    def assimilate(self, seen: Measurement) -> FloatArray:
         """Update by measurements of the last stage, and solve for the window."""
         stage, n = self.stages[-1], self.problem.n_states
-        kept = [array.copy() for array in seen]  # callers may reuse their arrays
-        stage.seen, self.has_failed = EpisodeMeasurements(*kept), False
+        # Callers may reuse their arrays.
+        observed, values, sigma, centre = seen
+        stage.seen = Measurement(observed.copy(), values.copy(), sigma.copy(), centre.copy())
+        self.has_failed = False
         stage.R = self.problem.R(self.x, seen, LEAST_DEVIATION)
         if self.mhe.linearisation == "paper":
             self._linearise_measurement(stage, stage.point)

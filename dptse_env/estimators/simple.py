@@ -5,8 +5,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from dptse_env.estimators.base import Estimate
-from dptse_env.estimators.batch import BatchEstimator, Measurements
+from dptse_env.estimators.base import BatchEstimator, Estimate, Measurement
 from dptse_env.estimators.ekf import EKF
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
@@ -27,8 +26,6 @@ class RandomWalk(BatchEstimator):
         means: Densities [veh/km] and speeds [km/h], `(n, S, 2)`.
         variances: Of these, `(n, S, 2)`.
     """
-
-    is_compiled: ClassVar[bool] = True
 
     def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
         """See `make_estimator`."""
@@ -77,11 +74,14 @@ class RandomWalk(BatchEstimator):
     def _predict(self, episodes: IntArray, inputs: FloatArray) -> None:
         self.variances[episodes] += self._process_variance
 
-    def _update(self, measured: Measurements) -> None:
+    def _update(self, episodes: IntArray, measured: Measurement) -> None:
         rows = self.model.rows
-        arrays = self.means, self.variances, self.innovations, self.diverged
-        _correct(rows.first, rows.span, self._largest, *arrays, *measured)
-        lost = measured.episodes[self.diverged[measured.episodes]]
+        observed, values, sigma, centre = measured
+        _correct(
+            rows.first, rows.span, self._largest, self.means, self.variances, self.innovations,
+            self.diverged, episodes, observed, values, sigma, centre,
+        )  # fmt: skip
+        lost = episodes[self.diverged[episodes]]
         if lost.size > 0:
             self._restart(lost)
 
@@ -119,8 +119,8 @@ def _correct(
         variances: `(n, S, 2)`, updated.
         innovations: `(n, M, 2)`, written.
         diverged: `(n,)`, written with whether a residual is not finite.
-        episodes: See `Measurements`, as the others below.
-        observed: `(k, M)`.
+        episodes: `(k,)`.
+        observed: `(k, M)`, of a `Measurement`, as the others below.
         values: `(k, M, 2)`.
         sigma: `(k, M, 2)`.
         centre: `(k, S)`.
@@ -205,10 +205,10 @@ class Blend(BatchEstimator):
         for part in (self.ekf, self.walk):
             part._predict(episodes, inputs)
 
-    def _update(self, measured: Measurements) -> None:
+    def _update(self, episodes: IntArray, measured: Measurement) -> None:
         for part in (self.ekf, self.walk):
-            part._update(measured)
-        episodes, c = measured.episodes, self._weights
+            part._update(episodes, measured)
+        c = self._weights
         first, second = self.ekf.innovations[episodes], self.walk.innovations[episodes]
         self.innovations[episodes] = c * first + (1.0 - c) * second
         self.diverged[episodes] = self.ekf.diverged[episodes] | self.walk.diverged[episodes]
@@ -258,8 +258,7 @@ class OpenLoop(BatchEstimator):
         after = self.model.step(self.states[episodes], inputs)
         self.states[episodes] = self.model.project(after, self.settings.bounds)
 
-    def _update(self, measured: Measurements) -> None:
-        episodes = measured.episodes
+    def _update(self, episodes: IntArray, measured: Measurement) -> None:
         self.diverged[episodes] = ~np.all(np.isfinite(self.states[episodes]), axis=1)
         lost = episodes[self.diverged[episodes]]
         self.states[lost] = self._priors[lost]

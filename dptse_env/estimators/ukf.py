@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dptse_env.estimators.batch import Measurements
+from dptse_env.estimators.base import Measurement
 from dptse_env.estimators.ekf import CovarianceFilter, Filters, process_noise, restart
 from dptse_env.estimators.linalg import (
     downdate,
@@ -85,8 +85,9 @@ class UKF(CovarianceFilter):
     def _predict(self, episodes: IntArray, inputs: FloatArray) -> None:
         predict(*self._all_packed, episodes, inputs)
 
-    def _update(self, measured: Measurements) -> None:
-        update(*self._all_packed, *measured)
+    def _update(self, episodes: IntArray, measured: Measurement) -> None:
+        observed, values, sigma, centre = measured
+        update(*self._all_packed, episodes, observed, values, sigma, centre)
 
     def _restart(self, episodes: IntArray) -> None:
         self._points.moved[episodes] = False

@@ -43,7 +43,7 @@ def make_batch_scratch(road: RoadArrays, width: int) -> BatchScratch:
     return BatchScratch(table[0], table[1], table[2], table[3], table[4], np.empty((4, width)))
 
 
-@kernel_part(kept=True, fastmath={"contract"})
+@kernel_part(fastmath={"contract"})
 def _tabulate(
     rho_row: FloatArray,
     psi_row: FloatArray,
@@ -116,7 +116,7 @@ def _merge(
         flow[j] = demand[j] if total <= supply[j] or total <= 0.0 else served
 
 
-@kernel_part(kept=True)
+@kernel_part
 def _flow_out(road: RoadArrays, scratch: BatchScratch, c: int, inputs: FloatArray) -> None:
     v_f, gamma = road.free_flow_speed, road.gamma
     kind, down, third = road.kind[c], road.parties[c, 1], road.parties[c, 2]
@@ -148,7 +148,7 @@ def _flow_out(road: RoadArrays, scratch: BatchScratch, c: int, inputs: FloatArra
         flow[j] = demand[j] if demand[j] <= supply[j] else supply[j]
 
 
-@kernel_part(kept=True)
+@kernel_part
 def _enter(
     road: RoadArrays, scratch: BatchScratch, e: int, inputs: FloatArray, states: FloatArray
 ) -> None:
@@ -191,7 +191,7 @@ def _arrive(
         psi[j] += come * w[j]
 
 
-@kernel_part(kept=True)
+@kernel_part
 def advance_states(
     road: RoadArrays, states: FloatArray, inputs: FloatArray, scratch: BatchScratch
 ) -> None:
@@ -237,7 +237,7 @@ def _into_box(row: FloatArray, largest: float) -> None:
         row[j] = largest if value > largest else value
 
 
-@kernel_part(kept=True)
+@kernel_part
 def project_states(road: RoadArrays, states: FloatArray, is_box: bool) -> None:
     """Project every column into its bounds, as `ARZModel.project`; a NaN stays NaN."""
     v_f, gamma = road.free_flow_speed, road.gamma
@@ -267,7 +267,7 @@ def measured_speeds(
 
 
 @kernel_part(fastmath={"contract"})
-def released_by_states(
+def _released(
     road: RoadArrays,
     s: int,
     rho_row: FloatArray,
@@ -275,10 +275,7 @@ def released_by_states(
     v_0: float,
     out: FloatArray,
 ) -> None:
-    """Write the measured speeds [km/h] or centred flows [veh/h], as `ARZModel.measure`.
-
-    Flows are centred on v_0 [km/h]; it is NaN where speeds are measured.
-    """
+    """Write flows centred on v_0 [km/h], or measured speeds [km/h] where it is NaN."""
     jam, v_f = road.jam[s], road.free_flow_speed
     if np.isnan(v_0):
         measured_speeds(rho_row, psi_row, jam, v_f, road.gamma, out)
@@ -315,7 +312,7 @@ def measure_row(
     part = 1.0 / span
     for s in range(first, first + span):
         rho, psi = states[2 * s], states[2 * s + 1]
-        released_by_states(road, s, rho, psi, centre[s], work)
+        _released(road, s, rho, psi, centre[s], work)
         if s == first:
             for j in range(rho.size):
                 density[j], second[j] = part * rho[j], part * work[j]

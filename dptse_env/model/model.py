@@ -92,7 +92,8 @@ class ARZModel:
         self.density_scale = per_lane * max(network.segment_lanes[: network.n_mainline])
         self.speed_scale = parameters.free_flow_speed
         pair = [self.density_scale, self.density_scale * self.speed_scale]
-        self.state_scale = np.append(np.tile(pair, self.n_segments), np.ones(self.n_demand_states))
+        factors = np.ones(self.n_demand_states)
+        self.state_scale: FloatArray = np.append(np.tile(pair, self.n_segments), factors)
 
         self.rows = rows or MeasurementRows.single(self.n_segments)
         if reference_speed is None and not (self.rows.span == 1).all():
@@ -102,7 +103,7 @@ class ARZModel:
         if reference_speed is not None:
             self.reference_speed = non_negative("model.reference_speed", reference_speed)
             second = self.density_scale * self.speed_scale
-        self.measurement_scale = np.array([self.density_scale, second])
+        self.measurement_scale: FloatArray = np.array([self.density_scale, second])
 
     @cached_property
     def road(self) -> RoadArrays:
@@ -304,8 +305,3 @@ def _blocks(by_rho: FloatArray, by_psi: FloatArray) -> FloatArray:
     blocks = np.zeros((*by_rho.shape, 2, 2))
     blocks[..., 0, 0], blocks[..., 1, 0], blocks[..., 1, 1] = 1.0, by_rho, by_psi
     return blocks
-
-
-def make_road_arrays(model: ARZModel) -> RoadArrays:
-    """Return a model as arrays and numbers."""
-    return model.road

@@ -78,7 +78,7 @@ def supply(
     return settled * speed, speed * slope, settled - speed * slope
 
 
-@kernel_part(kept=True)
+@kernel_part
 def _tabulate(road: RoadArrays, state: FloatArray, cells: FloatArray) -> None:
     """Fill the table of cells: w, speed, demand and their derivatives."""
     v_f, gamma = road.free_flow_speed, road.gamma
@@ -205,7 +205,7 @@ def _exit(
     return s, slope * cells[a, _W_RHO], slope * cells[a, _W_PSI], 0.0, 0.0, 0.0, 0.0
 
 
-@kernel_part(kept=True)
+@kernel_part
 def _flows_out(
     road: RoadArrays,
     cells: FloatArray,
@@ -236,7 +236,7 @@ def _flows_out(
         gradient[c, 0, 3] += flow[0] * cells[c, _W_PSI]
 
 
-@kernel_part(kept=True)
+@kernel_part
 def _sources(
     road: RoadArrays,
     cells: FloatArray,
@@ -269,7 +269,7 @@ def _sources(
         after[2 * c + 1] += road.step_ratio[c] * source * w_in
 
 
-@kernel_part(kept=True)
+@kernel_part
 def advance(
     road: RoadArrays,
     state: FloatArray,
@@ -406,7 +406,7 @@ def measured(
 
 
 @kernel_part
-def released(
+def _released(
     road: RoadArrays, s: int, rho: float, psi: float, centre: float
 ) -> tuple[float, float, float]:
     """Return a segment's released second number, and its derivatives by rho and psi.
@@ -450,7 +450,7 @@ def write_row(
     for i in range(span):
         s = first + i
         rho, psi = state[2 * s], state[2 * s + 1]
-        second, by_rho, by_psi = released(road, s, rho, psi, centre[s])
+        second, by_rho, by_psi = _released(road, s, rho, psi, centre[s])
         part = 1.0 / (span * road.second_scale)
         weights[0, 2 * i], weights[0, 2 * i + 1] = 1.0 / span, 0.0
         weights[1, 2 * i] = part * by_rho * units[2 * s]

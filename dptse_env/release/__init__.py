@@ -1,12 +1,9 @@
 """Release of traffic data: true traffic, release models, and boundary inputs."""
 
 from dptse_env.release.base import (
-    MeasuredRows,
-    Released,
     ReleaseModel,
     ReleaseRequest,
     ReleaseSetup,
-    split_release,
 )
 from dptse_env.release.boundary import BOUNDARIES, BoundaryModel
 from dptse_env.release.checks import check_released
@@ -57,7 +54,6 @@ __all__ = [
     "Detectors",
     "GaussianMechanism",
     "GaussianRelease",
-    "MeasuredRows",
     "Mechanism",
     "Paced",
     "PacedSettings",
@@ -72,12 +68,10 @@ __all__ = [
     "ReleaseModel",
     "ReleaseRequest",
     "ReleaseSetup",
-    "Released",
     "SpeedRelease",
     "TrafficTable",
     "TwoMechanisms",
     "Unit",
     "check_released",
     "require_gaussian",
-    "split_release",
 ]

@@ -10,8 +10,8 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dptse_env.estimators import Estimate
-from dptse_env.model import ARZModel, MeasurementRows
+from dptse_env.estimators import Estimate, Measurement
+from dptse_env.model import MeasurementRows
 from dptse_env.release.queries import NO_OPTIONS, QueryOptions
 from dptse_env.release.report import PrivacyReport
 from dptse_env.release.settings import PrivacySettings
@@ -154,59 +154,6 @@ class ReleaseRequest(NamedTuple):
     prediction: Callable[[], Estimate] = _no_prediction
 
 
-class Released(NamedTuple):
-    """Released values of a second of k episodes.
-
-    Attributes:
-        values: Density [veh/km] and mean speed [km/h] or centred flow [veh/h] of every column,
-            shape (k, n_columns, 2), in a fresh array; those not observed are to be discarded.
-        sigma: Standard deviations of their noise, in the same units, shape (k, n_columns, 2) or
-            (2,) where all columns have the same.
-        centre: Speeds [km/h] that the flows are centred on, of the segments and of the boundary
-            segments if they are released, shape (k, S) or (k, S + R); None for the `flow_centre`.
-        missing: Columns that were observed and did not answer, shape (k, n_columns); None where
-            all did.
-    """
-
-    values: FloatArray
-    sigma: FloatArray
-    centre: FloatArray | None = None
-    missing: BoolArray | None = None
-
-
-class MeasuredRows(NamedTuple):
-    """Part of a release that an estimator is given, beside the rows that were observed.
-
-    Attributes:
-        values: Shape (k, M, 2).
-        sigma: Shape (k, M, 2).
-        centre: Shape (k, S), NaN where mean speeds are released.
-    """
-
-    values: FloatArray
-    sigma: FloatArray
-    centre: FloatArray
-
-
-def split_release(
-    released: Released, model: ARZModel
-) -> tuple[MeasuredRows, tuple[FloatArray, FloatArray | None]]:
-    """Return what a release says of the model's rows, and of the boundary segments.
-
-    The latter are values of shape (k, R, 2), or (k, 0, 2) if they are not released, and the speeds
-    that their flows are centred on, shape (k, R), or None for the model's reference speed.
-    """
-    values, n_rows, n_segments = released.values, model.rows.n_rows, model.n_segments
-    sigma = np.broadcast_to(released.sigma, values.shape)[:, :n_rows]
-    centre = released.centre
-    if centre is None:
-        v_0 = np.nan if model.reference_speed is None else model.reference_speed
-        own, at_boundary = np.broadcast_to(np.float64(v_0), (len(values), n_segments)), None
-    else:
-        own, at_boundary = centre[:, :n_segments], centre[:, n_segments:]
-    return MeasuredRows(values[:, :n_rows], sigma, own), (values[:, n_rows:], at_boundary)
-
-
 class ReleaseModel(ABC):
     """Base class of release models, for a batch of episodes.
 
@@ -260,12 +207,42 @@ class ReleaseModel(ABC):
         """
 
     @abstractmethod
-    def release(self, request: ReleaseRequest) -> Released:
+    def release(self, request: ReleaseRequest) -> Measurement:
         """Release one second of some episodes.
 
         Noise should be drawn for all columns, observed or not, so that different policies with the
         same seed have common random numbers.
         """
+
+    def measurement(
+        self,
+        request: ReleaseRequest,
+        values: FloatArray,
+        sigma: FloatArray,
+        centre: FloatArray | None = None,
+    ) -> Measurement:
+        """Return a release in which all columns answer, with what they share written out.
+
+        Args:
+            request: The request.
+            values: Shape (k, n_columns, 2), a fresh array.
+            sigma: Shape (k, n_columns, 2), or one that broadcasts to it.
+            centre: Speeds that flows are centred on [km/h], shape (k, n_places); None for the
+                `flow_centre`.
+        """
+        if centre is None:
+            centre = np.full((len(values), self.setup.n_places), self._common_centre)
+        return Measurement(request.observed, values, np.broadcast_to(sigma, values.shape), centre)
+
+    @property
+    def releases_flow(self) -> bool:
+        """Whether flows are released, else mean speeds."""
+        return not math.isnan(self._common_centre)
+
+    @cached_property
+    def _common_centre(self) -> float:
+        centre = self.flow_centre(self.setup.corridor, self.setup.settings)
+        return math.nan if centre is None else centre
 
     def load(self, index: int, record: AnyRecord) -> None:  # noqa: B027 (nothing by default)
         """Prepare for the traffic of an index into the traffic seeds; called once for each."""
@@ -290,7 +267,6 @@ class ReleaseModel(ABC):
     def report(self) -> PrivacyReport:
         """Return the privacy report; that of the base class claims no guarantee."""
         settings, setup = self.setup.settings, self.setup
-        flow = self.flow_centre(setup.corridor, settings) is not None
         return PrivacyReport(
             preset=setup.name,
             guarantee="none",
@@ -298,7 +274,7 @@ class ReleaseModel(ABC):
             protects=f"not stated by {name_of_class(type(self))}",
             claimed_epsilon=settings.epsilon,
             claimed_delta=settings.delta,
-            speed_release="flow" if flow else "mean",
+            speed_release="flow" if self.releases_flow else "mean",
             boundary_inputs=settings.boundary,
         )
 

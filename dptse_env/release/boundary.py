@@ -5,6 +5,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from dptse_env.estimators import Measurement
 from dptse_env.model import ARZModel
 from dptse_env.release.nominal import nominal_inputs
 from dptse_env.release.settings import BoundaryInputs
@@ -36,17 +37,8 @@ class BoundaryModel(ABC):
     def reset(self, episodes: IntArray) -> None:  # noqa: B027 (nothing by default)
         """Begin new episodes, shape (k,)."""
 
-    def update(  # noqa: B027 (nothing by default)
-        self, episodes: IntArray, released: FloatArray, centre: FloatArray | None = None
-    ) -> None:
-        """Take the releases of the boundary segments.
-
-        Args:
-            episodes: Shape (k,).
-            released: Shape (k, R, 2); (k, 0, 2) without any.
-            centre: Speeds [km/h] that their flows are centred on, shape (k, R); None for the
-                model's reference speed.
-        """
+    def update(self, episodes: IntArray, measured: Measurement) -> None:  # noqa: B027 (nothing)
+        """Take the releases of the boundary segments of k episodes, shape (k,)."""
 
 
 class TrueBoundary(BoundaryModel):
@@ -127,17 +119,16 @@ class PrivateBoundary(NominalBoundary):
             inputs[~has_release] = super().inputs(episodes, traffic, times)[~has_release]
         return inputs
 
-    def update(
-        self, episodes: IntArray, released: FloatArray, centre: FloatArray | None = None
-    ) -> None:
+    def update(self, episodes: IntArray, measured: Measurement) -> None:
         """Turn releases into inputs, within what the road can hold."""
         model = self._model
+        released = measured.values[:, model.rows.n_rows :]
         # Not np.clip, which takes several times as long on so few numbers.
         density = np.minimum(np.maximum(released[..., 0], 0.0), self._jam_density)
         speed = released[..., 1]
         if model.reference_speed is not None:
-            v_0 = model.reference_speed if centre is None else centre
-            speed = speed / np.maximum(density, self._least_density) + v_0
+            centre = measured.centre[:, model.n_segments :]
+            speed = speed / np.maximum(density, self._least_density) + centre
             speed[density < self._least_density] = model.parameters.free_flow_speed
         speed = np.minimum(np.maximum(speed, 0.0), model.largest_speed)
         self._inputs[episodes] = model.boundary_inputs(density, speed)

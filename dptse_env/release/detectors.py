@@ -7,7 +7,7 @@ from typing import Annotated
 
 import numpy as np
 
-from dptse_env.release.base import Released
+from dptse_env.estimators import Measurement
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.fields import Interval, checked_fields
 
@@ -97,13 +97,15 @@ class DetectorErrors:
         silent: BoolArray = self._drawn(episodes, "random") < self._detectors.dropout
         return silent
 
-    def apply(self, episodes: IntArray, released: Released, *, releases_flow: bool) -> Released:
+    def apply(
+        self, episodes: IntArray, released: Measurement, *, releases_flow: bool
+    ) -> Measurement:
         """Return a release with the errors of this second; columns that are no sensor keep theirs.
 
         Mean speeds are not affected.
         """
         values, columns = released.values.copy(), self._columns
-        sigma = np.broadcast_to(released.sigma, values.shape).copy()
+        sigma = released.sigma.copy()
         detectors, density = self._detectors, values[:, columns, 0] * self._factor
         error = detectors.absolute / self._lengths + detectors.relative * np.maximum(
             density, 0.0

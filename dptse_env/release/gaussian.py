@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from dptse_env.estimators import Measurement
 from dptse_env.privacy import (
     ReleaseAccount,
     Sensitivity,
@@ -18,7 +19,7 @@ from dptse_env.privacy import (
     printed_noise_std,
     single_noise_std,
 )
-from dptse_env.release.base import Released, ReleaseModel, ReleaseRequest, ReleaseSetup
+from dptse_env.release.base import ReleaseModel, ReleaseRequest, ReleaseSetup
 from dptse_env.release.contributions import Contributions
 from dptse_env.release.mechanism import GaussianMechanism, Mechanism
 from dptse_env.release.noise import NoiseStreams
@@ -104,13 +105,14 @@ class GaussianRelease(ReleaseModel):
         """See `ReleaseModel.reset`."""
         self.mechanism.reset(episodes, generators)
 
-    def release(self, request: ReleaseRequest) -> Released:
+    def release(self, request: ReleaseRequest) -> Measurement:
         """See `ReleaseModel.release`."""
         values = self.true_values(request)
         if self._stretch is None:
-            return Released(self.mechanism.release(request.episodes, values), self.sigma)
+            released = self.mechanism.release(request.episodes, values)
+            return self.measurement(request, released, self.sigma)
         values = self.mechanism.release(request.episodes, values * self._stretch) / self._stretch
-        return Released(values, self.sigma / self._stretch)
+        return self.measurement(request, values, self.sigma / self._stretch)
 
     def spent(self, episodes: IntArray, steps: IntArray) -> tuple[FloatArray, FloatArray]:
         """See `ReleaseModel.spent`."""

@@ -8,8 +8,9 @@ from typing import ClassVar
 
 import numpy as np
 
+from dptse_env.estimators import Measurement
 from dptse_env.privacy import EpsilonTable, epsilon_of, mu_of
-from dptse_env.release.base import Released, ReleaseModel, ReleaseRequest, ReleaseSetup
+from dptse_env.release.base import ReleaseModel, ReleaseRequest, ReleaseSetup
 from dptse_env.release.ledgers import Columns, Ledgers, Sums
 from dptse_env.release.noise import NoiseStreams, grid_of
 from dptse_env.release.pacing import (
@@ -138,7 +139,7 @@ class Paced(ReleaseModel):
             array[episodes] = 0.0
         self._refused[episodes] = 0
 
-    def release(self, request: ReleaseRequest) -> Released:
+    def release(self, request: ReleaseRequest) -> Measurement:
         """See `ReleaseModel.release`."""
         episodes, prediction = request.episodes, request.prediction()
         density, speed = self._public(request, prediction.density, prediction.speed)
@@ -150,7 +151,7 @@ class Paced(ReleaseModel):
         self._charge(episodes, request.observed, prices)
         sums = self.collect(request, prices, centre)
         self._refused[episodes] = sums.refused
-        return self._published(episodes, sums, prices, centre)
+        return self._published(request, sums, prices, centre)
 
     def _public(
         self, request: ReleaseRequest, density: FloatArray, speed: FloatArray
@@ -187,11 +188,11 @@ class Paced(ReleaseModel):
         )
 
     def _published(
-        self, episodes: IntArray, sums: Sums, prices: FloatArray, centre: FloatArray
-    ) -> Released:
+        self, request: ReleaseRequest, sums: Sums, prices: FloatArray, centre: FloatArray
+    ) -> Measurement:
         """Add noise, round to the grid, and divide by the lengths of the queries."""
         deviations = self._deviations(prices)
-        values = self.noise.next(episodes)
+        values = self.noise.next(request.episodes)
         values *= deviations
         values[..., 0] += sums.counts
         values[..., 1] += sums.deviations
@@ -201,7 +202,7 @@ class Paced(ReleaseModel):
         values *= grid
         lengths = self.setup.lengths[:, None]
         values /= lengths
-        return Released(values, deviations / lengths, centre)
+        return self.measurement(request, values, deviations / lengths, centre)
 
     def spent(self, episodes: IntArray, steps: IntArray) -> tuple[FloatArray, FloatArray]:
         """See `ReleaseModel.spent`.

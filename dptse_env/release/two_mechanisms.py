@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from dptse_env.estimators import Measurement
 from dptse_env.model import MeasurementRows
 from dptse_env.privacy import EpsilonTable, epsilon_of
-from dptse_env.release.base import Released, ReleaseModel, ReleaseRequest, ReleaseSetup
+from dptse_env.release.base import ReleaseModel, ReleaseRequest, ReleaseSetup
 from dptse_env.release.detectors import DetectorErrors, Detectors
 from dptse_env.release.queries import NO_OPTIONS
 from dptse_env.release.report import PrivacyReport, in_order
@@ -136,7 +137,6 @@ class TwoMechanisms(ReleaseModel):
                     setup.lengths[self._sensor_columns],
                     setup.n_episodes,
                 )
-        self._flow = model.flow_centre(setup.corridor, setup.settings) is not None
 
     @cached_property
     def _sensor_columns(self) -> IntArray:
@@ -176,28 +176,25 @@ class TwoMechanisms(ReleaseModel):
         if self._errors is not None:
             self._errors.reset(episodes, streams[2])
 
-    def release(self, request: ReleaseRequest) -> Released:
+    def release(self, request: ReleaseRequest) -> Measurement:
         """See `ReleaseModel.release`."""
         observed, split = request.observed, self._split
         queried = self.queries.release(request._replace(observed=observed[:, :split]))
         if self.sensors is None:
             return queried
-        seen, missing = observed[:, split:], None
+        seen = observed[:, split:]
         if self._errors is not None:
-            missing = np.zeros(observed.shape, dtype=bool)
-            missing[:, self._sensor_columns] = self._errors.silent(request.episodes)
-            seen = seen & ~missing[:, split:]
+            seen = seen.copy()
+            seen[:, self._sensor_columns - split] &= ~self._errors.silent(request.episodes)
         sensed = self.sensors.release(request._replace(observed=seen))
         if self._errors is not None:
-            sensed = self._errors.apply(request.episodes, sensed, releases_flow=self._flow)
-        both = queried, sensed
-        return Released(
-            np.concatenate([each.values for each in both], axis=1),
-            np.concatenate(
-                [np.broadcast_to(each.sigma, each.values.shape) for each in both], axis=1
-            ),
+            flows = self.sensors.releases_flow
+            sensed = self._errors.apply(request.episodes, sensed, releases_flow=flows)
+        return Measurement(
+            np.concatenate([queried.observed, sensed.observed], axis=1),
+            np.concatenate([queried.values, sensed.values], axis=1),
+            np.concatenate([queried.sigma, sensed.sigma], axis=1),
             sensed.centre,
-            missing,
         )
 
     def spent(self, episodes: IntArray, steps: IntArray) -> tuple[FloatArray, FloatArray]:

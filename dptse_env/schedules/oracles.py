@@ -80,7 +80,7 @@ class OracleGain(ProcessSchedule):
         ahead.release.give_noise(np.zeros((ahead.n_episodes, every_column.shape[1], 2)))
         prediction = ahead.estimator.estimate().at(episodes)
         request = ReleaseRequest(episodes, traffic, times + 1, every_column, lambda: prediction)
-        answered, measured, _ = ahead.measure(request)
+        measured = ahead.measure(request)
         truth = ahead.traffic.aggregates(traffic, times + 1)[:, :n]
         density, speed = truth[..., 0], truth[..., 1]
         model = getattr(ahead.estimator, "model", None)
@@ -88,9 +88,9 @@ class OracleGain(ProcessSchedule):
         for segment in range(n):
             queried = np.zeros((len(episodes), n), dtype=bool)
             queried[:, segment] = True
-            observed = ahead.release.setup.observed(queried)[:, : ahead.model.rows.n_rows]
+            seen = ahead.release.setup.observed(queried) & measured.observed
             estimator = copy.deepcopy(ahead.estimator, {id(model): model})
-            estimator.update(episodes, observed & answered, *measured)
+            estimator.update(episodes, measured._replace(observed=seen))
             estimate = estimator.estimate().at(episodes)
             error = estimation_error(density, speed, estimate.density[:, :n], estimate.speed[:, :n])
             rewards[:, segment] = self.interface.reward(

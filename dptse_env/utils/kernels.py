@@ -33,7 +33,8 @@ import platformdirs
 from numba import config, njit, types
 from numba.core import serialize
 from numba.core.caching import NullCache
-from numba.core.compiler import CompileResult
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import Compiler, CompileResult
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.registry import CPUDispatcher
 
@@ -72,32 +73,26 @@ def kernel(function: Function) -> Function:
     """
     if config.DISABLE_JIT:
         return function
-    compiled: Any = _Dispatcher(function, targetoptions={**_OPTIONS, "nopython": True})
-    compiled._cache = _Kept(compiled)
-    return cast("Function", compiled)
+    return cast("Function", _Kernel(function, {**_OPTIONS, "nopython": True}))
 
 
 @overload
 def kernel_part(function: Function, /) -> Function: ...
 @overload
 def kernel_part(**options: Any) -> Callable[[Function], Function]: ...
-def kernel_part(function: Any = None, /, *, kept: bool = False, **options: Any) -> Any:
+def kernel_part(function: Any = None, /, **options: Any) -> Any:
     """Let kernels call a function.
 
-    A part has no entry for Python, which saves time when it is compiled.
+    A part is optimised in the kernels that call it, and has no machine code of its own: that would
+    take a fifth of the time of compiling.
 
     Args:
         function: The function.
-        kept: Keep its machine code on disk as that of a kernel, for the kernels of other
-            processes that call it. It pays where compiling takes some half a second or more.
         options: Options of numba, such as `fastmath`.
     """
 
     def decorate(function: Any) -> Any:
-        part: Any = _Part(function, targetoptions={**_OPTIONS, **_WITHOUT_PYTHON, **options})
-        if kept:
-            part._cache = _Kept(part)
-        return part
+        return _Part(function, {**_OPTIONS, **_WITHOUT_PYTHON, **options})
 
     return decorate if function is None else decorate(function)
 
@@ -122,10 +117,12 @@ def _collecting_seldom() -> Iterator[None]:
         gc.set_threshold(*thresholds)
 
 
-class _Dispatcher(CPUDispatcher):
-    """numba's dispatcher of a function that one process at a time compiles."""
+class _Kernel(CPUDispatcher):
+    """numba's dispatcher of a kernel, which one process at a time compiles."""
 
-    _cache: Any
+    def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
+        super().__init__(function, targetoptions=options)
+        self._cache = _Kept(self)
 
     def compile(self, sig: Any) -> Any:
         """Compile or load the version for a signature."""
@@ -133,15 +130,37 @@ class _Dispatcher(CPUDispatcher):
             with global_compiler_lock, _collecting_seldom():
                 return super().compile(sig)
         finally:
-            if isinstance(self._cache, _Kept):
-                self._cache.end_turn()
+            self._cache.end_turn()
 
 
-class _Part(_Dispatcher):
-    """numba's dispatcher of a function whose machine code has no entry for Python."""
+class _PartLibrary(JITCodeLibrary):
+    """numba's code of a part, which is optimised and becomes machine code in kernels alone."""
+
+    def _optimize_final_module(self) -> None: ...
+
+    def _finalize_final_module(self) -> None:
+        self._finalize_dynamic_globals()
+        self._finalized = True
+
+
+class _PartCompiler(Compiler):
+    """numba's compiler of a part."""
+
+    def __init__(self, typing: Any, target: Any, library: Any, *others: Any) -> None:
+        super().__init__(typing, target, _PartLibrary(target.codegen(), "part"), *others)
+        self.state.flags.no_compile = True
+
+
+class _Part(CPUDispatcher):
+    """numba's dispatcher of a function without machine code of its own."""
+
+    def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
+        super().__init__(function, targetoptions=options, pipeline_class=_PartCompiler)
 
     def add_overload(self, result: Any) -> None:
-        """Keep a compiled version for kernels, away from the table that Python calls by."""
+        """Keep a version for kernels, which look its code up by an entry that nothing calls."""
+        result = result._replace(entry_point=object())
+        self.targetctx.insert_user_function(result.entry_point, result.fndesc, [result.library])
         self.overloads[tuple(result.signature.args)] = result
 
     def get_call_template(self, args: Any, kws: Any) -> Any:

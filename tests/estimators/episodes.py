@@ -8,13 +8,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dptse_env.estimators import ESTIMATORS, REFERENCES, EstimatorSettings, make_estimator
+from dptse_env.estimators import (
+    ESTIMATORS,
+    REFERENCES,
+    EstimatorSettings,
+    Measurement,
+    make_estimator,
+)
 from dptse_env.estimators.base import Estimator
 from dptse_env.model import ARZModel
 from dptse_env.model.parameters import load_parameters
 from dptse_env.traffic import PAPER_HIGHWAY
 from dptse_env.traffic.record import Record
-from dptse_env.utils.arrays import BoolArray, FloatArray
+from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 
 SIGMA = np.array([15.0, 6.0])  # [veh/km, km/h]
 # What sensors release beside the density: the mean speed, or the flow rho (v - v_0), whose noise is
@@ -142,8 +148,21 @@ def run(
     sigma = episodes.sigma if sigma is None else sigma
     for k in steps:
         estimator.predict(episodes.everyone, episodes.inputs[k])
-        estimator.update(episodes.everyone, episodes.observed[k], episodes.values[k], sigma)
+        tell(estimator, episodes.everyone, episodes.observed[k], episodes.values[k], sigma)
         watch(k)
+
+
+def tell(
+    estimator: Estimator,
+    episodes: IntArray,
+    observed: BoolArray,
+    values: FloatArray,
+    sigma: FloatArray,
+    centre: FloatArray | None = None,
+) -> None:
+    """Update an estimator by a measurement of its rows."""
+    measured = Measurement.of(estimator.model, observed, values, sigma, centre)
+    estimator.update(episodes, measured)
 
 
 def scale_of(model: ARZModel) -> FloatArray:

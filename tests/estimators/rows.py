@@ -9,7 +9,7 @@ from dptse_env.model import ARZModel
 from dptse_env.model.network import MeasurementRows
 from dptse_env.utils.arrays import FloatArray
 
-from .episodes import SIGMAS, Episodes, simulate
+from .episodes import SIGMAS, Episodes, simulate, tell
 
 N_STEPS = 60
 PLAIN = EstimatorSettings()
@@ -56,4 +56,4 @@ def averaged(n_steps: int = N_STEPS) -> RowEpisodes:
 def update(estimator, episodes, k, observed=None):
     seen = episodes.observed[k] if observed is None else observed
     given = episodes.values[k], episodes.sigma[k], episodes.centre[k]
-    estimator.update(episodes.everyone, seen, *given)
+    tell(estimator, episodes.everyone, seen, *given)

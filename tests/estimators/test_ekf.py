@@ -8,7 +8,7 @@ from dptse_env.estimators.simple import estimated_traffic
 from dptse_env.model.parameters import VACUUM
 from tests.cases import pairwise
 
-from .episodes import RELEASES, SIGMA, run, scale_of, simulate, started
+from .episodes import RELEASES, SIGMA, run, scale_of, simulate, started, tell
 
 both_backends = pytest.mark.parametrize("backend", ["compiled", "reference"])
 
@@ -68,7 +68,7 @@ def test_a_broken_covariance_is_found(backend, poison):
         kept[0, 20, 4] = kept[0, 4, 20] = 10.0
     else:
         kept[0, 20, 20] = poison
-    ekf.update(episodes.everyone, episodes.observed[4], episodes.values[4], SIGMA)
+    tell(ekf, episodes.everyone, episodes.observed[4], episodes.values[4], SIGMA)
     assert ekf.diverged.tolist() == [True]
     np.testing.assert_array_equal(ekf.covariances[0], 1e-3 * np.eye(38))
 
@@ -81,7 +81,7 @@ def update_of_a_nearly_empty_road(backend, filling):
     settings = EstimatorSettings(bounds="box")
     ekf = started("ekf", backend, episodes, settings, start)
     values = np.tile([0.4, 60.0], (1, 19, 1))
-    ekf.update(episodes.everyone, np.ones((1, 19), bool), values, SIGMA)
+    tell(ekf, episodes.everyone, np.ones((1, 19), bool), values, SIGMA)
     return ekf, ekf.estimate().density_std[0]
 
 

@@ -18,7 +18,7 @@ from dptse_env.traffic import PAPER_HIGHWAY, SHORT_HIGHWAY
 from tests.cases import pairwise
 from tests.model.roads import Road
 
-from .episodes import SIGMA, random_streams, run, simulate, started
+from .episodes import SIGMA, random_streams, run, simulate, started, tell
 from .rows import averaged, every_row, update, with_rows
 
 FIELDS = ("density", "speed", "density_std", "speed_std")
@@ -93,7 +93,7 @@ def linear_errors(n_members, n_seeds=200, n_steps=20):
     for z in np.array([2.0, 1.6 * v_f / floor]) + offset + disturbance:
         filters.predict(everyone, inputs)
         values = np.broadcast_to(z, (n_seeds, 1, 2))
-        filters.update(everyone, np.ones((n_seeds, 1), bool), values, sigma)
+        tell(filters, everyone, np.ones((n_seeds, 1), bool), values, sigma)
         x, p = f @ x, f @ p @ f.T + q
         s = h @ p @ h.T + np.diag(sigma**2)
         gain = p @ h.T @ np.linalg.inv(s)
@@ -177,9 +177,9 @@ def test_inflation_alone_scales_distances_from_the_mean():
     filters = started("enkf", "compiled", episodes, settings)
     before, covariances = filters.states, filters.covariances
     nothing = np.zeros((1, 19), bool)
-    filters.update(episodes.everyone, nothing, episodes.values[0], SIGMA)
+    tell(filters, episodes.everyone, nothing, episodes.values[0], SIGMA)
     np.testing.assert_array_equal(filters.covariances, covariances)
-    filters.update(episodes.everyone, episodes.observed[0], episodes.values[0], 1e12 * SIGMA)
+    tell(filters, episodes.everyone, episodes.observed[0], episodes.values[0], 1e12 * SIGMA)
     np.testing.assert_allclose(filters.states, before, rtol=1e-9)
     np.testing.assert_allclose(filters.covariances, 1.5**2 * covariances, rtol=1e-6)
 
@@ -214,7 +214,7 @@ def test_a_taper_leaves_a_definite_s_where_a_few_members_do_not():
             filters = started("enkf", backend, episodes, EstimatorSettings(enkf=enkf))
             filters.predict(episodes.everyone, episodes.inputs[0])
             given = episodes.values[0], exact, episodes.centre[0]
-            filters.update(episodes.everyone, only, *given)
+            tell(filters, episodes.everyone, only, *given)
             np.testing.assert_array_equal(filters.diverged, diverges)
             assert np.isfinite(filters.members).all()
 
@@ -231,7 +231,7 @@ def test_single_rows_among_others_that_nobody_measures_change_nothing(taper):
         run(without, plain, [k])
         observed[:, :19], values[:, :19] = plain.observed[k], plain.values[k]
         among.predict(plain.everyone, plain.inputs[k])
-        among.update(plain.everyone, observed, values, plain.sigma)
+        tell(among, plain.everyone, observed, values, plain.sigma)
         np.testing.assert_array_equal(among.members, without.members)
         np.testing.assert_array_equal(among.innovations[:, :19], without.innovations)
 
@@ -291,7 +291,7 @@ def test_a_measurement_that_is_not_finite_is_not_projected_away(backend, bounds,
     filters.predict(episodes.everyone, episodes.inputs[0])
     values = episodes.values[0].copy()
     values[0, 14, 0] = bad
-    filters.update(episodes.everyone, np.arange(19)[None] == 14, values, SIGMA)
+    tell(filters, episodes.everyone, np.arange(19)[None] == 14, values, SIGMA)
     assert filters.diverged.all()
     np.testing.assert_array_equal(filters.innovations, 0.0)
 
@@ -303,5 +303,5 @@ def test_what_is_measured_does_not_change_how_members_are_disturbed(backend):
     for k in range(6):
         for filters, seen in ((seeing, episodes.observed[k]), (blind, np.zeros((1, 19), bool))):
             filters.predict(episodes.everyone, episodes.inputs[k])
-            filters.update(episodes.everyone, seen, episodes.values[k], 1e12 * SIGMA)
+            tell(filters, episodes.everyone, seen, episodes.values[k], 1e12 * SIGMA)
     np.testing.assert_allclose(seeing.members, blind.members, rtol=1e-7)

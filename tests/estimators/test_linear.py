@@ -17,7 +17,7 @@ from dptse_env.model import ARZModel, load_parameters
 from tests.cases import pairwise
 from tests.model.roads import Road
 
-from .episodes import random_streams
+from .episodes import random_streams, tell
 
 # One segment that nobody enters or leaves has linear dynamics.
 V_F, RHO_M, TAU, V_0 = 102.0, 333.0, 60.0, 51.0
@@ -96,7 +96,7 @@ def of_estimator(name, backend, sensor, values, **settings):
     estimator.reset(EVERYONE, START[None], random_streams(1))
     for z in values:
         estimator.predict(EVERYONE, INPUTS)
-        estimator.update(EVERYONE, np.ones((1, 1), bool), z, sensor.sigma)
+        tell(estimator, EVERYONE, np.ones((1, 1), bool), z, sensor.sigma)
         covariance = estimator.covariances[0] * np.outer(UNIT, UNIT)
         yield Step(estimator.states[0], covariance, estimator.innovations[0, 0].copy())
 

@@ -5,8 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from dptse_env.estimators import make_estimator
-from dptse_env.estimators.batch import checked_measurements
+from dptse_env.estimators import Measurement, make_estimator
 from dptse_env.estimators.recurrent_kernels import (
     CHANNELS,
     LARGEST_CORRECTION,
@@ -17,7 +16,7 @@ from dptse_env.estimators.recurrent_kernels import (
 )
 from dptse_env.model.network import MeasurementRows
 
-from .episodes import random_streams, run, simulate
+from .episodes import random_streams, run, simulate, tell
 from .networks import random_network, settings
 from .rows import averaged, with_rows
 
@@ -64,8 +63,7 @@ class Twin:
 
     def step(self, inputs, *measured):
         """Return the estimates and deviations after a step, and before the next `(n, S, 4)`."""
-        n = len(inputs)
-        given = checked_measurements(n, self.model, np.arange(n), *measured)
+        given = Measurement.of(self.model, *measured)
         tensors = (torch.from_numpy(part) for part in collecting.make_released(given))
         outside = torch.from_numpy(collecting.input_channels(self.cells, inputs))
         released = collecting.Released(*tensors)
@@ -99,7 +97,7 @@ def test_it_is_the_network_that_is_trained(kind, width, tmp_path):
         centre = (episodes.centre[k],) if kind == "rows" else (None,)
         measured = episodes.observed[k], episodes.values[k], own, *centre
         estimator.predict(episodes.everyone, episodes.inputs[k])
-        estimator.update(episodes.everyone, *measured)
+        tell(estimator, episodes.everyone, *measured)
         present, ahead = twin.step(episodes.inputs[k], *measured)
         np.testing.assert_allclose(estimator.hidden, twin.state.hidden, atol=1e-5)
         np.testing.assert_allclose(estimator.means, present[..., :2], rtol=1e-5, atol=1e-3)
@@ -228,7 +226,7 @@ def test_news_travel_from_cell_to_cell(tmp_path):
         for estimator, shift in zip(pair, (0.0, 30.0), strict=True):
             estimator.predict(episodes.everyone, episodes.inputs[0])
             values = episodes.values[0] + shift
-            estimator.update(episodes.everyone, observed, values, episodes.sigma)
+            tell(estimator, episodes.everyone, observed, values, episodes.sigma)
         a, b = (estimator.estimate().density[0] for estimator in pair)
         np.testing.assert_array_equal(np.abs(a - b) > 1e-9, reached)
         reached = sparsity @ reached
@@ -246,7 +244,7 @@ def test_what_is_not_finite_resets_its_episode_alone(bad, what, tmp_path):
     else:
         inputs[1, 0] = bad
     estimator.predict(episodes.everyone, inputs)
-    estimator.update(episodes.everyone, episodes.observed[5], values, episodes.sigma)
+    tell(estimator, episodes.everyone, episodes.observed[5], values, episodes.sigma)
     run(healthy, episodes, [5])
     assert estimator.diverged.tolist() == [False, True]
     np.testing.assert_array_equal(estimator.hidden[0], healthy.hidden[0])

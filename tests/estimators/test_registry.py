@@ -9,7 +9,7 @@ from dptse_env.estimators import REFERENCES, make_estimator
 from dptse_env.model import ARZModel, load_parameters
 from dptse_env.traffic import PAPER_HIGHWAY
 
-from .episodes import EVERY
+from .episodes import EVERY, tell
 
 MODEL = ARZModel(PAPER_HIGHWAY, load_parameters("paper"))
 
@@ -21,7 +21,7 @@ def test_every_name_and_backend_follows_the_protocol(name, backend):
     states = MODEL.states(np.full((3, 19), 30.0), np.full((3, 19), 80.0))
     estimator.reset(everyone, states, [np.random.default_rng(i) for i in everyone])
     estimator.predict(everyone, np.zeros((3, 9)))
-    estimator.update(everyone, np.ones((3, 19), bool), MODEL.measure(states), np.ones(2))
+    tell(estimator, everyone, np.ones((3, 19), bool), MODEL.measure(states), np.ones(2))
     assert estimator.n_episodes == 3
     assert estimator.innovations.shape == (3, 19, 2)
     assert estimator.diverged.tolist() == [False] * 3

@@ -7,7 +7,7 @@ import pytest
 
 from dptse_env.estimators import BACKENDS, DemandSettings, EstimatorSettings
 
-from .episodes import simulate, started
+from .episodes import simulate, started, tell
 from .rows import N_STEPS, PLAIN, RICH, RowEpisodes, averaged, every_row, update, with_rows
 
 both_filters = pytest.mark.parametrize("name", ["ekf", "ukf"])
@@ -129,7 +129,7 @@ def test_an_update_is_that_of_a_kalman_filter(name, backend, seen):
     observed[:, places] = True
 
     estimator.predict(episodes.everyone, inputs)
-    estimator.update(episodes.everyone, observed, values, sigma, centre)
+    tell(estimator, episodes.everyone, observed, values, sigma, centre)
     mean, covariance, innovations = textbook(
         model, name, x, inputs[0], values[0, places], sigma[0, places], centre[0], seen
     )
@@ -161,8 +161,8 @@ def test_segments_measured_singly_are_those_of_a_model_without_rows(name, backen
         observed[:, :S], values[:, :S] = plain.observed[k], plain.values[k]
         for estimator in (without, given):
             estimator.predict(plain.everyone, plain.inputs[k])
-        without.update(plain.everyone, plain.observed[k], plain.values[k], plain.sigma)
-        given.update(plain.everyone, observed, values, sigma, centre)
+        tell(without, plain.everyone, plain.observed[k], plain.values[k], plain.sigma)
+        tell(given, plain.everyone, observed, values, sigma, centre)
         np.testing.assert_allclose(given.states, without.states, rtol=1e-12)
         np.testing.assert_allclose(given.covariances, without.covariances, rtol=0.0, atol=1e-14)
         innovations = given.innovations[:, :S]

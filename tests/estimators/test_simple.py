@@ -10,7 +10,7 @@ from dptse_env.estimators import BlendSettings, DemandSettings, EstimatorSetting
 from dptse_env.model.network import MeasurementRows
 from tests.cases import pairwise
 
-from .episodes import RELEASES, assert_same, run, show, simulate
+from .episodes import RELEASES, assert_same, run, show, simulate, tell
 from .episodes import started as started_as
 from .rows import averaged, update, with_rows
 
@@ -66,7 +66,10 @@ class TextbookWalk:
 
 @pytest.mark.parametrize("kind", [*RELEASES, "rows"])
 def test_a_walk_is_a_kalman_filter_without_covariances(kind):
-    episodes = averaged(12) if kind == "rows" else simulate("paper", n_steps=40, release=kind)
+    if kind == "rows":
+        episodes = averaged(12)
+    else:
+        episodes = simulate("paper", n_steps=40, noise=3.0, release=kind)
     model = episodes.model
     walk, textbook = started("random_walk", episodes, WALK), TextbookWalk(model, episodes.start)
     for k in range(len(episodes.inputs)):
@@ -97,7 +100,7 @@ def test_a_flow_of_a_segment_found_empty_is_read_at_the_least_density():
     prior = walk.estimate()
     assert (prior.density == 0.0).all()
     values = np.tile([-500.0, 20.0], (1, 19, 1))  # the density stays at zero
-    walk.update(episodes.everyone, np.ones((1, 19), bool), values, episodes.sigma)
+    tell(walk, episodes.everyone, np.ones((1, 19), bool), values, episodes.sigma)
     estimate = walk.estimate()
     np.testing.assert_array_equal(estimate.density, 0.0)
     # An empty segment's flow tells next to nothing of a speed.
@@ -112,7 +115,7 @@ def test_noiseless_measurements_of_a_certain_state_are_no_division_by_zero(relea
     everywhere = np.ones((1, 19), bool)
     for _ in range(2):
         walk.predict(episodes.everyone, episodes.inputs[0])
-        walk.update(episodes.everyone, everywhere, np.full((1, 19, 2), 20.0), np.zeros(2))
+        tell(walk, episodes.everyone, everywhere, np.full((1, 19, 2), 20.0), np.zeros(2))
     np.testing.assert_allclose(walk.estimate().density, 20.0)
     speed = 20.0 if release == "speed" else episodes.model.reference_speed + 20.0 / 20.0
     np.testing.assert_allclose(walk.estimate().speed, speed)
@@ -132,10 +135,10 @@ def test_no_infinity_is_clipped_into_bounds(release, bad, which):
         walk = started("random_walk", episodes, settings)
         prior, seen = walk.estimate(), np.ones((2, 19), bool)
         if exact:
-            walk.update(episodes.everyone, seen, np.full((2, 19, 2), 20.0), np.zeros(2))
+            tell(walk, episodes.everyone, seen, np.full((2, 19, 2), 20.0), np.zeros(2))
         values = episodes.values[1].copy()
         values[1, 14, which] = bad
-        walk.update(episodes.everyone, seen, values, episodes.sigma)
+        tell(walk, episodes.everyone, seen, values, episodes.sigma)
         assert walk.diverged.tolist() == [False, True]
         estimate = walk.estimate()
         for field in FIELDS:
@@ -239,7 +242,7 @@ def test_both_parts_of_a_blend_are_reset_where_one_diverges():
     poisoned = episodes.inputs[5].copy()
     poisoned[1] = np.nan
     blend.predict(episodes.everyone, poisoned)
-    blend.update(episodes.everyone, episodes.observed[5], episodes.values[5], episodes.sigma)
+    tell(blend, episodes.everyone, episodes.observed[5], episodes.values[5], episodes.sigma)
     assert blend.diverged.tolist() == [False, True]
     estimate = blend.estimate()
     for field in FIELDS:

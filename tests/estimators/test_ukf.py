@@ -10,7 +10,7 @@ from dptse_env.model import ARZModel, load_parameters
 from dptse_env.traffic import PAPER_HIGHWAY
 from tests.cases import pairwise
 
-from .episodes import RELEASES, SIGMA, run, scale_of, simulate, started
+from .episodes import RELEASES, SIGMA, run, scale_of, simulate, started, tell
 
 BACKENDS = ("compiled", "reference")
 both_releases = pytest.mark.parametrize("release", RELEASES)
@@ -109,6 +109,6 @@ def test_a_broken_covariance_is_found(backend, poison):
         kept[0, 20, 4] = kept[0, 4, 20] = 10.0
     else:
         kept[0, 20, 20] = poison
-    filters.update(episodes.everyone, episodes.observed[4], episodes.values[4], SIGMA)
+    tell(filters, episodes.everyone, episodes.observed[4], episodes.values[4], SIGMA)
     assert filters.diverged.tolist() == [True]
     np.testing.assert_array_equal(filters.covariances[0], 1e-3 * np.eye(38))

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from dptse_env.release import Released, ReleaseModel
+from dptse_env.release import ReleaseModel
 
 
 class SumRelease(ReleaseModel):
@@ -35,7 +35,7 @@ class SumRelease(ReleaseModel):
         values = self.true_values(request).copy()
         for k, episode in enumerate(request.episodes.tolist()):
             values[k] += self.sigma * self.streams[episode].standard_normal(values[k].shape)
-        return Released(values, self.sigma)
+        return self.measurement(request, values, self.sigma)
 
 
 class PricedRelease(SumRelease):

@@ -5,6 +5,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from dptse_env.config import resolve
+from dptse_env.estimators import Measurement
 from dptse_env.model import ARZModel, load_parameters
 from dptse_env.parts import make_parts
 from dptse_env.process import QueryProcess
@@ -25,6 +26,16 @@ def traffic():
     traffic = TrafficTable(SHORT_HIGHWAY, (0, 1), RecordLibrary())
     traffic.load([0, 1])
     return traffic
+
+
+def take(boundary, released, arz):
+    """Have an episode's boundary segments released, (1, R, 2), and nothing of the road."""
+    nothing = np.zeros((1, arz.rows.n_rows, 2))
+    values = np.concatenate([nothing, released], axis=1)
+    observed = np.ones(values.shape[:2], dtype=bool)
+    centre = np.nan if arz.reference_speed is None else arz.reference_speed
+    places = np.full((1, arz.n_segments + arz.n_boundaries), centre)
+    boundary.update(ONE, Measurement(observed, values, np.ones(values.shape), places))
 
 
 def at(boundary, time, index=0, episode=0):
@@ -66,12 +77,12 @@ def test_private_inputs_are_nominal_at_first_and_then_the_last_release(traffic):
     np.testing.assert_array_equal(at(boundary, 7), table[7])
     density, speed = np.full((1, n), 30.0), np.linspace(20.0, 90.0, n)[None]
     flow = density * (speed - CENTRE)
-    boundary.update(ONE, np.stack([density, flow], axis=-1))
+    take(boundary, np.stack([density, flow], axis=-1), arz)
     expected = arz.boundary_inputs(density, speed)[0]
     for time in (8, 9):  # until the next release
         np.testing.assert_allclose(at(boundary, time), expected, rtol=1e-12)
     np.testing.assert_array_equal(at(boundary, 8, episode=1), table[8])  # nothing released yet
-    boundary.update(ONE, np.stack([2 * density, 2 * flow], axis=-1))
+    take(boundary, np.stack([2 * density, 2 * flow], axis=-1), arz)
     expected = arz.boundary_inputs(2 * density, speed)[0]
     np.testing.assert_allclose(at(boundary, 9), expected, rtol=1e-12)
     boundary.reset(ONE)
@@ -82,7 +93,7 @@ def test_a_released_mean_speed_is_taken_as_it_is(traffic):
     arz, n = model(None), SHORT_HIGHWAY.n_boundaries
     boundary = PrivateBoundary(traffic, arz, 1)
     released = np.stack([np.full((1, n), 30.0), np.full((1, n), 60.0)], axis=-1)
-    boundary.update(ONE, released)
+    take(boundary, released, arz)
     expected = arz.boundary_inputs(released[..., 0], released[..., 1])[0]
     np.testing.assert_array_equal(at(boundary, 1), expected)
 
@@ -96,7 +107,7 @@ def test_whatever_noise_makes_of_a_release_gives_inputs_that_a_road_can_have(
     size = st.floats(-1e7, 1e7) | st.sampled_from([0.0, -1e-300, 1e-300, 9.999, 10.0])
     released = data.draw(arrays(float, (1, arz.n_boundaries, 2), elements=size))
     boundary = PrivateBoundary(traffic, arz, 1)
-    boundary.update(ONE, released)
+    take(boundary, released, arz)
     inputs = at(boundary, 1)
     layout, v_f = arz.layout, arz.parameters.free_flow_speed
     assert np.isfinite(inputs).all()
@@ -111,7 +122,7 @@ def test_whatever_noise_makes_of_a_release_gives_inputs_that_a_road_can_have(
 def test_a_negative_density_demands_nothing_and_leaves_the_exits_free(traffic):
     arz = model()
     boundary = PrivateBoundary(traffic, arz, 1)
-    boundary.update(ONE, np.full((1, arz.n_boundaries, 2), -400.0))
+    take(boundary, np.full((1, arz.n_boundaries, 2), -400.0), arz)
     inputs, layout = at(boundary, 1), arz.layout
     np.testing.assert_array_equal(inputs[layout.entry_inputs], 0.0)
     np.testing.assert_array_equal(inputs[layout.exit_inputs], 0.0)
@@ -123,7 +134,7 @@ def test_hardly_a_vehicle_says_nothing_of_a_speed(traffic):
     boundary, free = PrivateBoundary(traffic, arz, 1), arz.parameters.free_flow_speed
     for density, speed in ((9.9, free), (10.1, CENTRE - 40.0)):
         released = np.stack([np.full((1, n), density), np.full((1, n), -40.0 * density)], axis=-1)
-        boundary.update(ONE, released)
+        take(boundary, released, arz)
         expected = arz.boundary_inputs(released[..., 0], np.full((1, n), speed))[0]
         np.testing.assert_allclose(at(boundary, 1), expected, rtol=1e-12)
 
@@ -133,7 +144,7 @@ def test_nobody_drives_backwards_or_faster_than_drivers_do(traffic):
     boundary, density = PrivateBoundary(traffic, arz, 1), np.full((1, n), 60.0)
     for noisy, speed in ((-30.0, 0.0), (1e3, arz.largest_speed)):
         flow = density * (noisy - CENTRE)
-        boundary.update(ONE, np.stack([density, flow], axis=-1))
+        take(boundary, np.stack([density, flow], axis=-1), arz)
         expected = arz.boundary_inputs(density, np.full((1, n), speed))[0]
         np.testing.assert_allclose(at(boundary, 1), expected, rtol=1e-12)
 
@@ -168,7 +179,7 @@ def test_boundary_segments_are_released_at_every_step_and_drive_the_next():
     np.testing.assert_array_equal(inputs[0][0], nominal_inputs(SHORT_HIGHWAY, private.model)[100])
     other = PrivateBoundary(private.traffic, private.model, 1)
     for k in range(4):
-        other.update(ONE, released[k][:, SHORT_HIGHWAY.n_segments :])
+        take(other, released[k][:, SHORT_HIGHWAY.n_segments :], private.model)
         np.testing.assert_array_equal(inputs[k + 1][0], at(other, 0))
 
 

@@ -259,14 +259,14 @@ def test_a_silent_detector_is_not_observed_and_charges_nobody():
     process = make(privacy={"preset": "paced"}, detectors={"dropout": 0.9}, truth_in_info=True)
     begin(process)
     seen, update = [], process.estimator.update
-    process.estimator.update = lambda episodes, observed, *rest: (
-        seen.append(observed[0].copy()),
-        update(episodes, observed, *rest),
+    process.estimator.update = lambda episodes, measured: (
+        seen.append(measured.observed[0].copy()),
+        update(episodes, measured),
     )
     found = play(process, 40)
-    silent = np.array([released.missing[0, [8, 9, 7]] for released, _ in found])
-    assert abs(silent.mean() - 0.9) < 0.1
-    np.testing.assert_array_equal(~np.array(seen)[:, [8, 9, 7]], silent)
+    answered = np.array([released.observed[0, [8, 9, 7]] for released, _ in found])
+    assert abs(answered.mean() - 0.1) < 0.1
+    np.testing.assert_array_equal(np.array(seen)[:, [8, 9, 7]], answered)
     often = make(privacy={"preset": "paced"}, truth_in_info=True)
     begin(often)
     play(often, 40)

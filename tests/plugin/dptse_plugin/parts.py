@@ -9,9 +9,8 @@ from typing import Annotated, Any
 import numpy as np
 from gymnasium import spaces
 
-from dptse_env.estimators import Estimate
-from dptse_env.estimators.batch import BatchEstimator
-from dptse_env.release import PrivacyReport, PrivacySettings, Released, ReleaseModel
+from dptse_env.estimators import BatchEstimator, Estimate, Measurement
+from dptse_env.release import PrivacyReport, PrivacySettings, ReleaseModel
 from dptse_env.schedules import Schedule
 from dptse_env.spaces.actions import ActionEncoding, Decision
 from dptse_env.traffic import SHORT_HIGHWAY
@@ -48,10 +47,10 @@ class Smoothed(BatchEstimator):
     def _predict(self, episodes: Any, inputs: Any) -> None:
         pass
 
-    def _update(self, given: Any) -> None:
-        weight, before = self.settings.weight, self.traffic[given.episodes]
-        after = (1.0 - weight) * before + weight * given.values
-        self.traffic[given.episodes] = np.where(given.observed[:, :, None], after, before)
+    def _update(self, episodes: Any, measured: Measurement) -> None:
+        weight, before = self.settings.weight, self.traffic[episodes]
+        after = (1.0 - weight) * before + weight * measured.values
+        self.traffic[episodes] = np.where(measured.observed[:, :, None], after, before)
 
     def estimate(self) -> Estimate:
         """See `BatchEstimator`."""
@@ -85,13 +84,13 @@ class LaplaceRelease(ReleaseModel):
         """See `ReleaseModel.reset`."""
         self.streams.update(zip(episodes.tolist(), generators, strict=True))
 
-    def release(self, request: Any) -> Released:
+    def release(self, request: Any) -> Measurement:
         """See `ReleaseModel.release`."""
         columns = self.setup.n_columns
         values = self.setup.traffic.aggregates(request.traffic, request.times, columns)
         for k, episode in enumerate(request.episodes.tolist()):
             values[k] += self.streams[episode].laplace(0.0, self.sigma / 2**0.5, values[k].shape)
-        return Released(values, self.sigma)
+        return self.measurement(request, values, self.sigma)
 
     def report(self) -> PrivacyReport:
         """Claim something, for the test that claims are shown as they are made."""

@@ -1,0 +1,225 @@
+"""The program of a window and its solution, beside dense algebra and a general solver."""
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from dptse_env.estimators import window as parts
+from dptse_env.estimators.linalg import padded
+from dptse_env.estimators.mhe import natural_residual, solve
+from dptse_env.estimators.window import ACTIVE_SET, NEWTON, REFINED, Point, Window
+from dptse_env.model import ARZModel, load_parameters
+from tests.model.roads import UNEVEN
+
+from .parts import compiled
+from .rows import every_row
+
+factorise, sweep = compiled(parts.factorise), compiled(parts.sweep)
+look, write_diagonal = compiled(parts.look), compiled(parts.write_diagonal)
+make_factor, minimise = compiled(parts.make_factor), compiled(parts.minimise)
+
+MODEL = ARZModel(
+    UNEVEN,
+    load_parameters("w99-3lane"),
+    reference_speed=51.0,
+    rows=every_row(UNEVEN.n_segments, UNEVEN.n_mainline),
+    demand_states=True,
+)
+ROAD, N = MODEL.road, MODEL.n_states
+WIDTH, N_ROWS = padded(N), MODEL.rows.n_rows
+
+
+class Program(NamedTuple):
+    """A window, and its objective z' H z + q' z as dense arrays."""
+
+    window: Window
+    H: np.ndarray
+    q: np.ndarray
+
+    @property
+    def n_stages(self):
+        return len(self.window.targets)
+
+    def bounds(self):
+        return (np.tile(b, self.n_stages) for b in (self.window.lower, self.window.upper))
+
+
+def random_program(n_stages=4, spread=1.0):
+    """A window of random transitions and rows, with bounds of 0 and 1, and its objective.
+
+    Args:
+        n_stages: Stages.
+        spread: Deviation of what is measured from the middle of the bounds.
+    """
+    rng = np.random.default_rng(0)
+    s, k, n_factors = ROAD.jam.size, ROAD.neighbours.shape[1], N - 2 * ROAD.jam.size
+    window = Window(
+        arrival=rng.normal(0.5, spread, N),
+        arrival_variance=rng.uniform(0.1, 1.0, N),
+        blocks=rng.normal(0.0, 0.5, (n_stages, s, k, 4)),
+        by_factor=rng.normal(0.0, 0.5, (n_stages, n_factors, 2)),
+        offsets=rng.normal(0.2, 0.1, (n_stages, N)),
+        process_variance=rng.uniform(0.01, 0.1, (n_stages, N)),
+        observed=rng.random((n_stages, N_ROWS)) < 0.3,
+        weights=rng.normal(0.0, 1.0, (n_stages, N_ROWS, 2, 6)),
+        targets=rng.normal(0.5, spread, (n_stages, N_ROWS, 2)),
+        noise=0.01 * rng.uniform(0.5, 1.5, (n_stages, N_ROWS, 2)),
+        lower=np.zeros(N),
+        upper=np.ones(N),
+    )
+    return Program(window, *dense(window))
+
+
+def transition(window, t):
+    A = np.zeros((N, N))
+    for c in range(ROAD.jam.size):
+        for slot in range(ROAD.degree[c]):
+            b = ROAD.neighbours[c, slot]
+            A[2 * c : 2 * c + 2, 2 * b : 2 * b + 2] += window.blocks[t, c, slot].reshape(2, 2)
+    for e in range(window.by_factor.shape[1]):
+        factor = 2 * ROAD.jam.size + e
+        A[2 * ROAD.entries[e] : 2 * ROAD.entries[e] + 2, factor] = window.by_factor[t, e]
+        A[factor, factor] = 1.0
+    return A
+
+
+def dense(window):
+    """Sum up the squares of the objective, each |c - B z|^2 / variance."""
+    n_stages = len(window.targets)
+    H, q = np.zeros((n_stages * N, n_stages * N)), np.zeros(n_stages * N)
+
+    def add(stages, B, c, variance):
+        at = np.concatenate([np.arange(t * N, t * N + N) for t in stages])
+        H[np.ix_(at, at)] += B.T @ (B / variance[:, None])
+        q[at] -= 2.0 * B.T @ (c / variance)
+
+    add([0], np.eye(N), window.arrival, window.arrival_variance)
+    for t in range(n_stages - 1):
+        B = np.hstack([-transition(window, t), np.eye(N)])
+        add([t, t + 1], B, window.offsets[t], window.process_variance[t])
+    for t in range(n_stages):
+        for m in np.flatnonzero(window.observed[t]):
+            at, B = 2 * ROAD.row_first[m], np.zeros((2, N))
+            size = 2 * ROAD.row_span[m]
+            B[:, at : at + size] = window.weights[t, m, :, :size]
+            add([t], B, window.targets[t, m], window.noise[t, m])
+    return H, q
+
+
+def point_at(program, z):
+    """What a trajectory `(L, n_x)` leaves."""
+    shape = program.n_stages, WIDTH
+    misfits = np.zeros((program.n_stages, 2 * N_ROWS))
+    point = Point(np.zeros(shape), np.zeros(shape), misfits, np.zeros(shape))
+    point.z[:, :N] = z
+    look(ROAD, program.window, point)
+    return point
+
+
+def random_side(program, n_fixed, seed=1):
+    side = np.zeros((program.n_stages, N), np.int64)
+    at = np.random.default_rng(seed).choice(side.size, n_fixed, replace=False)
+    side.flat[at] = 1
+    return side
+
+
+def factor_of(program, side):
+    factor = make_factor(program.n_stages, N, N_ROWS, program.window.weights.shape[3], WIDTH)
+    assert factorise(ROAD, program.window, side, factor)
+    return factor
+
+
+def step_from(program, factor, point, by_force, start=0):
+    step = np.empty((program.n_stages, WIDTH))
+    sweep(ROAD, program.window, factor, start, point, by_force, step)
+    return step[:, :N]
+
+
+def test_what_a_point_leaves_is_the_objectives_gradient():
+    program = random_program()
+    z = np.random.default_rng(2).random((4, N))
+    force, diagonal = point_at(program, z).force[:, :N].ravel(), np.ones((4, WIDTH))
+    np.testing.assert_allclose(force, -program.H @ z.ravel() - program.q / 2, atol=1e-10)
+    write_diagonal(ROAD, program.window, diagonal)
+    np.testing.assert_allclose(diagonal[:, :N].ravel(), np.diag(program.H), rtol=1e-12)
+
+
+@pytest.mark.parametrize("by_force", [False, True])
+@pytest.mark.parametrize("n_fixed", [0, 40])
+def test_a_sweep_steps_to_the_minimum_with_components_fixed(n_fixed, by_force):
+    program, z = random_program(), np.random.default_rng(2).random((4, N))
+    side = random_side(program, n_fixed)
+    factor, free = factor_of(program, side), side.ravel() == 0
+    point, expected = point_at(program, z), np.zeros(free.size)
+    force = -program.H @ z.ravel() - program.q / 2
+    inverse = np.linalg.inv(program.H[np.ix_(free, free)])
+    expected[free] = inverse @ force[free]
+    step = step_from(program, factor, point, by_force)
+    np.testing.assert_allclose(step.ravel(), expected, atol=1e-10)
+    assert (step.ravel()[~free] == 0.0).all()
+    last, end = free[-N:], np.zeros((N, N))
+    end[np.ix_(last, last)] = inverse[-last.sum() :, -last.sum() :]
+    np.testing.assert_allclose(factor.covariances[-1][:, :N], end, atol=1e-12)
+
+
+def test_a_force_on_one_component_gives_a_column_of_the_inverse():
+    program = random_program()
+    factor = factor_of(program, random_side(program, 0))
+    point = Point(*(np.zeros_like(part) for part in point_at(program, np.zeros((4, N)))))
+    inverse = np.linalg.inv(program.H)
+    for t, i in ((0, 3), (2, 11), (3, N - 1)):
+        point.force[t, i] = 1.0
+        column = step_from(program, factor, point, True, start=t)
+        np.testing.assert_allclose(column.ravel(), inverse[:, t * N + i], atol=1e-12)
+        point.force[t, i] = 0.0
+
+
+def test_the_covariance_before_the_last_rows_lacks_them():
+    program = random_program()
+    factor = factor_of(program, random_side(program, 0))
+    program.window.observed[-1] = False
+    blind = np.linalg.inv(dense(program.window)[0])[-N:, -N:]
+    np.testing.assert_allclose(factor.before[:, :N], blind, atol=1e-12)
+
+
+def test_a_factor_is_renewed_from_the_first_stage_whose_set_differs():
+    program, z = random_program(), np.random.default_rng(2).random((4, N))
+    one, other = random_side(program, 30), random_side(program, 30, seed=4)
+    other[:2] = one[:2]
+    used = factor_of(program, one)
+    assert factorise(ROAD, program.window, other, used)
+    fresh, point = factor_of(program, other), point_at(program, z)
+    steps = [step_from(program, factor, point, False) for factor in (used, fresh)]
+    np.testing.assert_array_equal(*steps)
+
+
+@pytest.mark.parametrize(
+    ("spread", "n_stages", "how"),
+    [(0.0, 1, ACTIVE_SET), (0.3, 6, ACTIVE_SET), (1.0, 4, ACTIVE_SET), (3.0, 6, NEWTON)],
+)
+@pytest.mark.parametrize("guess", ["middle", "corner"])
+def test_a_minimum_within_bounds_is_that_of_a_general_solver(spread, n_stages, how, guess):
+    """With many components at bounds, too many for the active set."""
+    program = random_program(n_stages, spread=spread)
+    factor = factor_of(program, np.zeros((n_stages, N), np.int64))
+    z, side = np.zeros((n_stages, WIDTH)), np.zeros((n_stages, WIDTH), np.int64)
+    z[:, :N] = 0.5 if guess == "middle" else 0.0
+    side[:, :N] = 0 if guess == "middle" else np.where(np.arange(N) % 7 == 0, -1, 0)
+    found = minimise(ROAD, program.window, factor, side, z)
+    lower, upper = program.bounds()
+    x = z[:, :N].ravel()
+    assert found == how if guess == "middle" else found in (ACTIVE_SET, NEWTON)
+    assert natural_residual(program.H, program.q, lower, upper, x) < 10.0 * REFINED
+    right = solve(program.H, program.q, lower, upper, "piqp")
+    np.testing.assert_allclose(x, right, atol=1e-9)
+    n_held = int(((x == lower) | (x == upper)).sum())
+    assert n_held > 10 or spread == 0.0
+
+
+def test_a_program_that_is_no_number_is_unsolved():
+    program = random_program()
+    factor = factor_of(program, np.zeros((4, N), np.int64))
+    program.window.targets[2] = np.nan
+    z, side = np.full((4, WIDTH), 0.5), np.zeros((4, WIDTH), np.int64)
+    assert minimise(ROAD, program.window, factor, side, z) == parts.UNSOLVED
