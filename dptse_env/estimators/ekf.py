@@ -28,7 +28,7 @@ from dptse_env.model.step import (
     write_row,
 )
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
-from dptse_env.utils.kernel_loops import all_finite, any_of, copy_vector
+from dptse_env.utils.kernel_loops import all_finite, any_of, copy_vector, fill_vector
 from dptse_env.utils.kernels import Packed, kernel, kernel_part
 
 
@@ -36,7 +36,7 @@ class Filters(NamedTuple):
     """State of the filters of n episodes."""
 
     means: FloatArray  # (n, n_x) [veh/km, veh/h], then demand factors if there are any
-    covariances: FloatArray  # (n, n_x, padded) normalised, the padding zero
+    covariances: FloatArray  # (n, n_x, padded) normalised, in their lower halves; padding is zero
     priors: FloatArray  # (n, n_x) prior means
     innovations: FloatArray  # (n, M, 2)
     diverged: BoolArray  # (n,)
@@ -83,7 +83,8 @@ class CovarianceFilter(BatchEstimator):
     @property
     def covariances(self) -> FloatArray:
         """Covariances `(n, n_x, n_x)`, rho normalised by rho_m and psi by rho_m v_f, a copy."""
-        return self._filters.covariances[:, :, : self.model.n_states].copy()
+        lower = np.tril(self._filters.covariances[:, :, : self.model.n_states])
+        return np.asarray(lower + np.tril(lower, -1).swapaxes(1, 2))
 
     def _estimate(self) -> Estimate:
         out = np.empty((4, self.n_episodes, self.model.n_segments))
@@ -139,6 +140,7 @@ def predict(road_: Packed, filters_: Packed, episodes: IntArray, inputs: FloatAr
         advance(road, mean, inputs[k], mean, blocks, scratch)
         project(road, mean, filters.is_box)
         normalise(road, filters.units[0], blocks, scratch.by_factor)
+        mirror(covariance)
         propagate(road, blocks, scratch.by_factor, noise, covariance, work, covariance)
 
 
@@ -164,8 +166,10 @@ def update(
 ) -> None:
     """Update by measurements; see `Estimator.update`."""
     road, filters = RoadArrays(*road_), Filters(*filters_)
-    n_rows, width = road.row_first.size, filters.covariances.shape[2]
-    weights = np.empty((n_rows, 2, 2 * np.max(road.row_span)))
+    n_rows, width, longest = road.row_first.size, filters.covariances.shape[2], 1
+    for m in range(n_rows):
+        longest = max(longest, road.row_span[m])
+    weights = np.empty((n_rows, 2, 2 * longest))
     rows = Rows(weights, np.empty((n_rows, 2)), np.empty((n_rows, 2)))
     shift, work = np.empty(width), np.empty((4, width))
     for k in range(episodes.size):
@@ -217,17 +221,18 @@ def _linearise(
 def _innovate(road: RoadArrays, filters: Filters, e: int, observed: BoolArray, rows: Rows) -> None:
     """Write residuals over their predicted deviations."""
     covariance, innovations = filters.covariances[e], filters.innovations[e]
-    innovations[:] = 0.0
     for m in range(observed.size):
+        fill_vector(innovations[m], 0.0)
         if not observed[m]:
             continue
         first, size = 2 * road.row_first[m], 2 * road.row_span[m]
         for q in range(2):
             variance = rows.noise[m, q]
             for i in range(size):
-                for j in range(size):
-                    weight = rows.weights[m, q, i] * rows.weights[m, q, j]
-                    variance += weight * covariance[first + i, first + j]
+                along = 0.5 * rows.weights[m, q, i] * covariance[first + i, first + i]
+                for j in range(i):
+                    along += rows.weights[m, q, j] * covariance[first + i, first + j]
+                variance += 2.0 * rows.weights[m, q, i] * along
             innovations[m, q] = rows.residuals[m, q] / np.sqrt(variance)
 
 
@@ -245,7 +250,7 @@ def _assimilate(
     Returns:
         Whether all variances of the measured numbers are sound.
     """
-    shift[:] = 0.0
+    fill_vector(shift, 0.0)
     for m in range(observed.size):
         if not observed[m]:
             continue
@@ -259,7 +264,6 @@ def _assimilate(
                 residual -= weights[q, i] * shift[first + i]
             for j in range(shift.size):
                 shift[j] += residual * work[2 + q, j]
-    mirror(covariance)
     return True
 
 
@@ -267,10 +271,11 @@ def _assimilate(
 def restart(filters: Filters, episode: int) -> None:
     """Reset an episode's filter to its prior."""
     copy_vector(filters.priors[episode], filters.means[episode])
-    filters.innovations[episode] = 0.0
+    for innovations in filters.innovations[episode]:
+        fill_vector(innovations, 0.0)
     covariance = filters.covariances[episode]
-    covariance[:] = 0.0
     for i in range(covariance.shape[0]):
+        fill_vector(covariance[i], 0.0)
         covariance[i, i] = filters.initial_variance[i]
 
 
@@ -287,7 +292,7 @@ def summarise(road_: Packed, filters_: Packed, out: FloatArray) -> None:
             w = psi / rho if rho > VACUUM * jam else v_f
             _, by_rho, by_psi = measured(rho, psi, jam, v_f, gamma)
             a, b = by_rho * filters.units[i], by_psi * filters.units[j]
-            variance = a * (a * covariance[i, i] + 2.0 * b * covariance[i, j])
+            variance = a * (a * covariance[i, i] + 2.0 * b * covariance[j, i])
             variance += b * b * covariance[j, j]
             out[0, e, s] = rho
             out[1, e, s] = clip(w - pressure(rho, jam, v_f, gamma), 0.0, LARGEST_W * v_f)

@@ -2,13 +2,16 @@
 
 Vectors and rows of matrices are padded with zeros to a multiple of eight numbers, so that inner
 loops run over full vector registers. `contract` allows fused multiply-adds and keeps NaNs, by which
-divergence is detected. All quantities are normalised.
+divergence is detected. Sums add one product at a time: `x + a b + c d` can be fused in one way, but
+`x + (a b + c d)` in two, and the compiler's choice would differ from one kernel to another. All
+quantities are normalised.
 """
 
 import numpy as np
 
 from dptse_env.model.network import RoadArrays
 from dptse_env.utils.arrays import FloatArray
+from dptse_env.utils.kernel_loops import fill_vector
 from dptse_env.utils.kernels import kernel_part
 
 VECTOR_WIDTH = 8  # numbers in a register
@@ -33,7 +36,7 @@ def multiply(
     by_factor: FloatArray,
     right: FloatArray,
     out: FloatArray,
-    is_lower: bool = False,
+    is_lower: bool,
 ) -> None:
     """Write A right to `out`; demand factors, the last components, stay.
 
@@ -50,21 +53,18 @@ def multiply(
         upper, lower = out[2 * c], out[2 * c + 1]
         if is_lower:
             width = to_diagonal(2 * c)
+        for j in range(width):
+            upper[j], lower[j] = 0.0, 0.0
         for slot in range(road.degree[c]):
             a, b = blocks[c, slot, 0], blocks[c, slot, 1]
             d, e = blocks[c, slot, 2], blocks[c, slot, 3]
-            if slot > 0 and a == 0.0 and b == 0.0 and d == 0.0 and e == 0.0:
+            if a == 0.0 and b == 0.0 and d == 0.0 and e == 0.0:
                 continue  # a flow depends on either demand or supply
             neighbour = road.neighbours[c, slot]
             first, second = right[2 * neighbour], right[2 * neighbour + 1]
-            if slot == 0:
-                for j in range(width):
-                    upper[j] = a * first[j] + b * second[j]
-                    lower[j] = d * first[j] + e * second[j]
-            else:
-                for j in range(width):
-                    upper[j] += a * first[j] + b * second[j]
-                    lower[j] += d * first[j] + e * second[j]
+            for j in range(width):
+                upper[j] = upper[j] + a * first[j] + b * second[j]
+                lower[j] = lower[j] + d * first[j] + e * second[j]
     for k in range(right.shape[0] - n):
         upper, lower, factor = out[2 * road.entries[k]], out[2 * road.entries[k] + 1], right[n + k]
         a, b, kept = by_factor[k, 0], by_factor[k, 1], out[n + k]
@@ -113,7 +113,7 @@ def move_back(
 ) -> None:
     """Write A' x `(>= n_x,)` to `out`, another vector; see `multiply`."""
     n = 2 * road.jam.size
-    out[:] = 0.0
+    fill_vector(out, 0.0)
     for c in range(road.jam.size):
         first, second = x[2 * c], x[2 * c + 1]
         for slot in range(road.degree[c]):
@@ -135,25 +135,25 @@ def propagate(
     scratch: FloatArray,
     out: FloatArray,
 ) -> None:
-    """Write A P A' + Q to `out`, which may be P.
+    """Write the lower half of A P A' + Q to `out`, which may be P.
 
     Args:
         road: The road, for the cells of the blocks.
         blocks: `(S, K, 4)` blocks of A.
         by_factor: `(E, 2)` derivatives by the demand factors.
         noise: `(n_x,)` variances that Q adds.
-        covariance: `(n_x, padded)` P.
+        covariance: `(n_x, padded)` P, of which both halves are read.
         scratch: `(2, n_x, padded)`.
         out: `(n_x, padded)`, its padding zero.
     """
     n, product, transposed = covariance.shape[0], scratch[0], scratch[1]
-    multiply(road, blocks, by_factor, covariance, product)
+    multiply(road, blocks, by_factor, covariance, product, False)
     for i in range(n):
         for j in range(n):
             transposed[i, j] = product[j, i]
-        transposed[i, n:] = 0.0
-    multiply(road, blocks, by_factor, transposed, out, is_lower=True)
-    mirror(out)
+        for j in range(n, transposed.shape[1]):
+            transposed[i, j] = 0.0
+    multiply(road, blocks, by_factor, transposed, out, True)
     for i in range(n):
         out[i, i] += noise[i]
 
@@ -190,7 +190,7 @@ def scalar_update(
         for i in range(covariance.shape[0]):
             k, rest, line = gain[i], column[i] - total * gain[i], covariance[i]
             for j in range(column.size):
-                line[j] -= k * column[j] + rest * gain[j]
+                line[j] = line[j] - k * column[j] - rest * gain[j]
     return total
 
 
@@ -201,15 +201,15 @@ def pair_update(
     """Update a covariance by both numbers of a row: two `scalar_update`, P traversed once.
 
     Only the lower half of P, and the rest of the registers on its diagonal, is read and replaced,
-    which is half the work; after the last row `mirror` makes it whole.
+    which is half the work; `mirror` makes it whole.
 
     Args:
         covariance: `(n_x, padded)` P.
         first: First component that the numbers depend on.
         rows: `(2, size)` derivatives by that component and the following ones.
         noise: `(2,)` variances.
-        work: `(4, padded)`, its last two written with the gains; the second number's is that after
-            the first update.
+        work: `(4, padded)`, written with P h of both numbers, then with their gains; the second
+            number's are those after the first update.
 
     Returns:
         Whether both variances are sound.
@@ -222,7 +222,7 @@ def pair_update(
         by_column += rows[1, i] * c[first + i]
         by_gain += rows[1, i] * k[first + i]
     for j in range(d.size):
-        d[j] -= by_column * k[j] + by_gain * (c[j] - first_total * k[j])
+        d[j] = d[j] - by_column * k[j] - by_gain * (c[j] - first_total * k[j])
     second_total = _gain(first, rows[1], noise[1], d, g)
     if not (first_total > 0.0 and second_total > 0.0):
         return False
@@ -230,7 +230,7 @@ def pair_update(
         x, y, line = k[i], g[i], covariance[i]
         rest_x, rest_y = c[i] - first_total * x, d[i] - second_total * y
         for j in range(to_diagonal(i)):
-            line[j] -= x * c[j] + rest_x * k[j] + (y * d[j] + rest_y * g[j])
+            line[j] = line[j] - x * c[j] - rest_x * k[j] - y * d[j] - rest_y * g[j]
     return True
 
 
@@ -239,7 +239,8 @@ def _project_pair(
     covariance: FloatArray, first: int, rows: FloatArray, one: FloatArray, other: FloatArray
 ) -> None:
     """Write P h of two rows h, P by its lower half."""
-    one[:], other[:] = 0.0, 0.0
+    fill_vector(one, 0.0)
+    fill_vector(other, 0.0)
     for i in range(rows.shape[1]):
         a, b, line, end = rows[0, i], rows[1, i], covariance[first + i], to_diagonal(first + i)
         for j in range(end):
@@ -249,6 +250,23 @@ def _project_pair(
             x = covariance[j, first + i]
             one[j] += a * x
             other[j] += b * x
+
+
+@kernel_part(fastmath={"contract"})
+def downdate(covariance: FloatArray, rows: FloatArray) -> None:
+    """Subtract V' V from a covariance, its lower half alone; see `pair_update`.
+
+    Args:
+        covariance: `(n_x, padded)`.
+        rows: `(m, >= padded)` V, m even, its padding zero.
+    """
+    for i in range(covariance.shape[0]):
+        line = covariance[i]
+        for r in range(0, rows.shape[0], 2):
+            one, other = rows[r], rows[r + 1]
+            a, b = one[i], other[i]
+            for j in range(to_diagonal(i)):
+                line[j] = line[j] - a * one[j] - b * other[j]
 
 
 @kernel_part
@@ -262,7 +280,7 @@ def mirror(matrix: FloatArray) -> None:
 @kernel_part(fastmath={"contract"})
 def _project_row(covariance: FloatArray, first: int, row: FloatArray, out: FloatArray) -> None:
     """Write P h."""
-    out[:] = 0.0
+    fill_vector(out, 0.0)
     for i in range(row.size):
         h, line = row[i], covariance[first + i]
         if h != 0.0:
@@ -322,7 +340,7 @@ def add_product(matrix: FloatArray, x: FloatArray, out: FloatArray) -> None:
         if a == 0.0 and b == 0.0:
             continue
         for j in range(out.size):
-            out[j] += a * upper[j] + b * lower[j]
+            out[j] = out[j] + a * upper[j] + b * lower[j]
 
 
 @kernel_part(fastmath={"contract", "reassoc"})
@@ -369,7 +387,8 @@ def forward(lower: FloatArray, right: FloatArray) -> None:
             weight, other = lower[i, k], right[k]
             for j in range(row.size):
                 row[j] -= weight * other[j]
-        row *= lower[i, i]
+        for j in range(row.size):
+            row[j] *= lower[i, i]
 
 
 @kernel_part(fastmath={"contract"})
@@ -378,7 +397,8 @@ def solve_many(lower: FloatArray, right: FloatArray) -> None:
     forward(lower, right)
     for i in range(right.shape[0] - 1, -1, -1):
         row = right[i]
-        row *= lower[i, i]
+        for j in range(row.size):
+            row[j] *= lower[i, i]
         for k in range(i):
             weight, other = lower[i, k], right[k]
             for j in range(row.size):

@@ -104,9 +104,9 @@ def restart(filters_: Packed, windows_: Packed, e: int) -> None:
     filters, windows = Filters(*filters_), Windows(*windows_)
     ekf.restart(filters, e)
     windows.length[e], windows.solved[e] = 1, UNSOLVED
-    windows.arrival_variance[e] = filters.initial_variance
+    copy_vector(filters.initial_variance, windows.arrival_variance[e])
     _enter(filters, windows, e, 0)
-    windows.point[e] = windows.solution[e, 0]
+    copy_vector(windows.solution[e, 0], windows.point[e])
 
 
 @kernel_part
@@ -126,7 +126,7 @@ def _shift(windows: Windows, e: int) -> None:
     if windows.length[e] < windows.solution.shape[1]:
         return
     windows.length[e] -= 1
-    windows.arrival_variance[e] = windows.moving_variance
+    copy_vector(windows.moving_variance, windows.arrival_variance[e])
     n_stages = windows.solution.shape[1]
     _drop(windows.predicted[e].reshape(n_stages, -1))
     _drop(windows.inputs[e].reshape(n_stages, -1))
@@ -167,13 +167,13 @@ def predict(
         for t in range(length):
             for i in range(point.size):
                 point[i] += windows.solution[e, t, i] / length
-        state[:] = filters.means[e]
+        copy_vector(filters.means[e], state)
         process_noise(road, filters, state, windows.process_variance[e, length - 1])
         project(road, state, False)
         advance(road, state, inputs[k], state, blocks, scratch)
         project(road, state, filters.is_box)
-        filters.means[e] = state
-        windows.inputs[e, length - 1] = inputs[k]
+        copy_vector(state, filters.means[e])
+        copy_vector(inputs[k], windows.inputs[e, length - 1])
         if not windows.along:
             _linearise_step(road, filters, windows, e, length - 1, point)
         windows.length[e] = length + 1
@@ -200,7 +200,7 @@ def _linearise_step(
     advance(road, state, windows.inputs[e, t], after, blocks, scratch)
     normalise(road, filters.units[0], blocks, scratch.by_factor)
     n_factors = windows.by_factor.shape[2]
-    windows.by_factor[e, t] = scratch.by_factor[:n_factors]
+    copy_matrix(scratch.by_factor[:n_factors], windows.by_factor[e, t])
     for i in range(state.size):
         state[i] /= windows.units[i]
     move(road, blocks, scratch.by_factor, n_factors, state, product)

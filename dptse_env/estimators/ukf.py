@@ -19,13 +19,12 @@ import numpy as np
 from dptse_env.estimators.base import Measurement
 from dptse_env.estimators.ekf import CovarianceFilter, Filters, process_noise, restart
 from dptse_env.estimators.linalg import (
+    downdate,
     factor,
     forward,
     is_covariance,
-    mirror,
     padded,
     products,
-    to_diagonal,
 )
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
@@ -38,7 +37,7 @@ from dptse_env.model.columns import (
 from dptse_env.model.network import RoadArrays
 from dptse_env.model.step import project
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
-from dptse_env.utils.kernel_loops import all_finite, copy_matrix
+from dptse_env.utils.kernel_loops import all_finite, copy_matrix, fill_vector
 from dptse_env.utils.kernels import Packed, kernel, kernel_part
 from dptse_env.utils.validation import require
 
@@ -109,7 +108,7 @@ def predict(
         mean, covariance, states = filters.means[e], filters.covariances[e], points.states[e]
         process_noise(road, filters, mean, noise)
         if not _draw(filters, points, e, root):
-            mean[:] = np.nan  # detected by the update, which resets the filter
+            fill_vector(mean, np.nan)  # detected by the update, which resets the filter
         advance_states(road, states, inputs[k], scratch)
         project_states(road, states, filters.is_box)
         _gather(filters, points, e, distances, shift)
@@ -126,11 +125,12 @@ def _draw(filters: Filters, points: Points, e: int, root: FloatArray) -> bool:
     states, n = points.states[e], root.shape[0]
     copy_matrix(filters.covariances[e], root)
     if not factor(root):
-        states[:] = np.nan
+        for i in range(n):
+            fill_vector(states[i], np.nan)
         return False
     for i in range(n):
         row, step = states[i], points.spread * filters.units[i]
-        row[:] = filters.means[e, i]
+        fill_vector(row, filters.means[e, i])
         root[i, i] = 1.0 / root[i, i]
         for k in range(i + 1):
             row[1 + k] += step * root[i, k]
@@ -148,13 +148,14 @@ def _distances_from_first(row: FloatArray, unit: float, weight: float, out: Floa
     return weight * total
 
 
-@kernel_part(fastmath={"contract"})
+@kernel_part
 def _gather(
     filters: Filters, points: Points, e: int, distances: FloatArray, shift: FloatArray
 ) -> None:
-    """Write an episode's covariance, and the distances `(n_x, width)` of its points.
+    """Write the lower half of an episode's covariance from its points.
 
-    `shift` `(n_x,)` is written with the normalised distance of their mean from the first one.
+    `distances` `(n_x, width)` are written with theirs from the first one, and `shift` `(n_x,)` with
+    that of their mean, normalised.
     """
     covariance, states = filters.covariances[e], points.states[e]
     for i in range(shift.size):
@@ -165,7 +166,6 @@ def _gather(
             covariance[i, j] = (
                 points.weight * covariance[i, j] + points.surplus * shift[i] * shift[j]
             )
-    mirror(covariance)
 
 
 @kernel
@@ -191,7 +191,8 @@ def update(
             if observed[k, m]:
                 rows[n_seen] = m
                 n_seen += 1
-        filters.innovations[e] = 0.0
+        for innovations in filters.innovations[e]:
+            fill_vector(innovations, 0.0)
         sound = True
         if n_seen > 0:
             seen = rows[:n_seen]
@@ -205,7 +206,7 @@ def update(
             points.moved[e] = False
 
 
-@kernel_part(fastmath={"contract"})
+@kernel_part
 def _assimilate(
     road: RoadArrays,
     filters: Filters,
@@ -258,15 +259,11 @@ def _assimilate(
     # With L L' = S, rows of [C, r] become [V, z]: V' V = C' S^-1 C and V' z is the gain times r.
     forward(joint, cross)
     for i in range(n):
-        total, line = shift[i], covariance[i]
-        for r in range(0, size, 2):
-            one, other = cross[r], cross[r + 1]
-            a, b = one[i], other[i]
-            total += a * one[residual] + b * other[residual]
-            for j in range(to_diagonal(i)):
-                line[j] -= a * one[j] + b * other[j]
+        total = shift[i]
+        for r in range(size):
+            total += cross[r, i] * cross[r, residual]
         mean[i] = states[i, 0] + total * filters.units[i]
-    mirror(covariance)
+    downdate(covariance, cross)
     project(road, mean, filters.is_box)
     return True
 

@@ -162,6 +162,7 @@ def factorise(road: RoadArrays, window: Window, side: IntArray, factor: Factor) 
             blocks, by_factor = window.blocks[t - 1], window.by_factor[t - 1]
             noise, previous = window.process_variance[t - 1], factor.covariances[t - 1]
             propagate(road, blocks, by_factor, noise, previous, factor.scratch, P)
+            mirror(P)
         if t == n_stages - 1:
             copy_matrix(P, factor.before)
         factor.length[0], factor.n_updates[t] = t, 0

@@ -216,6 +216,7 @@ def choose(
             normalise(road, design.units[0], work.blocks, no_factors)
             noise = design.process_variance
             propagate(road, work.blocks, no_factors, noise, covariance, work.square, covariance)
+            mirror(covariance)
         for segment in design.always:
             _update(design, covariance, segment, work)
         _weigh(design, covariance, work)

@@ -14,6 +14,13 @@ def copy_vector(source: AnyArray, target: AnyArray) -> None:
 
 
 @kernel_part
+def fill_vector(target: AnyArray, value: float) -> None:
+    """Write a number into all of a vector."""
+    for i in range(target.size):
+        target[i] = value
+
+
+@kernel_part
 def copy_matrix(source: AnyArray, target: AnyArray) -> None:
     """Write a matrix into another of its shape."""
     for i in range(source.shape[0]):

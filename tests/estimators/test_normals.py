@@ -39,6 +39,20 @@ def test_bits_are_those_of_xoshiro256_plus_plus():
             s[3] = rotated(s[3], 45)
 
 
+def test_numbers_are_the_transform_of_the_bits():
+    """Box and Muller's in double precision: a radius of the upper half, an angle of the lower."""
+    n = 64 * STREAM_WIDTH
+    bits = np.empty(n, dtype=np.uint64)
+    draw_bits(make_stream(np.random.default_rng(0)), bits)
+    single = np.float32
+    u = (bits >> np.uint64(32)).astype(single) * single(2.0**-32) + single(2.0**-33)
+    turn = (bits & np.uint64(2**32 - 1)).astype(float) / 2**32  # the circle from -pi / 2 on
+    radius = np.sqrt(-2.0 * np.log(u.astype(float)))
+    first = radius * np.cos(2.0 * np.pi * turn + 0.5 * np.pi)
+    second = radius * np.sin(2.0 * np.pi * turn + 0.5 * np.pi)
+    np.testing.assert_allclose(drawn(2 * n), np.concatenate([first, second]), atol=1e-5)
+
+
 def test_numbers_are_standard_normal():
     x = drawn(2_000_000)
     assert stats.kstest(x, "norm").pvalue > 1e-3

@@ -66,7 +66,10 @@ class TextbookWalk:
 
 @pytest.mark.parametrize("kind", [*RELEASES, "rows"])
 def test_a_walk_is_a_kalman_filter_without_covariances(kind):
-    episodes = averaged(12) if kind == "rows" else simulate("paper", n_steps=40, release=kind)
+    if kind == "rows":
+        episodes = averaged(12)
+    else:
+        episodes = simulate("paper", n_steps=40, noise=3.0, release=kind)
     model = episodes.model
     walk, textbook = started("random_walk", episodes, WALK), TextbookWalk(model, episodes.start)
     for k in range(len(episodes.inputs)):
