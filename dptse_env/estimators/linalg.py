@@ -208,8 +208,8 @@ def pair_update(
         first: First component that the numbers depend on.
         rows: `(2, size)` derivatives by that component and the following ones.
         noise: `(2,)` variances.
-        work: `(4, padded)`, its last two written with the gains; the second number's is that after
-            the first update.
+        work: `(4, padded)`, written with P h of both numbers, then with their gains; the second
+            number's are those after the first update.
 
     Returns:
         Whether both variances are sound.
