@@ -190,6 +190,7 @@ def test_a_spec_survives_json():
             "name": "mine", "free_flow_speed": 120.0, "jam_density": 350.0, "gamma": 1.0,
             "relaxation_time": 40.0,
         },
+        estimator_settings={"process_noise": [0.01, 0.01]},
     )  # fmt: skip
     again = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
     assert again.unwrapped.config == env.unwrapped.config

@@ -188,9 +188,9 @@ def test_an_emptiness_mask_would_show(monkeypatch):
     process = env.unwrapped.process
     update = process.estimator.update
 
-    def update_occupied(episodes, observed, *released):
-        truth = process.truth(episodes)
-        update(episodes, observed & (truth[..., 0] > 0), *released)
+    def update_occupied(episodes, measured):
+        occupied = process.truth(episodes)[..., 0] > 0
+        update(episodes, measured._replace(observed=measured.observed & occupied))
 
     monkeypatch.setattr(process.estimator, "update", update_occupied)
     assert unlike(env)

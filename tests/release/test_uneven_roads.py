@@ -126,7 +126,7 @@ def test_the_noise_has_the_deviations_that_are_stated():
     release = make(settings, one_vehicle(COLUMNS - 1, 50.0))
     seen = [release_all(release, np.full(1, 1 + k % T)) for k in range(2000)]
     values = np.array([each.values[0, : ROAD.n_segments] for each in seen])
-    stated = seen[0].sigma[: ROAD.n_segments]
+    stated = seen[0].sigma[0, : ROAD.n_segments]
     np.testing.assert_allclose(values.std(axis=0), stated, rtol=0.08)
     assert np.all(np.abs(values.mean(axis=0)) < 5.0 * stated / np.sqrt(len(seen)))
 
