@@ -47,7 +47,7 @@ class Estimate:
 
 
 class Measurement(NamedTuple):
-    """What is released of a second of k episodes, on its way from the mechanism to the estimator.
+    """A second of k episodes as it was released, on its way from the mechanism to the estimator.
 
     Its C columns are the M rows of ``model.rows``, then the R boundary segments where these are
     released; estimators read the first M.

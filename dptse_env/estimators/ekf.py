@@ -49,7 +49,11 @@ class Filters(NamedTuple):
 
 
 class CovarianceFilter(BatchEstimator):
-    """Means and covariances of all episodes as arrays for kernels."""
+    """Means and covariances of all episodes as arrays for kernels.
+
+    Attributes:
+        filters: These arrays, which predictions and updates change in place.
+    """
 
     is_compiled: ClassVar[bool] = True
 
@@ -58,7 +62,7 @@ class CovarianceFilter(BatchEstimator):
         super().__init__(model, n_episodes, settings)
         n_states = model.n_states
         start = model.project(np.zeros((n_episodes, n_states)), settings.bounds)
-        self._filters = Filters(
+        self.filters = Filters(
             means=start,
             covariances=np.zeros((n_episodes, n_states, padded(n_states))),
             priors=start.copy(),
@@ -71,19 +75,19 @@ class CovarianceFilter(BatchEstimator):
             count_variance=count_variance(model, settings),
             is_box=settings.bounds == "box",
         )
-        self._packed = tuple(model.road), tuple(self._filters)
+        self._packed = tuple(model.road), tuple(self.filters)
         for episode in range(n_episodes):
-            restart(self._filters, episode)
+            restart(self.filters, episode)
 
     @property
     def states(self) -> FloatArray:
         """Means `(n, n_x)` [veh/km, veh/h], then demand factors if there are any; a copy."""
-        return self._filters.means.copy()
+        return self.filters.means.copy()
 
     @property
     def covariances(self) -> FloatArray:
         """Covariances `(n, n_x, n_x)`, rho normalised by rho_m and psi by rho_m v_f, a copy."""
-        lower = np.tril(self._filters.covariances[:, :, : self.model.n_states])
+        lower = np.tril(self.filters.covariances[:, :, : self.model.n_states])
         return np.asarray(lower + np.tril(lower, -1).swapaxes(1, 2))
 
     def _estimate(self) -> Estimate:
@@ -94,13 +98,13 @@ class CovarianceFilter(BatchEstimator):
     def _reset(
         self, episodes: IntArray, states: FloatArray, generators: Sequence[np.random.Generator]
     ) -> None:
-        self._filters.priors[episodes] = self.model.project(states, self.settings.bounds)
+        self.filters.priors[episodes] = self.model.project(states, self.settings.bounds)
         self._restart(episodes)
 
     def _restart(self, episodes: IntArray) -> None:
         """Reset episodes to their priors."""
         for episode in episodes.tolist():
-            restart(self._filters, episode)
+            restart(self.filters, episode)
 
 
 class EKF(CovarianceFilter):

@@ -403,7 +403,7 @@ class MHE(CovarianceFilter):
 
     @property
     def solved(self) -> IntArray:
-        """How each episode's last program was solved `(n,)`, a copy.
+        """The way in which each episode's last program was solved `(n,)`, a copy.
 
         `UNSOLVED` where there was none, `ACTIVE_SET`, `NEWTON`, `GENERAL_SOLVER` or `FALLBACK`.
         """
@@ -439,7 +439,7 @@ class MHE(CovarianceFilter):
         self.fallback[episode], windows.side[episode] = z is None, 0
         windows.solved[episode] = FALLBACK if z is None else GENERAL_SOLVER
         if z is not None:
-            accept(self._road, self._filters, windows, episode, z.reshape(length, -1))
+            accept(self._road, self.filters, windows, episode, z.reshape(length, -1))
 
     def _restart(self, episodes: IntArray) -> None:
         for episode in episodes.tolist():

@@ -236,7 +236,7 @@ class ReleaseModel(ABC):
 
     @property
     def releases_flow(self) -> bool:
-        """Whether flows are released, else mean speeds."""
+        """True where flows are released, False where mean speeds are."""
         return not math.isnan(self._common_centre)
 
     @cached_property

@@ -63,7 +63,7 @@ def test_a_broken_covariance_is_found(backend, poison):
     episodes = simulate(n_steps=5)
     ekf = started("ekf", backend, episodes)
     run(ekf, episodes, range(3))
-    kept = ekf._filters.covariances if backend == "compiled" else ekf.filters[0].P[None]
+    kept = ekf.filters.covariances if backend == "compiled" else ekf.filters[0].P[None]
     if poison == "indefinite":
         kept[0, 20, 4] = kept[0, 4, 20] = 10.0
     else:
@@ -116,7 +116,7 @@ def test_the_estimate_of_a_nearly_empty_road_is_the_models(name):
     w = np.linspace(0.0, 2.0 * model.speed_scale, 19)
     states = np.stack([density, w * density], axis=-1).reshape(8, -1)
     states[:4, 1::2] += 1e-6  # more than the vacuum's density could carry
-    estimator._filters.means[:] = states
+    estimator.filters.means[:] = states
     shown = estimator.estimate()
     expected_density, expected_speed = estimated_traffic(model, states)
     np.testing.assert_array_equal(shown.density, expected_density)

@@ -104,7 +104,7 @@ def test_a_broken_covariance_is_found(backend, poison):
     episodes = simulate(n_steps=5)
     filters = started("ukf", backend, episodes)
     run(filters, episodes, range(3))
-    kept = filters._filters.covariances if backend == "compiled" else filters.filters[0].P[None]
+    kept = filters.filters.covariances if backend == "compiled" else filters.filters[0].P[None]
     if poison == "indefinite":
         kept[0, 20, 4] = kept[0, 4, 20] = 10.0
     else:
