@@ -45,8 +45,7 @@ from dptse_env.traffic import (
     randomised,
     read_road,
 )
-from dptse_env.utils.fields import Interval, checked_fields, field_hints, from_mapping
-from dptse_env.utils.validation import require_name
+from dptse_env.utils.fields import Interval, checked_fields, field_hints, from_mapping, require_name
 
 TRAINING_SEEDS = range(1_000)
 """Traffic seeds meant for training and calibration."""

@@ -15,7 +15,7 @@ from dptse_env.process import QueryProcess
 from dptse_env.rendering import History, Picture
 from dptse_env.traffic import Records, open_library
 from dptse_env.utils.arrays import Observation
-from dptse_env.utils.validation import integer
+from dptse_env.utils.fields import integer
 from dptse_env.window import Window
 
 _ONLY = np.zeros(1, dtype=np.int64)
