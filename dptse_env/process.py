@@ -334,7 +334,7 @@ class QueryProcess:
         }
 
 
-NAMES = ("traffic_seed", "start")
+RESET_OPTIONS = ("traffic_seed", "start")
 
 
 @dataclass(frozen=True)
@@ -362,9 +362,9 @@ class ResetOptions:
         """
         options = options or {}
         for key in options:
-            if key not in NAMES:
-                raise ValueError(f"options.{key} is unknown; allowed: {', '.join(NAMES)}")
-        seeds, starts = (per_episode(key, options.get(key), n_episodes) for key in NAMES)
+            if key not in RESET_OPTIONS:
+                raise ValueError(f"options.{key} is unknown; allowed: {', '.join(RESET_OPTIONS)}")
+        seeds, starts = (per_episode(key, options.get(key), n_episodes) for key in RESET_OPTIONS)
         known, last = config.traffic_seeds, config.last_start
         for seed in seeds:
             if seed is not None and (type(seed) is not int or seed not in known):
