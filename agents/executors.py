@@ -27,7 +27,7 @@ from tqdm import tqdm
 
 from dptse_env.command_line import TOOLS
 from dptse_env.utils.extras import needed_for
-from dptse_env.utils.validation import integer
+from dptse_env.utils.fields import integer
 
 TaskT = TypeVar("TaskT")
 ResultT = TypeVar("ResultT")

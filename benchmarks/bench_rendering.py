@@ -16,7 +16,7 @@ import gymnasium as gym
 
 from agents.terminal import make_table, print_table
 from dptse_env.registration import ENVIRONMENTS
-from dptse_env.utils.validation import integer
+from dptse_env.utils.fields import integer
 from scripts.cli import run
 
 WARM_UP = 5

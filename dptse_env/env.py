@@ -12,11 +12,10 @@ from dptse_env.config import resolve
 from dptse_env.estimators import check_settings
 from dptse_env.parts import make_interface, make_model, make_parts, warn_where_void
 from dptse_env.process import QueryProcess
-from dptse_env.rendering import History, Picture
+from dptse_env.rendering import History, Picture, Window
 from dptse_env.traffic import Records, open_library
 from dptse_env.utils.arrays import Observation
-from dptse_env.utils.validation import integer
-from dptse_env.window import Window
+from dptse_env.utils.fields import integer
 
 _ONLY = np.zeros(1, dtype=np.int64)
 

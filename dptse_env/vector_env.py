@@ -17,12 +17,11 @@ from numpy.typing import NDArray
 from dptse_env.config import resolve
 from dptse_env.estimators import check_settings
 from dptse_env.parts import make_interface, make_model, make_parts, warn_where_void
-from dptse_env.process import QueryProcess
+from dptse_env.process import QueryProcess, per_episode
 from dptse_env.rendering import History, Picture
-from dptse_env.reset_options import per_episode
 from dptse_env.traffic import Records, open_library
 from dptse_env.utils.arrays import Action, BoolArray, FloatArray, IntArray, Observation
-from dptse_env.utils.validation import integer, require
+from dptse_env.utils.fields import integer, require
 from dptse_env.utils.vector_info import Rows, in_vector_form, object_array, repeated_rows
 
 _MODES = {mode.value: mode for mode in AutoresetMode}

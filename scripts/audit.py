@@ -25,7 +25,7 @@ from dptse_env.privacy import mu_of
 from dptse_env.privacy.audit_statistics import Claim, audit
 from dptse_env.release import PrivacyReport
 from dptse_env.traffic import with_vehicles
-from dptse_env.utils.validation import inside, integer, positive, require
+from dptse_env.utils.fields import inside, integer, positive, require
 from scripts.cli import Machines, Road, run
 
 

@@ -38,7 +38,7 @@ from agents.terminal import make_table, print_table, print_text
 from dptse_env.config import EnvConfig, parse_seeds
 from dptse_env.schedules import OBSERVATION_SCHEDULES
 from dptse_env.traffic import is_road_file
-from dptse_env.utils.validation import require
+from dptse_env.utils.fields import require
 from scripts.cli import Machines, Road, resumable, run
 
 ALL = "all"

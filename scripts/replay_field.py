@@ -20,7 +20,7 @@ from agents.measured_field import Replay, field_corridor, read_field
 from agents.terminal import make_table, print_table
 from dptse_env.estimators import EstimatorSettings
 from dptse_env.traffic.importers.fields import FieldSource
-from dptse_env.utils.validation import integer
+from dptse_env.utils.fields import integer
 from scripts.cli import run
 
 PAPER = "dptse_env:dptse/PaperHighway-v0"

@@ -23,7 +23,7 @@ from agents.seeds import seed_kind
 from agents.study import Follow, Study, write_report
 from agents.study import run as run_study
 from dptse_env.config import parse_seeds
-from dptse_env.utils.validation import require
+from dptse_env.utils.fields import require
 from scripts.cli import Machines, resumable, run, suitable
 
 STUDIES = ("paper", "guarantees", "estimators", "policies", "suite")

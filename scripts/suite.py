@@ -28,7 +28,7 @@ from agents.studies.suite import (
 from agents.study import read_rows
 from agents.study import run as run_study
 from agents.terminal import make_table, print_table
-from dptse_env.utils.validation import require
+from dptse_env.utils.fields import require
 from scripts.cli import Machines, resumable, run, suitable
 
 

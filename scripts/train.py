@@ -25,7 +25,7 @@ from agents.training.run_files import Row, check_plan, read_progress
 from agents.training.several_seeds import train_all
 from agents.training.training import BEST, POLICY, Training
 from dptse_env.config import parse_seeds
-from dptse_env.utils.validation import integer
+from dptse_env.utils.fields import integer
 from scripts.cli import Machines, Road, resumable, run
 from scripts.training_bar import Bar, watched
 

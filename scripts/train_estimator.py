@@ -22,7 +22,7 @@ from agents.filters.training import FilterTraining
 from agents.training.run_files import check_plan
 from dptse_env.config import parse_seeds
 from dptse_env.estimators.recurrent_weights import read_network
-from dptse_env.utils.validation import integer
+from dptse_env.utils.fields import integer
 from scripts.cli import Machines, resumable, run
 from scripts.training_bar import Bar, watched
 

@@ -30,7 +30,7 @@ from agents.seeds import TUNING
 from agents.terminal import make_table, print_table
 from dptse_env.model import ARZParameters
 from dptse_env.model.parameters import read_parameters
-from dptse_env.utils.validation import integer
+from dptse_env.utils.fields import integer
 from scripts.cli import Machines, resumable, run
 
 

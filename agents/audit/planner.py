@@ -32,7 +32,7 @@ from dptse_env.parts import make_release
 from dptse_env.release import Paced
 from dptse_env.traffic import Record
 from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray, IntArray
-from dptse_env.utils.validation import require
+from dptse_env.utils.fields import require
 
 JAM_SPEED = 10.0
 """Speed below which a vehicle stands in a jam [km/h]."""

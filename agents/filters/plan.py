@@ -17,7 +17,7 @@ from agents.play import Cell
 from agents.seeds import TUNING, require_seeds
 from dptse_env.config import TRAINING_SEEDS, VALIDATION_SEEDS
 from dptse_env.estimators.recurrent_weights import read_network
-from dptse_env.utils.validation import inside, integer, positive, require
+from dptse_env.utils.fields import inside, integer, positive, require
 
 
 @dataclass(frozen=True)

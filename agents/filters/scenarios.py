@@ -10,7 +10,7 @@ import numpy as np
 
 from agents.environments import make_config, parse_env
 from agents.filters.roads import ROADS
-from dptse_env.utils.validation import require
+from dptse_env.utils.fields import require
 
 MECHANISMS = ("capped", "paced", "paper", "corrected")
 """Release models that scenarios draw from."""

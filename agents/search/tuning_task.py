@@ -24,7 +24,7 @@ from dptse_env.estimators.settings import settings_name
 from dptse_env.evaluation import WARM_UP, Row
 from dptse_env.model import ARZParameters
 from dptse_env.traffic import Records
-from dptse_env.utils.validation import integer, require
+from dptse_env.utils.fields import integer, require
 
 
 @dataclass(frozen=True)

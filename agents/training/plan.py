@@ -16,7 +16,7 @@ from agents.training.recipes import Recipe
 from agents.training.worlds import World
 from dptse_env.config import TRAINING_SEEDS, VALIDATION_SEEDS, EnvConfig
 from dptse_env.parts import make_interface
-from dptse_env.utils.validation import integer
+from dptse_env.utils.fields import integer
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from agents.training.worlds import World
 from dptse_env.config import EnvConfig
 from dptse_env.release import RELEASE_MODELS
 from dptse_env.sb3.policy import RULE
-from dptse_env.utils.validation import inside, integer, non_negative, positive, require
+from dptse_env.utils.fields import inside, integer, non_negative, positive, require
 
 
 @dataclass(frozen=True)

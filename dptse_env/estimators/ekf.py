@@ -28,8 +28,15 @@ from dptse_env.model.step import (
     write_row,
 )
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
-from dptse_env.utils.kernel_loops import all_finite, any_of, copy_vector, fill_vector
-from dptse_env.utils.kernels import Packed, kernel, kernel_part
+from dptse_env.utils.kernels import (
+    Packed,
+    all_finite,
+    any_of,
+    copy_vector,
+    fill_vector,
+    kernel,
+    kernel_part,
+)
 
 
 class Filters(NamedTuple):

@@ -11,8 +11,7 @@ import numpy as np
 
 from dptse_env.model.network import RoadArrays
 from dptse_env.utils.arrays import FloatArray
-from dptse_env.utils.kernel_loops import fill_vector
-from dptse_env.utils.kernels import kernel_part
+from dptse_env.utils.kernels import fill_vector, kernel_part
 
 VECTOR_WIDTH = 8  # numbers in a register
 

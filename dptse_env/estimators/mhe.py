@@ -41,9 +41,16 @@ from dptse_env.model.parameters import (
 )
 from dptse_env.model.step import advance, make_scratch, normalise, project, write_row
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
-from dptse_env.utils.kernel_loops import all_finite, any_of, copy_matrix, copy_vector
-from dptse_env.utils.kernels import Packed, kernel, kernel_part
-from dptse_env.utils.validation import integer, positive
+from dptse_env.utils.fields import integer, positive
+from dptse_env.utils.kernels import (
+    Packed,
+    all_finite,
+    any_of,
+    copy_matrix,
+    copy_vector,
+    kernel,
+    kernel_part,
+)
 
 # Largest natural residual of an optimum, in normalised states.
 RESIDUAL = 1e-8

@@ -25,7 +25,7 @@ import numpy as np
 
 from dptse_env.estimators.recurrent_kernels import CHANNELS, Network, shapes
 from dptse_env.utils.archive import open_archive, read_entry
-from dptse_env.utils.json_object import parse_object
+from dptse_env.utils.fields import parse_object
 
 LARGEST_FILE = 2**24
 """Largest size of a file and of its arrays together [bytes]; a network of width 32 has 60 kB."""

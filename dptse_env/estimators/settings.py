@@ -15,8 +15,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from dptse_env.model import ARZParameters, Bounds, available_parameters
-from dptse_env.utils.fields import Interval, checked_fields, from_mapping
-from dptse_env.utils.json_object import check_object, parse_json
+from dptse_env.utils.fields import Interval, check_object, checked_fields, from_mapping, parse_json
 
 Linearisation = Literal["paper", "trajectory"]
 

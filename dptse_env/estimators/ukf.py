@@ -37,9 +37,15 @@ from dptse_env.model.columns import (
 from dptse_env.model.network import RoadArrays
 from dptse_env.model.step import project
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
-from dptse_env.utils.kernel_loops import all_finite, copy_matrix, fill_vector
-from dptse_env.utils.kernels import Packed, kernel, kernel_part
-from dptse_env.utils.validation import require
+from dptse_env.utils.fields import require
+from dptse_env.utils.kernels import (
+    Packed,
+    all_finite,
+    copy_matrix,
+    fill_vector,
+    kernel,
+    kernel_part,
+)
 
 
 class Points(NamedTuple):

@@ -30,8 +30,7 @@ from dptse_env.estimators.linalg import (
 from dptse_env.estimators.linalg import factor as cholesky
 from dptse_env.model.network import RoadArrays
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
-from dptse_env.utils.kernel_loops import copy_matrix, copy_vector
-from dptse_env.utils.kernels import kernel_part
+from dptse_env.utils.kernels import copy_matrix, copy_vector, kernel_part
 
 # How a program was solved.
 UNSOLVED, ACTIVE_SET, NEWTON = 0, 1, 2

@@ -28,7 +28,7 @@ from dptse_env.model.parameters import (
 )
 from dptse_env.model.step import jacobians, next_states
 from dptse_env.utils.arrays import FloatArray
-from dptse_env.utils.validation import non_negative
+from dptse_env.utils.fields import non_negative
 
 
 class ARZModel:

@@ -10,9 +10,14 @@ from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from dptse_env.utils.fields import Interval, checked_fields, from_mapping
-from dptse_env.utils.json_object import parse_object, shipped_texts
-from dptse_env.utils.validation import require_name
+from dptse_env.utils.fields import (
+    Interval,
+    checked_fields,
+    from_mapping,
+    parse_object,
+    require_name,
+    shipped_texts,
+)
 
 SECONDS_PER_HOUR = 3600.0
 LARGEST_W = 1.1

@@ -26,8 +26,15 @@ from scipy.special import ndtr, ndtri
 from scipy.stats import beta, binom
 
 from dptse_env.utils.arrays import FloatArray
-from dptse_env.utils.fields import POSITIVE, Interval, checked_fields
-from dptse_env.utils.validation import inside, integer, positive, require
+from dptse_env.utils.fields import (
+    POSITIVE,
+    Interval,
+    checked_fields,
+    inside,
+    integer,
+    positive,
+    require,
+)
 
 _N_RATES = 4  # two thresholds, one for mu and one for epsilon, with two error rates each
 

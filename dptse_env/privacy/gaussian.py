@@ -23,7 +23,7 @@ from collections.abc import Iterable
 from scipy.optimize import brentq
 from scipy.special import erfcx, log_ndtr, ndtri
 
-from dptse_env.utils.validation import inside, positive
+from dptse_env.utils.fields import inside, positive
 
 _RELATIVE_TOLERANCE = 4 * 2.0**-52  # the tightest that brentq accepts
 _SQRT_TWO = math.sqrt(2.0)

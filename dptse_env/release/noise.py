@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from dptse_env.utils.arrays import FloatArray, IntArray
-from dptse_env.utils.validation import integer
+from dptse_env.utils.fields import integer
 
 GRID_SHARE = 2.0**-10
 """Largest spacing of the released grid over the noise's standard deviation."""

@@ -6,8 +6,7 @@ import numpy as np
 
 from dptse_env.model.parameters import SECONDS_PER_HOUR
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
-from dptse_env.utils.kernel_loops import copy_vector
-from dptse_env.utils.kernels import kernel, kernel_part
+from dptse_env.utils.kernels import copy_vector, kernel, kernel_part
 
 Packed = tuple[Any, ...]
 

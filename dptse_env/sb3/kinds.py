@@ -15,7 +15,7 @@ from dptse_env.sb3.channels import RoadChannels
 from dptse_env.sb3.policy import PlackettLucePolicy
 from dptse_env.sb3.torch_modules import KERNEL_SIZE
 from dptse_env.utils.extras import needed_for
-from dptse_env.utils.validation import integer
+from dptse_env.utils.fields import integer
 
 Shapes: TypeAlias = dict[str, tuple[int, ...]]
 

@@ -8,7 +8,7 @@ import numpy as np
 from dptse_env.parts import QueryInterface
 from dptse_env.process import QueryProcess
 from dptse_env.release import QueryOptions
-from dptse_env.spaces.picks import affordable
+from dptse_env.spaces.actions import affordable
 from dptse_env.utils.arrays import Action, BoolArray, FloatArray, IntArray, Observation
 
 

@@ -13,8 +13,7 @@ from dptse_env.model.step import advance, make_scratch, measured, normalise, pro
 from dptse_env.process import QueryProcess
 from dptse_env.schedules.base import ProcessSchedule, require_plain
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray, Observation
-from dptse_env.utils.kernel_loops import copy_matrix, copy_vector
-from dptse_env.utils.kernels import kernel, kernel_part
+from dptse_env.utils.kernels import copy_matrix, copy_vector, kernel, kernel_part
 
 
 class HasCovariance(Protocol):

@@ -8,35 +8,229 @@ truth, nor a clock, nor anything that distinguishes an empty segment from an occ
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Protocol
 
 import numpy as np
 from gymnasium import spaces
+from numpy.typing import NDArray
 
-from dptse_env.spaces.blocks import (
-    AGE_CAP,
-    BLOCKS,
-    DEFAULT,
-    SHIPPED_BLOCKS,
-    ObservationBlock,
-    ObservationSetup,
-    PublicState,
-    default_blocks,
-)
-from dptse_env.utils.arrays import Observation
-from dptse_env.utils.registry import is_foreign, name_of_class
+from dptse_env.estimators import Estimate
+from dptse_env.traffic import Corridor
+from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray, IntArray, Observation
+from dptse_env.utils.registry import Registry, is_foreign, missing_methods, name_of_class
 
-__all__ = [
-    "AGE_CAP",
-    "BLOCKS",
-    "DEFAULT",
-    "ObservationBlock",
-    "ObservationEncoding",
-    "ObservationSetup",
-    "PublicState",
-    "default_blocks",
-]
+AGE_CAP = 60
+"""Largest age of a segment [s] that observations distinguish."""
+
+PRICE_SCALE = 0.5
+"""Factor on the logarithm of prices that makes observations of them of order one."""
+
+DEFAULT = "default"
+"""Name that stands for all default blocks."""
+
+
+@dataclass(frozen=True)
+class PublicState:
+    """The operator's knowledge about k episodes, in physical units; the truth is no part of it.
+
+    Attributes:
+        estimate: Densities [veh/km], speeds [km/h] and their standard deviations, each (k, S).
+        released: Last released (density [veh/km], speed [km/h] or flow [veh/h]) per row, the
+            options first, shape (k, M, 2); zero before the first release.
+        innovations: Normalised innovations of the last update, shape (k, M, 2); zero where
+            nothing was observed.
+        age: Steps since each mainline segment was last observed, shape (k, n_mainline).
+        queried: The options that were last queried, shape (k, G).
+        picked: Options picked so far for the next query, shape (k, G).
+        prices: Price of the last query of each option, shape (k, G); zero where there was none.
+            None where queries have no prices.
+        tracer: The release model's public account of what a vehicle on each mainline segment has
+            been charged on average, over its budget, in [0, 1], shape (k, n_mainline). None where
+            queries have no prices.
+    """
+
+    estimate: Estimate
+    released: FloatArray
+    innovations: FloatArray
+    age: IntArray
+    queried: BoolArray
+    picked: BoolArray
+    prices: FloatArray | None = None
+    tracer: FloatArray | None = None
+
+
+@dataclass(frozen=True)
+class ObservationSetup:
+    """The public configuration behind an observation.
+
+    Attributes:
+        corridor: The road.
+        bandwidth: Largest total cost of the queries of a step.
+        epsilon: Privacy parameter epsilon.
+        n_options: Options G that can be queried.
+        sensor_rows: The row of a release in which each fixed sensor is, F of them.
+        releases_flow: Whether centred flows are released in place of mean speeds.
+        picks_one_by_one: Whether a decision takes several actions.
+        has_prices: Whether queries have prices.
+    """
+
+    corridor: Corridor
+    bandwidth: int
+    epsilon: float
+    n_options: int
+    sensor_rows: tuple[int, ...]
+    releases_flow: bool = False
+    picks_one_by_one: bool = False
+    has_prices: bool = False
+
+    @cached_property
+    def fixed_sensors(self) -> IntArray:
+        """Segments with a fixed sensor, shape (F,)."""
+        return np.array(self.corridor.fixed_sensors, dtype=np.int64)
+
+    @cached_property
+    def fixed_rows(self) -> IntArray:
+        """`sensor_rows` as an array, shape (F,)."""
+        return np.array(self.sensor_rows, dtype=np.int64)
+
+
+class ObservationBlock(Protocol):
+    """A named part of the observation; classes of blocks take no arguments.
+
+    Attributes:
+        name: Name, different from those of the blocks that ship with the package.
+        low: Lower bound; values below are clipped.
+        high: Upper bound; values above are clipped.
+    """
+
+    name: str
+    low: float
+    high: float
+
+    def size(self, setup: ObservationSetup) -> int:
+        """Return the number of values."""
+
+    def values(self, state: PublicState, setup: ObservationSetup) -> AnyArray | float:
+        """Return the values of k episodes, shape (k, size), or one number for all of them."""
+
+
+@dataclass(frozen=True)
+class Block:
+    """A block that ships with the package, see `ObservationBlock`."""
+
+    name: str
+    size: Callable[[ObservationSetup], int]
+    low: float
+    high: float
+    values: Callable[[PublicState, ObservationSetup], NDArray[Any] | float]
+
+    def __reduce__(self) -> tuple[Callable[[str], Block], tuple[str]]:
+        """Pickle as the name, since lambda functions cannot be pickled."""
+        return _shipped_block, (self.name,)
+
+
+_TINY = np.finfo(np.float64).tiny
+
+
+def _log(deviation: FloatArray) -> FloatArray:
+    # Zero has no logarithm; that of the smallest number is clipped to the lower bound.
+    return np.log(np.maximum(deviation, _TINY))
+
+
+def _segments(setup: ObservationSetup) -> int:
+    return setup.corridor.n_segments
+
+
+def _mainline(setup: ObservationSetup) -> int:
+    return setup.corridor.n_mainline
+
+
+def _options(setup: ObservationSetup) -> int:
+    return setup.n_options
+
+
+def _fixed(setup: ObservationSetup) -> int:
+    return len(setup.corridor.fixed_sensors)
+
+
+def _released(component: int, scale: Callable[[Corridor], float]) -> Any:
+    def value(state: PublicState, setup: ObservationSetup) -> FloatArray:
+        released = state.released[:, : setup.n_options, component]
+        values: FloatArray = released / scale(setup.corridor)
+        return values
+
+    return value
+
+
+def _innovation(component: int) -> Any:
+    return lambda state, setup: state.innovations[:, : setup.n_options, component]
+
+
+def _fixed_innovation(component: int) -> Any:
+    return lambda state, setup: state.innovations[:, setup.fixed_rows, component]
+
+
+def _scaled_prices(prices: FloatArray | None) -> FloatArray | float:
+    if prices is None:
+        return 0.0
+    return np.where(prices > 0.0, PRICE_SCALE * np.log10(np.maximum(prices, _TINY)), 0.0)
+
+
+SHIPPED_BLOCKS = (
+    Block("density", _segments, 0, 4,
+          lambda state, setup: state.estimate.density / setup.corridor.density_scale),
+    Block("speed", _segments, 0, 4,
+          lambda state, setup: state.estimate.speed / setup.corridor.speed_scale),
+    Block("density_log_std", _segments, -10, 5,
+          lambda state, setup: _log(state.estimate.density_std / setup.corridor.density_scale)),
+    Block("speed_log_std", _segments, -10, 5,
+          lambda state, setup: _log(state.estimate.speed_std / setup.corridor.speed_scale)),
+    Block("released_density", _options, -5, 5, _released(0, lambda road: road.density_scale)),
+    Block("released_speed", _options, -5, 5, _released(1, lambda road: road.speed_scale)),
+    Block("released_flow", _options, -5, 5,
+          _released(1, lambda road: road.density_scale * road.speed_scale)),
+    Block("density_innovation", _options, -10, 10, _innovation(0)),
+    Block("speed_innovation", _options, -10, 10, _innovation(1)),
+    Block("age", _mainline, 0, 1, lambda state, setup: state.age / AGE_CAP),
+    Block("queried", _options, 0, 1, lambda state, setup: state.queried),
+    Block("fixed_density_innovation", _fixed, -10, 10, _fixed_innovation(0)),
+    Block("fixed_speed_innovation", _fixed, -10, 10, _fixed_innovation(1)),
+    Block("bandwidth", lambda setup: 1, 0, 1,
+          lambda state, setup: setup.bandwidth / setup.corridor.n_mainline),
+    Block("epsilon", lambda setup: 1, -6, 6, lambda state, setup: float(np.log10(setup.epsilon))),
+    Block("picked", _options, 0, 1, lambda state, setup: state.picked),
+    Block("last_price", _options, -5, 5, lambda state, setup: _scaled_prices(state.prices)),
+    Block("tracer", _mainline, 0, 1,
+          lambda state, setup: 0.0 if state.tracer is None else state.tracer),
+)  # fmt: skip
+
+
+def _shipped_block(name: str) -> Block:
+    return next(block for block in SHIPPED_BLOCKS if block.name == name)
+
+
+def _expected(part: Any) -> str | None:
+    missing = missing_methods(part, ("size", "values"))
+    if missing is None and not isinstance(getattr(part, "name", None), str):
+        return "have a name"
+    return missing
+
+
+BLOCKS = Registry("observation", {block.name: block for block in SHIPPED_BLOCKS}, check=_expected)
+"""Observation blocks by name."""
+
+
+def default_blocks(setup: ObservationSetup) -> list[str]:
+    """Return the names of the default blocks."""
+    left_out = {"released_speed" if setup.releases_flow else "released_flow"}
+    if not setup.picks_one_by_one:
+        left_out.add("picked")
+    if not setup.has_prices:
+        left_out |= {"last_price", "tracer"}
+    return [block.name for block in SHIPPED_BLOCKS if block.name not in left_out]
 
 
 class ObservationEncoding:

@@ -22,8 +22,7 @@ from dptse_env.traffic.incident import Incident, IncidentDistribution
 from dptse_env.traffic.recordings import Recordings
 from dptse_env.traffic.road_segments import RoadSegments
 from dptse_env.traffic.sumo_scenario import SumoScenario
-from dptse_env.utils.fields import Interval, checked_fields
-from dptse_env.utils.validation import integer, require
+from dptse_env.utils.fields import Interval, checked_fields, integer, require
 
 NOT_TRAFFIC = ("name", "fixed_sensors", "density_scale", "speed_scale", "average_dwell")
 """Fields that describe the observation of the traffic and do not change the traffic itself."""

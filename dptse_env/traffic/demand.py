@@ -8,8 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from numpy.typing import NDArray
 
-from dptse_env.utils.fields import Interval, checked_fields
-from dptse_env.utils.validation import require
+from dptse_env.utils.fields import Interval, checked_fields, require
 
 Rate = Annotated[float, Interval(0, 100_000)]
 """Vehicles an hour."""

@@ -4,8 +4,7 @@ import re
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from dptse_env.utils.fields import Interval, checked_fields
-from dptse_env.utils.validation import require
+from dptse_env.utils.fields import Interval, checked_fields, require
 
 CarFollowing = Literal["W99", "Krauss", "IDM"]
 """SUMO's name of a car-following model."""

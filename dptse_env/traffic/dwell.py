@@ -7,7 +7,7 @@ import numpy as np
 from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.field_record import AnyRecord, FieldRecord, with_vehicles
 from dptse_env.traffic.record import mean_dwell
-from dptse_env.utils.validation import require
+from dptse_env.utils.fields import require
 
 
 def average_dwell(corridor: Corridor, records: Iterable[AnyRecord]) -> float:

@@ -15,7 +15,7 @@ from dptse_env.traffic.stored_arrays import (
     load_arrays,
     save_arrays,
 )
-from dptse_env.utils.validation import require
+from dptse_env.utils.fields import require
 
 FIELD_FORMAT = "dptse-field"
 FIELD_VERSION = 1

@@ -7,8 +7,7 @@ from typing import Annotated
 import numpy as np
 
 from dptse_env.traffic.demand import Second
-from dptse_env.utils.fields import Interval, checked_fields
-from dptse_env.utils.validation import require
+from dptse_env.utils.fields import Interval, checked_fields, require
 
 Segment = Annotated[int, Interval(0, 999)]
 """Index of a mainline segment."""

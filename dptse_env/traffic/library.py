@@ -40,8 +40,8 @@ from dptse_env.traffic.sumo import (
 )
 from dptse_env.traffic.sumo_network import NetworkError
 from dptse_env.traffic.worker import WorkerPool
+from dptse_env.utils.fields import integer, require
 from dptse_env.utils.threads import n_cores
-from dptse_env.utils.validation import integer, require
 
 CACHE_VARIABLE = "DPTSE_CACHE"
 """Environment variable with the directory of the records."""

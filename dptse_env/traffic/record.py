@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dptse_env.traffic.stored_arrays import InvalidRecordError, load_arrays, save_arrays
 from dptse_env.utils.arrays import BoolArray
-from dptse_env.utils.validation import integer, require
+from dptse_env.utils.fields import integer, require
 
 RECORD_FORMAT = "dptse-record"
 RECORD_VERSION = 1

@@ -14,9 +14,7 @@ from typing import Any, Literal
 from dptse_env.traffic.field_record import AnyRecord, load_record
 from dptse_env.traffic.stored_arrays import MANIFEST, InvalidRecordError
 from dptse_env.utils.digests import json_digest
-from dptse_env.utils.fields import checked_fields
-from dptse_env.utils.json_object import parse_object
-from dptse_env.utils.validation import integer
+from dptse_env.utils.fields import checked_fields, integer, parse_object
 
 RECORDINGS_FORMAT = "dptse-recordings"
 RECORDINGS_VERSION = 1

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.demand import Demand, DemandDistribution, value_at
 from dptse_env.traffic.incident import Incident, IncidentDistribution
-from dptse_env.utils.validation import integer
+from dptse_env.utils.fields import integer
 
 MAINLINE = -1
 """Origin or exit of a vehicle that enters or leaves by the mainline instead of a ramp."""

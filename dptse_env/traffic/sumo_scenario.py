@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Annotated
 
 from dptse_env.utils.digests import file_digest
-from dptse_env.utils.fields import Interval, checked_fields
-from dptse_env.utils.validation import require
+from dptse_env.utils.fields import Interval, checked_fields, require
 
 Position = Annotated[float, Interval(0, 1e6)]
 """Place on an edge, from its start [m]."""

@@ -7,12 +7,14 @@ generated from it. An error is one line: ``<path> must be <allowed>, got <value>
 """
 
 import dataclasses
+import json
 import math
 import types
 import typing
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from importlib.resources import files
 from numbers import Integral, Real
 from typing import Any, TypeVar
 
@@ -252,3 +254,91 @@ def _shown(value: Any) -> str:
     """Return a value for a message, cut where it is long."""
     text = repr(value)
     return text if len(text) <= 200 else f"{text[:200]}..."
+
+
+_NON_NEGATIVE = Interval(0, math.inf, open_high=True)
+
+
+def require(condition: bool, path: str, allowed: str, value: object) -> None:
+    """Raise ``ValueError`` "<path> must be <allowed>, got <value>" unless `condition` holds."""
+    if not condition:
+        raise ValueError(f"{path} must be {allowed}, got {value!r}")
+
+
+def require_name(path: str, name: object, known: Iterable[str]) -> None:
+    """Raise ``ValueError`` unless `name` is one of the `known` strings."""
+    names = list(known)
+    if not isinstance(name, str) or name not in names:
+        raise ValueError(f"{path} must be one of {', '.join(names)}, got {name!r}")
+
+
+def integer(path: str, value: object, low: int, high: float = math.inf) -> int:
+    """Return `value` as an ``int`` within [low, high], both inclusive, or raise ``ValueError``."""
+    return number(int, value, path, Interval(low, high))
+
+
+def positive(path: str, value: object) -> float:
+    """Return `value` as a finite ``float`` above zero, or raise ``ValueError``."""
+    return number(float, value, path, POSITIVE)
+
+
+def non_negative(path: str, value: object) -> float:
+    """Return `value` as a finite ``float`` of at least zero, or raise ``ValueError``."""
+    return number(float, value, path, _NON_NEGATIVE)
+
+
+def inside(path: str, value: object, low: float, high: float) -> float:
+    """Return `value` as a ``float`` strictly between `low` and `high`, or raise ``ValueError``."""
+    return number(float, value, path, Interval(low, high, open_low=True, open_high=True))
+
+
+def shipped_texts(package: str, folder: str) -> dict[str, str]:
+    """Return the JSON files in a folder of a package by name, without the suffix and sorted."""
+    entries = sorted((files(package) / folder).iterdir(), key=lambda entry: entry.name)
+    return {
+        entry.name.removesuffix(".json"): entry.read_text(encoding="utf-8")
+        for entry in entries
+        if entry.name.endswith(".json")
+    }
+
+
+def parse_object(text: str | bytes, path: str, keys: Mapping[str, type]) -> dict[str, Any]:
+    """Parse a JSON object that has exactly the given keys.
+
+    Args:
+        text: The JSON, as text or as the bytes of a file.
+        path: Its path, for error messages.
+        keys: Type of each value by its key.
+
+    Raises:
+        ValueError: It is no JSON, no object, or has other keys or types; the message starts with
+            ``path``.
+    """
+    return check_object(parse_json(text, path), path, keys)
+
+
+def parse_json(text: str | bytes, path: str) -> Any:
+    """Parse JSON.
+
+    Raises:
+        ValueError: It is no JSON; the message starts with ``path``.
+    """
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as problem:
+        raise ValueError(f"{path} must be JSON: {problem}") from problem
+
+
+def check_object(content: Any, path: str, keys: Mapping[str, type]) -> dict[str, Any]:
+    """Return parsed JSON where it is an object that has exactly the given keys.
+
+    Raises:
+        ValueError: It is no object, or has other keys or types; the message starts with ``path``.
+    """
+    if not isinstance(content, dict) or set(content) != set(keys):
+        got = str(sorted(content) if isinstance(content, dict) else content)[:200]
+        raise ValueError(f"{path} must be a mapping with the keys {', '.join(keys)}, got {got}")
+    for key, kind in keys.items():
+        if not isinstance(content[key], kind) or isinstance(content[key], bool):
+            raise ValueError(f"{path}: {key} must be of type {kind.__name__}, got {content[key]!r}")
+    return content

@@ -16,6 +16,7 @@ import gc
 import hashlib
 import inspect
 import logging
+import math
 import os
 import pickle
 import sys
@@ -37,6 +38,8 @@ from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler, CompileResult
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.registry import CPUDispatcher
+
+from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray
 
 logger = logging.getLogger(__name__)
 
@@ -383,3 +386,43 @@ def _written(options: dict[str, Any]) -> str:
     """Write options of numba in the same way in each process; some are sets."""
     values = [(k, sorted(v) if isinstance(v, set) else v) for k, v in sorted(options.items())]
     return repr(values)
+
+
+@kernel_part
+def copy_vector(source: AnyArray, target: AnyArray) -> None:
+    """Write a vector into another of its length."""
+    for i in range(source.size):
+        target[i] = source[i]
+
+
+@kernel_part
+def fill_vector(target: AnyArray, value: float) -> None:
+    """Write a number into all of a vector."""
+    for i in range(target.size):
+        target[i] = value
+
+
+@kernel_part
+def copy_matrix(source: AnyArray, target: AnyArray) -> None:
+    """Write a matrix into another of its shape."""
+    for i in range(source.shape[0]):
+        for j in range(source.shape[1]):
+            target[i, j] = source[i, j]
+
+
+@kernel_part
+def any_of(flags: BoolArray) -> bool:
+    """Return whether any flag of a vector is set."""
+    for i in range(flags.size):  # noqa: SIM110, a generator takes longer to compile
+        if flags[i]:
+            return True
+    return False
+
+
+@kernel_part
+def all_finite(vector: FloatArray) -> bool:
+    """Return whether all numbers of a vector are finite."""
+    for i in range(vector.size):  # noqa: SIM110
+        if not math.isfinite(vector[i]):
+            return False
+    return True

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
 from itertools import pairwise
 
-from dptse_env.utils.validation import integer
+from dptse_env.utils.fields import integer
 
 SMALLEST_BLOCK = 16
 """Smallest block of episodes that is worth a thread: handing over a block takes some 50 us."""

@@ -18,7 +18,7 @@ from dptse_env.traffic.importers.folder import ROAD, Split, assign_seeds
 from dptse_env.traffic.importers.new_folder import new_folder
 from dptse_env.traffic.recordings import Recordings, record_path, record_source, write_manifest
 from dptse_env.traffic.road_files import DENSITY_SCALE, write_corridor
-from dptse_env.utils.validation import integer, positive, require
+from dptse_env.utils.fields import integer, positive, require
 
 FloatTable = NDArray[np.float64]
 

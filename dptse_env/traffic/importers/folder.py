@@ -25,7 +25,7 @@ from dptse_env.traffic.importers.source import Source
 from dptse_env.traffic.record import Record, mean_dwell
 from dptse_env.traffic.recordings import Recordings, record_path, record_source, write_manifest
 from dptse_env.traffic.road_files import write_corridor
-from dptse_env.utils.validation import require, require_name
+from dptse_env.utils.fields import require, require_name
 
 FORMATS: Mapping[str, Format] = {
     "fcd": FCD(),

@@ -6,7 +6,7 @@ import uuid
 from collections.abc import Iterator
 from pathlib import Path
 
-from dptse_env.utils.validation import require
+from dptse_env.utils.fields import require
 
 
 @contextlib.contextmanager

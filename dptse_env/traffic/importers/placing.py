@@ -15,7 +15,7 @@ from dptse_env.traffic.importers.points import Labels, Points
 from dptse_env.traffic.importers.source import Layout, Part
 from dptse_env.traffic.sumo_network import edge_ids
 from dptse_env.utils.arrays import FloatArray
-from dptse_env.utils.validation import require
+from dptse_env.utils.fields import require
 
 LINE_SPACING = 0.005
 """Spacing of the points of a centre line by which the nearest one is found [km]."""

@@ -12,8 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
-from dptse_env.utils.fields import Interval, checked_fields, from_mapping
-from dptse_env.utils.validation import require, require_name
+from dptse_env.utils.fields import Interval, checked_fields, from_mapping, require, require_name
 
 TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "frame": 0.0}
 """Units of times in seconds; frames need a `Source.frame_rate`."""

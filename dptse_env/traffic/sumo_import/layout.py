@@ -13,7 +13,7 @@ from dptse_env.traffic.sumo_import.chain import Chain
 from dptse_env.traffic.sumo_import.net import Net
 from dptse_env.traffic.sumo_import.ramps import Ramp, find_ramps
 from dptse_env.traffic.sumo_scenario import Stretch
-from dptse_env.utils.validation import require
+from dptse_env.utils.fields import require
 
 SHORTEST = 40.0
 """Shortest segment [m]."""

@@ -21,7 +21,7 @@ from dptse_env.traffic.sumo_import.net import Net
 from dptse_env.traffic.sumo_scenario import SumoScenario
 from dptse_env.traffic.worker import simulate_in_child
 from dptse_env.utils.digests import file_digest
-from dptse_env.utils.validation import require
+from dptse_env.utils.fields import require
 
 
 @dataclass(frozen=True)
