@@ -244,7 +244,11 @@ def warn_where_void(config: EnvConfig) -> None:
     # Who asks for the truth in info knows that it is shown.
     reasons = set(privacy_report(config).void_reasons) - {"truth_in_info"}
     if reasons:
-        listed = "; ".join(f"{reason}: {VOID_REASONS[reason]}" for reason in in_order(reasons))
+        # A release model of another package may have reasons of its own, which explain themselves.
+        listed = "; ".join(
+            f"{reason}: {VOID_REASONS[reason]}" if reason in VOID_REASONS else reason
+            for reason in in_order(reasons)
+        )
         warnings.warn(
             f"privacy.preset is {config.privacy.preset!r}, yet no privacy is guaranteed. {listed}",
             UserWarning,

@@ -3,6 +3,7 @@
 import json
 import pickle
 import sys
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 
@@ -95,6 +96,18 @@ def test_a_claim_is_shown_as_it_is_made():
     values["privacy"]["boundary_inputs"] = "nominal"
     privacy = gym.make(SHORT, **values).reset(seed=0)[1]["privacy"]
     assert (privacy["guarantee"], privacy["void_reasons"]) == ("a claim", [])
+
+
+class Doubtful(parts.LaplaceRelease):
+    claims_guarantee = True
+
+    def report(self):
+        return replace(super().report(), guarantee="none", void_reasons=("a_doubt_of_its_own",))
+
+
+def test_a_reason_of_ones_own_against_a_guarantee_is_named():
+    with pytest.warns(UserWarning, match="no privacy is guaranteed.* a_doubt_of_its_own"):
+        gym.make(SHORT, privacy={"preset": Doubtful, "boundary_inputs": "nominal"})
 
 
 @pytest.mark.parametrize("form", [by_name, by_module])
