@@ -186,9 +186,7 @@ def update(
     for k in range(episodes.size):
         e = episodes[k]
         mean, covariance = filters.means[e], filters.covariances[e]
-        for m in range(n_rows):
-            if observed[k, m]:
-                _linearise(road, filters, e, m, values[k, m], sigma[k, m], centre[k], rows)
+        _linearise(road, filters, e, observed[k], values[k], sigma[k], centre[k], rows)
         _innovate(road, filters, e, observed[k], rows)
         sound = True
         if any_of(observed[k]):
@@ -206,26 +204,30 @@ def _linearise(
     road: RoadArrays,
     filters: Filters,
     e: int,
-    m: int,
+    observed: BoolArray,
     values: FloatArray,
     sigma: FloatArray,
     centre: FloatArray,
     rows: Rows,
 ) -> None:
-    """Write the weights, residuals and noise of a row at an episode's mean."""
-    mean, weights, residuals = filters.means[e], rows.weights[m], rows.residuals[m]
-    first, span = 2 * road.row_first[m], road.row_span[m]
-    write_row(road, filters.units, mean, centre, m, weights, residuals)
-    density = 0.0
-    for i in range(2 * span):
-        x = mean[first + i] / filters.units[first + i]
-        density += weights[0, i] * x
-        residuals[1] += weights[1, i] * x
-    residuals[0] = values[0] / filters.units[0] - density
-    residuals[1] = values[1] / road.second_scale - residuals[1]
-    rows.noise[m, 0] = (sigma[0] / filters.units[0]) ** 2
-    rows.noise[m, 0] += filters.count_variance[m] * density * filters.units[0] / span
-    rows.noise[m, 1] = (sigma[1] / road.second_scale) ** 2
+    """Write the weights, residuals and noise of the observed rows at an episode's mean."""
+    mean, units = filters.means[e], filters.units
+    for m in range(road.row_first.size):
+        if not observed[m]:
+            continue
+        weights, residuals = rows.weights[m], rows.residuals[m]
+        first, span = 2 * road.row_first[m], road.row_span[m]
+        write_row(road, units, mean, centre, m, weights, residuals)
+        density = 0.0
+        for i in range(2 * span):
+            x = mean[first + i] / units[first + i]
+            density += weights[0, i] * x
+            residuals[1] += weights[1, i] * x
+        residuals[0] = values[m, 0] / units[0] - density
+        residuals[1] = values[m, 1] / road.second_scale - residuals[1]
+        rows.noise[m, 0] = (sigma[m, 0] / units[0]) ** 2
+        rows.noise[m, 0] += filters.count_variance[m] * density * units[0] / span
+        rows.noise[m, 1] = (sigma[m, 1] / road.second_scale) ** 2
 
 
 @kernel_part

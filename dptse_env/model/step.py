@@ -407,13 +407,12 @@ def measured(
 
 @kernel_part
 def _released(
-    road: RoadArrays, s: int, rho: float, psi: float, centre: float
+    rho: float, psi: float, centre: float, jam: float, v_f: float, gamma: float
 ) -> tuple[float, float, float]:
     """Return a segment's released second number, and its derivatives by rho and psi.
 
     That is the flow [veh/h] centred on a speed [km/h], or the speed where the centre is NaN.
     """
-    jam, v_f, gamma = road.jam[s], road.free_flow_speed, road.gamma
     if np.isnan(centre):
         return measured(rho, psi, jam, v_f, gamma)
     p = pressure(rho, jam, v_f, gamma)
@@ -445,12 +444,12 @@ def write_row(
         weights: `(2, >= 2 span)`, written, of the components from 2 `row_first[m]` on.
         constants: `(2,)`, written.
     """
-    first, span = road.row_first[m], road.row_span[m]
-    constants[:] = 0.0
+    first, span, v_f, gamma = road.row_first[m], road.row_span[m], road.free_flow_speed, road.gamma
+    constants[0] = constants[1] = 0.0
     for i in range(span):
         s = first + i
         rho, psi = state[2 * s], state[2 * s + 1]
-        second, by_rho, by_psi = _released(road, s, rho, psi, centre[s])
+        second, by_rho, by_psi = _released(rho, psi, centre[s], road.jam[s], v_f, gamma)
         part = 1.0 / (span * road.second_scale)
         weights[0, 2 * i], weights[0, 2 * i + 1] = 1.0 / span, 0.0
         weights[1, 2 * i] = part * by_rho * units[2 * s]
