@@ -151,7 +151,8 @@ class SensorQueryEnv(gym.Env[Observation, Any]):
         self.config = config = resolve(preset, overrides)
         warn_where_void(config)
         self.interface = make_interface(config)
-        check_settings(config.estimator, make_model(config), config.settings())
+        self._model = make_model(config)
+        check_settings(config.estimator, self._model, config.settings())
         self.action_space = self.interface.actions.space
         self.observation_space = self.interface.observations.space
         self._library = open_library(records)
@@ -164,7 +165,9 @@ class SensorQueryEnv(gym.Env[Observation, Any]):
     def process(self) -> QueryProcess:
         """The process behind the environment, assembled at the first use."""
         if self._process is None:
-            parts = make_parts(self.config, 1, self._library, interface=self.interface)
+            parts = make_parts(
+                self.config, 1, self._library, interface=self.interface, model=self._model
+            )
             self._process = QueryProcess(parts)
         return self._process
 

@@ -130,7 +130,8 @@ class SensorQueryVectorEnv(VectorEnv[Observation, Action, Any]):
         self.config = config = resolve(preset, overrides)
         warn_where_void(config)
         self.interface = make_interface(config)
-        check_settings(config.estimator, make_model(config), config.settings())
+        self._model = make_model(config)
+        check_settings(config.estimator, self._model, config.settings())
         self.single_action_space = self.interface.actions.space
         self.single_observation_space = self.interface.observations.space
         self.action_space = batch_space(self.single_action_space, self.num_envs)
@@ -148,7 +149,10 @@ class SensorQueryVectorEnv(VectorEnv[Observation, Action, Any]):
     def process(self) -> QueryProcess:
         """The process behind the environment, assembled at the first use."""
         if self._process is None:
-            parts = make_parts(self.config, self.num_envs, self._library, interface=self.interface)
+            parts = make_parts(
+                self.config, self.num_envs, self._library,
+                interface=self.interface, model=self._model,
+            )  # fmt: skip
             self._process = QueryProcess(parts, self._threads)
         return self._process
 

@@ -30,7 +30,7 @@ from dptse_env.estimators.linalg import (
 from dptse_env.estimators.linalg import factor as cholesky
 from dptse_env.model.network import RoadArrays
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
-from dptse_env.utils.kernels import copy_matrix, copy_vector, kernel_part
+from dptse_env.utils.kernels import copy_matrix, copy_vector, fill_vector, kernel_part
 
 # How a program was solved.
 UNSOLVED, ACTIVE_SET, NEWTON = 0, 1, 2
@@ -154,8 +154,8 @@ def factorise(road: RoadArrays, window: Window, side: IntArray, factor: Factor) 
     for t in range(start, n_stages):
         P = factor.covariances[t]
         if t == 0:
-            _fill(0.0, P)
             for i in range(n):
+                fill_vector(P[i], 0.0)
                 P[i, i] = window.arrival_variance[i]
         else:
             blocks, by_factor = window.blocks[t - 1], window.by_factor[t - 1]
@@ -222,13 +222,6 @@ def _is_same(one: IntArray, other: IntArray) -> bool:
         if one[i] != other[i]:
             return False
     return True
-
-
-@kernel_part
-def _fill(value: float, out: FloatArray) -> None:
-    for i in range(out.shape[0]):
-        for j in range(out.shape[1]):
-            out[i, j] = value
 
 
 @kernel_part

@@ -132,7 +132,7 @@ def test_a_scalar_update_is_half_of_a_pair():
 
 
 def test_joseph_form_makes_up_for_a_rounded_gain():
-    """What a precise number leaves of a variance is small beside the rounding of K c'."""
+    """A precise number leaves a variance that is small beside the rounding of K c'."""
     noise = np.array([1.0, 3.0]) * 2.0**-40  # 1 + noise is exact
     expected = noise / (1.0 + noise)
     covariance = np.eye(N, WIDTH)

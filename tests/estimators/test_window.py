@@ -108,7 +108,7 @@ def dense(window):
 
 
 def point_at(program, z):
-    """What a trajectory `(L, n_x)` leaves."""
+    """The gaps and misfits that a trajectory `(L, n_x)` leaves."""
     shape = program.n_stages, WIDTH
     misfits = np.zeros((program.n_stages, 2 * N_ROWS))
     point = Point(np.zeros(shape), np.zeros(shape), misfits, np.zeros(shape))

@@ -1,4 +1,4 @@
-"""What the equations imply: equilibria, balances, bounds, and the limits of each face."""
+"""Consequences of the equations: equilibria, balances, bounds, and the limits of each face."""
 
 import itertools
 from dataclasses import replace
