@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
@@ -18,6 +17,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from dptse_env.estimators import Estimate
+from dptse_env.release import Task
 from dptse_env.traffic import Corridor
 from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray, IntArray, Observation
 from dptse_env.utils.registry import Registry, is_foreign, missing_methods, name_of_class
@@ -62,41 +62,6 @@ class PublicState:
     tracer: FloatArray | None = None
 
 
-@dataclass(frozen=True)
-class ObservationSetup:
-    """The public configuration behind an observation.
-
-    Attributes:
-        corridor: The road.
-        bandwidth: Largest total cost of the queries of a step.
-        epsilon: Privacy parameter epsilon.
-        n_options: Options G that can be queried.
-        sensor_rows: The row of a release in which each fixed sensor is, F of them.
-        releases_flow: Whether centred flows are released in place of mean speeds.
-        picks_one_by_one: Whether a decision takes several actions.
-        has_prices: Whether queries have prices.
-    """
-
-    corridor: Corridor
-    bandwidth: int
-    epsilon: float
-    n_options: int
-    sensor_rows: tuple[int, ...]
-    releases_flow: bool = False
-    picks_one_by_one: bool = False
-    has_prices: bool = False
-
-    @cached_property
-    def fixed_sensors(self) -> IntArray:
-        """Segments with a fixed sensor, shape (F,)."""
-        return np.array(self.corridor.fixed_sensors, dtype=np.int64)
-
-    @cached_property
-    def fixed_rows(self) -> IntArray:
-        """`sensor_rows` as an array, shape (F,)."""
-        return np.array(self.sensor_rows, dtype=np.int64)
-
-
 class ObservationBlock(Protocol):
     """A named part of the observation; classes of blocks take no arguments.
 
@@ -110,10 +75,10 @@ class ObservationBlock(Protocol):
     low: float
     high: float
 
-    def size(self, setup: ObservationSetup) -> int:
+    def size(self, task: Task) -> int:
         """Return the number of values."""
 
-    def values(self, state: PublicState, setup: ObservationSetup) -> AnyArray | float:
+    def values(self, state: PublicState, task: Task) -> AnyArray | float:
         """Return the values of k episodes, shape (k, size), or one number for all of them."""
 
 
@@ -122,10 +87,10 @@ class Block:
     """A block that ships with the package, see `ObservationBlock`."""
 
     name: str
-    size: Callable[[ObservationSetup], int]
+    size: Callable[[Task], int]
     low: float
     high: float
-    values: Callable[[PublicState, ObservationSetup], NDArray[Any] | float]
+    values: Callable[[PublicState, Task], NDArray[Any] | float]
 
     def __reduce__(self) -> tuple[Callable[[str], Block], tuple[str]]:
         """Pickle as the name, since lambda functions cannot be pickled."""
@@ -140,37 +105,37 @@ def _log(deviation: FloatArray) -> FloatArray:
     return np.log(np.maximum(deviation, _TINY))
 
 
-def _segments(setup: ObservationSetup) -> int:
-    return setup.corridor.n_segments
+def _segments(task: Task) -> int:
+    return task.corridor.n_segments
 
 
-def _mainline(setup: ObservationSetup) -> int:
-    return setup.corridor.n_mainline
+def _mainline(task: Task) -> int:
+    return task.corridor.n_mainline
 
 
-def _options(setup: ObservationSetup) -> int:
-    return setup.n_options
+def _options(task: Task) -> int:
+    return task.queries.n_options
 
 
-def _fixed(setup: ObservationSetup) -> int:
-    return len(setup.corridor.fixed_sensors)
+def _fixed(task: Task) -> int:
+    return len(task.corridor.fixed_sensors)
 
 
 def _released(component: int, scale: Callable[[Corridor], float]) -> Any:
-    def value(state: PublicState, setup: ObservationSetup) -> FloatArray:
-        released = state.released[:, : setup.n_options, component]
-        values: FloatArray = released / scale(setup.corridor)
+    def value(state: PublicState, task: Task) -> FloatArray:
+        released = state.released[:, : task.queries.n_options, component]
+        values: FloatArray = released / scale(task.corridor)
         return values
 
     return value
 
 
 def _innovation(component: int) -> Any:
-    return lambda state, setup: state.innovations[:, : setup.n_options, component]
+    return lambda state, task: state.innovations[:, : task.queries.n_options, component]
 
 
 def _fixed_innovation(component: int) -> Any:
-    return lambda state, setup: state.innovations[:, setup.fixed_rows, component]
+    return lambda state, task: state.innovations[:, task.sensors, component]
 
 
 def _scaled_prices(prices: FloatArray | None) -> FloatArray | float:
@@ -181,30 +146,30 @@ def _scaled_prices(prices: FloatArray | None) -> FloatArray | float:
 
 SHIPPED_BLOCKS = (
     Block("density", _segments, 0, 4,
-          lambda state, setup: state.estimate.density / setup.corridor.density_scale),
+          lambda state, task: state.estimate.density / task.corridor.density_scale),
     Block("speed", _segments, 0, 4,
-          lambda state, setup: state.estimate.speed / setup.corridor.speed_scale),
+          lambda state, task: state.estimate.speed / task.corridor.speed_scale),
     Block("density_log_std", _segments, -10, 5,
-          lambda state, setup: _log(state.estimate.density_std / setup.corridor.density_scale)),
+          lambda state, task: _log(state.estimate.density_std / task.corridor.density_scale)),
     Block("speed_log_std", _segments, -10, 5,
-          lambda state, setup: _log(state.estimate.speed_std / setup.corridor.speed_scale)),
+          lambda state, task: _log(state.estimate.speed_std / task.corridor.speed_scale)),
     Block("released_density", _options, -5, 5, _released(0, lambda road: road.density_scale)),
     Block("released_speed", _options, -5, 5, _released(1, lambda road: road.speed_scale)),
     Block("released_flow", _options, -5, 5,
           _released(1, lambda road: road.density_scale * road.speed_scale)),
     Block("density_innovation", _options, -10, 10, _innovation(0)),
     Block("speed_innovation", _options, -10, 10, _innovation(1)),
-    Block("age", _mainline, 0, 1, lambda state, setup: state.age / AGE_CAP),
-    Block("queried", _options, 0, 1, lambda state, setup: state.queried),
+    Block("age", _mainline, 0, 1, lambda state, task: state.age / AGE_CAP),
+    Block("queried", _options, 0, 1, lambda state, task: state.queried),
     Block("fixed_density_innovation", _fixed, -10, 10, _fixed_innovation(0)),
     Block("fixed_speed_innovation", _fixed, -10, 10, _fixed_innovation(1)),
-    Block("bandwidth", lambda setup: 1, 0, 1,
-          lambda state, setup: setup.bandwidth / setup.corridor.n_mainline),
-    Block("epsilon", lambda setup: 1, -6, 6, lambda state, setup: float(np.log10(setup.epsilon))),
-    Block("picked", _options, 0, 1, lambda state, setup: state.picked),
-    Block("last_price", _options, -5, 5, lambda state, setup: _scaled_prices(state.prices)),
+    Block("bandwidth", lambda task: 1, 0, 1,
+          lambda state, task: task.queries.bandwidth / task.corridor.n_mainline),
+    Block("epsilon", lambda task: 1, -6, 6, lambda state, task: float(np.log10(task.settings.epsilon))),
+    Block("picked", _options, 0, 1, lambda state, task: state.picked),
+    Block("last_price", _options, -5, 5, lambda state, task: _scaled_prices(state.prices)),
     Block("tracer", _mainline, 0, 1,
-          lambda state, setup: 0.0 if state.tracer is None else state.tracer),
+          lambda state, task: 0.0 if state.tracer is None else state.tracer),
 )  # fmt: skip
 
 
@@ -223,12 +188,12 @@ BLOCKS = Registry("observation", {block.name: block for block in SHIPPED_BLOCKS}
 """Observation blocks by name."""
 
 
-def default_blocks(setup: ObservationSetup) -> list[str]:
+def default_blocks(task: Task, *, picks_one_by_one: bool = False) -> list[str]:
     """Return the names of the default blocks."""
-    left_out = {"released_speed" if setup.releases_flow else "released_flow"}
-    if not setup.picks_one_by_one:
+    left_out = {"released_speed" if task.releases_flow else "released_flow"}
+    if not picks_one_by_one:
         left_out.add("picked")
-    if not setup.has_prices:
+    if not task.model.has_prices:
         left_out |= {"last_price", "tracer"}
     return [block.name for block in SHIPPED_BLOCKS if block.name not in left_out]
 
@@ -240,26 +205,30 @@ class ObservationEncoding:
     the bounds are clipped.
 
     Attributes:
-        setup: The public configuration.
+        task: What is measured.
         space: The Gymnasium space, a float32 ``Box``.
         slices: Position of each block, by name.
     """
 
-    def __init__(self, setup: ObservationSetup, blocks: Sequence[Any] = (DEFAULT,)) -> None:
+    def __init__(
+        self, task: Task, blocks: Sequence[Any] = (DEFAULT,), *, picks_one_by_one: bool = False
+    ) -> None:
         """Arrange blocks in a vector.
 
         Args:
-            setup: The public configuration.
+            task: What is measured.
             blocks: Names, ``"package.module:Class"``, objects or classes; ``"default"`` stands for
                 all default blocks.
+            picks_one_by_one: Whether a decision takes several actions.
 
         Raises:
             ValueError: There is no such block, it lacks a method, or two have the same name.
         """
-        self.setup = setup
-        names = [name for value in blocks for name in _expanded(value, setup)]
+        self.task = task
+        defaults = default_blocks(task, picks_one_by_one=picks_one_by_one)
+        names = [name for value in blocks for name in _expanded(value, defaults)]
         self.blocks: tuple[ObservationBlock, ...] = tuple(map(_made, names))
-        sizes = [_checked_size(block, setup) for block in self.blocks]
+        sizes = [_checked_size(block, task) for block in self.blocks]
         ends = np.cumsum(sizes).tolist()
         self.slices: dict[str, slice] = {}
         for block, size, end in zip(self.blocks, sizes, ends, strict=True):
@@ -277,7 +246,7 @@ class ObservationEncoding:
         k = len(state.released)
         flat = np.empty((k, self.space.shape[0]), dtype=np.float32)
         for block, place, checked in self._plan:
-            values = block.values(state, self.setup)
+            values = block.values(state, self.task)
             if checked:
                 _check_values(block, values, (k, place.stop - place.start))
             flat[:, place] = values
@@ -295,8 +264,8 @@ class ObservationEncoding:
         return observation[..., self.slices[name]]
 
 
-def _expanded(value: Any, setup: ObservationSetup) -> list[Any]:
-    return default_blocks(setup) if isinstance(value, str) and value == DEFAULT else [value]
+def _expanded(value: Any, defaults: list[str]) -> Sequence[Any]:
+    return defaults if isinstance(value, str) and value == DEFAULT else [value]
 
 
 def _made(value: Any) -> ObservationBlock:
@@ -318,8 +287,8 @@ def _made(value: Any) -> ObservationBlock:
     return made
 
 
-def _checked_size(block: ObservationBlock, setup: ObservationSetup) -> int:
-    size = block.size(setup)
+def _checked_size(block: ObservationBlock, task: Task) -> int:
+    size = block.size(task)
     if type(size) is not int or size < 0:
         raise ValueError(
             f"observation {name_of_class(block)}.size() must return an integer >= 0, got {size!r}"
