@@ -11,24 +11,23 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dptse_env.estimators import Estimate, Measurement
 from dptse_env.model import MeasurementRows
+from dptse_env.model.network import covered
 from dptse_env.privacy import Adjacency
 from dptse_env.release.queries import QueryOptions
 from dptse_env.release.report import PrivacyReport
+from dptse_env.release.vehicles import Traffic
 from dptse_env.traffic import Corridor, Penetration
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.fields import Interval, checked_fields
 from dptse_env.utils.registry import name_of_class
 from dptse_env.utils.vector_info import Rows
-
-if TYPE_CHECKING:
-    from dptse_env.release.vehicles import Traffic
 
 BoundaryInputs = Literal["true", "nominal", "private"]
 """Source of the estimator's inputs at the boundary: measured traffic, public demand, or the
@@ -230,14 +229,24 @@ class Task:
         """Return the mainline segments (k, n_mainline) of observed columns (k, C)."""
         if self.rows.are_single:
             return observed[:, : self.corridor.n_mainline]
-        covered: BoolArray = observed[:, : self.n_rows].astype(np.float32) @ self._covers > 0.0
-        return covered
+        rows = observed[:, : self.n_rows].astype(np.float32)
+        segments: BoolArray = rows @ self._rows_cover > 0.0
+        return segments
+
+    @property
+    def columns(self) -> tuple[IntArray, IntArray, IntArray]:
+        """First place, number of places and group of each column, shape (C,) each."""
+        return self.first, self.span, self.group
 
     @cached_property
-    def _covers(self) -> NDArray[np.float32]:
+    def covers(self) -> BoolArray:
+        """Whether each column covers each place, shape (C, S + R)."""
+        return covered(self.first, self.span, self.n_places)
+
+    @cached_property
+    def _rows_cover(self) -> NDArray[np.float32]:
         """Mainline segments in each row, shape (M, n_mainline): products of floats are faster."""
-        inside = self.rows.weights[:, : self.corridor.n_mainline] > 0.0
-        return inside.astype(np.float32)
+        return self.covers[: self.n_rows, : self.corridor.n_mainline].astype(np.float32)
 
     def at_places(self, values: FloatArray) -> FloatArray:
         """Return predictions of the segments, shape (k, S), at all places, shape (k, S + R).

@@ -84,7 +84,7 @@ class GaussianRelease(ReleaseModel):
         self._centre = np.full((n, task.n_places), v_0)
         self._price, self._zero = np.ones((n, task.n_columns)), np.zeros((n, task.n_places))
         self.noise = Noise(n, task.n_columns)
-        self.ledgers = Ledgers(task, np.full(len(groups), math.inf))
+        self.ledgers = Ledgers(task.columns, n, np.full(len(groups), math.inf))
 
     @abstractmethod
     def _sensitivity(self, group: int) -> Sensitivity:
@@ -137,12 +137,19 @@ class GaussianRelease(ReleaseModel):
 
         Without any of them the speed limit is the mean; unobserved columns hold these, too.
         """
-        k, task = len(request.episodes), self.task
-        rows = self.traffic.vehicles(request.traffic, request.times)
-        sums, _ = self.ledgers.collect(request, rows, self._price[:k], self._zero[:k])
+        task = self.task
+        sums = self._sums(request, self._zero)
         counts = sums[..., 0].copy()
         sums[..., 0] /= task.length
         sums[..., 1] = np.where(counts == 0.0, task.limit, sums[..., 1] / np.maximum(counts, 1.0))
+        return sums
+
+    def _sums(self, request: Request, centre: FloatArray) -> FloatArray:
+        """Return the sums of the vehicles that count, and of their speeds from a centre."""
+        k, rows = len(request.episodes), self.traffic.vehicles(request.traffic, request.times)
+        sums, _ = self.ledgers.collect(
+            request.episodes, request.observed, rows, self._price[:k], centre[:k]
+        )
         return sums
 
     def spent(self, episodes: IntArray, steps: IntArray) -> tuple[FloatArray, FloatArray]:
@@ -216,7 +223,7 @@ class Paper(GaussianRelease):
 
     def _sensitivity(self, group: int) -> Sensitivity:
         task, corridor = self.task, self.task.corridor
-        always = np.count_nonzero(task.group[task.always] == group)
+        always = int(np.count_nonzero(task.group[task.always] == group))
         return paper_sensitivity(
             n_sensors=(0 if group else task.queries.bandwidth) + always,
             average_dwell=corridor.average_dwell,
@@ -331,7 +338,8 @@ class Capped(GaussianRelease):
         super().__init__(task, traffic)
         cap = task.settings.contribution_cap
         budget = np.full(len(task.groups), math.inf if cap is None else float(cap))
-        self.ledgers = Ledgers(task, budget, fastest=task.corridor.largest_speed_limit)
+        fastest = task.corridor.largest_speed_limit
+        self.ledgers = Ledgers(task.columns, task.n_episodes, budget, fastest=fastest)
 
     def _sensitivity(self, group: int) -> Sensitivity:
         corridor, settings = self.task.corridor, self.task.settings
@@ -369,9 +377,7 @@ class Capped(GaussianRelease):
         """See `GaussianRelease.true_values`; unobserved columns hold zeros."""
         if not self.task.releases_flow:
             return self.mean_values(request)
-        k = len(request.episodes)
-        rows = self.traffic.vehicles(request.traffic, request.times)
-        sums, _ = self.ledgers.collect(request, rows, self._price[:k], self._centre[:k])
+        sums = self._sums(request, self._centre)
         sums /= self.task.length[:, None]
         return sums
 

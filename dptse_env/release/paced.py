@@ -11,7 +11,6 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 
 from dptse_env.estimators import Measurement
-from dptse_env.model.network import covered
 from dptse_env.privacy import Adjacency, EpsilonTable, epsilon_of, mu_of
 from dptse_env.release.base import (
     CHANGES,
@@ -129,7 +128,8 @@ class Paced(ReleaseModel):
         self._squares = 2.0 if settings.adjacency == "replace" else 1.0
         self.budget = self.mu**2 / self._squares
         self.ledgers = Ledgers(
-            task,
+            task.columns,
+            n,
             (1.0 - ROUNDING) * self.budget,
             ratio=settings.ratio,
             clip=settings.clip,
@@ -185,14 +185,20 @@ class Paced(ReleaseModel):
         centre = task.at_places(np.clip(speed, 0.0, task.corridor.largest_speed_limit))
         self.prices[episodes] = prices
         self._charge(episodes, observed, prices)
-        if self.task.settings.unit == "event":  # every second has a budget of its own
-            self.ledgers.reset(episodes)
-        rows = self.traffic.vehicles(request.traffic, request.times)
-        sums, self._refused[episodes] = self.ledgers.collect(request, rows, prices, centre)
+        sums, self._refused[episodes] = self.collect(request, prices, centre)
         sigma = self._deviations(prices)
         values = self.noise.added(episodes, sums, sigma, grid_of(sigma), task.length)
         sigma /= task.length[:, None]
         return Measurement(observed, values, sigma, centre)
+
+    def collect(
+        self, request: Request, prices: FloatArray, centre: FloatArray
+    ) -> tuple[FloatArray, IntArray]:
+        """Charge the vehicles of a second; return its true sums and refusals, see `Ledgers`."""
+        if self.task.settings.unit == "event":  # every second has a budget of its own
+            self.ledgers.reset(request.episodes)
+        rows = self.traffic.vehicles(request.traffic, request.times)
+        return self.ledgers.collect(request.episodes, request.observed, rows, prices, centre)
 
     def _predicted(self, request: Request) -> tuple[FloatArray, FloatArray]:
         """Return predicted densities and speeds; empty free road where they are not finite."""
@@ -223,8 +229,7 @@ class Paced(ReleaseModel):
         None where no two columns of a group cover the same place.
         """
         task = self.task
-        covers = covered(task.first, task.span, task.n_places).astype(np.float64)
-        own = [covers * (task.group == g)[:, None] for g in range(len(task.groups))]
+        own = [task.covers * (task.group == g)[:, None] * 1.0 for g in range(len(task.groups))]
         if all((each.sum(axis=0) <= 1.0).all() for each in own):
             return None
         return np.concatenate(own, axis=1)
@@ -289,8 +294,9 @@ class Paced(ReleaseModel):
         """See `ReleaseModel.budgets_spent`: payments over the budgets of all groups together."""
         if self.task.settings.unit == "event":
             return np.zeros(len(episodes))
-        paid: FloatArray = self.ledgers.paid[episodes].sum(axis=(1, 2))
-        return paid / self.budget.sum()
+        paid = self.ledgers.paid[episodes].sum(axis=(1, 2))
+        spent: FloatArray = paid / self.budget.sum()
+        return spent
 
     def private(self, episodes: IntArray, traffic: IntArray) -> Rows:
         """Return what each vehicle has paid over its budget, its epsilon, and refusals.

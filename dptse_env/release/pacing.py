@@ -216,7 +216,7 @@ class EventPacing(Pacing):
     def __init__(self, task: Task, budget: FloatArray) -> None:
         """Work out the price of a query that has a second's budget to itself."""
         super().__init__(task, budget)
-        self._whole = budget / (1.0 + task.settings.ratio)
+        self._whole: FloatArray = budget / (1.0 + task.settings.ratio)
         self._columns = tuple(PacedColumns.make(task))
 
     def prices(

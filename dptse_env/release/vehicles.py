@@ -19,7 +19,6 @@ import numpy as np
 import numpy.typing as npt
 from numpy.typing import NDArray
 
-from dptse_env.release.base import Request, Task
 from dptse_env.traffic import AnyRecord, Corridor, Penetration, RecordLibrary, with_vehicles
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.kernels import kernel
@@ -177,18 +176,28 @@ class Ledgers:
 
     def __init__(
         self,
-        task: Task,
+        columns: tuple[IntArray, IntArray, IntArray],
+        n_episodes: int,
         budget: FloatArray,
         *,
         ratio: float = 0.0,
         clip: float = math.inf,
         fastest: float = math.inf,
     ) -> None:
-        """Prepare for episodes; by default no contribution is clipped or costs by its speed."""
+        """Prepare for episodes; by default no contribution is clipped or costs by its speed.
+
+        Args:
+            columns: First place, number of places and group of each column, shape (C,) each.
+            n_episodes: Episodes n.
+            budget: See the attributes, as for the others.
+            ratio: At most 1 where vehicles are replaced: two may deviate in opposite directions.
+            clip: [km/h].
+            fastest: [km/h].
+        """
         self.budget, self.ratio, self.clip = budget, ratio, clip
         self.fastest = np.float32(fastest)
-        self.paid: FloatArray = np.zeros((task.n_episodes, len(task.groups), 0))
-        self._columns = task.first, task.span, task.group
+        self.paid: FloatArray = np.zeros((n_episodes, budget.size, 0))
+        self._columns = columns
 
     def reset(self, episodes: IntArray, n_vehicles: IntArray | None = None) -> None:
         """Clear the ledgers of episodes (k,), with room for the vehicles of every record."""
@@ -200,13 +209,19 @@ class Ledgers:
         self.paid[episodes] = 0.0
 
     def collect(
-        self, request: Request, rows: VehicleRows, prices: FloatArray, centre: FloatArray
+        self,
+        episodes: IntArray,
+        observed: BoolArray,
+        rows: VehicleRows,
+        prices: FloatArray,
+        centre: FloatArray,
     ) -> tuple[FloatArray, IntArray]:
         """Sum the contributions of a second to the observed columns, and charge the vehicles.
 
         Args:
-            request: The second.
-            rows: Its vehicles.
+            episodes: Shape (k,).
+            observed: Columns that are observed, shape (k, C).
+            rows: The vehicles of the second.
             prices: Price a of each column, shape (k, C).
             centre: Centre at each place [km/h], shape (k, S + R).
 
@@ -214,12 +229,12 @@ class Ledgers:
             The sums of vehicles and of their d [km/h], shape (k, C, 2), zero where not observed,
             and the contributions that ledgers did not cover, shape (k, groups).
         """
-        sums = np.zeros((*request.observed.shape, 2))
+        sums = np.zeros((*observed.shape, 2))
         refused = np.zeros((len(sums), self.budget.size), dtype=np.int64)
         _collect(
             *self._columns, rows.start, rows.stop, rows.vehicle, rows.place, rows.speed,
-            request.episodes, request.observed, prices, centre, self.fastest, self.clip, self.ratio,
-            self.budget, self.paid, sums, refused,
+            episodes, observed, prices, centre, self.fastest, self.clip, self.ratio, self.budget,
+            self.paid, sums, refused,
         )  # fmt: skip
         return sums, refused
 
