@@ -285,12 +285,13 @@ class Task:
         """
         if self.is_whole:
             return {}
+        total = float(mu @ mu)
         numbers = zip(self.groups, mu.tolist(), noise_std.tolist(), strict=True)
         reports = [
             {
                 "group": group.name,
                 "vehicles": "all" if group.population is None else "connected",
-                "budget_share": group.budget_share,
+                "budget_share": own**2 / total,
                 "mu": own,
                 "noise_std": stds,
             }

@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import binom, binomtest, norm
 
 from dptse_env.privacy import epsilon_of, mu_of
-from dptse_env.privacy.audit_statistics import (
+from agents.audit.statistics import (
     Claim,
     audit,
     detectable_mu,
