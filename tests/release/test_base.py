@@ -111,7 +111,9 @@ BAD = {
 @pytest.mark.parametrize(("changes", "message"), BAD.values(), ids=BAD)
 def test_bad_releases_are_refused_by_path(changes, message):
     release, found, asked = released(**changes)
-    with pytest.raises(ValueError, match=rf"^privacy\.preset .*PricedRelease\.release\(\) .*{message}"):
+    with pytest.raises(
+        ValueError, match=rf"^privacy\.preset .*PricedRelease\.release\(\) .*{message}"
+    ):
         check_released(release, found, asked)
 
 

@@ -116,9 +116,7 @@ def private():
 
 @pytest.mark.parametrize("speeds", ["mean", "flow"])
 @given(data=st.data())
-def test_whatever_noise_makes_of_a_release_gives_inputs_that_a_road_can_have(
-    private, speeds, data
-):
+def test_whatever_noise_makes_of_a_release_gives_inputs_that_a_road_can_have(private, speeds, data):
     boundary, arz = private[speeds]
     size = st.floats(-1e7, 1e7) | st.sampled_from([0.0, -1e-300, 1e-300, 9.999, 10.0])
     released = data.draw(arrays(float, (1, arz.n_boundaries, 2), elements=size))

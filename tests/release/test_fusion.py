@@ -86,6 +86,17 @@ def test_sampling_error_grows_as_the_share_falls():
 
 
 @pytest.mark.parametrize("flow", [True, False])
+def test_noise_of_the_release_adds_to_the_sampling_error_over_the_share(flow):
+    values, read = np.ones((1, N_SEGMENTS, 2)), make(share=0.1, flow=flow).read
+    with_noise, without = (
+        read(measured(values, sigma), predicted(50, 60)).sigma[0, :N] for sigma in (3.0, 1e-9)
+    )
+    added = np.sqrt(with_noise**2 - without**2)
+    np.testing.assert_allclose(added[:, 0], 30.0)
+    np.testing.assert_allclose(added[:, 1], 30.0 if flow else 3.0)
+
+
+@pytest.mark.parametrize("flow", [True, False])
 def test_answers_count_as_one_while_a_vehicle_is_on_the_segment(flow):
     values = np.ones((1, N_SEGMENTS, 2))
     speed = 36.0  # a segment of 0.1 km in 10 s

@@ -1,4 +1,4 @@
-"""Noise of releases, with a residual test that a wrong one fails: see the seeded mutations below."""
+"""Noise of releases, with a residual test that the seeded mutations below fail."""
 
 import copy
 import pickle

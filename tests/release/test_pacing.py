@@ -17,7 +17,7 @@ from dptse_env.release.pacing import EventPacing, TracerPacing, check_prices
 from dptse_env.traffic import SHORT_HIGHWAY
 from tests.cases import pairwise
 
-from .worlds import ONE
+from .worlds import ONE, WHOLE
 
 BUDGET, PACE, RATIO = 2.0, 0.8, 1.0
 N, S, LENGTH = SHORT_HIGHWAY.n_mainline, SHORT_HIGHWAY.n_segments, SHORT_HIGHWAY.segment_length
@@ -29,7 +29,7 @@ NOTHING = []
 
 def make(
     kind=TracerPacing, *, bandwidth=3, spans=(1,), levels=(1.0,), sensors=(), boundary="nominal",
-    n_episodes=1, groups=(Group("queries"),),
+    n_episodes=1, groups=WHOLE,
 ):  # fmt: skip
     """A pacing of half the road a second, unless another bandwidth is given."""
     road = dataclasses.replace(SHORT_HIGHWAY, fixed_sensors=sensors)

@@ -98,7 +98,7 @@ def test_a_model_that_knows_of_no_groups_is_refused_before_anything_is_recorded(
         config = resolve("short-highway", {"privacy": SumRelease, **keywords})
         with pytest.raises(ValueError, match=r"^penetration\.share must be 1, .*SumRelease'"):
             make_interface(config)
-        with pytest.raises(ValueError, match="which knows of no groups of columns$"):
+        with pytest.raises(ValueError, match=r"which knows of no groups of columns$"):
             gym.make("dptse_env:dptse/ShortHighway-v0", privacy=SumRelease, **keywords)
     assert make_release(resolve("short-highway", {"privacy": SumRelease})).task.is_whole
 
@@ -236,7 +236,7 @@ def test_only_connected_vehicles_have_ledgers_of_queries():
     assert len(truth["individual_epsilon"]) == record.n_vehicles
 
 
-# --- the process -----------------------------------------------------------------------------------
+# --- the process -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -266,7 +266,7 @@ def test_given_noise_reaches_both_groups():
     )
 
 
-# --- detectors ---------------------------------------------------------------------------------------
+# --- detectors ---------------------------------------------------------------------------------
 
 
 def test_an_error_of_a_detector_changes_what_it_measures_alone_and_no_release():
@@ -285,8 +285,7 @@ def test_an_error_of_a_detector_changes_what_it_measures_alone_and_no_release():
         others = np.arange(10) != 8
         np.testing.assert_array_equal(measured[1].values[0, others], measured[0].values[0, others])
         assert measured[1].values[0, 8, 0] == 2.0 * measured[0].values[0, 8, 0]
-        queries = slice(0, N)
-        np.testing.assert_array_equal(measured[2].values[0, queries], measured[0].values[0, queries])
+        np.testing.assert_array_equal(measured[2].values[0, :N], measured[0].values[0, :N])
         assert (measured[2].values[0, [7, 8, 9], 0] != measured[0].values[0, [7, 8, 9], 0]).all()
 
 

@@ -12,6 +12,7 @@ from dptse_env.release import RELEASE_MODELS, Group, QueryOptions, Request, Task
 from dptse_env.release.vehicles import Ledgers
 from dptse_env.traffic import SHORT_HIGHWAY, Demand, Record
 
+WHOLE = (Group("queries"),)
 AWAY = -1
 """Place of a vehicle that is not on the road."""
 
@@ -71,7 +72,7 @@ class Worlds:
     def ensure(self, corridor, seeds):
         """All records are there."""
 
-    def release(self, settings, kind=None, groups=(Group("queries"),), bandwidth=2):
+    def release(self, settings, kind=None, groups=WHOLE, bandwidth=2):
         """A release model of all record columns, of another class than the settings' if given."""
         n = len(self.records)
         settings = dataclasses.replace(settings, boundary_inputs="private")

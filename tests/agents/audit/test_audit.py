@@ -7,6 +7,7 @@ from agents.audit.attack import Adversary, attack
 from agents.audit.distances import ReleaseDistances, plan_contributions
 from agents.audit.planner import choose_target, make_policy
 from agents.audit.releases import Terms
+from agents.audit.statistics import Claim, audit
 from agents.audit.strategies import (
     DECISION_THRESHOLD,
     AdaptiveQueries,
@@ -17,7 +18,6 @@ from agents.audit.worlds import AdjacentWorlds, Trajectory
 from dptse_env.estimators import Measurement
 from dptse_env.parts import make_release, privacy_report
 from dptse_env.privacy import epsilon_of
-from agents.audit.statistics import Claim, audit
 from dptse_env.release import CappedSettings
 from tests.agents.elsewhere import Elsewhere
 from tests.cases import fast_and_slow

@@ -7,11 +7,11 @@ import pytest
 
 from agents.audit.attack import attack
 from agents.audit.planner import choose_target, make_policy
+from agents.audit.statistics import Claim, audit
 from agents.audit.strategies import FixedQueries
 from agents.audit.worlds import AdjacentWorlds, AuditedPenetration, Trajectory, audited
 from dptse_env.config import resolve
 from dptse_env.parts import make_task, privacy_report
-from agents.audit.statistics import Claim, audit
 from dptse_env.release import Capped
 from dptse_env.traffic import Penetration, RecordLibrary
 

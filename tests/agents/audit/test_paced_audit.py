@@ -14,12 +14,12 @@ from agents.audit.planner import (
     make_policy,
 )
 from agents.audit.releases import Terms, attacked
+from agents.audit.statistics import Claim, audit
 from agents.audit.strategies import public_plan
 from agents.audit.worlds import AdjacentWorlds, Trajectory
 from dptse_env.config import resolve
 from dptse_env.estimators import Measurement
 from dptse_env.parts import make_release, make_traffic, privacy_report
-from agents.audit.statistics import Claim, audit
 from dptse_env.release import ReleaseModel, Request
 from tests.cases import fast_and_slow
 

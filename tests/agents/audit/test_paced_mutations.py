@@ -9,9 +9,9 @@ import pytest
 
 from agents.audit.attack import attack
 from agents.audit.planner import make_policy
+from agents.audit.statistics import Claim, audit
 from agents.audit.worlds import AdjacentWorlds, Trajectory
 from dptse_env.privacy import mu_of
-from agents.audit.statistics import Claim, audit
 from dptse_env.release import Paced
 from dptse_env.release.vehicles import Ledgers
 from tests.release.test_paced import ReleasedUnclipped

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from scipy.stats import binom, binomtest, norm
 
-from dptse_env.privacy import epsilon_of, mu_of
 from agents.audit.statistics import (
     Claim,
     audit,
@@ -12,6 +11,7 @@ from agents.audit.statistics import (
     error_bound,
     rejection_probability,
 )
+from dptse_env.privacy import epsilon_of, mu_of
 
 
 def gaussian_scores(mu, n, seed):
