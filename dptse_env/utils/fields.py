@@ -262,14 +262,14 @@ _NON_NEGATIVE = Interval(0, math.inf, open_high=True)
 def require(condition: bool, path: str, allowed: str, value: object) -> None:
     """Raise ``ValueError`` "<path> must be <allowed>, got <value>" unless `condition` holds."""
     if not condition:
-        raise ValueError(f"{path} must be {allowed}, got {value!r}")
+        raise ValueError(f"{path} must be {allowed}, got {_shown(value)}")
 
 
 def require_name(path: str, name: object, known: Iterable[str]) -> None:
     """Raise ``ValueError`` unless `name` is one of the `known` strings."""
     names = list(known)
     if not isinstance(name, str) or name not in names:
-        raise ValueError(f"{path} must be one of {', '.join(names)}, got {name!r}")
+        raise ValueError(f"{path} must be one of {', '.join(names)}, got {_shown(name)}")
 
 
 def integer(path: str, value: object, low: int, high: float = math.inf) -> int:
@@ -340,5 +340,6 @@ def check_object(content: Any, path: str, keys: Mapping[str, type]) -> dict[str,
         raise ValueError(f"{path} must be a mapping with the keys {', '.join(keys)}, got {got}")
     for key, kind in keys.items():
         if not isinstance(content[key], kind) or isinstance(content[key], bool):
-            raise ValueError(f"{path}: {key} must be of type {kind.__name__}, got {content[key]!r}")
+            got = _shown(content[key])
+            raise ValueError(f"{path}: {key} must be of type {kind.__name__}, got {got}")
     return content
