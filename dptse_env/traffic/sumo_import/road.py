@@ -12,6 +12,7 @@ import numpy as np
 from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.demand import Demand
 from dptse_env.traffic.record import Record, average_dwell
+from dptse_env.traffic.recording import simulate_in_worker
 from dptse_env.traffic.road_files import DENSITY_SCALE
 from dptse_env.traffic.sumo import RecordingError
 from dptse_env.traffic.sumo_import.configuration import Files
@@ -19,7 +20,6 @@ from dptse_env.traffic.sumo_import.counts import counted_demand, counted_shares
 from dptse_env.traffic.sumo_import.layout import Layout, lay_out
 from dptse_env.traffic.sumo_import.net import Net
 from dptse_env.traffic.sumo_scenario import SumoScenario
-from dptse_env.traffic.worker import simulate_in_child
 from dptse_env.utils.digests import file_digest
 from dptse_env.utils.fields import require
 
@@ -104,7 +104,7 @@ def import_road(
     start = int(files.begin) + warm_up if begin is None else begin
     draft = _draft(files, layout, name, duration, start, warm_up, speed_limit)
     try:
-        record = simulate_in_child(draft, seed)
+        record = simulate_in_worker(draft, seed)
     except RecordingError as error:
         raise ValueError(f"SUMO refuses these files: {' '.join(str(error).split())}") from error
     in_road = record.segment < draft.n_mainline
