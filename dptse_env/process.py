@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from typing import Any
@@ -19,6 +19,7 @@ from dptse_env.spaces.actions import PendingPicks, check_decision
 from dptse_env.spaces.observations import AGE_CAP, PublicState
 from dptse_env.spaces.rewards import EstimationError, ScoredSecond, estimation_error
 from dptse_env.utils.arrays import Action, BoolArray, FloatArray, IntArray, Observation
+from dptse_env.utils.fields import shown
 from dptse_env.utils.registry import is_foreign
 from dptse_env.utils.threads import EpisodeThreads
 from dptse_env.utils.vector_info import Rows, row_of
@@ -203,7 +204,7 @@ class QueryProcess:
         own = slice(None) if self.n_episodes == 1 else episodes  # a slice is quicker to write to
         self.time[own] += 1
         observed = self.release.setup.observed(queried)
-        prediction = partial(self._predicted, episodes)
+        prediction: Callable[[], Estimate] = partial(self._predicted, episodes)
         if self.fusion is not None:  # reads it, too
             prediction = cache(prediction)
         request = ReleaseRequest(episodes, traffic, self.time[episodes], observed, prediction)
@@ -376,11 +377,13 @@ class ResetOptions:
             if seed is not None and (type(seed) is not int or seed not in known):
                 raise ValueError(
                     f"options.traffic_seed must be one of the environment's "
-                    f"{len(known)} traffic_seeds, got {seed!r}"
+                    f"{len(known)} traffic_seeds, got {shown(seed)}"
                 )
         for start in starts:
             if start is not None and (type(start) is not int or not 0 <= start <= last):
-                raise ValueError(f"options.start must be an integer in 0..{last}, got {start!r}")
+                raise ValueError(
+                    f"options.start must be an integer in 0..{last}, got {shown(start)}"
+                )
         traffic = [None if seed is None else known.index(seed) for seed in seeds]
         return cls(config, traffic, starts)
 
