@@ -133,7 +133,7 @@ def test_what_does_not_fit_is_found_before_anything_is_recorded(case, tmp_path):
     pytest.importorskip("sb3_contrib")
     from tests.agents.policies import save
 
-    policy = save(tmp_path / "policy.zip", bandwidth=3)
+    policy = save(tmp_path / "policy.safetensors", bandwidth=3)
     (script, *words), message = REFUSED[case]
     given = [word.replace("{policy}", str(policy)) for word in words]
     folders = "--output", tmp_path / "out", "--records", tmp_path / "cache"

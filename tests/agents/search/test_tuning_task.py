@@ -67,7 +67,7 @@ def test_a_task_takes_parameters_of_its_own():
 
 def test_settings_can_be_tuned_for_a_saved_policy(tmp_path):
     pytest.importorskip("torch")
-    path = save(tmp_path / "policy.zip", seed=1)
+    path = save(tmp_path / "policy.safetensors", seed=1)
     task = dataclasses.replace(TASK, schedule=str(path))
     settings = EstimatorSettings(process_noise=(0.02, 0.03))
     env = make(task.cell(settings))
