@@ -230,7 +230,11 @@ def _check_fit(card: Mapping[str, Any], config: EnvConfig, allow: Collection[str
     observations = there.get("observation"), here["observation"]
     if "channels" in here:
         # Another number of segments is a matter of the corridor: the network is shared by them.
-        theirs, ours = (set(map(str, fit.get("channels") or ())) for fit in (there, here))
+        named = there.get("channels")
+        theirs, ours = (
+            set(map(str, named if isinstance(named, list) else ())),
+            set(here["channels"]),
+        )
         pairs["channels"] = sorted(theirs - ours), sorted(ours - theirs)
         is_moved = (road_there, observations[0]) != (road_here, observations[1])
     else:
