@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from agents.files import refuse_to_replace, replacing
+from agents.files import refuse_to_replace
 from dptse_env.importers.network import (
     Files,
     ImportedRoad,
@@ -22,6 +22,7 @@ from dptse_env.importers.network import (
     read_configuration,
 )
 from dptse_env.traffic import write_corridor
+from dptse_env.utils.files import replacing
 from scripts.cli import run
 
 

@@ -13,7 +13,7 @@ from dptse_env.importers.network.configuration import Files
 from dptse_env.importers.network.layout import Layout
 from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.demand import Demand, Profile
-from dptse_env.traffic.record import Record, mean_dwell
+from dptse_env.traffic.record import Record, average_dwell
 from dptse_env.traffic.road_files import DENSITY_SCALE
 from dptse_env.traffic.sumo import RecordingError
 from dptse_env.traffic.sumo_scenario import SumoScenario
@@ -96,7 +96,7 @@ def import_road(
         draft,
         demand=_demand(draft, first),
         exit_shares=_exit_shares(draft, first),
-        average_dwell=round(mean_dwell([record], draft.n_mainline), 2),
+        average_dwell=round(average_dwell(draft, [record]), 2),
     )
     remarks = layout.remarks
     inside = (first.argmin(axis=1) < draft.n_mainline) & (first.min(axis=1) > 0)
