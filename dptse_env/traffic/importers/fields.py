@@ -16,7 +16,7 @@ from dptse_env.traffic.imported import save_record, write_manifest
 from dptse_env.traffic.importers.folder import ROAD, Split, assign_seeds
 from dptse_env.traffic.importers.new_folder import new_folder
 from dptse_env.traffic.record import Record, average_dwell
-from dptse_env.traffic.road_files import DENSITY_SCALE, write_corridor
+from dptse_env.traffic.roads import DENSITY_SCALE, write_corridor
 from dptse_env.utils.fields import integer, positive, require
 
 FloatTable = NDArray[np.float64]

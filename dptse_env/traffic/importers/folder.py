@@ -23,7 +23,7 @@ from dptse_env.traffic.importers.recording import Options, Recording, Window
 from dptse_env.traffic.importers.report import write_report
 from dptse_env.traffic.importers.source import Source
 from dptse_env.traffic.record import Record, average_dwell
-from dptse_env.traffic.road_files import write_corridor
+from dptse_env.traffic.roads import write_corridor
 from dptse_env.utils.fields import require, require_name
 
 FORMATS: Mapping[str, Format] = {

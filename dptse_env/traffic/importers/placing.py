@@ -13,7 +13,7 @@ from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.importers.branches import OFF, Road
 from dptse_env.traffic.importers.points import Labels, Points
 from dptse_env.traffic.importers.source import Layout, Part
-from dptse_env.traffic.sumo_network import edge_ids
+from dptse_env.traffic.sumo_input import edge_ids
 from dptse_env.utils.arrays import FloatArray
 from dptse_env.utils.fields import require
 

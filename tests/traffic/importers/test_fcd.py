@@ -14,7 +14,7 @@ from dptse_env.traffic.importers import (
     TrajectoryError,
     import_trajectories,
 )
-from dptse_env.traffic.sumo_network import edge_ids
+from dptse_env.traffic.sumo_input import edge_ids
 
 TRAINING = [Split("training", 1.0, range(1000))]
 
