@@ -9,18 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dptse_env.config import resolve
-from dptse_env.estimators import check_settings
-from dptse_env.parts import make_interface, make_model, make_parts, warn_where_void
-from dptse_env.process import QueryProcess
-from dptse_env.rendering import History, Picture, Window
-from dptse_env.traffic import Records, open_library
+from dptse_env.env_base import QueryEnvBase
+from dptse_env.parts import warn_where_void
+from dptse_env.rendering import Drawing, Window
+from dptse_env.traffic import Records
 from dptse_env.utils.arrays import Observation
-from dptse_env.utils.fields import integer, require
+from dptse_env.utils.fields import integer
 
 _ONLY = np.zeros(1, dtype=np.int64)
 
 
-class SensorQueryEnv(gym.Env[Observation, Any]):
+class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
     """Choose which segments' connected vehicles to query, second by second.
 
     One step is one second of traffic. A policy picks at most ``bandwidth`` of the n mainline
@@ -108,7 +107,7 @@ class SensorQueryEnv(gym.Env[Observation, Any]):
     ``video``). The picture shows true traffic.
     """
 
-    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 30}  # noqa: RUF012 (Gymnasium's own)
+    metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 30}  # noqa: RUF012 (Gymnasium's own)
 
     def __init__(
         self,
@@ -139,35 +138,15 @@ class SensorQueryEnv(gym.Env[Observation, Any]):
             UserWarning: A release model with a guarantee is configured, and other keywords void
                 it, or values of another road are used on this one.
         """
-        modes = (None, *self.metadata["render_modes"])
-        require(render_mode in modes, "render_mode", "None, 'rgb_array' or 'human'", render_mode)
-        self.render_mode = render_mode
-        self._window: Window | None = None
-        if render_mode == "human":
-            self._window = Window("dptse-env", self.metadata["render_fps"])
-        self.render_every = integer("render_every", render_every, 1)
-        self.config = config = resolve(preset, overrides)
-        warn_where_void(config)
-        self.interface = make_interface(config)
-        self._model = make_model(config)
-        check_settings(config.estimator, self._model, config.settings())
+        super().__init__(resolve(preset, overrides), 1, records, render_mode)
+        warn_where_void(self.config)
         self.action_space = self.interface.actions.space
         self.observation_space = self.interface.observations.space
-        self._library = open_library(records)
-        self._process: QueryProcess | None = None
-        self.history: History | None = None
-        self._picture: Picture | None = None
-        self._frame: tuple[int, NDArray[np.uint8]] | None = None
-
-    @property
-    def process(self) -> QueryProcess:
-        """The process behind the environment, assembled at the first use."""
-        if self._process is None:
-            parts = make_parts(
-                self.config, 1, self._library, interface=self.interface, model=self._model
-            )
-            self._process = QueryProcess(parts)
-        return self._process
+        self.render_every = integer("render_every", render_every, 1)
+        if render_mode is not None:
+            is_shown = render_mode == "human"
+            window = Window("dptse-env", self.metadata["render_fps"]) if is_shown else None
+            self.drawing = Drawing(every=self.render_every, window=window)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -182,16 +161,11 @@ class SensorQueryEnv(gym.Env[Observation, Any]):
             ValueError: An option is unknown or out of range.
             gymnasium.error.Error: ``render_mode`` is ``"human"``, and there is no display.
         """
-        super().reset(seed=seed)
+        gym.Env.reset(self, seed=seed)
         outcome = self.process.reset(_ONLY, [self.np_random], options)
-        if self.render_mode is not None:
-            self.history, self._frame = History.from_process(self.process), None
-        if self._window is not None:
-            self._window.reopen()
-            self._window.show(self._drawn())
-        info = self.process.info(0)
-        info |= self.process.reset_info()
-        return outcome.observation[0], info
+        if self.drawing is not None:
+            self.drawing.begin(self.process)
+        return outcome.observation[0], {**self.process.info(0), **self.process.reset_info()}
 
     def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Query, estimate and score one second.
@@ -204,17 +178,10 @@ class SensorQueryEnv(gym.Env[Observation, Any]):
         if process.over[0]:
             raise gym.error.ResetNeeded("the episode is over: call reset() before step()")
         outcome = process.step(_ONLY, np.asarray(action)[None])
-        if self.history is not None:
-            self.history.append(process)
-        if self._window is not None:
-            self._window.show(self._drawn())
-        return (
-            outcome.observation[0],
-            float(outcome.reward[0]),
-            False,
-            bool(outcome.truncated[0]),
-            process.info(0),
-        )
+        if self.drawing is not None:
+            self.drawing.follow(process)
+        reward, truncated = outcome.reward.item(), outcome.truncated.item()
+        return outcome.observation[0], reward, False, truncated, process.info(0)
 
     def action_masks(self) -> NDArray[np.bool_]:
         """Return flags (G,) of the options that may be picked next, for ``action="sequential"``.
@@ -226,13 +193,8 @@ class SensorQueryEnv(gym.Env[Observation, Any]):
         self.interface.require_sequential()
         if self.process.over[0]:
             raise gym.error.ResetNeeded("no episode is running: call reset() first")
-        picked = self.process.pending.picked[:1]
-        free: NDArray[np.bool_] = self.interface.actions.available(picked)[0]
+        free: NDArray[np.bool_] = self._available()[0]
         return free
-
-    def privacy(self) -> dict[str, Any]:
-        """Return the guarantee of an episode, or what voids it, and the account behind it."""
-        return self.process.privacy()
 
     def render(self) -> NDArray[np.uint8] | None:
         """Return the episode so far as a picture over space and time, shape (height, width, 3).
@@ -242,31 +204,10 @@ class SensorQueryEnv(gym.Env[Observation, Any]):
         Raises:
             gymnasium.error.ResetNeeded: No episode has begun.
         """
-        if self.render_mode is None:
-            gym.logger.warn(
-                "render() needs gym.make(..., render_mode='rgb_array'); nothing was drawn"
-            )
-            return None
-        if self.history is None:
-            raise gym.error.ResetNeeded("nothing to render: call reset() first")
-        return None if self._window is not None else self._drawn().copy()
-
-    def _drawn(self) -> NDArray[np.uint8]:
-        """Return the picture of the present second, drawn anew if it is due."""
-        assert self.history is not None
-        second = int(self.process.elapsed[0])
-        if self._frame is None or self._is_due(second - self._frame[0]):
-            if self._picture is None:
-                self._picture = Picture(self.history)
-            self._frame = second, self._picture.draw(self.history)
-        return self._frame[1]
+        picture = self._drawn()
+        return None if self.render_mode == "human" else picture
 
     def close(self) -> None:
         """Close the window, if there is one."""
-        if self._window is not None:
-            self._window.close()
-        super().close()
-
-    def _is_due(self, since: int) -> bool:
-        """Return whether a picture that is ``since`` seconds old is to be drawn again."""
-        return since >= self.render_every or (since > 0 and bool(self.process.over[0]))
+        if self.drawing is not None and self.drawing.window is not None:
+            self.drawing.window.close()
