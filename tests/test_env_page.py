@@ -1,4 +1,4 @@
-"""The page of the task, the docstring of `SensorQueryEnv`: its example runs, its tables are true."""
+"""The docstring of `SensorQueryEnv`, the page of the task: its example runs, its tables hold."""
 
 import ast
 import doctest
