@@ -1,0 +1,1 @@
+"""Import of roads and of recorded traffic."""
