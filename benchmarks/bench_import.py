@@ -24,7 +24,7 @@ import pyarrow.csv
 import pyarrow.parquet
 
 from dptse_env.traffic import Corridor, Demand
-from dptse_env.traffic.importers import Source, Split, import_trajectories
+from dptse_env.importers import Source, Split, import_trajectories
 
 FORMATS = ("csv", "parquet", "text")
 ROAD = Corridor(

@@ -1,7 +1,7 @@
 """Recorded traffic: a folder of records that were imported from trajectories, not simulated.
 
 Such records cannot be made again, so nothing here replaces one: what is missing, damaged or
-exchanged is an error. `dptse_env.traffic.importers` writes the folder.
+exchanged is an error. `dptse_env.importers` writes the folder.
 """
 
 import functools

@@ -8,30 +8,26 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from dptse_env.importers.folder import ROAD, Split, assign_seeds, new_folder
+from dptse_env.importers.source import LENGTHS, SPEEDS, TIMES
 from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.demand import Demand
 from dptse_env.traffic.dwell import average_dwell
 from dptse_env.traffic.field_record import FieldRecord
-from dptse_env.traffic.importers.folder import ROAD, Split, assign_seeds
-from dptse_env.traffic.importers.new_folder import new_folder
 from dptse_env.traffic.recordings import Recordings, record_path, record_source, write_manifest
 from dptse_env.traffic.road_files import DENSITY_SCALE, write_corridor
-from dptse_env.utils.fields import integer, positive, require
+from dptse_env.utils.arrays import FloatArray
+from dptse_env.utils.fields import integer, positive, require, require_name
 
-FloatTable = NDArray[np.float64]
-
-FEET, MILES = 0.0003048, 1.609344
-"""Kilometres."""
-DENSITY_UNITS = {"veh/km": 1.0, "veh/mi": 1.0 / MILES, "veh/ft": 1.0 / FEET, "veh/m": 1000.0}
-SPEED_UNITS = {"km/h": 1.0, "mi/h": MILES, "m/s": 3.6, "ft/s": 3600.0 * FEET}
-FLOW_UNITS = {"veh/h": 1.0, "veh/s": 3600.0, "veh/min": 60.0}
+UNITS = {
+    "density": {f"veh/{name}": 1.0 / LENGTHS[name] for name in ("km", "mi", "ft", "m")},
+    "speed": SPEEDS,
+    "flow": {f"veh/{name}": 3600.0 / factor for name, factor in TIMES.items() if factor >= 1.0},
+}
 """Factors to veh/km, km/h and veh/h."""
-
 LEAST_DENSITY = 1e-9
 """Density [veh/km] below which a cell is empty and has no speed of its own."""
-
 FASTEST = 300.0
 """Speed [km/h] above which a field has another unit than stated."""
 
@@ -46,9 +42,9 @@ class FieldSource:
         flow: File of flows, from which speeds are derived.
         cell: Length of a cell [km].
         interval: Length of an interval [s].
-        density_unit: One of `DENSITY_UNITS`; all lanes together.
-        speed_unit: One of `SPEED_UNITS`.
-        flow_unit: One of `FLOW_UNITS`; all lanes together.
+        density_unit: Unit of densities, all lanes together.
+        speed_unit: Unit of speeds.
+        flow_unit: Unit of flows, all lanes together.
         transposed: Whether rows are intervals.
         reversed: Whether the first cell is the last downstream.
         delimiter: What separates the numbers of a line; None for blanks.
@@ -66,7 +62,7 @@ class FieldSource:
     reversed: bool = False
     delimiter: str | None = None
 
-    def read(self) -> tuple[FloatTable, FloatTable]:
+    def read(self) -> tuple[FloatArray, FloatArray]:
         """Return density [veh/km] and flow [veh/h], of shape (cells, intervals), from upstream on.
 
         Raises:
@@ -77,31 +73,26 @@ class FieldSource:
         positive("cell", self.cell)
         positive("interval", self.interval)
         require((self.speed is None) != (self.flow is None), "speed", "given, or else flow", None)
-        density = self._table(self.density) * _factor(
-            "density_unit", self.density_unit, DENSITY_UNITS
-        )
-        if self.flow is not None:
-            path, flow = self.flow, self._table(self.flow)
-            flow = flow * _factor("flow_unit", self.flow_unit, FLOW_UNITS)
-        else:
-            assert self.speed is not None
-            path, speed = self.speed, self._table(self.speed)
-            speed = speed * _factor("speed_unit", self.speed_unit, SPEED_UNITS)
-            flow = density * speed if density.shape == speed.shape else speed
+        density = self._table("density")
+        kind = "speed" if self.flow is None else "flow"
+        path, other = str(getattr(self, kind)), self._table(kind)
         allowed = f"a table of {self.density}'s shape {density.shape}"
-        require(flow.shape == density.shape, str(path), allowed, flow.shape)
+        require(other.shape == density.shape, path, allowed, other.shape)
+        flow = other if kind == "flow" else density * other
         fastest = float((flow / np.maximum(density, LEAST_DENSITY)).max(initial=0.0))
         allowed = f"speeds of at most {FASTEST:g} km/h: check cell, interval and units"
-        require(fastest <= FASTEST, str(path), allowed, f"{fastest:.0f} km/h")
+        require(fastest <= FASTEST, path, allowed, f"{fastest:.0f} km/h")
         return density, flow
 
-    def _table(self, path: Path) -> FloatTable:
+    def _table(self, kind: str) -> FloatArray:
+        path, unit = getattr(self, kind), getattr(self, f"{kind}_unit")
+        require_name(f"{kind}_unit", unit, UNITS[kind])
         if path.is_dir():
             raise ValueError(f"{path} must be a file, got a directory")
         try:
             with path.open(encoding="utf-8-sig") as file:
                 table = np.loadtxt(file, ndmin=2, delimiter=self.delimiter)
-        except (ValueError, UnicodeDecodeError) as problem:
+        except ValueError as problem:
             raise ValueError(f"{path} must be a table of numbers: {problem}") from problem
         require(table.size > 0, str(path), "a table of at least one number", table.shape)
         for row, column in np.argwhere(~(np.isfinite(table) & (table >= 0.0)))[:1]:
@@ -109,13 +100,8 @@ class FieldSource:
                 f"{path}: row {row + 1}, column {column + 1} must be finite and >= 0, got "
                 f"{table[row, column]}"
             )
-        table = table.T if self.transposed else table
+        table = UNITS[kind][unit] * (table.T if self.transposed else table)
         return table[::-1] if self.reversed else table
-
-
-def _factor(path: str, unit: str, units: dict[str, float]) -> float:
-    require(unit in units, path, f"one of {', '.join(units)}", unit)
-    return units[unit]
 
 
 @dataclass(frozen=True)
@@ -135,14 +121,21 @@ class FieldRoad:
     lanes: int
     speed_limit: float
 
+    def corridor(self, segment_length: float, duration: int) -> Corridor:
+        """Return the road without demand and recordings."""
+        return Corridor(
+            name=self.name, n_mainline=self.segments, on_ramps=(), off_ramps=(), exit_shares=(),
+            demand=Demand(mainline=((0.0, 0.0),)), incident=None, fixed_sensors=(),
+            duration=duration, lanes=self.lanes, segment_length=segment_length,
+            speed_limit=self.speed_limit, density_scale=DENSITY_SCALE * self.lanes,
+            speed_scale=self.speed_limit,
+        )  # fmt: skip
+
 
 def import_field(
-    source: FieldSource,
-    road: FieldRoad,
-    output: Path,
-    splits: Sequence[Split],
+    source: FieldSource, road: FieldRoad, output: Path, splits: Sequence[Split],
     duration: int = 450,
-) -> tuple[Corridor, dict[str, tuple[int, ...]]]:
+) -> tuple[Corridor, dict[str, tuple[int, ...]]]:  # fmt: skip
     """Import a field as records without vehicles, and return its road and its traffic seeds.
 
     Cells are averaged over segments, density and flow alike, and intervals are interpolated to
@@ -169,28 +162,28 @@ def import_field(
     require(each >= 1, "segments", f"at most {len(density) - 2}", road.segments)
     field = by_second(density, flow, road.segments + 2, source.interval)
     starts = range(0, len(field[0]) - duration, duration + 1)
-    allowed = f"below the field's {len(field[0])} s"
-    require(len(starts) > 0, "duration", allowed, duration)
+    require(len(starts) > 0, "duration", f"below the field's {len(field[0])} s", duration)
     seeds = assign_seeds(splits, len(starts))
     flat = [seed for split in splits for seed in seeds[split.name]]
-    bare = _bare(road, each * source.cell, duration)
+    bare = road.corridor(each * source.cell, duration)
     # The boundary segments, at both ends, come last in a record.
     order = [*range(1, road.segments + 1), 0, road.segments + 1]
+    windows = [slice(start, start + duration + 1) for start in starts]
+    records = [FieldRecord(*(table[window][:, order] for table in field)) for window in windows]
+    training = records[: len(seeds[splits[0].name])]
+    entering = np.mean([(each.density * each.speed)[:, 0].mean() for each in training])
+    measured = dataclasses.replace(
+        bare,
+        demand=Demand(mainline=((0.0, round(float(entering), 1)),)),
+        average_dwell=round(average_dwell(bare, training), 3),
+    )
     with new_folder(output) as folder:
-        training, sources = [], []
-        for seed, start in zip(flat, starts, strict=True):
-            window = slice(start, start + duration + 1)
-            record = FieldRecord(field[0][window][:, order], field[1][window][:, order])
+        for seed, record in zip(flat, records, strict=True):
             record.save(record_path(folder, seed), record_source(seed, bare.record_layout))
-            sources.append({"seed": seed, "file": source.density.name, "start": start})
-            if seed in seeds[splits[0].name]:
-                training.append(record)
-        entering = np.mean([(each.density * each.speed)[:, 0].mean() for each in training])
-        measured = dataclasses.replace(
-            bare,
-            demand=Demand(mainline=((0.0, round(float(entering), 1)),)),
-            average_dwell=round(average_dwell(bare, training), 3),
-        )
+        sources = [
+            {"seed": seed, "file": source.density.name, "start": start}
+            for seed, start in zip(flat, starts, strict=True)
+        ]
         digest = write_manifest(folder, bare.record_layout, flat, sources, "fields")
         written = dataclasses.replace(measured, recordings=Recordings(str(folder), digest))
         comment = "A measured field. Demand and average dwell are those of its training windows."
@@ -200,33 +193,13 @@ def import_field(
 
 
 def by_second(
-    density: FloatTable, flow: FloatTable, n: int, interval: float
-) -> tuple[FloatTable, FloatTable]:
+    density: FloatArray, flow: FloatArray, n: int, interval: float
+) -> tuple[FloatArray, FloatArray]:
     """Return density and speed of every second of n segments, (seconds, n) each."""
-    each = len(density) // n
-    tables = (table[: n * each].reshape(n, each, -1).mean(axis=1) for table in (density, flow))
+    each, seconds = len(density) // n, np.arange(0.0, density.shape[1] * interval)
     middles = (np.arange(density.shape[1]) + 0.5) * interval
-    seconds = np.arange(0.0, density.shape[1] * interval)
     rho, q = (
-        np.column_stack([np.interp(seconds, middles, row) for row in table]) for table in tables
+        np.column_stack([np.interp(seconds, middles, row) for row in table])
+        for table in (t[: n * each].reshape(n, each, -1).mean(axis=1) for t in (density, flow))
     )
     return rho, q / np.maximum(rho, LEAST_DENSITY)
-
-
-def _bare(road: FieldRoad, segment_length: float, duration: int) -> Corridor:
-    return Corridor(
-        name=road.name,
-        n_mainline=road.segments,
-        on_ramps=(),
-        off_ramps=(),
-        exit_shares=(),
-        demand=Demand(mainline=((0.0, 0.0),)),
-        incident=None,
-        fixed_sensors=(),
-        duration=duration,
-        lanes=road.lanes,
-        segment_length=segment_length,
-        speed_limit=road.speed_limit,
-        density_scale=DENSITY_SCALE * road.lanes,
-        speed_scale=road.speed_limit,
-    )

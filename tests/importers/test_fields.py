@@ -8,8 +8,8 @@ import pytest
 
 from dptse_env.config import TEST_SEEDS, TRAINING_SEEDS, VALIDATION_SEEDS
 from dptse_env.traffic import FieldRecord, RecordLibrary, find_corridor
-from dptse_env.traffic.importers.fields import FieldRoad, FieldSource, import_field
-from dptse_env.traffic.importers.folder import Split
+from dptse_env.importers.fields import FieldRoad, FieldSource, import_field
+from dptse_env.importers.folder import Split
 
 SPLITS = [
     Split("training", 0.5, TRAINING_SEEDS),

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from dptse_env.traffic import SHORT_HIGHWAY, Record, RecordLibrary, simulate, sumo
-from dptse_env.traffic.importers import (
+from dptse_env.importers import (
     Layout,
     Source,
     Split,

@@ -9,9 +9,9 @@ import pyarrow.parquet
 import pytest
 
 from dptse_env.traffic import RecordLibrary
-from dptse_env.traffic.importers import Layout, Part, Source, TrajectoryError
-from dptse_env.traffic.importers.formats import NGSIM_COLUMNS
-from tests.traffic.importers.data import PLAIN, first_file, plain, run, stream, write_csv
+from dptse_env.importers import Layout, Part, Source, TrajectoryError
+from dptse_env.importers.tables import NGSIM_COLUMNS
+from tests.importers.data import PLAIN, first_file, plain, run, stream, write_csv
 
 FOOT = 0.3048
 EPOCH = 1118846979700  # NGSIM's clocks do not begin at a whole second

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from dptse_env.traffic.importers import FORMATS, Labels, Points, Source, Split, recording, spill
+from dptse_env.importers import FORMATS, Labels, Points, Source, Split, recording, spill
 from tests.cases import fast_and_slow
-from tests.traffic.importers.data import run
+from tests.importers.data import run
 
 CHUNK = 2_000
 TRIP = 200
@@ -42,7 +42,7 @@ def test_four_times_the_points_need_no_more_memory(by_vehicle, tmp_path, monkeyp
     monkeypatch.setattr(recording, "BUCKET_BYTES", 2e5)
     monkeypatch.setattr(spill, "MOST_WAITING", 6_000)
     monkeypatch.setattr(recording, "PICTURE_POINTS", 100)
-    monkeypatch.setattr("dptse_env.traffic.importers.folder.write_report", lambda *_: {})
+    monkeypatch.setattr("dptse_env.importers.folder.write_report", lambda *_: {})
     peaks = []
     for number, n_vehicles in enumerate((200, 200, 800)):
         monkeypatch.setitem(FORMATS, "table", Stream(n_vehicles, by_vehicle))

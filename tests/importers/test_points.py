@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from dptse_env.traffic import RecordLibrary
-from dptse_env.traffic.importers import Layout, Source, TrajectoryError
-from tests.traffic.importers.data import (
+from dptse_env.importers import Layout, Source, TrajectoryError
+from tests.importers.data import (
     PLAIN,
     ROAD,
     SPLITS,
@@ -264,7 +264,7 @@ def test_an_interruption_leaves_nothing(tmp_path, monkeypatch):
         raise KeyboardInterrupt
 
     path = plain(tmp_path / "a.csv", stream())
-    monkeypatch.setattr("dptse_env.traffic.importers.folder.write_report", interrupted)
+    monkeypatch.setattr("dptse_env.importers.folder.write_report", interrupted)
     with pytest.raises(KeyboardInterrupt):
         run(path)
     assert [each.name for each in tmp_path.iterdir()] == ["a.csv"]

@@ -1,0 +1,19 @@
+"""Import of recorded trajectories: files of points of vehicles become records of a corridor."""
+
+from dptse_env.importers.folder import Imported, Split, import_trajectories
+from dptse_env.importers.recording import Options
+from dptse_env.importers.source import Layout, Part, Source, TrajectoryError, read_source
+from dptse_env.importers.tables import FORMATS
+
+__all__ = [
+    "FORMATS",
+    "Imported",
+    "Layout",
+    "Options",
+    "Part",
+    "Source",
+    "Split",
+    "TrajectoryError",
+    "import_trajectories",
+    "read_source",
+]
