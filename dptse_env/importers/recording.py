@@ -16,12 +16,15 @@ import polars as pl
 from dptse_env.importers import tables
 from dptse_env.importers.placing import OFF, Road, part_in_words, placed
 from dptse_env.importers.resampling import TIME_UNIT, check_pieces, count_ends, whole_seconds
-from dptse_env.importers.source import Source, TrajectoryError
+from dptse_env.importers.source import Source, TrajectoryError, shown
 from dptse_env.traffic.record import Record
+from dptse_env.utils.fields import inside, integer, non_negative
 
-BUCKET_BYTES = 64e6
-"""Bytes of text whose points fit a bucket; buckets are in memory one at a time."""
+BUCKET_ROWS = 400_000
+"""Rows of a bucket; buckets are in memory one at a time."""
 MOST_BUCKETS = 512
+MOST_WAITING = 1_000_000
+"""Points of all buckets together that wait in memory to be written."""
 LONGEST_SILENCE = 3600.0
 """Time without any row [s] after which a file is another recording, with windows of its own."""
 LARGEST_NUMBER = 10_000
@@ -45,6 +48,13 @@ class Options:
     skip_end: float = 0.0
     pause: int = 0
 
+    def __post_init__(self) -> None:
+        """Check the fields."""
+        inside("longest_gap", self.longest_gap, 0.0, LONGEST_SILENCE)
+        non_negative("skip_start", self.skip_start)
+        non_negative("skip_end", self.skip_end)
+        integer("pause", self.pause, 0)
+
 
 @dataclass
 class Recording:
@@ -60,6 +70,7 @@ class Recording:
         windows: Its windows in order of time: window (number), group, first (its second 0, counted
             from `base`) and start (as the file counts).
         base: A whole second, from which times are counted.
+        shift: What is added to the file's times [s].
         speed_ratio: Given speeds over those that positions say; None without speeds.
         off_names: Names of lanes or edges that are not on the road, some of them.
     """
@@ -72,6 +83,7 @@ class Recording:
     counts: Counter[str] = field(default_factory=Counter)
     windows: pl.DataFrame = field(default_factory=pl.DataFrame)
     base: float = 0.0
+    shift: float = 0.0
     speed_ratio: float | None = None
     off_names: list[str] = field(default_factory=list)
 
@@ -86,10 +98,12 @@ class Recording:
             self._form = tables.FCD_IN_PLANE
         self._units = {**self._form.units, **self.source.units}
         n_buckets = self._spool()
-        seconds, shift = self._seconds_of_file()
-        coverage = self._cut(seconds, shift)
-        pieces = [self._take(bucket, shift, coverage) for bucket in range(n_buckets)]
-        self.speed_ratio = check_pieces(pl.concat(pieces), str(self.path), self._units)
+        seconds = self._seconds_of_file()
+        self.shift = self._time_shift(seconds)
+        coverage = self._cut(seconds)
+        pieces = pl.concat([self._take(bucket, coverage) for bucket in range(n_buckets)])
+        self._require_joined()
+        self.speed_ratio = check_pieces(pieces, str(self.path), self._units)
 
     def record(self, window: int) -> Record:
         """Return the record of a window."""
@@ -113,7 +127,7 @@ class Recording:
     def points(self) -> pl.DataFrame:
         """Return points of the first window on the mainline for a picture, some where many."""
         _, group, _, start = self.windows.row(0)
-        time = pl.col("time") - start
+        time = pl.col("time") + (self.shift - start)
         here = (pl.col("branch") == 0) & (pl.col("column") != OFF) & (pl.col("group") == group)
         points = (
             self._points.filter(here, time.is_between(0.0, self.road.corridor.duration))
@@ -124,15 +138,11 @@ class Recording:
 
     def _spool(self) -> int:
         """Place the points of the file and write them to buckets; return the number of these."""
-        size = self.path.stat().st_size if self.path.is_file() else 0
-        suffix = self.path.suffix.lower()
-        text = size * (5 if suffix in tables.PARQUET else 8 if suffix == ".gz" else 1)
-        text *= 3 if self._form.lists else 1  # a name is there once a vehicle
-        n_buckets = int(min(1 + text // BUCKET_BYTES, MOST_BUCKETS))
         layout, c = self.source.layout, pl.col
         unit = self.source.factor("length", self._form.units["length"])
         try:
-            points, roles = tables.scan(self.path, self._form, self.source)
+            points, roles, n_rows = tables.scan(self.path, self._form, self.source)
+            n_buckets = min(1 + n_rows // BUCKET_ROWS, MOST_BUCKETS)
             points = placed(points, roles, self.road, layout, unit).select(
                 "row", "time", "vehicle", "position", "speed", "branch", "column", "lane_number",
                 "bad", c("group").fill_null(""),
@@ -144,13 +154,15 @@ class Recording:
                     self.folder / "points", key={"bucket": key}, include_key=False,
                     approximate_bytes_per_file=1 << 50,
                 ),
-                compression="lz4", mkdir=True, row_group_size=20_000, engine="streaming",
+                compression="lz4", mkdir=True, engine="streaming",
+                row_group_size=min(20_000, MOST_WAITING // n_buckets),
             )  # fmt: skip
         except (pl.exceptions.PolarsError, OSError) as problem:
             if isinstance(problem.__cause__, TrajectoryError):
                 raise problem.__cause__ from None
-            what = "it is no complete Parquet file: " if suffix in tables.PARQUET else ""
-            reason = str(problem).partition("\n")[0]
+            parquet = self.path.suffix.lower() in tables.PARQUET
+            what = "it is no complete Parquet file: " if parquet else ""
+            reason = shown(str(problem).partition("\n")[0])
             raise TrajectoryError(f"{self.path}: {what}{reason}") from problem
         if not (self.folder / "points").is_dir():
             raise TrajectoryError(f"{self.path}: it must have rows of vehicles, got none")
@@ -163,8 +175,8 @@ class Recording:
             )
         return n_buckets
 
-    def _seconds_of_file(self) -> tuple[pl.DataFrame, float]:
-        """Count rows; return the occupied seconds of each group, and what is added to times."""
+    def _seconds_of_file(self) -> pl.DataFrame:
+        """Count rows, and return the occupied seconds of each group."""
         c = pl.col
         named, lost, off = c("vehicle").is_not_null(), c("branch") == OFF, c("column") == OFF
         seconds = (
@@ -192,9 +204,11 @@ class Recording:
         for name in ("off_lanes", "off_ends"):
             self.counts[name] = int(seconds[name].sum())
         names = self._points.filter(lost, c("off").is_not_null()).select("off").unique()
-        self.off_names = sorted(names.head(20).collect(engine="streaming")["off"].to_list())
+        names = names.bottom_k(20, by="off")
+        found = names.collect(engine="streaming")["off"].sort()
+        self.off_names = [shown(name) for name in found]
         self._require_on_road()
-        return seconds, self._shift(seconds)
+        return seconds
 
     def _require_on_road(self) -> None:
         counts, names = self.counts, ", ".join(self.off_names)
@@ -207,7 +221,7 @@ class Recording:
             f"{part_in_words(self.source.layout.mainline)}"
         )
 
-    def _shift(self, seconds: pl.DataFrame) -> float:
+    def _time_shift(self, seconds: pl.DataFrame) -> float:
         """Return what is added to times [s]: SUMO's step, where a file has its beginning."""
         if self.source.time_shift is not None or not self._form.sumo:
             return self.source.time_shift or 0.0
@@ -223,7 +237,18 @@ class Recording:
             )
         return float(times[1] - times[0])
 
-    def _cut(self, seconds: pl.DataFrame, shift: float) -> dict[str, tuple[float, float]]:
+    def _require_joined(self) -> None:
+        """Refuse a file in which points are mostly too far apart to be trajectories."""
+        cut, followed = self.counts["gaps_cut"] + self.counts["jumps_cut"], self.counts["followed"]
+        if 2 * cut > followed or followed == 0:
+            raise TrajectoryError(
+                f"{self.path}: points of a vehicle must mostly follow one another within "
+                f"{self.options.longest_gap:g} s at less than 300 km/h, got {followed - cut} of "
+                f"{followed} that do: are the units right (time in {self._units['time']}, length "
+                f"in {self._units['length']})?"
+            )
+
+    def _cut(self, seconds: pl.DataFrame) -> dict[str, tuple[float, float]]:
         """Lay windows over each group; return its first and last time since `base`.
 
         A silence parts a group into recordings. Those that are shorter than a window have none.
@@ -236,9 +261,9 @@ class Recording:
             seconds.sort("group", "second")
             .with_columns(part=part)
             .group_by("group", "part")
-            .agg(c("begin").min(), c("end").max() + shift, c("rows").sum(), c("row").min())
+            .agg(c("begin").min(), c("end").max() + self.shift, c("rows").sum(), c("row").min())
             .with_columns(begin=pl.when(empty & (c("begin") == 0)).then(0.0).otherwise(
-                c("begin") + shift))
+                c("begin") + self.shift))
             .sort("rows", "begin", descending=[True, False])
         )  # fmt: skip
         self.base = float(np.floor(parts["begin"][0]))
@@ -256,9 +281,11 @@ class Recording:
         self.counts["far_away"] = int(parts.filter(c("n") <= 0)["rows"].sum())
         if kept.is_empty():
             longest = (parts["last"] - parts["first"]).to_numpy().max() + 1
+            silences = f" between silences of over {LONGEST_SILENCE:g} s" if len(parts) > 1 else ""
             raise TrajectoryError(
                 f"{self.path}: it must last {self.road.corridor.duration + 1} s or more, the "
-                f"corridor's duration and a second, got {longest:.0f} s"
+                f"corridor's duration and a second, got {longest:.0f} s{silences} (time in "
+                f"{self._units['time']})"
             )
         self.windows = (
             kept.with_columns(place=pl.int_ranges(0, c("n").cast(pl.Int64)))
@@ -271,21 +298,23 @@ class Recording:
         ends = kept.group_by("group").agg(c("begin").min(), c("end").max())
         return {group: (low, high) for group, low, high in ends.rows()}
 
-    def _take(
-        self, bucket: int, shift: float, coverage: dict[str, tuple[float, float]]
-    ) -> pl.DataFrame:
+    def _take(self, bucket: int, coverage: dict[str, tuple[float, float]]) -> pl.DataFrame:
         """Write the seconds of a bucket that are in windows; return the pieces of trajectories."""
         c = pl.col
         files = self.folder / "points" / f"bucket={bucket}"
         points = pl.read_parquet(files) if files.is_dir() else self._points.head(0).collect()
         points = points.filter(c("vehicle").is_not_null(), c("group").is_in(list(coverage)))
-        time = ((c("time") + shift - self.base) / TIME_UNIT).round() * TIME_UNIT
+        time = ((c("time") + self.shift - self.base) / TIME_UNIT).round() * TIME_UNIT
         near = (c("time") - c("time").round()).abs() < 0.1 * TIME_UNIT
+        first, last = (
+            c("group").replace_strict({group: ends[i] for group, ends in coverage.items()})
+            for i in (0, 1)
+        )
         points = (
             points.sort("row", maintain_order=True)
             .with_columns(time=time, id=c("row").min().over("group", "vehicle"))
             .with_columns(time=pl.when(near).then(c("time").round()).otherwise("time"))
-            .filter(c("column") != OFF)
+            .filter(c("column") != OFF, c("time").is_between(first - 1.0, last + 1.0))
         )
         label = c("vehicle").first()
         whole = pl.when(label.str.contains(r"^\d{1,8}$")).then(label).cast(pl.Int64).fill_null(-1)

@@ -25,6 +25,8 @@ HALF_WIDTH = 0.5
 """A derived speed is the mean over this time [s] on both sides."""
 TOLERANCE = 1.25
 """Largest factor between speeds and what positions say of them."""
+SLOWEST_ROAD, FASTEST_ROAD = 1.0, 250.0
+"""Median speeds [km/h] of the vehicles that move furthest, beyond which a unit is wrong."""
 
 
 def whole_seconds(
@@ -39,7 +41,7 @@ def whole_seconds(
         longest_gap: Longest time without points that is filled by interpolation [s].
         counts: What happens is added to it.
     """
-    points = _in_order(points, counts)
+    points = _in_order(points, longest_gap, counts)
     c, following = pl.col, pl.all().shift(-1)
     same = (c("id") == c("next_id")).fill_null(False)
     wait, move = c("next_time") - c("time"), c("next_position") - c("position")
@@ -65,7 +67,8 @@ def whole_seconds(
         piece=c("chain") - c("chain").first().over("id"),
     )
     told = points.select(
-        gaps_cut=c("paused").sum(), jumps_cut=c("jumped").sum(), gaps_filled=c("filled").sum(),
+        followed=c("same").sum(), gaps_cut=c("paused").sum(), jumps_cut=c("jumped").sum(),
+        gaps_filled=c("filled").sum(),
         seconds_filled=(c("n") - on_time).clip(0).filter("filled").sum(),
         vehicles=c("id").n_unique(),
     )  # fmt: skip
@@ -105,7 +108,7 @@ def _between(name: str) -> pl.Expr:
     return pl.when(pl.col("share") > 0.0).then(at + pl.col("share") * (after - at)).otherwise(at)
 
 
-def _in_order(points: pl.DataFrame, counts: Counter[str]) -> pl.DataFrame:
+def _in_order(points: pl.DataFrame, longest_gap: float, counts: Counter[str]) -> pl.DataFrame:
     """Return points by vehicle and time without duplicates, with the track of each.
 
     A vehicle that is in two places at once is several vehicles that share an id: each is a track.
@@ -123,7 +126,8 @@ def _in_order(points: pl.DataFrame, counts: Counter[str]) -> pl.DataFrame:
     if len(ambiguous):
         kept = points.filter(c("id").is_in(ambiguous.implode()).not_())
         several = points.filter(c("id").is_in(ambiguous.implode()))
-        tracks = [_tracks(each) for each in several.partition_by("id", maintain_order=True)]
+        vehicles = several.partition_by("id", maintain_order=True)
+        tracks = [_tracks(each, longest_gap) for each in vehicles]
         counts["ids_shared"] += len(tracks)
         counts["duplicates"] += sum(int((each < 0).sum()) for each in tracks)
         several = several.with_columns(track=pl.Series(np.concatenate(tracks), dtype=pl.Int32))
@@ -132,19 +136,24 @@ def _in_order(points: pl.DataFrame, counts: Counter[str]) -> pl.DataFrame:
     return points.drop("twice", "near")
 
 
-def _tracks(points: pl.DataFrame) -> IntArray:
+def _tracks(points: pl.DataFrame, longest_gap: float) -> IntArray:
     """Return which of the vehicles that share an id each point belongs to; -1 for a duplicate.
 
     Points are taken in order of time. Each goes on with the track that would be nearest at its
     speed, one in its lane rather, if it can be reached, and begins another one otherwise.
     """
-    ends: list[tuple[float, float, int, float]] = []  # time, position, lane and speed of tracks
+    # Time, position, lane and speed at the end of each track that may go on.
+    ends: dict[int, tuple[float, float, int, float]] = {}
     found: IntArray = np.empty(len(points), dtype=np.int64)
+    n = 0
     rows = points.select("time", "position", "lane_number").iter_rows()
     for i, (time, position, lane) in enumerate(rows):
-        best, nearest = len(ends), np.inf
-        for number, (t, p, on, v) in enumerate(ends):
+        best, nearest = n, np.inf
+        for number, (t, p, on, v) in list(ends.items()):
             wait, move = time - t, position - p
+            if wait > longest_gap:
+                del ends[number]
+                continue
             if wait == 0.0 and abs(move) <= SAME_PLACE and lane == on:
                 best = -1
                 break
@@ -152,8 +161,9 @@ def _tracks(points: pl.DataFrame) -> IntArray:
             if wait > 0.0 and -JUMP <= move <= FASTEST * wait + JUMP and away < nearest:
                 best, nearest = number, away
         found[i] = best
-        if best == len(ends):
-            ends.append((time, position, lane, 0.0))
+        if best == n:
+            ends[n] = time, position, lane, 0.0
+            n += 1
         elif best >= 0:
             t, p, _, _ = ends[best]
             ends[best] = time, position, lane, (position - p) / (time - t)
@@ -234,6 +244,15 @@ def check_pieces(pieces: pl.DataFrame, where: str, units: Mapping[str, str]) -> 
         raise TrajectoryError(
             f"{where}: {told}, got positions that decrease for {100.0 * share:.0f} % of the "
             "vehicles"
+        )
+    lasting = pieces.filter(pl.col("end") > pl.col("begin"))
+    speeds = 3600.0 * lasting["move"] / (lasting["end"] - lasting["begin"])
+    usual: float | None = speeds.median()  # type: ignore[assignment]
+    if usual is not None and not SLOWEST_ROAD <= usual <= FASTEST_ROAD:
+        raise TrajectoryError(
+            f"{where}: vehicles must usually drive {SLOWEST_ROAD:g} to {FASTEST_ROAD:g} km/h, got "
+            f"{usual:.4g} km/h from positions and times: are the units right (time in "
+            f"{units['time']}, length in {units['length']})?"
         )
     ratio: float | None = pieces.select(pl.col("ratio").drop_nans().median()).item()
     if ratio is None or 1.0 / TOLERANCE <= ratio <= TOLERANCE:

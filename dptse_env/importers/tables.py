@@ -9,19 +9,21 @@ from __future__ import annotations
 
 import csv
 import gzip
+import io
 import json
 import re
+import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import IO, Any, cast
+from typing import IO, Any, NamedTuple, cast
 from xml.parsers import expat
 
 import numpy as np
 import polars as pl
 from polars.io.plugins import register_io_source
 
-from dptse_env.importers.source import LABELS, NUMBERS, Source, TrajectoryError
+from dptse_env.importers.source import LABELS, NUMBERS, Source, TrajectoryError, shown
 
 SCHEMA = {
     "row": pl.Int64,
@@ -33,15 +35,19 @@ SCHEMA = {
 seconds, lengths in kilometres, speeds in km/h. What a file does not have is null, and so is the
 vehicle of a row that tells a time alone; `bad` is the role of a field that is no finite number."""
 
+BYTES = 40
+"""Bytes that a point takes in XML or JSON at least."""
 BLOCK = 1 << 20
 """Bytes of XML or JSON that are read at a time."""
 CHUNK = 100_000
 """Points of XML or JSON that are handed on together."""
-LONGEST_DOCUMENT = 64 << 20
+LONGEST_DOCUMENT = 16 << 20
 """Characters of a JSON document after which the file is no array of vehicles."""
 HEAD = 1 << 16
 """Bytes at the start of a text file by which its delimiter and columns are told."""
 PARQUET = (".parquet", ".pq")
+ROW = "row of the file"
+"""Name of the column of row numbers beside the file's own columns."""
 
 
 @dataclass(frozen=True)
@@ -70,26 +76,53 @@ class Format:
     sumo: bool = False
 
 
-def scan(path: Path, form: Format, source: Source) -> tuple[pl.LazyFrame, set[str]]:
-    """Return the points of a file with the columns of `SCHEMA`, and the roles that it has.
+class Points(NamedTuple):
+    """A file of trajectories.
+
+    Attributes:
+        frame: Its points, with the columns of `SCHEMA`.
+        roles: The roles of columns that it has.
+        rows: Rows, at most by estimate.
+    """
+
+    frame: pl.LazyFrame
+    roles: set[str]
+    rows: int
+
+
+class _Raw(NamedTuple):
+    """Columns of a file, its rows, and whether digits are in groups that commas separate."""
+
+    frame: pl.LazyFrame
+    rows: int
+    grouped: bool = False
+
+
+def scan(path: Path, form: Format, source: Source) -> Points:
+    """Return the points of a file, which is read when they are collected.
 
     Raises:
-        TrajectoryError: There is no such file, its start is damaged, or columns are missing.
+        TrajectoryError: There is no such file, its start is damaged, columns are missing, or a row
+            of a text has too many or too few fields.
     """
-    raw, grouped = _raw(path, form, source)
-    roles = _roles(path, form, source, raw.collect_schema().names())
-    kinds, lengths = raw.collect_schema(), dict.fromkeys(("x", "y", "extent"), "length")
-    columns: dict[str, Any] = {"row": pl.col("row").cast(pl.Int64)}
+    raw, rows, grouped = _raw(path, form, source)
+    kinds = raw.collect_schema()
+    names = [name for name in kinds.names() if name != ROW]
+    roles = _roles(path, form, source, names)
+    lengths = dict.fromkeys(("x", "y", "extent"), "length")
+    columns: dict[str, Any] = {"row": pl.col(ROW).cast(pl.Int64)}
     for role, name in roles.items():
         if role in LABELS:
-            text = pl.col(name).cast(pl.String)
+            text = _label(kinds[name], name)
             columns[role] = pl.when(text != "").then(text)  # an empty name is no name
             continue
+        if not (kinds[name].is_numeric() or kinds[name] in (pl.String, pl.Null)):
+            raise TrajectoryError(f"{path}: {shown(name)} must be numbers, got {kinds[name]}")
         quantity = lengths.get(role, role)
         factor = source.factor(quantity, form.units[quantity])
         columns[role] = _number(kinds[name], name, grouped) * factor
     for name, value in source.where.items():
-        found = _find(path, name, raw.collect_schema().names(), "source.where")
+        found = _find(path, name, names, "source.where")
         # Rows without a vehicle tell times alone.
         raw = raw.filter(columns["vehicle"].is_null() | _equals(found, value))
     absent = {name: pl.lit(None, kind) for name, kind in SCHEMA.items() if name not in columns}
@@ -107,44 +140,50 @@ def scan(path: Path, form: Format, source: Source) -> tuple[pl.LazyFrame, set[st
         roles["edge"] = "lane"
     if form.sumo:
         points = points.with_columns(lane=pl.col("lane").str.extract("([^_]*)$"))
-    return (form.adjust(points, path, source) if form.adjust else points), set(roles)
+    if form.adjust:
+        points = form.adjust(points, path, source)
+    return Points(points, set(roles), rows)
 
 
 def field_text(path: Path, form: Format, source: Source, row: int, role: str) -> tuple[str, str]:
     """Return the name of a role's column and the text of its field in a row, for messages."""
-    raw, _ = _raw(path, form, source)
+    raw = _raw(path, form, source).frame
     name = _roles(path, form, source, raw.collect_schema().names()).get(role, role)
-    value = raw.filter(pl.col("row") == row).select(pl.col(name).cast(pl.String)).head(1).collect()
-    return name, repr(value.item()) if len(value) and value.item() else "nothing"
+    text = raw.filter(pl.col(ROW) == row).select(pl.col(name).cast(pl.String)).head(1)
+    value = text.collect(engine="streaming")
+    got = repr(shown(value.item())) if len(value) and value.item() else "nothing"
+    return shown(name), got
 
 
-def _raw(path: Path, form: Format, source: Source) -> tuple[pl.LazyFrame, bool]:
-    """Return the columns of a file and ``row``, and whether digits are grouped by commas."""
+def _raw(path: Path, form: Format, source: Source) -> _Raw:
+    """Return the columns of a file and `ROW`."""
     try:
         if path.is_dir():
             raise TrajectoryError(f"{path}: trajectories must be a file, got a directory")
-        if path.stat().st_size == 0:
+        size = path.stat().st_size * (10 if path.suffix.lower() == ".gz" else 1)
+        if size == 0:
             raise TrajectoryError(f"{path}: the file is empty")
         kind = "".join(path.suffixes[-2:]).lower().removesuffix(".gz")
         if kind.endswith(PARQUET):
-            return pl.scan_parquet(path, row_index_name="row", row_index_offset=1), False
+            frame = pl.scan_parquet(path, row_index_name=ROW, row_index_offset=1)
+            return _Raw(frame, frame.select(pl.len()).collect().item())
         if kind.endswith(".xml"):
-            return _from(lambda: _xml(path)), False
+            return _Raw(_from(lambda: _xml(path, form)), size // BYTES)
         if form.lists:
             scalars = {"_id", "direction", *source.where}
-            return _from(lambda: _json(path, form, scalars)), False
+            return _Raw(_from(lambda: _json(path, form, scalars)), size // BYTES)
         return _text(path, form)
-    except (OSError, EOFError) as problem:
+    except (OSError, EOFError, zlib.error) as problem:
         reason = getattr(problem, "strerror", None) or problem
         raise TrajectoryError(f"{path}: the file cannot be read: {reason}") from problem
 
 
-def _text(path: Path, form: Format) -> tuple[pl.LazyFrame, bool]:
+def _text(path: Path, form: Format) -> _Raw:
     with _open(path) as file:
-        lines = file.read(HEAD).decode("utf-8-sig", errors="replace").splitlines()
-    if not lines or not lines[0].strip():
+        text = file.read(HEAD).decode("utf-8-sig", errors="replace")
+    first = text.partition("\n")[0].rstrip("\r")
+    if not first.strip():
         raise TrajectoryError(f"{path}, row 1: a header or data must be there, got an empty line")
-    first = lines[0]
     separator = max(",;\t|", key=first.count)
     blanks = not first.count(separator)
     names = first.split() if blanks else next(csv.reader([first], delimiter=separator))
@@ -155,34 +194,58 @@ def _text(path: Path, form: Format) -> tuple[pl.LazyFrame, bool]:
             f"({', '.join(form.headless)}), got {len(names)}"
         )
     names = [name.strip() for name in names] if has_header else list(form.headless)
+    # A name that is there twice is that of its first column.
+    names = [
+        name if names.index(name) == i else f"{name} (column {i + 1})"
+        for i, name in enumerate(names)
+    ]
+    rows = _count_rows(path, None if blanks else separator, len(names))
     options: dict[str, Any] = {
-        "infer_schema": False, "has_header": has_header, "row_index_name": "row",
+        "infer_schema": False, "has_header": has_header, "row_index_name": ROW,
         "row_index_offset": 1 + has_header,
     }  # fmt: skip
     if not blanks:
-        _check_lines(path, separator, len(names))
         raw = pl.scan_csv(path, separator=separator, new_columns=names, **options)
-        return raw, any(re.search(r'"\d{1,3}(,\d{3})+(\.\d*)?"', line) for line in lines)
+        # "1,118,846,663,000": portals export numbers with their digits in groups.
+        grouped = separator == "," and re.search(r'"\d{1,3}(,\d{3})+(\.\d*)?"', text) is not None
+        return _Raw(raw, rows, grouped)
     # Runs of blanks: a line is one column first.
     raw = pl.scan_csv(path, separator="\x01", quote_char=None, new_columns=["line"], **options)
     fields = pl.col("line").str.extract_all(r"\S+")
     columns = (fields.list.get(i, null_on_oob=True).alias(name) for i, name in enumerate(names))
-    return raw.select("row", *columns), False
+    return _Raw(raw.select(ROW, *columns), rows)
 
 
-def _check_lines(path: Path, separator: str, n: int) -> None:
-    """Refuse a row with more or fewer fields than the first, which polars would let pass."""
+def _count_rows(path: Path, separator: str | None, n: int) -> int:
+    """Count rows; refuse one with more or fewer than `n` fields, which polars would let pass."""
     line = pl.col("line")
-    quoted = line.str.contains('"', literal=True)
-    bare = pl.when(quoted).then(line.str.replace_all(r'"[^"]*"', "")).otherwise(line)
-    found = bare.str.count_matches(separator, literal=True) + 1
+    if separator is None:
+        words = line.str.count_matches(r"\S+")
+        found = pl.when(words > 0).then(words)
+    else:
+        quoted = line.str.contains('"', literal=True)
+        bare = pl.when(quoted).then(line.str.replace_all(r'"[^"]*"', "")).otherwise(line)
+        fields = bare.str.count_matches(separator, literal=True) + 1
+        # A quote that its line does not close would join it with the next ones.
+        found = pl.when(bare.str.contains('"', literal=True)).then(0).otherwise(fields)
     lines = pl.scan_csv(
         path, separator="\x01", quote_char=None, has_header=False, new_columns=["line"],
         infer_schema=False, row_index_name="row", row_index_offset=1,
     )  # fmt: skip
-    wrong = lines.select("row", line.str.contains(r"\S"), n=found).filter("line", pl.col("n") != n)
-    for row, _, got in wrong.head(1).collect(engine="streaming").rows():
-        raise TrajectoryError(f"{path}, row {row}: it must have {n} fields, got {got}")
+    wrong = pl.col("n") != n
+    told = (
+        lines.select("row", n=pl.when(line.is_not_null()).then(found))
+        .select(pl.col("n").count(), row=pl.col("row").filter(wrong).min())
+        .collect(engine="streaming")
+    )
+    rows, row = told.row(0)
+    if row is not None:
+        got = lines.select("row", n=found).filter(pl.col("row") == row).head(1)
+        fields = got.collect(engine="streaming")["n"].item()
+        raise TrajectoryError(
+            f"{path}, row {row}: it must have {n} fields, got {fields or 'an open quote'}"
+        )
+    return int(rows)
 
 
 def _open(path: Path) -> IO[bytes]:
@@ -195,6 +258,14 @@ def _number(kind: Any, name: str, grouped: bool) -> pl.Expr:
         column = column.str.strip_chars()
         column = column.str.replace_all(",", "", literal=True) if grouped else column
     return column.cast(pl.Float64, strict=False)
+
+
+def _label(kind: Any, name: str) -> pl.Expr:
+    column = pl.col(name)
+    if kind.is_float():  # 3.0 is the name 3
+        whole = pl.when(column == column.round()).then(column).cast(pl.Int64, strict=False)
+        return pl.coalesce(whole.cast(pl.String), column.cast(pl.String))
+    return column.cast(pl.String)
 
 
 def _roles(path: Path, form: Format, source: Source, found: list[str]) -> dict[str, str]:
@@ -213,19 +284,17 @@ def _roles(path: Path, form: Format, source: Source, found: list[str]) -> dict[s
             missing.append(" or ".join(names))
     missing += [f"one for {r}" for r in form.required if r not in (*roles, *form.columns)]
     if missing:
-        shown = ", ".join(name for name in found if name != "row")
         raise TrajectoryError(
-            f"{path}: columns must be {', '.join(missing)} among others, found {shown}"
+            f"{path}: columns must be {', '.join(missing)} among others, found {shown(*found)}"
         )
     return roles
 
 
 def _find(path: Path, name: str, found: Iterable[str], option: str) -> str:
-    by_name = {_normal(each): each for each in found if each != "row"}
+    by_name = {_normal(each): each for each in found}
     if _normal(name) not in by_name:
         raise TrajectoryError(
-            f"{path}: {option} must be a column of the file, got {name!r}; found "
-            f"{', '.join(by_name.values())}"
+            f"{path}: {option} must be a column of the file, got {name!r}; found {shown(*found)}"
         )
     return by_name[_normal(name)]
 
@@ -268,10 +337,13 @@ _ATTRIBUTES = {
 """Attributes of SUMO's XML, and the names that its CSV has for them."""
 
 
-def _xml(path: Path) -> Iterator[pl.DataFrame]:
+def _xml(path: Path, form: Format) -> Iterator[pl.DataFrame]:
     """Read the points of SUMO's XML; a row is a line."""
     parser, rows, time = expat.ParserCreate(), [], ""
-    wanted = list(_ATTRIBUTES)[1:]
+    wanted = [name for name, column in _ATTRIBUTES.items() if (column,) in form.columns.values()]
+    wanted.remove("time")
+    schema = {ROW: pl.Int64, "timestep_time": pl.String}
+    schema |= {_ATTRIBUTES[name]: pl.String for name in wanted}
 
     def start(tag: str, attributes: dict[str, str]) -> None:
         nonlocal time
@@ -279,10 +351,9 @@ def _xml(path: Path) -> Iterator[pl.DataFrame]:
             time = attributes.get("time", "")
             rows.append((parser.CurrentLineNumber, time, *[None] * len(wanted)))
         elif tag == "vehicle":
-            rows.append((parser.CurrentLineNumber, time, *map(attributes.get, wanted)))
+            rows.append((parser.CurrentLineNumber, time, *[attributes[name] for name in wanted]))
 
     def frame() -> pl.DataFrame:
-        schema = {"row": pl.Int64, **dict.fromkeys(_ATTRIBUTES.values(), pl.String)}
         made = pl.DataFrame(rows, schema, orient="row")
         rows.clear()
         return made
@@ -296,7 +367,12 @@ def _xml(path: Path) -> Iterator[pl.DataFrame]:
                     yield frame()
             parser.Parse(b"", True)
         yield frame()
-    except (expat.ExpatError, EOFError, OSError) as broken:
+    except KeyError as missing:
+        raise TrajectoryError(
+            f"{path}, row {parser.CurrentLineNumber}: a vehicle must have the attributes "
+            f"{', '.join(wanted)}; {missing} is missing"
+        ) from missing
+    except (expat.ExpatError, EOFError, OSError, zlib.error) as broken:
         raise TrajectoryError(
             f"{path}, row {parser.CurrentLineNumber}: it is no complete XML file: {broken}"
         ) from broken
@@ -304,30 +380,32 @@ def _xml(path: Path) -> Iterator[pl.DataFrame]:
 
 def _documents(path: Path) -> Iterator[Any]:
     """Yield the documents of a JSON array, one in memory at a time."""
-    decoder, text, place, row = json.JSONDecoder(), "", 0, 1
+    decoder, row = json.JSONDecoder(), 0
     with _open(path) as binary:
-        file = iter(lambda: binary.read(BLOCK).decode("utf-8", errors="replace"), "")
-        text = next(file, "").removeprefix("\ufeff").lstrip()
-        if not text.startswith("["):
-            return
-        place = 1
-        while True:
-            while place < len(text) and text[place] in " \t\r\n,":
-                place += 1
-            if text[place : place + 1] == "]":
+        file = io.TextIOWrapper(binary, encoding="utf-8-sig")
+        try:
+            text, place = file.read(BLOCK).lstrip(), 1
+            if not text.startswith("["):
                 return
-            try:
-                document, place = decoder.raw_decode(text, place)
-            except json.JSONDecodeError as broken:
-                more = next(file, "") if len(text) - place < LONGEST_DOCUMENT else ""
-                if not more:
-                    raise TrajectoryError(
-                        f"{path}, row {row}: it is no complete JSON array: {broken.msg}"
-                    ) from broken
-                text, place = text[place:] + more, 0
-                continue
-            yield document
-            row += 1
+            while True:
+                while text[place : place + 1] in tuple(" \t\r\n,"):
+                    place += 1
+                if text[place : place + 1] == "]":
+                    return
+                try:
+                    document, place = decoder.raw_decode(text, place)
+                except json.JSONDecodeError:
+                    more = file.read(BLOCK) if len(text) - place < LONGEST_DOCUMENT else ""
+                    if not more:
+                        raise
+                    text, place = text[place:] + more, 0
+                    continue
+                yield document
+                row += 1
+        except (ValueError, RecursionError, EOFError, OSError, zlib.error) as broken:
+            raise TrajectoryError(
+                f"{path}, row {row + 1}: it is no complete JSON array: {shown(broken)}"
+            ) from broken
 
 
 def _json(path: Path, form: Format, scalars: Iterable[str]) -> Iterator[pl.DataFrame]:
@@ -336,24 +414,26 @@ def _json(path: Path, form: Format, scalars: Iterable[str]) -> Iterator[pl.DataF
     for row, document in enumerate(_documents(path), start=1):
         where = f"{path}, row {row}"
         if not isinstance(document, Mapping):
-            raise TrajectoryError(f"{where}: a document must be an object, got {document!r}")
+            raise TrajectoryError(f"{where}: a document must be an object, got {shown(document)}")
         missing = [name for name in (*form.lists, *scalars) if name not in document]
         if missing:
             raise TrajectoryError(
-                f"{where}: fields {', '.join(missing)} are missing, found {', '.join(document)}"
+                f"{where}: fields {', '.join(missing)} are missing, found {shown(*document)}"
             )
-        columns: dict[str, Any] = {"row": row}
+        columns: dict[str, Any] = {ROW: row}
         for name in scalars:
             value = document[name]
             columns[name] = str(value.get("$oid", value) if isinstance(value, Mapping) else value)
         try:
             lists = {name: np.array(document[name], dtype=float) for name in form.lists}
-            waiting.append(pl.DataFrame({**columns, **lists}))
-        except (TypeError, ValueError, pl.exceptions.PolarsError) as problem:
+        except (TypeError, ValueError, OverflowError) as problem:
             raise TrajectoryError(
-                f"{where}: {', '.join(form.lists)} must be lists of numbers of one length: "
-                f"{problem}"
+                f"{where}: {', '.join(form.lists)} must be lists of numbers: {shown(problem)}"
             ) from problem
+        shapes = {name: each.shape for name, each in lists.items()}
+        if len(set(shapes.values())) > 1 or len(shapes[form.lists[0]]) != 1:
+            raise TrajectoryError(f"{where}: lists must be of one length, got shapes {shapes}")
+        waiting.append(pl.DataFrame({**columns, **lists}))
         if sum(map(len, waiting)) >= CHUNK:
             yield pl.concat(waiting)
             waiting = []
@@ -374,13 +454,15 @@ def _by_direction(points: pl.LazyFrame, path: Path, source: Source) -> pl.LazyFr
     except (OSError, pl.exceptions.PolarsError) as problem:
         raise TrajectoryError(
             f"{path}: the driving directions must be in {meta} (columns id, drivingDirection), "
-            f"got {problem!r}"
+            f"got {shown(repr(problem))}"
         ) from problem
     unknown = points.select("vehicle").unique().drop_nulls()
     for (name,) in (
         unknown.join(table.lazy(), how="anti", left_on="vehicle", right_on="id").collect().rows()
     ):
-        raise TrajectoryError(f"{path}: vehicle {name} is not in {meta}, which has its direction")
+        raise TrajectoryError(
+            f"{path}: vehicle {shown(name)} is not in {meta}, which has its direction"
+        )
     extent = source.layout.extent
     if extent is None and "upper" in (source.groups or ["upper"]) and (table[:, 1] == "1").any():
         raise TrajectoryError(
