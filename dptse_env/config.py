@@ -45,7 +45,14 @@ from dptse_env.traffic import (
     randomised,
     read_road,
 )
-from dptse_env.utils.fields import Interval, checked_fields, field_hints, from_mapping, require_name
+from dptse_env.utils.fields import (
+    Interval,
+    checked_fields,
+    field_hints,
+    from_mapping,
+    require_name,
+    shown,
+)
 
 TRAINING_SEEDS = range(1_000)
 """Traffic seeds meant for training and calibration."""
@@ -109,7 +116,7 @@ class EnvConfig:
             with other ARZ parameters, and that nobody gave; filled in by `resolve`.
 
     Raises:
-        ValueError: A value is out of range, or the parameters violate the CFL condition.
+        ValueError: A value is out of range.
     """
 
     corridor: Corridor
@@ -171,7 +178,6 @@ class EnvConfig:
                 )
         if isinstance(self.parameters, str):
             require_name("parameters", self.parameters, available_parameters())
-        self.arz_parameters.require_time_step(TIME_STEP, min(self.corridor.segment_lengths))
         self._check_settings()
 
     def _check_queries(self) -> None:
@@ -226,7 +232,7 @@ class EnvConfig:
         elif settings is not None and not isinstance(settings, expected):
             raise ValueError(
                 f"estimator_settings must be a mapping, the name of a set, or a "
-                f"{expected.__name__}, got {settings!r}"
+                f"{expected.__name__}, got {shown(settings)}"
             )
         check_demand(self.estimator, self.settings())
 
@@ -523,12 +529,12 @@ def _privacy(base: PrivacySettings, values: dict[str, Any]) -> PrivacySettings:
         given = {"preset": given}
     elif not isinstance(given, Mapping):
         raise ValueError(
-            f"privacy must be the name of a release model, a class or a mapping, got {given!r}"
+            f"privacy must be the name of a release model, a class or a mapping, got {shown(given)}"
         )
     given = dict(given)
     preset = given.pop("preset", base.preset)
     if not isinstance(preset, str | type):
-        raise ValueError(f"privacy.preset must be a name or a class, got {preset!r}")
+        raise ValueError(f"privacy.preset must be a name or a class, got {shown(preset)}")
     if isinstance(preset, str):
         preset = RELEASE_MODELS.name_of(preset)
     if preset != base.preset:

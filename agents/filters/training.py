@@ -11,7 +11,6 @@ import numpy as np
 import torch
 
 from agents.executors import THIS_PROCESS, AnyExecutor, run_in_order
-from agents.files import replacing
 from agents.filters.batches import Batch, draw_batch
 from agents.filters.card import make_card
 from agents.filters.collecting import Collected, CollectTask, run_collect
@@ -28,6 +27,7 @@ from agents.training.run_files import (
 )
 from dptse_env.estimators.recurrent_weights import read_network, write_network
 from dptse_env.traffic import Records
+from dptse_env.utils.files import replacing
 
 WEIGHTS, PLAYED = "network.npz", "played.npz"
 """The trained network, and the network that the scenarios of a round are collected with."""
