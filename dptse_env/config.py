@@ -45,6 +45,7 @@ from dptse_env.traffic import (
     randomised,
     read_road,
 )
+from dptse_env.traffic.imported import has_vehicles, recorded_seeds, require_seeds
 from dptse_env.utils.fields import (
     Interval,
     checked_fields,
@@ -168,9 +169,9 @@ class EnvConfig:
             raise ValueError(f"traffic_seeds must be distinct, got {seeds}")
         self._check_sensors()
         if self.corridor.recordings is not None:
-            self.corridor.recordings.require(seeds)
+            require_seeds(self.corridor.recordings, seeds)
             needs = RELEASE_MODELS.find(self.privacy.preset).needs_vehicles
-            if needs and not self.corridor.recordings.has_vehicles:
+            if needs and not has_vehicles(self.corridor.recordings):
                 raise ValueError(
                     "privacy.preset must be a release model that needs no vehicles, such as "
                     "'paper' or 'corrected', on a road of measured fields, got "
@@ -219,7 +220,8 @@ class EnvConfig:
                 f"detectors must be left out on a road without fixed sensors, got {self.detectors}"
             )
         recordings = corridor.recordings
-        if self.has_separate_sensors and recordings is not None and not recordings.has_vehicles:
+        is_field = recordings is not None and not has_vehicles(recordings)
+        if self.has_separate_sensors and is_field:
             raise ValueError(
                 "penetration.share must be 1, and detectors left out, on a road of measured "
                 "fields, which have no vehicles"
@@ -393,7 +395,7 @@ def _config(base: EnvConfig, values: dict[str, Any], corridor: Corridor) -> EnvC
 def _read_seeds(values: dict[str, Any], corridor: Corridor) -> None:
     """Replace a range of traffic seeds by these, and put recorded ones where none are given."""
     if "traffic_seeds" not in values and corridor.recordings is not None:
-        recorded = corridor.recordings.seeds
+        recorded = recorded_seeds(corridor.recordings)
         values["traffic_seeds"] = tuple(seed for seed in recorded if seed in TRAINING_SEEDS)
     if isinstance(values.get("traffic_seeds"), str):
         values["traffic_seeds"] = parse_seeds(values["traffic_seeds"], "traffic_seeds")

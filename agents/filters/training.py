@@ -25,11 +25,10 @@ from agents.training.run_files import (
     write_checkpoint,
     write_progress,
 )
-from dptse_env.estimators.recurrent_weights import read_network, write_network
+from dptse_env.estimators.recurrent import read_network, write_network
 from dptse_env.traffic import Records
-from dptse_env.utils.files import replacing
 
-WEIGHTS, PLAYED = "network.npz", "played.npz"
+WEIGHTS, PLAYED = "network.safetensors", "played.safetensors"
 """The trained network, and the network that the scenarios of a round are collected with."""
 COLUMNS = ("update", "steps", "seconds", "round", "loss", "error", "rate", "validation", "chi2")
 Watcher = Callable[[Row], None]
@@ -185,8 +184,7 @@ class FilterTraining:
 
     def _save(self, name: str) -> None:
         card = make_card(self.plan, self.done, self.folder.name)
-        with replacing(self.folder / name) as temporary:
-            write_network(temporary, self.network.weights(), card)
+        write_network(self.folder / name, self.network.weights(), card)
 
     def _keep(self) -> None:
         write_progress(self.folder, self.rows, COLUMNS)

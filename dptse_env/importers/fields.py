@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from dptse_env.importers.folder import ROAD, Split, assign_seeds, new_folder
+from dptse_env.importers.folder import (
+    ROAD,
+    Split,
+    assign_seeds,
+    moved,
+    new_folder,
+    save_records,
+)
 from dptse_env.importers.source import LENGTHS, SPEEDS, TIMES
 from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.demand import Demand
-from dptse_env.traffic.dwell import average_dwell
-from dptse_env.traffic.field_record import FieldRecord
-from dptse_env.traffic.recordings import Recordings, record_path, record_source, write_manifest
+from dptse_env.traffic.record import Record, average_dwell
 from dptse_env.traffic.road_files import DENSITY_SCALE, write_corridor
 from dptse_env.utils.arrays import FloatArray
 from dptse_env.utils.fields import integer, positive, require, require_name
@@ -28,8 +35,12 @@ UNITS = {
 """Factors to veh/km, km/h and veh/h."""
 LEAST_DENSITY = 1e-9
 """Density [veh/km] below which a cell is empty and has no speed of its own."""
-FASTEST = 300.0
-"""Speed [km/h] above which a field has another unit than stated."""
+DENSEST = (1.0, 3000.0)
+"""Largest density of a field [veh/km], all lanes together, beyond which its unit is another one."""
+FASTEST = (5.0, 300.0)
+"""Largest speed of a field [km/h], beyond which its unit is another one."""
+DENSEST_LANE, BUSIEST_LANE = 250.0, 4000.0
+"""Density [veh/km] and flow [veh/h] that no lane exceeds."""
 
 
 @dataclass(frozen=True)
@@ -79,9 +90,14 @@ class FieldSource:
         allowed = f"a table of {self.density}'s shape {density.shape}"
         require(other.shape == density.shape, path, allowed, other.shape)
         flow = other if kind == "flow" else density * other
-        fastest = float((flow / np.maximum(density, LEAST_DENSITY)).max(initial=0.0))
-        allowed = f"speeds of at most {FASTEST:g} km/h: check cell, interval and units"
-        require(fastest <= FASTEST, path, allowed, f"{fastest:.0f} km/h")
+        speed = flow / np.maximum(density, LEAST_DENSITY)
+        for file, table, (low, high), what, unit in (
+            (str(self.density), density, DENSEST, "densities", "veh/km"),
+            (path, speed, FASTEST, "speeds", "km/h"),
+        ):
+            largest = float(table.max())
+            allowed = f"{what} whose largest is {low:g} to {high:g} {unit}: check the units"
+            require(low <= largest <= high, file, allowed, f"{largest:.4g} {unit}")
         return density, flow
 
     def _table(self, kind: str) -> FloatArray:
@@ -121,6 +137,27 @@ class FieldRoad:
     lanes: int
     speed_limit: float
 
+    def check(self, density: FloatArray, flow: FloatArray) -> None:
+        """Raise ``ValueError`` for a field that the lanes cannot hold; warn where it is slow.
+
+        Args:
+            density: Densities [veh/km], all lanes together.
+            flow: Flows [veh/h].
+        """
+        for name, table, most, unit in (
+            ("density", density, DENSEST_LANE, "veh/km"), ("flow", flow, BUSIEST_LANE, "veh/h"),
+        ):  # fmt: skip
+            allowed = f"at most {most * self.lanes:g} {unit} on {self.lanes} lanes: check the units"
+            largest = float(table.max())
+            require(largest <= most * self.lanes, name, allowed, f"{largest:.4g} {unit}")
+        fastest = float((flow / np.maximum(density, LEAST_DENSITY)).max())
+        if fastest < 0.4 * self.speed_limit:
+            warnings.warn(
+                f"no speed of the field is above {fastest:.0f} km/h, at a limit of "
+                f"{self.speed_limit:g} km/h: is speed_unit or flow_unit right?",
+                stacklevel=3,
+            )
+
     def corridor(self, segment_length: float, duration: int) -> Corridor:
         """Return the road without demand and recordings."""
         return Corridor(
@@ -158,38 +195,38 @@ def import_field(
     integer("duration", duration, 1)
     integer("segments", road.segments, 2)
     density, flow = source.read()
+    road.check(density, flow)
     each = len(density) // (road.segments + 2)
     require(each >= 1, "segments", f"at most {len(density) - 2}", road.segments)
-    field = by_second(density, flow, road.segments + 2, source.interval)
-    starts = range(0, len(field[0]) - duration, duration + 1)
-    require(len(starts) > 0, "duration", f"below the field's {len(field[0])} s", duration)
+    field = np.stack(by_second(density, flow, road.segments + 2, source.interval), axis=-1)
+    starts = range(0, len(field) - duration, duration + 1)
+    require(len(starts) > 0, "duration", f"below the field's {len(field)} s", duration)
     seeds = assign_seeds(splits, len(starts))
     flat = [seed for split in splits for seed in seeds[split.name]]
     bare = road.corridor(each * source.cell, duration)
     # The boundary segments, at both ends, come last in a record.
     order = [*range(1, road.segments + 1), 0, road.segments + 1]
-    windows = [slice(start, start + duration + 1) for start in starts]
-    records = [FieldRecord(*(table[window][:, order] for table in field)) for window in windows]
-    training = records[: len(seeds[splits[0].name])]
-    entering = np.mean([(each.density * each.speed)[:, 0].mean() for each in training])
+    windows = [field[start : start + duration + 1, order] for start in starts]
+    records = [
+        Record(n_steps=duration + 1, n_columns=len(order), field=window) for window in windows
+    ]
+    n_training = len(seeds[splits[0].name])
+    entering = np.mean([window[:, 0].prod(axis=-1).mean() for window in windows[:n_training]])
     measured = dataclasses.replace(
         bare,
         demand=Demand(mainline=((0.0, round(float(entering), 1)),)),
-        average_dwell=round(average_dwell(bare, training), 3),
+        average_dwell=round(average_dwell(bare, records[:n_training]), 3),
     )
+    sources: list[dict[str, Any]] = [
+        {"seed": seed, "file": source.density.name, "start": start}
+        for seed, start in zip(flat, starts, strict=True)
+    ]
     with new_folder(output) as folder:
-        for seed, record in zip(flat, records, strict=True):
-            record.save(record_path(folder, seed), record_source(seed, bare.record_layout))
-        sources = [
-            {"seed": seed, "file": source.density.name, "start": start}
-            for seed, start in zip(flat, starts, strict=True)
-        ]
-        digest = write_manifest(folder, bare.record_layout, flat, sources, "fields")
-        written = dataclasses.replace(measured, recordings=Recordings(str(folder), digest))
+        kept = save_records(folder, bare, records, sources, "fields")
+        written = dataclasses.replace(measured, recordings=kept)
         comment = "A measured field. Demand and average dwell are those of its training windows."
         write_corridor(folder / ROAD, written, comment=comment)
-    final = Recordings(str(output.absolute()), digest)
-    return dataclasses.replace(written, recordings=final), seeds
+    return moved(written, output), seeds
 
 
 def by_second(

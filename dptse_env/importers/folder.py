@@ -18,11 +18,10 @@ from dptse_env.importers.recording import Options, Recording
 from dptse_env.importers.report import write_report
 from dptse_env.importers.source import Source
 from dptse_env.importers.tables import FORMATS
-from dptse_env.traffic.corridor import Corridor
+from dptse_env.traffic.corridor import Corridor, Recordings
 from dptse_env.traffic.demand import Demand
-from dptse_env.traffic.field_record import load_record, with_vehicles
-from dptse_env.traffic.record import Record, mean_dwell
-from dptse_env.traffic.recordings import Recordings, record_path, record_source, write_manifest
+from dptse_env.traffic.imported import Kind, load_record, save_record, write_manifest
+from dptse_env.traffic.record import Record, average_dwell
 from dptse_env.traffic.road_files import write_corridor
 from dptse_env.utils.fields import require, require_name
 
@@ -104,29 +103,62 @@ def import_trajectories(
         windows = [(each, row) for each in recordings for row in each.windows.iter_rows(named=True)]
         seeds = assign_seeds(splits, len(windows))
         flat = [seed for split in splits for seed in seeds[split.name]]
-        sources = []
-        for seed, (recording, window) in zip(flat, windows, strict=True):
-            record = recording.record(window["window"])
-            record.save(record_path(folder, seed), record_source(seed, bare.record_layout))
-            sources.append(
-                {"seed": seed, "file": recording.path.name, "group": window["group"],
-                 "start": window["start"], "vehicles": len(np.unique(record.vehicle)),
-                 "rows": record.n_rows}
-            )  # fmt: skip
+        sources: list[dict[str, Any]] = [
+            {"seed": seed, "file": recording.path.name, "group": window["group"],
+             "start": window["start"]}
+            for seed, (recording, window) in zip(flat, windows, strict=True)
+        ]  # fmt: skip
+
+        def records() -> Iterator[Record]:
+            for source_of, (recording, window) in zip(sources, windows, strict=True):
+                record = recording.record(window["window"])
+                source_of |= {"vehicles": len(np.unique(record.vehicle)), "rows": record.n_rows}
+                yield record
+
+        kept = save_records(folder, bare, records(), sources)
 
         def load(seed: int) -> Record:
-            kept = record_source(seed, bare.record_layout)
-            return with_vehicles(load_record(record_path(folder, seed), kept), "an import")
+            return load_record(kept, seed, bare.record_layout)
 
-        # One at a time, since an open record holds four file descriptors.
+        # One at a time, so that one is in memory.
         measured = measure(bare, lambda: map(load, seeds[splits[0].name]))
-        digest = write_manifest(folder, bare.record_layout, flat, sources)
-        written = dataclasses.replace(measured, recordings=Recordings(str(folder), digest))
+        road = dataclasses.replace(measured, recordings=kept)
         comment = "Recorded traffic. Demand, exit shares and average dwell are measured."
-        write_corridor(folder / ROAD, written, environment, comment)
-        report = write_report(folder, written, recordings, seeds, sources, load(flat[0]))
-    final = dataclasses.replace(written, recordings=Recordings(str(output.absolute()), digest))
-    return Imported(final, seeds, report)
+        write_corridor(folder / ROAD, road, environment, comment)
+        report = write_report(folder, road, recordings, seeds, sources, load(flat[0]))
+    return Imported(moved(road, output), seeds, report)
+
+
+def save_records(
+    folder: Path, road: Corridor, records: Iterable[Record], sources: list[dict[str, Any]],
+    kind: Kind = "vehicles",
+) -> Recordings:  # fmt: skip
+    """Write records and their manifest to a folder, one after another.
+
+    Args:
+        folder: The folder.
+        road: The road.
+        records: A record for each source; each is asked for when the last one is written.
+        sources: A JSON description of each window, with its traffic ``seed``.
+        kind: Whether the records have vehicles or are measured fields.
+
+    Raises:
+        OSError: The folder cannot be written.
+    """
+    digests = {}
+    for source, record in zip(sources, records, strict=True):
+        save_record(folder, source["seed"], road.record_layout, record)
+        digests[source["seed"]] = record.digest
+    return Recordings(
+        str(folder), write_manifest(folder, road.record_layout, digests, sources, kind)
+    )
+
+
+def moved(road: Corridor, output: Path) -> Corridor:
+    """Return a road whose recordings are in another folder."""
+    assert road.recordings is not None
+    there = dataclasses.replace(road.recordings, folder=str(output.absolute()))
+    return dataclasses.replace(road, recordings=there)
 
 
 def measure(corridor: Corridor, records: Callable[[], Iterable[Record]]) -> Corridor:
@@ -154,7 +186,7 @@ def measure(corridor: Corridor, records: Callable[[], Iterable[Record]]) -> Corr
             on_ramps=tuple(round(float(each), 1) for each in entering),
         ),
         exit_shares=tuple(round(float(each), 4) for each in held),
-        average_dwell=round(mean_dwell(records(), corridor.n_mainline), 3),
+        average_dwell=round(average_dwell(corridor, records()), 3),
     )
 
 

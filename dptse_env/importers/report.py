@@ -11,8 +11,8 @@ import numpy as np
 
 from dptse_env.importers.recording import Recording
 from dptse_env.traffic.corridor import Corridor
+from dptse_env.traffic.imported import ranges
 from dptse_env.traffic.record import Record
-from dptse_env.traffic.recordings import ranges
 
 _COUNTS = {
     "rows": {

@@ -44,9 +44,9 @@ def read_tensors(
         largest: Largest size of the file [bytes].
 
     Returns:
-        The card, with the digest of the content as ``sha256``, and the arrays of integers and
-        finite floats by name. The caller checks what the card must have, and shapes and types of
-        the arrays (`require_arrays`).
+        The card, with the digest of the content as ``sha256``, and the arrays by name, read-only,
+        of integers or finite floats. The caller checks what the card must have, and shapes and
+        types of the arrays (`require_arrays`).
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -151,6 +151,7 @@ def _parsed(content: bytes) -> tuple[dict[str, Any], dict[str, AnyArray]]:
         raise ValueError(f"its header must have at most {LARGEST_HEADER} bytes, got {size}")
     arrays: dict[str, AnyArray] = load(content)
     for name, array in arrays.items():
+        array.flags.writeable = False
         if array.dtype.kind not in "iuf":
             raise ValueError(f"{name} must be of integers or floats, got {array.dtype}")
         if array.dtype.kind == "f" and not np.isfinite(array).all():
