@@ -21,8 +21,8 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from dptse_env.traffic import Corridor, Demand
 from dptse_env.importers import Source, Split, import_trajectories
+from dptse_env.traffic import Corridor, Demand
 
 FORMATS = ("csv", "parquet", "text")
 ROAD = Corridor(
@@ -80,7 +80,9 @@ def write(path: Path, n_vehicles: int) -> None:
             "Space_Headway": np.full(len(vehicle), 65.6),
             "Time_Headway": np.full(len(vehicle), 1.0),
         }  # fmt: skip
-        with path.with_suffix(".csv" if path.suffix == ".parquet" else path.suffix).open("ab") as file:
+        with path.with_suffix(".csv" if path.suffix == ".parquet" else path.suffix).open(
+            "ab"
+        ) as file:
             if path.suffix == ".txt":
                 np.savetxt(file, np.column_stack(list(columns.values())), fmt="%14.3f")
             else:
