@@ -26,7 +26,7 @@ demo: setup  ## Train a small query policy and evaluate it beside the schedules 
 		--traffic 0:32 --validation 1000:1008 --no-tensorboard --output results/demo/training \
 		recipe:plackett-luce --recipe.regression.rounds 2 --recipe.regression.batches 600 \
 		--recipe.swaps.rounds 1 --recipe.swaps.episodes 96 --recipe.swaps.batches 300
-	$(BIN)/python scripts/evaluate.py --policies results/demo/training/policy.zip --output results/demo --force
+	$(BIN)/python scripts/evaluate.py --policies results/demo/training/policy.safetensors --output results/demo --force
 
 reproduce: setup  ## Write the reports of all studies anew, after playing what their rows lack; results/.
 	$(BIN)/python scripts/study.py paper

@@ -15,7 +15,7 @@ from dptse_env.process import QueryProcess
 from dptse_env.rendering import History, Picture, Window
 from dptse_env.traffic import Records, open_library
 from dptse_env.utils.arrays import Observation
-from dptse_env.utils.fields import integer
+from dptse_env.utils.fields import integer, require
 
 _ONLY = np.zeros(1, dtype=np.int64)
 
@@ -139,10 +139,8 @@ class SensorQueryEnv(gym.Env[Observation, Any]):
             UserWarning: A release model with a guarantee is configured, and other keywords void
                 it, or values of another road are used on this one.
         """
-        if render_mode not in (None, *self.metadata["render_modes"]):
-            raise ValueError(
-                f"render_mode must be None, 'rgb_array' or 'human', got {render_mode!r}"
-            )
+        modes = (None, *self.metadata["render_modes"])
+        require(render_mode in modes, "render_mode", "None, 'rgb_array' or 'human'", render_mode)
         self.render_mode = render_mode
         self._window: Window | None = None
         if render_mode == "human":

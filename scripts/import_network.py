@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from agents.files import refuse_to_replace, replacing
+from agents.files import refuse_to_replace
 from dptse_env.traffic import write_corridor
 from dptse_env.traffic.sumo_import import (
     Files,
@@ -22,6 +22,7 @@ from dptse_env.traffic.sumo_import import (
     import_road,
     read_configuration,
 )
+from dptse_env.utils.files import replacing
 from scripts.cli import run
 
 

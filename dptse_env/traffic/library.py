@@ -6,18 +6,16 @@ when any of them changes, another record is made. Several processes may use a li
 The records of a corridor with recordings come from their folder instead, and are never made.
 
 A record appears under its name when it is complete, so a writer that is killed leaves a hidden
-folder at most. Its writer may still run, perhaps on another machine, so such a folder is removed
-when it has reached a certain age.
+file at most. Its writer may still run, perhaps on another machine, so such a file is removed when
+it has reached a certain age.
 """
 
 import contextlib
 import logging
 import os
-import shutil
 import tempfile
 import threading
 import time
-import uuid
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -28,9 +26,8 @@ import platformdirs
 from tqdm import tqdm
 
 from dptse_env.traffic.corridor import Corridor
-from dptse_env.traffic.field_record import AnyRecord, load_record
-from dptse_env.traffic.record import RECORD_VERSION
-from dptse_env.traffic.stored_arrays import InvalidRecordError
+from dptse_env.traffic.imported import load_record, record_path, require_seeds
+from dptse_env.traffic.record import RECORD_VERSION, InvalidRecordError, Record
 from dptse_env.traffic.sumo import (
     RecordingError,
     SumoVersionError,
@@ -47,7 +44,7 @@ CACHE_VARIABLE = "DPTSE_CACHE"
 """Environment variable with the directory of the records."""
 
 LEFTOVER_AGE = 6 * 3600.0
-"""Age [s] at which a hidden folder is considered abandoned. Writing takes a second."""
+"""Age [s] at which a hidden file is considered abandoned. Writing takes a second."""
 
 logger = logging.getLogger(__name__)
 
@@ -64,8 +61,7 @@ class RecordLibrary:
     Args:
         path: the library's directory; created when the first record is written. Default:
             `default_path`.
-        n_open: largest number of open records, at four file descriptors each; opening a record
-            again takes a few milliseconds.
+        n_open: largest number of records kept in memory; reading one again takes a millisecond.
 
     Raises:
         ValueError: `n_open` is not positive.
@@ -76,7 +72,7 @@ class RecordLibrary:
         self.is_default = path is None
         self.path = default_path() if path is None else Path(path).expanduser()
         self.n_open = integer("library.n_open", n_open, 1)
-        self._open: OrderedDict[tuple[str, int], AnyRecord] = OrderedDict()
+        self._open: OrderedDict[tuple[str, int], Record] = OrderedDict()
         self._lock = threading.Lock()
 
     def __reduce__(self) -> tuple[type["RecordLibrary"], tuple[Any, ...]]:
@@ -86,7 +82,7 @@ class RecordLibrary:
         """
         return type(self), (None if self.is_default else self.path, self.n_open)
 
-    def get(self, corridor: Corridor, seed: int) -> AnyRecord:
+    def get(self, corridor: Corridor, seed: int) -> Record:
         """Return the record of a traffic seed, which is made now if it is missing or damaged.
 
         Raises:
@@ -120,8 +116,8 @@ class RecordLibrary:
         """
         wanted = dict.fromkeys(integer("traffic seed", seed, 0) for seed in seeds)
         if corridor.recordings is not None:
-            corridor.recordings.require(wanted)
-        return [seed for seed in wanted if not self.record_path(corridor, seed).is_dir()]
+            require_seeds(corridor.recordings, wanted)
+        return [seed for seed in wanted if not self.record_path(corridor, seed).is_file()]
 
     def ensure(
         self,
@@ -153,26 +149,26 @@ class RecordLibrary:
                 self._record(corridor, missing, min(n_workers, len(missing)), progress)
 
     def record_path(self, corridor: Corridor, seed: int) -> Path:
-        """Return the directory of a record, whether it exists or not."""
+        """Return the file of a record, whether it exists or not."""
         if corridor.recordings is not None:
-            return corridor.recordings.record_path(seed)
+            return record_path(corridor.recordings.folder, seed)
         folder = f"records-v{RECORD_VERSION}-sumo-{sumo_version()}"
-        return self.path / folder / corridor.digest[:32] / f"{seed:08d}"
+        return self.path / folder / corridor.digest[:32] / f"{seed:08d}.safetensors"
 
-    def _load_or_record(self, corridor: Corridor, seed: int) -> AnyRecord:
+    def _load_or_record(self, corridor: Corridor, seed: int) -> Record:
         if corridor.recordings is not None:
-            return corridor.recordings.load(seed, corridor.record_layout)
+            return load_record(corridor.recordings, seed, corridor.record_layout)
         path, source = self.record_path(corridor, seed), _source(corridor, seed)
         try:
-            return load_record(path, source)
+            return Record.load(path, source)
         except FileNotFoundError:
             pass  # the usual first use
         except InvalidRecordError as error:
             logger.warning("record is made again: %s", error)
-            _discard(path)
+            path.unlink(missing_ok=True)
         self._record(corridor, [seed])
         try:
-            return load_record(path, source)
+            return Record.load(path, source)
         except (OSError, InvalidRecordError) as error:
             raise RecordingError.from_cause(corridor, seed, str(error)) from error
 
@@ -272,16 +268,6 @@ def _source(corridor: Corridor, seed: int) -> dict[str, object]:
     return {"corridor": corridor.digest, "seed": seed, "sumo": sumo_version()}
 
 
-def _discard(path: Path) -> None:
-    """Remove a record; it is renamed first, so that no process reads or completes a part of it."""
-    temporary = path.parent / f".{path.name}-{uuid.uuid4().hex}"
-    try:
-        path.rename(temporary)
-    except FileNotFoundError:
-        return  # another process has discarded it already
-    shutil.rmtree(temporary, ignore_errors=True)
-
-
 def _prepare(folder: Path) -> None:
     """Create the folder, check that it is writable, and remove abandoned records in it.
 
@@ -291,8 +277,8 @@ def _prepare(folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=".probe-", dir=folder):
         pass
-    for leftover in folder.glob(".*-*/"):
+    for leftover in folder.glob(".*-*"):
         # Its writer may finish just now, and another user may own it.
         with contextlib.suppress(FileNotFoundError, PermissionError):
             if time.time() - leftover.stat().st_mtime > LEFTOVER_AGE:
-                _discard(leftover)
+                leftover.unlink()

@@ -17,7 +17,6 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from dptse_env.traffic.corridor import Corridor
-from dptse_env.traffic.field_record import load_record, with_vehicles
 from dptse_env.traffic.record import Record
 from dptse_env.traffic.sumo import RecordingError
 from dptse_env.utils import python_process
@@ -156,6 +155,4 @@ def simulate_in_child(corridor: Corridor, seed: int) -> Record:
     with tempfile.TemporaryDirectory(prefix="dptse-record-") as directory, WorkerPool() as pool:
         path = Path(directory) / "record"
         pool.record(corridor, seed, path, {})
-        record = with_vehicles(load_record(path, {}), "a simulation")
-        # The files are removed with the directory.
-        return record.in_memory()
+        return Record.load(path, {})

@@ -10,13 +10,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dptse_env.traffic.corridor import Corridor
+from dptse_env.traffic.corridor import Corridor, Recordings
 from dptse_env.traffic.demand import Demand
-from dptse_env.traffic.dwell import average_dwell
-from dptse_env.traffic.field_record import FieldRecord
+from dptse_env.traffic.imported import save_record, write_manifest
 from dptse_env.traffic.importers.folder import ROAD, Split, assign_seeds
 from dptse_env.traffic.importers.new_folder import new_folder
-from dptse_env.traffic.recordings import Recordings, record_path, record_source, write_manifest
+from dptse_env.traffic.record import Record, average_dwell
 from dptse_env.traffic.road_files import DENSITY_SCALE, write_corridor
 from dptse_env.utils.fields import integer, positive, require
 
@@ -177,21 +176,24 @@ def import_field(
     # The boundary segments, at both ends, come last in a record.
     order = [*range(1, road.segments + 1), 0, road.segments + 1]
     with new_folder(output) as folder:
-        training, sources = [], []
+        training, flows, sources, digests = [], [], [], {}
         for seed, start in zip(flat, starts, strict=True):
             window = slice(start, start + duration + 1)
-            record = FieldRecord(field[0][window][:, order], field[1][window][:, order])
-            record.save(record_path(folder, seed), record_source(seed, bare.record_layout))
+            cut = np.stack([table[window][:, order] for table in field], axis=-1)
+            record = Record(n_steps=duration + 1, n_columns=len(order), field=cut)
+            save_record(folder, seed, bare.record_layout, record)
+            digests[seed] = record.digest
             sources.append({"seed": seed, "file": source.density.name, "start": start})
             if seed in seeds[splits[0].name]:
                 training.append(record)
-        entering = np.mean([(each.density * each.speed)[:, 0].mean() for each in training])
+                flows.append(cut[:, 0].prod(axis=-1).mean())
+        entering = np.mean(flows)
         measured = dataclasses.replace(
             bare,
             demand=Demand(mainline=((0.0, round(float(entering), 1)),)),
             average_dwell=round(average_dwell(bare, training), 3),
         )
-        digest = write_manifest(folder, bare.record_layout, flat, sources, "fields")
+        digest = write_manifest(folder, bare.record_layout, digests, sources, "fields")
         written = dataclasses.replace(measured, recordings=Recordings(str(folder), digest))
         comment = "A measured field. Demand and average dwell are those of its training windows."
         write_corridor(folder / ROAD, written, comment=comment)

@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dptse_env.traffic.corridor import Corridor
+from dptse_env.traffic.corridor import Corridor, Recordings
 from dptse_env.traffic.demand import Demand
-from dptse_env.traffic.field_record import load_record, with_vehicles
+from dptse_env.traffic.imported import load_record, save_record, write_manifest
 from dptse_env.traffic.importers.fcd import FCD
 from dptse_env.traffic.importers.formats import EXID, HIGHD, NGSIM, TABLE, TGSIM
 from dptse_env.traffic.importers.i24 import I24
@@ -22,8 +22,7 @@ from dptse_env.traffic.importers.points import Format
 from dptse_env.traffic.importers.recording import Options, Recording, Window
 from dptse_env.traffic.importers.report import write_report
 from dptse_env.traffic.importers.source import Source
-from dptse_env.traffic.record import Record, mean_dwell
-from dptse_env.traffic.recordings import Recordings, record_path, record_source, write_manifest
+from dptse_env.traffic.record import Record, average_dwell
 from dptse_env.traffic.road_files import write_corridor
 from dptse_env.utils.fields import require, require_name
 
@@ -114,24 +113,25 @@ def import_trajectories(
         windows = [(each, window) for each in recordings for window in each.windows]
         seeds = assign_seeds(splits, len(windows))
         flat = [seed for split in splits for seed in seeds[split.name]]
-        sources = []
+        sources, digests = [], {}
         for seed, (recording, window) in zip(flat, windows, strict=True):
             record = recording.record(window)
-            record.save(record_path(folder, seed), record_source(seed, bare.record_layout))
+            save_record(folder, seed, bare.record_layout, record)
+            digests[seed] = record.digest
             sources.append(_describe(seed, recording, window, record))
+        digest = write_manifest(folder, bare.record_layout, digests, sources)
+        written = Recordings(str(folder), digest)
 
         def load(seed: int) -> Record:
-            source = record_source(seed, bare.record_layout)
-            return with_vehicles(load_record(record_path(folder, seed), source), "an import")
+            return load_record(written, seed, bare.record_layout)
 
-        # One at a time, since an open record holds four file descriptors.
+        # One at a time, so that one is in memory.
         measured = measure(bare, lambda: map(load, seeds[splits[0].name]))
-        digest = write_manifest(folder, bare.record_layout, flat, sources)
-        written = dataclasses.replace(measured, recordings=Recordings(str(folder), digest))
+        road = dataclasses.replace(measured, recordings=written)
         comment = "Recorded traffic. Demand, exit shares and average dwell are measured."
-        write_corridor(folder / ROAD, written, environment, comment)
-        report = write_report(folder, written, recordings, seeds, sources, load(flat[0]))
-    final = dataclasses.replace(written, recordings=Recordings(str(output.absolute()), digest))
+        write_corridor(folder / ROAD, road, environment, comment)
+        report = write_report(folder, road, recordings, seeds, sources, load(flat[0]))
+    final = dataclasses.replace(road, recordings=Recordings(str(output.absolute()), digest))
     return Imported(final, seeds, report)
 
 
@@ -161,7 +161,7 @@ def measure(corridor: Corridor, records: Callable[[], Iterable[Record]]) -> Corr
             on_ramps=tuple(round(float(each), 1) for each in entering),
         ),
         exit_shares=tuple(round(float(each), 4) for each in held),
-        average_dwell=round(mean_dwell(records(), corridor.n_mainline), 3),
+        average_dwell=round(average_dwell(corridor, records()), 3),
     )
 
 

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from dptse_env.traffic.corridor import Corridor
+from dptse_env.traffic.imported import ranges
 from dptse_env.traffic.importers.recording import Recording
 from dptse_env.traffic.record import Record
-from dptse_env.traffic.recordings import ranges
 from dptse_env.utils.arrays import AnyArray
 
 REPORT, NUMBERS, PICTURE = "report.md", "report.json", "report.png"

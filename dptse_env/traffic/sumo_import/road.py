@@ -11,7 +11,7 @@ import numpy as np
 
 from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.demand import Demand
-from dptse_env.traffic.record import Record, mean_dwell
+from dptse_env.traffic.record import Record, average_dwell
 from dptse_env.traffic.road_files import DENSITY_SCALE
 from dptse_env.traffic.sumo import RecordingError
 from dptse_env.traffic.sumo_import.configuration import Files
@@ -119,7 +119,7 @@ def import_road(
         draft,
         demand=counted_demand(draft, record, max(60, min(300, duration // 4))),
         exit_shares=counted_shares(draft, record),
-        average_dwell=round(mean_dwell([record], draft.n_mainline), 2),
+        average_dwell=round(average_dwell(draft, [record]), 2),
     )
     remarks = (*layout.remarks, *_appearing(corridor, record))
     return ImportedRoad(corridor, layout, record, remarks)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from dptse_env.config import TEST_SEEDS, TRAINING_SEEDS, VALIDATION_SEEDS
-from dptse_env.traffic import FieldRecord, RecordLibrary, find_corridor
+from dptse_env.traffic import RecordLibrary, find_corridor
 from dptse_env.traffic.importers.fields import FieldRoad, FieldSource, import_field
 from dptse_env.traffic.importers.folder import Split
 
@@ -42,18 +42,18 @@ def test_a_field_becomes_a_road_with_records_of_its_own(tmp_path):
     assert corridor.density_scale == 444.0
     library = RecordLibrary(tmp_path / "cache")
     first, second = (library.get(corridor, seed) for seed in (0, 1))
-    assert isinstance(first, FieldRecord)
-    assert first.density.shape == (101, 5)
+    assert first.field.shape == (101, 5, 2)
+    densities = [record.field[..., 0] for record in (first, second)]
     # The first window's last second comes just before the second window's first.
-    step = second.density[0] - first.density[-1]
-    np.testing.assert_allclose(step, second.density[1] - second.density[0], rtol=1e-6)
+    step = densities[1][0] - densities[0][-1]
+    np.testing.assert_allclose(step, densities[1][1] - densities[1][0], rtol=1e-6)
     # Boundary segments come last: the upstream one is the thinnest, the downstream one fullest.
-    assert np.argmin(first.density[50]) == 3
-    assert np.argmax(first.density[50]) == 4
+    assert np.argmin(densities[0][50]) == 3
+    assert np.argmax(densities[0][50]) == 4
     expected = 0.01 / 0.0003048 * (1.0 + 0.1 * 2.5 + 0.01 * (50.0 / 5.0 - 0.5))
-    assert first.density[50, 0] == pytest.approx(expected, rel=1e-6)
+    assert densities[0][50, 0] == pytest.approx(expected, rel=1e-6)
     demand = corridor.demand.mainline[0][1]
-    flows = [record.density[:, 0] * record.speed[:, 0] for record in (first, second)]
+    flows = [record.field[:, 0].prod(axis=-1) for record in (first, second)]
     assert demand == pytest.approx(np.mean(flows), rel=1e-3)
 
 

@@ -3,6 +3,7 @@
 import dataclasses
 import pickle
 import shutil
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -21,7 +22,7 @@ from dptse_env.traffic import (
     simulate,
     sumo,
 )
-from dptse_env.traffic.recordings import record_source, write_manifest
+from dptse_env.traffic.imported import record_path, recorded_seeds, save_record, write_manifest
 from dptse_env.traffic.road_files import write_corridor
 
 FREE = dataclasses.replace(SHORT_HIGHWAY, incident=None)
@@ -35,11 +36,11 @@ def original(tmp_path_factory):
 
 
 def write(folder, variants):
-    for seed, variant in zip(SEEDS, variants, strict=True):
-        record = synthetic(variant)
-        path = Recordings(str(folder), "").record_path(seed)
-        record.save(path, record_source(seed, FREE.record_layout))
-    digest = write_manifest(folder, FREE.record_layout, SEEDS, [])
+    records = {seed: synthetic(variant) for seed, variant in zip(SEEDS, variants, strict=True)}
+    for seed, record in records.items():
+        save_record(folder, seed, FREE.record_layout, record)
+    digests = {seed: record.digest for seed, record in records.items()}
+    digest = write_manifest(folder, FREE.record_layout, digests, [])
     corridor = dataclasses.replace(FREE, recordings=Recordings(str(folder), digest))
     write_corridor(folder / "road.toml", corridor)
     return corridor
@@ -70,7 +71,7 @@ def test_the_library_reads_each_recorded_seed(recorded, tmp_path, monkeypatch):
     for variant, seed in enumerate(SEEDS):
         record = library.get(recorded, seed)
         assert set(record.speed.tolist()) == {50.0 + variant}
-        assert library.record_path(recorded, seed).is_dir()
+        assert library.record_path(recorded, seed).is_file()
     assert not (tmp_path / "cache").exists()
 
 
@@ -87,26 +88,25 @@ def test_a_seed_that_was_not_recorded_is_refused_with_those_that_are(recorded):
 
 
 def test_a_damaged_record_is_an_error(recorded):
-    path = recorded.recordings.record_path(1) / "speed.npy"
+    path = record_path(recorded.recordings.folder, 1)
     content = bytearray(path.read_bytes())
     content[-1] ^= 1
     path.write_bytes(content)
-    with pytest.raises(InvalidRecordError, match="the checksum does not match"):
+    with pytest.raises(InvalidRecordError, match="another digest"):
         RecordLibrary().get(recorded, 1)
     assert path.read_bytes() == content, "it must not be made again"
 
 
 def test_an_exchanged_or_missing_record_is_an_error(recorded, tmp_path):
-    paths = [recorded.recordings.record_path(seed) for seed in (0, 1)]
+    paths = [record_path(recorded.recordings.folder, seed) for seed in (0, 1)]
     other = write(tmp_path / "other", (7, 8, 9, 10))
-    shutil.rmtree(paths[0])
+    paths[0].unlink()
     with pytest.raises(InvalidRecordError, match="the record is missing"):
         RecordLibrary().get(recorded, 0)
     paths[1].rename(paths[0])
     with pytest.raises(InvalidRecordError, match="source is"):
         RecordLibrary().get(recorded, 0)
-    shutil.rmtree(paths[0])
-    shutil.copytree(other.recordings.record_path(0), paths[0])
+    shutil.copy(record_path(other.recordings.folder, 0), paths[0])
     with pytest.raises(InvalidRecordError, match="not the record that was imported"):
         RecordLibrary().get(recorded, 0)
 
@@ -116,18 +116,21 @@ def test_an_exchanged_or_missing_record_is_an_error(recorded, tmp_path):
     [
         (lambda text: text.replace('"0": "', '"3": "'), "not the manifest of"),
         (lambda text: text[: len(text) // 2], "must be JSON"),
-        (lambda text: text.replace('"version": 1', '"version": 2'), "format must be"),
+        (lambda text: text.replace('"version": 2', '"version": 3'), "format must be"),
+        (
+            lambda text: text.replace('"version": 2', '"version": 1'),
+            r"manifest\.json: an earlier version wrote .* 'dptse import trajectories",
+        ),
     ],
 )
 def test_a_damaged_manifest_is_an_error(change, message, recorded):
-    path = recorded.record_layout and recorded.recordings.record_path(0).parents[1]
-    manifest = path / "manifest.json"
+    manifest = Path(recorded.recordings.folder) / "manifest.json"
     manifest.write_text(change(manifest.read_text()))
     with pytest.raises(InvalidRecordError, match=message):
-        _ = recorded.recordings.seeds
+        recorded_seeds(recorded.recordings)
     manifest.unlink()
     with pytest.raises(InvalidRecordError, match="recordings cannot be read"):
-        _ = recorded.recordings.seeds
+        recorded_seeds(recorded.recordings)
 
 
 def test_the_digest_covers_the_content_and_not_the_folder(original, recorded, tmp_path):
@@ -149,7 +152,7 @@ def test_recorded_traffic_has_a_fixed_demand_and_no_incident(recorded):
 
 
 def test_default_traffic_seeds_are_the_recorded_training_seeds(recorded):
-    road = str(recorded.recordings.record_path(0).parents[1] / "road.toml")
+    road = f"{recorded.recordings.folder}/road.toml"
     assert resolve("short-highway", {"corridor": road}).traffic_seeds == (0, 1)
     given = resolve("short-highway", {"corridor": road, "traffic_seeds": [2000]})
     assert given.traffic_seeds == (2000,)
@@ -158,7 +161,7 @@ def test_default_traffic_seeds_are_the_recorded_training_seeds(recorded):
 
 
 def test_environments_replay_recordings(recorded):
-    road = str(recorded.recordings.record_path(0).parents[1] / "road.toml")
+    road = f"{recorded.recordings.folder}/road.toml"
     keywords = {"corridor": road, "estimator": "random_walk", "truth_in_info": True}
     env = gym.make("dptse_env:dptse/ShortHighway-v0", **keywords, traffic_seeds=[1000])
     env.reset(seed=0)
