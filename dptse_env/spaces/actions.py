@@ -379,7 +379,7 @@ class SequentialAction(ActionEncoding):
             one, each = refused.astype(np.int64), np.ones_like(self.costs)
             picked |= pending.in_turn(episodes, self.available(picked), one, each)
             pending.n_replaced[episodes] += refused
-        complete: BoolArray = ~self.available(picked).any(axis=1)
+        complete = self.available(picked).sum(axis=1) == 0
         n_dropped = np.where(complete, pending.n_replaced[episodes], 0)
         pending.picked[episodes] = picked & ~complete[:, None]
         pending.n_replaced[episodes[complete]] = 0
