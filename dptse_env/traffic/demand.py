@@ -129,10 +129,6 @@ class DemandDistribution:
         checked_fields(self, "demand")
         require(self.scale[0] <= self.scale[1], "demand.scale", "(low, high)", self.scale)
 
-    def draw(self, generator: np.random.Generator) -> Demand:
-        """Draw one demand."""
-        return self.base.scaled(self.draw_scale(generator))
-
     def draw_scale(self, generator: np.random.Generator) -> float:
         """Draw the factor on every rate [-]."""
         return float(generator.uniform(*self.scale))

@@ -8,7 +8,7 @@ nothing is written: output options are refused, and what additional files would 
 import gzip
 import re
 from bisect import bisect_right
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from operator import itemgetter
@@ -233,27 +233,21 @@ def command(folder: Path, network: SumoScenario, seed: int, scale: float) -> lis
     ]
 
 
-def seconds(libsumo: ModuleType, network: SumoScenario, duration: int) -> Iterator[int]:
-    """Advance a loaded simulation to the end of the warm-up, and then second by second.
-
-    Yields:
-        0, 1, ..., `duration`: the second [s] of the record whose state libsumo holds.
-    """
-    for _ in range(network.warm_up * network.substeps):
-        libsumo.simulationStep()
-    yield 0
-    for second in range(duration):
-        for _ in range(network.substeps):
-            libsumo.simulationStep()
-        yield second + 1
-
-
 def observe(
-    libsumo: ModuleType, network: SumoScenario, incidents: Sequence[Incident], duration: int
+    libsumo: ModuleType,
+    network: SumoScenario,
+    incidents: Sequence[Incident],
+    seconds: Iterable[int],
 ) -> list[tuple[int, int, int, float]]:
     """Run the loaded simulation to its end.
 
     Vehicles are numbered in the order in which they appear on the road.
+
+    Args:
+        libsumo: the module, with a simulation.
+        network: the places of the record's columns.
+        incidents: the incidents.
+        seconds: the seconds of the record, which advance the simulation.
 
     Returns:
         A row for each vehicle and second: second, vehicle, column of the record, speed [km/h].
@@ -263,7 +257,7 @@ def observe(
     limits = VehicleLimits(libsumo, incidents)
     numbers: dict[str, int] = {}
     rows: list[tuple[int, int, int, float]] = []
-    for second in seconds(libsumo, network, duration):
+    for second in seconds:
         affected: dict[str, int] = {}
         for edge in places:
             for name in vehicles_on(edge):

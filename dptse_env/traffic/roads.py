@@ -24,7 +24,8 @@ import tomli_w
 
 from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.demand import Demand, DemandDistribution, Incident, IncidentDistribution
-from dptse_env.utils.fields import from_mapping
+from dptse_env.utils.fields import from_mapping, shown
+from dptse_env.utils.files import write_atomically
 from dptse_env.utils.registry import Registry
 
 SUFFIX = ".toml"
@@ -52,7 +53,7 @@ PARTS = ("action", "estimator", "observation", "privacy", "reward")
 """Keywords that take names of parts. In a file these are registered names: ``"module:Name"`` would
 let a file that somebody sent run code of the current folder."""
 _WITH_FOLDER = ("recordings", "network")
-_FILE_ENDINGS = (".json", ".npz")
+_FILE_ENDINGS = (".json", ".safetensors")
 
 
 PAPER_HIGHWAY = Corridor(
@@ -139,7 +140,9 @@ def find_corridor(value: Any) -> Corridor:
     if not isinstance(corridor, Corridor) and callable(corridor):
         corridor = corridor()
     if not isinstance(corridor, Corridor):
-        raise ValueError(f"corridor {value!r} must be a Corridor, or return one, got {corridor!r}")
+        raise ValueError(
+            f"corridor {shown(value)} must be a Corridor, or return one, got {shown(corridor)}"
+        )
     return corridor
 
 
@@ -168,7 +171,7 @@ class RoadFile:
     Attributes:
         corridor: The road.
         environment: Keywords of an environment that suit the road. Names of files in it, strings
-            that end in ``.json`` or ``.npz``, are absolute.
+            that end in ``.json`` or ``.safetensors``, are absolute.
         assumed: Fields of the corridor that neither the file nor a record of the road gives.
     """
 
@@ -198,7 +201,7 @@ def read_road(path: str | os.PathLike[str]) -> RoadFile:
     content = _content(path)
     environment = content.pop(_ENVIRONMENT, {})
     if not isinstance(environment, Mapping):
-        raise ValueError(f"{path}: {_ENVIRONMENT} must be a table, got {environment!r}")
+        raise ValueError(f"{path}: {_ENVIRONMENT} must be a table, got {shown(environment)}")
     if "corridor" in environment:
         raise ValueError(f"{path}: {_ENVIRONMENT}.corridor must be left out: this file is one")
     try:
@@ -225,7 +228,7 @@ def write_corridor(
     environment: Mapping[str, Any] | None = None,
     comment: str = "",
 ) -> None:
-    """Write a road file that `read_road` reads as the same corridor.
+    """Write a road file that `read_road` reads as the same corridor, completely or not at all.
 
     Args:
         path: The file; its folder exists.
@@ -244,7 +247,7 @@ def write_corridor(
     if environment:
         content[_ENVIRONMENT] = _plain(dict(environment))
     head = "".join(f"# {line}\n" for line in comment.splitlines())
-    Path(path).write_text(head + tomli_w.dumps(content), encoding="utf-8")
+    write_atomically(path, head + tomli_w.dumps(content))
 
 
 def _content(path: Path) -> dict[str, Any]:
@@ -288,8 +291,8 @@ def _require_names(value: Any, path: str) -> None:
     """Refuse a value of a keyword for parts that has ``"module:Name"`` in it."""
     if isinstance(value, str) and ":" in value:
         raise ValueError(
-            f"{path} must be a registered name, got {value!r}: import strings come from Python "
-            "or the command line alone"
+            f"{path} must be a registered name, got {shown(value)}: import strings come from "
+            "Python or the command line alone"
         )
     if isinstance(value, Mapping | list):
         for each in value.values() if isinstance(value, Mapping) else value:

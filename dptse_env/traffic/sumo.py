@@ -1,7 +1,7 @@
 """Simulation of scenarios by SUMO, which gives records.
 
-libsumo has one simulation per process: starting a second one silently replaces the first. A
-recording therefore takes place in a child process when this one holds another simulation.
+libsumo has one simulation per process: starting a second one silently replaces the first. The
+library therefore records in processes of its own (`dptse_env.traffic.recording`).
 
 Two settings were chosen by measurement on the paper's corridor (W99, 12 seeds):
 
@@ -30,7 +30,7 @@ from dptse_env.traffic.demand import Incident, lowest_limit
 from dptse_env.traffic.own_sumo import KMH
 from dptse_env.traffic.record import Record
 from dptse_env.traffic.scenario import Scenario, draw_scenario
-from dptse_env.traffic.sumo_input import edge_ids, network_xml, routes_xml
+from dptse_env.traffic.sumo_input import LONGEST_OUTPUT, edge_ids, network_xml, routes_xml
 
 SUPPORTED_SUMO = "1.28"
 """Release series that records are made with: others simulate the same scenario differently."""
@@ -59,9 +59,6 @@ OPTIONS = (
     "--time-to-teleport=-1",
 )
 """Options on a network that is made for a corridor."""
-
-LONGEST_OUTPUT = 2000
-"""Characters of SUMO's messages that an error has at most."""
 
 _one_at_a_time = threading.Lock()
 
@@ -95,12 +92,6 @@ def sumo_version() -> str:
     return version
 
 
-def simulation_is_loaded() -> bool:
-    """Return whether libsumo holds a simulation in this process."""
-    libsumo = sys.modules.get("libsumo")
-    return libsumo is not None and bool(libsumo.isLoaded())
-
-
 def simulate(corridor: Corridor, seed: int) -> Record:
     """Simulate one scenario in this process and record it.
 
@@ -108,8 +99,7 @@ def simulate(corridor: Corridor, seed: int) -> Record:
 
     Raises:
         RecordingError: SUMO fails, the corridor's own files are missing or changed, or libsumo
-            already holds a simulation in this process, which is left unchanged (see
-            `dptse_env.traffic.recording`).
+            already holds a simulation in this process, which is left unchanged.
         NetworkError: The corridor has to be compiled and cannot be.
         SumoVersionError: libsumo is missing, broken or of another release series.
     """
@@ -117,7 +107,8 @@ def simulate(corridor: Corridor, seed: int) -> Record:
     with running(corridor, scenario) as libsumo:
         if corridor.network is None:
             return _observe(libsumo, corridor, scenario)
-        rows = own_sumo.observe(libsumo, corridor.network, scenario.incidents, corridor.duration)
+        clock = seconds(libsumo, corridor, scenario)
+        rows = own_sumo.observe(libsumo, corridor.network, scenario.incidents, clock)
     table = np.array(rows, dtype=np.float64).reshape(len(rows), 4).T
     step, vehicle, segment, speed = table[:, np.lexsort((table[2], table[0]))]
     return Record(
@@ -140,10 +131,10 @@ def running(corridor: Corridor, scenario: Scenario) -> Iterator[ModuleType]:
         raise RecordingError.from_cause(corridor, scenario.seed, cause)
     network = network_xml(corridor) if corridor.network is None else ""
     with _one_at_a_time, tempfile.TemporaryDirectory(prefix="dptse-sumo-") as directory:
-        if simulation_is_loaded():
+        libsumo = _import_libsumo()
+        if libsumo.isLoaded():
             cause = "libsumo holds another simulation in this process"
             raise RecordingError.from_cause(corridor, scenario.seed, cause)
-        libsumo = _import_libsumo()
         folder = Path(directory)
         messages = folder / "messages.txt"
         try:
@@ -166,13 +157,16 @@ def seconds(libsumo: ModuleType, corridor: Corridor, scenario: Scenario) -> Iter
     Yields:
         0, 1, ..., `corridor.duration`: the second [s] whose state libsumo holds.
     """
-    if corridor.network is not None:
-        yield from own_sumo.seconds(libsumo, corridor.network, corridor.duration)
-        return
-    changes = limit_changes(scenario.incidents, corridor.speed_limits)
+    network, substeps, changes = corridor.network, SUBSTEPS, list[tuple[float, int, float]]()
+    if network is None:
+        changes = limit_changes(scenario.incidents, corridor.speed_limits)
+    else:
+        substeps = network.substeps
+        for _ in range(network.warm_up * substeps):
+            libsumo.simulationStep()
     yield 0
     for second in range(corridor.duration):
-        for substep in range(SUBSTEPS):
+        for substep in range(substeps):
             while changes and changes[0][0] <= second + substep * STEP_LENGTH:
                 _, segment, limit = changes.pop(0)
                 libsumo.edge.setMaxSpeed(f"main_{segment}", limit / KMH)

@@ -37,6 +37,8 @@ NETCONVERT_OPTIONS = (
     "--xml-validation=never",
 )
 
+LONGEST_OUTPUT = 2000
+"""Characters of SUMO's messages that an error has at most."""
 
 Point = tuple[float, float]
 """Coordinates [m]."""
@@ -131,7 +133,8 @@ def compile_network(geometry: Geometry) -> str:
             [*command, "-o", str(output)], capture_output=True, text=True, check=False
         )
         if result.returncode != 0:
-            raise NetworkError(f"netconvert refused {geometry}:\n{result.stderr.strip()}")
+            said = result.stderr.strip()[:LONGEST_OUTPUT]
+            raise NetworkError(f"netconvert refused {str(geometry)[:LONGEST_OUTPUT]}:\n{said}")
         network = output.read_text(encoding="utf-8")
     return re.sub(r"<!--.*?-->\s*", "", network, flags=re.DOTALL)
 
@@ -147,63 +150,37 @@ def _netconvert() -> Path:
 
 def _plain_xml(geometry: Geometry) -> list[str]:
     """Describe nodes, edges and connections in netconvert's plain XML."""
-    xml = _PlainXML(geometry)
-    n, lanes, lengths = geometry.n_mainline, geometry.segment_lanes, xml.lengths_m
-    ends = [0.0, *itertools.accumulate(lengths[:n])]
-    x = [-lengths[0], *ends, ends[-1] + lengths[n - 1]]
-    for face in range(-1, n + 2):
-        # Plain priority junctions would starve the ramps; a zipper lets both branches flow.
-        kind = "zipper" if face in geometry.on_ramps else "priority"
-        xml.node(f"face_{face}", x[face + 1], kind=kind)
-    names = ["upstream", *(f"main_{i}" for i in range(n)), "downstream"]
-    segments = [0, *range(n), n - 1]
-    for face, (name, segment) in enumerate(zip(names, segments, strict=True), start=-1):
-        xml.edge(name, segment, f"face_{face}", f"face_{face + 1}")
-    for (start, up), (end, down) in itertools.pairwise(zip(names, segments, strict=True)):
-        xml.connect(start, end, min(lanes[up], lanes[down]))
+    xml, n = _PlainXML(geometry), geometry.n_mainline
+    lanes, lengths = geometry.segment_lanes, xml.lengths_m
+    cells, names = (
+        [0, *range(n), n - 1],
+        ["upstream", *(f"main_{i}" for i in range(n)), "downstream"],
+    )
+    x = [-lengths[0], *itertools.accumulate((lengths[cell] for cell in cells[1:]), initial=0.0)]
+    xml.edges(names, cells, [f"face_{face}" for face in range(-1, n + 2)], [(at, 0.0) for at in x])
+    xml.connect(names, [min(lanes[a], lanes[b]) for a, b in itertools.pairwise(cells)])
+    # Ramps are laid out from their face, on-ramps backwards.
     for i, (face, ramp) in enumerate(
         zip(geometry.on_ramps, geometry.on_ramp_segments, strict=True)
     ):
-        _on_ramp(xml, f"on_{i}", face, ends[face], ramp)
+        own, cells = ramp_edges(f"on_{i}", ramp), [ramp[0], *ramp]
+        names, node = [f"before_on_{i}", *own], f"face_{face}"
+        nodes = [f"on_{i}_entry", *(f"{edge}_start" for edge in own), node]
+        along = [-sum(lengths[cell] for cell in cells[k:]) for k in range(len(nodes))]
+        points = [xml.ramp_point(face, x[face + 1], ramp[0], distance) for distance in along]
+        xml.edges(names, cells, nodes, points, node)
+        xml.connect([*names, f"main_{face}"], [lanes[ramp[0]]] * len(names))
     for i, (face, ramp) in enumerate(
         zip(geometry.off_ramps, geometry.off_ramp_segments, strict=True)
     ):
-        _off_ramp(xml, f"off_{i}", face, ends[face], ramp)
+        own, cells = ramp_edges(f"off_{i}", ramp), [*ramp, ramp[-1]]
+        names, node = [*own, f"after_off_{i}"], f"face_{face}"
+        nodes = [node, *(f"{edge}_end" for edge in own), f"off_{i}_exit"]
+        along = [sum(lengths[cell] for cell in cells[:k]) for k in range(len(nodes))]
+        points = [xml.ramp_point(face - 1, x[face + 1], ramp[0], distance) for distance in along]
+        xml.edges(names, cells, nodes, points, node)
+        xml.connect([f"main_{face - 1}", *names], [lanes[ramp[0]]] * len(names))
     return xml.texts()
-
-
-def _on_ramp(xml: "_PlainXML", name: str, face: int, x: float, segments: tuple[int, ...]) -> None:
-    """Add an on-ramp that joins the mainline at a face."""
-    inner = [f"{edge}_start" for edge in ramp_edges(name, segments)]
-    nodes, edges = [f"{name}_entry", *inner], [f"before_{name}", *ramp_edges(name, segments)]
-    cells = (segments[0], *segments)
-    # On-ramps are laid out backwards, from the face.
-    along = [-sum(xml.lengths_m[cell] for cell in cells[k:]) for k in range(len(cells) + 1)]
-    points = [xml.ramp_point(face, x, segments[0], distance) for distance in along]
-    for node, point in zip(nodes, points, strict=False):
-        xml.node(node, *point)
-    targets = [*nodes[1:], f"face_{face}"]
-    for k, (edge, cell) in enumerate(zip(edges, cells, strict=True)):
-        at_face = k == len(edges) - 1
-        xml.edge(edge, cell, nodes[k], targets[k], points[k : k + 2] if at_face else None)
-    for start, end in itertools.pairwise([*edges, f"main_{face}"]):
-        xml.connect(start, end, xml.geometry.segment_lanes[segments[0]])
-
-
-def _off_ramp(xml: "_PlainXML", name: str, face: int, x: float, segments: tuple[int, ...]) -> None:
-    """Add an off-ramp that leaves the mainline at a face."""
-    inner = [f"{edge}_end" for edge in ramp_edges(name, segments)]
-    nodes, edges = [*inner, f"{name}_exit"], [*ramp_edges(name, segments), f"after_{name}"]
-    cells = (*segments, segments[-1])
-    along = [sum(xml.lengths_m[cell] for cell in cells[:k]) for k in range(len(cells) + 1)]
-    points = [xml.ramp_point(face - 1, x, segments[0], distance) for distance in along]
-    for node, point in zip(nodes, points[1:], strict=True):
-        xml.node(node, *point)
-    sources = [f"face_{face}", *nodes[:-1]]
-    for k, (edge, cell) in enumerate(zip(edges, cells, strict=True)):
-        xml.edge(edge, cell, sources[k], nodes[k], points[:2] if k == 0 else None)
-    for start, end in itertools.pairwise([f"main_{face - 1}", *edges]):
-        xml.connect(start, end, xml.geometry.segment_lanes[segments[0]])
 
 
 class _PlainXML:
@@ -212,36 +189,53 @@ class _PlainXML:
     def __init__(self, geometry: Geometry) -> None:
         self.geometry = geometry
         self.lengths_m = [1000.0 * length for length in geometry.segment_lengths]
-        self._nodes, self._edges, self._connections = (
-            ElementTree.Element(tag) for tag in ("nodes", "edges", "connections")
-        )
+        self._roots = [ElementTree.Element(tag) for tag in ("nodes", "edges", "connections")]
 
-    def node(self, name: str, x: float, y: float = 0.0, kind: str = "priority") -> None:
-        """Add a node [m]."""
-        place = {"x": f"{x:.2f}", "y": f"{y:.2f}"}
-        ElementTree.SubElement(self._nodes, "node", {"id": name, **place, "type": kind})
-
-    def edge(
-        self, name: str, segment: int, start: str, end: str, shape: Sequence[Point] | None = None
+    def edges(
+        self,
+        names: Sequence[str],
+        cells: Sequence[int],
+        nodes: Sequence[str],
+        points: Sequence[Point],
+        face: str = "",
     ) -> None:
-        """Add an edge with length, lanes and limit of a segment."""
-        geometry = self.geometry
-        lanes = str(geometry.segment_lanes[segment])
-        element = ElementTree.SubElement(
-            self._edges,
-            "edge",
-            {"id": name, "from": start, "to": end, "numLanes": lanes, "spreadType": "center"},
-            speed=f"{geometry.speed_limits[segment] / 3.6:.4f}",
-            length=f"{self.lengths_m[segment]:.2f}",
-        )
-        if shape is not None:
-            element.set("shape", " ".join("{:.2f},{:.2f}".format(*point) for point in shape))
+        """Add edges in a row, with length, lanes and limit of segments, and their nodes.
 
-    def connect(self, start: str, end: str, lanes: int) -> None:
-        """Connect the rightmost lanes of two edges."""
-        for lane in map(str, range(lanes)):
-            attributes = {"from": start, "to": end, "fromLane": lane, "toLane": lane}
-            ElementTree.SubElement(self._connections, "connection", attributes)
+        Args:
+            names: Names of the edges.
+            cells: Their segments.
+            nodes: Names of the nodes, one more.
+            points: Where these are [m].
+            face: A node of the mainline, which is there; the edge at it is drawn to its own point.
+        """
+        geometry = self.geometry
+        # Plain priority junctions would starve the ramps; a zipper lets both branches flow.
+        zippers = {f"face_{face}" for face in geometry.on_ramps}
+        for name, (x, y) in zip(nodes, points, strict=True):
+            kind = "zipper" if name in zippers else "priority"
+            if name != face:
+                place = {"id": name, "x": f"{x:.2f}", "y": f"{y:.2f}", "type": kind}
+                ElementTree.SubElement(self._roots[0], "node", place)
+        for k, (name, cell) in enumerate(zip(names, cells, strict=True)):
+            lanes = str(geometry.segment_lanes[cell])
+            element = ElementTree.SubElement(
+                self._roots[1],
+                "edge",
+                {"id": name, "from": nodes[k], "to": nodes[k + 1], "numLanes": lanes},
+                spreadType="center",
+                speed=f"{geometry.speed_limits[cell] / 3.6:.4f}",
+                length=f"{self.lengths_m[cell]:.2f}",
+            )
+            if face in nodes[k : k + 2]:
+                shape = points[k : k + 2]
+                element.set("shape", " ".join("{:.2f},{:.2f}".format(*point) for point in shape))
+
+    def connect(self, edges: Sequence[str], counts: Sequence[int]) -> None:
+        """Connect the rightmost lanes of each edge, so many of them, with those of the next."""
+        for (start, end), count in zip(itertools.pairwise(edges), counts, strict=True):
+            for lane in map(str, range(count)):
+                lanes = {"from": start, "to": end, "fromLane": lane, "toLane": lane}
+                ElementTree.SubElement(self._roots[2], "connection", lanes)
 
     def ramp_point(self, beside: int, x: float, ramp: int, along: float) -> Point:
         """Return the point at a distance along a ramp [m] from the face at x [m].
@@ -258,8 +252,7 @@ class _PlainXML:
 
     def texts(self) -> list[str]:
         """Return the three files."""
-        roots = (self._nodes, self._edges, self._connections)
-        return [ElementTree.tostring(root, encoding="unicode") for root in roots]
+        return [ElementTree.tostring(root, encoding="unicode") for root in self._roots]
 
 
 def routes_xml(corridor: Corridor, scenario: Scenario) -> bytes:

@@ -25,7 +25,7 @@ def test_a_distribution_scales_every_rate_by_one_factor_within_its_range():
     distribution = DemandDistribution(base, scale=(0.5, 1.5))
     factors = []
     for seed in range(200):
-        demand = distribution.draw(np.random.default_rng(seed))
+        demand = base.scaled(distribution.draw_scale(np.random.default_rng(seed)))
         factor = demand.on_ramps[0] / 300.0
         assert [rate for _, rate in demand.mainline] == pytest.approx([1e3 * factor, 2e3 * factor])
         assert [time for time, _ in demand.mainline] == [0.0, 100.0]

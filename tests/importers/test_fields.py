@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from dptse_env.config import TEST_SEEDS, TRAINING_SEEDS, VALIDATION_SEEDS
+from dptse_env.importers.fields import FieldRoad, FieldSource, import_field
+from dptse_env.importers.folder import Split
 from dptse_env.traffic import RecordLibrary, find_corridor
-from dptse_env.traffic.importers.fields import FieldRoad, FieldSource, import_field
-from dptse_env.traffic.importers.folder import Split
 
 SPLITS = [
     Split("training", 0.5, TRAINING_SEEDS),
@@ -90,10 +90,23 @@ def test_options_are_checked(tmp_path, changes, message):
 
 
 def test_another_unit_than_stated_is_noticed(tmp_path):
-    source = write(tmp_path, speed=None, flow=tmp_path / "flow.txt", density_unit="veh/km")
-    source = dataclasses.replace(source, flow_unit="veh/s")
-    with pytest.raises(ValueError, match=r"flow\.txt must be speeds of at most 300 km/h"):
-        source.read()
+    flow = write(tmp_path, speed=None, flow=tmp_path / "flow.txt", flow_unit="veh/s")
+    lane = dataclasses.replace(ROAD, lanes=1)
+    for source, road, message in (
+        (write(tmp_path, density_unit="veh/km"), ROAD, r"density\.txt must be .* got '0.0279 veh"),
+        (
+            dataclasses.replace(flow, flow_unit="veh/min"),
+            ROAD,
+            r"flow\.txt must be .* got '1.* km/h",
+        ),
+        (write(tmp_path), lane, r"flow must be at most 4000 veh/h on 1 lanes.* got '\d+ veh/h"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            import_field(source, road, tmp_path / "road", SPLITS, 100)
+    slow = write(tmp_path, speed_unit="ft/s")
+    np.savetxt(tmp_path / "speed.txt", 0.3048 * np.loadtxt(tmp_path / "speed.txt"))  # now in m/s
+    with pytest.warns(UserWarning, match=r"no speed of the field is above \d+ km/h, at a limit of"):
+        import_field(slow, ROAD, tmp_path / "road", SPLITS, 100)
 
 
 @pytest.mark.parametrize(

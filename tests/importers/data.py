@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
+from dptse_env.importers import Options, Source, Split, import_trajectories
 from dptse_env.traffic import Corridor, Demand
-from dptse_env.traffic.importers import Options, Source, Split, import_trajectories
 
 ROAD = Corridor(
     name="test-road", n_mainline=4, on_ramps=(1,), off_ramps=(3,), exit_shares=(0.1,),

@@ -2,40 +2,28 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import shutil
+import uuid
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from dptse_env.importers.placing import Road
+from dptse_env.importers.recording import Options, Recording
+from dptse_env.importers.report import write_report
+from dptse_env.importers.source import Source
+from dptse_env.importers.tables import FORMATS
 from dptse_env.traffic.corridor import Corridor, Recordings
 from dptse_env.traffic.demand import Demand
-from dptse_env.traffic.imported import load_record, save_record, write_manifest
-from dptse_env.traffic.importers.fcd import FCD
-from dptse_env.traffic.importers.formats import EXID, HIGHD, NGSIM, TABLE, TGSIM
-from dptse_env.traffic.importers.i24 import I24
-from dptse_env.traffic.importers.new_folder import new_folder
-from dptse_env.traffic.importers.placing import Placer
-from dptse_env.traffic.importers.points import Format
-from dptse_env.traffic.importers.recording import Options, Recording, Window
-from dptse_env.traffic.importers.report import write_report
-from dptse_env.traffic.importers.source import Source
+from dptse_env.traffic.imported import Kind, load_record, save_record, write_manifest
 from dptse_env.traffic.record import Record, average_dwell
 from dptse_env.traffic.roads import write_corridor
 from dptse_env.utils.fields import require, require_name
-
-FORMATS: Mapping[str, Format] = {
-    "fcd": FCD(),
-    "ngsim": NGSIM,
-    "highd": HIGHD,
-    "exid": EXID,
-    "i24": I24(),
-    "tgsim": TGSIM,
-    "table": TABLE,
-}
-"""Formats by name; ``table`` is any table whose columns a `Source` names."""
 
 ROAD = "road.toml"
 SMALLEST_SHARE = 0.001
@@ -99,7 +87,6 @@ def import_trajectories(
     Raises:
         ValueError: An argument is out of range, the folder exists, or a file cannot be imported
             (`TrajectoryError`); the message has its path, and the row where there is one.
-        MissingExtraError: A library that a format needs is not installed.
         OSError: The folder cannot be written.
     """
     require_name("source.format", source.format, FORMATS)
@@ -109,39 +96,77 @@ def import_trajectories(
         corridor, incident=None, recordings=None, demand=corridor.published_demand
     )
     with new_folder(output) as folder:
-        recordings = _read(files, source, bare, folder.parent, options)
-        windows = [(each, window) for each in recordings for window in each.windows]
+        recordings = [
+            Recording(path, Road(bare), source, options, folder.parent / f"file-{number}")
+            for number, path in enumerate(files)
+        ]
+        windows = [(each, row) for each in recordings for row in each.windows.iter_rows(named=True)]
         seeds = assign_seeds(splits, len(windows))
         flat = [seed for split in splits for seed in seeds[split.name]]
-        sources, digests = [], {}
-        for seed, (recording, window) in zip(flat, windows, strict=True):
-            record = recording.record(window)
-            save_record(folder, seed, bare.record_layout, record)
-            digests[seed] = record.digest
-            sources.append(_describe(seed, recording, window, record))
-        digest = write_manifest(folder, bare.record_layout, digests, sources)
-        written = Recordings(str(folder), digest)
+        sources: list[dict[str, Any]] = [
+            {"seed": seed, "file": recording.path.name, "group": window["group"],
+             "start": window["start"]}
+            for seed, (recording, window) in zip(flat, windows, strict=True)
+        ]  # fmt: skip
+
+        def records() -> Iterator[Record]:
+            for source_of, (recording, window) in zip(sources, windows, strict=True):
+                record = recording.record(window["window"])
+                source_of |= {"vehicles": len(np.unique(record.vehicle)), "rows": record.n_rows}
+                yield record
+
+        kept = save_records(folder, bare, records(), sources)
 
         def load(seed: int) -> Record:
-            return load_record(written, seed, bare.record_layout)
+            return load_record(kept, seed, bare.record_layout)
 
         # One at a time, so that one is in memory.
         measured = measure(bare, lambda: map(load, seeds[splits[0].name]))
-        road = dataclasses.replace(measured, recordings=written)
+        road = dataclasses.replace(measured, recordings=kept)
         comment = "Recorded traffic. Demand, exit shares and average dwell are measured."
         write_corridor(folder / ROAD, road, environment, comment)
         report = write_report(folder, road, recordings, seeds, sources, load(flat[0]))
-    final = dataclasses.replace(road, recordings=Recordings(str(output.absolute()), digest))
-    return Imported(final, seeds, report)
+    return Imported(moved(road, output), seeds, report)
+
+
+def save_records(
+    folder: Path, road: Corridor, records: Iterable[Record], sources: list[dict[str, Any]],
+    kind: Kind = "vehicles",
+) -> Recordings:  # fmt: skip
+    """Write records and their manifest to a folder, one after another.
+
+    Args:
+        folder: The folder.
+        road: The road.
+        records: A record for each source; each is asked for when the last one is written.
+        sources: A JSON description of each window, with its traffic ``seed``.
+        kind: Whether the records have vehicles or are measured fields.
+
+    Raises:
+        OSError: The folder cannot be written.
+    """
+    digests = {}
+    for source, record in zip(sources, records, strict=True):
+        save_record(folder, source["seed"], road.record_layout, record)
+        digests[source["seed"]] = record.digest
+    return Recordings(
+        str(folder), write_manifest(folder, road.record_layout, digests, sources, kind)
+    )
+
+
+def moved(road: Corridor, output: Path) -> Corridor:
+    """Return a road whose recordings are in another folder."""
+    assert road.recordings is not None
+    there = dataclasses.replace(road.recordings, folder=str(output.absolute()))
+    return dataclasses.replace(road, recordings=there)
 
 
 def measure(corridor: Corridor, records: Callable[[], Iterable[Record]]) -> Corridor:
     """Return a corridor with the demand, exit shares and average dwell of records.
 
-    The records are read twice, one after another.
-
-    Flows are Edie's: the mean over time of the sum of speeds over the length of a segment. That of
-    the mainline is taken in its first segment, those of ramps in the segment at their face.
+    The records are read twice. Flows are Edie's: the mean over time of the sum of speeds over the
+    length of a segment. That of the mainline is taken in its first segment, those of ramps in the
+    segment at their face.
 
     Raises:
         ValueError: No vehicle is on the mainline.
@@ -165,19 +190,6 @@ def measure(corridor: Corridor, records: Callable[[], Iterable[Record]]) -> Corr
     )
 
 
-def _read(
-    files: Sequence[Path], source: Source, corridor: Corridor, work: Path, options: Options
-) -> list[Recording]:
-    reader = FORMATS[source.format]
-    placer = Placer(corridor, source.layout, source.factor("length", reader.units["length"]))
-    recordings = []
-    for number, path in enumerate(files):
-        recording = Recording(path, corridor, source, options, reader, placer)
-        recording.read(work / f"file-{number}")
-        recordings.append(recording)
-    return recordings
-
-
 def check_splits(splits: Sequence[Split]) -> None:
     """Raise ``ValueError`` unless the shares add up."""
     shares = [split.share for split in splits]
@@ -192,29 +204,37 @@ def assign_seeds(splits: Sequence[Split], n_windows: int) -> dict[str, tuple[int
         ValueError: The shares do not add up, or a split has fewer seeds than windows.
     """
     check_splits(splits)
-    shares = [split.share for split in splits]
-    counts = [0] * len(shares)
+    counts = [0] * len(splits)
     for _ in range(n_windows):
         # The split that is furthest behind its share, those without a window first.
         behind = [
-            (share > 0.0 and count == 0, share * n_windows - count)
-            for share, count in zip(shares, counts, strict=True)
+            (split.share > 0.0 and count == 0, split.share * n_windows - count)
+            for split, count in zip(splits, counts, strict=True)
         ]
-        counts[max(range(len(shares)), key=behind.__getitem__)] += 1
+        counts[max(range(len(splits)), key=behind.__getitem__)] += 1
     for split, count in zip(splits, counts, strict=True):
         allowed = f"at most {len(split.seeds)} windows of split {split.name}"
         require(count <= len(split.seeds), "files", allowed, count)
-    return {
-        split.name: tuple(split.seeds[:count]) for split, count in zip(splits, counts, strict=True)
-    }
+    return {s.name: tuple(s.seeds[:count]) for s, count in zip(splits, counts, strict=True)}
 
 
-def _describe(seed: int, recording: Recording, window: Window, record: Record) -> dict[str, Any]:
-    return {
-        "seed": seed,
-        "file": recording.path.name,
-        "group": window.group,
-        "start": window.start,
-        "vehicles": len(np.unique(record.vehicle)),
-        "rows": record.n_rows,
-    }
+@contextlib.contextmanager
+def new_folder(output: Path) -> Iterator[Path]:
+    """Yield an empty folder that becomes `output` when the body ends, and vanishes if it fails.
+
+    Its parent is a folder for this alone, in which the body may leave what is thrown away.
+
+    Raises:
+        ValueError: There is something at `output`.
+        OSError: It cannot be written.
+    """
+    require(not output.exists(), "output", "a folder that does not exist yet", str(output))
+    output.parent.mkdir(parents=True, exist_ok=True)
+    work = output.parent / f".{output.name}-{uuid.uuid4().hex}"
+    folder = work / "result"
+    folder.mkdir(parents=True)
+    try:
+        yield folder
+        folder.rename(output)
+    finally:
+        shutil.rmtree(work, ignore_errors=True)

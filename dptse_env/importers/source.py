@@ -22,9 +22,30 @@ SPEEDS = {"m/s": 3.6, "km/h": 1.0, "ft/s": 1.09728, "mi/h": 1.609344}
 """Units of speeds in km/h."""
 UNITS = {"time": TIMES, "length": LENGTHS, "speed": SPEEDS}
 
-ROLES = ("time", "vehicle", "x", "y", "speed", "lane", "edge", "group", "extent")
-"""Roles of columns: see `dptse_env.traffic.importers.points.Points`; ``extent`` is the length of a
-vehicle along `x`, for data in which `x` is a corner of its box."""
+NUMBERS = ("time", "x", "y", "speed", "extent")
+LABELS = ("vehicle", "lane", "edge", "group")
+ROLES = NUMBERS + LABELS
+"""Roles of columns. ``x`` is the position along the road, along an ``edge`` of a network, or, with
+``y``, in the plane; else ``y`` is lateral. ``extent`` is the length of a vehicle along ``x``, for
+data in which ``x`` is a corner of its box. A ``group`` is a road of its own in the file, such as a
+driving direction."""
+
+LONGEST_SHOWN, MOST_SHOWN = 60, 20
+"""Characters of a text of a file, and texts of a list, that a message shows."""
+
+
+class TrajectoryError(ValueError):
+    """A file of trajectories cannot be imported; the message names file, row and field."""
+
+
+def shown(*texts: object) -> str:
+    """Return what a file says for a message, cut where it is long."""
+    cut = [
+        text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]}..."
+        for text in map(str, texts[:MOST_SHOWN])
+    ]
+    more = f" and {len(texts) - MOST_SHOWN} more" if len(texts) > MOST_SHOWN else ""
+    return ", ".join(cut) + more
 
 
 @dataclass(frozen=True)
@@ -89,7 +110,7 @@ class Source:
     """Meaning of a file of trajectories.
 
     Attributes:
-        format: name of the format; see `dptse_env.traffic.importers.FORMATS`.
+        format: name of the format; see `dptse_env.importers.FORMATS`.
         columns: name of the file's column by role (`ROLES`); changes those of the format.
         units: unit by quantity, ``time``, ``length`` and ``speed``; changes those of the format.
         where: values that columns must have; other rows are left out.

@@ -9,51 +9,50 @@ from typing import Any
 
 import numpy as np
 
+from dptse_env.importers.recording import Recording
 from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.imported import ranges
-from dptse_env.traffic.importers.recording import Recording
 from dptse_env.traffic.record import Record
-from dptse_env.utils.arrays import AnyArray
 
-REPORT, NUMBERS, PICTURE = "report.md", "report.json", "report.png"
-
-_ROWS = {
-    "rows": "rows of vehicles",
-    "other_group": "dropped: of another group than chosen",
-    "off_lanes": "dropped: on other lanes, lateral positions or edges than the road's",
-    "off_ends": "dropped: before the road's start or beyond its end",
-    "duplicates": "dropped: duplicates of another row",
-    "out_of_order": "out of order in time, sorted",
-    "seconds": "vehicles at whole seconds, from the others",
-    "negative_speeds": "of these with a speed below 0, set to 0",
+_COUNTS = {
+    "rows": {
+        "rows": "rows of vehicles",
+        "other_group": "dropped: of another group than chosen",
+        "off_lanes": "dropped: on other lanes, lateral positions or edges than the road's",
+        "off_ends": "dropped: before the road's start or beyond its end",
+        "far_away": "dropped: an hour or more from all windows; are these times right?",
+        "duplicates": "dropped: duplicates of another row",
+        "out_of_order": "out of order in time, sorted",
+        "seconds": "vehicles at whole seconds, from the others",
+        "negative_speeds": "of these with a speed below 0, set to 0",
+    },
+    "trajectories": {
+        "vehicles": "vehicles by id",
+        "ids_shared": "ids of several vehicles at one time, told apart by their positions",
+        "pieces": "trajectories after cuts; each counts as a vehicle",
+        "gaps_filled": "gaps filled by interpolation",
+        "seconds_filled": "whole seconds in them",
+        "gaps_cut": "cuts at longer gaps: missing frames, or an id that is used again",
+        "jumps_cut": "cuts where a vehicle jumps to another place",
+        "too_short": "trajectories without a whole second, dropped",
+    },
 }
-_TRAJECTORIES = {
-    "vehicles": "vehicles by id",
-    "pieces": "trajectories after cuts; each counts as a vehicle",
-    "gaps_filled": "gaps filled by interpolation",
-    "seconds_filled": "whole seconds in them",
-    "gaps_cut": "cuts at longer gaps: missing frames, or an id that is used again",
-    "jumps_cut": "cuts where a vehicle jumps to another place",
-    "too_short": "trajectories without a whole second, dropped",
+_BEGIN = {
+    "present_at_start": "are there at the start of the file",
+    "entered": "begin at an entry",
+    "appeared": "begin amid the road",
 }
-_ENDS = (
-    ("present_at_start", "are there at the start of the file"),
-    ("entered", "begin at an entry"),
-    ("appeared", "begin amid the road"),
-    ("present_at_end", "are there at its end"),
-    ("left", "end at an exit"),
-    ("vanished", "end amid the road"),
-)
+_END = {
+    "present_at_end": "are there at its end",
+    "left": "end at an exit",
+    "vanished": "end amid the road",
+}
 
 
 def write_report(
-    folder: Path,
-    corridor: Corridor,
-    recordings: Sequence[Recording],
-    seeds: Mapping[str, tuple[int, ...]],
-    windows: Sequence[Mapping[str, Any]],
-    first: Record,
-) -> dict[str, Any]:
+    folder: Path, corridor: Corridor, recordings: Sequence[Recording],
+    seeds: Mapping[str, tuple[int, ...]], windows: Sequence[Mapping[str, Any]], first: Record,
+) -> dict[str, Any]:  # fmt: skip
     """Write the report into a folder.
 
     Args:
@@ -78,21 +77,22 @@ def write_report(
         "files": [_file(recording) for recording in recordings],
         "windows": list(windows),
     }
-    (folder / NUMBERS).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-    (folder / REPORT).write_text(_markdown(content), encoding="utf-8")
-    _draw(folder / PICTURE, corridor, recordings[0], first)
+    (folder / "report.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    (folder / "report.md").write_text(_markdown(content), encoding="utf-8")
+    _draw(folder / "report.png", corridor, recordings[0], first)
     return content
 
 
 def _file(recording: Recording) -> dict[str, Any]:
+    names = (*_COUNTS["rows"], *_COUNTS["trajectories"], *_BEGIN, *_END, "no_vehicle")
     ratio = recording.speed_ratio
     return {
         "file": recording.path.name,
         "bytes": recording.path.stat().st_size,
         "windows": len(recording.windows),
-        "speed_ratio": None if np.isnan(ratio) else round(ratio, 4),
+        "speed_ratio": None if ratio is None else round(ratio, 4),
         "off_the_road": recording.off_names,
-        **vars(recording.counts),
+        **{name: int(recording.counts[name]) for name in names},
     }
 
 
@@ -108,16 +108,16 @@ def _markdown(content: Mapping[str, Any]) -> str:
         "\nMeasured in the windows of the first split: "
         f"{content['demand']['mainline']:g} veh/h on the mainline, on-ramps {on_ramps} veh/h, "
         f"exit shares {shares}, average dwell {content['average_dwell']:g} s.\n\n"
-        f"![Points, density and speed]({PICTURE})\n"
+        "![Points, density and speed](report.png)\n"
     )
     for file in content["files"]:
-        parts.append(f"## {file['file']}\n\n| rows | |\n| --: | :-- |")
-        parts += [f"| {file[key]} | {words} |" for key, words in _ROWS.items()]
-        parts.append("\n| trajectories | |\n| --: | :-- |")
-        parts += [f"| {file[key]} | {words} |" for key, words in _TRAJECTORIES.items()]
+        parts.append(f"## {file['file']}")
+        for title, told in _COUNTS.items():
+            parts.append(f"\n| {title} | |\n| --: | :-- |")
+            parts += [f"| {file[key]} | {words} |" for key, words in told.items()]
         begin, end = (
-            ", ".join(f"{file[key]} {words}" for key, words in ends)
-            for ends in (_ENDS[:3], _ENDS[3:])
+            ", ".join(f"{file[key]} {words}" for key, words in ends.items())
+            for ends in (_BEGIN, _END)
         )
         parts.append(
             f"\nOf the {file['pieces']} trajectories {begin}; {end}. Many that begin or end amid "
@@ -131,8 +131,7 @@ def _markdown(content: Mapping[str, Any]) -> str:
     parts.append("## Windows\n\n| seed | file | group | start [s] | vehicles |")
     parts.append("| --: | :-- | :-- | --: | --: |")
     parts += [
-        f"| {each['seed']} | {each['file']} | {each['group']} | {each['start']:.0f} | "
-        f"{each['vehicles']} |"
+        "| {seed} | {file} | {group} | {start:.0f} | {vehicles} |".format(**each)
         for each in content["windows"]
     ]
     return "\n".join(parts) + "\n"
@@ -147,27 +146,21 @@ def _draw(path: Path, corridor: Corridor, recording: Recording, record: Record) 
     faces = np.concatenate([[0.0], np.cumsum(lengths)])
     times = np.arange(record.n_steps + 1) - 0.5
     counts = record.counts[:, :n]
-    density = counts / lengths
     speed = np.where(counts > 0, record.speed_sums[:, :n] / np.maximum(counts, 1), np.nan)
     figure = Figure(figsize=(9.0, 9.0), layout="constrained")
     axes = figure.subplots(3, 1, sharex=True, sharey=True)
-    start = recording.windows[0].start - (recording.base or 0.0)
-    points = recording.points
     colours: dict[str, Any] = {"cmap": "RdYlGn", "vmin": 0.0, "vmax": corridor.largest_speed_limit}
-    if np.isnan(points["speed"]).any():
-        axes[0].plot(points["time"] - start, points["position"], ".", markersize=0.5, color="0.3")
-    else:
-        shown = points["time"] - start, points["position"]
-        axes[0].scatter(*shown, s=0.5, c=points["speed"], rasterized=True, **colours)
+    points = recording.points()
+    shown = {} if points["speed"].null_count() else {"c": points["speed"], **colours}
+    axes[0].scatter(points["time"], points["position"], s=0.5, rasterized=True, **shown)
     axes[0].set_title("points of the file on the mainline")
-
-    def field(axis: Any, values: AnyArray, title: str, **look: Any) -> None:
+    for axis, values, title, look in (
+        (axes[1], counts / lengths, "density of the record [veh/km]", {"cmap": "viridis"}),
+        (axes[2], speed, "speed of the record [km/h]", colours),
+    ):
         mesh = axis.pcolormesh(times, faces, values.T, rasterized=True, **look)
         figure.colorbar(mesh, ax=axis)
         axis.set_title(title)
-
-    field(axes[1], density, "density of the record [veh/km]", cmap="viridis")
-    field(axes[2], speed, "speed of the record [km/h]", **colours)
     for axis in axes:
         axis.set_ylabel("position [km]")
         axis.set_ylim(faces[0], faces[-1])
