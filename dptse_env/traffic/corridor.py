@@ -250,7 +250,7 @@ class Corridor(RoadSegments):
             ValueError: A field is unknown or out of range.
         """
         road = from_mapping(type(self), fields, "corridor", self)
-        scales = {}
+        scales: dict[str, Any] = {}
         if "lanes" in fields:
             scales["density_scale"] = self.density_scale * (road.most_lanes / self.most_lanes)
         if "speed_limit" in fields:
