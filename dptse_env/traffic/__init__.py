@@ -18,6 +18,7 @@ from dptse_env.traffic.presets import (
     randomised,
 )
 from dptse_env.traffic.record import InvalidRecordError, Record, average_dwell
+from dptse_env.traffic.recording import simulate_in_worker
 from dptse_env.traffic.road_files import (
     RoadFile,
     is_road_file,
@@ -29,7 +30,6 @@ from dptse_env.traffic.scenario import MAINLINE, Scenario, draw_scenario
 from dptse_env.traffic.sumo import RecordingError, SumoVersionError, simulate
 from dptse_env.traffic.sumo_network import NetworkError
 from dptse_env.traffic.sumo_scenario import SumoScenario
-from dptse_env.traffic.worker import simulate_in_child
 
 __all__ = [
     "CORRIDORS",
@@ -65,6 +65,6 @@ __all__ = [
     "read_corridor",
     "read_road",
     "simulate",
-    "simulate_in_child",
+    "simulate_in_worker",
     "write_corridor",
 ]

@@ -213,6 +213,11 @@ class Record:
         names = self.COLUMNS if self.has_vehicles else ["field"]
         return {name: getattr(self, name) for name in names}
 
+    @property
+    def n_bytes(self) -> int:
+        """Size of the arrays [bytes]."""
+        return sum(array.nbytes for array in self.arrays.values())
+
     @cached_property
     def digest(self) -> str:
         """SHA-256 (hex) of the content."""

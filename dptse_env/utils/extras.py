@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 EXTRAS: Mapping[str, tuple[str, ...]] = {
     "train": (
-        "loky", "optuna", "plotly", "polars", "rich", "sb3_contrib", "stable_baselines3", "torch",
+        "optuna", "plotly", "polars", "rich", "sb3_contrib", "stable_baselines3", "torch",
         "tyro",
     ),
     "corridors": ("polars", "sumo"),

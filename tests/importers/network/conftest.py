@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from dptse_env.traffic.sumo_import import Files
+from dptse_env.importers.network import Files
 
 NODES = """
 <nodes>

@@ -1,27 +1,32 @@
-"""A corridor made of a SUMO network, a path along it, and one simulated run."""
+"""A corridor made of a layout, with the demand and the exit shares of one simulated run."""
 
 from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from dptse_env.importers.network.configuration import Files
+from dptse_env.importers.network.layout import Layout
 from dptse_env.traffic.corridor import Corridor
-from dptse_env.traffic.demand import Demand
+from dptse_env.traffic.demand import Demand, Profile
 from dptse_env.traffic.record import Record, average_dwell
+from dptse_env.traffic.recording import simulate_in_worker
 from dptse_env.traffic.road_files import DENSITY_SCALE
 from dptse_env.traffic.sumo import RecordingError
-from dptse_env.traffic.sumo_import.configuration import Files
-from dptse_env.traffic.sumo_import.counts import counted_demand, counted_shares
-from dptse_env.traffic.sumo_import.layout import Layout, lay_out
-from dptse_env.traffic.sumo_import.net import Net
 from dptse_env.traffic.sumo_scenario import SumoScenario
-from dptse_env.traffic.worker import simulate_in_child
+from dptse_env.utils.arrays import BoolArray, IntArray
 from dptse_env.utils.digests import file_digest
 from dptse_env.utils.fields import require
+
+NEVER = np.iinfo(np.int64).max
+"""First step of a vehicle on a column where it never is."""
+
+LEAST_SHARE = 0.001
+"""Least exit share: a road has shares above 0 and below 1."""
 
 
 @dataclass(frozen=True)
@@ -39,36 +44,6 @@ class ImportedRoad:
     layout: Layout
     record: Record
     remarks: tuple[str, ...]
-
-
-def find_layout(
-    files: Files,
-    path: Sequence[str],
-    segment_length: float,
-    between: bool = False,
-    left_out: Collection[str] = (),
-    ends: tuple[float, float | None] = (0.0, None),
-) -> Layout:
-    """Return the segments of a path in a network.
-
-    Args:
-        files: what the simulation reads; of these only the network is read here.
-        path: ids of the path's edges, or of its first and last with `between`.
-        segment_length: wanted length of a segment [m].
-        between: take the shortest path between the two edges of `path`.
-        left_out: edges at the path that are no ramps.
-        ends: positions [m] on the first and the last edge at which the road begins and ends; None
-            for the end of the last.
-
-    Raises:
-        ValueError: The network or the path is of no use; the message names the file or the field.
-        MissingExtraError: `eclipse-sumo` is not installed.
-    """
-    require(segment_length >= 40.0, "segment_length", "at least 40 m", segment_length)
-    require(len(path) >= 1, "path", "at least one edge", list(path))
-    net = Net(files.net, files.internal_links)
-    edges = net.path_between(path[0], path[-1]) if between else net.path_along(path)
-    return lay_out(net, edges, segment_length, left_out, ends)
 
 
 def import_road(
@@ -99,29 +74,35 @@ def import_road(
             path.
     """
     files.check()
-    allowed = "whole seconds"
-    require(begin is not None or files.begin.is_integer(), "begin", allowed, files.begin)
-    start = int(files.begin) + warm_up if begin is None else begin
-    draft = _draft(files, layout, name, duration, start, warm_up, speed_limit)
+    if begin is None:
+        require(float(files.begin).is_integer(), "begin", "whole seconds", files.begin)
+        begin = int(files.begin) + warm_up
+    draft = _draft(files, layout, name, duration, begin, warm_up, speed_limit)
     try:
-        record = simulate_in_child(draft, seed)
+        record = simulate_in_worker(draft, seed)
     except RecordingError as error:
         raise ValueError(f"SUMO refuses these files: {' '.join(str(error).split())}") from error
-    in_road = record.segment < draft.n_mainline
-    if not in_road.any():
+    if not (record.segment < draft.n_mainline).any():
         seen = f"{record.n_vehicles} on its ramps or ends" if record.n_rows else "none"
         routes = ", ".join(path.name for path in files.routes)
         raise ValueError(
-            f"routes: {routes} must have vehicles that use the path from {start} s to "
-            f"{start + duration} s, got {seen}"
+            f"routes: {routes} must have vehicles that use the path from {begin} s to "
+            f"{begin + duration} s, got {seen}"
         )
+    # First step of each vehicle on each column.
+    first = np.full((record.n_vehicles, record.n_columns), NEVER)
+    np.minimum.at(first, (record.vehicle, record.segment), record.step.astype(np.int64))
     corridor = dataclasses.replace(
         draft,
-        demand=counted_demand(draft, record, max(60, min(300, duration // 4))),
-        exit_shares=counted_shares(draft, record),
+        demand=_demand(draft, first),
+        exit_shares=_exit_shares(draft, first),
         average_dwell=round(average_dwell(draft, [record]), 2),
     )
-    remarks = (*layout.remarks, *_appearing(corridor, record))
+    remarks = layout.remarks
+    inside = (first.argmin(axis=1) < draft.n_mainline) & (first.min(axis=1) > 0)
+    if inside.any():
+        share = f"{inside.sum()} of {record.n_vehicles} vehicles"
+        remarks += (f"{share} appear on the mainline, past every entrance",)
     return ImportedRoad(corridor, layout, record, remarks)
 
 
@@ -152,11 +133,9 @@ def _draft(
         options=files.options,
     )
     N, n_on, n_off = len(layout.lengths), len(layout.on_ramps), len(layout.off_ramps)
-    limits, ramp_limits = layout.limits, layout.ramp_limits
-    if speed_limit is not None:
-        limits, ramp_limits = (speed_limit,) * N, (speed_limit,) * (n_on + n_off)
     limits, ramp_limits = (
-        tuple(round(limit, 1) for limit in each) for each in (limits, ramp_limits)
+        tuple(round(each if speed_limit is None else speed_limit, 1) for each in of_edges)
+        for of_edges in (layout.limits, layout.ramp_limits)
     )
     return Corridor(
         name=name,
@@ -184,13 +163,41 @@ def _kilometres(lengths: Sequence[float]) -> tuple[float, ...]:
     return tuple(round(length / 1000.0, 4) for length in lengths)
 
 
-def _appearing(corridor: Corridor, record: Record) -> tuple[str, ...]:
-    """Say how many vehicles appear between the entrances of a road."""
-    order = np.lexsort((record.step, record.vehicle))
-    vehicles, first = np.unique(record.vehicle[order], return_index=True)
-    step, column = record.step[order][first], record.segment[order][first]
-    inside = (column < corridor.n_mainline) & (step > 0)
-    n_inside = int(inside.sum())
-    if not n_inside:
-        return ()
-    return (f"{n_inside} of {len(vehicles)} vehicles appear on the mainline, past every entrance",)
+def _demand(corridor: Corridor, first: IntArray) -> Demand:
+    """Count who comes over the upstream boundary segment, and who over the on-ramps.
+
+    Vehicles that are there at second 0 have entered before. Rates hold for a quarter of a record,
+    one minute at least and five at most.
+    """
+    period = max(60, min(300, corridor.duration // 4))
+    times = np.append(np.arange(0, corridor.duration, period), corridor.duration)
+    if len(times) > 2 and times[-1] - times[-2] < period:
+        times = np.delete(times, -2)  # a last step that is shorter joins the one before
+
+    def rates(steps: IntArray) -> Profile:
+        counts, _ = np.histogram(steps[(steps > 0) & (steps < NEVER)], times)
+        hourly = 3600.0 * counts / np.diff(times)
+        pairs = zip(times[:-1], hourly, strict=True)
+        return tuple((float(time), round(float(rate), 1)) for time, rate in pairs)
+
+    N, S, n_on = corridor.n_mainline, corridor.n_segments, corridor.n_on_ramps
+    ramps = [np.minimum(first[:, N + i], first[:, S + 2 + i]) for i in range(n_on)]
+    return Demand(mainline=rates(first[:, S]), on_ramps=tuple(map(rates, ramps)))
+
+
+def _exit_shares(corridor: Corridor, first: IntArray) -> tuple[float, ...]:
+    """Count the share of vehicles that leave, of those that pass each off-ramp."""
+
+    def reached(*columns: int) -> BoolArray:
+        found: BoolArray = np.any(first[:, columns] < NEVER, axis=1)
+        return found
+
+    N, S, n_on = corridor.n_mainline, corridor.n_segments, corridor.n_on_ramps
+    shares = []
+    for i, face in enumerate(corridor.off_ramps):
+        left = reached(N + n_on + i, S + 2 + n_on + i)
+        passed = reached(S, *range(face)) & reached(*range(face, N), S + 1) & ~left
+        n_left, n_all = int(left.sum()), int((left | passed).sum())
+        share = n_left / n_all if n_all else 0.0
+        shares.append(round(min(max(share, LEAST_SHARE), 1.0 - LEAST_SHARE), 4))
+    return tuple(shares)

@@ -1,6 +1,7 @@
 """Records of a network of one's own, against what SUMO says of it."""
 
 import dataclasses
+import re
 import shutil
 from pathlib import Path
 from xml.etree import ElementTree
@@ -8,6 +9,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from dptse_env.importers.network import Files, find_layout, import_road
 from dptse_env.traffic import (
     MAINLINE,
     SHORT_HIGHWAY,
@@ -20,9 +22,8 @@ from dptse_env.traffic import (
     write_corridor,
 )
 from dptse_env.traffic.sumo import running, seconds
-from dptse_env.traffic.sumo_import import Files, find_layout, import_road
 from dptse_env.traffic.sumo_network import packaged_network
-from tests.traffic.sumo_import.conftest import PATH, motorway
+from tests.importers.network.conftest import PATH, motorway
 
 
 def imported(files, **options):
@@ -32,6 +33,29 @@ def imported(files, **options):
 @pytest.fixture(scope="module")
 def road(files):
     return imported(files)
+
+
+ELSEWHERE = '<routes><vehicle id="v" depart="0"><route edges="elsewhere"/></vehicle></routes>'
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (ELSEWHERE, "routes: own.rou.xml must have vehicles that use the path from 0 s to 60 s"),
+        (
+            ELSEWHERE.replace("elsewhere", "nowhere"),
+            "SUMO refuses these files: recording road with traffic seed 0 failed",
+        ),
+        (None, "routes: must have at least one file, got none"),
+    ],
+)
+def test_routes_of_no_use_are_refused(files, tmp_path, content, message):
+    path = tmp_path / "own.rou.xml"
+    path.write_text(content or "")
+    own = dataclasses.replace(files, routes=(path,) if content else ())
+    with pytest.raises(ValueError, match=re.escape(message)) as refused:
+        import_road(own, find_layout(files, PATH, 100.0), "road", 60)
+    assert "\n" not in str(refused.value)
 
 
 def test_every_vehicle_on_the_path_and_its_ramps_is_counted_once(road):

@@ -1,16 +1,16 @@
-"""Networks of SUMO: reading one, and a path along it."""
+"""Networks of SUMO, as `sumolib` reads them: edges that are open to cars, and paths along them."""
 
 from __future__ import annotations
 
 import difflib
 import gzip
-import xml.sax
 import zlib
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
+from xml.sax import SAXException
 
 NEWEST_VERSION = (1, 20)
 """Newest version of network files that the supported release of SUMO reads."""
@@ -18,27 +18,24 @@ NEWEST_VERSION = (1, 20)
 VEHICLE_CLASS = "passenger"
 """Lanes that this class may not use (bus lanes, hard shoulders, pavements) do not count."""
 
-GZIP_MAGIC = b"\x1f\x8b"
+UNREADABLE = (SyntaxError, LookupError, ValueError, EOFError, zlib.error, gzip.BadGzipFile)
+"""Errors of reading a file that is no XML, or is cut or damaged."""
 
-
-_UNREADABLE = (
-    SyntaxError,
-    xml.sax.SAXException,
-    LookupError,
-    ValueError,
-    EOFError,
-    OSError,
-    zlib.error,
-)
+# `sumolib` checks no element: one that is missing or of no use meets it as one of these.
+_BROKEN = (*UNREADABLE, OSError, SAXException, AttributeError, TypeError)
 
 
 class Net:
-    """A network of SUMO, as `sumolib` reads it.
+    """A network of SUMO.
 
     Args:
         path: the network file, plain or gzipped.
         internal_links: whether vehicles drive on the internal edges of junctions; False for a
             simulation with ``--no-internal-links``.
+
+    Attributes:
+        path: the network file.
+        edges: edges by id, without internal ones.
 
     Raises:
         ValueError: There is no such file, or it is no network that SUMO reads.
@@ -46,20 +43,22 @@ class Net:
 
     def __init__(self, path: Path, internal_links: bool = True) -> None:
         """Read the file."""
-        import sumolib  # noqa: PLC0415  (heavy, and only an import needs it)
+        from sumolib.net import readNet  # noqa: PLC0415  (slow to import)
 
-        self.path = path
-        _check_head(path)
+        root = root_of(path, "net")
+        if root.tag != "net":
+            raise ValueError(f"net: {path} must be a network (<net>), got <{root.tag:.60}>")
+        _check_version(path, root.get("version", ""))
         try:
-            self._net: Any = sumolib.net.readNet(str(path), withInternal=internal_links)
-        except _UNREADABLE as error:
-            raise ValueError(f"net: {path}: no network of SUMO: {error}") from error
-        self._internal_links = internal_links
-        self.edges: dict[str, Any] = {
-            edge.getID(): edge for edge in self._net.getEdges(withInternal=False)
-        }
+            self._net: Any = readNet(str(path), withInternal=internal_links)
+            edges = self._net.getEdges(withInternal=False)
+        except _BROKEN as error:
+            problem = f"{type(error).__name__}: {error}"[:200]
+            raise ValueError(f"net: {path} must be a network of SUMO, got {problem}") from error
+        self.path, self._internal_links = path, internal_links
+        self.edges: dict[str, Any] = {edge.getID(): edge for edge in edges}
         if not self.edges:
-            raise ValueError(f"net: {path}: must have edges, got a network without any")
+            raise ValueError(f"net: {path} must have edges, got a network without any")
 
     def edge(self, name: str, where: str) -> Any:
         """Return an edge.
@@ -71,10 +70,9 @@ class Net:
             near = difflib.get_close_matches(name, self.edges, n=3)
             hint = f"; similar: {', '.join(near)}" if near else ""
             raise ValueError(f"{where}: {self.path} has no edge {name!r}{hint}")
-        edge = self.edges[name]
-        if not edge.allows(VEHICLE_CLASS):
+        if not self.edges[name].allows(VEHICLE_CLASS):
             raise ValueError(f"{where}: edge {name!r} must be open to cars, got a closed one")
-        return edge
+        return self.edges[name]
 
     def path_along(self, names: Sequence[str]) -> list[Any]:
         """Return the edges of a path that is given edge by edge.
@@ -84,11 +82,9 @@ class Net:
                 next.
         """
         path = [self.edge(name, "path") for name in names]
-        seen: set[str] = set()
-        for name in names:
-            if name in seen:
+        for place, name in enumerate(names):
+            if name in names[:place]:
                 raise ValueError(f"path: must not be a loop, got edge {name!r} twice")
-            seen.add(name)
         for edge, following in pairwise(path):
             if not connections(edge, following):
                 onward = ", ".join(each.getID() for each in successors(edge)) or "none"
@@ -111,58 +107,61 @@ class Net:
         return self.path_along([edge.getID() for edge in path])
 
     def crossing(self, edge: Any, following: Any) -> list[list[Any]]:
-        """Return the ways over the junction between two edges, each a list of internal edges."""
-        ways: dict[str, list[Any]] = {}
-        for connection in connections(edge, following):
-            via = connection.getViaLaneID() if self._internal_links else ""
-            if via:
-                way, _ = self._net.getInternalPath([connection])
-                ways.setdefault(" ".join(part.getID() for part in way), way)
-        # Edges that a way shares with another belong to the first.
-        taken: set[str] = set()
-        found = []
-        for way in ways.values():
-            own = [part for part in way if part.getID() not in taken]
-            taken.update(part.getID() for part in own)
-            found.append(own)
-        return [way for way in found if way]
+        """Return the ways over the junction between two edges, each a list of internal edges.
+
+        Raises:
+            ValueError: A way leads nowhere, or round in a circle.
+        """
+        taken: set[str] = set()  # edges that a way shares with another belong to the first
+        ways = []
+        for connection in connections(edge, following) if self._internal_links else ():
+            ways.append([each for each in self._way(connection) if each.getID() not in taken])
+            taken.update(each.getID() for each in ways[-1])
+        return [way for way in ways if way]
+
+    def _way(self, connection: Any) -> list[Any]:
+        """Return the internal edges of a connection, in the direction of travel."""
+        way: list[Any] = []
+        while via := connection.getViaLaneID():
+            where = f"net: {self.path}: lane {via!r} must lead over its junction"
+            try:
+                lane = self._net.getLane(via)
+                connection = lane.getOutgoing()[0]
+            except (LookupError, ValueError) as error:
+                raise ValueError(f"{where}, got an end") from error
+            if lane.getEdge() in way:
+                raise ValueError(f"{where}, got a circle")
+            way.append(lane.getEdge())
+        return way
 
     def remarks(self, path: Sequence[Any]) -> Iterator[str]:
         """Yield what is unusual of a path: traffic lights and roundabouts on it."""
         for edge in path[:-1]:
             junction = edge.getToNode()
-            if "traffic_light" in junction.getType():
+            if junction and "traffic_light" in (junction.getType() or ""):
                 yield f"traffic light at junction {junction.getID()!r}, after {edge.getID()!r}"
         names = {edge.getID() for edge in path}
         for roundabout in self._net.getRoundabouts():
-            shared = sorted(names & set(roundabout.getEdges()))
-            if shared:
+            if shared := sorted(names & set(roundabout.getEdges())):
                 yield f"roundabout: edge(s) {', '.join(shared)}"
 
 
 def connections(edge: Any, following: Any) -> list[Any]:
     """Return the connections for cars from one edge to another, without turning round."""
-    return [
-        connection
-        for connection in edge.getOutgoing().get(following, ())
-        if connection.getDirection() != "t"
-        and connection.getFromLane().allows(VEHICLE_CLASS)
-        and connection.getToLane().allows(VEHICLE_CLASS)
-    ]
+    allowed = edge.getAllowedOutgoing(VEHICLE_CLASS).get(following, ())
+    return [connection for connection in allowed if connection.getDirection() != "t"]
 
 
 def successors(edge: Any) -> list[Any]:
     """Return the edges to which cars can go on, by id."""
-    roads = [each for each in edge.getOutgoing() if not each.isSpecial()]
-    found = [each for each in roads if connections(edge, each)]
-    return sorted(found, key=lambda each: each.getID())
+    onward = (each for each in edge.getOutgoing() if not each.isSpecial())
+    return sorted((each for each in onward if connections(edge, each)), key=_name)
 
 
 def predecessors(edge: Any) -> list[Any]:
     """Return the edges from which cars can come, by id."""
-    roads = [each for each in edge.getIncoming() if not each.isSpecial()]
-    found = [each for each in roads if connections(each, edge)]
-    return sorted(found, key=lambda each: each.getID())
+    before = (each for each in edge.getIncoming() if not each.isSpecial())
+    return sorted((each for each in before if connections(each, edge)), key=_name)
 
 
 def n_lanes(edge: Any) -> int:
@@ -173,7 +172,7 @@ def n_lanes(edge: Any) -> int:
 def open_xml(path: Path) -> Any:
     """Open a file, plain or gzipped, for reading bytes."""
     with path.open("rb") as file:
-        zipped = file.read(2) == GZIP_MAGIC
+        zipped = file.read(2) == b"\x1f\x8b"
     return gzip.open(path) if zipped else path.open("rb")
 
 
@@ -189,28 +188,29 @@ def root_of(path: Path, where: str) -> ElementTree.Element:
         with open_xml(path) as file:
             root: ElementTree.Element = next(ElementTree.iterparse(file, events=("start",)))[1]
             return root
-    except (ElementTree.ParseError, gzip.BadGzipFile, zlib.error, EOFError) as error:
+    except UNREADABLE as error:
         raise ValueError(
             f"{where}: {path} must be XML, got something else (binary, encrypted or damaged): "
-            f"{error}"
+            f"{error!s:.200}"
         ) from error
     except OSError as error:
         raise ValueError(f"{where}: {path} cannot be read: {error.strerror}") from error
 
 
-def _check_head(path: Path) -> None:
-    """Check that a file is a network, and of a version that can be read."""
-    root = root_of(path, "net")
-    if root.tag != "net":
-        raise ValueError(f"net: {path} must be a network (<net>), got <{root.tag}>")
-    version = root.get("version", "")
+def _check_version(path: Path, version: str) -> None:
+    """Check that a network is of a version that can be read."""
     try:
         numbers = tuple(int(part) for part in version.split(".")[:2])
     except ValueError as error:
-        raise ValueError(f"net: {path}: version must be numbers, got {version!r}") from error
+        raise ValueError(f"net: {path}: version must be numbers, got {version[:20]!r}") from error
     if numbers > NEWEST_VERSION:
         newest = ".".join(map(str, NEWEST_VERSION))
         raise ValueError(
-            f"net: {path}: version must be at most {newest}, got {version}; write it with the "
+            f"net: {path}: version must be at most {newest}, got {version:.20}; write it with the "
             "netconvert of the supported release"
         )
+
+
+def _name(edge: Any) -> str:
+    name: str = edge.getID()
+    return name

@@ -4,8 +4,8 @@ from xml.etree import ElementTree
 
 import pytest
 
-from dptse_env.traffic.sumo_import import Files, find_layout
-from tests.traffic.sumo_import.conftest import CONNECTIONS, EDGES, NODES, PATH, netconvert
+from dptse_env.importers.network import Files, find_layout
+from tests.importers.network.conftest import CONNECTIONS, EDGES, NODES, PATH, netconvert
 
 
 def lengths_of_edges(network):
@@ -121,6 +121,7 @@ def test_a_lay_by_is_an_off_ramp_and_an_on_ramp_on_either_half(tmp_path):
         (PATH, {"ends": (450.0, None)}, "first_position must be in [0, "),
         (PATH, {"left_out": ("narrow",)}, "leave_out: 'narrow' must be an edge that joins"),
         (("in", "merge"), {"ends": (350.0, None)}, "from its start to on-ramp ramp-b"),
+        (("in",), {"ends": (200.0, 100.0)}, "from its start to its end for its segments"),
     ],
 )
 def test_paths_of_no_use_are_refused_in_one_line(files, path, options, message):
