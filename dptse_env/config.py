@@ -45,7 +45,15 @@ from dptse_env.traffic import (
     randomised,
     read_road,
 )
-from dptse_env.utils.fields import Interval, checked_fields, field_hints, from_mapping, require_name
+from dptse_env.traffic.imported import has_vehicles, recorded_seeds, require_seeds
+from dptse_env.utils.fields import (
+    Interval,
+    checked_fields,
+    field_hints,
+    from_mapping,
+    require_name,
+    shown,
+)
 
 TRAINING_SEEDS = range(1_000)
 """Traffic seeds meant for training and calibration."""
@@ -109,7 +117,7 @@ class EnvConfig:
             with other ARZ parameters, and that nobody gave; filled in by `resolve`.
 
     Raises:
-        ValueError: A value is out of range, or the parameters violate the CFL condition.
+        ValueError: A value is out of range.
     """
 
     corridor: Corridor
@@ -161,9 +169,9 @@ class EnvConfig:
             raise ValueError(f"traffic_seeds must be distinct, got {seeds}")
         self._check_sensors()
         if self.corridor.recordings is not None:
-            self.corridor.recordings.require(seeds)
+            require_seeds(self.corridor.recordings, seeds)
             needs = RELEASE_MODELS.find(self.privacy.preset).needs_vehicles
-            if needs and not self.corridor.recordings.has_vehicles:
+            if needs and not has_vehicles(self.corridor.recordings):
                 raise ValueError(
                     "privacy.preset must be a release model that needs no vehicles, such as "
                     "'paper' or 'corrected', on a road of measured fields, got "
@@ -171,7 +179,6 @@ class EnvConfig:
                 )
         if isinstance(self.parameters, str):
             require_name("parameters", self.parameters, available_parameters())
-        self.arz_parameters.require_time_step(TIME_STEP, min(self.corridor.segment_lengths))
         self._check_settings()
 
     def _check_queries(self) -> None:
@@ -213,7 +220,8 @@ class EnvConfig:
                 f"detectors must be left out on a road without fixed sensors, got {self.detectors}"
             )
         recordings = corridor.recordings
-        if self.has_separate_sensors and recordings is not None and not recordings.has_vehicles:
+        is_field = recordings is not None and not has_vehicles(recordings)
+        if self.has_separate_sensors and is_field:
             raise ValueError(
                 "penetration.share must be 1, and detectors left out, on a road of measured "
                 "fields, which have no vehicles"
@@ -226,7 +234,7 @@ class EnvConfig:
         elif settings is not None and not isinstance(settings, expected):
             raise ValueError(
                 f"estimator_settings must be a mapping, the name of a set, or a "
-                f"{expected.__name__}, got {settings!r}"
+                f"{expected.__name__}, got {shown(settings)}"
             )
         check_demand(self.estimator, self.settings())
 
@@ -387,7 +395,7 @@ def _config(base: EnvConfig, values: dict[str, Any], corridor: Corridor) -> EnvC
 def _read_seeds(values: dict[str, Any], corridor: Corridor) -> None:
     """Replace a range of traffic seeds by these, and put recorded ones where none are given."""
     if "traffic_seeds" not in values and corridor.recordings is not None:
-        recorded = corridor.recordings.seeds
+        recorded = recorded_seeds(corridor.recordings)
         values["traffic_seeds"] = tuple(seed for seed in recorded if seed in TRAINING_SEEDS)
     if isinstance(values.get("traffic_seeds"), str):
         values["traffic_seeds"] = parse_seeds(values["traffic_seeds"], "traffic_seeds")
@@ -523,12 +531,12 @@ def _privacy(base: PrivacySettings, values: dict[str, Any]) -> PrivacySettings:
         given = {"preset": given}
     elif not isinstance(given, Mapping):
         raise ValueError(
-            f"privacy must be the name of a release model, a class or a mapping, got {given!r}"
+            f"privacy must be the name of a release model, a class or a mapping, got {shown(given)}"
         )
     given = dict(given)
     preset = given.pop("preset", base.preset)
     if not isinstance(preset, str | type):
-        raise ValueError(f"privacy.preset must be a name or a class, got {preset!r}")
+        raise ValueError(f"privacy.preset must be a name or a class, got {shown(preset)}")
     if isinstance(preset, str):
         preset = RELEASE_MODELS.name_of(preset)
     if preset != base.preset:

@@ -131,8 +131,9 @@ def require_in_step(env: SensorQueryVectorEnv) -> None:
     Raises:
         ValueError: The decisions of a second may take different numbers of actions.
     """
-    actions = env.interface.actions
-    if env.num_envs > 1 and actions.picks_one_by_one and actions.costs is not None:
+    interface = env.interface
+    one_by_one = interface.actions.picks_one_by_one
+    if env.num_envs > 1 and one_by_one and interface.queries.costs_differ:
         raise ValueError(
             f"action {env.config.action!r} takes different numbers of actions for a second where "
             f"queries cost different amounts ({env.config.queries}): episodes cannot be played as "

@@ -73,7 +73,7 @@ def shipped_parameters(corridor: Corridor) -> list[ARZParameters]:
     known = []
     for name in available_parameters():
         try:
-            ARZModel(corridor, load_parameters(name))
+            ARZModel(corridor, load_parameters(name)).require_time_step()
         except ValueError as problem:
             logger.info("without %s: %s", name, problem)
         else:

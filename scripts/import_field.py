@@ -15,9 +15,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dptse_env.config import TEST_SEEDS, TRAINING_SEEDS, VALIDATION_SEEDS
+from dptse_env.importers.fields import FieldRoad, FieldSource, import_field
+from dptse_env.importers.folder import ROAD, Split
 from dptse_env.traffic import ranges
-from dptse_env.traffic.importers.fields import FieldRoad, FieldSource, import_field
-from dptse_env.traffic.importers.folder import ROAD, Split
 from scripts.cli import run
 
 

@@ -14,14 +14,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from agents.files import refuse_to_replace
-from dptse_env.traffic import write_corridor
-from dptse_env.traffic.sumo_import import (
+from dptse_env.importers.network import (
     Files,
     ImportedRoad,
     find_layout,
     import_road,
     read_configuration,
 )
+from dptse_env.traffic import write_corridor
 from dptse_env.utils.files import replacing
 from scripts.cli import run
 

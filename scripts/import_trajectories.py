@@ -19,16 +19,16 @@ from pathlib import Path
 
 from agents.environments import given_keywords
 from dptse_env.config import TEST_SEEDS, TRAINING_SEEDS, VALIDATION_SEEDS
-from dptse_env.traffic import is_road_file, ranges, read_road
-from dptse_env.traffic.importers import (
+from dptse_env.importers import (
     Options,
     Source,
     Split,
     import_trajectories,
     read_source,
 )
-from dptse_env.traffic.importers.folder import ROAD
-from dptse_env.traffic.importers.report import REPORT
+from dptse_env.importers.folder import ROAD
+from dptse_env.importers.report import REPORT
+from dptse_env.traffic import is_road_file, ranges, read_road
 from scripts.cli import make_corridor, run
 
 

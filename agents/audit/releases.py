@@ -18,7 +18,7 @@ from dptse_env.release import (
     require_gaussian,
 )
 from dptse_env.release.noise import NoiseStreams
-from dptse_env.traffic import AnyRecord
+from dptse_env.traffic import Record
 from dptse_env.utils.arrays import AnyArray, FloatArray, IntArray
 
 
@@ -211,7 +211,7 @@ class Overheard(ReleaseModel):
         """See `ReleaseModel.shared`."""
         return self.model.shared
 
-    def load(self, index: int, record: AnyRecord) -> None:
+    def load(self, index: int, record: Record) -> None:
         """See `ReleaseModel.load`."""
         self.model.load(index, record)
 

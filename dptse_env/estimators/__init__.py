@@ -16,6 +16,7 @@ from dptse_env.estimators.settings import (
     SigmaPointSettings,
 )
 from dptse_env.model import ARZModel
+from dptse_env.utils.fields import shown
 from dptse_env.utils.registry import Registry, is_foreign, missing_methods, name_of_class
 
 __all__ = [
@@ -84,6 +85,8 @@ REFERENCES = {
 """The backend ``reference`` of the estimators that have one."""
 WITHOUT_DEMAND = ("random_walk", "open_loop", "recurrent")
 """Estimators without demand states."""
+WITHOUT_DYNAMICS = ("random_walk", "recurrent")
+"""Estimators that take geometry and scales of the traffic model, and do not step it."""
 BACKENDS = get_args(Backend)
 
 
@@ -106,9 +109,12 @@ def check_settings(estimator: Any, model: ARZModel, settings: Any) -> None:
     ``ValueError``. The model has the demand states that the settings ask for.
 
     Raises:
-        ValueError: A setting is out of range on this road, or the estimator has no demand states.
+        ValueError: A setting is out of range on this road, the estimator has no demand states, or
+            it steps the model and its time step violates the CFL condition.
     """
     check_demand(estimator, settings)
+    if estimator not in WITHOUT_DYNAMICS:
+        model.require_time_step()
     check = getattr(_loaded(ESTIMATORS.find(estimator)), "check_settings", None)
     if check is not None:
         check(with_demand(model, settings), settings)
@@ -174,7 +180,7 @@ def check_estimator(estimator: Any, backend: str) -> None:
     """
     ESTIMATORS.find(estimator)
     if backend not in BACKENDS:
-        raise ValueError(f"backend must be one of {', '.join(BACKENDS)}, got {backend!r}")
+        raise ValueError(f"backend must be one of {', '.join(BACKENDS)}, got {shown(backend)}")
     if backend == "reference" and not (isinstance(estimator, str) and estimator in REFERENCES):
         raise ValueError(
             f"backend must be 'compiled' for {ESTIMATORS.name_of(estimator)!r}, only "

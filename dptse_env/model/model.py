@@ -61,9 +61,9 @@ class ARZModel:
         measurement_scale: Units of the two numbers of a row of a measurement.
 
     Raises:
-        ValueError: The network is impossible, the time step violates the CFL condition, the
-            reference speed is negative or not finite, or rows cover several segments where mean
-            speeds are released, which have no sum.
+        ValueError: The network is impossible, the reference speed is negative or not finite, or
+            rows cover several segments where mean speeds are released, which have no sum. The
+            dynamics, not the constructor, refuse a time step that violates the CFL condition.
     """
 
     def __init__(
@@ -75,10 +75,9 @@ class ARZModel:
         rows: MeasurementRows | None = None,
         demand_states: bool = False,
     ) -> None:
-        """Derive what the equations need and check the time step."""
+        """Derive what the equations need."""
         self.network, self.parameters, self.time_step = network, parameters, time_step
         self.layout = layout = make_layout(network)
-        parameters.require_time_step(time_step, min(network.segment_lengths))
         self.n_segments = layout.n_segments
         self.n_demand_states = layout.entries.size if demand_states else 0
         self.n_states = 2 * self.n_segments + self.n_demand_states
@@ -107,7 +106,12 @@ class ARZModel:
 
     @cached_property
     def road(self) -> RoadArrays:
-        """The model as arrays and numbers, for kernels."""
+        """The model as arrays and numbers, for kernels.
+
+        Raises:
+            ValueError: The time step violates the CFL condition.
+        """
+        self.require_time_step()
         layout, n = self.layout, self.n_segments
         entry, leave = np.full((2, n), -1, dtype=np.int64)
         entry[layout.entries] = layout.entry_inputs
@@ -139,6 +143,10 @@ class ARZModel:
             row_first=self.rows.first,
             row_span=self.rows.span,
         )
+
+    def require_time_step(self) -> None:
+        """Raise ``ValueError`` where the time step violates the CFL condition on a segment."""
+        self.parameters.require_time_step(self.time_step, min(self.network.segment_lengths))
 
     # States -------------------------------------------------------------------------------------
 

@@ -97,8 +97,9 @@ class ARZParameters:
             # Rounded down, so that the number in the message is admissible.
             named = math.floor(100.0 * largest) / 100.0
             raise ValueError(
-                f"model.time_step must be > 0 and at most {named:.2f} s (CFL condition of "
-                f"parameters {self.name!r} on a segment of {segment_length:g} km), got {time_step}"
+                f"corridor.segment_length must be longer for the parameters {self.name!r}: on "
+                f"{segment_length:g} km their CFL condition needs a time step > 0 and at most "
+                f"{named:.2f} s, got {time_step:g} s"
             )
 
 

@@ -16,7 +16,7 @@ from dptse_env.release.queries import NO_OPTIONS, QueryOptions
 from dptse_env.release.report import PrivacyReport
 from dptse_env.release.settings import PrivacySettings
 from dptse_env.release.traffic_table import TrafficTable
-from dptse_env.traffic import AnyRecord, Corridor
+from dptse_env.traffic import Corridor, Record
 from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from dptse_env.utils.registry import name_of_class
 from dptse_env.utils.vector_info import Rows
@@ -244,7 +244,7 @@ class ReleaseModel(ABC):
         centre = self.flow_centre(self.setup.corridor, self.setup.settings)
         return math.nan if centre is None else centre
 
-    def load(self, index: int, record: AnyRecord) -> None:  # noqa: B027 (nothing by default)
+    def load(self, index: int, record: Record) -> None:  # noqa: B027 (nothing by default)
         """Prepare for the traffic of an index into the traffic seeds; called once for each."""
 
     @property

@@ -25,7 +25,7 @@ from dptse_env.release.mechanism import GaussianMechanism, Mechanism
 from dptse_env.release.noise import NoiseStreams
 from dptse_env.release.report import STRICT_DELTA, PrivacyReport, QuantityReport, in_order
 from dptse_env.release.settings import CappedSettings, PrivacySettings
-from dptse_env.traffic import AnyRecord, Corridor, with_vehicles
+from dptse_env.traffic import Corridor, Record
 from dptse_env.utils.arrays import AnyArray, FloatArray, IntArray
 from dptse_env.utils.registry import name_of_class
 from dptse_env.utils.vector_info import Rows, object_array
@@ -277,10 +277,10 @@ class Capped(GaussianRelease):
         """The vehicles of all traffic."""
         return self.contributions.vehicles.arrays
 
-    def load(self, index: int, record: AnyRecord) -> None:
+    def load(self, index: int, record: Record) -> None:
         """Read the vehicle table of a record."""
         user = f"the release model {self.setup.name!r}"
-        self.contributions.load(index, with_vehicles(record, user))
+        self.contributions.load(index, record.vehicles_for(user))
 
     def reset(self, episodes: IntArray, generators: Sequence[np.random.Generator]) -> None:
         """See `ReleaseModel.reset`; no vehicle has counted yet."""

@@ -24,7 +24,7 @@ from dptse_env.release.queries import QueryOptions
 from dptse_env.release.report import STRICT_DELTA, PrivacyReport
 from dptse_env.release.settings import PacedSettings, PrivacySettings
 from dptse_env.release.vehicle_table import VehicleTable
-from dptse_env.traffic import AnyRecord, Corridor, with_vehicles
+from dptse_env.traffic import Corridor, Record
 from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from dptse_env.utils.vector_info import Rows, object_array
 
@@ -125,10 +125,10 @@ class Paced(ReleaseModel):
         """The vehicles of all traffic."""
         return self.ledgers.vehicles.arrays
 
-    def load(self, index: int, record: AnyRecord) -> None:
+    def load(self, index: int, record: Record) -> None:
         """Read the vehicles of a record."""
         user = f"the release model {self.setup.name!r}"
-        self.ledgers.load(index, with_vehicles(record, user))
+        self.ledgers.load(index, record.vehicles_for(user))
 
     def reset(self, episodes: IntArray, generators: Sequence[np.random.Generator]) -> None:
         """See `ReleaseModel.reset`; no vehicle has paid anything yet."""

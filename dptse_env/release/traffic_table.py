@@ -3,7 +3,7 @@
 import numpy as np
 import numpy.typing as npt
 
-from dptse_env.traffic import AnyRecord, Corridor, RecordLibrary
+from dptse_env.traffic import Corridor, Record, RecordLibrary
 from dptse_env.utils.arrays import FloatArray, IntArray
 
 
@@ -27,7 +27,7 @@ class TrafficTable:
         self._lengths = np.array(corridor.with_boundaries(corridor.segment_lengths))
         self.limits = np.array(corridor.with_boundaries(corridor.speed_limits))
 
-    def load(self, indices: npt.ArrayLike) -> list[tuple[int, AnyRecord]]:
+    def load(self, indices: npt.ArrayLike) -> list[tuple[int, Record]]:
         """Load the records of some traffic seeds; return those that were not in memory before.
 
         Records that are missing on disk are made, on all cores where there are several. The result
@@ -44,7 +44,7 @@ class TrafficTable:
             records.append((index, record))
         return records
 
-    def record(self, index: int) -> AnyRecord:
+    def record(self, index: int) -> Record:
         """Return the record of ``traffic_seeds[index]``, which is made now if it is missing."""
         return self.library.get(self.corridor, self.traffic_seeds[index])
 

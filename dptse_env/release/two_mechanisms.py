@@ -18,7 +18,7 @@ from dptse_env.release.detectors import DetectorErrors, Detectors
 from dptse_env.release.queries import NO_OPTIONS
 from dptse_env.release.report import PrivacyReport, in_order
 from dptse_env.release.traffic_table import TrafficTable
-from dptse_env.traffic import AnyRecord, Penetration, with_vehicles
+from dptse_env.traffic import Penetration, Record
 from dptse_env.utils.arrays import FloatArray, IntArray
 from dptse_env.utils.vector_info import Rows
 
@@ -69,9 +69,9 @@ class ConnectedTraffic(TrafficTable):
         super().__init__(traffic.corridor, traffic.traffic_seeds, traffic.library)
         self._penetration = penetration
 
-    def record(self, index: int) -> AnyRecord:
+    def record(self, index: int) -> Record:
         """Return the rows of the connected vehicles in the record of ``traffic_seeds[index]``."""
-        record = with_vehicles(super().record(index), "the keyword penetration")
+        record = super().record(index).vehicles_for("the keyword penetration")
         return self._penetration.reports(self.traffic_seeds[index], record)
 
 
@@ -160,7 +160,7 @@ class TwoMechanisms(ReleaseModel):
         arrays = [array for part in self.parts for array in (*part.shared, part.setup)]
         return (*arrays, self._connected)
 
-    def load(self, index: int, record: AnyRecord) -> None:
+    def load(self, index: int, record: Record) -> None:
         """See `ReleaseModel.load`; queries read the connected vehicles alone."""
         for _, reported in self._connected.load([index]):
             self.queries.load(index, reported)

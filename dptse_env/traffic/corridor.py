@@ -19,7 +19,6 @@ from typing import Annotated, Any
 from dptse_env.traffic.demand import Demand, DemandDistribution, Share
 from dptse_env.traffic.drivers import Drivers, VehicleClass
 from dptse_env.traffic.incident import Incident, IncidentDistribution
-from dptse_env.traffic.recordings import Recordings
 from dptse_env.traffic.road_segments import RoadSegments
 from dptse_env.traffic.sumo_scenario import SumoScenario
 from dptse_env.utils.fields import Interval, checked_fields, integer, require
@@ -41,6 +40,24 @@ RampSegments = Annotated[int, Interval(1, 100)]
 
 UNIFORM = {"ramp_length": None, "ramp_speed_limit": None, "ramp_segments": 1}
 """Fields of ramps that do not enter a digest where they have these values."""
+
+
+@dataclass(frozen=True)
+class Recordings:
+    """A folder of imported records, real or foreign traffic that episodes replay.
+
+    Attributes:
+        folder: the folder; in a road file it may be relative to that file.
+        digest: SHA-256 (hex) of the digests of all records and of the road that they are made
+            for, from the folder's manifest.
+    """
+
+    folder: str
+    digest: str
+
+    def __post_init__(self) -> None:
+        """Check the fields."""
+        checked_fields(self, "corridor.recordings")
 
 
 @dataclass(frozen=True)
@@ -74,7 +91,7 @@ class Corridor(RoadSegments):
         density_scale: constant that scales densities in rewards and observations [veh/km].
         speed_scale: constant that scales speeds in rewards and observations [km/h].
         average_dwell: T_avg of the paper's eq. (6): average time of a vehicle on a mainline
-            segment [s], measured from records (`dptse_env.traffic.record.mean_dwell`).
+            segment [s], measured from records (`dptse_env.traffic.average_dwell`).
         drivers: the car-following model of all vehicles.
         network: SUMO files of one's own, from which the road is recorded; None for a network made
             of the fields above. With files, the vehicles are those of the files: the rates of

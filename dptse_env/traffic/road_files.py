@@ -43,6 +43,9 @@ _OPTIONAL: dict[str, Any] = {
     "fixed_sensors": (),
 }
 _ENVIRONMENT = "environment"
+PARTS = ("action", "estimator", "observation", "privacy", "reward")
+"""Keywords that take names of parts. In a file these are registered names: ``"module:Name"`` would
+let a file that somebody sent run code of the current folder."""
 _WITH_FOLDER = ("recordings", "network")
 _FILE_ENDINGS = (".json", ".npz")
 
@@ -76,8 +79,9 @@ def read_road(path: str | os.PathLike[str]) -> RoadFile:
     `ASSUMED_PACE` times the time of a crossing at the speed limit, and named in ``assumed``.
 
     Raises:
-        ValueError: There is no such file, it is no TOML, or a field is unknown, missing or out of
-            range; the message starts with the file's path and the field.
+        ValueError: There is no such file, it is no TOML, a field is unknown, missing or out of
+            range, or a part is named by an import string; the message starts with the file's path
+            and the field.
     """
     path = Path(path)
     content = _content(path)
@@ -90,7 +94,12 @@ def read_road(path: str | os.PathLike[str]) -> RoadFile:
         corridor, assumed = _corridor(content, path)
     except ValueError as problem:
         raise ValueError(f"{path}: {problem}") from problem
-    keywords = {key: _absolute(value, path.parent) for key, value in environment.items()}
+    try:
+        for key in PARTS:
+            _require_names(environment.get(key), f"{path}: {_ENVIRONMENT}.{key}")
+        keywords = {key: _absolute(value, path.parent) for key, value in environment.items()}
+    except RecursionError as problem:
+        raise ValueError(f"{path}: {_ENVIRONMENT} must not be nested so deeply") from problem
     return RoadFile(corridor, keywords, assumed)
 
 
@@ -162,6 +171,18 @@ def _corridor(content: Mapping[str, Any], path: Path) -> tuple[Corridor, tuple[s
     fields |= {name: value for name, value in derived.items() if name not in content}
     assumed = () if "average_dwell" in content else ("average_dwell",)
     return from_mapping(Corridor, fields, "corridor"), assumed
+
+
+def _require_names(value: Any, path: str) -> None:
+    """Refuse a value of a keyword for parts that has ``"module:Name"`` in it."""
+    if isinstance(value, str) and ":" in value:
+        raise ValueError(
+            f"{path} must be a registered name, got {value!r}: import strings come from Python "
+            "or the command line alone"
+        )
+    if isinstance(value, Mapping | list):
+        for each in value.values() if isinstance(value, Mapping) else value:
+            _require_names(each, path)
 
 
 def _absolute(value: Any, folder: Path) -> Any:

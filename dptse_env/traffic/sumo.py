@@ -97,7 +97,7 @@ def simulate(corridor: Corridor, seed: int) -> Record:
     Raises:
         RecordingError: SUMO fails, the corridor's own files are missing or changed, or libsumo
             already holds a simulation in this process, which is left unchanged (see
-            `dptse_env.traffic.worker`).
+            `dptse_env.traffic.recording`).
         NetworkError: The corridor has to be compiled and cannot be.
         SumoVersionError: libsumo is missing, broken or of another release series.
     """

@@ -109,7 +109,7 @@ def observe(libsumo: ModuleType, corridor: Corridor, scenario: Scenario) -> Reco
     table = np.array(rows, dtype=np.float64).reshape(len(rows), 4).T
     step, number, column, speed = table[:, np.lexsort((table[2], table[0]))]
     return Record(
-        step, number, column, speed,
+        step=step, vehicle=number, segment=column, speed=speed,
         n_steps=corridor.duration + 1, n_columns=len(network.columns),
     )  # fmt: skip
 

@@ -8,6 +8,8 @@ from collections.abc import Callable, Iterator, Mapping
 from importlib.metadata import entry_points
 from typing import Any
 
+from dptse_env.utils.fields import shown
+
 PLUGINS = "dptse_env.plugins"
 """Group of entry points of other packages. Each names a function that registers their parts; it is
 called once, when a name is looked up that is not known yet."""
@@ -114,7 +116,7 @@ class Registry(Mapping[str, Any]):
         if value not in self._parts and ":" not in value:
             raise ValueError(
                 f"{self.keyword} must be one of {', '.join(self._parts)}, or "
-                f"'package.module:Name', got {value!r}"
+                f"'package.module:Name', got {shown(value)}"
             )
         return value
 
@@ -140,7 +142,7 @@ class Registry(Mapping[str, Any]):
         if expected is None:
             return
         if type(part).__module__ == "builtins" and not hasattr(part, "__qualname__"):
-            raise ValueError(f"{self.keyword} must {expected}, got {part!r}")
+            raise ValueError(f"{self.keyword} must {expected}, got {shown(part)}")
         raise ValueError(f"{self.keyword} {name_of_class(part)} must {expected}")
 
 

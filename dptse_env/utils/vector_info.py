@@ -20,7 +20,7 @@ def row_of(rows: Mapping[str, Any], k: int) -> dict[str, Any]:
     """Return row k, as plain Python numbers and as fresh arrays where a value has a shape."""
     return {
         key: row_of(value, k)
-        if isinstance(value, Mapping)
+        if type(value) is dict
         else (value.item(k) if value.ndim == 1 else value[k].copy())
         for key, value in rows.items()
     }

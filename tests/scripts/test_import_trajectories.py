@@ -8,9 +8,9 @@ from dptse_env.traffic import RecordLibrary, read_corridor
 from scripts.import_trajectories import Args, main
 from scripts.record import Args as RecordArgs
 from scripts.record import main as record
+from tests.importers.data import STRAIGHT, plain, stream
+from tests.importers.test_formats import ngsim, write_csv
 from tests.scripts.commands import ROOT, run_script
-from tests.traffic.importers.data import STRAIGHT, plain, stream
-from tests.traffic.importers.test_formats import ngsim, write_csv
 
 ROAD = '{"n_mainline": 4, "on_ramps": [], "off_ramps": [], "exit_shares": [], "duration": 20,'
 ROAD += ' "demand": {"mainline": [[0, 1]], "on_ramps": []}, "incident": null, "fixed_sensors": []}'

@@ -5,6 +5,7 @@ import dataclasses
 import pytest
 
 from dptse_env.config import resolve
+from dptse_env.registration import REGISTRIES
 from dptse_env.traffic import (
     PAPER_HIGHWAY,
     find_corridor,
@@ -13,6 +14,7 @@ from dptse_env.traffic import (
     read_road,
     write_corridor,
 )
+from dptse_env.traffic.road_files import PARTS
 
 ROAD = """
 n_mainline = 8
@@ -94,12 +96,36 @@ def test_what_a_file_leaves_out_is_derived_from_the_road(road):
         ("lanes = 2", "lanes = 2\nlanes = 3", r"must be TOML: .*line 4"),
         ("bandwidth = 3", 'corridor = "x"', r"environment\.corridor must be left out"),
         ("[environment]", "[[environment]]", r"environment must be a table"),
+        ("bandwidth = 3", "incident" + ".a" * 5000 + " = 1", r"environment must not be nested so"),
     ],
 )
 def test_bad_files_are_refused_by_file_and_field(road, old, new, message):
     road.write_text(ROAD.replace(old, new, 1))
     with pytest.raises(ValueError, match=message):
         read_road(road)
+
+
+@pytest.mark.parametrize(
+    ("keyword", "value"),
+    [
+        ("action", '"own:Part"'),
+        ("estimator", '"own:Part.json"'),
+        ("observation", '["default", "own:Part"]'),
+        ("privacy", '{ preset = "own:Part" }'),
+        ("reward", '"own:Part"'),
+    ],
+)
+def test_a_file_imports_no_code(road, keyword, value, monkeypatch):
+    (road.parent / "own.py").write_text("raise SystemExit('code of the current folder has run')")
+    monkeypatch.syspath_prepend(road.parent)
+    road.write_text(ROAD.replace("bandwidth = 3", f"{keyword} = {value}"))
+    message = rf"My road\.toml: environment\.{keyword} must be a registered name, got 'own:Part"
+    with pytest.raises(ValueError, match=message):
+        resolve("private-highway-v1", {"corridor": str(road)})
+
+
+def test_every_keyword_for_parts_is_among_those_that_import_no_code():
+    assert {*REGISTRIES} - {"corridor", "pacing", "schedule"} == {*PARTS}
 
 
 def test_files_that_cannot_be_read(tmp_path):

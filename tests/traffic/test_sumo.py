@@ -12,8 +12,8 @@ from dptse_env.traffic import (
     Record,
     RecordingError,
     SumoVersionError,
+    average_dwell,
     draw_scenario,
-    mean_dwell,
     simulate,
 )
 from dptse_env.traffic.sumo import running, seconds
@@ -115,7 +115,7 @@ def test_ramps_flow_and_no_merge_locks(paper_records):
 
 def test_a_vehicle_dwells_as_long_as_the_preset_says(paper_records):
     """The preset's value is the mean over seeds 0..15; these four come close to it."""
-    measured = mean_dwell(paper_records, N)
+    measured = average_dwell(PAPER_HIGHWAY, paper_records)
     assert measured == pytest.approx(PAPER_HIGHWAY.average_dwell, rel=0.06)
 
 
@@ -123,9 +123,7 @@ def test_a_vehicle_dwells_as_long_as_the_preset_says(paper_records):
 @pytest.mark.parametrize("corridor", CORRIDORS.values(), ids=CORRIDORS)
 def test_the_presets_dwell_is_that_of_seeds_0_to_15(corridor):
     records = [simulate(corridor, seed) for seed in range(16)]
-    assert mean_dwell(records, corridor.n_mainline) == pytest.approx(
-        corridor.average_dwell, abs=0.005
-    )
+    assert average_dwell(corridor, records) == pytest.approx(corridor.average_dwell, abs=0.005)
 
 
 def test_the_same_seed_gives_the_same_record_silently_and_another_seed_another(short_record, capfd):
