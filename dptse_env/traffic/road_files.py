@@ -47,7 +47,7 @@ PARTS = ("action", "estimator", "observation", "privacy", "reward")
 """Keywords that take names of parts. In a file these are registered names: ``"module:Name"`` would
 let a file that somebody sent run code of the current folder."""
 _WITH_FOLDER = ("recordings", "network")
-_FILE_ENDINGS = (".json", ".npz")
+_FILE_ENDINGS = (".json", ".safetensors")
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class RoadFile:
     Attributes:
         corridor: The road.
         environment: Keywords of an environment that suit the road. Names of files in it, strings
-            that end in ``.json`` or ``.npz``, are absolute.
+            that end in ``.json`` or ``.safetensors``, are absolute.
         assumed: Fields of the corridor that neither the file nor a record of the road gives.
     """
 

@@ -9,8 +9,8 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Annotated
 
-from dptse_env.utils.digests import file_digest
 from dptse_env.utils.fields import Interval, checked_fields, require
+from dptse_env.utils.files import file_digest
 
 Position = Annotated[float, Interval(0, 1e6)]
 """Place on an edge, from its start [m]."""

@@ -177,3 +177,11 @@ def test_a_complete_file_warns_of_nothing(road):
     assert config.inherited == ()
     assert config.arz_parameters == arz
     assert config.settings() == load_settings("ekf-w99-3lane-paced")
+
+
+@pytest.mark.parametrize("name", ["ekf.json", "networks/mine-flows.safetensors"])
+def test_names_of_files_are_those_of_the_folder_of_the_road_file(road, name):
+    text = f'estimator_settings = {{ recurrent = {{ weights = "{name}" }} }}\n'
+    road.write_text(ROAD + text)
+    found = read_road(road).environment["estimator_settings"]
+    assert found == {"recurrent": {"weights": str(road.parent / name)}}
