@@ -13,10 +13,10 @@ import itertools
 import json
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Self, TypeVar
 
 from dptse_env.traffic.demand import (
     Demand,
@@ -28,12 +28,18 @@ from dptse_env.traffic.demand import (
     VehicleClass,
 )
 from dptse_env.traffic.own_sumo import SumoScenario
-from dptse_env.utils.fields import Interval, checked_fields, integer, require
+from dptse_env.utils.fields import Interval, checked_fields, from_mapping, integer, require
 
 T = TypeVar("T")
 
 NOT_TRAFFIC = ("name", "fixed_sensors", "density_scale", "speed_scale", "average_dwell")
 """Fields that describe the observation of the traffic and do not change the traffic itself."""
+
+GEOMETRY = (
+    "n_mainline", "on_ramps", "off_ramps", "exit_shares", "lanes", "ramp_lanes", "segment_length",
+    "speed_limit", "ramp_segments", "ramp_length", "ramp_speed_limit",
+)  # fmt: skip
+"""Fields by which a corridor is another road: what was fitted to one may not suit another."""
 
 Face = Annotated[int, Interval(1, 999)]
 """Number of a face between two mainline segments."""
@@ -240,6 +246,25 @@ class Corridor:
         require(self.recordings is None, "corridor.recordings", without, self.recordings)
         allowed = "left out on a road with a network of its own"
         require(self.drivers == Drivers(), "corridor.drivers", allowed, self.drivers)
+
+    def has_geometry_of(self, other: Self) -> bool:
+        """Return whether another corridor is the same road, whatever drives on it."""
+        return all(getattr(self, name) == getattr(other, name) for name in GEOMETRY)
+
+    def replaced(self, fields: Mapping[str, Any]) -> Self:
+        """Return the corridor with other fields, plain JSON; scales follow lanes and speed limit.
+
+        Raises:
+            ValueError: A field is unknown or out of range.
+        """
+        road = from_mapping(type(self), fields, "corridor", self)
+        scales: dict[str, Any] = {}
+        if "lanes" in fields:
+            scales["density_scale"] = self.density_scale * (road.most_lanes / self.most_lanes)
+        if "speed_limit" in fields:
+            ratio = road.largest_speed_limit / self.largest_speed_limit
+            scales["speed_scale"] = self.speed_scale * ratio
+        return dataclasses.replace(road, **{k: v for k, v in scales.items() if k not in fields})
 
     @property
     def n_on_ramps(self) -> int:
