@@ -125,7 +125,7 @@ def load_record(recordings: Recordings, seed: int, road: Mapping[str, Any]) -> R
             f"the corridor's: import the trajectories again for this corridor"
         )
     try:
-        record = Record.load(path, _source(seed, road))
+        record = Record.load(path, _source(seed, road), _shape(road))
     except FileNotFoundError as problem:
         raise InvalidRecordError(f"{path}: the record is missing") from problem
     if record.digest != manifest["records"][str(seed)]:
@@ -177,6 +177,12 @@ def _manifest(recordings: Recordings) -> dict[str, Any]:
 def _digest(manifest: Mapping[str, Any]) -> str:
     content = {key: manifest[key] for key in ("format", "version", "kind", "road", "records")}
     return json_digest(content)
+
+
+def _shape(road: Mapping[str, Any]) -> tuple[int, int]:
+    """Return `Corridor.record_shape`, given the layout."""
+    n_ramps = len(road["ramp_segments"])
+    return road["duration"] + 1, road["n_mainline"] + sum(road["ramp_segments"]) + 2 + n_ramps
 
 
 def _source(seed: int, road: Mapping[str, Any]) -> dict[str, object]:

@@ -153,14 +153,14 @@ class RecordLibrary:
             return load_record(corridor.recordings, seed, corridor.record_layout)
         path, source = self.record_path(corridor, seed), _source(corridor, seed)
         try:
-            return Record.load(path, source)
+            return Record.load(path, source, corridor.record_shape)
         except FileNotFoundError:
             pass  # the usual first use
         except InvalidRecordError as error:
             logger.warning("record is made again: %s", error)
         self._record(corridor, [seed])
         try:
-            return Record.load(path, source)
+            return Record.load(path, source, corridor.record_shape)
         except (OSError, InvalidRecordError) as error:
             raise RecordingError.from_cause(corridor, seed, str(error)) from error
 

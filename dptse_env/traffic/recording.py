@@ -92,7 +92,7 @@ def simulate_in_worker(corridor: Corridor, seed: int) -> Record:
     with tempfile.TemporaryDirectory(prefix="dptse-record-") as folder:
         path = Path(folder) / "record"
         record_seeds(corridor, {seed: path}, {seed: {}})
-        return Record.load(path, {})
+        return Record.load(path, {}, corridor.record_shape)
 
 
 def _record_until_death(
