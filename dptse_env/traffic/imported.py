@@ -19,7 +19,7 @@ MANIFEST = "manifest.json"
 FORMAT = "dptse-recordings"
 VERSION = 2
 
-LARGEST_MANIFEST = 100_000_000
+LARGEST_MANIFEST = 10_000_000
 """Largest size of a manifest [bytes]."""
 
 Kind = Literal["vehicles", "fields"]
@@ -99,8 +99,8 @@ def require_seeds(recordings: Recordings, seeds: Iterable[int]) -> None:
     lacking = sorted(set(seeds) - set(known))
     if lacking:
         raise ValueError(
-            f"traffic seed must be one that was recorded ({ranges(known)} in {recordings.folder}), "
-            f"got {ranges(lacking)}"
+            f"traffic seed must be one that was recorded ({ranges(known):.200} in "
+            f"{recordings.folder}), got {ranges(lacking):.200}"
         )
 
 
@@ -171,6 +171,9 @@ def _manifest(recordings: Recordings) -> dict[str, Any]:
             f"{path}: it is not the manifest of corridor.recordings.digest "
             f"{recordings.digest!r:.100}"
         )
+    for seed in manifest["records"]:
+        if not (seed.isdecimal() and len(seed) < 19):
+            raise InvalidRecordError(f"{path}: records must have traffic seeds, got {seed!r:.100}")
     return manifest
 
 

@@ -123,7 +123,7 @@ class RecordLibrary:
         workers: int | None = None,
         progress: bool = False,
     ) -> None:
-        """Make the missing records of `seeds`, several at once.
+        """Make the missing records of `seeds`, several at once; imported ones cannot be made.
 
         The default number of `workers` is that of usable cores; `progress` shows a progress bar.
 
@@ -138,7 +138,7 @@ class RecordLibrary:
         wanted = list(dict.fromkeys(integer("traffic seed", seed, 0) for seed in seeds))
         with self._explained_errors(corridor, wanted):
             missing = self.missing(corridor, wanted)
-            if missing:
+            if missing and corridor.recordings is None:
                 self._record(corridor, missing, n_workers, progress)
 
     def record_path(self, corridor: Corridor, seed: int) -> Path:
