@@ -14,6 +14,7 @@ from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.imported import ranges
 from dptse_env.traffic.record import Record
 
+REPORT = "report.md"
 _COUNTS = {
     "rows": {
         "rows": "rows of vehicles",
@@ -78,7 +79,7 @@ def write_report(
         "windows": list(windows),
     }
     (folder / "report.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-    (folder / "report.md").write_text(_markdown(content), encoding="utf-8")
+    (folder / REPORT).write_text(_markdown(content), encoding="utf-8")
     _draw(folder / "report.png", corridor, recordings[0], first)
     return content
 

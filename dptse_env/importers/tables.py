@@ -221,7 +221,7 @@ def _count_rows(path: Path, separator: str | None, n: int) -> int:
     line = pl.col("line")
     if separator is None:
         words = line.str.count_matches(r"\S+")
-        found = pl.when(words > 0).then(words)
+        found: pl.Expr = pl.when(words > 0).then(words)
     else:
         quoted = line.str.contains('"', literal=True)
         bare = pl.when(quoted).then(line.str.replace_all(r'"[^"]*"', "")).otherwise(line)

@@ -5,11 +5,12 @@ from pathlib import Path
 import pytest
 
 from dptse_env.traffic import RecordLibrary, read_corridor
-from scripts.import_trajectories import Args, main
+from dptse_env.traffic.imported import recorded_seeds
+from scripts.import_road import Args, Trajectories, main
 from scripts.record import Args as RecordArgs
 from scripts.record import main as record
-from tests.importers.data import STRAIGHT, plain, stream
-from tests.importers.test_formats import ngsim, write_csv
+from tests.importers.data import STRAIGHT, plain, stream, write_csv
+from tests.importers.test_tables import ngsim
 from tests.scripts.commands import ROOT, run_script
 
 ROAD = '{"n_mainline": 4, "on_ramps": [], "off_ramps": [], "exit_shares": [], "duration": 20,'
@@ -20,8 +21,8 @@ COLUMNS = ("time=t", "vehicle=id", "x=s", "speed=v")
 def test_one_command_makes_a_road_that_the_other_scripts_take(tmp_path, capsys):
     path = plain(tmp_path / "a.csv", stream(seconds=125.0))
     result = run_script(
-        "import_trajectories.py", "--files", str(path), "--corridor", ROAD, "--format", "table",
-        "--columns", *COLUMNS, "--output", str(tmp_path / "my-data"),
+        "import_road.py", "trajectories", "--files", str(path), "--corridor", ROAD,
+        "--format", "table", "--columns", *COLUMNS, "--output", str(tmp_path / "my-data"),
     )  # fmt: skip
     assert result.returncode == 0, result.stderr
     assert "training: 4 window(s), traffic seeds 0..3" in result.stdout
@@ -47,7 +48,7 @@ def test_a_mapping_file_and_a_road_file_describe_the_data(tmp_path):
     columns = ngsim(stream())
     columns["Location"] = ["us-101"] * len(columns["Vehicle_ID"])
     path = write_csv(tmp_path / "a.csv", columns)
-    given = Args(
+    given = Trajectories(
         (path,), str(tmp_path / "road.toml"), tmp_path / "new", mapping=tmp_path / "data.toml",
         shares=(1.0, 0.0, 0.0),
     )  # fmt: skip
@@ -55,7 +56,7 @@ def test_a_mapping_file_and_a_road_file_describe_the_data(tmp_path):
     text = (tmp_path / "new" / "road.toml").read_text()
     assert re.search(r"\[environment\]\s+bandwidth = 2", text)
     corridor = read_corridor(tmp_path / "new" / "road.toml")
-    assert corridor.recordings.seeds == tuple(range(5))
+    assert recorded_seeds(corridor.recordings) == tuple(range(5))
     assert RecordLibrary().get(corridor, 0).n_steps == STRAIGHT.duration + 1
 
 
@@ -76,7 +77,7 @@ def test_mistakes_end_in_one_line_on_stderr(arguments, message, tmp_path, monkey
 
     path = plain(tmp_path / "a.csv", stream(seconds=30.0))
     common = ["--files", str(path), "--corridor", ROAD, "--output", str(tmp_path / "new")]
-    monkeypatch.setattr(sys, "argv", ["import_trajectories.py", *common, *arguments])
+    monkeypatch.setattr(sys, "argv", ["import_road.py", "trajectories", *common, *arguments])
     with pytest.raises(SystemExit) as ended:
         run(main, Args, None)
     assert ended.value.code == 2
@@ -92,11 +93,11 @@ def test_the_page_on_own_data_has_commands_that_run(tmp_path):
         (tmp_path / name).write_text(content)
     points = stream(seconds=1300.0, length=640.0)
     write_csv(tmp_path / "0750.csv", ngsim(points))
-    (command,) = re.findall(r"python scripts/import_trajectories.py (.*?--mapping.*?)\n```", page,
+    (command,) = re.findall(r"python scripts/import_road.py (.*?--mapping.*?)\n```", page,
                             re.DOTALL)  # fmt: skip
     words = command.replace("\\\n", " ").split()
     here = [str(tmp_path / word) if re.search(r"\.(csv|toml)$|^us-101$", word) else word
             for word in words]  # fmt: skip
-    result = run_script("import_trajectories.py", *here)
+    result = run_script("import_road.py", *here)
     assert result.returncode == 0, result.stderr
     assert Path(tmp_path / "us-101" / "road.toml").is_file()
