@@ -25,7 +25,7 @@ PACKAGES = (
     "gymnasium", "libsumo", "sumolib", "eclipse-sumo", "numpy", "scipy", "numba", "filterpy",
     "qpsolvers", "piqp", "matplotlib", "platformdirs", "tomli-w", "tqdm", "torch",
     "stable-baselines3", "sb3-contrib", "optuna", "plotly", "polars", "loky", "rich", "tyro",
-    "pyarrow", "ijson", "ray", "filelock", "moviepy", "pygame",
+    "ray", "filelock", "moviepy", "pygame",
 )  # fmt: skip
 
 

@@ -152,5 +152,5 @@ def test_it_draws_the_chosen_episode_as_the_scalar_environment_does():
     # The next episode begins with an empty picture.
     for _ in range(9):
         env.step(actions)
-    assert len(env.history.truth) == 1
+    assert len(env.drawing.history.truth) == 1
     assert (env.render()[0] != picture).any()

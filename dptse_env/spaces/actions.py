@@ -19,7 +19,7 @@ from gymnasium import spaces
 
 from dptse_env.utils.arrays import Action, BoolArray, IntArray
 from dptse_env.utils.kernels import kernel
-from dptse_env.utils.registry import Registry, missing_methods, name_of_class
+from dptse_env.utils.registry import Registry, name_of_class
 
 
 class PendingPicks:
@@ -127,39 +127,38 @@ class Decision(NamedTuple):
 
 
 class ActionEncoding(ABC):
-    """Base class of the encodings, made of (n_options, bandwidth).
+    """Base class of the encodings.
 
     An option is a mainline segment, unless the environment has other spans or price levels
-    (`dptse_env.release.QueryOptions`). Where options cost different amounts, an encoding is made of
-    (n_options, bandwidth, costs=costs).
+    (`dptse_env.release.QueryOptions`).
 
     Attributes:
         space: The Gymnasium space of one action.
-        n_options: Options that can be queried, n. Also called ``n_mainline``.
+        n_options: Options that can be queried, n.
         bandwidth: Largest total cost of the queries of a step, B.
-        costs: Costs of the options, shape (n,); 1 each where they do not differ.
-        actions_per_step: Number of actions per decision; where options cost different amounts and
-            are picked one by one, the largest number.
+        costs: Costs of the options, 1 each where they do not differ, shape (n,).
+        most_queries: Largest number of queries in a step.
         picks_one_by_one: Whether an action picks one option, so that those which cannot be picked
             any more can be masked.
     """
 
-    actions_per_step = 1
     picks_one_by_one: ClassVar[bool] = False
 
-    def __init__(
-        self,
-        space: spaces.Space[Any],
-        n_options: int,
-        bandwidth: int,
-        costs: IntArray | None = None,
-    ) -> None:
-        """Store the space and the sizes."""
-        self.space = space
-        self.n_options = self.n_mainline = n_options
-        self.bandwidth = bandwidth
-        self.costs = _costs(n_options, costs)
-        self._shape = space.shape or ()
+    def __init__(self, n_options: int, bandwidth: int, costs: IntArray) -> None:
+        """Store the sizes, and the space that they give."""
+        self.n_options, self.bandwidth, self.costs = n_options, bandwidth, costs
+        self.most_queries = int(np.count_nonzero(np.cumsum(np.sort(costs)) <= bandwidth))
+        self.space = self.make_space()
+        self._shape = self.space.shape or ()
+
+    @abstractmethod
+    def make_space(self) -> spaces.Space[Any]:
+        """Return the space of one action, given the sizes."""
+
+    @property
+    def actions_per_step(self) -> int:
+        """Largest number of actions of a decision."""
+        return self.most_queries if self.picks_one_by_one else 1
 
     @abstractmethod
     def decode(self, episodes: IntArray, actions: Action, pending: PendingPicks) -> Decision:
@@ -197,7 +196,7 @@ class ActionEncoding(ABC):
 
     def completes(self, queried: BoolArray, picked: BoolArray) -> BoolArray:
         """Return whether the action of `encode` for the same arguments completes a decision."""
-        n_actions = queried.sum(axis=1) if self.picks_one_by_one else self.actions_per_step
+        n_actions = queried.sum(axis=1) if self.picks_one_by_one else 1
         complete: BoolArray = picked.sum(axis=1) + 1 == n_actions
         return complete
 
@@ -243,15 +242,6 @@ class ActionEncoding(ABC):
             )
 
 
-def _costs(n_options: int, costs: IntArray | None) -> IntArray:
-    return np.ones(n_options, dtype=np.int64) if costs is None else np.asarray(costs, np.int64)
-
-
-def _most_queries(n_options: int, bandwidth: int, costs: IntArray | None) -> int:
-    cheapest_first = np.sort(_costs(n_options, costs))
-    return int(np.count_nonzero(np.cumsum(cheapest_first) <= bandwidth))
-
-
 def check_decision(encoding: ActionEncoding, decision: Any, n_actions: int) -> None:
     """Refuse a decision of another package that is malformed or exceeds the bandwidth."""
     name, shape = name_of_class(encoding), (n_actions, encoding.n_options)
@@ -288,9 +278,9 @@ class MaskAction(ActionEncoding):
     all values are exactly 0 or 1, since learning libraries send flags as floats.
     """
 
-    def __init__(self, n_options: int, bandwidth: int, costs: IntArray | None = None) -> None:
-        """See `ActionEncoding`."""
-        super().__init__(spaces.MultiBinary(n_options), n_options, bandwidth, costs)
+    def make_space(self) -> spaces.Space[Any]:
+        """See `ActionEncoding.make_space`."""
+        return spaces.MultiBinary(self.n_options)
 
     def decode(self, episodes: IntArray, actions: Action, pending: PendingPicks) -> Decision:
         """See `ActionEncoding.decode`."""
@@ -311,10 +301,9 @@ class ScoresAction(ActionEncoding):
     An option that costs more than is left is passed over. Ties go to the first option, upstream.
     """
 
-    def __init__(self, n_options: int, bandwidth: int, costs: IntArray | None = None) -> None:
-        """See `ActionEncoding`."""
-        space = spaces.Box(-1.0, 1.0, (n_options,), np.float32)
-        super().__init__(space, n_options, bandwidth, costs)
+    def make_space(self) -> spaces.Space[Any]:
+        """See `ActionEncoding.make_space`."""
+        return spaces.Box(-1.0, 1.0, (self.n_options,), np.float32)
 
     def decode(self, episodes: IntArray, actions: Action, pending: PendingPicks) -> Decision:
         """See `ActionEncoding.decode`."""
@@ -338,11 +327,9 @@ class SlotsAction(ActionEncoding):
     rotation that the bandwidth pays for.
     """
 
-    def __init__(self, n_options: int, bandwidth: int, costs: IntArray | None = None) -> None:
-        """See `ActionEncoding`."""
-        self._n_slots = _most_queries(n_options, bandwidth, costs)
-        space = spaces.MultiDiscrete([n_options] * self._n_slots)
-        super().__init__(space, n_options, bandwidth, costs)
+    def make_space(self) -> spaces.Space[Any]:
+        """See `ActionEncoding.make_space`."""
+        return spaces.MultiDiscrete([self.n_options] * self.most_queries)
 
     def decode(self, episodes: IntArray, actions: Action, pending: PendingPicks) -> Decision:
         """See `ActionEncoding.decode`."""
@@ -355,14 +342,14 @@ class SlotsAction(ActionEncoding):
             added = pending.in_turn(episodes, self.available(queried), left, self.costs)
             queried = queried | added
             # A repeat that nothing replaces asks for nothing that is not served.
-            repeats = self._n_slots - wanted.sum(axis=1)
+            repeats = self.most_queries - wanted.sum(axis=1)
             n_dropped += np.minimum(repeats, added.sum(axis=1))
         return _all_complete(queried, n_dropped)
 
     def encode(self, queried: BoolArray, picked: BoolArray) -> Action:
         """See `ActionEncoding.encode`; slots that are left over repeat the first one."""
         self._require_full(queried)
-        chosen_first = np.argsort(~queried, axis=1, kind="stable")[:, : self._n_slots]
+        chosen_first = np.argsort(~queried, axis=1, kind="stable")[:, : self.most_queries]
         is_chosen = np.take_along_axis(queried, chosen_first, axis=1)
         return np.where(is_chosen, chosen_first, chosen_first[:, :1])
 
@@ -377,10 +364,9 @@ class SequentialAction(ActionEncoding):
 
     picks_one_by_one: ClassVar[bool] = True
 
-    def __init__(self, n_options: int, bandwidth: int, costs: IntArray | None = None) -> None:
-        """See `ActionEncoding`."""
-        super().__init__(spaces.Discrete(n_options), n_options, bandwidth, costs)
-        self.actions_per_step = _most_queries(n_options, bandwidth, costs)
+    def make_space(self) -> spaces.Space[Any]:
+        """See `ActionEncoding.make_space`."""
+        return spaces.Discrete(self.n_options)
 
     def decode(self, episodes: IntArray, actions: Action, pending: PendingPicks) -> Decision:
         """See `ActionEncoding.decode`."""
@@ -393,7 +379,7 @@ class SequentialAction(ActionEncoding):
             one, each = refused.astype(np.int64), np.ones_like(self.costs)
             picked |= pending.in_turn(episodes, self.available(picked), one, each)
             pending.n_replaced[episodes] += refused
-        complete = ~self.available(picked).any(axis=1)
+        complete = self.available(picked).sum(axis=1) == 0
         n_dropped = np.where(complete, pending.n_replaced[episodes], 0)
         pending.picked[episodes] = picked & ~complete[:, None]
         pending.n_replaced[episodes[complete]] = 0
@@ -407,9 +393,9 @@ class SequentialAction(ActionEncoding):
 
 
 def _expected(part: Any) -> str | None:
-    if not isinstance(part, type):
-        return "be a class, made of (n_options, bandwidth)"
-    return missing_methods(part, ("decode", "encode"))
+    if isinstance(part, type) and issubclass(part, ActionEncoding):
+        return None
+    return "be a subclass of dptse_env.spaces.actions.ActionEncoding"
 
 
 ACTION_ENCODINGS = Registry(
@@ -422,4 +408,4 @@ ACTION_ENCODINGS = Registry(
     },
     check=_expected,
 )
-"""Action encodings by name, each a class made of (n_options, bandwidth)."""
+"""Action encodings by name, each a class made of (n_options, bandwidth, costs)."""

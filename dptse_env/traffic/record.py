@@ -174,11 +174,6 @@ class Record:
         offsets.flags.writeable = False
         return offsets
 
-    def rows(self, step: int) -> slice:
-        """Return the rows of one step, for use as ``record.vehicle[record.rows(step)]``."""
-        integer("step", step, 0, self.n_steps - 1)
-        return slice(int(self.offsets[step]), int(self.offsets[step + 1]))
-
     def without(self, vehicle: int) -> "Record":
         """Return the adjacent record, in the sense of differential privacy, without a vehicle.
 
@@ -212,6 +207,11 @@ class Record:
         """The columns of the table of vehicles by name, or else the field."""
         names = self.COLUMNS if self.has_vehicles else ["field"]
         return {name: getattr(self, name) for name in names}
+
+    @property
+    def n_bytes(self) -> int:
+        """Size of the arrays [bytes]."""
+        return sum(array.nbytes for array in self.arrays.values())
 
     @cached_property
     def digest(self) -> str:

@@ -7,10 +7,10 @@ from contextlib import contextmanager
 
 EXTRAS: Mapping[str, tuple[str, ...]] = {
     "train": (
-        "loky", "optuna", "plotly", "polars", "rich", "sb3_contrib", "stable_baselines3", "torch",
+        "optuna", "plotly", "polars", "rich", "sb3_contrib", "stable_baselines3", "torch",
         "tyro",
     ),
-    "corridors": ("ijson", "pyarrow", "sumo"),
+    "corridors": ("polars", "sumo"),
     "ray": ("ray",),
     "video": ("moviepy", "pygame"),
 }  # fmt: skip
@@ -44,7 +44,7 @@ def needed_for(purpose: str) -> Iterator[None]:
 
 def missing_extra(module: str, purpose: str) -> MissingExtraError:
     """Return the error for a module of `EXTRAS` that is not installed."""
-    (extra,) = (extra for extra, modules in EXTRAS.items() if module in modules)
+    bringing = [f"'dptse-env[{extra}]'" for extra, modules in EXTRAS.items() if module in modules]
     return MissingExtraError(
-        f"{purpose} needs {module}, which is not installed: pip install 'dptse-env[{extra}]'"
+        f"{purpose} needs {module}, which is not installed: pip install {' or '.join(bringing)}"
     )

@@ -46,15 +46,18 @@ FILES = {
     ),
     "trajectories": (
         "t.xml", FCD,
-        ["import_trajectories", "--format", "fcd", "--corridor", "short-highway", "--files"],
+        [
+            "import_road", "trajectories", "--format", "fcd", "--corridor", "short-highway",
+            "--files",
+        ],
     ),
     "mapping": (
         "m.toml", b'format = "fcd"\n',
-        ["import_trajectories", "--corridor", "short-highway", "--files", "x", "--mapping"],
+        ["import_road", "trajectories", "--corridor", "short-highway", "--files", "x", "--mapping"],
     ),
     "field": (
         "d.txt", b"1 2 3\n4 5 6\n",
-        ["import_field", *FIELD, *ROAD, "--source.density", "{path}", "--source.speed"],
+        ["import_road", "field", *FIELD, *ROAD, "--source.density", "{path}", "--source.speed"],
     ),
     "replayed field": (
         "d.txt", b"1 2 3\n4 5 6\n",

@@ -13,11 +13,11 @@ from dptse_env.importers.network.configuration import Files
 from dptse_env.importers.network.layout import Layout
 from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.demand import Demand, Profile
+from dptse_env.traffic.own_sumo import SumoScenario
 from dptse_env.traffic.record import Record, average_dwell
-from dptse_env.traffic.road_files import DENSITY_SCALE
+from dptse_env.traffic.recording import simulate_in_worker
+from dptse_env.traffic.roads import DENSITY_SCALE
 from dptse_env.traffic.sumo import RecordingError
-from dptse_env.traffic.sumo_scenario import SumoScenario
-from dptse_env.traffic.worker import simulate_in_child
 from dptse_env.utils.arrays import BoolArray, IntArray
 from dptse_env.utils.digests import file_digest
 from dptse_env.utils.fields import require
@@ -79,7 +79,7 @@ def import_road(
         begin = int(files.begin) + warm_up
     draft = _draft(files, layout, name, duration, begin, warm_up, speed_limit)
     try:
-        record = simulate_in_child(draft, seed)
+        record = simulate_in_worker(draft, seed)
     except RecordingError as error:
         raise ValueError(f"SUMO refuses these files: {' '.join(str(error).split())}") from error
     if not (record.segment < draft.n_mainline).any():
