@@ -53,7 +53,9 @@ def test_a_wrong_time_is_counted_and_left_out(stray, tmp_path):
     ):
         imported = run(plain(subfolder(tmp_path, name), np.array(rows)))
         assert starts(imported) == starts(expected)
-        assert first_file(imported)["far_away"] == 1
+        file = first_file(imported)
+        assert file["far_away"] == 1
+        assert file["pieces"] == first_file(expected)["pieces"]
         for seed in (0, 1, 2000):
             one, other = record_of(imported, seed), record_of(expected, seed)
             np.testing.assert_array_equal(one.counts, other.counts)
