@@ -16,7 +16,7 @@ from dptse_env.release import Capped, PacedSettings, ReleaseModel, TwoMechanisms
 from dptse_env.release.paced import Paced
 from dptse_env.release.vehicle_table import VehicleTable
 from dptse_env.traffic import draw_scenario
-from dptse_env.traffic.incident import Incident
+from dptse_env.traffic.demand import Incident
 from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray
 
 LENGTHS = (0, 30, 60, 90, 120, 150, 180)

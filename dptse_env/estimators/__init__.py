@@ -14,6 +14,7 @@ from dptse_env.estimators.settings import (
     HorizonSettings,
     RecurrentSettings,
     SigmaPointSettings,
+    load_settings,
 )
 from dptse_env.model import ARZModel
 from dptse_env.utils.fields import shown
@@ -34,10 +35,10 @@ __all__ = [
     "Measurement",
     "RecurrentSettings",
     "SigmaPointSettings",
-    "check_demand",
     "check_estimate",
     "check_estimator",
     "check_settings",
+    "checked_settings",
     "make_estimator",
     "settings_type",
 ]
@@ -171,6 +172,27 @@ def settings_type(estimator: Any) -> type:
     """Return the dataclass of an estimator's settings."""
     cls: type = getattr(ESTIMATORS.find(estimator), "settings_type", EstimatorSettings)
     return cls
+
+
+def checked_settings(estimator: Any, settings: Any) -> Any:
+    """Return an estimator's settings, by name, as they are, or the defaults in place of None.
+
+    Raises:
+        ValueError: There are none of this name, they are of another type, or the estimator has no
+            demand states, which they ask for.
+    """
+    expected = settings_type(estimator)
+    if isinstance(settings, str):
+        settings = load_settings(settings)
+    elif settings is None:
+        settings = expected()
+    elif not isinstance(settings, expected):
+        raise ValueError(
+            f"estimator_settings must be a mapping, the name of a set, or a {expected.__name__}, "
+            f"got {shown(settings)}"
+        )
+    check_demand(estimator, settings)
+    return settings
 
 
 def check_estimator(estimator: Any, backend: str) -> None:

@@ -23,7 +23,7 @@ from dptse_env.importers.source import LENGTHS, SPEEDS, TIMES
 from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.demand import Demand
 from dptse_env.traffic.record import Record, average_dwell
-from dptse_env.traffic.road_files import DENSITY_SCALE, write_corridor
+from dptse_env.traffic.roads import DENSITY_SCALE, write_corridor
 from dptse_env.utils.arrays import FloatArray
 from dptse_env.utils.fields import integer, positive, require, require_name
 

@@ -22,7 +22,7 @@ from dptse_env.traffic.corridor import Corridor, Recordings
 from dptse_env.traffic.demand import Demand
 from dptse_env.traffic.imported import Kind, load_record, save_record, write_manifest
 from dptse_env.traffic.record import Record, average_dwell
-from dptse_env.traffic.road_files import write_corridor
+from dptse_env.traffic.roads import write_corridor
 from dptse_env.utils.fields import require, require_name
 
 ROAD = "road.toml"

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from dptse_env.importers.source import Layout, Part
 from dptse_env.traffic.corridor import Corridor
-from dptse_env.traffic.sumo_network import edge_ids
+from dptse_env.traffic.sumo_input import edge_ids
 from dptse_env.utils.arrays import FloatArray, IntArray
 from dptse_env.utils.fields import require
 

@@ -12,9 +12,11 @@ from typing import Annotated, Any, Literal
 
 from dptse_env.utils.fields import (
     Interval,
+    check_object,
     checked_fields,
     from_mapping,
-    parse_object,
+    parse_json,
+    read_json,
     require_name,
     shipped_texts,
 )
@@ -121,17 +123,17 @@ def load_parameters(name: str) -> ARZParameters:
         ValueError: There is no such set; the message lists the available ones.
     """
     require_name("parameters", name, available_parameters())
-    return _parse(_shipped()[name], name)
+    return _parse(parse_json(_shipped()[name], name), name)
 
 
 def read_parameters(path: str | Path) -> ARZParameters:
     """Read a set from a JSON file, as written by `write_parameters`.
 
     Raises:
-        ValueError: The file has another format or a value is out of range; the message starts with
-            the path of the file.
+        ValueError: The file cannot be read, has another format, or a value is out of range; the
+            message starts with the path of the file.
     """
-    return _parse(Path(path).read_bytes(), str(path))
+    return _parse(read_json(path), str(path))
 
 
 def write_parameters(
@@ -142,9 +144,9 @@ def write_parameters(
     Path(path).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 
-def _parse(text: str | bytes, path: str) -> ARZParameters:
-    content = parse_object(text, path, {"parameters": dict, "provenance": dict})
+def _parse(content: Any, path: str) -> ARZParameters:
+    checked = check_object(content, path, {"parameters": dict, "provenance": dict})
     try:
-        return ARZParameters.from_mapping(content["parameters"])
+        return ARZParameters.from_mapping(checked["parameters"])
     except ValueError as problem:
         raise ValueError(f"{path}: {problem}") from problem

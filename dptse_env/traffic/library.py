@@ -30,7 +30,7 @@ from dptse_env.traffic.imported import load_record, record_path, require_seeds
 from dptse_env.traffic.record import RECORD_VERSION, InvalidRecordError, Record
 from dptse_env.traffic.recording import record_seeds
 from dptse_env.traffic.sumo import RecordingError, SumoVersionError, sumo_version
-from dptse_env.traffic.sumo_network import NetworkError
+from dptse_env.traffic.sumo_input import NetworkError
 from dptse_env.utils.fields import integer, require
 from dptse_env.utils.threads import n_cores
 

@@ -174,11 +174,6 @@ class Record:
         offsets.flags.writeable = False
         return offsets
 
-    def rows(self, step: int) -> slice:
-        """Return the rows of one step, for use as ``record.vehicle[record.rows(step)]``."""
-        integer("step", step, 0, self.n_steps - 1)
-        return slice(int(self.offsets[step]), int(self.offsets[step + 1]))
-
     def without(self, vehicle: int) -> "Record":
         """Return the adjacent record, in the sense of differential privacy, without a vehicle.
 

@@ -27,7 +27,7 @@ from loky.process_executor import BrokenProcessPool
 from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.record import Record
 from dptse_env.traffic.sumo import RecordingError, SumoVersionError, simulate
-from dptse_env.traffic.sumo_network import NetworkError
+from dptse_env.traffic.sumo_input import NetworkError
 from dptse_env.utils.extras import MissingExtraError
 
 ATTEMPTS = 3

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from numbers import Integral, Real
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -333,6 +334,19 @@ def parse_json(text: str | bytes, path: str) -> Any:
         return json.loads(text)
     except (ValueError, RecursionError) as problem:
         raise ValueError(f"{path} must be JSON: {problem}") from problem
+
+
+def read_json(path: str | Path) -> Any:
+    """Parse a JSON file.
+
+    Raises:
+        ValueError: It cannot be read or is no JSON; the message starts with its path.
+    """
+    try:
+        text = Path(path).read_bytes()
+    except OSError as problem:
+        raise ValueError(f"{path} cannot be read: {problem.strerror}") from problem
+    return parse_json(text, str(path))
 
 
 def check_object(content: Any, path: str, keys: Mapping[str, type]) -> dict[str, Any]:

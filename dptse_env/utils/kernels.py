@@ -61,10 +61,6 @@ LONGEST_WAIT = 180.0
 SILENT_WAIT = 1.0
 """Seconds to wait before saying so."""
 
-Packed = tuple[Any, ...]
-"""A named tuple of arrays as a plain one, which kernels that Python calls take: to pass a named
-tuple costs 2 us more, a tenth of a filter's step."""
-
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
@@ -328,6 +324,8 @@ def _name(function: FunctionType) -> str:
 
 def _spelled(kind: Any) -> str:
     """Write a type of numba; the name of a named tuple's leaves out its module and fields."""
+    if isinstance(kind, types.StructRef):
+        return f"{type(kind).__qualname__}{[_spelled(field) for _, field in kind._fields]}"
     if not isinstance(kind, types.BaseTuple):
         return str(kind)
     cls, names = getattr(kind, "instance_class", tuple), getattr(kind, "fields", ())

@@ -12,7 +12,7 @@ import pytest
 from dptse_env.importers import Layout, Part, Source, Split, TrajectoryError, import_trajectories
 from dptse_env.importers.tables import NGSIM_COLUMNS
 from dptse_env.traffic import SHORT_HIGHWAY, Record, RecordLibrary, simulate, sumo
-from dptse_env.traffic.sumo_network import edge_ids
+from dptse_env.traffic.sumo_input import edge_ids
 from tests.importers.data import PLAIN, first_file, plain, run, stream, write_csv
 
 FOOT = 0.3048

@@ -85,6 +85,13 @@ def test_an_interrupted_run_goes_on_and_a_forced_one_begins_anew(tmp_path):
         ({"keywords": "[]"}, r"keywords must be a JSON object, got '\[\]'"),
         ({"keywords": "{"}, "keywords must be a JSON object, got '{'"),
         ({"keywords": '{"cargo": 1}'}, "cargo"),
+        (
+            {
+                "estimators": ("ekf", "recurrent"),
+                "keywords": '{"estimator_settings": {"recurrent": {"weights": "none"}}}',
+            },
+            r"estimator_settings\.recurrent\.weights must be a file or one of .*, got 'none'",
+        ),
     ],
 )
 def test_bad_arguments_are_named_and_nothing_is_written(changes, message, tmp_path):

@@ -23,7 +23,7 @@ from dptse_env.traffic import (
     sumo,
 )
 from dptse_env.traffic.imported import record_path, recorded_seeds, save_record, write_manifest
-from dptse_env.traffic.road_files import write_corridor
+from dptse_env.traffic.roads import write_corridor
 
 FREE = dataclasses.replace(SHORT_HIGHWAY, incident=None)
 SEEDS = (0, 1, 1000, 2000)

@@ -56,7 +56,7 @@ def once_a_step():
 
 
 @given(once_a_step())
-def test_rows_and_grids_agree_with_a_loop(entries):
+def test_offsets_and_grids_agree_with_a_loop(entries):
     entries.sort()
     step, vehicle, segment = zip(*entries, strict=True) if entries else ((), (), ())
     speed = np.linspace(0, 100, len(entries))
@@ -64,7 +64,8 @@ def test_rows_and_grids_agree_with_a_loop(entries):
         step=step, vehicle=vehicle, segment=segment, speed=speed, n_steps=6, n_columns=4
     )
     for k in range(6):
-        assert list(record.step[record.rows(k)]) == [k] * sum(s == k for s in step)
+        rows = slice(*record.offsets[k : k + 2])
+        assert list(record.step[rows]) == [k] * sum(s == k for s in step)
         for j in range(4):
             here = (record.step == k) & (record.segment == j)
             assert record.counts[k, j] == here.sum()

@@ -181,7 +181,7 @@ def test_a_simulation_of_the_user_survives(short_record, tmp_path):
     """libsumo holds one simulation per process; the user's own must not be replaced."""
     import libsumo
 
-    from dptse_env.traffic.sumo_network import packaged_network
+    from dptse_env.traffic.sumo_input import packaged_network
 
     network = tmp_path / "users.net.xml"
     network.write_text(packaged_network("paper-highway"))

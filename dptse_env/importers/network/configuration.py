@@ -9,8 +9,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from dptse_env.importers.network.net import UNREADABLE, open_xml, root_of
-from dptse_env.traffic.sumo_files import READ_BY
-from dptse_env.traffic.sumo_scenario import FORCED, WRITES
+from dptse_env.traffic.own_sumo import FORCED, READ_BY, WRITES
 
 SHORT = {
     "n": "net-file", "net": "net-file",

@@ -18,7 +18,7 @@ from dptse_env.importers.network.net import (
     predecessors,
     successors,
 )
-from dptse_env.traffic.sumo_scenario import TOLERANCE, Stretch
+from dptse_env.traffic.own_sumo import TOLERANCE, Stretch
 from dptse_env.utils.fields import require
 
 SHORTEST = 40.0

@@ -13,14 +13,14 @@ from dptse_env.importers.network.configuration import Files
 from dptse_env.importers.network.layout import Layout
 from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.demand import Demand, Profile
+from dptse_env.traffic.own_sumo import SumoScenario
 from dptse_env.traffic.record import Record, average_dwell
 from dptse_env.traffic.recording import simulate_in_worker
-from dptse_env.traffic.road_files import DENSITY_SCALE
+from dptse_env.traffic.roads import DENSITY_SCALE
 from dptse_env.traffic.sumo import RecordingError
-from dptse_env.traffic.sumo_scenario import SumoScenario
 from dptse_env.utils.arrays import BoolArray, IntArray
-from dptse_env.utils.digests import file_digest
 from dptse_env.utils.fields import require
+from dptse_env.utils.files import file_digest
 
 NEVER = np.iinfo(np.int64).max
 """First step of a vehicle on a column where it never is."""

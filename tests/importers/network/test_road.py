@@ -22,7 +22,7 @@ from dptse_env.traffic import (
     write_corridor,
 )
 from dptse_env.traffic.sumo import running, seconds
-from dptse_env.traffic.sumo_network import packaged_network
+from dptse_env.traffic.sumo_input import packaged_network
 from tests.importers.network.conftest import PATH, motorway
 
 

@@ -1,3 +1,5 @@
+"""What SUMO reads: networks that come with the package, and networks that are compiled."""
+
 import dataclasses
 import importlib.util
 import re
@@ -5,7 +7,7 @@ import re
 import pytest
 
 from dptse_env.traffic import CORRIDORS, PAPER_HIGHWAY, SHORT_HIGHWAY, simulate
-from dptse_env.traffic.sumo_network import (
+from dptse_env.traffic.sumo_input import (
     Geometry,
     compile_network,
     edge_ids,
@@ -13,6 +15,7 @@ from dptse_env.traffic.sumo_network import (
     packaged_network,
 )
 from dptse_env.utils.extras import MissingExtraError
+from tests.model.roads import UNEVEN
 
 needs_netconvert = pytest.mark.skipif(
     importlib.util.find_spec("sumo") is None, reason="eclipse-sumo (extra corridors) is missing"
@@ -38,7 +41,7 @@ def test_packaged_networks_are_what_netconvert_makes_of_the_presets(name):
 
 
 def test_a_preset_is_not_compiled(monkeypatch):
-    monkeypatch.setattr("dptse_env.traffic.sumo_network.compile_network", None)
+    monkeypatch.setattr("dptse_env.traffic.sumo_input.compile_network", None)
     changed = dataclasses.replace(PAPER_HIGHWAY, name="mine", incident=None, duration=60)
     assert network_xml(changed) == packaged_network("paper-highway")
 
@@ -71,3 +74,17 @@ def test_a_missing_netconvert_names_the_extra(monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", without_sumo)
     with pytest.raises(MissingExtraError, match=r"pip install 'dptse-env\[corridors\]'"):
         compile_network(Geometry.from_corridor(PAPER_HIGHWAY)._replace(n_mainline=21))
+
+
+def test_the_network_has_the_lengths_lanes_and_limits_of_the_corridor():
+    text = network_xml(UNEVEN)
+    lengths = UNEVEN.with_boundaries(UNEVEN.segment_lengths)
+    lanes = UNEVEN.with_boundaries(UNEVEN.segment_lanes)
+    limits = UNEVEN.with_boundaries(UNEVEN.speed_limits)
+    for edge, length, count, limit in zip(edge_ids(UNEVEN), lengths, lanes, limits, strict=True):
+        found = re.findall(
+            rf'<lane id="{edge}_\d+" index="\d+" .*?speed="([\d.]+)" length="([\d.]+)"', text
+        )
+        assert len(found) == count, edge
+        assert {float(speed) for speed, _ in found} == {round(limit / 3.6, 2)}
+        assert {float(each) for _, each in found} == {round(1000.0 * length, 2)}

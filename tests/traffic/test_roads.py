@@ -1,4 +1,4 @@
-"""Roads as TOML files."""
+"""Roads by name and as TOML files."""
 
 import dataclasses
 
@@ -7,14 +7,16 @@ import pytest
 from dptse_env.config import resolve
 from dptse_env.registration import REGISTRIES
 from dptse_env.traffic import (
+    CORRIDORS,
     PAPER_HIGHWAY,
+    DemandDistribution,
     find_corridor,
     randomised,
     read_corridor,
     read_road,
     write_corridor,
 )
-from dptse_env.traffic.road_files import PARTS
+from dptse_env.traffic.roads import PARTS
 
 ROAD = """
 n_mainline = 8
@@ -177,3 +179,22 @@ def test_a_complete_file_warns_of_nothing(road):
     assert config.inherited == ()
     assert config.arz_parameters == arz
     assert config.settings() == load_settings("ekf-w99-3lane-paced")
+
+
+@pytest.mark.parametrize("corridor", CORRIDORS.values(), ids=CORRIDORS)
+def test_randomised_traffic_keeps_the_road_and_the_base_demand(corridor):
+    random = randomised(corridor)
+    assert random.demand == DemandDistribution(corridor.published_demand)
+    assert random.digest != corridor.digest
+    assert random.on_ramps == corridor.on_ramps
+    assert randomised(random) == random
+    last_start = random.incident.start[1]
+    assert last_start + random.incident.duration[0] < corridor.duration
+
+
+@pytest.mark.parametrize("name", ["ekf.json", "networks/mine-flows.safetensors"])
+def test_names_of_files_are_those_of_the_folder_of_the_road_file(road, name):
+    text = f'estimator_settings = {{ recurrent = {{ weights = "{name}" }} }}\n'
+    road.write_text(ROAD + text)
+    found = read_road(road).environment["estimator_settings"]
+    assert found == {"recurrent": {"weights": str(road.parent / name)}}

@@ -1,16 +1,25 @@
-"""SUMO files of one's own: what a road is recorded from in place of a generated network."""
+"""SUMO files of one's own: what a road is recorded from in place of a network made for it.
 
+The network, its internal links, routes, vehicle types and options are those of the files. Three
+things differ from ``sumo -c``: the seed is that of the traffic seed, the demand may be scaled, and
+nothing is written: output options are refused, and what additional files would write goes nowhere.
+"""
+
+import gzip
 import re
 from bisect import bisect_right
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from operator import itemgetter
 from pathlib import Path
+from types import ModuleType
 from typing import Annotated
+from xml.etree import ElementTree
 
-from dptse_env.utils.digests import file_digest
+from dptse_env.traffic.demand import Incident, lowest_limit
 from dptse_env.utils.fields import Interval, checked_fields, require
+from dptse_env.utils.files import file_digest
 
 Position = Annotated[float, Interval(0, 1e6)]
 """Place on an edge, from its start [m]."""
@@ -34,8 +43,16 @@ WRITES = re.compile(
 )
 """Options of SUMO that write files, which a recording does not."""
 
+READ_BY = frozenset(["rerouter", "variableSpeedSign", "vss", "include"])
+"""Elements of routes and additional files whose ``file`` is read; of all others it is written."""
+
 TOLERANCE = 0.01
 """Precision of lengths in network files [m]."""
+
+KMH = 3.6
+"""Factor from m/s to km/h."""
+
+_WRITTEN = ("file", "output", "dest")
 
 
 class ChangedFilesError(ValueError):
@@ -184,3 +201,130 @@ class Places:
         if index < 0 or position > parts[index][1] + TOLERANCE:
             return None
         return parts[index][2]
+
+
+def command(folder: Path, network: SumoScenario, seed: int, scale: float) -> list[str]:
+    """Return SUMO's command line.
+
+    Args:
+        folder: an empty folder, for copies of additional files.
+        network: the files, which are checked against their digests.
+        seed: SUMO's seed.
+        scale: factor on the demand [-].
+
+    Raises:
+        ChangedFilesError: A file is missing or has changed.
+        ValueError: An additional file is no XML.
+    """
+    network.check_files()
+    files = ["-n", str(network.path(network.net))]
+    if network.routes:
+        files += ["-r", ",".join(str(network.path(name)) for name in network.routes)]
+    if network.additional:
+        copies = [
+            _without_outputs(network.path(name), folder / f"additional-{i}.xml")
+            for i, name in enumerate(network.additional)
+        ]
+        files += ["-a", ",".join(map(str, copies))]
+    return [
+        *("sumo", *files, "--seed", str(seed), "--scale", f"{scale:.6g}"),
+        *("--begin", str(network.begin - network.warm_up)),
+        *("--step-length", f"{network.step_length:g}", *network.options),
+    ]
+
+
+def observe(
+    libsumo: ModuleType,
+    network: SumoScenario,
+    incidents: Sequence[Incident],
+    seconds: Iterable[int],
+) -> list[tuple[int, int, int, float]]:
+    """Run the loaded simulation to its end.
+
+    Vehicles are numbered in the order in which they appear on the road.
+
+    Args:
+        libsumo: the module, with a simulation.
+        network: the places of the record's columns.
+        incidents: the incidents.
+        seconds: the seconds of the record, which advance the simulation.
+
+    Returns:
+        A row for each vehicle and second: second, vehicle, column of the record, speed [km/h].
+    """
+    places, vehicle = Places(network.columns), libsumo.vehicle
+    vehicles_on, position_of = libsumo.edge.getLastStepVehicleIDs, vehicle.getLanePosition
+    limits = VehicleLimits(libsumo, incidents)
+    numbers: dict[str, int] = {}
+    rows: list[tuple[int, int, int, float]] = []
+    for second in seconds:
+        affected: dict[str, int] = {}
+        for edge in places:
+            for name in vehicles_on(edge):
+                column = places.find(edge, position_of(name))
+                if column is None:
+                    continue
+                number = numbers.setdefault(name, len(numbers))
+                rows.append((second, number, column, KMH * vehicle.getSpeed(name)))
+                if column in limits.segments:
+                    affected[name] = column
+        limits.update(second, affected)
+    return rows
+
+
+class VehicleLimits:
+    """Limits of incidents, for the vehicles on their segments.
+
+    Edges of one's own network may be much longer than a segment, so limits are not set on them: a
+    vehicle has one from the first second at which it is on the segment to the first at which it is
+    not.
+
+    Args:
+        libsumo: the module, with a simulation.
+        incidents: the incidents.
+
+    Attributes:
+        segments: the segments with an incident.
+    """
+
+    def __init__(self, libsumo: ModuleType, incidents: Sequence[Incident]) -> None:
+        """Start without limited vehicles."""
+        self.segments = frozenset(incident.segment for incident in incidents)
+        self._libsumo = libsumo
+        self._incidents = incidents
+        self._usual: dict[str, float] = {}
+
+    def update(self, second: int, vehicles: Mapping[str, int]) -> None:
+        """Limit vehicles by name on their segments at a second of the record; free all others."""
+        vehicle = self._libsumo.vehicle
+        limited = {
+            name: limit
+            for name, segment in vehicles.items()
+            if (limit := lowest_limit(self._incidents, segment, second)) is not None
+        }
+        for name, limit in limited.items():
+            usual = self._usual.setdefault(name, vehicle.getMaxSpeed(name))
+            vehicle.setMaxSpeed(name, min(limit / KMH, usual))
+        free = self._usual.keys() - limited.keys()
+        present = set(vehicle.getIDList()) if free else set()
+        for name in sorted(free):
+            usual = self._usual.pop(name)
+            if name in present:
+                vehicle.setMaxSpeed(name, usual)
+
+
+def _without_outputs(path: Path, copy: Path) -> Path:
+    """Copy an additional file so that what it would write goes nowhere; return the copy."""
+    with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
+        try:
+            tree = ElementTree.parse(file)
+        except ElementTree.ParseError as error:
+            raise ValueError(f"{path}: must be XML: {error}") from error
+    for element in tree.iter():
+        for name in _WRITTEN:
+            if name in element.attrib and element.tag not in READ_BY:
+                element.set(name, "NUL")
+            elif name in element.attrib:
+                element.set(name, str((path.parent / element.attrib[name]).absolute()))
+    tree.write(copy)
+    return copy
