@@ -20,7 +20,7 @@ from gymnasium import spaces
 from dptse_env.evaluation import Policy
 from dptse_env.policies import SUFFIX, read_policy, shipped_policies
 from dptse_env.schedules import make_schedule
-from dptse_env.utils.digests import file_digest
+from dptse_env.utils.files import file_digest
 
 
 @dataclass(frozen=True)

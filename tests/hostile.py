@@ -99,7 +99,6 @@ def odd(card, arrays):
     yield "not-a-number", signed(card, {**arrays, first: np.full(array.shape, np.nan, "f4")})
     yield "infinite", signed(card, {**arrays, first: np.full(array.shape, np.inf, "f4")})
     yield "flags", signed(card, {**arrays, first: array != 0})
-    yield "complex", signed(card, {**arrays, first: array.astype("c8")})
     deep = {}
     for _ in range(20):
         deep = {"a": deep}

@@ -26,7 +26,7 @@ from dptse_env.model.parameters import (
     ARZParameters,
     Bounds,
 )
-from dptse_env.model.step import jacobians, next_states
+from dptse_env.model.step import jacobians, next_states, write_inputs
 from dptse_env.utils.arrays import FloatArray
 from dptse_env.utils.fields import non_negative
 
@@ -241,20 +241,13 @@ class ARZModel:
         of an empty cell is zero for any speed, NaN included. w is clipped to [0, 1.1 v_f], so that
         no input violates the CFL condition.
         """
-        layout, jam = self.layout, self.entry_jam_density
-        v_f, gamma = self.parameters.free_flow_speed, self.parameters.gamma
-        inputs = np.empty((density.shape[0], self.n_inputs))
-        rho = density[:, layout.entry_boundaries]
-        occupied = rho > VACUUM * jam
-        v, p = np.where(occupied, speed[:, layout.entry_boundaries], 0.0), self.pressure(rho, jam)
-        w = np.where(occupied, np.clip(v + p, 0.0, self.largest_speed), v_f)
-        # Up to the critical density a cell sends what it holds, beyond the capacity q_max(w).
-        critical = jam * (w / (1.0 + gamma) / v_f) ** (1.0 / gamma)
-        capacity = critical * w * (gamma / (1.0 + gamma))
-        demand = np.where((1.0 + gamma) * p <= w, rho * (w - p), capacity)
-        inputs[:, layout.entry_inputs] = np.where(occupied, demand, 0.0)
-        inputs[:, layout.entry_inputs + 1] = w
-        inputs[:, layout.exit_inputs] = density[:, layout.exit_boundaries]
+        layout, inputs = self.layout, np.empty((density.shape[0], self.n_inputs))
+        density, speed = np.ascontiguousarray(density), np.ascontiguousarray(speed)
+        write_inputs(
+            self.parameters.free_flow_speed, self.parameters.gamma, self.entry_jam_density,
+            layout.entry_boundaries, layout.entry_inputs,
+            layout.exit_boundaries, layout.exit_inputs, density, speed, inputs,
+        )  # fmt: skip
         return inputs
 
     # Measurements -------------------------------------------------------------------------------

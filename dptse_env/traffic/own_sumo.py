@@ -18,8 +18,8 @@ from typing import Annotated
 from xml.etree import ElementTree
 
 from dptse_env.traffic.demand import Incident, lowest_limit
-from dptse_env.utils.digests import file_digest
 from dptse_env.utils.fields import Interval, checked_fields, require
+from dptse_env.utils.files import file_digest
 
 Position = Annotated[float, Interval(0, 1e6)]
 """Place on an edge, from its start [m]."""

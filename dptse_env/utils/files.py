@@ -1,4 +1,4 @@
-"""Files that are complete or not there, and arrays with a card, read within bounds.
+"""Files that are complete or not there, their digests, and arrays with a card.
 
 Weights and records are files in the format of safetensors: a header in JSON, then the arrays as
 they are in memory. Their card, what one should know of the arrays, stands in the header's
@@ -218,3 +218,22 @@ def write_atomically(path: str | os.PathLike[str], content: bytes | str) -> None
     """
     with replacing(path) as temporary:
         temporary.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
+def file_digest(path: str | os.PathLike[str]) -> str:
+    """Return the SHA-256 (hex) of a file's content.
+
+    Raises:
+        OSError: The file cannot be read.
+    """
+    with Path(path).open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def json_digest(content: Any) -> str:
+    """Return the SHA-256 (hex) of plain values as JSON, whatever the order of keys.
+
+    Raises:
+        TypeError: A value is not plain.
+    """
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()

@@ -266,6 +266,19 @@ def test_weights_fit_other_roads_of_the_same_kinds():
     assert other.predict(observations(other).numpy())[0].max() > 14
 
 
+def test_policies_of_two_environments_share_their_weights():
+    policy = make_policy("short-highway")
+    config = resolve("short-highway", {"action": "slots", "bandwidth": 4})
+    twin = policy.sharing(config)
+    with torch.no_grad():
+        policy.scorer.rule.add_(1.0)
+    seen = observations(policy)
+    torch.testing.assert_close(twin.scores(seen), policy.scores(seen), rtol=0, atol=0)
+    assert twin.bandwidth == 4
+    with pytest.raises(ValueError, match=r"one lacks \['mainline released_speed'\]"):
+        policy.sharing(resolve("short-highway", {"action": "slots", "privacy": "capped"}))
+
+
 def test_spaces_that_do_not_fit_are_refused():
     config = resolve("short-highway", {"action": "slots"})
     interface, road = make_interface(config), RoadChannels.from_config(config)

@@ -71,8 +71,10 @@ def test_it_is_loaded_for_any_form_of_the_environment(stored):
     vector = gym.make_vec(
         SHORT, num_envs=3, action="slots", traffic_seeds="0:2", autoreset_mode="SameStep"
     )
+    before = torch.get_rng_state()
     for env in (make_env(), vector, SB3VecEnv(vector)):
         assert load_policy(stored, env).card["training"]["seed"] == 3
+    assert torch.equal(torch.get_rng_state(), before)
     assert load_policy(str(stored), vector).predict(vector.reset(seed=0)[0])[0].shape == (3, 2)
     with pytest.raises(ValueError, match="env must be an environment of this package"):
         load_policy(stored, gym.make("CartPole-v1"))

@@ -190,3 +190,11 @@ def test_randomised_traffic_keeps_the_road_and_the_base_demand(corridor):
     assert randomised(random) == random
     last_start = random.incident.start[1]
     assert last_start + random.incident.duration[0] < corridor.duration
+
+
+@pytest.mark.parametrize("name", ["ekf.json", "networks/mine-flows.safetensors"])
+def test_names_of_files_are_those_of_the_folder_of_the_road_file(road, name):
+    text = f'estimator_settings = {{ recurrent = {{ weights = "{name}" }} }}\n'
+    road.write_text(ROAD + text)
+    found = read_road(road).environment["estimator_settings"]
+    assert found == {"recurrent": {"weights": str(road.parent / name)}}

@@ -1,14 +1,13 @@
-"""A window that shows an episode, and videos of it."""
+"""Pictures of an episode, a window that shows it, and videos."""
 
 import sys
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.utils.env_checker import check_env
 
 from dptse_env.utils.extras import MissingExtraError
-
-pytest.importorskip("pygame", reason="the extra video is not installed")
 
 SHORT = "dptse_env:dptse/ShortHighway-v0"
 
@@ -16,12 +15,21 @@ SHORT = "dptse_env:dptse/ShortHighway-v0"
 @pytest.fixture
 def display(monkeypatch):
     """A display in memory, by SDL's own driver for machines without one."""
+    pytest.importorskip("pygame", reason="the extra video is not installed")
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     monkeypatch.setenv("PYGAME_HIDE_SUPPORT_PROMPT", "1")
 
 
-def make(render_mode="human"):
-    return gym.make(SHORT, render_mode=render_mode, horizon=30, random_start=True)
+def make(render_mode="human", **keywords):
+    keywords = {"horizon": 30, "random_start": True, "traffic_seeds": [0], **keywords}
+    return gym.make(SHORT, render_mode=render_mode, **keywords)
+
+
+def play(env, n_steps, seed):
+    env.action_space.seed(seed)
+    env.reset(seed=seed)
+    for _ in range(n_steps):
+        env.step(env.action_space.sample())
 
 
 def shown():
@@ -31,6 +39,39 @@ def shown():
     if not pygame.display.get_init():
         return None
     return np.swapaxes(pygame.surfarray.array3d(pygame.display.get_surface()), 0, 1)
+
+
+def test_a_picture_shows_the_episode_so_far():
+    env = make("rgb_array")
+    with pytest.raises(gym.error.ResetNeeded):
+        env.unwrapped.render()
+    env.reset(seed=0)
+    empty = env.render()
+    for seed in (0, 1):
+        play(env, 20, seed)
+        picture = env.render()
+    assert (picture.dtype, picture.shape) == (np.uint8, empty.shape)
+    assert (picture != empty).mean() > 0.05
+    # A figure that is used again shows what a new one does.
+    fresh = make("rgb_array")
+    play(fresh, 20, 1)
+    np.testing.assert_array_equal(picture, fresh.render())
+
+
+def test_it_is_drawn_anew_every_kth_second_and_at_the_end():
+    env = make("rgb_array", render_every=4, horizon=10)
+    env.reset(seed=0)
+    pictures = [env.render()]
+    for _ in range(10):
+        env.step(env.action_space.sample())
+        pictures.append(env.render())
+    drawn = [k for k in range(1, 11) if (pictures[k] != pictures[k - 1]).any()]
+    assert drawn == [4, 8, 10]
+
+
+@pytest.mark.slow
+def test_the_checker_finds_nothing_in_any_render_mode(display):
+    check_env(make("rgb_array").unwrapped)
 
 
 def test_a_window_shows_what_a_picture_would(display):
