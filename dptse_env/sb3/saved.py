@@ -23,9 +23,9 @@ from dptse_env.sb3.plackett_luce import PlackettLucePolicy, RoadChannels
 from dptse_env.spaces.actions import ACTION_ENCODINGS
 from dptse_env.traffic import Corridor
 from dptse_env.utils.arrays import Action, BoolArray, Observation
-from dptse_env.utils.extras import needed_for
 from dptse_env.utils.fields import Interval, integer, number
 from dptse_env.utils.files import write_tensors
+from dptse_env.utils.registry import needed_for
 
 POLICY_FORMAT = "dptse-policy-1"
 """Format of the weights; its number is raised when saved weights change their meaning."""
