@@ -16,11 +16,11 @@ from matplotlib.image import AxesImage
 from matplotlib.ticker import FixedLocator, NullLocator
 from numpy.typing import ArrayLike, NDArray
 
-from agents.files import replacing
 from agents.statistics import Interval
 from agents.tables import METRICS, UnmeasuredError
 from dptse_env.rendering import DENSITY_MAP, QUERY_COLOUR, History
 from dptse_env.utils.arrays import FloatArray
+from dptse_env.utils.files import replacing
 
 COLOURS = ("#1b4f72", "#c1272d", "#5d8233", "#7d5ba6", "#b9770e")
 GRID_COLOUR = "#e3e6ea"

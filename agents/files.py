@@ -1,15 +1,15 @@
-"""Atomic writes: after an interruption either the old or the new file is there, complete."""
+"""CSV and JSON files, complete or not there, and refusals to write over others."""
 
 from __future__ import annotations
 
-import contextlib
 import csv
 import io
 import json
-import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+from dptse_env.utils.files import write_atomically
 
 
 def refuse_to_replace(paths: Iterable[Path], force: bool) -> None:
@@ -29,33 +29,6 @@ def refuse_to_replace(paths: Iterable[Path], force: bool) -> None:
         raise FileExistsError(
             f"{', '.join(there)} would be replaced: choose another --output, or give --force"
         )
-
-
-@contextlib.contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """Yield a temporary path, whose file takes the place of ``path`` when the body is done.
-
-    Raises:
-        OSError: The file cannot be written; the old one stays.
-    """
-    temporary = path.with_name(f"{path.name}.tmp")
-    try:
-        yield temporary
-        with temporary.open("rb+") as file:
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-def write_atomically(path: Path, content: bytes | str) -> None:
-    """Write a file in one piece, text as UTF-8.
-
-    Raises:
-        OSError: It cannot be written; the old one stays.
-    """
-    with replacing(path) as temporary:
-        temporary.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
 def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:

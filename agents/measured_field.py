@@ -13,10 +13,10 @@ import numpy as np
 
 from dptse_env.estimators import Measurement, make_estimator
 from dptse_env.evaluation import WARM_UP
+from dptse_env.importers.fields import FieldSource, by_second
 from dptse_env.model import ARZModel, ARZParameters
 from dptse_env.privacy import paper_sensitivity, single_noise_std
 from dptse_env.traffic import Corridor, Demand
-from dptse_env.traffic.importers.fields import FieldSource, by_second
 from dptse_env.utils.arrays import FloatArray
 
 

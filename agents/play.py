@@ -18,7 +18,7 @@ from agents.watchers import WATCHERS
 from dptse_env.evaluation import Row, evaluate
 from dptse_env.policies import TRANSFERABLE
 from dptse_env.traffic import Corridor, RecordLibrary, Records, open_library
-from dptse_env.utils.digests import file_digest
+from dptse_env.utils.files import file_digest
 
 POLICY_SEED = 0
 """Seeds the draws of a schedule, and torch for the draws of a learned policy."""

@@ -18,9 +18,9 @@ from typing import Any
 from gymnasium import spaces
 
 from dptse_env.evaluation import Policy
-from dptse_env.policies import read_policy, shipped_policies
+from dptse_env.policies import SUFFIX, read_policy, shipped_policies
 from dptse_env.schedules import make_schedule
-from dptse_env.utils.digests import file_digest
+from dptse_env.utils.files import file_digest
 
 
 @dataclass(frozen=True)
@@ -72,21 +72,17 @@ class SavedPolicy:
 
     Attributes:
         source: The file, or the name of a policy that comes with the package.
+        identity: Digest that tells policies apart whatever their files are called.
     """
 
     source: str
-    sha256: str
+    identity: str
     card: Mapping[str, Any]
 
     @property
     def keywords(self) -> dict[str, Any]:
         """Keywords that an environment needs for it: its action encoding."""
         return {"action": self.action}
-
-    @property
-    def identity(self) -> str:
-        """Digest of the file, which tells policies apart whatever their files are called."""
-        return self.sha256
 
     @property
     def action(self) -> str:
@@ -111,9 +107,9 @@ class SavedPolicy:
         """
         from dptse_env.sb3 import load_policy  # noqa: PLC0415
 
-        present = read_policy(self.source).sha256
-        if present != self.sha256:
-            raise ValueError(f"{self.source!r} has changed: sha256 {present}, it was {self.sha256}")
+        present, known = (card["sha256"] for card in (read_policy(self.source).card, self.card))
+        if present != known:
+            raise ValueError(f"{self.source!r} has changed: sha256 {present}, it was {known}")
         policy: Policy = load_policy(self.source, env, allow=allow)
         return policy
 
@@ -234,23 +230,27 @@ PolicySource = NamedSchedule | SavedPolicy | SavedModel
 """A query policy before it is bound to an environment."""
 
 
+_ENDINGS = (SUFFIX, ".zip")
+"""Endings of the files of policies; libraries save theirs as .zip."""
+
+
 def policy_name(source: str) -> str:
     """Return the name of a policy in tables.
 
     Files of trainings have one name; their folders differ.
     """
     path = Path(source.partition("=")[2] or source)
-    return f"{path.parent.name}/{path.stem}" if path.suffix == ".zip" else source
+    return f"{path.parent.name}/{path.stem}" if path.suffix in _ENDINGS else source
 
 
 def find_policy(source: str) -> PolicySource:
     """Return the policy that a name or a file stands for.
 
     Args:
-        source: The ``.zip`` file of a saved policy, the name of one that comes with the package, a
-            model of stable-baselines3 as ``"module:Class=file.zip"``, or else a schedule: its name
-            or ``"module:Class"``. Whether a schedule or a model exists and suits an environment is
-            checked when it is loaded.
+        source: The ``.safetensors`` file of a saved policy, the name of one that comes with the
+            package, a model of stable-baselines3 as ``"module:Class=file.zip"``, or else a
+            schedule: its name or ``"module:Class"``. Whether a schedule or a model exists and suits
+            an environment is checked when it is loaded.
 
     Raises:
         FileNotFoundError: There is no such saved policy.
@@ -258,7 +258,7 @@ def find_policy(source: str) -> PolicySource:
     """
     if ":" in source.partition("=")[0] and "=" in source:
         return SavedModel(source)
-    if source.endswith(".zip") or source in shipped_policies():
+    if source.endswith(_ENDINGS) or source in shipped_policies():
         return read_saved_policy(source)
     return NamedSchedule(source)
 
@@ -271,7 +271,7 @@ def read_saved_policy(source: str | Path) -> SavedPolicy:
         ValueError: The file is not a saved policy.
     """
     file = read_policy(source)
-    saved = SavedPolicy(file.source, file.sha256, file.card)
+    saved = SavedPolicy(file.source, file.identity, file.card)
     try:
         # The entries of the card that the properties rely on must be there.
         _ = saved.recipe, saved.training_seed

@@ -19,10 +19,10 @@ import polars as pl
 
 import dptse_env
 from agents.executors import AnyExecutor, ThisProcess, run_shown
-from agents.files import replacing, write_atomically
 from agents.play import Cell, corridor_of, play, record
 from dptse_env.evaluation import Row
 from dptse_env.traffic import Records
+from dptse_env.utils.files import replacing, write_atomically
 
 ROWS, TABLES = "rows.parquet", "tables.md"
 """Files of a study's folder, beside its figures."""

@@ -15,7 +15,7 @@ from dptse_env.process import QueryProcess
 from dptse_env.release import Capped, Paced, ReleaseModel
 from dptse_env.release.vehicles import Ledgers, VehicleRows
 from dptse_env.traffic import draw_scenario
-from dptse_env.traffic.incident import Incident
+from dptse_env.traffic.demand import Incident
 from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray
 
 LENGTHS = (0, 30, 60, 90, 120, 150, 180)

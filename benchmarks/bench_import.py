@@ -19,12 +19,10 @@ import time
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.csv
-import pyarrow.parquet
+import polars as pl
 
+from dptse_env.importers import Source, Split, import_trajectories
 from dptse_env.traffic import Corridor, Demand
-from dptse_env.traffic.importers import Source, Split, import_trajectories
 
 FORMATS = ("csv", "parquet", "text")
 ROAD = Corridor(
@@ -63,7 +61,6 @@ def main() -> None:
 
 def write(path: Path, n_vehicles: int) -> None:
     """Write a file of vehicles that follow one another by a second."""
-    writer = None
     for first in range(0, n_vehicles, BATCH):
         vehicle = np.repeat(np.arange(first, min(first + BATCH, n_vehicles)), POINTS)
         since = np.tile(0.1 * np.arange(POINTS), len(vehicle) // POINTS)
@@ -83,22 +80,19 @@ def write(path: Path, n_vehicles: int) -> None:
             "Space_Headway": np.full(len(vehicle), 65.6),
             "Time_Headway": np.full(len(vehicle), 1.0),
         }  # fmt: skip
-        table = pa.table(columns)
-        if path.suffix == ".txt":
-            with path.open("a") as file:
+        with path.with_suffix(".csv" if path.suffix == ".parquet" else path.suffix).open(
+            "ab"
+        ) as file:
+            if path.suffix == ".txt":
                 np.savetxt(file, np.column_stack(list(columns.values())), fmt="%14.3f")
-            continue
-        if writer is None:
-            kind = pa.parquet.ParquetWriter if path.suffix == ".parquet" else pa.csv.CSVWriter
-            writer = kind(path, table.schema)
-        writer.write_table(table)
-    if writer is not None:
-        writer.close()
+            else:
+                pl.DataFrame(columns).write_csv(file, include_header=first == 0)
+    if path.suffix == ".parquet":
+        pl.scan_csv(path.with_suffix(".csv")).sink_parquet(path)
 
 
 def import_file(path: Path) -> None:
     """Import a file, and print rows, seconds and bytes as JSON."""
-    pa.set_cpu_count(1)
     splits = [Split("training", 1.0, range(10_000))]
     start = time.perf_counter()
     imported = import_trajectories([path], Source("ngsim"), ROAD, path.parent / "imported", splits)

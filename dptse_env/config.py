@@ -12,9 +12,8 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Annotated, Any
 
-from dptse_env.estimators import ESTIMATORS, check_demand, check_estimator, settings_type
+from dptse_env.estimators import ESTIMATORS, check_estimator, checked_settings, settings_type
 from dptse_env.estimators.settings import (
-    load_settings,
     read_settings,
     tuned_estimator,
     tuned_settings,
@@ -39,13 +38,20 @@ from dptse_env.traffic import (
     CORRIDORS,
     Corridor,
     Penetration,
-    RoadFile,
     find_corridor,
     is_road_file,
     randomised,
     read_road,
 )
-from dptse_env.utils.fields import Interval, checked_fields, field_hints, from_mapping, require_name
+from dptse_env.traffic.imported import has_vehicles, recorded_seeds, require_seeds
+from dptse_env.utils.fields import (
+    Interval,
+    checked_fields,
+    field_hints,
+    from_mapping,
+    require_name,
+    shown,
+)
 
 TRAINING_SEEDS = range(1_000)
 """Traffic seeds meant for training and calibration."""
@@ -109,7 +115,7 @@ class EnvConfig:
             with other ARZ parameters, and that nobody gave; filled in by `resolve`.
 
     Raises:
-        ValueError: A value is out of range, or the parameters violate the CFL condition.
+        ValueError: A value is out of range.
     """
 
     corridor: Corridor
@@ -161,9 +167,9 @@ class EnvConfig:
             raise ValueError(f"traffic_seeds must be distinct, got {seeds}")
         self._check_sensors()
         if self.corridor.recordings is not None:
-            self.corridor.recordings.require(seeds)
+            require_seeds(self.corridor.recordings, seeds)
             needs = RELEASE_MODELS.find(self.privacy.preset).needs_vehicles
-            if needs and not self.corridor.recordings.has_vehicles:
+            if needs and not has_vehicles(self.corridor.recordings):
                 raise ValueError(
                     "privacy.preset must be a release model that needs no vehicles, such as "
                     "'paper' or 'corrected', on a road of measured fields, got "
@@ -171,8 +177,7 @@ class EnvConfig:
                 )
         if isinstance(self.parameters, str):
             require_name("parameters", self.parameters, available_parameters())
-        self.arz_parameters.require_time_step(TIME_STEP, min(self.corridor.segment_lengths))
-        self._check_settings()
+        self.settings()
 
     def _check_queries(self) -> None:
         """Check the options, and that the release model can answer them."""
@@ -213,22 +218,12 @@ class EnvConfig:
                 f"detectors must be left out on a road without fixed sensors, got {self.detectors}"
             )
         recordings = corridor.recordings
-        if self.has_separate_sensors and recordings is not None and not recordings.has_vehicles:
+        is_field = recordings is not None and not has_vehicles(recordings)
+        if self.has_separate_sensors and is_field:
             raise ValueError(
                 "penetration.share must be 1, and detectors left out, on a road of measured "
                 "fields, which have no vehicles"
             )
-
-    def _check_settings(self) -> None:
-        settings, expected = self.estimator_settings, settings_type(self.estimator)
-        if isinstance(settings, str):
-            load_settings(settings)
-        elif settings is not None and not isinstance(settings, expected):
-            raise ValueError(
-                f"estimator_settings must be a mapping, the name of a set, or a "
-                f"{expected.__name__}, got {settings!r}"
-            )
-        check_demand(self.estimator, self.settings())
 
     @cached_property
     def queries(self) -> QueryOptions:
@@ -269,12 +264,12 @@ class EnvConfig:
         return tuned_settings(self.estimator, self.arz_parameters, self.privacy.preset, road)
 
     def settings(self) -> Any:
-        """Return the estimator's settings in force, of its settings' type."""
-        name = self.settings_name
-        if name is not None:
-            return load_settings(name)
-        given = self.estimator_settings
-        return settings_type(self.estimator)() if given is None else given
+        """Return the estimator's settings in force, of its settings' type.
+
+        Raises:
+            ValueError: They are no settings of this estimator.
+        """
+        return checked_settings(self.estimator, self.settings_name or self.estimator_settings)
 
 
 PRESETS = {
@@ -298,13 +293,6 @@ PRESETS = {
     "short-highway": EnvConfig(corridor=CORRIDORS["short-highway"], bandwidth=2),
 }
 """Configurations by name."""
-
-
-GEOMETRY = (
-    "n_mainline", "on_ramps", "off_ramps", "exit_shares", "lanes", "ramp_lanes", "segment_length",
-    "speed_limit", "ramp_segments", "ramp_length", "ramp_speed_limit",
-)  # fmt: skip
-"""Fields of a corridor by which it is another road: what was fitted to one may not suit another."""
 
 
 class UnknownKeywordError(TypeError, ValueError):
@@ -343,24 +331,30 @@ def resolve(preset: str, overrides: Mapping[str, Any]) -> EnvConfig:
             values that were measured or tuned for others, or assumed, are used.
     """
     require_name("preset", preset, PRESETS)
-    road = _road_file(overrides)
-    base, values = PRESETS[preset], {**road.environment, **overrides} if road else dict(overrides)
+    base, corridor = PRESETS[preset], overrides.get("corridor")
+    road = read_road(corridor) if is_road_file(corridor) else None
+    values = {**road.environment, **overrides, "corridor": road.corridor} if road else {**overrides}
     _check_keywords(values)
-    _read_files(values)
-    if road and _is_tuned_for_another(road, overrides, values.get("estimator", base.estimator)):
+    estimator = values.get("estimator", base.estimator)
+    if road and "estimator_settings" not in overrides and _is_tuned_for_another(values, estimator):
         del values["estimator_settings"]
-    overrides = dict(values)
-    if road:
-        values["corridor"] = road.corridor
-    corridor = _corridor(base.corridor, values)
+    _read_files(values)
+    given = {**values, "corridor": corridor} if road else dict(values)
+    values["corridor"] = corridor = _corridor(base.corridor, values)
     values["privacy"] = _privacy(base.privacy, values)
-    if "penetration" in values and not isinstance(values["penetration"], Mapping | Penetration):
+    if not isinstance(values.get("penetration", {}), Mapping | Penetration):
         values["penetration"] = {"share": values["penetration"]}
     _read_seeds(values, corridor)
     if isinstance(values.get("observation"), str):
         values["observation"] = (values["observation"],)
-    config = _config(base, values, corridor)
-    inherited = _inherited(corridor, config, overrides, road.assumed if road else ())
+    settings = values.get("estimator_settings")
+    changes = values.pop("estimator_settings") if isinstance(settings, Mapping) else None
+    config = from_mapping(EnvConfig, values, "", base)
+    if changes is not None:
+        expected = settings_type(config.estimator)
+        settings = from_mapping(expected, changes, "estimator_settings", config.settings())
+        config = replace(config, estimator_settings=settings)
+    inherited = _inherited(corridor, config, given, road.assumed if road else ())
     if inherited and not config.inherited:
         config = replace(config, inherited=inherited)
         warnings.warn(
@@ -372,55 +366,27 @@ def resolve(preset: str, overrides: Mapping[str, Any]) -> EnvConfig:
     return config
 
 
-def _config(base: EnvConfig, values: dict[str, Any], corridor: Corridor) -> EnvConfig:
-    """Return the configuration; a mapping of settings changes those that are otherwise in force."""
-    settings = values.get("estimator_settings")
-    if not isinstance(settings, Mapping):
-        return from_mapping(EnvConfig, {**values, "corridor": corridor}, "", base)
-    del values["estimator_settings"]
-    config = from_mapping(EnvConfig, {**values, "corridor": corridor}, "", base)
-    expected = settings_type(config.estimator)
-    given = from_mapping(expected, settings, "estimator_settings", config.settings())
-    return replace(config, estimator_settings=given)
-
-
 def _read_seeds(values: dict[str, Any], corridor: Corridor) -> None:
     """Replace a range of traffic seeds by these, and put recorded ones where none are given."""
     if "traffic_seeds" not in values and corridor.recordings is not None:
-        recorded = corridor.recordings.seeds
+        recorded = recorded_seeds(corridor.recordings)
         values["traffic_seeds"] = tuple(seed for seed in recorded if seed in TRAINING_SEEDS)
     if isinstance(values.get("traffic_seeds"), str):
         values["traffic_seeds"] = parse_seeds(values["traffic_seeds"], "traffic_seeds")
 
 
-def _road_file(overrides: Mapping[str, Any]) -> RoadFile | None:
-    """Return the road file that the keyword ``corridor`` names; None for another corridor."""
-    corridor = overrides.get("corridor")
-    return read_road(corridor) if is_road_file(corridor) else None
-
-
 def _read_files(values: dict[str, Any]) -> None:
-    """Replace names of JSON files of parameters and estimator settings by their content.
-
-    Raises:
-        ValueError: A file cannot be read, or has another format.
-    """
-    readers = {"parameters": read_parameters, "estimator_settings": read_settings}
-    for key, read in readers.items():
+    """Replace names of JSON files of parameters and estimator settings by their content."""
+    for key, read in (("parameters", read_parameters), ("estimator_settings", read_settings)):
         value = values.get(key)
         if isinstance(value, str) and value.endswith(".json"):
-            try:
-                values[key] = read(value)
-            except OSError as problem:
-                raise ValueError(f"{key}: {value} cannot be read: {problem.strerror}") from problem
+            values[key] = read(value)
 
 
-def _is_tuned_for_another(road: RoadFile, overrides: Mapping[str, Any], estimator: Any) -> bool:
-    """Return whether settings come from a road's table and were tuned for another estimator."""
-    settings = road.environment.get("estimator_settings")
-    if "estimator_settings" in overrides or not str(settings).endswith(".json"):
-        return False
-    return tuned_estimator(str(settings)) != ESTIMATORS.name_of(estimator)
+def _is_tuned_for_another(values: Mapping[str, Any], estimator: Any) -> bool:
+    """Return whether settings are a file of those that were tuned for another estimator."""
+    path = str(values.get("estimator_settings"))
+    return path.endswith(".json") and tuned_estimator(path) != ESTIMATORS.name_of(estimator)
 
 
 def parse_seeds(text: str, path: str = "seeds") -> tuple[int, ...]:
@@ -455,58 +421,36 @@ def _check_keywords(values: Mapping[str, Any]) -> None:
 
 def _corridor(base: Corridor, values: dict[str, Any]) -> Corridor:
     """Take the keywords about the corridor out of ``values`` and apply them."""
-    corridor = values.pop("corridor", {})
-    if isinstance(corridor, Mapping):
-        base = from_mapping(Corridor, _with_scales(base, corridor), "corridor", base)
-    else:
-        base = find_corridor(corridor)
-    for key, names in (
-        ("demand", ("preset", "random")),
-        ("incident", ("preset", "random", "none")),
-    ):
-        if key not in values:
-            continue
-        value = values.pop(key)
-        if isinstance(value, str):
-            require_name(key, value, names)
-            source = randomised(base) if value == "random" else base
-            value = None if value == "none" else getattr(source, key)
-        base = from_mapping(Corridor, {key: value}, "corridor", base)
-    return base
-
-
-def _with_scales(base: Corridor, fields: Mapping[str, Any]) -> dict[str, Any]:
-    """Return fields of a corridor with scales that follow a change of lanes and speed limit."""
-    scales = {"density_scale": "lanes", "speed_scale": "speed_limit"}
-    changed = {scale for scale, cause in scales.items() if cause in fields and scale not in fields}
-    if not changed:
-        return dict(fields)
-    road = from_mapping(Corridor, fields, "corridor", base)
-    factors = {
-        "density_scale": road.most_lanes / base.most_lanes,
-        "speed_scale": road.largest_speed_limit / base.largest_speed_limit,
-    }
-    return {**fields, **{scale: getattr(base, scale) * factors[scale] for scale in changed}}
+    given = values.pop("corridor", {})
+    corridor = base.replaced(given) if isinstance(given, Mapping) else find_corridor(given)
+    for key, names in (("demand", ()), ("incident", ("none",))):
+        if key in values:
+            value = values.pop(key)
+            if isinstance(value, str):
+                require_name(key, value, ("preset", "random", *names))
+                source = randomised(corridor) if value == "random" else corridor
+                value = None if value == "none" else getattr(source, key)
+            corridor = corridor.replaced({key: value})
+    return corridor
 
 
 def _inherited(
-    corridor: Corridor, config: EnvConfig, overrides: Mapping[str, Any], assumed: tuple[str, ...]
+    corridor: Corridor, config: EnvConfig, given: Mapping[str, Any], assumed: tuple[str, ...]
 ) -> tuple[str, ...]:
     """Return the keywords whose values are of another road or parameter set, or assumed."""
-    geometry = [getattr(corridor, name) for name in GEOMETRY]
     shipped = [preset.corridor for preset in PRESETS.values()]
-    is_other_road = all(geometry != [getattr(road, name) for name in GEOMETRY] for road in shipped)
+    is_other_road = not any(corridor.has_geometry_of(road) for road in shipped)
     found = []
     if is_other_road:
         found = [f"corridor.{name}" for name in assumed]
-        given = overrides.get("corridor")
-        if isinstance(given, Mapping) and "average_dwell" not in given:
+        fields = given.get("corridor")
+        if isinstance(fields, Mapping) and "average_dwell" not in fields:
             found.append("corridor.average_dwell")
-        if isinstance(config.parameters, str) and "parameters" not in overrides:
+        if isinstance(config.parameters, str) and "parameters" not in given:
             found.append("parameters")
     parameters = config.arz_parameters
     is_other = is_other_road or tuned_with(parameters) != parameters.name
-    if is_other and config.settings_name is not None and "estimator_settings" not in overrides:
+    if is_other and config.settings_name is not None and "estimator_settings" not in given:
         found.append("estimator_settings")
     return tuple(found)
 
@@ -523,12 +467,12 @@ def _privacy(base: PrivacySettings, values: dict[str, Any]) -> PrivacySettings:
         given = {"preset": given}
     elif not isinstance(given, Mapping):
         raise ValueError(
-            f"privacy must be the name of a release model, a class or a mapping, got {given!r}"
+            f"privacy must be the name of a release model, a class or a mapping, got {shown(given)}"
         )
     given = dict(given)
     preset = given.pop("preset", base.preset)
     if not isinstance(preset, str | type):
-        raise ValueError(f"privacy.preset must be a name or a class, got {preset!r}")
+        raise ValueError(f"privacy.preset must be a name or a class, got {shown(preset)}")
     if isinstance(preset, str):
         preset = RELEASE_MODELS.name_of(preset)
     if preset != base.preset:

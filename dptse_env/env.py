@@ -9,106 +9,174 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dptse_env.config import resolve
-from dptse_env.estimators import check_settings
-from dptse_env.parts import make_interface, make_model, make_parts, warn_where_void
-from dptse_env.process import QueryProcess
-from dptse_env.rendering import History, Picture, Window
-from dptse_env.traffic import Records, open_library
+from dptse_env.env_base import QueryEnvBase
+from dptse_env.parts import warn_where_void
+from dptse_env.rendering import Drawing, Window
+from dptse_env.traffic import Records
 from dptse_env.utils.arrays import Observation
 from dptse_env.utils.fields import integer
 
 _ONLY = np.zeros(1, dtype=np.int64)
 
 
-class SensorQueryEnv(gym.Env[Observation, Any]):
+class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
     """Choose which segments' connected vehicles to query, second by second.
 
-    One step is one second of traffic. A policy picks at most ``bandwidth`` of the n mainline
-    segments, a private mechanism answers for them and for the fixed sensors, an estimator updates
-    its estimate of all S segments (mainline, on-ramps, off-ramps), and the reward is minus the
-    error of that estimate. Queries never change the traffic: an episode replays a record of SUMO,
-    made once for each traffic seed and cached on disk.
+    Traffic flows along a motorway of n mainline segments with on- and off-ramps, S segments in all.
+    A step is one second. A policy picks a few mainline segments; the connected vehicles there are
+    queried, and a private release model answers for them and for the F fixed sensors with noisy
+    numbers. An estimator, by default an extended Kalman filter on a macroscopic traffic model,
+    updates its estimate of density and speed on all segments. The aim is to keep the error of that
+    estimate small with few queries. Queries never change the traffic: an episode replays a record
+    of SUMO, made once for each traffic seed and cached on disk.
 
-    **Queries**: by default an option is a mainline segment, and there are G = n of them. With
-    ``query_spans`` an option is the average over one or several neighbouring segments, with
-    ``price_levels`` one of several prices for it; ``interface.queries`` is the table of all G. An
-    option costs as much of the ``bandwidth`` as it has segments, or one
-    (``bandwidth_unit="sums"``). Options that overlap may be queried together; each answer has noise
-    of its own.
+    **Queries**: by default an option is one mainline segment, so that there are G = n options, and
+    a step may query as many as the ``bandwidth``. With ``query_spans`` an option is the average
+    over one or several neighbouring segments, with ``price_levels`` one of several prices for it;
+    ``interface.queries`` is the table of all G. An option costs as much of the ``bandwidth`` as it
+    has segments, or one (``bandwidth_unit="sums"``). Options that overlap may be queried together;
+    each answer has noise of its own.
 
     **Observation**: a flat float32 ``Box`` of named blocks, in this order; ``interface.observations
-    .slices`` has the place of each. F is the number of fixed sensors, and the density and speed
-    scales are constants of the corridor.
+    .slices`` has the place of each. The scales are constants of the corridor: of densities
+    ``corridor.density_scale`` (111 veh/km for each lane on the roads that ship), of speeds
+    ``corridor.speed_scale`` (their speed limit, 102 km/h), of flows the product of both. Values
+    beyond the bounds are clipped. Nothing in it shows the true traffic or the time.
 
-    | block                    | size | value                                       | bounds    |
-    | :--                      | :--  | :--                                         | :--       |
-    | density                  | S    | estimated density / density scale           | [0, 4]    |
-    | speed                    | S    | estimated speed / speed scale               | [0, 4]    |
-    | density_log_std          | S    | log of (standard deviation / scale)         | [-10, 5]  |
-    | speed_log_std            | S    | the same for the speed                      | [-10, 5]  |
-    | released_density         | G    | last released density / scale               | [-5, 5]   |
-    | released_speed           | G    | last released speed / scale (or flow)       | [-5, 5]   |
-    | density_innovation       | G    | normalised innovation, 0 if not observed    | [-10, 10] |
-    | speed_innovation         | G    | the same for the second released quantity   | [-10, 10] |
-    | age                      | n    | seconds since last observed / 60, at most 1 | [0, 1]    |
-    | queried                  | G    | the last query                              | {0, 1}    |
-    | fixed_density_innovation | F    | normalised innovation of the fixed sensors  | [-10, 10] |
-    | fixed_speed_innovation   | F    | the same for the second released quantity   | [-10, 10] |
-    | bandwidth                | 1    | queries a step / n                          | [0, 1]    |
-    | epsilon                  | 1    | log10 of the privacy parameter              | [-6, 6]   |
-    | picked                   | G    | picks so far (``sequential`` only)          | {0, 1}    |
-    | last_price               | G    | log10 of last price / 2; 0 before the first | [-5, 5]   |
-    | tracer                   | n    | mean charge of a vehicle over its budget    | [0, 1]    |
+    | block                    | size | value                                          | bounds    |
+    | :--                      | :--  | :--                                            | :--       |
+    | density                  | S    | estimated density [scale]                      | [0, 4]    |
+    | speed                    | S    | estimated speed [scale]                        | [0, 4]    |
+    | density_log_std          | S    | ln of the density's standard deviation [scale] | [-10, 5]  |
+    | speed_log_std            | S    | ln of the speed's standard deviation [scale]   | [-10, 5]  |
+    | released_density         | G    | last released density [scale], 0 before        | [-5, 5]   |
+    | released_speed           | G    | last released speed [scale], 0 before          | [-5, 5]   |
+    | released_flow            | G    | last released centred flow [scale], 0 before   | [-5, 5]   |
+    | density_innovation       | G    | innovation of the density [its deviation]      | [-10, 10] |
+    | speed_innovation         | G    | innovation of the speed or flow                | [-10, 10] |
+    | age                      | n    | time since last observed [min], at most 1      | [0, 1]    |
+    | queried                  | G    | whether the last step queried it               | [0, 1]    |
+    | fixed_density_innovation | F    | as density_innovation, of the fixed sensors    | [-10, 10] |
+    | fixed_speed_innovation   | F    | as speed_innovation, of the fixed sensors      | [-10, 10] |
+    | bandwidth                | 1    | ``bandwidth`` / n                              | [0, 1]    |
+    | epsilon                  | 1    | log10 of the privacy parameter                 | [-6, 6]   |
+    | picked                   | G    | whether it is picked for the step to come      | [0, 1]    |
+    | last_price               | G    | log10(price of the last query) / 2, 0 before   | [-5, 5]   |
+    | tracer                   | n    | mean charge of a vehicle there [its budget]    | [0, 1]    |
 
-    ``released_flow`` takes the place of ``released_speed`` where flows are released; ``last_price``
-    and ``tracer`` are there under release models with prices. Values beyond the bounds are clipped.
-    ``observation`` chooses other blocks.
+    Either ``released_speed`` or ``released_flow`` is there, whichever the release model releases,
+    ``picked`` under ``action="sequential"``, ``last_price`` and ``tracer`` under release models
+    with prices. Innovations are 0 where nothing was observed. ``observation`` chooses other blocks.
 
     **Action**: ``action`` chooses the encoding; a sampled action never raises. B is the largest
-    number of queries that the bandwidth pays for; under ``sequential`` an action picks one option,
-    until the bandwidth pays for no other.
+    number of queries that the bandwidth pays for.
 
-    | ``action``     | space                      | meaning                                   |
-    | :--            | :--                        | :--                                       |
-    | ``mask``       | ``MultiBinary(G)``         | one flag per option (default)             |
-    | ``scores``     | ``Box(-1, 1, (G,))``       | the options of highest score              |
-    | ``slots``      | ``MultiDiscrete([G] * B)`` | one option for each of the B queries      |
-    | ``sequential`` | ``Discrete(G)``            | one option per action, see `action_masks` |
+    | ``action``     | space                      | meaning                                        |
+    | :--            | :--                        | :--                                            |
+    | ``mask``       | ``MultiBinary(G)``         | a flag per option; too many are cut in turn    |
+    | ``scores``     | ``Box(-1, 1, (G,))``       | the highest scores, as far as bandwidth goes   |
+    | ``slots``      | ``MultiDiscrete([G] * B)`` | one option for each of the B queries           |
+    | ``sequential`` | ``Discrete(G)``            | one option per action, see `action_masks`      |
 
-    **Reward**: minus the root mean squared error over the mainline, density and speed each in
-    units of its scale; ``reward`` chooses one of the two or another reward.
+    Under ``sequential`` the traffic stands still, and the reward is 0, until the bandwidth pays for
+    no other option.
 
-    **Episode**: is truncated after ``horizon`` seconds and never terminates.
+    **Reward**: minus the root mean squared error over the mainline, at most 0: of densities and
+    speeds together, each in units of its scale (``joint``), or of one of them (``density``,
+    ``speed``), or a function of your own. A segment without a vehicle has no speed to err in.
 
-    **Info**: numbers are floats and have the same keys at the reset and at every step.
+    **Start of an episode**: a traffic seed is drawn from ``traffic_seeds``, and with
+    ``random_start`` the first second. The estimator starts from the traffic of the nominal demand.
+    The options of `reset` fix ``traffic_seed`` (one of ``traffic_seeds``) and ``start`` [s].
 
-    | key              | value                                                                     |
-    | :--              | :--                                                                       |
-    | ``rmse_density`` | error of the estimated mainline densities [veh/km]; true traffic          |
-    | ``rmse_speed``   | error of the speeds of occupied segments [km/h]; true traffic             |
-    | ``n_occupied``   | mainline segments with a vehicle; true traffic                            |
-    | ``n_dropped``    | requested options that were cut, repeated or replaced                     |
-    | ``queried``      | the options that were queried, flags of shape (G,)                        |
-    | ``diverged``     | 1 if the estimator diverged in this second and was started anew           |
-    | ``fallback``     | 1 if its update had no solution in this second, so that it only predicted |
-    | ``mu``           | privacy loss of a vehicle so far, at most: Gaussian DP parameter          |
-    | ``epsilon``      | the same as epsilon at the configured delta                               |
-    | ``truth``        | true traffic, with ``truth_in_info=True`` only                            |
-    | ``privacy``      | at the reset only: the guarantee and its account (`privacy`)              |
-    | ``inherited``    | at the reset only: keywords whose values belong to another road           |
+    **End of an episode**: truncated after ``horizon`` seconds, by default with the record; never
+    terminated.
+
+    **Info**: the same keys at the reset and at every step; numbers are floats.
+
+    | key                 | value                                                                  |
+    | :--                 | :--                                                                    |
+    | ``rmse_density``    | error of the estimated mainline densities [veh/km]; true traffic       |
+    | ``rmse_speed``      | error of the speeds of occupied segments [km/h]; true traffic          |
+    | ``n_occupied``      | mainline segments with a vehicle; true traffic                         |
+    | ``n_dropped``       | requested options that were cut, repeated or replaced                  |
+    | ``queried``         | the options that were queried, flags of shape (G,)                     |
+    | ``diverged``        | 1 if the estimator diverged in this second and was started anew        |
+    | ``fallback``        | 1 if its update had no solution in this second: it only predicted      |
+    | ``mu``              | privacy loss of a vehicle so far, at most: Gaussian DP parameter       |
+    | ``epsilon``         | the same as epsilon at the configured delta                            |
+    | ``centre_fallback`` | under ``paced``: 1 if no prediction was finite to centre flows on      |
+    | ``truth``           | true traffic, with ``truth_in_info=True`` only                         |
+    | ``privacy``         | at the reset only: the guarantee and its account, see `privacy`        |
+    | ``inherited``       | at the reset only: keywords whose values belong to another road        |
 
     Values marked "true traffic" serve training and evaluation, as the reward does. They are not
-    covered by the guarantee, and no policy may act on them. The others are public.
+    covered by the guarantee, and no policy may act on them. The others are public. A guarantee is
+    about complete episodes: it is that of the last ``mu`` and ``epsilon``.
 
-    **Reset options**: ``traffic_seed`` (one of ``traffic_seeds``) and ``start`` (first second of
-    the record).
+    **Arguments** of ``gym.make``, with the defaults of ``PaperHighway-v0``. All are plain JSON, but
+    for parts of your own (a class or ``"package.module:Class"``). ``docs/configuration.md`` has
+    every field of those that take a mapping.
 
-    **Rendering**: ``render_mode="rgb_array"`` draws true density, estimate, queries and error over
-    space and time; ``"human"`` shows the same in a window at every reset and step (extra
-    ``video``). The picture shows true traffic.
+    | argument             | default         | meaning                                             |
+    | :--                  | :--             | :--                                                 |
+    | `corridor`           | "paper-highway" | the road: a name, a mapping or a road file          |
+    | `estimator`          | "ekf"           | or `ukf`, `enkf`, `mhe`, `recurrent`, ...           |
+    | `backend`            | "compiled"      | or `reference`: textbook versions of the filters    |
+    | `parameters`         | "paper"         | of the traffic model: a name, a mapping, a file     |
+    | `estimator_settings` | None            | tuning of the estimator; None for what ships        |
+    | `bandwidth`          | 5               | largest cost of the queries of a step               |
+    | `query_spans`        | (1,)            | numbers of neighbouring segments of an option       |
+    | `price_levels`       | (1.0,)          | factors on the price of an option                   |
+    | `bandwidth_unit`     | "segments"      | or `sums`: what an option costs                     |
+    | `action`             | "mask"          | encoding of actions, see above                      |
+    | `observation`        | ("default",)    | blocks of the observation, see above                |
+    | `privacy`            | "paper"         | or `corrected`, `capped`, `paced`, a mapping        |
+    | `penetration`        | 1.0             | share of connected vehicles, or a mapping           |
+    | `detectors`          | {}              | errors of the fixed sensors, a mapping              |
+    | `fusion`             | {}              | how queries and sensors are put together            |
+    | `reward`             | "joint"         | see above                                           |
+    | `horizon`            | None            | length of an episode [s]; None for the record's     |
+    | `random_start`       | False           | whether episodes start anywhere in their record     |
+    | `traffic_seeds`      | "0:64"          | traffic to draw from                                |
+    | `truth_in_info`      | False           | whether `info` shows the true traffic               |
+    | `epsilon`            | 1.0             | short for `privacy`'s                               |
+    | `delta`              | 0.05            | short for `privacy`'s                               |
+    | `incident`           | "preset"        | short for `corridor`'s; `random`, `none`, a mapping |
+    | `demand`             | "preset"        | short for `corridor`'s; `random`, a mapping         |
+    | `render_mode`        | None            | or `rgb_array`, `human` (extra `video`)             |
+    | `render_every`       | 1               | seconds between two drawings                        |
+    | `records`            | None            | folder of the record cache; None for the user's     |
+
+    **Ids**, all in the namespace ``dptse``:
+
+    | id                  | n   | S   | record | release, epsilon | bandwidth | demand, incident |
+    | :--                 | :-- | :-- | :--    | :--              | :--       | :--              |
+    | `PaperHighway-v0`   | 15  | 19  | 700 s  | paper, 1         | 5         | fixed            |
+    | `PrivateHighway-v0` | 15  | 19  | 700 s  | capped, 5        | 5         | random           |
+    | `PrivateHighway-v1` | 15  | 19  | 700 s  | paced, 5         | 5         | random           |
+    | `LongHighway-v0`    | 120 | 128 | 1200 s | paced, 5         | 8         | random           |
+    | `ShortHighway-v0`   | 6   | 8   | 240 s  | paper, 1         | 2         | fixed            |
+
+    **Rendering**: true density, estimate, queries and error over space and time, as a picture
+    (``rgb_array``) or in a window (``human``). It shows true traffic.
+
+    Examples:
+        >>> import gymnasium as gym
+        >>> env = gym.make("dptse_env:dptse/ShortHighway-v0", bandwidth=3, horizon=60)
+        >>> observation, info = env.reset(seed=0)
+        >>> env.action_space, observation.shape, info["privacy"]["guarantee"]
+        (MultiBinary(6), (74,), 'none')
+        >>> total, truncated = 0.0, False
+        >>> while not truncated:
+        ...     action = env.action_space.sample()
+        ...     observation, reward, terminated, truncated, info = env.step(action)
+        ...     total += reward
+        >>> terminated, int(info["queried"].sum()) <= 3, total < 0.0
+        (False, True, True)
     """
 
-    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 30}  # noqa: RUF012 (Gymnasium's own)
+    metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 30}  # noqa: RUF012 (Gymnasium's own)
 
     def __init__(
         self,
@@ -139,37 +207,15 @@ class SensorQueryEnv(gym.Env[Observation, Any]):
             UserWarning: A release model with a guarantee is configured, and other keywords void
                 it, or values of another road are used on this one.
         """
-        if render_mode not in (None, *self.metadata["render_modes"]):
-            raise ValueError(
-                f"render_mode must be None, 'rgb_array' or 'human', got {render_mode!r}"
-            )
-        self.render_mode = render_mode
-        self._window: Window | None = None
-        if render_mode == "human":
-            self._window = Window("dptse-env", self.metadata["render_fps"])
-        self.render_every = integer("render_every", render_every, 1)
-        self.config = config = resolve(preset, overrides)
-        warn_where_void(config)
-        self.interface = make_interface(config)
-        self._model = make_model(config)
-        check_settings(config.estimator, self._model, config.settings())
+        super().__init__(resolve(preset, overrides), 1, records, render_mode)
+        warn_where_void(self.config)
         self.action_space = self.interface.actions.space
         self.observation_space = self.interface.observations.space
-        self._library = open_library(records)
-        self._process: QueryProcess | None = None
-        self.history: History | None = None
-        self._picture: Picture | None = None
-        self._frame: tuple[int, NDArray[np.uint8]] | None = None
-
-    @property
-    def process(self) -> QueryProcess:
-        """The process behind the environment, assembled at the first use."""
-        if self._process is None:
-            parts = make_parts(
-                self.config, 1, self._library, interface=self.interface, model=self._model
-            )
-            self._process = QueryProcess(parts)
-        return self._process
+        self.render_every = integer("render_every", render_every, 1)
+        if render_mode is not None:
+            is_shown = render_mode == "human"
+            window = Window("dptse-env", self.metadata["render_fps"]) if is_shown else None
+            self.drawing = Drawing(every=self.render_every, window=window)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -184,16 +230,11 @@ class SensorQueryEnv(gym.Env[Observation, Any]):
             ValueError: An option is unknown or out of range.
             gymnasium.error.Error: ``render_mode`` is ``"human"``, and there is no display.
         """
-        super().reset(seed=seed)
+        gym.Env.reset(self, seed=seed)
         outcome = self.process.reset(_ONLY, [self.np_random], options)
-        if self.render_mode is not None:
-            self.history, self._frame = History.from_process(self.process), None
-        if self._window is not None:
-            self._window.reopen()
-            self._window.show(self._drawn())
-        info = self.process.info(0)
-        info |= self.process.reset_info()
-        return outcome.observation[0], info
+        if self.drawing is not None:
+            self.drawing.begin(self.process)
+        return outcome.observation[0], {**self.process.info(0), **self.process.reset_info()}
 
     def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Query, estimate and score one second.
@@ -206,17 +247,10 @@ class SensorQueryEnv(gym.Env[Observation, Any]):
         if process.over[0]:
             raise gym.error.ResetNeeded("the episode is over: call reset() before step()")
         outcome = process.step(_ONLY, np.asarray(action)[None])
-        if self.history is not None:
-            self.history.append(process)
-        if self._window is not None:
-            self._window.show(self._drawn())
-        return (
-            outcome.observation[0],
-            float(outcome.reward[0]),
-            False,
-            bool(outcome.truncated[0]),
-            process.info(0),
-        )
+        if self.drawing is not None:
+            self.drawing.follow(process)
+        reward, truncated = outcome.reward.item(), outcome.truncated.item()
+        return outcome.observation[0], reward, False, truncated, process.info(0)
 
     def action_masks(self) -> NDArray[np.bool_]:
         """Return flags (G,) of the options that may be picked next, for ``action="sequential"``.
@@ -228,13 +262,8 @@ class SensorQueryEnv(gym.Env[Observation, Any]):
         self.interface.require_sequential()
         if self.process.over[0]:
             raise gym.error.ResetNeeded("no episode is running: call reset() first")
-        picked = self.process.pending.picked[:1]
-        free: NDArray[np.bool_] = self.interface.actions.available(picked)[0]
+        free: NDArray[np.bool_] = self._available()[0]
         return free
-
-    def privacy(self) -> dict[str, Any]:
-        """Return the guarantee of an episode, or what voids it, and the account behind it."""
-        return self.process.privacy()
 
     def render(self) -> NDArray[np.uint8] | None:
         """Return the episode so far as a picture over space and time, shape (height, width, 3).
@@ -244,31 +273,10 @@ class SensorQueryEnv(gym.Env[Observation, Any]):
         Raises:
             gymnasium.error.ResetNeeded: No episode has begun.
         """
-        if self.render_mode is None:
-            gym.logger.warn(
-                "render() needs gym.make(..., render_mode='rgb_array'); nothing was drawn"
-            )
-            return None
-        if self.history is None:
-            raise gym.error.ResetNeeded("nothing to render: call reset() first")
-        return None if self._window is not None else self._drawn().copy()
-
-    def _drawn(self) -> NDArray[np.uint8]:
-        """Return the picture of the present second, drawn anew if it is due."""
-        assert self.history is not None
-        second = int(self.process.elapsed[0])
-        if self._frame is None or self._is_due(second - self._frame[0]):
-            if self._picture is None:
-                self._picture = Picture(self.history)
-            self._frame = second, self._picture.draw(self.history)
-        return self._frame[1]
+        picture = self._drawn()
+        return None if self.render_mode == "human" else picture
 
     def close(self) -> None:
         """Close the window, if there is one."""
-        if self._window is not None:
-            self._window.close()
-        super().close()
-
-    def _is_due(self, since: int) -> bool:
-        """Return whether a picture that is ``since`` seconds old is to be drawn again."""
-        return since >= self.render_every or (since > 0 and bool(self.process.over[0]))
+        if self.drawing is not None and self.drawing.window is not None:
+            self.drawing.window.close()

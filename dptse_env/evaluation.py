@@ -17,6 +17,7 @@ from gymnasium.vector import AutoresetMode
 from dptse_env.env import SensorQueryEnv
 from dptse_env.process import QueryProcess
 from dptse_env.schedules import make_schedule
+from dptse_env.utils.fields import require
 from dptse_env.vector_env import SensorQueryVectorEnv
 
 WARM_UP = 60
@@ -96,11 +97,9 @@ def evaluate(
     Raises:
         ValueError: There is no seed or one that the environment does not have, the schedule is
             unknown, episodes are not longer than the warm-up, or a vector environment resets
-            episodes in the step in which they end.
+            episodes in the step in which they end. Nothing was played then.
         TypeError: The environment is none of this package.
     """
-    if not seeds:
-        raise ValueError("seeds must be one or more traffic seeds, got none")
     bare = env.unwrapped
     batch: _Single | _Batch
     if isinstance(bare, SensorQueryVectorEnv):
@@ -109,6 +108,12 @@ def evaluate(
         batch = _Single(env, bare)
     else:
         raise TypeError(f"env must be an environment of dptse_env, got {type(bare).__name__}")
+    seeds, config = [int(seed) for seed in seeds], bare.config
+    require(len(seeds) > 0, "seeds", "one or more traffic seeds", seeds)
+    known = set(config.traffic_seeds)
+    unknown = [seed for seed in seeds if seed not in known]
+    require(not unknown, "seeds", "among the environment's traffic_seeds", unknown)
+    require(config.horizon_steps > warm_up, "warm_up", "shorter than an episode", warm_up)
     player = make_schedule(policy, bare)
     rows: list[Row] = []
     for first in range(0, len(seeds), batch.size):
@@ -131,8 +136,9 @@ def require_in_step(env: SensorQueryVectorEnv) -> None:
     Raises:
         ValueError: The decisions of a second may take different numbers of actions.
     """
-    actions = env.interface.actions
-    if env.num_envs > 1 and actions.picks_one_by_one and actions.costs is not None:
+    interface = env.interface
+    one_by_one = interface.actions.picks_one_by_one
+    if env.num_envs > 1 and one_by_one and interface.queries.costs_differ:
         raise ValueError(
             f"action {env.config.action!r} takes different numbers of actions for a second where "
             f"queries cost different amounts ({env.config.queries}): episodes cannot be played as "
@@ -225,8 +231,6 @@ def _pool(
     rows = []
     for k, traffic_seed in enumerate(traffic_seeds):
         counts = tables["time"][:, k] > warm_up
-        if not counts.any():
-            raise ValueError(f"the episode must be longer than the warm-up of {warm_up} s")
         series = {key: table[counts, k] for key, table in tables.items()}
         n_occupied = series["n_occupied"]
         squares = n_occupied * series["rmse_speed"] ** 2

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import warnings
 from dataclasses import dataclass
 from typing import Any
@@ -106,46 +105,16 @@ def make_interface(config: EnvConfig) -> QueryInterface:
     Raises:
         ValueError: A part of another package is not what is expected.
     """
-    actions = _make_actions(config)
+    encoding, queries = ACTION_ENCODINGS.find(config.action), config.queries
+    actions = encoding(queries.n_options, queries.bandwidth, queries.cost)
     return QueryInterface(
-        queries=config.queries,
+        queries=queries,
         actions=actions,
         observations=ObservationEncoding(
             make_task(config), config.observation, picks_one_by_one=actions.actions_per_step > 1
         ),
         reward=make_reward(config.reward),
     )
-
-
-def _make_actions(config: EnvConfig) -> ActionEncoding:
-    """Make the action encoding; it learns of costs where these differ, and else of their number.
-
-    Raises:
-        ValueError: It is no encoding, or costs differ and it cannot be made of them.
-    """
-    encoding, queries = ACTION_ENCODINGS.find(config.action), config.queries
-    if not queries.costs_differ:
-        actions = encoding(queries.n_options, queries.most_queries)
-    elif _takes(encoding, "costs"):
-        actions = encoding(queries.n_options, config.bandwidth, costs=queries.cost)
-    else:
-        raise ValueError(
-            f"action {name_of_class(encoding)} must take the argument costs where queries cost "
-            f"different amounts of the bandwidth, as they do with query_spans "
-            f"{config.query_spans} and bandwidth_unit {config.bandwidth_unit!r}"
-        )
-    if not isinstance(actions, ActionEncoding):
-        raise ValueError(
-            f"action {name_of_class(encoding)} must be a subclass of "
-            "dptse_env.spaces.actions.ActionEncoding"
-        )
-    return actions
-
-
-def _takes(function: Any, name: str) -> bool:
-    """Return whether a function or class can be called with an argument of a name."""
-    parameters = inspect.signature(function).parameters
-    return name in parameters or any(p.kind is p.VAR_KEYWORD for p in parameters.values())
 
 
 def flow_centre(config: EnvConfig) -> float | None:

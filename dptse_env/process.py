@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from dptse_env.spaces.actions import PendingPicks, check_decision
 from dptse_env.spaces.observations import AGE_CAP, PublicState
 from dptse_env.spaces.rewards import EstimationError, ScoredSecond, estimation_error
 from dptse_env.utils.arrays import Action, BoolArray, FloatArray, IntArray, Observation
+from dptse_env.utils.fields import shown
 from dptse_env.utils.registry import is_foreign
 from dptse_env.utils.threads import EpisodeThreads
 from dptse_env.utils.vector_info import Rows, row_of
@@ -173,16 +174,18 @@ class QueryProcess:
         decision = encoding.decode(episodes, actions, self.pending)
         if self._checks_decisions:
             check_decision(encoding, decision, len(episodes))
-        ready, n_ready = decision.complete, np.count_nonzero(decision.complete)
         self.n_dropped[episodes] = decision.n_dropped
+        ready, n_ready = decision.complete, np.count_nonzero(decision.complete)
+        if n_ready == len(episodes):
+            self._advance(episodes, decision.queried)
+            estimate = self._estimated(episodes)
+            return self._outcome(episodes, estimate, self._score(episodes, estimate))
         reward = np.zeros(len(episodes))
-        if n_ready == 0:
-            return self._outcome(episodes, self.estimate.at(episodes), reward)
-        self._advance(episodes[ready], decision.queried[ready])
-        estimate = self._estimated(episodes)
-        acted = estimate if n_ready == len(episodes) else self.estimate.at(episodes[ready])
-        reward[ready] = self._score(episodes[ready], acted)
-        return self._outcome(episodes, estimate, reward)
+        if n_ready > 0:
+            acting = episodes[ready]
+            self._advance(acting, decision.queried[ready])
+            reward[ready] = self._score(acting, self._estimated(acting))
+        return self._outcome(episodes, self.estimate.at(episodes), reward)
 
     @property
     def elapsed(self) -> IntArray:
@@ -200,19 +203,22 @@ class QueryProcess:
         inputs = self.boundary.inputs(episodes, traffic, self.time[episodes])
         predict, update = self.estimator.predict, self.estimator.update
         self._threads.run(len(episodes), lambda block: predict(episodes[block], inputs[block]))
-        self.time[episodes] += 1
+        own = slice(None) if self.n_episodes == 1 else episodes  # a slice is quicker to write to
+        self.time[own] += 1
         observed = self.release.task.observed(queried)
-        prediction = cache(lambda: self._predicted(episodes))
+        prediction: Callable[[], Estimate] = partial(self._predicted, episodes)
+        if self.fusion is not None:  # reads it, too
+            prediction = cache(prediction)
         request = Request(episodes, traffic, self.time[episodes], observed, prediction)
         measured = self.measure(request)
         self.boundary.update(episodes, measured)
         self._threads.run(len(episodes), lambda block: update(episodes[block], measured.at(block)))
-        self.queried[episodes] = queried
+        self.queried[own] = queried
         rows = slice(self.model.rows.n_rows)
-        answered, before = measured.observed[:, rows, None], self.released[episodes]
-        self.released[episodes] = np.where(answered, measured.values[:, rows], before)
+        answered = measured.observed[:, rows, None]
+        self.released[own] = np.where(answered, measured.values[:, rows], self.released[own])
         covered = self.release.task.covered(measured.observed)
-        self.age[episodes] = np.where(covered, 0, self.age[episodes] + 1)
+        self.age[own] = np.where(covered, 0, self.age[own] + 1)
 
     def measure(self, request: Request) -> Measurement:
         """Release a second, which charges its vehicles; return what the estimator is given."""
@@ -259,7 +265,7 @@ class QueryProcess:
         self.error.n_occupied[episodes] = error.n_occupied
         rewards: FloatArray = self.interface.reward(
             ScoredSecond(
-                error, true_density, true_speed, estimate, self.queried[episodes],
+                error, true_density, true_speed, estimate, self.queried.take(episodes, 0),
                 self.config.corridor,
             )
         )  # fmt: skip
@@ -280,11 +286,11 @@ class QueryProcess:
         public = self.release.public(episodes)
         state = PublicState(
             estimate=estimate,
-            released=self.released[episodes],
-            innovations=self.estimator.innovations[episodes],
-            age=self.age[episodes],
-            queried=self.queried[episodes],
-            picked=self.pending.picked[episodes],
+            released=self.released.take(episodes, 0),
+            innovations=self.estimator.innovations.take(episodes, 0),
+            age=self.age.take(episodes, 0),
+            queried=self.queried.take(episodes, 0),
+            picked=self.pending.picked.take(episodes, 0),
             prices=public.get("prices"),
             tracer=public.get("tracer"),
         )
@@ -312,7 +318,8 @@ class QueryProcess:
         The keys in `TRUTH_INFO` come from the true traffic. They serve training and evaluation, as
         the reward does, and are not covered by the guarantee. The others are public.
         """
-        mu, epsilon = self.release.spent(episodes, self.elapsed[episodes])
+        elapsed = self.config.horizon_steps - self.end[episodes] + self.time[episodes]
+        mu, epsilon = self.release.spent(episodes, elapsed)
         infos: Rows = {
             "rmse_density": self.error.density[episodes],
             "rmse_speed": self.error.speed[episodes],
@@ -322,7 +329,7 @@ class QueryProcess:
             "fallback": self.estimator.fallback[episodes].astype(np.float64),
             "mu": mu,
             "epsilon": epsilon,
-            "queried": self.queried[episodes],
+            "queried": self.queried.take(episodes, 0),
             **self.release.public(episodes),
         }
         if self.config.truth_in_info:
@@ -376,11 +383,13 @@ class ResetOptions:
             if seed is not None and (type(seed) is not int or seed not in known):
                 raise ValueError(
                     f"options.traffic_seed must be one of the environment's "
-                    f"{len(known)} traffic_seeds, got {seed!r}"
+                    f"{len(known)} traffic_seeds, got {shown(seed)}"
                 )
         for start in starts:
             if start is not None and (type(start) is not int or not 0 <= start <= last):
-                raise ValueError(f"options.start must be an integer in 0..{last}, got {start!r}")
+                raise ValueError(
+                    f"options.start must be an integer in 0..{last}, got {shown(start)}"
+                )
         traffic = [None if seed is None else known.index(seed) for seed in seeds]
         return cls(config, traffic, starts)
 

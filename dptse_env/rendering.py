@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
-from dptse_env.utils.extras import needed_for
+from dptse_env.utils.registry import needed_for
 
 if TYPE_CHECKING:
     from dptse_env.process import QueryProcess
@@ -147,7 +147,7 @@ class Picture:
             artist.axes.draw_artist(artist)
             for spine in artist.axes.spines.values():
                 artist.axes.draw_artist(spine)
-        return np.array(self._canvas.buffer_rgba())[..., :3].copy()
+        return np.array(self._canvas.buffer_rgba())[..., :3]
 
     def _draw_background(self, limit: float) -> None:
         """Draw what stays from second to second, anew where the axis of errors must grow."""
@@ -157,6 +157,59 @@ class Picture:
         self._error.axes.set_ylim(0.0, limit)
         self._canvas.draw()
         self._background = self._canvas.copy_from_bbox(self._canvas.figure.bbox)
+
+
+class Drawing:
+    """The picture of an episode that goes on, and a window that shows it.
+
+    Attributes:
+        history: The episode so far; None before the first one begins.
+    """
+
+    def __init__(self, episode: int = 0, every: int = 1, window: Window | None = None) -> None:
+        """Draw an episode of a process.
+
+        Args:
+            episode: Its number.
+            every: Seconds between two drawings; in between, `draw` returns the last one.
+            window: Shows every second; None for none.
+        """
+        self.episode, self.every, self.window = episode, every, window
+        self.history: History | None = None
+        self._picture: Picture | None = None
+        self._frame: tuple[int, NDArray[np.uint8]] | None = None
+
+    def begin(self, process: QueryProcess) -> None:
+        """Take up an episode that was just reset."""
+        self.history, self._frame = History.from_process(process, self.episode), None
+        if self.window is not None:
+            self.window.reopen()
+            self.window.show(self.draw())
+
+    def follow(self, process: QueryProcess) -> None:
+        """Add the second that the episode stands at."""
+        assert self.history is not None
+        self.history.append(process)
+        if self.window is not None:
+            self.window.show(self.draw())
+
+    def draw(self) -> NDArray[np.uint8]:
+        """Return the picture, shape (height, width, 3), drawn anew if it is due.
+
+        Raises:
+            gymnasium.error.ResetNeeded: No episode has begun.
+        """
+        history = self.history
+        if history is None:
+            raise gym.error.ResetNeeded("nothing to render: call reset() first")
+        second = len(history.truth) - 1
+        drawn = self._frame[0] if self._frame is not None else -self.every
+        if second - drawn >= self.every or drawn < second == history.horizon:
+            if self._picture is None:
+                self._picture = Picture(history)
+            self._frame = second, self._picture.draw(history)
+        assert self._frame is not None
+        return self._frame[1].copy()
 
 
 class Window:
@@ -178,11 +231,6 @@ class Window:
         self._surface: Any = None
         self._clock = pygame.time.Clock()
         self._was_closed = False
-
-    @property
-    def is_open(self) -> bool:
-        """True while there is a window."""
-        return self._surface is not None
 
     def reopen(self) -> None:
         """Let the next picture open a window, if the last one was closed by hand."""

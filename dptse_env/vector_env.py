@@ -15,13 +15,13 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from dptse_env.config import resolve
-from dptse_env.estimators import check_settings
-from dptse_env.parts import make_interface, make_model, make_parts, warn_where_void
-from dptse_env.process import QueryProcess, per_episode
-from dptse_env.rendering import History, Picture
-from dptse_env.traffic import Records, open_library
+from dptse_env.env_base import QueryEnvBase
+from dptse_env.parts import warn_where_void
+from dptse_env.process import per_episode
+from dptse_env.rendering import Drawing
+from dptse_env.traffic import Records
 from dptse_env.utils.arrays import Action, BoolArray, FloatArray, IntArray, Observation
-from dptse_env.utils.fields import integer, require
+from dptse_env.utils.fields import integer, require_name
 from dptse_env.utils.vector_info import Rows, in_vector_form, object_array, repeated_rows
 
 _MODES = {mode.value: mode for mode in AutoresetMode}
@@ -61,7 +61,7 @@ class Transition:
     final: FinalStates | None
 
 
-class SensorQueryVectorEnv(VectorEnv[Observation, Action, Any]):
+class SensorQueryVectorEnv(QueryEnvBase, VectorEnv[Observation, Action, Any]):
     """A batch of n episodes in one process, sharing the records in memory.
 
     Spaces, keywords, rewards and infos are those of `dptse_env.env.SensorQueryEnv`. Every array has
@@ -118,43 +118,25 @@ class SensorQueryVectorEnv(VectorEnv[Observation, Action, Any]):
             UserWarning: A release model with a guarantee is configured, and other keywords void
                 it, or values of another road are used on this one.
         """
-        modes = (None, *self.metadata["render_modes"])
-        require(render_mode in modes, "render_mode", "None or 'rgb_array'", render_mode)
-        self.render_mode = render_mode
         self.num_envs = integer("num_envs", num_envs, 1, 1_000_000)
+        threads = None if threads is None else integer("threads", threads, 1, 1024)
+        config = resolve(preset, overrides)
+        super().__init__(config, self.num_envs, records, render_mode, threads=threads)
+        warn_where_void(config)
         self.render_episode = integer("render_episode", render_episode, 0, self.num_envs - 1)
-        self.history: History | None = None
-        self._picture: Picture | None = None
+        if render_mode is not None:
+            self.drawing = Drawing(self.render_episode)
         self.autoreset_mode = _mode(autoreset_mode)
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
-        self.config = config = resolve(preset, overrides)
-        warn_where_void(config)
-        self.interface = make_interface(config)
-        self._model = make_model(config)
-        check_settings(config.estimator, self._model, config.settings())
         self.single_action_space = self.interface.actions.space
         self.single_observation_space = self.interface.observations.space
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
-        self._library = open_library(records)
-        self._threads = None if threads is None else integer("threads", threads, 1, 1024)
-        self._process: QueryProcess | None = None
         self._generators: list[tuple[np.random.Generator, int] | None] = [None] * self.num_envs
         self._was_reset = np.zeros(self.num_envs, dtype=bool)
         self._all = np.arange(self.num_envs)
         size = self.single_observation_space.shape
         self._observation = np.zeros((self.num_envs, *size), dtype=np.float32)
-
-    @property
-    def process(self) -> QueryProcess:
-        """The process behind the environment, assembled at the first use."""
-        if self._process is None:
-            parts = make_parts(
-                self.config, self.num_envs, self._library,
-                interface=self.interface, model=self._model,
-            )  # fmt: skip
-            self._process = QueryProcess(parts, self._threads)
-        return self._process
 
     @property  # type: ignore[misc]
     def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]
@@ -240,8 +222,8 @@ class SensorQueryVectorEnv(VectorEnv[Observation, Action, Any]):
             outcome = self.process.step(live, actions[live])
             self._observation[live] = outcome.observation
             reward[live], truncated[live] = outcome.reward, outcome.truncated
-            if self.history is not None and not over[self.render_episode]:
-                self.history.append(self.process)
+            if self.drawing is not None and not over[self.render_episode]:
+                self.drawing.follow(self.process)
         to_reset, final = over, None
         if self.autoreset_mode is AutoresetMode.SAME_STEP and truncated.any():
             to_reset, done = truncated, np.flatnonzero(truncated)
@@ -259,11 +241,7 @@ class SensorQueryVectorEnv(VectorEnv[Observation, Action, Any]):
         """
         self.interface.require_sequential()
         self._require_reset()
-        return self.interface.actions.available(self.process.pending.picked)
-
-    def privacy(self) -> dict[str, Any]:
-        """Return the guarantee of an episode, or what voids it, and the account behind it."""
-        return self.process.privacy()
+        return self._available()
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Return the episode ``render_episode`` so far as the one picture of a tuple.
@@ -274,23 +252,15 @@ class SensorQueryVectorEnv(VectorEnv[Observation, Action, Any]):
         Raises:
             gymnasium.error.ResetNeeded: No episode has begun.
         """
-        if self.render_mode is None:
-            gym.logger.warn(
-                "render() needs gym.make_vec(..., render_mode='rgb_array'); nothing was drawn"
-            )
-            return None
-        if self.history is None:
-            raise gym.error.ResetNeeded("nothing to render: call reset() first")
-        if self._picture is None:
-            self._picture = Picture(self.history)
-        return (self._picture.draw(self.history),)
+        picture = self._drawn()
+        return None if picture is None else (picture,)
 
     def _reset(self, episodes: IntArray, options: Mapping[str, Any] | None = None) -> None:
         generators = [self._generator(e)[0] for e in episodes]
         self._observation[episodes] = self.process.reset(episodes, generators, options).observation
         self._was_reset[episodes] = True
-        if self.render_mode is not None and self.render_episode in episodes:
-            self.history = History.from_process(self.process, self.render_episode)
+        if self.drawing is not None and self.render_episode in episodes:
+            self.drawing.begin(self.process)
 
     def _infos(self, episodes: IntArray, reset: IntArray) -> dict[str, Any]:
         """Return the infos of ``episodes``, and the reset infos of those in ``reset``."""
@@ -354,6 +324,5 @@ class SensorQueryVectorEnv(VectorEnv[Observation, Action, Any]):
 def _mode(mode: AutoresetMode | str) -> AutoresetMode:
     if isinstance(mode, AutoresetMode):
         return mode
-    if mode not in _MODES:
-        raise ValueError(f"autoreset_mode must be one of {', '.join(_MODES)}, got {mode!r}")
+    require_name("autoreset_mode", mode, _MODES)
     return _MODES[mode]

@@ -24,7 +24,6 @@ from dptse_env.config import EnvConfig
 from dptse_env.parts import privacy_report
 from dptse_env.privacy import mu_of
 from dptse_env.release import PrivacyReport
-from dptse_env.traffic import with_vehicles
 from dptse_env.utils.fields import inside, integer, positive, require
 from scripts.cli import Machines, Road, run
 
@@ -149,7 +148,7 @@ def run_audit(args: Args, config: EnvConfig) -> Finding:
     """Choose two worlds, play them, and test the claim."""
     executor = args.start_executor()
     library = args.library(config.corridor, [args.traffic_seed])
-    record = with_vehicles(library.get(config.corridor, args.traffic_seed), "an audit")
+    record = library.get(config.corridor, args.traffic_seed).vehicles_for("an audit")
     worlds = choose_target(config, record, args.target, args.policy)
     policy = make_policy(config, args.policy, worlds)
     start = time.perf_counter()

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from agents.files import refuse_to_replace, replacing
+from agents.files import refuse_to_replace
 from agents.terminal import make_table, print_table
 from dptse_env.config import parse_seeds
 from dptse_env.model import ARZModel, ARZParameters, available_parameters, load_parameters
@@ -29,6 +29,7 @@ from dptse_env.model.calibration import (
 from dptse_env.model.parameters import write_parameters
 from dptse_env.release import Traffic
 from dptse_env.traffic import Corridor, RecordLibrary, average_dwell
+from dptse_env.utils.files import replacing
 from scripts.cli import Recording, Road, make_corridor, run
 
 logger = logging.getLogger(__name__)
@@ -72,7 +73,7 @@ def shipped_parameters(corridor: Corridor) -> list[ARZParameters]:
     known = []
     for name in available_parameters():
         try:
-            ARZModel(corridor, load_parameters(name))
+            ARZModel(corridor, load_parameters(name)).require_time_step()
         except ValueError as problem:
             logger.info("without %s: %s", name, problem)
         else:

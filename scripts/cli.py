@@ -14,12 +14,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import tyro
 
-from agents.environments import given_keywords, make_config
+from agents.environments import given_keywords
 from agents.executors import AnyExecutor, ExecutorError, ExecutorName, make_executor
 from agents.play import Cell, PlayError, record
 from agents.study import Place
+from dptse_env.config import resolve
 from dptse_env.traffic import (
     Corridor,
     NetworkError,
@@ -27,7 +29,7 @@ from dptse_env.traffic import (
     RecordLibrary,
     SumoVersionError,
 )
-from dptse_env.utils.extras import MissingExtraError
+from dptse_env.utils.registry import MissingExtraError
 from dptse_env.utils.threads import n_cores
 
 
@@ -188,10 +190,11 @@ def make_corridor(env: str, keywords: Mapping[str, Any]) -> Corridor:
     """
     # Traffic does not depend on queries, and a short road may have fewer segments.
     queries = {"bandwidth": 1, "query_spans": [1]} if "corridor" in keywords else {}
+    given = {**queries, **keywords}
     with warnings.catch_warnings():
         # They are about the guarantee and the estimator; only the corridor is wanted.
         warnings.simplefilter("ignore", UserWarning)
-        return make_config(env, {**queries, **keywords}).corridor
+        return resolve(gym.spec(env.rpartition(":")[2]).kwargs["preset"], given).corridor
 
 
 def suitable(cells: Sequence[Cell], what: str) -> tuple[Cell, ...]:

@@ -35,10 +35,12 @@ COMMANDS: Mapping[str, Command] = {
     "info": Command("info", "Print versions, machine and caches, as a bug report needs them."),
     "record": Command("record", "Record traffic with SUMO, so that environments only replay it."),
     "import trajectories": Command(
-        "import_trajectories", "Import recorded trajectories as records of a road."
+        "import_road", "Import recorded trajectories as records of a road.", "Trajectories"
     ),
     "import network": Command("import_network", "Make a road of a SUMO network."),
-    "import field": Command("import_field", "Import a measured field of density and speed."),
+    "import field": Command(
+        "import_road", "Import a measured field of density and speed.", "Field"
+    ),
     "calibrate": Command("calibrate", "Fit the ARZ parameters to recorded traffic."),
     "tune": Command("tune", "Tune the estimators' settings."),
     "train": Command("train", "Train a query policy."),
@@ -119,7 +121,11 @@ def overview(names: Sequence[str] = tuple(COMMANDS)) -> str:
 
 def as_commands(text: str) -> str:
     """Return a text in which scripts are named as commands."""
-    names = {command.module: name for name, command in COMMANDS.items()}
+    # A script of several commands has their last words as subcommands.
+    names = {
+        command.module: name if command.arguments == "Args" else name.split()[0]
+        for name, command in COMMANDS.items()
+    }
     return re.sub(
         r"python scripts/(\w+)\.py",
         lambda found: f"{PROGRAM} {names[found[1]]}" if found[1] in names else found[0],

@@ -1,7 +1,7 @@
 """Evaluate query schedules and trained policies on recorded traffic, paired on traffic and noise.
 
 python scripts/evaluate.py --schedules paper round-robin --seeds 2000:2020
-python scripts/evaluate.py --policies results/training/primary/pl-0/best.zip
+python scripts/evaluate.py --policies results/training/primary/pl-0/best.safetensors
 """
 
 from __future__ import annotations

@@ -13,15 +13,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from agents.files import refuse_to_replace, replacing
-from dptse_env.traffic import write_corridor
-from dptse_env.traffic.sumo_import import (
+from agents.files import refuse_to_replace
+from dptse_env.importers.network import (
     Files,
     ImportedRoad,
     find_layout,
     import_road,
     read_configuration,
 )
+from dptse_env.traffic import write_corridor
+from dptse_env.utils.files import replacing
 from scripts.cli import run
 
 

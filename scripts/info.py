@@ -6,6 +6,7 @@ python scripts/info.py --json
 
 from __future__ import annotations
 
+import hashlib
 import importlib.metadata
 import json
 import platform
@@ -17,15 +18,14 @@ from typing import Any
 import dptse_env
 from dptse_env.registration import ENVIRONMENTS
 from dptse_env.traffic import RecordLibrary
-from dptse_env.utils.digests import package_digest
 from dptse_env.utils.threads import n_cores
 from scripts.cli import run
 
 PACKAGES = (
     "gymnasium", "libsumo", "sumolib", "eclipse-sumo", "numpy", "scipy", "numba", "filterpy",
-    "qpsolvers", "piqp", "matplotlib", "platformdirs", "tomli-w", "tqdm", "torch",
+    "qpsolvers", "piqp", "safetensors", "matplotlib", "platformdirs", "tomli-w", "tqdm", "torch",
     "stable-baselines3", "sb3-contrib", "optuna", "plotly", "polars", "loky", "rich", "tyro",
-    "pyarrow", "ijson", "ray", "filelock", "moviepy", "pygame",
+    "ray", "filelock", "moviepy", "pygame",
 )  # fmt: skip
 
 
@@ -37,13 +37,21 @@ class Args:
     """Print JSON, for a program."""
 
 
+def _code_digest() -> str:
+    """Return 12 digits of a digest of the code, which changes more often than the version."""
+    digest, root = hashlib.sha256(), Path(dptse_env.__file__).parent
+    for path in sorted(root.rglob("*.py")):
+        digest.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
+    return digest.hexdigest()[:12]
+
+
 def collect() -> dict[str, Any]:
     """Return what a bug report needs, as plain JSON."""
     library = RecordLibrary()
     records = [path for path in library.path.glob("records-*/*/*") if path.name[0] != "."]
     return {
         "dptse-env": dptse_env.__version__,
-        "digest": package_digest(dptse_env),
+        "digest": _code_digest(),
         "folder": str(Path(dptse_env.__file__).parent),
         "python": sys.version.split()[0],
         "platform": platform.platform(),

@@ -19,7 +19,7 @@ from agents.figures import LABELS
 from agents.measured_field import Replay, field_corridor, read_field
 from agents.terminal import make_table, print_table
 from dptse_env.estimators import EstimatorSettings
-from dptse_env.traffic.importers.fields import FieldSource
+from dptse_env.importers.fields import FieldSource
 from dptse_env.utils.fields import integer
 from scripts.cli import run
 

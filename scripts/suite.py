@@ -1,7 +1,7 @@
 """Score policies in the tasks of the query suite, beside those that come with the package.
 
 python scripts/suite.py --policies round-robin my_package:MySchedule
-python scripts/suite.py --policies results/training/primary/pl-0/best.zip --output results/my-suite
+python scripts/suite.py --policies results/training/best.safetensors --output results/my-suite
 """
 
 from __future__ import annotations

@@ -5,9 +5,9 @@ python scripts/train.py --seeds 0:5 --workers 2 --output results/training/pl
 python scripts/train.py --steps 2000000 --output results/training/maskable-0 recipe:maskable
 
 The folder gets plan.json (the settings), progress.csv (the learning curve), checkpoint.pt,
-best.zip and policy.zip (the policy best in validation, and the last). After an interruption, or a
-kill, the same command continues from the last checkpoint to the same numbers; other arguments
-need another folder.
+best.safetensors and policy.safetensors (the policy best in validation, and the last). After an
+interruption, or a kill, the same command continues from the last checkpoint to the same numbers;
+other arguments need another folder.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 python scripts/train_estimator.py --seed 0 --output results/filters/0
 
-The folder gets plan.json, progress.csv (the learning curve), checkpoint.pt and
-network.npz, which ``estimator_settings={"recurrent": {"weights": "<folder>/network.npz"}}`` takes.
+The folder gets plan.json, progress.csv (the learning curve), checkpoint.pt and the file of weights
+that ``estimator_settings={"recurrent": {"weights": "<folder>/network.safetensors"}}`` takes.
 After an interruption, or a kill, the same command continues from the last checkpoint to the same
 numbers; other arguments need another folder.
 """
@@ -21,7 +21,7 @@ from agents.filters.scenarios import ScenarioRanges
 from agents.filters.training import FilterTraining
 from agents.training.run_files import check_plan
 from dptse_env.config import parse_seeds
-from dptse_env.estimators.recurrent_weights import read_network
+from dptse_env.estimators.recurrent import read_network
 from dptse_env.utils.fields import integer
 from scripts.cli import Machines, resumable, run
 from scripts.training_bar import Bar, watched
@@ -131,7 +131,7 @@ def main(args: Args) -> None:
             executor=executor,
         )
         training.run()
-    print(f"the network is in {args.output / 'network.npz'}")
+    print(f"the network is in {args.output / 'network.safetensors'}")
 
 
 if __name__ == "__main__":

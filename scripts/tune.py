@@ -59,7 +59,7 @@ class Args(Machines):
     trials_at_once: int = 1
     """Trials that run at once; results depend on the number."""
     schedule: str = "paper"
-    """Query schedule, or a saved policy: its .zip file or shipped name."""
+    """Query schedule, or a saved policy: its .safetensors file or shipped name."""
     bandwidth: int | None = None
     """Most segments to query a second; the environment's own if not given."""
     epsilon: float = 1.0

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from numba.core.registry import CPUDispatcher
 
-from dptse_env.traffic import RecordLibrary
+from dptse_env.traffic import library
 from dptse_env.utils.kernels import default_folder
 
 LIMIT = 3.0
@@ -42,7 +42,7 @@ class CpuLimit:
         self._depth = 0
         self._patches = [
             mock.patch.object(owner, name, self._outside(getattr(owner, name)))
-            for owner, name in ((CPUDispatcher, "compile"), (RecordLibrary, "ensure"))
+            for owner, name in ((CPUDispatcher, "compile"), (library, "record_seeds"))
         ]
         for patch in self._patches:
             patch.start()

@@ -1,9 +1,10 @@
 """Numbers of the package in a file, to show that a change of code leaves them alone.
 
 ``python -m tests.numbers`` writes ``tests/numbers.npz`` anew, where a change is meant to move
-them, and with words only the parts whose names have one of them; the slow test ``tests/test_numbers.py`` compares with it. A step of every estimator is taken
-from recorded states with recorded releases, so that the drift of a chaotic filter does not count;
-means of errors are those of whole episodes.
+them, and with words only the parts whose names have one of them; the slow test
+``tests/test_numbers.py`` compares with it. A step of every estimator is taken from recorded states
+with recorded releases, so that the drift of a chaotic filter does not count; means of errors are
+those of whole episodes.
 """
 
 from __future__ import annotations

@@ -160,9 +160,9 @@ def test_late_starts_drop_the_same_seconds_of_their_episodes():
 @pytest.mark.parametrize(
     ("env", "seeds", "message"),
     [
-        (lambda: make(horizon=30), [0], "longer than the warm-up of 60 s"),
+        (lambda: make(horizon=60), [0], "warm_up must be shorter than an episode, got 60"),
         (make, [], "seeds must be one or more"),
-        (make, [7], "traffic_seed must be one of"),
+        (make, [0, 7], r"seeds must be among the environment's traffic_seeds, got \[7\]"),
         (lambda: make_batch(autoreset_mode="SameStep"), [0], "another autoreset_mode"),
         (lambda: gym.make("CartPole-v1"), [0], "environment of dptse_env, got CartPoleEnv"),
     ],

@@ -10,7 +10,7 @@ from agents.environments import make_vector
 from dptse_env.config import resolve
 from dptse_env.parts import make_parts
 from dptse_env.process import QueryProcess
-from dptse_env.spaces.actions import ACTION_ENCODINGS, ActionEncoding, MaskAction
+from dptse_env.spaces.actions import ACTION_ENCODINGS
 from tests.cases import fast_and_slow
 
 from .release.sums import PricedRelease, SumRelease
@@ -188,24 +188,6 @@ def test_a_fork_goes_on_alike():
     first, second = process.fork(), process.fork()
     np.testing.assert_array_equal(query(first, 7, 2), query(second, 7, 2))
     assert np.flatnonzero(process.release.prices[0]).tolist() == [3]
-
-
-class Naive(ActionEncoding):
-    """An encoding of another package that counts queries."""
-
-    def __init__(self, n_options, bandwidth):
-        super().__init__(gym.spaces.MultiBinary(n_options), n_options, bandwidth)
-
-    decode = MaskAction.decode
-    encode = MaskAction.encode
-
-
-def test_an_encoding_that_knows_no_costs_is_refused_where_they_differ():
-    keywords = {"privacy": SumRelease, "action": Naive, "bandwidth": 3}
-    with pytest.raises(ValueError, match=r"^action .*Naive must take the argument costs where .*"):
-        gym.make(SHORT, query_spans=(1, 2), **keywords)
-    counted = gym.make(SHORT, query_spans=(2, 3), bandwidth_unit="sums", **keywords)
-    assert counted.action_space == gym.spaces.MultiBinary(9)
 
 
 def test_a_batch_of_decisions_of_different_lengths_is_not_evaluated():

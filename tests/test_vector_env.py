@@ -1,13 +1,107 @@
+"""`SensorQueryVectorEnv`: a batch is as many scalar environments, in Gymnasium's vector form."""
+
 import pickle
+import threading
+import time
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
 
+from dptse_env.estimators import ESTIMATORS
+from dptse_env.registration import ENVIRONMENTS
+from dptse_env.utils.threads import SMALLEST_BLOCK
 from dptse_env.vector_env import SensorQueryVectorEnv
+from tests.cases import fast_and_slow
 
-from .vectors import COUNTED, EPISODES, SHORT, assert_same, short, staggered
+from .vectors import COUNTED, EPISODES, SHORT, assert_same, briefly, lock_step, short, staggered
+
+# --- lock step with the scalar environment --------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("estimator", "action", "privacy"),
+    [
+        ("ekf", "mask", COUNTED),
+        ("ukf", "scores", "paper"),
+        ("enkf", "slots", "paper"),
+        ("mhe", "sequential", "paper"),
+        ("blend", "mask", COUNTED),
+        ("recurrent", "slots", "paper"),
+    ],
+)
+def test_a_batch_is_so_many_scalar_environments(estimator, action, privacy):
+    keywords = {"estimator": estimator, "action": action, "privacy": privacy}
+    lock_step({**keywords, "truth_in_info": True}, n_steps=17)
+
+
+LONG = [name for name in ENVIRONMENTS if "Long" in name]
+
+
+@pytest.mark.parametrize("env_id", fast_and_slow(ENVIRONMENTS, set(ENVIRONMENTS) - set(LONG)))
+def test_every_id_is_so_many_scalar_environments(env_id):
+    lock_step({"traffic_seeds": "0:2", **briefly(env_id)}, n_steps=8, env_id=f"dptse_env:{env_id}")
+
+
+@pytest.mark.parametrize(
+    ("mode", "truth_in_info"), [("NextStep", False), ("NextStep", True), ("SameStep", True)]
+)
+def test_autoreset_is_that_of_gymnasium(mode, truth_in_info):
+    keywords = {"truth_in_info": truth_in_info, "privacy": COUNTED}
+    lock_step(keywords, n_steps=20, autoreset_mode=mode)
+
+
+@pytest.mark.parametrize(
+    "estimator", fast_and_slow(ESTIMATORS, ["ekf", "enkf", "mhe", "recurrent"])
+)
+def test_threads_change_nothing(estimator):
+    n = 3 * SMALLEST_BLOCK
+    one, two = (short(n, estimator=estimator, threads=threads) for threads in (1, 2))
+    assert_same(one.reset(seed=5), two.reset(seed=5), tolerance=0)
+    one.action_space.seed(1)
+    for _ in range(8):
+        actions = one.action_space.sample()
+        assert_same(one.step(actions), two.step(actions), tolerance=0)
+
+
+@pytest.mark.parametrize(
+    ("estimator", "threads_given", "n_names"),
+    [("ekf", 1, 1), ("ekf", 2, 2), ("enkf", 2, 2), ("random_walk", 2, 1)],
+)
+def test_compiled_estimators_work_on_so_many_threads(
+    estimator, threads_given, n_names, monkeypatch
+):
+    env = short(2 * SMALLEST_BLOCK, estimator=estimator, threads=threads_given)
+    env.reset(seed=0)
+    names, predict = set(), env.process.estimator.predict
+
+    def watched(episodes, inputs):
+        names.add(threading.current_thread().name)
+        time.sleep(0.02)
+        predict(episodes, inputs)
+
+    monkeypatch.setattr(env.process.estimator, "predict", watched)
+    env.step(env.action_space.sample())
+    assert len(names) == n_names
+
+
+def test_traffic_and_start_one_by_one():
+    env, single = short(truth_in_info=True), short(1, truth_in_info=True)
+    options = {"traffic_seed": [2, 0, 2], "start": np.array([100, 3, 0])}
+    observation, infos = env.reset(seed=4, options=options)
+    for episode in range(3):
+        own = {key: int(values[episode]) for key, values in options.items()}
+        alone, info = single.reset(seed=4 + episode, options=own)
+        np.testing.assert_array_equal(observation[episode], alone[0])
+        for key in ("traffic_seed", "time"):
+            assert infos["truth"][key][episode] == info["truth"][key][0]
+    options["reset_mask"] = np.array([False, True, True])
+    options["start"] = [999, 7, 8]  # of an episode that goes on, and so never looked at
+    assert env.reset(options=options)[1]["truth"]["time"].tolist() == [0, 7, 8]
+
+
+# --- autoreset, infos and seeds -------------------------------------------------------------------
 
 
 def test_next_step_ignores_the_action_of_an_episode_that_begins_again():
@@ -152,5 +246,78 @@ def test_it_draws_the_chosen_episode_as_the_scalar_environment_does():
     # The next episode begins with an empty picture.
     for _ in range(9):
         env.step(actions)
-    assert len(env.history.truth) == 1
+    assert len(env.drawing.history.truth) == 1
     assert (env.render()[0] != picture).any()
+
+
+# --- bad input ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("keywords", "message"),
+    [
+        ({"num_envs": 0}, r"^num_envs must be an integer in 1\.\.1000000, got 0"),
+        ({"num_envs": True}, r"^num_envs must be an integer in 1\.\.1000000, got True"),
+        ({"autoreset_mode": "next"}, r"^autoreset_mode must"),
+        ({"render_mode": "human"}, r"^render_mode must be None or 'rgb_array', got 'human'"),
+        ({"render_episode": 3}, r"^render_episode must be an integer in 0\.\.1, got 3"),
+        ({"threads": 0}, r"^threads must be an integer in 1\.\.1024, got 0"),
+    ],
+)
+def test_bad_keywords_name_themselves(keywords, message):
+    with pytest.raises(ValueError, match=message):
+        SensorQueryVectorEnv(**{"num_envs": 2, "preset": "short-highway", **keywords})
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"options": {"reset_mask": [True] * 3}}, r"reset_mask must be a bool array .*, got list"),
+        ({"options": {"reset_mask": np.ones(2, bool)}}, r"reset_mask must"),
+        ({"options": {"reset_mask": np.zeros(3, bool)}}, r"reset_mask must"),
+        ({"options": {"start": [1, 2]}}, r"options\.start must"),
+        ({"options": {"traffic_seed": [0, 1, 7]}}, r"options\.traffic_seed must be .*, got 7"),
+        ({"seed": [1, 2]}, r"seed must be an integer or a list of 3, got 2"),
+    ],
+)
+def test_bad_resets_are_refused_and_the_episodes_go_on(arguments, message):
+    (env, actions), (undisturbed, _) = staggered(), staggered()
+    with pytest.raises(ValueError, match=message):
+        env.reset(**arguments)
+    for _ in range(5):
+        assert_same(env.step(actions), undisturbed.step(actions), tolerance=0)
+
+
+@pytest.mark.parametrize(
+    ("mode", "bad", "message"),
+    [
+        ("NextStep", np.zeros((2, 6), np.int8), r"actions must have shape \(3, 6\), got \(2, 6\)"),
+        ("SameStep", np.zeros((3, 5), np.int8), r"action must have shape \(6,\)"),
+        ("Disabled", np.full((3, 6), 2), r"action must hold 0 and 1 only"),
+    ],
+)
+def test_bad_actions_are_refused_and_the_episodes_go_on(mode, bad, message):
+    (env, actions), (undisturbed, _) = (staggered(autoreset_mode=mode) for _ in range(2))
+    for _ in range(4):
+        assert_same(env.step(actions), undisturbed.step(actions), tolerance=0)
+    # Episode 1 is over now, or has just been begun again.
+    if mode == "Disabled":
+        for one in (env, undisturbed):
+            one.reset(options={"reset_mask": np.array([False, True, False])})
+    with pytest.raises(ValueError, match=message):
+        env.step(bad)
+    for _ in range(3 if mode == "Disabled" else 5):
+        came_back = env.step(actions)
+        assert_same(came_back, undisturbed.step(actions), tolerance=0)
+        if mode == "Disabled" and came_back[3].any():
+            break
+
+
+def test_a_step_before_the_first_reset_is_refused():
+    env = short()
+    actions = np.zeros((3, 6), dtype=np.int8)
+    with pytest.raises(gym.error.ResetNeeded, match="3 of 3 episodes were never reset"):
+        env.step(actions)
+    env.reset(options={"reset_mask": np.array([True, False, False])})
+    with pytest.raises(gym.error.ResetNeeded, match="2 of 3 episodes were never reset"):
+        env.step(actions)

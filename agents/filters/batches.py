@@ -12,7 +12,7 @@ from torch import Tensor
 
 from agents.filters.collecting import Collected, Released, Rows
 from agents.filters.torch_network import Road
-from dptse_env.config import GEOMETRY
+from dptse_env.traffic.corridor import GEOMETRY
 from dptse_env.utils.arrays import IntArray
 
 Picks = Sequence[tuple[Collected, IntArray]]

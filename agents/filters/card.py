@@ -7,8 +7,8 @@ from typing import Any
 
 from agents.environments import make_config, parse_env
 from agents.filters.plan import FilterPlan
+from dptse_env.estimators.recurrent import FORMAT
 from dptse_env.estimators.recurrent_kernels import CHANNELS
-from dptse_env.estimators.recurrent_weights import FORMAT
 from dptse_env.parts import flow_centre
 
 

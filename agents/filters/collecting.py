@@ -187,7 +187,7 @@ def run_collect(task: CollectTask) -> Collected:
     if task.network is None:
         return collect(task.scenario, {"estimator": task.estimator}, task.records)
     with tempfile.TemporaryDirectory(prefix="dptse-network-") as folder:
-        path = Path(folder) / "network.npz"
+        path = Path(folder) / "network.safetensors"
         path.write_bytes(task.network)
         settings = {"recurrent": {"weights": str(path), "outside": True}}
         estimator = {"estimator": task.estimator, "estimator_settings": settings}

@@ -16,7 +16,7 @@ from agents.filters.scenarios import Scenario, ScenarioRanges
 from agents.play import Cell
 from agents.seeds import TUNING, require_seeds
 from dptse_env.config import TRAINING_SEEDS, VALIDATION_SEEDS
-from dptse_env.estimators.recurrent_weights import read_network
+from dptse_env.estimators.recurrent import read_network
 from dptse_env.utils.fields import inside, integer, positive, require
 
 
@@ -152,7 +152,7 @@ class FilterPlan:
         """Return the plan as plain JSON."""
         plain: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(self)))
         if self.initial is not None:
-            plain["initial_sha256"] = read_network(self.initial).sha256
+            plain["initial_sha256"] = read_network(self.initial).card["sha256"]
         return plain
 
     def validation_cells(self, weights: str | None = None) -> list[Cell]:

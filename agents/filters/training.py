@@ -11,7 +11,6 @@ import numpy as np
 import torch
 
 from agents.executors import THIS_PROCESS, AnyExecutor, run_in_order
-from agents.files import replacing
 from agents.filters.batches import Batch, draw_batch
 from agents.filters.card import make_card
 from agents.filters.collecting import Collected, CollectTask, run_collect
@@ -26,10 +25,10 @@ from agents.training.run_files import (
     write_checkpoint,
     write_progress,
 )
-from dptse_env.estimators.recurrent_weights import read_network, write_network
+from dptse_env.estimators.recurrent import read_network, write_network
 from dptse_env.traffic import Records
 
-WEIGHTS, PLAYED = "network.npz", "played.npz"
+WEIGHTS, PLAYED = "network.safetensors", "played.safetensors"
 """The trained network, and the network that the scenarios of a round are collected with."""
 COLUMNS = ("update", "steps", "seconds", "round", "loss", "error", "rate", "validation", "chi2")
 Watcher = Callable[[Row], None]
@@ -185,8 +184,7 @@ class FilterTraining:
 
     def _save(self, name: str) -> None:
         card = make_card(self.plan, self.done, self.folder.name)
-        with replacing(self.folder / name) as temporary:
-            write_network(temporary, self.network.weights(), card)
+        write_network(self.folder / name, self.network.weights(), card)
 
     def _keep(self) -> None:
         write_progress(self.folder, self.rows, COLUMNS)

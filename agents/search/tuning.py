@@ -24,13 +24,14 @@ from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock, Jou
 from optuna.trial import FrozenTrial, TrialState
 
 from agents.executors import AnyExecutor
-from agents.files import first_difference, replacing
+from agents.files import first_difference
 from agents.search.space import DEMAND_START, at_bound, holds, nested, rounded, values_of
 from agents.search.tuning_task import TuningTask, score_episodes
 from dptse_env.estimators import EstimatorSettings
 from dptse_env.estimators.settings import write_settings
 from dptse_env.evaluation import Row
 from dptse_env.utils.fields import from_mapping
+from dptse_env.utils.files import replacing
 
 _FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
 _COUNTED = (*_FINISHED, TrialState.RUNNING)

@@ -38,7 +38,7 @@ class TuningTask:
         privacy: Privacy preset.
         seeds: Traffic seeds, ``"first:stop"``, within `TRAINING_SEEDS`.
         keywords: Other keywords of the environment; a mapping ``privacy`` goes with the preset.
-        schedule: Query schedule, or a saved policy: its ``.zip`` file or shipped name.
+        schedule: Query schedule, or a saved policy: its ``.safetensors`` file or shipped name.
         noise_seed: Noise and estimators are seeded with this plus the traffic seed.
         records: Library of records, or its folder; None for the user's cache.
         with_noise_scale: Whether to search the scale of the noise of flows or speeds, too.

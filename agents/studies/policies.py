@@ -162,9 +162,9 @@ def find_trained(given: Sequence[str]) -> list[Trained]:
 def _files(path: Path) -> list[Path]:
     if path.is_file():
         return [path]
-    found = sorted([*path.glob("best.zip"), *path.glob("*/best.zip")])
+    found = sorted([*path.glob("best.safetensors"), *path.glob("*/best.safetensors")])
     if not found:
-        raise FileNotFoundError(f"there is no best.zip in {path} nor one folder below it")
+        raise FileNotFoundError(f"there is no best.safetensors in {path} nor one folder below it")
     return found
 
 

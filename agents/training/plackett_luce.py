@@ -21,8 +21,7 @@ from agents.training.regression import Practice, regress
 from agents.training.swap_parts import collect_parts, untrained
 from agents.training.swaps import Swaps
 from agents.training.worlds import World
-from dptse_env.parts import make_interface
-from dptse_env.sb3 import PlackettLucePolicy, RoadChannels
+from dptse_env.sb3 import PlackettLucePolicy
 from dptse_env.vector_env import SensorQueryVectorEnv
 
 
@@ -135,9 +134,7 @@ def _sharing(policy: PlackettLucePolicy, world: World) -> PlackettLucePolicy:
     Raises:
         ValueError: The world's observations have other channels.
     """
-    interface = make_interface(world.config)
-    spaces = interface.observations.space, interface.actions.space
     try:
-        return policy.sharing(*spaces, RoadChannels.from_config(world.config))
+        return policy.sharing(world.config)
     except ValueError as problem:
         raise ValueError(f"also: {world}: {problem}") from problem

@@ -10,7 +10,7 @@ from typing import ClassVar
 from agents.training.worlds import World
 from dptse_env.config import EnvConfig
 from dptse_env.release import RELEASE_MODELS
-from dptse_env.sb3.policy import RULE
+from dptse_env.sb3.plackett_luce import RULE
 from dptse_env.utils.fields import inside, integer, non_negative, positive, require
 
 

@@ -11,7 +11,8 @@ from typing import Any
 
 import torch
 
-from agents.files import first_difference, write_atomically, write_json
+from agents.files import first_difference, write_json
+from dptse_env.utils.files import write_atomically
 
 PLAN, CHECKPOINT, PROGRESS = "plan.json", "checkpoint.pt", "progress.csv"
 

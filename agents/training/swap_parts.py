@@ -16,8 +16,7 @@ from agents.training.policy_iteration import collect_swaps, first_seed
 from agents.training.recipes import PlackettLuceRecipe
 from agents.training.swaps import Swaps
 from agents.training.worlds import World
-from dptse_env.parts import make_interface
-from dptse_env.sb3 import PlackettLucePolicy, RoadChannels
+from dptse_env.sb3 import PlackettLucePolicy
 
 
 @dataclass(frozen=True)
@@ -108,11 +107,4 @@ def split(count: int, parts: int) -> list[range]:
 
 def untrained(world: World, recipe: PlackettLuceRecipe) -> PlackettLucePolicy:
     """Return a policy for a world with the initial weights that torch draws."""
-    interface = make_interface(world.config)
-    return PlackettLucePolicy(
-        interface.observations.space,
-        interface.actions.space,
-        road=RoadChannels.from_config(world.config),
-        width=recipe.width,
-        rule=recipe.rule,
-    )
+    return PlackettLucePolicy.from_config(world.config, width=recipe.width, rule=recipe.rule)

@@ -27,7 +27,7 @@ from dptse_env.parts import make_interface
 from dptse_env.sb3.saved import ActingPolicy, save_policy
 from dptse_env.traffic import Records
 
-POLICY, BEST = "policy.zip", "best.zip"
+POLICY, BEST = "policy.safetensors", "best.safetensors"
 
 
 Watcher = Callable[[Row], None]

@@ -14,8 +14,10 @@ from dptse_env.estimators.settings import (
     HorizonSettings,
     RecurrentSettings,
     SigmaPointSettings,
+    load_settings,
 )
 from dptse_env.model import ARZModel
+from dptse_env.utils.fields import shown
 from dptse_env.utils.registry import Registry, is_foreign, missing_methods, name_of_class
 
 __all__ = [
@@ -33,10 +35,10 @@ __all__ = [
     "Measurement",
     "RecurrentSettings",
     "SigmaPointSettings",
-    "check_demand",
     "check_estimate",
     "check_estimator",
     "check_settings",
+    "checked_settings",
     "make_estimator",
     "settings_type",
 ]
@@ -84,6 +86,8 @@ REFERENCES = {
 """The backend ``reference`` of the estimators that have one."""
 WITHOUT_DEMAND = ("random_walk", "open_loop", "recurrent")
 """Estimators without demand states."""
+WITHOUT_DYNAMICS = ("random_walk", "recurrent")
+"""Estimators that take geometry and scales of the traffic model, and do not step it."""
 BACKENDS = get_args(Backend)
 
 
@@ -106,9 +110,12 @@ def check_settings(estimator: Any, model: ARZModel, settings: Any) -> None:
     ``ValueError``. The model has the demand states that the settings ask for.
 
     Raises:
-        ValueError: A setting is out of range on this road, or the estimator has no demand states.
+        ValueError: A setting is out of range on this road, the estimator has no demand states, or
+            it steps the model and its time step violates the CFL condition.
     """
     check_demand(estimator, settings)
+    if estimator not in WITHOUT_DYNAMICS:
+        model.require_time_step()
     check = getattr(_loaded(ESTIMATORS.find(estimator)), "check_settings", None)
     if check is not None:
         check(with_demand(model, settings), settings)
@@ -167,6 +174,27 @@ def settings_type(estimator: Any) -> type:
     return cls
 
 
+def checked_settings(estimator: Any, settings: Any) -> Any:
+    """Return an estimator's settings, by name, as they are, or the defaults in place of None.
+
+    Raises:
+        ValueError: There are none of this name, they are of another type, or the estimator has no
+            demand states, which they ask for.
+    """
+    expected = settings_type(estimator)
+    if isinstance(settings, str):
+        settings = load_settings(settings)
+    elif settings is None:
+        settings = expected()
+    elif not isinstance(settings, expected):
+        raise ValueError(
+            f"estimator_settings must be a mapping, the name of a set, or a {expected.__name__}, "
+            f"got {shown(settings)}"
+        )
+    check_demand(estimator, settings)
+    return settings
+
+
 def check_estimator(estimator: Any, backend: str) -> None:
     """Refuse an unknown estimator or backend, or a backend that an estimator does not have.
 
@@ -174,7 +202,7 @@ def check_estimator(estimator: Any, backend: str) -> None:
     """
     ESTIMATORS.find(estimator)
     if backend not in BACKENDS:
-        raise ValueError(f"backend must be one of {', '.join(BACKENDS)}, got {backend!r}")
+        raise ValueError(f"backend must be one of {', '.join(BACKENDS)}, got {shown(backend)}")
     if backend == "reference" and not (isinstance(estimator, str) and estimator in REFERENCES):
         raise ValueError(
             f"backend must be 'compiled' for {ESTIMATORS.name_of(estimator)!r}, only "

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, NamedTuple, Protocol
 
 import numpy as np
@@ -20,8 +19,7 @@ from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 Backend = Literal["compiled", "reference"]
 
 
-@dataclass(frozen=True)
-class Estimate:
+class Estimate(NamedTuple):
     """Estimates and their standard deviations, `(n, S)` each, in fresh arrays.
 
     Attributes:
@@ -38,11 +36,12 @@ class Estimate:
 
     def at(self, episodes: IntArray) -> Estimate:
         """Return a copy of the rows of `episodes` `(k,)`, `(k, S)` each."""
+        density, speed, density_std, speed_std = self
         return Estimate(
-            self.density[episodes],
-            self.speed[episodes],
-            self.density_std[episodes],
-            self.speed_std[episodes],
+            density.take(episodes, 0),
+            speed.take(episodes, 0),
+            density_std.take(episodes, 0),
+            speed_std.take(episodes, 0),
         )
 
 
@@ -180,7 +179,7 @@ class BatchEstimator(ABC):
     """Base class of the package's estimators of a batch of episodes.
 
     Public methods are documented in `Estimator`. A subclass writes `innovations` and `diverged` of
-    the episodes that it updates, and `fallback` where its update can fail. It has `_estimate`, or
+    the episodes that it updates, and `fallback` too if its update can fail. It has `_estimate`, or
     `estimate` where its settings have no ``speed_cap``.
     """
 
@@ -191,10 +190,12 @@ class BatchEstimator(ABC):
         self.model = model
         self.n_episodes = n_episodes
         self.settings = settings
-        self._noise_scale = np.array(getattr(settings, "noise_scale", (1.0, 1.0)))
+        scale = np.array(getattr(settings, "noise_scale", (1.0, 1.0)))
+        self._noise_scale = None if (scale == 1.0).all() else scale
         cap = getattr(settings, "speed_cap", None)
         self._largest_speed = None if cap is None else cap * np.array(model.network.speed_limits)
-        self.innovations = np.zeros((n_episodes, model.rows.n_rows, 2))
+        self._n_rows = model.rows.n_rows
+        self.innovations = np.zeros((n_episodes, self._n_rows, 2))
         self.diverged = np.zeros(n_episodes, dtype=np.bool_)
         self.fallback = np.zeros(n_episodes, dtype=np.bool_)
 
@@ -222,9 +223,11 @@ class BatchEstimator(ABC):
 
     def update(self, episodes: IntArray, measured: Measurement) -> None:
         """See `Estimator.update`; observed values that are not finite make a filter diverge."""
-        model, self.fallback[episodes] = self.model, False
-        own = measured.on_road(model.rows.n_rows, model.n_segments)
-        self._update(episodes, own._replace(sigma=self._noise_scale * own.sigma))
+        own = measured.on_road(self._n_rows, self.model.n_segments)
+        if self._noise_scale is not None:
+            observed, values, sigma, centre = own
+            own = Measurement(observed, values, self._noise_scale * sigma, centre)
+        self._update(episodes, own)
 
     def estimate(self) -> Estimate:
         """Current estimate of all episodes, its speeds held to the settings' ``speed_cap``."""

@@ -29,7 +29,7 @@ from dptse_env.model.step import (
 )
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.kernels import (
-    Packed,
+    Bundle,
     all_finite,
     any_of,
     copy_vector,
@@ -82,7 +82,7 @@ class CovarianceFilter(BatchEstimator):
             count_variance=count_variance(model, settings),
             is_box=settings.bounds == "box",
         )
-        self._packed = tuple(model.road), tuple(self.filters)
+        self._bundle = Bundle(model.road, self.filters)
         for episode in range(n_episodes):
             restart(self.filters, episode)
 
@@ -99,7 +99,7 @@ class CovarianceFilter(BatchEstimator):
 
     def _estimate(self) -> Estimate:
         out = np.empty((4, self.n_episodes, self.model.n_segments))
-        summarise(*self._packed, out)
+        summarise(self._bundle, out)
         return Estimate(*out)
 
     def _reset(
@@ -123,11 +123,11 @@ class EKF(CovarianceFilter):
     """
 
     def _predict(self, episodes: IntArray, inputs: FloatArray) -> None:
-        predict(*self._packed, episodes, inputs)
+        predict(self._bundle, episodes, inputs)
 
     def _update(self, episodes: IntArray, measured: Measurement) -> None:
         observed, values, sigma, centre = measured
-        update(*self._packed, episodes, observed, values, sigma, centre)
+        update(self._bundle, episodes, observed, values, sigma, centre)
 
 
 class Rows(NamedTuple):
@@ -139,9 +139,9 @@ class Rows(NamedTuple):
 
 
 @kernel
-def predict(road_: Packed, filters_: Packed, episodes: IntArray, inputs: FloatArray) -> None:
+def predict(bundle: Bundle, episodes: IntArray, inputs: FloatArray) -> None:
     """Predict one step ahead under inputs `(k, n_u)`: x = f(x, u), P = F P F' + Q."""
-    road, filters = RoadArrays(*road_), Filters(*filters_)
+    road, filters = bundle.parts
     scratch, noise = make_scratch(road), np.empty(filters.units.size)
     blocks = np.empty((*road.neighbours.shape, 4))
     work = np.empty((2, *filters.covariances.shape[1:]))
@@ -167,8 +167,7 @@ def process_noise(
 
 @kernel
 def update(
-    road_: Packed,
-    filters_: Packed,
+    bundle: Bundle,
     episodes: IntArray,
     observed: BoolArray,
     values: FloatArray,
@@ -176,7 +175,7 @@ def update(
     centre: FloatArray,
 ) -> None:
     """Update by measurements; see `Estimator.update`."""
-    road, filters = RoadArrays(*road_), Filters(*filters_)
+    road, filters = bundle.parts
     n_rows, width, longest = road.row_first.size, filters.covariances.shape[2], 1
     for m in range(n_rows):
         longest = max(longest, road.row_span[m])
@@ -293,9 +292,9 @@ def restart(filters: Filters, episode: int) -> None:
 
 
 @kernel
-def summarise(road_: Packed, filters_: Packed, out: FloatArray) -> None:
+def summarise(bundle: Bundle, out: FloatArray) -> None:
     """Write density, speed and their standard deviations to `out` `(4, n, S)`, physical units."""
-    road, filters = RoadArrays(*road_), Filters(*filters_)
+    road, filters = bundle.parts
     v_f, gamma = road.free_flow_speed, road.gamma
     for e in range(filters.means.shape[0]):
         covariance = filters.covariances[e]

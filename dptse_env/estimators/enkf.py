@@ -28,7 +28,7 @@ from dptse_env.model.columns import (
 from dptse_env.model.network import RoadArrays, RoadNetwork
 from dptse_env.model.parameters import LARGEST_W
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
-from dptse_env.utils.kernels import Packed, copy_vector, kernel, kernel_part
+from dptse_env.utils.kernels import Bundle, copy_vector, kernel, kernel_part
 
 
 class Ensembles(NamedTuple):
@@ -80,7 +80,6 @@ class EnKF(BatchEstimator):
         taper, none = settings.enkf.taper, np.empty((0, 0))
         weights = Tapers(none, none) if taper is None else make_tapers(model, taper)
         self.n_members = settings.enkf.n_members
-        self._road = tuple(model.road)
         self._ensembles = Ensembles(
             members=np.repeat(priors[:, :, None], padded(self.n_members), axis=2),
             n_members=self.n_members,
@@ -98,7 +97,7 @@ class EnKF(BatchEstimator):
             row_tapers=weights.among_rows,
             is_box=settings.bounds == "box",
         )
-        self._packed = tuple(self._ensembles)
+        self._bundle = Bundle(model.road, self._ensembles)
         self._seed(np.arange(n_episodes), [np.random.default_rng(0)] * n_episodes)
 
     @property
@@ -129,7 +128,7 @@ class EnKF(BatchEstimator):
     ) -> None:
         self._ensembles.priors[episodes] = self.model.project(states, self.settings.bounds)
         self._seed(episodes, generators)
-        restart(self._road, self._packed, episodes)
+        restart(self._bundle, episodes)
 
     def _seed(self, episodes: IntArray, generators: Sequence[np.random.Generator]) -> None:
         """Seed the streams of process noise and of measurement noise."""
@@ -138,15 +137,15 @@ class EnKF(BatchEstimator):
                 self._ensembles.streams[episode, kind] = make_stream(generator)
 
     def _predict(self, episodes: IntArray, inputs: FloatArray) -> None:
-        predict(self._road, self._packed, episodes, inputs)
+        predict(self._bundle, episodes, inputs)
 
     def _update(self, episodes: IntArray, measured: Measurement) -> None:
         observed, values, sigma, centre = measured
-        update(self._road, self._packed, episodes, observed, values, sigma, centre)
+        update(self._bundle, episodes, observed, values, sigma, centre)
 
     def _estimate(self) -> Estimate:
         out = np.empty((4, self.n_episodes, self.model.n_segments))
-        summarise(self._road, self._ensembles.members, self.n_members, out)
+        summarise(self._bundle, out)
         return Estimate(*out)
 
 
@@ -214,9 +213,9 @@ def gaspari_cohn(distance: FloatArray, reach: float) -> FloatArray:
 
 
 @kernel
-def restart(road_: Packed, ensembles_: Packed, episodes: IntArray) -> None:
+def restart(bundle: Bundle, episodes: IntArray) -> None:
     """Draw the members of episodes around their priors."""
-    road, ensembles = RoadArrays(*road_), Ensembles(*ensembles_)
+    road, ensembles = bundle.parts
     for e in episodes:
         _restart(road, ensembles, e)
 
@@ -242,9 +241,9 @@ def _perturb(members: FloatArray, n: int, deviation: FloatArray, draws: Draws) -
 
 
 @kernel
-def predict(road_: Packed, ensembles_: Packed, episodes: IntArray, inputs: FloatArray) -> None:
+def predict(bundle: Bundle, episodes: IntArray, inputs: FloatArray) -> None:
     """Predict members one step ahead under inputs `(k, n_u)`, with noise, and project them."""
-    road, ensembles = RoadArrays(*road_), Ensembles(*ensembles_)
+    road, ensembles = bundle.parts
     size, width = ensembles.members.shape[1:]
     scratch, deviation = make_batch_scratch(road, width), np.empty(size)
     for k in range(episodes.size):
@@ -273,8 +272,7 @@ def _process_deviation(
 
 @kernel
 def update(
-    road_: Packed,
-    ensembles_: Packed,
+    bundle: Bundle,
     episodes: IntArray,
     observed: BoolArray,
     values: FloatArray,
@@ -282,7 +280,7 @@ def update(
     centre: FloatArray,
 ) -> None:
     """Update by measurements, perturbed for each member; see `Estimator.update`."""
-    road, ensembles = RoadArrays(*road_), Ensembles(*ensembles_)
+    road, ensembles = bundle.parts
     rows = np.empty(road.row_first.size, dtype=np.int64)
     for k in range(episodes.size):
         e, n_seen = episodes[k], 0
@@ -411,9 +409,10 @@ def _taper(ensembles: Ensembles, rows: IntArray, joint: FloatArray, gain: FloatA
 
 
 @kernel
-def summarise(road_: Packed, members: FloatArray, n: int, out: FloatArray) -> None:
+def summarise(bundle: Bundle, out: FloatArray) -> None:
     """Write density and speed of the mean and the deviations of members to `out` `(4, n, S)`."""
-    road = RoadArrays(*road_)
+    road, ensembles = bundle.parts
+    members, n = ensembles.members, ensembles.n_members
     v_f, gamma, width = road.free_flow_speed, road.gamma, members.shape[2]
     speed, mean = np.empty(width), np.empty((3, 1))
     for e in range(members.shape[0]):

@@ -43,7 +43,7 @@ from dptse_env.model.step import advance, make_scratch, normalise, project, writ
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.fields import integer, positive
 from dptse_env.utils.kernels import (
-    Packed,
+    Bundle,
     all_finite,
     any_of,
     copy_matrix,
@@ -106,9 +106,9 @@ class Windows(NamedTuple):
 
 
 @kernel
-def restart(filters_: Packed, windows_: Packed, e: int) -> None:
+def restart(bundle: Bundle, e: int) -> None:
     """Reset an episode to a window of a single stage, its prior."""
-    filters, windows = Filters(*filters_), Windows(*windows_)
+    _, filters, windows = bundle.parts
     ekf.restart(filters, e)
     windows.length[e], windows.solved[e] = 1, UNSOLVED
     copy_vector(filters.initial_variance, windows.arrival_variance[e])
@@ -159,11 +159,9 @@ def _drop(stages: FloatArray) -> None:
 
 
 @kernel
-def predict(
-    road_: Packed, filters_: Packed, windows_: Packed, episodes: IntArray, inputs: FloatArray
-) -> None:
+def predict(bundle: Bundle, episodes: IntArray, inputs: FloatArray) -> None:
     """Append the model's prediction, under inputs `(k, n_u)`, to each window."""
-    road, filters, windows = RoadArrays(*road_), Filters(*filters_), Windows(*windows_)
+    road, filters, windows = bundle.parts
     scratch, state = make_scratch(road), np.empty(filters.means.shape[1])
     blocks = np.empty((*road.neighbours.shape, 4))
     for k in range(episodes.size):
@@ -229,9 +227,7 @@ def _linearise_rows(road: RoadArrays, windows: Windows, e: int, t: int, point: F
 
 @kernel
 def update(
-    road_: Packed,
-    filters_: Packed,
-    windows_: Packed,
+    bundle: Bundle,
     episodes: IntArray,
     observed: BoolArray,
     values: FloatArray,
@@ -239,7 +235,7 @@ def update(
     centre: FloatArray,
 ) -> None:
     """Update by measurements, `sigma` no less than allowed; see `Estimator.update`."""
-    road, filters, windows = RoadArrays(*road_), Filters(*filters_), Windows(*windows_)
+    road, filters, windows = bundle.parts
     n, n_stages, width = (
         windows.units.size,
         windows.solution.shape[1] - 1,
@@ -266,10 +262,10 @@ def update(
         if sound and any_of(observed[k]):
             windows.solved[e] = minimise(road, window, factor, side, z)
             if windows.solved[e] != UNSOLVED:
-                accept(road, filters, windows, e, z)
+                accept(bundle, e, z)
         filters.diverged[e] = not sound
         if not sound:
-            restart(filters_, windows_, e)
+            restart(bundle, e)
 
 
 @kernel_part
@@ -335,8 +331,9 @@ def _innovate(
 
 
 @kernel
-def accept(road: RoadArrays, filters: Filters, windows: Windows, e: int, z: FloatArray) -> None:
+def accept(bundle: Bundle, e: int, z: FloatArray) -> None:
     """Accept a solution `(>= L, padded)`, whose last state is the estimate."""
+    road, filters, windows = bundle.parts
     for t in range(windows.length[e]):
         for i in range(windows.units.size):
             windows.solution[e, t, i] = z[t, i]
@@ -368,9 +365,9 @@ def window_of(windows: Windows, e: int) -> Window:
 
 
 @kernel
-def write_program(road_: Packed, windows_: Packed, e: int, H: FloatArray, q: FloatArray) -> None:
+def write_program(bundle: Bundle, e: int, H: FloatArray, q: FloatArray) -> None:
     """Write H `(L, n_x, L, n_x)` and q `(L, n_x)` of an episode: z' H z + q' z."""
-    road, windows = RoadArrays(*road_), Windows(*windows_)
+    road, _, windows = bundle.parts
     window, length, n = window_of(windows, e), windows.length[e], windows.units.size
     point = make_point(length, windows.solution.shape[2], windows.observed.shape[2])
     look(road, window, point)
@@ -395,9 +392,8 @@ class MHE(CovarianceFilter):
     def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
         """See `make_estimator`."""
         super().__init__(model, n_episodes, settings_of_mhe(settings))
-        self._road = model.road
-        self._windows = _allocate(model, n_episodes, settings, self._road)
-        self._all_packed = (*self._packed, tuple(self._windows))
+        self._windows = _allocate(model, n_episodes, settings)
+        self._all = Bundle(model.road, self.filters, self._windows)
         self._restart(np.arange(n_episodes))
 
     @staticmethod
@@ -423,16 +419,17 @@ class MHE(CovarianceFilter):
         """
         n, length = self.model.n_states, int(self._windows.length[episode])
         H, q = np.empty((length, n, length, n)), np.empty((length, n))
-        write_program(self._packed[0], self._all_packed[2], episode, H, q)
+        write_program(self._all, episode, H, q)
         return H.reshape(length * n, length * n), q.ravel()
 
     def _predict(self, episodes: IntArray, inputs: FloatArray) -> None:
-        predict(*self._all_packed, episodes, inputs)
+        predict(self._all, episodes, inputs)
 
     def _update(self, episodes: IntArray, measured: Measurement) -> None:
         least = LEAST_DEVIATION * self.model.measurement_scale
         observed, values, sigma, centre = measured
-        update(*self._all_packed, episodes, observed, values, np.maximum(sigma, least), centre)
+        self.fallback[episodes] = False
+        update(self._all, episodes, observed, values, np.maximum(sigma, least), centre)
         unsolved = self._windows.solved[episodes] == UNSOLVED
         unsolved &= observed.any(axis=1) & ~self.diverged[episodes]
         for episode in episodes[unsolved].tolist():
@@ -446,16 +443,14 @@ class MHE(CovarianceFilter):
         self.fallback[episode], windows.side[episode] = z is None, 0
         windows.solved[episode] = FALLBACK if z is None else GENERAL_SOLVER
         if z is not None:
-            accept(self._road, self.filters, windows, episode, z.reshape(length, -1))
+            accept(self._all, episode, z.reshape(length, -1))
 
     def _restart(self, episodes: IntArray) -> None:
         for episode in episodes.tolist():
-            restart(*self._all_packed[1:], episode)
+            restart(self._all, episode)
 
 
-def _allocate(
-    model: ARZModel, n_episodes: int, settings: EstimatorSettings, road: RoadArrays
-) -> Windows:
+def _allocate(model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> Windows:
     """Return empty windows."""
     n, s, n_rows = model.n_states, model.n_segments, model.rows.n_rows
     width, shape = padded(n), (n_episodes, settings.mhe.horizon + 2)
@@ -466,7 +461,7 @@ def _allocate(
         predicted=np.zeros((*shape, n)),
         inputs=np.zeros((*shape, model.n_inputs)),
         process_variance=np.ones((*shape, n)),
-        blocks=np.zeros((*shape, *road.neighbours.shape, 4)),
+        blocks=np.zeros((*shape, *model.road.neighbours.shape, 4)),
         by_factor=np.zeros((*shape, model.n_demand_states, 2)),
         offsets=np.zeros((*shape, n)),
         observed=np.zeros((*shape, n_rows), dtype=np.bool_),

@@ -1,19 +1,41 @@
-"""A recurrent network as an estimator: it learned from simulated traffic what releases mean."""
+"""A recurrent network as an estimator: it learned from simulated traffic what releases mean.
+
+Its weights are files (`read_network`): the arrays of a `Network`, and a card that says what the
+network was trained on.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import ClassVar
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 
 from dptse_env.estimators.base import BatchEstimator, Estimate, Measurement
-from dptse_env.estimators.recurrent_kernels import LONGEST_AGE, advance, make_cells, read
-from dptse_env.estimators.recurrent_weights import SavedNetwork, member_for, read_network
+from dptse_env.estimators.recurrent_kernels import (
+    CHANNELS,
+    LONGEST_AGE,
+    Network,
+    advance,
+    make_cells,
+    read,
+    shapes,
+)
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.estimators.simple import estimated_traffic
 from dptse_env.model import ARZModel
-from dptse_env.utils.arrays import FloatArray, IntArray
+from dptse_env.utils.arrays import AnyArray, FloatArray, IntArray
+from dptse_env.utils.files import read_tensors, require_arrays, write_tensors
+
+LARGEST_WIDTH = 512
+FORMAT = "recurrent-2"
+"""Name of the channels' order and meaning; another one is refused."""
+
+_FOLDER, _SUFFIX = Path(__file__).parent / "networks", ".safetensors"
 
 
 class Recurrent(BatchEstimator):
@@ -120,3 +142,98 @@ def check_ranges(saved: SavedNetwork, model: ARZModel) -> None:
                 f"[{bounds[0]:g}, {bounds[1]:g}], this environment has [{low:g}, {high:g}]; choose "
                 "others, or set estimator_settings.recurrent.outside to true"
             )
+
+
+@dataclass(frozen=True)
+class SavedNetwork:
+    """A network with its card.
+
+    Attributes:
+        network: The weights.
+        card: ``name``, ``format``, ``channels``, ``ranges``, ``training``, and ``sha256`` of the
+            content.
+        source: The file, or the name of a network that comes with the package.
+    """
+
+    network: Network
+    card: Mapping[str, Any]
+    source: str
+
+
+def shipped_networks() -> list[str]:
+    """Return the names of the networks that come with the package."""
+    return sorted(path.stem for path in _FOLDER.glob(f"*{_SUFFIX}"))
+
+
+def member_for(source: str, flows: bool) -> str:
+    """Return the network of a pair that suits releases of flows, or of speeds.
+
+    A pair is two networks whose names, or files, are ``<source>-flows`` and ``<source>-speeds``. A
+    name or file of a single network is returned as it is.
+    """
+    member = f"{source}-{'flows' if flows else 'speeds'}"
+    if member in shipped_networks():
+        return member
+    return f"{member}{_SUFFIX}" if Path(f"{member}{_SUFFIX}").is_file() else source
+
+
+def read_network(source: str) -> SavedNetwork:
+    """Read a network, given by name or as a file.
+
+    Raises:
+        ValueError: There is no such name or file, or it is no saved network, or damaged.
+    """
+    if source in shipped_networks():
+        return _shipped(source)
+    if not Path(source).is_file():
+        names = {name.removesuffix("-flows") for name in shipped_networks()}
+        known = ", ".join(sorted(names.union(shipped_networks())))
+        raise ValueError(
+            f"estimator_settings.recurrent.weights must be a file or one of {known}, got {source!r}"
+        )
+    return _read(Path(source), source)
+
+
+@cache
+def _shipped(name: str) -> SavedNetwork:
+    return _read(_FOLDER / f"{name}{_SUFFIX}", name)
+
+
+def _read(path: Path, source: str) -> SavedNetwork:
+    card, arrays = read_tensors(path)
+    try:
+        return SavedNetwork(_checked(arrays, card), card, source)
+    except ValueError as problem:
+        raise ValueError(f"{source} is not a saved network: {problem!s:.300}") from problem
+
+
+def write_network(path: str | os.PathLike[str], network: Network, card: Mapping[str, Any]) -> None:
+    """Write a network with its card; the same arrays and card give the same bytes.
+
+    Raises:
+        ValueError: The network or its card has another layout; nothing is written.
+        OSError: The file cannot be written; what was there stays.
+    """
+    arrays = network._asdict()
+    _checked(arrays, card)
+    write_tensors(path, arrays, card)
+
+
+def _checked(arrays: Mapping[str, AnyArray], card: Mapping[str, Any]) -> Network:
+    """Return the network of a file's arrays and card, or refuse them."""
+    if card.get("format") != FORMAT or card.get("channels") != list(CHANNELS):
+        raise ValueError(
+            f"it has channels of format {card.get('format')!r}, this version reads {FORMAT!r}"
+        )
+    ranges = card.get("ranges")
+    if not isinstance(ranges, dict):
+        raise ValueError(f"its card must have ranges, got {ranges!r}")
+    for name, bounds in ranges.items():
+        numbers = isinstance(bounds, list) and len(bounds) == 2
+        if not numbers or not all(isinstance(bound, int | float) for bound in bounds):
+            raise ValueError(f"its card's range of {name!r} must be two numbers, got {bounds!r}")
+    width = len(arrays["hidden"]) if "hidden" in arrays and arrays["hidden"].ndim else 0
+    if not 1 <= width <= LARGEST_WIDTH:
+        raise ValueError(f"its width must be in 1..{LARGEST_WIDTH}, got {width}")
+    require_arrays(arrays, shapes(width), np.float32)
+    return Network(**arrays)

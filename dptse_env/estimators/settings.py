@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from dptse_env.model import ARZParameters, Bounds, available_parameters
-from dptse_env.utils.fields import Interval, check_object, checked_fields, from_mapping, parse_json
+from dptse_env.utils.fields import Interval, check_object, checked_fields, from_mapping, read_json
 
 Linearisation = Literal["paper", "trajectory"]
 
@@ -297,19 +297,19 @@ def read_settings(path: str | Path) -> EstimatorSettings:
     """Read tuned settings from a JSON file, as written by `write_settings`.
 
     Raises:
-        ValueError: The file has another format, or a setting is out of range; the message starts
-            with the path of the file.
+        ValueError: The file cannot be read, has another format, or a setting is out of range; the
+            message starts with the path of the file.
     """
-    return _parse(_entry(Path(path).read_bytes(), str(path)), str(path))
+    return _parse(_entry(read_json(path), str(path)), str(path))
 
 
 def tuned_estimator(path: str | Path) -> str:
     """Return the estimator that the settings in a JSON file were tuned for.
 
     Raises:
-        ValueError: The file has another format.
+        ValueError: The file cannot be read, or has another format.
     """
-    return str(_entry(Path(path).read_bytes(), str(path))["estimator"])
+    return str(_entry(read_json(path), str(path))["estimator"])
 
 
 def write_settings(
@@ -332,7 +332,7 @@ def write_settings(
     }  # fmt: skip
     name = settings_name(estimator, parameters, privacy, variant)
     text = json.dumps({name: entry}, indent=2) + "\n"
-    _parse(_entry(text, str(path)), str(path))
+    _parse(_entry(json.loads(text), str(path)), str(path))
     Path(path).write_text(text, encoding="utf-8")
 
 
@@ -343,9 +343,8 @@ def _table() -> dict[str, dict[str, Any]]:
     return table
 
 
-def _entry(text: str | bytes, path: str) -> dict[str, Any]:
+def _entry(content: Any, path: str) -> dict[str, Any]:
     """Return the entry of a file that has one."""
-    content = parse_json(text, path)
     if not isinstance(content, dict) or len(content) != 1:
         raise ValueError(
             f"{path} must be a mapping with one name of settings, got {content!r:.200}"

@@ -39,7 +39,7 @@ from dptse_env.model.step import project
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.fields import require
 from dptse_env.utils.kernels import (
-    Packed,
+    Bundle,
     all_finite,
     copy_matrix,
     fill_vector,
@@ -86,14 +86,14 @@ class UKF(CovarianceFilter):
             surplus=beta - alpha**2,
             spread=float(np.sqrt(spread)),
         )
-        self._all_packed = (*self._packed, tuple(self._points))
+        self._all = Bundle(model.road, self.filters, self._points)
 
     def _predict(self, episodes: IntArray, inputs: FloatArray) -> None:
-        predict(*self._all_packed, episodes, inputs)
+        predict(self._all, episodes, inputs)
 
     def _update(self, episodes: IntArray, measured: Measurement) -> None:
         observed, values, sigma, centre = measured
-        update(*self._all_packed, episodes, observed, values, sigma, centre)
+        update(self._all, episodes, observed, values, sigma, centre)
 
     def _restart(self, episodes: IntArray) -> None:
         self._points.moved[episodes] = False
@@ -101,11 +101,9 @@ class UKF(CovarianceFilter):
 
 
 @kernel
-def predict(
-    road_: Packed, filters_: Packed, points_: Packed, episodes: IntArray, inputs: FloatArray
-) -> None:
+def predict(bundle: Bundle, episodes: IntArray, inputs: FloatArray) -> None:
     """Predict one step ahead under inputs `(k, n_u)` by points that are made, moved, projected."""
-    road, filters, points = RoadArrays(*road_), Filters(*filters_), Points(*points_)
+    road, filters, points = bundle.parts
     n, width = points.states.shape[1:]
     scratch, noise, shift = make_batch_scratch(road, width), np.empty(n), np.empty(n)
     root, distances = np.empty(filters.covariances.shape[1:]), np.empty((n, width))
@@ -176,9 +174,7 @@ def _gather(
 
 @kernel
 def update(
-    road_: Packed,
-    filters_: Packed,
-    points_: Packed,
+    bundle: Bundle,
     episodes: IntArray,
     observed: BoolArray,
     values: FloatArray,
@@ -186,7 +182,7 @@ def update(
     centre: FloatArray,
 ) -> None:
     """Update by measurements; see `Estimator.update`."""
-    road, filters, points = RoadArrays(*road_), Filters(*filters_), Points(*points_)
+    road, filters, points = bundle.parts
     rows, variances = (
         np.empty(road.row_first.size, np.int64),
         np.empty(filters.covariances.shape[2]),

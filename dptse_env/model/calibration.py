@@ -260,9 +260,10 @@ def calibrate(
         return ARZParameters(name, v_f, scale * least_jam, gamma, tau, _most_lanes(network))
 
     def loss(values: FloatArray) -> float:
+        model = ARZModel(network, parameters_at(values), time_step)
         try:
-            model = ARZModel(network, parameters_at(values), time_step)
-        except ValueError:  # violates the CFL condition
+            model.require_time_step()
+        except ValueError:
             return _REFUSED
         return _relative(prediction_error(model, data, horizons, stride), persistence)
 

@@ -26,7 +26,7 @@ from dptse_env.model.parameters import (
     ARZParameters,
     Bounds,
 )
-from dptse_env.model.step import jacobians, next_states
+from dptse_env.model.step import jacobians, next_states, write_inputs
 from dptse_env.utils.arrays import FloatArray
 from dptse_env.utils.fields import non_negative
 
@@ -61,9 +61,9 @@ class ARZModel:
         measurement_scale: Units of the two numbers of a row of a measurement.
 
     Raises:
-        ValueError: The network is impossible, the time step violates the CFL condition, the
-            reference speed is negative or not finite, or rows cover several segments where mean
-            speeds are released, which have no sum.
+        ValueError: The network is impossible, the reference speed is negative or not finite, or
+            rows cover several segments where mean speeds are released, which have no sum. The
+            dynamics, not the constructor, refuse a time step that violates the CFL condition.
     """
 
     def __init__(
@@ -75,10 +75,9 @@ class ARZModel:
         rows: MeasurementRows | None = None,
         demand_states: bool = False,
     ) -> None:
-        """Derive what the equations need and check the time step."""
+        """Derive what the equations need."""
         self.network, self.parameters, self.time_step = network, parameters, time_step
         self.layout = layout = make_layout(network)
-        parameters.require_time_step(time_step, min(network.segment_lengths))
         self.n_segments = layout.n_segments
         self.n_demand_states = layout.entries.size if demand_states else 0
         self.n_states = 2 * self.n_segments + self.n_demand_states
@@ -107,7 +106,12 @@ class ARZModel:
 
     @cached_property
     def road(self) -> RoadArrays:
-        """The model as arrays and numbers, for kernels."""
+        """The model as arrays and numbers, for kernels.
+
+        Raises:
+            ValueError: The time step violates the CFL condition.
+        """
+        self.require_time_step()
         layout, n = self.layout, self.n_segments
         entry, leave = np.full((2, n), -1, dtype=np.int64)
         entry[layout.entries] = layout.entry_inputs
@@ -139,6 +143,10 @@ class ARZModel:
             row_first=self.rows.first,
             row_span=self.rows.span,
         )
+
+    def require_time_step(self) -> None:
+        """Raise ``ValueError`` where the time step violates the CFL condition on a segment."""
+        self.parameters.require_time_step(self.time_step, min(self.network.segment_lengths))
 
     # States -------------------------------------------------------------------------------------
 
@@ -233,20 +241,13 @@ class ARZModel:
         of an empty cell is zero for any speed, NaN included. w is clipped to [0, 1.1 v_f], so that
         no input violates the CFL condition.
         """
-        layout, jam = self.layout, self.entry_jam_density
-        v_f, gamma = self.parameters.free_flow_speed, self.parameters.gamma
-        inputs = np.empty((density.shape[0], self.n_inputs))
-        rho = density[:, layout.entry_boundaries]
-        occupied = rho > VACUUM * jam
-        v, p = np.where(occupied, speed[:, layout.entry_boundaries], 0.0), self.pressure(rho, jam)
-        w = np.where(occupied, np.clip(v + p, 0.0, self.largest_speed), v_f)
-        # Up to the critical density a cell sends what it holds, beyond the capacity q_max(w).
-        critical = jam * (w / (1.0 + gamma) / v_f) ** (1.0 / gamma)
-        capacity = critical * w * (gamma / (1.0 + gamma))
-        demand = np.where((1.0 + gamma) * p <= w, rho * (w - p), capacity)
-        inputs[:, layout.entry_inputs] = np.where(occupied, demand, 0.0)
-        inputs[:, layout.entry_inputs + 1] = w
-        inputs[:, layout.exit_inputs] = density[:, layout.exit_boundaries]
+        layout, inputs = self.layout, np.empty((density.shape[0], self.n_inputs))
+        density, speed = np.ascontiguousarray(density), np.ascontiguousarray(speed)
+        write_inputs(
+            self.parameters.free_flow_speed, self.parameters.gamma, self.entry_jam_density,
+            layout.entry_boundaries, layout.entry_inputs,
+            layout.exit_boundaries, layout.exit_inputs, density, speed, inputs,
+        )  # fmt: skip
         return inputs
 
     # Measurements -------------------------------------------------------------------------------

@@ -299,7 +299,7 @@ class MeasurementRows:
 
 
 class RoadArrays(NamedTuple):
-    """A model of S segments as arrays and numbers, for compiled code."""
+    """A model of S segments as arrays and numbers, for compiled code; nothing changes them."""
 
     free_flow_speed: float  # v_f [km/h]
     gamma: float  # Exponent of the pressure
@@ -322,3 +322,7 @@ class RoadArrays(NamedTuple):
     second_scale: float  # unit of the second number that sensors release [km/h or veh/h]
     row_first: IntArray  # (M,) first segment of each row of a measurement
     row_span: IntArray  # (M,) segments of each row
+
+    def __deepcopy__(self, memo: object) -> RoadArrays:
+        """Return the same arrays, which copies of a filter share."""
+        return self

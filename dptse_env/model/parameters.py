@@ -12,9 +12,11 @@ from typing import Annotated, Any, Literal
 
 from dptse_env.utils.fields import (
     Interval,
+    check_object,
     checked_fields,
     from_mapping,
-    parse_object,
+    parse_json,
+    read_json,
     require_name,
     shipped_texts,
 )
@@ -97,8 +99,9 @@ class ARZParameters:
             # Rounded down, so that the number in the message is admissible.
             named = math.floor(100.0 * largest) / 100.0
             raise ValueError(
-                f"model.time_step must be > 0 and at most {named:.2f} s (CFL condition of "
-                f"parameters {self.name!r} on a segment of {segment_length:g} km), got {time_step}"
+                f"corridor.segment_length must be longer for the parameters {self.name!r}: on "
+                f"{segment_length:g} km their CFL condition needs a time step > 0 and at most "
+                f"{named:.2f} s, got {time_step:g} s"
             )
 
 
@@ -120,17 +123,17 @@ def load_parameters(name: str) -> ARZParameters:
         ValueError: There is no such set; the message lists the available ones.
     """
     require_name("parameters", name, available_parameters())
-    return _parse(_shipped()[name], name)
+    return _parse(parse_json(_shipped()[name], name), name)
 
 
 def read_parameters(path: str | Path) -> ARZParameters:
     """Read a set from a JSON file, as written by `write_parameters`.
 
     Raises:
-        ValueError: The file has another format or a value is out of range; the message starts with
-            the path of the file.
+        ValueError: The file cannot be read, has another format, or a value is out of range; the
+            message starts with the path of the file.
     """
-    return _parse(Path(path).read_bytes(), str(path))
+    return _parse(read_json(path), str(path))
 
 
 def write_parameters(
@@ -141,9 +144,9 @@ def write_parameters(
     Path(path).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 
-def _parse(text: str | bytes, path: str) -> ARZParameters:
-    content = parse_object(text, path, {"parameters": dict, "provenance": dict})
+def _parse(content: Any, path: str) -> ARZParameters:
+    checked = check_object(content, path, {"parameters": dict, "provenance": dict})
     try:
-        return ARZParameters.from_mapping(content["parameters"])
+        return ARZParameters.from_mapping(checked["parameters"])
     except ValueError as problem:
         raise ValueError(f"{path}: {problem}") from problem

@@ -30,7 +30,7 @@ from dptse_env.model.parameters import (
     STANDING,
     VACUUM,
 )
-from dptse_env.utils.arrays import FloatArray
+from dptse_env.utils.arrays import FloatArray, IntArray
 from dptse_env.utils.kernels import kernel, kernel_part
 
 # Columns of the table of cells: values, then partial derivatives by the cell's rho and psi.
@@ -348,6 +348,57 @@ def jacobians(
             derivatives[i, j, j] = 1.0
             for k in range(2):
                 derivatives[i, 2 * road.entries[e] + k, j] = scratch.by_factor[e, k]
+
+
+@kernel
+def write_inputs(
+    v_f: float,
+    gamma: float,
+    jam: FloatArray,
+    entry_boundaries: IntArray,
+    entry_inputs: IntArray,
+    exit_boundaries: IntArray,
+    exit_inputs: IntArray,
+    density: FloatArray,
+    speed: FloatArray,
+    inputs: FloatArray,
+) -> None:
+    """Write the inputs (n, n_u) of boundary cells; see `ARZModel.boundary_inputs`.
+
+    Args:
+        v_f: Free speed [km/h].
+        gamma: Exponent of the pressure.
+        jam: Jam densities of the cells before the entries (1 + I,) [veh/km].
+        entry_boundaries: These cells (1 + I,).
+        entry_inputs: The columns of their demands (1 + I,), before those of w.
+        exit_boundaries: The cells behind the exits (1 + O,).
+        exit_inputs: The columns of their densities (1 + O,).
+        density: Densities of the boundary cells (n, R) [veh/km].
+        speed: Their speeds (n, R) [km/h].
+        inputs: Written.
+    """
+    for i in range(density.shape[0]):
+        for e in range(exit_boundaries.size):
+            inputs[i, exit_inputs[e]] = density[i, exit_boundaries[e]]
+        for e in range(entry_boundaries.size):
+            rho, demand, w = density[i, entry_boundaries[e]], 0.0, v_f
+            if rho > VACUUM * jam[e]:
+                p = v_f * _rounded_power(rho / jam[e], gamma)
+                w = clip(speed[i, entry_boundaries[e]] + p, 0.0, LARGEST_W * v_f)
+                if (1.0 + gamma) * p <= w:
+                    demand = rho * (w - p)
+                else:
+                    critical = jam[e] * _rounded_power(w / (1.0 + gamma) / v_f, 1.0 / gamma)
+                    demand = critical * w * (gamma / (1.0 + gamma))
+            inputs[i, entry_inputs[e]], inputs[i, entry_inputs[e] + 1] = demand, w
+
+
+@kernel_part
+def _rounded_power(base: float, exponent: float) -> float:
+    """Return a power, squares and roots correctly rounded, as numpy has them."""
+    if exponent == 2.0:
+        return base * base
+    return float(np.sqrt(base) if exponent == 0.5 else base**exponent)
 
 
 @kernel_part

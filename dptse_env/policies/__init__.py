@@ -1,29 +1,54 @@
-"""Saved policies: files are read without torch; some policies come with the package."""
+"""Saved policies: weights with a card, read without torch; some come with the package."""
 
 import os
-from importlib.resources import files
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from dptse_env.policies.reading import CARD, LARGEST_FILE, WEIGHTS, PolicyFile, parse_policy
+from dptse_env.utils.arrays import AnyArray
+from dptse_env.utils.files import read_tensors
 
-__all__ = [
-    "CARD",
-    "TRANSFERABLE",
-    "WEIGHTS",
-    "PolicyFile",
-    "parse_policy",
-    "read_policy",
-    "shipped_policies",
-]
+SUFFIX = ".safetensors"
+"""Ending of the names of files with weights."""
 
 TRANSFERABLE = ("corridor", "bandwidth")
 """Properties that a caller may allow to differ between a policy and its environment."""
 
+_FOLDER = Path(__file__).parent
+_FIELDS: Mapping[str, type] = {
+    "fits": dict, "fits.action": str, "fits.corridor": str, "policy": dict, "policy.class": str,
+    "policy.arguments": dict, "env": str, "keywords": dict, "trained_on": str, "training": dict,
+}  # fmt: skip
+"""Fields that a card must have, with their types."""
+
+
+@dataclass(frozen=True)
+class PolicyFile:
+    """The content of a policy file, read without torch.
+
+    Attributes:
+        source: The file, or the name of a policy that comes with the package.
+        card: Description of the policy: its class, its training, and the environments it fits.
+        weights: Arrays by name; all values are finite.
+    """
+
+    source: str
+    card: Mapping[str, Any]
+    weights: Mapping[str, AnyArray]
+
+    @property
+    def identity(self) -> str:
+        """Digest of card and weights; of a file converted from an older form that of the old one.
+
+        Results that were recorded with the old file are recognised by it.
+        """
+        return str(self.card.get("converted_from", self.card["sha256"]))
+
 
 def shipped_policies() -> list[str]:
     """Return the names of the policies that come with the package."""
-    entries = files("dptse_env").joinpath("policies").iterdir()
-    return sorted(entry.name[:-4] for entry in entries if entry.name.endswith(".zip"))
+    return sorted(path.stem for path in _FOLDER.glob(f"*{SUFFIX}"))
 
 
 def read_policy(source: str | os.PathLike[str]) -> PolicyFile:
@@ -35,17 +60,25 @@ def read_policy(source: str | os.PathLike[str]) -> PolicyFile:
     Raises:
         FileNotFoundError: There is no such file, nor such a name.
         ValueError: The file is not a saved policy, is damaged, or exceeds a limit of
-            `dptse_env.policies.reading`.
+            `dptse_env.utils.files`.
     """
-    name = os.fspath(source)
+    name, path = os.fspath(source), Path(source)
     if name in shipped_policies():
-        path = files("dptse_env").joinpath("policies", f"{name}.zip")
-        return parse_policy(path.read_bytes(), name)
-    if not Path(source).is_file():
+        path = _FOLDER / f"{name}{SUFFIX}"
+    elif not path.exists():
         known = ", ".join(shipped_policies()) or "none"
         raise FileNotFoundError(
             f"there is no saved policy {name!r}: neither a file, nor one of those that come with "
             f"the package ({known})"
         )
-    with Path(source).open("rb") as file:
-        return parse_policy(file.read(LARGEST_FILE + 1), name)
+    card, weights = read_tensors(path)
+    for field, kind in _FIELDS.items():
+        value: Any = card
+        for key in field.split("."):
+            value = value.get(key) if isinstance(value, dict) else None
+        if not isinstance(value, kind):
+            raise ValueError(
+                f"{name} is not a saved policy: its card must have a field {field!r} of type "
+                f"{kind.__name__}"
+            )
+    return PolicyFile(name, card, weights)

@@ -17,8 +17,10 @@ from dptse_env.model.parameters import SECONDS_PER_HOUR
 from dptse_env.release.base import Task
 from dptse_env.release.queries import QueryOptions
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
-from dptse_env.utils.kernels import Packed, copy_vector, kernel, kernel_part
+from dptse_env.utils.kernels import copy_vector, kernel, kernel_part
 from dptse_env.utils.registry import Registry
+
+Packed = tuple[Any, ...]
 
 MEAN_SQUARE = 0.15
 """Expected value of d^2 / D^2, by which a contribution costs more than its price."""

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from numpy.typing import NDArray
 
-from dptse_env.traffic import AnyRecord, Corridor, Penetration, RecordLibrary, with_vehicles
+from dptse_env.traffic import Corridor, Penetration, Record, RecordLibrary
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.kernels import kernel
 
@@ -106,7 +106,7 @@ class Traffic:
             self._loaded[index] = True
         return new
 
-    def record(self, index: int) -> AnyRecord:
+    def record(self, index: int) -> Record:
         """Return the record of ``seeds[index]``, which is made now if it is missing."""
         return self.library.get(self.corridor, self.seeds[index])
 
@@ -136,9 +136,9 @@ class Traffic:
         start, stop = self._start[indices, times], self._start[indices, times + 1]
         return VehicleRows(start, stop, self._vehicle, self._place, self._speed)
 
-    def _append(self, index: int, record: AnyRecord) -> None:
+    def _append(self, index: int, record: Record) -> None:
         """Append the vehicles of a record, with what each group sees of them."""
-        record = with_vehicles(record, "the release model, or the keyword penetration,")
+        record = record.vehicles_for("the release model, or the keyword penetration,")
         end = self._n_rows + record.n_rows
         if end > self._vehicle.size:
             size = max(end, int(GROWTH * self._vehicle.size))

@@ -1,29 +1,44 @@
 """Trained policies as small files, which are checked against the environment when loaded."""
 
-import io
-import json
+from __future__ import annotations
+
 import os
-import zipfile
 from collections.abc import Collection, Mapping
-from dataclasses import asdict
 from importlib.metadata import version
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from stable_baselines3.common.policies import BasePolicy
+from gymnasium import spaces
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+from torch import nn
 
 from dptse_env.config import EnvConfig
 from dptse_env.estimators import ESTIMATORS
 from dptse_env.parts import QueryInterface, make_interface
-from dptse_env.policies import CARD, TRANSFERABLE, WEIGHTS, PolicyFile, parse_policy, read_policy
-from dptse_env.sb3.fit import TrainedOn, check_fit, make_fit
-from dptse_env.sb3.kinds import KINDS, Shapes
+from dptse_env.policies import SUFFIX, TRANSFERABLE, read_policy
+from dptse_env.sb3.plackett_luce import PlackettLucePolicy, RoadChannels
+from dptse_env.spaces.actions import ACTION_ENCODINGS
+from dptse_env.traffic import Corridor
 from dptse_env.utils.arrays import Action, BoolArray, Observation
+from dptse_env.utils.fields import Interval, integer, number
+from dptse_env.utils.files import write_tensors
+from dptse_env.utils.registry import needed_for
 
-CARD_TEXT = "CARD.md"
-"""Entry of a policy file with the readable card."""
+POLICY_FORMAT = "dptse-policy-1"
+"""Format of the weights; its number is raised when saved weights change their meaning."""
+
+MOST_LAYERS = 64
+"""Largest number of layers of a perceptron."""
+
+SHARED, MASKED = "PlackettLucePolicy", "MaskableActorCriticPolicy"
+CLASSES = (SHARED, "ActorCriticPolicy", MASKED)
+"""Classes of policies that can be saved. The network of the first is shared by all segments."""
+
+_PLAIN = "single segments"
+_LARGEST_RULE = Interval(-1e6, 1e6)
 
 
 class ActingPolicy:
@@ -31,13 +46,17 @@ class ActingPolicy:
 
     Attributes:
         interface: Interface of its environment.
+        card: Description of the policy, its training, and the environments it fits; empty where it
+            was not loaded.
     """
 
-    def __init__(self, policy: BasePolicy, interface: QueryInterface) -> None:
+    def __init__(
+        self, policy: BasePolicy, interface: QueryInterface, card: Mapping[str, Any] | None = None
+    ) -> None:
         """Bind a policy to an environment's interface."""
-        self._policy, self.interface = policy, interface
+        self._policy, self.interface, self.card = policy, interface, dict(card or {})
         # A maskable policy expects masks as an argument; they are part of the observation.
-        self._takes_masks = type(policy).__name__ == "MaskableActorCriticPolicy"
+        self._takes_masks = type(policy).__name__ == MASKED
 
     def predict(
         self,
@@ -70,23 +89,6 @@ class ActingPolicy:
         return actions.available(np.atleast_2d(picked)).reshape(picked.shape)
 
 
-class SavedPolicy(ActingPolicy):
-    """A trained policy with the ``predict`` of stable-baselines3.
-
-    Attributes:
-        card: Description of the policy, its training, and the environments it fits.
-        trained_on: The road that it was trained on.
-        interface: Interface of its environment.
-    """
-
-    def __init__(
-        self, policy: BasePolicy, card: Mapping[str, Any], interface: QueryInterface
-    ) -> None:
-        """Bind a policy to its card and to an environment's interface."""
-        super().__init__(policy, interface)
-        self.card, self.trained_on = dict(card), TrainedOn.from_card(card)
-
-
 def save_policy(
     path: str | os.PathLike[str],
     policy: BasePolicy,
@@ -102,7 +104,7 @@ def save_policy(
     An existing file is replaced when the new one is complete.
 
     Args:
-        path: A file that ends in ``.zip``.
+        path: A file that ends in ``.safetensors``.
         policy: One of `PlackettLucePolicy`, ``ActorCriticPolicy``, ``MaskableActorCriticPolicy``.
         config: Configuration of the environment that it was trained on.
         env: Id of that environment.
@@ -113,50 +115,41 @@ def save_policy(
     Raises:
         ValueError: The policy could not be loaded again: it is of another class, has additional
             parts, is too large, or has weights that are not finite. Or the path does not end
-            in ``.zip``.
+            in ``.safetensors``.
         OSError: The file cannot be written.
     """
-    target = Path(path)
     name = type(policy).__name__
-    if name not in KINDS:
-        raise ValueError(f"policy must be one of {', '.join(KINDS)}, got {name}")
-    if target.suffix != ".zip":
-        raise ValueError(f"path must end in .zip, got {str(path)!r}")
-    kind = KINDS[name]
-    arguments = kind.describe(policy)
+    if name not in CLASSES:
+        raise ValueError(f"policy must be one of {', '.join(CLASSES)}, got {name}")
+    if Path(path).suffix != SUFFIX:
+        raise ValueError(f"path must end in {SUFFIX}, got {os.fspath(path)!r}")
     card = {
-        "fits": make_fit(config, kind),
-        "policy": {"class": name, "arguments": arguments},
+        "fits": _fit(config, name),
+        "policy": {"class": name, "arguments": _arguments(policy)},
         "env": env,
         "keywords": dict(keywords),
-        "corridor": config.corridor.name,
-        "trained_on": asdict(TrainedOn.from_corridor(config.corridor)),
+        "trained_on": describe_road(config.corridor),
         "estimator": ESTIMATORS.name_of(config.estimator),
         "epsilon": config.privacy.epsilon,
         "versions": {name: version(name) for name in ("dptse-env", "stable-baselines3", "torch")},
         "training": dict(training),
         "figures": dict(figures),
     }
-    content = _packed(card, policy)
+    weights = {key: value.detach().cpu().numpy() for key, value in policy.state_dict().items()}
     try:
-        _check_weights(parse_policy(content, str(path)), kind.shapes(config, arguments))
+        _made(card, weights, config)
     except ValueError as problem:
         raise ValueError(f"policy cannot be saved: {problem}") from problem
-    temporary = target.with_suffix(".tmp")
-    try:
-        temporary.write_bytes(content)
-        temporary.replace(target)
-    finally:
-        temporary.unlink(missing_ok=True)
+    write_tensors(path, weights, card)
 
 
 def load_policy(
     source: str | os.PathLike[str], env: Any, *, allow: Collection[str] = ()
-) -> SavedPolicy:
+) -> ActingPolicy:
     """Load a policy for an environment.
 
-    No code in the file is run. Its size, its values and the shapes of its network are checked
-    before anything is built (`dptse_env.policies.reading`).
+    No code in the file is run. Its size, its values and the size of its network are checked before
+    anything is built.
 
     Args:
         source: A file, or the name of a policy that comes with the package
@@ -179,59 +172,20 @@ def load_policy(
     config = _config_of(env)
     file = read_policy(source)
     try:
-        return _bind(file, config, allow)
+        _check_fit(file.card, config, allow)
+        policy = _made(file.card, file.weights, config)
     except ValueError as problem:
         raise ValueError(f"policy {file.source!r} cannot be loaded: {problem!s:.1000}") from problem
+    return ActingPolicy(policy, make_interface(config), file.card)
 
 
-def _bind(file: PolicyFile, config: EnvConfig, allow: Collection[str]) -> SavedPolicy:
-    """Make the policy of a file for an environment of ``config``.
-
-    Raises:
-        ValueError: It does not fit, or its card and its weights do not agree.
-    """
-    name, arguments = (file.card["policy"][key] for key in ("class", "arguments"))
-    if name not in KINDS:
-        raise ValueError(f"its class must be one of {', '.join(KINDS)}, got {name!r}")
-    kind = KINDS[name]
-    check_fit(file.card, kind, config, allow)
-    _check_weights(file, kind.shapes(config, arguments))
-    # The random initial weights are replaced; torch's generator is left unchanged.
-    with torch.random.fork_rng(devices=[]):
-        policy = kind.make(config, arguments)
-    weights = {name: torch.from_numpy(array) for name, array in file.weights.items()}
-    policy.load_state_dict(weights)
-    policy.set_training_mode(False)
-    return SavedPolicy(policy, file.card, make_interface(config))
-
-
-def _check_weights(file: PolicyFile, shapes: Shapes) -> None:
-    """Refuse weights that are not exactly those of the network that a card describes."""
-    found = {name: array.shape for name, array in file.weights.items()}
-    missing = [name for name in shapes if name not in found]
-    unknown = [name for name in found if name not in shapes]
-    for problem, names in (("lacks weights", missing), ("has unknown weights", unknown)):
-        if names:
-            raise ValueError(f"it {problem} {', '.join(map(repr, names[:5]))}")
-    for name, shape in shapes.items():
-        if found[name] != shape:
-            raise ValueError(f"weight {name!r} must have shape {shape}, got {found[name]}")
-
-
-def _packed(card: Mapping[str, Any], policy: BasePolicy) -> bytes:
-    """Return the content of a policy file."""
-    weights = io.BytesIO()
-    torch.save({k: v.detach().cpu().contiguous() for k, v in policy.state_dict().items()}, weights)
-    content = io.BytesIO()
-    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, entry in (
-            (CARD, json.dumps(card, indent=2) + "\n"),
-            (CARD_TEXT, _text(card)),
-            (WEIGHTS, weights.getvalue()),
-        ):
-            # ZipInfo has a fixed date, so that the same policy gives the same file.
-            archive.writestr(zipfile.ZipInfo(name), entry, zipfile.ZIP_DEFLATED)
-    return content.getvalue()
+def describe_road(corridor: Corridor) -> str:
+    """Return the name and the sizes of a corridor in words."""
+    length = min(corridor.segment_lengths[: corridor.n_mainline])
+    return (
+        f"{corridor.name} ({corridor.n_mainline} mainline segments of {length:g} km, "
+        f"{corridor.most_lanes} lanes, fixed sensors on {list(corridor.fixed_sensors)})"
+    )
 
 
 def _config_of(env: Any) -> EnvConfig:
@@ -242,34 +196,163 @@ def _config_of(env: Any) -> EnvConfig:
     return config
 
 
-def _text(card: Mapping[str, Any]) -> str:
-    """Return the readable card."""
-    fits, training = card["fits"], card["training"]
-    lines = [
-        f"# {card['policy']['class']} for {card['env'].rpartition(':')[2]}",
-        "",
-        f"Chooses {_shown_bandwidth(fits)} a second on corridor {TrainedOn.from_card(card)} "
-        f"(action encoding `{fits['action']}`), trained with estimator {card['estimator']} at "
-        f"epsilon {card['epsilon']:g}.",
-        "",
-        "It observes released values, the estimator's output and the query history, and no truth; "
-        "an episode's guarantee of privacy is that of the environment's mechanism, whatever the "
-        "policy queries. It was trained on simulated traffic and has not been tried on real roads.",
-        "",
-        "| | |",
-        "|---|---|",
-    ]
-    rows = {**{f"training: {k}": v for k, v in training.items()}, **card["figures"]}
-    rows |= {f"version: {name}": number for name, number in card["versions"].items()}
-    lines += [f"| {name} | {_shown(value)} |" for name, value in rows.items()]
-    return "\n".join(lines) + "\n"
+# The environment that a policy fits.
 
 
-def _shown_bandwidth(fits: Mapping[str, Any]) -> str:
-    if "queries" not in fits:
-        return f"{fits['bandwidth']} segments"
-    return f"queries for a bandwidth of {fits['bandwidth']} ({fits['queries']})"
+def _fit(config: EnvConfig, name: str) -> dict[str, Any]:
+    """Return what an environment and a policy of class `name` must agree in, as plain JSON."""
+    encoding = make_interface(config).observations
+    sizes = [f"{block}:{place.stop - place.start}" for block, place in encoding.slices.items()]
+    fit: dict[str, Any] = {
+        "format": POLICY_FORMAT,
+        "observation": " ".join(sizes),
+        "action": ACTION_ENCODINGS.name_of(config.action),
+        "corridor": config.corridor.digest,
+        "bandwidth": config.bandwidth,
+    }
+    if not config.queries.are_plain:
+        fit["queries"] = f"{config.queries}, bandwidth_unit {config.bandwidth_unit!r}"
+    if name == SHARED:
+        fit["channels"] = [channel.name for channel in RoadChannels.from_config(config).channels]
+    return fit
 
 
-def _shown(value: Any) -> str:
-    return f"{value:.6g}" if isinstance(value, float) else str(value).replace("|", "\\|")
+def _check_fit(card: Mapping[str, Any], config: EnvConfig, allow: Collection[str]) -> None:
+    """Refuse a policy that does not fit an environment.
+
+    Raises:
+        ValueError: A property outside `allow` differs; the message names the values of both.
+    """
+    there, here = card["fits"], _fit(config, card["policy"]["class"])
+    pairs = {key: (there.get(key), here[key]) for key in ("format", "action", "bandwidth")}
+    pairs["queries"] = there.get("queries", _PLAIN), here.get("queries", _PLAIN)
+    road_there, road_here = there["corridor"], here["corridor"]
+    observations = there.get("observation"), here["observation"]
+    if "channels" in here:
+        # Another number of segments is a matter of the corridor: the network is shared by them.
+        named, ours = there.get("channels"), set(here["channels"])
+        theirs = set(map(str, named)) if isinstance(named, list) else set()
+        pairs["channels"] = sorted(theirs - ours), sorted(ours - theirs)
+        is_moved = (road_there, observations[0]) != (road_here, observations[1])
+    else:
+        pairs["observation"] = observations
+        is_moved = road_there != road_here
+    if is_moved:
+        pairs["corridor"] = (
+            f"{card['trained_on']}, traffic {road_there:.8}",
+            f"{describe_road(config.corridor)}, traffic {road_here:.8}",
+        )
+    differences = {key: pair for key, pair in pairs.items() if pair[0] != pair[1]}
+    refused = {key: pair for key, pair in differences.items() if key not in allow}
+    if refused:
+        text = "; ".join(
+            f"{key} is {there!r:.300} for the policy and {here!r:.300} for the environment"
+            for key, (there, here) in refused.items()
+        )
+        if all(key in TRANSFERABLE for key in refused):
+            text += f"; to transfer it on purpose, allow {' and '.join(sorted(refused))}"
+        raise ValueError(text)
+
+
+# The network of a policy, described by the arguments on its card.
+
+
+def _arguments(policy: BasePolicy) -> dict[str, Any]:
+    """Return the arguments from which `_made` makes such a policy, as plain JSON."""
+    if isinstance(policy, PlackettLucePolicy):
+        names = ("width", "rule", "skips_sensors")
+        return {name: getattr(policy, name) for name in names}
+    # Maskable policies have the same attributes, without being of the same class.
+    perceptron: Any = policy
+    if perceptron.activation_fn is not nn.Tanh:
+        units = perceptron.activation_fn.__name__
+        raise ValueError(f"policy must have Tanh units, got {units}")
+    return {"net_arch": perceptron.net_arch}
+
+
+def _made(
+    card: Mapping[str, Any], weights: Mapping[str, np.ndarray[Any, Any]], config: EnvConfig
+) -> BasePolicy:
+    """Make the policy of a card for an environment of ``config``.
+
+    Raises:
+        ValueError: An argument is unknown or out of range, or the weights are others.
+    """
+    name, arguments = card["policy"]["class"], card["policy"]["arguments"]
+    if name not in CLASSES:
+        raise ValueError(f"policy.class must be one of {', '.join(CLASSES)}, got {name!r:.80}")
+    if any(array.dtype != np.float32 for array in weights.values()):
+        raise ValueError("weights must be of float32 alone")
+    n_values = sum(array.size for array in weights.values())
+    # The random initial weights are replaced; torch's generator is left unchanged.
+    with torch.random.fork_rng(devices=[]):
+        if name == SHARED:
+            _check_shared(arguments, n_values)
+            policy: BasePolicy = PlackettLucePolicy.from_config(config, **arguments)
+        else:
+            policy = _perceptron(name, arguments, config, n_values)
+    tensors = {key: torch.tensor(array) for key, array in weights.items()}
+    try:
+        policy.load_state_dict(tensors)
+    except RuntimeError as problem:  # the message has a line for each of them
+        raise ValueError(" ".join(str(problem).split())) from problem
+    policy.set_training_mode(False)
+    return policy
+
+
+def _check_shared(arguments: Mapping[str, Any], n_values: int) -> None:
+    _check_names(arguments, {"width", "rule", "skips_sensors"})
+    width, rule = integer("policy.arguments.width", arguments["width"], 1), arguments["rule"]
+    _check_size(6 * width * width, n_values)  # of the trunk's second convolution and of its mean
+    if not isinstance(rule, dict) or not rule:
+        raise ValueError(f"policy.arguments.rule must be a mapping of blocks, got {rule!r:.80}")
+    for name, weight in rule.items():
+        number(float, weight, f"policy.arguments.rule.{name:.80}", _LARGEST_RULE)
+    if not isinstance(skips := arguments["skips_sensors"], bool):
+        raise ValueError(f"policy.arguments.skips_sensors must be a bool, got {skips!r:.80}")
+
+
+def _perceptron(
+    name: str, arguments: Mapping[str, Any], config: EnvConfig, n_values: int
+) -> BasePolicy:
+    _check_names(arguments, {"net_arch"})
+    architecture, interface = arguments["net_arch"], make_interface(config)
+    branches = architecture if isinstance(architecture, dict) else {"pi": architecture}
+    for branch, widths in branches.items():
+        if branch not in ("pi", "vf") or not isinstance(widths, list):
+            raise ValueError(
+                "policy.arguments.net_arch must be a list of widths, or one each for pi and vf, "
+                f"got {architecture!r:.80}"
+            )
+        integer("policy.arguments.net_arch: layers", len(widths), 0, MOST_LAYERS)
+        units = [integer(f"policy.arguments.net_arch[{k}]", w, 1) for k, w in enumerate(widths)]
+        inputs = spaces.flatdim(interface.observations.space)
+        _check_size(sum(a * b for a, b in pairwise([inputs, *units])), n_values)
+    kind: Any = ActorCriticPolicy
+    if name == MASKED:
+        if config.action != "sequential":
+            raise ValueError(f"{name} acts by action encoding 'sequential', got {config.action!r}")
+        with needed_for("a policy with masks"):  # no other one needs sb3-contrib
+            from sb3_contrib.common.maskable import policies  # noqa: PLC0415
+
+        kind = policies.MaskableActorCriticPolicy
+    # The weights are replaced, so the slow orthogonal initialisation is not needed.
+    policy: BasePolicy = kind(
+        interface.observations.space, interface.actions.space, lambda _: 0.0, ortho_init=False,
+        **arguments,
+    )  # fmt: skip
+    return policy
+
+
+def _check_names(arguments: Mapping[str, Any], expected: set[str]) -> None:
+    if set(arguments) != expected:
+        raise ValueError(
+            f"policy.arguments must be {', '.join(sorted(expected))}, got "
+            f"{', '.join(map(repr, arguments))!s:.80}"
+        )
+
+
+def _check_size(wanted: int, n_values: int) -> None:
+    """Refuse a network of more weights than a file has, before it takes memory."""
+    if wanted > n_values:
+        raise ValueError(f"policy.arguments describe {wanted:.3g} weights, it has {n_values}")

@@ -8,7 +8,7 @@ import numpy as np
 from dptse_env.parts import QueryInterface
 from dptse_env.process import QueryProcess
 from dptse_env.release import QueryOptions
-from dptse_env.spaces.actions import affordable
+from dptse_env.spaces.actions import first_that_fit
 from dptse_env.utils.arrays import Action, BoolArray, FloatArray, IntArray, Observation
 
 
@@ -122,12 +122,7 @@ class Schedule(ABC):
 
         An option that costs more than is left is passed over.
         """
-        if not self.queries.costs_differ:
-            return self.mask(order[:, : self.queries.most_queries])
-        mask, limit = self.mask(order[:, :0]), np.full(len(order), self.bandwidth)
-        kept = affordable(np.ones_like(mask), self.queries.cost[order], limit)
-        np.put_along_axis(mask, order, kept, axis=1)
-        return mask
+        return first_that_fit(order, self.queries.cost, self.bandwidth)
 
     def completed(self, chosen: IntArray) -> BoolArray:
         """Return flags (k, G) of chosen options, and of others that the bandwidth still pays for.

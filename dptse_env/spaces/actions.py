@@ -12,14 +12,14 @@ beyond the options raises ``ValueError``.
 """
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
 
 from dptse_env.utils.arrays import Action, BoolArray, IntArray
-from dptse_env.utils.registry import Registry, missing_methods, name_of_class
+from dptse_env.utils.kernels import kernel
+from dptse_env.utils.registry import Registry, name_of_class
 
 
 class PendingPicks:
@@ -45,70 +45,73 @@ class PendingPicks:
         self.n_replaced[episodes] = 0
 
     def in_turn(
-        self,
-        episodes: IntArray,
-        wanted: BoolArray,
-        limit: IntArray,
-        costs: IntArray | None = None,
+        self, episodes: IntArray, wanted: BoolArray, limit: IntArray, costs: IntArray
     ) -> BoolArray:
         """Keep wanted options (k, n) from the pointer on, and move it past them.
 
-        Where options cost different amounts, one that costs more than is left is passed over, and
-        the pointer stops there, so that it comes first in the next turn.
+        An option that costs more than is left is passed over, and the pointer stops there, so that
+        it comes first in the next turn.
 
         Args:
             episodes: Shape (k,).
             wanted: Shape (k, n).
-            limit: What may be kept, shape (k,): a number of options, or the sum of their costs.
-            costs: Of the options, shape (n,); None where options are counted.
+            limit: What the kept options of an episode may cost together, shape (k,).
+            costs: Of the options, at least 1 each, shape (n,).
         """
-        n = wanted.shape[1]
-        order = (self.pointer[episodes, None] + np.arange(n)) % n
-        turned = np.take_along_axis(wanted, order, axis=1)
-        if costs is None:
-            turned &= np.cumsum(turned, axis=1) <= limit[:, None]
-            passed = turned
-        else:
-            turned &= costs[order] <= limit[:, None]
-            asked, turned = turned, affordable(turned, costs[order], limit)
-            passed = turned & (np.cumsum(asked & ~turned, axis=1) == 0)
-        last = n - 1 - np.argmax(passed[:, ::-1], axis=1)
-        moved = (order[np.arange(len(episodes)), last] + 1) % n
-        self.pointer[episodes] = np.where(passed.any(axis=1), moved, self.pointer[episodes])
         kept = np.zeros_like(wanted)
-        np.put_along_axis(kept, order, turned, axis=1)
+        _keep_in_turn(episodes, wanted, limit, costs, self.pointer, kept)
         return kept
 
 
-def affordable(wanted: BoolArray, costs: IntArray, limit: IntArray) -> BoolArray:
-    """Return the wanted columns that a limit pays for, from the first column on.
+@kernel
+def _keep_in_turn(
+    episodes: IntArray,
+    wanted: BoolArray,
+    limit: IntArray,
+    costs: IntArray,
+    pointer: IntArray,
+    kept: BoolArray,
+) -> None:
+    """Write what `PendingPicks.in_turn` keeps, and move the pointers (n_episodes,)."""
+    n = wanted.shape[1]
+    for k in range(episodes.size):
+        first, left, is_passed_over = pointer[episodes[k]], limit[k], False
+        for turn in range(n):
+            option = (first + turn) % n
+            if wanted[k, option] and costs[option] <= left:
+                kept[k, option] = True
+                left -= costs[option]
+                if not is_passed_over:
+                    pointer[episodes[k]] = (option + 1) % n
+            elif wanted[k, option] and costs[option] <= limit[k]:
+                is_passed_over = True
 
-    A column that costs more than is left is passed over.
+
+def first_that_fit(order: IntArray, costs: IntArray, limit: int) -> BoolArray:
+    """Return the first options of an order that a limit pays for, flags of shape (k, n).
+
+    An option that costs more than is left is passed over.
 
     Args:
-        wanted: Shape (k, n).
-        costs: Shape (k, n).
-        limit: Shape (k,).
+        order: The options, best first, shape (k, n).
+        costs: Of the options, shape (n,).
+        limit: What they may cost together.
     """
-    kept, left = np.zeros_like(wanted), limit.copy()
-    for column in range(wanted.shape[1]):
-        fits = wanted[:, column] & (costs[:, column] <= left)
-        kept[:, column] = fits
-        left -= np.where(fits, costs[:, column], 0)
+    kept, rows = np.zeros(order.shape, dtype=bool), np.arange(len(order))
+    if (costs == costs[0]).all():
+        kept[rows[:, None], order[:, : limit // costs[0]]] = True
+        return kept
+    left = np.full(len(order), limit)
+    for option in order.T:
+        fits = costs[option] <= left
+        kept[rows, option] = fits
+        left -= np.where(fits, costs[option], 0)
         if not left.any():
             break
     return kept
 
 
-def most_affordable(limit: int, costs: IntArray | None) -> int:
-    """Return the most options that a limit pays for; without costs, they are counted."""
-    if costs is None:
-        return limit
-    return int(np.count_nonzero(np.cumsum(np.sort(costs)) <= limit))
-
-
-@dataclass(frozen=True)
-class Decision:
+class Decision(NamedTuple):
     """The queries of a batch of actions.
 
     Attributes:
@@ -124,39 +127,38 @@ class Decision:
 
 
 class ActionEncoding(ABC):
-    """Base class of the encodings, made of (n_options, bandwidth).
+    """Base class of the encodings.
 
     An option is a mainline segment, unless the environment has other spans or price levels
-    (`dptse_env.release.QueryOptions`). Where options cost different amounts, an encoding is made of
-    (n_options, bandwidth, costs=costs).
+    (`dptse_env.release.QueryOptions`).
 
     Attributes:
         space: The Gymnasium space of one action.
-        n_options: Options that can be queried, n. Also called ``n_mainline``.
-        bandwidth: Largest number of queries in a step, B; where options cost different amounts,
-            what they may cost together.
-        costs: Costs of the options, shape (n,); None where all cost the same.
-        actions_per_step: Number of actions per decision; where options cost different amounts and
-            are picked one by one, the largest number.
+        n_options: Options that can be queried, n.
+        bandwidth: Largest total cost of the queries of a step, B.
+        costs: Costs of the options, 1 each where they do not differ, shape (n,).
+        most_queries: Largest number of queries in a step.
         picks_one_by_one: Whether an action picks one option, so that those which cannot be picked
             any more can be masked.
     """
 
-    actions_per_step = 1
     picks_one_by_one: ClassVar[bool] = False
 
-    def __init__(
-        self,
-        space: spaces.Space[Any],
-        n_options: int,
-        bandwidth: int,
-        costs: IntArray | None = None,
-    ) -> None:
-        """Store the space and the sizes."""
-        self.space = space
-        self.n_options = self.n_mainline = n_options
-        self.bandwidth = bandwidth
-        self.costs = None if costs is None else np.asarray(costs, dtype=np.int64)
+    def __init__(self, n_options: int, bandwidth: int, costs: IntArray) -> None:
+        """Store the sizes, and the space that they give."""
+        self.n_options, self.bandwidth, self.costs = n_options, bandwidth, costs
+        self.most_queries = int(np.count_nonzero(np.cumsum(np.sort(costs)) <= bandwidth))
+        self.space = self.make_space()
+        self._shape = self.space.shape or ()
+
+    @abstractmethod
+    def make_space(self) -> spaces.Space[Any]:
+        """Return the space of one action, given the sizes."""
+
+    @property
+    def actions_per_step(self) -> int:
+        """Largest number of actions of a decision."""
+        return self.most_queries if self.picks_one_by_one else 1
 
     @abstractmethod
     def decode(self, episodes: IntArray, actions: Action, pending: PendingPicks) -> Decision:
@@ -188,40 +190,32 @@ class ActionEncoding(ABC):
 
         They are not picked yet, and do not cost more than is left of the bandwidth.
         """
-        free: BoolArray = ~picked
-        if self.costs is None:
-            return free
-        left = self.bandwidth - picked @ self.costs
-        return free & (self.costs <= left[:, None])
+        left = self.bandwidth - picked.dot(self.costs)
+        free: BoolArray = ~picked & (self.costs <= left[:, None])
+        return free
 
     def completes(self, queried: BoolArray, picked: BoolArray) -> BoolArray:
         """Return whether the action of `encode` for the same arguments completes a decision."""
-        n_actions: Any = self.actions_per_step
-        if self.picks_one_by_one and self.costs is not None:
-            n_actions = queried.sum(axis=1)
+        n_actions = queried.sum(axis=1) if self.picks_one_by_one else 1
         complete: BoolArray = picked.sum(axis=1) + 1 == n_actions
         return complete
 
-    def _cost(self, options: BoolArray) -> IntArray:
-        """Return what options (k, n_options) cost of the bandwidth, shape (k,)."""
-        cost: IntArray = options.sum(axis=1) if self.costs is None else options @ self.costs
-        return cost
-
-    def _cut(self, episodes: IntArray, wanted: BoolArray, pending: PendingPicks) -> IntArray:
-        """Cut options (k, n_options), in place and in rotation; return how many, shape (k,)."""
-        n_cut = np.zeros(len(episodes), dtype=np.int64)
-        over = self._cost(wanted) > self.bandwidth
-        if over.any():
-            n_cut[over] = wanted[over].sum(axis=1)
-            limit = np.full(int(over.sum()), self.bandwidth)
-            wanted[over] = pending.in_turn(episodes[over], wanted[over], limit, self.costs)
-            n_cut[over] -= wanted[over].sum(axis=1)
-        return n_cut
+    def _cut(
+        self, episodes: IntArray, wanted: BoolArray, pending: PendingPicks
+    ) -> tuple[BoolArray, IntArray]:
+        """Cut options (k, n_options) in rotation; return the rest, and how many were cut (k,)."""
+        over = wanted.dot(self.costs) > self.bandwidth
+        if not np.count_nonzero(over):  # faster than any()
+            return wanted, np.zeros(len(wanted), dtype=np.int64)
+        limit = np.where(over, self.bandwidth, 0)
+        kept = pending.in_turn(episodes, wanted, limit, self.costs)
+        kept = np.where(over[:, None], kept, wanted)
+        return kept, (wanted & ~kept).sum(axis=1)
 
     def _checked(self, episodes: IntArray, actions: Action) -> Action:
         """Return ``actions`` as an array, checked for its shape and for a numeric dtype."""
         array = np.asarray(actions)
-        expected = (len(episodes), *(self.space.shape or ()))
+        expected = (len(episodes), *self._shape)
         if array.shape != expected:
             raise ValueError(
                 f"action must have shape {expected[1:]} of {self.space}, got {array.shape[1:]}"
@@ -234,20 +228,14 @@ class ActionEncoding(ABC):
         array, last = self._checked(episodes, actions), self.n_options - 1
         if array.dtype.kind not in "iu":
             raise ValueError(f"action must hold integers for {self.space}, got {array.dtype}")
-        if array.size and (array.min() < 0 or array.max() > last):
+        if np.count_nonzero((array < 0) | (array > last)):
             raise ValueError(f"action must lie in [0, {last}], got {array.tolist()}")
         return array.astype(np.int64)
 
     def _require_full(self, queried: BoolArray) -> None:
         """Refuse sets to which another option could be added."""
-        cost = self._cost(queried)
-        if self.costs is None:
-            if (cost != self.bandwidth).any():
-                raise ValueError(
-                    f"{self.space} always queries {self.bandwidth} options, got sets of "
-                    f"{cost.tolist()}; use action='mask' to query fewer"
-                )
-        elif (cost > self.bandwidth).any() or self.available(queried).any():
+        cost = queried @ self.costs
+        if (cost > self.bandwidth).any() or self.available(queried).any():
             raise ValueError(
                 f"{self.space} queries as much as the bandwidth of {self.bandwidth} pays for, got "
                 f"sets that cost {cost.tolist()}; use action='mask' to query fewer"
@@ -271,11 +259,11 @@ def check_decision(encoding: ActionEncoding, decision: Any, n_actions: int) -> N
             f"{np.shape(decision.n_dropped)}"
         )
     asked = queried[complete]
-    cost = asked.sum(axis=1) if encoding.costs is None else asked @ encoding.costs
-    most, unit = int(cost.max(initial=0)), "options" if encoding.costs is None else "of bandwidth"
+    most = int((asked @ encoding.costs).max(initial=0))
     if most > encoding.bandwidth:
         raise ValueError(
-            f"action {name}.decode() must query at most {encoding.bandwidth} {unit}, got {most}"
+            f"action {name}.decode() must query at most {encoding.bandwidth} of bandwidth, got "
+            f"{most}"
         )
 
 
@@ -290,18 +278,17 @@ class MaskAction(ActionEncoding):
     all values are exactly 0 or 1, since learning libraries send flags as floats.
     """
 
-    def __init__(self, n_options: int, bandwidth: int, costs: IntArray | None = None) -> None:
-        """See `ActionEncoding`."""
-        super().__init__(spaces.MultiBinary(n_options), n_options, bandwidth, costs)
+    def make_space(self) -> spaces.Space[Any]:
+        """See `ActionEncoding.make_space`."""
+        return spaces.MultiBinary(self.n_options)
 
     def decode(self, episodes: IntArray, actions: Action, pending: PendingPicks) -> Decision:
         """See `ActionEncoding.decode`."""
         array = self._checked(episodes, actions)
         wanted = array != 0
-        if array.dtype.kind != "b" and not np.array_equal(array, wanted):
+        if array.dtype.kind != "b" and np.count_nonzero(array != wanted):
             raise ValueError(f"action must hold 0 and 1 only, got {array.tolist()}")
-        n_dropped = self._cut(episodes, wanted, pending)
-        return _all_complete(wanted, n_dropped)
+        return _all_complete(*self._cut(episodes, wanted, pending))
 
     def encode(self, queried: BoolArray, picked: BoolArray) -> Action:
         """See `ActionEncoding.encode`."""
@@ -314,10 +301,9 @@ class ScoresAction(ActionEncoding):
     An option that costs more than is left is passed over. Ties go to the first option, upstream.
     """
 
-    def __init__(self, n_options: int, bandwidth: int, costs: IntArray | None = None) -> None:
-        """See `ActionEncoding`."""
-        space = spaces.Box(-1.0, 1.0, (n_options,), np.float32)
-        super().__init__(space, n_options, bandwidth, costs)
+    def make_space(self) -> spaces.Space[Any]:
+        """See `ActionEncoding.make_space`."""
+        return spaces.Box(-1.0, 1.0, (self.n_options,), np.float32)
 
     def decode(self, episodes: IntArray, actions: Action, pending: PendingPicks) -> Decision:
         """See `ActionEncoding.decode`."""
@@ -325,13 +311,7 @@ class ScoresAction(ActionEncoding):
         if array.dtype.kind != "f" or not np.isfinite(array).all():
             raise ValueError(f"action must hold finite floats, got {array.tolist()}")
         order = np.argsort(-array, axis=1, kind="stable")
-        queried = np.zeros(array.shape, dtype=bool)
-        if self.costs is None:
-            np.put_along_axis(queried, order[:, : self.bandwidth], True, axis=1)
-        else:
-            limit = np.full(len(episodes), self.bandwidth)
-            kept = affordable(np.ones_like(queried), self.costs[order], limit)
-            np.put_along_axis(queried, order, kept, axis=1)
+        queried = first_that_fit(order, self.costs, self.bandwidth)
         return _all_complete(queried, np.zeros(len(episodes), dtype=np.int64))
 
     def encode(self, queried: BoolArray, picked: BoolArray) -> Action:
@@ -347,35 +327,29 @@ class SlotsAction(ActionEncoding):
     rotation that the bandwidth pays for.
     """
 
-    def __init__(self, n_options: int, bandwidth: int, costs: IntArray | None = None) -> None:
-        """See `ActionEncoding`."""
-        self._n_slots = most_affordable(bandwidth, costs)
-        space = spaces.MultiDiscrete([n_options] * self._n_slots)
-        super().__init__(space, n_options, bandwidth, costs)
+    def make_space(self) -> spaces.Space[Any]:
+        """See `ActionEncoding.make_space`."""
+        return spaces.MultiDiscrete([self.n_options] * self.most_queries)
 
     def decode(self, episodes: IntArray, actions: Action, pending: PendingPicks) -> Decision:
         """See `ActionEncoding.decode`."""
         slots = self._checked_indices(episodes, actions)
-        queried = np.zeros((len(episodes), self.n_options), dtype=bool)
-        np.put_along_axis(queried, slots, True, axis=1)
-        repeats = slots.shape[1] - queried.sum(axis=1)
-        n_dropped, left = np.zeros_like(repeats), repeats
-        if self.costs is not None:
-            n_dropped = self._cut(episodes, queried, pending)
-            left = self.bandwidth - self._cost(queried)
-        short = left > 0
-        if short.any():
-            free = self.available(queried[short])
-            added = pending.in_turn(episodes[short], free, left[short], self.costs)
-            queried[short] |= added
+        wanted = np.zeros((len(episodes), self.n_options), dtype=bool)
+        wanted[np.arange(len(slots))[:, None], slots] = True
+        queried, n_dropped = self._cut(episodes, wanted, pending)
+        left = self.bandwidth - queried.dot(self.costs)
+        if np.count_nonzero(left):
+            added = pending.in_turn(episodes, self.available(queried), left, self.costs)
+            queried = queried | added
             # A repeat that nothing replaces asks for nothing that is not served.
-            n_dropped[short] += np.minimum(repeats[short], added.sum(axis=1))
+            repeats = self.most_queries - wanted.sum(axis=1)
+            n_dropped += np.minimum(repeats, added.sum(axis=1))
         return _all_complete(queried, n_dropped)
 
     def encode(self, queried: BoolArray, picked: BoolArray) -> Action:
         """See `ActionEncoding.encode`; slots that are left over repeat the first one."""
         self._require_full(queried)
-        chosen_first = np.argsort(~queried, axis=1, kind="stable")[:, : self._n_slots]
+        chosen_first = np.argsort(~queried, axis=1, kind="stable")[:, : self.most_queries]
         is_chosen = np.take_along_axis(queried, chosen_first, axis=1)
         return np.where(is_chosen, chosen_first, chosen_first[:, :1])
 
@@ -390,36 +364,26 @@ class SequentialAction(ActionEncoding):
 
     picks_one_by_one: ClassVar[bool] = True
 
-    def __init__(self, n_options: int, bandwidth: int, costs: IntArray | None = None) -> None:
-        """See `ActionEncoding`."""
-        super().__init__(spaces.Discrete(n_options), n_options, bandwidth, costs)
-        self.actions_per_step = most_affordable(bandwidth, costs)
+    def make_space(self) -> spaces.Space[Any]:
+        """See `ActionEncoding.make_space`."""
+        return spaces.Discrete(self.n_options)
 
     def decode(self, episodes: IntArray, actions: Action, pending: PendingPicks) -> Decision:
         """See `ActionEncoding.decode`."""
         picks = self._checked_indices(episodes, actions)
-        if self.costs is None:
-            refused = pending.picked[episodes, picks]
-            pending.picked[episodes, picks] = True
-        else:
-            free = self.available(pending.picked[episodes])
-            refused = ~free[np.arange(len(episodes)), picks]
-            pending.picked[episodes, picks] |= ~refused
-        if refused.any():
-            again = episodes[refused]
-            limit = np.ones(len(again), dtype=np.int64)
-            others = self.available(pending.picked[again])
-            pending.picked[again] |= pending.in_turn(again, others, limit)
-            pending.n_replaced[again] += 1
-        queried = pending.picked[episodes]
-        if self.costs is None:
-            complete = queried.sum(axis=1) == self.bandwidth
-        else:
-            complete = ~self.available(queried).any(axis=1)
+        picked = pending.picked[episodes]
+        rows = np.arange(len(picks))
+        refused = ~self.available(picked)[rows, picks]
+        picked[rows, picks] |= ~refused
+        if np.count_nonzero(refused):
+            one, each = refused.astype(np.int64), np.ones_like(self.costs)
+            picked |= pending.in_turn(episodes, self.available(picked), one, each)
+            pending.n_replaced[episodes] += refused
+        complete = self.available(picked).sum(axis=1) == 0
         n_dropped = np.where(complete, pending.n_replaced[episodes], 0)
-        pending.picked[episodes[complete]] = False
+        pending.picked[episodes] = picked & ~complete[:, None]
         pending.n_replaced[episodes[complete]] = 0
-        return Decision(queried, n_dropped, complete)
+        return Decision(picked, n_dropped, complete)
 
     def encode(self, queried: BoolArray, picked: BoolArray) -> Action:
         """See `ActionEncoding.encode`."""
@@ -429,9 +393,9 @@ class SequentialAction(ActionEncoding):
 
 
 def _expected(part: Any) -> str | None:
-    if not isinstance(part, type):
-        return "be a class, made of (n_options, bandwidth)"
-    return missing_methods(part, ("decode", "encode"))
+    if isinstance(part, type) and issubclass(part, ActionEncoding):
+        return None
+    return "be a subclass of dptse_env.spaces.actions.ActionEncoding"
 
 
 ACTION_ENCODINGS = Registry(
@@ -444,4 +408,4 @@ ACTION_ENCODINGS = Registry(
     },
     check=_expected,
 )
-"""Action encodings by name, each a class made of (n_options, bandwidth)."""
+"""Action encodings by name, each a class made of (n_options, bandwidth, costs)."""

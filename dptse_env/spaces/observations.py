@@ -10,30 +10,27 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import NDArray
 
 from dptse_env.estimators import Estimate
 from dptse_env.release import Task
-from dptse_env.traffic import Corridor
 from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray, IntArray, Observation
 from dptse_env.utils.registry import Registry, is_foreign, missing_methods, name_of_class
 
 AGE_CAP = 60
 """Largest age of a segment [s] that observations distinguish."""
 
-PRICE_SCALE = 0.5
-"""Factor on the logarithm of prices that makes observations of them of order one."""
+PRICE_UNIT = 2.0
+"""Unit of the logarithm of prices that makes observations of them of order one."""
 
 DEFAULT = "default"
 """Name that stands for all default blocks."""
 
 
-@dataclass(frozen=True)
-class PublicState:
+class PublicState(NamedTuple):
     """The operator's knowledge about k episodes, in physical units; the truth is no part of it.
 
     Attributes:
@@ -79,18 +76,23 @@ class ObservationBlock(Protocol):
         """Return the number of values."""
 
     def values(self, state: PublicState, task: Task) -> AnyArray | float:
-        """Return the values of k episodes, shape (k, size), or one number for all of them."""
+        """Return finite values of k episodes, shape (k, size), or one number for all of them."""
 
 
 @dataclass(frozen=True)
 class Block:
-    """A block that ships with the package, see `ObservationBlock`."""
+    """A block that ships with the package: its values over a unit, or the logarithms of these.
+
+    See `ObservationBlock`.
+    """
 
     name: str
     size: Callable[[Task], int]
     low: float
     high: float
-    values: Callable[[PublicState, Task], NDArray[Any] | float]
+    values: Callable[[PublicState, Task], AnyArray | float]
+    unit: Callable[[Task], float] = lambda task: 1.0
+    is_log: bool = False
 
     def __reduce__(self) -> tuple[Callable[[str], Block], tuple[str]]:
         """Pickle as the name, since lambda functions cannot be pickled."""
@@ -98,11 +100,6 @@ class Block:
 
 
 _TINY = np.finfo(np.float64).tiny
-
-
-def _log(deviation: FloatArray) -> FloatArray:
-    # Zero has no logarithm; that of the smallest number is clipped to the lower bound.
-    return np.log(np.maximum(deviation, _TINY))
 
 
 def _segments(task: Task) -> int:
@@ -121,13 +118,20 @@ def _fixed(task: Task) -> int:
     return len(task.corridor.fixed_sensors)
 
 
-def _released(component: int, scale: Callable[[Corridor], float]) -> Any:
-    def value(state: PublicState, task: Task) -> FloatArray:
-        released = state.released[:, : task.queries.n_options, component]
-        values: FloatArray = released / scale(task.corridor)
-        return values
+def _density_scale(task: Task) -> float:
+    return task.corridor.density_scale
 
-    return value
+
+def _speed_scale(task: Task) -> float:
+    return task.corridor.speed_scale
+
+
+def _flow_scale(task: Task) -> float:
+    return task.corridor.density_scale * task.corridor.speed_scale
+
+
+def _released(component: int) -> Any:
+    return lambda state, task: state.released[:, : task.queries.n_options, component]
 
 
 def _innovation(component: int) -> Any:
@@ -138,40 +142,37 @@ def _fixed_innovation(component: int) -> Any:
     return lambda state, task: state.innovations[:, task.sensors, component]
 
 
-def _scaled_prices(prices: FloatArray | None) -> FloatArray | float:
-    if prices is None:
+def _log_prices(state: PublicState, _: Task) -> FloatArray | float:
+    if state.prices is None:
         return 0.0
-    return np.where(prices > 0.0, PRICE_SCALE * np.log10(np.maximum(prices, _TINY)), 0.0)
+    return np.where(state.prices > 0.0, np.log10(np.maximum(state.prices, _TINY)), 0.0)
 
 
 SHIPPED_BLOCKS = (
-    Block("density", _segments, 0, 4,
-          lambda state, task: state.estimate.density / task.corridor.density_scale),
-    Block("speed", _segments, 0, 4,
-          lambda state, task: state.estimate.speed / task.corridor.speed_scale),
+    Block("density", _segments, 0, 4, lambda state, _: state.estimate.density, _density_scale),
+    Block("speed", _segments, 0, 4, lambda state, _: state.estimate.speed, _speed_scale),
     Block("density_log_std", _segments, -10, 5,
-          lambda state, task: _log(state.estimate.density_std / task.corridor.density_scale)),
+          lambda state, _: state.estimate.density_std, _density_scale, is_log=True),
     Block("speed_log_std", _segments, -10, 5,
-          lambda state, task: _log(state.estimate.speed_std / task.corridor.speed_scale)),
-    Block("released_density", _options, -5, 5, _released(0, lambda road: road.density_scale)),
-    Block("released_speed", _options, -5, 5, _released(1, lambda road: road.speed_scale)),
-    Block("released_flow", _options, -5, 5,
-          _released(1, lambda road: road.density_scale * road.speed_scale)),
+          lambda state, _: state.estimate.speed_std, _speed_scale, is_log=True),
+    Block("released_density", _options, -5, 5, _released(0), _density_scale),
+    Block("released_speed", _options, -5, 5, _released(1), _speed_scale),
+    Block("released_flow", _options, -5, 5, _released(1), _flow_scale),
     Block("density_innovation", _options, -10, 10, _innovation(0)),
     Block("speed_innovation", _options, -10, 10, _innovation(1)),
-    Block("age", _mainline, 0, 1, lambda state, task: state.age / AGE_CAP),
-    Block("queried", _options, 0, 1, lambda state, task: state.queried),
+    Block("age", _mainline, 0, 1, lambda state, _: state.age, lambda _: AGE_CAP),
+    Block("queried", _options, 0, 1, lambda state, _: state.queried),
     Block("fixed_density_innovation", _fixed, -10, 10, _fixed_innovation(0)),
     Block("fixed_speed_innovation", _fixed, -10, 10, _fixed_innovation(1)),
-    Block("bandwidth", lambda task: 1, 0, 1,
-          lambda state, task: task.queries.bandwidth / task.corridor.n_mainline),
-    Block("epsilon", lambda task: 1, -6, 6,
-          lambda state, task: float(np.log10(task.settings.epsilon))),
-    Block("picked", _options, 0, 1, lambda state, task: state.picked),
-    Block("last_price", _options, -5, 5, lambda state, task: _scaled_prices(state.prices)),
+    Block("bandwidth", lambda _: 1, 0, 1,
+          lambda _, task: task.queries.bandwidth, lambda task: task.corridor.n_mainline),
+    Block("epsilon", lambda _: 1, -6, 6, lambda _, task: float(np.log10(task.settings.epsilon))),
+    Block("picked", _options, 0, 1, lambda state, _: state.picked),
+    Block("last_price", _options, -5, 5, _log_prices, lambda _: PRICE_UNIT),
     Block("tracer", _mainline, 0, 1,
-          lambda state, task: 0.0 if state.tracer is None else state.tracer),
+          lambda state, _: 0.0 if state.tracer is None else state.tracer),
 )  # fmt: skip
+"""The shipped blocks, in the order of the default observation."""
 
 
 def _shipped_block(name: str) -> Block:
@@ -239,18 +240,29 @@ class ObservationEncoding:
         low = np.repeat([block.low for block in self.blocks], sizes).astype(np.float32)
         high = np.repeat([block.high for block in self.blocks], sizes).astype(np.float32)
         self.space = spaces.Box(low, high, dtype=np.float32)
-        places = self.slices.values()
-        self._plan = tuple(zip(self.blocks, places, map(is_foreign, self.blocks), strict=True))
+        self._plan, self._units = [], np.ones(len(low))
+        for block in self.blocks:
+            place, log_unit = self.slices[block.name], None
+            if isinstance(block, Block) and block.is_log:
+                log_unit = block.unit(task)
+            elif isinstance(block, Block):
+                self._units[place] = block.unit(task)
+            self._plan.append((block, place, is_foreign(block), log_unit))
 
     def encode(self, state: PublicState) -> Observation:
         """Return the observations of k episodes, shape (k, size), always inside the space."""
-        k = len(state.released)
-        flat = np.empty((k, self.space.shape[0]), dtype=np.float32)
-        for block, place, checked in self._plan:
-            values = block.values(state, self.task)
-            if checked:
+        k = len(state.age)
+        raw = np.empty((k, self.space.shape[0]))
+        for block, place, is_checked, log_unit in self._plan:
+            values: Any = block.values(state, self.task)
+            if is_checked:
                 _check_values(block, values, (k, place.stop - place.start))
-            flat[:, place] = values
+            if log_unit is not None:
+                # Zero has no logarithm; that of the smallest number is clipped to the lower bound.
+                values = np.log(np.maximum(values / log_unit, _TINY))
+            raw[:, place] = values
+        flat = np.empty(raw.shape, dtype=np.float32)
+        np.divide(raw, self._units, out=flat, casting="same_kind")
         np.maximum(flat, self.space.low, out=flat)
         return np.minimum(flat, self.space.high, out=flat)
 

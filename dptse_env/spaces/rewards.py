@@ -1,6 +1,5 @@
 """Estimation errors, and the rewards that are derived from them."""
 
-from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -14,8 +13,7 @@ REWARD_TERMS = ("joint", "density", "speed")
 """Terms of the rewards that ship with the package."""
 
 
-@dataclass(frozen=True)
-class EstimationError:
+class EstimationError(NamedTuple):
     """The error over the mainline of k episodes at a step.
 
     Attributes:
@@ -93,12 +91,12 @@ class ErrorReward:
     def __call__(self, second: ScoredSecond) -> FloatArray:
         """Return the rewards of k episodes, shape (k,)."""
         error, corridor = second.error, second.corridor
+        if self.term == "density":
+            return -error.density / corridor.density_scale
+        if self.term == "speed":
+            return -error.speed / corridor.speed_scale
         density = error.density / corridor.density_scale
         speed = error.speed / corridor.speed_scale
-        if self.term == "density":
-            return -density
-        if self.term == "speed":
-            return -speed
         n, m = corridor.n_mainline, error.n_occupied
         return -np.sqrt((n * density**2 + m * speed**2) / (n + m))
 

@@ -3,48 +3,46 @@
 Importing this package does not import libsumo; only making a record does.
 """
 
-from dptse_env.traffic.corridor import Corridor
-from dptse_env.traffic.demand import Demand, DemandDistribution
-from dptse_env.traffic.drivers import Drivers, VehicleClass
-from dptse_env.traffic.dwell import average_dwell
-from dptse_env.traffic.field_record import AnyRecord, FieldRecord, with_vehicles
-from dptse_env.traffic.incident import Incident, IncidentDistribution
+from dptse_env.traffic.corridor import Corridor, Recordings
+from dptse_env.traffic.demand import (
+    Demand,
+    DemandDistribution,
+    Drivers,
+    Incident,
+    IncidentDistribution,
+    VehicleClass,
+)
+from dptse_env.traffic.imported import ranges
 from dptse_env.traffic.library import RecordLibrary, Records, open_library
+from dptse_env.traffic.own_sumo import SumoScenario
 from dptse_env.traffic.penetration import Penetration
-from dptse_env.traffic.presets import (
+from dptse_env.traffic.record import InvalidRecordError, Record, average_dwell
+from dptse_env.traffic.recording import simulate_in_worker
+from dptse_env.traffic.roads import (
     CORRIDORS,
     PAPER_HIGHWAY,
     SHORT_HIGHWAY,
-    find_corridor,
-    randomised,
-)
-from dptse_env.traffic.record import Record, mean_dwell
-from dptse_env.traffic.recordings import Recordings, ranges
-from dptse_env.traffic.road_files import (
     RoadFile,
+    find_corridor,
     is_road_file,
+    randomised,
     read_corridor,
     read_road,
     write_corridor,
 )
 from dptse_env.traffic.scenario import MAINLINE, Scenario, draw_scenario
-from dptse_env.traffic.stored_arrays import InvalidRecordError
 from dptse_env.traffic.sumo import RecordingError, SumoVersionError, simulate
-from dptse_env.traffic.sumo_network import NetworkError
-from dptse_env.traffic.sumo_scenario import SumoScenario
-from dptse_env.traffic.worker import simulate_in_child
+from dptse_env.traffic.sumo_input import NetworkError
 
 __all__ = [
     "CORRIDORS",
     "MAINLINE",
     "PAPER_HIGHWAY",
     "SHORT_HIGHWAY",
-    "AnyRecord",
     "Corridor",
     "Demand",
     "DemandDistribution",
     "Drivers",
-    "FieldRecord",
     "Incident",
     "IncidentDistribution",
     "InvalidRecordError",
@@ -64,14 +62,12 @@ __all__ = [
     "draw_scenario",
     "find_corridor",
     "is_road_file",
-    "mean_dwell",
     "open_library",
     "randomised",
     "ranges",
     "read_corridor",
     "read_road",
     "simulate",
-    "simulate_in_child",
-    "with_vehicles",
+    "simulate_in_worker",
     "write_corridor",
 ]

@@ -9,23 +9,37 @@ length, lanes and limit of the segment that it lies next to.
 
 import dataclasses
 import hashlib
+import itertools
 import json
 import math
 import re
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Annotated, Any
+from typing import Annotated, Any, Self, TypeVar
 
-from dptse_env.traffic.demand import Demand, DemandDistribution, Share
-from dptse_env.traffic.drivers import Drivers, VehicleClass
-from dptse_env.traffic.incident import Incident, IncidentDistribution
-from dptse_env.traffic.recordings import Recordings
-from dptse_env.traffic.road_segments import RoadSegments
-from dptse_env.traffic.sumo_scenario import SumoScenario
-from dptse_env.utils.fields import Interval, checked_fields, integer, require
+from dptse_env.traffic.demand import (
+    Demand,
+    DemandDistribution,
+    Drivers,
+    Incident,
+    IncidentDistribution,
+    Share,
+    VehicleClass,
+)
+from dptse_env.traffic.own_sumo import SumoScenario
+from dptse_env.utils.fields import Interval, checked_fields, from_mapping, integer, require
+
+T = TypeVar("T")
 
 NOT_TRAFFIC = ("name", "fixed_sensors", "density_scale", "speed_scale", "average_dwell")
 """Fields that describe the observation of the traffic and do not change the traffic itself."""
+
+GEOMETRY = (
+    "n_mainline", "on_ramps", "off_ramps", "exit_shares", "lanes", "ramp_lanes", "segment_length",
+    "speed_limit", "ramp_segments", "ramp_length", "ramp_speed_limit",
+)  # fmt: skip
+"""Fields by which a corridor is another road: what was fitted to one may not suit another."""
 
 Face = Annotated[int, Interval(1, 999)]
 """Number of a face between two mainline segments."""
@@ -44,7 +58,25 @@ UNIFORM = {"ramp_length": None, "ramp_speed_limit": None, "ramp_segments": 1}
 
 
 @dataclass(frozen=True)
-class Corridor(RoadSegments):
+class Recordings:
+    """A folder of imported records, real or foreign traffic that episodes replay.
+
+    Attributes:
+        folder: the folder; in a road file it may be relative to that file.
+        digest: SHA-256 (hex) of the digests of all records and of the road that they are made
+            for, from the folder's manifest.
+    """
+
+    folder: str
+    digest: str
+
+    def __post_init__(self) -> None:
+        """Check the fields."""
+        checked_fields(self, "corridor.recordings")
+
+
+@dataclass(frozen=True)
+class Corridor:
     """A stretch of highway with ramps, its demand and its incident.
 
     Lengths, lanes and speed limits are one value for all mainline segments or a sequence with one
@@ -74,7 +106,7 @@ class Corridor(RoadSegments):
         density_scale: constant that scales densities in rewards and observations [veh/km].
         speed_scale: constant that scales speeds in rewards and observations [km/h].
         average_dwell: T_avg of the paper's eq. (6): average time of a vehicle on a mainline
-            segment [s], measured from records (`dptse_env.traffic.record.mean_dwell`).
+            segment [s], measured from records (`dptse_env.traffic.average_dwell`).
         drivers: the car-following model of all vehicles.
         network: SUMO files of one's own, from which the road is recorded; None for a network made
             of the fields above. With files, the vehicles are those of the files: the rates of
@@ -206,7 +238,7 @@ class Corridor(RoadSegments):
     def _check_network(self) -> None:
         if self.network is None:
             return
-        n_columns = self.n_segments + self.n_boundaries
+        n_columns = self.record_shape[1]
         allowed = f"one for each of the {n_columns} record columns of this geometry"
         fits = len(self.network.columns) == n_columns
         require(fits, "corridor.network.columns", allowed, len(self.network.columns))
@@ -214,6 +246,129 @@ class Corridor(RoadSegments):
         require(self.recordings is None, "corridor.recordings", without, self.recordings)
         allowed = "left out on a road with a network of its own"
         require(self.drivers == Drivers(), "corridor.drivers", allowed, self.drivers)
+
+    def has_geometry_of(self, other: Self) -> bool:
+        """Return whether another corridor is the same road, whatever drives on it."""
+        return all(getattr(self, name) == getattr(other, name) for name in GEOMETRY)
+
+    def replaced(self, fields: Mapping[str, Any]) -> Self:
+        """Return the corridor with other fields, plain JSON; scales follow lanes and speed limit.
+
+        Raises:
+            ValueError: A field is unknown or out of range.
+        """
+        road = from_mapping(type(self), fields, "corridor", self)
+        scales: dict[str, Any] = {}
+        if "lanes" in fields:
+            scales["density_scale"] = self.density_scale * (road.most_lanes / self.most_lanes)
+        if "speed_limit" in fields:
+            ratio = road.largest_speed_limit / self.largest_speed_limit
+            scales["speed_scale"] = self.speed_scale * ratio
+        return dataclasses.replace(road, **{k: v for k, v in scales.items() if k not in fields})
+
+    @property
+    def n_on_ramps(self) -> int:
+        """Number I of on-ramps."""
+        return len(self.on_ramps)
+
+    @property
+    def n_off_ramps(self) -> int:
+        """Number O of off-ramps."""
+        return len(self.off_ramps)
+
+    @property
+    def n_segments(self) -> int:
+        """Number S of segments that are estimated: those of the mainline and of all ramps."""
+        return self.n_mainline + sum(self._per_ramp(self.ramp_segments))
+
+    @property
+    def n_ramps(self) -> int:
+        """Number I + O of ramps."""
+        return self.n_on_ramps + self.n_off_ramps
+
+    @property
+    def n_boundaries(self) -> int:
+        """Number R = 2 + I + O of boundary segments around them."""
+        return 2 + self.n_ramps
+
+    @cached_property
+    def on_ramp_segments(self) -> tuple[tuple[int, ...], ...]:
+        """Segments of each on-ramp, in the direction of travel."""
+        return self._ramp_segments[: self.n_on_ramps]
+
+    @cached_property
+    def off_ramp_segments(self) -> tuple[tuple[int, ...], ...]:
+        """Segments of each off-ramp, in the direction of travel."""
+        return self._ramp_segments[self.n_on_ramps :]
+
+    @cached_property
+    def _ramp_segments(self) -> tuple[tuple[int, ...], ...]:
+        counts = self._per_ramp(self.ramp_segments)
+        firsts = itertools.accumulate(counts, initial=self.n_mainline)
+        return tuple(
+            tuple(range(first, first + count)) for first, count in zip(firsts, counts, strict=False)
+        )
+
+    @cached_property
+    def segment_lengths(self) -> tuple[float, ...]:
+        """Length [km] of each of the S segments."""
+        return self._along(self.segment_length, self.ramp_length)
+
+    @cached_property
+    def segment_lanes(self) -> tuple[int, ...]:
+        """Lanes of each of the S segments."""
+        return self._along(self.lanes, self.ramp_lanes)
+
+    @cached_property
+    def speed_limits(self) -> tuple[float, ...]:
+        """Speed limit [km/h] of each of the S segments, outside incidents."""
+        return self._along(self.speed_limit, self.ramp_speed_limit)
+
+    @cached_property
+    def boundary_neighbours(self) -> tuple[int, ...]:
+        """Segment next to each of the R boundary segments."""
+        before = [segments[0] for segments in self.on_ramp_segments]
+        after = [segments[-1] for segments in self.off_ramp_segments]
+        return (0, self.n_mainline - 1, *before, *after)
+
+    @property
+    def boundary_lanes(self) -> tuple[int, ...]:
+        """Lanes of each of the R boundary segments."""
+        return tuple(self.segment_lanes[s] for s in self.boundary_neighbours)
+
+    def with_boundaries(self, values: Sequence[T]) -> tuple[T, ...]:
+        """Return values of the S segments, followed by those of the R boundary segments."""
+        return (*values, *(values[s] for s in self.boundary_neighbours))
+
+    @property
+    def most_lanes(self) -> int:
+        """Largest number of lanes of the mainline."""
+        return max(self.segment_lanes[: self.n_mainline])
+
+    @property
+    def largest_speed_limit(self) -> float:
+        """Largest speed limit of the road [km/h]."""
+        return max(self.speed_limits)
+
+    def ramps(self) -> Iterator[tuple[int, int, tuple[int, ...]]]:
+        """Yield each ramp's face, the mainline segment that it joins or leaves, its segments."""
+        faces = [*self.on_ramps, *self.off_ramps]
+        beside = [*self.on_ramps, *(face - 1 for face in self.off_ramps)]
+        yield from zip(faces, beside, self._ramp_segments, strict=True)
+
+    def _per_ramp(self, values: T | tuple[T, ...]) -> tuple[T, ...]:
+        return values if isinstance(values, tuple) else (values,) * self.n_ramps
+
+    def _along(
+        self, values: T | tuple[T, ...], of_ramps: T | tuple[T, ...] | None
+    ) -> tuple[T, ...]:
+        """Return values of the S segments, given those of the mainline and of ramps."""
+        n = self.n_mainline
+        mainline = values if isinstance(values, tuple) else (values,) * n
+        if of_ramps is None:
+            of_ramps = tuple(mainline[beside] for _, beside, _ in self.ramps())
+        ramps = zip(self._per_ramp(of_ramps), self._ramp_segments, strict=True)
+        return (*mainline, *(value for value, segments in ramps for _ in segments))
 
     @property
     def published_demand(self) -> Demand:
@@ -227,6 +382,11 @@ class Corridor(RoadSegments):
         if self.incident is None:
             return ()
         return self.incident if isinstance(self.incident, tuple) else (self.incident,)
+
+    @property
+    def record_shape(self) -> tuple[int, int]:
+        """Number of steps of a record, the second 0 among them, and of its columns, S + R."""
+        return self.duration + 1, self.n_segments + self.n_boundaries
 
     @property
     def record_layout(self) -> dict[str, Any]:

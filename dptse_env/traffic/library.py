@@ -3,24 +3,22 @@
 A record is found by the corridor's digest, the traffic seed, SUMO's version and the record format;
 when any of them changes, another record is made. Several processes may use a library at once.
 
-The records of a corridor with recordings come from their folder instead, and are never made.
+The library decides by the corridor how a record comes to be: that of a corridor with recordings is
+read from their folder and never made, any other is read, or else simulated.
 
 A record appears under its name when it is complete, so a writer that is killed leaves a hidden
-folder at most. Its writer may still run, perhaps on another machine, so such a folder is removed
-when it has reached a certain age.
+file at most. Its writer may still run, perhaps on another machine, so such a file is removed when
+it has reached a certain age.
 """
 
 import contextlib
 import logging
 import os
-import shutil
 import tempfile
 import threading
 import time
-import uuid
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
@@ -28,26 +26,22 @@ import platformdirs
 from tqdm import tqdm
 
 from dptse_env.traffic.corridor import Corridor
-from dptse_env.traffic.field_record import AnyRecord, load_record
-from dptse_env.traffic.record import RECORD_VERSION
-from dptse_env.traffic.stored_arrays import InvalidRecordError
-from dptse_env.traffic.sumo import (
-    RecordingError,
-    SumoVersionError,
-    simulate,
-    simulation_is_loaded,
-    sumo_version,
-)
-from dptse_env.traffic.sumo_network import NetworkError
-from dptse_env.traffic.worker import WorkerPool
+from dptse_env.traffic.imported import load_record, record_path, require_seeds
+from dptse_env.traffic.record import RECORD_VERSION, InvalidRecordError, Record
+from dptse_env.traffic.recording import record_seeds
+from dptse_env.traffic.sumo import RecordingError, SumoVersionError, sumo_version
+from dptse_env.traffic.sumo_input import NetworkError
 from dptse_env.utils.fields import integer, require
 from dptse_env.utils.threads import n_cores
 
 CACHE_VARIABLE = "DPTSE_CACHE"
 """Environment variable with the directory of the records."""
 
+MEMORY = 2**28
+"""Size of the records that a library keeps in memory [bytes], if nothing else is said."""
+
 LEFTOVER_AGE = 6 * 3600.0
-"""Age [s] at which a hidden folder is considered abandoned. Writing takes a second."""
+"""Age [s] at which a hidden file is considered abandoned. Writing takes a second."""
 
 logger = logging.getLogger(__name__)
 
@@ -64,29 +58,29 @@ class RecordLibrary:
     Args:
         path: the library's directory; created when the first record is written. Default:
             `default_path`.
-        n_open: largest number of open records, at four file descriptors each; opening a record
+        memory: size of the records kept in memory [bytes], at least the one read last; reading one
             again takes a few milliseconds.
 
     Raises:
-        ValueError: `n_open` is not positive.
+        ValueError: `memory` is negative.
     """
 
-    def __init__(self, path: str | os.PathLike[str] | None = None, n_open: int = 64) -> None:
+    def __init__(self, path: str | os.PathLike[str] | None = None, memory: int = MEMORY) -> None:
         """Store the path; nothing is read or written yet."""
         self.is_default = path is None
         self.path = default_path() if path is None else Path(path).expanduser()
-        self.n_open = integer("library.n_open", n_open, 1)
-        self._open: OrderedDict[tuple[str, int], AnyRecord] = OrderedDict()
+        self.memory = integer("library.memory", memory, 0)
+        self._kept: OrderedDict[tuple[str, int], Record] = OrderedDict()
         self._lock = threading.Lock()
 
     def __reduce__(self) -> tuple[type["RecordLibrary"], tuple[Any, ...]]:
-        """Pickle as the path alone: each process opens the records itself.
+        """Pickle as the path alone: each process reads the records itself.
 
         The default path is found anew, as another machine may have another one.
         """
-        return type(self), (None if self.is_default else self.path, self.n_open)
+        return type(self), (None if self.is_default else self.path, self.memory)
 
-    def get(self, corridor: Corridor, seed: int) -> AnyRecord:
+    def get(self, corridor: Corridor, seed: int) -> Record:
         """Return the record of a traffic seed, which is made now if it is missing or damaged.
 
         Raises:
@@ -99,14 +93,13 @@ class RecordLibrary:
         seed = integer("traffic seed", seed, 0)
         key = corridor.digest, seed
         with self._lock:
-            record = self._open.get(key)
+            record = self._kept.pop(key, None)
             if record is None:
                 with self._explained_errors(corridor, [seed]):
-                    record = self._open[key] = self._load_or_record(corridor, seed)
-                if len(self._open) > self.n_open:
-                    self._open.popitem(last=False)
-            else:
-                self._open.move_to_end(key)
+                    record = self._load_or_record(corridor, seed)
+            self._kept[key] = record
+            while len(self._kept) > 1 and sum(r.n_bytes for r in self._kept.values()) > self.memory:
+                self._kept.popitem(last=False)
             return record
 
     def missing(self, corridor: Corridor, seeds: Iterable[int]) -> list[int]:
@@ -120,8 +113,8 @@ class RecordLibrary:
         """
         wanted = dict.fromkeys(integer("traffic seed", seed, 0) for seed in seeds)
         if corridor.recordings is not None:
-            corridor.recordings.require(wanted)
-        return [seed for seed in wanted if not self.record_path(corridor, seed).is_dir()]
+            require_seeds(corridor.recordings, wanted)
+        return [seed for seed in wanted if not self.record_path(corridor, seed).is_file()]
 
     def ensure(
         self,
@@ -130,11 +123,7 @@ class RecordLibrary:
         workers: int | None = None,
         progress: bool = False,
     ) -> None:
-        """Make the missing records of `seeds`, several at once.
-
-        A single record, or all of them with one worker, are made in this process unless libsumo
-        holds another simulation here. A worker that dies is replaced and its record tried again
-        (see `WorkerPool.record`).
+        """Make the missing records of `seeds`, several at once; imported ones cannot be made.
 
         The default number of `workers` is that of usable cores; `progress` shows a progress bar.
 
@@ -149,84 +138,44 @@ class RecordLibrary:
         wanted = list(dict.fromkeys(integer("traffic seed", seed, 0) for seed in seeds))
         with self._explained_errors(corridor, wanted):
             missing = self.missing(corridor, wanted)
-            if missing:
-                self._record(corridor, missing, min(n_workers, len(missing)), progress)
+            if missing and corridor.recordings is None:
+                self._record(corridor, missing, n_workers, progress)
 
     def record_path(self, corridor: Corridor, seed: int) -> Path:
-        """Return the directory of a record, whether it exists or not."""
+        """Return the file of a record, whether it exists or not."""
         if corridor.recordings is not None:
-            return corridor.recordings.record_path(seed)
+            return record_path(corridor.recordings.folder, seed)
         folder = f"records-v{RECORD_VERSION}-sumo-{sumo_version()}"
-        return self.path / folder / corridor.digest[:32] / f"{seed:08d}"
+        return self.path / folder / corridor.digest[:32] / f"{seed:08d}.safetensors"
 
-    def _load_or_record(self, corridor: Corridor, seed: int) -> AnyRecord:
+    def _load_or_record(self, corridor: Corridor, seed: int) -> Record:
         if corridor.recordings is not None:
-            return corridor.recordings.load(seed, corridor.record_layout)
+            return load_record(corridor.recordings, seed, corridor.record_layout)
         path, source = self.record_path(corridor, seed), _source(corridor, seed)
         try:
-            return load_record(path, source)
+            return Record.load(path, source, corridor.record_shape)
         except FileNotFoundError:
             pass  # the usual first use
         except InvalidRecordError as error:
             logger.warning("record is made again: %s", error)
-            _discard(path)
         self._record(corridor, [seed])
         try:
-            return load_record(path, source)
+            return Record.load(path, source, corridor.record_shape)
         except (OSError, InvalidRecordError) as error:
             raise RecordingError.from_cause(corridor, seed, str(error)) from error
 
     def _record(
-        self, corridor: Corridor, seeds: list[int], n_workers: int = 1, progress: bool = False
+        self, corridor: Corridor, seeds: list[int], workers: int = 1, progress: bool = False
     ) -> None:
-        """Make the records of one or more `seeds`, in this process or in `n_workers` others."""
-        folder = self.record_path(corridor, seeds[0]).parent
+        paths = {seed: self.record_path(corridor, seed) for seed in seeds}
         try:
-            _prepare(folder)
+            _prepare(paths[seeds[0]].parent)
         except OSError as error:
             raise RecordingError.from_cause(corridor, seeds[0], str(error)) from error
-        in_children = n_workers > 1 or simulation_is_loaded()
-        logger.info(
-            "%s: recording %d traffic seed(s) in %s into %s",
-            corridor.name,
-            len(seeds),
-            f"{n_workers} child process(es)" if in_children else "this process",
-            self.path,
-        )
+        logger.info("%s: recording %d seed(s) into %s", corridor.name, len(seeds), self.path)
+        sources = {seed: _source(corridor, seed) for seed in seeds}
         with tqdm(total=len(seeds), desc=corridor.name, unit="record", disable=not progress) as bar:
-            if in_children:
-                self._record_in_children(corridor, seeds, n_workers, bar)
-                return
-            for seed in seeds:
-                try:
-                    simulate(corridor, seed).save(
-                        self.record_path(corridor, seed), _source(corridor, seed)
-                    )
-                except OSError as error:
-                    raise RecordingError.from_cause(corridor, seed, str(error)) from error
-                bar.update()
-
-    def _record_in_children(
-        self, corridor: Corridor, seeds: list[int], n_workers: int, bar: tqdm
-    ) -> None:
-        with WorkerPool() as pool, ThreadPoolExecutor(n_workers) as threads:
-            futures = [
-                threads.submit(
-                    pool.record,
-                    corridor,
-                    seed,
-                    self.record_path(corridor, seed),
-                    _source(corridor, seed),
-                )
-                for seed in seeds
-            ]
-            try:
-                for future in as_completed(futures):
-                    future.result()
-                    bar.update()
-            except BaseException:
-                threads.shutdown(cancel_futures=True)
-                raise
+            record_seeds(corridor, paths, sources, workers, bar.update)
 
     @contextlib.contextmanager
     def _explained_errors(self, corridor: Corridor, seeds: list[int]) -> Iterator[None]:
@@ -272,16 +221,6 @@ def _source(corridor: Corridor, seed: int) -> dict[str, object]:
     return {"corridor": corridor.digest, "seed": seed, "sumo": sumo_version()}
 
 
-def _discard(path: Path) -> None:
-    """Remove a record; it is renamed first, so that no process reads or completes a part of it."""
-    temporary = path.parent / f".{path.name}-{uuid.uuid4().hex}"
-    try:
-        path.rename(temporary)
-    except FileNotFoundError:
-        return  # another process has discarded it already
-    shutil.rmtree(temporary, ignore_errors=True)
-
-
 def _prepare(folder: Path) -> None:
     """Create the folder, check that it is writable, and remove abandoned records in it.
 
@@ -289,10 +228,10 @@ def _prepare(folder: Path) -> None:
         OSError: It cannot be created or written to.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=".probe-", dir=folder):
+    with tempfile.TemporaryFile(dir=folder):
         pass
-    for leftover in folder.glob(".*-*/"):
+    for leftover in folder.glob(".*-*"):
         # Its writer may finish just now, and another user may own it.
         with contextlib.suppress(FileNotFoundError, PermissionError):
             if time.time() - leftover.stat().st_mtime > LEFTOVER_AGE:
-                _discard(leftover)
+                leftover.unlink()

@@ -1,7 +1,12 @@
-"""Records: segment and speed of each vehicle at every second."""
+"""Records: what is on a road at every second, vehicles or a measured field.
 
+A record is one file in the format of safetensors (`dptse_env.utils.files`).
+"""
+
+import dataclasses
+import hashlib
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
@@ -9,33 +14,47 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from dptse_env.traffic.stored_arrays import InvalidRecordError, load_arrays, save_arrays
-from dptse_env.utils.arrays import BoolArray
+from dptse_env.traffic.corridor import Corridor
+from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from dptse_env.utils.fields import integer, require
+from dptse_env.utils.files import read_tensors, write_tensors
 
 RECORD_FORMAT = "dptse-record"
-RECORD_VERSION = 1
+RECORD_VERSION = 2
 """Version of the format, raised when content or layout change: older records are made again."""
 
+LARGEST_RECORD = 2**30
+"""Largest size of a stored record [bytes]: 75 million rows."""
 
-@dataclass(frozen=True, eq=False)
+
+class InvalidRecordError(ValueError):
+    """A stored record is damaged, incomplete, or not the requested one."""
+
+
+def _no_rows() -> AnyArray:
+    return np.empty(0)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Record:
-    """The vehicle table of one simulated scenario, at most one row per vehicle and step.
+    """What is on a road at each of its seconds: a table of vehicles, or a measured field.
 
-    Step k is the state of the road k seconds after the start, so step 0 is the empty road. Within a
-    step, a recording lists the vehicles segment by segment.
+    Step k is the state of the road k seconds after the start. A table has at most one row for each
+    vehicle and step, and within a step it lists the vehicles segment by segment. A field, as from
+    detectors, has no rows. Columns are the S segments, then the R boundary segments.
 
     Attributes:
-        step: (rows,) int32, non-decreasing, in 0..n_steps-1.
-        vehicle: (rows,) int32, index of the vehicle in its scenario.
-        segment: (rows,) int16, record column: the S segments, then the boundary segments.
-        speed: (rows,) float32 [km/h].
         n_steps: number of steps.
         n_columns: number of record columns, S + R.
+        step: (rows,) int32, non-decreasing, in 0..n_steps-1.
+        vehicle: (rows,) int32, index of the vehicle in its scenario, at most once in a step.
+        segment: (rows,) int16, record column that the vehicle is on.
+        speed: (rows,) float32, at least 0 [km/h].
+        field: None for vehicles; or else (n_steps, n_columns, 2) float64, at least 0, the density
+            [veh/km] and the mean speed [km/h].
 
     Raises:
-        ValueError: The columns differ in length, are not ordered by step, leave their range, or
-            have a vehicle twice in one step.
+        ValueError: An array has another shape, leaves its range, or is not ordered as stated.
     """
 
     COLUMNS: ClassVar[Mapping[str, np.dtype[Any]]] = {
@@ -44,39 +63,51 @@ class Record:
         "segment": np.dtype("<i2"),
         "speed": np.dtype("<f4"),
     }
-    """Columns of the vehicle table and how they are stored."""
+    """Columns of the table of vehicles and their types."""
 
-    step: NDArray[np.int32]
-    vehicle: NDArray[np.int32]
-    segment: NDArray[np.int16]
-    speed: NDArray[np.float32]
     n_steps: int
     n_columns: int
+    step: NDArray[np.int32] = dataclasses.field(default_factory=_no_rows, repr=False)
+    vehicle: NDArray[np.int32] = dataclasses.field(default_factory=_no_rows, repr=False)
+    segment: NDArray[np.int16] = dataclasses.field(default_factory=_no_rows, repr=False)
+    speed: NDArray[np.float32] = dataclasses.field(default_factory=_no_rows, repr=False)
+    field: FloatArray | None = dataclasses.field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         """Check the fields and bring them to their declared types."""
-        object.__setattr__(self, "n_steps", integer("record.n_steps", self.n_steps, 1))
-        object.__setattr__(self, "n_columns", integer("record.n_columns", self.n_columns, 1))
+        for name in ("n_steps", "n_columns"):
+            object.__setattr__(self, name, integer(f"record.{name}", getattr(self, name), 1))
+        shape = np.shape(self.step)[:1]
         for name, dtype in self.COLUMNS.items():
-            column = np.asarray(getattr(self, name), dtype=dtype)
-            require(column.ndim == 1, f"record.{name}", "one-dimensional", column.shape)
-            allowed = f"as long as record.step ({len(self.step)})"
-            require(len(column) == len(self.step), f"record.{name}", allowed, len(column))
-            if column.flags.writeable:
-                column = column.copy()
-                column.flags.writeable = False
-            object.__setattr__(self, name, column)
-        if len(self.step):
+            self._keep(name, dtype, shape)
+        if self.field is not None:
+            require(not self.n_rows, "record.field", "None where there are vehicles", "a field")
+            field = self._keep("field", np.dtype("<f8"), (self.n_steps, self.n_columns, 2))
+            sound = bool(np.isfinite(field).all() and field.min() >= 0.0)
+            require(sound, "record.field", "finite and >= 0", float(field.min()))
+        elif self.n_rows:
             self._check_rows()
 
+    def _keep(self, name: str, dtype: np.dtype[Any], shape: tuple[int, ...]) -> AnyArray:
+        array = np.asarray(getattr(self, name), dtype=dtype)
+        require(array.shape == shape, f"record.{name}", f"of shape {shape}", array.shape)
+        if array.flags.writeable:
+            array = array.copy()
+            array.flags.writeable = False
+        object.__setattr__(self, name, array)
+        return array
+
     def _check_rows(self) -> None:
-        require(bool(np.all(np.diff(self.step) >= 0)), "record.step", "non-decreasing", self.step)
+        back = np.flatnonzero(self.step[1:] < self.step[:-1])
+        if len(back):
+            pair = tuple(self.step[back[0] : back[0] + 2].tolist())
+            raise ValueError(f"record.step must be non-decreasing, got {pair}")
         for name, bound in (("step", self.n_steps), ("segment", self.n_columns)):
             low, high = int(getattr(self, name).min()), int(getattr(self, name).max())
             require(low >= 0 and high < bound, f"record.{name}", f"in 0..{bound - 1}", (low, high))
         require(int(self.vehicle.min()) >= 0, "record.vehicle", ">= 0", int(self.vehicle.min()))
-        valid = bool(np.isfinite(self.speed).all() and self.speed.min() >= 0.0)
-        require(valid, "record.speed", "finite and >= 0", self.speed.min())
+        sound = bool(np.isfinite(self.speed).all() and self.speed.min() >= 0.0)
+        require(sound, "record.speed", "finite and >= 0", float(self.speed.min()))
         # Privacy relies on this: a vehicle is on one segment at a step and counts there once.
         places = np.sort(self.step.astype(np.int64) * self.n_vehicles + self.vehicle)
         twice = np.flatnonzero(places[1:] == places[:-1])
@@ -88,8 +119,26 @@ class Record:
             )
 
     @property
+    def has_vehicles(self) -> bool:
+        """True for a table of vehicles, which may be empty; False for a measured field."""
+        return self.field is None
+
+    def vehicles_for(self, user: str) -> "Record":
+        """Return this record, which has vehicles; `user` names in the error what needs them.
+
+        Raises:
+            ValueError: The record is a measured field.
+        """
+        if self.has_vehicles:
+            return self
+        raise ValueError(
+            f"{user} needs the vehicles of a record, and this traffic is a measured field of "
+            "density and speed: use the release model 'paper' or 'corrected'"
+        )
+
+    @property
     def n_rows(self) -> int:
-        """Number of rows of the vehicle table."""
+        """Number of rows of the table of vehicles."""
         return len(self.step)
 
     @cached_property
@@ -98,12 +147,12 @@ class Record:
         return int(self.vehicle.max()) + 1 if self.n_rows else 0
 
     @cached_property
-    def counts(self) -> NDArray[np.int64]:
+    def counts(self) -> IntArray:
         """(n_steps, n_columns) number of vehicles on each segment at each step."""
         return self._per_cell(None, np.int64)
 
     @cached_property
-    def speed_sums(self) -> NDArray[np.float64]:
+    def speed_sums(self) -> FloatArray:
         """(n_steps, n_columns) sum of the vehicles' speeds on each segment at each step [km/h].
 
         Divided by `counts` it is the mean speed over vehicles. SUMO's mean speed of an edge is not
@@ -111,24 +160,19 @@ class Record:
         """
         return self._per_cell(self.speed, np.float64)
 
-    def _per_cell(self, weights: NDArray[np.float32] | None, dtype: type) -> NDArray[Any]:
+    def _per_cell(self, weights: NDArray[np.float32] | None, dtype: type) -> AnyArray:
         cells = self.step.astype(np.int64) * self.n_columns + self.segment
         flat = np.bincount(cells, weights, minlength=self.n_steps * self.n_columns)
-        grid: NDArray[Any] = flat.reshape(self.n_steps, self.n_columns).astype(dtype, copy=False)
+        grid: AnyArray = flat.reshape(self.n_steps, self.n_columns).astype(dtype, copy=False)
         grid.flags.writeable = False
         return grid
 
     @cached_property
-    def offsets(self) -> NDArray[np.int64]:
+    def offsets(self) -> IntArray:
         """(n_steps + 1,) first row of each step; the last entry is the number of rows."""
         offsets = np.searchsorted(self.step, np.arange(self.n_steps + 1)).astype(np.int64)
         offsets.flags.writeable = False
         return offsets
-
-    def rows(self, step: int) -> slice:
-        """Return the rows of one step, for use as ``record.vehicle[record.rows(step)]``."""
-        integer("step", step, 0, self.n_steps - 1)
-        return slice(int(self.offsets[step]), int(self.offsets[step + 1]))
 
     def without(self, vehicle: int) -> "Record":
         """Return the adjacent record, in the sense of differential privacy, without a vehicle.
@@ -143,90 +187,133 @@ class Record:
         Vehicles keep their indices.
         """
         columns: dict[str, Any] = {name: getattr(self, name)[keep] for name in self.COLUMNS}
-        return replace(self, **columns)
+        return dataclasses.replace(self, **columns)
 
-    def in_memory(self) -> "Record":
-        """Return the same record, independent of the files it was mapped from."""
-        columns: dict[str, Any] = {name: np.array(getattr(self, name)) for name in self.COLUMNS}
-        return replace(self, **columns)
-
-    def save(self, path: Path, source: Mapping[str, object]) -> None:
-        """Write the record to the directory `path`, completely or not at all.
-
-        An existing record stays: recording is deterministic, so it is the same.
-
-        Args:
-            path: directory to create; its parents are created too.
-            source: JSON description of the recorded scenario, checked again by `load`.
-
-        Raises:
-            OSError: It cannot be written; `path` is then unchanged.
-        """
-        header = {
-            "format": RECORD_FORMAT,
-            "version": RECORD_VERSION,
-            "n_steps": self.n_steps,
-            "n_columns": self.n_columns,
-            "source": dict(source),
-        }
-        save_arrays(path, {name: getattr(self, name) for name in self.COLUMNS}, header)
-
-    @classmethod
-    def load(cls, path: Path, source: Mapping[str, object]) -> "Record":
-        """Open a stored record; its columns are mapped into memory, read-only.
-
-        Args:
-            path: the record's directory.
-            source: the expected description, as given to `save`.
-
-        Raises:
-            FileNotFoundError: There is no such directory.
-            InvalidRecordError: The record is damaged, incomplete, of another format version, or of
-                another source.
-        """
-        wanted = {"format": RECORD_FORMAT, "version": RECORD_VERSION, "source": dict(source)}
-        columns, header = load_arrays(path, list(cls.COLUMNS), wanted)
-        try:
-            fields: dict[str, Any] = {**columns, **header}
-            return cls(**{name: value for name, value in fields.items() if name not in wanted})
-        except (ValueError, LookupError, TypeError) as error:
-            raise InvalidRecordError(f"{path}: {error!r}") from error
-
-    def traffic(
-        self, lengths: NDArray[np.float64], limits: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def traffic(self, lengths: FloatArray, limits: FloatArray) -> FloatArray:
         """Return density [veh/km] and mean speed over vehicles [km/h], (n_steps, n_columns, 2).
 
         Args:
             lengths: (n_columns,) lengths of the record columns [km].
             limits: (n_columns,) their speed limits [km/h], the speed of an empty one.
         """
-        counts = self.counts
-        mean = self.speed_sums / np.maximum(counts, 1)
-        return np.stack([counts / lengths, np.where(counts > 0, mean, limits)], axis=-1)
+        if self.field is not None:
+            density, mean = self.field[..., 0], self.field[..., 1]
+        else:
+            density, mean = self.counts / lengths, self.speed_sums / np.maximum(self.counts, 1)
+        return np.stack([density, np.where(density > 0.0, mean, limits)], axis=-1)
+
+    @property
+    def arrays(self) -> dict[str, AnyArray]:
+        """The columns of the table of vehicles by name, or else the field."""
+        names = self.COLUMNS if self.has_vehicles else ["field"]
+        return {name: getattr(self, name) for name in names}
+
+    @property
+    def n_bytes(self) -> int:
+        """Size of the arrays [bytes]."""
+        return sum(array.nbytes for array in self.arrays.values())
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 (hex) of the content."""
+        digest = hashlib.sha256(f"{self.n_steps} {self.n_columns}".encode())
+        for name, array in self.arrays.items():
+            digest.update(f" {name} ".encode() + np.ascontiguousarray(array).data)
+        return digest.hexdigest()
+
+    def save(self, path: Path, source: Mapping[str, object]) -> None:
+        """Write the record to the file `path`, completely or not at all.
+
+        Args:
+            path: the file; its folders are created, and an existing file is replaced.
+            source: JSON description of what is recorded, checked again by `load`.
+
+        Raises:
+            OSError: It cannot be written; what was at `path` stays.
+            ValueError: It has more than `LARGEST_RECORD` bytes.
+        """
+        card = _card(source, (self.n_steps, self.n_columns))
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_tensors(path, self.arrays, card, LARGEST_RECORD)
+
+    @classmethod
+    def load(cls, path: Path, source: Mapping[str, object], shape: tuple[int, int]) -> "Record":
+        """Read a stored record.
+
+        Args:
+            path: the file.
+            source: the expected description, as given to `save`.
+            shape: the expected numbers of steps and of columns, `Corridor.record_shape`.
+
+        Raises:
+            FileNotFoundError: There is no such file.
+            InvalidRecordError: It is damaged, of another version of the format, or not the expected
+                one; the message starts with the path.
+        """
+        try:
+            card, arrays = read_tensors(path, LARGEST_RECORD)
+        except FileNotFoundError:
+            raise
+        except (OSError, ValueError) as error:
+            raise InvalidRecordError(str(error)) from error
+        try:
+            for key, expected in _card(source, shape).items():
+                found = card.get(key)
+                if found != expected:
+                    raise ValueError(f"{key} is {found!r:.200}, not {expected!r:.200}")
+            wanted = {"field": np.dtype("<f8")} if "field" in arrays else dict(cls.COLUMNS)
+            types = {name: array.dtype for name, array in arrays.items()}
+            require(types == wanted, "arrays", str(wanted), types)
+            for array in arrays.values():
+                array.flags.writeable = False  # nobody else has them: they need not be copied
+            fields: dict[str, Any] = dict(arrays)
+            return cls(n_steps=shape[0], n_columns=shape[1], **fields)
+        except ValueError as error:
+            raise InvalidRecordError(f"{path}: {error}") from error
 
 
-def mean_dwell(records: Iterable[Record], n_mainline: int) -> float:
-    """Measure T_avg of the paper's eq. (6): the average time of a vehicle on a mainline segment.
+def _card(source: Mapping[str, object], shape: tuple[int, int]) -> dict[str, Any]:
+    return {
+        "format": RECORD_FORMAT,
+        "version": RECORD_VERSION,
+        "source": dict(source),
+        "n_steps": shape[0],
+        "n_columns": shape[1],
+    }
 
-    It is the mean number of consecutive steps [s] of a vehicle on a mainline segment, over all
-    passages. A passage between two steps is not counted.
+
+def average_dwell(corridor: Corridor, records: Iterable[Record]) -> float:
+    """Return the average time of a vehicle on a mainline segment [s]: T_avg of the paper's eq. (6).
+
+    Of vehicles it is the mean number of consecutive steps on a segment, over all passages; one
+    between two steps is not counted. In fields it is the vehicles' time on the segments over the
+    number of passages, their flow.
 
     Raises:
         ValueError: No vehicle was ever on the mainline.
     """
-    n_rows = n_passages = 0
+    present = passages = 0.0
     for record in records:
-        mainline = record.segment < n_mainline
-        step, vehicle, segment = (
-            column[mainline].astype(np.int64)
-            for column in (record.step, record.vehicle, record.segment)
-        )
-        order = np.lexsort((step, segment, vehicle))
-        same_vehicle = np.diff(vehicle[order]) == 0
-        same_segment = np.diff(segment[order]) == 0
-        next_step = np.diff(step[order]) == 1
-        n_rows += len(step)
-        n_passages += len(step) - int(np.sum(same_vehicle & same_segment & next_step))
-    require(n_passages > 0, "records", "records with a vehicle on the mainline", n_passages)
-    return n_rows / n_passages
+        more_present, more_passages = _dwell(record, corridor)
+        present, passages = present + more_present, passages + more_passages
+    require(passages > 0.0, "records", "records with a vehicle on the mainline", passages)
+    return present / passages
+
+
+def _dwell(record: Record, corridor: Corridor) -> tuple[float, float]:
+    """Return the time of vehicles on mainline segments [s] in a record, and their passages."""
+    n = corridor.n_mainline
+    if record.field is not None:
+        vehicles = record.field[:, :n, 0] * np.array(corridor.segment_lengths[:n])
+        passing = record.field[:, :n].prod(axis=-1)
+        return float(vehicles.sum()), float(passing.sum()) / 3600.0
+    mainline = record.segment < n
+    step, vehicle, segment = (
+        column[mainline].astype(np.int64)
+        for column in (record.step, record.vehicle, record.segment)
+    )
+    order = np.lexsort((step, segment, vehicle))
+    same_vehicle = np.diff(vehicle[order]) == 0
+    same_segment = np.diff(segment[order]) == 0
+    next_step = np.diff(step[order]) == 1
+    return len(step), len(step) - int(np.sum(same_vehicle & same_segment & next_step))

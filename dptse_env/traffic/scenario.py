@@ -10,8 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dptse_env.traffic.corridor import Corridor
-from dptse_env.traffic.demand import Demand, DemandDistribution, value_at
-from dptse_env.traffic.incident import Incident, IncidentDistribution
+from dptse_env.traffic.demand import (
+    Demand,
+    DemandDistribution,
+    Incident,
+    IncidentDistribution,
+    value_at,
+)
 from dptse_env.utils.fields import integer
 
 MAINLINE = -1

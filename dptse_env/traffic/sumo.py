@@ -1,7 +1,7 @@
 """Simulation of scenarios by SUMO, which gives records.
 
-libsumo has one simulation per process: starting a second one silently replaces the first. A
-recording therefore takes place in a child process when this one holds another simulation.
+libsumo has one simulation per process: starting a second one silently replaces the first. The
+library therefore records in processes of its own (`dptse_env.traffic.recording`).
 
 Two settings were chosen by measurement on the paper's corridor (W99, 12 seeds):
 
@@ -17,20 +17,20 @@ import os
 import sys
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Self
 
 import numpy as np
 
-from dptse_env.traffic import sumo_files
+from dptse_env.traffic import own_sumo
 from dptse_env.traffic.corridor import Corridor
-from dptse_env.traffic.incident import limit_changes
+from dptse_env.traffic.demand import Incident, lowest_limit
+from dptse_env.traffic.own_sumo import KMH
 from dptse_env.traffic.record import Record
 from dptse_env.traffic.scenario import Scenario, draw_scenario
-from dptse_env.traffic.sumo_network import edge_ids, network_xml
-from dptse_env.traffic.sumo_routes import routes_xml
+from dptse_env.traffic.sumo_input import LONGEST_OUTPUT, edge_ids, network_xml, routes_xml
 
 SUPPORTED_SUMO = "1.28"
 """Release series that records are made with: others simulate the same scenario differently."""
@@ -40,7 +40,16 @@ STEP_LENGTH = 0.5
 per run of 730 vehicles on the paper's corridor) and overlaps twice as often."""
 
 SUBSTEPS = round(1.0 / STEP_LENGTH)
-KMH = sumo_files.KMH
+
+QUIET = (
+    "--no-step-log",
+    "--duration-log.disable",
+    "--no-warnings",
+    "--xml-validation=never",
+    "--xml-validation.net=never",
+    "--xml-validation.routes=never",
+)
+"""Options of every recording. Validation would look for schemas under SUMO_HOME."""
 
 OPTIONS = (
     f"--step-length={STEP_LENGTH}",
@@ -48,8 +57,8 @@ OPTIONS = (
     "--collision.action=none",
     # Vehicles that stand still in a jam are not removed.
     "--time-to-teleport=-1",
-    *sumo_files.QUIET,
 )
+"""Options on a network that is made for a corridor."""
 
 _one_at_a_time = threading.Lock()
 
@@ -83,12 +92,6 @@ def sumo_version() -> str:
     return version
 
 
-def simulation_is_loaded() -> bool:
-    """Return whether libsumo holds a simulation in this process."""
-    libsumo = sys.modules.get("libsumo")
-    return libsumo is not None and bool(libsumo.isLoaded())
-
-
 def simulate(corridor: Corridor, seed: int) -> Record:
     """Simulate one scenario in this process and record it.
 
@@ -96,15 +99,22 @@ def simulate(corridor: Corridor, seed: int) -> Record:
 
     Raises:
         RecordingError: SUMO fails, the corridor's own files are missing or changed, or libsumo
-            already holds a simulation in this process, which is left unchanged (see
-            `dptse_env.traffic.worker`).
+            already holds a simulation in this process, which is left unchanged.
         NetworkError: The corridor has to be compiled and cannot be.
         SumoVersionError: libsumo is missing, broken or of another release series.
     """
     scenario = draw_scenario(corridor, seed)
     with running(corridor, scenario) as libsumo:
-        observe = _observe if corridor.network is None else sumo_files.observe
-        return observe(libsumo, corridor, scenario)
+        if corridor.network is None:
+            return _observe(libsumo, corridor, scenario)
+        clock = seconds(libsumo, corridor, scenario)
+        rows = own_sumo.observe(libsumo, corridor.network, scenario.incidents, clock)
+    table = np.array(rows, dtype=np.float64).reshape(len(rows), 4).T
+    step, vehicle, segment, speed = table[:, np.lexsort((table[2], table[0]))]
+    return Record(
+        step=step, vehicle=vehicle, segment=segment, speed=speed,
+        n_steps=corridor.record_shape[0], n_columns=corridor.record_shape[1],
+    )  # fmt: skip
 
 
 @contextlib.contextmanager
@@ -121,21 +131,19 @@ def running(corridor: Corridor, scenario: Scenario) -> Iterator[ModuleType]:
         raise RecordingError.from_cause(corridor, scenario.seed, cause)
     network = network_xml(corridor) if corridor.network is None else ""
     with _one_at_a_time, tempfile.TemporaryDirectory(prefix="dptse-sumo-") as directory:
-        if simulation_is_loaded():
+        libsumo = _import_libsumo()
+        if libsumo.isLoaded():
             cause = "libsumo holds another simulation in this process"
             raise RecordingError.from_cause(corridor, scenario.seed, cause)
-        libsumo = _import_libsumo()
         folder = Path(directory)
         messages = folder / "messages.txt"
         try:
             with _stderr_to(messages):
-                if corridor.network is None:
-                    libsumo.start(_command(folder, network, corridor, scenario))
-                else:
-                    libsumo.start(sumo_files.command(folder, corridor.network, scenario))
+                libsumo.start([*_command(folder, network, corridor, scenario), *QUIET])
             yield libsumo
         except Exception as error:
             output = messages.read_text(encoding="utf-8", errors="replace").strip()
+            output = output[-LONGEST_OUTPUT:]
             cause = f"{type(error).__name__}: {error}" + (f"\n{output}" if output else "")
             raise RecordingError.from_cause(corridor, scenario.seed, cause) from error
         finally:
@@ -149,18 +157,45 @@ def seconds(libsumo: ModuleType, corridor: Corridor, scenario: Scenario) -> Iter
     Yields:
         0, 1, ..., `corridor.duration`: the second [s] whose state libsumo holds.
     """
-    if corridor.network is not None:
-        yield from sumo_files.seconds(libsumo, corridor.network, corridor.duration)
-        return
-    changes = limit_changes(scenario.incidents, corridor.speed_limits)
+    network, substeps, changes = corridor.network, SUBSTEPS, list[tuple[float, int, float]]()
+    if network is None:
+        changes = limit_changes(scenario.incidents, corridor.speed_limits)
+    else:
+        substeps = network.substeps
+        for _ in range(network.warm_up * substeps):
+            libsumo.simulationStep()
     yield 0
     for second in range(corridor.duration):
-        for substep in range(SUBSTEPS):
+        for substep in range(substeps):
             while changes and changes[0][0] <= second + substep * STEP_LENGTH:
                 _, segment, limit = changes.pop(0)
                 libsumo.edge.setMaxSpeed(f"main_{segment}", limit / KMH)
             libsumo.simulationStep()
         yield second + 1
+
+
+def limit_changes(
+    incidents: Sequence[Incident], speed_limits: Sequence[float]
+) -> list[tuple[float, int, float]]:
+    """Return the changes of limits in order, each as (time [s], segment, new limit [km/h]).
+
+    Where several incidents act on a segment at once, the lowest of their limits holds.
+
+    Args:
+        incidents: The incidents.
+        speed_limits: Limit of each segment outside incidents [km/h].
+    """
+    changes = []
+    ends = {
+        (time, incident.segment)
+        for incident in incidents
+        for start, end, _ in incident.phases
+        for time in (start, end)
+    }
+    for time, segment in sorted(ends):
+        limit = lowest_limit(incidents, segment, time)
+        changes.append((time, segment, speed_limits[segment] if limit is None else limit))
+    return changes
 
 
 def _import_libsumo() -> ModuleType:
@@ -209,6 +244,8 @@ def _stderr_to(path: Path) -> Iterator[None]:
 
 def _command(folder: Path, network: str, corridor: Corridor, scenario: Scenario) -> list[str]:
     """Write SUMO's input files and return its command line."""
+    if corridor.network is not None:
+        return own_sumo.command(folder, corridor.network, scenario.sumo_seed, scenario.scale)
     network_file, route_file = folder / "corridor.net.xml", folder / "scenario.rou.xml"
     network_file.write_text(network, encoding="utf-8")
     route_file.write_bytes(routes_xml(corridor, scenario))

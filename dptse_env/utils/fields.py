@@ -9,6 +9,7 @@ generated from it. An error is one line: ``<path> must be <allowed>, got <value>
 import dataclasses
 import json
 import math
+import reprlib
 import types
 import typing
 from collections.abc import Iterable, Mapping, Sequence
@@ -16,6 +17,7 @@ from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from numbers import Integral, Real
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -69,7 +71,7 @@ def from_mapping(cls: type[T], values: Any, path: str, base: T | None = None) ->
     if isinstance(values, cls):
         return values
     if not isinstance(values, Mapping):
-        raise ValueError(f"{path} must be a mapping or {cls.__name__}, got {_shown(values)}")
+        raise ValueError(f"{path} must be a mapping or {cls.__name__}, got {shown(values)}")
     prefix = f"{path}." if path else ""
     hints = field_hints(cls)
     for key in values:
@@ -145,7 +147,7 @@ def convert(hint: Any, value: Any, path: str, base: Any = None) -> Any:
         return _convert_tuple(items, value, path)
     if (isinstance(value, bool) and kind is not bool) or not isinstance(value, kind):
         name = "None" if kind is type(None) else kind.__name__
-        raise ValueError(f"{path} must be of type {name}, got {_shown(value)}")
+        raise ValueError(f"{path} must be of type {name}, got {shown(value)}")
     return value
 
 
@@ -174,7 +176,7 @@ def number(kind: type[N], value: Any, path: str, interval: Interval | None) -> N
             converted = math.nan
     if converted in interval if interval is not None else math.isfinite(converted):
         return typing.cast(N, converted)
-    raise ValueError(f"{path} must be {allowed_numbers(kind, interval)}, got {_shown(value)}")
+    raise ValueError(f"{path} must be {allowed_numbers(kind, interval)}, got {shown(value)}")
 
 
 def allowed_numbers(kind: type, interval: Interval | None) -> str:
@@ -193,19 +195,19 @@ def _choice(allowed: tuple[Any, ...], value: Any, path: str) -> Any:
     # Membership by type first: an array compares element by element.
     if not isinstance(value, str | int | float | None) or value not in allowed:
         names = ", ".join(map(repr, allowed))
-        raise ValueError(f"{path} must be one of {names}, got {_shown(value)}")
+        raise ValueError(f"{path} must be one of {names}, got {shown(value)}")
     return value
 
 
 def _convert_tuple(items: tuple[Any, ...], value: Any, path: str) -> tuple[Any, ...]:
     if isinstance(value, str | bytes) or not isinstance(value, Sequence):
-        raise ValueError(f"{path} must be a sequence, got {_shown(value)}")
+        raise ValueError(f"{path} must be a sequence, got {shown(value)}")
     if len(value) > LONGEST_SEQUENCE:
         raise ValueError(f"{path} must have at most {LONGEST_SEQUENCE} items, got {len(value)}")
     if len(items) == 2 and items[1] is Ellipsis:
         items = (items[0],) * len(value)
     if len(items) != len(value):
-        raise ValueError(f"{path} must have {len(items)} items, got {len(value)}: {_shown(value)}")
+        raise ValueError(f"{path} must have {len(items)} items, got {len(value)}: {shown(value)}")
     return tuple(
         convert(item, element, f"{path}[{i}]")
         for i, (item, element) in enumerate(zip(items, value, strict=True))
@@ -240,7 +242,7 @@ def _convert_union(options: tuple[Any, ...], value: Any, path: str, base: Any) -
     if all(dataclasses.is_dataclass(option) for option in options):
         names = " or ".join(option.__name__ for option in options)
         if not isinstance(value, options):
-            raise ValueError(f"{path} must be a mapping or {names}{suffix}, got {_shown(value)}")
+            raise ValueError(f"{path} must be a mapping or {names}{suffix}, got {shown(value)}")
     problems = []
     for option in options:
         try:
@@ -250,9 +252,14 @@ def _convert_union(options: tuple[Any, ...], value: Any, path: str, base: Any) -
     raise ValueError("; or ".join(problems))
 
 
-def _shown(value: Any) -> str:
-    """Return a value for a message, cut where it is long."""
-    text = repr(value)
+_SHORT = reprlib.Repr()
+_SHORT.maxlevel, _SHORT.maxlong, _SHORT.maxstring, _SHORT.maxother = 5, 200, 200, 200
+_SHORT.maxdict = _SHORT.maxlist = _SHORT.maxtuple = 50
+
+
+def shown(value: Any) -> str:
+    """Return a value for a message, cut where it is long or nested deeply."""
+    text = _SHORT.repr(value)
     return text if len(text) <= 200 else f"{text[:200]}..."
 
 
@@ -262,14 +269,14 @@ _NON_NEGATIVE = Interval(0, math.inf, open_high=True)
 def require(condition: bool, path: str, allowed: str, value: object) -> None:
     """Raise ``ValueError`` "<path> must be <allowed>, got <value>" unless `condition` holds."""
     if not condition:
-        raise ValueError(f"{path} must be {allowed}, got {value!r}")
+        raise ValueError(f"{path} must be {allowed}, got {shown(value)}")
 
 
 def require_name(path: str, name: object, known: Iterable[str]) -> None:
     """Raise ``ValueError`` unless `name` is one of the `known` strings."""
     names = list(known)
     if not isinstance(name, str) or name not in names:
-        raise ValueError(f"{path} must be one of {', '.join(names)}, got {name!r}")
+        raise ValueError(f"{path} must be one of {', '.join(names)}, got {shown(name)}")
 
 
 def integer(path: str, value: object, low: int, high: float = math.inf) -> int:
@@ -329,6 +336,19 @@ def parse_json(text: str | bytes, path: str) -> Any:
         raise ValueError(f"{path} must be JSON: {problem}") from problem
 
 
+def read_json(path: str | Path) -> Any:
+    """Parse a JSON file.
+
+    Raises:
+        ValueError: It cannot be read or is no JSON; the message starts with its path.
+    """
+    try:
+        text = Path(path).read_bytes()
+    except OSError as problem:
+        raise ValueError(f"{path} cannot be read: {problem.strerror}") from problem
+    return parse_json(text, str(path))
+
+
 def check_object(content: Any, path: str, keys: Mapping[str, type]) -> dict[str, Any]:
     """Return parsed JSON where it is an object that has exactly the given keys.
 
@@ -336,9 +356,10 @@ def check_object(content: Any, path: str, keys: Mapping[str, type]) -> dict[str,
         ValueError: It is no object, or has other keys or types; the message starts with ``path``.
     """
     if not isinstance(content, dict) or set(content) != set(keys):
-        got = str(sorted(content) if isinstance(content, dict) else content)[:200]
+        got = shown(sorted(content) if isinstance(content, dict) else content)
         raise ValueError(f"{path} must be a mapping with the keys {', '.join(keys)}, got {got}")
     for key, kind in keys.items():
         if not isinstance(content[key], kind) or isinstance(content[key], bool):
-            raise ValueError(f"{path}: {key} must be of type {kind.__name__}, got {content[key]!r}")
+            got = shown(content[key])
+            raise ValueError(f"{path}: {key} must be of type {kind.__name__}, got {got}")
     return content

@@ -20,7 +20,7 @@ def row_of(rows: Mapping[str, Any], k: int) -> dict[str, Any]:
     """Return row k, as plain Python numbers and as fresh arrays where a value has a shape."""
     return {
         key: row_of(value, k)
-        if isinstance(value, Mapping)
+        if type(value) is dict
         else (value.item(k) if value.ndim == 1 else value[k].copy())
         for key, value in rows.items()
     }
@@ -52,7 +52,7 @@ def in_vector_form(rows: Mapping[str, Any], episodes: IntArray, n_episodes: int)
 
     Args:
         rows: Infos of ``episodes``.
-        episodes: Indices, shape (k,).
+        episodes: Indices, ascending, shape (k,).
         n_episodes: Size of the batch n.
 
     Returns:
@@ -65,6 +65,8 @@ def in_vector_form(rows: Mapping[str, Any], episodes: IntArray, n_episodes: int)
     for key, value in rows.items():
         if isinstance(value, Mapping):
             infos[key] = in_vector_form(value, episodes, n_episodes)
+        elif len(episodes) == n_episodes:  # all of them, in order
+            infos[key] = value.copy()
         else:
             blank = None if value.dtype == object else 0
             infos[key] = np.full((n_episodes, *value.shape[1:]), blank, dtype=value.dtype)

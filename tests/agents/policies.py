@@ -1,7 +1,6 @@
 """Untrained policies for the short road, saved as trained ones are."""
 
 from dptse_env.config import resolve
-from dptse_env.parts import make_interface
 
 SHORT = "dptse_env:dptse/ShortHighway-v0"
 
@@ -10,16 +9,12 @@ def save(path, seed=0, **keywords):
     """Save a Plackett-Luce policy with weights of `seed` for an environment of these keywords."""
     import torch
 
-    from dptse_env.sb3 import PlackettLucePolicy, RoadChannels, save_policy
+    from dptse_env.sb3 import PlackettLucePolicy, save_policy
 
     keywords = {"bandwidth": 2, **keywords}
     config = resolve("short-highway", {**keywords, "action": "slots"})
-    interface = make_interface(config)
     torch.manual_seed(seed)
-    policy = PlackettLucePolicy(
-        interface.observations.space, interface.actions.space,
-        road=RoadChannels.from_config(config), width=8,
-    )  # fmt: skip
+    policy = PlackettLucePolicy.from_config(config, width=8)
     with torch.no_grad():
         for weights in policy.parameters():  # fresh ones leave the rule as it is
             weights.add_(0.05 * torch.randn_like(weights))

@@ -5,7 +5,7 @@ pytest.importorskip("tyro")
 
 from agents.environments import make_config
 from agents.measured_field import Field, Replay, field_corridor, read_field
-from dptse_env.traffic.importers.fields import FieldSource
+from dptse_env.importers.fields import FieldSource
 from scripts import replay_field
 
 PAPER = "dptse_env:dptse/PaperHighway-v0"

@@ -1,12 +1,11 @@
-import hashlib
-import json
 import pickle
 import subprocess
 import sys
-import zipfile
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
+import polars as pl
 import pytest
 
 from agents.environments import make_vector
@@ -16,17 +15,18 @@ from dptse_env.evaluation import evaluate
 from dptse_env.policies import TRANSFERABLE
 from dptse_env.schedules import make_schedule
 from tests.agents.policies import SHORT, save
+from tests.hostile import edited
 
 
 def test_the_card_says_what_it_is(tmp_path):
-    path = save(tmp_path / "policy.zip", seed=3)
+    path = save(tmp_path / "policy.safetensors", seed=3)
     saved = read_saved_policy(path)
     assert (saved.recipe, saved.training_seed, saved.action) == ("plackett-luce", 3, "slots")
-    assert saved.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
+    assert saved.identity == saved.card["sha256"]
 
 
 def test_it_acts_as_the_policy_that_was_saved(tmp_path):
-    path = save(tmp_path / "policy.zip")
+    path = save(tmp_path / "policy.safetensors")
     env = gym.make(SHORT, action="slots")
     observation, _ = env.reset(seed=0)
     action, _ = (
@@ -37,7 +37,7 @@ def test_it_acts_as_the_policy_that_was_saved(tmp_path):
 
 
 def test_another_bandwidth_is_refused_unless_it_is_meant(tmp_path):
-    saved = read_saved_policy(save(tmp_path / "policy.zip"))
+    saved = read_saved_policy(save(tmp_path / "policy.safetensors"))
     env = gym.make(SHORT, action="slots", bandwidth=3)
     with pytest.raises(ValueError, match="bandwidth is 2 for the policy and 3 for the environment"):
         saved.load(env)
@@ -45,7 +45,7 @@ def test_another_bandwidth_is_refused_unless_it_is_meant(tmp_path):
 
 
 def test_a_file_that_has_changed_is_refused(tmp_path):
-    path = save(tmp_path / "policy.zip", seed=0)
+    path = save(tmp_path / "policy.safetensors", seed=0)
     saved = read_saved_policy(path)
     save(path, seed=1)
     with pytest.raises(ValueError, match="has changed"):
@@ -56,22 +56,16 @@ def test_what_is_no_policy_is_refused(tmp_path):
     with pytest.raises(FileNotFoundError, match="no saved policy 'nobody'"):
         read_saved_policy("nobody")
     text = tmp_path / "text.zip"
-    text.write_text("no archive")
-    with pytest.raises(ValueError, match="not a saved policy, or damaged: File is not a zip file"):
+    text.write_text("no weights")
+    with pytest.raises(ValueError, match=r"text\.zip is damaged, or no safetensors file"):
         read_saved_policy(text)
-    for card in ({"fits": {}}, {"fits": {"action": "mask"}, "training": {"seed": 1}}, []):
-        with zipfile.ZipFile(text, "w") as archive:
-            archive.writestr("card.json", json.dumps(card))
-        with pytest.raises(ValueError, match="not a saved policy"):
-            read_saved_policy(text)
 
 
 def test_a_name_is_a_saved_policy_or_a_schedule(tmp_path):
-    path = save(tmp_path / "policy.zip", seed=2)
+    path = save(tmp_path / "policy.safetensors", seed=2)
     saved, schedule = find_policy(str(path)), find_policy("paper")
     assert saved == read_saved_policy(path)
     assert saved.keywords == {"action": "slots"}
-    assert saved.identity == saved.sha256
     assert (schedule.keywords, schedule.identity) == ({}, "paper")
     assert find_policy("private-highway").keywords == {"action": "slots"}
     env = gym.make(SHORT)
@@ -87,27 +81,22 @@ def test_a_name_is_a_saved_policy_or_a_schedule(tmp_path):
 
 @pytest.mark.parametrize("training", [{"seed": 1}, {"learner": "mask", "seed": "first"}])
 def test_a_card_without_recipe_or_training_seed_is_refused(tmp_path, training):
-    path = save(tmp_path / "policy.zip")
-    with zipfile.ZipFile(path) as archive:
-        entries = {name: archive.read(name) for name in archive.namelist()}
-    card = {**json.loads(entries["card.json"]), "training": training}
-    with zipfile.ZipFile(path, "w") as archive:
-        for name, content in {**entries, "card.json": json.dumps(card)}.items():
-            archive.writestr(name, content)
+    path = save(tmp_path / "policy.safetensors")
+    path.write_bytes(edited(path, lambda card, weights: card.update(training=training)))
     with pytest.raises(ValueError, match="not a saved policy"):
         read_saved_policy(path)
 
 
-def test_a_name_is_looked_up_in_the_package(tmp_path, monkeypatch):
-    (tmp_path / "policies").mkdir()
-    save(tmp_path / "policies" / "shipped.zip", seed=4)
-    monkeypatch.setattr("dptse_env.policies.files", lambda _: tmp_path)
-    assert read_saved_policy("shipped").training_seed == 4
+def test_a_converted_policy_keeps_its_identity_in_recorded_results():
+    saved = read_saved_policy("private-highway")
+    assert saved.identity.startswith("5efbbd09f911b3d1")
+    rows = pl.read_parquet(Path(__file__).parents[2] / "results" / "policies" / "rows.parquet")
+    assert rows["cell"].str.contains(f"sha256:{saved.identity}").any()
 
 
 @pytest.mark.slow
 def test_a_card_is_read_without_torch(tmp_path):
-    path = save(tmp_path / "policy.zip")
+    path = save(tmp_path / "policy.safetensors")
     code = (
         "import sys; import scripts.evaluate; from agents.policies import find_policy; "
         f"assert find_policy({str(path)!r}).action == 'slots'; assert 'torch' not in sys.modules"

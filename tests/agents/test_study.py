@@ -125,7 +125,7 @@ def test_an_id_says_all_that_rows_depend_on(tmp_path):
     assert len(ids) == len(changes) + 1
     assert replace(cell, labels={}, seeds=(1,)).id == cell.id
     # A policy that was trained again is another cell, and so is a road that was edited.
-    path = save(tmp_path / "policy.zip", seed=0)
+    path = save(tmp_path / "policy.safetensors", seed=0)
     trained = replace(cell, policy=str(path))
     before = trained.id
     save(path, seed=1)

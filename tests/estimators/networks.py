@@ -3,8 +3,8 @@
 import numpy as np
 
 from dptse_env.estimators import EstimatorSettings, RecurrentSettings
+from dptse_env.estimators.recurrent import FORMAT, write_network
 from dptse_env.estimators.recurrent_kernels import CHANNELS, Network, shapes
-from dptse_env.estimators.recurrent_weights import FORMAT, write_network
 
 RANGES = {
     "n_mainline": [2, 30],
@@ -35,6 +35,6 @@ def card(**ranges):
 
 def settings(folder, network=None, outside=False, **ranges):
     """Settings of a network that is written into a folder."""
-    path = folder / "network.npz"
+    path = folder / "network.safetensors"
     write_network(path, network or random_network(), card(**ranges))
     return EstimatorSettings(recurrent=RecurrentSettings(weights=str(path), outside=outside))

@@ -15,10 +15,8 @@ from dptse_env.estimators import (
     make_estimator,
 )
 from dptse_env.estimators import mhe as mhe_module
-from dptse_env.estimators.ekf import Filters
 from dptse_env.estimators.mhe import (
     GENERAL_SOLVER,
-    Windows,
     natural_residual,
     normalised_bounds,
     solve,
@@ -223,11 +221,11 @@ def missing(problem, **_):
     raise qpsolvers.SolverNotFound("no such solver")
 
 
-def unsolved(road, filters, windows, *given):
+def unsolved(bundle, *given):
     """The update's kernel with its solution taken away."""
-    mine = Windows(*windows)
-    kept = [(array, array.copy()) for array in (Filters(*filters).means, mine.solution, mine.side)]
-    solve_and_update(road, filters, windows, *given)
+    _, filters, mine = bundle.parts
+    kept = [(array, array.copy()) for array in (filters.means, mine.solution, mine.side)]
+    solve_and_update(bundle, *given)
     for array, before in kept:
         array[:] = before
     mine.solved[:] = UNSOLVED

@@ -1,11 +1,18 @@
 """The recurrent network beside the one that is trained; what it is told, and what it gives."""
 
 import dataclasses
+import hashlib
 
 import numpy as np
 import pytest
 
 from dptse_env.estimators import Measurement, make_estimator
+from dptse_env.estimators.recurrent import (
+    member_for,
+    read_network,
+    shipped_networks,
+    write_network,
+)
 from dptse_env.estimators.recurrent_kernels import (
     CHANNELS,
     LARGEST_CORRECTION,
@@ -15,9 +22,10 @@ from dptse_env.estimators.recurrent_kernels import (
     read,
 )
 from dptse_env.model.network import MeasurementRows
+from tests.hostile import check_hostile, edited
 
 from .episodes import random_streams, run, simulate, tell
-from .networks import random_network, settings
+from .networks import card, random_network, settings
 from .rows import averaged, with_rows
 
 torch = pytest.importorskip("torch")
@@ -281,3 +289,85 @@ def test_a_road_outside_of_the_card_is_refused_unless_asked(tmp_path):
         make_estimator("recurrent", "compiled", model, 1, settings(tmp_path))
     with pytest.raises(ValueError, match=r"trained on flows in \[1, 1\]"):
         started(episodes, settings(tmp_path, flows=[1, 1]))
+
+
+# Files of networks --------------------------------------------------------------------------------
+
+DIGESTS = {
+    "highway-flows": ("a7cd6a7d0da0", "463df28b4d90"),
+    "highway-speeds": ("98c08e7ad753", "2bb2c4ca118a"),
+    "long-highway-flows": ("0718f2eebe91", "af13a07e0dc6"),
+}
+"""The first digits of the digests of the files before they were converted, and of their weights."""
+
+
+@pytest.fixture
+def path(tmp_path):
+    path = tmp_path / "network.safetensors"
+    write_network(path, random_network(), card())
+    return path
+
+
+def test_what_is_written_is_read(path, tmp_path):
+    saved = read_network(str(path))
+    for name, array in random_network()._asdict().items():
+        np.testing.assert_array_equal(getattr(saved.network, name), array)
+    assert {key: value for key, value in saved.card.items() if key != "sha256"} == card()
+    write_network(tmp_path / "again.safetensors", random_network(), card())
+    assert (tmp_path / "again.safetensors").read_bytes() == path.read_bytes()
+
+
+def test_the_weights_that_ship_are_those_that_were_recorded():
+    digests = {}
+    for name in shipped_networks():
+        saved, content = read_network(name), hashlib.sha256()
+        for array in saved.network:
+            content.update(array.tobytes())
+        digests[name] = saved.card["converted_from"][:12], content.hexdigest()[:12]
+    assert digests == DIGESTS
+
+
+def test_a_pair_is_found_by_the_name_it_shares(tmp_path):
+    source = str(tmp_path / "pair")
+    single = f"{source}-flows.safetensors"
+    write_network(single, random_network(), card())
+    assert member_for(source, flows=True) == single
+    assert member_for(source, flows=False) == source  # refused by the one who reads it
+    assert member_for(single, flows=True) == single
+    assert member_for("highway", flows=True) == "highway-flows"
+    assert member_for("highway", flows=False) == "highway-speeds"
+    with pytest.raises(ValueError, match=r"must be a file or one of highway, highway-flows, .*, g"):
+        read_network("nowhere")
+
+
+def test_damaged_files_are_refused(path, tmp_path):
+    check_hostile(lambda path: read_network(str(path)), path, tmp_path / "bad.safetensors")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda c, a: a.update(heads=a["heads"][:, :7].copy()), "heads must be float32 of shape"),
+        (lambda c, a: a.update(hidden=np.zeros((0, 0), "f4")), r"width must be in 1\.\.512, got 0"),
+        (lambda c, a: a.update(hidden=np.array(1.0)), r"width must be in 1\.\.512, got 0"),
+        (lambda c, a: c.update(format="recurrent-9"), "'recurrent-9', this version reads"),
+        (lambda c, a: c.update(channels=["queried"]), "channels of format"),
+        (lambda c, a: c.update(ranges={"lanes": [1, "2"]}), "'lanes' must be two numbers"),
+    ],
+)
+def test_other_content_is_refused(change, message, path):
+    path.write_bytes(edited(path, change))
+    with pytest.raises(ValueError, match=rf"\.safetensors is not a saved network: .*{message}"):
+        read_network(str(path))
+
+
+def test_nothing_is_written_that_could_not_be_read(tmp_path):
+    network, path = random_network(), tmp_path / "x.safetensors"
+    for bad, about in (
+        (network._replace(heads=network.heads * np.float32(np.inf)), card()),
+        (network._replace(heads=network.heads[:1]), card()),
+        (network, {**card(), "format": "mine"}),
+    ):
+        with pytest.raises(ValueError, match=r"heads|format"):
+            write_network(path, bad, about)
+    assert not path.exists()

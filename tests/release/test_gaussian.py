@@ -154,7 +154,7 @@ def test_without_a_cap_the_values_are_the_aggregates_and_the_cap_belongs_to_trip
             np.testing.assert_allclose(release.true_values(request(t))[0, :, 0], density)
         trip.true_values(request(t))
         flow = density * (mean - 0.5 * LIMIT)
-        rows = whole.rows(t)
+        rows = whole.step == t
         clipped = np.bincount(
             whole.segment[rows], np.maximum(whole.speed[rows] - LIMIT, 0.0), COLUMNS
         )

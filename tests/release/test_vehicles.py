@@ -41,7 +41,7 @@ def traffic():
 
 def test_aggregates_are_counts_and_means_over_vehicles(traffic):
     record = traffic.library.get(SHORT_HIGHWAY, 4)
-    rows = record.rows(120)
+    rows = record.step == 120
     segments, speeds = record.segment[rows], record.speed[rows].astype(float)
     (answer,) = traffic.aggregates(np.array([0]), np.array([120]))
     occupied = 0
@@ -86,7 +86,7 @@ def test_missing_records_are_made_together_and_loaded_once(tmp_path, monkeypatch
 def test_vehicles_are_those_of_the_second_and_groups_see_some_of_them(traffic):
     record = traffic.library.get(SHORT_HIGHWAY, 4)
     rows = traffic.vehicles(np.array([0]), np.array([120]))
-    second, own = slice(rows.start[0], rows.stop[0]), record.rows(120)
+    second, own = slice(rows.start[0], rows.stop[0]), record.step == 120
     np.testing.assert_array_equal(rows.vehicle[second], record.vehicle[own])
     np.testing.assert_array_equal(rows.place[second], record.segment[own])
     np.testing.assert_array_equal(rows.speed[0, second], record.speed[own])

@@ -34,7 +34,10 @@ def record(places, speeds, n_columns=COLUMNS):
     """A record of places (V, T + 1) of V vehicles, `AWAY` where there is none, and their speeds."""
     step, vehicle = np.nonzero(np.asarray(places).T != AWAY)
     place, speed = (np.asarray(table)[vehicle, step] for table in (places, speeds))
-    return Record(step, vehicle, place, speed, n_steps=np.shape(places)[1], n_columns=n_columns)
+    return Record(
+        step=step, vehicle=vehicle, segment=place, speed=speed,
+        n_steps=np.shape(places)[1], n_columns=n_columns,
+    )  # fmt: skip
 
 
 def drives(places, speed):

@@ -1,14 +1,23 @@
 import itertools
 import math
 
+import gymnasium as gym
+import numpy as np
 import pytest
+from gymnasium import spaces
 
 pytest.importorskip("torch")
 pytest.importorskip("stable_baselines3")
 
 import torch
 
-from dptse_env.sb3 import PlackettLuce
+from dptse_env.config import PRESETS, resolve
+from dptse_env.parts import make_interface
+from dptse_env.sb3 import PlackettLuce, PlackettLucePolicy, RoadChannels
+from dptse_env.sb3.plackett_luce import RoadFeatures
+from tests.release.sums import PricedRelease, SumRelease
+
+# The distribution.
 
 SCORES = torch.tensor([[0.3, -1.2, 2.0, 0.1], [5.0, 5.0, -5.0, 0.0]], dtype=torch.float64)
 
@@ -105,3 +114,180 @@ def test_bad_distributions(scores, size, message):
 def test_bad_sets(chosen, message):
     with pytest.raises(ValueError, match=message):
         PlackettLuce(SCORES, 2).log_prob(torch.tensor(chosen))
+
+
+# The observation as channels along the road.
+
+
+def numbered(config):
+    """An observation in which every number is its place, and where its blocks begin."""
+    encoding = make_interface(config).observations
+    starts = {name: place.start for name, place in encoding.slices.items()}
+    return torch.arange(encoding.space.shape[0], dtype=torch.float32)[None], starts
+
+
+def raw(road, name, observation):
+    """The values of a channel before it is scaled; None where there are none."""
+    (k,) = (k for k, channel in enumerate(road.channels) if channel.name == name)
+    channel = road.channels[k]
+    shown = RoadFeatures(road)(observation)[0, k].numpy() * channel.scale + channel.centre
+    return [x if at is not None else None for x, at in zip(shown, channel.source, strict=True)]
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_mainline_blocks_stand_at_their_segments(preset):
+    config = PRESETS[preset]
+    road, n = RoadChannels.from_config(config), config.corridor.n_mainline
+    observation, starts = numbered(config)
+    released = (
+        "released_flow" if preset.startswith(("private-highway", "long")) else "released_speed"
+    )
+    for name in ("density", "speed_log_std", "released_density", released, "age", "queried"):
+        expected = starts[name] + np.arange(n)
+        np.testing.assert_allclose(raw(road, f"mainline {name}", observation), expected, rtol=1e-5)
+    assert RoadFeatures(road)(observation).shape == (1, road.n_channels, n)
+
+
+def test_ramps_stand_where_they_join_and_fixed_sensors_with_them():
+    config = PRESETS["paper-highway"]  # on-ramps at faces 3 and 9, off-ramps at 6 and 12
+    road = RoadChannels.from_config(config)
+    observation, starts = numbered(config)
+    on, off = (raw(road, f"{kind}-ramp density", observation) for kind in ("on", "off"))
+    assert {i: round(x) - starts["density"] for i, x in enumerate(on) if x is not None} == {
+        3: 15, 9: 16,
+    }  # fmt: skip
+    assert {i: round(x) - starts["density"] for i, x in enumerate(off) if x is not None} == {
+        5: 17, 11: 18,
+    }  # fmt: skip
+    innovation = raw(road, "off-ramp fixed_density_innovation", observation)
+    first = starts["fixed_density_innovation"]
+    assert {i: round(x) - first for i, x in enumerate(innovation) if x is not None} == {5: 1, 11: 2}
+    assert [np.flatnonzero(mark).tolist() for mark in road.marks] == [[3, 9], [5, 11], [14]]
+
+
+def test_channels_of_real_observations_are_of_order_one():
+    keywords = {"traffic_seeds": "0:2", "action": "slots"}
+    env = gym.make("dptse_env:dptse/ShortHighway-v0", privacy="capped", **keywords)
+    road = RoadFeatures(RoadChannels.from_config(env.unwrapped.config))
+    env.reset(seed=0)
+    env.action_space.seed(0)
+    seen = [env.step(env.action_space.sample())[0] for _ in range(240)]
+    shown = road(torch.tensor(np.stack(seen))).abs()
+    assert shown.mean() < 1.5
+    assert shown.amax(dim=(0, 2)).median() > 0.5
+
+
+def test_prices_and_the_tracer_are_channels_where_they_are_observed():
+    named = [RoadChannels.from_config(resolve("short-highway", {"privacy": privacy})).channels
+             for privacy in (SumRelease, PricedRelease)]  # fmt: skip
+    without, priced = ({channel.name for channel in channels} for channels in named)
+    assert priced - without == {"mainline last_price", "mainline tracer"}
+
+
+# The policy.
+
+
+def make_policy(preset="private-highway", *, skips_sensors=True, **keywords):
+    config = resolve(preset, {"action": "slots", **keywords})
+    torch.manual_seed(0)
+    return PlackettLucePolicy.from_config(config, skips_sensors=skips_sensors)
+
+
+def observations(policy, k=64):
+    torch.manual_seed(1)
+    return torch.randn(k, policy.observation_space.shape[0])
+
+
+@pytest.mark.parametrize("bandwidth", [1, 5, 15])
+def test_actions_are_distinct_and_follow_the_distribution(bandwidth):
+    policy = make_policy(bandwidth=bandwidth)
+    seen = observations(policy)
+    torch.manual_seed(2)
+    actions, _ = policy.predict(seen.numpy())
+    assert actions.shape == (64, bandwidth)
+    assert (np.diff(np.sort(actions, axis=1), axis=1) > 0).all()
+    torch.manual_seed(2)
+    distribution = policy.get_distribution(seen)
+    np.testing.assert_array_equal(distribution.sample().numpy(), actions)
+    assert torch.isfinite(distribution.log_prob(torch.from_numpy(actions))).all()
+
+
+def test_deterministic_actions_are_the_highest_scores():
+    policy = make_policy()
+    seen = observations(policy)
+    scores = policy.scores(seen).detach()
+    scores[:, 14] = -torch.inf  # the last segment has a fixed sensor
+    best = scores.argsort(dim=1, descending=True)[:, :5]
+    actions, state = policy.predict(seen.numpy(), deterministic=True)
+    np.testing.assert_array_equal(actions, best.numpy())
+    assert state is None
+    np.testing.assert_array_equal(policy.predict(seen[0].numpy(), deterministic=True)[0], best[0])
+    drawn = [policy.predict(seen.numpy())[0] for _ in range(2)]
+    assert (drawn[0] != drawn[1]).any()
+
+
+def test_a_segment_with_a_fixed_sensor_is_queried_when_there_is_no_other():
+    seen = observations(make_policy())
+    for deterministic in (True, False):
+        some, _ = make_policy(bandwidth=14).predict(seen.numpy(), deterministic=deterministic)
+        assert not (some == 14).any()
+        every, _ = make_policy(bandwidth=15).predict(seen.numpy(), deterministic=deterministic)
+        assert (every[:, -1] == 14).all()
+
+
+def test_neighbours_and_the_whole_road_count():
+    policy = make_policy()
+    channels = policy.features(observations(policy, 1)).requires_grad_()
+    (gradient,) = torch.autograd.grad(policy.scorer(channels)[0, 7], channels)
+    seen = gradient[0].abs().sum(dim=0)
+    near = seen[3:12]
+    assert (near > 0).all()
+    # Two convolutions of width 5 reach four segments; what is further counts by the mean alone.
+    far = torch.cat([seen[:3], seen[12:]])
+    assert (far > 0).all()
+    assert far.max() < near.max()
+
+
+def test_segments_share_one_scorer():
+    """Shifted along a road without ramps, away from its ends, scores shift with the traffic."""
+    policy = make_policy()
+    channels = torch.zeros(1, policy.road.n_channels, 15)
+    channels[0, :3, 7] = 1.0
+    scores = policy.scorer(channels)
+    shifted = policy.scorer(channels.roll(1, dims=2))
+    torch.testing.assert_close(shifted[:, 4:12], scores[:, 3:11])
+
+
+def test_weights_fit_other_roads_of_the_same_kinds():
+    policy = make_policy("paper-highway")
+    with pytest.warns(UserWarning, match="on another road"):
+        other = make_policy("paper-highway", corridor={"n_mainline": 18}, bandwidth=7)
+    other.load_state_dict(policy.state_dict())
+    assert other.predict(observations(other).numpy())[0].max() > 14
+
+
+def test_policies_of_two_environments_share_their_weights():
+    policy = make_policy("short-highway")
+    config = resolve("short-highway", {"action": "slots", "bandwidth": 4})
+    twin = policy.sharing(config)
+    with torch.no_grad():
+        policy.scorer.rule.add_(1.0)
+    seen = observations(policy)
+    torch.testing.assert_close(twin.scores(seen), policy.scores(seen), rtol=0, atol=0)
+    assert twin.bandwidth == 4
+    with pytest.raises(ValueError, match=r"one lacks \['mainline released_speed'\]"):
+        policy.sharing(resolve("short-highway", {"action": "slots", "privacy": "capped"}))
+
+
+def test_spaces_that_do_not_fit_are_refused():
+    config = resolve("short-highway", {"action": "slots"})
+    interface, road = make_interface(config), RoadChannels.from_config(config)
+    seen, taken = interface.observations.space, interface.actions.space
+    longer = spaces.Box(0, 1, (road.size + road.n_mainline,))
+    for wrong in (longer, spaces.Box(0, 1, (3, 3)), taken):
+        with pytest.raises(ValueError, match="observation_space must have shape"):
+            PlackettLucePolicy(wrong, taken, road=road)
+    misfits = [spaces.Discrete(6), spaces.MultiDiscrete([6, 5]), spaces.MultiDiscrete([6] * 7)]
+    for wrong in misfits:
+        with pytest.raises(ValueError, match=r"MultiDiscrete\(\[6\] \* B\).* of action='slots'"):
+            PlackettLucePolicy(seen, wrong, road=road)

@@ -14,6 +14,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
 from dptse_env.sb3 import SB3VecEnv
+from tests.release.sums import SumRelease
 
 SHORT = "dptse_env:dptse/ShortHighway-v0"
 EPISODES = {"traffic_seeds": "0:3", "horizon": 6, "random_start": True}
@@ -209,3 +210,13 @@ def test_maskable_ppo_never_picks_twice(algorithm, masked):
     if masked:
         _, lengths = evaluate_masked(model, env, 8, return_episode_rewards=True)
         assert lengths == [24] * 8
+
+
+def test_maskable_ppo_trains_where_decisions_take_different_numbers_of_actions():
+    env = make(action="sequential", horizon=12, privacy=SumRelease, query_spans=(1, 2), bandwidth=3)
+    model = MaskablePPO("MlpPolicy", env, n_steps=20, batch_size=30, seed=0)
+    model.learn(60)
+    assert model.num_timesteps == 60
+    picks = model.rollout_buffer.actions[..., 0]
+    assert set(np.unique(picks).astype(int)) <= set(range(11))
+    assert not env.env.process.n_dropped.any()

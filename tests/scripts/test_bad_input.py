@@ -24,7 +24,7 @@ def shipped(pattern):
 
 PARAMETERS = shipped("dptse_env/model/sets/*.json")
 SETTINGS = b'{"x": {"estimator": "ekf", "settings": {"count_noise": 1}, "provenance": {}}}'
-POLICY = shipped("dptse_env/policies/*.zip")
+POLICY = shipped("dptse_env/policies/*.safetensors")
 FCD = b"<fcd-export><timestep time='0'><vehicle id='a' x='0' y='0' speed='3' lane='e_0'/>"
 NETWORK = b"<configuration><input><net-file value='n.net.xml'/></input></configuration>"
 FIELD = ["--source.cell", "0.1", "--source.interval", "5"]
@@ -38,23 +38,26 @@ FILES = {
         "s.json", SETTINGS,
         ["evaluate", "--keywords", '{{"estimator_settings": "{path}"}}'],
     ),
-    "policy": ("p.zip", POLICY, ["tune", "--schedule"]),
+    "policy": ("p.safetensors", POLICY, ["tune", "--schedule"]),
     "model": ("m.zip", POLICY, ["evaluate", "--policies", "stable_baselines3:PPO={path}"]),
     "network": (
-        "n.npz", shipped("dptse_env/estimators/networks/*.npz"),
+        "n.safetensors", shipped("dptse_env/estimators/networks/*.safetensors"),
         ["train_estimator", "--initial"],
     ),
     "trajectories": (
         "t.xml", FCD,
-        ["import_trajectories", "--format", "fcd", "--corridor", "short-highway", "--files"],
+        [
+            "import_road", "trajectories", "--format", "fcd", "--corridor", "short-highway",
+            "--files",
+        ],
     ),
     "mapping": (
         "m.toml", b'format = "fcd"\n',
-        ["import_trajectories", "--corridor", "short-highway", "--files", "x", "--mapping"],
+        ["import_road", "trajectories", "--corridor", "short-highway", "--files", "x", "--mapping"],
     ),
     "field": (
         "d.txt", b"1 2 3\n4 5 6\n",
-        ["import_field", *FIELD, *ROAD, "--source.density", "{path}", "--source.speed"],
+        ["import_road", "field", *FIELD, *ROAD, "--source.density", "{path}", "--source.speed"],
     ),
     "replayed field": (
         "d.txt", b"1 2 3\n4 5 6\n",
@@ -133,7 +136,7 @@ def test_what_does_not_fit_is_found_before_anything_is_recorded(case, tmp_path):
     pytest.importorskip("sb3_contrib")
     from tests.agents.policies import save
 
-    policy = save(tmp_path / "policy.zip", bandwidth=3)
+    policy = save(tmp_path / "policy.safetensors", bandwidth=3)
     (script, *words), message = REFUSED[case]
     given = [word.replace("{policy}", str(policy)) for word in words]
     folders = "--output", tmp_path / "out", "--records", tmp_path / "cache"

@@ -4,6 +4,7 @@ import pytest
 
 from dptse_env.model.parameters import read_parameters
 from scripts.calibrate import Args, main
+from scripts.cli import make_corridor
 
 
 def test_it_fits_on_some_seeds_and_reports_on_others(tmp_path, capsys):
@@ -23,6 +24,14 @@ def test_it_fits_on_some_seeds_and_reports_on_others(tmp_path, capsys):
         assert len(errors[name]["density"]) == len(errors[name]["horizons"])
     assert errors["fitted"]["density"][-1] < errors["persistence"]["density"][-1]
     assert provenance["train"] == "0:2"
+
+
+def test_a_road_is_recorded_whose_segments_are_too_short_for_the_default_parameters():
+    for length in (0.05, 0.04):
+        road = make_corridor(
+            "dptse_env:dptse/PaperHighway-v0", {"corridor": {"segment_length": length}}
+        )
+        assert road.segment_lengths[0] == length
 
 
 def test_a_corridor_of_other_fields_is_calibrated(tmp_path):

@@ -85,6 +85,13 @@ def test_an_interrupted_run_goes_on_and_a_forced_one_begins_anew(tmp_path):
         ({"keywords": "[]"}, r"keywords must be a JSON object, got '\[\]'"),
         ({"keywords": "{"}, "keywords must be a JSON object, got '{'"),
         ({"keywords": '{"cargo": 1}'}, "cargo"),
+        (
+            {
+                "estimators": ("ekf", "recurrent"),
+                "keywords": '{"estimator_settings": {"recurrent": {"weights": "none"}}}',
+            },
+            r"estimator_settings\.recurrent\.weights must be a file or one of .*, got 'none'",
+        ),
     ],
 )
 def test_bad_arguments_are_named_and_nothing_is_written(changes, message, tmp_path):
@@ -94,7 +101,7 @@ def test_bad_arguments_are_named_and_nothing_is_written(changes, message, tmp_pa
 
 
 def test_a_saved_policy_stands_beside_schedules(tmp_path, capsys):
-    path = save(tmp_path / "run-0" / "best.zip")
+    path = save(tmp_path / "run-0" / "best.safetensors")
     main(
         Args(
             env=SHORT, schedules=(), policies=(str(path),),
@@ -154,7 +161,7 @@ def test_seeds_are_called_what_they_are(tmp_path, capsys):
 
 
 def test_policies_that_do_not_fit_or_share_a_name_are_refused(tmp_path):
-    path = str(save(tmp_path / "run" / "best.zip", bandwidth=3))
+    path = str(save(tmp_path / "run" / "best.safetensors", bandwidth=3))
     arguments = Args(env=SHORT, policies=(path,), seeds="2000:2002", output=tmp_path / "out")
     with pytest.raises(ValueError, match="bandwidth is 3 for the policy and 2 for the environment"):
         main(arguments)

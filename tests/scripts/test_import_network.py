@@ -6,8 +6,8 @@ import pytest
 from dptse_env.traffic import read_corridor
 from scripts.cli import run
 from scripts.import_network import Args, main
+from tests.importers.network.conftest import PATH, motorway
 from tests.scripts.commands import run_script
-from tests.traffic.sumo_import.conftest import PATH, motorway
 
 
 @pytest.fixture(scope="module")

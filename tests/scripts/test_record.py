@@ -19,13 +19,13 @@ def test_the_command_records_into_the_library_and_reports_the_dwell(tmp_path):
     assert f"short-highway: 2 record(s) in {tmp_path}" in result.stdout
     assert "T_avg" in result.stdout
     records = RecordLibrary(tmp_path)
-    made = [seed for seed in range(10) if records.record_path(SHORT_HIGHWAY, seed).is_dir()]
+    made = [seed for seed in range(10) if records.record_path(SHORT_HIGHWAY, seed).is_file()]
     assert made == [3, 4]
 
 
 def test_random_traffic_is_recorded_on_request(tmp_path, capsys):
     main(Args(corridor="short-highway", seeds="0:1", random=True, workers=1, records=tmp_path))
-    assert RecordLibrary(tmp_path).record_path(randomised(SHORT_HIGHWAY), 0).is_dir()
+    assert RecordLibrary(tmp_path).record_path(randomised(SHORT_HIGHWAY), 0).is_file()
     assert "1 record(s)" in capsys.readouterr().out
 
 
@@ -36,10 +36,10 @@ def test_fields_of_a_corridor_and_keywords_are_recorded(tmp_path):
         env="dptse_env:dptse/ShortHighway-v0", workers=1, records=tmp_path,
     )  # fmt: skip
     main(given)
-    assert RecordLibrary(tmp_path).record_path(calm, 0).is_dir()
+    assert RecordLibrary(tmp_path).record_path(calm, 0).is_file()
     main(dataclasses.replace(given, corridor=None, keywords='{"incident": "none"}', seeds="1:2"))
     full = resolve("short-highway", {"incident": "none"}).corridor
-    assert RecordLibrary(tmp_path).record_path(full, 1).is_dir()
+    assert RecordLibrary(tmp_path).record_path(full, 1).is_file()
 
 
 @pytest.mark.parametrize(

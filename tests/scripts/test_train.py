@@ -48,9 +48,9 @@ def test_it_trains_and_continues(tmp_path, capsys):
     train.main(arguments(tmp_path))
     assert "error in validation 0." in capsys.readouterr().out
     assert read_progress(tmp_path)[-1]["steps"] == STEPS
-    before = (tmp_path / "policy.zip").read_bytes()
+    before = (tmp_path / "policy.safetensors").read_bytes()
     train.main(arguments(tmp_path))
-    assert (tmp_path / "policy.zip").read_bytes() == before
+    assert (tmp_path / "policy.safetensors").read_bytes() == before
     with pytest.raises(ValueError, match="seed is 0 there and 1 now"):
         train.main(arguments(tmp_path, "--seed", "1"))
 

@@ -25,16 +25,16 @@ def arguments(output, *more):
 
 def test_it_trains_a_network_that_an_environment_takes(tmp_path, capsys):
     train_estimator.main(arguments(tmp_path))
-    assert f"the network is in {tmp_path / 'network.npz'}" in capsys.readouterr().out
+    assert f"the network is in {tmp_path / 'network.safetensors'}" in capsys.readouterr().out
     assert [row["round"] for row in read_progress(tmp_path)] == [1, 1, 2]
-    weights = {"recurrent": {"weights": str(tmp_path / "network.npz")}}
+    weights = {"recurrent": {"weights": str(tmp_path / "network.safetensors")}}
     env = gym.make(SHORT, estimator="recurrent", privacy="capped", estimator_settings=weights)
     env.reset(seed=0)
     with pytest.raises(ValueError, match=r"trained on flows in \[1, 1\], .* has \[0, 0\]"):
         gym.make(SHORT, estimator="recurrent", estimator_settings=weights).reset(seed=0)
-    before = (tmp_path / "network.npz").read_bytes()
+    before = (tmp_path / "network.safetensors").read_bytes()
     train_estimator.main(arguments(tmp_path))
-    assert (tmp_path / "network.npz").read_bytes() == before
+    assert (tmp_path / "network.safetensors").read_bytes() == before
     with pytest.raises(ValueError, match="seed is 0 there and 1 now"):
         train_estimator.main(arguments(tmp_path, "--seed", "1"))
 

@@ -1,8 +1,10 @@
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dptse_env.config import resolve
+from dptse_env.parts import make_interface
 from dptse_env.spaces.actions import (
     ACTION_ENCODINGS,
     MaskAction,
@@ -10,103 +12,236 @@ from dptse_env.spaces.actions import (
     ScoresAction,
     SequentialAction,
     SlotsAction,
+    first_that_fit,
 )
+from tests.release.sums import SumRelease
 
 FIRST = np.zeros(1, dtype=np.int64)
+EQUAL = np.ones(6, dtype=np.int64)
+COSTS = np.array([1, 1, 1, 1, 2, 2, 2, 3])
+SEEDS = st.integers(0, 2**32 - 1)
 
 
 class Played:
-    """An encoding with the state of a batch of episodes."""
+    """An encoding, and the state of one episode."""
 
-    def __init__(self, kind, n_mainline=6, bandwidth=2, n_episodes=1):
-        self.encoding = kind(n_mainline, bandwidth)
-        self.pending = PendingPicks(n_episodes, n_mainline)
+    def __init__(self, kind, bandwidth=2, costs=EQUAL):
+        self.encoding = kind(len(costs), bandwidth, costs)
+        self.pending = PendingPicks(1, len(costs))
 
-    def decode(self, actions, episodes=FIRST):
-        return self.encoding.decode(episodes, actions, self.pending)
+    def decode(self, action):
+        return self.encoding.decode(FIRST, np.asarray(action)[None], self.pending)
+
+    def decided(self, next_action):
+        """Play one decision; ``next_action`` gives each action by the picks so far."""
+        for _ in range(self.encoding.actions_per_step):
+            decision = self.decode(next_action(self.pending.picked))
+            if decision.complete[0]:
+                return decision
+        raise AssertionError("a decision takes more actions than announced")
 
 
-def indices(mask):
-    return np.flatnonzero(mask).tolist()
+def flags(*options, n=8):
+    return np.isin(np.arange(n), options).astype(np.int8)
 
 
-def test_mask_over_budget_is_cut_in_rotation():
+def indices(decision):
+    return np.flatnonzero(decision.queried[0]).tolist()
+
+
+# --- one encoding after the other -------------------------------------------------------------
+
+
+def test_a_mask_beyond_the_bandwidth_is_cut_in_rotation():
     played = Played(MaskAction)
-    everything = np.ones((1, 6), dtype=np.int8)
-    turns = [indices(played.decode(everything).queried[0]) for _ in range(4)]
-    assert turns == [[0, 1], [2, 3], [4, 5], [0, 1]]
-    assert played.decode(everything).n_dropped.tolist() == [4]
+    everything = flags(*range(6), n=6)
+    decisions = [played.decode(everything) for _ in range(4)]
+    assert [indices(decision) for decision in decisions] == [[0, 1], [2, 3], [4, 5], [0, 1]]
+    assert decisions[0].n_dropped.tolist() == [4]
     played.pending.reset(FIRST)
-    assert indices(played.decode(everything).queried[0]) == [0, 1]
+    assert indices(played.decode(everything)) == [0, 1]
 
 
-def test_mask_takes_the_floats_that_learning_libraries_send():
+def test_a_mask_is_cut_to_what_the_bandwidth_pays_for():
+    played = Played(MaskAction, 4, COSTS)
+    decision = played.decode(flags(0, 4, 5, 6))
+    assert indices(decision) == [0, 4]  # option 5 costs more than is left
+    assert decision.n_dropped.tolist() == [2]
+    assert indices(played.decode(flags(0, 4, 5, 6))) == [5, 6]
+    assert indices(played.decode(flags(0, 1))) == [0, 1]
+
+
+def test_an_option_beyond_the_bandwidth_is_never_queried():
+    played = Played(MaskAction, 2, COSTS)
+    assert indices(played.decode(flags(7))) == []
+    turns = [indices(played.decode(flags(4, 5, 7))) for _ in range(5)]
+    assert turns == [[4], [5], [4], [5], [4]]
+
+
+@given(seed=SEEDS, bandwidth=st.integers(3, 8))
+def test_rotation_serves_every_request(seed, bandwidth):
+    played = Played(MaskAction, bandwidth, COSTS)
+    wanted = np.random.default_rng(seed).integers(0, 2, 8)
+    served = sum(played.decode(wanted).queried[0].astype(int) for _ in range(8))
+    assert ((served > 0) == (wanted > 0)).all()
+
+
+def test_a_mask_may_come_as_floats():
     played = Played(MaskAction)
-    assert indices(played.decode(np.array([[0.0, 1, 0, 0, 0, 0]])).queried[0]) == [1]
+    assert indices(played.decode([0.0, 1, 0, 0, 0, 0])) == [1]
     with pytest.raises(ValueError, match="0 and 1 only"):
-        played.decode(np.array([[0.0, 0.5, 0, 0, 0, 0]]))
+        played.decode([0.0, 0.5, 0, 0, 0, 0])
 
 
 def test_scores_take_the_highest_and_break_ties_upstream():
-    played = Played(ScoresAction)
-    decision = played.decode(np.array([[0.1, 0.9, -1, 0.9, 0.9, 0]], dtype=np.float32))
-    assert indices(decision.queried[0]) == [1, 3]
+    decision = Played(ScoresAction).decode(np.array([0.1, 0.9, -1, 0.9, 0.9, 0], np.float32))
+    assert indices(decision) == [1, 3]
+
+
+def test_scores_pass_over_what_does_not_fit():
+    scores = np.array([0.1, 0.2, 0, 0, 0.7, 0.8, 0, 0.9], dtype=np.float32)
+    assert indices(Played(ScoresAction, 4, COSTS).decode(scores)) == [1, 7]
+    assert indices(Played(ScoresAction, 5, COSTS).decode(scores)) == [5, 7]
+    assert indices(Played(ScoresAction, 2, COSTS).decode(scores)) == [5]
+
+
+def test_equal_costs_of_two_are_paid_for_while_the_bandwidth_lasts():
+    order = np.array([[3, 1, 0, 2], [0, 1, 2, 3]])
+    kept = first_that_fit(order, np.full(4, 2), 5)
+    assert kept.tolist() == [[False, True, False, True], [True, True, False, False]]
+
+
+def test_slots_are_as_many_as_there_may_be_queries():
+    for bandwidth, slots in ((4, 4), (7, 5), (99, 8)):
+        assert Played(SlotsAction, bandwidth, COSTS).encoding.space.nvec.tolist() == [8] * slots
 
 
 def test_slots_refill_repeats_in_rotation():
-    played = Played(SlotsAction, 6, 3)
-    repeated = np.array([[4, 4, 4]])
-    first, second = (played.decode(repeated) for _ in range(2))
-    assert indices(first.queried[0]) == [0, 1, 4]
-    assert indices(second.queried[0]) == [2, 3, 4]
+    played = Played(SlotsAction, 3)
+    first, second = (played.decode([4, 4, 4]) for _ in range(2))
+    assert indices(first) == [0, 1, 4]
+    assert indices(second) == [2, 3, 4]
     assert first.n_dropped.tolist() == [2]
 
 
+def test_slots_are_filled_up_and_cut():
+    played = Played(SlotsAction, 4, COSTS)
+    decision = played.decode([7, 7, 7, 7])
+    assert indices(decision) == [0, 7]
+    assert decision.n_dropped.tolist() == [1]
+    decision = played.decode([4, 5, 6, 7])
+    assert decision.queried[0] @ COSTS == 4
+    assert decision.n_dropped.tolist() == [2]
+
+
 def test_sequential_completes_after_bandwidth_picks():
-    played = Played(SequentialAction, 6, 3)
-    decisions = [played.decode(np.array([pick])) for pick in (5, 2, 0)]
+    played = Played(SequentialAction, 3)
+    decisions = [played.decode(pick) for pick in (5, 2, 0)]
     assert [bool(decision.complete[0]) for decision in decisions] == [False, False, True]
-    assert indices(decisions[-1].queried[0]) == [0, 2, 5]
+    assert indices(decisions[-1]) == [0, 2, 5]
     assert not played.pending.picked.any()
 
 
-def test_sequential_masks_what_is_taken_and_replaces_a_repeat():
-    played = Played(SequentialAction, 4, 2)
-    played.decode(np.array([0]))
-    assert played.pending.picked[0].tolist() == [True, False, False, False]
-    decision = played.decode(np.array([0]))
-    assert decision.complete.all()
-    assert indices(decision.queried[0]) == [0, 1]
+def test_sequential_is_complete_when_nothing_fits_any_more():
+    played = Played(SequentialAction, 4, COSTS)
+    assert not played.decode(7).complete.any()
+    free = played.encoding.available(played.pending.picked)
+    assert np.flatnonzero(free[0]).tolist() == [0, 1, 2, 3]
+    assert indices(played.decode(2)) == [2, 7]
+    assert not played.pending.picked.any()
+
+
+@pytest.mark.parametrize(
+    ("costs", "bandwidth", "picks", "queried"),
+    [(EQUAL, 2, (0, 0), [0, 1]), (COSTS, 4, (7, 6), [0, 7])],  # a repeat; one that does not fit
+)
+def test_a_pick_that_cannot_be_is_replaced_and_counted(costs, bandwidth, picks, queried):
+    played = Played(SequentialAction, bandwidth, costs)
+    played.decode(picks[0])
+    decision = played.decode(picks[1])
+    assert indices(decision) == queried
     assert decision.n_dropped.tolist() == [1]
-    played.decode(np.array([2]))
-    assert played.decode(np.array([3])).n_dropped.tolist() == [0]  # counted anew
+    played.decode(2)
+    assert played.decode(3).n_dropped.tolist() == [0]  # counted anew
 
 
-def test_episodes_of_a_batch_rotate_on_their_own():
-    played = Played(MaskAction, n_episodes=3)
-    everything = np.ones((1, 6), dtype=np.int8)
-    played.decode(everything, np.array([1]))
-    decision = played.decode(np.repeat(everything, 3, axis=0), np.arange(3))
-    assert [indices(row) for row in decision.queried] == [[0, 1], [2, 3], [0, 1]]
+# --- all of them ------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ACTION_ENCODINGS)
-@given(seed=st.integers(0, 2**32 - 1))
-def test_decode_undoes_encode(name, seed):
-    played = Played(ACTION_ENCODINGS[name], 6, 3)
-    wanted = np.zeros((1, 6), dtype=bool)
-    wanted[0, np.random.default_rng(seed).permutation(6)[:3]] = True
-    for _ in range(played.encoding.actions_per_step):
-        decision = played.decode(played.encoding.encode(wanted, played.pending.picked))
+@given(
+    seed=SEEDS,
+    costs=st.lists(st.integers(1, 6), min_size=1, max_size=20).map(np.array),
+    data=st.data(),
+)
+def test_no_sampled_action_exceeds_the_bandwidth(name, seed, costs, data):
+    bandwidth = data.draw(st.integers(int(costs.min()), int(costs.sum()) + 3))
+    played = Played(ACTION_ENCODINGS[name], bandwidth, costs)
+    played.encoding.space.seed(seed)
+    for _ in range(3):
+        decision = played.decided(lambda _: played.encoding.space.sample())
+        assert decision.queried[0] @ costs <= bandwidth
+        assert name == "mask" or not played.encoding.available(decision.queried).any()
+
+
+@pytest.mark.parametrize("name", ACTION_ENCODINGS)
+@given(
+    seed=SEEDS,
+    spans=st.sets(st.integers(1, 6), min_size=1).map(sorted),
+    levels=st.lists(st.sampled_from([0.05, 0.5, 1.0, 20.0]), min_size=1, unique=True),
+    unit=st.sampled_from(["segments", "sums"]),
+    data=st.data(),
+)
+@settings(max_examples=25)
+def test_no_mix_of_spans_and_levels_exceeds_the_bandwidth(name, seed, spans, levels, unit, data):
+    bandwidth = data.draw(st.integers(spans[0] if unit == "segments" else 1, 6))
+    keywords = {"query_spans": spans, "price_levels": levels, "bandwidth_unit": unit}
+    given = {"privacy": SumRelease, "action": name, "bandwidth": bandwidth, **keywords}
+    interface = make_interface(resolve("short-highway", given))
+    options, encoding = interface.queries, interface.actions
+    played = Played(lambda *_: encoding, bandwidth, options.cost)
+    encoding.space.seed(seed)
+    for _ in range(2):
+        decision = played.decided(lambda _: encoding.space.sample())
+        assert decision.queried.shape == (1, options.n_options)
+        assert decision.queried[0].sum() <= options.most_queries
+        assert decision.queried[0] @ options.cost <= bandwidth
+
+
+@pytest.mark.parametrize("name", ACTION_ENCODINGS)
+@given(seed=SEEDS, bandwidth=st.integers(1, 13), differ=st.booleans())
+def test_decode_undoes_encode(name, seed, bandwidth, differ):
+    costs = COSTS if differ else np.ones(8, dtype=np.int64)
+    played = Played(ACTION_ENCODINGS[name], bandwidth, costs)
+    wanted = np.zeros((1, 8), dtype=bool)
+    for option in np.random.default_rng(seed).permutation(8):
+        wanted[0, option] = wanted[0] @ costs + costs[option] <= bandwidth
+    n_actions = 0
+
+    def next_action(picked):
+        nonlocal n_actions
+        n_actions += 1
+        is_last = played.encoding.completes(wanted, picked)
+        assert name != "sequential" or is_last[0] == (n_actions == wanted.sum())
+        return played.encoding.encode(wanted, picked)[0]
+
+    decision = played.decided(next_action)
     assert (decision.queried == wanted).all()
     assert decision.n_dropped.tolist() == [0]
+
+
+@pytest.mark.parametrize("kind", [ScoresAction, SlotsAction, SequentialAction])
+def test_sets_that_an_encoding_cannot_ask_for_are_refused(kind):
+    for wanted in ((7,), (4, 5, 6)):  # too few, too many
+        with pytest.raises(ValueError, match="as much as the bandwidth of 4 pays for"):
+            Played(kind, 4, COSTS).encoding.encode(flags(*wanted)[None] > 0, flags()[None] > 0)
 
 
 @pytest.mark.parametrize(
     ("kind", "action", "message"),
     [
         (MaskAction, np.ones(5, dtype=np.int8), r"shape \(6,\) of MultiBinary\(6\), got \(5,\)"),
-        (MaskAction, np.full(6, 2), "0 and 1 only"),
+        (MaskAction, np.full(6, np.nan), "0 and 1 only"),
         (ScoresAction, np.full(6, np.nan), "finite floats"),
         (SlotsAction, np.array([0.0, 1.0]), "integers"),
         (SlotsAction, np.array([0, 6]), r"\[0, 5\]"),
@@ -116,16 +251,29 @@ def test_decode_undoes_encode(name, seed):
 def test_bad_actions_are_refused_and_leave_no_trace(kind, action, message):
     played = Played(kind)
     with pytest.raises(ValueError, match=message):
-        played.decode(action[None])
+        played.decode(action)
     assert not played.pending.picked.any()
+    assert played.pending.pointer.tolist() == [0]
+
+
+def test_episodes_of_a_batch_rotate_on_their_own():
+    encoding, pending = MaskAction(6, 2, EQUAL), PendingPicks(3, 6)
+    everything = np.ones((3, 6), dtype=np.int8)
+    encoding.decode(np.array([1]), everything[:1], pending)
+    queried = encoding.decode(np.arange(3), everything, pending).queried
+    assert [np.flatnonzero(row).tolist() for row in queried] == [[0, 1], [2, 3], [0, 1]]
+    everything[0, 2:] = 0  # within the bandwidth: it is served, and its pointer stays
+    queried = encoding.decode(np.arange(3), everything, pending).queried
+    assert [np.flatnonzero(row).tolist() for row in queried] == [[0, 1], [4, 5], [2, 3]]
+    assert pending.pointer.tolist() == [2, 0, 4]
 
 
 def test_two_batches_of_one_encoding_do_not_meet():
     """The encoding holds no state, so that any number of processes can share an interface."""
-    encoding = SequentialAction(6, 2)
+    encoding = SequentialAction(6, 2, EQUAL)
     first, second = PendingPicks(1, 6), PendingPicks(1, 6)
     encoding.decode(FIRST, np.array([4]), first)
     decision = encoding.decode(FIRST, np.array([0]), second)
     assert not decision.complete.any()
-    assert indices(first.picked[0]) == [4]
-    assert indices(second.picked[0]) == [0]
+    assert np.flatnonzero(first.picked[0]).tolist() == [4]
+    assert np.flatnonzero(second.picked[0]).tolist() == [0]

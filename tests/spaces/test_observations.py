@@ -1,5 +1,3 @@
-import dataclasses
-
 import numpy as np
 import pytest
 
@@ -89,9 +87,8 @@ def test_a_released_flow_has_its_own_name_and_scale():
     encoder = encoding(epsilon=5.0, model=SumRelease)
     assert "released_speed" not in encoder.slices
     assert list(encoder.slices).index("released_flow") == 5
-    shown = dataclasses.replace(
-        state(), released=np.dstack([np.full((2, S), 20.0), np.full((2, S), -2500.0)])
-    )
+    released = np.dstack([np.full((2, S), 20.0), np.full((2, S), -2500.0)])
+    shown = state()._replace(released=released)
     observation = encoder.encode(shown)
     np.testing.assert_allclose(encoder.block(observation, "released_flow"), [[-0.5] * N] * 2)
     np.testing.assert_allclose(encoder.block(observation, "epsilon"), np.log10(5.0), rtol=1e-6)

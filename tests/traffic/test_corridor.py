@@ -1,3 +1,5 @@
+"""Corridors: what is refused, and what identifies their traffic."""
+
 import dataclasses
 import json
 
@@ -107,3 +109,16 @@ def test_the_digest_covers_what_shapes_the_traffic_and_nothing_else():
 
 def test_records_from_before_drivers_could_be_chosen_keep_their_digests():
     assert PAPER_HIGHWAY.digest.startswith("2324ff6dffb73fb3")
+
+
+def test_equal_values_are_the_same_road_as_one_value():
+    same = dataclasses.replace(
+        PAPER_HIGHWAY,
+        lanes=(3,) * 15,
+        segment_length=(0.1,) * 15,
+        speed_limit=(102.0,) * 15,
+        ramp_lanes=(1,) * 4,
+        ramp_segments=(1,) * 4,
+    )
+    assert same == PAPER_HIGHWAY
+    assert same.digest == PAPER_HIGHWAY.digest

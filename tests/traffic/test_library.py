@@ -4,7 +4,6 @@ import errno
 import logging
 import os
 import pickle
-import sys
 import time
 
 import numpy as np
@@ -20,57 +19,59 @@ from dptse_env.traffic import (
     library,
     randomised,
     sumo,
-    worker,
 )
-from dptse_env.traffic.worker import WorkerDiedError
-from tests.traffic.test_recorder import LONG_HIGHWAY, assert_same, everything_in
+from tests.traffic.test_record import assert_same
+
+
+def everything_in(path):
+    return [entry for entry in path.rglob("*") if entry.is_file()]
 
 
 def forbid_recording(monkeypatch):
     def refuse(*_):
         raise AssertionError("recorded again")
 
-    monkeypatch.setattr(library, "simulate", refuse)
-    monkeypatch.setattr(library.WorkerPool, "record", refuse)
+    monkeypatch.setattr(library, "record_seeds", refuse)
 
 
 def tiny_record(path, seed):
     """Put a record of one row where the library looks for one."""
     one = np.ones(1)
     columns = SHORT_HIGHWAY.n_segments + SHORT_HIGHWAY.n_boundaries
-    record = Record(one, one, one, one, SHORT_HIGHWAY.duration + 1, columns)
+    record = Record(
+        step=one, vehicle=one, segment=one, speed=one,
+        n_steps=SHORT_HIGHWAY.duration + 1, n_columns=columns,
+    )  # fmt: skip
     source = library._source(SHORT_HIGHWAY, seed)
     record.save(RecordLibrary(path).record_path(SHORT_HIGHWAY, seed), source)
 
 
-def test_a_record_is_made_once_in_this_process_and_then_read(
-    tmp_path, short_record, monkeypatch, caplog
-):
-    monkeypatch.setattr(library, "WorkerPool", None)
+def test_a_record_is_made_once_and_then_read(tmp_path, short_record, monkeypatch, caplog):
     with caplog.at_level(logging.INFO, logger="dptse_env"):
         assert_same(RecordLibrary(tmp_path).get(SHORT_HIGHWAY, 0), short_record)
         RecordLibrary(tmp_path).ensure(SHORT_HIGHWAY, [0, 1, 1], workers=8)  # one is missing
     assert [record.levelname for record in caplog.records] == ["INFO", "INFO"]
-    assert len(everything_in(tmp_path)) == 2 * (len(Record.COLUMNS) + 1)
-    monkeypatch.undo()
+    assert len(everything_in(tmp_path)) == 2
     forbid_recording(monkeypatch)
     records = RecordLibrary(tmp_path)
     records.ensure(SHORT_HIGHWAY, [0, 1])
     record = records.get(SHORT_HIGHWAY, 0)
     assert_same(record, short_record)
-    monkeypatch.setattr(Record, "load", None)  # it stays open
+    monkeypatch.setattr(Record, "load", None)  # it is kept
     assert records.get(SHORT_HIGHWAY, np.int64(0)) is record
 
 
-def test_only_the_most_recent_records_stay_open(tmp_path):
+def test_the_records_read_last_are_kept_in_memory(tmp_path):
     for seed in range(3):
         tiny_record(tmp_path, seed)
-    records = RecordLibrary(tmp_path, n_open=2)
+    records = RecordLibrary(tmp_path, memory=28)  # two records of a row of 14 bytes
     first, second = records.get(SHORT_HIGHWAY, 0), records.get(SHORT_HIGHWAY, 1)
     assert records.get(SHORT_HIGHWAY, 0) is first
     records.get(SHORT_HIGHWAY, 2)  # pushes out 1, the least recently used
     assert records.get(SHORT_HIGHWAY, 0) is first
     assert records.get(SHORT_HIGHWAY, 1) is not second
+    without = RecordLibrary(tmp_path, memory=0)
+    assert without.get(SHORT_HIGHWAY, 0) is without.get(SHORT_HIGHWAY, 0)
 
 
 def test_what_shapes_a_record_is_in_its_path(tmp_path, monkeypatch):
@@ -90,17 +91,17 @@ def test_what_shapes_a_record_is_in_its_path(tmp_path, monkeypatch):
 def test_a_damaged_record_is_made_again_with_a_logged_warning(tmp_path, short_record, caplog):
     path = RecordLibrary(tmp_path).record_path(SHORT_HIGHWAY, 0)
     RecordLibrary(tmp_path).get(SHORT_HIGHWAY, 0)
-    content = bytearray((path / "speed.npy").read_bytes())
+    content = bytearray(path.read_bytes())
     content[-1] ^= 1
-    (path / "speed.npy").write_bytes(content)
+    path.write_bytes(content)
     with caplog.at_level(logging.WARNING, logger="dptse_env"):
         assert_same(RecordLibrary(tmp_path).get(SHORT_HIGHWAY, 0), short_record)
     assert [record.levelname for record in caplog.records] == ["WARNING"]
-    assert "checksum" in caplog.text
+    assert "another digest" in caplog.text
     caplog.clear()
     assert_same(RecordLibrary(tmp_path).get(SHORT_HIGHWAY, 0), short_record)
     assert caplog.text == ""
-    assert len(everything_in(tmp_path)) == len(Record.COLUMNS) + 1
+    assert len(everything_in(tmp_path)) == 1
 
 
 def test_a_record_of_another_seed_is_not_taken_for_this_one(tmp_path, caplog, short_record):
@@ -111,24 +112,12 @@ def test_a_record_of_another_seed_is_not_taken_for_this_one(tmp_path, caplog, sh
     assert "source is" in caplog.text
 
 
-def test_a_full_disk_is_one_error_that_names_the_seed(tmp_path, monkeypatch):
-    def full(_descriptor):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "fsync", full)
-        with pytest.raises(RecordingError, match=r"seed 3 failed: .*No space left"):
-            RecordLibrary(tmp_path).get(SHORT_HIGHWAY, 3)
-    assert everything_in(tmp_path) == []
-    assert RecordLibrary(tmp_path).get(SHORT_HIGHWAY, 3).n_rows > 0
-
-
 def test_a_library_pickles_as_its_path_which_the_environment_may_give(tmp_path, monkeypatch):
     tiny_record(tmp_path, 0)
-    records = RecordLibrary(tmp_path, n_open=7)
+    records = RecordLibrary(tmp_path, memory=7)
     records.get(SHORT_HIGHWAY, 0)
     copy = pickle.loads(pickle.dumps(records))
-    assert (copy.path, copy.n_open) == (tmp_path, 7)
+    assert (copy.path, copy.memory) == (tmp_path, 7)
     assert_same(copy.get(SHORT_HIGHWAY, 0), records.get(SHORT_HIGHWAY, 0))
     monkeypatch.setenv("DPTSE_CACHE", str(tmp_path))
     assert RecordLibrary().path == tmp_path
@@ -147,35 +136,9 @@ def test_bad_seeds_and_counts_are_refused(tmp_path):
             refused()
     with pytest.raises(ValueError, match="workers must be"):
         records.ensure(SHORT_HIGHWAY, [0], workers=0)
-    with pytest.raises(ValueError, match=r"library\.n_open must be"):
-        RecordLibrary(tmp_path, n_open=0)
+    with pytest.raises(ValueError, match=r"library\.memory must be"):
+        RecordLibrary(tmp_path, memory=-1)
     assert everything_in(tmp_path) == []
-
-
-@pytest.mark.parametrize(
-    ("error", "n_attempts"), [(RecordingError, 1), (WorkerDiedError, worker.ATTEMPTS)]
-)
-def test_a_dead_worker_is_replaced_and_what_sumo_reports_is_not_tried_again(
-    tmp_path, monkeypatch, caplog, error, n_attempts
-):
-    tasks = []
-
-    class Failing:
-        alive = False
-
-        def record(self, corridor, seed, path, source):
-            tasks.append(seed)
-            raise error.from_cause(corridor, seed, "no valid route")
-
-        def close(self):
-            tasks.append("closed")
-
-    monkeypatch.setattr(worker, "Worker", Failing)
-    monkeypatch.setattr(library, "simulation_is_loaded", lambda: True)  # children even for one
-    with pytest.raises(RecordingError, match=r"holds 0 of the 1 .*no valid route"):
-        RecordLibrary(tmp_path).get(SHORT_HIGHWAY, 5)
-    assert tasks == [5, "closed"] * n_attempts
-    assert len(caplog.records) == n_attempts - 1
 
 
 def test_what_a_dead_writer_left_is_removed_when_it_is_old(tmp_path):
@@ -184,8 +147,7 @@ def test_what_a_dead_writer_left_is_removed_when_it_is_old(tmp_path):
     folder = records.record_path(SHORT_HIGHWAY, 0).parent
     names = [".00000007-1111", ".00000008-2222"]
     for name, age in zip(names, (library.LEFTOVER_AGE + 60, 60), strict=True):
-        (folder / name).mkdir()
-        (folder / name / "step.npy").write_bytes(b"half")
+        (folder / name).write_bytes(b"half")
         then = time.time() - age
         os.utime(folder / name, (then, then))
     then = time.time() - 2 * library.LEFTOVER_AGE
@@ -193,7 +155,8 @@ def test_what_a_dead_writer_left_is_removed_when_it_is_old(tmp_path):
     records.ensure(SHORT_HIGHWAY, [0])
     assert (folder / names[0]).exists()  # nothing is written, so nothing is swept
     records.ensure(SHORT_HIGHWAY, [1])
-    assert sorted(entry.name for entry in folder.iterdir()) == [names[1], "00000000", "00000001"]
+    kept = [names[1], "00000000.safetensors", "00000001.safetensors"]
+    assert sorted(entry.name for entry in folder.iterdir()) == kept
 
 
 def test_missing_names_each_absent_record_once_and_in_order(tmp_path):
@@ -201,7 +164,7 @@ def test_missing_names_each_absent_record_once_and_in_order(tmp_path):
         tiny_record(tmp_path, seed)
     records = RecordLibrary(tmp_path)
     assert records.missing(SHORT_HIGHWAY, (5, np.int64(3), 1, 0, 5)) == [5, 1]
-    assert records.missing(LONG_HIGHWAY, [0]) == [0]
+    assert records.missing(PAPER_HIGHWAY, [0]) == [0]
 
 
 def test_a_library_that_cannot_grow_says_what_it_holds_and_why(tmp_path, monkeypatch):
@@ -212,8 +175,8 @@ def test_a_library_that_cannot_grow_says_what_it_holds_and_why(tmp_path, monkeyp
     def refuse(*_, **__):
         raise OSError(errno.EROFS, os.strerror(errno.EROFS))
 
-    monkeypatch.setattr("tempfile.mkdtemp", refuse)
-    monkeypatch.setattr(library, "simulate", None)  # it is known before an hour of simulation
+    monkeypatch.setattr("tempfile.TemporaryFile", refuse)
+    forbid_recording(monkeypatch)  # it is known before an hour of simulation
     pattern = rf"{tmp_path} holds 3 of the 5 .* seed 3 failed: .*{os.strerror(errno.EROFS)}"
     for workers in (1, 2):
         with pytest.raises(RecordingError, match=pattern):
@@ -234,8 +197,12 @@ def test_a_missing_or_broken_libsumo_is_an_error_of_the_library(tmp_path, monkey
         patch.setattr(sumo.importlib.metadata, "version", missing)
         with pytest.raises(SumoVersionError, match=r"neither find nor make the 1 .*libsumo"):
             RecordLibrary(tmp_path).get(SHORT_HIGHWAY, 0)
-    monkeypatch.setitem(sys.modules, "libsumo", None)
+    (tmp_path / "broken").mkdir()
+    (tmp_path / "broken" / "libsumo.py").write_text("raise ImportError('no libproj')")
+    monkeypatch.syspath_prepend(tmp_path / "broken")
     records = RecordLibrary(tmp_path)
-    with pytest.raises(SumoVersionError, match=r"holds 1 of the 2 .* cannot be imported"):
+    with pytest.raises(
+        SumoVersionError, match=r"holds 1 of the 2 .* cannot be imported .no libproj"
+    ):
         records.ensure(SHORT_HIGHWAY, [0, 1], workers=1)
     assert records.get(SHORT_HIGHWAY, 0).n_rows == 1

@@ -15,7 +15,10 @@ def road_of(n_vehicles, n_steps=4):
     """A record in which every vehicle stands on segment 0 in every second."""
     step, vehicle = (grid.ravel() for grid in np.indices((n_steps, n_vehicles)))
     speed = 10.0 + vehicle
-    return Record(step, vehicle, np.zeros_like(step), speed, n_steps=n_steps, n_columns=3)
+    return Record(
+        step=step, vehicle=vehicle, segment=np.zeros_like(step), speed=speed,
+        n_steps=n_steps, n_columns=3,
+    )  # fmt: skip
 
 
 def test_connected_vehicles_at_a_share_are_connected_at_every_larger_one():

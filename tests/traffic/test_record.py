@@ -1,46 +1,51 @@
+"""Records of vehicles and of fields: what they say of traffic, and how they are kept."""
+
 import errno
-import json
 import os
 import threading
+from functools import partial
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dptse_env.traffic import InvalidRecordError, Record, mean_dwell
-from dptse_env.traffic.stored_arrays import _checksum
+from dptse_env.traffic import SHORT_HIGHWAY, InvalidRecordError, Record, average_dwell
+from dptse_env.utils.files import read_tensors
+from tests.hostile import check_refusals, damaged, edited, odd
 
 SOURCE = {"corridor": "abc", "seed": 3, "sumo": "1.28.0"}
-
-
-def small_record(**changed):
-    fields = {
-        "step": [0, 0, 1, 1, 1, 3],
-        "vehicle": [0, 1, 0, 1, 4, 4],
-        "segment": [0, 0, 0, 1, 1, 2],
-        "speed": [10.0, 20.0, 30.0, 40.0, 50.0, 60.0],
-        "n_steps": 4,
-        "n_columns": 3,
-    }
-    return Record(**fields | changed)
+TABLE = {
+    "step": [0, 0, 1, 1, 1, 3],
+    "vehicle": [0, 1, 0, 1, 4, 4],
+    "segment": [0, 0, 0, 1, 1, 2],
+    "speed": [10.0, 20.0, 30.0, 40.0, 50.0, 60.0],
+    "n_steps": 4,
+    "n_columns": 3,
+}
+FIELD = {
+    "field": [[[10.0, 90.0], [0.0, 5.0]], [[20.5, 80.0], [3.0, 70.0]]],
+    "n_steps": 2,
+    "n_columns": 2,
+}
 
 
 def assert_same(first, second):
     assert (first.n_steps, first.n_columns) == (second.n_steps, second.n_columns)
-    for name in Record.COLUMNS:
-        np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
+    assert first.arrays.keys() == second.arrays.keys()
+    for name, array in first.arrays.items():
+        np.testing.assert_array_equal(array, second.arrays[name])
 
 
 def test_counts_and_speed_sums_by_hand():
-    record = small_record()
+    record = Record(**TABLE)
     np.testing.assert_array_equal(record.counts, [[2, 0, 0], [1, 2, 0], [0, 0, 0], [0, 0, 1]])
     np.testing.assert_array_equal(
         record.speed_sums, [[30, 0, 0], [30, 90, 0], [0, 0, 0], [0, 0, 60]]
     )
-    assert record.counts is record.counts
-    assert record.speed_sums.dtype == np.float64
-    assert record.n_vehicles == 5
+    traffic = record.traffic(np.array([0.1, 0.2, 0.1]), np.array([100.0, 80.0, 60.0]))
+    np.testing.assert_array_equal(traffic[1], [[10.0, 30.0], [10.0, 45.0], [0.0, 60.0]])
+    assert (record.n_vehicles, record.has_vehicles) == (5, True)
 
 
 def once_a_step():
@@ -49,13 +54,15 @@ def once_a_step():
 
 
 @given(once_a_step())
-def test_rows_and_grids_agree_with_a_loop(entries):
+def test_offsets_and_grids_agree_with_a_loop(entries):
     entries.sort()
     step, vehicle, segment = zip(*entries, strict=True) if entries else ((), (), ())
     speed = np.linspace(0, 100, len(entries))
-    record = Record(step, vehicle, segment, speed, n_steps=6, n_columns=4)
+    record = Record(
+        step=step, vehicle=vehicle, segment=segment, speed=speed, n_steps=6, n_columns=4
+    )
     for k in range(6):
-        rows = record.rows(k)
+        rows = slice(*record.offsets[k : k + 2])
         assert list(record.step[rows]) == [k] * sum(s == k for s in step)
         for j in range(4):
             here = (record.step == k) & (record.segment == j)
@@ -63,84 +70,95 @@ def test_rows_and_grids_agree_with_a_loop(entries):
             assert record.speed_sums[k, j] == pytest.approx(record.speed[here].sum(), rel=1e-6)
 
 
-def test_columns_have_the_declared_types_are_contiguous_and_read_only():
-    record = small_record()
+def test_arrays_are_read_only_copies_of_the_declared_types():
+    given = np.array(TABLE["speed"], dtype=np.float32)
+    record = Record(**TABLE | {"speed": given})
+    given[0] = 99.0
+    assert record.speed[0] == 10.0
     for name, dtype in Record.COLUMNS.items():
-        column = getattr(record, name)
-        assert column.dtype == dtype
-        assert column.flags.c_contiguous
-        with pytest.raises(ValueError, match="read-only"):
-            column[0] = 1
-    for grid in (record.counts, record.speed_sums, record.offsets):
-        assert not grid.flags.writeable
+        assert getattr(record, name).dtype == dtype
+    for array in (*record.arrays.values(), record.counts, record.offsets, Record(**FIELD).field):
+        assert not array.flags.writeable
 
 
 IMPOSSIBLE = [
-    ({"step": [0, 0, 1, 1, 1]}, "vehicle must be as long as"),
-    ({"step": [0, 1, 0, 1, 1, 3]}, "step must be non-decreasing"),
-    ({"n_steps": 3}, "step must be in"),
-    ({"n_columns": 2}, "segment must be in"),
-    ({"vehicle": [-1, 0, 0, 0, 0, 0]}, "vehicle must be >= 0"),
-    ({"speed": [1, 1, 1, np.nan, 1, 1]}, "speed must be finite"),
-    ({"speed": [1, 1, 1, -1, 1, 1]}, "speed must be finite and >= 0"),
-    ({"n_steps": 0}, "n_steps must be"),
-    ({"speed": np.ones((6, 1))}, "speed must be one-dimensional"),
-    ({"vehicle": [0, 1, 4, 1, 4, 4]}, "vehicle must be at most once in a step"),
+    (TABLE | {"step": [0, 0, 1, 1, 1]}, r"vehicle must be of shape \(5,\), got \(6,\)"),
+    (TABLE | {"step": [0, 1, 0, 1, 1, 3]}, r"step must be non-decreasing, got \(1, 0\)"),
+    (TABLE | {"n_steps": 3}, "step must be in"),
+    (TABLE | {"n_columns": 2}, "segment must be in"),
+    (TABLE | {"vehicle": [-1, 0, 0, 0, 0, 0]}, "vehicle must be >= 0"),
+    (TABLE | {"speed": [1, 1, 1, np.nan, 1, 1]}, "speed must be finite"),
+    (TABLE | {"speed": [1, 1, 1, -1, 1, 1]}, "speed must be finite and >= 0"),
+    (TABLE | {"vehicle": [0, 1, 4, 1, 4, 4]}, "vehicle must be at most once in a step"),
+    (TABLE | FIELD, "field must be None where there are vehicles"),
+    (FIELD | {"n_steps": 3}, r"field must be of shape \(3, 2, 2\)"),
+    (FIELD | {"field": np.full((2, 2, 2), np.nan)}, "field must be finite"),
+    (FIELD | {"field": np.full((2, 2, 2), -1.0)}, "field must be finite and >= 0"),
 ]
 
 
-def test_impossible_tables_are_refused():
+def test_impossible_records_are_refused():
     for fields, message in IMPOSSIBLE:
         with pytest.raises(ValueError, match=rf"^record\.{message}"):
-            small_record(**fields)
+            Record(**fields)
 
 
 def test_removing_a_vehicle_removes_exactly_its_rows():
-    record = small_record()
+    record = Record(**TABLE)
     adjacent = record.without(4)
     np.testing.assert_array_equal(
         record.counts - adjacent.counts, [[0] * 3, [0, 1, 0], [0] * 3, [0, 0, 1]]
     )
     assert_same(record.without(99), record)
+    assert record.digest == record.without(99).digest != adjacent.digest
 
 
-def test_mean_dwell_by_hand():
+def test_a_field_is_its_own_traffic_with_the_limit_where_the_road_is_empty():
+    record = Record(**FIELD)
+    traffic = record.traffic(np.array([0.1, 0.2]), np.array([100.0, 60.0]))
+    np.testing.assert_array_equal(traffic, [[[10, 90], [0, 60]], [[20.5, 80], [3, 70]]])
+    with pytest.raises(ValueError, match=r"privacy.preset 'paced' needs the vehicles of a record"):
+        record.vehicles_for("privacy.preset 'paced'")
+
+
+def test_average_dwell_by_hand():
+    road = SHORT_HIGHWAY  # six segments of 0.1 km
     record = Record(
         # Vehicle 0 stays 2 steps on segment 0 and 1 on segment 1, vehicle 1 stays 4 on segment 1,
-        # and its later return counts as another passage; segment 2 is not on the mainline.
+        # and its later return counts as another passage; segment 6 is not on the mainline.
         step=[0, 1, 1, 2, 2, 3, 4, 5, 7],
         vehicle=[0, 0, 1, 0, 1, 1, 1, 1, 1],
-        segment=[0, 0, 1, 1, 1, 1, 1, 2, 1],
+        segment=[0, 0, 1, 1, 1, 1, 1, 6, 1],
         speed=np.ones(9),
         n_steps=8,
-        n_columns=3,
+        n_columns=7,
     )
-    assert mean_dwell([record], n_mainline=2) == pytest.approx((2 + 1 + 4 + 1) / 4)
-    assert mean_dwell([record, record], n_mainline=2) == pytest.approx(2.0)
+    assert average_dwell(road, [record, record]) == pytest.approx((2 + 1 + 4 + 1) / 4)
+    field = Record(field=np.full((5, 12, 2), [20.0, 36.0]), n_steps=5, n_columns=12)
+    assert average_dwell(road, [field]) == pytest.approx(10.0)  # 100 m at 10 m/s
     with pytest.raises(ValueError, match="records with a vehicle on the mainline"):
-        mean_dwell([], n_mainline=2)
+        average_dwell(road, [])
 
 
-def test_a_saved_record_comes_back_memory_mapped(tmp_path):
-    record = small_record()
-    record.save(tmp_path / "a" / "b", SOURCE)
-    loaded = Record.load(tmp_path / "a" / "b", SOURCE)
+@pytest.mark.parametrize("content", [TABLE, FIELD])
+def test_a_saved_record_comes_back(content, tmp_path):
+    record, path = Record(**content), tmp_path / "a" / "b"
+    record.save(path, SOURCE)
+    loaded = Record.load(path, SOURCE, (record.n_steps, record.n_columns))
     assert_same(record, loaded)
-    assert isinstance(loaded.speed.base, np.memmap) or isinstance(loaded.speed, np.memmap)
-    assert isinstance(loaded.in_memory().speed.base, np.memmap) is False
-    assert [entry.name for entry in (tmp_path / "a").iterdir()] == ["b"]
+    assert loaded.digest == record.digest
+    assert [entry.name for entry in path.parent.iterdir()] == ["b"]
 
 
 def test_many_writers_of_one_record_leave_one_valid_record(tmp_path):
-    writers = [
-        threading.Thread(target=small_record().save, args=(tmp_path / "record", SOURCE))
-        for _ in range(8)
-    ]
+    path = tmp_path / "record"
+    save = partial(Record(**TABLE).save, path, SOURCE)
+    writers = [threading.Thread(target=save) for _ in range(8)]
     for writer in writers:
         writer.start()
     for writer in writers:
         writer.join()
-    assert_same(Record.load(tmp_path / "record", SOURCE), small_record())
+    assert_same(Record.load(path, SOURCE, (4, 3)), Record(**TABLE))
     assert [entry.name for entry in tmp_path.iterdir()] == ["record"]
 
 
@@ -150,58 +168,49 @@ def test_a_full_disk_leaves_nothing_behind(tmp_path, monkeypatch):
 
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(OSError, match="No space left"):
-        small_record().save(tmp_path / "record", SOURCE)
+        Record(**TABLE).save(tmp_path / "record", SOURCE)
     assert list(tmp_path.iterdir()) == []
 
 
-def flip_a_byte(path):
-    content = bytearray((path / "speed.npy").read_bytes())
-    content[-1] ^= 1
-    (path / "speed.npy").write_bytes(content)
+@pytest.mark.parametrize("content", [TABLE, FIELD])
+def test_hostile_files_are_refused_soon_in_one_line_with_their_path(content, tmp_path):
+    good = tmp_path / "good"
+    Record(**content).save(good, SOURCE)
+    load = partial(Record.load, source=SOURCE, shape=(content["n_steps"], content["n_columns"]))
+    check_refusals(load, tmp_path / "bad", damaged(good.read_bytes(), flips=400))
+    kinds = odd(*read_tensors(good))
+    same = "shape: type" if content is FIELD else None  # float64, as it should be
+    check_refusals(load, tmp_path / "bad", [each for each in kinds if each[0] != same])
 
 
-def double_a_vehicle(path):
-    """Write a record that no recording makes, with a checksum that is right."""
-    vehicle = np.load(path / "vehicle.npy")
-    vehicle[:] = 0
-    np.save(path / "vehicle.npy", vehicle)
-    manifest = json.loads((path / "manifest.json").read_text())
-    del manifest["sha256"]
-    edit_manifest(path, sha256=_checksum(path, list(Record.COLUMNS), manifest))
-
-
-def edit_manifest(path, **changes):
-    manifest = json.loads((path / "manifest.json").read_text())
-    (path / "manifest.json").write_text(json.dumps(manifest | changes))
-
-
-DAMAGE = {
-    "flipped bit": flip_a_byte,
-    "vehicle in two places": double_a_vehicle,
-    "truncated column": lambda path: os.truncate(path / "step.npy", 130),
-    "empty column": lambda path: os.truncate(path / "step.npy", 0),
-    "missing column": lambda path: (path / "vehicle.npy").unlink(),
-    "missing manifest": lambda path: (path / "manifest.json").unlink(),
-    "manifest that is no JSON": lambda path: (path / "manifest.json").write_text("{"),
-    "manifest that is nested without end": lambda path: (path / "manifest.json").write_text(
-        "[" * 100_000
-    ),
-    "manifest that is a list": lambda path: (path / "manifest.json").write_text("[]"),
-    "manifest with another number of steps": lambda path: edit_manifest(path, n_steps=5),
-    "manifest of another version": lambda path: edit_manifest(path, version=0),
-    "manifest of another source": lambda path: edit_manifest(path, source=SOURCE | {"seed": 4}),
+FOREIGN = {
+    "n_steps": [("many", "n_steps is 'many', not 4"), (10**12, "n_steps is 10+, not 4")],
+    "version": [(0, "version is 0, not 2")],
+    "source": [(SOURCE | {"seed": 4}, "source is"), ("x" * 100_000, "source is 'x")],
+    "vehicle": [
+        (np.zeros(6, dtype=np.int32), "vehicle must be at most once in a step"),
+        (np.arange(5, dtype=np.int32), "vehicle must be of shape"),
+    ],
+    "step": [(np.array(TABLE["step"], dtype=np.float32), "arrays must be")],
+    "field": [(np.zeros((4, 3, 2)), "arrays must be")],
 }
 
 
-def test_damaged_and_foreign_records_are_refused(tmp_path):
-    for name, damage in DAMAGE.items():
-        path = tmp_path / name
-        small_record().save(path, SOURCE)
-        damage(path)
-        with pytest.raises(InvalidRecordError, match=name):
-            Record.load(path, SOURCE)
+@pytest.mark.parametrize("name", FOREIGN)
+def test_a_foreign_record_with_a_true_digest_is_refused(name, tmp_path):
+    good, bad = tmp_path / "good", tmp_path / "bad"
+    Record(**TABLE).save(good, SOURCE)
+    for value, message in FOREIGN[name]:
+
+        def change(card, arrays, value=value):
+            (arrays if isinstance(value, np.ndarray) else card)[name] = value
+
+        bad.write_bytes(edited(good, change))
+        with pytest.raises(InvalidRecordError, match=f"{bad}: (record\\.)?{message}") as caught:
+            Record.load(bad, SOURCE, (4, 3))
+        assert len(str(caught.value)) < 1000
 
 
 def test_a_record_that_is_not_there_is_not_called_invalid(tmp_path):
     with pytest.raises(FileNotFoundError):
-        Record.load(tmp_path / "nothing", SOURCE)
+        Record.load(tmp_path / "nothing", SOURCE, (4, 3))

@@ -1,3 +1,5 @@
+"""Scenarios: arrivals, routes, classes and incidents of a traffic seed."""
+
 import dataclasses
 
 import numpy as np
@@ -11,11 +13,13 @@ from dptse_env.traffic import (
     Demand,
     Incident,
     IncidentDistribution,
+    VehicleClass,
     draw_scenario,
     randomised,
 )
 
 SEEDS = range(200)
+CLASSES = (VehicleClass("car", 0.7), VehicleClass("truck", 0.3, length=12.0))
 
 
 def test_the_same_seed_draws_the_same_scenario_and_another_seed_another():
@@ -94,6 +98,19 @@ def test_rates_of_a_ramp_and_shares_of_an_exit_follow_their_steps():
     for when, share in ((early, 0.9), (~early, 0.1)):
         taken = scenario.exits[through & when] == 0
         assert taken.mean() == pytest.approx(share, abs=0.05)
+
+
+def test_vehicles_have_classes_by_their_shares_and_else_move_alike():
+    corridor = dataclasses.replace(PAPER_HIGHWAY, vehicle_classes=CLASSES)
+    scenarios = [draw_scenario(corridor, seed) for seed in range(20)]
+    classes = np.concatenate([each.classes for each in scenarios])
+    assert classes.mean() == pytest.approx(0.3, abs=0.02)
+    assert set(classes.tolist()) == {0, 1}
+    plain = draw_scenario(PAPER_HIGHWAY, 3)
+    assert not plain.classes.any()
+    for name in ("departures", "origins", "exits"):
+        np.testing.assert_array_equal(getattr(plain, name), getattr(scenarios[3], name))
+    assert plain.sumo_seed == scenarios[3].sumo_seed
 
 
 def test_incidents_are_drawn_one_by_one():

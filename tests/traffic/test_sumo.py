@@ -1,4 +1,7 @@
+"""Simulated traffic: it flows, jams and recovers, and runs in SUMO are closed."""
+
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
@@ -9,22 +12,27 @@ from dptse_env.traffic import (
     PAPER_HIGHWAY,
     SHORT_HIGHWAY,
     Drivers,
-    Record,
+    Incident,
     RecordingError,
     SumoVersionError,
+    VehicleClass,
+    average_dwell,
     draw_scenario,
-    mean_dwell,
     simulate,
 )
-from dptse_env.traffic.sumo import running, seconds
+from dptse_env.traffic.sumo import limit_changes, running, seconds
+from tests.model.roads import UNEVEN
+from tests.traffic.test_record import assert_same
 
 N = PAPER_HIGHWAY.n_mainline
 INCIDENT = PAPER_HIGHWAY.incident.segment
-
-
-def assert_same(first, second):
-    for name in Record.COLUMNS:
-        np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
+CLASSES = (
+    VehicleClass("car", 0.7),
+    VehicleClass("truck", 0.3, length=12.0, largest_speed=60.0, drivers=Drivers("Krauss")),
+)
+ROAD = dataclasses.replace(
+    UNEVEN, duration=240, incident=Incident(5, ((60.0, 120.0, 10.0), (120.0, 140.0, 40.0)))
+)
 
 
 def mean_speed(record, steps, columns):
@@ -115,7 +123,7 @@ def test_ramps_flow_and_no_merge_locks(paper_records):
 
 def test_a_vehicle_dwells_as_long_as_the_preset_says(paper_records):
     """The preset's value is the mean over seeds 0..15; these four come close to it."""
-    measured = mean_dwell(paper_records, N)
+    measured = average_dwell(PAPER_HIGHWAY, paper_records)
     assert measured == pytest.approx(PAPER_HIGHWAY.average_dwell, rel=0.06)
 
 
@@ -123,9 +131,7 @@ def test_a_vehicle_dwells_as_long_as_the_preset_says(paper_records):
 @pytest.mark.parametrize("corridor", CORRIDORS.values(), ids=CORRIDORS)
 def test_the_presets_dwell_is_that_of_seeds_0_to_15(corridor):
     records = [simulate(corridor, seed) for seed in range(16)]
-    assert mean_dwell(records, corridor.n_mainline) == pytest.approx(
-        corridor.average_dwell, abs=0.005
-    )
+    assert average_dwell(corridor, records) == pytest.approx(corridor.average_dwell, abs=0.005)
 
 
 def test_the_same_seed_gives_the_same_record_silently_and_another_seed_another(short_record, capfd):
@@ -177,3 +183,85 @@ def test_drivers_shape_the_traffic(short_record):
     assert record.n_steps == short_record.n_steps
     assert len(record.speed) > 0
     assert not np.array_equal(record.speed_sums, short_record.speed_sums)
+
+
+def test_sumo_has_the_lengths_speeds_and_models_of_the_classes():
+    corridor = dataclasses.replace(SHORT_HIGHWAY, vehicle_classes=CLASSES)
+    scenario = draw_scenario(corridor, 0)
+    seen, fastest = set(), np.zeros(2)
+    with running(corridor, scenario) as libsumo:
+        for _ in seconds(libsumo, corridor, scenario):
+            for name in libsumo.vehicle.getIDList():
+                kind = int(scenario.classes[int(name)])
+                length = libsumo.vehicle.getLength(name)
+                seen.add((kind, length))
+                fastest[kind] = max(fastest[kind], 3.6 * libsumo.vehicle.getSpeed(name))
+    assert seen == {(0, 5.0), (1, 12.0)}
+    assert fastest[1] == pytest.approx(60.0, abs=0.001)
+    assert fastest[0] > 80.0
+
+
+def test_limits_return_to_normal_between_phases_only_where_there_is_a_gap():
+    touching = Incident(0, ((10, 20, 5), (20, 30, 50)))
+    apart = Incident(0, ((10, 20, 5), (25, 30, 50)))
+    assert limit_changes([touching], [100.0]) == [(10, 0, 5), (20, 0, 50), (30, 0, 100)]
+    assert limit_changes([apart], [100.0]) == [
+        (10, 0, 5), (20, 0, 100), (25, 0, 50), (30, 0, 100),
+    ]  # fmt: skip
+
+
+def test_the_lowest_limit_holds_where_incidents_overlap():
+    first, second = Incident(1, ((10, 40, 20),)), Incident(1, ((20, 30, 5), (30, 50, 60)))
+    elsewhere = Incident(0, ((15, 25, 8),))
+    assert limit_changes([first, second, elsewhere], [100.0, 80.0]) == [
+        (10, 1, 20), (15, 0, 8), (20, 1, 5), (25, 0, 100), (30, 1, 20), (40, 1, 60), (50, 1, 80),
+    ]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def uneven():
+    return simulate(ROAD, 0)
+
+
+def successors(corridor):
+    """Columns into which a vehicle may pass from each column."""
+    n, s = corridor.n_mainline, corridor.n_segments
+    following = {i: {i + 1} for i in range(n - 1)} | {n - 1: {s + 1}, s: {0}}
+    boundary = s + 2
+    for face, segments in zip(corridor.on_ramps, corridor.on_ramp_segments, strict=True):
+        chain = [boundary, *segments, face]
+        following |= {a: {b} for a, b in itertools.pairwise(chain)}
+        boundary += 1
+    for face, segments in zip(corridor.off_ramps, corridor.off_ramp_segments, strict=True):
+        chain = [*segments, boundary]
+        following |= {a: {b} for a, b in itertools.pairwise(chain)}
+        following[face - 1].add(segments[0])
+        boundary += 1
+    return following
+
+
+def test_vehicles_pass_from_segment_to_segment_along_the_road(uneven):
+    following = successors(ROAD)
+    passed = set()
+    for vehicle in range(uneven.n_vehicles):
+        mine = uneven.vehicle == vehicle
+        places, steps = uneven.segment[mine].tolist(), uneven.step[mine]
+        assert np.all(np.diff(steps) == 1), "a vehicle vanished for a while"
+        for a, b in itertools.pairwise(places):
+            if a != b:
+                # A second may take a fast vehicle over the whole of a short segment.
+                reached, two = following[a], set()
+                for between in reached:
+                    two |= following.get(between, set())
+                assert b in reached | two, (a, b)
+                passed.add((a, b))
+    for a, reached in following.items():
+        assert any((a, b) in passed for b in reached), f"nobody ever left column {a}"
+
+
+def test_the_limit_after_an_incident_is_that_of_its_segment(uneven):
+    slow, after = slice(80, 120), slice(180, 240)
+    speeds = uneven.speed_sums[:, 5] / np.maximum(uneven.counts[:, 5], 1)
+    seen = uneven.counts[:, 5] > 0
+    assert speeds[slow][seen[slow]].mean() < 20.0
+    assert 40.0 < speeds[after][seen[after]].mean() <= 1.2 * 80.0

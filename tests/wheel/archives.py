@@ -19,7 +19,7 @@ PACKAGES = {
     "results/suite/rows.parquet": "dptse_env/_tools/results/suite/rows.parquet",
 }
 """Folders and files of the repository that are in a wheel, and where."""
-IN_A_WHEEL = {"", ".json", ".npz", ".parquet", ".py", ".typed", ".xml", ".zip"}
+IN_A_WHEEL = {"", ".json", ".parquet", ".py", ".safetensors", ".typed", ".xml"}
 """Kinds of files of the packages: code, settings, networks, rows, policies."""
 
 FOLDERS = {*PACKAGES, "benchmarks", "docs", "examples", "tests"}

@@ -33,7 +33,7 @@ COMMANDS = [
     ],
     [
         "evaluate", *SHORT, "--keywords", '{"horizon": 64}', "--seeds", "2000:2002",
-        "--schedules", "round-robin", "--policies", "trained/policy.zip",
+        "--schedules", "round-robin", "--policies", "trained/policy.safetensors",
         "--estimators", "random_walk", "--output", "ladder",
     ],
 ]  # fmt: skip
@@ -141,7 +141,7 @@ def use_tools(installed: Installed, wheel: Path) -> None:
     assert not {"agents", "scripts"} & {path.name for path in packages.iterdir()}
     for words in COMMANDS:
         installed.run(installed.python.with_name("dptse"), *words, cwd=empty)
-    assert (empty / "trained" / "policy.zip").is_file()
+    assert (empty / "trained" / "policy.safetensors").is_file()
     assert (empty / "ladder" / "tables.md").is_file()
     installed.run(installed.python, HERE / "extras.py", "train", cwd=installed.folder)
 

@@ -49,7 +49,7 @@ def main() -> None:
     assert np.isfinite(envs.step(envs.action_space.sample())[1]).all()
     use_parts_of_another_package()
     policies = Path(dptse_env.__file__).parent / "policies"
-    assert (policies / "private-highway.zip").is_file(), "a trained policy must come with it"
+    assert any(policies.glob("*.safetensors")), "a trained policy must come with it"
     print(f"the wheel works with gymnasium {gym.__version__}")
 
 

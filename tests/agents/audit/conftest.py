@@ -18,4 +18,7 @@ def record():
             place += speed / 100.0 * generator.uniform(0.1, 1.0)
             speed = float(np.clip(speed + generator.normal(0.0, 10.0), 0.0, 120.0))
     step, vehicle, segment, speed = (np.array(column) for column in zip(*sorted(rows), strict=True))
-    return Record(step, vehicle, segment, speed, n_steps=HORIZON + 1, n_columns=N_COLUMNS)
+    return Record(
+        step=step, vehicle=vehicle, segment=segment, speed=speed,
+        n_steps=HORIZON + 1, n_columns=N_COLUMNS,
+    )  # fmt: skip

@@ -38,7 +38,7 @@ class HalfTheLimit(OpenLoop):
     def estimate(self):
         estimate = super().estimate()
         speed = np.full_like(estimate.speed, 0.5 * ROAD.speed_limit)
-        return dataclasses.replace(estimate, speed=speed)
+        return estimate._replace(speed=speed)
 
 
 def assert_runs_do_not_depend_on_the_batch(setting, record):

@@ -14,7 +14,7 @@ from agents.filters.plan import OWN, Round  # noqa: E402
 from agents.filters.torch_network import RecurrentNetwork, second_loss  # noqa: E402
 from agents.filters.training import FilterTraining  # noqa: E402
 from agents.training.run_files import read_progress  # noqa: E402
-from dptse_env.estimators.recurrent_weights import read_network, write_network  # noqa: E402
+from dptse_env.estimators.recurrent import read_network, write_network  # noqa: E402
 from dptse_env.evaluation import evaluate  # noqa: E402
 from tests.agents.elsewhere import Elsewhere  # noqa: E402
 from tests.estimators.networks import card  # noqa: E402
@@ -50,7 +50,7 @@ def test_the_network_with_gradients_is_the_estimator(tmp_path):
     network = RecurrentNetwork(5)
     with torch.no_grad():
         network.heads.normal_(0.0, 0.5)
-    path = tmp_path / "network.npz"
+    path = tmp_path / "network.safetensors"
     write_network(path, network.weights(), card())
     recurrent = {"weights": str(path), "outside": True}
     own = {"estimator": "recurrent", "estimator_settings": {"recurrent": recurrent}}
@@ -181,7 +181,9 @@ def test_a_training_that_was_killed_comes_out_as_one_that_was_not(whole, tmp_pat
     assert resumed.done == 2
     resumed.run()
     assert rows_of(resumed) == rows_of(whole)
-    one, other = (read_network(str(each / "network.npz")) for each in (whole.folder, tmp_path))
+    one, other = (
+        read_network(str(each / "network.safetensors")) for each in (whole.folder, tmp_path)
+    )
     for name, array in one.network._asdict().items():
         np.testing.assert_array_equal(array, getattr(other.network, name))
     assert len(read_progress(tmp_path)) == 4
@@ -193,7 +195,7 @@ def test_a_training_that_was_killed_comes_out_as_one_that_was_not(whole, tmp_pat
 def test_the_card_says_what_it_was_trained_on(tmp_path):
     training = FilterTraining(dataclasses.replace(PLAN, rounds=(Round("ekf", 1, 1),)), tmp_path)
     training.run()
-    saved = read_network(str(tmp_path / "network.npz"))
+    saved = read_network(str(tmp_path / "network.safetensors"))
     assert saved.card["ranges"]["span"] == [1.0, 2.0]
     assert saved.card["ranges"]["flows"] == [0.0, 1.0]
     assert saved.card["ranges"]["n_mainline"] == [6, 6]
@@ -210,15 +212,15 @@ def test_a_folder_of_another_plan_is_refused(tmp_path):
 def test_a_training_may_begin_with_another_network(tmp_path):
     first = FilterTraining(dataclasses.replace(PLAN, rounds=(Round("ekf", 1, 1),)), tmp_path / "a")
     first.run()
-    initial = str(tmp_path / "a" / "network.npz")
+    initial = str(tmp_path / "a" / "network.safetensors")
     plan = dataclasses.replace(PLAN, initial=initial, rounds=(Round(OWN, 1, 1),), seed=5)
     second = FilterTraining(plan, tmp_path / "b")
     for taken, given in zip(second.network.weights(), first.network.weights(), strict=True):
         np.testing.assert_array_equal(taken, given)
     second.run()
     assert not np.array_equal(second.network.weights().hidden, first.network.weights().hidden)
-    card = read_network(str(tmp_path / "b" / "network.npz")).card
-    assert card["training"]["plan"]["initial_sha256"] == read_network(initial).sha256
+    card = read_network(str(tmp_path / "b" / "network.safetensors")).card
+    assert card["training"]["plan"]["initial_sha256"] == read_network(initial).card["sha256"]
     with pytest.raises(ValueError, match="width must be that of the initial network, 4, got 8"):
         dataclasses.replace(plan, width=8)
 

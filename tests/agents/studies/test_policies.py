@@ -145,7 +145,7 @@ def test_a_small_study_plays_validation_then_test_traffic(tmp_path, monkeypatch)
         monkeypatch.setattr(policies, name, value)
     runs = tmp_path / "runs"
     for seed in range(2):
-        save(runs / f"pl-{seed}" / "best.zip", seed=seed)
+        save(runs / f"pl-{seed}" / "best.safetensors", seed=seed)
     with pytest.raises(ValueError, match="both plackett-luce of training seed 0"):
         policies.study([f"primary={runs}", f"primary={runs}/pl-0"])
     study = policies.study([f"primary={runs}", f"paced={runs}"])

@@ -1,4 +1,3 @@
-import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -10,7 +9,7 @@ from agents.training.policy_iteration import LARGEST_GAIN, raise_scores
 from agents.training.recipes import SwapRounds
 from agents.training.swaps import Swaps
 from dptse_env.config import resolve
-from dptse_env.sb3 import PlackettLucePolicy, RoadChannels
+from dptse_env.sb3 import PlackettLucePolicy
 
 N = 6
 STEP = 3.0
@@ -19,16 +18,9 @@ SETTINGS = SwapRounds(price=0.01, batches=400, batch_size=256, rate=1e-2)
 
 @pytest.fixture
 def policy():
-    env = gym.make(
-        "dptse_env:dptse/ShortHighway-v0", action="slots", traffic_seeds="0:2", bandwidth=2
-    )
     torch.manual_seed(0)
-    return PlackettLucePolicy(
-        env.observation_space,
-        env.action_space,
-        road=RoadChannels.from_config(resolve("short-highway", {})),
-        width=16,
-    )
+    config = resolve("short-highway", {"action": "slots", "bandwidth": 2})
+    return PlackettLucePolicy.from_config(config, width=16)
 
 
 def planted(policy, gain, spent=None, n_states=300, trials=20):

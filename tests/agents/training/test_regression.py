@@ -9,7 +9,7 @@ import torch
 from agents.training.episodes import make_episodes
 from agents.training.recipes import PlackettLuceRecipe, RegressionRounds
 from agents.training.regression import Practice, regress, squared_errors
-from dptse_env.sb3 import PlackettLucePolicy, RoadChannels
+from dptse_env.sb3 import PlackettLucePolicy
 
 SHORT = "dptse_env:dptse/ShortHighway-v0"
 SETTINGS = {"rounds": 1, "seconds": 100, "batches": 200, "batch_size": 64, "rate": 3e-3}
@@ -20,12 +20,7 @@ def make(**changes):
     recipe = PlackettLuceRecipe(n_envs=8, replicas=1, regression=settings)
     episodes = make_episodes(SHORT, {"traffic_seeds": "0:3", "privacy": "capped"}, recipe, 0)
     torch.manual_seed(0)
-    policy = PlackettLucePolicy(
-        episodes.observation_space,
-        episodes.action_space,
-        road=RoadChannels.from_config(episodes.env.config),
-        width=8,
-    )
+    policy = PlackettLucePolicy.from_config(episodes.env.config, width=8)
     return settings, episodes, policy
 
 

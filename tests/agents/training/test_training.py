@@ -6,12 +6,13 @@ import shutil
 import numpy as np
 import pytest
 
+from dptse_env.utils.files import write_atomically
+
 pytest.importorskip("sb3_contrib")
 
 import torch
 
 import dptse_env
-from agents.files import write_atomically
 from agents.training.recipes import RECIPES, RegressionRounds
 from agents.training.run_files import CHECKPOINT, PLAN, PROGRESS, read_progress
 from agents.training.training import BEST, POLICY, Training

@@ -119,13 +119,13 @@ class MeanDensity:
 class Neighbours(ActionEncoding):
     """``Discrete(n - 1)``: a segment and the next one downstream."""
 
-    def __init__(self, n_mainline: int, bandwidth: int) -> None:
-        """See `ActionEncoding`."""
-        super().__init__(spaces.Discrete(n_mainline - 1), n_mainline, bandwidth)
+    def make_space(self) -> Any:
+        """See `ActionEncoding.make_space`."""
+        return spaces.Discrete(self.n_options - 1)
 
     def decode(self, episodes: Any, actions: Any, pending: Any) -> Decision:
         """See `ActionEncoding.decode`."""
-        ahead = np.arange(self.n_mainline) - np.asarray(actions)[:, None]
+        ahead = np.arange(self.n_options) - np.asarray(actions)[:, None]
         k = len(ahead)
         queried = (ahead == 0) | (ahead == 1)
         return Decision(queried, np.zeros(k, dtype=np.int64), np.ones(k, dtype=bool))

@@ -1,0 +1,85 @@
+"""What the scalar and the vectorised environment share; their episodes are those of a process."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from dptse_env.config import EnvConfig
+from dptse_env.estimators import check_settings
+from dptse_env.parts import make_interface, make_model, make_parts
+from dptse_env.process import QueryProcess
+from dptse_env.rendering import Drawing
+from dptse_env.traffic import Records, open_library
+from dptse_env.utils.arrays import BoolArray
+from dptse_env.utils.fields import require
+
+
+class QueryEnvBase:
+    """Configuration, process, masks, privacy and pictures of an environment of n episodes.
+
+    Attributes:
+        config: The configuration.
+        interface: Action encoding, observation and reward.
+        drawing: The episode that `render` draws; None without a render mode.
+    """
+
+    metadata: dict[str, Any]
+    render_mode: str | None
+
+    def __init__(
+        self,
+        config: EnvConfig,
+        n_episodes: int,
+        records: Records,
+        render_mode: str | None,
+        *,
+        threads: int | None = 1,
+    ) -> None:
+        """Describe the environment; nothing is recorded or compiled before the first reset.
+
+        Raises:
+            ValueError: A part of another package, a setting of the estimator on this road, the
+                render mode or ``records`` is not what is expected.
+        """
+        modes = self.metadata["render_modes"]
+        allowed = " or ".join(["None", *map(repr, modes)])
+        require(render_mode in (None, *modes), "render_mode", allowed, render_mode)
+        self.config, self.render_mode = config, render_mode
+        self.interface = make_interface(config)
+        self._model = make_model(config)
+        check_settings(config.estimator, self._model, config.settings())
+        self._library, self._threads = open_library(records), threads
+        self._n_episodes = n_episodes
+        self._process: QueryProcess | None = None
+        self.drawing: Drawing | None = None
+
+    @property
+    def process(self) -> QueryProcess:
+        """The process behind the environment, assembled at the first use."""
+        if self._process is None:
+            parts = make_parts(
+                self.config, self._n_episodes, self._library,
+                interface=self.interface, model=self._model,
+            )  # fmt: skip
+            self._process = QueryProcess(parts, self._threads)
+        return self._process
+
+    def privacy(self) -> dict[str, Any]:
+        """Return the guarantee of an episode, or what voids it, and the account behind it."""
+        return self.process.privacy()
+
+    def _available(self) -> BoolArray:
+        """Return flags (n, G) of the options that may be picked next."""
+        return self.interface.actions.available(self.process.pending.picked)
+
+    def _drawn(self) -> NDArray[np.uint8] | None:
+        """Return the picture of the episode so far; None, with a warning, without a render mode."""
+        if self.render_mode is None:
+            gym.logger.warn("render() needs render_mode='rgb_array'; nothing was drawn")
+            return None
+        assert self.drawing is not None
+        return self.drawing.draw()

@@ -1,0 +1,26 @@
+"""Import of recorded trajectories: files of points of vehicles become records of a corridor.
+
+`import_trajectories` writes a folder with a road file, on which everything works that works on a
+simulated road. Tables are read by polars (extra ``corridors``).
+"""
+
+from dptse_env.utils.registry import needed_for
+
+with needed_for("an import"):
+    from dptse_env.importers.folder import Imported, Split, import_trajectories
+    from dptse_env.importers.recording import Options
+    from dptse_env.importers.source import Layout, Part, Source, TrajectoryError, read_source
+    from dptse_env.importers.tables import FORMATS
+
+__all__ = [
+    "FORMATS",
+    "Imported",
+    "Layout",
+    "Options",
+    "Part",
+    "Source",
+    "Split",
+    "TrajectoryError",
+    "import_trajectories",
+    "read_source",
+]

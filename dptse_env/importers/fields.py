@@ -1,0 +1,242 @@
+"""Import of measured fields: density and speed, or flow, on a grid of space and time."""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dptse_env.importers.folder import (
+    ROAD,
+    Split,
+    assign_seeds,
+    moved,
+    new_folder,
+    save_records,
+)
+from dptse_env.importers.source import LENGTHS, SPEEDS, TIMES
+from dptse_env.traffic.corridor import Corridor
+from dptse_env.traffic.demand import Demand
+from dptse_env.traffic.record import Record, average_dwell
+from dptse_env.traffic.roads import DENSITY_SCALE, write_corridor
+from dptse_env.utils.arrays import FloatArray
+from dptse_env.utils.fields import integer, positive, require, require_name
+
+UNITS = {
+    "density": {f"veh/{name}": 1.0 / LENGTHS[name] for name in ("km", "mi", "ft", "m")},
+    "speed": SPEEDS,
+    "flow": {f"veh/{name}": 3600.0 / factor for name, factor in TIMES.items() if factor >= 1.0},
+}
+"""Factors to veh/km, km/h and veh/h."""
+LEAST_DENSITY = 1e-9
+"""Density [veh/km] below which a cell is empty and has no speed of its own."""
+DENSEST = (1.0, 3000.0)
+"""Largest density of a field [veh/km], all lanes together, beyond which its unit is another one."""
+FASTEST = (5.0, 300.0)
+"""Largest speed of a field [km/h], beyond which its unit is another one."""
+DENSEST_LANE, BUSIEST_LANE = 250.0, 4000.0
+"""Density [veh/km] and flow [veh/h] that no lane exceeds."""
+
+
+@dataclass(frozen=True)
+class FieldSource:
+    """A field in text files with a row for each cell and a column for each interval.
+
+    Attributes:
+        density: File of densities.
+        speed: File of speeds; or else `flow`.
+        flow: File of flows, from which speeds are derived.
+        cell: Length of a cell [km].
+        interval: Length of an interval [s].
+        density_unit: Unit of densities, all lanes together.
+        speed_unit: Unit of speeds.
+        flow_unit: Unit of flows, all lanes together.
+        transposed: Whether rows are intervals.
+        reversed: Whether the first cell is the last downstream.
+        delimiter: What separates the numbers of a line; None for blanks.
+    """
+
+    density: Path
+    cell: float
+    interval: float
+    speed: Path | None = None
+    flow: Path | None = None
+    density_unit: str = "veh/km"
+    speed_unit: str = "km/h"
+    flow_unit: str = "veh/h"
+    transposed: bool = False
+    reversed: bool = False
+    delimiter: str | None = None
+
+    def read(self) -> tuple[FloatArray, FloatArray]:
+        """Return density [veh/km] and flow [veh/h], of shape (cells, intervals), from upstream on.
+
+        Raises:
+            ValueError: A file is no table of numbers, the files do not fit one another, or a unit
+                is unknown or not that of the data; the message has the file.
+            OSError: A file cannot be read.
+        """
+        positive("cell", self.cell)
+        positive("interval", self.interval)
+        require((self.speed is None) != (self.flow is None), "speed", "given, or else flow", None)
+        density = self._table("density")
+        kind = "speed" if self.flow is None else "flow"
+        path, other = str(getattr(self, kind)), self._table(kind)
+        allowed = f"a table of {self.density}'s shape {density.shape}"
+        require(other.shape == density.shape, path, allowed, other.shape)
+        flow = other if kind == "flow" else density * other
+        speed = flow / np.maximum(density, LEAST_DENSITY)
+        for file, table, (low, high), what, unit in (
+            (str(self.density), density, DENSEST, "densities", "veh/km"),
+            (path, speed, FASTEST, "speeds", "km/h"),
+        ):
+            largest = float(table.max())
+            allowed = f"{what} whose largest is {low:g} to {high:g} {unit}: check the units"
+            require(low <= largest <= high, file, allowed, f"{largest:.4g} {unit}")
+        return density, flow
+
+    def _table(self, kind: str) -> FloatArray:
+        path, unit = getattr(self, kind), getattr(self, f"{kind}_unit")
+        require_name(f"{kind}_unit", unit, UNITS[kind])
+        if path.is_dir():
+            raise ValueError(f"{path} must be a file, got a directory")
+        try:
+            with path.open(encoding="utf-8-sig") as file:
+                table = np.loadtxt(file, ndmin=2, delimiter=self.delimiter)
+        except ValueError as problem:
+            raise ValueError(f"{path} must be a table of numbers: {problem}") from problem
+        require(table.size > 0, str(path), "a table of at least one number", table.shape)
+        for row, column in np.argwhere(~(np.isfinite(table) & (table >= 0.0)))[:1]:
+            raise ValueError(
+                f"{path}: row {row + 1}, column {column + 1} must be finite and >= 0, got "
+                f"{table[row, column]}"
+            )
+        table = UNITS[kind][unit] * (table.T if self.transposed else table)
+        return table[::-1] if self.reversed else table
+
+
+@dataclass(frozen=True)
+class FieldRoad:
+    """The road of a field, which has no ramps.
+
+    Attributes:
+        name: Lower-case letters, digits and hyphens.
+        segments: Segments N that are estimated, each of equally many cells; one more at either end
+            of the road is the boundary.
+        lanes: Lanes.
+        speed_limit: Speed limit [km/h].
+    """
+
+    name: str
+    segments: int
+    lanes: int
+    speed_limit: float
+
+    def check(self, density: FloatArray, flow: FloatArray) -> None:
+        """Raise ``ValueError`` for a field that the lanes cannot hold; warn where it is slow.
+
+        Args:
+            density: Densities [veh/km], all lanes together.
+            flow: Flows [veh/h].
+        """
+        for name, table, most, unit in (
+            ("density", density, DENSEST_LANE, "veh/km"), ("flow", flow, BUSIEST_LANE, "veh/h"),
+        ):  # fmt: skip
+            allowed = f"at most {most * self.lanes:g} {unit} on {self.lanes} lanes: check the units"
+            largest = float(table.max())
+            require(largest <= most * self.lanes, name, allowed, f"{largest:.4g} {unit}")
+        fastest = float((flow / np.maximum(density, LEAST_DENSITY)).max())
+        if fastest < 0.4 * self.speed_limit:
+            warnings.warn(
+                f"no speed of the field is above {fastest:.0f} km/h, at a limit of "
+                f"{self.speed_limit:g} km/h: is speed_unit or flow_unit right?",
+                stacklevel=3,
+            )
+
+    def corridor(self, segment_length: float, duration: int) -> Corridor:
+        """Return the road without demand and recordings."""
+        return Corridor(
+            name=self.name, n_mainline=self.segments, on_ramps=(), off_ramps=(), exit_shares=(),
+            demand=Demand(mainline=((0.0, 0.0),)), incident=None, fixed_sensors=(),
+            duration=duration, lanes=self.lanes, segment_length=segment_length,
+            speed_limit=self.speed_limit, density_scale=DENSITY_SCALE * self.lanes,
+            speed_scale=self.speed_limit,
+        )  # fmt: skip
+
+
+def import_field(
+    source: FieldSource, road: FieldRoad, output: Path, splits: Sequence[Split],
+    duration: int = 450,
+) -> tuple[Corridor, dict[str, tuple[int, ...]]]:  # fmt: skip
+    """Import a field as records without vehicles, and return its road and its traffic seeds.
+
+    Cells are averaged over segments, density and flow alike, and intervals are interpolated to
+    seconds. The field is cut into windows of `duration` seconds, that many and the second 0, which
+    do not overlap: each is the record of a traffic seed, the first windows those of the first
+    split. The demand of the written road is the mean flow of the first split.
+
+    Args:
+        source: The files.
+        road: The road.
+        output: Folder to create; it appears when it is complete.
+        splits: Parts of the windows, in order of time.
+        duration: Length of a window [s].
+
+    Raises:
+        ValueError: The field or an argument is malformed, there are fewer cells than segments or
+            fewer seconds than a window, or the folder exists.
+        OSError: A file cannot be read, or the folder not be written.
+    """
+    integer("duration", duration, 1)
+    integer("segments", road.segments, 2)
+    density, flow = source.read()
+    road.check(density, flow)
+    each = len(density) // (road.segments + 2)
+    require(each >= 1, "segments", f"at most {len(density) - 2}", road.segments)
+    field = np.stack(by_second(density, flow, road.segments + 2, source.interval), axis=-1)
+    starts = range(0, len(field) - duration, duration + 1)
+    require(len(starts) > 0, "duration", f"below the field's {len(field)} s", duration)
+    seeds = assign_seeds(splits, len(starts))
+    flat = [seed for split in splits for seed in seeds[split.name]]
+    bare = road.corridor(each * source.cell, duration)
+    # The boundary segments, at both ends, come last in a record.
+    order = [*range(1, road.segments + 1), 0, road.segments + 1]
+    windows = [field[start : start + duration + 1, order] for start in starts]
+    records = [
+        Record(n_steps=duration + 1, n_columns=len(order), field=window) for window in windows
+    ]
+    n_training = len(seeds[splits[0].name])
+    entering = np.mean([window[:, 0].prod(axis=-1).mean() for window in windows[:n_training]])
+    measured = dataclasses.replace(
+        bare,
+        demand=Demand(mainline=((0.0, round(float(entering), 1)),)),
+        average_dwell=round(average_dwell(bare, records[:n_training]), 3),
+    )
+    sources: list[dict[str, Any]] = [
+        {"seed": seed, "file": source.density.name, "start": start}
+        for seed, start in zip(flat, starts, strict=True)
+    ]
+    with new_folder(output) as folder:
+        kept = save_records(folder, bare, records, sources, "fields")
+        written = dataclasses.replace(measured, recordings=kept)
+        comment = "A measured field. Demand and average dwell are those of its training windows."
+        write_corridor(folder / ROAD, written, comment=comment)
+    return moved(written, output), seeds
+
+
+def by_second(
+    density: FloatArray, flow: FloatArray, n: int, interval: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return density and speed of every second of n segments, (seconds, n) each."""
+    each, seconds = len(density) // n, np.arange(0.0, density.shape[1] * interval)
+    middles = (np.arange(density.shape[1]) + 0.5) * interval
+    rho, q = (
+        np.column_stack([np.interp(seconds, middles, row) for row in table])
+        for table in (t[: n * each].reshape(n, each, -1).mean(axis=1) for t in (density, flow))
+    )
+    return rho, q / np.maximum(rho, LEAST_DENSITY)

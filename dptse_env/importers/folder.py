@@ -1,0 +1,240 @@
+"""The folder of an import: a road file, records, a manifest and a report, all of them or none."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import shutil
+import uuid
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from dptse_env.importers.placing import Road
+from dptse_env.importers.recording import Options, Recording
+from dptse_env.importers.report import write_report
+from dptse_env.importers.source import Source
+from dptse_env.importers.tables import FORMATS
+from dptse_env.traffic.corridor import Corridor, Recordings
+from dptse_env.traffic.demand import Demand
+from dptse_env.traffic.imported import Kind, load_record, save_record, write_manifest
+from dptse_env.traffic.record import Record, average_dwell
+from dptse_env.traffic.roads import write_corridor
+from dptse_env.utils.fields import require, require_name
+
+ROAD = "road.toml"
+SMALLEST_SHARE = 0.001
+"""Exit shares must be above 0 and below 1: nobody or everybody leaving counts as this much."""
+
+
+class Split(NamedTuple):
+    """A part of the windows, one after another in time.
+
+    Attributes:
+        name: Such as ``training``.
+        share: Its share of the windows.
+        seeds: Traffic seeds that its windows get, from the first on.
+    """
+
+    name: str
+    share: float
+    seeds: range
+
+
+@dataclass(frozen=True)
+class Imported:
+    """An import that is complete.
+
+    Attributes:
+        corridor: The road, with its recordings.
+        seeds: Traffic seeds by name of the split.
+        report: What the report says, as plain JSON.
+    """
+
+    corridor: Corridor
+    seeds: Mapping[str, tuple[int, ...]]
+    report: Mapping[str, Any]
+
+
+def import_trajectories(
+    files: Sequence[Path],
+    source: Source,
+    corridor: Corridor,
+    output: Path,
+    splits: Sequence[Split],
+    options: Options = Options(),  # noqa: B008 (frozen)
+    environment: Mapping[str, Any] | None = None,
+) -> Imported:
+    """Import files of trajectories as records of a corridor.
+
+    Each file is cut into windows of `corridor.duration` seconds (that many, and the second 0),
+    which do not overlap. Windows are in the order of the files and of time; the first are those of
+    the first split. Demand, exit shares and average dwell of the written road are measured in the
+    windows of the first split; its incident is dropped.
+
+    Args:
+        files: The files, in order of time.
+        source: What they mean.
+        corridor: The road that they are on.
+        output: Folder to create. It appears when it is complete.
+        splits: Parts of the windows.
+        options: How trajectories are cut.
+        environment: Keywords for the road file's table ``environment``.
+
+    Raises:
+        ValueError: An argument is out of range, the folder exists, or a file cannot be imported
+            (`TrajectoryError`); the message has its path, and the row where there is one.
+        OSError: The folder cannot be written.
+    """
+    require_name("source.format", source.format, FORMATS)
+    require(len(files) > 0, "files", "one or more", len(files))
+    check_splits(splits)
+    bare = dataclasses.replace(
+        corridor, incident=None, recordings=None, demand=corridor.published_demand
+    )
+    with new_folder(output) as folder:
+        recordings = [
+            Recording(path, Road(bare), source, options, folder.parent / f"file-{number}")
+            for number, path in enumerate(files)
+        ]
+        windows = [(each, row) for each in recordings for row in each.windows.iter_rows(named=True)]
+        seeds = assign_seeds(splits, len(windows))
+        flat = [seed for split in splits for seed in seeds[split.name]]
+        sources: list[dict[str, Any]] = [
+            {"seed": seed, "file": recording.path.name, "group": window["group"],
+             "start": window["start"]}
+            for seed, (recording, window) in zip(flat, windows, strict=True)
+        ]  # fmt: skip
+
+        def records() -> Iterator[Record]:
+            for source_of, (recording, window) in zip(sources, windows, strict=True):
+                record = recording.record(window["window"])
+                source_of |= {"vehicles": len(np.unique(record.vehicle)), "rows": record.n_rows}
+                yield record
+
+        kept = save_records(folder, bare, records(), sources)
+
+        def load(seed: int) -> Record:
+            return load_record(kept, seed, bare.record_layout)
+
+        # One at a time, so that one is in memory.
+        measured = measure(bare, lambda: map(load, seeds[splits[0].name]))
+        road = dataclasses.replace(measured, recordings=kept)
+        comment = "Recorded traffic. Demand, exit shares and average dwell are measured."
+        write_corridor(folder / ROAD, road, environment, comment)
+        report = write_report(folder, road, recordings, seeds, sources, load(flat[0]))
+    return Imported(moved(road, output), seeds, report)
+
+
+def save_records(
+    folder: Path, road: Corridor, records: Iterable[Record], sources: list[dict[str, Any]],
+    kind: Kind = "vehicles",
+) -> Recordings:  # fmt: skip
+    """Write records and their manifest to a folder, one after another.
+
+    Args:
+        folder: The folder.
+        road: The road.
+        records: A record for each source; each is asked for when the last one is written.
+        sources: A JSON description of each window, with its traffic ``seed``.
+        kind: Whether the records have vehicles or are measured fields.
+
+    Raises:
+        OSError: The folder cannot be written.
+    """
+    digests = {}
+    for source, record in zip(sources, records, strict=True):
+        save_record(folder, source["seed"], road.record_layout, record)
+        digests[source["seed"]] = record.digest
+    return Recordings(
+        str(folder), write_manifest(folder, road.record_layout, digests, sources, kind)
+    )
+
+
+def moved(road: Corridor, output: Path) -> Corridor:
+    """Return a road whose recordings are in another folder."""
+    assert road.recordings is not None
+    there = dataclasses.replace(road.recordings, folder=str(output.absolute()))
+    return dataclasses.replace(road, recordings=there)
+
+
+def measure(corridor: Corridor, records: Callable[[], Iterable[Record]]) -> Corridor:
+    """Return a corridor with the demand, exit shares and average dwell of records.
+
+    The records are read twice. Flows are Edie's: the mean over time of the sum of speeds over the
+    length of a segment. That of the mainline is taken in its first segment, those of ramps in the
+    segment at their face.
+
+    Raises:
+        ValueError: No vehicle is on the mainline.
+    """
+    sums = np.mean([record.speed_sums.mean(axis=0) for record in records()], axis=0)
+    flow = sums[: corridor.n_segments] / np.array(corridor.segment_lengths)
+    shares = [
+        flow[segments[0]] / max(flow[face - 1], 1e-9)
+        for face, segments in zip(corridor.off_ramps, corridor.off_ramp_segments, strict=True)
+    ]
+    entering = [flow[segments[-1]] for segments in corridor.on_ramp_segments]
+    held = np.clip(shares, SMALLEST_SHARE, 1.0 - SMALLEST_SHARE)
+    return dataclasses.replace(
+        corridor,
+        demand=Demand(
+            mainline=((0.0, round(float(flow[0]), 1)),),
+            on_ramps=tuple(round(float(each), 1) for each in entering),
+        ),
+        exit_shares=tuple(round(float(each), 4) for each in held),
+        average_dwell=round(average_dwell(corridor, records()), 3),
+    )
+
+
+def check_splits(splits: Sequence[Split]) -> None:
+    """Raise ``ValueError`` unless the shares add up."""
+    shares = [split.share for split in splits]
+    fits = min(shares) >= 0.0 and shares[0] > 0.0 and abs(sum(shares) - 1.0) < 1e-9
+    require(fits, "shares", "at least 0, the first above 0, with the sum 1", shares)
+
+
+def assign_seeds(splits: Sequence[Split], n_windows: int) -> dict[str, tuple[int, ...]]:
+    """Return the traffic seeds of each split: as many as its share says, at least one if it can.
+
+    Raises:
+        ValueError: The shares do not add up, or a split has fewer seeds than windows.
+    """
+    check_splits(splits)
+    counts = [0] * len(splits)
+    for _ in range(n_windows):
+        # The split that is furthest behind its share, those without a window first.
+        behind = [
+            (split.share > 0.0 and count == 0, split.share * n_windows - count)
+            for split, count in zip(splits, counts, strict=True)
+        ]
+        counts[max(range(len(splits)), key=behind.__getitem__)] += 1
+    for split, count in zip(splits, counts, strict=True):
+        allowed = f"at most {len(split.seeds)} windows of split {split.name}"
+        require(count <= len(split.seeds), "files", allowed, count)
+    return {s.name: tuple(s.seeds[:count]) for s, count in zip(splits, counts, strict=True)}
+
+
+@contextlib.contextmanager
+def new_folder(output: Path) -> Iterator[Path]:
+    """Yield an empty folder that becomes `output` when the body ends, and vanishes if it fails.
+
+    Its parent is a folder for this alone, in which the body may leave what is thrown away.
+
+    Raises:
+        ValueError: There is something at `output`.
+        OSError: It cannot be written.
+    """
+    require(not output.exists(), "output", "a folder that does not exist yet", str(output))
+    output.parent.mkdir(parents=True, exist_ok=True)
+    work = output.parent / f".{output.name}-{uuid.uuid4().hex}"
+    folder = work / "result"
+    folder.mkdir(parents=True)
+    try:
+        yield folder
+        folder.rename(output)
+    finally:
+        shutil.rmtree(work, ignore_errors=True)

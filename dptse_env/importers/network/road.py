@@ -1,0 +1,203 @@
+"""A corridor made of a layout, with the demand and the exit shares of one simulated run."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from dptse_env.importers.network.configuration import Files
+from dptse_env.importers.network.layout import Layout
+from dptse_env.traffic.corridor import Corridor
+from dptse_env.traffic.demand import Demand, Profile
+from dptse_env.traffic.own_sumo import SumoScenario
+from dptse_env.traffic.record import Record, average_dwell
+from dptse_env.traffic.recording import simulate_in_worker
+from dptse_env.traffic.roads import DENSITY_SCALE
+from dptse_env.traffic.sumo import RecordingError
+from dptse_env.utils.arrays import BoolArray, IntArray
+from dptse_env.utils.fields import require
+from dptse_env.utils.files import file_digest
+
+NEVER = np.iinfo(np.int64).max
+"""First step of a vehicle on a column where it never is."""
+
+LEAST_SHARE = 0.001
+"""Least exit share: a road has shares above 0 and below 1."""
+
+
+@dataclass(frozen=True)
+class ImportedRoad:
+    """A road of a SUMO network.
+
+    Attributes:
+        corridor: the road, with demand, exit shares and average dwell counted in `record`.
+        layout: where its segments are in the network.
+        record: the run that was counted.
+        remarks: what was unusual, for people.
+    """
+
+    corridor: Corridor
+    layout: Layout
+    record: Record
+    remarks: tuple[str, ...]
+
+
+def import_road(
+    files: Files,
+    layout: Layout,
+    name: str,
+    duration: int,
+    begin: int | None = None,
+    warm_up: int = 0,
+    speed_limit: float | None = None,
+    seed: int = 0,
+) -> ImportedRoad:
+    """Make a corridor of a layout, and count its demand in one simulated run.
+
+    Args:
+        files: what the simulation reads.
+        layout: the segments.
+        name: name of the corridor.
+        duration: length of a record [s].
+        begin: second of SUMO's clock at which a record starts; that of `files` after the warm-up
+            if None.
+        warm_up: seconds simulated before, at most `begin`.
+        speed_limit: limit of all segments [km/h]; that of the edges if None.
+        seed: traffic seed of the run that is counted.
+
+    Raises:
+        ValueError: Files or fields are of no use, SUMO refuses the files, or no vehicle uses the
+            path.
+    """
+    files.check()
+    if begin is None:
+        require(float(files.begin).is_integer(), "begin", "whole seconds", files.begin)
+        begin = int(files.begin) + warm_up
+    draft = _draft(files, layout, name, duration, begin, warm_up, speed_limit)
+    try:
+        record = simulate_in_worker(draft, seed)
+    except RecordingError as error:
+        raise ValueError(f"SUMO refuses these files: {' '.join(str(error).split())}") from error
+    if not (record.segment < draft.n_mainline).any():
+        seen = f"{record.n_vehicles} on its ramps or ends" if record.n_rows else "none"
+        routes = ", ".join(path.name for path in files.routes)
+        raise ValueError(
+            f"routes: {routes} must have vehicles that use the path from {begin} s to "
+            f"{begin + duration} s, got {seen}"
+        )
+    # First step of each vehicle on each column.
+    first = np.full((record.n_vehicles, record.n_columns), NEVER)
+    np.minimum.at(first, (record.vehicle, record.segment), record.step.astype(np.int64))
+    corridor = dataclasses.replace(
+        draft,
+        demand=_demand(draft, first),
+        exit_shares=_exit_shares(draft, first),
+        average_dwell=round(average_dwell(draft, [record]), 2),
+    )
+    remarks = layout.remarks
+    inside = (first.argmin(axis=1) < draft.n_mainline) & (first.min(axis=1) > 0)
+    if inside.any():
+        share = f"{inside.sum()} of {record.n_vehicles} vehicles"
+        remarks += (f"{share} appear on the mainline, past every entrance",)
+    return ImportedRoad(corridor, layout, record, remarks)
+
+
+def _draft(
+    files: Files,
+    layout: Layout,
+    name: str,
+    duration: int,
+    begin: int,
+    warm_up: int,
+    speed_limit: float | None,
+) -> Corridor:
+    """Return the corridor without what is counted."""
+    folder = files.net.parent.resolve()
+    paths = (files.net, *files.routes, *files.additional)
+    names = tuple(os.path.relpath(path.resolve(), folder) for path in paths)
+    n_routes = len(files.routes)
+    network = SumoScenario(
+        net=names[0],
+        routes=names[1 : 1 + n_routes],
+        additional=names[1 + n_routes :],
+        sha256=tuple(file_digest(path) for path in paths),
+        columns=layout.columns,
+        folder=str(folder),
+        begin=begin,
+        warm_up=warm_up,
+        step_length=files.step_length,
+        options=files.options,
+    )
+    N, n_on, n_off = len(layout.lengths), len(layout.on_ramps), len(layout.off_ramps)
+    limits, ramp_limits = (
+        tuple(round(each if speed_limit is None else speed_limit, 1) for each in of_edges)
+        for of_edges in (layout.limits, layout.ramp_limits)
+    )
+    return Corridor(
+        name=name,
+        n_mainline=N,
+        on_ramps=layout.on_ramps,
+        off_ramps=layout.off_ramps,
+        exit_shares=(0.5,) * n_off,
+        demand=Demand(mainline=((0.0, 0.0),), on_ramps=(0.0,) * n_on),
+        incident=None,
+        fixed_sensors=(N - 1, *(N + n_on + i for i in range(n_off))),
+        duration=duration,
+        lanes=layout.lanes,
+        ramp_lanes=layout.ramp_lanes or 1,
+        segment_length=_kilometres(layout.lengths),
+        speed_limit=limits,
+        ramp_length=_kilometres(layout.ramp_lengths) or None,
+        ramp_speed_limit=ramp_limits or None,
+        density_scale=DENSITY_SCALE * max(layout.lanes),
+        speed_scale=max(limits),
+        network=network,
+    )
+
+
+def _kilometres(lengths: Sequence[float]) -> tuple[float, ...]:
+    return tuple(round(length / 1000.0, 4) for length in lengths)
+
+
+def _demand(corridor: Corridor, first: IntArray) -> Demand:
+    """Count who comes over the upstream boundary segment, and who over the on-ramps.
+
+    Vehicles that are there at second 0 have entered before. Rates hold for a quarter of a record,
+    one minute at least and five at most.
+    """
+    period = max(60, min(300, corridor.duration // 4))
+    times = np.append(np.arange(0, corridor.duration, period), corridor.duration)
+    if len(times) > 2 and times[-1] - times[-2] < period:
+        times = np.delete(times, -2)  # a last step that is shorter joins the one before
+
+    def rates(steps: IntArray) -> Profile:
+        counts, _ = np.histogram(steps[(steps > 0) & (steps < NEVER)], times)
+        hourly = 3600.0 * counts / np.diff(times)
+        pairs = zip(times[:-1], hourly, strict=True)
+        return tuple((float(time), round(float(rate), 1)) for time, rate in pairs)
+
+    N, S, n_on = corridor.n_mainline, corridor.n_segments, corridor.n_on_ramps
+    ramps = [np.minimum(first[:, N + i], first[:, S + 2 + i]) for i in range(n_on)]
+    return Demand(mainline=rates(first[:, S]), on_ramps=tuple(map(rates, ramps)))
+
+
+def _exit_shares(corridor: Corridor, first: IntArray) -> tuple[float, ...]:
+    """Count the share of vehicles that leave, of those that pass each off-ramp."""
+
+    def reached(*columns: int) -> BoolArray:
+        found: BoolArray = np.any(first[:, columns] < NEVER, axis=1)
+        return found
+
+    N, S, n_on = corridor.n_mainline, corridor.n_segments, corridor.n_on_ramps
+    shares = []
+    for i, face in enumerate(corridor.off_ramps):
+        left = reached(N + n_on + i, S + 2 + n_on + i)
+        passed = reached(S, *range(face)) & reached(*range(face, N), S + 1) & ~left
+        n_left, n_all = int(left.sum()), int((left | passed).sum())
+        share = n_left / n_all if n_all else 0.0
+        shares.append(round(min(max(share, LEAST_SHARE), 1.0 - LEAST_SHARE), 4))
+    return tuple(shares)

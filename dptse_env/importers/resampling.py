@@ -1,0 +1,271 @@
+"""From points at any times to one row for each vehicle and whole second."""
+
+from __future__ import annotations
+
+import itertools
+from collections import Counter
+from collections.abc import Mapping
+
+import numpy as np
+import polars as pl
+
+from dptse_env.importers.placing import Road
+from dptse_env.importers.source import LENGTHS, SPEEDS, TrajectoryError
+from dptse_env.utils.arrays import FloatArray, IntArray
+
+TIME_UNIT = 1e-4
+"""Times are rounded to this [s]: sums of frame lengths are not whole in floating point."""
+FASTEST = 300.0 / 3600.0
+"""Distance a second that no vehicle exceeds [km/s]; more is a jump to another place."""
+JUMP = 0.05
+"""Distance that noise may add, forwards or backwards [km]."""
+SAME_PLACE = 0.005
+"""Largest distance between two points that count as duplicates [km]."""
+HALF_WIDTH = 0.5
+"""A derived speed is the mean over this time [s] on both sides."""
+TOLERANCE = 1.25
+"""Largest factor between speeds and what positions say of them."""
+SLOWEST_ROAD, FASTEST_ROAD = 1.0, 250.0
+"""Median speeds [km/h] of the vehicles that move furthest, beyond which a unit is wrong."""
+
+
+def whole_seconds(
+    points: pl.DataFrame, road: Road, longest_gap: float, counts: Counter[str]
+) -> tuple[pl.DataFrame, pl.DataFrame]:
+    """Return vehicles at whole seconds, and a row for each piece of a trajectory.
+
+    Args:
+        points: All points on the road of some vehicles: row, id (whole numbers), time [s],
+            position [km], speed [km/h] (null to derive it), branch, column, lane_number, group.
+        road: The road that they are on.
+        longest_gap: Longest time without points that is filled by interpolation [s].
+        counts: What happens is added to it.
+    """
+    points = _in_order(points, longest_gap, counts)
+    c, following = pl.col, pl.all().shift(-1)
+    same = (c("id") == c("next_id")).fill_null(False)
+    wait, move = c("next_time") - c("time"), c("next_position") - c("position")
+    points = (
+        points.with_columns(following.name.prefix("next_"))
+        .with_columns(same=same & (c("track") == c("next_track")), wait=wait, move=move)
+        .with_columns(paused=c("same") & (c("wait") > longest_gap))
+        .with_columns(
+            jumped=c("same")
+            & ~c("paused")
+            & ((c("move") > FASTEST * c("wait") + JUMP) | (c("move") < -JUMP))
+        )
+        .with_columns(joined=c("same") & ~c("paused") & ~c("jumped"))
+        .with_columns(chain=c("joined").not_().cum_sum().shift(1, fill_value=0))
+    )
+    # The usual time between the points of a vehicle; more is a gap.
+    usual = c("wait").filter(c("same")).median()
+    on_time = c("time").ceil() == c("time")
+    end = pl.when("joined").then(c("next_time").ceil()).otherwise(c("time").ceil() + on_time)
+    points = points.with_columns(
+        filled=c("joined") & (c("wait") > 1.5 * usual),
+        n=(end - c("time").ceil()).cast(pl.Int64),
+        piece=c("chain") - c("chain").first().over("id"),
+    )
+    told = points.select(
+        followed=c("same").sum(), gaps_cut=c("paused").sum(), jumps_cut=c("jumped").sum(),
+        gaps_filled=c("filled").sum(),
+        seconds_filled=(c("n") - on_time).clip(0).filter("filled").sum(),
+        vehicles=c("id").n_unique(),
+    )  # fmt: skip
+    counts.update(told.row(0, named=True))
+    share = (c("second") - c("time")) / pl.when("joined").then("wait").otherwise(1.0)
+    rows = (
+        points.with_row_index("place")
+        .filter(c("n") > 0)
+        .with_columns(first=c("time").ceil().cast(pl.Int64))
+        .with_columns(second=pl.int_ranges("first", c("first") + c("n")))
+        .explode("second")
+        .with_columns(share=share)
+        .with_columns(_between("position"), _between("speed"))
+        .with_columns(
+            nearer=pl.when(c("share") < 0.5).then("branch").otherwise("next_branch"),
+            changed=(c("share") > 0.0) & (c("next_column") != c("column")),
+        )
+    )
+    at = rows.filter("changed").select(c("nearer"), c("position"))
+    column = rows["column"].to_numpy().copy()
+    column[rows["changed"].to_numpy()] = road.column(*(each.to_numpy() for each in at))
+    speed = rows["speed"].to_numpy()
+    if points["speed"].null_count():
+        speed = _derived(points, rows["place"].to_numpy(), rows["second"].to_numpy())
+    rows = rows.with_columns(column=column, speed=speed).filter(
+        c("column") >= 0, c("speed").is_finite()
+    )
+    counts["negative_speeds"] += rows.filter(c("speed") < 0.0).height
+    counts["seconds"] += len(rows)
+    rows = rows.with_columns(c("speed").clip(0.0), lane=c("lane_number"))
+    wanted = ("id", "piece", "group", "second", "column", "lane", "position", "speed")
+    return rows.select(wanted), _pieces(points, counts)
+
+
+def _between(name: str) -> pl.Expr:
+    at, after = pl.col(name), pl.col(f"next_{name}")
+    return pl.when(pl.col("share") > 0.0).then(at + pl.col("share") * (after - at)).otherwise(at)
+
+
+def _in_order(points: pl.DataFrame, longest_gap: float, counts: Counter[str]) -> pl.DataFrame:
+    """Return points by vehicle and time without duplicates, with the track of each.
+
+    A vehicle that is in two places at once is several vehicles that share an id: each is a track.
+    """
+    c = pl.col
+    late = points.select((c("time").diff().over("id") < 0.0).sum()).item()
+    counts["out_of_order"] += late
+    points = points.sort("id", "time", "row")
+    again = (c("id").diff() == 0) & (c("time").diff() == 0.0)
+    near = (c("position").diff().abs() <= SAME_PLACE) & (c("lane_number").diff() == 0)
+    points = points.with_columns(twice=again.fill_null(False), near=near, track=pl.lit(0))
+    counts["duplicates"] += points.filter("twice", "near").height
+    points = points.filter((c("twice") & c("near")).not_())
+    ambiguous = points.filter("twice")["id"].unique()
+    if len(ambiguous):
+        kept = points.filter(c("id").is_in(ambiguous.implode()).not_())
+        several = points.filter(c("id").is_in(ambiguous.implode()))
+        vehicles = several.partition_by("id", maintain_order=True)
+        tracks = [_tracks(each, longest_gap) for each in vehicles]
+        counts["ids_shared"] += len(tracks)
+        counts["duplicates"] += sum(int((each < 0).sum()) for each in tracks)
+        several = several.with_columns(track=pl.Series(np.concatenate(tracks), dtype=pl.Int32))
+        points = pl.concat([kept, several.filter(c("track") >= 0)], how="vertical_relaxed")
+        points = points.sort("id", "track", "time")
+    return points.drop("twice", "near")
+
+
+def _tracks(points: pl.DataFrame, longest_gap: float) -> IntArray:
+    """Return which of the vehicles that share an id each point belongs to; -1 for a duplicate.
+
+    Points are taken in order of time. Each goes on with the track that would be nearest at its
+    speed, one in its lane rather, if it can be reached, and begins another one otherwise.
+    """
+    # Time, position, lane and speed at the end of each track that may go on.
+    ends: dict[int, tuple[float, float, int, float]] = {}
+    found: IntArray = np.empty(len(points), dtype=np.int64)
+    n = 0
+    rows = points.select("time", "position", "lane_number").iter_rows()
+    for i, (time, position, lane) in enumerate(rows):
+        best, nearest = n, np.inf
+        for number, (t, p, on, v) in list(ends.items()):
+            wait, move = time - t, position - p
+            if wait > longest_gap:
+                del ends[number]
+                continue
+            if wait == 0.0 and abs(move) <= SAME_PLACE and lane == on:
+                best = -1
+                break
+            away = abs(move - v * wait) + SAME_PLACE * (lane != on)
+            if wait > 0.0 and -JUMP <= move <= FASTEST * wait + JUMP and away < nearest:
+                best, nearest = number, away
+        found[i] = best
+        if best == n:
+            ends[n] = time, position, lane, 0.0
+            n += 1
+        elif best >= 0:
+            t, p, _, _ = ends[best]
+            ends[best] = time, position, lane, (position - p) / (time - t)
+    return found
+
+
+def _derived(points: pl.DataFrame, place: IntArray, second: IntArray) -> FloatArray:
+    """Return mean speeds [km/h] around seconds, from positions of the same piece.
+
+    A piece of a single point has none: NaN.
+    """
+    time, position, piece = (points[name].to_numpy() for name in ("time", "position", "chain"))
+    first = np.searchsorted(piece, np.arange(piece[-1] + 1))
+    last = np.append(first[1:], len(piece)) - 1
+    start = np.maximum(second - HALF_WIDTH, time[first[piece[place]]])
+    end = np.minimum(second + HALF_WIDTH, time[last[piece[place]]])
+    # Pieces one after another on a single axis, so that one interpolation serves all.
+    lengths = time[last] - time[first]
+    offset = np.concatenate([[0.0], np.cumsum(lengths + 1.0)[:-1]]) - time[first]
+    axis, shift = time + offset[piece], offset[piece[place]]
+    moved = np.interp(end + shift, axis, position) - np.interp(start + shift, axis, position)
+    none = np.full(len(place), np.nan)
+    speed: FloatArray = np.divide(3600.0 * moved, end - start, none, where=end > start)
+    return speed
+
+
+def _pieces(points: pl.DataFrame, counts: Counter[str]) -> pl.DataFrame:
+    """Return begin, end, move [km] and the ratio of speeds to positions of each piece."""
+    c = pl.col
+    mean = 0.5 * (c("next_speed") + c("speed"))
+    # As its speeds say, by the trapezoidal rule.
+    driven = pl.when("joined").then(mean * c("wait") / 3600.0).otherwise(0.0)
+    pieces = points.group_by("chain", maintain_order=True).agg(
+        group=c("group").first(), begin=c("time").first(), end=c("time").last(),
+        enters=c("column").first(), leaves=c("column").last(), n=c("n").sum(),
+        move=c("position").last() - c("position").first(),
+        driven=pl.when(c("speed").null_count() == 0).then(driven.sum()),
+    )  # fmt: skip
+    counts.update(pieces=len(pieces), too_short=pieces.filter(c("n") == 0).height)
+    return pieces.drop("chain", "n").with_columns(ratio=c("driven") / c("move").abs())
+
+
+def count_ends(
+    pieces: pl.DataFrame, coverage: Mapping[str, tuple[float, float]], road: Road
+) -> Counter[str]:
+    """Count where the pieces of trajectories begin and end: at an entry, or amid the road."""
+    road_ = road.corridor
+    n, first, n_on = road_.n_mainline, road_.n_segments, road_.n_on_ramps
+    before = range(first + 2, first + 2 + n_on)
+    after = range(first + 2 + n_on, first + 2 + road_.n_ramps)
+    entries = [0, first, *itertools.chain(*road_.on_ramp_segments), *before]
+    exits = [n - 1, first + 1, *itertools.chain(*road_.off_ramp_segments), *after]
+    first_time, last_time = (
+        pl.col("group").replace_strict({g: c[i] for g, c in coverage.items()}) for i in (0, 1)
+    )
+    at_start, at_end = pl.col("begin") < first_time + 1.0, pl.col("end") > last_time - 1.0
+    enters, leaves = pl.col("enters").is_in(entries), pl.col("leaves").is_in(exits)
+    told = pieces.select(
+        present_at_start=at_start.sum(), entered=(enters & ~at_start).sum(),
+        appeared=(~enters & ~at_start).sum(), present_at_end=at_end.sum(),
+        left=(leaves & ~at_end).sum(), vanished=(~leaves & ~at_end).sum(),
+    )  # fmt: skip
+    return Counter(told.row(0, named=True))
+
+
+def check_pieces(pieces: pl.DataFrame, where: str, units: Mapping[str, str]) -> float | None:
+    """Return the median ratio of given speeds to those of positions, of the longer pieces.
+
+    Raises:
+        TrajectoryError: Vehicles move backwards, or the ratio is not near 1.
+    """
+    distance = pl.col("move").abs()
+    pieces = pieces.filter(distance >= pl.max_horizontal(distance.median(), 1e-9))
+    share = pieces.filter(pl.col("move") < 0.0).height / max(len(pieces), 1)
+    if share > 0.1:
+        told = "one direction must be chosen by source.where or source.groups"
+        told = "layout.reversed must be turned round" if share > 0.9 else told
+        raise TrajectoryError(
+            f"{where}: {told}, got positions that decrease for {100.0 * share:.0f} % of the "
+            "vehicles"
+        )
+    lasting = pieces.filter(pl.col("end") > pl.col("begin"))
+    speeds = 3600.0 * lasting["move"] / (lasting["end"] - lasting["begin"])
+    usual: float | None = speeds.median()  # type: ignore[assignment]
+    if usual is not None and not SLOWEST_ROAD <= usual <= FASTEST_ROAD:
+        raise TrajectoryError(
+            f"{where}: vehicles must usually drive {SLOWEST_ROAD:g} to {FASTEST_ROAD:g} km/h, got "
+            f"{usual:.4g} km/h from positions and times: are the units right (time in "
+            f"{units['time']}, length in {units['length']})?"
+        )
+    ratio: float | None = pieces.select(pl.col("ratio").drop_nans().median()).item()
+    if ratio is None or 1.0 / TOLERANCE <= ratio <= TOLERANCE:
+        return ratio  # None without speeds
+    # Speeds in a larger unit are larger, and so are positions, to which they are held.
+    fits = [
+        f"{name} in {other}"
+        for name, known, power in (("speed", SPEEDS, 1), ("length", LENGTHS, -1))
+        for other, factor in known.items()
+        if abs(ratio * (factor / known[units[name]]) ** power - 1.0) < 0.05
+    ]
+    raise TrajectoryError(
+        f"{where}: speeds must agree with positions, got speeds {ratio:.4g} times as large as "
+        f"positions say (speed in {units['speed']}, length in {units['length']}); what would "
+        f"agree: {' or '.join(fits) or 'no known unit'}"
+    )

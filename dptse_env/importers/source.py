@@ -1,0 +1,166 @@
+"""What a file of trajectories means: its format, columns and units, and where the road lies in it.
+
+All of it can be given in a TOML file with the fields of `Source`; ``docs/own_data.md`` has
+examples.
+"""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+from dptse_env.utils.fields import Interval, checked_fields, from_mapping, require, require_name
+
+TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "frame": 0.0}
+"""Units of times in seconds; frames need a `Source.frame_rate`."""
+LENGTHS = {"m": 1e-3, "km": 1.0, "ft": 0.0003048, "mi": 1.609344}
+"""Units of lengths in kilometres."""
+SPEEDS = {"m/s": 3.6, "km/h": 1.0, "ft/s": 1.09728, "mi/h": 1.609344}
+"""Units of speeds in km/h."""
+UNITS = {"time": TIMES, "length": LENGTHS, "speed": SPEEDS}
+
+NUMBERS = ("time", "x", "y", "speed", "extent")
+LABELS = ("vehicle", "lane", "edge", "group")
+ROLES = NUMBERS + LABELS
+"""Roles of columns. ``x`` is the position along the road, along an ``edge`` of a network, or, with
+``y``, in the plane; else ``y`` is lateral. ``extent`` is the length of a vehicle along ``x``, for
+data in which ``x`` is a corner of its box. A ``group`` is a road of its own in the file, such as a
+driving direction."""
+
+LONGEST_SHOWN, MOST_SHOWN = 60, 20
+"""Characters of a text of a file, and texts of a list, that a message shows."""
+
+
+class TrajectoryError(ValueError):
+    """A file of trajectories cannot be imported; the message names file, row and field."""
+
+
+def shown(*texts: object) -> str:
+    """Return what a file says for a message, cut where it is long."""
+    cut = [
+        text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]}..."
+        for text in map(str, texts[:MOST_SHOWN])
+    ]
+    more = f" and {len(texts) - MOST_SHOWN} more" if len(texts) > MOST_SHOWN else ""
+    return ", ".join(cut) + more
+
+
+@dataclass(frozen=True)
+class Part:
+    """Criteria for vehicles on a part of the road; without any, all other vehicles are on it.
+
+    Attributes:
+        lanes: names of its lanes.
+        lateral: range of lateral positions, in the file's unit of length.
+    """
+
+    lanes: tuple[int | str, ...] = ()
+    lateral: tuple[float, float] | None = None
+
+    @property
+    def names(self) -> frozenset[str]:
+        """Names of the lanes as text."""
+        return frozenset(map(str, self.lanes))
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Position of the road in the data. Lengths are in the file's unit.
+
+    Attributes:
+        origin: position of the upstream end of the first mainline segment.
+        reversed: whether positions decrease in the direction of travel.
+        extent: in data with both directions, the position at which that against x begins.
+        centre_line: points of the road's axis in the plane, in the direction of travel. Positions
+            and lateral positions, positive to the left, are then those of the projection on it.
+        mainline: lanes or lateral range of the mainline.
+        on_ramps: the same for each on-ramp. A ramp's vehicles count as the mainline's from its
+            face on.
+        off_ramps: the same for each off-ramp, whose vehicles count as the mainline's before it.
+        edges: for data by edges of a network, where each edge lies: the name of a record column
+            (``main_3``, ``on_0``, ``upstream``, ``before_on_0``, ...), or the kilometre of the
+            mainline at which the edge starts. By default edges have the names of the columns.
+    """
+
+    origin: float = 0.0
+    reversed: bool = False
+    extent: float | None = None
+    centre_line: tuple[tuple[float, float], ...] = ()
+    mainline: Part = field(default_factory=Part)
+    on_ramps: tuple[Part, ...] = ()
+    off_ramps: tuple[Part, ...] = ()
+    edges: dict = field(default_factory=dict)  # type: ignore[type-arg]
+
+    def __post_init__(self) -> None:
+        """Check the fields."""
+        checked_fields(self, "layout")
+        line = self.centre_line
+        require(len(line) != 1, "layout.centre_line", "two points or more, or none", line)
+        for name, value in self.edges.items():
+            known = isinstance(value, str | int | float) and not isinstance(value, bool)
+            allowed = "the name of a column or a number of kilometres"
+            require(known, f"layout.edges.{name}", allowed, value)
+
+
+@dataclass(frozen=True)
+class Source:
+    """Meaning of a file of trajectories.
+
+    Attributes:
+        format: name of the format; see `dptse_env.importers.FORMATS`.
+        columns: name of the file's column by role (`ROLES`); changes those of the format.
+        units: unit by quantity, ``time``, ``length`` and ``speed``; changes those of the format.
+        where: values that columns must have; other rows are left out.
+        groups: separate roads in the file that are wanted, such as ``lower`` for one driving
+            direction of highD; empty for all.
+        frame_rate: frames a second, where times are frames.
+        time_shift: added to all times [s]; None for what the format has.
+        layout: where the road lies.
+    """
+
+    format: str
+    columns: dict = field(default_factory=dict)  # type: ignore[type-arg]
+    units: dict = field(default_factory=dict)  # type: ignore[type-arg]
+    where: dict = field(default_factory=dict)  # type: ignore[type-arg]
+    groups: tuple[int | str, ...] = ()
+    frame_rate: Annotated[float, Interval(0.01, 10_000)] = 25.0
+    time_shift: float | None = None
+    layout: Layout = field(default_factory=Layout)
+
+    def __post_init__(self) -> None:
+        """Check the fields."""
+        checked_fields(self, "source")
+        for role, column in self.columns.items():
+            require_name("source.columns", role, ROLES)
+            require(isinstance(column, str), f"source.columns.{role}", "a column's name", column)
+        for quantity, unit in self.units.items():
+            require_name("source.units", quantity, UNITS)
+            require_name(f"source.units.{quantity}", unit, UNITS[quantity])
+
+    def factor(self, quantity: str, default: str) -> float:
+        """Return the factor of a quantity to s, km or km/h, given the format's unit."""
+        unit = self.units.get(quantity, default)
+        return 1.0 / self.frame_rate if unit == "frame" else UNITS[quantity][unit]
+
+
+def read_source(path: str | os.PathLike[str]) -> Source:
+    """Read a TOML file with the fields of `Source`.
+
+    Raises:
+        ValueError: It cannot be read, is no TOML, or a field is unknown or out of range; the
+            message starts with the file's path.
+    """
+    path = Path(path)
+    try:
+        content: dict[str, Any] = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except OSError as problem:
+        raise ValueError(f"{path}: the mapping cannot be read: {problem.strerror}") from problem
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as problem:
+        raise ValueError(f"{path}: a mapping must be TOML: {problem}") from problem
+    try:
+        return from_mapping(Source, content, "source")
+    except ValueError as problem:
+        raise ValueError(f"{path}: {problem}") from problem

@@ -1,0 +1,192 @@
+"""Folders of imported records: real or foreign traffic, not simulated.
+
+Such records cannot be made again, so nothing here replaces one: what is missing, damaged or
+exchanged is an error. Importers write the folder, and a corridor names it (`Recordings`).
+"""
+
+import functools
+import json
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+from dptse_env.traffic.corridor import Recordings
+from dptse_env.traffic.record import InvalidRecordError, Record
+from dptse_env.utils.fields import integer, parse_object
+from dptse_env.utils.files import json_digest
+
+MANIFEST = "manifest.json"
+FORMAT = "dptse-recordings"
+VERSION = 2
+
+LARGEST_MANIFEST = 10_000_000
+"""Largest size of a manifest [bytes]."""
+
+Kind = Literal["vehicles", "fields"]
+"""Kind of the records of a folder."""
+
+_IMPORTS = {"vehicles": "import trajectories", "fields": "import field"}
+"""Commands that write folders of each kind."""
+
+_KEYS = {"format": str, "version": int, "kind": str, "road": dict, "records": dict, "sources": list}
+
+
+def record_path(folder: str | Path, seed: int) -> Path:
+    """Return the path of a record in a folder of recordings, whether it exists or not."""
+    return Path(folder) / "records" / f"{seed:08d}.safetensors"
+
+
+def save_record(folder: Path, seed: int, road: Mapping[str, Any], record: Record) -> None:
+    """Write the record of a traffic seed to a folder whose manifest is written last.
+
+    Args:
+        folder: The folder of the recordings.
+        seed: The traffic seed.
+        road: `Corridor.record_layout` of the road that the record is made for.
+        record: The record.
+
+    Raises:
+        OSError: It cannot be written.
+    """
+    record.save(record_path(folder, seed), _source(seed, road))
+
+
+def write_manifest(
+    folder: Path,
+    road: Mapping[str, Any],
+    digests: Mapping[int, str],
+    sources: list[dict[str, Any]],
+    kind: Kind = "vehicles",
+) -> str:
+    """Write the manifest of a folder whose records are complete; return its digest.
+
+    Args:
+        folder: The folder of the recordings.
+        road: `Corridor.record_layout` of the road that they are made for.
+        digests: `Record.digest` of each record by traffic seed.
+        sources: JSON descriptions of the windows that they were cut from, for the reader.
+        kind: Whether the records have vehicles or are measured fields.
+    """
+    manifest = {
+        "format": FORMAT,
+        "version": VERSION,
+        "kind": kind,
+        "road": dict(road),
+        "records": {str(seed): digest for seed, digest in digests.items()},
+        "sources": sources,
+    }
+    (folder / MANIFEST).write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")
+    return _digest(manifest)
+
+
+def recorded_seeds(recordings: Recordings) -> tuple[int, ...]:
+    """Return the traffic seeds that there are records of, ascending.
+
+    Raises:
+        InvalidRecordError: The manifest is missing, damaged, or not that of the digest.
+    """
+    return tuple(sorted(map(int, _manifest(recordings)["records"])))
+
+
+def has_vehicles(recordings: Recordings) -> bool:
+    """Return whether the records have vehicles; errors are those of `recorded_seeds`."""
+    return bool(_manifest(recordings)["kind"] == "vehicles")
+
+
+def require_seeds(recordings: Recordings, seeds: Iterable[int]) -> None:
+    """Raise ``ValueError`` unless there is a record of each of `seeds`."""
+    known = recorded_seeds(recordings)
+    lacking = sorted(set(seeds) - set(known))
+    if lacking:
+        raise ValueError(
+            f"traffic seed must be one that was recorded ({ranges(known):.200} in "
+            f"{recordings.folder}), got {ranges(lacking):.200}"
+        )
+
+
+def load_record(recordings: Recordings, seed: int, road: Mapping[str, Any]) -> Record:
+    """Read the record of a traffic seed.
+
+    Args:
+        recordings: The folder.
+        seed: The traffic seed.
+        road: What the record must be made for: `Corridor.record_layout`.
+
+    Raises:
+        ValueError: There is no record of the seed.
+        InvalidRecordError: The record is damaged or another one, or made for another road.
+    """
+    require_seeds(recordings, [integer("traffic seed", seed, 0)])
+    manifest, path = _manifest(recordings), record_path(recordings.folder, seed)
+    if manifest["road"] != road:
+        differing = [key for key in road if manifest["road"].get(key) != road[key]]
+        raise InvalidRecordError(
+            f"{recordings.folder} was recorded on a road with other {', '.join(differing)} than "
+            f"the corridor's: import the trajectories again for this corridor"
+        )
+    try:
+        record = Record.load(path, _source(seed, road), _shape(road))
+    except FileNotFoundError as problem:
+        raise InvalidRecordError(f"{path}: the record is missing") from problem
+    if record.digest != manifest["records"][str(seed)]:
+        raise InvalidRecordError(f"{path}: it is not the record that was imported")
+    return record
+
+
+def ranges(seeds: Iterable[int]) -> str:
+    """Return integers as text, neighbours together: ``0..3, 7``; ``none`` if there are none."""
+    found: list[list[int]] = []
+    for seed in sorted(seeds):
+        if found and seed == found[-1][1] + 1:
+            found[-1][1] = seed
+        else:
+            found.append([seed, seed])
+    return ", ".join(str(a) if a == b else f"{a}..{b}" for a, b in found) or "none"
+
+
+@functools.lru_cache(maxsize=64)
+def _manifest(recordings: Recordings) -> dict[str, Any]:
+    """Read a manifest and hold it to the digest; what was read once need not be read again."""
+    path = Path(recordings.folder) / MANIFEST
+    try:
+        if path.stat().st_size > LARGEST_MANIFEST:
+            raise InvalidRecordError(f"{path} must have at most {LARGEST_MANIFEST} bytes")
+        manifest = parse_object(path.read_bytes(), str(path), _KEYS)
+    except OSError as problem:
+        message = f"{path}: recordings cannot be read: {problem.strerror}"
+        raise InvalidRecordError(message) from problem
+    except ValueError as problem:
+        raise InvalidRecordError(str(problem)) from problem
+    found = manifest["format"], manifest["version"]
+    if found == (FORMAT, 1):
+        command = _IMPORTS.get(manifest["kind"], _IMPORTS["vehicles"])
+        raise InvalidRecordError(
+            f"{path}: an earlier version wrote these recordings: import the files again with "
+            f"'dptse {command} ... --output FOLDER'"
+        )
+    if found != (FORMAT, VERSION):
+        raise InvalidRecordError(f"{path}: format must be {(FORMAT, VERSION)}, got {found!r:.100}")
+    if _digest(manifest) != recordings.digest:
+        raise InvalidRecordError(
+            f"{path}: it is not the manifest of corridor.recordings.digest "
+            f"{recordings.digest!r:.100}"
+        )
+    for seed in manifest["records"]:
+        if not (seed.isdecimal() and len(seed) < 19):
+            raise InvalidRecordError(f"{path}: records must have traffic seeds, got {seed!r:.100}")
+    return manifest
+
+
+def _digest(manifest: Mapping[str, Any]) -> str:
+    content = {key: manifest[key] for key in ("format", "version", "kind", "road", "records")}
+    return json_digest(content)
+
+
+def _shape(road: Mapping[str, Any]) -> tuple[int, int]:
+    """Return `Corridor.record_shape`, given the layout."""
+    n_ramps = len(road["ramp_segments"])
+    return road["duration"] + 1, road["n_mainline"] + sum(road["ramp_segments"]) + 2 + n_ramps
+
+
+def _source(seed: int, road: Mapping[str, Any]) -> dict[str, object]:
+    return {"recorded": True, "seed": seed, "road": dict(road)}

@@ -1,0 +1,183 @@
+"""Recording in worker processes, each of which runs one simulation of SUMO at a time.
+
+libsumo has one simulation in a process, and a crash of SUMO ends its process; so it runs in none of
+the caller's. Workers are plain processes of the interpreter that loky starts: they never import the
+caller's ``__main__``. When one dies, loky fails all tasks; those are done again by new workers.
+"""
+
+import contextlib
+import logging
+import multiprocessing
+import os
+import re
+import shutil
+import signal
+import tempfile
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from itertools import islice
+from pathlib import Path
+
+from loky import ProcessPoolExecutor
+from loky.process_executor import BrokenProcessPool
+
+from dptse_env.traffic.corridor import Corridor
+from dptse_env.traffic.record import Record
+from dptse_env.traffic.sumo import RecordingError, SumoVersionError, simulate
+from dptse_env.traffic.sumo_input import NetworkError
+from dptse_env.utils.registry import MissingExtraError
+
+ATTEMPTS = 3
+"""Workers that may die on a traffic seed, for instance for lack of memory. An error that a worker
+reports is final, since the same seed would fail in the same way again."""
+
+WATCH = 0.5
+"""Time [s] between two looks of a worker at whether its parent is there."""
+
+Sources = Mapping[int, Mapping[str, object]]
+"""What is saved with the record of each traffic seed; see `Record.save`."""
+
+logger = logging.getLogger(__name__)
+
+
+def record_seeds(
+    corridor: Corridor,
+    paths: Mapping[int, Path],
+    sources: Sources,
+    workers: int = 1,
+    done: Callable[[], object] = lambda: None,
+) -> None:
+    """Record traffic seeds, several at once.
+
+    Args:
+        corridor: The road.
+        paths: The file of each traffic seed's record, which is replaced if it exists.
+        sources: What is saved with each.
+        workers: Number of processes.
+        done: Called after each record.
+
+    Raises:
+        RecordingError: A recording fails, or `ATTEMPTS` workers died on a seed. Recordings in
+            progress are finished and kept, no other is started.
+        NetworkError: The corridor has to be compiled and cannot be.
+        SumoVersionError: libsumo is missing, broken or of another release series.
+        MissingExtraError: The corridor has to be compiled and netconvert is missing.
+    """
+    waiting, deaths = dict(paths), Counter[int]()
+
+    def finished(seed: int) -> None:
+        del waiting[seed]
+        done()
+
+    while waiting:
+        # One whose worker died is recorded alone, so that another death is on its account.
+        alone = [seed for seed in waiting if deaths[seed]][:1]
+        seeds = {seed: paths[seed] for seed in alone or waiting}
+        lost, cause = _record_until_death(corridor, seeds, sources, workers, finished)
+        deaths.update(lost)
+        for seed in lost:
+            if deaths[seed] == ATTEMPTS:
+                cause = f"{cause}\n(tried {ATTEMPTS} times; no worker survived it)"
+                raise RecordingError.from_cause(corridor, seed, cause)
+        if lost:
+            again = ", ".join(map(str, lost[:20]))
+            logger.warning("%s: %s; recording again: traffic seeds %s", corridor.name, cause, again)
+
+
+def simulate_in_worker(corridor: Corridor, seed: int) -> Record:
+    """Simulate and record one scenario in another process; errors are those of `record_seeds`."""
+    with tempfile.TemporaryDirectory(prefix="dptse-record-") as folder:
+        path = Path(folder) / "record"
+        record_seeds(corridor, {seed: path}, {seed: {}})
+        return Record.load(path, {}, corridor.record_shape)
+
+
+def _record_until_death(
+    corridor: Corridor,
+    paths: Mapping[int, Path],
+    sources: Sources,
+    workers: int,
+    finished: Callable[[int], None],
+) -> tuple[list[int], str]:
+    """Record until all is done or a worker dies; return what was in progress then, and why."""
+    waiting, running, cause = iter(paths), dict[Future[None], int](), ""
+    with _worker_processes(min(workers, len(paths))) as (pool, n_workers):
+        while not cause:
+            try:
+                # No more than there are workers: all of them are in progress.
+                for seed in islice(waiting, n_workers - len(running)):
+                    task = corridor, seed, paths[seed], dict(sources[seed])
+                    running[pool.submit(_record, *task)] = seed
+            except BrokenProcessPool as error:
+                cause = _cause(error)
+            if not running:
+                break
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                try:
+                    future.result()
+                except BrokenProcessPool as error:
+                    cause = _cause(error)
+                else:
+                    finished(running.pop(future))
+    return list(running.values()), cause
+
+
+@contextlib.contextmanager
+def _worker_processes(n_workers: int) -> Iterator[tuple[ProcessPoolExecutor, int]]:
+    """Start processes that end with this one, and remove what they leave in their folder."""
+    this = multiprocessing.current_process()
+    # Daemonic processes, such as those of vectorised environments, may have no children since these
+    # would outlive them; workers do not.
+    was_daemon, this.daemon = this.daemon, False
+    try:
+        with (
+            tempfile.TemporaryDirectory(prefix="dptse-worker-") as folder,
+            ProcessPoolExecutor(
+                n_workers,
+                initializer=follow_parent,
+                initargs=(os.getpid(), folder),
+                # Modules in the working directory must not shadow those of the interpreter.
+                env={"TMPDIR": folder, "PYTHONSAFEPATH": "1"},
+            ) as pool,
+        ):
+            yield pool, n_workers
+    finally:
+        this.daemon = was_daemon
+
+
+def follow_parent(parent: int, folder: str | None = None) -> None:
+    """Leave interrupts to the parent of this process, and end when it ends.
+
+    Args:
+        parent: The process id of the parent.
+        folder: A folder to remove if the parent is killed and cannot do so.
+    """
+
+    def end_with_parent() -> None:
+        while os.getppid() == parent:
+            time.sleep(WATCH)
+        if folder is not None:
+            shutil.rmtree(folder, ignore_errors=True)
+        os._exit(1)
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=end_with_parent, daemon=True).start()
+
+
+def _record(corridor: Corridor, seed: int, path: Path, source: dict[str, object]) -> None:
+    try:
+        simulate(corridor, seed).save(path, source)
+    except (RecordingError, NetworkError, SumoVersionError, MissingExtraError):
+        raise
+    except Exception as error:
+        cause = f"{type(error).__name__}: {error}"
+        raise RecordingError.from_cause(corridor, seed, cause) from error
+
+
+def _cause(error: BrokenProcessPool) -> str:
+    """Return what is known of a worker's death: loky's message has exit codes of all workers."""
+    codes = re.search(r"exit codes of the workers are \{(.{1,200}?)\}", str(error))
+    return f"a recording process died ({codes[1] if codes else type(error).__name__})"

@@ -1,0 +1,319 @@
+"""Roads by name, and roads as TOML files.
+
+The corridors that come with the package have an `average_dwell` measured on the training seeds
+0..15, by ``dptse record --corridor NAME --seeds 0:16``; a test repeats the measurement.
+
+A road file is a corridor, and the keywords of an environment that suit it. It has the fields of
+`Corridor`, with tables for ``demand``, ``incident``, ``drivers`` and ``recordings``, whose folder
+may be relative to the file, and a table ``environment`` of keywords of ``gym.make`` that hold on
+this road unless the caller gives them. ``docs/own_road.md`` has the format and an example.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import re
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeGuard
+
+import tomli_w
+
+from dptse_env.traffic.corridor import Corridor
+from dptse_env.traffic.demand import Demand, DemandDistribution, Incident, IncidentDistribution
+from dptse_env.utils.fields import from_mapping, shown
+from dptse_env.utils.files import write_atomically
+from dptse_env.utils.registry import Registry
+
+SUFFIX = ".toml"
+"""Ending of the name of a road file."""
+
+LARGEST_FILE = 10_000_000
+"""Bytes of a road file at most."""
+
+ASSUMED_PACE = 3.0
+"""Assumed ratio of the average dwell to the time of a crossing at the speed limit, where a file
+does not give the dwell. Records of the shipped roads, with their jams, have 2.8 to 2.9."""
+
+DENSITY_SCALE = 111.0
+"""Scale of densities for each lane [veh/km], which the shipped roads have, too."""
+
+_OPTIONAL: dict[str, Any] = {
+    "on_ramps": (),
+    "off_ramps": (),
+    "exit_shares": (),
+    "incident": None,
+    "fixed_sensors": (),
+}
+_ENVIRONMENT = "environment"
+PARTS = ("action", "estimator", "observation", "privacy", "reward")
+"""Keywords that take names of parts. In a file these are registered names: ``"module:Name"`` would
+let a file that somebody sent run code of the current folder."""
+_WITH_FOLDER = ("recordings", "network")
+_FILE_ENDINGS = (".json", ".safetensors")
+
+
+PAPER_HIGHWAY = Corridor(
+    name="paper-highway",
+    n_mainline=15,
+    on_ramps=(3, 9),
+    off_ramps=(6, 12),
+    exit_shares=(0.1, 0.1),
+    demand=Demand(
+        mainline=((0.0, 2050.0), (200.0, 6050.0), (400.0, 2050.0)), on_ramps=(320.0, 300.0)
+    ),
+    incident=Incident(segment=10, phases=((200.0, 400.0, 10.08), (400.0, 500.0, 50.95))),
+    fixed_sensors=(14, 17, 18),
+    duration=700,
+    average_dwell=10.25,
+)
+"""The paper's 1.5 km stretch (section IV), its demand and its incident on segment 11.
+
+The paper does not state the three lanes, the exit shares of 10 % and the end after 700 s.
+"""
+
+SHORT_HIGHWAY = Corridor(
+    name="short-highway",
+    n_mainline=6,
+    on_ramps=(2,),
+    off_ramps=(4,),
+    exit_shares=(0.1,),
+    demand=Demand(mainline=((0.0, 1800.0), (60.0, 3000.0), (150.0, 1500.0)), on_ramps=(300.0,)),
+    incident=Incident(segment=4, phases=((60.0, 140.0, 12.0), (140.0, 170.0, 50.0))),
+    fixed_sensors=(5, 7),
+    duration=240,
+    lanes=2,
+    density_scale=222.0,
+    average_dwell=9.95,
+)
+"""A 0.6 km stretch with one ramp of each kind and a jam, for tests and first trials."""
+
+LONG_HIGHWAY = Corridor(
+    name="long-highway",
+    n_mainline=120,
+    on_ramps=(24, 52, 80, 108),
+    off_ramps=(20, 48, 76, 104),
+    exit_shares=(0.1, 0.1, 0.1, 0.1),
+    demand=DemandDistribution(
+        Demand(
+            mainline=((0.0, 3000.0), (300.0, 5000.0), (750.0, 3000.0)),
+            on_ramps=(400.0, 400.0, 400.0, 400.0),
+        )
+    ),
+    incident=(
+        IncidentDistribution(tuple(range(10, 60)), start=(300.0, 700.0)),
+        IncidentDistribution(tuple(range(60, 119)), start=(400.0, 800.0)),
+    ),
+    fixed_sensors=(119, 124, 125, 126, 127),
+    duration=1200,
+    average_dwell=4.52,
+)
+"""A 12 km stretch with four interchanges; demand level and two incidents vary with the seed."""
+
+SHIPPED_CORRIDORS = (PAPER_HIGHWAY, SHORT_HIGHWAY, LONG_HIGHWAY)
+"""Corridors whose compiled networks come with the package."""
+
+CORRIDORS = Registry(
+    "corridor",
+    {corridor.name: corridor for corridor in SHIPPED_CORRIDORS},
+    check=lambda part: (
+        None if isinstance(part, Corridor) or callable(part) else "be a Corridor, or return one"
+    ),
+)
+"""Corridors by name."""
+
+
+def find_corridor(value: Any) -> Corridor:
+    """Return a corridor by name, of a road file, by ``"package.module:NAME"``, or as it is.
+
+    A string that ends in ``.toml`` is a road file (`read_road`); a function returns the corridor.
+
+    Raises:
+        ValueError: There is none, or it is no `Corridor`.
+    """
+    if is_road_file(value):
+        return read_corridor(value)
+    corridor = CORRIDORS.find(value)
+    if not isinstance(corridor, Corridor) and callable(corridor):
+        corridor = corridor()
+    if not isinstance(corridor, Corridor):
+        raise ValueError(
+            f"corridor {shown(value)} must be a Corridor, or return one, got {shown(corridor)}"
+        )
+    return corridor
+
+
+def randomised(corridor: Corridor) -> Corridor:
+    """Return `corridor` with a random demand level and incident for every traffic seed.
+
+    The demand varies by a fifth either way. The incident may block any mainline segment but the
+    last, at any time that leaves a third of the record for the jam, with ranges in proportion to
+    the record's duration. The demand of `corridor` is the base of the distribution; its incident is
+    dropped. Other fields are unchanged, also `average_dwell`, which should be measured again.
+    """
+    base, total = corridor.published_demand, corridor.duration
+    incident = IncidentDistribution(
+        segments=tuple(range(corridor.n_mainline - 1)),
+        start=(0.1 * total, 0.65 * total),
+        duration=(0.1 * total, 0.4 * total),
+        recovery_duration=(0.05 * total, 0.2 * total),
+    )
+    return dataclasses.replace(corridor, demand=DemandDistribution(base), incident=incident)
+
+
+@dataclass(frozen=True)
+class RoadFile:
+    """The content of a road file.
+
+    Attributes:
+        corridor: The road.
+        environment: Keywords of an environment that suit the road. Names of files in it, strings
+            that end in ``.json`` or ``.safetensors``, are absolute.
+        assumed: Fields of the corridor that neither the file nor a record of the road gives.
+    """
+
+    corridor: Corridor
+    environment: Mapping[str, Any] = field(default_factory=dict)
+    assumed: tuple[str, ...] = ()
+
+
+def is_road_file(value: object) -> TypeGuard[str | os.PathLike[str]]:
+    """Return whether a value names a road file, by the ending of its name."""
+    return isinstance(value, str | os.PathLike) and os.fspath(value).endswith(SUFFIX)
+
+
+def read_road(path: str | os.PathLike[str]) -> RoadFile:
+    """Read a road file.
+
+    Fields that may be left out: ``name`` is then the file's, there are no ramps, incidents or fixed
+    sensors, and the scales follow lanes and speed limit. The average dwell is then assumed to be
+    `ASSUMED_PACE` times the time of a crossing at the speed limit, and named in ``assumed``.
+
+    Raises:
+        ValueError: There is no such file, it is no TOML, a field is unknown, missing or out of
+            range, or a part is named by an import string; the message starts with the file's path
+            and the field.
+    """
+    path = Path(path)
+    content = _content(path)
+    environment = content.pop(_ENVIRONMENT, {})
+    if not isinstance(environment, Mapping):
+        raise ValueError(f"{path}: {_ENVIRONMENT} must be a table, got {shown(environment)}")
+    if "corridor" in environment:
+        raise ValueError(f"{path}: {_ENVIRONMENT}.corridor must be left out: this file is one")
+    try:
+        corridor, assumed = _corridor(content, path)
+    except ValueError as problem:
+        raise ValueError(f"{path}: {problem}") from problem
+    try:
+        for key in PARTS:
+            _require_names(environment.get(key), f"{path}: {_ENVIRONMENT}.{key}")
+        keywords = {key: _absolute(value, path.parent) for key, value in environment.items()}
+    except RecursionError as problem:
+        raise ValueError(f"{path}: {_ENVIRONMENT} must not be nested so deeply") from problem
+    return RoadFile(corridor, keywords, assumed)
+
+
+def read_corridor(path: str | os.PathLike[str]) -> Corridor:
+    """Return the corridor of a road file; errors are those of `read_road`."""
+    return read_road(path).corridor
+
+
+def write_corridor(
+    path: str | os.PathLike[str],
+    corridor: Corridor,
+    environment: Mapping[str, Any] | None = None,
+    comment: str = "",
+) -> None:
+    """Write a road file that `read_road` reads as the same corridor, completely or not at all.
+
+    Args:
+        path: The file; its folder exists.
+        corridor: The road.
+        environment: Keywords of an environment for the table ``environment``.
+        comment: Text for the head of the file.
+    """
+    content = _plain(dataclasses.asdict(corridor))
+    for name in _WITH_FOLDER:
+        given = getattr(corridor, name)
+        if given is None:
+            continue
+        folder, home = Path(given.folder).absolute(), Path(path).absolute().parent
+        if folder.is_relative_to(home):  # so that the folder can be moved with the file in it
+            content[name]["folder"] = str(folder.relative_to(home))
+    if environment:
+        content[_ENVIRONMENT] = _plain(dict(environment))
+    head = "".join(f"# {line}\n" for line in comment.splitlines())
+    write_atomically(path, head + tomli_w.dumps(content))
+
+
+def _content(path: Path) -> dict[str, Any]:
+    try:
+        if path.stat().st_size > LARGEST_FILE:
+            raise ValueError(f"{path}: a road file must have at most {LARGEST_FILE} bytes")
+        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except OSError as problem:
+        raise ValueError(f"{path}: the road file cannot be read: {problem.strerror}") from problem
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as problem:
+        raise ValueError(f"{path}: a road file must be TOML: {problem}") from problem
+
+
+def _corridor(content: Mapping[str, Any], path: Path) -> tuple[Corridor, tuple[str, ...]]:
+    """Return the corridor of a file's fields, and the names of those that were assumed."""
+    fields = {**_OPTIONAL, **content}
+    for name in _WITH_FOLDER:
+        given = fields.get(name)
+        if isinstance(given, Mapping) and isinstance(given.get("folder"), str):
+            folder = str((path.parent / given["folder"]).absolute())
+            fields[name] = {**given, "folder": folder}
+    if "name" not in fields:
+        fields["name"] = re.sub(r"[^a-z0-9]+", "-", path.stem.lower()).strip("-")
+    corridor = from_mapping(Corridor, fields, "corridor")
+    n = corridor.n_mainline
+    crossings = [
+        3600.0 * length / limit
+        for length, limit in zip(corridor.segment_lengths, corridor.speed_limits, strict=True)
+    ]
+    derived = {
+        "density_scale": DENSITY_SCALE * corridor.most_lanes,
+        "speed_scale": corridor.largest_speed_limit,
+        "average_dwell": ASSUMED_PACE * sum(crossings[:n]) / n,
+    }
+    fields |= {name: value for name, value in derived.items() if name not in content}
+    assumed = () if "average_dwell" in content else ("average_dwell",)
+    return from_mapping(Corridor, fields, "corridor"), assumed
+
+
+def _require_names(value: Any, path: str) -> None:
+    """Refuse a value of a keyword for parts that has ``"module:Name"`` in it."""
+    if isinstance(value, str) and ":" in value:
+        raise ValueError(
+            f"{path} must be a registered name, got {shown(value)}: import strings come from "
+            "Python or the command line alone"
+        )
+    if isinstance(value, Mapping | list):
+        for each in value.values() if isinstance(value, Mapping) else value:
+            _require_names(each, path)
+
+
+def _absolute(value: Any, folder: Path) -> Any:
+    """Return a value in which names of files start at a folder."""
+    if isinstance(value, Mapping):
+        return {key: _absolute(each, folder) for key, each in value.items()}
+    if isinstance(value, list):
+        return [_absolute(each, folder) for each in value]
+    if isinstance(value, str) and value.endswith(_FILE_ENDINGS):
+        return str((folder / value).absolute())
+    return value
+
+
+def _plain(value: Any) -> Any:
+    """Return a value as TOML has it: without None, and with lists for tuples."""
+    if isinstance(value, Mapping):
+        return {key: _plain(each) for key, each in value.items() if each is not None}
+    if isinstance(value, tuple | list):
+        return [_plain(each) for each in value]
+    return value

@@ -1,0 +1,309 @@
+"""What SUMO reads for a corridor: a network with one edge per segment, and vehicles with routes.
+
+The networks of the package's corridors come with it; any other geometry is compiled by netconvert
+on demand, which needs `eclipse-sumo` (extra ``corridors``).
+
+Every edge declares the nominal length of its segment, and the recording runs with SUMO's internal
+links switched off: every vehicle is then on exactly one segment.
+"""
+
+import importlib.util
+import itertools
+import math
+import os
+import re
+import subprocess
+import tempfile
+from collections.abc import Sequence
+from functools import lru_cache
+from importlib import resources
+from pathlib import Path
+from typing import NamedTuple
+from xml.etree import ElementTree
+
+from dptse_env.traffic.corridor import Corridor
+from dptse_env.traffic.roads import SHIPPED_CORRIDORS
+from dptse_env.traffic.scenario import MAINLINE, Scenario
+from dptse_env.utils.registry import missing_extra
+
+LANE_WIDTH_M = 3.2
+RAMP_ANGLE = math.radians(45.0)  # a flat ramp would stretch the junction over half a segment
+NETCONVERT_OPTIONS = (
+    "--no-turnarounds",
+    "--offset.disable-normalization",
+    # Rounded corners would enlarge the junctions, and a limit on turns would slow the ramps down.
+    "--default.junctions.radius=0",
+    "--junctions.limit-turn-speed=-1",
+    "--xml-validation=never",
+)
+
+LONGEST_OUTPUT = 2000
+"""Characters of SUMO's messages that an error has at most."""
+
+Point = tuple[float, float]
+"""Coordinates [m]."""
+
+
+class NetworkError(RuntimeError):
+    """A network cannot be compiled: netconvert refused it."""
+
+
+class Geometry(NamedTuple):
+    """The part of a corridor that its network depends on."""
+
+    n_mainline: int
+    on_ramps: tuple[int, ...]
+    off_ramps: tuple[int, ...]
+    on_ramp_segments: tuple[tuple[int, ...], ...]
+    off_ramp_segments: tuple[tuple[int, ...], ...]
+    segment_lengths: tuple[float, ...]
+    segment_lanes: tuple[int, ...]
+    speed_limits: tuple[float, ...]
+
+    @classmethod
+    def from_corridor(cls, corridor: Corridor) -> "Geometry":
+        """Return the geometry of a corridor."""
+        return cls(*(getattr(corridor, field) for field in cls._fields))
+
+
+def edge_ids(corridor: Corridor) -> tuple[str, ...]:
+    """Return the SUMO edge of each record column: the S segments, then the R boundary segments."""
+    on_ramps, off_ramps = corridor.on_ramp_segments, corridor.off_ramp_segments
+    return (
+        *(f"main_{i}" for i in range(corridor.n_mainline)),
+        *(edge for i, ramp in enumerate(on_ramps) for edge in ramp_edges(f"on_{i}", ramp)),
+        *(edge for i, ramp in enumerate(off_ramps) for edge in ramp_edges(f"off_{i}", ramp)),
+        "upstream",
+        "downstream",
+        *(f"before_on_{i}" for i in range(len(on_ramps))),
+        *(f"after_off_{i}" for i in range(len(off_ramps))),
+    )
+
+
+def ramp_edges(name: str, segments: Sequence[int]) -> tuple[str, ...]:
+    """Return the SUMO edges of a ramp's segments, in the direction of travel."""
+    several = len(segments) > 1
+    return tuple(f"{name}_{k}" for k in range(len(segments))) if several else (name,)
+
+
+def network_xml(corridor: Corridor) -> str:
+    """Return the corridor's compiled network: the packaged one, else a fresh compilation.
+
+    Raises:
+        MissingExtraError: The geometry is not that of a preset, and netconvert is missing.
+        NetworkError: netconvert fails.
+    """
+    geometry = Geometry.from_corridor(corridor)
+    for preset in SHIPPED_CORRIDORS:
+        if Geometry.from_corridor(preset) == geometry:
+            return packaged_network(preset.name)
+    return compile_network(geometry)
+
+
+@lru_cache
+def packaged_network(name: str) -> str:
+    """Read the compiled network of the preset `name` from the package."""
+    resource = resources.files("dptse_env.traffic") / "networks" / f"{name}.net.xml"
+    return resource.read_text(encoding="utf-8")
+
+
+@lru_cache
+def compile_network(geometry: Geometry) -> str:
+    """Compile a network with netconvert.
+
+    Returns:
+        The network's XML, without the comment that holds netconvert's time and paths, so that the
+        same geometry always gives the same text.
+
+    Raises:
+        MissingExtraError: `eclipse-sumo` is not installed.
+        NetworkError: netconvert fails.
+    """
+    command = [str(_netconvert()), *NETCONVERT_OPTIONS]
+    with tempfile.TemporaryDirectory(prefix="dptse-network-") as directory:
+        folder = Path(directory)
+        for option, suffix, text in zip(
+            ("-n", "-e", "-x"), ("nod", "edg", "con"), _plain_xml(geometry), strict=True
+        ):
+            path = folder / f"corridor.{suffix}.xml"
+            path.write_text(text, encoding="utf-8")
+            command += [option, str(path)]
+        output = folder / "corridor.net.xml"
+        result = subprocess.run(
+            [*command, "-o", str(output)], capture_output=True, text=True, check=False
+        )
+        if result.returncode != 0:
+            said = result.stderr.strip()[:LONGEST_OUTPUT]
+            raise NetworkError(f"netconvert refused {str(geometry)[:LONGEST_OUTPUT]}:\n{said}")
+        network = output.read_text(encoding="utf-8")
+    return re.sub(r"<!--.*?-->\s*", "", network, flags=re.DOTALL)
+
+
+def _netconvert() -> Path:
+    """Return the path of the netconvert of `eclipse-sumo`; SUMO_HOME is not used."""
+    spec = importlib.util.find_spec("sumo")
+    if spec is None or spec.origin is None:
+        raise missing_extra("sumo", "netconvert, which compiles a corridor of another geometry,")
+    suffix = ".exe" if os.name == "nt" else ""
+    return Path(spec.origin).parent / "bin" / f"netconvert{suffix}"
+
+
+def _plain_xml(geometry: Geometry) -> list[str]:
+    """Describe nodes, edges and connections in netconvert's plain XML."""
+    xml, n = _PlainXML(geometry), geometry.n_mainline
+    lanes, lengths = geometry.segment_lanes, xml.lengths_m
+    cells, names = (
+        [0, *range(n), n - 1],
+        ["upstream", *(f"main_{i}" for i in range(n)), "downstream"],
+    )
+    x = [-lengths[0], *itertools.accumulate((lengths[cell] for cell in cells[1:]), initial=0.0)]
+    xml.edges(names, cells, [f"face_{face}" for face in range(-1, n + 2)], [(at, 0.0) for at in x])
+    xml.connect(names, [min(lanes[a], lanes[b]) for a, b in itertools.pairwise(cells)])
+    # Ramps are laid out from their face, on-ramps backwards.
+    for i, (face, ramp) in enumerate(
+        zip(geometry.on_ramps, geometry.on_ramp_segments, strict=True)
+    ):
+        own, cells = ramp_edges(f"on_{i}", ramp), [ramp[0], *ramp]
+        names, node = [f"before_on_{i}", *own], f"face_{face}"
+        nodes = [f"on_{i}_entry", *(f"{edge}_start" for edge in own), node]
+        along = [-sum(lengths[cell] for cell in cells[k:]) for k in range(len(nodes))]
+        points = [xml.ramp_point(face, x[face + 1], ramp[0], distance) for distance in along]
+        xml.edges(names, cells, nodes, points, node)
+        xml.connect([*names, f"main_{face}"], [lanes[ramp[0]]] * len(names))
+    for i, (face, ramp) in enumerate(
+        zip(geometry.off_ramps, geometry.off_ramp_segments, strict=True)
+    ):
+        own, cells = ramp_edges(f"off_{i}", ramp), [*ramp, ramp[-1]]
+        names, node = [*own, f"after_off_{i}"], f"face_{face}"
+        nodes = [node, *(f"{edge}_end" for edge in own), f"off_{i}_exit"]
+        along = [sum(lengths[cell] for cell in cells[:k]) for k in range(len(nodes))]
+        points = [xml.ramp_point(face - 1, x[face + 1], ramp[0], distance) for distance in along]
+        xml.edges(names, cells, nodes, points, node)
+        xml.connect([f"main_{face - 1}", *names], [lanes[ramp[0]]] * len(names))
+    return xml.texts()
+
+
+class _PlainXML:
+    """Nodes, edges and connections of a network, as netconvert reads them."""
+
+    def __init__(self, geometry: Geometry) -> None:
+        self.geometry = geometry
+        self.lengths_m = [1000.0 * length for length in geometry.segment_lengths]
+        self._roots = [ElementTree.Element(tag) for tag in ("nodes", "edges", "connections")]
+
+    def edges(
+        self,
+        names: Sequence[str],
+        cells: Sequence[int],
+        nodes: Sequence[str],
+        points: Sequence[Point],
+        face: str = "",
+    ) -> None:
+        """Add edges in a row, with length, lanes and limit of segments, and their nodes.
+
+        Args:
+            names: Names of the edges.
+            cells: Their segments.
+            nodes: Names of the nodes, one more.
+            points: Where these are [m].
+            face: A node of the mainline, which is there; the edge at it is drawn to its own point.
+        """
+        geometry = self.geometry
+        # Plain priority junctions would starve the ramps; a zipper lets both branches flow.
+        zippers = {f"face_{face}" for face in geometry.on_ramps}
+        for name, (x, y) in zip(nodes, points, strict=True):
+            kind = "zipper" if name in zippers else "priority"
+            if name != face:
+                place = {"id": name, "x": f"{x:.2f}", "y": f"{y:.2f}", "type": kind}
+                ElementTree.SubElement(self._roots[0], "node", place)
+        for k, (name, cell) in enumerate(zip(names, cells, strict=True)):
+            lanes = str(geometry.segment_lanes[cell])
+            element = ElementTree.SubElement(
+                self._roots[1],
+                "edge",
+                {"id": name, "from": nodes[k], "to": nodes[k + 1], "numLanes": lanes},
+                spreadType="center",
+                speed=f"{geometry.speed_limits[cell] / 3.6:.4f}",
+                length=f"{self.lengths_m[cell]:.2f}",
+            )
+            if face in nodes[k : k + 2]:
+                shape = points[k : k + 2]
+                element.set("shape", " ".join("{:.2f},{:.2f}".format(*point) for point in shape))
+
+    def connect(self, edges: Sequence[str], counts: Sequence[int]) -> None:
+        """Connect the rightmost lanes of each edge, so many of them, with those of the next."""
+        for (start, end), count in zip(itertools.pairwise(edges), counts, strict=True):
+            for lane in map(str, range(count)):
+                lanes = {"from": start, "to": end, "fromLane": lane, "toLane": lane}
+                ElementTree.SubElement(self._roots[2], "connection", lanes)
+
+    def ramp_point(self, beside: int, x: float, ramp: int, along: float) -> Point:
+        """Return the point at a distance along a ramp [m] from the face at x [m].
+
+        Ramps start and end on the axis of the mainline's rightmost lanes, not of its middle;
+        `beside` is the mainline segment that the ramp joins or leaves.
+        """
+        lanes = self.geometry.segment_lanes
+        axis_y = -0.5 * LANE_WIDTH_M * (lanes[beside] - lanes[ramp])
+        return (
+            x + along * math.cos(RAMP_ANGLE),
+            axis_y - abs(along) * math.sin(RAMP_ANGLE),
+        )
+
+    def texts(self) -> list[str]:
+        """Return the three files."""
+        return [ElementTree.tostring(root, encoding="unicode") for root in self._roots]
+
+
+def routes_xml(corridor: Corridor, scenario: Scenario) -> bytes:
+    """Return SUMO's route file of a scenario, on the network that is made for its corridor."""
+    root = ElementTree.Element("routes")
+    classes = {each.name: each.attributes(corridor.drivers) for each in corridor.vehicle_classes}
+    classes = classes or {"car": corridor.drivers.attributes()}
+    for name, attributes in classes.items():
+        ElementTree.SubElement(root, "vType", {"id": name, **attributes})
+    names = list(classes)
+    for origin in range(MAINLINE, corridor.n_on_ramps):
+        for end in range(MAINLINE, corridor.n_off_ramps):
+            first = 0 if origin == MAINLINE else corridor.on_ramps[origin]
+            last = corridor.n_mainline if end == MAINLINE else corridor.off_ramps[end]
+            if first >= last:
+                continue
+            edges = (
+                *_entry_edges(corridor, origin),
+                *(f"main_{i}" for i in range(first, last)),
+                *_exit_edges(corridor, end),
+            )
+            ElementTree.SubElement(root, "route", id=f"{origin}:{end}", edges=" ".join(edges))
+    for vehicle, (departure, origin, end, kind) in enumerate(
+        zip(scenario.departures, scenario.origins, scenario.exits, scenario.classes, strict=True)
+    ):
+        ElementTree.SubElement(
+            root,
+            "vehicle",
+            id=str(vehicle),
+            type=names[kind],
+            route=f"{origin}:{end}",
+            depart=f"{departure:.3f}",
+            # As fast as is safe, on the lane that suits the route, and by default at the start of
+            # the boundary segment, so that it is measured there. About 4,700 veh/h can then enter
+            # the paper's mainline; others queue outside. With `departPos="last"` 9 % more can
+            # enter, but vehicles start at the far end of an empty boundary segment.
+            departSpeed="max",
+            departLane="best",
+        )
+    return ElementTree.tostring(root)
+
+
+def _entry_edges(corridor: Corridor, origin: int) -> list[str]:
+    if origin == MAINLINE:
+        return ["upstream"]
+    name = f"on_{origin}"
+    return [f"before_{name}", *ramp_edges(name, corridor.on_ramp_segments[origin])]
+
+
+def _exit_edges(corridor: Corridor, end: int) -> list[str]:
+    if end == MAINLINE:
+        return ["downstream"]
+    name = f"off_{end}"
+    return [*ramp_edges(name, corridor.off_ramp_segments[end]), f"after_{name}"]

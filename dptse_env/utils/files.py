@@ -1,0 +1,239 @@
+"""Files that are complete or not there, their digests, and arrays with a card.
+
+Weights and records are files in the format of safetensors: a header in JSON, then the arrays as
+they are in memory. Their card, what one should know of the arrays, stands in the header's
+``__metadata__`` as JSON under ``card``; it has the digest of card and arrays, too.
+"""
+
+import contextlib
+import hashlib
+import json
+import os
+import stat
+import uuid
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike
+from safetensors import SafetensorError
+from safetensors.numpy import load, save
+
+from dptse_env.utils.arrays import AnyArray
+
+LARGEST_FILE = 2**24
+"""Largest size of a file, where the caller says nothing else [bytes]."""
+
+LARGEST_HEADER = 2**20
+"""Largest size of a header, which the card is a part of [bytes]."""
+
+DEEPEST_CARD = 16
+"""Largest nesting of a card."""
+
+_DIGEST = "sha256"
+
+
+def read_tensors(
+    path: str | os.PathLike[str], largest: int = LARGEST_FILE
+) -> tuple[dict[str, Any], dict[str, AnyArray]]:
+    """Read a file of arrays that `write_tensors` wrote. Nothing in it is run.
+
+    Args:
+        path: The file.
+        largest: Largest size of the file [bytes].
+
+    Returns:
+        The card, with the digest of the content as ``sha256``, and the arrays by name, read-only,
+        of integers or finite floats. The caller checks what the card must have, and shapes and
+        types of the arrays (`require_arrays`).
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        OSError: It cannot be read.
+        ValueError: It is not such a file, is damaged, or exceeds a limit of this module.
+    """
+    try:
+        status = Path(path).stat()
+        if not stat.S_ISREG(status.st_mode):
+            raise ValueError("it is not a regular file")
+        if status.st_size > largest:
+            raise ValueError(f"it must have at most {largest} bytes, got {status.st_size}")
+        return _parsed(Path(path).read_bytes())
+    except (ValueError, SafetensorError, LookupError, RecursionError) as problem:
+        reason = " ".join(str(problem).split())
+        raise ValueError(
+            f"{os.fspath(path)} is damaged, or no safetensors file with a card: {reason:.300}"
+        ) from problem
+
+
+def write_tensors(
+    path: str | os.PathLike[str],
+    arrays: Mapping[str, AnyArray],
+    card: Mapping[str, Any],
+    largest: int = LARGEST_FILE,
+) -> None:
+    """Write arrays and a card, completely or not at all; the same ones give the same bytes.
+
+    Args:
+        path: The file; one that is there is replaced.
+        arrays: Integers and finite floats by name.
+        card: Plain JSON. The digest of the content is added as ``sha256``.
+        largest: Largest size of the file [bytes].
+
+    Raises:
+        OSError: It cannot be written; what was there stays.
+        ValueError: `read_tensors` would refuse the file; what was there stays.
+    """
+    stored = {
+        name: np.asarray(array, array.dtype.newbyteorder("<"), order="C")
+        for name, array in arrays.items()
+    }
+    try:
+        signed = {**card, _DIGEST: content_digest(card, stored)}
+        content = save(stored, {"card": _text(signed)})
+        if len(content) > largest:
+            raise ValueError(f"it would have {len(content)} bytes, more than {largest}")
+        _parsed(content)
+    except (TypeError, ValueError, SafetensorError, RecursionError) as problem:
+        raise ValueError(f"{os.fspath(path)} cannot be written: {problem!s:.300}") from problem
+    write_atomically(path, content)
+
+
+def require_arrays(
+    arrays: Mapping[str, AnyArray], shapes: Mapping[str, tuple[int, ...]], dtype: DTypeLike
+) -> None:
+    """Refuse other arrays than those of the given names, shapes and type.
+
+    Raises:
+        ValueError: One is missing, unknown, or of another shape or type.
+    """
+    for problem, names in (
+        ("lacks", set(shapes) - set(arrays)),
+        ("has", set(arrays) - set(shapes)),
+    ):
+        if names:
+            raise ValueError(f"it {problem} the arrays {', '.join(sorted(names))!s:.200}")
+    for name, shape in shapes.items():
+        array = arrays[name]
+        if array.dtype != dtype or array.shape != shape:
+            raise ValueError(
+                f"{name} must be {np.dtype(dtype)} of shape {shape}, got {array.dtype} of "
+                f"{array.shape}"
+            )
+
+
+def content_digest(card: Mapping[str, Any], arrays: Mapping[str, AnyArray]) -> str:
+    """Return the SHA-256 (hex) of a card and of arrays, whatever their order.
+
+    Raises:
+        ValueError: A number in the card is not finite.
+        TypeError: The card is not plain JSON.
+    """
+    digest = hashlib.sha256(_text({k: v for k, v in card.items() if k != _DIGEST}).encode())
+    for name in sorted(arrays):
+        array = arrays[name]
+        digest.update(f"{name} {array.dtype.str} {array.shape}".encode())
+        digest.update(np.ascontiguousarray(array).data)
+    return digest.hexdigest()
+
+
+def _parsed(content: bytes) -> tuple[dict[str, Any], dict[str, AnyArray]]:
+    """Return the card and the arrays in the content of a file.
+
+    Raises:
+        ValueError, LookupError, RecursionError, SafetensorError: It is damaged.
+    """
+    if content[:2] == b"PK":
+        raise ValueError("it is a zip archive, as earlier versions wrote; make the file again")
+    size = int.from_bytes(content[:8], "little")
+    if size > LARGEST_HEADER:
+        raise ValueError(f"its header must have at most {LARGEST_HEADER} bytes, got {size}")
+    arrays: dict[str, AnyArray] = load(content)
+    for name, array in arrays.items():
+        array.flags.writeable = False
+        if array.dtype.kind not in "iuf":
+            raise ValueError(f"{name} must be of integers or floats, got {array.dtype}")
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise ValueError(f"{name} must be finite, it has NaN or infinite values")
+    match _json(content[8 : 8 + size]):
+        case {"__metadata__": {"card": str(text)}}:
+            card = _json(text)
+        case _:
+            raise ValueError("it has no card")
+    if not isinstance(card, dict) or _depth(card) > DEEPEST_CARD:
+        raise ValueError(f"its card must be a mapping of at most {DEEPEST_CARD} levels")
+    digest = card.pop(_DIGEST, None)
+    if digest != content_digest(card, arrays):
+        raise ValueError("its content has another digest than its card says")
+    return {**card, _DIGEST: digest}, arrays
+
+
+def _json(text: str | bytes) -> Any:
+    return json.loads(text, object_pairs_hook=_unique)
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    if len(dict(pairs)) != len(pairs):
+        raise ValueError("its header has a key twice")
+    return dict(pairs)
+
+
+def _text(card: Mapping[str, Any]) -> str:
+    """Return a card as text that does not depend on the order of keys; it has finite numbers."""
+    return json.dumps(card, sort_keys=True, allow_nan=False)
+
+
+def _depth(node: Any) -> int:
+    if isinstance(node, dict):
+        node = node.values()
+    elif not isinstance(node, list):
+        return 1
+    return 1 + max(map(_depth, node), default=0)
+
+
+@contextlib.contextmanager
+def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Yield a temporary path, whose file takes the place of `path` when the body is done.
+
+    Raises:
+        OSError: The file cannot be written; the old one stays.
+    """
+    target = Path(path)
+    temporary = target.with_name(f".{target.name}-{uuid.uuid4().hex}")
+    try:
+        yield temporary
+        with temporary.open("rb+") as file:
+            os.fsync(file.fileno())
+        temporary.replace(target)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_atomically(path: str | os.PathLike[str], content: bytes | str) -> None:
+    """Write a file in one piece, text as UTF-8.
+
+    Raises:
+        OSError: It cannot be written; the old one stays.
+    """
+    with replacing(path) as temporary:
+        temporary.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
+def file_digest(path: str | os.PathLike[str]) -> str:
+    """Return the SHA-256 (hex) of a file's content.
+
+    Raises:
+        OSError: The file cannot be read.
+    """
+    with Path(path).open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def json_digest(content: Any) -> str:
+    """Return the SHA-256 (hex) of plain values as JSON, whatever the order of keys.
+
+    Raises:
+        TypeError: A value is not plain.
+    """
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()

@@ -1,0 +1,155 @@
+"""Files made to mislead, or to cost time and memory: kinds of damage to any file with a card."""
+
+import copy
+import json
+import os
+import pickle
+import re
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from safetensors.numpy import save
+
+from dptse_env.utils.files import LARGEST_FILE, content_digest, read_tensors
+
+ADDITIONAL = 128 * 2**20
+"""Bytes that reading may take beyond those of the imports and of first, good files."""
+
+
+def signed(card, arrays):
+    """The content of a file with a true digest, whatever the card and the arrays are."""
+    return save(arrays, {"card": json.dumps({**card, "sha256": content_digest(card, arrays)})})
+
+
+def edited(path, change):
+    """The content of a file after ``change(card, arrays)``, with a true digest."""
+    card, arrays = copy.deepcopy(read_tensors(path))
+    change(card, arrays)
+    return signed(card, arrays)
+
+
+def packed(header, data):
+    """The content of a file with any header: bytes, or what becomes JSON."""
+    header = header if isinstance(header, bytes) else json.dumps(header).encode()
+    return len(header).to_bytes(8, "little") + header + data
+
+
+def damaged(content, flips=100, cuts=20):
+    """Damage that no file survives, by kind; large files are made of holes by `write`."""
+    rng = np.random.default_rng(0)
+    for place, bit in zip(rng.integers(len(content), size=flips), range(flips), strict=True):
+        flipped = bytearray(content)
+        # Every second one is in the header, where damage is most varied.
+        flipped[place if bit % 2 else place % 900] ^= 1 << bit % 8
+        yield f"flip-{place}-{bit}", bytes(flipped)
+    for size in (0, 7, 8, *rng.integers(len(content), size=cuts)):
+        yield f"cut-{size}", content[:size]
+    size = int.from_bytes(content[:8], "little")
+    text, data = content[8 : 8 + size], content[8 + size :]
+    header = json.loads(text)
+    arrays = {name: entry for name, entry in header.items() if name != "__metadata__"}
+    first, entry = next(iter(arrays.items()))
+    begin, end = entry["data_offsets"]
+
+    def with_entry(**changes):
+        return packed({**header, first: {**entry, **changes}}, data)
+
+    def with_card(card):
+        return packed({**header, "__metadata__": {"card": card}}, data)
+
+    yield "longer", content + bytes(4)
+    yield "zip", b"PK\x03\x04" + bytes(100)
+    yield "pickle", pickle.dumps(print)
+    yield "header-of-100-MB", (10**8).to_bytes(8, "little") + content[8:]
+    yield "header-without-end", b"\xff" * 8 + content[8:]
+    yield "header-is-a-list", packed([header], data)
+    yield "header-deep", packed(b'{"a":' * 200_000, data)
+    yield "header-of-digits", packed(b'{"a":' + b"9" * 10**6 + b"}", data)
+    yield (
+        "key-twice",
+        packed(text.rstrip()[:-1] + f',"{first}":{json.dumps(entry)}}}'.encode(), data),
+    )
+    yield "overlap", packed({**header, "again": entry}, data)
+    yield "gap", packed({**header, "last": {**entry, "data_offsets": [len(data) + 4, 0]}}, data)
+    yield "outside", with_entry(data_offsets=[begin, 2**40])
+    yield "negative-offset", with_entry(data_offsets=[-4, end])
+    yield "large-shape", with_entry(shape=[2**40, 2**40])
+    yield "huge-number", with_entry(shape=[10**4000])
+    yield "many-dimensions", with_entry(shape=[1] * 200_000)
+    yield "bfloat16", with_entry(dtype="BF16")
+    yield "unknown-type", with_entry(dtype="PICKLE")
+    yield "no-card", packed(arrays, data)
+    yield "card-is-a-number", packed({**header, "__metadata__": {"card": 1}}, data)
+    yield "card-is-a-list", with_card("[]")
+    yield "card-deep", with_card("[" * 400_000)
+    yield "card-of-digits", with_card('{"a": ' + "9" * 10**6 + "}")
+    yield "card-infinite", with_card('{"a": 1e999}')
+    yield "card-key-twice", with_card('{"a": 1, "a": 2}')
+    yield "card-without-digest", with_card("{}")
+    yield "card-unsigned", with_card('{"sha256": 1}')
+
+
+def odd(card, arrays):
+    """Damage with true digests, which only a check of the content can find, by kind."""
+    first = max(arrays, key=lambda name: arrays[name].size)
+    array = arrays[first]
+    yield "not-a-number", signed(card, {**arrays, first: np.full(array.shape, np.nan, "f4")})
+    yield "infinite", signed(card, {**arrays, first: np.full(array.shape, np.inf, "f4")})
+    yield "flags", signed(card, {**arrays, first: array != 0})
+    deep = {}
+    for _ in range(20):
+        deep = {"a": deep}
+    yield "card-of-20-levels", signed({**card, "a": deep}, arrays)
+    # Whoever knows what the arrays should be refuses these, `read_tensors` does not.
+    yield "shape: flat", signed(card, {**arrays, first: np.zeros(array.size + 1, array.dtype)})
+    yield "shape: type", signed(card, {**arrays, first: array.astype("f8")})
+    yield "shape: missing", signed(card, {k: v for k, v in arrays.items() if k != first})
+    yield "shape: unknown", signed(card, {**arrays, "unknown": np.zeros(2**20, "f4")})
+    yield "shape: none", signed(card, {})
+
+
+@contextmanager
+def little_memory():
+    """Leave this process no more than `ADDITIONAL` bytes of further memory."""
+    resource = pytest.importorskip("resource")
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + ADDITIONAL, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, before)
+
+
+def check_refusals(read, path, kinds):
+    """Check that ``read(path)`` refuses each content soon, in little memory and one line."""
+    for kind, content in kinds:
+        path.write_bytes(content)
+        with little_memory():
+            began = time.process_time()
+            try:
+                with pytest.raises(ValueError, match=re.escape(path.name)) as refused:
+                    read(path)
+            except BaseException as problem:
+                problem.add_note(f"kind: {kind}")
+                raise
+            assert time.process_time() - began < 2.0, kind
+        assert len(str(refused.value).splitlines()) == 1, kind
+
+
+def check_hostile(read, good, path, shapes=True):
+    """Check that ``read(path)`` refuses all kinds of damage to the file `good`.
+
+    Other shapes count as damage where `read` knows which ones there should be.
+    """
+    read(good)
+    check_refusals(read, path, damaged(good.read_bytes()))
+    kinds = odd(*read_tensors(good))
+    check_refusals(read, path, [each for each in kinds if shapes or "shape" not in each[0]])
+    path.write_bytes(b"")
+    os.truncate(path, 20 * LARGEST_FILE)  # a hole, which takes no room
+    with little_memory(), pytest.raises(ValueError, match=f"at most {LARGEST_FILE} bytes"):
+        read(path)

@@ -1,0 +1,83 @@
+"""What is read of files of a simulation, and what is refused in one line that names the file."""
+
+import re
+from dataclasses import replace
+
+import pytest
+
+from dptse_env.importers.network import Files, read_configuration
+
+CONFIGURATION = """
+<configuration>
+    <input>
+        <net-file value="net/road.net.xml"/>
+        <route-files value="a.rou.xml, b.rou.xml"/>
+        <additional-files v="types.add.xml"/>
+    </input>
+    <output><fcd-output value="fcd.xml"/><tripinfo value="trips.xml"/></output>
+    <time><begin value="07:00:00"/><end value="36000"/><step-length value="0.5"/></time>
+    <processing>
+        <time-to-teleport value="300"/><no-internal-links value="true"/>
+        <max-depart-delay value="600"/>
+    </processing>
+    <random_number><seed value="3"/><random value="true"/></random_number>
+    <report><verbose value="true"/><log value="run.log"/><no-step-log value="true"/></report>
+    <gui_only><gui-settings-file value="view.xml"/><delay value="20"/></gui_only>
+</configuration>"""
+
+
+def read(folder, *change):
+    path = folder / "town.sumocfg"
+    path.write_text(CONFIGURATION.replace(*change) if change else CONFIGURATION)
+    return read_configuration(path)
+
+
+def test_a_configuration_gives_files_and_options_of_the_traffic(tmp_path):
+    files = read(tmp_path)
+    assert files == Files(
+        net=tmp_path / "net/road.net.xml",
+        routes=(tmp_path / "a.rou.xml", tmp_path / "b.rou.xml"),
+        additional=(tmp_path / "types.add.xml",),
+        begin=25200.0,
+        step_length=0.5,
+        options=("--time-to-teleport=300", "--no-internal-links=true", "--max-depart-delay=600"),
+    )
+    assert not files.internal_links
+    assert read(tmp_path, "07:00:00", "1:00:00:10.5").begin == 86410.5
+    assert read(tmp_path, "07:00:00", "12").begin == 12.0
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (('"07:00:00"', '"seven"'), ": begin must be seconds or hh:mm:ss, got 'seven'"),
+        (('<net-file value="net/road.net.xml"/>', ""), " must name one net-file, got 0"),
+        (("<processing>", '<processing><mesosim value="true"/>'), ": mesosim must be left out"),
+        (("</configuration>", ""), " must be XML"),
+        (("configuration>", "net>"), " must be a <configuration> of SUMO, got <net>"),
+    ],
+)
+def test_configurations_of_no_use_are_refused(tmp_path, change, message):
+    expected = re.escape(f"configuration: {tmp_path / 'town.sumocfg'}{message}")
+    with pytest.raises(ValueError, match=f"^{expected}"):
+        read(tmp_path, *change)
+
+
+@pytest.mark.parametrize(
+    ("kind", "content", "message"),
+    [
+        ("routes", "<routes/>", " must have vehicles, got an empty file"),
+        ("routes", "no xml", " must be XML"),
+        ("routes", "<net><edge/></net>", " must hold routes, got <net>"),
+        ("routes", '<routes><include href="b.xml"/></routes>', ": <include> must not read another"),
+        ("additional", '<a><vss file="s.xml"/></a>', ": <vss> must not read another file, got 's."),
+        ("additional", "<a><b/>", " must be XML"),
+    ],
+)
+def test_routes_and_additional_files_of_no_use_are_refused(tmp_path, kind, content, message):
+    routes, path = tmp_path / "all.rou.xml", tmp_path / "own.xml"
+    routes.write_text("<routes><vehicle/></routes>")
+    path.write_text(content)
+    files = replace(Files(tmp_path / "net.xml", (routes,)), **{kind: (path,)})
+    with pytest.raises(ValueError, match=re.escape(f"{kind}: {path}{message}")):
+        files.check()

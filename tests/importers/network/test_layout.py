@@ -1,0 +1,149 @@
+import re
+from itertools import pairwise
+from xml.etree import ElementTree
+
+import pytest
+
+from dptse_env.importers.network import Files, find_layout
+from tests.importers.network.conftest import CONNECTIONS, EDGES, NODES, PATH, netconvert
+
+
+def lengths_of_edges(network):
+    """Return the length of every edge, internal ones included [m]."""
+    return {
+        edge.get("id"): max(float(lane.get("length")) for lane in edge.iter("lane"))
+        for edge in ElementTree.parse(network).iter("edge")
+    }
+
+
+def test_segments_cover_the_path_without_gaps(files):
+    layout = find_layout(files, PATH, 100.0)
+    edges = lengths_of_edges(files.net)
+    S = len(layout.lengths) + 2
+    on_path = [*layout.columns[S : S + 1], *layout.columns[: S - 2], layout.columns[S + 1]]
+    stretches = [stretch for column in on_path for stretch in column]
+    for name in PATH:
+        parts = [(start, end) for edge, start, end in stretches if edge == name]
+        assert parts[0][0] == 0.0
+        assert parts[-1][1] == pytest.approx(edges[name], abs=0.01)
+        assert all(end == start for (_, end), (start, _) in pairwise(parts))
+    internal = {edge for edge, _, _ in stretches if edge.startswith(":")}
+    assert len(internal) == 5  # four junctions along the path, and one way out of it
+    total = sum(layout.lengths) + 2 * layout.lengths[0]
+    crossings = sum(edges[edge] for edge in internal)
+    assert total == pytest.approx(sum(edges[name] for name in PATH) + crossings, rel=0.02)
+
+
+def test_ramps_lie_at_faces_with_equal_segments_between_them(files):
+    layout = find_layout(files, PATH, 100.0)
+    (on,), (off,) = layout.on_ramps, layout.off_ramps
+    assert on == 3  # 400 m before the junction are four parts, the first of them the boundary
+    assert layout.names == ("ramp-b", "exit-a")
+    between = layout.lengths[on:off]
+    assert between == pytest.approx([between[0]] * len(between))
+    assert 90.0 < between[0] < 110.0
+    assert layout.ramp_lengths == pytest.approx((100.0, 100.0))
+
+
+def test_acceleration_lanes_count_as_lanes_of_the_mainline(files):
+    layout = find_layout(files, PATH, 100.0)
+    on = layout.on_ramps[0]
+    assert layout.lanes[:on] == (2,) * on
+    assert layout.lanes[on : on + 2] == (3, 3)  # 250 m: two segments, and less than half of one
+    assert set(layout.lanes[on + 3 :]) == {2}
+    longer = find_layout(files, PATH, 150.0)
+    assert longer.lanes[longer.on_ramps[0] + 1] == 3  # two thirds of it
+    assert layout.limits[0] == pytest.approx(108.0)
+    assert layout.limits[-1] == pytest.approx(90.0)
+
+
+def test_ramps_of_several_edges_go_on_behind_a_boundary_inside_an_edge(files):
+    columns = find_layout(files, PATH, 150.0).columns
+    N = len(columns) - 6
+    ramp, before = columns[N], columns[-2]
+    assert {edge for edge, _, _ in ramp if not edge.startswith(":")} == {"ramp-b"}
+    assert {edge for edge, _, _ in before if not edge.startswith(":")} == {"ramp-b", "ramp-a"}
+
+
+def test_the_ends_may_lie_inside_edges(files):
+    whole = find_layout(files, PATH, 100.0)
+    part = find_layout(files, PATH, 100.0, ends=(150.0, 300.0))
+    assert len(part.lengths) < len(whole.lengths)
+    (upstream,) = part.columns[len(part.lengths) + 2]
+    assert upstream[:2] == ("in", 150.0)
+    assert part.columns[len(part.lengths) + 3][-1] == ("out", pytest.approx(200.0, abs=5.0), 300.0)
+
+
+def test_roads_that_meet_at_one_junction_are_one_ramp(tmp_path):
+    edges = EDGES.replace(
+        "</edges>", '<edge id="second" from="alone" to="n1" numLanes="1" speed="20"/></edges>'
+    )
+    connections = CONNECTIONS.replace(
+        "</connections>",
+        '<connection from="second" to="merge" fromLane="0" toLane="2"/></connections>',
+    )
+    layout = find_layout(Files(netconvert(tmp_path, NODES, edges, connections), ()), PATH, 100.0)
+    assert layout.names[0] == "ramp-b + second"
+    assert layout.ramp_lanes == (2, 1)
+    columns = layout.columns[len(layout.lengths)]
+    assert {"ramp-b", "second"} <= {edge for edge, _, _ in columns}
+
+
+def test_a_lay_by_is_an_off_ramp_and_an_on_ramp_on_either_half(tmp_path):
+    edges = EDGES.replace(
+        "</edges>",
+        '<edge id="lay-by" from="n2" to="n3" numLanes="1" speed="20" '
+        'shape="650,0 700,-30 950,-30 1000,0"/></edges>',
+    )
+    connections = CONNECTIONS.replace(
+        "</connections>",
+        '<connection from="merge" to="lay-by" fromLane="0" toLane="0"/>'
+        '<connection from="lay-by" to="bend" fromLane="0" toLane="0"/></connections>',
+    )
+    network = netconvert(tmp_path, NODES, edges, connections)
+    layout = find_layout(Files(network, ()), PATH, 100.0)
+    assert layout.names == ("ramp-b", "lay-by", "lay-by", "exit-a")
+    N = len(layout.lengths)
+    joining, leaving = layout.columns[N + 1], layout.columns[N + 2]
+    assert leaving[0][:2] == ("lay-by", 0.0)
+    assert joining[0][1] > leaving[0][2] + 100.0  # the two boundary segments lie between them
+    # Not one vehicle can be on two columns: the road would be refused.
+    taken = sorted((s, e) for column in layout.columns for n, s, e in column if n == "lay-by")
+    assert all(end <= start for (_, end), (start, _) in pairwise(taken))
+
+
+@pytest.mark.parametrize(
+    ("path", "options", "message"),
+    [
+        (("in", "merg", "narrow"), {}, "no edge 'merg'; similar: merge"),
+        (("in", "narrow"), {}, "'in' must be connected to 'narrow', got connections to merge"),
+        (("in", "elsewhere"), {"between": True}, "'elsewhere' must be reachable from 'in'"),
+        (PATH, {"ends": (450.0, None)}, "first_position must be in [0, "),
+        (PATH, {"left_out": ("narrow",)}, "leave_out: 'narrow' must be an edge that joins"),
+        (("in", "merge"), {"ends": (350.0, None)}, "from its start to on-ramp ramp-b"),
+        (("in",), {"ends": (200.0, 100.0)}, "from its start to its end for its segments"),
+    ],
+)
+def test_paths_of_no_use_are_refused_in_one_line(files, path, options, message):
+    with pytest.raises(ValueError, match=re.escape(message)) as refused:
+        find_layout(files, path, 100.0, **options)
+    assert "\n" not in str(refused.value)
+
+
+def test_ramps_too_near_to_one_another_are_refused_by_name(tmp_path):
+    nodes = NODES.replace('<node id="n2" x="650" y="0"/>', '<node id="n2" x="425" y="0"/>')
+    edges = EDGES.replace(
+        "</edges>", '<edge id="off" from="n2" to="r0" numLanes="1" speed="20"/></edges>'
+    )
+    connections = CONNECTIONS.replace(
+        "</connections>",
+        '<connection from="merge" to="off" fromLane="0" toLane="0"/></connections>',
+    )
+    found = Files(netconvert(tmp_path, nodes, edges, connections), ())
+    with pytest.raises(
+        ValueError, match=r'on-ramp ramp-b and off-ramp off are \d+ m apart; .* --leave-out="off"$'
+    ):
+        find_layout(found, PATH, 100.0)
+    kept = find_layout(found, PATH, 100.0, left_out=("off",))
+    assert kept.names == ("ramp-b", "exit-a")
+    assert any(remark.startswith("left out: off") for remark in kept.remarks)

@@ -1,0 +1,251 @@
+"""Records of a network of one's own, against what SUMO says of it."""
+
+import dataclasses
+import re
+import shutil
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from dptse_env.importers.network import Files, find_layout, import_road
+from dptse_env.traffic import (
+    MAINLINE,
+    SHORT_HIGHWAY,
+    Drivers,
+    Incident,
+    RecordingError,
+    draw_scenario,
+    read_corridor,
+    simulate,
+    write_corridor,
+)
+from dptse_env.traffic.sumo import running, seconds
+from dptse_env.traffic.sumo_input import packaged_network
+from tests.importers.network.conftest import PATH, motorway
+
+
+def imported(files, **options):
+    return import_road(files, find_layout(files, PATH, 100.0), "motorway", 240, **options)
+
+
+@pytest.fixture(scope="module")
+def road(files):
+    return imported(files)
+
+
+ELSEWHERE = '<routes><vehicle id="v" depart="0"><route edges="elsewhere"/></vehicle></routes>'
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (ELSEWHERE, "routes: own.rou.xml must have vehicles that use the path from 0 s to 60 s"),
+        (
+            ELSEWHERE.replace("elsewhere", "nowhere"),
+            "SUMO refuses these files: recording road with traffic seed 0 failed",
+        ),
+        (None, "routes: must have at least one file, got none"),
+    ],
+)
+def test_routes_of_no_use_are_refused(files, tmp_path, content, message):
+    path = tmp_path / "own.rou.xml"
+    path.write_text(content or "")
+    own = dataclasses.replace(files, routes=(path,) if content else ())
+    with pytest.raises(ValueError, match=re.escape(message)) as refused:
+        import_road(own, find_layout(files, PATH, 100.0), "road", 60)
+    assert "\n" not in str(refused.value)
+
+
+def test_every_vehicle_on_the_path_and_its_ramps_is_counted_once(road):
+    corridor = road.corridor
+    limits = {}
+    for column in corridor.network.columns:
+        for edge, start, end in column:
+            low, high = limits.get(edge, (np.inf, 0.0))
+            limits[edge] = min(low, start), max(high, end)
+    assert sum(edge.startswith(":") for edge in limits) == 7  # also in the middle of junctions
+    counts = []
+    scenario = draw_scenario(corridor, 0)
+    with running(corridor, scenario) as libsumo:
+        for _ in seconds(libsumo, corridor, scenario):
+            places = {
+                name: libsumo.vehicle.getLanePosition(name)
+                for edge in limits
+                for name in libsumo.edge.getLastStepVehicleIDs(edge)
+                if limits[edge][0] - 0.01
+                <= libsumo.vehicle.getLanePosition(name)
+                <= limits[edge][1] + 0.01
+            }
+            counts.append(len(places))
+    np.testing.assert_array_equal(road.record.counts.sum(axis=1), counts)
+    assert max(counts) > 30
+
+
+def test_vehicles_pass_from_segment_to_segment_without_gaps(road):
+    record, corridor = road.record, road.corridor
+    N, S = corridor.n_mainline, corridor.n_segments
+    order = np.lexsort((record.step, record.vehicle))
+    vehicle, step, column = (
+        each[order].astype(int) for each in (record.vehicle, record.step, record.segment)
+    )
+    same = vehicle[1:] == vehicle[:-1]
+    assert set(np.diff(step)[same]) == {1}
+    passages = set(zip(column[:-1][same], column[1:][same], strict=True))
+    passages = {(here, there) for here, there in passages if here != there}
+    (on,), (off,) = corridor.on_ramps, corridor.off_ramps
+    assert passages == {
+        *((i, i + 1) for i in range(N - 1)),
+        *((S, 0), (N - 1, S + 1)),
+        *((S + 2, N), (N, on)),
+        *((off - 1, N + 1), (N + 1, S + 3)),
+    }
+
+
+def test_the_record_is_that_of_the_generated_network_if_the_files_are_the_same(tmp_path):
+    calm = dataclasses.replace(SHORT_HIGHWAY, incident=None)
+    scenario = draw_scenario(calm, 3)
+    network, routes = tmp_path / "short.net.xml", tmp_path / "short.rou.xml"
+    network.write_text(packaged_network("short-highway"))
+    routes.write_bytes(ElementTree.tostring(_vehicles(calm, scenario)))
+    files = Files(
+        network,
+        (routes,),
+        step_length=0.5,
+        options=("--no-internal-links", "--collision.action=none", "--time-to-teleport=-1"),
+    )
+    path = ["upstream", *(f"main_{i}" for i in range(6)), "downstream"]
+    road = import_road(files, find_layout(files, path, 100.0), "short", 240, seed=3)
+    expected = simulate(calm, 3)
+    for name in ("step", "segment", "speed"):
+        np.testing.assert_array_equal(getattr(road.record, name), getattr(expected, name))
+    pairs = set(zip(road.record.vehicle.tolist(), expected.vehicle.tolist(), strict=True))
+    assert len(pairs) == len(set(expected.vehicle)) == road.record.n_vehicles
+    same = ("n_mainline", "on_ramps", "off_ramps", "fixed_sensors", "lanes", "ramp_lanes")
+    for name in (*same, "segment_length", "speed_limit", "density_scale", "speed_scale"):
+        assert getattr(road.corridor, name) == getattr(calm, name), name
+
+
+def _vehicles(corridor, scenario):
+    """Write a scenario of a generated network as SUMO's routes."""
+    root = ElementTree.Element("routes")
+    ElementTree.SubElement(root, "vType", {"id": "car", **corridor.drivers.attributes()})
+    for i, origin in enumerate(scenario.origins):
+        end = scenario.exits[i]
+        first = 0 if origin == MAINLINE else corridor.on_ramps[origin]
+        last = corridor.n_mainline if end == MAINLINE else corridor.off_ramps[end]
+        start = ["upstream"] if origin == MAINLINE else [f"before_on_{origin}", f"on_{origin}"]
+        stop = ["downstream"] if end == MAINLINE else [f"off_{end}", f"after_off_{end}"]
+        edges = [*start, *(f"main_{k}" for k in range(first, last)), *stop]
+        vehicle = ElementTree.SubElement(
+            root, "vehicle", id=f"car-{i}", type="car", depart=f"{scenario.departures[i]:.3f}",
+            departSpeed="max", departLane="best",
+        )  # fmt: skip
+        ElementTree.SubElement(vehicle, "route", edges=" ".join(edges))
+    return root
+
+
+def test_demand_exit_shares_and_dwell_are_counted(road):
+    corridor = road.corridor
+    rates = [rate for _, rate in corridor.demand.mainline]
+    assert np.mean(rates) == pytest.approx(1800.0, rel=0.1)  # those who leave come along, too
+    on_ramp = [rate for _, rate in corridor.demand.on_ramps[0]]
+    assert np.mean(on_ramp) == pytest.approx(400.0, rel=0.1)
+    # At the off-ramp: 300 of 1500 + 300 + 400 an hour.
+    assert corridor.exit_shares[0] == pytest.approx(300 / 2200, rel=0.3)
+    assert 3.0 < corridor.average_dwell < 6.0
+    assert road.remarks == ()
+
+
+def test_a_warm_up_starts_the_record_with_traffic(files):
+    warm = imported(files, warm_up=120)
+    cold = imported(files)
+    assert warm.corridor.network.begin == 120
+    assert cold.record.counts[0].sum() == 0
+    np.testing.assert_array_equal(warm.record.counts[0], cold.record.counts[120])
+
+
+def test_an_incident_slows_the_vehicles_on_its_segment_alone(road):
+    segment = road.corridor.n_mainline - 2
+    incident = Incident(segment=segment, phases=((60.0, 120.0, 10.0),))
+    slow = simulate(dataclasses.replace(road.corridor, incident=incident), 0)
+    here = (slow.segment == segment) & (slow.step > 80) & (slow.step <= 120)
+    assert slow.speed[here].mean() < 20.0
+    assert slow.speed[here].max() < 90.0
+    beyond = (slow.segment == segment + 1) & (slow.step > 80) & (slow.step <= 120)
+    assert slow.speed[beyond].max() > 35.0  # free again, and faster
+    late = (slow.segment == segment) & (slow.step > 200)
+    assert slow.speed[late].mean() > 40.0
+    before = slow.step <= 60
+    np.testing.assert_array_equal(slow.speed[before], road.record.speed[road.record.step <= 60])
+
+
+def test_digests_are_of_the_content_of_files(files, road, tmp_path):
+    for path in (files.net, *files.routes):
+        shutil.copy(path, tmp_path / f"copy-{path.name}")
+    copies = Files(
+        tmp_path / f"copy-{files.net.name}",
+        tuple(tmp_path / f"copy-{path.name}" for path in files.routes),
+        step_length=files.step_length,
+    )
+    assert imported(copies).corridor.digest == road.corridor.digest
+    published = dataclasses.replace(road.corridor, demand=road.corridor.demand.scaled(2.0), lanes=4)
+    assert published.digest == road.corridor.digest  # the vehicles are those of the files
+    longer = dataclasses.replace(road.corridor, duration=241)
+    assert longer.digest != road.corridor.digest
+
+
+def test_changed_and_missing_files_are_named(tmp_path):
+    corridor = imported(motorway(tmp_path)).corridor
+    routes = tmp_path / "road.rou.xml"
+    routes.write_text(routes.read_text().replace("1500", "1600"))
+    with pytest.raises(RecordingError, match=r"road\.rou\.xml: is not the file that the road was"):
+        simulate(corridor, 0)
+    routes.unlink()
+    with pytest.raises(RecordingError, match=r"road\.rou\.xml: cannot be read: No such file"):
+        simulate(corridor, 0)
+
+
+def test_a_road_file_moves_with_its_files(tmp_path):
+    here = tmp_path / "here"
+    here.mkdir()
+    corridor = imported(motorway(here)).corridor
+    write_corridor(here / "road.toml", corridor)
+    assert str(tmp_path) not in (here / "road.toml").read_text()
+    assert read_corridor(here / "road.toml") == corridor
+    there = here.rename(tmp_path / "there")
+    moved = read_corridor(there / "road.toml")
+    assert Path(moved.network.folder) == there
+    assert moved.digest == corridor.digest
+    assert simulate(moved, 0).n_rows == simulate(moved, 0).n_rows > 0
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"options": ("--fcd-output=all.xml",)}, "network.options must be free of outputs"),
+        ({"options": ("-v",)}, "network.options must be --name=value each"),
+        ({"step_length": 0.3}, "network.step_length must be a whole part of a second"),
+        ({"sha256": ()}, "network.sha256 must be one for each of 2 files"),
+        ({"columns": ((("in", 5.0, 5.0),),)}, r"network.columns\[0\] must be stretches that end"),
+        ({"columns": ((("in", 0.0, 5.0),), (("in", 4.0, 9.0),))}, "without overlap on edge 'in'"),
+    ],
+)
+def test_scenarios_of_no_use_are_refused(road, change, message):
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(road.corridor.network, **change)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"n_mainline": 5}, "corridor.network.columns must be one for each of the 11"),
+        ({"drivers": Drivers("IDM")}, "corridor.drivers must be left out"),
+    ],
+)
+def test_corridors_that_do_not_fit_their_files_are_refused(road, change, message):
+    plain = {"on_ramps": (2,), "off_ramps": (3,), "fixed_sensors": (), "lanes": 2,
+             "ramp_lanes": 1, "segment_length": 0.1, "speed_limit": 100.0}  # fmt: skip
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(road.corridor, **{**plain, **change})

@@ -1,0 +1,142 @@
+"""Import of measured fields."""
+
+import dataclasses
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from dptse_env.config import TEST_SEEDS, TRAINING_SEEDS, VALIDATION_SEEDS
+from dptse_env.importers.fields import FieldRoad, FieldSource, import_field
+from dptse_env.importers.folder import Split
+from dptse_env.traffic import RecordLibrary, find_corridor
+
+SPLITS = [
+    Split("training", 0.5, TRAINING_SEEDS),
+    Split("validation", 0.25, VALIDATION_SEEDS),
+    Split("test", 0.25, TEST_SEEDS),
+]
+ROAD = FieldRoad("measured", segments=3, lanes=4, speed_limit=110.0)
+
+
+def write(folder, cells=10, intervals=90, **changes):
+    """A field in veh/ft and ft/s that grows along the road and over time."""
+    along, times = np.arange(cells)[:, None], np.arange(intervals)[None]
+    density = 0.01 * (1.0 + 0.1 * along + 0.01 * times)
+    speed = 60.0 * (1.0 + 0.02 * along + 0.0 * times)
+    np.savetxt(folder / "density.txt", density)
+    np.savetxt(folder / "speed.txt", speed)
+    np.savetxt(folder / "flow.txt", density * speed)
+    fields = {
+        "density": folder / "density.txt", "speed": folder / "speed.txt", "cell": 0.05,
+        "interval": 5.0, "density_unit": "veh/ft", "speed_unit": "ft/s",
+    }  # fmt: skip
+    return FieldSource(**{**fields, **changes})
+
+
+def test_a_field_becomes_a_road_with_records_of_its_own(tmp_path):
+    corridor, seeds = import_field(write(tmp_path), ROAD, tmp_path / "road", SPLITS, 100)
+    assert seeds == {"training": (0, 1), "validation": (1000,), "test": (2000,)}
+    assert find_corridor(str(tmp_path / "road" / "road.toml")) == corridor
+    assert corridor.segment_length == pytest.approx(0.1)
+    assert corridor.density_scale == 444.0
+    library = RecordLibrary(tmp_path / "cache")
+    first, second = (library.get(corridor, seed) for seed in (0, 1))
+    assert first.field.shape == (101, 5, 2)
+    densities = [record.field[..., 0] for record in (first, second)]
+    # The first window's last second comes just before the second window's first.
+    step = densities[1][0] - densities[0][-1]
+    np.testing.assert_allclose(step, densities[1][1] - densities[1][0], rtol=1e-6)
+    # Boundary segments come last: the upstream one is the thinnest, the downstream one fullest.
+    assert np.argmin(densities[0][50]) == 3
+    assert np.argmax(densities[0][50]) == 4
+    expected = 0.01 / 0.0003048 * (1.0 + 0.1 * 2.5 + 0.01 * (50.0 / 5.0 - 0.5))
+    assert densities[0][50, 0] == pytest.approx(expected, rel=1e-6)
+    demand = corridor.demand.mainline[0][1]
+    flows = [record.field[:, 0].prod(axis=-1) for record in (first, second)]
+    assert demand == pytest.approx(np.mean(flows), rel=1e-3)
+
+
+def test_environments_play_a_field_and_refuse_what_needs_vehicles(tmp_path):
+    import_field(write(tmp_path), ROAD, tmp_path / "road", SPLITS, 100)
+    path = str(tmp_path / "road" / "road.toml")
+    with pytest.warns(UserWarning, match="on another road"):
+        env = gym.make("dptse_env:dptse/PaperHighway-v0", corridor=path, bandwidth=2)
+    assert env.unwrapped.config.traffic_seeds == (0, 1)
+    env.reset(seed=0)
+    truncated, rewards = False, []
+    while not truncated:
+        _, reward, _, truncated, _ = env.step(env.action_space.sample())
+        rewards.append(reward)
+    assert len(rewards) == 100
+    assert np.isfinite(rewards).all()
+    for preset in ("capped", "paced"):
+        with pytest.raises(ValueError, match=rf"on a road of measured fields, got '{preset}'"):
+            gym.make("dptse_env:dptse/PaperHighway-v0", corridor=path, bandwidth=2, privacy=preset)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"speed": None}, r"speed must be given, or else flow"),
+        ({"density_unit": "cars"}, r"density_unit must be one of veh/km, .*, got 'cars'"),
+        ({"speed_unit": "m/s", "cell": 0.0}, r"cell must be"),
+    ],
+)
+def test_options_are_checked(tmp_path, changes, message):
+    source = write(tmp_path, **changes)
+    with pytest.raises(ValueError, match=message):
+        source.read()
+
+
+def test_another_unit_than_stated_is_noticed(tmp_path):
+    flow = write(tmp_path, speed=None, flow=tmp_path / "flow.txt", flow_unit="veh/s")
+    lane = dataclasses.replace(ROAD, lanes=1)
+    for source, road, message in (
+        (write(tmp_path, density_unit="veh/km"), ROAD, r"density\.txt must be .* got '0.0279 veh"),
+        (
+            dataclasses.replace(flow, flow_unit="veh/min"),
+            ROAD,
+            r"flow\.txt must be .* got '1.* km/h",
+        ),
+        (write(tmp_path), lane, r"flow must be at most 4000 veh/h on 1 lanes.* got '\d+ veh/h"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            import_field(source, road, tmp_path / "road", SPLITS, 100)
+    slow = write(tmp_path, speed_unit="ft/s")
+    np.savetxt(tmp_path / "speed.txt", 0.3048 * np.loadtxt(tmp_path / "speed.txt"))  # now in m/s
+    with pytest.warns(UserWarning, match=r"no speed of the field is above \d+ km/h, at a limit of"):
+        import_field(slow, ROAD, tmp_path / "road", SPLITS, 100)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("fast slow\n", r"speed\.txt must be a table of numbers"),
+        ("1 2\n3 4\n", r"speed\.txt must be a table of .*density\.txt's shape"),
+        ("1 2\n-3 4\n", r"speed\.txt: row 2, column 1 must be finite and >= 0, got -3"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:loadtxt:UserWarning")
+def test_bad_files_are_named(tmp_path, content, message):
+    source = write(tmp_path)
+    (tmp_path / "speed.txt").write_text(content)
+    with pytest.raises(ValueError, match=message):
+        import_field(source, ROAD, tmp_path / "road", SPLITS, 100)
+    assert not (tmp_path / "road").exists()
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_places_that_are_taken_and_windows_that_do_not_fit(tmp_path):
+    source = write(tmp_path)
+    with pytest.raises(ValueError, match=r"duration must be below the field's 450 s, got 450"):
+        import_field(source, ROAD, tmp_path / "road", SPLITS, 450)
+    many = dataclasses.replace(ROAD, segments=9)
+    with pytest.raises(ValueError, match=r"segments must be at most 8, got 9"):
+        import_field(source, many, tmp_path / "road", SPLITS, 100)
+    (tmp_path / "road").mkdir()
+    with pytest.raises(ValueError, match=r"output must be a folder that does not exist yet"):
+        import_field(source, ROAD, tmp_path / "road", SPLITS, 100)
+    folder = dataclasses.replace(source, speed=tmp_path / "road")
+    with pytest.raises(ValueError, match=r"road must be a file, got a directory"):
+        folder.read()

@@ -1,0 +1,54 @@
+"""The folder of an import: splits, seeds, and all or nothing."""
+
+import dataclasses
+
+import pytest
+
+from dptse_env.importers import Layout, Part, Source
+from tests.importers.data import PLAIN, SPLITS, plain, run, stream
+
+
+def test_several_files_are_several_recordings(tmp_path):
+    paths = [plain(tmp_path / f"{name}.csv", stream(seconds=45.0)) for name in "abc"]
+    imported = run(paths)
+    windows = [(window["file"], window["start"]) for window in imported.report["windows"]]
+    assert windows == [(f"{name}.csv", start) for name in "abc" for start in (0.0, 21.0)]
+    assert {name: len(each) for name, each in imported.seeds.items()} == {
+        "training": 4, "validation": 1, "test": 1
+    }  # fmt: skip
+
+
+def test_other_errors_name_the_option(tmp_path):
+    path = plain(tmp_path / "a.csv", stream())
+    lanes = Part(lanes=(1,))
+    for message, arguments in {
+        "shares must be": {"splits": [SPLITS[0]._replace(share=0.5)]},
+        "at most 1 windows of split training, got 3": {
+            "splits": [SPLITS[0]._replace(seeds=range(1)), *SPLITS[1:]]
+        },
+        r"source\.format must be one of fcd, ngsim": {"source": Source("csv")},
+        r"layout\.on_ramps must be one part for each of the 0": {
+            "source": dataclasses.replace(PLAIN, layout=Layout(on_ramps=(lanes,)))
+        },
+        r"layout needs lanes": {
+            "source": dataclasses.replace(PLAIN, layout=Layout(mainline=lanes))
+        },
+        r"pause must be": {"pause": -21},
+    }.items():
+        with pytest.raises(ValueError, match=message):
+            run(path, **arguments)
+    assert [each.name for each in tmp_path.iterdir()] == ["a.csv"]
+    run(path)
+    with pytest.raises(ValueError, match="output must be a folder that does not exist yet"):
+        run(path)
+
+
+def test_an_interruption_leaves_nothing(tmp_path, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    path = plain(tmp_path / "a.csv", stream())
+    monkeypatch.setattr("dptse_env.importers.folder.write_report", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run(path)
+    assert [each.name for each in tmp_path.iterdir()] == ["a.csv"]

@@ -1,0 +1,274 @@
+"""What becomes of points: windows, whole seconds, gaps, ids that are used again, wrong rows."""
+
+import dataclasses
+import subprocess
+import sys
+
+import numpy as np
+import polars as pl
+import pytest
+
+from dptse_env.importers import Layout, Part, Source, Split, TrajectoryError
+from dptse_env.traffic import RecordLibrary
+from tests.importers.data import PLAIN, ROAD, first_file, plain, run, stream
+
+ALL = [Split("training", 1.0, range(100_000))]
+WITH_LANES = dataclasses.replace(PLAIN, columns={**PLAIN.columns, "lane": "lane"})
+
+
+def record_of(imported, seed=0):
+    return RecordLibrary().get(imported.corridor, seed)
+
+
+def starts(imported):
+    return [window["start"] for window in imported.report["windows"]]
+
+
+def subfolder(tmp_path, name):
+    (tmp_path / name).mkdir()
+    return tmp_path / name / "a.csv"
+
+
+def test_windows_follow_one_another_and_are_split_by_time(tmp_path):
+    imported = run(plain(tmp_path / "a.csv", stream(seconds=124.0)))
+    assert imported.seeds == {"training": (0, 1, 2), "validation": (1000,), "test": (2000,)}
+    assert starts(imported) == [0.0, 21.0, 42.0, 63.0, 84.0]  # 20 s and second 0: they share none
+    assert [window["seed"] for window in imported.report["windows"]] == [0, 1, 2, 1000, 2000]
+
+
+def test_a_pause_between_windows_and_skipped_ends(tmp_path):
+    path = plain(tmp_path / "a.csv", stream(seconds=125.0))
+    assert starts(run(path, pause=9, skip_start=5.0, skip_end=20.0)) == [5.0, 35.0, 65.0]
+
+
+@pytest.mark.parametrize("stray", [-4000.0, 1e9, 1e300])
+def test_a_wrong_time_is_counted_and_left_out(stray, tmp_path):
+    points = stream()
+    expected = run(plain(subfolder(tmp_path, "clean"), points))
+    wrong = points[[500]] * [1, 0, 1, 1] + np.array([0, stray, 0, 0])
+    # In the place of the first row, as well as amid the file.
+    for name, rows in (
+        ("first", [*wrong, *points]),
+        ("amid", [*points[:900], *wrong, *points[900:]]),
+    ):
+        imported = run(plain(subfolder(tmp_path, name), np.array(rows)))
+        assert starts(imported) == starts(expected)
+        file = first_file(imported)
+        assert file["far_away"] == 1
+        assert file["pieces"] == first_file(expected)["pieces"]
+        for seed in (0, 1, 2000):
+            one, other = record_of(imported, seed), record_of(expected, seed)
+            np.testing.assert_array_equal(one.counts, other.counts)
+            np.testing.assert_array_equal(one.speed_sums, other.speed_sums)
+
+
+def test_a_silence_of_over_an_hour_begins_another_recording(tmp_path):
+    points = stream(seconds=45.0)
+    later = points + np.array([100, 86_400, 0, 0])
+    imported = run(plain(tmp_path / "a.csv", np.concatenate([points, later])), splits=ALL)
+    assert starts(imported) == [0.0, 21.0, 86_400.0, 86_421.0]
+    alone = run(plain(subfolder(tmp_path, "alone"), points), splits=ALL)
+    for seed in (0, 1):
+        np.testing.assert_array_equal(
+            record_of(imported, seed).counts, record_of(alone, seed).counts
+        )
+        vehicles = record_of(imported, 2 + seed).vehicle
+        assert set(vehicles) == {100 + vehicle for vehicle in record_of(alone, seed).vehicle}
+
+
+def test_positions_and_speeds_are_interpolated_in_time(tmp_path):
+    time = 0.3 + 0.7 * np.arange(40)
+    x, speed = 5.0 * time + 0.25 * time**2, 5.0 + 0.5 * time
+    points = np.column_stack([np.zeros(40), time, x, speed])
+    record = record_of(run(plain(tmp_path / "a.csv", points)))
+    second = record.step + 1  # the first whole second is 1
+    np.testing.assert_allclose(record.speed, 3.6 * (5.0 + 0.5 * second), rtol=1e-5)
+    place = 5.0 * second + 0.25 * second**2 + 0.03  # a chord is 0.03 m at most above the arc
+    np.testing.assert_array_equal(record.segment, place // 100.0)
+
+
+def test_ramps_are_told_by_lanes_or_lateral_positions(tmp_path):
+    points = stream(length=600.0)
+    points[:, 2] -= 150.0
+    vehicle, _, x, _ = points.T
+    on, off = (vehicle % 3 == 1) & (x < 150), (vehicle % 3 == 2) & (x > 250)
+    lane = np.where(on, 7, np.where(off, 8, 1))
+    counts = []
+    for role, parts in {
+        "lane": (Part(lanes=(7,)), Part(lanes=(8,)), Part(lanes=(1,))),
+        "y": (Part(lateral=(30, 37)), Part(lateral=(37, 45)), Part(lateral=(-3, 3))),
+    }.items():
+        layout = Layout(on_ramps=parts[:1], off_ramps=parts[1:2], mainline=parts[2])
+        source = Source("table", {**PLAIN.columns, role: role}, layout=layout)
+        path = subfolder(tmp_path, role)
+        plain(path, points, lane=lane, y=np.where(lane == 1, 0.0, 5.0 * lane))
+        imported = run(path, source, ROAD)
+        counts.append(record_of(imported).counts)
+        assert first_file(imported)["off_lanes"] == 0
+        assert imported.corridor.demand.on_ramps[0] == pytest.approx(300.0, rel=0.3)
+    np.testing.assert_array_equal(*counts)
+    # Vehicles of the ramp are on it to the face at 100 m, then on the mainline, as on lane 7 at
+    # 100 to 150 m; those of the off-ramp likewise: two thirds of all before and behind.
+    total = counts[0].sum(axis=0)[:6]  # main_0 to main_3, on_0, off_0
+    np.testing.assert_allclose(total / total[2], [2 / 3, 1, 1, 2 / 3, 1 / 3, 1 / 3], atol=0.15)
+
+
+def test_a_curved_road_is_straightened_by_its_centre_line(tmp_path):
+    points = stream()
+    angle = points[:, 2] / 1000.0  # a bend of 1 km radius, to the left
+    x, y = 1000.0 * np.sin(angle), 1000.0 * (1.0 - np.cos(angle))
+    line = [(1000.0 * np.sin(a), 1000.0 * (1.0 - np.cos(a))) for a in np.linspace(0, 0.5, 26)]
+    columns = {**PLAIN.columns, "x": "px", "y": "py"}
+    source = Source("table", columns, layout=Layout(centre_line=tuple(line)))
+    straight = record_of(run(plain(tmp_path / "a.csv", points)))
+    bent = run(plain(subfolder(tmp_path, "bent"), points, px=x, py=y), source)
+    np.testing.assert_array_equal(record_of(bent).counts, straight.counts)
+
+
+def test_units_and_direction(tmp_path):
+    points = stream()
+    feet = points * [1.0, 1000.0, -1 / 0.3048, 3600 / 1609.344]
+    feet[:, 2] += 5000.0
+    source = dataclasses.replace(
+        PLAIN,
+        units={"time": "ms", "length": "ft", "speed": "mi/h"},
+        layout=Layout(origin=5000.0, reversed=True),
+    )
+    straight = record_of(run(plain(tmp_path / "a.csv", points)))
+    record = record_of(run(plain(subfolder(tmp_path, "feet"), feet), source))
+    np.testing.assert_array_equal(record.counts, straight.counts)
+    np.testing.assert_allclose(record.speed, straight.speed, rtol=1e-4)
+
+
+def test_short_gaps_are_filled_and_longer_ones_and_jumps_cut(tmp_path):
+    points = stream()
+    vehicle, time = points[:, 0], points[:, 1]
+    points[(vehicle == 12) & (time > 34.0), 2] -= 150.0
+    filled = (vehicle == 10) & (time > 26.05) & (time < 28.05)
+    cut = (vehicle == 11) & (time > 28.05) & (time < 36.05)
+    imported = run(plain(tmp_path / "a.csv", points[~filled & ~cut]))
+    file = first_file(imported)
+    assert (file["gaps_filled"], file["seconds_filled"]) == (1, 2)
+    assert (file["gaps_cut"], file["jumps_cut"]) == (1, 1)
+    assert file["pieces"] == file["vehicles"] + 2
+    assert file["present_at_start"] + file["entered"] + file["appeared"] == file["pieces"]
+    assert file["present_at_end"] + file["left"] + file["vanished"] == file["pieces"]
+    record = record_of(imported, 1)  # seconds 21 to 41
+    assert (record.vehicle == 10).any()
+    assert record.counts[27 - 21].sum() == record.counts[26 - 21].sum()
+
+
+def test_an_id_that_is_used_again_is_another_vehicle(tmp_path):
+    points = stream(headway=4.0)
+    points[:, 0] %= 8  # a vehicle is there for 20 s, its id is free again after 12 s
+    imported = run(plain(tmp_path / "a.csv", points))
+    file = first_file(imported)
+    assert (file["vehicles"], file["ids_shared"]) == (8, 0)
+    assert file["pieces"] == len(np.unique(stream(headway=4.0)[:, 0]))
+    record = record_of(imported, 1)
+    steps = [np.sort(record.step[record.vehicle == v]) for v in np.unique(record.vehicle)]
+    assert all((np.diff(each) == 1).all() for each in steps)
+
+
+@pytest.mark.parametrize("shuffled", [False, True])
+def test_vehicles_that_share_an_id_at_one_time_are_told_apart(shuffled, tmp_path):
+    points = stream(headway=4.0)
+    expected = record_of(run(plain(tmp_path / "a.csv", points)), 1)
+    shared = points.copy()
+    shared[:, 0] %= 4  # five are on the road at once
+    shared = np.concatenate([shared, shared[300:310]])
+    if shuffled:
+        shared = np.random.default_rng(0).permutation(shared)
+    imported = run(plain(subfolder(tmp_path, "shared"), shared))
+    file = first_file(imported)
+    assert (file["vehicles"], file["ids_shared"], file["duplicates"]) == (4, 4, 10)
+    assert file["pieces"] == len(np.unique(points[:, 0]))
+    record = record_of(imported, 1)
+    np.testing.assert_array_equal(record.counts, expected.counts)
+    np.testing.assert_allclose(record.speed_sums, expected.speed_sums)
+    for vehicle in np.unique(record.vehicle):
+        assert (np.diff(record.segment[record.vehicle == vehicle][:-1]) >= 0).all()
+    text = (tmp_path / "shared" / "imported" / "report.md").read_text()
+    assert "| 4 | ids of several vehicles at one time, told apart by their positions |" in text
+
+
+def test_rows_in_any_order_and_duplicates_give_the_same_records(tmp_path):
+    points = stream()
+    ordered = run(plain(tmp_path / "a.csv", points))
+    mixed = np.concatenate([points, points[100:140]])[::-1]
+    shuffled = run(plain(subfolder(tmp_path, "b"), mixed))
+    file = first_file(shuffled)
+    assert file["duplicates"] == 40
+    assert file["out_of_order"] > 100
+    for seed in (0, 1, 2000):
+        one, other = record_of(ordered, seed), record_of(shuffled, seed)
+        np.testing.assert_array_equal(one.counts, other.counts)
+        np.testing.assert_allclose(one.speed_sums, other.speed_sums)
+
+
+def test_rows_off_the_road_are_dropped_and_counted(tmp_path):
+    points = stream()
+    lane = np.where(points[:, 0] == 3, 9, 1)
+    points[points[:, 0] == 5, 2] += 1000.0
+    source = dataclasses.replace(WITH_LANES, layout=Layout(mainline=Part(lanes=(1,))))
+    file = first_file(run(plain(tmp_path / "a.csv", points, lane=lane), source))
+    assert file["off_lanes"] == (points[:, 0] == 3).sum()
+    assert file["off_ends"] == (points[:, 0] == 5).sum()
+    assert file["off_the_road"] == ["9"]
+    text = (tmp_path / "imported" / "report.md").read_text()
+    assert f"| {file['off_ends']} | dropped: before the road's start or beyond its end |" in text
+
+
+@pytest.mark.parametrize(
+    ("factors", "offset", "message"),
+    [
+        ([1, 1, 1, 3.6], 0, r"speeds 3\.6 times as large .*speed in km/h$"),
+        ([1, 1, -1, 1], 400, r"layout\.reversed must be turned round"),
+        ([1, 1, 1, np.nan], 0, r"row 2: v must be a finite number, got 'nan'"),
+        ([1, 1, 1, 1], 900, r"rows must be on the road, got \d+ of \d+"),
+        ([1, 0.1, 1, 1], 0, r"it must last 21 s or more, .*, got 13 s \(time in s\)"),
+        ([1, 1000, 1, 1], 0, r"got 0 of \d+ that do: are the units \(time in s"),
+        ([1, 0.25, 1, 4], 0, r"usually drive 1 to 250 km/h, got 288 km/h"),
+        ([1, 1, 0.01, 0.01], 0, r"usually drive 1 to 250 km/h, got 0\.72 km/h"),
+    ],
+)
+def test_wrong_units_directions_and_numbers_are_refused(factors, offset, message, tmp_path):
+    points = stream() * np.array(factors) + np.array([0, 0, offset, 0])
+    path = plain(tmp_path / "a.csv", points)
+    with pytest.raises(TrajectoryError, match=message) as refused:
+        run(path)
+    assert str(refused.value).startswith(str(path))
+    assert [each.name for each in tmp_path.iterdir()] == ["a.csv"]
+
+
+def test_both_directions_in_one_file_need_a_choice(tmp_path):
+    points = stream()
+    back = points[:, 0] % 2 == 1
+    points[back, 2] = 400.0 - points[back, 2]
+    with pytest.raises(TrajectoryError, match=r"one direction must be chosen .* \d+ % of the veh"):
+        run(plain(tmp_path / "a.csv", points))
+
+
+@pytest.mark.slow
+def test_memory_does_not_grow_with_the_file(tmp_path):
+    code = (
+        "import sys, resource; from pathlib import Path; from dptse_env.importers import recording;"
+        "from tests.importers.test_recording import ALL, run; recording.BUCKET_ROWS = 50_000;"
+        "run(Path(sys.argv[1]), splits=ALL);"
+        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024)"
+    )
+    peaks = []
+    for n_vehicles in (2_000, 10_000):
+        vehicle, point = np.divmod(np.arange(200 * n_vehicles), 200)
+        columns = {
+            "t": 2.0 * vehicle + 0.1 * point,
+            "id": vehicle,
+            "s": 2.0 * point + 0.1,
+            "v": 20.0,
+        }
+        path = subfolder(tmp_path, f"{n_vehicles}")
+        pl.DataFrame(columns).write_csv(path)
+        child = [sys.executable, "-c", code, str(path)]
+        peaks.append(int(subprocess.run(child, check=True, capture_output=True).stdout))
+    smaller, larger = peaks  # [MB]; all rows at once would be 150 MB more
+    assert larger < smaller + 70

@@ -1,0 +1,390 @@
+"""Files of each format, with the quirks of the real ones, and damaged ones."""
+
+import dataclasses
+import gzip
+import json
+import sys
+
+import numpy as np
+import polars as pl
+import pytest
+
+from dptse_env.importers import Layout, Part, Source, Split, TrajectoryError, import_trajectories
+from dptse_env.importers.tables import NGSIM_COLUMNS
+from dptse_env.traffic import SHORT_HIGHWAY, Record, RecordLibrary, simulate, sumo
+from dptse_env.traffic.sumo_input import edge_ids
+from tests.importers.data import PLAIN, first_file, plain, run, stream, write_csv
+
+FOOT = 0.3048
+EPOCH = 1118846979700  # NGSIM's clocks do not begin at a whole second
+
+
+@pytest.fixture(scope="module")
+def expected(tmp_path_factory):
+    """Counts of the first record of the stream, at seconds from its start."""
+    path = plain(tmp_path_factory.mktemp("plain") / "a.csv", stream())
+    return counts(run(path))
+
+
+def counts(imported, seed=0):
+    return RecordLibrary().get(imported.corridor, seed).counts
+
+
+def ngsim(points, shift=300.0):
+    """Return the 18 columns of a stream, `shift` ms later than `EPOCH` and its times."""
+    vehicle, time, x, speed = points.T
+    n = len(points)
+    values = (
+        vehicle + 1, 1 + 10 * time, np.full(n, 200), EPOCH + shift + 1000 * time, np.full(n, 18.2),
+        x / FOOT, np.full(n, 6451137.641), np.full(n, 1873344.962), np.full(n, 14.5),
+        np.full(n, 4.9), np.full(n, 2), speed / FOOT, np.zeros(n), np.full(n, 2), np.zeros(n),
+        np.zeros(n), np.zeros(n), np.zeros(n),
+    )  # fmt: skip
+    whole = {"Vehicle_ID", "Frame_ID", "Total_Frames", "Global_Time", "v_Class", "Lane_ID"}
+    return {
+        name: column.round().astype(int) if name in whole else column.round(3)
+        for name, column in zip(NGSIM_COLUMNS, values, strict=True)
+    }
+
+
+def text_of_ngsim(points):
+    rows = zip(*ngsim(points).values(), strict=True)
+    return ["  " + "   ".join(f"{value:>9}" for value in row) + "  " for row in rows]
+
+
+def test_ngsim_text_is_in_columns_of_blanks_without_a_header(tmp_path, expected):
+    path = tmp_path / "trajectories-0750am-0805am.txt"
+    path.write_text("\r\n".join(text_of_ngsim(stream())) + "\r\n\r\n  \r\n")
+    imported = run(path, Source("ngsim"))
+    np.testing.assert_array_equal(counts(imported), expected)
+    assert imported.report["windows"][0]["start"] == (EPOCH + 300) / 1000
+
+
+def test_ngsims_portal_has_a_header_grouped_digits_and_other_sites(tmp_path, expected):
+    columns = ngsim(stream())
+    columns = {name: columns[name] for name in reversed(columns)}
+    n = len(columns["Vehicle_ID"])
+    columns["Global_Time"] = [f'"{time:,}"' for time in columns["Global_Time"]]
+    columns |= {"O_Zone": [""] * n, "Location": ["us-101"] * n}
+    other = ",".join("nowhere" if name == "Location" else "1" for name in columns)
+    path = write_csv(tmp_path / "portal.csv", columns, head="\ufeff", lines=[other] * 3)
+    imported = run(path, Source("ngsim", where={"Location": "us-101"}))
+    np.testing.assert_array_equal(counts(imported), expected)
+    assert first_file(imported)["rows"] == n
+
+
+def highd(points, folder, period=0.04):
+    """Write a recording: even vehicles move to the right, odd ones to the left, on 400 m."""
+    vehicle, time, x, speed = points.T
+    left = vehicle % 2 == 1
+    length = 4.6
+    columns = {
+        "frame": (1 + time / period).round().astype(int), "id": (vehicle + 1).astype(int),
+        # x is the left corner of the box, the front of those that move to the left
+        "x": np.where(left, 400.0 - x, x - length).round(3), "y": np.where(left, 8.5, 22.0),
+        "width": np.full(len(x), length), "height": np.full(len(x), 1.9),
+        "xVelocity": np.where(left, -speed, speed), "yVelocity": np.zeros(len(x)),
+        "laneId": np.where(left, 3, 6),
+    }  # fmt: skip
+    path = write_csv(folder / "01_tracks.csv", columns)
+    distinct = np.unique(vehicle).astype(int)
+    directions = np.where(distinct % 2 == 1, 1, 2)
+    write_csv(folder / "01_tracksMeta.csv", {"id": distinct + 1, "drivingDirection": directions})
+    return path
+
+
+def test_highd_has_both_directions_and_corners_of_boxes(tmp_path):
+    points = stream(period=0.04)
+    path = highd(points, tmp_path)
+    imported = run(path, Source("highd", layout=Layout(extent=400.0)))
+    groups = [(w["group"], w["start"]) for w in imported.report["windows"]]
+    assert groups[:4] == [("lower", 1.0), ("upper", 1.0), ("lower", 22.0), ("upper", 22.0)]
+    file = first_file(imported)
+    assert (file["rows"], file["entered"]) == (len(points), 29)
+    for record in (RecordLibrary().get(imported.corridor, seed) for seed in (0, 1)):
+        first = record.vehicle == record.vehicle[0]
+        assert (np.diff(record.segment[first][record.segment[first] < 4]) >= 0).all()
+        np.testing.assert_allclose(record.speed, 72.0, rtol=1e-5)
+
+
+def test_one_direction_of_highd_may_be_chosen(tmp_path, expected):
+    points = stream(period=0.04, headway=2.0)
+    points = points[points[:, 0] % 2 == 0]
+    path = highd(np.concatenate([points, points + np.array([1, 0, 0, 0])]), tmp_path)
+    meta = tmp_path / "01_tracksMeta.csv"
+    text = meta.read_text()
+    meta.write_text("id,drivingDirection\n1,2\n")
+    with pytest.raises(TrajectoryError, match=r"vehicle \d+ is not in .*_tracksMeta\.csv"):
+        run(path, Source("highd"))
+    meta.write_text(text)
+    with pytest.raises(TrajectoryError, match=r"layout\.extent must be given, .* \['lower'\]"):
+        run(path, Source("highd"))
+    imported = run(path, Source("highd", groups=("lower",)))
+    assert {window["group"] for window in imported.report["windows"]} == {"lower"}
+    # frame 1 is at 0.04 s: the grid is the file's
+    assert abs(counts(imported)[:, :4].sum() - expected[:20, :4].sum()) <= 12
+    assert first_file(imported)["other_group"] == len(points)
+
+
+def test_exid_has_frames_lanelets_in_lists_and_a_plane(tmp_path, expected):
+    vehicle, time, x, speed = stream(period=0.04).T
+    columns = {
+        "recordingId": np.full(len(x), 7), "trackId": vehicle.astype(int),
+        "frame": (time * 25).round().astype(int), "xCenter": (100 + 0.6 * x).round(4),
+        "yCenter": (-50 - 0.8 * x).round(4), "heading": np.full(len(x), 306.9),
+        "lonVelocity": speed, "laneletId": ["1500;1502" if s > 200 else "1500" for s in x],
+    }  # fmt: skip
+    line = ((100.0, -50.0), (340.0, -370.0))
+    layout = Layout(centre_line=line, mainline=Part(lanes=(1500, 1501)))
+    imported = run(write_csv(tmp_path / "07_tracks.csv", columns), Source("exid", layout=layout))
+    np.testing.assert_array_equal(counts(imported), expected)
+    assert imported.report["windows"][0]["group"] == "7"
+
+
+def i24(points, direction=1, first=0):
+    """Return documents of a stream, as MongoDB exports them."""
+    documents = []
+    for vehicle in np.unique(points[:, 0]):
+        _, time, x, _ = points[points[:, 0] == vehicle].T
+        place = 310000.0 + direction * x / FOOT
+        documents.append({
+            "_id": {"$oid": f"{first + int(vehicle):024x}"},
+            "timestamp": (1.6691e9 + time).tolist(),
+            "x_position": place.tolist(), "y_position": [direction * 20.0] * len(x),
+            "direction": direction, "length": [15.0, 15.1], "flags": [None, "a"],
+        })  # fmt: skip
+    return documents
+
+
+LISTS = ("timestamp", "x_position", "y_position")
+
+
+def test_i24_is_an_array_of_documents_by_vehicle_without_speeds(tmp_path, expected):
+    path = tmp_path / "i24.json"
+    path.write_text("\ufeff" + json.dumps(i24(stream()) + i24(stream(), -1, 500)))
+    with pytest.raises(TrajectoryError, match=r"\d+ % of the vehicles"):
+        run(path, Source("i24", layout=Layout(origin=310000.0)))
+    east = Source("i24", where={"direction": 1}, layout=Layout(origin=310000.0))
+    imported = run(path, east)
+    np.testing.assert_array_equal(counts(imported), expected)
+    np.testing.assert_allclose(RecordLibrary().get(imported.corridor, 0).speed, 72.0, rtol=1e-3)
+    (tmp_path / "west").mkdir()
+    path = path.rename(tmp_path / "west" / "i24.json")
+    west = Source("i24", groups=(-1,), layout=Layout(origin=310000.0, reversed=True))
+    np.testing.assert_array_equal(counts(run(path, west)), expected)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (json.dumps(i24(stream()))[:-2000], r"row 34: it is no complete JSON array"),
+        ("[" * 100_000, "row 1: it is no complete JSON array"),
+        ("[]", "must be a JSON array of documents, got none"),
+        (json.dumps([{**dict.fromkeys(LISTS, ()), "_id": 1, "direction": 1}]), "got none"),
+        ("[3]", "row 1: a document must be an object, got 3"),
+        ('[{"_id": 1}]', "row 1: fields timestamp, x_position, y_position, .* are missing"),
+        (json.dumps([{**i24(stream())[0], "x_position": [1.0]}]), "row 1: lists must"),
+    ],
+)
+def test_bad_json_is_named_by_document_and_field(text, message, tmp_path):
+    path = tmp_path / "i24.json"
+    path.write_text(text)
+    with pytest.raises(TrajectoryError, match=message):
+        run(path, Source("i24", layout=Layout(origin=310000.0)))
+
+
+@pytest.mark.parametrize("sign", ["-", "_"])
+def test_tgsim_has_runs_and_two_spellings(sign, tmp_path, expected):
+    vehicle, time, x, speed = stream().T
+    columns = {
+        "id": vehicle.astype(int), "time": time.round(1), f"xloc{sign}kf": (x + 30.0).round(4),
+        f"yloc{sign}kf": 0 * x, f"lane{sign}kf": 0 * x + 1, f"speed{sign}kf": speed,
+        f"run{sign}index": 0 * x.astype(int) + 3,
+    }  # fmt: skip
+    path = write_csv(tmp_path / "tgsim.csv", columns)
+    imported = run(path, Source("tgsim", layout=Layout(origin=30.0)))
+    np.testing.assert_array_equal(counts(imported), expected)
+    assert imported.report["windows"][0]["group"] == "3"
+
+
+def test_tables_may_be_parquet_compressed_or_by_other_delimiters(tmp_path, expected):
+    path = plain(tmp_path / "a.csv", stream())
+    text = path.read_text()
+    (tmp_path / "a.csv.gz").write_bytes(gzip.compress(text.encode()))
+    (tmp_path / "semicolons.csv").write_text(text.replace(",", ";").replace("\n", "\n\n", 3))
+    (tmp_path / "tabs.txt").write_text("\ufeff" + text.replace(",", "\t"))
+    vehicle, time, x, speed = stream().T
+    table = pl.DataFrame({"t": time.round(4), "id": vehicle, "s": x.round(4), "v": speed})
+    table.write_parquet(tmp_path / "a.parquet")
+    for name in ("a.csv.gz", "semicolons.csv", "tabs.txt", "a.parquet"):
+        folder = tmp_path / name.replace(".", "-")
+        folder.mkdir()
+        imported = run([(tmp_path / name).rename(folder / name)])
+        np.testing.assert_array_equal(counts(imported), expected, name)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "the file is empty"),
+        (b"t,id,s,v\n", "must have rows of vehicles, got none"),
+        (b"t,id,s,v\n0,1,2,3\n1,1,here,3\n", "row 3: s must be a finite number, got 'here'"),
+        (b"t,id,s,v\n0,1,2,3\n\n1,1,,3\n", "row 4: s must be a finite number, got nothing"),
+        (b"t,id,x,v\n0,1,2,3\n", r"source\.columns\.x must be .*'s'; found t, id, x, v"),
+        (b"t,id,s,v\n0,\xff,2,3\n", "utf-8"),
+    ],
+)
+def test_bad_tables_are_named_by_row_and_field(content, message, tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_bytes(content)
+    with pytest.raises(TrajectoryError, match=message) as refused:
+        run(path, PLAIN)
+    assert str(refused.value).startswith(str(path))
+
+
+@pytest.mark.parametrize("kind", ["csv", "csv.gz", "txt"])
+@pytest.mark.parametrize(
+    ("change", "got"), [("{},7", "{more}"), ("{less}", "{fewer}"), ('{},"', "an open quote")]
+)
+def test_rows_of_another_length_are_refused_with_their_number(change, got, kind, tmp_path):
+    blanks = kind == "txt"
+    lines = plain(tmp_path / "a.csv", stream()).read_text().splitlines()
+    n = 4
+    if blanks:
+        lines, n = text_of_ngsim(stream()), len(NGSIM_COLUMNS)
+        change, got = change.replace(",", " "), got.replace("an open quote", "{more}")
+    separator = None if blanks else ","
+    less = (separator or " ").join(lines[4000].split(separator)[:-1])
+    lines[4000] = change.format(lines[4000], less=less)
+    data = "\n".join(lines).encode()
+    path = tmp_path / f"b.{kind}"
+    path.write_bytes(gzip.compress(data) if kind == "csv.gz" else data)
+    told = got.format(more=n + 1, fewer=n - 1)
+    with pytest.raises(TrajectoryError, match=rf"row 4001: it must have {n} fields, got {told}$"):
+        run(path, Source("ngsim") if blanks else PLAIN)
+
+
+def test_messages_show_little_of_a_file(tmp_path):
+    long = "x" * 100_000
+    path = tmp_path / "a.csv"
+    for content in (
+        f"t,id,s,v\n0,1,{long},3\n", f"t,id,{long},v\n", ",".join(f"c{i}" for i in range(10_000)),
+    ):  # fmt: skip
+        path.write_text(content)
+        with pytest.raises(TrajectoryError) as refused:
+            run(path, PLAIN)
+        assert len(str(refused.value)) < 500 + len(str(path))
+
+
+def test_what_is_no_file_of_its_kind_is_refused(tmp_path):
+    for path, source, message in (
+        ("..", PLAIN, "must be a file, got a directory"),
+        ("none.csv", PLAIN, "the file cannot be read: No such file"),
+        ("none.json", Source("i24"), "the file cannot be read: No such file"),
+        ("a.parquet", PLAIN, "it is no complete Parquet file"),
+        ("a.csv.gz", PLAIN, "the file cannot be read: Not a gzipped file"),
+        ("dates.parquet", PLAIN, "t must be numbers, got Date"),
+    ):
+        (tmp_path / "a.parquet").write_bytes(b"PAR1 and no more")
+        (tmp_path / "a.csv.gz").write_bytes(b"not compressed")
+        dates = pl.DataFrame({"t": [0], "id": 1, "s": 2, "v": 3}).cast({"t": pl.Date})
+        dates.write_parquet(tmp_path / "dates.parquet")
+        with pytest.raises(TrajectoryError, match=message):
+            run(tmp_path / path, source)
+
+
+def test_missing_polars_is_named_with_its_extra(monkeypatch):
+    for name in [each for each in sys.modules if each.startswith("dptse_env.importers")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "polars", None)
+    with pytest.raises(ImportError, match=r"polars, .*'dptse-env\[corridors\]'"):
+        __import__("dptse_env.importers")
+
+
+# -- SUMO ------------------------------------------------------------------------------------------
+
+TRAINING = [Split("training", 1.0, range(1000))]
+
+
+def import_fcd(path, folder, road=SHORT_HIGHWAY, **fields):
+    imported = import_trajectories([path], Source("fcd", **fields), road, folder / "new", TRAINING)
+    return RecordLibrary(folder).get(imported.corridor, 0)
+
+
+@pytest.fixture(scope="module")
+def fcd(tmp_path_factory):
+    """Record a seed once for each kind of FCD file; return their folder and the record."""
+    folder, options = tmp_path_factory.mktemp("fcd"), sumo.OPTIONS
+    try:
+        for suffix in ("xml", "csv", "parquet"):
+            output = "--fcd-output", str(folder / f"fcd.{suffix}"), "--precision", "17"
+            sumo.OPTIONS = (*options, *output)
+            record = simulate(SHORT_HIGHWAY, 3)
+    finally:
+        sumo.OPTIONS = options
+    (folder / "fcd.xml.gz").write_bytes(gzip.compress((folder / "fcd.xml").read_bytes()))
+    return folder, record
+
+
+@pytest.mark.parametrize("suffix", ["xml.gz", "csv", "parquet"])
+def test_imported_fcd_is_the_record_number_for_number(suffix, fcd, tmp_path):
+    folder, recorded = fcd
+    record = import_fcd(folder / f"fcd.{suffix}", tmp_path)
+    for name in Record.COLUMNS:
+        np.testing.assert_array_equal(getattr(record, name), getattr(recorded, name))
+    assert (record.n_steps, record.n_columns) == (recorded.n_steps, recorded.n_columns)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("fcd.xml", r"fcd\.xml, row \d+: it is no complete XML file"),
+        ("fcd.xml.gz", r"fcd\.xml\.gz, row \d+: it is no complete XML file"),
+        ("fcd.csv", r"fcd\.csv, row \d+: it must have 11 fields"),
+        ("fcd.csv.gz", r"fcd\.csv\.gz: the file cannot be read: .*end of file"),
+        ("fcd.parquet", r"fcd\.parquet: it is no complete Parquet file"),
+    ],
+)
+def test_files_that_are_cut_are_refused(name, message, fcd, tmp_path):
+    zipped = name == "fcd.csv.gz"
+    content = (fcd[0] / (name.removesuffix(".gz") if zipped else name)).read_bytes()
+    content = gzip.compress(content) if zipped else content
+    content = content[: len(content) * 2 // 3]
+    if name == "fcd.csv":  # within a line: at its end nothing would be missing
+        content = content.rpartition(b"\n")[0] + b"\n150.000;12;3.0"
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(TrajectoryError, match=message):
+        import_fcd(tmp_path / name, tmp_path)
+    assert sorted(each.name for each in tmp_path.iterdir()) == [name]
+
+
+def test_fcd_that_does_not_fit_the_road_is_refused(fcd, tmp_path):
+    path = fcd[0] / "fcd.csv"
+    with pytest.raises(TrajectoryError, match=r"must be on the road, got .*such as .*main_0"):
+        import_fcd(path, tmp_path, layout=Layout(edges={"A0": 0.0}))
+    with pytest.raises(ValueError, match=r"layout\.edges\.A0 must be one of main_0"):
+        import_fcd(path, tmp_path, layout=Layout(edges={"A0": "main_9"}))
+    (tmp_path / "a.xml").write_text(
+        '<a>\n<timestep time="0.00">\n<vehicle id="1" lane="main_0_0" speed="3"/></timestep></a>'
+    )
+    with pytest.raises(TrajectoryError, match=r"a\.xml, row 3: .* lane, speed, pos; 'pos' is miss"):
+        import_fcd(tmp_path / "a.xml", tmp_path)
+
+
+def test_an_uneven_road_with_long_ramps_is_imported_number_for_number(tmp_path, monkeypatch):
+    lengths = (0.1, 0.15, 0.08, 0.1, 0.12, 0.1)
+    road = dataclasses.replace(
+        SHORT_HIGHWAY, segment_length=lengths, ramp_segments=(2, 3), duration=90
+    )
+    path = tmp_path / "fcd.csv"
+    output = "--fcd-output", str(path), "--precision", "17"
+    monkeypatch.setattr(sumo, "OPTIONS", (*sumo.OPTIONS, *output))
+    recorded = simulate(road, 0)
+    record = import_fcd(path, tmp_path / "by-edge", road)
+    for name in Record.COLUMNS:
+        np.testing.assert_array_equal(getattr(record, name), getattr(recorded, name))
+    # By position: edges of the mainline start at kilometres.
+    edges = {name: name for name in edge_ids(road)}
+    edges |= {f"main_{i}": float(sum(lengths[:i])) for i in range(6)}
+    record = import_fcd(path, tmp_path / "by-position", road, layout=Layout(edges=edges))
+    assert (record.counts != recorded.counts).mean() < 0.005

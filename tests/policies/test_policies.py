@@ -1,0 +1,65 @@
+"""Policy files read without torch."""
+
+import hashlib
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import dptse_env.policies
+from dptse_env.policies import read_policy, shipped_policies
+from tests.hostile import check_hostile, edited
+
+SHIPPED = Path(dptse_env.policies.__file__).parent / "private-highway.safetensors"
+DIGESTS = {
+    "capped-roads": ("845aec0177e6", "03d6ded5bf35"),
+    "paced-roads": ("ec2d9184add7", "3ba36acf9081"),
+    "private-highway": ("5efbbd09f911", "0e8b48dbb626"),
+}
+"""The first digits of the digests of the files as they were recorded, and of their weights."""
+
+
+def test_card_and_weights_are_read_without_torch(monkeypatch):
+    monkeypatch.setitem(sys.modules, "torch", None)
+    file = read_policy("private-highway")
+    assert file.card["training"]["seed"] == 3
+    assert len(file.weights) == 7
+    assert {array.dtype for array in file.weights.values()} == {np.dtype(np.float32)}
+
+
+def test_the_weights_are_those_of_the_files_that_were_recorded():
+    digests = {}
+    for name in shipped_policies():
+        file, content = read_policy(name), hashlib.sha256()
+        for key in sorted(file.weights):
+            content.update(file.weights[key].tobytes())
+        digests[name] = file.identity[:12], content.hexdigest()[:12]
+    assert digests == DIGESTS
+
+
+def test_damage_is_refused(tmp_path):
+    check_hostile(read_policy, SHIPPED, tmp_path / "bad.safetensors", shapes=False)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda card: card.pop("fits"), "'fits' of type dict"),
+        (lambda card: card["fits"].update(action=3), r"'fits\.action' of type str"),
+        (lambda card: card.update(policy=[]), "'policy' of type dict"),
+    ],
+)
+def test_a_card_that_lacks_a_field_is_refused(change, message, tmp_path):
+    path = tmp_path / "some.safetensors"
+    path.write_bytes(edited(SHIPPED, lambda card, weights: change(card)))
+    with pytest.raises(ValueError, match=rf"some.* is not a saved policy: .*{message}"):
+        read_policy(path)
+
+
+def test_files_that_are_not_there_or_old(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"'absent': .*come with the package \(.*private-"):
+        read_policy("absent")
+    (tmp_path / "old.zip").write_bytes(b"PK\x03\x04")
+    with pytest.raises(ValueError, match=r"old\.zip is .* zip archive, as earlier versions wrote"):
+        read_policy(tmp_path / "old.zip")

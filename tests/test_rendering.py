@@ -1,0 +1,131 @@
+"""Pictures of an episode, a window that shows it, and videos."""
+
+import sys
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from dptse_env.utils.registry import MissingExtraError
+
+SHORT = "dptse_env:dptse/ShortHighway-v0"
+
+
+@pytest.fixture
+def display(monkeypatch):
+    """A display in memory, by SDL's own driver for machines without one."""
+    pytest.importorskip("pygame", reason="the extra video is not installed")
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    monkeypatch.setenv("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+
+
+def make(render_mode="human", **keywords):
+    keywords = {"horizon": 30, "random_start": True, "traffic_seeds": [0], **keywords}
+    return gym.make(SHORT, render_mode=render_mode, **keywords)
+
+
+def play(env, n_steps, seed):
+    env.action_space.seed(seed)
+    env.reset(seed=seed)
+    for _ in range(n_steps):
+        env.step(env.action_space.sample())
+
+
+def shown():
+    """The pixels of the window, shape (height, width, 3); None while there is none."""
+    import pygame
+
+    if not pygame.display.get_init():
+        return None
+    return np.swapaxes(pygame.surfarray.array3d(pygame.display.get_surface()), 0, 1)
+
+
+def test_a_picture_shows_the_episode_so_far():
+    env = make("rgb_array")
+    with pytest.raises(gym.error.ResetNeeded):
+        env.unwrapped.render()
+    env.reset(seed=0)
+    empty = env.render()
+    for seed in (0, 1):
+        play(env, 20, seed)
+        picture = env.render()
+    assert (picture.dtype, picture.shape) == (np.uint8, empty.shape)
+    assert (picture != empty).mean() > 0.05
+    # A figure that is used again shows what a new one does.
+    fresh = make("rgb_array")
+    play(fresh, 20, 1)
+    np.testing.assert_array_equal(picture, fresh.render())
+
+
+def test_it_is_drawn_anew_every_kth_second_and_at_the_end():
+    env = make("rgb_array", render_every=4, horizon=10)
+    env.reset(seed=0)
+    pictures = [env.render()]
+    for _ in range(10):
+        env.step(env.action_space.sample())
+        pictures.append(env.render())
+    drawn = [k for k in range(1, 11) if (pictures[k] != pictures[k - 1]).any()]
+    assert drawn == [4, 8, 10]
+
+
+@pytest.mark.slow
+def test_the_checker_finds_nothing_in_any_render_mode(display):
+    check_env(make("rgb_array").unwrapped)
+
+
+def test_a_window_shows_what_a_picture_would(display):
+    human, picture = make(), make("rgb_array")
+    for env in (human, picture):
+        env.reset(seed=3)
+        env.action_space.seed(0)
+    np.testing.assert_array_equal(shown(), picture.render())
+    for _ in range(4):
+        before = shown()
+        action = human.action_space.sample()
+        human.step(action)
+        picture.step(action)
+        np.testing.assert_array_equal(shown(), picture.render())
+        assert (shown() != before).any()
+        assert human.render() is None
+    human.close()
+    assert shown() is None
+
+
+def test_an_episode_goes_on_when_its_window_is_closed_by_hand(display):
+    import pygame
+
+    env = make()
+    env.reset(seed=3)
+    pygame.event.post(pygame.event.Event(pygame.QUIT))
+    env.step(env.action_space.sample())
+    assert shown() is None
+    env.step(env.action_space.sample())
+    assert shown() is None
+    env.reset(seed=4)
+    assert shown() is not None
+    env.close()
+    env.close()
+
+
+def test_a_missing_pygame_names_the_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pygame", None)
+    with pytest.raises(MissingExtraError, match=r"pip install 'dptse-env\[video\]'"):
+        make()
+
+
+def test_a_video_has_a_frame_for_each_second(tmp_path):
+    pytest.importorskip("moviepy", reason="the extra video is not installed")
+    import imageio_ffmpeg
+
+    folder = tmp_path / "videos"
+    env = gym.wrappers.RecordVideo(make("rgb_array"), str(folder), disable_logger=True)
+    env.reset(seed=3)
+    truncated = False
+    while not truncated:
+        *_, truncated, _ = env.step(env.action_space.sample())
+    env.close()
+    (video,) = folder.glob("*.mp4")
+    frames, seconds = imageio_ffmpeg.count_frames_and_secs(str(video))
+    assert frames in (30, 31)  # the encoder may round the last one away
+    assert seconds == pytest.approx(31 / env.metadata["render_fps"], abs=0.1)

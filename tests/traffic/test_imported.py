@@ -1,0 +1,178 @@
+"""Corridors with recordings: their records are read, never made."""
+
+import dataclasses
+import pickle
+import shutil
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from dptse_env.config import resolve
+from dptse_env.traffic import (
+    SHORT_HIGHWAY,
+    InvalidRecordError,
+    Record,
+    RecordingError,
+    Recordings,
+    RecordLibrary,
+    randomised,
+    read_corridor,
+    simulate,
+    sumo,
+)
+from dptse_env.traffic.imported import record_path, recorded_seeds, save_record, write_manifest
+from dptse_env.traffic.roads import write_corridor
+
+FREE = dataclasses.replace(SHORT_HIGHWAY, incident=None)
+SEEDS = (0, 1, 1000, 2000)
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory):
+    """Write a folder of recordings; return its corridor."""
+    return write(tmp_path_factory.mktemp("recordings"), range(4))
+
+
+def write(folder, variants):
+    records = {seed: synthetic(variant) for seed, variant in zip(SEEDS, variants, strict=True)}
+    for seed, record in records.items():
+        save_record(folder, seed, FREE.record_layout, record)
+    digests = {seed: record.digest for seed, record in records.items()}
+    digest = write_manifest(folder, FREE.record_layout, digests, [])
+    corridor = dataclasses.replace(FREE, recordings=Recordings(str(folder), digest))
+    write_corridor(folder / "road.toml", corridor)
+    return corridor
+
+
+def synthetic(variant):
+    steps = np.arange(FREE.duration + 1)
+    return Record(
+        step=steps, vehicle=np.full(len(steps), variant), segment=steps % 6,
+        speed=np.full(len(steps), 50.0 + variant), n_steps=FREE.duration + 1,
+        n_columns=FREE.n_segments + FREE.n_boundaries,
+    )  # fmt: skip
+
+
+@pytest.fixture
+def recorded(original, tmp_path):
+    """Copy the folder, so that a test may damage it; return the copy's corridor."""
+    folder = tmp_path / "moved"
+    shutil.copytree(original.recordings.folder, folder)
+    return read_corridor(folder / "road.toml")
+
+
+def test_the_library_reads_each_recorded_seed(recorded, tmp_path, monkeypatch):
+    monkeypatch.setattr(sumo, "sumo_version", None)  # libsumo is not asked for
+    library = RecordLibrary(tmp_path / "cache")
+    library.ensure(recorded, SEEDS)
+    assert library.missing(recorded, SEEDS) == []
+    for variant, seed in enumerate(SEEDS):
+        record = library.get(recorded, seed)
+        assert set(record.speed.tolist()) == {50.0 + variant}
+        assert library.record_path(recorded, seed).is_file()
+    assert not (tmp_path / "cache").exists()
+
+
+def test_a_seed_that_was_not_recorded_is_refused_with_those_that_are(recorded):
+    library = RecordLibrary()
+    message = r"must be one that was recorded \(0\.\.1, 1000, 2000 in .*\), got 5, 7\.\.8"
+    for refused in (library.missing, library.ensure):
+        with pytest.raises(ValueError, match=message):
+            refused(recorded, [0, 5, 7, 8])
+    with pytest.raises(ValueError, match=r"got 5$"):
+        library.get(recorded, 5)
+    with pytest.raises(ValueError, match="traffic seed must be an integer >= 0"):
+        library.get(recorded, -1)
+
+
+def test_a_damaged_record_is_an_error(recorded):
+    path = record_path(recorded.recordings.folder, 1)
+    content = bytearray(path.read_bytes())
+    content[-1] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(InvalidRecordError, match="another digest"):
+        RecordLibrary().get(recorded, 1)
+    assert path.read_bytes() == content, "it must not be made again"
+
+
+def test_an_exchanged_or_missing_record_is_an_error(recorded, tmp_path):
+    paths = [record_path(recorded.recordings.folder, seed) for seed in (0, 1)]
+    other = write(tmp_path / "other", (7, 8, 9, 10))
+    paths[0].unlink()
+    RecordLibrary().ensure(recorded, [0])  # it must not be made
+    with pytest.raises(InvalidRecordError, match="the record is missing"):
+        RecordLibrary().get(recorded, 0)
+    paths[1].rename(paths[0])
+    with pytest.raises(InvalidRecordError, match="source is"):
+        RecordLibrary().get(recorded, 0)
+    shutil.copy(record_path(other.recordings.folder, 0), paths[0])
+    with pytest.raises(InvalidRecordError, match="not the record that was imported"):
+        RecordLibrary().get(recorded, 0)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda text: text.replace('"0": "', '"3": "'), "not the manifest of"),
+        (lambda text: text[: len(text) // 2], "must be JSON"),
+        (lambda text: text.replace('"version": 2', '"version": 3'), "format must be"),
+        (
+            lambda text: text.replace('"version": 2', '"version": 1'),
+            r"manifest\.json: an earlier version wrote .* 'dptse import trajectories",
+        ),
+    ],
+)
+def test_a_damaged_manifest_is_an_error(change, message, recorded):
+    manifest = Path(recorded.recordings.folder) / "manifest.json"
+    manifest.write_text(change(manifest.read_text()))
+    with pytest.raises(InvalidRecordError, match=message):
+        recorded_seeds(recorded.recordings)
+    manifest.unlink()
+    with pytest.raises(InvalidRecordError, match="recordings cannot be read"):
+        recorded_seeds(recorded.recordings)
+
+
+def test_a_manifest_of_other_keys_than_seeds_is_an_error(tmp_path):
+    digest = write_manifest(tmp_path, FREE.record_layout, {"x" * 1000: ""}, [])
+    with pytest.raises(InvalidRecordError, match=r"manifest\.json: records must have .{1,150}$"):
+        recorded_seeds(Recordings(str(tmp_path), digest))
+
+
+def test_the_digest_covers_the_content_and_not_the_folder(original, recorded, tmp_path):
+    assert recorded.recordings.folder != original.recordings.folder
+    assert recorded.digest == original.digest
+    assert recorded.digest != FREE.digest
+    other = write(tmp_path / "other", (0, 1, 2, 9))
+    assert other.digest != original.digest
+    assert pickle.loads(pickle.dumps(recorded)) == recorded
+
+
+def test_recorded_traffic_has_a_fixed_demand_and_no_incident(recorded):
+    with pytest.raises(ValueError, match=r"corridor\.incident must be None where traffic is rec"):
+        dataclasses.replace(recorded, incident=SHORT_HIGHWAY.incident)
+    with pytest.raises(ValueError, match=r"corridor\.demand must be fixed where traffic is rec"):
+        dataclasses.replace(recorded, demand=randomised(SHORT_HIGHWAY).demand)
+    with pytest.raises(RecordingError, match="its traffic is recorded, not simulated"):
+        simulate(recorded, 0)
+
+
+def test_default_traffic_seeds_are_the_recorded_training_seeds(recorded):
+    road = f"{recorded.recordings.folder}/road.toml"
+    assert resolve("short-highway", {"corridor": road}).traffic_seeds == (0, 1)
+    given = resolve("short-highway", {"corridor": road, "traffic_seeds": [2000]})
+    assert given.traffic_seeds == (2000,)
+    with pytest.raises(ValueError, match=r"must be one that was recorded .*, got 2\.\.63"):
+        resolve("short-highway", {"corridor": road, "traffic_seeds": "0:64"})
+
+
+def test_environments_replay_recordings(recorded):
+    road = f"{recorded.recordings.folder}/road.toml"
+    keywords = {"corridor": road, "estimator": "random_walk", "truth_in_info": True}
+    env = gym.make("dptse_env:dptse/ShortHighway-v0", **keywords, traffic_seeds=[1000])
+    env.reset(seed=0)
+    for _ in range(3):
+        info = env.step(np.zeros(6, dtype=np.int8))[4]
+    np.testing.assert_allclose(info["truth"]["density"], [0, 0, 0, 10, 0, 0, 0, 0])
+    assert info["truth"]["speed"][3] == pytest.approx(52.0)

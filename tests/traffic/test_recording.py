@@ -1,0 +1,231 @@
+"""SUMO in worker processes: what they record, and workers and parents that die."""
+
+import logging
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from dptse_env.traffic import (
+    SHORT_HIGHWAY,
+    Record,
+    RecordingError,
+    RecordLibrary,
+    simulate,
+    simulate_in_worker,
+)
+from dptse_env.traffic.recording import record_seeds
+from tests.traffic.test_record import assert_same
+
+UNGUARDED = """
+from dptse_env.traffic import SHORT_HIGHWAY, simulate_in_worker
+print(simulate_in_worker(SHORT_HIGHWAY, 0).n_rows)
+"""
+ENSURE = """
+import signal, sys
+from dptse_env.traffic import SHORT_HIGHWAY, RecordLibrary
+signal.signal(signal.SIGINT, signal.default_int_handler)
+RecordLibrary(sys.argv[1]).ensure(SHORT_HIGHWAY, range(int(sys.argv[2])), workers=2)
+"""
+
+
+class Code:
+    """Runs as soon as a worker takes it."""
+
+    def __init__(self, text):
+        self.text = text
+
+    def __reduce__(self):
+        return exec, (self.text,)
+
+
+DIES = Code("import os; os._exit(9)")
+
+
+def wait_for(condition, seconds=60.0):
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "waited in vain"
+        time.sleep(0.01)
+
+
+def record(folder, sources, workers=1):
+    """Record seeds with what is saved with each, and return their files."""
+    paths = {seed: folder / f"{seed}" for seed in sources}
+    record_seeds(SHORT_HIGHWAY, paths, sources, workers)
+    return paths
+
+
+def test_a_seed_whose_worker_dies_is_recorded_by_another(
+    tmp_path, short_record, monkeypatch, caplog
+):
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
+    dies_once = Code(
+        f"import os\nif not os.path.exists(p := {str(tmp_path / 'died')!r}):\n"
+        "    open(p, 'w').close()\n"
+        "    open(os.environ['TMPDIR'] + '/left', 'w').close()\n"
+        "    os.kill(os.getpid(), 9)"
+    )
+    with caplog.at_level(logging.WARNING, logger="dptse_env"):
+        paths = record(tmp_path, {1: {}, 0: {"value": dies_once}})
+    (warning,) = caplog.messages
+    assert "SIGKILL" in warning
+    assert warning.endswith("recording again: traffic seeds 0")
+    loaded = Record.load(paths[0], {"value": None}, SHORT_HIGHWAY.record_shape)
+    assert_same(loaded, short_record)
+    assert paths[1].is_file()
+    assert (tmp_path / "died").is_file()
+    assert list((tmp_path / "temporary").iterdir()) == []
+
+
+def test_a_seed_that_kills_three_workers_is_named(tmp_path, caplog):
+    message = r"traffic seed 5 failed: a recording process died \(EXIT\(9\)\)\n\(tried 3 times"
+    with pytest.raises(RecordingError, match=message):
+        record(tmp_path, {4: {}, 5: {"value": DIES}}, workers=2)
+    assert len(caplog.messages) == 2
+
+
+def test_what_a_worker_reports_is_not_tried_again(tmp_path, caplog):
+    (tmp_path / "1").mkdir()
+    with pytest.raises(RecordingError, match=r"seed 1 failed: IsADirectoryError"):
+        record(tmp_path, {0: {}, 1: {}, 2: {}})
+    assert (tmp_path / "0").is_file()  # kept
+    assert not (tmp_path / "2").exists()  # not begun
+    assert caplog.messages == []
+
+
+def in_daemon(folder):
+    record(folder, {0: {}})
+
+
+@pytest.mark.slow
+def test_a_daemonic_process_records_and_stays_daemonic(tmp_path):
+    process = multiprocessing.get_context("spawn").Process(
+        target=in_daemon, args=(tmp_path,), daemon=True
+    )
+    process.start()
+    process.join(60)
+    assert (process.exitcode, process.daemon) == (0, True)
+    assert (tmp_path / "0").is_file()
+
+
+def start_ensure(path, n_seeds, temporary="/tmp"):
+    environment = {"PYTHONPATH": str(Path.cwd()), "TMPDIR": str(temporary)}
+    return subprocess.Popen(
+        [sys.executable, "-c", ENSURE, str(path), str(n_seeds)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | environment,
+        start_new_session=True,
+    )
+
+
+def session_of(pid):
+    """Return the processes of a session that run, other than its leader."""
+    table = subprocess.run(
+        ["ps", "-A", "-o", "pid=,sess=,stat="], capture_output=True, text=True, check=True
+    )
+    rows = [line.split() for line in table.stdout.splitlines()]
+    return [int(row[0]) for row in rows if row[1] == str(pid) and row[2][0] != "Z"][1:]
+
+
+def interrupted_ensure(folder, interrupt):
+    """Start to record, interrupt it in the middle; return its exit code and stderr."""
+    temporary = folder / "temporary"
+    temporary.mkdir()
+    process = start_ensure(folder / "library", 400, temporary)
+    wait_for(lambda: len(list((folder / "library").rglob("*.safetensors"))) >= 4)
+    workers = session_of(process.pid)
+    assert len(workers) >= 2
+    interrupt(process.pid)
+    _, said = process.communicate(timeout=60)
+    wait_for(lambda: not any(map(exists, workers)), seconds=20)
+    wait_for(lambda: list(temporary.iterdir()) == [], seconds=20)
+    records = RecordLibrary(folder / "library")
+    made = set(range(400)) - set(records.missing(SHORT_HIGHWAY, range(400)))
+    assert 0 < len(made) < 400
+    assert all(records.get(SHORT_HIGHWAY, seed).n_rows > 0 for seed in made)
+    return process.returncode, said
+
+
+def exists(pid):
+    return subprocess.run(["ps", "-p", str(pid)], check=False, capture_output=True).returncode == 0
+
+
+@pytest.mark.slow
+def test_a_killed_parent_leaves_no_orphans_no_files_and_a_valid_library(tmp_path):
+    code, _ = interrupted_ensure(tmp_path, lambda pid: os.kill(pid, signal.SIGKILL))
+    assert code == -signal.SIGKILL
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("send", [os.kill, os.killpg], ids=["to the parent", "from a terminal"])
+def test_ctrl_c_ends_all_processes_and_no_record_is_tried_again(tmp_path, send):
+    code, said = interrupted_ensure(tmp_path, lambda pid: send(pid, signal.SIGINT))
+    assert code == -signal.SIGINT
+    assert said.strip().endswith("KeyboardInterrupt")
+    assert "recording again" not in said
+
+
+@pytest.mark.slow
+def test_processes_recording_the_same_seeds_agree(tmp_path, short_record):
+    processes = [start_ensure(tmp_path, 3) for _ in range(2)]
+    for process in processes:
+        _, errors = process.communicate(timeout=60)
+        assert process.returncode == 0, errors
+    assert_same(RecordLibrary(tmp_path).get(SHORT_HIGHWAY, 0), short_record)
+    assert len([path for path in tmp_path.rglob("*") if path.is_file()]) == 3
+
+
+@pytest.mark.slow
+def test_a_simulation_of_the_user_survives(short_record, tmp_path):
+    """libsumo holds one simulation per process; the user's own must not be replaced."""
+    import libsumo
+
+    from dptse_env.traffic.sumo_input import packaged_network
+
+    network = tmp_path / "users.net.xml"
+    network.write_text(packaged_network("paper-highway"))
+    libsumo.start(["sumo", "-n", str(network), "--no-step-log", "--xml-validation.net", "never"])
+    try:
+        libsumo.simulationStep()
+        with pytest.raises(RecordingError, match="another simulation in this process"):
+            simulate(SHORT_HIGHWAY, 0)
+        assert_same(RecordLibrary(tmp_path).get(SHORT_HIGHWAY, 0), short_record)
+        assert libsumo.simulation.getTime() == 1.0
+        assert "main_14" in libsumo.edge.getIDList()
+    finally:
+        libsumo.close()
+
+
+@pytest.mark.slow
+def test_a_script_without_a_main_guard_and_one_from_a_pipe_work(tmp_path, short_record):
+    script = tmp_path / "unguarded.py"
+    script.write_text(UNGUARDED)
+    for arguments, text in (([str(script)], ""), (["-"], UNGUARDED)):
+        result = subprocess.run(
+            [sys.executable, *arguments],
+            input=text,
+            env=os.environ | {"PYTHONPATH": str(Path.cwd())},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert result.stdout.strip() == str(short_record.n_rows), result.stderr
+
+
+@pytest.mark.slow
+def test_modules_in_the_working_directory_do_not_shadow_those_of_a_worker(
+    tmp_path, monkeypatch, short_record
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "queue.py").write_text("raise RuntimeError('shadowed')")
+    monkeypatch.setattr(sys, "path", [entry for entry in sys.path if entry])
+    assert_same(simulate_in_worker(SHORT_HIGHWAY, 0), short_record)

@@ -1,0 +1,200 @@
+"""Roads by name and as TOML files."""
+
+import dataclasses
+
+import pytest
+
+from dptse_env.config import resolve
+from dptse_env.registration import REGISTRIES
+from dptse_env.traffic import (
+    CORRIDORS,
+    PAPER_HIGHWAY,
+    DemandDistribution,
+    find_corridor,
+    randomised,
+    read_corridor,
+    read_road,
+    write_corridor,
+)
+from dptse_env.traffic.roads import PARTS
+
+ROAD = """
+n_mainline = 8
+lanes = 2
+segment_length = 0.2
+speed_limit = 90
+duration = 300
+on_ramps = [3]
+
+[demand]
+mainline = [[0, 1800], [100, 3000]]
+on_ramps = [300]
+
+[drivers]
+model = "IDM"
+
+[environment]
+bandwidth = 3
+parameters = "arz.json"
+"""
+
+
+@pytest.fixture
+def road(tmp_path):
+    path = tmp_path / "My road.toml"
+    path.write_text(ROAD)
+    return path
+
+
+@pytest.mark.parametrize("corridor", [randomised(PAPER_HIGHWAY)], ids=lambda c: c.name)
+def test_a_corridor_survives_a_file(corridor, tmp_path):
+    write_corridor(tmp_path / "road.toml", corridor, comment="a road\nin two lines")
+    assert read_corridor(tmp_path / "road.toml") == corridor
+    assert find_corridor(str(tmp_path / "road.toml")).digest == corridor.digest
+
+
+def test_several_incidents_and_rates_that_vary(road):
+    text = ROAD.replace("on_ramps = [300]", "on_ramps = [[[0, 100], [60, 900]]]")
+    road.write_text(
+        text
+        + """
+[[incident]]
+segment = 2
+phases = [[50, 90, 20]]
+
+[[incident]]
+segments = [4, 5]
+start = [100, 120]
+"""
+    )
+    corridor = read_corridor(road)
+    assert corridor.demand.ramp_profiles == (((0.0, 100.0), (60.0, 900.0)),)
+    assert [type(each).__name__ for each in corridor.incidents] == [
+        "Incident", "IncidentDistribution",
+    ]  # fmt: skip
+    write_corridor(road, corridor)
+    assert read_corridor(road) == corridor
+
+
+def test_what_a_file_leaves_out_is_derived_from_the_road(road):
+    read = read_road(road)
+    corridor = read.corridor
+    assert corridor.name == "my-road"
+    assert corridor.drivers.model == "IDM"
+    assert corridor.incident is None
+    assert corridor.fixed_sensors == ()
+    assert corridor.density_scale == 222.0
+    assert corridor.speed_scale == 90.0
+    assert corridor.average_dwell == pytest.approx(3 * 3600 * 0.2 / 90)
+    assert read.assumed == ("average_dwell",)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("lanes = 2", "lane = 2", r"My road\.toml: corridor\.lane is unknown; allowed: name"),
+        ("n_mainline = 8", "", r"My road\.toml: corridor\.n_mainline is missing"),
+        ("1800", '"many"', r"My road\.toml: corridor\.demand\.mainline\[0\]\[1\]"),
+        ("lanes = 2", "lanes = 2\nlanes = 3", r"must be TOML: .*line 4"),
+        ("bandwidth = 3", 'corridor = "x"', r"environment\.corridor must be left out"),
+        ("[environment]", "[[environment]]", r"environment must be a table"),
+        ("bandwidth = 3", "incident" + ".a" * 5000 + " = 1", r"environment must not be nested so"),
+    ],
+)
+def test_bad_files_are_refused_by_file_and_field(road, old, new, message):
+    road.write_text(ROAD.replace(old, new, 1))
+    with pytest.raises(ValueError, match=message):
+        read_road(road)
+
+
+@pytest.mark.parametrize(
+    ("keyword", "value"),
+    [
+        ("action", '"own:Part"'),
+        ("estimator", '"own:Part.json"'),
+        ("observation", '["default", "own:Part"]'),
+        ("privacy", '{ preset = "own:Part" }'),
+        ("reward", '"own:Part"'),
+    ],
+)
+def test_a_file_imports_no_code(road, keyword, value, monkeypatch):
+    (road.parent / "own.py").write_text("raise SystemExit('code of the current folder has run')")
+    monkeypatch.syspath_prepend(road.parent)
+    road.write_text(ROAD.replace("bandwidth = 3", f"{keyword} = {value}"))
+    message = rf"My road\.toml: environment\.{keyword} must be a registered name, got 'own:Part"
+    with pytest.raises(ValueError, match=message):
+        resolve("private-highway-v1", {"corridor": str(road)})
+
+
+def test_every_keyword_for_parts_is_among_those_that_import_no_code():
+    assert {*REGISTRIES} - {"corridor", "pacing", "schedule"} == {*PARTS}
+
+
+def test_files_that_cannot_be_read(tmp_path):
+    with pytest.raises(ValueError, match=r"none\.toml: the road file cannot be read"):
+        read_road(tmp_path / "none.toml")
+    (tmp_path / "folder.toml").mkdir()
+    with pytest.raises(ValueError, match=r"folder\.toml: the road file cannot be read"):
+        read_road(tmp_path / "folder.toml")
+    (tmp_path / "binary.toml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(ValueError, match="must be TOML"):
+        read_road(tmp_path / "binary.toml")
+    (tmp_path / "deep.toml").write_text("a = " + "[" * 100_000)
+    with pytest.raises(ValueError, match="must be TOML"):
+        read_road(tmp_path / "deep.toml")
+
+
+def test_the_keywords_of_a_file_come_after_the_callers(road):
+    road.write_text(ROAD.replace('"arz.json"', '"w99-3lane"'))
+    with pytest.warns(UserWarning, match=r"corridor\.average_dwell"):
+        config = resolve("private-highway-v1", {"corridor": str(road)})
+    assert config.bandwidth == 3
+    assert config.parameters == "w99-3lane"
+    assert "parameters" not in config.inherited
+    assert "corridor.average_dwell" in config.inherited
+    with pytest.warns(UserWarning, match=r"corridor\.average_dwell"):
+        config = resolve("private-highway-v1", {"corridor": str(road), "bandwidth": 1})
+    assert config.bandwidth == 1
+
+
+def test_a_complete_file_warns_of_nothing(road):
+    from dptse_env.estimators.settings import load_settings, write_settings
+    from dptse_env.model import load_parameters
+    from dptse_env.model.parameters import write_parameters
+
+    arz = dataclasses.replace(load_parameters("w99-3lane"), name="mine")
+    write_parameters(road.parent / "arz.json", arz, {})
+    tuned = dataclasses.asdict(load_settings("ekf-w99-3lane-paced"))
+    write_settings(
+        road.parent / "ekf.json",
+        estimator="ekf",
+        parameters="mine",
+        privacy="paced",
+        settings=tuned,
+        provenance={},
+    )
+    text = "average_dwell = 9.5\n" + ROAD + 'estimator_settings = "ekf.json"\n'
+    road.write_text(text)
+    config = resolve("private-highway-v1", {"corridor": str(road)})
+    assert config.inherited == ()
+    assert config.arz_parameters == arz
+    assert config.settings() == load_settings("ekf-w99-3lane-paced")
+
+
+@pytest.mark.parametrize("corridor", CORRIDORS.values(), ids=CORRIDORS)
+def test_randomised_traffic_keeps_the_road_and_the_base_demand(corridor):
+    random = randomised(corridor)
+    assert random.demand == DemandDistribution(corridor.published_demand)
+    assert random.digest != corridor.digest
+    assert random.on_ramps == corridor.on_ramps
+    assert randomised(random) == random
+    last_start = random.incident.start[1]
+    assert last_start + random.incident.duration[0] < corridor.duration
+
+
+@pytest.mark.parametrize("name", ["ekf.json", "networks/mine-flows.safetensors"])
+def test_names_of_files_are_those_of_the_folder_of_the_road_file(road, name):
+    text = f'estimator_settings = {{ recurrent = {{ weights = "{name}" }} }}\n'
+    road.write_text(ROAD + text)
+    found = read_road(road).environment["estimator_settings"]
+    assert found == {"recurrent": {"weights": str(road.parent / name)}}

@@ -1,0 +1,90 @@
+"""What SUMO reads: networks that come with the package, and networks that are compiled."""
+
+import dataclasses
+import importlib.util
+import re
+
+import pytest
+
+from dptse_env.traffic import CORRIDORS, PAPER_HIGHWAY, SHORT_HIGHWAY, simulate
+from dptse_env.traffic.sumo_input import (
+    Geometry,
+    compile_network,
+    edge_ids,
+    network_xml,
+    packaged_network,
+)
+from dptse_env.utils.registry import MissingExtraError
+from tests.model.roads import UNEVEN
+
+needs_netconvert = pytest.mark.skipif(
+    importlib.util.find_spec("sumo") is None, reason="eclipse-sumo (extra corridors) is missing"
+)
+
+
+@pytest.mark.parametrize("name", CORRIDORS)
+def test_packaged_networks_have_one_edge_per_column_of_nominal_length(name):
+    corridor = CORRIDORS[name]
+    network = packaged_network(name)
+    edges = re.findall(r'<edge id="([^":]+)"', network)
+    assert sorted(edges) == sorted(edge_ids(corridor))
+    assert len(edges) == corridor.n_segments + corridor.n_boundaries
+    lanes = re.findall(r'<lane id="[^":]+".*? speed="([\d.]+)" length="([\d.]+)"', network)
+    assert {float(length) for _, length in lanes} == {1000 * corridor.segment_length}
+    assert {float(speed) for speed, _ in lanes} == {round(corridor.speed_limit / 3.6, 2)}
+
+
+@needs_netconvert
+@pytest.mark.parametrize("name", CORRIDORS)
+def test_packaged_networks_are_what_netconvert_makes_of_the_presets(name):
+    assert compile_network(Geometry.from_corridor(CORRIDORS[name])) == packaged_network(name)
+
+
+def test_a_preset_is_not_compiled(monkeypatch):
+    monkeypatch.setattr("dptse_env.traffic.sumo_input.compile_network", None)
+    changed = dataclasses.replace(PAPER_HIGHWAY, name="mine", incident=None, duration=60)
+    assert network_xml(changed) == packaged_network("paper-highway")
+
+
+@needs_netconvert
+def test_a_geometry_of_ones_own_is_compiled_and_drives():
+    corridor = dataclasses.replace(
+        SHORT_HIGHWAY,
+        n_mainline=4,
+        on_ramps=(1,),
+        off_ramps=(2,),
+        lanes=3,
+        ramp_lanes=2,
+        segment_length=0.15,
+        speed_limit=90.0,
+        incident=None,
+        duration=60,
+        fixed_sensors=(),
+    )
+    record = simulate(corridor, 0)
+    assert record.counts[:, : corridor.n_segments].any(axis=0).all()
+
+
+def test_a_missing_netconvert_names_the_extra(monkeypatch):
+    found = importlib.util.find_spec
+
+    def without_sumo(name, *rest):
+        return None if name == "sumo" else found(name, *rest)
+
+    monkeypatch.setattr(importlib.util, "find_spec", without_sumo)
+    with pytest.raises(MissingExtraError, match=r"pip install 'dptse-env\[corridors\]'"):
+        compile_network(Geometry.from_corridor(PAPER_HIGHWAY)._replace(n_mainline=21))
+
+
+def test_the_network_has_the_lengths_lanes_and_limits_of_the_corridor():
+    text = network_xml(UNEVEN)
+    lengths = UNEVEN.with_boundaries(UNEVEN.segment_lengths)
+    lanes = UNEVEN.with_boundaries(UNEVEN.segment_lanes)
+    limits = UNEVEN.with_boundaries(UNEVEN.speed_limits)
+    for edge, length, count, limit in zip(edge_ids(UNEVEN), lengths, lanes, limits, strict=True):
+        found = re.findall(
+            rf'<lane id="{edge}_\d+" index="\d+" .*?speed="([\d.]+)" length="([\d.]+)"', text
+        )
+        assert len(found) == count, edge
+        assert {float(speed) for speed, _ in found} == {round(limit / 3.6, 2)}
+        assert {float(each) for _, each in found} == {round(1000.0 * length, 2)}
