@@ -412,7 +412,7 @@ def _json(path: Path, form: Format, scalars: Iterable[str]) -> Iterator[pl.DataF
     """Read the points of a JSON array with a document for each vehicle; a row is a document."""
     waiting: list[list[Any]] = []
     scalars, row, n_waiting = tuple(scalars), 0, 0
-    kinds = {ROW: pl.Int64, **dict.fromkeys(scalars, pl.String)}
+    kinds: dict[str, Any] = {ROW: pl.Int64, **dict.fromkeys(scalars, pl.String)}
     kinds |= dict.fromkeys(form.lists, pl.List(pl.Float64))
 
     def frame() -> pl.DataFrame:
