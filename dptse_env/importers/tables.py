@@ -482,7 +482,8 @@ def _by_direction(points: pl.LazyFrame, path: Path, source: Source) -> pl.LazyFr
             "for the vehicles that move to the left (drivingDirection 1), or source.groups be "
             "['lower']"
         )
-    upper = pl.col("vehicle").replace_strict(table[:, 0], table[:, 1] == "1", default=False)
+    # By membership, since `replace` is not streamed.
+    upper = pl.col("vehicle").is_in(table.filter(table[:, 1] == "1")[:, 0].implode())
     length = source.factor("length", "m")
     # x is the left corner of the box: the rear of those that move to the right.
     return points.with_columns(
