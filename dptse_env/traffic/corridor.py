@@ -238,7 +238,7 @@ class Corridor:
     def _check_network(self) -> None:
         if self.network is None:
             return
-        n_columns = self.n_segments + self.n_boundaries
+        n_columns = self.record_shape[1]
         allowed = f"one for each of the {n_columns} record columns of this geometry"
         fits = len(self.network.columns) == n_columns
         require(fits, "corridor.network.columns", allowed, len(self.network.columns))
@@ -382,6 +382,11 @@ class Corridor:
         if self.incident is None:
             return ()
         return self.incident if isinstance(self.incident, tuple) else (self.incident,)
+
+    @property
+    def record_shape(self) -> tuple[int, int]:
+        """Number of steps of a record, the second 0 among them, and of its columns, S + R."""
+        return self.duration + 1, self.n_segments + self.n_boundaries
 
     @property
     def record_layout(self) -> dict[str, Any]:

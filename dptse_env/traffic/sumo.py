@@ -113,7 +113,7 @@ def simulate(corridor: Corridor, seed: int) -> Record:
     step, vehicle, segment, speed = table[:, np.lexsort((table[2], table[0]))]
     return Record(
         step=step, vehicle=vehicle, segment=segment, speed=speed,
-        n_steps=corridor.duration + 1, n_columns=len(corridor.network.columns),
+        n_steps=corridor.record_shape[0], n_columns=corridor.record_shape[1],
     )  # fmt: skip
 
 
