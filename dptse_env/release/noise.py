@@ -1,6 +1,5 @@
 """Noise of a batch of episodes, and rounding of releases to a public grid."""
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -14,6 +13,8 @@ GRID_SHARE = 2.0**-10
 BLOCK = 32
 """Seconds for which noise is drawn at a time; a large draw costs far less than many small ones."""
 
+_EXPONENT = 0x7FF0_0000_0000_0000  # the bits of a double's exponent
+
 
 @kernel_part
 def grid_of(sigma: float) -> float:
@@ -22,8 +23,9 @@ def grid_of(sigma: float) -> float:
     It is the power of two in (sigma / 2048, sigma / 1024]: scaling by it is exact, so that a
     rounded release is a multiple of the grid.
     """
-    _, exponent = math.frexp(sigma * GRID_SHARE)
-    return math.ldexp(1.0, exponent - 1)
+    # Without its fraction a float is the power of two below it.
+    bits = np.float64(sigma * GRID_SHARE).view(np.int64) & np.int64(_EXPONENT)
+    return float(np.int64(bits).view(np.float64))
 
 
 class Noise:
