@@ -78,7 +78,6 @@ def test_demand_states_without_a_traffic_model_are_refused_by_the_configuration(
         resolve("paper-highway", keywords)
 
 
-@pytest.mark.parametrize("make", [gym.make, gym.make_vec])
 @pytest.mark.parametrize(
     ("estimator", "settings", "message"),
     [
@@ -90,10 +89,11 @@ def test_demand_states_without_a_traffic_model_are_refused_by_the_configuration(
     ],
 )
 def test_settings_that_an_estimator_cannot_have_are_refused_when_it_is_made(
-    make, estimator, settings, message
+    estimator, settings, message
 ):
+    keywords = {"estimator": estimator, "estimator_settings": settings}
     with pytest.raises(ValueError, match=f"^estimator_settings.{message}"):
-        make("dptse_env:dptse/ShortHighway-v0", estimator=estimator, estimator_settings=settings)
+        gym.make("dptse_env:dptse/ShortHighway-v0", **keywords)
 
 
 def test_a_set_for_the_corridor_comes_before_that_for_any():
