@@ -57,6 +57,14 @@ def test_a_card_that_lacks_a_field_is_refused(change, message, tmp_path):
         read_policy(path)
 
 
+def test_a_card_imports_no_code(tmp_path):
+    path = tmp_path / "some.safetensors"
+    change = {"action": "own:Part"}
+    path.write_bytes(edited(SHIPPED, lambda card, weights: card["fits"].update(change)))
+    with pytest.raises(ValueError, match=r"fits\.action must be a registered name, got 'own:Part'"):
+        read_policy(path)
+
+
 def test_files_that_are_not_there_or_old(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"'absent': .*come with the package \(.*private-"):
         read_policy("absent")
