@@ -25,8 +25,8 @@ from tqdm import tqdm
 
 from dptse_env.command_line import TOOLS
 from dptse_env.traffic.recording import follow_parent
-from dptse_env.utils.extras import needed_for
 from dptse_env.utils.fields import integer
+from dptse_env.utils.registry import needed_for
 
 TaskT = TypeVar("TaskT")
 ResultT = TypeVar("ResultT")

@@ -18,8 +18,8 @@ from dptse_env.process import QueryProcess
 from dptse_env.rendering import DENSITY_MAP, History
 from dptse_env.traffic import Records
 from dptse_env.utils.arrays import FloatArray
-from dptse_env.utils.extras import needed_for
 from dptse_env.utils.files import write_atomically
+from dptse_env.utils.registry import needed_for
 
 FRAMES = 140
 """Most positions of the slider: more would make the page large and slow."""

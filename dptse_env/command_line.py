@@ -9,7 +9,7 @@ import importlib
 import sys
 from pathlib import Path
 
-from dptse_env.utils.extras import MissingExtraError, needed_for
+from dptse_env.utils.registry import MissingExtraError, needed_for
 
 TOOLS = Path(__file__).parent / "_tools"
 """Folder of the tools in a wheel; an editable installation has them beside this package."""

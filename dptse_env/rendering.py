@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
-from dptse_env.utils.extras import needed_for
+from dptse_env.utils.registry import needed_for
 
 if TYPE_CHECKING:
     from dptse_env.process import QueryProcess

@@ -1,6 +1,6 @@
 """Command-line entry points, one job each. They need the extra ``train``."""
 
-from dptse_env.utils.extras import needed_for
+from dptse_env.utils.registry import needed_for
 
 with needed_for("dptse"):
     import rich  # noqa: F401

@@ -29,7 +29,7 @@ from dptse_env.traffic import (
     RecordLibrary,
     SumoVersionError,
 )
-from dptse_env.utils.extras import MissingExtraError
+from dptse_env.utils.registry import MissingExtraError
 from dptse_env.utils.threads import n_cores
 
 

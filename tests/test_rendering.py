@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from dptse_env.utils.extras import MissingExtraError
+from dptse_env.utils.registry import MissingExtraError
 
 SHORT = "dptse_env:dptse/ShortHighway-v0"
 

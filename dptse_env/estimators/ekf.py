@@ -28,8 +28,8 @@ from dptse_env.model.step import (
     write_row,
 )
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
-from dptse_env.utils.bundle import Bundle
 from dptse_env.utils.kernels import (
+    Bundle,
     all_finite,
     any_of,
     copy_vector,

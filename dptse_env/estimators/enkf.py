@@ -28,8 +28,7 @@ from dptse_env.model.columns import (
 from dptse_env.model.network import RoadArrays, RoadNetwork
 from dptse_env.model.parameters import LARGEST_W
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
-from dptse_env.utils.bundle import Bundle
-from dptse_env.utils.kernels import copy_vector, kernel, kernel_part
+from dptse_env.utils.kernels import Bundle, copy_vector, kernel, kernel_part
 
 
 class Ensembles(NamedTuple):

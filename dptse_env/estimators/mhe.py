@@ -41,9 +41,9 @@ from dptse_env.model.parameters import (
 )
 from dptse_env.model.step import advance, make_scratch, normalise, project, write_row
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
-from dptse_env.utils.bundle import Bundle
 from dptse_env.utils.fields import integer, positive
 from dptse_env.utils.kernels import (
+    Bundle,
     all_finite,
     any_of,
     copy_matrix,

@@ -37,9 +37,9 @@ from dptse_env.model.columns import (
 from dptse_env.model.network import RoadArrays
 from dptse_env.model.step import project
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
-from dptse_env.utils.bundle import Bundle
 from dptse_env.utils.fields import require
 from dptse_env.utils.kernels import (
+    Bundle,
     all_finite,
     copy_matrix,
     fill_vector,

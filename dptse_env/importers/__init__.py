@@ -4,7 +4,7 @@
 simulated road. Tables are read by polars (extra ``corridors``).
 """
 
-from dptse_env.utils.extras import needed_for
+from dptse_env.utils.registry import needed_for
 
 with needed_for("an import"):
     from dptse_env.importers.folder import Imported, Split, import_trajectories

@@ -1,7 +1,7 @@
 """Learning with stable-baselines3 on many episodes at once; needs the extra ``train``."""
 
 from dptse_env.policies import shipped_policies
-from dptse_env.utils.extras import needed_for
+from dptse_env.utils.registry import needed_for
 
 with needed_for("dptse_env.sb3"):
     from dptse_env.sb3.plackett_luce import PlackettLuce, PlackettLucePolicy, RoadChannels

@@ -28,7 +28,7 @@ from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.record import Record
 from dptse_env.traffic.sumo import RecordingError, SumoVersionError, simulate
 from dptse_env.traffic.sumo_input import NetworkError
-from dptse_env.utils.extras import MissingExtraError
+from dptse_env.utils.registry import MissingExtraError
 
 ATTEMPTS = 3
 """Workers that may die on a traffic seed, for instance for lack of memory. An error that a worker

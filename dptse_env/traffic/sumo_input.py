@@ -23,7 +23,7 @@ from typing import NamedTuple
 from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.roads import SHIPPED_CORRIDORS
 from dptse_env.traffic.scenario import MAINLINE, Scenario
-from dptse_env.utils.extras import missing_extra
+from dptse_env.utils.registry import missing_extra
 
 LANE_WIDTH_M = 3.2
 RAMP_ANGLE = math.radians(45.0)  # a flat ramp would stretch the junction over half a segment

@@ -1,12 +1,11 @@
 """Compiled functions: kernels, which Python calls, and the parts that kernels call.
 
-numba compiles a kernel at its first call and keeps the machine code on disk, in the folder of
-``NUMBA_CACHE_DIR`` or else in the user's cache. It is found by the fingerprint of the code,
-wherever the code lies and however old its files are: another environment or checkout loads what the
-first one has compiled. What was not used for `KEPT_FOR` is removed when something is compiled.
-Parts are compiled into the kernels that call them; called from Python they run as Python.
+numba compiles a kernel at its first call, and the machine code is kept on disk, in the folder of
+``NUMBA_CACHE_DIR`` or else in the user's cache. numba's own cache knows a function by the age of
+its file alone: it would go on with machine code whose parts or constants, in other files, have
+changed. Here it is found by the fingerprint of all the code that it reaches, wherever that lies.
 
-Processes take turns: one compiles a function, and the others load what it has kept.
+Parts are compiled into the kernels that call them; called from Python they run as Python.
 """
 
 from __future__ import annotations
@@ -20,7 +19,6 @@ import math
 import os
 import pickle
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator
 from functools import cache, cached_property
@@ -38,16 +36,18 @@ from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler, CompileResult
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.registry import CPUDispatcher
+from numba.experimental import structref
 
 from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray
+from dptse_env.utils.files import write_atomically
 
 logger = logging.getLogger(__name__)
 
 _PACKAGE = __name__.partition(".")[0]
 
-_OPTIONS: dict[str, Any] = {"error_model": "numpy", "nogil": True, "no_cfunc_wrapper": True}
-_WITHOUT_PYTHON = {"nopython": True, "no_cpython_wrapper": True}
-_ENDING = "machine-code"
+_OPTIONS: dict[str, Any] = {
+    "error_model": "numpy", "nogil": True, "nopython": True, "no_cfunc_wrapper": True,
+}  # fmt: skip
 
 COLLECTED_EVERY = 100_000
 """Objects after which Python looks for garbage while a kernel is compiled."""
@@ -56,23 +56,16 @@ KEPT_FOR = 30 * 24 * 3600.0
 """Seconds for which machine code that no process loads is kept on disk."""
 
 LONGEST_WAIT = 180.0
-"""Seconds to wait for a function that another process compiles; none takes more than 25 s."""
-
-SILENT_WAIT = 1.0
-"""Seconds to wait before saying so."""
+"""Seconds to wait for a kernel that another process compiles; none takes more than 25 s."""
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def kernel(function: Function) -> Function:
-    """Compile a function that Python calls, which then runs without the interpreter's lock.
-
-    Its machine code is kept under a fingerprint of the function and of all parts and constants
-    that it reaches: a change of any of them compiles it anew.
-    """
+    """Compile a function that Python calls, which then runs without the interpreter's lock."""
     if config.DISABLE_JIT:
         return function
-    return cast("Function", _Kernel(function, {**_OPTIONS, "nopython": True}))
+    return cast("Function", _Kernel(function, _OPTIONS))
 
 
 @overload
@@ -83,7 +76,7 @@ def kernel_part(function: Any = None, /, **options: Any) -> Any:
     """Let kernels call a function.
 
     A part is optimised in the kernels that call it, and has no machine code of its own: that would
-    take a fifth of the time of compiling.
+    take half as long again to compile, and for the MHE three times as long.
 
     Args:
         function: The function.
@@ -91,7 +84,7 @@ def kernel_part(function: Any = None, /, **options: Any) -> Any:
     """
 
     def decorate(function: Any) -> Any:
-        return _Part(function, {**_OPTIONS, **_WITHOUT_PYTHON, **options})
+        return _Part(function, {**_OPTIONS, "no_cpython_wrapper": True, **options})
 
     return decorate if function is None else decorate(function)
 
@@ -99,37 +92,6 @@ def kernel_part(function: Any = None, /, **options: Any) -> Any:
 def inline_part(function: Function) -> Function:
     """Let kernels call a function whose body takes the place of each call."""
     return cast("Function", njit(error_model="numpy", inline="always")(function))
-
-
-@contextlib.contextmanager
-def _collecting_seldom() -> Iterator[None]:
-    """Let Python collect garbage seldom, since numba's compiler makes objects by the million.
-
-    The default takes a tenth of the time of compiling.
-    """
-    thresholds = gc.get_threshold()
-    if thresholds[0] > 0:  # with 0 the caller has none collected
-        gc.set_threshold(max(thresholds[0], COLLECTED_EVERY), *thresholds[1:])
-    try:
-        yield
-    finally:
-        gc.set_threshold(*thresholds)
-
-
-class _Kernel(CPUDispatcher):
-    """numba's dispatcher of a kernel, which one process at a time compiles."""
-
-    def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
-        super().__init__(function, targetoptions=options)
-        self._cache = _Kept(self)
-
-    def compile(self, sig: Any) -> Any:
-        """Compile or load the version for a signature."""
-        try:
-            with global_compiler_lock, _collecting_seldom():
-                return super().compile(sig)
-        finally:
-            self._cache.end_turn()
 
 
 class _PartLibrary(JITCodeLibrary):
@@ -172,6 +134,19 @@ class _Part(CPUDispatcher):
         return self.py_func
 
 
+class _Kernel(CPUDispatcher):
+    """numba's dispatcher of a kernel, which one process at a time compiles."""
+
+    def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
+        super().__init__(function, targetoptions=options)
+        self._cache = _Kept(self)
+
+    def compile(self, sig: Any) -> Any:
+        """Compile or load the version for a signature."""
+        with global_compiler_lock, self._cache.turn():
+            return super().compile(sig)
+
+
 def default_folder() -> Path:
     """Return the folder of machine code: ``NUMBA_CACHE_DIR``, or one in the user's cache."""
     if config.CACHE_DIR:
@@ -182,11 +157,11 @@ def default_folder() -> Path:
 class _Kept(NullCache):
     """The machine code of a function on disk, a file for each signature."""
 
-    _turn: Any = None
-
     def __init__(self, dispatcher: CPUDispatcher) -> None:
-        self._function: Any = dispatcher.py_func
-        self._options, self._folder = dispatcher.targetoptions, default_folder()
+        function: Any = dispatcher.py_func
+        self._function, self._folder = function, default_folder()
+        self._name = f"{function.__module__}.{function.__qualname__}".replace("<locals>.", "")
+        self._waits = contextlib.ExitStack()
 
     # At the first use: before that, functions that are defined further down are missing.
     @cached_property
@@ -195,51 +170,71 @@ class _Kept(NullCache):
 
     def _path(self, signature: tuple[Any, ...], codegen: Any) -> Path:
         about = (
-            self._digest, _written(self._options), [_spelled(kind) for kind in signature],
-            codegen.magic_tuple(), sys.implementation.cache_tag, numba.__version__,
+            self._digest, list(map(_spelled, signature)), codegen.magic_tuple(),
+            numba.__version__, sys.implementation.cache_tag,
         )  # fmt: skip
         digest = hashlib.sha256(repr(about).encode()).hexdigest()
-        return self._folder / f"{_name(self._function)}-{digest[:32]}.{_ENDING}"
+        return self._folder / f"{self._name}-{digest[:32]}.machine-code"
 
     def load_overload(self, signature: tuple[Any, ...], context: Any) -> Any:
-        """Return kept machine code; where there is none, say that compiling begins.
+        """Return kept machine code, or None.
 
-        Another process may be compiling the function: then wait, and return what it has kept.
+        Another process may be compiling the kernel: then wait, and return what it has kept.
         """
         context.refresh()
         path = self._path(signature, context.codegen())
         loaded = _loaded(path, context)
-        if loaded is None and _is_writable(self._folder):
-            self._turn = _turn(self._function, self._folder)
-            loaded = _loaded(path, context)
         if loaded is None:
-            _remove_unused(self._folder)
-            _announce(self._function, self._folder)
+            name = self._name.removeprefix(f"{_PACKAGE}.")
+            logger.warning("Compiling %s (kept in %s)", name, self._folder)
+            self._waits.enter_context(_alone(self._folder / f"{self._name}.lock"))
+            loaded = _loaded(path, context)
         return loaded
 
     def save_overload(self, signature: tuple[Any, ...], compiled: Any) -> None:
-        """Keep machine code.
-
-        Raises:
-            TypeError: It holds addresses of this process.
-        """
+        """Keep machine code, unless it holds addresses of this process."""
         if compiled.library.has_dynamic_globals:
-            raise TypeError(f"the machine code of {_name(self._function)} holds addresses")
-        if not _is_writable(self._folder):
-            return
+            raise TypeError(f"the machine code of {self._name} holds addresses")
         path = self._path(signature, compiled.codegen)
-        unfinished = path.with_name(f"{path.name}-{os.urandom(8).hex()}")
         try:
-            unfinished.write_bytes(serialize.dumps(compiled._reduce()))
-            unfinished.replace(path)
-        except OSError as error:
-            logger.warning("Could not keep %s: %s", path, error)
+            write_atomically(path, serialize.dumps(compiled._reduce()))
+            _remove_unused(self._folder)
+        except OSError as problem:
+            _say_not_kept(self._folder, problem.strerror)
 
-    def end_turn(self) -> None:
-        """Let other processes load the function, or compile it where this one has failed."""
-        if self._turn is not None:
-            self._turn.release()
-            self._turn = None
+    @contextlib.contextmanager
+    def turn(self) -> Iterator[None]:
+        """Let other processes go on at the end, whether or not compiling has failed.
+
+        Python collects garbage seldom meanwhile, since the compiler makes objects by the million;
+        as often as usual, that takes a tenth of the time.
+        """
+        usual = gc.get_threshold()
+        if usual[0] > 0:  # with 0 the caller has none collected
+            gc.set_threshold(max(usual[0], COLLECTED_EVERY), *usual[1:])
+        try:
+            with self._waits:
+                yield
+        finally:
+            gc.set_threshold(*usual)
+
+
+@contextlib.contextmanager
+def _alone(path: Path) -> Iterator[None]:
+    """Wait until no other process has a lock, but not for ever, nor where there are no locks.
+
+    Compiling a kernel twice loses time only.
+    """
+    from filelock import FileLock, Timeout  # noqa: PLC0415  (slow to import)
+
+    lock = FileLock(path, thread_local=False)
+    with contextlib.suppress(OSError, NotImplementedError, Timeout):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        lock.acquire(timeout=LONGEST_WAIT)
+    try:
+        yield
+    finally:
+        lock.release()
 
 
 def _loaded(path: Path, context: Any) -> Any:
@@ -259,67 +254,20 @@ def _loaded(path: Path, context: Any) -> Any:
         return None
 
 
-def _turn(function: FunctionType, folder: Path) -> Any:
-    """Return the lock of a function once no other process has it.
-
-    After `LONGEST_WAIT` it is returned all the same, not taken, since compiling a function twice
-    loses time only; so it is where the file system has no locks.
-    """
-    from filelock import FileLock, Timeout  # noqa: PLC0415  (slow to import)
-
-    lock = FileLock(folder / f"{_name(function)}.lock", thread_local=False)
-    for wait, news in (
-        (SILENT_WAIT, "Waiting for another process, which compiles %s"),
-        (LONGEST_WAIT, "It has not ended; compiling %s here too"),
-    ):
-        try:
-            lock.acquire(timeout=wait)
-            break
-        except Timeout:
-            logger.warning(news, _name(function))
-        except (OSError, NotImplementedError) as error:
-            _say_unlocked(folder, str(error))
-            break
-    return lock
-
-
-@cache
-def _say_unlocked(folder: Path, problem: str) -> None:
-    """Say once that a folder takes no locks."""
-    message = "%s takes no locks (%s); processes may compile the same function there"
-    logger.warning(message, folder, problem)
-
-
-@cache
-def _is_writable(folder: Path) -> bool:
-    """Try once in a process whether files can be kept in a folder; make it."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=folder).close()
-    except OSError:
-        return False
-    return True
-
-
 def _remove_unused(folder: Path) -> None:
     """Remove machine code that was not loaded for a long time."""
-    for path in folder.glob(f"*.{_ENDING}*"):
+    for path in folder.glob("*.machine-code"):
         with contextlib.suppress(OSError):  # another user's, or removed meanwhile
             if time.time() - path.stat().st_mtime > KEPT_FOR:
                 path.unlink()
 
 
 @cache
-def _announce(function: FunctionType, folder: Path) -> None:
-    """Say once in a process that a kernel is being compiled, since that takes seconds."""
-    fate = f"kept in {folder}"
-    if not _is_writable(folder):
-        fate = "for this process only: set NUMBA_CACHE_DIR to keep it"
-    logger.warning("Compiling %s (%s)", _name(function).removeprefix(f"{_PACKAGE}."), fate)
-
-
-def _name(function: FunctionType) -> str:
-    return f"{function.__module__}.{function.__qualname__}".replace("<locals>.", "")
+def _say_not_kept(folder: Path, problem: str | None) -> None:
+    """Say once that machine code cannot be kept in a folder."""
+    logger.warning(
+        "%s cannot keep machine code (%s): set NUMBA_CACHE_DIR to another folder", folder, problem
+    )
 
 
 def _spelled(kind: Any) -> str:
@@ -342,7 +290,8 @@ def fingerprint(function: FunctionType) -> str:
         if following in seen:
             continue
         seen.add(following)
-        digest.update(following.__module__.encode())  # which machine code imports
+        # Machine code imports the module.
+        digest.update(repr((following.__module__, following.__defaults__)).encode())
         for code in _codes(following.__code__):
             constants = [c for c in code.co_consts if not isinstance(c, CodeType)]
             digest.update(repr((code.co_code, code.co_names, code.co_varnames, constants)).encode())
@@ -351,7 +300,6 @@ def fingerprint(function: FunctionType) -> str:
                     waiting.append(value)
                 else:
                     digest.update(repr(value).encode())
-        digest.update(repr(following.__defaults__).encode())
     return digest.hexdigest()
 
 
@@ -371,19 +319,55 @@ def _used(function: FunctionType, code: CodeType) -> Iterator[Any]:
     for value in values:
         if callable(value):
             inside = inspect.unwrap(value)
-            fields = getattr(inside, "_fields", None), inside.__module__
-            yield inside if isinstance(inside, FunctionType) else fields
-            yield _written(getattr(value, "targetoptions", {}))
+            yield inside if isinstance(inside, FunctionType) else inside.__module__
+            yield getattr(value, "_fields", None)
+            options = getattr(value, "targetoptions", {})
+            # In the same order in each process; some are sets.
+            yield sorted((k, sorted(v) if isinstance(v, set) else v) for k, v in options.items())
         elif isinstance(value, np.ndarray):
             yield value.dtype, value.tolist()  # its `repr` leaves digits and elements out
         elif not isinstance(value, ModuleType):
             yield value
 
 
-def _written(options: dict[str, Any]) -> str:
-    """Write options of numba in the same way in each process; some are sets."""
-    values = [(k, sorted(v) if isinstance(v, set) else v) for k, v in sorted(options.items())]
-    return repr(values)
+@structref.register
+class _BundleType(types.StructRef):
+    """numba's type of a bundle."""
+
+    def preprocess_fields(self, fields: Any) -> Any:
+        """Keep one version for constants and variables of a type."""
+        return tuple((name, types.unliteral(kind)) for name, kind in fields)
+
+
+class Bundle(structref.StructRefProxy):
+    """Named tuples of arrays and numbers as one argument of kernels.
+
+    To pass a filter's forty arrays one by one takes 4 us, a third of its step at one episode, and a
+    bundle of them less than one. Its arrays are those that it was made of, not copies.
+
+    Attributes:
+        parts: The named tuples.
+    """
+
+    parts: Any
+
+    def __new__(cls, *parts: Any) -> Bundle:
+        """Make a bundle of named tuples."""
+        bundle: Bundle = _bundled(parts)
+        bundle.parts = parts
+        return bundle
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copy, or pickle, the arrays."""
+        return Bundle, self.parts
+
+
+structref.define_proxy(Bundle, _BundleType, ["parts"])
+
+
+@kernel
+def _bundled(parts: Any) -> Any:
+    return Bundle(parts)
 
 
 @kernel_part

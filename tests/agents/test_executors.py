@@ -13,7 +13,7 @@ from agents.executors import (
     run_in_order,
     run_tasks,
 )
-from dptse_env.utils.extras import MissingExtraError
+from dptse_env.utils.registry import MissingExtraError
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ pytest.importorskip("tyro")
 
 import dptse_env
 from dptse_env import command_line
-from dptse_env.utils.extras import EXTRAS
+from dptse_env.utils.registry import EXTRAS
 from scripts import dptse
 from scripts.dptse import COMMANDS, as_commands
 from tests.cases import fast_and_slow

@@ -14,7 +14,7 @@ from dptse_env.traffic.sumo_input import (
     network_xml,
     packaged_network,
 )
-from dptse_env.utils.extras import MissingExtraError
+from dptse_env.utils.registry import MissingExtraError
 from tests.model.roads import UNEVEN
 
 needs_netconvert = pytest.mark.skipif(

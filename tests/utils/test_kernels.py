@@ -1,20 +1,18 @@
 """Compiled functions: what is kept on disk, when it is compiled anew, and what is said then."""
 
-import gc
 import importlib
 import logging
 import os
 import subprocess
 import sys
 import time
-from contextlib import suppress
 
 import pytest
 from filelock import FileLock
-from numba.core import config, event
+from numba.core import config
 from numba.core.errors import TypingError
 
-from dptse_env.utils.kernels import COLLECTED_EVERY, KEPT_FOR, fingerprint
+from dptse_env.utils.kernels import KEPT_FOR, fingerprint
 
 MODULE = """
 from typing import NamedTuple
@@ -142,24 +140,19 @@ def test_machine_code_is_found_wherever_the_module_lies(load, tmp_path, monkeypa
 
 def test_what_nobody_has_loaded_for_long_is_removed_when_something_is_compiled(load, kept):
     load().run(1.5)
-    files = {*kept.glob("*.machine-code")}
-    for path in files:
-        os.utime(path, (time.time() - KEPT_FOR / 2,) * 2)
+    (file,) = kept.glob("*.machine-code")
+    os.utime(file, (time.time() - KEPT_FOR / 2,) * 2)
     load().run(1.5)  # which is noted
-    assert min(path.stat().st_mtime for path in files) > time.time() - 60.0
-    for path in files:
-        os.utime(path, (time.time() - KEPT_FOR - 60.0,) * 2)
+    assert file.stat().st_mtime > time.time() - 60.0
+    os.utime(file, (time.time() - KEPT_FOR - 60.0,) * 2)
     load(MODULE.replace("FACTOR = 2.0", "FACTOR = 4.0")).run(1.5)
-    assert len(files) == len({*kept.glob("*.machine-code")}) == 1
-    assert not files & {*kept.glob("*.machine-code")}
+    assert not file.exists()
+    assert len([*kept.glob("*.machine-code")]) == 1
 
 
-def test_compiling_is_said_once_and_loading_is_not(load, caplog):
+def test_compiling_is_said_and_loading_is_not(load, caplog):
     with caplog.at_level(logging.WARNING, logger=LOG):
-        run = load().run
-        run(1.5)
-        run(2)
-        assert len(caplog.messages) == 1
+        load().run(1.5)
         assert "Compiling kernels_of_a_test.run (kept in" in caplog.text
         caplog.clear()
         load().run(1.5)
@@ -170,8 +163,19 @@ def test_a_kernel_runs_where_no_folder_can_keep_it_and_says_so(load, tmp_path, m
     (tmp_path / "file").touch()
     monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path / "file" / "kept"))
     with caplog.at_level(logging.WARNING, logger=LOG):
-        assert load().run(1.5) == 3.0
-    assert "for this process only: set NUMBA_CACHE_DIR" in caplog.text
+        module = load()
+        assert module.run(1.5) == 3.0
+        assert module.second(module.Pair(1.5, 2.5)) == 2.5
+    assert caplog.text.count("set NUMBA_CACHE_DIR to another folder") == 1
+
+
+def test_damaged_machine_code_is_made_again(load, kept):
+    load().run(1.5)
+    (file,) = kept.glob("*.machine-code")
+    file.write_bytes(file.read_bytes()[:100])
+    assert load().run(1.5) == 3.0
+    assert load().run.stats.cache_hits == {}
+    assert load().run(1.5) == 3.0
 
 
 HOLD = """
@@ -179,18 +183,19 @@ import sys, time
 from filelock import FileLock
 with FileLock(sys.argv[1]):
     print("held", flush=True)
-    time.sleep(2.5)
+    time.sleep(1.5)
+print("done", flush=True)
 """
 
 
-def test_a_function_that_another_process_compiles_is_waited_for(load, kept, caplog):
+def test_a_kernel_that_another_process_compiles_is_waited_for(load, kept):
     kept.mkdir()
     command = [sys.executable, "-c", HOLD, str(kept / "kernels_of_a_test.run.lock")]
     with subprocess.Popen(command, stdout=subprocess.PIPE) as other:
         assert other.stdout.readline() == b"held\n"
-        with caplog.at_level(logging.WARNING, logger=LOG):
-            assert load().run(1.5) == 3.0
-    assert "Waiting for another process, which compiles kernels_of_a_test.run" in caplog.text
+        began = time.monotonic()
+        assert load().run(1.5) == 3.0
+        assert time.monotonic() - began > 1.0
 
 
 def test_the_turn_ends_where_compiling_fails(load, kept):
@@ -201,16 +206,12 @@ def test_the_turn_ends_where_compiling_fails(load, kept):
     FileLock(kept / "kernels_of_a_test.run.lock").acquire(timeout=0.0).lock.release()
 
 
-def test_a_folder_without_locks_is_compiled_into_all_the_same(load, monkeypatch, caplog):
+def test_a_folder_without_locks_is_compiled_into_all_the_same(load, monkeypatch):
     def acquire(*_, **__):
         raise OSError(37, "No locks available")
 
     monkeypatch.setattr(FileLock, "acquire", acquire)
-    module = load()
-    with caplog.at_level(logging.WARNING, logger=LOG):
-        assert module.run(1.5) == 3.0
-        assert module.run(1) == 2.0
-    assert caplog.text.count("takes no locks") == 1
+    assert load().run(1.5) == 3.0
 
 
 def test_a_part_runs_as_python_when_python_calls_it(load):
@@ -224,31 +225,3 @@ def test_a_part_has_one_version_for_constants_and_variables(load):
     module = load(text)
     assert module.run(1.5) == 9.0
     assert len(module.scaled.overloads) == 1
-
-
-class _Thresholds(event.Listener):
-    """Collects the thresholds of Python's garbage collector while functions are compiled."""
-
-    def __init__(self):
-        self.seen = []
-
-    def on_start(self, happened):
-        self.seen.append(gc.get_threshold())
-
-    def on_end(self, happened):
-        self.seen.append(gc.get_threshold())
-
-
-@pytest.mark.parametrize("text", [MODULE, MODULE.replace("x * FACTOR", "x.nothing")])
-@pytest.mark.parametrize("first", [700, 0, 2 * COLLECTED_EVERY])
-def test_garbage_is_collected_seldom_only_while_a_kernel_is_compiled(load, text, first):
-    usual, listener = gc.get_threshold(), _Thresholds()
-    gc.set_threshold(first, 10, 10)
-    try:
-        with event.install_listener("numba:compile", listener), suppress(TypingError):
-            load(text).run(1.5)
-        assert gc.get_threshold()[0] == first
-    finally:
-        gc.set_threshold(*usual)
-    expected = max(first, COLLECTED_EVERY) if first else 0
-    assert {seen[0] for seen in listener.seen} == {expected}

@@ -12,7 +12,7 @@ import gymnasium as gym
 
 import dptse_env
 from dptse_env.command_line import add_tools_path
-from dptse_env.utils.extras import MissingExtraError
+from dptse_env.utils.registry import MissingExtraError
 
 SHORT = ["--env", "dptse_env:dptse/ShortHighway-v0"]
 LONGER = {"n_mainline": 7}

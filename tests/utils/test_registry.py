@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from dptse_env.utils.extras import EXTRAS, MissingExtraError, needed_for
+from dptse_env.utils.registry import EXTRAS, MissingExtraError, needed_for
 
 PROJECT = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text(encoding="utf-8"))
 BROUGHT_BY = {"sumo": "eclipse_sumo"}
