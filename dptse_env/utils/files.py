@@ -180,7 +180,7 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _text(card: Mapping[str, Any]) -> str:
-    """Return a card as text. Keys keep their order, which can mean something; numbers are finite."""
+    """Return a card as text. Keys keep their order, which can mean something."""
     return json.dumps(card, allow_nan=False)
 
 
