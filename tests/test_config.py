@@ -225,7 +225,7 @@ def test_bad_privacy_is_named_with_its_path():
 )
 def test_a_sensitivity_counts_what_the_unit_can_contribute(unit, horizon, contributions):
     config = resolve("private-highway", {"privacy": {"unit": unit}, "horizon": horizon})
-    sensitivity = make_release(config).sensitivity
+    (sensitivity,) = make_release(config).sensitivity
     assert sensitivity.contributions == contributions
     assert sensitivity.releases[0].bound == pytest.approx(10 * (2 * contributions) ** 0.5)
     assert sensitivity.releases[1].bound == pytest.approx(2 * 510 * contributions**0.5)
@@ -241,7 +241,7 @@ def test_neither_bandwidth_nor_sensors_enter_an_honest_bound():
 
 def test_the_papers_sensitivity_counts_released_boundary_segments():
     keywords = {"privacy": {"boundary_inputs": "private"}}
-    fewer, more = (make_release(resolve("paper-highway", k)).sensitivity for k in ({}, keywords))
+    fewer, more = (make_release(resolve("paper-highway", k)).sensitivity[0] for k in ({}, keywords))
     assert dict(fewer.assumptions)["n_sensors"] == 8
     assert dict(more.assumptions)["n_sensors"] == 8 + PAPER_HIGHWAY.n_boundaries
 

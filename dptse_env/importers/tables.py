@@ -412,7 +412,7 @@ def _json(path: Path, form: Format, scalars: Iterable[str]) -> Iterator[pl.DataF
     """Read the points of a JSON array with a document for each vehicle; a row is a document."""
     waiting: list[list[Any]] = []
     scalars, row, n_waiting = tuple(scalars), 0, 0
-    kinds = {ROW: pl.Int64, **dict.fromkeys(scalars, pl.String)}
+    kinds: dict[str, Any] = {ROW: pl.Int64, **dict.fromkeys(scalars, pl.String)}
     kinds |= dict.fromkeys(form.lists, pl.List(pl.Float64))
 
     def frame() -> pl.DataFrame:
@@ -482,7 +482,8 @@ def _by_direction(points: pl.LazyFrame, path: Path, source: Source) -> pl.LazyFr
             "for the vehicles that move to the left (drivingDirection 1), or source.groups be "
             "['lower']"
         )
-    upper = pl.col("vehicle").replace_strict(table[:, 0], table[:, 1] == "1", default=False)
+    # By membership, since `replace` is not streamed.
+    upper = pl.col("vehicle").is_in(table.filter(table[:, 1] == "1")[:, 0].implode())
     length = source.factor("length", "m")
     # x is the left corner of the box: the rear of those that move to the right.
     return points.with_columns(
