@@ -24,6 +24,9 @@ def test_card_and_weights_are_read_without_torch(monkeypatch):
     monkeypatch.setitem(sys.modules, "torch", None)
     file = read_policy("private-highway")
     assert file.card["training"]["seed"] == 3
+    # By this order the weights of the rule belong to its blocks.
+    rule = file.card["policy"]["arguments"]["rule"]
+    assert list(rule) == ["density_log_std", "speed_log_std", "age"]
     assert len(file.weights) == 7
     assert {array.dtype for array in file.weights.values()} == {np.dtype(np.float32)}
 
