@@ -213,12 +213,12 @@ BAD = [
     ({"traffic_seeds": [-1]}, r"traffic_seeds\[0\] must be"),
     ({"traffic_seeds": "0:99999999999999"}, "traffic_seeds must be"),
     ({"traffic_seeds": []}, "traffic_seeds must be"),
-    ({"traffic_seeds": "3:1"}, "traffic_seeds must not be empty"),
+    ({"traffic_seeds": "3:1"}, "traffic_seeds must be a range of seeds that is not empty"),
     ({"traffic_seeds": [1, 1]}, "traffic_seeds must be distinct"),
     ({"truth_in_info": 1}, "truth_in_info must be"),
     ({"penetration": 5e-324, "privacy": "paced"}, r"penetration\.share must be"),
     ({"horizon": 241}, "horizon must be"),
-    ({"random_start": True}, "random_start needs a horizon"),
+    ({"random_start": True}, "horizon must be below the record"),
     ({"parameters": 3}, "parameters must be"),
     ({"parameters": "fast"}, "parameters must be one of"),
     ({"estimator_settings": {},
@@ -237,8 +237,7 @@ def nested(depth=100_000):
     return value
 
 
-@pytest.mark.parametrize("make", [gym.make, gym.make_vec])
-def test_values_that_are_nested_deeply_are_refused_by_their_path(make):
+def test_values_that_are_nested_deeply_are_refused_by_their_path():
     deep = nested()
     values = dict.fromkeys(field_hints(EnvConfig), deep) | {
         "estimator_settings": {"mhe": {"solver": deep}},
@@ -247,9 +246,8 @@ def test_values_that_are_nested_deeply_are_refused_by_their_path(make):
         "render_every": deep,
     }
     for key, value in values.items():
-        if make is gym.make or key != "render_every":
-            with pytest.raises(ValueError, match=rf"^{key}\S* must .*\[\[\.\.\.\]\]"):
-                make(SHORT, **{key: value})
+        with pytest.raises(ValueError, match=rf"^{key}\S* must .*\[\[\.\.\.\]\]"):
+            gym.make(SHORT, **{key: value})
 
 
 def test_bad_keywords_name_themselves():

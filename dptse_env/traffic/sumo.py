@@ -248,7 +248,7 @@ def _command(folder: Path, network: str, corridor: Corridor, scenario: Scenario)
         return own_sumo.command(folder, corridor.network, scenario.sumo_seed, scenario.scale)
     network_file, route_file = folder / "corridor.net.xml", folder / "scenario.rou.xml"
     network_file.write_text(network, encoding="utf-8")
-    route_file.write_bytes(routes_xml(corridor, scenario))
+    route_file.write_text(routes_xml(corridor, scenario), encoding="utf-8")
     files = ["-n", str(network_file), "-r", str(route_file)]
     return ["sumo", *files, "--seed", str(scenario.sumo_seed), *OPTIONS]
 

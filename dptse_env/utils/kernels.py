@@ -169,8 +169,10 @@ class _Kept(NullCache):
         return fingerprint(self._function)
 
     def _path(self, signature: tuple[Any, ...], codegen: Any) -> Path:
-        about = self._digest, list(map(_spelled, signature)), codegen.magic_tuple()
-        about = *about, numba.__version__, sys.implementation.cache_tag
+        about = (
+            self._digest, list(map(_spelled, signature)), codegen.magic_tuple(),
+            numba.__version__, sys.implementation.cache_tag,
+        )  # fmt: skip
         digest = hashlib.sha256(repr(about).encode()).hexdigest()
         return self._folder / f"{self._name}-{digest[:32]}.machine-code"
 
