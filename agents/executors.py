@@ -10,12 +10,10 @@ import contextlib
 import logging
 import os
 import platform
-import signal
 import socket
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
 from functools import partial
@@ -26,6 +24,7 @@ import loky
 from tqdm import tqdm
 
 from dptse_env.command_line import TOOLS
+from dptse_env.traffic.recording import follow_parent
 from dptse_env.utils.fields import integer
 from dptse_env.utils.registry import needed_for
 
@@ -130,22 +129,10 @@ class LocalProcesses(Executor):
         """Return the processes, new ones where one has died."""
         return loky.get_reusable_executor(
             self.workers,
-            initializer=_follow_parent,
+            initializer=follow_parent,
             initargs=(os.getpid(),),
             env={"OMP_NUM_THREADS": "1"},
         )
-
-
-def _follow_parent(parent: int) -> None:
-    """Leave interrupts to the parent process, and end when it ends."""
-
-    def end_with_parent() -> None:
-        while os.getppid() == parent:
-            time.sleep(0.5)
-        os._exit(1)  # the parent was killed: nobody takes results any more
-
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=end_with_parent, daemon=True).start()
 
 
 class RayCluster(Executor):

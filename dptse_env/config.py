@@ -49,6 +49,7 @@ from dptse_env.utils.fields import (
     checked_fields,
     field_hints,
     from_mapping,
+    require,
     require_name,
     shown,
 )
@@ -148,33 +149,18 @@ class EnvConfig:
         for block in self.observation:
             if not (isinstance(block, str) and block == DEFAULT):
                 BLOCKS.find(block)
-        RELEASE_MODELS.find(self.privacy.preset)
         check_estimator(self.estimator, self.backend)
-        n, duration = self.corridor.n_mainline, self.corridor.duration
-        if self.bandwidth > n:
-            raise ValueError(f"bandwidth must be in 1..{n}, got {self.bandwidth}")
+        n, duration, seeds = self.corridor.n_mainline, self.corridor.duration, self.traffic_seeds
+        require(self.bandwidth <= n, "bandwidth", f"in 1..{n}", self.bandwidth)
+        require(self.horizon_steps <= duration, "horizon", f"in 1..{duration}", self.horizon)
+        if self.random_start:
+            shorter = f"below the record's {duration} s where random_start is true"
+            require(self.horizon_steps < duration, "horizon", shorter, self.horizon)
+        most = f"1 to {MOST_SEEDS} seeds"
+        require(1 <= len(seeds) <= MOST_SEEDS, "traffic_seeds", most, f"{len(seeds)} of them")
+        require(len(set(seeds)) == len(seeds), "traffic_seeds", "distinct", seeds)
         self._check_queries()
-        if self.horizon_steps > duration:
-            raise ValueError(f"horizon must be in 1..{duration}, got {self.horizon}")
-        if self.random_start and self.horizon_steps == duration:
-            raise ValueError(
-                f"random_start needs a horizon below the record's {duration} s, got {self.horizon}"
-            )
-        seeds = self.traffic_seeds
-        if not 1 <= len(seeds) <= MOST_SEEDS:
-            raise ValueError(f"traffic_seeds must be 1 to {MOST_SEEDS} seeds, got {len(seeds)}")
-        if len(set(seeds)) < len(seeds):
-            raise ValueError(f"traffic_seeds must be distinct, got {seeds}")
         self._check_sensors()
-        if self.corridor.recordings is not None:
-            require_seeds(self.corridor.recordings, seeds)
-            needs = RELEASE_MODELS.find(self.privacy.preset).needs_vehicles
-            if needs and not has_vehicles(self.corridor.recordings):
-                raise ValueError(
-                    "privacy.preset must be a release model that needs no vehicles, such as "
-                    "'paper' or 'corrected', on a road of measured fields, got "
-                    f"{RELEASE_MODELS.name_of(self.privacy.preset)!r}"
-                )
         if isinstance(self.parameters, str):
             require_name("parameters", self.parameters, available_parameters())
         self.settings()
@@ -183,47 +169,43 @@ class EnvConfig:
         """Check the options, and that the release model can answer them."""
         _ = self.queries  # refuses bad values
         model, spans = RELEASE_MODELS.find(self.privacy.preset), self.query_spans
+        plain = (
+            f"(1,) with the release model {RELEASE_MODELS.name_of(model)!r}, which releases no sums"
+        )
         for key in ("query_spans", "price_levels"):
-            if getattr(self, key) != (1,) and not model.releases_sums:
-                raise ValueError(
-                    f"{key} must be (1,) with the release model "
-                    f"{RELEASE_MODELS.name_of(model)!r}, which releases no sums, got "
-                    f"{getattr(self, key)}"
-                )
-        lengths = self.corridor.segment_lengths[: self.corridor.n_mainline]
-        if max(spans) > 1 and len(set(lengths)) > 1:
-            raise ValueError(
-                f"query_spans must be (1,) where mainline segments differ in length, got {spans}"
-            )
-        if max(spans) > 1 and model.flow_centre(self.corridor, self.privacy) is None:
-            raise ValueError(
-                f"query_spans must be (1,) where mean speeds are released, got {spans}"
-            )
+            value = getattr(self, key)
+            require(value == (1,) or model.releases_sums, key, plain, value)
+        if max(spans) > 1:
+            lengths = set(self.corridor.segment_lengths[: self.corridor.n_mainline])
+            alike = "(1,) where mainline segments differ in length"
+            require(len(lengths) == 1, "query_spans", alike, spans)
+            centre = model.flow_centre(self.corridor, self.privacy)
+            require(centre is not None, "query_spans", "(1,) where mean speeds are released", spans)
+
+    def _check_sensors(self) -> None:
+        """Check that the road has what penetration, detectors and the release model need."""
+        n, factor, recordings = (
+            len(self.corridor.fixed_sensors), self.detectors.factor, self.corridor.recordings
+        )  # fmt: skip
+        each = f"one number, or one for each of the {n} fixed sensors"
+        require(not isinstance(factor, tuple) or len(factor) == n, "detectors.factor", each, factor)
+        has_some = n > 0 or self.detectors == Detectors()
+        require(has_some, "detectors", "left out on a road without fixed sensors", self.detectors)
+        if recordings is None:
+            return
+        require_seeds(recordings, self.traffic_seeds)
+        if not has_vehicles(recordings):
+            preset, share = self.privacy.preset, self.penetration.share
+            blind = "one that needs no vehicles, as 'paper', on a road of measured fields"
+            is_blind = not RELEASE_MODELS.find(preset).needs_vehicles
+            require(is_blind, "privacy.preset", blind, RELEASE_MODELS.name_of(preset))
+            whole = "1, and detectors left out, on a road of measured fields"
+            require(not self.has_separate_sensors, "penetration.share", whole, share)
 
     @property
     def has_separate_sensors(self) -> bool:
         """True if fixed sensors measure other things than queries do."""
         return not self.penetration.is_complete or self.detectors != Detectors()
-
-    def _check_sensors(self) -> None:
-        """Check that the road can have this penetration and these detectors."""
-        corridor, factor = self.corridor, self.detectors.factor
-        if isinstance(factor, tuple) and len(factor) != len(corridor.fixed_sensors):
-            raise ValueError(
-                f"detectors.factor must be one number, or one for each of the "
-                f"{len(corridor.fixed_sensors)} fixed sensors, got {factor}"
-            )
-        if self.detectors != Detectors() and not corridor.fixed_sensors:
-            raise ValueError(
-                f"detectors must be left out on a road without fixed sensors, got {self.detectors}"
-            )
-        recordings = corridor.recordings
-        is_field = recordings is not None and not has_vehicles(recordings)
-        if self.has_separate_sensors and is_field:
-            raise ValueError(
-                "penetration.share must be 1, and detectors left out, on a road of measured "
-                "fields, which have no vehicles"
-            )
 
     @cached_property
     def queries(self) -> QueryOptions:
@@ -396,13 +378,11 @@ def parse_seeds(text: str, path: str = "seeds") -> tuple[int, ...]:
         ValueError: The text is neither, or the range is empty or too long.
     """
     first, colon, stop = text.partition(":")
-    if not (first.isdecimal() and (stop.isdecimal() or not colon)) or len(text) > 40:
-        raise ValueError(f"{path} must be 'first:stop' or one seed, got {text[:60]!r}")
+    is_range = first.isdecimal() and (stop.isdecimal() or not colon) and len(text) <= 40
+    require(is_range, path, "'first:stop' or one seed", text)
     seeds = range(int(first), int(stop) if colon else int(first) + 1)
-    if not seeds:
-        raise ValueError(f"{path} must not be empty, got {text!r}")
-    if seeds.stop - seeds.start > MOST_SEEDS:
-        raise ValueError(f"{path} must be at most {MOST_SEEDS} seeds, got {text!r}")
+    require(seeds.stop > seeds.start, path, "a range of seeds that is not empty", text)
+    require(seeds.stop - seeds.start <= MOST_SEEDS, path, f"at most {MOST_SEEDS} seeds", text)
     return tuple(seeds)
 
 

@@ -111,15 +111,9 @@ def placed(
         line = _Line(np.array(layout.centre_line) * unit)
         plane = pl.col("plane").struct
         points = points.with_columns(plane=line.project()).with_columns(plane["x"], plane["y"])
-    if "edge" in roles:
-        edges = _edges(layout, road)
-        at = pl.col("edge").replace_strict(
-            list(edges), list(edges.values()), default=None, return_dtype=pl.Struct(_EDGE)
-        )
-        points = points.with_columns(at=at).with_columns(
-            branch=pl.col("at").struct["branch"].fill_null(OFF),
-            position=pl.col("at").struct["start"] + pl.col("x"),
-            known=pl.col("at").struct["column"],
+    if "edge" in roles and not layout.centre_line:
+        points = points.join(_edges(layout, road), on="edge", how="left").with_columns(
+            pl.col("branch").fill_null(OFF), position=pl.col("start") + pl.col("x")
         )
         column = pl.coalesce("known", column_at(road))
         return points.with_columns(column=column, lane_number=number)
@@ -143,22 +137,20 @@ def column_at(road: Road) -> pl.Expr:
     return both.map_batches(find, return_dtype=pl.Int16, is_elementwise=True)
 
 
-_EDGE = {"branch": pl.Int16, "start": pl.Float64, "column": pl.Int16}
-
-
-def _edges(layout: Layout, road: Road) -> dict[str, dict[str, object]]:
-    """Return branch, start [km] and column of each edge; None for the mainline by position."""
+def _edges(layout: Layout, road: Road) -> pl.LazyFrame:
+    """Return branch, start [km] and column of each edge; null for the mainline by position."""
     names = edge_ids(road.corridor)
     branches, starts = road.column_starts
-    edges: dict[str, dict[str, object]] = {}
+    edges: list[tuple[str, int, float, int | None]] = []
     for name, value in (layout.edges or {each: each for each in names}).items():
         if not isinstance(value, str):
-            edges[name] = {"branch": 0, "start": float(value), "column": None}
+            edges.append((name, 0, float(value), None))
             continue
         require(value in names, f"layout.edges.{name}", f"one of {', '.join(names)}", value)
         at = names.index(value)
-        edges[name] = {"branch": int(branches[at]), "start": float(starts[at]), "column": at}
-    return edges
+        edges.append((name, int(branches[at]), float(starts[at]), at))
+    kinds = {"edge": pl.String, "branch": pl.Int16, "start": pl.Float64, "known": pl.Int16}
+    return pl.LazyFrame(edges, kinds, orient="row")
 
 
 def _branch(layout: Layout, n_on_ramps: int, unit: float) -> pl.Expr:

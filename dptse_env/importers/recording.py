@@ -244,8 +244,8 @@ class Recording:
             raise TrajectoryError(
                 f"{self.path}: points of a vehicle must mostly follow one another within "
                 f"{self.options.longest_gap:g} s at less than 300 km/h, got {followed - cut} of "
-                f"{followed} that do: are the units right (time in {self._units['time']}, length "
-                f"in {self._units['length']})?"
+                f"{followed} that do: are the units (time in {self._units['time']}, length in "
+                f"{self._units['length']}) and layout.reversed right?"
             )
 
     def _cut(self, seconds: pl.DataFrame) -> dict[str, tuple[float, float]]:

@@ -39,7 +39,7 @@ BYTES = 40
 """Bytes that a point takes in XML or JSON at least."""
 BLOCK = 1 << 20
 """Bytes of XML or JSON that are read at a time."""
-CHUNK = 100_000
+CHUNK = 25_000
 """Points of XML or JSON that are handed on together."""
 LONGEST_DOCUMENT = 16 << 20
 """Characters of a JSON document after which the file is no array of vehicles."""
@@ -410,7 +410,15 @@ def _documents(path: Path) -> Iterator[Any]:
 
 def _json(path: Path, form: Format, scalars: Iterable[str]) -> Iterator[pl.DataFrame]:
     """Read the points of a JSON array with a document for each vehicle; a row is a document."""
-    waiting, row = [], 0
+    waiting: list[list[Any]] = []
+    scalars, row, n_waiting = tuple(scalars), 0, 0
+    kinds: dict[str, Any] = {ROW: pl.Int64, **dict.fromkeys(scalars, pl.String)}
+    kinds |= dict.fromkeys(form.lists, pl.List(pl.Float64))
+
+    def frame() -> pl.DataFrame:
+        columns = [*zip(*waiting, strict=True)] or [()] * len(kinds)
+        return pl.DataFrame(dict(zip(kinds, columns, strict=True)), kinds).explode(form.lists)
+
     for row, document in enumerate(_documents(path), start=1):
         where = f"{path}, row {row}"
         if not isinstance(document, Mapping):
@@ -420,27 +428,28 @@ def _json(path: Path, form: Format, scalars: Iterable[str]) -> Iterator[pl.DataF
             raise TrajectoryError(
                 f"{where}: fields {', '.join(missing)} are missing, found {shown(*document)}"
             )
-        columns: dict[str, Any] = {ROW: row}
-        for name in scalars:
-            value = document[name]
-            columns[name] = str(value.get("$oid", value) if isinstance(value, Mapping) else value)
+        texts = (document[name] for name in scalars)
+        names = [
+            str(each.get("$oid", each) if isinstance(each, Mapping) else each) for each in texts
+        ]
         try:
-            lists = {name: np.array(document[name], dtype=float) for name in form.lists}
+            lists = [np.array(document[name], dtype=float) for name in form.lists]
         except (TypeError, ValueError, OverflowError) as problem:
             raise TrajectoryError(
                 f"{where}: {', '.join(form.lists)} must be lists of numbers: {shown(problem)}"
             ) from problem
-        shapes = {name: each.shape for name, each in lists.items()}
-        if len(set(shapes.values())) > 1 or len(shapes[form.lists[0]]) != 1:
+        shapes = {each.shape for each in lists}
+        if len(shapes) > 1 or lists[0].ndim != 1:
             raise TrajectoryError(f"{where}: lists must be of one length, got shapes {shapes}")
-        waiting.append(pl.DataFrame({**columns, **lists}))
-        if sum(map(len, waiting)) >= CHUNK:
-            yield pl.concat(waiting)
-            waiting = []
+        if len(lists[0]):
+            waiting.append([row, *names, *lists])
+            n_waiting += len(lists[0])
+        if n_waiting >= CHUNK:
+            yield frame()
+            waiting, n_waiting = [], 0
     if not row:
         raise TrajectoryError(f"{path}: it must be a JSON array of documents, got none")
-    if waiting:
-        yield pl.concat(waiting)
+    yield frame()
 
 
 # -- formats ---------------------------------------------------------------------------------------
@@ -458,7 +467,10 @@ def _by_direction(points: pl.LazyFrame, path: Path, source: Source) -> pl.LazyFr
         ) from problem
     unknown = points.select("vehicle").unique().drop_nulls()
     for (name,) in (
-        unknown.join(table.lazy(), how="anti", left_on="vehicle", right_on="id").collect().rows()
+        unknown.join(table.lazy(), how="anti", left_on="vehicle", right_on="id")
+        .head(1)
+        .collect(engine="streaming")
+        .rows()
     ):
         raise TrajectoryError(
             f"{path}: vehicle {shown(name)} is not in {meta}, which has its direction"
@@ -470,7 +482,8 @@ def _by_direction(points: pl.LazyFrame, path: Path, source: Source) -> pl.LazyFr
             "for the vehicles that move to the left (drivingDirection 1), or source.groups be "
             "['lower']"
         )
-    upper = pl.col("vehicle").replace_strict(table[:, 0], table[:, 1] == "1", default=False)
+    # By membership, since `replace` is not streamed.
+    upper = pl.col("vehicle").is_in(table.filter(table[:, 1] == "1")[:, 0].implode())
     length = source.factor("length", "m")
     # x is the left corner of the box: the rear of those that move to the right.
     return points.with_columns(

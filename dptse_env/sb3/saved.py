@@ -230,11 +230,8 @@ def _check_fit(card: Mapping[str, Any], config: EnvConfig, allow: Collection[str
     observations = there.get("observation"), here["observation"]
     if "channels" in here:
         # Another number of segments is a matter of the corridor: the network is shared by them.
-        named = there.get("channels")
-        theirs, ours = (
-            set(map(str, named if isinstance(named, list) else ())),
-            set(here["channels"]),
-        )
+        named, ours = there.get("channels"), set(here["channels"])
+        theirs = set(map(str, named)) if isinstance(named, list) else set()
         pairs["channels"] = sorted(theirs - ours), sorted(ours - theirs)
         is_moved = (road_there, observations[0]) != (road_here, observations[1])
     else:
@@ -306,7 +303,7 @@ def _made(
 def _check_shared(arguments: Mapping[str, Any], n_values: int) -> None:
     _check_names(arguments, {"width", "rule", "skips_sensors"})
     width, rule = integer("policy.arguments.width", arguments["width"], 1), arguments["rule"]
-    _check_size(width * width, n_values)
+    _check_size(6 * width * width, n_values)  # of the trunk's second convolution and of its mean
     if not isinstance(rule, dict) or not rule:
         raise ValueError(f"policy.arguments.rule must be a mapping of blocks, got {rule!r:.80}")
     for name, weight in rule.items():

@@ -150,14 +150,13 @@ class Corridor:
         """Check the fields and bring them to their declared types."""
         checked_fields(self, "corridor")
         is_name = bool(re.fullmatch(r"[a-z0-9][a-z0-9-]*", self.name))
-        require(is_name, "corridor.name", "lower-case letters, digits and hyphens", self.name)
+        self._require(is_name, "name", "lower-case letters, digits and hyphens")
         self._check_ramps()
         self._check_profiles()
-        sensors = self.fixed_sensors
-        for i, sensor in enumerate(sensors):
+        for i, sensor in enumerate(self.fixed_sensors):
             integer(f"corridor.fixed_sensors[{i}]", sensor, 0, self.n_segments - 1)
-        unique = len(set(sensors)) == len(sensors)
-        require(unique, "corridor.fixed_sensors", "free of duplicates", sensors)
+        unique = len(set(self.fixed_sensors)) == len(self.fixed_sensors)
+        self._require(unique, "fixed_sensors", "free of duplicates")
         demand = self.published_demand
         allowed = f"one rate for each of the {self.n_on_ramps} on-ramps"
         fits = len(demand.on_ramps) == self.n_on_ramps
@@ -170,42 +169,23 @@ class Corridor:
             object.__setattr__(self, "incident", self.incident[0] if self.incident else None)
         for incident in self.incidents:
             self._check_incident(incident)
-        if self.recordings is not None:
-            fixed, free = isinstance(self.demand, Demand), self.incident is None
-            allowed = "None where traffic is recorded"
-            require(free, "corridor.incident", allowed, self.incident)
-            allowed = "fixed where traffic is recorded"
-            require(fixed, "corridor.demand", allowed, self.demand)
-        self._check_network()
-        self._check_classes()
+        self._check_sources()
 
-    def _check_classes(self) -> None:
-        classes = self.vehicle_classes
-        if not classes:
-            return
-        simulated = self.network is None and self.recordings is None
-        allowed = "left out where the traffic has classes of its own"
-        require(simulated, "corridor.vehicle_classes", allowed, classes)
-        names = [each.name for each in classes]
-        unique = len(set(names)) == len(names)
-        require(unique, "corridor.vehicle_classes", "classes of different names", names)
-        total = math.fsum(each.share for each in classes)
-        allowed = "classes whose shares add up to 1"
-        require(math.isclose(total, 1.0, abs_tol=1e-9), "corridor.vehicle_classes", allowed, total)
+    def _require(self, condition: bool, name: str, allowed: str) -> None:
+        """Raise ``ValueError`` with the value of a field unless a condition holds."""
+        require(condition, f"corridor.{name}", allowed, getattr(self, name))
 
     def _check_ramps(self) -> None:
         for name in ("on_ramps", "off_ramps"):
             faces = getattr(self, name)
             for i, face in enumerate(faces):
                 integer(f"corridor.{name}[{i}]", face, 1, self.n_mainline - 1)
-            increasing = list(faces) == sorted(set(faces))
-            require(increasing, f"corridor.{name}", "increasing", faces)
-        allowed = f"at other faces than the on-ramps {self.on_ramps}"
+            self._require(list(faces) == sorted(set(faces)), name, "increasing")
         disjoint = not set(self.on_ramps) & set(self.off_ramps)
-        require(disjoint, "corridor.off_ramps", allowed, self.off_ramps)
-        allowed = f"one share for each of the {self.n_off_ramps} off-ramps"
+        self._require(disjoint, "off_ramps", f"at other faces than the on-ramps {self.on_ramps}")
         fits = len(self.exit_shares) == self.n_off_ramps
-        require(fits, "corridor.exit_shares", allowed, self.exit_shares)
+        allowed = f"one share for each of the {self.n_off_ramps} off-ramps"
+        self._require(fits, "exit_shares", allowed)
 
     def _check_profiles(self) -> None:
         """Check what varies along the road, and collapse sequences of equal values."""
@@ -217,7 +197,7 @@ class Corridor:
                 continue
             each = "mainline segment" if count == self.n_mainline else "ramp"
             allowed = f"one value, or {count}, one for each {each}"
-            require(len(values) == count, f"corridor.{name}", allowed, values)
+            self._require(len(values) == count, name, allowed)
             if len(set(values)) == 1:
                 object.__setattr__(self, name, values[0])
         lanes = self.segment_lanes
@@ -235,17 +215,29 @@ class Corridor:
             integer("corridor.incident.segment", segment, 0, self.n_mainline - 1)
         require(start < self.duration, "corridor.incident.start", f"< {self.duration} s", start)
 
-    def _check_network(self) -> None:
-        if self.network is None:
-            return
-        n_columns = self.n_segments + self.n_boundaries
-        allowed = f"one for each of the {n_columns} record columns of this geometry"
-        fits = len(self.network.columns) == n_columns
-        require(fits, "corridor.network.columns", allowed, len(self.network.columns))
-        without = "None on a road with a network of its own"
-        require(self.recordings is None, "corridor.recordings", without, self.recordings)
-        allowed = "left out on a road with a network of its own"
-        require(self.drivers == Drivers(), "corridor.drivers", allowed, self.drivers)
+    def _check_sources(self) -> None:
+        """Check what traffic that is imported, or recorded from files of one's own, excludes."""
+        if self.recordings is not None:
+            self._require(self.incident is None, "incident", "None where traffic is recorded")
+            fixed = isinstance(self.demand, Demand)
+            self._require(fixed, "demand", "fixed where traffic is recorded")
+        if self.network is not None:
+            columns, n_columns = len(self.network.columns), self.record_shape[1]
+            allowed = f"one for each of the {n_columns} record columns of this geometry"
+            require(columns == n_columns, "corridor.network.columns", allowed, columns)
+            without = "on a road with a network of its own"
+            self._require(self.recordings is None, "recordings", f"None {without}")
+            self._require(self.drivers == Drivers(), "drivers", f"left out {without}")
+        if self.vehicle_classes:
+            simulated = self.network is None and self.recordings is None
+            allowed = "left out where the traffic has classes of its own"
+            self._require(simulated, "vehicle_classes", allowed)
+            names = {each.name for each in self.vehicle_classes}
+            different = len(names) == len(self.vehicle_classes)
+            self._require(different, "vehicle_classes", "classes of different names")
+            total = math.fsum(each.share for each in self.vehicle_classes)
+            complete, allowed = math.isclose(total, 1.0, abs_tol=1e-9), "whose shares add up to 1"
+            require(complete, "corridor.vehicle_classes", f"classes {allowed}", total)
 
     def has_geometry_of(self, other: Self) -> bool:
         """Return whether another corridor is the same road, whatever drives on it."""
@@ -382,6 +374,11 @@ class Corridor:
         if self.incident is None:
             return ()
         return self.incident if isinstance(self.incident, tuple) else (self.incident,)
+
+    @property
+    def record_shape(self) -> tuple[int, int]:
+        """Number of steps of a record, the second 0 among them, and of its columns, S + R."""
+        return self.duration + 1, self.n_segments + self.n_boundaries
 
     @property
     def record_layout(self) -> dict[str, Any]:

@@ -19,7 +19,7 @@ MANIFEST = "manifest.json"
 FORMAT = "dptse-recordings"
 VERSION = 2
 
-LARGEST_MANIFEST = 100_000_000
+LARGEST_MANIFEST = 10_000_000
 """Largest size of a manifest [bytes]."""
 
 Kind = Literal["vehicles", "fields"]
@@ -99,8 +99,8 @@ def require_seeds(recordings: Recordings, seeds: Iterable[int]) -> None:
     lacking = sorted(set(seeds) - set(known))
     if lacking:
         raise ValueError(
-            f"traffic seed must be one that was recorded ({ranges(known)} in {recordings.folder}), "
-            f"got {ranges(lacking)}"
+            f"traffic seed must be one that was recorded ({ranges(known):.200} in "
+            f"{recordings.folder}), got {ranges(lacking):.200}"
         )
 
 
@@ -125,7 +125,7 @@ def load_record(recordings: Recordings, seed: int, road: Mapping[str, Any]) -> R
             f"the corridor's: import the trajectories again for this corridor"
         )
     try:
-        record = Record.load(path, _source(seed, road))
+        record = Record.load(path, _source(seed, road), _shape(road))
     except FileNotFoundError as problem:
         raise InvalidRecordError(f"{path}: the record is missing") from problem
     if record.digest != manifest["records"][str(seed)]:
@@ -171,12 +171,21 @@ def _manifest(recordings: Recordings) -> dict[str, Any]:
             f"{path}: it is not the manifest of corridor.recordings.digest "
             f"{recordings.digest!r:.100}"
         )
+    for seed in manifest["records"]:
+        if not (seed.isdecimal() and len(seed) < 19):
+            raise InvalidRecordError(f"{path}: records must have traffic seeds, got {seed!r:.100}")
     return manifest
 
 
 def _digest(manifest: Mapping[str, Any]) -> str:
     content = {key: manifest[key] for key in ("format", "version", "kind", "road", "records")}
     return json_digest(content)
+
+
+def _shape(road: Mapping[str, Any]) -> tuple[int, int]:
+    """Return `Corridor.record_shape`, given the layout."""
+    n_ramps = len(road["ramp_segments"])
+    return road["duration"] + 1, road["n_mainline"] + sum(road["ramp_segments"]) + 2 + n_ramps
 
 
 def _source(seed: int, road: Mapping[str, Any]) -> dict[str, object]:

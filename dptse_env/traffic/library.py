@@ -123,7 +123,7 @@ class RecordLibrary:
         workers: int | None = None,
         progress: bool = False,
     ) -> None:
-        """Make the missing records of `seeds`, several at once.
+        """Make the missing records of `seeds`, several at once; imported ones cannot be made.
 
         The default number of `workers` is that of usable cores; `progress` shows a progress bar.
 
@@ -138,7 +138,7 @@ class RecordLibrary:
         wanted = list(dict.fromkeys(integer("traffic seed", seed, 0) for seed in seeds))
         with self._explained_errors(corridor, wanted):
             missing = self.missing(corridor, wanted)
-            if missing:
+            if missing and corridor.recordings is None:
                 self._record(corridor, missing, n_workers, progress)
 
     def record_path(self, corridor: Corridor, seed: int) -> Path:
@@ -153,14 +153,14 @@ class RecordLibrary:
             return load_record(corridor.recordings, seed, corridor.record_layout)
         path, source = self.record_path(corridor, seed), _source(corridor, seed)
         try:
-            return Record.load(path, source)
+            return Record.load(path, source, corridor.record_shape)
         except FileNotFoundError:
             pass  # the usual first use
         except InvalidRecordError as error:
             logger.warning("record is made again: %s", error)
         self._record(corridor, [seed])
         try:
-            return Record.load(path, source)
+            return Record.load(path, source, corridor.record_shape)
         except (OSError, InvalidRecordError) as error:
             raise RecordingError.from_cause(corridor, seed, str(error)) from error
 

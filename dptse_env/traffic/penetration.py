@@ -9,8 +9,8 @@ from dptse_env.traffic.record import Record
 from dptse_env.utils.arrays import BoolArray, FloatArray
 from dptse_env.utils.fields import Interval, checked_fields
 
-ConnectedShare = Annotated[float, Interval(1e-6, 1)]
-"""A share of connected vehicles, of which one in a million is as good as none."""
+ConnectedShare = Annotated[float, Interval(1e-9, 1)]
+"""A share of connected vehicles, the smallest of which is as good as none."""
 
 
 @dataclass(frozen=True)

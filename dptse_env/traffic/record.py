@@ -232,22 +232,23 @@ class Record:
             OSError: It cannot be written; what was at `path` stays.
             ValueError: It has more than `LARGEST_RECORD` bytes.
         """
-        card = _card(source) | {"n_steps": self.n_steps, "n_columns": self.n_columns}
+        card = _card(source, (self.n_steps, self.n_columns))
         path.parent.mkdir(parents=True, exist_ok=True)
         write_tensors(path, self.arrays, card, LARGEST_RECORD)
 
     @classmethod
-    def load(cls, path: Path, source: Mapping[str, object]) -> "Record":
+    def load(cls, path: Path, source: Mapping[str, object], shape: tuple[int, int]) -> "Record":
         """Read a stored record.
 
         Args:
             path: the file.
             source: the expected description, as given to `save`.
+            shape: the expected numbers of steps and of columns, `Corridor.record_shape`.
 
         Raises:
             FileNotFoundError: There is no such file.
-            InvalidRecordError: It is damaged, of another version of the format, or of another
-                source; the message starts with the path.
+            InvalidRecordError: It is damaged, of another version of the format, or not the expected
+                one; the message starts with the path.
         """
         try:
             card, arrays = read_tensors(path, LARGEST_RECORD)
@@ -256,7 +257,7 @@ class Record:
         except (OSError, ValueError) as error:
             raise InvalidRecordError(str(error)) from error
         try:
-            for key, expected in _card(source).items():
+            for key, expected in _card(source, shape).items():
                 found = card.get(key)
                 if found != expected:
                     raise ValueError(f"{key} is {found!r:.200}, not {expected!r:.200}")
@@ -265,14 +266,20 @@ class Record:
             require(types == wanted, "arrays", str(wanted), types)
             for array in arrays.values():
                 array.flags.writeable = False  # nobody else has them: they need not be copied
-            fields: dict[str, Any] = {name: card.get(name) for name in ("n_steps", "n_columns")}
-            return cls(**(fields | arrays))
+            fields: dict[str, Any] = dict(arrays)
+            return cls(n_steps=shape[0], n_columns=shape[1], **fields)
         except ValueError as error:
             raise InvalidRecordError(f"{path}: {error}") from error
 
 
-def _card(source: Mapping[str, object]) -> dict[str, Any]:
-    return {"format": RECORD_FORMAT, "version": RECORD_VERSION, "source": dict(source)}
+def _card(source: Mapping[str, object], shape: tuple[int, int]) -> dict[str, Any]:
+    return {
+        "format": RECORD_FORMAT,
+        "version": RECORD_VERSION,
+        "source": dict(source),
+        "n_steps": shape[0],
+        "n_columns": shape[1],
+    }
 
 
 def average_dwell(corridor: Corridor, records: Iterable[Record]) -> float:

@@ -92,7 +92,7 @@ def simulate_in_worker(corridor: Corridor, seed: int) -> Record:
     with tempfile.TemporaryDirectory(prefix="dptse-record-") as folder:
         path = Path(folder) / "record"
         record_seeds(corridor, {seed: path}, {seed: {}})
-        return Record.load(path, {})
+        return Record.load(path, {}, corridor.record_shape)
 
 
 def _record_until_death(
@@ -137,7 +137,7 @@ def _worker_processes(n_workers: int) -> Iterator[tuple[ProcessPoolExecutor, int
             tempfile.TemporaryDirectory(prefix="dptse-worker-") as folder,
             ProcessPoolExecutor(
                 n_workers,
-                initializer=_follow_parent,
+                initializer=follow_parent,
                 initargs=(os.getpid(), folder),
                 # Modules in the working directory must not shadow those of the interpreter.
                 env={"TMPDIR": folder, "PYTHONSAFEPATH": "1"},
@@ -148,13 +148,19 @@ def _worker_processes(n_workers: int) -> Iterator[tuple[ProcessPoolExecutor, int
         this.daemon = was_daemon
 
 
-def _follow_parent(parent: int, folder: str) -> None:
-    """Leave interrupts to the parent process, and end when it ends."""
+def follow_parent(parent: int, folder: str | None = None) -> None:
+    """Leave interrupts to the parent of this process, and end when it ends.
+
+    Args:
+        parent: The process id of the parent.
+        folder: A folder to remove if the parent is killed and cannot do so.
+    """
 
     def end_with_parent() -> None:
         while os.getppid() == parent:
             time.sleep(WATCH)
-        shutil.rmtree(folder, ignore_errors=True)  # the parent was killed before it could
+        if folder is not None:
+            shutil.rmtree(folder, ignore_errors=True)
         os._exit(1)
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -113,7 +113,7 @@ def simulate(corridor: Corridor, seed: int) -> Record:
     step, vehicle, segment, speed = table[:, np.lexsort((table[2], table[0]))]
     return Record(
         step=step, vehicle=vehicle, segment=segment, speed=speed,
-        n_steps=corridor.duration + 1, n_columns=len(corridor.network.columns),
+        n_steps=corridor.record_shape[0], n_columns=corridor.record_shape[1],
     )  # fmt: skip
 
 
@@ -248,7 +248,7 @@ def _command(folder: Path, network: str, corridor: Corridor, scenario: Scenario)
         return own_sumo.command(folder, corridor.network, scenario.sumo_seed, scenario.scale)
     network_file, route_file = folder / "corridor.net.xml", folder / "scenario.rou.xml"
     network_file.write_text(network, encoding="utf-8")
-    route_file.write_bytes(routes_xml(corridor, scenario))
+    route_file.write_text(routes_xml(corridor, scenario), encoding="utf-8")
     files = ["-n", str(network_file), "-r", str(route_file)]
     return ["sumo", *files, "--seed", str(scenario.sumo_seed), *OPTIONS]
 

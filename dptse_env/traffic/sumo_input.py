@@ -19,7 +19,6 @@ from functools import lru_cache
 from importlib import resources
 from pathlib import Path
 from typing import NamedTuple
-from xml.etree import ElementTree
 
 from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.roads import SHIPPED_CORRIDORS
@@ -152,17 +151,14 @@ def _plain_xml(geometry: Geometry) -> list[str]:
     """Describe nodes, edges and connections in netconvert's plain XML."""
     xml, n = _PlainXML(geometry), geometry.n_mainline
     lanes, lengths = geometry.segment_lanes, xml.lengths_m
-    cells, names = (
-        [0, *range(n), n - 1],
-        ["upstream", *(f"main_{i}" for i in range(n)), "downstream"],
-    )
+    cells = [0, *range(n), n - 1]
+    names = ["upstream", *(f"main_{i}" for i in range(n)), "downstream"]
     x = [-lengths[0], *itertools.accumulate((lengths[cell] for cell in cells[1:]), initial=0.0)]
     xml.edges(names, cells, [f"face_{face}" for face in range(-1, n + 2)], [(at, 0.0) for at in x])
     xml.connect(names, [min(lanes[a], lanes[b]) for a, b in itertools.pairwise(cells)])
     # Ramps are laid out from their face, on-ramps backwards.
-    for i, (face, ramp) in enumerate(
-        zip(geometry.on_ramps, geometry.on_ramp_segments, strict=True)
-    ):
+    on_ramps = zip(geometry.on_ramps, geometry.on_ramp_segments, strict=True)
+    for i, (face, ramp) in enumerate(on_ramps):
         own, cells = ramp_edges(f"on_{i}", ramp), [ramp[0], *ramp]
         names, node = [f"before_on_{i}", *own], f"face_{face}"
         nodes = [f"on_{i}_entry", *(f"{edge}_start" for edge in own), node]
@@ -170,9 +166,8 @@ def _plain_xml(geometry: Geometry) -> list[str]:
         points = [xml.ramp_point(face, x[face + 1], ramp[0], distance) for distance in along]
         xml.edges(names, cells, nodes, points, node)
         xml.connect([*names, f"main_{face}"], [lanes[ramp[0]]] * len(names))
-    for i, (face, ramp) in enumerate(
-        zip(geometry.off_ramps, geometry.off_ramp_segments, strict=True)
-    ):
+    off_ramps = zip(geometry.off_ramps, geometry.off_ramp_segments, strict=True)
+    for i, (face, ramp) in enumerate(off_ramps):
         own, cells = ramp_edges(f"off_{i}", ramp), [*ramp, ramp[-1]]
         names, node = [*own, f"after_off_{i}"], f"face_{face}"
         nodes = [node, *(f"{edge}_end" for edge in own), f"off_{i}_exit"]
@@ -189,7 +184,7 @@ class _PlainXML:
     def __init__(self, geometry: Geometry) -> None:
         self.geometry = geometry
         self.lengths_m = [1000.0 * length for length in geometry.segment_lengths]
-        self._roots = [ElementTree.Element(tag) for tag in ("nodes", "edges", "connections")]
+        self._content: dict[str, list[str]] = {"nodes": [], "edges": [], "connections": []}
 
     def edges(
         self,
@@ -214,28 +209,24 @@ class _PlainXML:
         for name, (x, y) in zip(nodes, points, strict=True):
             kind = "zipper" if name in zippers else "priority"
             if name != face:
-                place = {"id": name, "x": f"{x:.2f}", "y": f"{y:.2f}", "type": kind}
-                ElementTree.SubElement(self._roots[0], "node", place)
+                node = f'<node id="{name}" x="{x:.2f}" y="{y:.2f}" type="{kind}"/>'
+                self._content["nodes"].append(node)
         for k, (name, cell) in enumerate(zip(names, cells, strict=True)):
-            lanes = str(geometry.segment_lanes[cell])
-            element = ElementTree.SubElement(
-                self._roots[1],
-                "edge",
-                {"id": name, "from": nodes[k], "to": nodes[k + 1], "numLanes": lanes},
-                spreadType="center",
-                speed=f"{geometry.speed_limits[cell] / 3.6:.4f}",
-                length=f"{self.lengths_m[cell]:.2f}",
+            shape = " ".join("{:.2f},{:.2f}".format(*point) for point in points[k : k + 2])
+            self._content["edges"].append(
+                f'<edge id="{name}" from="{nodes[k]}" to="{nodes[k + 1]}" spreadType="center" '
+                f'numLanes="{geometry.segment_lanes[cell]}" length="{self.lengths_m[cell]:.2f}" '
+                f'speed="{geometry.speed_limits[cell] / 3.6:.4f}"'
+                + (f' shape="{shape}"/>' if face in nodes[k : k + 2] else "/>")
             )
-            if face in nodes[k : k + 2]:
-                shape = points[k : k + 2]
-                element.set("shape", " ".join("{:.2f},{:.2f}".format(*point) for point in shape))
 
     def connect(self, edges: Sequence[str], counts: Sequence[int]) -> None:
         """Connect the rightmost lanes of each edge, so many of them, with those of the next."""
         for (start, end), count in zip(itertools.pairwise(edges), counts, strict=True):
-            for lane in map(str, range(count)):
-                lanes = {"from": start, "to": end, "fromLane": lane, "toLane": lane}
-                ElementTree.SubElement(self._roots[2], "connection", lanes)
+            self._content["connections"] += (
+                f'<connection from="{start}" to="{end}" fromLane="{lane}" toLane="{lane}"/>'
+                for lane in range(count)
+            )
 
     def ramp_point(self, beside: int, x: float, ramp: int, along: float) -> Point:
         """Return the point at a distance along a ramp [m] from the face at x [m].
@@ -245,54 +236,42 @@ class _PlainXML:
         """
         lanes = self.geometry.segment_lanes
         axis_y = -0.5 * LANE_WIDTH_M * (lanes[beside] - lanes[ramp])
-        return (
-            x + along * math.cos(RAMP_ANGLE),
-            axis_y - abs(along) * math.sin(RAMP_ANGLE),
-        )
+        return x + along * math.cos(RAMP_ANGLE), axis_y - abs(along) * math.sin(RAMP_ANGLE)
 
     def texts(self) -> list[str]:
         """Return the three files."""
-        return [ElementTree.tostring(root, encoding="unicode") for root in self._roots]
+        return [f"<{tag}>{''.join(lines)}</{tag}>" for tag, lines in self._content.items()]
 
 
-def routes_xml(corridor: Corridor, scenario: Scenario) -> bytes:
+def routes_xml(corridor: Corridor, scenario: Scenario) -> str:
     """Return SUMO's route file of a scenario, on the network that is made for its corridor."""
-    root = ElementTree.Element("routes")
     classes = {each.name: each.attributes(corridor.drivers) for each in corridor.vehicle_classes}
     classes = classes or {"car": corridor.drivers.attributes()}
+    lines = []
     for name, attributes in classes.items():
-        ElementTree.SubElement(root, "vType", {"id": name, **attributes})
-    names = list(classes)
+        values = " ".join(f'{key}="{value}"' for key, value in attributes.items())
+        lines.append(f'<vType id="{name}" {values}/>')
     for origin in range(MAINLINE, corridor.n_on_ramps):
         for end in range(MAINLINE, corridor.n_off_ramps):
             first = 0 if origin == MAINLINE else corridor.on_ramps[origin]
             last = corridor.n_mainline if end == MAINLINE else corridor.off_ramps[end]
             if first >= last:
                 continue
-            edges = (
-                *_entry_edges(corridor, origin),
-                *(f"main_{i}" for i in range(first, last)),
-                *_exit_edges(corridor, end),
-            )
-            ElementTree.SubElement(root, "route", id=f"{origin}:{end}", edges=" ".join(edges))
-    for vehicle, (departure, origin, end, kind) in enumerate(
-        zip(scenario.departures, scenario.origins, scenario.exits, scenario.classes, strict=True)
-    ):
-        ElementTree.SubElement(
-            root,
-            "vehicle",
-            id=str(vehicle),
-            type=names[kind],
-            route=f"{origin}:{end}",
-            depart=f"{departure:.3f}",
-            # As fast as is safe, on the lane that suits the route, and by default at the start of
-            # the boundary segment, so that it is measured there. About 4,700 veh/h can then enter
-            # the paper's mainline; others queue outside. With `departPos="last"` 9 % more can
-            # enter, but vehicles start at the far end of an empty boundary segment.
-            departSpeed="max",
-            departLane="best",
+            entry, leave = _entry_edges(corridor, origin), _exit_edges(corridor, end)
+            edges = " ".join([*entry, *(f"main_{i}" for i in range(first, last)), *leave])
+            lines.append(f'<route id="{origin}:{end}" edges="{edges}"/>')
+    # As fast as is safe, on the lane that suits the route, and by default at the start of the
+    # boundary segment, so that it is measured there. About 4,700 veh/h can then enter the paper's
+    # mainline; others queue outside. With `departPos="last"` 9 % more can enter, but vehicles start
+    # at the far end of an empty boundary segment.
+    how, names = 'departSpeed="max" departLane="best"', list(classes)
+    columns = scenario.departures, scenario.origins, scenario.exits, scenario.classes
+    for vehicle, (departure, origin, end, kind) in enumerate(zip(*columns, strict=True)):
+        lines.append(
+            f'<vehicle id="{vehicle}" type="{names[kind]}" route="{origin}:{end}" '
+            f'depart="{departure:.3f}" {how}/>'
         )
-    return ElementTree.tostring(root)
+    return f"<routes>{''.join(lines)}</routes>"
 
 
 def _entry_edges(corridor: Corridor, origin: int) -> list[str]:

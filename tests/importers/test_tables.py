@@ -156,6 +156,9 @@ def i24(points, direction=1, first=0):
     return documents
 
 
+LISTS = ("timestamp", "x_position", "y_position")
+
+
 def test_i24_is_an_array_of_documents_by_vehicle_without_speeds(tmp_path, expected):
     path = tmp_path / "i24.json"
     path.write_text("\ufeff" + json.dumps(i24(stream()) + i24(stream(), -1, 500)))
@@ -177,6 +180,7 @@ def test_i24_is_an_array_of_documents_by_vehicle_without_speeds(tmp_path, expect
         (json.dumps(i24(stream()))[:-2000], r"row 34: it is no complete JSON array"),
         ("[" * 100_000, "row 1: it is no complete JSON array"),
         ("[]", "must be a JSON array of documents, got none"),
+        (json.dumps([{**dict.fromkeys(LISTS, ()), "_id": 1, "direction": 1}]), "got none"),
         ("[3]", "row 1: a document must be an object, got 3"),
         ('[{"_id": 1}]', "row 1: fields timestamp, x_position, y_position, .* are missing"),
         (json.dumps([{**i24(stream())[0], "x_position": [1.0]}]), "row 1: lists must"),

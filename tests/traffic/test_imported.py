@@ -101,6 +101,7 @@ def test_an_exchanged_or_missing_record_is_an_error(recorded, tmp_path):
     paths = [record_path(recorded.recordings.folder, seed) for seed in (0, 1)]
     other = write(tmp_path / "other", (7, 8, 9, 10))
     paths[0].unlink()
+    RecordLibrary().ensure(recorded, [0])  # it must not be made
     with pytest.raises(InvalidRecordError, match="the record is missing"):
         RecordLibrary().get(recorded, 0)
     paths[1].rename(paths[0])
@@ -131,6 +132,12 @@ def test_a_damaged_manifest_is_an_error(change, message, recorded):
     manifest.unlink()
     with pytest.raises(InvalidRecordError, match="recordings cannot be read"):
         recorded_seeds(recorded.recordings)
+
+
+def test_a_manifest_of_other_keys_than_seeds_is_an_error(tmp_path):
+    digest = write_manifest(tmp_path, FREE.record_layout, {"x" * 1000: ""}, [])
+    with pytest.raises(InvalidRecordError, match=r"manifest\.json: records must have .{1,150}$"):
+        recorded_seeds(Recordings(str(tmp_path), digest))
 
 
 def test_the_digest_covers_the_content_and_not_the_folder(original, recorded, tmp_path):
