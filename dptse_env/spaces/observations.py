@@ -119,7 +119,7 @@ class ObservationBlock(Protocol):
 class Block:
     """A block that ships with the package: its values over a unit, or the logarithms of these.
 
-    See `ObservationBlock`.
+    See `ObservationBlock`. ``is_default`` says whether the default observation has it.
     """
 
     name: str
@@ -129,6 +129,7 @@ class Block:
     values: Callable[[PublicState, ObservationSetup], AnyArray | float]
     unit: Callable[[ObservationSetup], float] = lambda setup: 1.0
     is_log: bool = False
+    is_default: Callable[[ObservationSetup], bool] = lambda setup: True
 
     def __reduce__(self) -> tuple[Callable[[str], Block], tuple[str]]:
         """Pickle as the name, since lambda functions cannot be pickled."""
@@ -192,8 +193,10 @@ SHIPPED_BLOCKS = (
     Block("speed_log_std", _segments, -10, 5,
           lambda state, _: state.estimate.speed_std, _speed_scale, is_log=True),
     Block("released_density", _options, -5, 5, _released(0), _density_scale),
-    Block("released_speed", _options, -5, 5, _released(1), _speed_scale),
-    Block("released_flow", _options, -5, 5, _released(1), _flow_scale),
+    Block("released_speed", _options, -5, 5, _released(1), _speed_scale,
+          is_default=lambda setup: not setup.releases_flow),
+    Block("released_flow", _options, -5, 5, _released(1), _flow_scale,
+          is_default=lambda setup: setup.releases_flow),
     Block("density_innovation", _options, -10, 10, _innovation(0)),
     Block("speed_innovation", _options, -10, 10, _innovation(1)),
     Block("age", _mainline, 0, 1, lambda state, _: state.age, lambda _: AGE_CAP),
@@ -203,12 +206,15 @@ SHIPPED_BLOCKS = (
     Block("bandwidth", lambda _: 1, 0, 1,
           lambda _, setup: setup.bandwidth, lambda setup: setup.corridor.n_mainline),
     Block("epsilon", lambda _: 1, -6, 6, lambda _, setup: float(np.log10(setup.epsilon))),
-    Block("picked", _options, 0, 1, lambda state, _: state.picked),
-    Block("last_price", _options, -5, 5, _log_prices, lambda _: PRICE_UNIT),
+    Block("picked", _options, 0, 1, lambda state, _: state.picked,
+          is_default=lambda setup: setup.picks_one_by_one),
+    Block("last_price", _options, -5, 5, _log_prices, lambda _: PRICE_UNIT,
+          is_default=lambda setup: setup.has_prices),
     Block("tracer", _mainline, 0, 1,
-          lambda state, _: 0.0 if state.tracer is None else state.tracer),
+          lambda state, _: 0.0 if state.tracer is None else state.tracer,
+          is_default=lambda setup: setup.has_prices),
 )  # fmt: skip
-"""The shipped blocks, in the order of the default observation."""
+"""The shipped blocks; the default observation has those that are in it, in this order."""
 
 
 def _shipped_block(name: str) -> Block:
@@ -228,12 +234,7 @@ BLOCKS = Registry("observation", {block.name: block for block in SHIPPED_BLOCKS}
 
 def default_blocks(setup: ObservationSetup) -> list[str]:
     """Return the names of the default blocks."""
-    left_out = {"released_speed" if setup.releases_flow else "released_flow"}
-    if not setup.picks_one_by_one:
-        left_out.add("picked")
-    if not setup.has_prices:
-        left_out |= {"last_price", "tracer"}
-    return [block.name for block in SHIPPED_BLOCKS if block.name not in left_out]
+    return [block.name for block in SHIPPED_BLOCKS if block.is_default(setup)]
 
 
 class ObservationEncoding:
