@@ -132,7 +132,7 @@ def test_queries_count_connected_vehicles_and_sensors_all(preset):
 
 
 def test_no_connected_vehicle_on_a_queried_segment_is_a_normal_answer():
-    process = make(penetration=1e-9, privacy={"preset": "capped"})
+    process = make(penetration=1e-6, privacy={"preset": "capped"})
     begin(process)
     values = np.array([released.values[0, [0, 3]] for released, *_ in play(process, 50)])
     sigma = process.release.sigma
