@@ -12,9 +12,8 @@ from scipy import stats
 
 from dptse_env.evaluation import WARM_UP, Row, WatcherFactory
 from dptse_env.process import QueryProcess
-from dptse_env.release import Capped, PacedSettings, ReleaseModel, TwoMechanisms
-from dptse_env.release.paced import Paced
-from dptse_env.release.vehicle_table import VehicleTable
+from dptse_env.release import Capped, Paced, ReleaseModel
+from dptse_env.release.vehicles import Ledgers, VehicleRows
 from dptse_env.traffic import draw_scenario
 from dptse_env.traffic.demand import Incident
 from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray
@@ -27,8 +26,8 @@ class Contributions:
     """Contributions of the vehicles of a batch of episodes, by place and by length of trip.
 
     A contribution is counted once for each second in which a query covers a vehicle. Where queries
-    and fixed sensors are two mechanisms, it is those that answer queries. Episodes begin at second
-    0 of their records. A vehicle that still drives at the end of an episode counts with what it has
+    and fixed sensors are two groups of columns, it is those to queries. Episodes begin at second 0
+    of their records. A vehicle that still drives at the end of an episode counts with what it has
     done by then.
 
     Columns:
@@ -45,33 +44,34 @@ class Contributions:
 
     def __init__(self, process: QueryProcess) -> None:
         """Prepare for the episodes of a process."""
-        self._process, self._release = process, of_queries(process.release)
-        _, self._table = accounts(self._release)
-        settings = self._release.setup.settings
-        self._is_cleared = isinstance(settings, PacedSettings) and settings.unit == "event"
+        self._process, self._ledgers = process, ledgers_of(process.release)
+        task = process.release.task
+        self._is_cleared = isinstance(process.release, Paced) and task.settings.unit == "event"
+        self._covers = task.covers[task.group == 0]
         shape = (process.n_episodes, process.interface.n_mainline)
         self._met, self._refused = np.zeros((2, *shape), dtype=np.int64)
         self._before: AnyArray | None = None
 
     def __call__(self) -> None:
         """Count the contributions of the second that has passed."""
-        paid, _ = accounts(self._release)
+        paid, process = self._ledgers.paid[:, 0], self._process
         if self._before is None:  # the call after the reset, before any query
             self._seconds, self._met_of, self._refused_of = np.zeros((3, *paid.shape), dtype=int)
         else:
-            covered = covered_places(self._release, self._process.queried)
+            observed = process.release.task.observed(process.queried)[:, : len(self._covers)]
+            covered = observed @ self._covers
             # Ledgers that are cleared every second begin at zero.
             pays = paid > (0.0 if self._is_cleared else self._before)
+            rows = process.traffic.vehicles(process.traffic_index, process.time)
             for k in range(len(paid)):
-                self._follow(k, covered[k], pays[k])
+                self._follow(k, rows, covered[k], pays[k])
         self._before = paid.copy()
 
-    def _follow(self, k: int, covered: BoolArray, pays: BoolArray) -> None:
+    def _follow(self, k: int, rows: VehicleRows, covered: BoolArray, pays: BoolArray) -> None:
         """Count the contributions of one episode: covered places, and who has paid."""
-        table, n = self._table, self._met.shape[1]
-        slot, time = self._process.traffic_index[k], self._process.time[k]
-        rows = slice(table.start[slot, time], table.start[slot, time + 1])
-        vehicle, place = table.vehicle[rows], table.segment[rows]
+        n, second = self._met.shape[1], slice(rows.start[k], rows.stop[k])
+        seen = rows.speed[0, second] >= 0.0
+        vehicle, place = rows.vehicle[second][seen], rows.place[second][seen]
         self._seconds[k, vehicle[place < n]] += 1
         met = np.append(covered, False)[np.minimum(place, len(covered))]
         vehicle, place = vehicle[met], place[met]
@@ -102,31 +102,15 @@ class Contributions:
         }
 
 
-def of_queries(release: ReleaseModel) -> ReleaseModel:
-    """Return the release model of the queries, where fixed sensors have one of their own."""
-    return release.queries if isinstance(release, TwoMechanisms) else release
-
-
-def accounts(release: ReleaseModel) -> tuple[AnyArray, VehicleTable]:
-    """Return what vehicles have paid, shape (n_episodes, n_vehicles), and the true vehicles.
+def ledgers_of(release: ReleaseModel) -> Ledgers:
+    """Return what vehicles have paid.
 
     Raises:
         ValueError: The release model keeps no account of single vehicles.
     """
-    if isinstance(release, Paced):
-        return release.ledgers.paid, release.ledgers.vehicles
-    if isinstance(release, Capped):
-        return release.contributions.exposures, release.contributions.vehicles
-    raise ValueError(f"privacy.preset must keep account of vehicles, got {release.setup.name!r}")
-
-
-def covered_places(release: ReleaseModel, queried: BoolArray) -> BoolArray:
-    """Return which record columns the queries and the fixed sensors cover, shape (k, places)."""
-    observed = release.setup.observed(queried)
-    if not isinstance(release, Paced):
-        return observed
-    covered: BoolArray = observed @ release.ledgers.covers > 0.0
-    return covered
+    if isinstance(release, Paced | Capped):
+        return release.ledgers
+    raise ValueError(f"privacy.preset must keep account of vehicles, got {release.task.name!r}")
 
 
 LEVELS = (50, 90, 95)
@@ -347,7 +331,7 @@ class Summary:
     def __init__(self, process: QueryProcess) -> None:
         """Prepare for the episodes of a process."""
         self._process, self._honesty = process, Honesty(process)
-        has_accounts = isinstance(of_queries(process.release), Capped | Paced)
+        has_accounts = isinstance(process.release, Capped | Paced)
         self._contributions = Contributions(process) if has_accounts else None
         self._queries, self._seconds = np.zeros(process.n_episodes), 0
 

@@ -11,8 +11,7 @@ from dptse_env.config import EnvConfig, resolve
 from dptse_env.estimators import EstimatorSettings
 from dptse_env.model import ARZModel
 from dptse_env.parts import make_model, make_release
-from dptse_env.release import ReleaseRequest
-from dptse_env.release.nominal import nominal_state
+from dptse_env.release import Request, nominal_state
 from dptse_env.utils.arrays import BoolArray, FloatArray
 
 PERIOD = 4  # [s] after which the paper's schedule moves on
@@ -93,7 +92,7 @@ def replay_of(config: EnvConfig, n_episodes: int, n_steps: int, first: int = 0) 
     if not 1 <= n_steps <= corridor.duration - first:
         raise ValueError(f"steps must be in 1..{corridor.duration - first}, got {n_steps}")
     s, release = corridor.n_segments, make_release(config, n)
-    traffic = release.setup.traffic
+    traffic = release.traffic
     traffic.load(np.arange(len(seeds)))
     episodes, indices = np.arange(n), np.arange(n) % len(seeds)
     boundary = [traffic.complete(index)[first:, s:] for index in range(len(seeds))]
@@ -101,9 +100,9 @@ def replay_of(config: EnvConfig, n_episodes: int, n_steps: int, first: int = 0) 
         model.boundary_inputs(ends[:n_steps, :, 0], ends[:n_steps, :, 1]) for ends in boundary
     ]
     release.reset(episodes, [np.random.default_rng([0, i]) for i in range(n)])
-    sensors = release.setup.observed(np.zeros((n, corridor.n_mainline), dtype=bool))
+    sensors = release.task.observed(np.zeros((n, corridor.n_mainline), dtype=bool))
     values = [
-        release.release(ReleaseRequest(episodes, indices, np.full(n, k + 1), sensors)).values
+        release.release(Request(episodes, indices, np.full(n, k + 1), sensors)).values
         for k in range(first, first + n_steps)
     ]
     roaming = np.setdiff1d(np.arange(corridor.n_mainline), corridor.fixed_sensors)

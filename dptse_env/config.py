@@ -19,7 +19,6 @@ from dptse_env.estimators.settings import (
     tuned_settings,
     tuned_with,
 )
-from dptse_env.fusion import FusionSettings
 from dptse_env.model import ARZParameters, available_parameters, load_parameters
 from dptse_env.model.parameters import read_parameters
 from dptse_env.release import (
@@ -27,6 +26,7 @@ from dptse_env.release import (
     BandwidthUnit,
     CappedSettings,
     Detectors,
+    FusionSettings,
     PacedSettings,
     PrivacySettings,
     QueryOptions,

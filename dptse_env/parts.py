@@ -6,27 +6,26 @@ import warnings
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from dptse_env.config import TIME_STEP, EnvConfig
 from dptse_env.estimators import Estimator, make_estimator
-from dptse_env.fusion import Fusion
 from dptse_env.model import ARZModel
 from dptse_env.release import (
     BOUNDARIES,
     RELEASE_MODELS,
     VOID_REASONS,
     BoundaryModel,
+    DetectorErrors,
+    Fusion,
     PrivacyReport,
     QueryOptions,
     ReleaseModel,
-    ReleaseSetup,
-    TrafficTable,
-    TwoMechanisms,
+    Task,
+    Traffic,
+    make_groups,
 )
 from dptse_env.release.report import in_order
 from dptse_env.spaces.actions import ACTION_ENCODINGS, ActionEncoding
-from dptse_env.spaces.observations import ObservationEncoding, ObservationSetup
+from dptse_env.spaces.observations import ObservationEncoding
 from dptse_env.spaces.rewards import make_reward
 from dptse_env.traffic import RecordLibrary
 from dptse_env.utils.registry import name_of_class
@@ -80,16 +79,18 @@ class Parts:
         model: The traffic model of the estimator and the boundary.
         boundary: The model's inputs at the road's ends and ramps.
         estimator: The estimator.
+        detectors: Errors of the fixed sensors; None where they have none.
         fusion: What turns releases into measurements of all vehicles; None where they are.
     """
 
     config: EnvConfig
     interface: QueryInterface
-    traffic: TrafficTable
+    traffic: Traffic
     release: ReleaseModel
     model: ARZModel
     boundary: BoundaryModel
     estimator: Estimator
+    detectors: DetectorErrors | None
     fusion: Fusion | None
 
     @property
@@ -104,23 +105,14 @@ def make_interface(config: EnvConfig) -> QueryInterface:
     Raises:
         ValueError: A part of another package is not what is expected.
     """
-    corridor, queries = config.corridor, config.queries
-    encoding = ACTION_ENCODINGS.find(config.action)
+    encoding, queries = ACTION_ENCODINGS.find(config.action), config.queries
     actions = encoding(queries.n_options, queries.bandwidth, queries.cost)
-    setup = ObservationSetup(
-        corridor,
-        config.bandwidth,
-        config.privacy.epsilon,
-        n_options=queries.n_options,
-        sensor_rows=queries.sensor_rows(corridor),
-        releases_flow=flow_centre(config) is not None,
-        picks_one_by_one=actions.actions_per_step > 1,
-        has_prices=RELEASE_MODELS.find(config.privacy.preset).has_prices,
-    )
     return QueryInterface(
         queries=queries,
         actions=actions,
-        observations=ObservationEncoding(setup, config.observation),
+        observations=ObservationEncoding(
+            make_task(config), config.observation, picks_one_by_one=actions.actions_per_step > 1
+        ),
         reward=make_reward(config.reward),
     )
 
@@ -143,8 +135,40 @@ def make_model(config: EnvConfig) -> ARZModel:
     )
 
 
+def make_task(config: EnvConfig, n_episodes: int = 1) -> Task:
+    """Make what is measured in a batch of episodes.
+
+    Raises:
+        ValueError: The release model knows of no groups of columns, and there are some.
+    """
+    privacy = config.privacy
+    return Task(
+        name=RELEASE_MODELS.name_of(privacy.preset),
+        model=RELEASE_MODELS.find(privacy.preset),
+        settings=privacy,
+        corridor=config.corridor,
+        queries=config.queries,
+        horizon=config.horizon_steps,
+        n_episodes=n_episodes,
+        groups=make_groups(
+            config.penetration,
+            config.detectors,
+            config.corridor,
+            private_boundary=privacy.boundary == "private",
+        ),
+    )
+
+
+def make_traffic(config: EnvConfig, library: RecordLibrary | None = None) -> Traffic:
+    """Make the tables of the true traffic; nothing is recorded or loaded."""
+    task = make_task(config)
+    reads_vehicles = task.model.needs_vehicles or not task.is_whole
+    populations = [group.population for group in task.groups] if reads_vehicles else []
+    return Traffic(config.corridor, config.traffic_seeds, library or RecordLibrary(), populations)
+
+
 def make_release(
-    config: EnvConfig, n_episodes: int = 1, traffic: TrafficTable | None = None
+    config: EnvConfig, n_episodes: int = 1, traffic: Traffic | None = None
 ) -> ReleaseModel:
     """Make the release model for a batch of episodes; nothing is recorded or loaded.
 
@@ -153,41 +177,8 @@ def make_release(
         n_episodes: Size n of the batch.
         traffic: The true traffic; made of the user's records if None.
     """
-    preset = config.privacy.preset
-    model: type[ReleaseModel] = RELEASE_MODELS.find(preset)
-    setup = ReleaseSetup(
-        name=RELEASE_MODELS.name_of(preset),
-        settings=config.privacy,
-        traffic=make_traffic(config) if traffic is None else traffic,
-        bandwidth=config.bandwidth,
-        horizon=config.horizon_steps,
-        n_episodes=n_episodes,
-        queries=config.queries,
-    )
-    if config.has_separate_sensors:
-        return TwoMechanisms(model, setup, config.penetration, config.detectors)
-    return model(setup)
-
-
-def make_traffic(config: EnvConfig, library: RecordLibrary | None = None) -> TrafficTable:
-    """Make the table of the true traffic; nothing is recorded or loaded."""
-    return TrafficTable(config.corridor, config.traffic_seeds, library or RecordLibrary())
-
-
-def make_fusion(config: EnvConfig, model: ARZModel) -> Fusion | None:
-    """Make what turns releases into measurements of all vehicles; None where they are."""
-    if not config.has_separate_sensors:
-        return None
-    corridor, rows = config.corridor, model.rows
-    return Fusion(
-        config.fusion,
-        rows,
-        n_options=config.queries.n_options,
-        lengths=np.array(corridor.segment_lengths)[rows.first] * rows.span,
-        share=config.penetration.published_share,
-        limits=np.array(corridor.speed_limits)[rows.first],
-        releases_flow=flow_centre(config) is not None,
-    )
+    task = make_task(config, n_episodes)
+    return task.model(task, make_traffic(config) if traffic is None else traffic)
 
 
 def privacy_report(config: EnvConfig) -> PrivacyReport:
@@ -231,7 +222,7 @@ def make_parts(
     library: RecordLibrary | None = None,
     *,
     interface: QueryInterface | None = None,
-    traffic: TrafficTable | None = None,
+    traffic: Traffic | None = None,
     release: ReleaseModel | None = None,
     model: ARZModel | None = None,
     boundary: BoundaryModel | None = None,
@@ -259,10 +250,12 @@ def make_parts(
     interface = interface or make_interface(config)
     traffic = traffic or make_traffic(config, library)
     release = release or make_release(config, n_episodes, traffic)
-    model = model or make_model(config)
-    boundary = boundary or BOUNDARIES[config.privacy.boundary](traffic, model, n_episodes)
+    model, task = model or make_model(config), release.task
+    boundary = boundary or BOUNDARIES[config.privacy.boundary](task, traffic, model)
     estimator = estimator or make_estimator(
         config.estimator, config.backend, model, n_episodes, config.settings()
     )
-    fusion = make_fusion(config, model)
-    return Parts(config, interface, traffic, release, model, boundary, estimator, fusion)
+    detectors = None if config.detectors.are_exact else DetectorErrors(task, config.detectors)
+    share = config.penetration.published_share
+    fusion = Fusion(task, config.fusion, share) if config.has_separate_sensors else None
+    return Parts(config, interface, traffic, release, model, boundary, estimator, detectors, fusion)

@@ -13,8 +13,7 @@ import numpy as np
 from dptse_env.config import EnvConfig
 from dptse_env.estimators import Estimate, Measurement, check_estimate
 from dptse_env.parts import Parts, complete_report
-from dptse_env.release import ReleaseRequest, check_released
-from dptse_env.release.nominal import nominal_state
+from dptse_env.release import Request, check_released, nominal_state
 from dptse_env.spaces.actions import PendingPicks, check_decision
 from dptse_env.spaces.observations import AGE_CAP, PublicState
 from dptse_env.spaces.rewards import EstimationError, ScoredSecond, estimation_error
@@ -58,6 +57,7 @@ class QueryProcess:
         boundary: The model's inputs at the road's ends and ramps.
         model: The traffic model.
         estimator: The estimator.
+        detectors: Errors of the fixed sensors; None where they have none.
         fusion: Turns releases into measurements of all vehicles; None where they are these.
         n_episodes: Size of the batch.
         time: Second of the record that each episode stands at, shape (n,).
@@ -79,7 +79,8 @@ class QueryProcess:
         """
         self.config, self.interface = parts.config, parts.interface
         self.traffic, self.release, self.boundary = parts.traffic, parts.release, parts.boundary
-        self.model, self.estimator, self.fusion = parts.model, parts.estimator, parts.fusion
+        self.model, self.estimator = parts.model, parts.estimator
+        self.detectors, self.fusion = parts.detectors, parts.fusion
         self._threads = EpisodeThreads(threads if self.estimator.is_compiled else 1)
         self._checks_estimates = is_foreign(self.estimator)
         self._checks_releases = is_foreign(self.release)
@@ -106,7 +107,7 @@ class QueryProcess:
         """
         shared = (
             self.config, self.interface, self.model, self.traffic, self._threads,
-            *self.boundary.shared, *self.release.shared, self.release.setup,
+            self.release.task, *self.boundary.shared,
         )  # fmt: skip
         fork = copy.deepcopy(self, {id(item): item for item in shared})
         fork._is_fork = True
@@ -140,12 +141,13 @@ class QueryProcess:
             for generator in generators
         ]
         traffic, starts = choice.draw([stream for stream, _, _ in streams])
-        for index, record in self.traffic.load(traffic):
-            self.release.load(index, record)
+        for index in self.traffic.load(traffic):
             self.boundary.load(index)
         self.traffic_index[episodes], self.time[episodes] = traffic, starts
         self.end[episodes] = starts + self.config.horizon_steps
         self.pending.reset(episodes)
+        if self.detectors is not None:
+            self.detectors.reset(episodes, [noise.spawn(1)[0] for _, noise, _ in streams])
         self.release.reset(episodes, [noise for _, noise, _ in streams])
         self.boundary.reset(episodes)
         prior = nominal_state(self.config.corridor, self.model, self.time[episodes])
@@ -203,11 +205,11 @@ class QueryProcess:
         self._threads.run(len(episodes), lambda block: predict(episodes[block], inputs[block]))
         own = slice(None) if self.n_episodes == 1 else episodes  # a slice is quicker to write to
         self.time[own] += 1
-        observed = self.release.setup.observed(queried)
+        observed = self.release.task.observed(queried)
         prediction: Callable[[], Estimate] = partial(self._predicted, episodes)
         if self.fusion is not None:  # reads it, too
             prediction = cache(prediction)
-        request = ReleaseRequest(episodes, traffic, self.time[episodes], observed, prediction)
+        request = Request(episodes, traffic, self.time[episodes], observed, prediction)
         measured = self.measure(request)
         self.boundary.update(episodes, measured)
         self._threads.run(len(episodes), lambda block: update(episodes[block], measured.at(block)))
@@ -215,14 +217,18 @@ class QueryProcess:
         rows = slice(self.model.rows.n_rows)
         answered = measured.observed[:, rows, None]
         self.released[own] = np.where(answered, measured.values[:, rows], self.released[own])
-        covered = self.release.setup.covered(measured.observed)
+        covered = self.release.task.covered(measured.observed)
         self.age[own] = np.where(covered, 0, self.age[own] + 1)
 
-    def measure(self, request: ReleaseRequest) -> Measurement:
+    def measure(self, request: Request) -> Measurement:
         """Release a second, which charges its vehicles; return what the estimator is given."""
+        if self.detectors is not None:
+            request = self.detectors.answering(request)
         measured = self.release.release(request)
         if self._checks_releases:
             check_released(self.release, measured, request)
+        if self.detectors is not None:
+            measured = self.detectors.added(request.episodes, measured)
         if self.fusion is not None:
             measured = self.fusion.read(measured, request.prediction())
         return measured
@@ -277,7 +283,7 @@ class QueryProcess:
         return Outcome(self._encoded(episodes, estimate), reward, self.over[episodes])
 
     def _encoded(self, episodes: IntArray, estimate: Estimate) -> Observation:
-        prices, tracer = self.release.public_state(episodes) or (None, None)
+        public = self.release.public(episodes)
         state = PublicState(
             estimate=estimate,
             released=self.released.take(episodes, 0),
@@ -285,8 +291,8 @@ class QueryProcess:
             age=self.age.take(episodes, 0),
             queried=self.queried.take(episodes, 0),
             picked=self.pending.picked.take(episodes, 0),
-            prices=prices,
-            tracer=tracer,
+            prices=public.get("prices"),
+            tracer=public.get("tracer"),
         )
         return self.interface.observations.encode(state)
 
@@ -324,7 +330,7 @@ class QueryProcess:
             "mu": mu,
             "epsilon": epsilon,
             "queried": self.queried.take(episodes, 0),
-            **self.release.public_info(episodes),
+            **self.release.public(episodes),
         }
         if self.config.truth_in_info:
             infos["truth"] = self._truth_infos(episodes)
@@ -337,7 +343,7 @@ class QueryProcess:
             "speed": truth[:, :, 1].copy(),
             "traffic_seed": np.array(self.config.traffic_seeds)[traffic],
             "time": self.time[episodes],
-            **self.release.private_info(episodes, traffic),
+            **self.release.private(episodes, traffic),
         }
 
 

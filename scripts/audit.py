@@ -15,6 +15,7 @@ from pathlib import Path
 from agents.audit.attack import attack
 from agents.audit.planner import TARGET_KINDS, choose_target, make_planner, make_policy
 from agents.audit.report import Finding
+from agents.audit.statistics import Claim, audit
 from agents.audit.strategies import STRATEGIES
 from agents.environments import make_config
 from agents.files import refuse_to_replace
@@ -22,7 +23,6 @@ from agents.play import Cell
 from dptse_env.config import EnvConfig
 from dptse_env.parts import privacy_report
 from dptse_env.privacy import mu_of
-from dptse_env.privacy.audit_statistics import Claim, audit
 from dptse_env.release import PrivacyReport
 from dptse_env.utils.fields import inside, integer, positive, require
 from scripts.cli import Machines, Road, run

@@ -27,7 +27,7 @@ from dptse_env.model.calibration import (
     prediction_error,
 )
 from dptse_env.model.parameters import write_parameters
-from dptse_env.release.traffic_table import TrafficTable
+from dptse_env.release import Traffic
 from dptse_env.traffic import Corridor, RecordLibrary, average_dwell
 from dptse_env.utils.files import replacing
 from scripts.cli import Recording, Road, make_corridor, run
@@ -59,7 +59,7 @@ def load_series(
     corridor: Corridor, seeds: tuple[int, ...], library: RecordLibrary
 ) -> list[TrafficSeries]:
     """Return the aggregates of the recorded traffic of ``seeds``."""
-    traffic, s = TrafficTable(corridor, seeds, library), corridor.n_segments
+    traffic, s = Traffic(corridor, seeds, library), corridor.n_segments
     series = []
     for index in range(len(seeds)):
         traffic.load(index)

@@ -29,10 +29,9 @@ from dptse_env.estimators.settings import (
     RecurrentSettings,
     SigmaPointSettings,
 )
-from dptse_env.fusion import FusionSettings
 from dptse_env.model import ARZParameters
 from dptse_env.registration import ENVIRONMENTS
-from dptse_env.release import CappedSettings, Detectors, PrivacySettings
+from dptse_env.release import CappedSettings, Detectors, FusionSettings, PrivacySettings
 from dptse_env.traffic import (
     Corridor,
     Demand,

@@ -13,10 +13,9 @@ import numpy as np
 import pytest
 
 from dptse_env.estimators import ESTIMATORS
-from dptse_env.parts import flow_centre
 from dptse_env.process import TRUTH_INFO
 from dptse_env.release.boundary import NominalBoundary
-from dptse_env.release.noise import NoiseStreams
+from dptse_env.release.noise import Noise
 from dptse_env.schedules import (
     OBSERVATION_SCHEDULES,
     ORACLES,
@@ -31,11 +30,11 @@ START, STEPS = 250, 30
 BLIND_SCHEDULES = sorted({*OBSERVATION_SCHEDULES, *PROCESS_SCHEDULES} - {"all"})
 
 
-class ConstantMechanism(NoiseStreams):
+class ConstantNoise(Noise):
     """Releases the same values whatever the traffic: others for every second and segment."""
 
-    def __init__(self, mechanism, releases_flow):
-        self.sigma, self._scale = mechanism.sigma, 2000.0 if releases_flow else 80.0
+    def __init__(self, releases_flow):
+        self._largest = 2000.0 if releases_flow else 80.0
         self._step = 0
 
     def reset(self, episodes, generators):
@@ -44,10 +43,10 @@ class ConstantMechanism(NoiseStreams):
     def give(self, noise):
         pass  # its answers have no noise
 
-    def release(self, episodes, values):
+    def added(self, episodes, values, sigma, grid, unit):
         self._step += 1
         answer = np.random.default_rng(self._step).uniform(-0.2, 1.0, values.shape)
-        return answer * [60.0, self._scale]
+        return answer * [60.0, self._largest]
 
 
 def transcript(env, traffic_seed, schedule=None):
@@ -77,7 +76,7 @@ def public(env, info):
     shown = {key: value for key, value in info.items() if key not in TRUTH_INFO}
     terms = {
         name: getattr(process.release, name).copy()
-        for name in ("prices", "centres", "sigmas")
+        for name in ("prices", "centre", "sigmas")
         if hasattr(process.release, name)
     }
     return shown | estimate | masks | terms
@@ -96,8 +95,7 @@ def blind(env):
         env.reset(seed=0, options={"traffic_seed": seed})
     process = env.unwrapped.process
     release = process.release
-    flow = flow_centre(process.config) is not None
-    release.mechanism = ConstantMechanism(release.mechanism, flow)
+    release.noise = ConstantNoise(release.task.releases_flow)
     return env
 
 
@@ -113,7 +111,7 @@ def make_paper(**keywords):
 def with_nominal_boundary(env):
     """Take the declared exception of the paper's presets away."""
     process = env.unwrapped.process
-    process.boundary = NominalBoundary(process.traffic, process.model, 1)
+    process.boundary = NominalBoundary(process.release.task, process.traffic, process.model)
     return env
 
 
@@ -198,13 +196,13 @@ def test_an_emptiness_mask_would_show(monkeypatch):
 
 def test_a_marker_for_empty_segments_would_show(monkeypatch):
     env = blind(make_private())
-    mechanism = env.unwrapped.process.release.mechanism
-    release = mechanism.release
+    noise = env.unwrapped.process.release.noise
+    added = noise.added
 
-    def release_marked(episodes, values):
-        return np.where(values[..., :1] > 0, release(episodes, values), 0.0)
+    def marked(episodes, values, *declared):
+        return np.where(values[..., :1] > 0, added(episodes, values, *declared), 0.0)
 
-    monkeypatch.setattr(mechanism, "release", release_marked)
+    monkeypatch.setattr(noise, "added", marked)
     assert unlike(env)
 
 
@@ -228,10 +226,8 @@ def test_realised_exposures_in_info_would_show(monkeypatch):
     info = process.info
 
     def telling(episode):
-        exposures = process.release.contributions.exposures_of(
-            episode, process.traffic_index[episode]
-        )
-        return info(episode) | {"mu": float(exposures.max(initial=0))}
+        paid = process.release.ledgers.paid[episode]
+        return info(episode) | {"mu": float(paid.max(initial=0))}
 
     monkeypatch.setattr(process, "info", telling)
     assert unlike(env)

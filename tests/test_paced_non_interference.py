@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 
 from dptse_env.estimators import ESTIMATORS
-from dptse_env.fusion import Fusion
-from dptse_env.release import Paced, Pacing
+from dptse_env.release import Fusion, Paced, Pacing
 from tests.cases import fast_and_slow
 
 from .test_non_interference import (
@@ -36,20 +35,22 @@ class Blind:
     Ledgers and everything else are as in the class that it is mixed into.
 
     Attributes:
+        centre: The last centres, shape (k, places).
         sigmas: The last deviations, shape (k, C, 2).
     """
 
-    def __init__(self, setup):
-        super().__init__(setup)
-        self._seconds, self.sigmas = 0, np.empty(0)
+    def __init__(self, task, traffic):
+        super().__init__(task, traffic)
+        self._seconds, self.centre, self.sigmas = 0, np.empty(0), np.empty(0)
 
     def reset(self, episodes, generators):
         super().reset(episodes, generators)
-        self._seconds, self.sigmas = 0, np.empty(0)
+        self._seconds, self.centre, self.sigmas = 0, np.empty(0), np.empty(0)
 
     def release(self, request):
         released = super().release(request)
         self._seconds, self.sigmas = self._seconds + 1, released.sigma
+        self.centre = released.centre
         answer = np.random.default_rng(self._seconds).uniform(-0.2, 1.0, released.values.shape)
         return released._replace(values=answer * [60.0, 2000.0])
 
@@ -77,7 +78,7 @@ def test_traffic_does_not_show(estimator, unit, boundary):
     first, second = transcript(env, 0), transcript(env, 1)
     assert same(first, second)
     # What is held equal is alive.
-    for name in ("observation", "centres", "prices", "queried"):
+    for name in ("observation", "centre", "prices", "queried"):
         moving = unit == "trip" or name != "prices"
         assert np.array_equal(first[1][name], first[-1][name]) != moving
     assert first[-1]["sigmas"].shape == (1, *first[-1]["prices"].shape[1:], 2)
@@ -146,7 +147,7 @@ def test_a_share_that_only_the_truth_shows_would_be_noticed(monkeypatch):
 
 def truth_of(release, request):
     """True density and speed of this second, shape (k, S) each."""
-    traffic = release.setup.traffic.aggregates(request.traffic, request.times)
+    traffic = release.traffic.aggregates(request.traffic, request.times)
     return {"density": traffic[..., 0], "speed": traffic[..., 1]}
 
 
@@ -177,29 +178,28 @@ class CentreOfTheSameSecond(Paced):
 class PriceOfTrueLedgers(Paced):
     """Prices by what the vehicles have really left."""
 
-    def __init__(self, setup):
-        super().__init__(setup)
+    def __init__(self, task, traffic):
+        super().__init__(task, traffic)
         ledgers = self.ledgers
 
         class FromLedgers(Pacing):
-            def prices(self, step):
-                left = ledgers.budget - ledgers.paid[step.episodes].max(axis=1, initial=0.0)
-                price = np.maximum(0.05 * left, 1e-3)[:, None]
-                return np.broadcast_to(price, step.observed.shape).copy()
+            def prices(self, episodes, observed, density, speed):
+                left = ledgers.budget - ledgers.paid[episodes].max(axis=2, initial=0.0)
+                return np.broadcast_to(np.maximum(0.05 * left, 1e-3), observed.shape).copy()
 
-        self.pacing = FromLedgers(self.pacing.setup)
+        self.pacing = FromLedgers(task, self.pacing.budget)
 
 
 class AccountOfTrueLedgers(Paced):
     def spent(self, episodes, steps):
-        most = self.ledgers.paid[episodes].max(axis=1, initial=0.0)
+        most = self.ledgers.paid[episodes, 0].max(axis=1, initial=0.0)
         return np.sqrt(2.0 * most), np.sqrt(2.0 * most)
 
 
 class RefusalsInPublic(Paced):
-    def public_info(self, episodes):
-        refused = self.private_info(episodes, np.zeros_like(episodes))["n_refused"]
-        return super().public_info(episodes) | {"n_refused": refused}
+    def public(self, episodes):
+        refused = self.private(episodes, np.zeros_like(episodes))["n_refused"]
+        return super().public(episodes) | {"n_refused": refused}
 
 
 class FallsBackWhereNobodyIs(Paced):

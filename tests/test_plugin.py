@@ -233,8 +233,8 @@ class Clash(parts.MeanDensity):
 
 
 class BlockOfNan(parts.MeanDensity):
-    def values(self, state, setup):
-        return super().values(state, setup) * np.nan
+    def values(self, state, task):
+        return super().values(state, task) * np.nan
 
 
 class TooMany(parts.Neighbours):

@@ -110,10 +110,11 @@ def test_forks_share_traffic_and_begin_no_episodes():
     process.reset(ALL, generators(SEEDS))
     fork = process.fork()
     assert fork.traffic is process.traffic
-    tables, shared = ([*p.release.shared, *p.boundary.shared] for p in (process, fork))
+    assert fork.release.traffic is process.traffic
+    assert fork.release.task is process.release.task
+    tables, shared = (p.boundary.shared for p in (process, fork))
     assert all(a is b for a, b in zip(tables, shared, strict=True))
-    exposures = process.release.contributions.exposures
-    assert not np.shares_memory(fork.release.contributions.exposures, exposures)
+    assert not np.shares_memory(fork.release.ledgers.paid, process.release.ledgers.paid)
     for forked in (fork, fork.fork()):
         with pytest.raises(RuntimeError, match="reset the process that it was made from"):
             forked.reset(ALL, generators(SEEDS))
@@ -156,14 +157,14 @@ def test_residuals_are_the_noise_that_is_declared(keywords):
     """Released minus true over sigma: unit variance, uncorrelated over time and quantities."""
     process = make(1, estimator="random_walk", random_start=False, **keywords)
     residuals = []
-    release = process.release.mechanism.release
+    added = process.release.noise.added
 
-    def spy(episodes, values):
-        released = release(episodes, values)
+    def spy(episodes, values, sigma, grid, unit):
+        released = added(episodes, values, sigma, grid, unit)
         residuals.append((released - values)[0] / process.release.sigma)
         return released
 
-    process.release.mechanism.release = spy
+    process.release.noise.added = spy
     for seed in range(4):
         process.reset(ALL[:1], generators([seed]))
         for action in sampled(process, process.config.horizon_steps):
@@ -192,6 +193,8 @@ def test_released_values_are_kept_until_the_next_query():
     process.step(ALL[:1], np.roll(first, 2))
     np.testing.assert_array_equal(process.released[0, :2], kept[:2])
     assert process.age[0].tolist() == [1, 1, 0, 0, 62, 0]
+    process.reset(ALL[:1], generators([4]))
+    assert not process.released.any()
 
 
 def test_a_step_from_t_predicts_with_t_and_measures_at_t_plus_one():
@@ -202,12 +205,12 @@ def test_a_step_from_t_predicts_with_t_and_measures_at_t_plus_one():
     def predict(episodes, inputs):
         seen["inputs"] = inputs.copy()
 
-    def release(episodes, values):
+    def added(episodes, values, *noise):
         seen["values"] = values.copy()
         return values
 
     process.estimator.predict = predict
-    process.release.mechanism.release = release
+    process.release.noise.added = added
     for t in range(100):
         process.step(ALL[:1], np.zeros((1, 6), dtype=np.int8))
         record = process.traffic.library.get(process.config.corridor, 1)
@@ -219,12 +222,12 @@ def test_a_step_from_t_predicts_with_t_and_measures_at_t_plus_one():
 def test_a_diverging_filter_is_flagged_and_the_episode_goes_on():
     process = make(1)
     process.reset(ALL[:1], generators([4]))
-    release = process.release.mechanism.release
-    process.release.mechanism.release = lambda episodes, values: np.full_like(values, np.nan)
+    added = process.release.noise.added
+    process.release.noise.added = lambda episodes, values, *noise: np.full_like(values, np.nan)
     outcome = process.step(ALL[:1], np.ones((1, 6), dtype=np.int8))
     assert process.info(0)["diverged"] == 1.0
     assert np.isfinite(process.estimate.density).all()
-    process.release.mechanism.release = release
+    process.release.noise.added = added
     outcome = process.step(ALL[:1], np.ones((1, 6), dtype=np.int8))
     assert process.info(0)["diverged"] == 0.0
     assert np.isfinite(outcome.reward).all()

@@ -118,7 +118,7 @@ def test_a_sensor_without_an_option_has_a_row_of_its_own():
     process = make_process(query_spans=(2,), bandwidth=2)
     observation = query(process, 0)
     block = process.interface.observations.block
-    assert process.interface.observations.setup.sensor_rows == (7, 6)  # segment 5, and a ramp
+    assert process.interface.observations.task.sensors.tolist() == [7, 6]  # segment 5, and a ramp
     innovations = process.estimator.innovations[0]
     assert np.flatnonzero(innovations.all(axis=1)).tolist() == [0, 6, 7]
     fixed = block(observation, "fixed_density_innovation")[0]

@@ -6,6 +6,7 @@ import pytest
 from dptse_env.config import resolve
 from dptse_env.parts import make_parts
 from dptse_env.process import QueryProcess
+from dptse_env.release.noise import grid_of
 from dptse_env.traffic import RecordLibrary
 
 TWO = np.arange(2)
@@ -33,7 +34,7 @@ def play(process, n_steps=80):
 def test_two_seeds_share_no_noise_on_one_record():
     process = begin((1, 2), {"traffic_seed": 0, "start": 0})
     _, noise = play(process)
-    assert (np.abs(noise[:, 0] - noise[:, 1]) > process.release.mechanism.grid).mean() > 0.99
+    assert (np.abs(noise[:, 0] - noise[:, 1]) > grid_of(process.release.sigma)).mean() > 0.99
     for component in (0, 1):
         first, second = noise[:, 0, :, component].ravel(), noise[:, 1, :, component].ravel()
         assert abs(np.corrcoef(first, second)[0, 1]) < 0.2
@@ -47,7 +48,7 @@ def test_one_seed_has_one_noise_on_any_traffic(options):
     released, noise = play(process)
     assert not np.array_equal(released[:, 0], released[:, 1])
     # Sums are rounded to the grid, so their noise agrees to half its spacing on either side.
-    assert (np.abs(noise[:, 0] - noise[:, 1]) <= 1.001 * process.release.mechanism.grid).all()
+    assert (np.abs(noise[:, 0] - noise[:, 1]) <= 1.001 * grid_of(process.release.sigma)).all()
 
 
 @pytest.mark.parametrize("estimator", ["enkf", "random_walk"])

@@ -12,9 +12,10 @@ from agents.audit.strategies import FixedQueries
 from agents.audit.worlds import AdjacentWorlds, Trajectory, audited
 from agents.executors import THIS_PROCESS, AnyExecutor, run_in_order
 from dptse_env.config import EnvConfig
-from dptse_env.parts import make_parts, make_release
+from dptse_env.estimators import Measurement
+from dptse_env.parts import make_parts, make_release, make_traffic
 from dptse_env.process import QueryProcess
-from dptse_env.release import ReleaseRequest, TrafficTable
+from dptse_env.release import Request
 from dptse_env.traffic import Record
 from dptse_env.utils.arrays import BoolArray, FloatArray
 
@@ -46,11 +47,10 @@ class Adversary:
 
     def __init__(self, config: EnvConfig, worlds: AdjacentWorlds, n_runs: int) -> None:
         """Prepare for n_runs at once."""
-        traffic = TrafficTable(config.corridor, (0, 1), worlds)
+        traffic = make_traffic(config, worlds)
+        traffic.load([0, 1])
         # Sums of both worlds for every run, whichever world it is in.
         self._attacked = attacked(make_release(config, 2 * n_runs, traffic))
-        for world, record in traffic.load([0, 1]):
-            self._attacked.model.load(world, record)
 
     def reset(self, n_runs: int) -> None:
         """Begin new runs."""
@@ -59,24 +59,23 @@ class Adversary:
         self._attacked.model.reset(self._episodes, [nothing] * len(self._episodes))
         self.score, self.square = np.zeros(n_runs), np.zeros(n_runs)
 
-    def expect(self, time: int, queried: BoolArray, terms: Terms) -> tuple[FloatArray, FloatArray]:
-        """Return midpoint and difference of both worlds' sums, (k, n_columns, 2), and add up.
+    def expect(self, time: int, observed: BoolArray, terms: Terms) -> tuple[FloatArray, FloatArray]:
+        """Return midpoint and difference of both worlds' sums, (k, C, 2), and add up.
 
         Both are in units of the noise; the difference is zero where nothing is observed.
         """
-        observed = self._attacked.model.setup.observed(queried)
         times = np.full(len(self._episodes), time)
-        request = ReleaseRequest(self._episodes, self._worlds, times, np.tile(observed, (2, 1)))
+        request = Request(self._episodes, self._worlds, times, np.tile(observed, (2, 1)))
         both = terms.repeated(2)
         zero, first = np.split(self._attacked.sums(request, both) / both.sigma, 2)
         difference = np.where(observed[:, :, None], first - zero, 0.0)
         self.square += np.sum(difference**2, axis=(1, 2))
         return 0.5 * (zero + first), difference
 
-    def update(self, time: int, queried: BoolArray, released: FloatArray, terms: Terms) -> None:
+    def update(self, time: int, released: Measurement, terms: Terms) -> None:
         """Score one released step: the log-likelihood ratio of Gaussians of either mean."""
-        midpoint, difference = self.expect(time, queried, terms)
-        self.score += np.sum((released / terms.sigma - midpoint) * difference, axis=(1, 2))
+        midpoint, difference = self.expect(time, released.observed, terms)
+        self.score += np.sum((released.values / terms.sigma - midpoint) * difference, axis=(1, 2))
 
 
 @dataclass(frozen=True)
@@ -159,8 +158,7 @@ def play(batch: Batch) -> Runs:
     for step in range(config.horizon_steps):
         queries = batch.policy.queries(step, adversary.score)
         process.step(np.arange(n), queries.astype(np.int8))
-        terms = played.terms(release.last.sigma)
-        adversary.update(step + 1, process.queried, release.last.values, terms)
+        adversary.update(step + 1, release.last, played.terms(release.last))
     return Runs(adversary.score.reshape(2, -1), np.sqrt(adversary.square).reshape(2, -1))
 
 
@@ -168,7 +166,7 @@ def _make_process(
     config: EnvConfig, worlds: AdjacentWorlds, n: int
 ) -> tuple[QueryProcess, Overheard, AttackedRelease]:
     """Return a process of n episodes in either world, and its release model, overheard."""
-    traffic = TrafficTable(config.corridor, (0, 1), worlds)
+    traffic = make_traffic(config, worlds)
     release = Overheard(make_release(config, n, traffic))
     process = QueryProcess(make_parts(config, n, traffic=traffic, release=release))
     return process, release, attacked(release.model)
@@ -189,7 +187,7 @@ def public_terms(config: EnvConfig, record: Record, plan: BoolArray, seed: int =
     process.reset(one, [np.random.default_rng(seed)], {"traffic_seed": 0, "start": 0})
     for queried in plan:
         process.step(one, queried[None].astype(np.int8))
-        terms.append(played.terms(release.last.sigma))
+        terms.append(played.terms(release.last))
     return Terms(*(np.concatenate(rows) for rows in zip(*terms, strict=True)))
 
 

@@ -18,7 +18,7 @@ from agents.audit.distances import (
     protects_seconds,
     replaces,
 )
-from agents.audit.releases import AttackedGaussian, AttackedPaced, AttackedPair, Terms, attacked
+from agents.audit.releases import Terms, attacked
 from agents.audit.strategies import (
     PUBLIC_SCHEDULES,
     AdaptiveQueries,
@@ -301,7 +301,7 @@ class PacedPlanner(Planner):
             paid: FloatArray = np.zeros(record.n_vehicles)
             np.maximum.at(paid, vehicle, costs)
         else:
-            paid = np.minimum(asked, self._release.ledgers.budget)
+            paid = np.minimum(asked, self._release.ledgers.budget[0])
         suits: AnyArray = paid
         if kind == "runs-out":
             suits = asked - paid
@@ -330,10 +330,11 @@ class PacedPlanner(Planner):
         Where several queries cover a segment, it is the mean of what they cost.
         """
         ledgers, terms = self._release.ledgers, self._typical(record)
-        prices = terms.prices @ (ledgers.covers / ledgers.covers.sum(axis=0))
-        prices, limit = prices[step - 1, segment], ledgers.vehicles.largest_speed
-        centres = terms.centres[step - 1, segment]
-        deviations = np.clip(np.clip(speed, 0.0, limit) - centres, -ledgers.clip, ledgers.clip)
+        covers = self._release.task.covers
+        prices = (terms.prices @ (covers / covers.sum(axis=0)))[step - 1, segment]
+        centre = terms.centre[step - 1, segment]
+        speed = np.clip(speed, 0.0, ledgers.fastest)
+        deviations = np.clip(speed - centre, -ledgers.clip, ledgers.clip)
         costs: FloatArray = prices * (1.0 + ledgers.ratio * (deviations / ledgers.clip) ** 2)
         return costs
 
@@ -345,7 +346,7 @@ class PacedPlanner(Planner):
         """
         corridor, clip = self.config.corridor, self._release.ledgers.clip
         limit, mainline = corridor.largest_speed_limit, slice(corridor.n_mainline)
-        centres = self._typical(record).centres[self.seconds - 1, mainline]
+        centres = self._typical(record).centre[self.seconds - 1, mainline]
         products = np.minimum(limit - centres, clip) * np.minimum(centres, clip)
         products = np.where(self.observable(record)[self.seconds, mainline], products, -1.0)
         best = products.max(axis=1)
@@ -377,8 +378,8 @@ class PacedPlanner(Planner):
         return plan
 
 
-class PairPlanner(Planner):
-    """Plans against two mechanisms: a made-up connected vehicle that stands in front of a sensor.
+class GroupsPlanner(Planner):
+    """Plans against two groups of columns: a made-up connected vehicle that stands at a sensor.
 
     It is seen in every second by the fixed sensor, and queried as well.
     """
@@ -400,20 +401,17 @@ class PairPlanner(Planner):
         return self.by_turns(vehicle, self.queryable(vehicle) & on_mainline, world)
 
 
-PLANNERS: dict[type, type[Planner]] = {
-    AttackedGaussian: GaussianPlanner,
-    AttackedPaced: PacedPlanner,
-    AttackedPair: PairPlanner,
-}
-"""Planners by the way a release model is attacked."""
-
 TARGET_KINDS = PacedPlanner.kinds
 """Kinds of targets; release models other than the paced ledger have some of them."""
 
 
 def make_planner(config: EnvConfig, policy: str) -> Planner:
     """Return what plans an attack on a configuration by a policy."""
-    return PLANNERS[type(attacked(make_release(config)))](config, policy)
+    release = attacked(make_release(config)).model
+    if not release.task.is_whole:
+        return GroupsPlanner(config, policy)
+    kind = PacedPlanner if isinstance(release, Paced) else GaussianPlanner
+    return kind(config, policy)
 
 
 def make_policy(config: EnvConfig, policy: str, worlds: AdjacentWorlds) -> FixedQueries:

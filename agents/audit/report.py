@@ -10,10 +10,10 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from agents.audit.statistics import AuditResult, detectable_mu, rejection_probability
 from agents.files import write_json
 from agents.terminal import make_table, print_table, print_text
 from dptse_env.privacy import epsilon_of
-from dptse_env.privacy.audit_statistics import AuditResult, detectable_mu, rejection_probability
 from dptse_env.release import PrivacyReport
 
 VIOLATION = math.sqrt(2.0)

@@ -54,10 +54,9 @@ from agents.watchers import LENGTHS
 from dptse_env.config import EnvConfig
 from dptse_env.parts import privacy_report
 from dptse_env.privacy import epsilon_of
-from dptse_env.release import PublicStep, ReleaseModel, ReleaseSetup
-from dptse_env.release.paced import Paced
-from dptse_env.release.pacing import Pacing, TracerPacing
-from dptse_env.utils.arrays import FloatArray
+from dptse_env.release import Paced, Pacing, ReleaseModel, Task, Traffic
+from dptse_env.release.pacing import TracerPacing
+from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 
 ENV = "dptse_env:dptse/PrivateHighway-v0"
 SEEDS = tuple(range(2000, 2020))
@@ -69,13 +68,15 @@ DELTA, STRICT, CAP = 0.05, 0.001, 64
 class AnyPrice(Pacing):
     """A price for every query that leaves a count the noise of a thousandth of a vehicle."""
 
-    def prices(self, step: PublicStep) -> FloatArray:
+    def prices(
+        self, episodes: IntArray, observed: BoolArray, density: FloatArray, speed: FloatArray
+    ) -> FloatArray:
         """See `Pacing.prices`."""
-        return np.full(step.observed.shape, 1e6)
+        return np.full(observed.shape, 1e6)
 
-    def expected_price(self, speed: FloatArray) -> float:
-        """See `Pacing.expected_price`."""
-        return 1e6
+    def expected_prices(self, speed: FloatArray) -> FloatArray:
+        """See `Pacing.expected_prices`."""
+        return np.full(self.budget.shape, 1e6)
 
 
 class Exact(Paced):
@@ -88,13 +89,13 @@ class Exact(Paced):
     claims_guarantee: ClassVar[bool] = False
     # What is known of a release without a guarantee, and without budgets.
     spent, report = ReleaseModel.spent, ReleaseModel.report
-    private_info = ReleaseModel.private_info
+    private = ReleaseModel.private
 
-    def __init__(self, setup: ReleaseSetup) -> None:
+    def __init__(self, task: Task, traffic: Traffic) -> None:
         """Make ledgers without a limit."""
-        super().__init__(setup)
-        self.ledgers.budget = math.inf
-        self.pacing = AnyPrice(self.pacing.setup)
+        super().__init__(task, traffic)
+        self.ledgers.budget[:] = math.inf
+        self.pacing = AnyPrice(task, self.pacing.budget)
 
 
 class EqualRates(TracerPacing):
@@ -104,10 +105,12 @@ class EqualRates(TracerPacing):
     road.
     """
 
-    def prices(self, step: PublicStep) -> FloatArray:
+    def prices(
+        self, episodes: IntArray, observed: BoolArray, density: FloatArray, speed: FloatArray
+    ) -> FloatArray:
         """See `Pacing.prices`."""
-        prices = super().prices(step)
-        self._rates[step.episodes] = self._first_rates
+        prices = super().prices(episodes, observed, density, speed)
+        self._rates[episodes] = self._first_rates
         return prices
 
 

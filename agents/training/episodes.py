@@ -26,7 +26,7 @@ class TrainingEpisodes(VecEnvWrapper):
     phase. In their first round, episode i of n is therefore restarted after i/n of its length, so
     that from then on an update sees every second of the records. All later episodes run to their
     end, from the first second on: an episode that began in the middle of a record would meet
-    vehicles without any previous contribution (`dptse_env.release.contributions`), as no
+    vehicles without any previous contribution (`dptse_env.release.vehicles`), as no
     evaluated episode does.
 
     **Resumable.** Traffic is replayed and every draw is seeded, so an episode is given by its seed

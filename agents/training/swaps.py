@@ -128,7 +128,7 @@ def _tried(
 ) -> Swaps:
     """Try swaps in the first of ``actions``, in every episode of ``before``."""
     n, every = len(shown), np.arange(len(shown))
-    columns = before.release.setup.n_columns
+    columns = before.release.task.n_columns
     noise = generator.choice([-1.0, 1.0], size=(n, columns, 2))
     reward, spent = _replayed(before, actions, noise)
     queried = np.zeros((n, before.interface.queries.n_options), dtype=bool)

@@ -1,15 +1,16 @@
 """Differential privacy, mathematics only: Gaussian relations, sensitivities, noise, accounts."""
 
-from dptse_env.privacy.account import EpsilonTable, ReleaseAccount
 from dptse_env.privacy.gaussian import (
-    analytic_multiplier,
-    compose,
+    EpsilonTable,
+    ReleaseAccount,
     delta_of,
     epsilon_of,
+    joint_noise_std,
     le_ny_kappa,
     mu_of,
+    printed_noise_std,
+    single_noise_std,
 )
-from dptse_env.privacy.noise_std import joint_noise_std, printed_noise_std, single_noise_std
 from dptse_env.privacy.sensitivity import (
     Adjacency,
     ReleaseSensitivity,
@@ -24,8 +25,6 @@ __all__ = [
     "ReleaseAccount",
     "ReleaseSensitivity",
     "Sensitivity",
-    "analytic_multiplier",
-    "compose",
     "contribution_sensitivity",
     "delta_of",
     "epsilon_of",

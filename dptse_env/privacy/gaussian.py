@@ -18,12 +18,18 @@ $b$, so the second term is $\varphi(a)$ times a ratio that stays of order one.
 """
 
 import math
-from collections.abc import Iterable
+from functools import cached_property, lru_cache
 
+import numpy as np
 from scipy.optimize import brentq
 from scipy.special import erfcx, log_ndtr, ndtri
 
+from dptse_env.privacy.sensitivity import Sensitivity
+from dptse_env.utils.arrays import FloatArray, IntArray
 from dptse_env.utils.fields import inside, positive
+
+N_LEVELS = 256
+"""Levels of mu at which an `EpsilonTable` has epsilon; one between them is rounded up."""
 
 _RELATIVE_TOLERANCE = 4 * 2.0**-52  # the tightest that brentq accepts
 _SQRT_TWO = math.sqrt(2.0)
@@ -90,32 +96,120 @@ def mu_of(epsilon: float, delta: float) -> float:
     return float(brentq(excess, low, high, xtol=1e-16 * low, rtol=_RELATIVE_TOLERANCE))
 
 
-def compose(mus: Iterable[float]) -> float:
-    """Parameter of several Gaussian releases of the same data taken together.
-
-    It is the root of the sum of squares (Dong, Roth and Su 2022, corollary 3.3), 0 without any.
-    """
-    return math.hypot(*(positive("mu", mu) for mu in mus))
-
-
-def analytic_multiplier(epsilon: float, delta: float) -> float:
-    """Least noise standard deviation per unit of sensitivity for (epsilon, delta)-privacy.
-
-    The analytic calibration of Balle and Wang (2018).
-    """
-    return 1.0 / mu_of(epsilon, delta)
-
-
 def le_ny_kappa(epsilon: float, delta: float) -> float:
     """Noise standard deviation per unit of sensitivity that suffices, in closed form.
 
     It is (K + sqrt(K^2 + 2 epsilon)) / (2 epsilon) with K the upper delta-quantile of the standard
     normal (Le Ny and Pappas 2014, theorem 3; section III of the paper). That bounds delta by the
-    first of its two terms, so the result is always above `analytic_multiplier`.
+    first of its two terms, so the result is always above the least multiplier, 1 / `mu_of`.
     """
     epsilon, delta = positive("epsilon", epsilon), _checked_delta(delta)
     quantile = -float(ndtri(delta))
     return (quantile + math.sqrt(quantile * quantile + 2.0 * epsilon)) / (2.0 * epsilon)
+
+
+def printed_noise_std(sensitivity: Sensitivity, epsilon: float, delta: float) -> tuple[float, ...]:
+    """Noise of *variance* kappa^2 Delta for each release, as printed in section III of the paper.
+
+    A variance in veh/km cannot be right: the number depends on the units, here veh/km and km/h.
+    """
+    kappa = le_ny_kappa(epsilon, delta)
+    return tuple(kappa * math.sqrt(release.bound) for release in sensitivity.releases)
+
+
+def single_noise_std(sensitivity: Sensitivity, epsilon: float, delta: float) -> tuple[float, ...]:
+    """Noise of standard deviation kappa Delta for each release by itself, in its unit.
+
+    Le Ny and Pappas (2014), theorem 3. Nothing accounts for the releases together.
+    """
+    kappa = le_ny_kappa(epsilon, delta)
+    return tuple(kappa * release.bound for release in sensitivity.releases)
+
+
+def joint_noise_std(
+    sensitivity: Sensitivity, epsilon: float, delta: float, share: float
+) -> tuple[float, ...]:
+    """Noise under which two releases together are (epsilon, delta)-private, analytic calibration.
+
+    The budget mu^2 is divided between the sensitivities that can occur together. A release that
+    has a larger sensitivity on its own gets the noise that this needs. `share`, in (0, 1), is the
+    part of mu^2 for the first release.
+    """
+    mu = mu_of(epsilon, delta)
+    alone = tuple(release.bound for release in sensitivity.releases)
+    together = sensitivity.extremes[0] if sensitivity.extremes else alone
+    shares = share, 1.0 - share
+    return tuple(
+        max(bound / math.sqrt(part), largest) / mu
+        for bound, part, largest in zip(together, shares, alone, strict=True)
+    )
+
+
+class EpsilonTable:
+    """Epsilon at fixed levels of mu, so that a step takes no root finding.
+
+    Attributes:
+        mu: The largest mu, that of a complete episode.
+    """
+
+    def __init__(self, mu: float, delta: float) -> None:
+        """Store the numbers of a complete episode."""
+        self.mu, self._delta = mu, delta
+
+    @cached_property
+    def _epsilons(self) -> FloatArray:
+        """Epsilon at the levels of mu, shape (N_LEVELS + 1,)."""
+        levels = self.mu * np.arange(1, N_LEVELS + 1) / N_LEVELS
+        return np.array([0.0, *(epsilon_of(mu, self._delta) for mu in levels.tolist())])
+
+    def bounds(self, mu: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return mu, held to the largest, and epsilon, rounded up to one of 256 levels of mu."""
+        mu = np.minimum(mu, self.mu)
+        level = np.ceil(mu / self.mu * N_LEVELS * (1.0 - 1e-12)).astype(np.int64)
+        return mu, self._epsilons[level]
+
+
+class ReleaseAccount:
+    """Privacy loss of a vehicle by the number of released steps that its data may have entered.
+
+    Attributes:
+        mu: Parameter of Gaussian differential privacy of a complete episode.
+        delta: The delta at which epsilon is given.
+        contributions: C, released steps that a vehicle's data can enter; None if not bounded.
+    """
+
+    def __init__(self, mu: float, delta: float, contributions: int | None) -> None:
+        """Store the numbers of a complete episode."""
+        self.mu, self.delta, self.contributions = mu, delta, contributions
+
+    @cached_property
+    def _tables(self) -> tuple[FloatArray, FloatArray]:
+        """Values of mu and epsilon after 0..C steps."""
+        n = self.contributions
+        mu = self.mu * np.sqrt(np.arange(n + 1) / n) if n else np.array([self.mu])
+        return mu, np.array([_exact_epsilon(value, self.delta) for value in mu.tolist()])
+
+    def spent(self, steps: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Return upper bounds on the privacy loss of a vehicle, if the sensitivities hold.
+
+        Where contributions are bounded, a vehicle makes at most one per step. The paper's
+        sensitivities bound a complete episode and no part of it, so a complete episode is charged
+        from the start. `steps` is the number of steps released so far in each of k episodes, and
+        the result mu and epsilon at `delta` of all releases together, shape (k,) each.
+        """
+        mu, epsilon = self._tables
+        charged = np.minimum(steps, len(mu) - 1)
+        return mu[charged], epsilon[charged]
+
+    def epsilons(self, squares: FloatArray) -> list[float]:
+        """Return the exact epsilon of vehicles that have spent these parts of mu^2, shape (m,)."""
+        mus = np.sqrt(np.minimum(squares, self.mu**2))
+        return [_exact_epsilon(mu, self.delta) for mu in mus.tolist()]
+
+
+@lru_cache(maxsize=2**16)
+def _exact_epsilon(mu: float, delta: float) -> float:
+    return epsilon_of(mu, delta) if mu > 0.0 else 0.0
 
 
 def _checked_delta(delta: float) -> float:

@@ -1,29 +1,31 @@
-"""Release of traffic data: true traffic, release models, and boundary inputs."""
+"""Release of traffic data: the task, true traffic, release models, sensors and boundary inputs."""
 
 from dptse_env.release.base import (
+    BoundaryInputs,
+    Group,
+    PrivacySettings,
     ReleaseModel,
-    ReleaseRequest,
-    ReleaseSetup,
+    Request,
+    Task,
+    check_released,
 )
-from dptse_env.release.boundary import BOUNDARIES, BoundaryModel
-from dptse_env.release.checks import check_released
-from dptse_env.release.detectors import Detectors
-from dptse_env.release.gaussian import Capped, Corrected, GaussianRelease, Paper, require_gaussian
-from dptse_env.release.mechanism import GaussianMechanism, Mechanism
-from dptse_env.release.paced import Paced
-from dptse_env.release.pacing import PACINGS, Pacing, PacingSetup, PublicStep
+from dptse_env.release.boundary import BOUNDARIES, BoundaryModel, nominal_state
+from dptse_env.release.fusion import Fusion, FusionSettings
+from dptse_env.release.gaussian import (
+    Capped,
+    CappedSettings,
+    Corrected,
+    GaussianRelease,
+    Paper,
+    SpeedRelease,
+    require_gaussian,
+)
+from dptse_env.release.paced import Paced, PacedSettings
+from dptse_env.release.pacing import PACINGS, Pacing
 from dptse_env.release.queries import MOST_OPTIONS, BandwidthUnit, QueryOptions
 from dptse_env.release.report import VOID_REASONS, PrivacyReport, QuantityReport
-from dptse_env.release.settings import (
-    BoundaryInputs,
-    CappedSettings,
-    PacedSettings,
-    PrivacySettings,
-    SpeedRelease,
-    Unit,
-)
-from dptse_env.release.traffic_table import TrafficTable
-from dptse_env.release.two_mechanisms import TwoMechanisms
+from dptse_env.release.sensors import DetectorErrors, Detectors, make_groups
+from dptse_env.release.vehicles import Traffic
 from dptse_env.utils.registry import Registry
 
 RELEASE_MODELS = Registry(
@@ -51,27 +53,27 @@ __all__ = [
     "Capped",
     "CappedSettings",
     "Corrected",
+    "DetectorErrors",
     "Detectors",
-    "GaussianMechanism",
+    "Fusion",
+    "FusionSettings",
     "GaussianRelease",
-    "Mechanism",
+    "Group",
     "Paced",
     "PacedSettings",
     "Pacing",
-    "PacingSetup",
     "Paper",
     "PrivacyReport",
     "PrivacySettings",
-    "PublicStep",
     "QuantityReport",
     "QueryOptions",
     "ReleaseModel",
-    "ReleaseRequest",
-    "ReleaseSetup",
+    "Request",
     "SpeedRelease",
-    "TrafficTable",
-    "TwoMechanisms",
-    "Unit",
+    "Task",
+    "Traffic",
     "check_released",
+    "make_groups",
+    "nominal_state",
     "require_gaussian",
 ]

@@ -1,122 +1,255 @@
-"""Base class of release models: released values, privacy account and privacy report."""
+"""The types of a release, and the base class of release models.
+
+A `Task` says what is measured of which road, a `Request` asks for a second of it, and a
+`ReleaseModel` answers with a `dptse_env.estimators.Measurement`.
+"""
+
+from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dptse_env.estimators import Estimate, Measurement
 from dptse_env.model import MeasurementRows
-from dptse_env.release.queries import NO_OPTIONS, QueryOptions
+from dptse_env.model.network import covered
+from dptse_env.privacy import Adjacency
+from dptse_env.release.queries import QueryOptions
 from dptse_env.release.report import PrivacyReport
-from dptse_env.release.settings import PrivacySettings
-from dptse_env.release.traffic_table import TrafficTable
-from dptse_env.traffic import Corridor, Record
-from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray, IntArray
+from dptse_env.release.vehicles import Traffic
+from dptse_env.traffic import Corridor, Penetration
+from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+from dptse_env.utils.fields import Interval, checked_fields
 from dptse_env.utils.registry import name_of_class
 from dptse_env.utils.vector_info import Rows
 
+BoundaryInputs = Literal["true", "nominal", "private"]
+"""Source of the estimator's inputs at the boundary: measured traffic, public demand, or the
+boundary segments' releases."""
+
+CHANGES: dict[Adjacency, str] = {
+    "replace": "replaced by another",
+    "add_remove": "added or removed",
+}
+"""Change of a vehicle's data between two adjacent records, in words."""
+
 
 @dataclass(frozen=True)
-class ReleaseSetup:
-    """Configuration that a release model is made for.
+class PrivacySettings:
+    """Settings of every release model, the keyword ``privacy``; subclasses add further ones.
 
     Attributes:
-        name: Name of the model, for reports.
-        settings: The privacy settings.
-        traffic: The true traffic, with its corridor.
-        bandwidth: Largest total cost of the queries of a step, in the unit of ``queries``.
-        horizon: Steps of an episode.
-        n_episodes: Size n of the batch.
-        queries: The G options that can be queried; the mainline segments where they are not given.
-        budget_share: Part of the privacy budget mu^2 that the releases may spend.
+        preset: The release model: ``paper``, ``corrected``, ``capped``, ``paced``, a registered
+            name, ``"package.module:Class"``, or a class.
+        epsilon: Privacy parameter epsilon.
+        delta: Privacy parameter delta.
+        boundary_inputs: Source of the estimator's inputs at the boundary: ``true``, ``nominal`` or
+            ``private``; None for the model's default.
+
+    Raises:
+        ValueError: A field is out of range; the message names its path below ``privacy``.
+    """
+
+    default_boundary: ClassVar[BoundaryInputs] = "true"
+
+    preset: Any = "paper"
+    epsilon: Annotated[float, Interval(1e-4, 1e4)] = 1.0
+    delta: Annotated[float, Interval(1e-12, 0.5, open_high=True)] = 0.05
+    boundary_inputs: BoundaryInputs | None = None
+
+    def __post_init__(self) -> None:
+        """Check the fields."""
+        checked_fields(self, "privacy")
+
+    @property
+    def boundary(self) -> BoundaryInputs:
+        """Source of the estimator's inputs at the boundary."""
+        return self.boundary_inputs or self.default_boundary
+
+    def guarantee(self, quantities: str, protected: str) -> str:
+        """Return the sentence that states (epsilon, delta) for quantities and what is protected."""
+        return (
+            f"({self.epsilon:g}, {self.delta:g})-differential privacy of {quantities} together, "
+            f"for {protected}"
+        )
+
+
+class Group(NamedTuple):
+    """Columns of a release that see the same vehicles and have a part of the budget to themselves.
+
+    Attributes:
+        name: ``queries`` or ``sensors``.
+        budget_share: Part of the privacy budget mu^2 of a vehicle.
+        population: Which vehicles it sees, and what they report; None for all, with their speeds.
     """
 
     name: str
-    settings: PrivacySettings
-    traffic: TrafficTable
-    bandwidth: int
-    horizon: int
-    n_episodes: int
-    queries: QueryOptions = NO_OPTIONS
     budget_share: float = 1.0
+    population: Penetration | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """What is measured of which road, in a batch of n episodes.
+
+    *Places* are the columns of a record: the S segments, then the R boundary segments where they
+    are released. *Columns* are those of a release: first the M rows of the road, which estimators
+    are given (the G options, the ramps, the fixed sensors that are no option), then the R boundary
+    segments. Each covers one place, or several that are neighbours; columns of a group are
+    neighbours, too.
+
+    Attributes:
+        name: Name of the release model, for reports.
+        model: Its class.
+        settings: Its settings, of its ``settings_type``.
+        corridor: The road, with the scales of densities and speeds.
+        queries: The options that can be queried, the first G columns, and their bandwidth.
+        horizon: Steps of an episode.
+        n_episodes: Size n of the batch.
+        groups: Groups of columns, one or two. All columns are one group, or the options are the
+            first and all others the second.
+
+    Raises:
+        ValueError: Groups see other vehicles, or there are two, and the model knows of none.
+    """
+
+    name: str
+    model: type[ReleaseModel]
+    settings: Any
+    corridor: Corridor
+    queries: QueryOptions
+    horizon: int
+    n_episodes: int = 1
+    groups: tuple[Group, ...] = (Group("queries"),)
 
     def __post_init__(self) -> None:
-        """Fill in the options."""
-        if self.queries is NO_OPTIONS:
-            options = QueryOptions.make(self.corridor.n_mainline, self.bandwidth)
-            object.__setattr__(self, "queries", options)
+        """Check that the release model can serve the groups."""
+        if not (self.is_whole or self.model.knows_groups):
+            raise ValueError(
+                f"penetration.share must be 1, and detectors left out, with the release model "
+                f"{self.name!r}, which knows of no groups of columns"
+            )
 
     @property
-    def corridor(self) -> Corridor:
-        """The road."""
-        return self.traffic.corridor
+    def is_whole(self) -> bool:
+        """True if all columns see all vehicles, as one group."""
+        return len(self.groups) == 1 and self.groups[0].population is None
+
+    # Speeds -------------------------------------------------------------------------------------
+
+    @cached_property
+    def flow_centre(self) -> float | None:
+        """Speed v_0 [km/h] that released flows are centred on; None where mean speeds are."""
+        return self.model.flow_centre(self.corridor, self.settings)
+
+    @property
+    def releases_flow(self) -> bool:
+        """True where flows are released, False where mean speeds are."""
+        return self.flow_centre is not None
+
+    # Columns and places -------------------------------------------------------------------------
 
     @cached_property
     def rows(self) -> MeasurementRows:
-        """The M rows that estimators may be given: the options and what is observed besides."""
+        """The M rows."""
         return self.queries.rows(self.corridor)
 
-    @cached_property
-    def n_columns(self) -> int:
-        """Columns of a release: the M rows, then the boundary segments if they are released."""
-        private = self.settings.boundary == "private"
-        return self.rows.n_rows + (self.corridor.n_boundaries if private else 0)
+    @property
+    def n_rows(self) -> int:
+        """Rows M that estimators are given."""
+        return self.rows.n_rows
 
     @cached_property
-    def places(self) -> IntArray:
-        """The first record column of each column of a release, shape (n_columns,)."""
-        boundaries = np.arange(self.n_columns - self.rows.n_rows)
-        return np.concatenate([self.rows.first, self.corridor.n_segments + boundaries])
+    def _boundary(self) -> IntArray:
+        """Places of the boundary segments, shape (R,)."""
+        is_private = self.settings.boundary == "private"
+        return self.corridor.n_segments + np.arange(self.corridor.n_boundaries * is_private)
 
     @property
     def n_places(self) -> int:
-        """Record columns: the segments, and the boundary segments if they are released."""
-        return self.corridor.n_segments + self.n_columns - self.rows.n_rows
+        """Places S + R."""
+        return self.corridor.n_segments + self._boundary.size
+
+    @property
+    def n_columns(self) -> int:
+        """Columns C of a release."""
+        return self.first.size
 
     @cached_property
-    def spans(self) -> IntArray:
-        """Number of record columns that each column of a release covers, shape (n_columns,)."""
-        boundaries = np.ones(self.n_columns - self.rows.n_rows, dtype=np.int64)
-        return np.concatenate([self.rows.span, boundaries])
+    def first(self) -> IntArray:
+        """The first place of each column, shape (C,)."""
+        return np.concatenate([self.rows.first, self._boundary])
 
     @cached_property
-    def lengths(self) -> FloatArray:
-        """Length of each column of a release [km], shape (n_columns,)."""
-        every = np.array(self.corridor.with_boundaries(self.corridor.segment_lengths))
-        # Sums over several segments are released where all lengths on the mainline are equal.
-        lengths: FloatArray = every[self.places] * self.spans
-        return lengths
+    def span(self) -> IntArray:
+        """Number of places that each column covers, shape (C,)."""
+        return np.concatenate([self.rows.span, np.ones_like(self._boundary)])
 
     @cached_property
-    def always_observed(self) -> IntArray:
-        """Columns that are observed at every step without a query."""
-        sensors = self.queries.sensor_rows(self.corridor)
-        boundaries = range(self.rows.n_rows, self.n_columns)
-        return np.array([*sensors, *boundaries], dtype=np.int64)
+    def length(self) -> FloatArray:
+        """Length of each column [km], shape (C,).
+
+        Sums over several segments are released where all lengths on the mainline are equal.
+        """
+        corridor = self.corridor
+        every: FloatArray = np.array(corridor.with_boundaries(corridor.segment_lengths))
+        return every[self.first] * self.span
+
+    @cached_property
+    def limit(self) -> FloatArray:
+        """Speed limit at the first place of each column [km/h], shape (C,)."""
+        corridor = self.corridor
+        every: FloatArray = np.array(corridor.with_boundaries(corridor.speed_limits))
+        return every[self.first]
+
+    @cached_property
+    def sensors(self) -> IntArray:
+        """Column of each of the corridor's fixed sensors, shape (F,)."""
+        return np.array(self.queries.sensor_rows(self.corridor), dtype=np.int64)
+
+    @cached_property
+    def always(self) -> IntArray:
+        """Columns that are observed at every step without a query, shape (A,)."""
+        return np.concatenate([self.sensors, np.arange(self.n_rows, self.n_columns)])
 
     def observed(self, queried: BoolArray) -> BoolArray:
-        """Return the observed columns (k, n_columns) of queried options (k, G)."""
+        """Return the observed columns (k, C) of queried options (k, G)."""
         observed = np.zeros((len(queried), self.n_columns), dtype=bool)
         observed[:, : queried.shape[1]] = queried
-        observed[:, self.always_observed] = True
+        observed[:, self.always] = True
         return observed
 
     def covered(self, observed: BoolArray) -> BoolArray:
-        """Return the mainline segments (k, n_mainline) of observed columns (k, n_columns)."""
-        n = self.corridor.n_mainline
+        """Return the mainline segments (k, n_mainline) of observed columns (k, C)."""
         if self.rows.are_single:
-            return observed[:, :n]
-        covered: BoolArray = observed[:, : self.rows.n_rows].astype(np.float32) @ self._covers > 0.0
-        return covered
+            return observed[:, : self.corridor.n_mainline]
+        rows = observed[:, : self.n_rows].astype(np.float32)
+        segments: BoolArray = rows @ self._rows_cover > 0.0
+        return segments
+
+    @property
+    def columns(self) -> tuple[IntArray, IntArray, IntArray]:
+        """First place, number of places and group of each column, shape (C,) each."""
+        return self.first, self.span, self.group
+
+    @cached_property
+    def covers(self) -> BoolArray:
+        """Whether each column covers each place, shape (C, S + R)."""
+        return covered(self.first, self.span, self.n_places)
+
+    @cached_property
+    def _rows_cover(self) -> NDArray[np.float32]:
+        """Mainline segments in each row, shape (M, n_mainline): products of floats are faster."""
+        return self.covers[: self.n_rows, : self.corridor.n_mainline].astype(np.float32)
 
     def at_places(self, values: FloatArray) -> FloatArray:
-        """Return predictions of the segments, shape (k, S), for all record columns: (k, n_places).
+        """Return predictions of the segments, shape (k, S), at all places, shape (k, S + R).
 
         That of a boundary segment is the prediction of the road's segment next to it.
         """
@@ -124,25 +257,61 @@ class ReleaseSetup:
             return values
         return np.concatenate([values, values[:, self.corridor.boundary_neighbours]], axis=1)
 
+    # Groups -------------------------------------------------------------------------------------
+
     @cached_property
-    def _covers(self) -> NDArray[np.float32]:
-        """Mainline segments in each row, shape (M, n_mainline): products of floats are faster."""
-        return (self.rows.weights[:, : self.corridor.n_mainline] > 0.0).astype(np.float32)
+    def group(self) -> IntArray:
+        """Group of each column, ascending, shape (C,)."""
+        is_option = np.arange(self.n_columns) < self.queries.n_options
+        return np.where(is_option, 0, len(self.groups) - 1)
+
+    @cached_property
+    def shares(self) -> FloatArray:
+        """Part of the budget mu^2 of each group, shape (groups,)."""
+        return np.array([group.budget_share for group in self.groups])
+
+    def protects(self, what: str) -> str:
+        """Return what a release protects, in words: a vehicle that all groups see."""
+        if self.is_whole:
+            return what
+        return f"a connected vehicle: {what}, under queries and fixed sensors together"
+
+    def group_reports(self, mu: FloatArray, noise_std: FloatArray) -> dict[str, Any]:
+        """Return ``groups`` for the details of a report; nothing where all columns are one group.
+
+        Args:
+            mu: Parameter of each group, shape (groups,).
+            noise_std: Standard deviations of its noise, shape (groups, 2).
+        """
+        if self.is_whole:
+            return {}
+        total = float(mu @ mu)
+        numbers = zip(self.groups, mu.tolist(), noise_std.tolist(), strict=True)
+        reports = [
+            {
+                "group": group.name,
+                "vehicles": "all" if group.population is None else "connected",
+                "budget_share": own**2 / total,
+                "mu": own,
+                "noise_std": stds,
+            }
+            for group, own, stds in numbers
+        ]
+        return {"groups": reports}
 
 
 def _no_prediction() -> Estimate:
-    raise RuntimeError("this release request carries no prediction")
+    raise RuntimeError("this request carries no prediction")
 
 
-class ReleaseRequest(NamedTuple):
+class Request(NamedTuple):
     """A second of k episodes whose data is to be released.
 
     Attributes:
         episodes: Distinct rows of the batch, shape (k,).
         traffic: Index of each episode's traffic seed, shape (k,).
         times: Second of the record, shape (k,).
-        observed: Columns that were queried or are always observed, shape (k, n_columns): those of
-            the options come first.
+        observed: Columns that were queried or are always observed, shape (k, C).
         prediction: Returns the estimator's prediction for this second, which is public: it depends
             on earlier releases and the configuration alone. Raises where there is no estimator.
     """
@@ -158,10 +327,14 @@ class ReleaseModel(ABC):
     """Base class of release models, for a batch of episodes.
 
     Estimators, observations and policies learn of the traffic through `release` and the boundary
-    inputs (`dptse_env.release.boundary`) alone. A subclass may read true traffic from
-    ``setup.traffic``. Its constructor must be cheap: nothing is loaded before `load`.
+    inputs (`dptse_env.release.boundary`) alone. A subclass reads true traffic from ``traffic``. Its
+    constructor must be cheap: nothing is loaded then.
 
     A model with a guarantee overrides `report` and `spent`; otherwise no guarantee is reported.
+
+    Attributes:
+        task: What is measured.
+        traffic: The true traffic; that of an episode is in memory from its `reset` on.
     """
 
     settings_type: ClassVar[type[PrivacySettings]] = PrivacySettings
@@ -173,8 +346,11 @@ class ReleaseModel(ABC):
     needs_vehicles: ClassVar[bool] = False
     """True where the model reads the vehicles of a record, which measured fields have not."""
     has_prices: ClassVar[bool] = False
-    """True where queries have prices, which `public_state` gives."""
-    takes_noise: bool = False
+    """True where queries have prices, which `public` gives."""
+    knows_groups: ClassVar[bool] = False
+    """True where each column shows what its group sees, and spends its group's part of the
+    budget."""
+    takes_noise: ClassVar[bool] = False
     """True where `give_noise` works, which trainings by swaps need."""
 
     @classmethod
@@ -185,14 +361,14 @@ class ReleaseModel(ABC):
         """
         return None
 
-    def __init__(self, setup: ReleaseSetup) -> None:
+    def __init__(self, task: Task, traffic: Traffic) -> None:
         """Store the configuration."""
-        self.setup = setup
+        self.task, self.traffic = task, traffic
 
     @property
     @abstractmethod
     def sigma(self) -> FloatArray:
-        """Standard deviations of the noise of both released quantities, shape (2,).
+        """Standard deviations of the noise of both released quantities of a query, shape (2,).
 
         Where they vary, those that are expected before an episode begins.
         """
@@ -202,55 +378,29 @@ class ReleaseModel(ABC):
         """Begin new episodes.
 
         Args:
-            episodes: Distinct rows of the batch, shape (k,).
+            episodes: Distinct rows of the batch, shape (k,); their traffic is loaded.
             generators: k noise streams; only the model uses them from now on.
         """
 
     @abstractmethod
-    def release(self, request: ReleaseRequest) -> Measurement:
-        """Release one second of some episodes.
+    def release(self, request: Request) -> Measurement:
+        """Release one second of some episodes; called once for every second.
 
         Noise should be drawn for all columns, observed or not, so that different policies with the
         same seed have common random numbers.
         """
 
-    def measurement(
-        self,
-        request: ReleaseRequest,
-        values: FloatArray,
-        sigma: FloatArray,
-        centre: FloatArray | None = None,
-    ) -> Measurement:
-        """Return a release in which all columns answer, with what they share written out.
+    def measurement(self, request: Request, values: FloatArray, sigma: FloatArray) -> Measurement:
+        """Return a release in which all columns answer, around the `flow_centre`.
 
         Args:
             request: The request.
-            values: Shape (k, n_columns, 2), a fresh array.
-            sigma: Shape (k, n_columns, 2), or one that broadcasts to it.
-            centre: Speeds that flows are centred on [km/h], shape (k, n_places); None for the
-                `flow_centre`.
+            values: Shape (k, C, 2), a fresh array.
+            sigma: Shape (k, C, 2), or one that broadcasts to it.
         """
-        if centre is None:
-            centre = np.full((len(values), self.setup.n_places), self._common_centre)
-        return Measurement(request.observed, values, np.broadcast_to(sigma, values.shape), centre)
-
-    @property
-    def releases_flow(self) -> bool:
-        """True where flows are released, False where mean speeds are."""
-        return not math.isnan(self._common_centre)
-
-    @cached_property
-    def _common_centre(self) -> float:
-        centre = self.flow_centre(self.setup.corridor, self.setup.settings)
-        return math.nan if centre is None else centre
-
-    def load(self, index: int, record: Record) -> None:  # noqa: B027 (nothing by default)
-        """Prepare for the traffic of an index into the traffic seeds; called once for each."""
-
-    @property
-    def shared(self) -> tuple[AnyArray, ...]:
-        """Arrays that depend on the traffic alone, so that forks of the process share them."""
-        return ()
+        centre = math.nan if self.task.flow_centre is None else self.task.flow_centre
+        places = np.full((len(values), self.task.n_places), centre)
+        return Measurement(request.observed, values, np.broadcast_to(sigma, values.shape), places)
 
     def spent(self, episodes: IntArray, steps: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return upper bounds on a vehicle's privacy loss so far, mu and epsilon, shape (k,) each.
@@ -266,39 +416,29 @@ class ReleaseModel(ABC):
 
     def report(self) -> PrivacyReport:
         """Return the privacy report; that of the base class claims no guarantee."""
-        settings, setup = self.setup.settings, self.setup
+        task, settings = self.task, self.task.settings
         return PrivacyReport(
-            preset=setup.name,
+            preset=task.name,
             guarantee="none",
             void_reasons=("not_stated",),
             protects=f"not stated by {name_of_class(type(self))}",
             claimed_epsilon=settings.epsilon,
             claimed_delta=settings.delta,
-            speed_release="flow" if self.releases_flow else "mean",
+            speed_release="flow" if task.releases_flow else "mean",
             boundary_inputs=settings.boundary,
         )
 
-    def public_info(self, episodes: IntArray) -> Rows:
-        """Return further public entries of ``info``, rows of k episodes; by default none."""
+    def public(self, episodes: IntArray) -> Rows:
+        """Return further public numbers for ``info``, rows of k episodes; by default none.
+
+        Where queries have prices, ``prices`` (k, G) and ``tracer`` (k, n_mainline) are among them,
+        as `dptse_env.spaces.observations.PublicState` describes them.
+        """
         return {}
 
-    def public_state(self, episodes: IntArray) -> tuple[FloatArray, FloatArray] | None:
-        """Return prices (k, G) and tracer (k, n_mainline) of ``episodes``, see `PublicState`.
-
-        None where queries have no prices.
-        """
-        return None
-
-    def give_noise(self, noise: FloatArray) -> None:
-        """Set the noise of the next release of all episodes, as what-if trials in forks need it.
-
-        Args:
-            noise: In standard deviations, shape (n_episodes, n_columns, 2).
-
-        Raises:
-            ValueError: Noise of this model cannot be set, or ``noise`` has another shape.
-        """
-        raise ValueError(f"noise of the release model {self.setup.name!r} cannot be set")
+    def private(self, episodes: IntArray, traffic: IntArray) -> Rows:
+        """Return private data for ``info["truth"]`` alone, rows of k episodes; by default none."""
+        return {}
 
     def budgets_spent(self, episodes: IntArray) -> FloatArray:
         """Return the budgets that vehicles have spent so far, parts of them added up, shape (k,).
@@ -307,6 +447,45 @@ class ReleaseModel(ABC):
         """
         return np.zeros(len(episodes))
 
-    def private_info(self, episodes: IntArray, traffic: IntArray) -> Rows:
-        """Return private data for ``info["truth"]`` alone, rows of k episodes; by default none."""
-        return {}
+    def give_noise(self, noise: FloatArray) -> None:
+        """Set the noise of the next release of all episodes, as what-if trials in forks need it.
+
+        Args:
+            noise: In standard deviations, shape (n, C, 2).
+
+        Raises:
+            ValueError: Noise of this model cannot be set, or ``noise`` has another shape.
+        """
+        raise ValueError(f"noise of the release model {self.task.name!r} cannot be set")
+
+
+def check_released(release: ReleaseModel, released: Any, request: Request) -> None:
+    """Refuse a foreign model's release of a wrong type or shape, or that is not finite.
+
+    Raises:
+        ValueError: See above; what was not observed may be anything.
+    """
+    path = f"privacy.preset {name_of_class(release)}.release()"
+    if not isinstance(released, Measurement):
+        raise ValueError(f"{path} must return a Measurement, got {type(released).__name__}")
+    columns, places = request.observed.shape, (len(request.observed), release.task.n_places)
+    for name, array, kind, shape in (
+        ("observed", released.observed, "b", columns),
+        ("values", released.values, "f", (*columns, 2)),
+        ("sigma", released.sigma, "f", (*columns, 2)),
+        ("centre", released.centre, "f", places),
+    ):
+        found = np.asarray(array)
+        if found.shape != shape or found.dtype.kind != kind:
+            raise ValueError(
+                f"{path} must return {name} of shape {shape}, got {found.dtype} of shape "
+                f"{found.shape}"
+            )
+    if (released.observed & ~request.observed).any():
+        raise ValueError(f"{path} must not say that a column was observed that was not asked for")
+    if not np.isfinite(released.values[released.observed]).all():
+        raise ValueError(f"{path} must return finite values of observed segments")
+    if not (np.isfinite(released.sigma) & (released.sigma >= 0.0)).all():
+        raise ValueError(f"{path} must return finite standard deviations >= 0")
+    if release.task.releases_flow and not np.isfinite(released.centre).all():
+        raise ValueError(f"{path} must return finite centres of flows")

@@ -1,15 +1,20 @@
-"""Inputs of the traffic model at the road's ends and ramps: true, nominal or private."""
+"""Inputs of the traffic model at the road's ends and ramps: true, nominal or private.
+
+Nominal flows, inputs and states follow from the published demand alone.
+"""
 
 from abc import ABC, abstractmethod
 from typing import ClassVar
 
 import numpy as np
+import numpy.typing as npt
 
 from dptse_env.estimators import Measurement
 from dptse_env.model import ARZModel
-from dptse_env.release.nominal import nominal_inputs
-from dptse_env.release.settings import BoundaryInputs
-from dptse_env.release.traffic_table import TrafficTable
+from dptse_env.release.base import BoundaryInputs, Task
+from dptse_env.release.vehicles import Traffic
+from dptse_env.traffic import Corridor
+from dptse_env.traffic.demand import value_at
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 
 
@@ -22,10 +27,14 @@ class BoundaryModel(ABC):
 
     void_reasons: ClassVar[tuple[str, ...]] = ()
 
+    def __init__(self, task: Task, traffic: Traffic, model: ARZModel) -> None:
+        """Store the configuration; nothing is loaded."""
+        self.task, self.traffic, self.model = task, traffic, model
+
     @property
-    @abstractmethod
     def shared(self) -> tuple[FloatArray, ...]:
-        """Arrays that depend on the traffic alone, so that forks of the process share them."""
+        """Arrays that no episode changes, so that forks of the process share them."""
+        return ()
 
     @abstractmethod
     def inputs(self, episodes: IntArray, traffic: IntArray, times: IntArray) -> FloatArray:
@@ -38,7 +47,7 @@ class BoundaryModel(ABC):
         """Begin new episodes, shape (k,)."""
 
     def update(self, episodes: IntArray, measured: Measurement) -> None:  # noqa: B027 (nothing)
-        """Take the releases of the boundary segments of k episodes, shape (k,)."""
+        """Take the release of a second, whose last R columns are the boundary segments."""
 
 
 class TrueBoundary(BoundaryModel):
@@ -46,12 +55,11 @@ class TrueBoundary(BoundaryModel):
 
     void_reasons: ClassVar[tuple[str, ...]] = ("boundary_inputs",)
 
-    def __init__(self, traffic: TrafficTable, model: ARZModel, n_episodes: int) -> None:
-        """Prepare a table for all traffic seeds; nothing is loaded yet."""
-        self._traffic, self._model = traffic, model
-        shape = len(traffic.traffic_seeds), traffic.corridor.duration + 1, model.n_inputs
+    def __init__(self, task: Task, traffic: Traffic, model: ARZModel) -> None:
+        """Prepare a table for all traffic seeds."""
+        super().__init__(task, traffic, model)
         # np.empty takes address space, not memory, until traffic is loaded.
-        self._table = np.empty(shape)
+        self._table = np.empty((len(traffic.seeds), task.corridor.duration + 1, model.n_inputs))
 
     @property
     def shared(self) -> tuple[FloatArray, ...]:
@@ -60,8 +68,8 @@ class TrueBoundary(BoundaryModel):
 
     def load(self, index: int) -> None:
         """Compute the inputs of a complete record."""
-        traffic = self._traffic.complete(index)[:, self._model.n_segments :]
-        self._table[index] = self._model.boundary_inputs(traffic[..., 0], traffic[..., 1])
+        traffic = self.traffic.complete(index)[:, self.model.n_segments :]
+        self._table[index] = self.model.boundary_inputs(traffic[..., 0], traffic[..., 1])
 
     def inputs(self, episodes: IntArray, traffic: IntArray, times: IntArray) -> FloatArray:
         """Return the true inputs."""
@@ -72,9 +80,10 @@ class TrueBoundary(BoundaryModel):
 class NominalBoundary(BoundaryModel):
     """The published demand, the same for every traffic seed."""
 
-    def __init__(self, traffic: TrafficTable, model: ARZModel, n_episodes: int) -> None:
+    def __init__(self, task: Task, traffic: Traffic, model: ARZModel) -> None:
         """Compute the inputs of every second."""
-        self._table = nominal_inputs(traffic.corridor, model)
+        super().__init__(task, traffic, model)
+        self._table = nominal_inputs(task.corridor, model)
 
     @property
     def shared(self) -> tuple[FloatArray, ...]:
@@ -90,22 +99,21 @@ class NominalBoundary(BoundaryModel):
 class PrivateBoundary(NominalBoundary):
     """Inputs from the boundary segments' releases a step ago; the published demand at first.
 
-    A released flow gives a speed by the density released with it, v_0 + q / rho; below a density
-    of one vehicle per segment that is mostly noise, and the free speed is used.
+    A released flow gives a speed by the density released with it, c + q / rho, around the centre c
+    of the release; below a density of one vehicle per segment that is mostly noise, and the free
+    speed is used.
     """
 
-    def __init__(self, traffic: TrafficTable, model: ARZModel, n_episodes: int) -> None:
+    def __init__(self, task: Task, traffic: Traffic, model: ARZModel) -> None:
         """Prepare for episodes without any release yet."""
-        super().__init__(traffic, model, n_episodes)
-        self._model, corridor = model, traffic.corridor
-        lengths = [corridor.segment_lengths[s] for s in corridor.boundary_neighbours]
-        self._least_density = 1.0 / np.array(lengths)
+        super().__init__(task, traffic, model)
+        self._least_density = 1.0 / task.length[task.n_rows :]
         layout = model.layout
         self._jam_density = np.empty(model.n_boundaries)
         self._jam_density[layout.entry_boundaries] = model.entry_jam_density
         self._jam_density[layout.exit_boundaries] = model.exit_jam_density
-        self._has_release: BoolArray = np.zeros(n_episodes, dtype=bool)
-        self._inputs = np.empty((n_episodes, model.n_inputs))
+        self._has_release: BoolArray = np.zeros(task.n_episodes, dtype=bool)
+        self._inputs = np.empty((task.n_episodes, model.n_inputs))
 
     def reset(self, episodes: IntArray) -> None:
         """Forget earlier releases."""
@@ -121,8 +129,7 @@ class PrivateBoundary(NominalBoundary):
 
     def update(self, episodes: IntArray, measured: Measurement) -> None:
         """Turn releases into inputs, within what the road can hold."""
-        model = self._model
-        released = measured.values[:, model.rows.n_rows :]
+        model, released = self.model, measured.values[:, self.task.n_rows :]
         # Not np.clip, which takes several times as long on so few numbers.
         density = np.minimum(np.maximum(released[..., 0], 0.0), self._jam_density)
         speed = released[..., 1]
@@ -141,3 +148,76 @@ BOUNDARIES: dict[BoundaryInputs, type[TrueBoundary | NominalBoundary]] = {
     "private": PrivateBoundary,
 }
 """Boundary models by the value of ``privacy.boundary_inputs``."""
+
+
+def nominal_flows(corridor: Corridor, times: npt.ArrayLike) -> FloatArray:
+    """Return the flows [veh/h] at the published demand, (..., S), at times [s] of shape (...)."""
+    demand = corridor.published_demand
+    flow = value_at(demand.mainline, times)
+    entering = [value_at(steps, times) for steps in demand.ramp_profiles]
+    on = dict(zip(corridor.on_ramps, entering, strict=True))
+    shares: list[FloatArray] = (
+        [np.full_like(flow, share) for share in corridor.exit_shares]
+        if demand.exit_shares is None
+        else [value_at(steps, times) for steps in demand.exit_shares]
+    )
+    off = dict(zip(corridor.off_ramps, shares, strict=True))
+    mainline, leaving = [], []
+    for segment in range(corridor.n_mainline):
+        if segment in off:
+            leaving.append(off[segment] * flow)
+            flow = flow - leaving[-1]
+        flow = flow + on.get(segment, 0.0)
+        mainline.append(flow)
+    ramps = zip(
+        (*corridor.on_ramp_segments, *corridor.off_ramp_segments),
+        (*entering, *leaving),
+        strict=True,
+    )
+    of_ramps = [of_ramp for segments, of_ramp in ramps for _ in segments]
+    return np.stack([*mainline, *of_ramps], axis=-1)
+
+
+def free_flow_density(
+    model: ARZModel, flow: FloatArray, jam: FloatArray | None = None
+) -> FloatArray:
+    """Return the density [veh/km] at which each segment carries ``flow`` freely, both (..., S).
+
+    The smaller root of q = rho (v_f - p(rho)); a flow above the capacity gives the critical
+    density. Jam densities are by default those of the segments.
+    """
+    jam = model.jam_density if jam is None else jam
+    v_f, gamma = model.parameters.free_flow_speed, model.parameters.gamma
+    filling = np.linspace(0.0, (1.0 + gamma) ** (-1.0 / gamma), 4096)
+    scaled_flow = filling * (1.0 - filling**gamma)
+    density: FloatArray = jam * np.interp(flow / (jam * v_f), scaled_flow, filling)
+    return density
+
+
+def nominal_inputs(corridor: Corridor, model: ARZModel) -> FloatArray:
+    """Return the model's inputs at the published demand for every second, shape (T + 1, n_u).
+
+    Vehicles enter at free speed; behind the exits traffic flows freely, at the density of the flow
+    that reaches them. Incidents are not considered.
+    """
+    layout, v_f = model.layout, model.parameters.free_flow_speed
+    flows = nominal_flows(corridor, np.arange(corridor.duration + 1))
+    inputs = np.empty((len(flows), model.n_inputs))
+    inputs[:, layout.entry_inputs[0]] = flows[:, 0]  # no ramp lies ahead of the first segment
+    inputs[:, layout.entry_inputs[1:]] = flows[:, layout.entries[1:]]
+    inputs[:, layout.entry_inputs + 1] = v_f
+    leaving = flows[:, layout.exits]
+    inputs[:, layout.exit_inputs] = free_flow_density(model, leaving, model.exit_jam_density)
+    return inputs
+
+
+def nominal_state(corridor: Corridor, model: ARZModel, times: npt.ArrayLike) -> FloatArray:
+    """Return the free-flow equilibrium of the published demand, shape (..., n_x).
+
+    It is public: it depends on the corridor's description and on the times [s] of shape (...),
+    never on a record.
+    """
+    density = free_flow_density(model, nominal_flows(corridor, times))
+    v_f, gamma = model.parameters.free_flow_speed, model.parameters.gamma
+    speed = v_f * (1.0 - (density / model.jam_density) ** gamma)
+    return model.states(density, speed)

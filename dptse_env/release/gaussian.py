@@ -1,15 +1,18 @@
-"""Release models with Gaussian noise: `Paper`, `Corrected` and `Capped`."""
+"""Release models with Gaussian noise of a constant deviation: `Paper`, `Corrected`, `Capped`."""
+
+from __future__ import annotations
 
 import math
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from typing import Any, ClassVar
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 
 from dptse_env.estimators import Measurement
 from dptse_env.privacy import (
+    Adjacency,
     ReleaseAccount,
     Sensitivity,
     contribution_sensitivity,
@@ -19,16 +22,27 @@ from dptse_env.privacy import (
     printed_noise_std,
     single_noise_std,
 )
-from dptse_env.release.base import ReleaseModel, ReleaseRequest, ReleaseSetup
-from dptse_env.release.contributions import Contributions
-from dptse_env.release.mechanism import GaussianMechanism, Mechanism
-from dptse_env.release.noise import NoiseStreams
+from dptse_env.release.base import (
+    CHANGES,
+    BoundaryInputs,
+    PrivacySettings,
+    ReleaseModel,
+    Request,
+    Task,
+)
+from dptse_env.release.noise import Noise, grid_of
 from dptse_env.release.report import STRICT_DELTA, PrivacyReport, QuantityReport, in_order
-from dptse_env.release.settings import CappedSettings, PrivacySettings
-from dptse_env.traffic import Corridor, Record
-from dptse_env.utils.arrays import AnyArray, FloatArray, IntArray
-from dptse_env.utils.registry import name_of_class
+from dptse_env.release.vehicles import Ledgers, Traffic
+from dptse_env.traffic import Corridor
+from dptse_env.utils.arrays import FloatArray, IntArray
+from dptse_env.utils.fields import Interval
 from dptse_env.utils.vector_info import Rows, object_array
+
+Unit = Literal["trip", "horizon", "event"]
+"""Unit of protection: a trip with capped contributions, a complete trip, or a second of it."""
+
+SpeedRelease = Literal["mean", "flow"]
+"""Release of speeds: as their mean over a segment's vehicles, or as a sum, the centred flow."""
 
 
 class GaussianRelease(ReleaseModel):
@@ -39,117 +53,147 @@ class GaussianRelease(ReleaseModel):
     counts alike on every segment, in units of the noise.
 
     Attributes:
-        sensitivity: L2 sensitivities of both released quantities over an episode.
+        sensitivity: L2 sensitivities of both released quantities over an episode, by group.
+        noise_std: Standard deviations of the noise of both, shape (groups, 2).
+        mu: Parameter of Gaussian differential privacy of each group, shape (groups,).
+        ledgers: Contributions of the vehicles so far.
+        noise: Standard normal noise.
     """
 
-    takes_noise: bool = True
+    knows_groups: ClassVar[bool] = True
+    takes_noise: ClassVar[bool] = True
 
-    def __init__(self, setup: ReleaseSetup) -> None:
+    def __init__(self, task: Task, traffic: Traffic) -> None:
         """Compute sensitivity and noise; nothing is loaded."""
-        super().__init__(setup)
-        self.sensitivity = self._sensitivity()
-        stretch = setup.lengths / min(setup.corridor.segment_lengths)
-        self._stretch = None if (stretch == 1.0).all() else stretch[:, None]
-        self.mechanism = GaussianMechanism(
-            self._noise_std(), n_episodes=setup.n_episodes, n_segments=setup.n_columns
+        super().__init__(task, traffic)
+        n, groups = task.n_episodes, range(len(task.groups))
+        self.sensitivity = tuple(self._sensitivity(group) for group in groups)
+        self.noise_std: FloatArray = np.array([self._noise_std(group) for group in groups])
+        self.mu: FloatArray = np.array(
+            [self.sensitivity[group].joint_mu(self.noise_std[group].tolist()) for group in groups]
         )
-
-    @property
-    def mechanism(self) -> Mechanism:
-        """The mechanism that adds the noise; account and report describe it."""
-        return self._mechanism
-
-    @mechanism.setter
-    def mechanism(self, mechanism: Mechanism) -> None:
-        self._mechanism = mechanism
-        mu = self.sensitivity.joint_mu(mechanism.sigma.tolist())
-        contributions = self.sensitivity.contributions
-        self._account = ReleaseAccount(mu, self.setup.settings.delta, contributions)
-
-    def give_noise(self, noise: FloatArray) -> None:
-        """See `ReleaseModel.give_noise`."""
-        if not isinstance(self.mechanism, NoiseStreams):
-            raise ValueError(f"noise of {name_of_class(type(self.mechanism))} cannot be set")
-        self.mechanism.give(noise)
+        self._account = ReleaseAccount(
+            math.hypot(*self.mu), task.settings.delta, self.sensitivity[0].contributions
+        )
+        self._stretch = task.length / min(task.corridor.segment_lengths)
+        self._is_even = bool((self._stretch == 1.0).all())
+        self._sigma = np.tile(self.noise_std[task.group], (n, 1, 1))
+        self._released_sigma = self._sigma / self._stretch[:, None]
+        self._grid = grid_of(self._sigma)
+        v_0 = math.nan if task.flow_centre is None else task.flow_centre
+        self._centre = np.full((n, task.n_places), v_0)
+        self._price, self._zero = np.ones((n, task.n_columns)), np.zeros((n, task.n_places))
+        self.noise = Noise(n, task.n_columns)
+        self.ledgers = Ledgers(task.columns, n, np.full(len(groups), math.inf))
 
     @abstractmethod
-    def _sensitivity(self) -> Sensitivity:
-        """Return the sensitivities of both released quantities."""
+    def _sensitivity(self, group: int) -> Sensitivity:
+        """Return the sensitivities of both released quantities in a group of columns."""
 
     @abstractmethod
-    def _noise_std(self) -> tuple[float, ...]:
-        """Return the standard deviations of the noise that `sensitivity` needs."""
+    def _noise_std(self, group: int) -> tuple[float, ...]:
+        """Return the standard deviations of the noise that `sensitivity` needs in a group."""
 
     @abstractmethod
     def _void_reasons(self) -> tuple[str, ...]:
         """Return the reasons for which the sensitivity or the noise gives no guarantee."""
 
     @abstractmethod
-    def true_values(self, request: ReleaseRequest) -> FloatArray:
-        """Return what is released before noise is added, shape (k, n_columns, 2).
+    def true_values(self, request: Request) -> FloatArray:
+        """Return what is released before noise is added, shape (k, C, 2).
 
         Where contributions are bounded, those of the observed columns are charged.
         """
 
     @property
-    def protects(self) -> str:
+    def protected(self) -> str:
         """Description of the protected data and of the change that is protected."""
         return "one vehicle's trip, replaced by another"
 
     @property
     def sigma(self) -> FloatArray:
         """See `ReleaseModel.sigma`."""
-        return self.mechanism.sigma
+        sigma: FloatArray = self.noise_std[0]
+        return sigma
 
     def reset(self, episodes: IntArray, generators: Sequence[np.random.Generator]) -> None:
-        """See `ReleaseModel.reset`."""
-        self.mechanism.reset(episodes, generators)
+        """See `ReleaseModel.reset`; no vehicle has counted yet."""
+        self.noise.reset(episodes, generators)
+        self.ledgers.reset(episodes, self.traffic.n_vehicles)
 
-    def release(self, request: ReleaseRequest) -> Measurement:
+    def release(self, request: Request) -> Measurement:
         """See `ReleaseModel.release`."""
         values = self.true_values(request)
-        if self._stretch is None:
-            released = self.mechanism.release(request.episodes, values)
-            return self.measurement(request, released, self.sigma)
-        values = self.mechanism.release(request.episodes, values * self._stretch) / self._stretch
-        return self.measurement(request, values, self.sigma / self._stretch)
+        if not self._is_even:
+            values = values * self._stretch[:, None]
+        k = len(values)
+        values = self.noise.added(
+            request.episodes, values, self._sigma[:k], self._grid[:k], self._stretch
+        )
+        return Measurement(request.observed, values, self._released_sigma[:k], self._centre[:k])
+
+    def mean_values(self, request: Request) -> FloatArray:
+        """Return densities and mean speeds of the vehicles that count, shape (k, C, 2).
+
+        Without any of them the speed limit is the mean; unobserved columns hold these, too.
+        """
+        task = self.task
+        sums = self._sums(request, self._zero)
+        counts = sums[..., 0].copy()
+        sums[..., 0] /= task.length
+        sums[..., 1] = np.where(counts == 0.0, task.limit, sums[..., 1] / np.maximum(counts, 1.0))
+        return sums
+
+    def _sums(self, request: Request, centre: FloatArray) -> FloatArray:
+        """Return the sums of the vehicles that count, and of their speeds from a centre."""
+        k, rows = len(request.episodes), self.traffic.vehicles(request.traffic, request.times)
+        sums, _ = self.ledgers.collect(
+            request.episodes, request.observed, rows, self._price[:k], centre[:k]
+        )
+        return sums
 
     def spent(self, episodes: IntArray, steps: IntArray) -> tuple[FloatArray, FloatArray]:
         """See `ReleaseModel.spent`."""
         return self._account.spent(steps)
 
     def report(self) -> PrivacyReport:
-        """See `ReleaseModel.report`; it describes the noise in force."""
-        settings, sensitivity = self.setup.settings, self.sensitivity
-        stds, mu = self.sigma.tolist(), self._account.mu
+        """See `ReleaseModel.report`; it describes the noise in force, its quantities the queries'.
+
+        With two groups the parameters are those of a vehicle that both see: its mu^2 is the sum of
+        theirs.
+        """
+        task, settings, sensitivity = self.task, self.task.settings, self.sensitivity[0]
+        mu = self._account.mu
         epsilon = epsilon_of(mu, settings.delta)
         found = list(self._void_reasons())
         # Le Ny's kappa may be so loose that even both releases together stay below epsilon.
         if epsilon > settings.epsilon * (1.0 + 1e-9):
             found.append("releases_not_composed")
+        protects = task.protects(self.protected)
+        quantities = " and ".join(release.quantity for release in sensitivity.releases)
         return replace(
             super().report(),
-            guarantee="none" if found else self._guarantee(),
+            guarantee="none" if found else settings.guarantee(quantities, protects),
             void_reasons=in_order(found),
-            protects=self.protects,
+            protects=protects,
             mu=mu,
             epsilon=epsilon,
             epsilon_strict=epsilon_of(mu, STRICT_DELTA),
             releases=tuple(
                 QuantityReport(item.quantity, item.unit, item.bound, std, item.bound / std)
-                for item, std in zip(sensitivity.releases, stds, strict=True)
+                for item, std in zip(sensitivity.releases, self.sigma.tolist(), strict=True)
             ),
             assumptions=dict(sensitivity.assumptions),
-            details=self._details(),
+            details={**self._details(), **task.group_reports(self.mu, self.noise_std)},
         )
 
     def _details(self) -> Mapping[str, Any]:
         """Return the settings specific to this model, for the report; none of them is None."""
         return {"adjacency": "replace"}
 
-    def _guarantee(self) -> str:
-        quantities = " and ".join(release.quantity for release in self.sensitivity.releases)
-        return self.setup.settings.guarantee(quantities, self.protects)
+    def give_noise(self, noise: FloatArray) -> None:
+        """See `ReleaseModel.give_noise`."""
+        self.noise.give(noise)
 
 
 def require_gaussian(release: ReleaseModel, user: str) -> GaussianRelease:
@@ -160,23 +204,28 @@ def require_gaussian(release: ReleaseModel, user: str) -> GaussianRelease:
     """
     if not isinstance(release, GaussianRelease):
         raise ValueError(
-            f"{user} needs a release model with Gaussian noise, got {release.setup.name!r}"
+            f"{user} needs a release model with Gaussian noise, got {release.task.name!r}"
         )
     return release
 
 
 class Paper(GaussianRelease):
-    """True density and mean speed of all vehicles, with the noise as printed in the paper."""
+    """True density and mean speed of all vehicles, with the noise as printed in the paper.
 
-    def __init__(self, setup: ReleaseSetup) -> None:
+    Where a group of columns does not see all vehicles, of those that it sees.
+    """
+
+    def __init__(self, task: Task, traffic: Traffic) -> None:
         """See `GaussianRelease`."""
-        super().__init__(setup)
-        self._in_order = np.array_equal(setup.places, np.arange(setup.n_places))
+        super().__init__(task, traffic)
+        in_order = np.array_equal(task.first, np.arange(task.n_places))
+        self._places = slice(None) if in_order else task.first
 
-    def _sensitivity(self) -> Sensitivity:
-        setup, corridor = self.setup, self.setup.corridor
+    def _sensitivity(self, group: int) -> Sensitivity:
+        task, corridor = self.task, self.task.corridor
+        always = int(np.count_nonzero(task.group[task.always] == group))
         return paper_sensitivity(
-            n_sensors=setup.bandwidth + len(setup.always_observed),
+            n_sensors=(0 if group else task.queries.bandwidth) + always,
             average_dwell=corridor.average_dwell,
             segment_length=min(corridor.segment_lengths),
             # Constants of the corridor, so that the noise does not depend on the estimator.
@@ -184,29 +233,86 @@ class Paper(GaussianRelease):
             jam_density=corridor.density_scale,
         )
 
-    def _noise_std(self) -> tuple[float, ...]:
-        settings = self.setup.settings
-        return printed_noise_std(self.sensitivity, settings.epsilon, settings.delta)
+    def _noise_std(self, group: int) -> tuple[float, ...]:
+        settings = self.task.settings
+        return printed_noise_std(self.sensitivity[group], settings.epsilon, settings.delta)
 
     def _void_reasons(self) -> tuple[str, ...]:
         return ("literal_variance", "average_dwell", "adaptive_queries", "speed_sensitivity")
 
-    def true_values(self, request: ReleaseRequest) -> FloatArray:
+    def true_values(self, request: Request) -> FloatArray:
         """See `GaussianRelease.true_values`."""
-        setup = self.setup
-        values = setup.traffic.aggregates(request.traffic, request.times, setup.n_places)
-        return values if self._in_order else values[:, setup.places]
+        task = self.task
+        if not task.is_whole:
+            return self.mean_values(request)
+        values = self.traffic.aggregates(request.traffic, request.times, task.n_places)
+        return values[:, self._places]
 
 
 class Corrected(Paper):
     """The same as `Paper`, with the noise that the theorem cited there needs, per release."""
 
-    def _noise_std(self) -> tuple[float, ...]:
-        settings = self.setup.settings
-        return single_noise_std(self.sensitivity, settings.epsilon, settings.delta)
+    def _noise_std(self, group: int) -> tuple[float, ...]:
+        settings = self.task.settings
+        return single_noise_std(self.sensitivity[group], settings.epsilon, settings.delta)
 
     def _void_reasons(self) -> tuple[str, ...]:
         return super()._void_reasons()[1:]
+
+
+@dataclass(frozen=True)
+class CappedSettings(PrivacySettings):
+    """Settings of `Capped`.
+
+    Attributes:
+        unit: Unit of protection: ``trip``, a vehicle's trip, which counts in its first ``cap``
+            queried steps; ``horizon``, a trip without a cap, charged for every step of an episode;
+            ``event``, one second of a trip.
+        cap: Queried steps in which a vehicle counts, for the unit ``trip``.
+        adjacency: Difference of two adjacent records: ``replace`` or ``add_remove``.
+        share: Part of the budget mu^2 for the density.
+        speed_release: ``flow``, or ``mean`` for mean speeds, which void the guarantee.
+
+    Raises:
+        ValueError: A field is out of range; the message names its path below ``privacy``.
+    """
+
+    default_boundary: ClassVar[BoundaryInputs] = "nominal"
+
+    preset: Any = "capped"
+    unit: Unit = "trip"
+    cap: Annotated[int, Interval(1, 1_000_000)] = 64
+    adjacency: Adjacency = "replace"
+    share: Annotated[float, Interval(0.001, 0.999)] = 0.5
+    speed_release: SpeedRelease = "flow"
+
+    def __post_init__(self) -> None:
+        """Check the fields, and that they are compatible."""
+        super().__post_init__()
+        if self.speed_release == "mean" and self.adjacency == "add_remove":
+            raise ValueError(
+                "privacy.adjacency must be 'replace' where mean speeds are released, got "
+                "'add_remove': without its one vehicle a segment has no mean"
+            )
+
+    @property
+    def contribution_cap(self) -> int | None:
+        """Queried steps in which a vehicle counts; None if it counts in all of them."""
+        return self.cap if self.unit == "trip" else None
+
+    def contributions(self, horizon: int) -> int:
+        """Return the most steps of ``horizon`` in which the protected unit can count."""
+        return {"trip": min(self.cap, horizon), "horizon": horizon, "event": 1}[self.unit]
+
+    @property
+    def protected(self) -> str:
+        """Description of the protected data and of the change that is protected."""
+        change = CHANGES[self.adjacency]
+        return {
+            "trip": f"one vehicle's trip, {change}, which counts in {self.cap} queried steps",
+            "horizon": f"one vehicle's whole trip, {change}",
+            "event": f"one second of one vehicle's trip, {change}",
+        }[self.unit]
 
 
 class Capped(GaussianRelease):
@@ -214,7 +320,8 @@ class Capped(GaussianRelease):
 
     The guarantee holds for any query policy. The centred flow [veh/h] is the sum of v - v_0 over
     the vehicles that count, per length, with v clipped to [0, 2 v_0]: it changes by at most v_0 / l
-    when a vehicle comes or goes. ``docs/privacy.md`` has the proof.
+    when a vehicle comes or goes. ``docs/privacy.md`` has the proof. A vehicle's ledger has a budget
+    of C contributions at a price of 1 each, in each group of columns.
     """
 
     settings_type: ClassVar[type[PrivacySettings]] = CappedSettings
@@ -226,101 +333,74 @@ class Capped(GaussianRelease):
         """Return half of the largest speed limit, the centre of the speeds clipped to it."""
         return 0.5 * corridor.largest_speed_limit if settings.speed_release == "flow" else None
 
-    def __init__(self, setup: ReleaseSetup) -> None:
-        """See `GaussianRelease`; the vehicle tables are empty until `load`."""
-        assert isinstance(setup.settings, CappedSettings)
-        self._settings = setup.settings
-        super().__init__(setup)
-        corridor, traffic = setup.corridor, setup.traffic
-        self.contributions = Contributions(
-            len(traffic.traffic_seeds),
-            corridor.duration + 1,
-            setup.n_episodes,
-            corridor.largest_speed_limit,
-            setup.settings.contribution_cap,
-            setup.places,
-        )
+    def __init__(self, task: Task, traffic: Traffic) -> None:
+        """See `GaussianRelease`."""
+        super().__init__(task, traffic)
+        cap = task.settings.contribution_cap
+        budget = np.full(len(task.groups), math.inf if cap is None else float(cap))
+        fastest = task.corridor.largest_speed_limit
+        self.ledgers = Ledgers(task.columns, task.n_episodes, budget, fastest=fastest)
 
-    def _sensitivity(self) -> Sensitivity:
-        corridor, settings = self.setup.corridor, self._settings
+    def _sensitivity(self, group: int) -> Sensitivity:
+        corridor, settings = self.task.corridor, self.task.settings
         slope = corridor.speed_scale / corridor.density_scale
         return contribution_sensitivity(
-            contributions=settings.contributions(self.setup.horizon),
+            contributions=settings.contributions(self.task.horizon),
             adjacency=settings.adjacency,
             segment_length=min(corridor.segment_lengths),
             largest_speed=corridor.largest_speed_limit,
             mean_speed_slope=slope if settings.speed_release == "mean" else None,
         )
 
-    def _noise_std(self) -> tuple[float, ...]:
-        settings = self._settings
-        noise = joint_noise_std(self.sensitivity, settings.epsilon, settings.delta, settings.share)
-        return tuple(std / math.sqrt(self.setup.budget_share) for std in noise)
+    def _noise_std(self, group: int) -> tuple[float, ...]:
+        settings, sensitivity = self.task.settings, self.sensitivity[group]
+        noise = joint_noise_std(sensitivity, settings.epsilon, settings.delta, settings.share)
+        return tuple(std / math.sqrt(self.task.shares[group]) for std in noise)
 
     def _void_reasons(self) -> tuple[str, ...]:
-        return ("speed_sensitivity",) if self._settings.speed_release == "mean" else ()
+        return ("speed_sensitivity",) if self.task.settings.speed_release == "mean" else ()
 
     @property
-    def protects(self) -> str:
-        """See `GaussianRelease.protects`."""
-        return self._settings.protected
+    def protected(self) -> str:
+        """See `GaussianRelease.protected`."""
+        described: str = self.task.settings.protected
+        return described
 
     def _details(self) -> Mapping[str, Any]:
-        settings = self._settings
+        settings = self.task.settings
         cap = {"cap": settings.cap} if settings.unit == "trip" else {}
         return {
             "unit": settings.unit, **cap, "adjacency": settings.adjacency, "share": settings.share,
         }  # fmt: skip
 
-    @property
-    def shared(self) -> tuple[AnyArray, ...]:
-        """The vehicles of all traffic."""
-        return self.contributions.vehicles.arrays
-
-    def load(self, index: int, record: Record) -> None:
-        """Read the vehicle table of a record."""
-        user = f"the release model {self.setup.name!r}"
-        self.contributions.load(index, record.vehicles_for(user))
-
-    def reset(self, episodes: IntArray, generators: Sequence[np.random.Generator]) -> None:
-        """See `ReleaseModel.reset`; no vehicle has counted yet."""
-        super().reset(episodes, generators)
-        self.contributions.reset(episodes)
-
-    def true_values(self, request: ReleaseRequest) -> FloatArray:
+    def true_values(self, request: Request) -> FloatArray:
         """See `GaussianRelease.true_values`; unobserved columns hold zeros."""
-        setup, corridor = self.setup, self.setup.corridor
-        counts, speeds = self.contributions.collect(
-            request.episodes, request.traffic, request.times, request.observed
-        )
-        values = np.empty((*counts.shape, 2))
-        np.divide(counts, setup.lengths, out=values[..., 0])
-        if self._settings.speed_release == "flow":
-            speeds -= 0.5 * corridor.largest_speed_limit * counts
-            np.divide(speeds, setup.lengths, out=values[..., 1])
-        else:
-            empty, limits = counts == 0.0, setup.traffic.limits[setup.places]
-            values[..., 1] = np.where(empty, limits, speeds / np.where(empty, 1.0, counts))
-        return values
+        if not self.task.releases_flow:
+            return self.mean_values(request)
+        sums = self._sums(request, self._centre)
+        sums /= self.task.length[:, None]
+        return sums
 
     def budgets_spent(self, episodes: IntArray) -> FloatArray:
-        """See `ReleaseModel.budgets_spent`: contributions over their cap."""
-        spent: FloatArray = self.contributions.exposures[episodes].sum(axis=1, dtype=np.float64)
-        return spent / self.contributions.cap if self.contributions.cap else np.zeros_like(spent)
+        """See `ReleaseModel.budgets_spent`: contributions over their cap, by shares of groups."""
+        cap = self.task.settings.contribution_cap
+        counted = self.task.shares @ self.ledgers.paid[episodes].sum(axis=2).T
+        spent: FloatArray = counted / cap if cap else np.zeros(len(episodes))
+        return spent
 
-    def private_info(self, episodes: IntArray, traffic: IntArray) -> Rows:
-        """Return each vehicle's contributions and the epsilon that it has spent.
+    def private(self, episodes: IntArray, traffic: IntArray) -> Rows:
+        """Return each vehicle's contributions, and the epsilon that it has spent.
 
         Lists, since records differ in their number of vehicles and Gymnasium stacks arrays of equal
-        shape only.
+        shape only. ``exposures`` are contributions to queries; those to a second group of columns
+        are ``sensor_exposures``.
         """
-        counted = [
-            self.contributions.exposures_of(episode, index)
-            for episode, index in zip(episodes, traffic, strict=True)
-        ]
+        counted = self.ledgers.of(episodes, self.traffic.n_vehicles[traffic])
         # A vehicle that has counted k times has spent the budget of a cap of k.
-        spent = [self._account.spent(steps.astype(np.int64))[1].tolist() for steps in counted]
-        return {
-            "exposures": object_array([steps.tolist() for steps in counted]),
-            "individual_epsilon": object_array(spent),
+        cap = self._account.contributions or 1
+        spent = [self._account.epsilons(self.mu**2 @ steps / cap) for steps in counted]
+        rows: Rows = {
+            f"{prefix}exposures": object_array([steps[g].astype(int).tolist() for steps in counted])
+            for g, prefix in zip(range(len(self.task.groups)), ("", "sensor_"), strict=False)
         }
+        return {**rows, "individual_epsilon": object_array(spent)}

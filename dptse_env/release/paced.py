@@ -1,56 +1,108 @@
 """The release model `Paced`: prices from public predictions, paid from a ledger of each vehicle."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 
 from dptse_env.estimators import Measurement
-from dptse_env.privacy import EpsilonTable, epsilon_of, mu_of
-from dptse_env.release.base import ReleaseModel, ReleaseRequest, ReleaseSetup
-from dptse_env.release.ledgers import Columns, Ledgers, Sums
-from dptse_env.release.noise import NoiseStreams, grid_of
-from dptse_env.release.pacing import (
-    PACINGS,
-    EventPacing,
-    PacingSetup,
-    PublicStep,
-    check_prices,
+from dptse_env.privacy import Adjacency, EpsilonTable, epsilon_of, mu_of
+from dptse_env.release.base import (
+    CHANGES,
+    BoundaryInputs,
+    PrivacySettings,
+    ReleaseModel,
+    Request,
+    Task,
 )
-from dptse_env.release.queries import QueryOptions
+from dptse_env.release.noise import Noise, grid_of
+from dptse_env.release.pacing import PACINGS, EventPacing, check_prices
 from dptse_env.release.report import STRICT_DELTA, PrivacyReport
-from dptse_env.release.settings import PacedSettings, PrivacySettings
-from dptse_env.release.vehicle_table import VehicleTable
-from dptse_env.traffic import Corridor, Record
-from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray, IntArray
+from dptse_env.release.vehicles import Ledgers, Traffic
+from dptse_env.traffic import Corridor
+from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+from dptse_env.utils.fields import Interval
+from dptse_env.utils.registry import is_foreign
 from dptse_env.utils.vector_info import Rows, object_array
 
 ROUNDING = 1e-9
 """Part of the budget that is kept back for rounding errors of ledgers."""
 
 
-class Paced(ReleaseModel):
-    """Counts and deviations of speeds, for which each vehicle pays from a ledger of its own.
+PacedUnit = Literal["trip", "event"]
+"""Unit of protection of the paced ledger: a complete trip, or a second of it."""
 
-    A vehicle on a queried segment pays for its own deviation from the speed that the estimator
-    predicts there, as in `dptse_env.release.ledgers`; prices are those of a pacing
-    (`dptse_env.release.pacing`). With mu the parameter of the guarantee, a vehicle has a budget of
-    mu^2 / 2 against its replacement by another, and of mu^2 against being added or removed. The
-    guarantee holds for any query policy, any estimator and any pacing: ``docs/privacy.md`` has the
-    proof.
+
+@dataclass(frozen=True)
+class PacedSettings(PrivacySettings):
+    """Settings of `Paced`.
 
     Attributes:
-        mu: Parameter of Gaussian differential privacy of all releases together.
-        budget: Budget of a vehicle, a part of which ledgers keep back for rounding.
+        unit: Unit of protection: ``trip``, all of a vehicle's trip that an episode covers;
+            ``event``, one second of a trip.
+        adjacency: Difference of two adjacent records: ``replace`` or ``add_remove``.
+        pace: Part of the budget that the pacing tries to have spent at the end of a trip.
+        clip: Largest deviation D of a speed from its centre that is released [km/h]; larger ones
+            are clipped.
+        ratio: Ratio r of the charge for a deviation of D and the charge for being counted; noise
+            of flows has D / sqrt(r) times the deviation of that of counts. At most 1 for the
+            adjacency ``replace``.
+        pacing: Rule that sets the prices: ``tracer``, a registered name,
+            ``"package.module:Class"``, or a class.
+
+    Raises:
+        ValueError: A field is out of range; the message names its path below ``privacy``.
+    """
+
+    default_boundary: ClassVar[BoundaryInputs] = "nominal"
+
+    preset: Any = "paced"
+    unit: PacedUnit = "trip"
+    adjacency: Adjacency = "replace"
+    pace: Annotated[float, Interval(0.05, 1)] = 0.85
+    clip: Annotated[float, Interval(1, 200)] = 25.0
+    ratio: Annotated[float, Interval(0.01, 100)] = 1.0
+    pacing: Any = "tracer"
+
+    def __post_init__(self) -> None:
+        """Check the fields, and that they are compatible."""
+        super().__post_init__()
+        PACINGS.find(self.pacing)
+        if self.ratio > 1.0 and self.adjacency == "replace":
+            raise ValueError(
+                "privacy.ratio must be at most 1 for privacy.adjacency 'replace', where two "
+                f"vehicles may deviate in opposite directions, got {self.ratio:g}"
+            )
+
+    @property
+    def protected(self) -> str:
+        """Description of the protected data and of the change that is protected."""
+        part = "whole trip" if self.unit == "trip" else "second of a trip"
+        return f"one vehicle's {part}, {CHANGES[self.adjacency]}"
+
+
+class Paced(ReleaseModel):
+    """Counts and deviations of speeds, for which each vehicle pays from ledgers of its own.
+
+    A vehicle on a queried segment pays for its own deviation from the speed that the estimator
+    predicts there, as in `dptse_env.release.vehicles`; prices are those of a pacing
+    (`dptse_env.release.pacing`). With mu the parameter of the guarantee of a group of columns, a
+    vehicle has a budget of mu^2 / 2 there against its replacement by another, and of mu^2 against
+    being added or removed; the mu^2 of the groups add up to that of all releases. The guarantee
+    holds for any query policy, any estimator and any pacing: ``docs/privacy.md`` has the proof.
+
+    Attributes:
+        mu: Parameter of Gaussian differential privacy of each group, shape (groups,).
+        budget: Budget of a vehicle in each group, a part of which ledgers keep back for rounding.
         ledgers: Charges that the vehicles have paid.
         pacing: Rule that sets the prices.
         noise: Standard normal noise.
         prices: Prices of the last release, shape (n, C); public, as the centres are.
-        centres: Centres of the last release [km/h], of the segments and of the boundary segments
-            if they are released, shape (n, places).
     """
 
     settings_type: ClassVar[type[PrivacySettings]] = PacedSettings
@@ -58,225 +110,212 @@ class Paced(ReleaseModel):
     needs_vehicles: ClassVar[bool] = True
     releases_sums: ClassVar[bool] = True
     has_prices: ClassVar[bool] = True
-    takes_noise: bool = True
+    knows_groups: ClassVar[bool] = True
+    takes_noise: ClassVar[bool] = True
 
     @classmethod
     def flow_centre(cls, corridor: Corridor, settings: PacedSettings) -> float | None:
         """Return half of the largest speed limit; a release has a centre for each segment."""
         return 0.5 * corridor.largest_speed_limit
 
-    def __init__(self, setup: ReleaseSetup) -> None:
-        """Compute the budget; nothing is loaded."""
-        super().__init__(setup)
-        assert isinstance(setup.settings, PacedSettings)
-        self._settings = settings = setup.settings
-        corridor, n = setup.corridor, setup.n_episodes
-        self.mu = mu_of(settings.epsilon, settings.delta) * math.sqrt(setup.budget_share)
-        self._epsilons = EpsilonTable(self.mu, settings.delta)
+    def __init__(self, task: Task, traffic: Traffic) -> None:
+        """Compute the budgets; nothing is loaded."""
+        super().__init__(task, traffic)
+        n, settings = task.n_episodes, task.settings
+        self.mu: FloatArray = mu_of(settings.epsilon, settings.delta) * np.sqrt(task.shares)
+        self._epsilons = EpsilonTable(math.hypot(*self.mu), settings.delta)
+        # The counts of two vehicles on one segment cancel; deviations may be opposite.
         self._squares = 2.0 if settings.adjacency == "replace" else 1.0
         self.budget = self.mu**2 / self._squares
-        first, span, places = setup.places, setup.spans, setup.n_places
-        level = np.ones(setup.n_columns)
-        level[: setup.queries.n_options] = setup.queries.level
         self.ledgers = Ledgers(
-            Columns(first, span, places),
-            VehicleTable(
-                len(setup.traffic.traffic_seeds),
-                corridor.duration + 1,
-                corridor.largest_speed_limit,
-            ),
+            task.columns,
             n,
-            budget=(1.0 - ROUNDING) * self.budget,
-            clip=settings.clip,
+            (1.0 - ROUNDING) * self.budget,
             ratio=settings.ratio,
+            clip=settings.clip,
+            fastest=task.corridor.largest_speed_limit,
         )
-        # A pacing that offers the whole budget at once stays below what ledgers hold back.
-        offered = (1.0 - 2.0 * ROUNDING) * self.budget
-        made_for = PacingSetup(
-            corridor, offered, settings.pace, settings.ratio, first, span, level,
-            setup.always_observed, _coverage(setup.queries), places, n,
-        )  # fmt: skip
         pacing = EventPacing if settings.unit == "event" else PACINGS.find(settings.pacing)
-        self.pacing = pacing(made_for)
-        self.noise = NoiseStreams(n, setup.n_columns)
-        self.prices = np.zeros((n, setup.n_columns))
-        self.centres = np.zeros((n, places))
-        self._charged = np.zeros(n)  # largest payments that a vehicle can have made
+        # A pacing that offers the whole budget at once stays below what ledgers hold back.
+        self.pacing = pacing(task, (1.0 - 2.0 * ROUNDING) * self.budget)
+        self._checks_prices = is_foreign(self.pacing)
+        self.noise = Noise(n, task.n_columns)
+        self.prices = np.zeros((n, task.n_columns))
+        # The largest payments that a vehicle can have made in each group.
+        self._charged = np.zeros((n, len(task.groups)))
         self._fallback = np.zeros(n)
-        self._refused = np.zeros(n, dtype=np.int64)
+        self._refused = np.zeros((n, len(task.groups)), dtype=np.int64)
 
     @cached_property
+    def _expected_std(self) -> FloatArray:
+        """Deviations of the shortest segment's noise at the published demand, shape (groups, 2)."""
+        corridor = self.task.corridor
+        prices = self.pacing.expected_prices(np.array(corridor.speed_limits))
+        return self._deviations(prices) / min(corridor.segment_lengths)
+
+    @property
     def sigma(self) -> FloatArray:
-        """Deviations of the shortest segment's noise at the published demand, shape (2,)."""
-        corridor = self.setup.corridor
-        price = self.pacing.expected_price(np.array(corridor.speed_limits))
-        shortest = min(corridor.segment_lengths)
-        sigma: FloatArray = self._deviations(np.array([[price]]))[0, 0] / shortest
+        """See `ReleaseModel.sigma`; at the published demand, of the shortest segment."""
+        sigma: FloatArray = self._expected_std[0]
         return sigma
 
     def _deviations(self, prices: FloatArray) -> FloatArray:
-        """Return the deviations of the noise of both sums, shape (k, C, 2), at prices (k, C)."""
-        settings = self._settings
+        """Return the deviations of the noise of both sums, shape (..., 2), at prices (...)."""
+        settings, deviations = self.task.settings, np.empty((*prices.shape, 2))
         count = 1.0 / np.sqrt(prices)
-        return np.stack([count, settings.clip / math.sqrt(settings.ratio) * count], axis=-1)
-
-    @property
-    def shared(self) -> tuple[AnyArray, ...]:
-        """The vehicles of all traffic."""
-        return self.ledgers.vehicles.arrays
-
-    def load(self, index: int, record: Record) -> None:
-        """Read the vehicles of a record."""
-        user = f"the release model {self.setup.name!r}"
-        self.ledgers.load(index, record.vehicles_for(user))
+        deviations[..., 0] = count
+        deviations[..., 1] = settings.clip / math.sqrt(settings.ratio) * count
+        return deviations
 
     def reset(self, episodes: IntArray, generators: Sequence[np.random.Generator]) -> None:
         """See `ReleaseModel.reset`; no vehicle has paid anything yet."""
         self.noise.reset(episodes, generators)
-        self.ledgers.reset(episodes)
+        self.ledgers.reset(episodes, self.traffic.n_vehicles)
         self.pacing.reset(episodes)
-        for array in (self.prices, self.centres, self._charged, self._fallback):
-            array[episodes] = 0.0
-        self._refused[episodes] = 0
+        for array in (self.prices, self._charged, self._fallback, self._refused):
+            array[episodes] = 0
 
-    def release(self, request: ReleaseRequest) -> Measurement:
+    def release(self, request: Request) -> Measurement:
         """See `ReleaseModel.release`."""
-        episodes, prediction = request.episodes, request.prediction()
-        density, speed = self._public(request, prediction.density, prediction.speed)
-        step = PublicStep(episodes, request.observed, density, speed)
-        prices = check_prices(self.pacing.prices(step), request.observed.shape)
-        fastest = self.setup.corridor.largest_speed_limit
-        centre = self.setup.at_places(np.clip(speed, 0.0, fastest))
-        self.prices[episodes], self.centres[episodes] = prices, centre
-        self._charge(episodes, request.observed, prices)
-        sums = self.collect(request, prices, centre)
-        self._refused[episodes] = sums.refused
-        return self._published(request, sums, prices, centre)
+        task, episodes, observed = self.task, request.episodes, request.observed
+        density, speed = self._predicted(request)
+        prices = self.pacing.prices(episodes, observed, density, speed)
+        if self._checks_prices:
+            prices = check_prices(prices, observed.shape)
+        centre = task.at_places(np.clip(speed, 0.0, task.corridor.largest_speed_limit))
+        self.prices[episodes] = prices
+        self._charge(episodes, observed, prices)
+        sums, self._refused[episodes] = self.collect(request, prices, centre)
+        sigma = self._deviations(prices)
+        values = self.noise.added(episodes, sums, sigma, grid_of(sigma), task.length)
+        sigma /= task.length[:, None]
+        return Measurement(observed, values, sigma, centre)
 
-    def _public(
-        self, request: ReleaseRequest, density: FloatArray, speed: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
+    def collect(
+        self, request: Request, prices: FloatArray, centre: FloatArray
+    ) -> tuple[FloatArray, IntArray]:
+        """Charge the vehicles of a second; return its true sums and refusals, see `Ledgers`."""
+        if self.task.settings.unit == "event":  # every second has a budget of its own
+            self.ledgers.reset(request.episodes)
+        rows = self.traffic.vehicles(request.traffic, request.times)
+        return self.ledgers.collect(request.episodes, request.observed, rows, prices, centre)
+
+    def _predicted(self, request: Request) -> tuple[FloatArray, FloatArray]:
         """Return predicted densities and speeds; empty free road where they are not finite."""
+        prediction = request.prediction()
+        density, speed = prediction.density, prediction.speed
         finite = np.isfinite(density) & np.isfinite(speed)
         self._fallback[request.episodes] = ~finite.all(axis=1)
         if finite.all():
             return density, speed
-        nominal = np.array(self.setup.corridor.speed_limits)
+        nominal = np.array(self.task.corridor.speed_limits)
         return np.where(finite, density, 0.0), np.where(finite, speed, nominal)
 
     def _charge(self, episodes: IntArray, observed: BoolArray, prices: FloatArray) -> None:
-        """Add the largest payment that a vehicle can make in this second."""
-        paid = np.where(observed, (1.0 + self._settings.ratio) * prices, 0.0)
-        if self.ledgers.are_single:
-            largest = paid.max(axis=1)
-        else:
-            largest = (paid @ self.ledgers.covers).max(axis=1)
-        if self._settings.unit == "event":
+        """Add the largest payment that a vehicle can make to each group in this second."""
+        paid = np.where(observed, (1.0 + self.task.settings.ratio) * prices, 0.0)
+        if self._covers is not None:
+            paid = paid @ self._covers
+        largest = np.maximum.reduceat(paid, self._starts, axis=1)
+        if self.task.settings.unit == "event":
             self._charged[episodes] = np.maximum(self._charged[episodes], largest)
         else:
             self._charged[episodes] += largest
 
-    def collect(self, request: ReleaseRequest, prices: FloatArray, centre: FloatArray) -> Sums:
-        """Return the true sums of a second, and charge the vehicles.
+    @cached_property
+    def _covers(self) -> FloatArray | None:
+        """Whether a column covers a place, 1 or 0, for each group: shape (C, groups * places).
 
-        For the unit ``event`` every second has a budget of its own.
+        None where no two columns of a group cover the same place.
         """
-        if self._settings.unit == "event":
-            self.ledgers.reset(request.episodes)
-        return self.ledgers.collect(
-            request.episodes, request.traffic, request.times, request.observed, prices, centre
-        )
+        task = self.task
+        own = [task.covers * (task.group == g)[:, None] * 1.0 for g in range(len(task.groups))]
+        if all((each.sum(axis=0) <= 1.0).all() for each in own):
+            return None
+        return np.concatenate(own, axis=1)
 
-    def _published(
-        self, request: ReleaseRequest, sums: Sums, prices: FloatArray, centre: FloatArray
-    ) -> Measurement:
-        """Add noise, round to the grid, and divide by the lengths of the queries."""
-        deviations = self._deviations(prices)
-        values = self.noise.next(request.episodes)
-        values *= deviations
-        values[..., 0] += sums.counts
-        values[..., 1] += sums.deviations
-        grid = grid_of(deviations)
-        values /= grid
-        np.rint(values, out=values)
-        values *= grid
-        lengths = self.setup.lengths[:, None]
-        values /= lengths
-        return self.measurement(request, values, deviations / lengths, centre)
+    @cached_property
+    def _starts(self) -> IntArray:
+        """Where each group begins in what `_charge` looks at."""
+        groups = np.arange(len(self.task.groups))
+        if self._covers is None:
+            return np.searchsorted(self.task.group, groups)
+        return groups * self.task.n_places
 
     def spent(self, episodes: IntArray, steps: IntArray) -> tuple[FloatArray, FloatArray]:
         """See `ReleaseModel.spent`.
 
         Squared distances are at most those of two vehicles that have paid the largest price of
-        each second so far, within the budget. Epsilon is rounded up to one of 256 levels of mu.
+        each second so far, within their budgets. Epsilon is rounded up to one of 256 levels of mu.
         """
         return self._losses(self._charged[episodes])
 
     def _losses(self, paid: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return mu and epsilon of vehicles that have paid these amounts at most."""
-        return self._epsilons.bounds(np.sqrt(self._squares * paid))
+        """Return mu and epsilon of vehicles that have paid at most (vehicles, groups)."""
+        squares = np.minimum(self._squares * paid, self.mu**2)
+        return self._epsilons.bounds(np.sqrt(squares.sum(axis=1)))
 
     def report(self) -> PrivacyReport:
         """See `ReleaseModel.report`."""
-        settings, mu = self._settings, self.mu
+        task, settings, mu = self.task, self.task.settings, self._epsilons.mu
+        protects = task.protects(settings.protected)
         return replace(
             super().report(),
-            guarantee=settings.guarantee("count and flow", settings.protected),
+            guarantee=settings.guarantee("count and flow", protects),
             void_reasons=(),
-            protects=settings.protected,
+            protects=protects,
             mu=mu,
             epsilon=epsilon_of(mu, settings.delta),
             epsilon_strict=epsilon_of(mu, STRICT_DELTA),
-            assumptions={"budget": self.budget},
+            assumptions={"budget": float(self.budget[0])},
             details={
                 "unit": settings.unit,
                 "adjacency": settings.adjacency,
                 "pace": settings.pace,
                 "clip": settings.clip,
                 "ratio": settings.ratio,
+                **task.group_reports(self.mu, self._expected_std),
             },
         )
 
-    def public_state(self, episodes: IntArray) -> tuple[FloatArray, FloatArray]:
-        """See `ReleaseModel.public_state`; prices are those of the last second, 0 at first."""
-        n_options = self.setup.queries.n_options
-        return self.prices[episodes, :n_options], self.pacing.tracer(episodes)
+    def public(self, episodes: IntArray) -> Rows:
+        """Return prices and tracer of the queries, and whether no prediction was finite.
 
-    def public_info(self, episodes: IntArray) -> Rows:
-        """Return whether centres fell back to nominal speeds, since no prediction was finite."""
-        return {"centre_fallback": self._fallback[episodes].copy()}
+        Prices (k, G) are those of the last second, 0 at first; the tracer is of shape
+        (k, n_mainline); then ``centre_fallback`` is 1.
+        """
+        return {
+            "prices": self.prices[episodes, : self.task.queries.n_options],
+            "tracer": self.pacing.tracer(episodes),
+            "centre_fallback": self._fallback[episodes].copy(),
+        }
+
+    def budgets_spent(self, episodes: IntArray) -> FloatArray:
+        """See `ReleaseModel.budgets_spent`: payments over the budgets of all groups together."""
+        if self.task.settings.unit == "event":
+            return np.zeros(len(episodes))
+        paid = self.ledgers.paid[episodes].sum(axis=(1, 2))
+        spent: FloatArray = paid / self.budget.sum()
+        return spent
+
+    def private(self, episodes: IntArray, traffic: IntArray) -> Rows:
+        """Return what each vehicle has paid over its budget, its epsilon, and refusals.
+
+        The first two are lists, since records differ in their number of vehicles and Gymnasium
+        stacks arrays of equal shape only. ``ledgers`` are those of the queries; those of a second
+        group of columns are ``sensor_ledgers``.
+        """
+        paid = self.ledgers.of(episodes, self.traffic.n_vehicles[traffic])
+        rows: Rows = {
+            f"{prefix}ledgers": object_array([(each[g] / self.budget[g]).tolist() for each in paid])
+            for g, prefix in zip(range(self.budget.size), ("", "sensor_"), strict=False)
+        }
+        return {
+            **rows,
+            "individual_epsilon": object_array([self._losses(p.T)[1].tolist() for p in paid]),
+            "n_refused": self._refused[episodes].sum(axis=1),
+        }
 
     def give_noise(self, noise: FloatArray) -> None:
         """See `ReleaseModel.give_noise`."""
         self.noise.give(noise)
-
-    def budgets_spent(self, episodes: IntArray) -> FloatArray:
-        """See `ReleaseModel.budgets_spent`: payments over the budget."""
-        if self._settings.unit == "event":
-            return np.zeros(len(episodes))
-        paid: FloatArray = self.ledgers.paid[episodes].sum(axis=1)
-        return paid / self.budget
-
-    def private_info(self, episodes: IntArray, traffic: IntArray) -> Rows:
-        """Return what each vehicle has paid, the epsilon that it has spent, and refusals.
-
-        ``ledgers`` are payments over the budget. The first two are lists, since records differ in
-        their number of vehicles and Gymnasium stacks arrays of equal shape only.
-        """
-        paid = [
-            self.ledgers.paid_by(episode, index)
-            for episode, index in zip(episodes, traffic, strict=True)
-        ]
-        return {
-            "ledgers": object_array([(ledger / self.budget).tolist() for ledger in paid]),
-            "individual_epsilon": object_array([self._losses(row)[1].tolist() for row in paid]),
-            "n_refused": self._refused[episodes].copy(),
-        }
-
-
-def _coverage(options: QueryOptions) -> float:
-    """Return the share of the mainline that a step's queries cover if all options are alike."""
-    if options.n_options == 0:
-        return 0.0
-    bought = options.bandwidth * float(np.mean(options.span / options.cost))
-    return min(bought / options.n_mainline, 1.0)

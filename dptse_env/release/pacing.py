@@ -2,21 +2,25 @@
 
 A price a buys noise of variance 1 / a on the count of a query, and every vehicle that is counted
 pays for it. Pacing should make a vehicle's budget last for its trip. It decides how accurate the
-releases are, never whether the guarantee holds.
+releases are, never whether the guarantee holds. Each group of columns is paced by itself.
 """
 
+from __future__ import annotations
+
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
-from typing import Any, NoReturn
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from dptse_env.model.network import Layout, make_layout
 from dptse_env.model.parameters import SECONDS_PER_HOUR
-from dptse_env.release import pacing_kernels as kernels
-from dptse_env.traffic import Corridor
+from dptse_env.release.base import Task
+from dptse_env.release.queries import QueryOptions
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+from dptse_env.utils.kernels import copy_vector, kernel, kernel_part
 from dptse_env.utils.registry import Registry
+
+Packed = tuple[Any, ...]
 
 MEAN_SQUARE = 0.15
 """Expected value of d^2 / D^2, by which a contribution costs more than its price."""
@@ -24,175 +28,49 @@ MEAN_SQUARE = 0.15
 LEAST_SHARE = 0.01
 """Least part of the budget that is offered for the rest of a trip, so that prices stay positive."""
 
+SLOWEST, FASTEST = 8.0, 102.0
+"""Range that predicted speeds [km/h] are held to where they give the time of a trip."""
 
-@dataclass(frozen=True)
-class PacingSetup:
-    """Configuration that a pacing is made for.
+MARGIN = 2.0
+"""Queried seconds added to those that are expected for the rest of a trip [s]."""
 
-    Attributes:
-        corridor: The road.
-        budget: Budget b of a vehicle.
-        pace: Part of the budget that should be spent by the end of a trip.
-        ratio: Ratio r of the charge for speeds.
-        first: First record column that each of the C columns of a release covers, shape (C,).
-        span: Number of record columns that each covers, shape (C,).
-        level: Price level of each column, shape (C,).
-        always: Columns that are observed at every step, shape (A,).
-        coverage: Expected share of the mainline's segments that a step's queries cover.
-        n_places: Record columns: the segments, and the boundary segments if they are released.
-        n_episodes: Size n of the batch.
-    """
-
-    corridor: Corridor
-    budget: float
-    pace: float
-    ratio: float
-    first: IntArray
-    span: IntArray
-    level: FloatArray
-    always: IntArray
-    coverage: float
-    n_places: int
-    n_episodes: int
+MEMORY = 60.0
+"""Time constant of the average by which rates of querying follow the queries [s]."""
 
 
-@dataclass(frozen=True)
-class PublicStep:
-    """Public numbers that a price may depend on: a second of k episodes, before its release.
+class PacedRoad(NamedTuple):
+    """A road, by its places: mainline, ramps, boundary segments."""
 
-    Attributes:
-        episodes: Distinct rows of the batch, shape (k,).
-        observed: Columns that are observed, shape (k, C).
-        density: Predicted densities [veh/km], shape (k, S).
-        speed: Predicted speeds [km/h], shape (k, S).
-    """
+    n_mainline: int  # n
+    n_segments: int  # S
+    length: FloatArray  # (S,) l of the segments [km]
+    edges: IntArray  # (E, 2) segments (from, to) between which vehicles pass
+    edge_share: FloatArray  # (E,) share of the outflow that passes
+    entries: IntArray  # (1 + I,) segments with inflow from outside: the first, then the on-ramps
+    entry_places: IntArray  # (1 + I,) boundary segments before them; negative if not released
+    exits: IntArray  # (1 + O,) segments with outflow: the last of the mainline, the off-ramps
+    exit_places: IntArray  # (1 + O,) boundary segments after them; negative if not released
+    next_segment: IntArray  # (S,) segment that each leads to, ahead on the mainline; -1 at exits
 
-    episodes: IntArray
-    observed: BoolArray
-    density: FloatArray
-    speed: FloatArray
-
-    def __getattr__(self, name: str) -> NoReturn:
-        """Refuse what is not public.
-
-        Raises:
-            AttributeError: Always; the message says that prices depend on public numbers alone.
-        """
-        raise AttributeError(
-            f"privacy.pacing must depend on public numbers alone: a step has episodes, observed, "
-            f"density and speed, got a request for {name!r}"
-        )
-
-
-class Pacing(ABC):
-    """Base class of pacings, for a batch of n episodes.
-
-    A subclass keeps public state of episodes, and returns prices.
-    """
-
-    def __init__(self, setup: PacingSetup) -> None:
-        """Store the configuration."""
-        self.setup = setup
-
-    def reset(self, episodes: IntArray) -> None:  # noqa: B027 (nothing by default)
-        """Begin new episodes, shape (k,)."""
-
-    @abstractmethod
-    def prices(self, step: PublicStep) -> FloatArray:
-        """Return the price [1/veh^2] of every column, positive and finite, shape (k, C).
-
-        It is called once for every second.
-        """
-
-    def expected_price(self, speed: FloatArray) -> float:
-        """Return a typical price at predicted speeds [km/h] of shape (S,)."""
-        return self.setup.budget
-
-    def tracer(self, episodes: IntArray) -> FloatArray:
-        """Return the part of the budget that vehicles on each mainline segment may have spent.
-
-        Shape (k, n_mainline), in [0, 1].
-        """
-        return np.zeros((len(episodes), self.setup.corridor.n_mainline))
-
-
-class TracerPacing(Pacing):
-    """Prices that spend what is left of a budget evenly over the rest of a trip.
-
-    A tracer m follows the mean ledger of the vehicles on each segment: a query adds its expected
-    charge, ``a (1 + 0.15 r)``, predicted flows carry it along, and vehicles enter with 0. The rest
-    of a trip has R queried seconds: the sum, over the segments from here on, of the rate of
-    querying times the length over the predicted speed, which is held to [8, 102] km/h, and a margin
-    of 2 s. The price on a segment is ``max(pace b - m, 0.01 b) / R``, and that of a query the mean
-    over its segments, times its level. Where vehicles contribute deviations of what they report in
-    place of being counted, they pay less for it, and prices are higher in proportion.
-
-    Rates of querying are averages over the last minute or so. They begin at equal rates for all
-    segments, so that a policy that keeps querying the same place is soon paced for that.
-    """
-
-    def __init__(self, setup: PacingSetup) -> None:
-        """Prepare for episodes without any charge so far."""
-        super().__init__(setup)
-        corridor, n = setup.corridor, setup.n_episodes
-        layout = make_layout(corridor)
+    @classmethod
+    def make(cls, task: Task) -> PacedRoad:
+        """Return the road of a task."""
+        layout = make_layout(task.corridor)
         S = layout.n_segments
-        boundary = [layout.entry_boundaries, layout.exit_boundaries]
-        if setup.n_places > S:
-            entry_places, exit_places = (S + places for places in boundary)
-        else:
-            entry_places, exit_places = (np.full_like(places, -1) for places in boundary)
-        road = kernels.PacedRoad(
-            n_mainline=corridor.n_mainline,
+        released = task.n_places > S
+        before, after = layout.entry_boundaries, layout.exit_boundaries
+        return cls(
+            n_mainline=task.corridor.n_mainline,
             n_segments=S,
             length=layout.lengths,
             edges=layout.edges,
             edge_share=layout.edge_shares,
             entries=layout.entries,
-            entry_places=entry_places,
+            entry_places=S + before if released else np.full_like(before, -1),
             exits=layout.exits,
-            exit_places=exit_places,
+            exit_places=S + after if released else np.full_like(after, -1),
             next_segment=_next_segments(layout),
         )
-        columns = kernels.PacedColumns(setup.first, setup.span, setup.level)
-        self._packed = tuple(road), tuple(columns)
-        always = np.zeros(setup.n_places, dtype=bool)
-        for column in setup.always:
-            always[setup.first[column]] = True
-        self._first_rates = np.where(always, 1.0, 0.0)
-        mainline = slice(0, corridor.n_mainline)
-        self._first_rates[mainline] = np.maximum(self._first_rates[mainline], setup.coverage)
-        self._rates = np.tile(self._first_rates, (n, 1))
-        self._tracer = np.zeros((n, setup.n_places))
-        self._offer = setup.pace * setup.budget, LEAST_SHARE * setup.budget
-
-    def reset(self, episodes: IntArray) -> None:
-        """See `Pacing.reset`."""
-        self._rates[episodes] = self._first_rates
-        self._tracer[episodes] = 0.0
-
-    def prices(self, step: PublicStep) -> FloatArray:
-        """See `Pacing.prices`."""
-        prices = np.empty(step.observed.shape)
-        kernels.pace(
-            *self._packed, step.episodes, step.observed, step.density, step.speed, *self._offer,
-            1.0 + MEAN_SQUARE * self.setup.ratio, self._rates,
-            self._tracer, prices,
-        )  # fmt: skip
-        return prices
-
-    def expected_price(self, speed: FloatArray) -> float:
-        """Return the price at the upstream end, at these speeds and the rates of the beginning."""
-        corridor = self.setup.corridor
-        n, length = corridor.n_mainline, np.array(corridor.segment_lengths[: corridor.n_mainline])
-        seconds = SECONDS_PER_HOUR * length / np.clip(speed[:n], kernels.SLOWEST, kernels.FASTEST)
-        queried = float((self._first_rates[:n] * seconds).sum()) + kernels.MARGIN
-        return self._offer[0] / queried
-
-    def tracer(self, episodes: IntArray) -> FloatArray:
-        """See `Pacing.tracer`."""
-        tracer = self._tracer[episodes, : self.setup.corridor.n_mainline]
-        return np.minimum(tracer / self.setup.budget, 1.0)
 
 
 def _next_segments(layout: Layout) -> IntArray:
@@ -204,27 +82,155 @@ def _next_segments(layout: Layout) -> IntArray:
     return following
 
 
+class PacedColumns(NamedTuple):
+    """Columns of a release."""
+
+    first: IntArray  # (C,) first place of each
+    span: IntArray  # (C,) number of places that each covers
+    group: IntArray  # (C,) its group
+    level: FloatArray  # (C,) price level
+
+    @classmethod
+    def make(cls, task: Task) -> PacedColumns:
+        """Return the columns of a task; only options have price levels."""
+        level = np.ones(task.n_columns)
+        level[: task.queries.n_options] = task.queries.level
+        return cls(task.first, task.span, task.group, level)
+
+
+class Pacing(ABC):
+    """Base class of pacings, for a batch of n episodes.
+
+    A subclass keeps public state of episodes, and returns prices. It is shown public numbers alone.
+
+    Attributes:
+        task: What is measured.
+        budget: Budget of a vehicle in each group of columns, shape (groups,).
+    """
+
+    def __init__(self, task: Task, budget: FloatArray) -> None:
+        """Store the configuration."""
+        self.task, self.budget = task, budget
+
+    def reset(self, episodes: IntArray) -> None:  # noqa: B027 (nothing by default)
+        """Begin new episodes, shape (k,)."""
+
+    @abstractmethod
+    def prices(
+        self, episodes: IntArray, observed: BoolArray, density: FloatArray, speed: FloatArray
+    ) -> FloatArray:
+        """Return the price [1/veh^2] of every column, positive and finite, shape (k, C).
+
+        It is called once for every second, before its release.
+
+        Args:
+            episodes: Distinct rows of the batch, shape (k,).
+            observed: Columns that are observed, shape (k, C).
+            density: Predicted densities [veh/km], shape (k, S).
+            speed: Predicted speeds [km/h], shape (k, S).
+        """
+
+    def expected_prices(self, speed: FloatArray) -> FloatArray:
+        """Return a typical price of each group (groups,) at predicted speeds [km/h] (S,)."""
+        return self.budget
+
+    def tracer(self, episodes: IntArray) -> FloatArray:
+        """Return the part of the budget for queries that vehicles on a segment may have spent.
+
+        Shape (k, n_mainline), in [0, 1].
+        """
+        return np.zeros((len(episodes), self.task.corridor.n_mainline))
+
+
+class TracerPacing(Pacing):
+    """Prices that spend what is left of a budget evenly over the rest of a trip.
+
+    A tracer m follows the mean ledger of the vehicles on each segment: a query adds its expected
+    charge, ``a (1 + 0.15 r)``, predicted flows carry it along, and vehicles enter with 0. The rest
+    of a trip has R queried seconds: the sum, over the segments from here on, of the rate of
+    querying times the length over the predicted speed, which is held to [8, 102] km/h, and a margin
+    of 2 s. The price on a segment is ``max(pace b - m, 0.01 b) / R``, and that of a query the mean
+    over its segments, times its level.
+
+    Rates of querying are averages over the last minute or so. They begin at equal rates for all
+    segments, so that a policy that keeps querying the same place is soon paced for that.
+    """
+
+    def __init__(self, task: Task, budget: FloatArray) -> None:
+        """Prepare for episodes without any charge so far."""
+        super().__init__(task, budget)
+        self._packed = tuple(PacedRoad.make(task)), tuple(PacedColumns.make(task))
+        self._first_rates = np.zeros((len(task.groups), task.n_places))
+        self._first_rates[task.group[task.always], task.first[task.always]] = 1.0
+        mainline = self._first_rates[0, : task.corridor.n_mainline]
+        mainline[:] = np.maximum(mainline, _coverage(task.queries))
+        self._rates = np.tile(self._first_rates, (task.n_episodes, 1, 1))
+        self._tracer = np.zeros((task.n_episodes, *self._first_rates.shape))
+        self._offer = task.settings.pace * budget, LEAST_SHARE * budget
+
+    def reset(self, episodes: IntArray) -> None:
+        """See `Pacing.reset`."""
+        self._rates[episodes] = self._first_rates
+        self._tracer[episodes] = 0.0
+
+    def prices(
+        self, episodes: IntArray, observed: BoolArray, density: FloatArray, speed: FloatArray
+    ) -> FloatArray:
+        """See `Pacing.prices`."""
+        prices = np.empty(observed.shape)
+        charge = 1.0 + MEAN_SQUARE * self.task.settings.ratio
+        _pace(
+            *self._packed, episodes, observed, density, speed, *self._offer, charge,
+            self._rates, self._tracer, prices,
+        )  # fmt: skip
+        return prices
+
+    def expected_prices(self, speed: FloatArray) -> FloatArray:
+        """Return prices at the upstream end, at these speeds and the rates of the beginning."""
+        corridor = self.task.corridor
+        n, length = corridor.n_mainline, np.array(corridor.segment_lengths[: corridor.n_mainline])
+        seconds = SECONDS_PER_HOUR * length / np.clip(speed[:n], SLOWEST, FASTEST)
+        queried = (self._first_rates[:, :n] * seconds).sum(axis=1) + MARGIN
+        prices: FloatArray = self._offer[0] / queried
+        return prices
+
+    def tracer(self, episodes: IntArray) -> FloatArray:
+        """See `Pacing.tracer`."""
+        tracer = self._tracer[episodes, 0, : self.task.corridor.n_mainline]
+        part: FloatArray = np.minimum(tracer / self.budget[0], 1.0)
+        return part
+
+
+def _coverage(options: QueryOptions) -> float:
+    """Return the share of the mainline that a step's queries cover if all options are alike."""
+    if options.n_options == 0:
+        return 0.0
+    bought = options.bandwidth * float(np.mean(options.span / options.cost))
+    return min(bought / options.n_mainline, 1.0)
+
+
 class EventPacing(Pacing):
     """Prices for the unit ``event``, where each second of a trip has a budget of its own.
 
     Every vehicle can pay for all queries that cover it, at any deviation.
     """
 
-    def __init__(self, setup: PacingSetup) -> None:
+    def __init__(self, task: Task, budget: FloatArray) -> None:
         """Work out the price of a query that has a second's budget to itself."""
-        super().__init__(setup)
-        self._whole = setup.budget / (1.0 + setup.ratio)
-        self._columns = tuple(kernels.PacedColumns(setup.first, setup.span, setup.level))
+        super().__init__(task, budget)
+        self._whole: FloatArray = budget / (1.0 + task.settings.ratio)
+        self._columns = tuple(PacedColumns.make(task))
 
-    def prices(self, step: PublicStep) -> FloatArray:
+    def prices(
+        self, episodes: IntArray, observed: BoolArray, density: FloatArray, speed: FloatArray
+    ) -> FloatArray:
         """See `Pacing.prices`."""
-        prices = np.empty(step.observed.shape)
-        places = self.setup.n_places
-        kernels.divide(self._columns, places, step.observed, self._whole, prices)
+        prices = np.empty(observed.shape)
+        _divide(self._columns, self.task.n_places, observed, self._whole, prices)
         return prices
 
-    def expected_price(self, speed: FloatArray) -> float:
-        """Return the price where queries do not overlap."""
+    def expected_prices(self, speed: FloatArray) -> FloatArray:
+        """Return the prices where queries do not overlap."""
         return self._whole
 
 
@@ -255,3 +261,154 @@ def check_prices(prices: Any, shape: tuple[int, ...]) -> FloatArray:
     if not ((array > 0.0) & np.isfinite(array)).all():
         raise ValueError("privacy.pacing must return prices that are positive and finite")
     return array
+
+
+@kernel
+def _pace(
+    road_: Packed,
+    columns_: Packed,
+    episodes: IntArray,
+    observed: BoolArray,
+    density: FloatArray,
+    speed: FloatArray,
+    offered: FloatArray,
+    least: FloatArray,
+    charge: float,
+    rates: FloatArray,
+    tracer: FloatArray,
+    prices: FloatArray,
+) -> None:
+    """Move the tracers along, set prices, and charge the tracers for the queries.
+
+    Args:
+        road_: The `PacedRoad`.
+        columns_: The `PacedColumns`.
+        episodes: Shape (k,).
+        observed: Columns that are observed, shape (k, C).
+        density: Predicted densities [veh/km], shape (k, S).
+        speed: Predicted speeds [km/h], shape (k, S).
+        offered: Part of each group's budget that a trip should spend, shape (groups,).
+        least: Least that is offered for the rest of a trip, shape (groups,).
+        charge: Expected payment over the price.
+        rates: Rates of querying, shape (n, groups, places), updated.
+        tracer: Expected payments so far, shape (n, groups, places), updated.
+        prices: Output, shape (k, C).
+    """
+    road, columns = PacedRoad(*road_), PacedColumns(*columns_)
+    n_groups, places = tracer.shape[1], tracer.shape[2]
+    rest, before, charged = np.empty(places), np.empty(places), np.empty(places)
+    inflow = np.empty((2, road.n_segments))
+    for k in range(episodes.size):
+        for g in range(n_groups):
+            paid, rate = tracer[episodes[k], g], rates[episodes[k], g]
+            copy_vector(paid, before)
+            _carry(road, density[k], speed[k], before, paid, inflow)
+            _remaining(road, speed[k], rate, rest)
+            charged[:] = 0.0
+            for c in range(columns.first.size):
+                if columns.group[c] != g:
+                    continue
+                first, last = columns.first[c], columns.first[c] + columns.span[c]
+                price = 0.0
+                for s in range(first, last):
+                    price += max(offered[g] - paid[s], least[g]) / rest[s]
+                price *= columns.level[c] / columns.span[c]
+                prices[k, c] = price
+                if observed[k, c]:
+                    for s in range(first, last):
+                        charged[s] += price
+            for s in range(places):
+                paid[s] += charge * charged[s]
+                seen = 1.0 if charged[s] > 0.0 else 0.0
+                rate[s] += (seen - rate[s]) / MEMORY
+
+
+@kernel_part
+def _carry(
+    road: PacedRoad,
+    density: FloatArray,
+    speed: FloatArray,
+    before: FloatArray,
+    after: FloatArray,
+    inflow: FloatArray,
+) -> None:
+    """Mix the tracer on each segment with that of the vehicles that arrived in a second."""
+    flow, mass = inflow[0], inflow[1]
+    flow[:], mass[:] = 0.0, 0.0
+    for e in range(road.edges.shape[0]):
+        start, end = road.edges[e, 0], road.edges[e, 1]
+        arriving = road.edge_share[e] * density[start] * speed[start]
+        flow[end] += arriving
+        mass[end] += arriving * before[start]
+    for e in range(road.entries.size):
+        s, place = road.entries[e], road.entry_places[e]
+        arriving = density[s] * speed[s]
+        flow[s] += arriving
+        if place >= 0:
+            mass[s] += arriving * before[place]
+            after[place] *= 1.0 - _moved(road.length[s], speed[s])
+    for s in range(road.n_segments):
+        if flow[s] > 0.0:
+            arrived = flow[s] / (SECONDS_PER_HOUR * road.length[s] * max(density[s], 1e-9))
+            share = min(arrived, 1.0)
+            after[s] = (1.0 - share) * before[s] + share * mass[s] / flow[s]
+    for e in range(road.exits.size):
+        s, place = road.exits[e], road.exit_places[e]
+        if place >= 0:
+            share = _moved(road.length[s], speed[s])
+            after[place] = (1.0 - share) * before[place] + share * before[s]
+
+
+@kernel_part
+def _moved(length: float, speed: float) -> float:
+    """Return the share of the vehicles on a length [km] that leave it in a second."""
+    return float(min(speed / (SECONDS_PER_HOUR * length), 1.0))
+
+
+@kernel_part
+def _remaining(road: PacedRoad, speed: FloatArray, rate: FloatArray, rest: FloatArray) -> None:
+    """Write the queried seconds that a vehicle on each record column has still to come."""
+    n, S = road.n_mainline, road.n_segments
+    rest[:S] = 0.0
+    for e in range(road.exits.size):
+        s, place = road.exits[e], road.exit_places[e]
+        rest[s] = MARGIN
+        if place >= 0:
+            rest[s] += _seconds(road.length[s], speed[s]) * rate[place]
+            rest[place] = rest[s]
+    # Against the traffic: the segment that each one leads to comes first.
+    for first, last in ((n, -1), (S, n - 1)):
+        for s in range(first - 1, last, -1):
+            ahead = rest[road.next_segment[s]] if road.next_segment[s] >= 0 else rest[s]
+            rest[s] = ahead + _seconds(road.length[s], speed[s]) * rate[s]
+    for e in range(road.entries.size):
+        s, place = road.entries[e], road.entry_places[e]
+        if place >= 0:
+            rest[place] = rest[s] + _seconds(road.length[s], speed[s]) * rate[place]
+
+
+@kernel_part
+def _seconds(length: float, speed: float) -> float:
+    """Return the time [s] on a length [km] at a speed [km/h]."""
+    return float(SECONDS_PER_HOUR * length / min(max(speed, SLOWEST), FASTEST))
+
+
+@kernel
+def _divide(
+    columns_: Packed, n_places: int, observed: BoolArray, whole: FloatArray, prices: FloatArray
+) -> None:
+    """Divide a second's budgets among a group's queries that cover a place, by their levels."""
+    columns = PacedColumns(*columns_)
+    total = np.empty((whole.size, n_places))
+    for k in range(observed.shape[0]):
+        total[:] = 0.0
+        for c in range(columns.first.size):
+            if observed[k, c]:
+                for s in range(columns.first[c], columns.first[c] + columns.span[c]):
+                    total[columns.group[c], s] += columns.level[c]
+        for c in range(columns.first.size):
+            most, g = columns.level[c], columns.group[c]
+            for s in range(columns.first[c], columns.first[c] + columns.span[c]):
+                own = 0.0 if observed[k, c] else columns.level[c]
+                most = max(most, total[g, s] + own)
+            prices[k, c] = whole[g] * columns.level[c] / most

@@ -165,12 +165,6 @@ class QueryOptions:
         return {int(self.first[option]): int(option) for option in single}
 
 
-_NONE = np.zeros(0, dtype=np.int64)
-
-NO_OPTIONS = QueryOptions(_NONE, _NONE, np.zeros(0), _NONE, 0, 0)
-"""In place of options that are not given."""
-
-
 def _check(
     n: int, bandwidth: int, spans: Sequence[int], levels: Sequence[float], unit: BandwidthUnit
 ) -> None:

@@ -208,7 +208,8 @@ class Schedule(ABC):
                 differ.
             step: Decisions completed so far, shape (k,).
         """
-        fixed = self.interface.observations.setup.fixed_sensors
+        task = self.interface.observations.task
+        fixed = task.first[task.sensors]
         fixed = fixed[fixed < self.n_mainline]
         score = np.array(value, dtype=np.float64)
         if self.queries.are_segments:

@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 
 from dptse_env.process import QueryProcess
-from dptse_env.release import ReleaseRequest
+from dptse_env.release import Request
 from dptse_env.schedules import ProcessSchedule, require_plain
 from dptse_env.spaces.rewards import ScoredSecond, estimation_error
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray, Observation
@@ -60,7 +60,7 @@ class OracleGain(ProcessSchedule):
         if not process.release.takes_noise:
             raise ValueError(
                 f"schedule {self.name!r} needs a release model whose noise can be set, got "
-                f"{process.release.setup.name!r}"
+                f"{process.release.task.name!r}"
             )
 
     def _choose(self, rows: IntArray, step: IntArray, observation: Observation) -> BoolArray:
@@ -75,10 +75,10 @@ class OracleGain(ProcessSchedule):
         ahead, n = self.process.fork(), self.n_mainline
         traffic, times = ahead.traffic_index[episodes], ahead.time[episodes]
         ahead.estimator.predict(episodes, ahead.boundary.inputs(episodes, traffic, times))
-        every_column = np.ones((len(episodes), ahead.release.setup.n_columns), dtype=bool)
+        every_column = np.ones((len(episodes), ahead.release.task.n_columns), dtype=bool)
         ahead.release.give_noise(np.zeros((ahead.n_episodes, every_column.shape[1], 2)))
         prediction = ahead.estimator.estimate().at(episodes)
-        request = ReleaseRequest(episodes, traffic, times + 1, every_column, lambda: prediction)
+        request = Request(episodes, traffic, times + 1, every_column, lambda: prediction)
         measured = ahead.measure(request)
         truth = ahead.traffic.aggregates(traffic, times + 1)[:, :n]
         density, speed = truth[..., 0], truth[..., 1]
@@ -87,7 +87,7 @@ class OracleGain(ProcessSchedule):
         for segment in range(n):
             queried = np.zeros((len(episodes), n), dtype=bool)
             queried[:, segment] = True
-            seen = ahead.release.setup.observed(queried) & measured.observed
+            seen = ahead.release.task.observed(queried) & measured.observed
             estimator = copy.deepcopy(ahead.estimator, {id(model): model})
             estimator.update(episodes, measured._replace(observed=seen))
             estimate = estimator.estimate().at(episodes)

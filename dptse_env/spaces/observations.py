@@ -10,14 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from gymnasium import spaces
 
 from dptse_env.estimators import Estimate
-from dptse_env.traffic import Corridor
+from dptse_env.release import Task
 from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray, IntArray, Observation
 from dptse_env.utils.registry import Registry, is_foreign, missing_methods, name_of_class
 
@@ -60,41 +59,6 @@ class PublicState(NamedTuple):
     tracer: FloatArray | None = None
 
 
-@dataclass(frozen=True)
-class ObservationSetup:
-    """The public configuration behind an observation.
-
-    Attributes:
-        corridor: The road.
-        bandwidth: Largest total cost of the queries of a step.
-        epsilon: Privacy parameter epsilon.
-        n_options: Options G that can be queried.
-        sensor_rows: The row of a release in which each fixed sensor is, F of them.
-        releases_flow: Whether centred flows are released in place of mean speeds.
-        picks_one_by_one: Whether a decision takes several actions.
-        has_prices: Whether queries have prices.
-    """
-
-    corridor: Corridor
-    bandwidth: int
-    epsilon: float
-    n_options: int
-    sensor_rows: tuple[int, ...]
-    releases_flow: bool = False
-    picks_one_by_one: bool = False
-    has_prices: bool = False
-
-    @cached_property
-    def fixed_sensors(self) -> IntArray:
-        """Segments with a fixed sensor, shape (F,)."""
-        return np.array(self.corridor.fixed_sensors, dtype=np.int64)
-
-    @cached_property
-    def fixed_rows(self) -> IntArray:
-        """`sensor_rows` as an array, shape (F,)."""
-        return np.array(self.sensor_rows, dtype=np.int64)
-
-
 class ObservationBlock(Protocol):
     """A named part of the observation; classes of blocks take no arguments.
 
@@ -108,10 +72,10 @@ class ObservationBlock(Protocol):
     low: float
     high: float
 
-    def size(self, setup: ObservationSetup) -> int:
+    def size(self, task: Task) -> int:
         """Return the number of values."""
 
-    def values(self, state: PublicState, setup: ObservationSetup) -> AnyArray | float:
+    def values(self, state: PublicState, task: Task) -> AnyArray | float:
         """Return finite values of k episodes, shape (k, size), or one number for all of them."""
 
 
@@ -119,17 +83,18 @@ class ObservationBlock(Protocol):
 class Block:
     """A block that ships with the package: its values over a unit, or the logarithms of these.
 
-    See `ObservationBlock`. ``is_default`` says whether the default observation has it.
+    See `ObservationBlock`. ``is_default(task, picks_one_by_one)`` says whether the default
+    observation has it.
     """
 
     name: str
-    size: Callable[[ObservationSetup], int]
+    size: Callable[[Task], int]
     low: float
     high: float
-    values: Callable[[PublicState, ObservationSetup], AnyArray | float]
-    unit: Callable[[ObservationSetup], float] = lambda setup: 1.0
+    values: Callable[[PublicState, Task], AnyArray | float]
+    unit: Callable[[Task], float] = lambda task: 1.0
     is_log: bool = False
-    is_default: Callable[[ObservationSetup], bool] = lambda setup: True
+    is_default: Callable[[Task, bool], bool] = lambda task, one_by_one: True
 
     def __reduce__(self) -> tuple[Callable[[str], Block], tuple[str]]:
         """Pickle as the name, since lambda functions cannot be pickled."""
@@ -139,47 +104,47 @@ class Block:
 _TINY = np.finfo(np.float64).tiny
 
 
-def _segments(setup: ObservationSetup) -> int:
-    return setup.corridor.n_segments
+def _segments(task: Task) -> int:
+    return task.corridor.n_segments
 
 
-def _mainline(setup: ObservationSetup) -> int:
-    return setup.corridor.n_mainline
+def _mainline(task: Task) -> int:
+    return task.corridor.n_mainline
 
 
-def _options(setup: ObservationSetup) -> int:
-    return setup.n_options
+def _options(task: Task) -> int:
+    return task.queries.n_options
 
 
-def _fixed(setup: ObservationSetup) -> int:
-    return len(setup.corridor.fixed_sensors)
+def _fixed(task: Task) -> int:
+    return len(task.corridor.fixed_sensors)
 
 
-def _density_scale(setup: ObservationSetup) -> float:
-    return setup.corridor.density_scale
+def _density_scale(task: Task) -> float:
+    return task.corridor.density_scale
 
 
-def _speed_scale(setup: ObservationSetup) -> float:
-    return setup.corridor.speed_scale
+def _speed_scale(task: Task) -> float:
+    return task.corridor.speed_scale
 
 
-def _flow_scale(setup: ObservationSetup) -> float:
-    return setup.corridor.density_scale * setup.corridor.speed_scale
+def _flow_scale(task: Task) -> float:
+    return task.corridor.density_scale * task.corridor.speed_scale
 
 
 def _released(component: int) -> Any:
-    return lambda state, setup: state.released[:, : setup.n_options, component]
+    return lambda state, task: state.released[:, : task.queries.n_options, component]
 
 
 def _innovation(component: int) -> Any:
-    return lambda state, setup: state.innovations[:, : setup.n_options, component]
+    return lambda state, task: state.innovations[:, : task.queries.n_options, component]
 
 
 def _fixed_innovation(component: int) -> Any:
-    return lambda state, setup: state.innovations[:, setup.fixed_rows, component]
+    return lambda state, task: state.innovations[:, task.sensors, component]
 
 
-def _log_prices(state: PublicState, _: ObservationSetup) -> FloatArray | float:
+def _log_prices(state: PublicState, _: Task) -> FloatArray | float:
     if state.prices is None:
         return 0.0
     return np.where(state.prices > 0.0, np.log10(np.maximum(state.prices, _TINY)), 0.0)
@@ -194,9 +159,9 @@ SHIPPED_BLOCKS = (
           lambda state, _: state.estimate.speed_std, _speed_scale, is_log=True),
     Block("released_density", _options, -5, 5, _released(0), _density_scale),
     Block("released_speed", _options, -5, 5, _released(1), _speed_scale,
-          is_default=lambda setup: not setup.releases_flow),
+          is_default=lambda task, _: not task.releases_flow),
     Block("released_flow", _options, -5, 5, _released(1), _flow_scale,
-          is_default=lambda setup: setup.releases_flow),
+          is_default=lambda task, _: task.releases_flow),
     Block("density_innovation", _options, -10, 10, _innovation(0)),
     Block("speed_innovation", _options, -10, 10, _innovation(1)),
     Block("age", _mainline, 0, 1, lambda state, _: state.age, lambda _: AGE_CAP),
@@ -204,15 +169,15 @@ SHIPPED_BLOCKS = (
     Block("fixed_density_innovation", _fixed, -10, 10, _fixed_innovation(0)),
     Block("fixed_speed_innovation", _fixed, -10, 10, _fixed_innovation(1)),
     Block("bandwidth", lambda _: 1, 0, 1,
-          lambda _, setup: setup.bandwidth, lambda setup: setup.corridor.n_mainline),
-    Block("epsilon", lambda _: 1, -6, 6, lambda _, setup: float(np.log10(setup.epsilon))),
+          lambda _, task: task.queries.bandwidth, lambda task: task.corridor.n_mainline),
+    Block("epsilon", lambda _: 1, -6, 6, lambda _, task: float(np.log10(task.settings.epsilon))),
     Block("picked", _options, 0, 1, lambda state, _: state.picked,
-          is_default=lambda setup: setup.picks_one_by_one),
+          is_default=lambda _, one_by_one: one_by_one),
     Block("last_price", _options, -5, 5, _log_prices, lambda _: PRICE_UNIT,
-          is_default=lambda setup: setup.has_prices),
+          is_default=lambda task, _: task.model.has_prices),
     Block("tracer", _mainline, 0, 1,
           lambda state, _: 0.0 if state.tracer is None else state.tracer,
-          is_default=lambda setup: setup.has_prices),
+          is_default=lambda task, _: task.model.has_prices),
 )  # fmt: skip
 """The shipped blocks; the default observation has those that are in it, in this order."""
 
@@ -232,9 +197,9 @@ BLOCKS = Registry("observation", {block.name: block for block in SHIPPED_BLOCKS}
 """Observation blocks by name."""
 
 
-def default_blocks(setup: ObservationSetup) -> list[str]:
+def default_blocks(task: Task, *, picks_one_by_one: bool = False) -> list[str]:
     """Return the names of the default blocks."""
-    return [block.name for block in SHIPPED_BLOCKS if block.is_default(setup)]
+    return [block.name for block in SHIPPED_BLOCKS if block.is_default(task, picks_one_by_one)]
 
 
 class ObservationEncoding:
@@ -244,26 +209,30 @@ class ObservationEncoding:
     the bounds are clipped.
 
     Attributes:
-        setup: The public configuration.
+        task: What is measured.
         space: The Gymnasium space, a float32 ``Box``.
         slices: Position of each block, by name.
     """
 
-    def __init__(self, setup: ObservationSetup, blocks: Sequence[Any] = (DEFAULT,)) -> None:
+    def __init__(
+        self, task: Task, blocks: Sequence[Any] = (DEFAULT,), *, picks_one_by_one: bool = False
+    ) -> None:
         """Arrange blocks in a vector.
 
         Args:
-            setup: The public configuration.
+            task: What is measured.
             blocks: Names, ``"package.module:Class"``, objects or classes; ``"default"`` stands for
                 all default blocks.
+            picks_one_by_one: Whether a decision takes several actions.
 
         Raises:
             ValueError: There is no such block, it lacks a method, or two have the same name.
         """
-        self.setup = setup
-        names = [name for value in blocks for name in _expanded(value, setup)]
+        self.task = task
+        defaults = default_blocks(task, picks_one_by_one=picks_one_by_one)
+        names = [name for value in blocks for name in _expanded(value, defaults)]
         self.blocks: tuple[ObservationBlock, ...] = tuple(map(_made, names))
-        sizes = [_checked_size(block, setup) for block in self.blocks]
+        sizes = [_checked_size(block, task) for block in self.blocks]
         ends = np.cumsum(sizes).tolist()
         self.slices: dict[str, slice] = {}
         for block, size, end in zip(self.blocks, sizes, ends, strict=True):
@@ -277,9 +246,9 @@ class ObservationEncoding:
         for block in self.blocks:
             place, log_unit = self.slices[block.name], None
             if isinstance(block, Block) and block.is_log:
-                log_unit = block.unit(setup)
+                log_unit = block.unit(task)
             elif isinstance(block, Block):
-                self._units[place] = block.unit(setup)
+                self._units[place] = block.unit(task)
             self._plan.append((block, place, is_foreign(block), log_unit))
 
     def encode(self, state: PublicState) -> Observation:
@@ -287,7 +256,7 @@ class ObservationEncoding:
         k = len(state.age)
         raw = np.empty((k, self.space.shape[0]))
         for block, place, is_checked, log_unit in self._plan:
-            values: Any = block.values(state, self.setup)
+            values: Any = block.values(state, self.task)
             if is_checked:
                 _check_values(block, values, (k, place.stop - place.start))
             if log_unit is not None:
@@ -310,8 +279,8 @@ class ObservationEncoding:
         return observation[..., self.slices[name]]
 
 
-def _expanded(value: Any, setup: ObservationSetup) -> list[Any]:
-    return default_blocks(setup) if isinstance(value, str) and value == DEFAULT else [value]
+def _expanded(value: Any, defaults: list[str]) -> Sequence[Any]:
+    return defaults if isinstance(value, str) and value == DEFAULT else [value]
 
 
 def _made(value: Any) -> ObservationBlock:
@@ -333,8 +302,8 @@ def _made(value: Any) -> ObservationBlock:
     return made
 
 
-def _checked_size(block: ObservationBlock, setup: ObservationSetup) -> int:
-    size = block.size(setup)
+def _checked_size(block: ObservationBlock, task: Task) -> int:
+    size = block.size(task)
     if type(size) is not int or size < 0:
         raise ValueError(
             f"observation {name_of_class(block)}.size() must return an integer >= 0, got {size!r}"

@@ -1,9 +1,10 @@
 """Penetration: which of the vehicles of a record are connected, and what they report."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dptse_env.traffic.record import Record
 from dptse_env.utils.arrays import BoolArray, FloatArray
@@ -75,17 +76,15 @@ class Penetration:
         connected: BoolArray = uniform < self.share_of(traffic_seed)
         return connected
 
-    def reports(self, traffic_seed: int, record: Record) -> Record:
-        """Return what the connected vehicles of a record report: their rows, with their speeds.
-
-        Vehicles keep their indices.
-        """
-        reported = record.where(self.connected(traffic_seed, record)[record.vehicle])
-        if not self.misreports:
-            return reported
-        wrong = self._uniform(traffic_seed, 2, record.n_vehicles) < self.misreporting
-        factor = np.where(wrong, self.misreport_factor, 1.0)[reported.vehicle]
-        return replace(reported, speed=(reported.speed * factor).astype(np.float32))
+    def speeds(self, traffic_seed: int, record: Record) -> NDArray[np.float32]:
+        """Return the speed that each row's vehicle reports [km/h], -1 if it is not connected."""
+        speeds = record.speed
+        if self.misreports:
+            wrong = self._uniform(traffic_seed, 2, record.n_vehicles) < self.misreporting
+            factor = np.where(wrong, self.misreport_factor, 1.0)[record.vehicle]
+            speeds = (speeds * factor).astype(np.float32)
+        reports = self.connected(traffic_seed, record)[record.vehicle]
+        return np.where(reports, speeds, np.float32(-1.0))
 
     def _uniform(self, traffic_seed: int, stream: int, n: int) -> FloatArray:
         """Return the uniform numbers of n vehicles in one of several streams, shape (n,).

@@ -10,9 +10,9 @@ from agents.watchers import (
     LENGTHS,
     PHASES,
     Honesty,
-    accounts,
     by_offset,
     by_segment,
+    ledgers_of,
     near_since_start,
     regimes,
 )
@@ -112,7 +112,7 @@ def test_released_boundary_segments_are_met_too(paced):
 def test_a_release_model_without_accounts_is_refused():
     release = make_release(make_config(SHORT, {"privacy": {"preset": "corrected"}}))
     with pytest.raises(ValueError, match=r"privacy\.preset must keep account .* got 'corrected'"):
-        accounts(release)
+        ledgers_of(release)
 
 
 def test_regimes_part_the_occupied_segments():

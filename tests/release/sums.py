@@ -15,8 +15,8 @@ class SumRelease(ReleaseModel):
     def flow_centre(cls, corridor, settings):
         return 0.5 * corridor.speed_limit
 
-    def __init__(self, setup):
-        super().__init__(setup)
+    def __init__(self, task, traffic):
+        super().__init__(task, traffic)
         self.streams = {}
 
     def reset(self, episodes, generators):
@@ -24,12 +24,12 @@ class SumRelease(ReleaseModel):
 
     def true_values(self, request):
         """Return what is released before noise is added, shape (k, n_columns, 2)."""
-        setup, corridor = self.setup, self.setup.corridor
+        task, corridor = self.task, self.task.corridor
         n, every = corridor.n_segments, corridor.n_segments + corridor.n_boundaries
-        values = setup.traffic.aggregates(request.traffic, request.times, every)
+        values = self.traffic.aggregates(request.traffic, request.times, every)
         values[..., 1] = values[..., 0] * (values[..., 1] - 0.5 * corridor.speed_limit)
-        rows = setup.rows.averages(values[:, :n])
-        return np.concatenate([rows, values[:, n:]], axis=1)[:, : setup.n_columns]
+        rows = task.rows.averages(values[:, :n])
+        return np.concatenate([rows, values[:, n:]], axis=1)[:, : task.n_columns]
 
     def release(self, request):
         values = self.true_values(request).copy()
@@ -43,25 +43,25 @@ class PricedRelease(SumRelease):
 
     has_prices = True
 
-    def __init__(self, setup):
-        super().__init__(setup)
-        self.prices = np.zeros((setup.n_episodes, setup.queries.n_options))
-        self.tracer = np.zeros((setup.n_episodes, setup.corridor.n_mainline))
+    def __init__(self, task, traffic):
+        super().__init__(task, traffic)
+        self.prices = np.zeros((task.n_episodes, task.queries.n_options))
+        self.tracer = np.zeros((task.n_episodes, task.corridor.n_mainline))
 
     def reset(self, episodes, generators):
         super().reset(episodes, generators)
         self.prices[episodes], self.tracer[episodes] = 0.0, 0.0
 
     def release(self, request):
-        queries = self.setup.queries
+        queries = self.task.queries
         asked = request.observed[:, : queries.n_options]
         before = self.prices[request.episodes]
         self.prices[request.episodes] = np.where(asked, 0.01 * queries.level, before)
-        self.tracer[request.episodes] += 0.25 * self.setup.covered(request.observed)
+        self.tracer[request.episodes] += 0.25 * self.task.covered(request.observed)
         return super().release(request)
 
-    def public_state(self, episodes):
-        return self.prices[episodes], self.tracer[episodes]
+    def public(self, episodes):
+        return {"prices": self.prices[episodes], "tracer": self.tracer[episodes]}
 
 
 class MeanRelease(SumRelease):

@@ -3,12 +3,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from dptse_env.config import resolve
-from dptse_env.parts import make_model, make_release
 from dptse_env.release import QueryOptions
 from dptse_env.traffic import SHORT_HIGHWAY
-
-from .sums import SumRelease
 
 ROAD = dataclasses.replace(SHORT_HIGHWAY, fixed_sensors=(5, 7, 2))  # 6 mainline segments, 2 ramps
 
@@ -93,29 +89,3 @@ def test_sensors_share_the_option_of_span_and_level_one():
 def test_covered_is_what_queries_cover():
     options = QueryOptions.make(6, 4, (1, 3))
     assert np.flatnonzero(options.covered(flags(10, 0, 7, 8))).tolist() == [0, 1, 2, 3, 4]
-
-
-def setup(**keywords):
-    keywords = {"privacy": SumRelease, "corridor": {"fixed_sensors": [5, 7, 2]}, **keywords}
-    return make_release(resolve("short-highway", keywords)).setup
-
-
-def test_columns_of_a_release():
-    plain, sums = setup(), setup(query_spans=(2,))
-    assert plain.n_columns == 8
-    assert plain.always_observed.tolist() == [5, 7, 2]
-    assert sums.n_columns == 5 + 2 + 2
-    private = setup(query_spans=(2,), privacy={"preset": SumRelease, "boundary_inputs": "private"})
-    assert private.n_columns == 9 + private.corridor.n_boundaries
-    assert private.always_observed.tolist() == [7, 6, 8, *range(9, private.n_columns)]
-    observed = private.observed(flags(5, 0, 2))
-    assert np.flatnonzero(observed).tolist() == [0, 2, *range(6, private.n_columns)]
-    assert np.flatnonzero(private.covered(observed)).tolist() == [0, 1, 2, 3, 5]
-
-
-def test_a_model_has_the_rows_of_the_release():
-    config = resolve("short-highway", {"privacy": SumRelease, "query_spans": (1, 2)})
-    rows, expected = make_model(config).rows, make_release(config).setup.rows
-    np.testing.assert_array_equal(rows.first, expected.first)
-    np.testing.assert_array_equal(rows.span, expected.span)
-    assert make_model(resolve("short-highway", {})).rows.are_single

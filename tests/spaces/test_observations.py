@@ -2,13 +2,14 @@ import numpy as np
 import pytest
 
 from dptse_env.estimators import Estimate
+from dptse_env.release import Corrected, PrivacySettings, QueryOptions, Task
 from dptse_env.spaces.observations import (
     AGE_CAP,
     ObservationEncoding,
-    ObservationSetup,
     PublicState,
 )
 from dptse_env.traffic import Corridor, Demand
+from tests.release.sums import SumRelease
 
 N, S = 4, 6
 ROAD = Corridor(
@@ -26,9 +27,10 @@ ROAD = Corridor(
 )
 
 
-def encoding(blocks=("default",), epsilon=0.1, **changes):
-    setup = {"n_options": N, "sensor_rows": ROAD.fixed_sensors, **changes}
-    return ObservationEncoding(ObservationSetup(ROAD, 2, epsilon, **setup), blocks)
+def encoding(blocks=("default",), epsilon=0.1, model=Corrected, **changes):
+    settings, queries = PrivacySettings(epsilon=epsilon), QueryOptions.make(N, 2)
+    task = Task("own", model, settings, ROAD, queries, 100)
+    return ObservationEncoding(task, blocks, **changes)
 
 
 def state(k=2, fill=1.0):
@@ -82,7 +84,7 @@ def test_observations_stay_inside_the_space(fill):
 
 
 def test_a_released_flow_has_its_own_name_and_scale():
-    encoder = encoding(epsilon=5.0, releases_flow=True)
+    encoder = encoding(epsilon=5.0, model=SumRelease)
     assert "released_speed" not in encoder.slices
     assert list(encoder.slices).index("released_flow") == 5
     released = np.dstack([np.full((2, S), 20.0), np.full((2, S), -2500.0)])

@@ -59,11 +59,13 @@ def test_a_share_of_a_range_is_drawn_for_each_traffic_seed():
 def test_the_connected_vehicles_report_and_some_misreport_their_speed():
     record = road_of(2_000, n_steps=1)
     penetration = Penetration(0.5, misreporting=0.25, misreport_factor=2.0)
-    reported = penetration.reports(7, record)
+    speeds = penetration.speeds(7, record)
+    reported = np.flatnonzero(speeds >= 0.0)
     np.testing.assert_array_equal(
-        reported.vehicle, np.flatnonzero(penetration.connected(7, record))
+        record.vehicle[reported], np.flatnonzero(penetration.connected(7, record))
     )
-    factor = reported.speed / (10.0 + reported.vehicle)
+    assert (speeds == -1.0).sum() == record.n_rows - reported.size
+    factor = speeds[reported] / (10.0 + record.vehicle[reported])
     assert set(np.round(factor, 3).tolist()) == {1.0, 2.0}
     assert abs((factor > 1.5).mean() - 0.25) < 0.06
 

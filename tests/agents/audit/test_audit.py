@@ -7,6 +7,7 @@ from agents.audit.attack import Adversary, attack
 from agents.audit.distances import ReleaseDistances, plan_contributions
 from agents.audit.planner import choose_target, make_policy
 from agents.audit.releases import Terms
+from agents.audit.statistics import Claim, audit
 from agents.audit.strategies import (
     DECISION_THRESHOLD,
     AdaptiveQueries,
@@ -14,9 +15,9 @@ from agents.audit.strategies import (
     public_plan,
 )
 from agents.audit.worlds import AdjacentWorlds, Trajectory
-from dptse_env.parts import privacy_report
+from dptse_env.estimators import Measurement
+from dptse_env.parts import make_release, privacy_report
 from dptse_env.privacy import epsilon_of
-from dptse_env.privacy.audit_statistics import Claim, audit
 from dptse_env.release import CappedSettings
 from tests.agents.elsewhere import Elsewhere
 from tests.cases import fast_and_slow
@@ -243,30 +244,29 @@ def test_the_score_is_the_log_likelihood_ratio_of_the_transcript(preset, record)
     worlds = choose_target(setting, record, "worst-case", "hunter")
     # A schedule that mostly looks elsewhere: what it does not see must not count.
     plan = make_policy(setting, "paper", worlds).plan
-    sigma = ReleaseDistances.from_config(setting).sigma
-    terms = Terms(np.tile(sigma, (2, ROAD.n_segments, 1)), np.empty((2, 0)), np.empty((2, 0)))
+    task = make_release(setting).task
+    sigma = np.tile(ReleaseDistances.from_config(setting).sigma, (2, task.n_columns, 1))
+    terms = Terms(sigma, np.empty((2, 0)), np.empty((2, 0)))
     square = distance_of(setting, worlds, plan) ** 2
     answers, adversary = (Adversary(setting, worlds, 2) for _ in range(2))
     answers.reset(2)
     adversary.reset(2)
-    noise = np.random.default_rng(0).standard_normal((HORIZON, ROAD.n_segments, 2))
+    noise = np.random.default_rng(0).standard_normal((HORIZON, task.n_columns, 2))
     expected = np.zeros(2)
     for step, queried in enumerate(plan):
-        both = np.tile(queried, (2, 1))
-        midpoint, difference = answers.expect(step + 1, both, terms)
+        observed = task.observed(np.tile(queried, (2, 1)))
+        midpoint, difference = answers.expect(step + 1, observed, terms)
         zero, first = (midpoint - 0.5 * difference)[0], (midpoint + 0.5 * difference)[0]
         # The transcript of world 1 without noise, and one of world 0 with it.
-        released = np.stack([first, zero + noise[step]])
-        watched = np.zeros(ROAD.n_segments, dtype=bool)
-        watched[list(ROAD.fixed_sensors)] = True
-        watched[: ROAD.n_mainline] |= queried
+        released, watched = np.stack([first, zero + noise[step]]), observed[0]
         logs = [
             -0.5 * np.sum((released - mean)[:, watched] ** 2, axis=(1, 2)) for mean in (zero, first)
         ]
         expected += logs[1] - logs[0]
         # What is not observed must not matter.
         released[:, ~watched] = 1e6
-        adversary.update(step + 1, both, released * sigma, terms)
+        told = Measurement(observed, released * sigma, sigma, np.empty((2, 0)))
+        adversary.update(step + 1, told, terms)
     np.testing.assert_allclose(adversary.score, expected, rtol=1e-9)
     assert adversary.score[0] == pytest.approx(0.5 * square)
 

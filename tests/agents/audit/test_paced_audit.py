@@ -14,12 +14,13 @@ from agents.audit.planner import (
     make_policy,
 )
 from agents.audit.releases import Terms, attacked
+from agents.audit.statistics import Claim, audit
 from agents.audit.strategies import public_plan
 from agents.audit.worlds import AdjacentWorlds, Trajectory
 from dptse_env.config import resolve
-from dptse_env.parts import make_release, privacy_report
-from dptse_env.privacy.audit_statistics import Claim, audit
-from dptse_env.release import ReleaseModel, ReleaseRequest, TrafficTable
+from dptse_env.estimators import Measurement
+from dptse_env.parts import make_release, make_traffic, privacy_report
+from dptse_env.release import ReleaseModel, Request
 from tests.cases import fast_and_slow
 
 from .small import (
@@ -169,7 +170,7 @@ def test_a_release_model_without_known_noise_is_no_target():
     release = make_release(dataclasses.replace(paced(), privacy=config(preset="paper").privacy))
     assert not attacked(release).follows_estimates
     with pytest.raises(ValueError, match="the audit needs a release model with Gaussian noise"):
-        attacked(Silent(release.setup))
+        attacked(Silent(release.task, release.traffic))
 
 
 # --- queries ---------------------------------------------------------------------------------
@@ -212,7 +213,7 @@ def test_public_numbers_of_an_episode_are_as_long_as_it(record):
     terms = public_terms(setting, record, plan)
     assert terms.prices.shape == (HORIZON, N_COLUMNS)
     np.testing.assert_allclose(terms.sigma[..., 0] * ROAD.segment_length, terms.prices**-0.5)
-    assert terms.centres.std() > 0.0
+    assert terms.centre.std() > 0.0
     other = public_terms(setting, record, plan, seed=1)
     assert not np.array_equal(terms.prices, other.prices)
 
@@ -248,39 +249,40 @@ def test_the_score_is_the_log_likelihood_ratio_of_the_transcript(record):
     setting = attacked_form(paced(boundary_inputs="private"))
     worlds = choose_target(setting, record, "replaced", "hunter")
     plan = public_plan(setting, "paper")
-    observed = make_release(setting).setup.observed(plan)
+    observed = make_release(setting).task.observed(plan)
     public = public_terms(setting, record, plan)
     steps = [Terms(*(array[[step]] for array in public)) for step in range(len(plan))]
     apart = sums_by_world(setting, worlds, observed, steps)
     adversary, noise = Adversary(setting, worlds, 1), np.random.default_rng(0)
     adversary.reset(1)
     expected = 0.0
-    for step, queried in enumerate(plan):
-        terms, seen = steps[step], observed[step]
+    for step, terms in enumerate(steps):
+        seen = observed[step]
         sigma, (zero, first) = terms.sigma[0], apart[step]
         released = zero + sigma * noise.standard_normal(sigma.shape)
         logs = [-0.5 * np.sum(((released - mean) / sigma)[seen] ** 2) for mean in (zero, first)]
         expected += logs[1] - logs[0]
         released[~seen] = 1e6
-        adversary.update(step + 1, queried[None], released[None], terms)
+        told = Measurement(seen[None], released[None], terms.sigma, terms.centre)
+        adversary.update(step + 1, told, terms)
         assert adversary.score[0] == pytest.approx(expected, rel=1e-9, abs=1e-12)
     assert adversary.square[0] > 0.1
 
 
 def sums_by_world(setting, worlds, observed, public):
-    releases, one = [], np.array([0])
-    for world in (0, 1):
-        release = make_release(setting, 1, TrafficTable(ROAD, (world,), worlds))
-        release.load(0, worlds.get(ROAD, world))
+    one, traffic = np.array([0]), make_traffic(setting, worlds)
+    traffic.load([0, 1])
+    releases = [make_release(setting, 1, traffic) for _ in range(2)]
+    for release in releases:
         release.reset(one, [np.random.default_rng(0)])
-        releases.append(release)
     steps = []
     for step, terms in enumerate(public):
-        asked = ReleaseRequest(one, one, np.array([step + 1]), observed[[step]])
-        sums = [r.collect(asked, terms.prices, terms.centres) for r in releases]
-        steps.append(
-            [np.stack([s.counts[0], s.deviations[0]], axis=1) / ROAD.segment_length for s in sums]
-        )
+        asked = [Request(one, one + w, np.array([step + 1]), observed[[step]]) for w in (0, 1)]
+        sums = [
+            release.collect(second, terms.prices, terms.centre)[0][0]
+            for release, second in zip(releases, asked, strict=True)
+        ]
+        steps.append([each / ROAD.segment_length for each in sums])
     return steps
 
 

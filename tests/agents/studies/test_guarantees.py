@@ -22,10 +22,9 @@ from agents.studies.guarantees import (
 )
 from agents.study import Place, read_rows, run
 from agents.tables import DENSITY, format_interval, values
-from dptse_env.parts import privacy_report
+from dptse_env.parts import make_task, privacy_report
 from dptse_env.privacy import epsilon_of
-from dptse_env.release import PublicStep
-from dptse_env.release.pacing import PacingSetup, TracerPacing
+from dptse_env.release.pacing import TracerPacing
 from dptse_env.schedules import make_schedule
 
 FOLDER = Path(__file__).parents[3] / "results" / "guarantees"
@@ -127,17 +126,15 @@ def test_exact_releases_the_true_densities_of_what_is_queried_and_claims_nothing
 
 def test_equal_rates_do_not_follow_the_queries():
     """The last segment's price depends on its rate of querying alone, where nothing moves."""
-    corridor = make_config(SHORT, {}).corridor
-    n, last = corridor.n_segments, corridor.n_mainline - 1
-    setup = PacingSetup(
-        corridor=corridor, budget=2.0, pace=0.8, ratio=1.0, first=np.arange(n),
-        span=np.ones(n, dtype=np.int64), level=np.ones(n), always=np.zeros(0, dtype=np.int64),
-        coverage=1 / 3, n_places=n, n_episodes=1,
-    )  # fmt: skip
-    observed = np.arange(n)[None] == 0
-    step = PublicStep(np.arange(1), observed, np.full((1, n), 20.0), np.zeros((1, n)))
-    pacings = TracerPacing(setup), EqualRates(setup)
-    followed, equal = ([each.prices(step)[0, last] for _ in range(60)] for each in pacings)
+    bare = {"privacy": {"preset": "paced"}, "corridor": {"fixed_sensors": []}}
+    task = make_task(make_config(SHORT, bare))
+    last, still = task.corridor.n_mainline - 1, np.zeros((1, task.corridor.n_segments))
+    observed = np.arange(task.n_columns)[None] == 0
+    given = np.arange(1), observed, still + 20.0, still
+    pacings = TracerPacing(task, np.array([2.0])), EqualRates(task, np.array([2.0]))
+    for pacing in pacings:
+        pacing.reset(np.arange(1))
+    followed, equal = ([each.prices(*given)[0, last] for _ in range(60)] for each in pacings)
     assert followed[0] == equal[0] == equal[-1]
     assert followed[-1] > 1.3 * followed[0]
 

@@ -82,7 +82,7 @@ def signs(env):
     """Signs as the first state's, drawn like the swaps: they come after the choice of seconds."""
     generator = np.random.default_rng(0)
     generator.integers(SECONDS)
-    return generator.choice([-1.0, 1.0], size=(3, env.process.release.setup.n_columns, 2))
+    return generator.choice([-1.0, 1.0], size=(3, env.process.release.task.n_columns, 2))
 
 
 def test_gains_are_those_of_episodes_run_apart(pass_of_swaps, privacy):

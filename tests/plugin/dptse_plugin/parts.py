@@ -70,15 +70,15 @@ class LaplaceRelease(ReleaseModel):
 
     settings_type = LaplaceSettings
 
-    def __init__(self, setup: Any) -> None:
+    def __init__(self, task: Any, traffic: Any) -> None:
         """See `ReleaseModel`."""
-        super().__init__(setup)
+        super().__init__(task, traffic)
         self.streams: dict[int, np.random.Generator] = {}
 
     @property
     def sigma(self) -> Any:
         """See `ReleaseModel.sigma`."""
-        return 2**0.5 * self.setup.settings.scale * np.array([1.0, 0.3])
+        return 2**0.5 * self.task.settings.scale * np.array([1.0, 0.3])
 
     def reset(self, episodes: Any, generators: Any) -> None:
         """See `ReleaseModel.reset`."""
@@ -86,8 +86,7 @@ class LaplaceRelease(ReleaseModel):
 
     def release(self, request: Any) -> Measurement:
         """See `ReleaseModel.release`."""
-        columns = self.setup.n_columns
-        values = self.setup.traffic.aggregates(request.traffic, request.times, columns)
+        values = self.traffic.aggregates(request.traffic, request.times, self.task.n_columns)
         for k, episode in enumerate(request.episodes.tolist()):
             values[k] += self.streams[episode].laplace(0.0, self.sigma / 2**0.5, values[k].shape)
         return self.measurement(request, values, self.sigma)
@@ -108,13 +107,13 @@ class MeanDensity:
 
     name, low, high = "mean_density", 0.0, 4.0
 
-    def size(self, setup: Any) -> int:
+    def size(self, task: Any) -> int:
         """See `ObservationBlock.size`."""
         return 1
 
-    def values(self, state: Any, setup: Any) -> Any:
+    def values(self, state: Any, task: Any) -> Any:
         """See `ObservationBlock.values`."""
-        return state.estimate.density.mean(axis=1, keepdims=True) / setup.corridor.density_scale
+        return state.estimate.density.mean(axis=1, keepdims=True) / task.corridor.density_scale
 
 
 class Neighbours(ActionEncoding):

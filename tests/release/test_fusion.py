@@ -4,18 +4,27 @@ import numpy as np
 import pytest
 
 from dptse_env.estimators import Estimate, Measurement
-from dptse_env.fusion import Fusion, FusionSettings
-from dptse_env.model import MeasurementRows
+from dptse_env.release import (
+    CappedSettings,
+    Corrected,
+    Fusion,
+    FusionSettings,
+    Paced,
+    PacedSettings,
+    QueryOptions,
+    Task,
+)
+from dptse_env.traffic import SHORT_HIGHWAY
 
-LENGTH, LIMIT, SPREAD = 0.1, 100.0, 12.0
-N_SEGMENTS = 4
+LENGTH, LIMIT, SPREAD = 0.1, SHORT_HIGHWAY.speed_limit, 12.0
+N_SEGMENTS, N = SHORT_HIGHWAY.n_segments, SHORT_HIGHWAY.n_mainline
 
 
-def make(share=0.2, *, flow=True, n_options=3, **settings):
-    rows = MeasurementRows.single(N_SEGMENTS)
-    lengths, limits = np.full(N_SEGMENTS, LENGTH), np.full(N_SEGMENTS, LIMIT)
-    given = FusionSettings(speed_spread=SPREAD, **settings)
-    return Fusion(given, rows, n_options, lengths, share, limits, flow)
+def make(share=0.2, *, flow=True, **settings):
+    """Of the short road, whose six mainline segments are queries; two ramps follow."""
+    model, privacy = (Paced, PacedSettings()) if flow else (Corrected, CappedSettings())
+    task = Task("own", model, privacy, SHORT_HIGHWAY, QueryOptions.make(N, 2), 240)
+    return Fusion(task, FusionSettings(speed_spread=SPREAD, **settings), share)
 
 
 def predicted(density, speed, n_episodes=1, density_std=5.0, speed_std=3.0):
@@ -42,9 +51,9 @@ def test_the_error_of_a_scaled_count_and_flow_is_as_large_as_it_says(share):
     counts, flows = connected.sum(axis=2), (connected * (speeds - centre)).sum(axis=2)
     truth = np.stack([np.full(counts.shape, n), (speeds - centre).sum(axis=2)], axis=-1) / LENGTH
     released = np.stack([counts, flows], axis=-1) / LENGTH
-    fusion = make(share, n_options=N_SEGMENTS)
+    fusion = make(share)
     found = fusion.read(measured(released, 1e-9, centre), predicted(n / LENGTH, speed, episodes))
-    errors = (found.values - truth) / found.sigma
+    errors = ((found.values - truth) / found.sigma)[:, :N]
     np.testing.assert_allclose(errors.mean(axis=(0, 1)), 0.0, atol=0.03)
     np.testing.assert_allclose(errors.std(axis=(0, 1)), 1.0, atol=0.04)
 
@@ -58,9 +67,9 @@ def test_the_error_of_a_mean_speed_is_as_large_as_it_says(share):
     counts = connected.sum(axis=2)
     means = (connected * speeds).sum(axis=2) / np.maximum(counts, 1)
     released = np.stack([counts / LENGTH, np.where(counts > 0, means, LIMIT)], axis=-1)
-    fusion = make(share, flow=False, n_options=N_SEGMENTS)
+    fusion = make(share, flow=False)
     found = fusion.read(measured(released, 1e-9, np.nan), predicted(n / LENGTH, speed, episodes))
-    errors = (found.values[..., 1] - speeds.mean(axis=2)) / found.sigma[..., 1]
+    errors = ((found.values[..., 1] - speeds.mean(axis=2)) / found.sigma[..., 1])[:, :N]
     assert 0.9 < errors.std() < 1.15
 
 
@@ -68,12 +77,23 @@ def test_sampling_error_grows_as_the_share_falls():
     values, before = np.ones((1, N_SEGMENTS, 2)), np.zeros(2)
     for share in (0.9, 0.3, 0.1, 0.01):
         found = make(share).read(measured(values), predicted(50, 60))
-        assert (found.sigma[0, :3] > before).all()
+        assert (found.sigma[0, :N] > before).all()
         before = found.sigma[0, 0]
-        np.testing.assert_allclose(found.values[0, :3], 1.0 / share)
-        # The last row is a fixed sensor's.
-        np.testing.assert_array_equal(found.values[0, 3], 1.0)
-        np.testing.assert_array_equal(found.sigma[0, 3], 1.0)
+        np.testing.assert_allclose(found.values[0, :N], 1.0 / share)
+        # The last rows are fixed sensors.
+        np.testing.assert_array_equal(found.values[0, N:], 1.0)
+        np.testing.assert_array_equal(found.sigma[0, N:], 1.0)
+
+
+@pytest.mark.parametrize("flow", [True, False])
+def test_noise_of_the_release_adds_to_the_sampling_error_over_the_share(flow):
+    values, read = np.ones((1, N_SEGMENTS, 2)), make(share=0.1, flow=flow).read
+    with_noise, without = (
+        read(measured(values, sigma), predicted(50, 60)).sigma[0, :N] for sigma in (3.0, 1e-9)
+    )
+    added = np.sqrt(with_noise**2 - without**2)
+    np.testing.assert_allclose(added[:, 0], 30.0)
+    np.testing.assert_allclose(added[:, 1], 30.0 if flow else 3.0)
 
 
 @pytest.mark.parametrize("flow", [True, False])
@@ -85,9 +105,9 @@ def test_answers_count_as_one_while_a_vehicle_is_on_the_segment(flow):
         fusion = make(share=0.2, flow=flow, dwell_factor=factor)
         return fusion.read(measured(values, sigma), predicted(50, speed))
 
-    once, alike = read(0.0).sigma[0, :3], read(1.0).sigma[0, :3]
+    once, alike = read(0.0).sigma[0, :N], read(1.0).sigma[0, :N]
     np.testing.assert_allclose((alike / once) ** 2, 10.0, rtol=1e-6)
-    np.testing.assert_allclose(read(0.05).sigma[0, :3], once)  # never less than a second
+    np.testing.assert_allclose(read(0.05).sigma[0, :N], once)  # never less than a second
 
 
 def test_deviations_of_noise_are_scaled_by_the_share():

@@ -1,4 +1,4 @@
-"""Fixed sensors as a mechanism of their own: their errors, and their part of the budget."""
+"""Connected vehicles and fixed sensors: their groups of columns, and the errors of detectors."""
 
 import math
 from collections.abc import Sequence
@@ -8,6 +8,8 @@ from typing import Annotated
 import numpy as np
 
 from dptse_env.estimators import Measurement
+from dptse_env.release.base import Group, Request, Task
+from dptse_env.traffic import Corridor, Penetration
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.fields import Interval, checked_fields
 
@@ -53,76 +55,76 @@ class Detectors:
                 f"vehicles would have no error, got {self.absolute:g}"
             )
 
-    def part_of_budget(self, share: float) -> float:
-        """Return their part of the budget, given the published share of connected vehicles."""
-        if self.budget_share is not None:
-            return self.budget_share
-        return 1.0 / (1.0 + 3.0 * math.sqrt(share))
-
     @property
     def are_exact(self) -> bool:
         """True if detectors have no errors."""
         return replace(self, budget_share=Detectors.budget_share) == Detectors()
 
 
-class DetectorErrors:
-    """Errors of the F fixed sensors in a batch of n episodes.
+def make_groups(
+    penetration: Penetration, detectors: Detectors, corridor: Corridor, *, private_boundary: bool
+) -> tuple[Group, ...]:
+    """Return the groups of columns.
 
-    They are drawn for every sensor and second, whatever is queried, and change released values
-    alone: what is released of a vehicle has its guarantee before.
+    A query sums over the connected vehicles of its segments, a fixed sensor over all vehicles of
+    its segment. They share no ledger, since a fixed sensor cannot tell which vehicle is which: each
+    group has a part of the budget mu^2 for the trip of a vehicle. The squared parameters of groups
+    add up to that of a connected vehicle (composition of Gaussian mechanisms); a vehicle that is
+    not connected is seen by the fixed sensors alone and has their smaller parameter.
+
+    Where all vehicles are connected and detectors have no errors there is one group, and one
+    ledger; without fixed sensors or private boundary segments the queries have the whole budget.
+    """
+    if penetration.is_complete and detectors == Detectors():
+        return (Group("queries"),)
+    if not (corridor.fixed_sensors or private_boundary):
+        return (Group("queries", 1.0, penetration),)
+    share = detectors.budget_share
+    if share is None:
+        share = 1.0 / (1.0 + 3.0 * math.sqrt(penetration.published_share))
+    return Group("queries", 1.0 - share, penetration), Group("sensors", share)
+
+
+class DetectorErrors:
+    """Errors of the F fixed sensors in a batch of n episodes; they are no part of a release.
+
+    They are drawn for every sensor and second, whatever is queried, from streams of their own. Who
+    does not answer is not asked; what is released of the others has its guarantee before its error.
     """
 
-    def __init__(
-        self, detectors: Detectors, columns: IntArray, lengths: FloatArray, n_episodes: int
-    ) -> None:
-        """Prepare for episodes.
-
-        Args:
-            detectors: Their errors.
-            columns: Column of each sensor in its release, shape (F,).
-            lengths: Length of each sensor's segment [km], shape (F,).
-            n_episodes: Size n of the batch.
-        """
-        self._detectors, self._columns, self._lengths = detectors, columns, lengths
-        self._factor = np.broadcast_to(np.array(detectors.factor, dtype=np.float64), columns.shape)
-        self._streams: list[np.random.Generator | None] = [None] * n_episodes
+    def __init__(self, task: Task, detectors: Detectors) -> None:
+        """Prepare for episodes."""
+        self._detectors, self._columns = detectors, task.sensors
+        self._length, self._releases_flow = task.length[task.sensors], task.releases_flow
+        self._factor = np.broadcast_to(np.array(detectors.factor, np.float64), task.sensors.shape)
+        self._streams: dict[int, np.random.Generator] = {}
 
     def reset(self, episodes: IntArray, generators: Sequence[np.random.Generator]) -> None:
         """Begin new episodes, shape (k,), with a stream for each."""
-        for episode, generator in zip(episodes.tolist(), generators, strict=True):
-            self._streams[episode] = generator
+        self._streams |= dict(zip(episodes.tolist(), generators, strict=True))
 
-    def silent(self, episodes: IntArray) -> BoolArray:
-        """Draw which sensors do not answer in this second, shape (k, F)."""
-        silent: BoolArray = self._drawn(episodes, "random") < self._detectors.dropout
-        return silent
+    def answering(self, request: Request) -> Request:
+        """Return a request without the sensors that do not answer in this second."""
+        silent = self._drawn(request.episodes, "random") < self._detectors.dropout
+        observed: BoolArray = request.observed.copy()
+        observed[:, self._columns] &= ~silent
+        return request._replace(observed=observed)
 
-    def apply(
-        self, episodes: IntArray, released: Measurement, *, releases_flow: bool
-    ) -> Measurement:
-        """Return a release with the errors of this second; columns that are no sensor keep theirs.
-
-        Mean speeds are not affected.
-        """
-        values, columns = released.values.copy(), self._columns
-        sigma = released.sigma.copy()
-        detectors, density = self._detectors, values[:, columns, 0] * self._factor
-        error = detectors.absolute / self._lengths + detectors.relative * np.maximum(
+    def added(self, episodes: IntArray, released: Measurement) -> Measurement:
+        """Return a release with the errors of this second; mean speeds are not affected."""
+        values, sigma = released.values.copy(), released.sigma.copy()
+        detectors, columns = self._detectors, self._columns
+        density = values[:, columns, 0] * self._factor
+        error = detectors.absolute / self._length + detectors.relative * np.maximum(
             density, 0.0
         )  # [veh/km]
         values[:, columns, 0] = density + error * self._drawn(episodes, "standard_normal")
         sigma[:, columns, 0] = np.hypot(sigma[:, columns, 0], error)
-        if releases_flow:
+        if self._releases_flow:
             values[:, columns, 1] *= self._factor
         return released._replace(values=values, sigma=sigma)
 
     def _drawn(self, episodes: IntArray, kind: str) -> FloatArray:
         """Return a draw for each sensor of k episodes, shape (k, F)."""
-        rows = [self._stream(episode) for episode in episodes.tolist()]
+        rows = [self._streams[episode] for episode in episodes.tolist()]
         return np.stack([getattr(row, kind)(self._columns.size) for row in rows])
-
-    def _stream(self, episode: int) -> np.random.Generator:
-        stream = self._streams[episode]
-        if stream is None:
-            raise RuntimeError(f"episode {episode} was released before its first reset")
-        return stream

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from scipy.stats import binom, binomtest, norm
 
-from dptse_env.privacy import epsilon_of, mu_of
-from dptse_env.privacy.audit_statistics import (
+from agents.audit.statistics import (
     Claim,
     audit,
     detectable_mu,
     error_bound,
     rejection_probability,
 )
+from dptse_env.privacy import epsilon_of, mu_of
 
 
 def gaussian_scores(mu, n, seed):

@@ -7,12 +7,12 @@ import pytest
 
 from agents.audit.attack import attack
 from agents.audit.planner import choose_target, make_policy
+from agents.audit.statistics import Claim, audit
 from agents.audit.strategies import FixedQueries
 from agents.audit.worlds import AdjacentWorlds, AuditedPenetration, Trajectory, audited
 from dptse_env.config import resolve
-from dptse_env.parts import privacy_report
-from dptse_env.privacy.audit_statistics import Claim, audit
-from dptse_env.release import two_mechanisms
+from dptse_env.parts import make_task, privacy_report
+from dptse_env.release import Capped
 from dptse_env.traffic import Penetration, RecordLibrary
 
 HORIZON, SENSOR = 60, 3
@@ -55,9 +55,8 @@ def test_a_vehicle_that_both_see_is_as_visible_as_the_account_says(record):
     assert reached(config(), standing(record)) == pytest.approx(1.0, rel=1e-9)
 
 
-def test_each_mechanism_alone_has_its_part(record):
-    setting = config()
-    share = setting.detectors.part_of_budget(setting.penetration.share)
+def test_each_group_alone_has_its_part(record):
+    _, share = make_task(config()).shares
     alone = reached(config(), standing(record), queried=False)
     assert alone == pytest.approx(np.sqrt(share), rel=1e-9)
     queried = reached(config(), standing(record, segment=1), segment=1)
@@ -69,18 +68,18 @@ def test_the_paced_ledgers_of_both_stay_below_mu(record):
     assert 0.9 < reached(setting, standing(record)) <= 1.0 + 1e-12
 
 
-def test_a_mechanism_that_forgets_its_share_is_found_out(record, monkeypatch):
-    sound = two_mechanisms.PartSetup.__init__
+class Generous(Capped):
+    """Spends the whole budget in each group."""
 
-    def generous(self, *args, **keywords):
-        keywords["budget_share"] = 1.0
-        sound(self, *args, **keywords)
+    def _noise_std(self, group):
+        return tuple(std * np.sqrt(self.task.shares[group]) for std in super()._noise_std(group))
 
-    monkeypatch.setattr(two_mechanisms.PartSetup, "__init__", generous)
-    setting = config()
-    declared = 1.0 * np.sqrt(2.0)
+
+def test_groups_that_forget_their_shares_are_found_out(record):
+    setting = config(Generous, cap=20)
     assert privacy_report(setting).void_reasons == ("releases_not_composed",)
-    assert reached(setting, standing(record)) * declared > 1.4
+    assert reached(setting, standing(record)) == pytest.approx(1.0)
+    assert privacy_report(setting).mu == pytest.approx(np.sqrt(2.0) * privacy_report(config()).mu)
 
 
 @pytest.mark.parametrize("adjacency", ["add_remove", "replace"])

@@ -12,8 +12,8 @@ from typing import Annotated
 import numpy as np
 
 from dptse_env.estimators import Estimate, Measurement
-from dptse_env.model import MeasurementRows
 from dptse_env.model.parameters import SECONDS_PER_HOUR
+from dptse_env.release.base import Task
 from dptse_env.utils.arrays import FloatArray
 from dptse_env.utils.fields import Interval, checked_fields
 
@@ -46,34 +46,24 @@ class FusionSettings:
         checked_fields(self, "fusion")
 
 
-@dataclass(frozen=True, eq=False)
 class Fusion:
     """Turns answers of connected vehicles into measurements of all vehicles, with their errors.
 
     A query counts n_c connected vehicles of n, of which every one is connected with probability p:
-    ``n_c / p`` estimates n with a variance of ``n (1 - p) / p`` beside the mechanism's. So it is
-    with the sum of ``v - c`` over them, whose variance is ``n (1 - p) / p`` times the mean of
+    ``n_c / p`` estimates n with a variance of ``n (1 - p) / p`` beside the release's. So it is with
+    the sum of ``v - c`` over them, whose variance is ``n (1 - p) / p`` times the mean of
     ``(v - c)^2``. The mean speed of n_c of n vehicles has the variance ``s^2 (1/n_c - 1/n)``, with
     s the spread of speeds. For n and the mean speed the estimator's prediction is taken, of one
     vehicle at least.
-
-    Attributes:
-        settings: Its settings.
-        rows: The M rows of a measurement.
-        n_options: How many of them are queries, which come first.
-        lengths: Length of each row [km], shape (M,).
-        share: Published share p of connected vehicles.
-        limits: Speed limit of each row [km/h], shape (M,).
-        releases_flow: Whether flows are released, else mean speeds.
     """
 
-    settings: FusionSettings
-    rows: MeasurementRows
-    n_options: int
-    lengths: FloatArray
-    share: float
-    limits: FloatArray
-    releases_flow: bool
+    def __init__(self, task: Task, settings: FusionSettings, share: float) -> None:
+        """Prepare for the queries of a task, with the published share p of connected vehicles."""
+        self.settings, self.share = settings, share
+        self.releases_flow = task.releases_flow
+        self._queries = queries = slice(0, task.queries.n_options)
+        self._length, self._limit = task.length[queries], task.limit[queries]
+        self._weights = task.rows.weights[queries].T  # (S, G)
 
     def scaled(self, sigma: FloatArray) -> FloatArray:
         """Return deviations (2,) of a query's noise, scaled to all vehicles."""
@@ -88,24 +78,24 @@ class Fusion:
             measured: The release of k episodes.
             prediction: The estimator's prediction for this second, rows of shape (k, S).
         """
-        queries, weights, p = slice(0, self.n_options), self.rows.weights.T, self.share
-        length, spread = self.lengths[queries], self.settings.speed_spread
-        density = np.maximum(prediction.density @ weights, 0.0)[:, queries]
-        speed = (prediction.speed @ weights)[:, queries]
-        count, alike = np.maximum(density * length, 1.0), self._seconds_alike(speed, length)
+        queries, weights, p = self._queries, self._weights, self.share
+        length, spread = self._length, self.settings.speed_spread
+        speed = prediction.speed @ weights
+        count = np.maximum((prediction.density @ weights) * length, 1.0)
+        alike = self._seconds_alike(speed, length)
         sampling = alike * count * (1.0 - p) / p / length**2
         values, sigma = measured.values.copy(), measured.sigma.copy()
         values[:, queries, 0] /= p
         sigma[:, queries, 0] = np.sqrt((sigma[:, queries, 0] / p) ** 2 + sampling)
         if self.releases_flow:
-            offset = speed - (measured.centre[:, : len(weights)] @ weights)[:, queries]
+            offset = speed - measured.centre[:, : len(weights)] @ weights
             square = offset**2 + spread**2
             values[:, queries, 1] /= p
             sigma[:, queries, 1] = np.sqrt((sigma[:, queries, 1] / p) ** 2 + sampling * square)
         else:
             answering = p * count
             # Without a connected vehicle the speed limit is released.
-            none = np.exp(-answering) * (self.limits[queries] - speed) ** 2
+            none = np.exp(-answering) * (self._limit - speed) ** 2
             sigma[:, queries, 1] = np.sqrt(
                 sigma[:, queries, 1] ** 2 + alike * (spread**2 * (1.0 - p) / answering + none)
             )

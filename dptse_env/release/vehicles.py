@@ -1,0 +1,296 @@
+"""The true traffic in memory, and what vehicles contribute to the sums of a release.
+
+A vehicle on an observed column contributes (1, d) to its sums, with d its speed less the centre of
+its place, clipped to [-D, D], and pays ``a (1 + r d^2 / D^2)`` for it, with the price a of the
+column and the ratio r. It has a ledger for each group of columns, and contributes if that covers
+the charge; otherwise it neither contributes nor pays. Whether it does depends on its own trip and
+on public numbers, never on other vehicles: removing one from a record does not change the
+contributions of the others. A price of 1, a ratio of 0 and a budget of C is a cap: a vehicle counts
+in its first C observed steps.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+from numpy.typing import NDArray
+
+from dptse_env.traffic import Corridor, Penetration, Record, RecordLibrary
+from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+from dptse_env.utils.kernels import kernel
+
+GROWTH = 1.5
+"""Factor on the size of full tables."""
+
+NumberT = TypeVar("NumberT", bound=np.generic)
+
+
+class VehicleRows(NamedTuple):
+    """The vehicles of a second of k episodes: ranges of rows in a table of all that are loaded.
+
+    Attributes:
+        start: First row of each episode, shape (k,).
+        stop: The row after its last, shape (k,).
+        vehicle: Index of a row's vehicle in its record, shape (rows,).
+        place: Column of the record that it is on, shape (rows,).
+        speed: Speed that it reports to each group of columns [km/h], shape (groups, rows); negative
+            where the group does not see it.
+    """
+
+    start: IntArray
+    stop: IntArray
+    vehicle: NDArray[np.int32]
+    place: NDArray[np.int16]
+    speed: NDArray[np.float32]
+
+
+class Traffic:
+    """The true traffic of a set of traffic seeds, in memory: per segment, and vehicle by vehicle.
+
+    Aggregates are computed once per record and stored in one table, so that a batch of episodes
+    reads its traffic with a single index. A mean speed is over vehicles; an empty segment has its
+    speed limit, so that no gap reveals that it is empty.
+
+    Attributes:
+        corridor: The road.
+        seeds: The traffic seeds.
+        library: Source of the records.
+        populations: Vehicles that each group of columns sees, None for all; none where vehicles are
+            not read.
+        n_vehicles: Vehicles of each record, shape (n_seeds,); 0 where vehicles are not read.
+    """
+
+    def __init__(
+        self,
+        corridor: Corridor,
+        seeds: tuple[int, ...],
+        library: RecordLibrary,
+        populations: Sequence[Penetration | None] = (),
+    ) -> None:
+        """Prepare tables; nothing is loaded or recorded yet."""
+        self.corridor, self.seeds, self.library = corridor, seeds, library
+        self.populations = tuple(populations)
+        columns = corridor.n_segments + corridor.n_boundaries
+        # np.empty takes address space, not memory, until a record is written.
+        self._table = np.empty((len(seeds), corridor.duration + 1, columns, 2))
+        self._loaded = np.zeros(len(seeds), dtype=bool)
+        self._lengths = np.array(corridor.with_boundaries(corridor.segment_lengths))
+        self._limits = np.array(corridor.with_boundaries(corridor.speed_limits))
+        self.n_vehicles: IntArray = np.zeros(len(seeds), dtype=np.int64)
+        self._start: IntArray = np.zeros((len(seeds), corridor.duration + 2), dtype=np.int64)
+        self._vehicle: NDArray[np.int32] = np.empty(0, dtype=np.int32)
+        self._place: NDArray[np.int16] = np.empty(0, dtype=np.int16)
+        self._speed: NDArray[np.float32] = np.empty((len(self.populations), 0), dtype=np.float32)
+        self._n_rows = 0
+
+    def load(self, indices: npt.ArrayLike) -> list[int]:
+        """Load the records of some traffic seeds; return the indices that were not in memory.
+
+        Records that are missing on disk are made, on all cores where there are several.
+
+        Raises:
+            ValueError: A record is a measured field, and vehicles are read.
+        """
+        new = [index for index in np.unique(indices).tolist() if not self._loaded[index]]
+        if len(new) > 1:
+            self.library.ensure(self.corridor, [self.seeds[index] for index in new])
+        for index in new:
+            record = self.record(index)
+            self._table[index] = record.traffic(self._lengths, self._limits)
+            if self.populations:
+                self._append(index, record)
+            self._loaded[index] = True
+        return new
+
+    def record(self, index: int) -> Record:
+        """Return the record of ``seeds[index]``, which is made now if it is missing."""
+        return self.library.get(self.corridor, self.seeds[index])
+
+    def aggregates(
+        self, indices: IntArray, times: IntArray, n_places: int | None = None
+    ) -> FloatArray:
+        """Return density [veh/km] and mean speed [km/h] of every segment, shape (k, S, 2).
+
+        Args:
+            indices: Indices of loaded traffic seeds, shape (k,).
+            times: Seconds of their records, shape (k,).
+            n_places: Number of record columns; None for the S segments.
+        """
+        rows: FloatArray = self._table[indices, times, : n_places or self.corridor.n_segments]
+        return rows
+
+    def complete(self, index: int) -> FloatArray:
+        """Return density and speed of all segments over a complete record, (T + 1, S + R, 2).
+
+        The boundary segments come last, in the order of `dptse_env.traffic.corridor`.
+        """
+        traffic: FloatArray = self._table[index]
+        return traffic
+
+    def vehicles(self, indices: IntArray, times: IntArray) -> VehicleRows:
+        """Return the vehicles of a second of k episodes; arguments are as in `aggregates`."""
+        start, stop = self._start[indices, times], self._start[indices, times + 1]
+        return VehicleRows(start, stop, self._vehicle, self._place, self._speed)
+
+    def _append(self, index: int, record: Record) -> None:
+        """Append the vehicles of a record, with what each group sees of them."""
+        record = record.vehicles_for("the release model, or the keyword penetration,")
+        end = self._n_rows + record.n_rows
+        if end > self._vehicle.size:
+            size = max(end, int(GROWTH * self._vehicle.size))
+            self._vehicle, self._place = _longer(self._vehicle, size), _longer(self._place, size)
+            self._speed = _longer(self._speed, size)
+        rows = slice(self._n_rows, end)
+        self._vehicle[rows], self._place[rows] = record.vehicle, record.segment
+        for group, population in enumerate(self.populations):
+            self._speed[group, rows] = (
+                record.speed if population is None else population.speeds(self.seeds[index], record)
+            )
+        self._start[index] = self._n_rows + record.offsets
+        self.n_vehicles[index] = record.n_vehicles
+        self._n_rows = end
+
+
+def _longer(column: NDArray[NumberT], size: int) -> NDArray[NumberT]:
+    """Return a copy with a longer last axis; values beyond its end are undefined."""
+    longer = np.empty((*column.shape[:-1], size), dtype=column.dtype)
+    longer[..., : column.shape[-1]] = column
+    return longer
+
+
+class Ledgers:
+    """Ledgers of the vehicles of each episode: what each has paid in each group of columns.
+
+    Attributes:
+        budget: Largest total that a vehicle can pay in each group, shape (groups,).
+        ratio: r.
+        clip: D [km/h].
+        fastest: Speed that reports are clipped to [km/h].
+        paid: What each vehicle has paid, shape (n, groups, vehicles); as wide as the largest record
+            so far.
+    """
+
+    def __init__(
+        self,
+        columns: tuple[IntArray, IntArray, IntArray],
+        n_episodes: int,
+        budget: FloatArray,
+        *,
+        ratio: float = 0.0,
+        clip: float = math.inf,
+        fastest: float = math.inf,
+    ) -> None:
+        """Prepare for episodes; by default no contribution is clipped or costs by its speed.
+
+        Args:
+            columns: First place, number of places and group of each column, shape (C,) each.
+            n_episodes: Episodes n.
+            budget: See the attributes, as for the others.
+            ratio: At most 1 where vehicles are replaced: two may deviate in opposite directions.
+            clip: [km/h].
+            fastest: [km/h].
+        """
+        self.budget, self.ratio, self.clip = budget, ratio, clip
+        self.fastest = np.float32(fastest)
+        self.paid: FloatArray = np.zeros((n_episodes, budget.size, 0))
+        self._columns = columns
+
+    def reset(self, episodes: IntArray, n_vehicles: IntArray | None = None) -> None:
+        """Clear the ledgers of episodes (k,), with room for the vehicles of every record."""
+        most = 0 if n_vehicles is None else int(n_vehicles.max())
+        if most > self.paid.shape[2]:
+            wider = np.zeros((*self.paid.shape[:2], most))
+            wider[..., : self.paid.shape[2]] = self.paid
+            self.paid = wider
+        self.paid[episodes] = 0.0
+
+    def collect(
+        self,
+        episodes: IntArray,
+        observed: BoolArray,
+        rows: VehicleRows,
+        prices: FloatArray,
+        centre: FloatArray,
+    ) -> tuple[FloatArray, IntArray]:
+        """Sum the contributions of a second to the observed columns, and charge the vehicles.
+
+        Args:
+            episodes: Shape (k,).
+            observed: Columns that are observed, shape (k, C).
+            rows: The vehicles of the second.
+            prices: Price a of each column, shape (k, C).
+            centre: Centre at each place [km/h], shape (k, S + R).
+
+        Returns:
+            The sums of vehicles and of their d [km/h], shape (k, C, 2), zero where not observed,
+            and the contributions that ledgers did not cover, shape (k, groups).
+        """
+        sums = np.zeros((*observed.shape, 2))
+        refused = np.zeros((len(sums), self.budget.size), dtype=np.int64)
+        _collect(
+            *self._columns, rows.start, rows.stop, rows.vehicle, rows.place, rows.speed,
+            episodes, observed, prices, centre, self.fastest, self.clip, self.ratio, self.budget,
+            self.paid, sums, refused,
+        )  # fmt: skip
+        return sums, refused
+
+    def of(self, episodes: IntArray, n_vehicles: IntArray) -> list[FloatArray]:
+        """Return what each vehicle of k episodes has paid, arrays of shape (groups, n_vehicles)."""
+        pairs = zip(episodes.tolist(), n_vehicles.tolist(), strict=True)
+        return [self.paid[episode, :, :n].copy() for episode, n in pairs]
+
+
+@kernel
+def _collect(
+    first: IntArray,
+    span: IntArray,
+    group: IntArray,
+    start: IntArray,
+    stop: IntArray,
+    vehicle: NDArray[np.int32],
+    place: NDArray[np.int16],
+    speed: NDArray[np.float32],
+    episodes: IntArray,
+    observed: BoolArray,
+    prices: FloatArray,
+    centre: FloatArray,
+    fastest: Any,
+    clip: float,
+    ratio: float,
+    budget: FloatArray,
+    paid: FloatArray,
+    sums: FloatArray,
+    refused: IntArray,
+) -> None:
+    n_columns, n_places = first.size, centre.shape[1]
+    n_covering = np.empty(n_places, dtype=np.int64)
+    covering = np.empty((n_places, n_columns), dtype=np.int64)
+    for k in range(episodes.size):
+        n_covering[:] = 0
+        for c in range(n_columns):
+            if observed[k, c]:
+                for s in range(first[c], first[c] + span[c]):
+                    covering[s, n_covering[s]] = c
+                    n_covering[s] += 1
+        ledgers = paid[episodes[k]]
+        for row in range(start[k], stop[k]):
+            s, v = place[row], vehicle[row]
+            # A vehicle pays for every query that covers it, in the order of the columns.
+            for i in range(n_covering[s] if s < n_places else 0):
+                c = covering[s, i]
+                g = group[c]
+                reported = speed[g, row]
+                if reported < 0.0:
+                    continue
+                d = min(max(min(reported, fastest) - centre[k, s], -clip), clip)
+                cost = prices[k, c] * (1.0 + ratio * d * d / (clip * clip))
+                if ledgers[g, v] + cost <= budget[g]:
+                    ledgers[g, v] += cost
+                    sums[k, c, 0] += 1.0
+                    sums[k, c, 1] += d
+                else:
+                    refused[k, g] += 1
