@@ -43,7 +43,7 @@ class ConstantNoise(Noise):
     def give(self, noise):
         pass  # its answers have no noise
 
-    def added(self, episodes, values, sigma, grid, unit):
+    def added(self, episodes, values, sigma, unit):
         self._step += 1
         answer = np.random.default_rng(self._step).uniform(-0.2, 1.0, values.shape)
         return answer * [60.0, self._largest]
