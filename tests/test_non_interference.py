@@ -43,7 +43,7 @@ class ConstantNoise(Noise):
     def give(self, noise):
         pass  # its answers have no noise
 
-    def added(self, episodes, values, sigma, grid, unit):
+    def added(self, episodes, values, sigma, unit):
         self._step += 1
         answer = np.random.default_rng(self._step).uniform(-0.2, 1.0, values.shape)
         return answer * [60.0, self._largest]
@@ -71,7 +71,7 @@ def transcript(env, traffic_seed, schedule=None):
 
 def public(env, info):
     process = env.unwrapped.process
-    estimate = {name: getattr(process.estimate, name).copy() for name in vars(process.estimate)}
+    estimate = {name: rows.copy() for name, rows in process.estimate._asdict().items()}
     masks = {"released": process.released.copy(), "age": process.age.copy()}
     shown = {key: value for key, value in info.items() if key not in TRUTH_INFO}
     terms = {

@@ -5,7 +5,6 @@ that publishes the same values whatever the traffic, two episodes over different
 the same, bit by bit, in prices, centres and deviations as in observations, estimates and ``info``.
 """
 
-import dataclasses
 import itertools
 
 import gymnasium as gym
@@ -153,13 +152,13 @@ def truth_of(release, request):
 
 class CentreOfTheTruth(Paced):
     def release(self, request):
-        seen = dataclasses.replace(request.prediction(), speed=truth_of(self, request)["speed"])
+        seen = request.prediction()._replace(speed=truth_of(self, request)["speed"])
         return super().release(request._replace(prediction=lambda: seen))
 
 
 class PriceOfTrueCounts(Paced):
     def release(self, request):
-        seen = dataclasses.replace(request.prediction(), density=truth_of(self, request)["density"])
+        seen = request.prediction()._replace(density=truth_of(self, request)["density"])
         return super().release(request._replace(prediction=lambda: seen))
 
 
@@ -171,7 +170,7 @@ class CentreOfTheSameSecond(Paced):
         values = first.values[:, : prediction.speed.shape[1]]
         told = prediction.speed + values[..., 1] / np.maximum(values[..., 0], 10.0)
         seen = request.observed[:, : prediction.speed.shape[1]]
-        updated = dataclasses.replace(prediction, speed=np.where(seen, told, prediction.speed))
+        updated = prediction._replace(speed=np.where(seen, told, prediction.speed))
         return super().release(request._replace(prediction=lambda: updated))
 
 
@@ -208,7 +207,7 @@ class FallsBackWhereNobodyIs(Paced):
     def release(self, request):
         empty = truth_of(self, request)["density"] == 0.0
         prediction = request.prediction()
-        holed = dataclasses.replace(prediction, speed=np.where(empty, np.nan, prediction.speed))
+        holed = prediction._replace(speed=np.where(empty, np.nan, prediction.speed))
         return super().release(request._replace(prediction=lambda: holed))
 
 

@@ -159,8 +159,8 @@ def test_residuals_are_the_noise_that_is_declared(keywords):
     residuals = []
     added = process.release.noise.added
 
-    def spy(episodes, values, sigma, grid, unit):
-        released = added(episodes, values, sigma, grid, unit)
+    def spy(episodes, values, sigma, unit):
+        released = added(episodes, values, sigma, unit)
         residuals.append((released - values)[0] / process.release.sigma)
         return released
 

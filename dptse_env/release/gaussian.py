@@ -30,7 +30,7 @@ from dptse_env.release.base import (
     Request,
     Task,
 )
-from dptse_env.release.noise import Noise, grid_of
+from dptse_env.release.noise import Noise
 from dptse_env.release.report import STRICT_DELTA, PrivacyReport, QuantityReport, in_order
 from dptse_env.release.vehicles import Ledgers, Traffic
 from dptse_env.traffic import Corridor
@@ -79,7 +79,6 @@ class GaussianRelease(ReleaseModel):
         self._is_even = bool((self._stretch == 1.0).all())
         self._sigma = np.tile(self.noise_std[task.group], (n, 1, 1))
         self._released_sigma = self._sigma / self._stretch[:, None]
-        self._grid = grid_of(self._sigma)
         v_0 = math.nan if task.flow_centre is None else task.flow_centre
         self._centre = np.full((n, task.n_places), v_0)
         self._price, self._zero = np.ones((n, task.n_columns)), np.zeros((n, task.n_places))
@@ -127,9 +126,7 @@ class GaussianRelease(ReleaseModel):
         if not self._is_even:
             values = values * self._stretch[:, None]
         k = len(values)
-        values = self.noise.added(
-            request.episodes, values, self._sigma[:k], self._grid[:k], self._stretch
-        )
+        values = self.noise.added(request.episodes, values, self._sigma[:k], self._stretch)
         return Measurement(request.observed, values, self._released_sigma[:k], self._centre[:k])
 
     def mean_values(self, request: Request) -> FloatArray:

@@ -1,11 +1,12 @@
 """Noise of a batch of episodes, and rounding of releases to a public grid."""
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
 
 from dptse_env.utils.arrays import FloatArray, IntArray
-from dptse_env.utils.kernels import kernel
+from dptse_env.utils.kernels import kernel, kernel_part
 
 GRID_SHARE = 2.0**-10
 """Largest spacing of the released grid over the noise's standard deviation."""
@@ -13,18 +14,16 @@ GRID_SHARE = 2.0**-10
 BLOCK = 32
 """Seconds for which noise is drawn at a time; a large draw costs far less than many small ones."""
 
-_EXPONENT = 0x7FF0_0000_0000_0000  # the bits of a double's exponent
 
-
-def grid_of(sigma: FloatArray) -> FloatArray:
-    """Return the spacing of the grid for noise of standard deviations `sigma` > 0, of any shape.
+@kernel_part
+def grid_of(sigma: float) -> float:
+    """Return the spacing of the grid for noise of a standard deviation > 0.
 
     It is the power of two in (sigma / 2048, sigma / 1024]: scaling by it is exact, so that a
     rounded release is a multiple of the grid.
     """
-    bits = (sigma * GRID_SHARE).view(np.int64)
-    bits &= _EXPONENT  # without its fraction a float is the power of two below it
-    return bits.view(np.float64)
+    _, exponent = math.frexp(sigma * GRID_SHARE)
+    return math.ldexp(1.0, exponent - 1)
 
 
 class Noise:
@@ -81,10 +80,9 @@ class Noise:
         episodes: IntArray,
         values: FloatArray,
         sigma: FloatArray,
-        grid: FloatArray,
         unit: FloatArray,
     ) -> FloatArray:
-        """Return values with the noise of the next step, rounded to the grid, over their unit.
+        """Return values with the noise of the next step, rounded to `grid_of` it, over their unit.
 
         The low bits of a sum in double precision depend on the true value: released unrounded, they
         would prove that a segment is empty (Mironov, 2012). Rounding raises the variance by less
@@ -94,7 +92,6 @@ class Noise:
             episodes: Shape (k,).
             values: True values, shape (k, C, 2).
             sigma: Standard deviations of the noise, shape (k, C, 2).
-            grid: `grid_of` them.
             unit: What released values are divided by, shape (C,).
 
         Raises:
@@ -107,7 +104,7 @@ class Noise:
         noise, given, self._given = self._noise, self._given, None
         if given is not None:
             noise = np.repeat(given[:, None], BLOCK, axis=1)
-        _add(noise, self._next, episodes, values, sigma, grid, unit, released)
+        _add(noise, self._next, episodes, values, sigma, unit, released)
         return released
 
     def _refill(self, episodes: IntArray) -> None:
@@ -133,7 +130,6 @@ def _add(
     episodes: IntArray,
     values: FloatArray,
     sigma: FloatArray,
-    grid: FloatArray,
     unit: FloatArray,
     released: FloatArray,
 ) -> None:
@@ -142,5 +138,6 @@ def _add(
         next_[episodes[k]] += 1
         for c in range(unit.size):
             for q in range(2):
+                grid = grid_of(sigma[k, c, q])
                 noisy = noise[episodes[k], step, c, q] * sigma[k, c, q] + values[k, c, q]
-                released[k, c, q] = np.rint(noisy / grid[k, c, q]) * grid[k, c, q] / unit[c]
+                released[k, c, q] = np.rint(noisy / grid) * grid / unit[c]

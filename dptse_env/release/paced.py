@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
@@ -20,13 +20,14 @@ from dptse_env.release.base import (
     Request,
     Task,
 )
-from dptse_env.release.noise import Noise, grid_of
+from dptse_env.release.noise import Noise
 from dptse_env.release.pacing import PACINGS, EventPacing, check_prices
 from dptse_env.release.report import STRICT_DELTA, PrivacyReport
 from dptse_env.release.vehicles import Ledgers, Traffic
 from dptse_env.traffic import Corridor
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.fields import Interval
+from dptse_env.utils.kernels import Bundle, kernel
 from dptse_env.utils.registry import is_foreign
 from dptse_env.utils.vector_info import Rows, object_array
 
@@ -126,7 +127,8 @@ class Paced(ReleaseModel):
         self._epsilons = EpsilonTable(math.hypot(*self.mu), settings.delta)
         # The counts of two vehicles on one segment cancel; deviations may be opposite.
         self._squares = 2.0 if settings.adjacency == "replace" else 1.0
-        self.budget = self.mu**2 / self._squares
+        self._whole = self.mu**2
+        self.budget = self._whole / self._squares
         self.ledgers = Ledgers(
             task.columns,
             n,
@@ -143,6 +145,16 @@ class Paced(ReleaseModel):
         self.prices = np.zeros((n, task.n_columns))
         # The largest payments that a vehicle can have made in each group.
         self._charged = np.zeros((n, len(task.groups)))
+        self._accounts = Bundle(
+            _Accounts(
+                *task.columns, settings.ratio, settings.unit == "event", task.n_places,
+                self.prices, self._charged,
+            )
+        )  # fmt: skip
+        self._flow_noise = settings.clip / math.sqrt(settings.ratio)
+        self._limits = np.array(task.corridor.speed_limits)
+        n_boundaries = task.n_places - task.corridor.n_segments
+        self._neighbours = np.array(task.corridor.boundary_neighbours)[:n_boundaries]
         self._fallback = np.zeros(n)
         self._refused = np.zeros((n, len(task.groups)), dtype=np.int64)
 
@@ -151,21 +163,15 @@ class Paced(ReleaseModel):
         """Deviations of the shortest segment's noise at the published demand, shape (groups, 2)."""
         corridor = self.task.corridor
         prices = self.pacing.expected_prices(np.array(corridor.speed_limits))
-        return self._deviations(prices) / min(corridor.segment_lengths)
+        count = 1.0 / np.sqrt(prices)
+        std: FloatArray = np.stack([count, self._flow_noise * count], axis=-1)
+        return std / min(corridor.segment_lengths)
 
     @property
     def sigma(self) -> FloatArray:
         """See `ReleaseModel.sigma`; at the published demand, of the shortest segment."""
         sigma: FloatArray = self._expected_std[0]
         return sigma
-
-    def _deviations(self, prices: FloatArray) -> FloatArray:
-        """Return the deviations of the noise of both sums, shape (..., 2), at prices (...)."""
-        settings, deviations = self.task.settings, np.empty((*prices.shape, 2))
-        count = 1.0 / np.sqrt(prices)
-        deviations[..., 0] = count
-        deviations[..., 1] = settings.clip / math.sqrt(settings.ratio) * count
-        return deviations
 
     def reset(self, episodes: IntArray, generators: Sequence[np.random.Generator]) -> None:
         """See `ReleaseModel.reset`; no vehicle has paid anything yet."""
@@ -178,18 +184,32 @@ class Paced(ReleaseModel):
     def release(self, request: Request) -> Measurement:
         """See `ReleaseModel.release`."""
         task, episodes, observed = self.task, request.episodes, request.observed
-        density, speed = self._predicted(request)
-        prices = self.pacing.prices(episodes, observed, density, speed)
+        predicted, centre = self._predicted(request)
+        prices = self.pacing.prices(episodes, observed, *predicted)
         if self._checks_prices:
             prices = check_prices(prices, observed.shape)
-        centre = task.at_places(np.clip(speed, 0.0, task.corridor.largest_speed_limit))
-        self.prices[episodes] = prices
-        self._charge(episodes, observed, prices)
+        sigma = np.empty((*prices.shape, 2))
+        _charge(self._accounts, episodes, observed, prices, self._flow_noise, sigma)
         sums, self._refused[episodes] = self.collect(request, prices, centre)
-        sigma = self._deviations(prices)
-        values = self.noise.added(episodes, sums, sigma, grid_of(sigma), task.length)
+        values = self.noise.added(episodes, sums, sigma, task.length)
         sigma /= task.length[:, None]
         return Measurement(observed, values, sigma, centre)
+
+    def _predicted(self, request: Request) -> tuple[FloatArray, FloatArray]:
+        """Return predicted densities and speeds (2, k, S), and speeds as centres (k, S + R).
+
+        They are those of an empty free road where they are not finite.
+        """
+        prediction, task = request.prediction(), self.task
+        predicted = np.empty((2, *prediction.density.shape))
+        centre = np.empty((predicted.shape[1], task.n_places))
+        fallback = np.empty(len(centre))
+        _centre(
+            prediction.density, prediction.speed, self._limits, self._neighbours,
+            task.corridor.largest_speed_limit, predicted, centre, fallback,
+        )  # fmt: skip
+        self._fallback[request.episodes] = fallback
+        return predicted, centre
 
     def collect(
         self, request: Request, prices: FloatArray, centre: FloatArray
@@ -199,48 +219,6 @@ class Paced(ReleaseModel):
             self.ledgers.reset(request.episodes)
         rows = self.traffic.vehicles(request.traffic, request.times)
         return self.ledgers.collect(request.episodes, request.observed, rows, prices, centre)
-
-    def _predicted(self, request: Request) -> tuple[FloatArray, FloatArray]:
-        """Return predicted densities and speeds; empty free road where they are not finite."""
-        prediction = request.prediction()
-        density, speed = prediction.density, prediction.speed
-        finite = np.isfinite(density) & np.isfinite(speed)
-        self._fallback[request.episodes] = ~finite.all(axis=1)
-        if finite.all():
-            return density, speed
-        nominal = np.array(self.task.corridor.speed_limits)
-        return np.where(finite, density, 0.0), np.where(finite, speed, nominal)
-
-    def _charge(self, episodes: IntArray, observed: BoolArray, prices: FloatArray) -> None:
-        """Add the largest payment that a vehicle can make to each group in this second."""
-        paid = np.where(observed, (1.0 + self.task.settings.ratio) * prices, 0.0)
-        if self._covers is not None:
-            paid = paid @ self._covers
-        largest = np.maximum.reduceat(paid, self._starts, axis=1)
-        if self.task.settings.unit == "event":
-            self._charged[episodes] = np.maximum(self._charged[episodes], largest)
-        else:
-            self._charged[episodes] += largest
-
-    @cached_property
-    def _covers(self) -> FloatArray | None:
-        """Whether a column covers a place, 1 or 0, for each group: shape (C, groups * places).
-
-        None where no two columns of a group cover the same place.
-        """
-        task = self.task
-        own = [task.covers * (task.group == g)[:, None] * 1.0 for g in range(len(task.groups))]
-        if all((each.sum(axis=0) <= 1.0).all() for each in own):
-            return None
-        return np.concatenate(own, axis=1)
-
-    @cached_property
-    def _starts(self) -> IntArray:
-        """Where each group begins in what `_charge` looks at."""
-        groups = np.arange(len(self.task.groups))
-        if self._covers is None:
-            return np.searchsorted(self.task.group, groups)
-        return groups * self.task.n_places
 
     def spent(self, episodes: IntArray, steps: IntArray) -> tuple[FloatArray, FloatArray]:
         """See `ReleaseModel.spent`.
@@ -252,7 +230,7 @@ class Paced(ReleaseModel):
 
     def _losses(self, paid: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return mu and epsilon of vehicles that have paid at most (vehicles, groups)."""
-        squares = np.minimum(self._squares * paid, self.mu**2)
+        squares = np.minimum(self._squares * paid, self._whole)
         return self._epsilons.bounds(np.sqrt(squares.sum(axis=1)))
 
     def report(self) -> PrivacyReport:
@@ -285,9 +263,9 @@ class Paced(ReleaseModel):
         (k, n_mainline); then ``centre_fallback`` is 1.
         """
         return {
-            "prices": self.prices[episodes, : self.task.queries.n_options],
+            "prices": self.prices.take(episodes, 0)[:, : self.task.queries.n_options],
             "tracer": self.pacing.tracer(episodes),
-            "centre_fallback": self._fallback[episodes].copy(),
+            "centre_fallback": self._fallback[episodes],
         }
 
     def budgets_spent(self, episodes: IntArray) -> FloatArray:
@@ -319,3 +297,73 @@ class Paced(ReleaseModel):
     def give_noise(self, noise: FloatArray) -> None:
         """See `ReleaseModel.give_noise`."""
         self.noise.give(noise)
+
+
+class _Accounts(NamedTuple):
+    """Columns of a release, and what is published of it."""
+
+    first: IntArray  # (C,) first place of each column
+    span: IntArray  # (C,) number of places that each covers
+    group: IntArray  # (C,) its group
+    ratio: float
+    is_event: bool
+    n_places: int
+    prices: FloatArray  # (n, C) of the last release
+    charged: FloatArray  # (n, groups) the largest payments that a vehicle can have made
+
+
+@kernel
+def _centre(
+    density: FloatArray,
+    speed: FloatArray,
+    limits: FloatArray,
+    neighbours: IntArray,
+    fastest: float,
+    predicted: FloatArray,
+    centre: FloatArray,
+    fallback: FloatArray,
+) -> None:
+    """Write finite predictions, their speeds as centres, and whether some were not finite."""
+    n_segments = limits.size
+    for k in range(fallback.size):
+        fallback[k] = 0.0
+        for s in range(n_segments):
+            rho, v = density[k, s], speed[k, s]
+            if not (np.isfinite(rho) and np.isfinite(v)):
+                rho, v = 0.0, limits[s]
+                fallback[k] = 1.0
+            predicted[0, k, s], predicted[1, k, s] = rho, v
+            centre[k, s] = min(max(v, 0.0), fastest)
+        for r in range(neighbours.size):
+            centre[k, n_segments + r] = centre[k, neighbours[r]]
+
+
+@kernel
+def _charge(
+    bundle: Bundle,
+    episodes: IntArray,
+    observed: BoolArray,
+    prices: FloatArray,
+    flow_noise: float,
+    sigma: FloatArray,
+) -> None:
+    """Publish prices; add the largest payment that a vehicle can make to each group in a second.
+
+    Write the deviations of the noise of both sums to `sigma`, shape (k, C, 2).
+    """
+    (accounts,) = bundle.parts
+    paid = np.empty((accounts.charged.shape[1], accounts.n_places))
+    for k in range(episodes.size):
+        paid[:] = 0.0
+        for c in range(accounts.first.size):
+            price, first = prices[k, c], accounts.first[c]
+            accounts.prices[episodes[k], c] = price
+            sigma[k, c, 0] = 1.0 / np.sqrt(price)
+            sigma[k, c, 1] = flow_noise * sigma[k, c, 0]
+            if observed[k, c]:
+                for s in range(first, first + accounts.span[c]):
+                    paid[accounts.group[c], s] += (1.0 + accounts.ratio) * price
+        charged = accounts.charged[episodes[k]]
+        for g in range(charged.size):
+            largest = paid[g].max()
+            charged[g] = max(charged[g], largest) if accounts.is_event else charged[g] + largest

@@ -196,7 +196,7 @@ class TracerPacing(Pacing):
 
     def tracer(self, episodes: IntArray) -> FloatArray:
         """See `Pacing.tracer`."""
-        tracer = self._tracer[episodes, 0, : self.task.corridor.n_mainline]
+        tracer = self._tracer.take(episodes, 0)[:, 0, : self.task.corridor.n_mainline]
         part: FloatArray = np.minimum(tracer / self.budget[0], 1.0)
         return part
 

@@ -133,7 +133,8 @@ class Traffic:
 
     def vehicles(self, indices: IntArray, times: IntArray) -> VehicleRows:
         """Return the vehicles of a second of k episodes; arguments are as in `aggregates`."""
-        start, stop = self._start[indices, times], self._start[indices, times + 1]
+        at = indices * self._start.shape[1] + times
+        start, stop = self._start.take(at), self._start.take(at + 1)  # quicker than two indices
         return VehicleRows(start, stop, self._vehicle, self._place, self._speed)
 
     def _append(self, index: int, record: Record) -> None:

@@ -94,7 +94,7 @@ class Block:
     values: Callable[[PublicState, Task], AnyArray | float]
     unit: Callable[[Task], float] = lambda task: 1.0
     is_log: bool = False
-    is_default: Callable[[Task, bool], bool] = lambda task, picks_one_by_one: True
+    is_default: Callable[[Task, bool], bool] = lambda task, one_by_one: True
 
     def __reduce__(self) -> tuple[Callable[[str], Block], tuple[str]]:
         """Pickle as the name, since lambda functions cannot be pickled."""
@@ -150,10 +150,6 @@ def _log_prices(state: PublicState, _: Task) -> FloatArray | float:
     return np.where(state.prices > 0.0, np.log10(np.maximum(state.prices, _TINY)), 0.0)
 
 
-def _has_prices(task: Task, _: bool) -> bool:
-    return task.model.has_prices
-
-
 SHIPPED_BLOCKS = (
     Block("density", _segments, 0, 4, lambda state, _: state.estimate.density, _density_scale),
     Block("speed", _segments, 0, 4, lambda state, _: state.estimate.speed, _speed_scale),
@@ -176,12 +172,12 @@ SHIPPED_BLOCKS = (
           lambda _, task: task.queries.bandwidth, lambda task: task.corridor.n_mainline),
     Block("epsilon", lambda _: 1, -6, 6, lambda _, task: float(np.log10(task.settings.epsilon))),
     Block("picked", _options, 0, 1, lambda state, _: state.picked,
-          is_default=lambda _, picks_one_by_one: picks_one_by_one),
+          is_default=lambda _, one_by_one: one_by_one),
     Block("last_price", _options, -5, 5, _log_prices, lambda _: PRICE_UNIT,
-          is_default=_has_prices),
+          is_default=lambda task, _: task.model.has_prices),
     Block("tracer", _mainline, 0, 1,
           lambda state, _: 0.0 if state.tracer is None else state.tracer,
-          is_default=_has_prices),
+          is_default=lambda task, _: task.model.has_prices),
 )  # fmt: skip
 """The shipped blocks; the default observation has those that are in it, in this order."""
 

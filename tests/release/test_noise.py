@@ -32,7 +32,7 @@ def started(*seeds, kind=Noise):
 
 def added(noise, values, episodes=ONE):
     sigma = np.broadcast_to(SIGMA, values.shape).copy()
-    return noise.added(np.asarray(episodes), values, sigma, grid_of(sigma), UNIT)
+    return noise.added(np.asarray(episodes), values, sigma, UNIT)
 
 
 def drawn(noise, n_steps, episodes=ONE):
@@ -173,7 +173,7 @@ def test_a_release_is_the_value_plus_noise_over_its_unit_in_a_fresh_array():
     noise, twin, unit = started(1), started(1), np.linspace(0.5, 2.0, S)
     values = on_grid(np.random.default_rng(0).uniform(0.0, 300.0, (1, S, 2)))
     before, sigma = values.copy(), np.broadcast_to(SIGMA, values.shape).copy()
-    found = noise.added(ONE, values, sigma, grid_of(sigma), unit)
+    found = noise.added(ONE, values, sigma, unit)
     np.testing.assert_array_equal(values, before)
     expected = (values + drawn(twin, 1)[0]) / unit[:, None]
     np.testing.assert_array_equal(found, expected)
@@ -183,11 +183,11 @@ def test_a_release_is_the_value_plus_noise_over_its_unit_in_a_fresh_array():
 @pytest.mark.parametrize("sigma", [(20.3, 11.2), (1e-3, 1e9), (1024.0, 0.5)])
 def test_releases_lie_on_a_public_grid_much_finer_than_the_noise(sigma):
     deviations = np.broadcast_to(sigma, (1, S, 2)).copy()
-    grid = grid_of(deviations)
+    grid = np.vectorize(grid_of)(deviations)
     assert ((grid <= deviations / 1024.0) & (grid > deviations / 2048.0)).all()
     np.testing.assert_array_equal(np.frexp(grid)[0], 0.5)  # powers of two
     values = np.random.default_rng(0).uniform(0.0, 300.0, (1, S, 2))
-    steps = started(1).added(ONE, values, deviations, grid, UNIT) / grid
+    steps = started(1).added(ONE, values, deviations, UNIT) / grid
     np.testing.assert_array_equal(steps, np.rint(steps))
     assert (steps % 2.0 == 1.0).any()
 
