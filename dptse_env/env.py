@@ -105,6 +105,8 @@ class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
     | ``fallback``        | 1 if its update had no solution in this second: it only predicted      |
     | ``mu``              | privacy loss of a vehicle so far, at most: Gaussian DP parameter       |
     | ``epsilon``         | the same as epsilon at the configured delta                            |
+    | ``prices``          | under ``paced``: last price of each option, 0 before, shape (G,)       |
+    | ``tracer``          | under ``paced``: as in the observation, shape (n,)                     |
     | ``centre_fallback`` | under ``paced``: 1 if no prediction was finite to centre flows on      |
     | ``truth``           | true traffic, with ``truth_in_info=True`` only                         |
     | ``privacy``         | at the reset only: the guarantee and its account, see `privacy`        |

@@ -78,7 +78,6 @@ def test_demand_states_without_a_traffic_model_are_refused_by_the_configuration(
         resolve("paper-highway", keywords)
 
 
-@pytest.mark.parametrize("make", [gym.make, gym.make_vec])
 @pytest.mark.parametrize(
     ("estimator", "settings", "message"),
     [
@@ -90,10 +89,11 @@ def test_demand_states_without_a_traffic_model_are_refused_by_the_configuration(
     ],
 )
 def test_settings_that_an_estimator_cannot_have_are_refused_when_it_is_made(
-    make, estimator, settings, message
+    estimator, settings, message
 ):
+    keywords = {"estimator": estimator, "estimator_settings": settings}
     with pytest.raises(ValueError, match=f"^estimator_settings.{message}"):
-        make("dptse_env:dptse/ShortHighway-v0", estimator=estimator, estimator_settings=settings)
+        gym.make("dptse_env:dptse/ShortHighway-v0", **keywords)
 
 
 def test_a_set_for_the_corridor_comes_before_that_for_any():
@@ -140,16 +140,6 @@ def test_a_mapping_of_settings_keeps_what_would_have_been_chosen():
     ):
         with pytest.raises(ValueError, match=message):
             resolve("paper-highway", {"estimator_settings": bad})
-
-
-def test_settings_survive_the_spec_of_an_environment():
-    settings = {"process_noise": [0.5, 0.25], "ukf": {"alpha": 1.0}}
-    env = gym.make("dptse_env:dptse/PaperHighway-v0", estimator_settings=settings)
-    again = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
-    config, other = env.unwrapped.config, again.unwrapped.config
-    assert other == config
-    plain = json.loads(json.dumps(dataclasses.asdict(config)))
-    assert resolve("short-highway", plain) == config
 
 
 def test_seed_ranges():
@@ -199,15 +189,9 @@ def test_every_privacy_keyword_is_reachable_from_json():
 
 
 BAD_PRIVACY = [
-    ({"cap": 0}, "cap must be"),
     ({"cap": 2.5}, "cap must be"),
-    ({"share": 1.0}, "share must be"),
     ({"epsilon": 0}, "epsilon must be"),
-    ({"delta": 0.5}, "delta must be"),
     ({"unit": "week"}, "unit must be one of"),
-    ({"adjacency": "swap"}, "adjacency must be one of"),
-    ({"speed_release": "sum"}, "speed_release must be one of"),
-    ({"boundary_inputs": "no"}, "boundary_inputs must be one of"),
     ({"speed_release": "mean", "adjacency": "add_remove"}, "adjacency must be 'replace'"),
     ({"preset": "paper", "speed_release": "flow"}, "speed_release is unknown"),
 ]
@@ -217,18 +201,6 @@ def test_bad_privacy_is_named_with_its_path():
     for privacy, message in BAD_PRIVACY:
         with pytest.raises(ValueError, match=rf"^privacy\.{message}"):
             resolve("private-highway", {"privacy": privacy})
-
-
-@pytest.mark.parametrize(
-    ("unit", "horizon", "contributions"),
-    [("trip", 700, 64), ("trip", 50, 50), ("horizon", 50, 50), ("event", 700, 1)],
-)
-def test_a_sensitivity_counts_what_the_unit_can_contribute(unit, horizon, contributions):
-    config = resolve("private-highway", {"privacy": {"unit": unit}, "horizon": horizon})
-    (sensitivity,) = make_release(config).sensitivity
-    assert sensitivity.contributions == contributions
-    assert sensitivity.releases[0].bound == pytest.approx(10 * (2 * contributions) ** 0.5)
-    assert sensitivity.releases[1].bound == pytest.approx(2 * 510 * contributions**0.5)
 
 
 def test_neither_bandwidth_nor_sensors_enter_an_honest_bound():
@@ -277,14 +249,15 @@ SUMS = "tests.release.sums:SumRelease"
 KEYWORDS = {"privacy": SUMS, "query_spans": [1, 2, 4], "price_levels": [0.5, 1, 2]}
 
 
-def test_a_configuration_with_spans_survives_json_and_a_spec():
+def test_a_configuration_survives_json_and_a_spec():
     config = resolve("short-highway", {**KEYWORDS, "bandwidth_unit": "sums"})
     assert config.query_spans == (1, 2, 4)
     assert config.price_levels == (0.5, 1.0, 2.0)
     plain = json.loads(json.dumps(dataclasses.asdict(config)))
     plain["privacy"]["preset"] = SUMS
     assert resolve("paper-highway", plain) == config
-    env = gym.make("dptse_env:dptse/ShortHighway-v0", **KEYWORDS)
+    settings = {"process_noise": [0.5, 0.25], "ukf": {"alpha": 1.0}}
+    env = gym.make("dptse_env:dptse/ShortHighway-v0", estimator_settings=settings, **KEYWORDS)
     again = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
     assert again.unwrapped.config == env.unwrapped.config
     assert again.action_space == env.action_space

@@ -63,15 +63,23 @@ def test_errors_are_pooled_over_segments_and_seconds():
     assert row["rmse_speed"] == pytest.approx(expected_speed)
 
 
+def watched(release, values):
+    """Return a function that releases, and keeps the values of all columns, queried or not."""
+
+    def release_and_keep(request):
+        measured = release(request)
+        values.append(measured.values.copy())
+        return measured
+
+    return release_and_keep
+
+
 def test_a_seed_gives_the_same_noise_under_every_policy_and_another_with_a_noise_seed():
     released = []
     for name, noise in (("static", 0), ("random", 0), ("static", 1)):
         env = make()
-        mechanism, values = env.unwrapped.process.release.mechanism, []
-        release = mechanism.release
-        mechanism.release = lambda episodes, truth, f=release, v=values: (
-            v.append(f(episodes, truth)) or v[-1]
-        )
+        release, values = env.unwrapped.process.release, []
+        release.release = watched(release.release, values)
         evaluate(env, make_schedule(name, env, seed=0), [0], noise)
         released.append(np.array(values))
     np.testing.assert_array_equal(released[0], released[1])

@@ -6,7 +6,7 @@ import numpy as np
 
 from dptse_env.config import EnvConfig
 from dptse_env.parts import make_interface
-from dptse_env.schedules import OBSERVATION_SCHEDULES
+from dptse_env.schedules import SCHEDULES
 from dptse_env.utils.arrays import BoolArray, FloatArray
 
 DECISION_THRESHOLD = 3.0
@@ -53,7 +53,7 @@ def public_plan(config: EnvConfig, name: str) -> BoolArray:
     interface = make_interface(config)
     steps = np.arange(config.horizon_steps)
     size = interface.observations.space.shape[0]
-    schedule = OBSERVATION_SCHEDULES[name](interface)
+    schedule = SCHEDULES.find(name)(interface)
     queried: BoolArray = schedule.select(steps, np.zeros((len(steps), size), dtype=np.float32))
     return queried
 

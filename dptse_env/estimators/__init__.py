@@ -1,7 +1,7 @@
 """Traffic state estimators with a common protocol, by name and backend."""
 
 from pkgutil import resolve_name
-from typing import Any, NamedTuple, get_args
+from typing import Any, get_args
 
 import numpy as np
 
@@ -44,17 +44,6 @@ __all__ = [
 ]
 
 
-class Shipped(NamedTuple):
-    """A class of this package, imported when an estimator is made: not all libraries are needed."""
-
-    module: str
-    name: str
-
-    def load(self) -> Any:
-        """Import the class."""
-        return resolve_name(f"dptse_env.estimators.{self.module}:{self.name}")
-
-
 def _expected(part: Any) -> str | None:
     if isinstance(part, type):
         return missing_methods(part, ("reset", "predict", "update", "estimate"))
@@ -64,30 +53,27 @@ def _expected(part: Any) -> str | None:
 ESTIMATORS = Registry(
     "estimator",
     {
-        "ekf": Shipped("ekf", "EKF"),
-        "ukf": Shipped("ukf", "UKF"),
-        "enkf": Shipped("enkf", "EnKF"),
-        "mhe": Shipped("mhe", "MHE"),
-        "random_walk": Shipped("simple", "RandomWalk"),
-        "blend": Shipped("simple", "Blend"),
-        "open_loop": Shipped("simple", "OpenLoop"),
-        "recurrent": Shipped("recurrent", "Recurrent"),
+        "ekf": "dptse_env.estimators.ekf:EKF",
+        "ukf": "dptse_env.estimators.ukf:UKF",
+        "enkf": "dptse_env.estimators.enkf:EnKF",
+        "mhe": "dptse_env.estimators.mhe:MHE",
+        "random_walk": "dptse_env.estimators.simple:RandomWalk",
+        "blend": "dptse_env.estimators.simple:Blend",
+        "open_loop": "dptse_env.estimators.simple:OpenLoop",
+        "recurrent": "dptse_env.estimators.recurrent:Recurrent",
     },
     check=_expected,
 )
-"""Estimators by name. Those of other packages are classes or functions of (model, n_episodes,
-settings); their attribute ``settings_type`` may be a dataclass of other settings."""
+"""Estimators by name, classes or functions of (model, n_episodes, settings), imported when they are
+asked for. Their attribute ``settings_type`` may be a dataclass of other settings; a class without
+demand states has ``has_demand`` False, one that does not step the model ``steps_model`` False."""
 REFERENCES = {
-    "ekf": Shipped("reference", "ReferenceEKF"),
-    "ukf": Shipped("reference", "ReferenceUKF"),
-    "enkf": Shipped("reference", "ReferenceEnKF"),
-    "mhe": Shipped("reference", "ReferenceMHE"),
+    "ekf": "dptse_env.estimators.reference:ReferenceEKF",
+    "ukf": "dptse_env.estimators.reference:ReferenceUKF",
+    "enkf": "dptse_env.estimators.reference:ReferenceEnKF",
+    "mhe": "dptse_env.estimators.reference:ReferenceMHE",
 }
 """The backend ``reference`` of the estimators that have one."""
-WITHOUT_DEMAND = ("random_walk", "open_loop", "recurrent")
-"""Estimators without demand states."""
-WITHOUT_DYNAMICS = ("random_walk", "recurrent")
-"""Estimators that take geometry and scales of the traffic model, and do not step it."""
 BACKENDS = get_args(Backend)
 
 
@@ -97,14 +83,15 @@ def check_demand(estimator: Any, settings: Any) -> None:
     Raises:
         ValueError: It has none.
     """
-    if estimator in WITHOUT_DEMAND and settings.demand is not None:
+    has_demand = getattr(ESTIMATORS.find(estimator), "has_demand", True)
+    if not has_demand and settings.demand is not None:
         raise ValueError(
             f"estimator_settings.demand must be None for {estimator!r}, which has no demand states"
         )
 
 
 def check_settings(estimator: Any, model: ARZModel, settings: Any) -> None:
-    """Refuse settings that an estimator cannot have on a road; it is imported, but not made.
+    """Refuse settings that an estimator cannot have on a road; it is not made.
 
     A class may have a static method ``check_settings(model, settings)``, which raises
     ``ValueError``. The model has the demand states that the settings ask for.
@@ -114,9 +101,10 @@ def check_settings(estimator: Any, model: ARZModel, settings: Any) -> None:
             it steps the model and its time step violates the CFL condition.
     """
     check_demand(estimator, settings)
-    if estimator not in WITHOUT_DYNAMICS:
+    part = ESTIMATORS.find(estimator)
+    if getattr(part, "steps_model", True):
         model.require_time_step()
-    check = getattr(_loaded(ESTIMATORS.find(estimator)), "check_settings", None)
+    check = getattr(part, "check_settings", None)
     if check is not None:
         check(with_demand(model, settings), settings)
 
@@ -130,10 +118,6 @@ def with_demand(model: ARZModel, settings: Any) -> ARZModel:
         model.network, model.parameters, model.time_step, model.reference_speed, model.rows,
         has_demand,
     )  # fmt: skip
-
-
-def _loaded(part: Any) -> Any:
-    return part.load() if isinstance(part, Shipped) else part
 
 
 def make_estimator(
@@ -161,8 +145,9 @@ def make_estimator(
     check_estimator(estimator, backend)
     settings = settings_type(estimator)() if settings is None else settings
     check_settings(estimator, model, settings)
-    part = REFERENCES[estimator] if backend == "reference" else ESTIMATORS.find(estimator)
-    made: Estimator = _loaded(part)(with_demand(model, settings), n_episodes, settings)
+    reference = backend == "reference"
+    part: Any = resolve_name(REFERENCES[estimator]) if reference else ESTIMATORS.find(estimator)
+    made: Estimator = part(with_demand(model, settings), n_episodes, settings)
     if is_foreign(made):
         _check_attributes(made, model, n_episodes)
     return made
@@ -196,10 +181,7 @@ def checked_settings(estimator: Any, settings: Any) -> Any:
 
 
 def check_estimator(estimator: Any, backend: str) -> None:
-    """Refuse an unknown estimator or backend, or a backend that an estimator does not have.
-
-    No estimator of this package is imported.
-    """
+    """Refuse an unknown estimator or backend, or a backend that an estimator does not have."""
     ESTIMATORS.find(estimator)
     if backend not in BACKENDS:
         raise ValueError(f"backend must be one of {', '.join(BACKENDS)}, got {shown(backend)}")

@@ -12,7 +12,6 @@ import numpy as np
 
 from dptse_env.estimators.base import BatchEstimator, Estimate, Measurement
 from dptse_env.estimators.linalg import is_covariance, mirror, padded, pair_update, propagate
-from dptse_env.estimators.noise import count_variance, initial_variance, process_variance
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
 from dptse_env.model.network import RoadArrays
@@ -248,6 +247,17 @@ def _innovate(road: RoadArrays, filters: Filters, e: int, observed: BoolArray, r
             innovations[m, q] = rows.residuals[m, q] / np.sqrt(variance)
 
 
+@kernel_part
+def rows_seen(observed: BoolArray, rows: IntArray) -> IntArray:
+    """Return the indices of observed rows, which are written to the beginning of `rows` `(M,)`."""
+    n_seen = 0
+    for m in range(rows.size):
+        if observed[m]:
+            rows[n_seen] = m
+            n_seen += 1
+    return rows[:n_seen]
+
+
 @kernel_part(fastmath={"contract"})
 def _assimilate(
     road: RoadArrays,
@@ -310,3 +320,30 @@ def summarise(bundle: Bundle, out: FloatArray) -> None:
             out[1, e, s] = clip(w - pressure(rho, jam, v_f, gamma), 0.0, LARGEST_W * v_f)
             out[2, e, s] = filters.units[i] * np.sqrt(max(covariance[i, i], 0.0))
             out[3, e, s] = np.sqrt(max(variance, 0.0))
+
+
+# Variances of the noise and of the prior, normalised: rho by rho_m, psi by rho_m v_f --------------
+
+
+def process_variance(model: ARZModel, settings: EstimatorSettings) -> FloatArray:
+    """Return the variances, shape (n_x,), of a step's process noise at a density of zero."""
+    traffic = np.tile(settings.process_noise, model.n_segments)
+    walk = 0.0 if settings.demand is None else settings.demand.walk
+    return np.concatenate([traffic, np.full(model.n_demand_states, walk)]) ** 2
+
+
+def initial_variance(model: ARZModel, settings: EstimatorSettings) -> FloatArray:
+    """Return the variances, shape (n_x,), of the prior."""
+    traffic = np.full(2 * model.n_segments, settings.initial_variance)
+    deviation = 0.0 if settings.demand is None else settings.demand.deviation
+    return np.concatenate([traffic, np.full(model.n_demand_states, deviation**2)])
+
+
+def count_variance(model: ARZModel, settings: EstimatorSettings) -> FloatArray:
+    """Return the variances of measured densities beside the noise, over rho [km/veh], shape (M,).
+
+    They are those of a row's first segment; a row of several segments has so many times less.
+    """
+    lengths = model.layout.lengths[model.rows.first]
+    variance: FloatArray = settings.count_noise / lengths / model.density_scale**2
+    return variance

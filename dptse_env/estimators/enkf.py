@@ -13,8 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dptse_env.estimators.base import BatchEstimator, Estimate, Measurement
+from dptse_env.estimators.ekf import (
+    count_variance,
+    initial_variance,
+    process_variance,
+    rows_seen,
+)
 from dptse_env.estimators.linalg import factor, padded, solve_many
-from dptse_env.estimators.noise import count_variance, initial_variance, process_variance
 from dptse_env.estimators.normals import STREAM_WIDTH, Draws, draw, make_stream
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
@@ -283,15 +288,10 @@ def update(
     road, ensembles = bundle.parts
     rows = np.empty(road.row_first.size, dtype=np.int64)
     for k in range(episodes.size):
-        e, n_seen = episodes[k], 0
-        for m in range(rows.size):
-            if observed[k, m]:
-                rows[n_seen] = m
-                n_seen += 1
+        e, seen, sound = episodes[k], rows_seen(observed[k], rows), True
         ensembles.innovations[e] = 0.0
-        members, sound = ensembles.members[e], True
-        if n_seen > 0:
-            seen = rows[:n_seen]
+        members = ensembles.members[e]
+        if seen.size > 0:
             sound = _assimilate(road, ensembles, e, seen, values[k], sigma[k], centre[k])
             project_states(road, members, ensembles.is_box)
         ensembles.diverged[e] = not (sound and is_finite(members))

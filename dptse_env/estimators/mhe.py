@@ -17,11 +17,11 @@ from scipy.sparse.linalg import splu
 
 from dptse_env.estimators import ekf
 from dptse_env.estimators.base import Measurement
-from dptse_env.estimators.ekf import CovarianceFilter, Filters, process_noise
+from dptse_env.estimators.ekf import CovarianceFilter, Filters, initial_variance, process_noise
 from dptse_env.estimators.linalg import move, padded
-from dptse_env.estimators.noise import initial_variance
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.estimators.window import (
+    AT_BOUND,
     UNSOLVED,
     Window,
     factorise,
@@ -54,8 +54,6 @@ from dptse_env.utils.kernels import (
 
 # Largest natural residual of an optimum, in normalised states.
 RESIDUAL = 1e-8
-# Components so near to a bound are set to it: a speed is a quotient of numbers that may vanish.
-AT_BOUND = 1e-13
 # Solutions with a larger residual are not inaccurate optima, but wrong. The largest one of piqp is
 # 4e-5, and 2e-2 where measurements are treated as exact.
 ROUGH = 0.05
@@ -236,11 +234,8 @@ def update(
 ) -> None:
     """Update by measurements, `sigma` no less than allowed; see `Estimator.update`."""
     road, filters, windows = bundle.parts
-    n, n_stages, width = (
-        windows.units.size,
-        windows.solution.shape[1] - 1,
-        windows.solution.shape[2],
-    )
+    n, width = windows.units.size, windows.solution.shape[2]
+    n_stages = windows.solution.shape[1] - 1
     n_rows, size = windows.weights.shape[2], windows.weights.shape[4]
     factor, free = make_factor(n_stages, n, n_rows, size, width), np.zeros((n_stages, n), np.int64)
     for k in range(episodes.size):

@@ -53,6 +53,8 @@ class Recurrent(BatchEstimator):
     """
 
     is_compiled: ClassVar[bool] = True
+    has_demand: ClassVar[bool] = False
+    steps_model: ClassVar[bool] = False
 
     def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
         """See `make_estimator`."""

@@ -22,6 +22,7 @@ from filterpy.kalman import (
 from scipy.linalg import LinAlgError, LinAlgWarning
 
 from dptse_env.estimators.base import BatchEstimator, Estimate, Measurement
+from dptse_env.estimators.ekf import count_variance, initial_variance, process_variance
 from dptse_env.estimators.enkf import make_tapers
 from dptse_env.estimators.mhe import (
     LEAST_DEVIATION,
@@ -30,7 +31,6 @@ from dptse_env.estimators.mhe import (
     settings_of_mhe,
     solve,
 )
-from dptse_env.estimators.noise import count_variance, initial_variance, process_variance
 from dptse_env.estimators.normals import draw, make_stream
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.estimators.simple import estimated_traffic

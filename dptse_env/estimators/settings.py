@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from dptse_env.model import ARZParameters, Bounds, available_parameters
 from dptse_env.utils.fields import Interval, check_object, checked_fields, from_mapping, read_json
@@ -37,30 +37,41 @@ ArrivalDeviation = Annotated[float, Interval(1e-6, 10)]
 """A positive standard deviation in units of rho_m or v_f."""
 
 
+class _Checked:
+    """Base class of settings, whose fields are checked when they are made.
+
+    Raises:
+        ValueError: A value is out of range.
+    """
+
+    _path: ClassVar[str]
+
+    def __init_subclass__(cls, path: str) -> None:
+        """Set the path of the settings in error messages."""
+        cls._path = path
+
+    def __post_init__(self) -> None:
+        """Check values; lists become tuples."""
+        checked_fields(self, self._path)
+
+
 @dataclass(frozen=True)
-class SigmaPointSettings:
+class SigmaPointSettings(_Checked, path=f"{_PATH}.ukf"):
     """Sigma points of the unscented Kalman filter (van der Merwe, 2004), with the paper's values.
 
     Attributes:
         alpha: Spread of the points.
         beta: Weight of the first point in covariances; 2 suits normal distributions.
         kappa: Secondary spread; above minus the number of states.
-
-    Raises:
-        ValueError: A value is out of range.
     """
 
     alpha: Annotated[float, Interval(1e-3, 1)] = 0.1
     beta: Annotated[float, Interval(0, 100)] = 2.0
     kappa: Annotated[float, Interval(-10_000, 10_000)] = -4.0
 
-    def __post_init__(self) -> None:
-        """Check values."""
-        checked_fields(self, f"{_PATH}.ukf")
-
 
 @dataclass(frozen=True)
-class EnsembleSettings:
+class EnsembleSettings(_Checked, path=f"{_PATH}.enkf"):
     """Settings of the ensemble Kalman filter beside `EstimatorSettings`.
 
     Attributes:
@@ -69,22 +80,15 @@ class EnsembleSettings:
             (Anderson and Anderson, 1999); 1 has no effect.
         taper: Distance along the road [km] from which a measurement does not affect a state
             (Gaspari and Cohn, 1999); None for no limit.
-
-    Raises:
-        ValueError: A value is out of range.
     """
 
     n_members: Annotated[int, Interval(2, 10_000)] = 100
     inflation: Annotated[float, Interval(1, 10)] = 1.0
     taper: Annotated[float, Interval(0, 1e6, open_low=True)] | None = None
 
-    def __post_init__(self) -> None:
-        """Check values."""
-        checked_fields(self, f"{_PATH}.enkf")
-
 
 @dataclass(frozen=True)
-class HorizonSettings:
+class HorizonSettings(_Checked, path=f"{_PATH}.mhe"):
     """Settings of the moving horizon estimator beside `EstimatorSettings`.
 
     The weights of the paper's objective (eq. 14) are inverse variances, so that H is the inverse
@@ -102,9 +106,6 @@ class HorizonSettings:
         bounds: `box`, the paper's, or `cone`: the smallest box around the cone of physical states
             bounds the program, and its last state is projected into the cone.
         solver: Name of a solver of qpsolvers.
-
-    Raises:
-        ValueError: A value is out of range.
     """
 
     horizon: Annotated[int, Interval(1, 1000)] = 10
@@ -115,7 +116,7 @@ class HorizonSettings:
 
     def __post_init__(self) -> None:
         """Check values; lists become tuples."""
-        checked_fields(self, f"{_PATH}.mhe")
+        super().__post_init__()
         if self.solver in REFUSED_SOLVERS:
             raise ValueError(
                 f"{_PATH}.mhe.solver must not be {self.solver!r}, which reports false optima of "
@@ -124,7 +125,7 @@ class HorizonSettings:
 
 
 @dataclass(frozen=True)
-class RecurrentSettings:
+class RecurrentSettings(_Checked, path=f"{_PATH}.recurrent"):
     """Settings of the recurrent network.
 
     Attributes:
@@ -132,21 +133,14 @@ class RecurrentSettings:
             for releases of flows and one for releases of speeds, goes by the name that they share:
             ``highway`` stands for ``highway-flows`` or ``highway-speeds``.
         outside: Whether to take a network for roads and releases outside of the ranges on its card.
-
-    Raises:
-        ValueError: A value is out of range.
     """
 
     weights: str = "highway"
     outside: bool = False
 
-    def __post_init__(self) -> None:
-        """Check values."""
-        checked_fields(self, f"{_PATH}.recurrent")
-
 
 @dataclass(frozen=True)
-class DemandSettings:
+class DemandSettings(_Checked, path=f"{_PATH}.demand"):
     """Settings of demand states: factors on the demands at the entries, estimated as well.
 
     A factor begins at 1 and follows a random walk.
@@ -154,41 +148,27 @@ class DemandSettings:
     Attributes:
         deviation: Standard deviation of the prior.
         walk: Standard deviation of a step of the random walk.
-
-    Raises:
-        ValueError: A value is out of range.
     """
 
     deviation: Annotated[float, Interval(1e-3, 1)] = 0.2
     walk: Annotated[float, Interval(1e-6, 1)] = 0.058
 
-    def __post_init__(self) -> None:
-        """Check values."""
-        checked_fields(self, f"{_PATH}.demand")
-
 
 @dataclass(frozen=True)
-class BlendSettings:
+class BlendSettings(_Checked, path=f"{_PATH}.blend"):
     """Settings of the blend of an EKF and a random walk beside `EstimatorSettings`.
 
     Attributes:
         density_weight: Weight of the EKF's density; the random walk's has the rest.
         speed_weight: Weight of the EKF's speed; the random walk's has the rest.
-
-    Raises:
-        ValueError: A value is out of range.
     """
 
     density_weight: Annotated[float, Interval(0, 1)] = 0.6
     speed_weight: Annotated[float, Interval(0, 1)] = 0.6
 
-    def __post_init__(self) -> None:
-        """Check values."""
-        checked_fields(self, f"{_PATH}.blend")
-
 
 @dataclass(frozen=True)
-class EstimatorSettings:
+class EstimatorSettings(_Checked, path=_PATH):
     """Tuning of the estimators, in units of the jam density rho_m and of v_f.
 
     Attributes:
@@ -216,9 +196,6 @@ class EstimatorSettings:
         blend: Further settings of the blend, whose EKF and random walk share the others.
         recurrent: Settings of the recurrent network; of the others it has `initial_variance`,
             `noise_scale` and `speed_cap`.
-
-    Raises:
-        ValueError: A value is out of range.
     """
 
     process_noise: tuple[Deviation, Deviation] = (0.01, 0.01)
@@ -235,10 +212,6 @@ class EstimatorSettings:
     mhe: HorizonSettings = field(default_factory=HorizonSettings)
     blend: BlendSettings = field(default_factory=BlendSettings)
     recurrent: RecurrentSettings = field(default_factory=RecurrentSettings)
-
-    def __post_init__(self) -> None:
-        """Check values; lists become tuples."""
-        checked_fields(self, _PATH)
 
 
 def tuned_settings(

@@ -27,6 +27,9 @@ class RandomWalk(BatchEstimator):
         variances: Of these, `(n, S, 2)`.
     """
 
+    has_demand: ClassVar[bool] = False
+    steps_model: ClassVar[bool] = False
+
     def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
         """See `make_estimator`."""
         super().__init__(model, n_episodes, settings)
@@ -241,6 +244,8 @@ class OpenLoop(BatchEstimator):
     Attributes:
         states: `(n, 2 S)` [veh/km, veh/h].
     """
+
+    has_demand: ClassVar[bool] = False
 
     def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
         """See `make_estimator`."""

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dptse_env.estimators.base import Measurement
-from dptse_env.estimators.ekf import CovarianceFilter, Filters, process_noise, restart
+from dptse_env.estimators.ekf import CovarianceFilter, Filters, process_noise, restart, rows_seen
 from dptse_env.estimators.linalg import (
     downdate,
     factor,
@@ -183,21 +183,13 @@ def update(
 ) -> None:
     """Update by measurements; see `Estimator.update`."""
     road, filters, points = bundle.parts
-    rows, variances = (
-        np.empty(road.row_first.size, np.int64),
-        np.empty(filters.covariances.shape[2]),
-    )
+    variances = np.empty(filters.covariances.shape[2])
+    rows = np.empty(road.row_first.size, np.int64)
     for k in range(episodes.size):
-        e, n_seen = episodes[k], 0
-        for m in range(rows.size):
-            if observed[k, m]:
-                rows[n_seen] = m
-                n_seen += 1
+        e, seen, sound = episodes[k], rows_seen(observed[k], rows), True
         for innovations in filters.innovations[e]:
             fill_vector(innovations, 0.0)
-        sound = True
-        if n_seen > 0:
-            seen = rows[:n_seen]
+        if seen.size > 0:
             sound = _assimilate(road, filters, points, e, seen, values[k], sigma[k], centre[k])
         mean, covariance = filters.means[e], filters.covariances[e]
         filters.diverged[e] = not (

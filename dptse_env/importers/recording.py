@@ -157,7 +157,8 @@ class Recording:
                 compression="lz4", mkdir=True, engine="streaming",
                 row_group_size=min(20_000, MOST_WAITING // n_buckets),
             )  # fmt: skip
-        except (pl.exceptions.PolarsError, OSError) as problem:
+        # polars panics on some damaged Parquet files.
+        except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError) as problem:
             if isinstance(problem.__cause__, TrajectoryError):
                 raise problem.__cause__ from None
             parquet = self.path.suffix.lower() in tables.PARQUET

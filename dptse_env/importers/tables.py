@@ -173,7 +173,7 @@ def _raw(path: Path, form: Format, source: Source) -> _Raw:
             scalars = {"_id", "direction", *source.where}
             return _Raw(_from(lambda: _json(path, form, scalars)), size // BYTES)
         return _text(path, form)
-    except (OSError, EOFError, zlib.error) as problem:
+    except (OSError, EOFError, zlib.error, csv.Error) as problem:
         reason = getattr(problem, "strerror", None) or problem
         raise TrajectoryError(f"{path}: the file cannot be read: {reason}") from problem
 

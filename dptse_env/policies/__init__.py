@@ -59,8 +59,8 @@ def read_policy(source: str | os.PathLike[str]) -> PolicyFile:
 
     Raises:
         FileNotFoundError: There is no such file, nor such a name.
-        ValueError: The file is not a saved policy, is damaged, or exceeds a limit of
-            `dptse_env.utils.files`.
+        ValueError: The file is not a saved policy, is damaged, exceeds a limit of
+            `dptse_env.utils.files`, or names its action by an import string.
     """
     name, path = os.fspath(source), Path(source)
     if name in shipped_policies():
@@ -81,4 +81,19 @@ def read_policy(source: str | os.PathLike[str]) -> PolicyFile:
                 f"{name} is not a saved policy: its card must have a field {field!r} of type "
                 f"{kind.__name__}"
             )
+    require_registered(card, name)
     return PolicyFile(name, card, weights)
+
+
+def require_registered(card: Mapping[str, Any], name: str) -> None:
+    """Refuse a card whose action is an import string: a file may not run code of a folder.
+
+    Raises:
+        ValueError: Its action is no name that a package registered.
+    """
+    action = card["fits"]["action"]
+    if ":" in action:
+        raise ValueError(
+            f"{name}: fits.action must be a registered name, got {action!r}: import strings come "
+            "from Python or the command line alone (dptse_env.register_part)"
+        )

@@ -18,7 +18,7 @@ from torch import nn
 from dptse_env.config import EnvConfig
 from dptse_env.estimators import ESTIMATORS
 from dptse_env.parts import QueryInterface, make_interface
-from dptse_env.policies import SUFFIX, TRANSFERABLE, read_policy
+from dptse_env.policies import SUFFIX, TRANSFERABLE, read_policy, require_registered
 from dptse_env.sb3.plackett_luce import PlackettLucePolicy, RoadChannels
 from dptse_env.spaces.actions import ACTION_ENCODINGS
 from dptse_env.traffic import Corridor
@@ -137,6 +137,7 @@ def save_policy(
     }
     weights = {key: value.detach().cpu().numpy() for key, value in policy.state_dict().items()}
     try:
+        require_registered(card, "card")
         _made(card, weights, config)
     except ValueError as problem:
         raise ValueError(f"policy cannot be saved: {problem}") from problem

@@ -5,80 +5,46 @@ learned policies alike. Its memory between steps travels in ``state``, so one sc
 number of episodes at once.
 """
 
-from functools import partial
-from typing import Any
+from abc import ABC, abstractmethod
+from typing import Any, ClassVar, NamedTuple
 
-from dptse_env.schedules.base import ProcessSchedule, Schedule, ScheduleState
-from dptse_env.schedules.greedy import GreedyTrace
-from dptse_env.schedules.oracles import OracleError, OracleGain
-from dptse_env.schedules.rules import (
-    Everything,
-    ExpectedReduction,
-    LargestDeviation,
-    LargestVariance,
-    Nothing,
-    OldestFirst,
-    Random,
-    Shifting,
-    SpeedFront,
-    StaleVariance,
-)
+import numpy as np
+
+from dptse_env.parts import QueryInterface
+from dptse_env.process import QueryProcess
+from dptse_env.release import QueryOptions
+from dptse_env.spaces.actions import first_that_fit
+from dptse_env.utils.arrays import Action, BoolArray, FloatArray, IntArray, Observation
 from dptse_env.utils.registry import Registry, name_of_class
 
-__all__ = [
-    "OBSERVATION_SCHEDULES",
-    "ORACLES",
-    "PROCESS_SCHEDULES",
-    "SCHEDULES",
-    "Everything",
-    "ExpectedReduction",
-    "GreedyTrace",
-    "LargestDeviation",
-    "LargestVariance",
-    "Nothing",
-    "OldestFirst",
-    "OracleError",
-    "OracleGain",
-    "ProcessSchedule",
-    "Random",
-    "Schedule",
-    "ScheduleState",
-    "Shifting",
-    "SpeedFront",
-    "StaleVariance",
-    "make_schedule",
-]
-
-OBSERVATION_SCHEDULES: dict[str, Any] = {
-    "none": Nothing,
-    "static": partial(Shifting, period=None),
-    "paper": partial(Shifting, period=4),
-    "round-robin": partial(Shifting, period=1),
-    "random": Random,
-    "oldest-first": OldestFirst,
-    "largest-variance": LargestVariance,
-    "largest-density-variance": partial(LargestVariance, term="density"),
-    "stale-variance": StaleVariance,
-    "largest-deviation": LargestDeviation,
-    "speed-front": SpeedFront,
-    "all": Everything,
+OBSERVATION_SCHEDULES = {
+    "none": "dptse_env.schedules.rules:Nothing",
+    "static": "dptse_env.schedules.rules:Static",
+    "paper": "dptse_env.schedules.rules:Paper",
+    "round-robin": "dptse_env.schedules.rules:RoundRobin",
+    "random": "dptse_env.schedules.rules:Random",
+    "oldest-first": "dptse_env.schedules.rules:OldestFirst",
+    "largest-variance": "dptse_env.schedules.rules:LargestVariance",
+    "largest-density-variance": "dptse_env.schedules.rules:LargestDensityVariance",
+    "stale-variance": "dptse_env.schedules.rules:StaleVariance",
+    "largest-deviation": "dptse_env.schedules.rules:LargestDeviation",
+    "speed-front": "dptse_env.schedules.rules:SpeedFront",
+    "all": "dptse_env.schedules.rules:Everything",
 }
-"""Schedules that use the observation alone, each made of (interface, seed); a step costs at most a
-sort."""
+"""Schedules that use the observation alone; a step costs at most a sort."""
 
-PROCESS_SCHEDULES: dict[str, type[ProcessSchedule]] = {
-    "expected-reduction": ExpectedReduction,
-    "greedy-trace": GreedyTrace,
+PROCESS_SCHEDULES = {
+    "expected-reduction": "dptse_env.schedules.rules:ExpectedReduction",
+    "greedy-trace": "dptse_env.schedules.greedy:GreedyTrace",
 }
 """Schedules that use the process, but not the truth: the noise to expect, and the estimator's
-deviations or covariance. Each is made of (process, seed); a step costs a sort, or some two steps of
-the EKF."""
+deviations or covariance. A step costs a sort, or some two steps of the EKF."""
 
-ORACLES: dict[str, type[ProcessSchedule]] = {
-    "oracle-error": OracleError,
-    "oracle-gain": OracleGain,
+ORACLES = {
+    "oracle-error": "dptse_env.schedules.oracles:OracleError",
+    "oracle-gain": "dptse_env.schedules.oracles:OracleGain",
 }
-"""Bounds that use the truth, each made of (process, seed); they are not policies."""
+"""Bounds that use the truth; they are not policies."""
 
 
 def _expected(part: Any) -> str | None:
@@ -90,9 +56,7 @@ def _expected(part: Any) -> str | None:
 
 
 SCHEDULES = Registry(
-    "schedule",
-    {**OBSERVATION_SCHEDULES, **PROCESS_SCHEDULES, **ORACLES},
-    check=_expected,
+    "schedule", {**OBSERVATION_SCHEDULES, **PROCESS_SCHEDULES, **ORACLES}, check=_expected
 )
 """All schedules by name."""
 
@@ -109,12 +73,240 @@ def make_schedule(schedule: Any, env: Any, seed: int | None = None) -> Any:
     Raises:
         ValueError: The name is unknown or the schedule does not suit the environment.
     """
-    env = env.unwrapped
-    part = SCHEDULES.find(schedule)
-    if not isinstance(part, type | partial):
+    part, env = SCHEDULES.find(schedule), env.unwrapped
+    if not isinstance(part, type):
         return part
-    cls: Any = part.func if isinstance(part, partial) else part
-    made = part(env.process if issubclass(cls, ProcessSchedule) else env.interface, seed)
+    made: Any = part(env.process if issubclass(part, ProcessSchedule) else env.interface, seed)
     if not callable(getattr(made, "predict", None)):
-        raise ValueError(f"schedule {name_of_class(cls)} must have predict()")
+        raise ValueError(f"schedule {name_of_class(part)} must have predict()")
     return made
+
+
+class ScheduleState(NamedTuple):
+    """State of a schedule between steps.
+
+    Attributes:
+        step: Decisions completed in the episode, shape (k,).
+        wanted: The options of the decision in progress, shape (k, G).
+    """
+
+    step: IntArray
+    wanted: BoolArray
+
+
+class Schedule(ABC):
+    """A query policy that needs no training; subclasses choose options in `select`.
+
+    Options are the mainline segments, unless the environment has other spans or price levels
+    (`dptse_env.release.QueryOptions`).
+
+    Attributes:
+        queries: The G options.
+        n_mainline: Mainline segments.
+        bandwidth: Largest total cost of the queries of a step.
+        uses_truth: Whether the choice depends on the true traffic. Such a schedule is a bound on
+            policies, not a policy.
+    """
+
+    uses_truth: ClassVar[bool] = False
+
+    def __init__(self, interface: QueryInterface, seed: int | None = None) -> None:
+        """Bind the schedule to an environment's interface (``env.unwrapped.interface``)."""
+        self.interface = interface
+        self.queries = interface.queries
+        self.n_mainline = interface.n_mainline
+        self.bandwidth = interface.bandwidth
+        self.generator = np.random.default_rng(seed)
+
+    @abstractmethod
+    def select(self, step: IntArray, observation: Observation) -> BoolArray:
+        """Return the options to query, shape (k, G).
+
+        Args:
+            step: Decisions completed so far in each episode, shape (k,).
+            observation: Observations, shape (k, size).
+        """
+
+    def predict(
+        self,
+        observation: Observation,
+        state: tuple[Any, ...] | None = None,
+        episode_start: Any = None,
+        deterministic: bool = False,
+    ) -> tuple[Action, tuple[Any, ...]]:
+        """Return the actions for one observation or a batch of them, and the new state.
+
+        Args:
+            observation: Shape (size,) or (k, size).
+            state: The state returned by the last call, None at the first.
+            episode_start: Flags of episodes that have just begun, shape (k,) or a single flag.
+            deterministic: Part of the common signature, without effect.
+        """
+        del deterministic
+        batch = np.atleast_2d(observation)
+        k = len(batch)
+        step, wanted = self._resume(k, state, episode_start)
+        picked = self._picked(batch)
+        fresh = np.flatnonzero(~picked.any(axis=1))
+        if fresh.size:
+            wanted[fresh] = self._choose(fresh, step[fresh], batch[fresh])
+        action = self.interface.actions.encode(wanted, picked)
+        last_pick = self.interface.actions.completes(wanted, picked)
+        new_state = ScheduleState(step + last_pick, wanted)
+        return (action[0] if np.ndim(observation) == 1 else action), new_state
+
+    def _choose(self, rows: IntArray, step: IntArray, observation: Observation) -> BoolArray:
+        """Return `select` for some ``rows`` of the batch; all arrays have these rows alone."""
+        del rows
+        return self.select(step, observation)
+
+    def _resume(
+        self, k: int, state: tuple[Any, ...] | None, episode_start: Any
+    ) -> tuple[IntArray, BoolArray]:
+        if state is None:
+            step = np.zeros(k, dtype=np.int64)
+            wanted = np.zeros((k, self.queries.n_options), dtype=bool)
+        else:
+            step, wanted = np.array(state[0]), np.array(state[1])
+        if episode_start is not None:
+            step[np.broadcast_to(episode_start, (k,)).astype(bool)] = 0
+        return step, wanted
+
+    def _picked(self, batch: Observation) -> BoolArray:
+        if "picked" not in self.interface.observations.slices:
+            return np.zeros((len(batch), self.queries.n_options), dtype=bool)
+        return self.interface.observations.block(batch, "picked") > 0
+
+    def block(self, observation: Observation, name: str) -> Observation:
+        """Return a block of observations (k, size), shape (k, size of the block)."""
+        return self.interface.observations.block(observation, name)
+
+    def mask(self, chosen: IntArray) -> BoolArray:
+        """Return flags (k, G) of the chosen options, given their indices (k, m) for any m."""
+        mask = np.zeros((len(chosen), self.queries.n_options), dtype=bool)
+        np.put_along_axis(mask, chosen, True, axis=1)
+        return mask
+
+    def first_that_fit(self, order: IntArray) -> BoolArray:
+        """Return the mask of the first options of an order (k, G) that the bandwidth pays for.
+
+        An option that costs more than is left is passed over.
+        """
+        return first_that_fit(order, self.queries.cost, self.bandwidth)
+
+    def highest(self, value: FloatArray | Observation, step: IntArray) -> BoolArray:
+        """Return the options of the highest value that the bandwidth pays for, shape (k, G).
+
+        Ties rotate along the road with the step: breaking them from one end would query the
+        segments there 1.5 times as often. A mainline segment with a fixed sensor is observed
+        without a query, so it comes last for any value.
+
+        Other options are chosen as `best_options` says.
+
+        Args:
+            value: Value of each mainline segment, shape (k, n_mainline); none below 0 where costs
+                differ.
+            step: Decisions completed so far, shape (k,).
+        """
+        task = self.interface.observations.task
+        fixed = task.first[task.sensors]
+        fixed = fixed[fixed < self.n_mainline]
+        score = np.array(value, dtype=np.float64)
+        if self.queries.are_segments:
+            score[:, fixed] = -np.inf
+            turn = (np.arange(self.n_mainline) - step[:, None]) % self.n_mainline
+            return self.first_that_fit(np.lexsort((turn, -score), axis=1))
+        return best_options(self.queries, score, fixed, step)
+
+
+def require_plain(interface: QueryInterface, name: str) -> None:
+    """Refuse options other than the mainline segments at the release model's price.
+
+    Raises:
+        ValueError: There are others; ``name`` is the schedule's.
+    """
+    if not interface.queries.are_plain:
+        raise ValueError(
+            f"schedule {name!r} queries single segments: it needs query_spans (1,) and "
+            f"price_levels (1.0,), got {interface.queries}"
+        )
+
+
+class ProcessSchedule(Schedule):
+    """A schedule that uses the state of its environment's process beside the observation.
+
+    Its batch is all episodes of that process, in order; `predict` refuses another one.
+    """
+
+    name: ClassVar[str]
+
+    def __init__(self, process: QueryProcess, seed: int | None = None) -> None:
+        """Bind the schedule to a ``process`` (``env.unwrapped.process``)."""
+        super().__init__(process.interface, seed)
+        self.process = process
+
+    def _resume(
+        self, k: int, state: tuple[Any, ...] | None, episode_start: Any
+    ) -> tuple[IntArray, BoolArray]:
+        if k != self.process.n_episodes:
+            raise ValueError(
+                f"schedule {self.name!r} follows the {self.process.n_episodes} episodes of its "
+                f"environment, all of them and in order; got a batch of {k}"
+            )
+        return super()._resume(k, state, episode_start)
+
+    def select(self, step: IntArray, observation: Observation) -> BoolArray:
+        """See `Schedule.select`; the batch is all episodes."""
+        return self._choose(np.arange(self.process.n_episodes), step, observation)
+
+    @abstractmethod
+    def _choose(self, rows: IntArray, step: IntArray, observation: Observation) -> BoolArray: ...
+
+
+def best_options(
+    queries: QueryOptions, value: FloatArray, fixed: IntArray, step: IntArray
+) -> BoolArray:
+    """Return the options of the highest `option_values` that the bandwidth pays for, shape (k, G).
+
+    They do not overlap, and have the price level nearest to 1. Where bandwidth is left that pays
+    for no such option, it is used for others. Ties rotate along the road with the step.
+
+    Args:
+        queries: The G options.
+        value: Value of each mainline segment, shape (k, n_mainline).
+        fixed: Mainline segments with a fixed sensor.
+        step: Steps of the episode so far, shape (k,).
+    """
+    score = option_values(queries, value, fixed)
+    turn = (queries.first - step[:, None]) % queries.n_mainline
+    other = queries.level != queries.standard_level
+    order = np.lexsort((turn, -score, np.broadcast_to(other, score.shape)), axis=1)
+    chosen, rows = np.zeros(score.shape, dtype=bool), np.arange(len(score))
+    left = np.full(len(score), queries.bandwidth)
+    covered = np.zeros((len(score), queries.n_mainline), dtype=bool)
+    for is_distinct in (True, False):
+        for option in order.T:
+            if (left < queries.cost.min()).all():
+                return chosen
+            fits = (queries.cost[option] <= left) & ~chosen[rows, option]
+            if is_distinct:
+                fits &= ~other[option] & ~(covered & queries.covers[option]).any(axis=1)
+            chosen[rows, option] |= fits
+            covered |= queries.covers[option] & fits[:, None]
+            left -= np.where(fits, queries.cost[option], 0)
+    return chosen
+
+
+def option_values(queries: QueryOptions, value: FloatArray, fixed: IntArray) -> FloatArray:
+    """Return the mean values of the options' segments, shape (k, G), per unit of cost.
+
+    A segment with a fixed sensor counts as the least of the others; an option of such segments
+    alone has minus infinity.
+    """
+    free = np.delete(np.arange(queries.n_mainline), fixed)
+    known = np.array(value, dtype=np.float64)
+    if free.size:
+        known[:, fixed] = known[:, free].min(axis=1, keepdims=True)
+    mean = known @ queries.covers.T / queries.span
+    mean[:, ~queries.covers[:, free].any(axis=1)] = -np.inf
+    return mean / queries.cost if queries.costs_differ else mean

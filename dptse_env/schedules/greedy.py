@@ -3,7 +3,7 @@
 Kernels treat episodes one by one. States are normalised: rho by rho_m, psi by rho_m v_f.
 """
 
-from typing import Any, ClassVar, NamedTuple, Protocol, cast
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -11,21 +11,9 @@ from dptse_env.estimators.linalg import mirror, padded, pair_update, propagate
 from dptse_env.model.network import RoadArrays
 from dptse_env.model.step import advance, make_scratch, measured, normalise, project, write_row
 from dptse_env.process import QueryProcess
-from dptse_env.schedules.base import ProcessSchedule, require_plain
+from dptse_env.schedules import ProcessSchedule, require_plain
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray, Observation
 from dptse_env.utils.kernels import copy_matrix, copy_vector, kernel, kernel_part
-
-
-class HasCovariance(Protocol):
-    """An estimator with a covariance."""
-
-    @property
-    def states(self) -> FloatArray:
-        """Means, shape (n, 2 S) [veh/km, veh/h], or with demand factors at their end."""
-
-    @property
-    def covariances(self) -> FloatArray:
-        """Those of the means, rho normalised by rho_m and psi by rho_m v_f."""
 
 
 class Design(NamedTuple):
@@ -96,7 +84,7 @@ class GreedyTrace(ProcessSchedule):
                 f"schedule {self.name!r} needs an estimator with a covariance, "
                 f"{process.config.estimator!r} has none"
             )
-        self._estimator = cast(HasCovariance, process.estimator)
+        self._estimator: Any = process.estimator
         every = np.arange(process.model.n_segments)
         road = process.model.road._replace(row_first=every, row_span=np.ones_like(every))
         self._road, self._design = tuple(road), tuple(self._make_design())

@@ -7,7 +7,7 @@ import numpy as np
 
 from dptse_env.process import QueryProcess
 from dptse_env.release import Request
-from dptse_env.schedules.base import ProcessSchedule, require_plain
+from dptse_env.schedules import ProcessSchedule, require_plain
 from dptse_env.spaces.rewards import ScoredSecond, estimation_error
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray, Observation
 
@@ -68,8 +68,7 @@ class OracleGain(ProcessSchedule):
         live = ~self.process.over[rows]
         if live.any():
             value[live] = self._rewards(rows[live])
-        order = np.argsort(-value, axis=1, kind="stable")
-        return self.mask(order[:, : self.bandwidth])
+        return self.first_that_fit(np.argsort(-value, axis=1, kind="stable"))
 
     def _rewards(self, episodes: IntArray) -> FloatArray:
         """Return the rewards of querying each segment by itself, shape (k, n_mainline)."""

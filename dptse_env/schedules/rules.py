@@ -6,7 +6,7 @@ import numpy as np
 
 from dptse_env.parts import QueryInterface
 from dptse_env.process import QueryProcess
-from dptse_env.schedules.base import ProcessSchedule, Schedule
+from dptse_env.schedules import ProcessSchedule, Schedule
 from dptse_env.spaces.observations import AGE_CAP
 from dptse_env.utils.arrays import Action, BoolArray, FloatArray, IntArray, Observation
 
@@ -52,21 +52,17 @@ class Shifting(Schedule):
     """An evenly spread set that moves one segment downstream every ``period`` steps.
 
     The set starts at floor(n i / B) for i = 0 .. B-1; segments beyond the downstream end continue
-    upstream. ``period=4`` is the schedule of Vishnoi et al. (section IV-A), ``period=1`` a round
-    robin, ``period=None`` a static set.
+    upstream.
 
     Among several spans and price levels it keeps to the smallest span and the level nearest to 1:
     n is the number of these options, and B how many of them the bandwidth pays for.
     """
 
-    def __init__(
-        self, interface: QueryInterface, seed: int | None = None, *, period: int | None = 4
-    ) -> None:
-        """Bind the schedule; ``period`` [steps] must be None or at least 1."""
+    period: ClassVar[int]
+
+    def __init__(self, interface: QueryInterface, seed: int | None = None) -> None:
+        """Bind the schedule."""
         super().__init__(interface, seed)
-        if period is not None and period < 1:
-            raise ValueError(f"schedule.period must be None or >= 1, got {period}")
-        self.period = period
         queries = self.queries
         own = (queries.span == queries.span.min()) & (queries.level == queries.standard_level)
         self._options = np.flatnonzero(own)
@@ -76,9 +72,28 @@ class Shifting(Schedule):
 
     def select(self, step: IntArray, observation: Observation) -> BoolArray:
         """See `Schedule.select`."""
-        shift = np.zeros_like(step) if self.period is None else step // self.period
-        place = (self._start + shift[:, None]) % self._options.size
-        return self.completed(self._options[place])
+        place = (self._start + step[:, None] // self.period) % self._options.size
+        chosen = self.mask(self._options[place])
+        # What is left of the bandwidth goes to the first of the others.
+        return self.first_that_fit(np.argsort(~chosen, axis=1, kind="stable"))
+
+
+class Static(Shifting):
+    """An evenly spread set that stays, see `Shifting`."""
+
+    period = np.iinfo(np.int64).max
+
+
+class Paper(Shifting):
+    """The schedule of Vishnoi et al. (section IV-A): a set that moves every four steps."""
+
+    period = 4
+
+
+class RoundRobin(Shifting):
+    """An evenly spread set that moves at every step, see `Shifting`."""
+
+    period = 1
 
 
 class Random(Schedule):
@@ -103,54 +118,30 @@ class OldestFirst(Schedule):
 
 
 class LargestVariance(Schedule):
-    """The segments of the largest posterior variance in the reward's metric.
+    """The segments of the largest posterior variance, in the reward's metric.
 
-    With the standard deviations s_rho and s_v of the observation, in the reward's units, it is
-    s_rho^2 + s_v^2, or one of the two for a reward, or a ``term``, of density or speed alone. The
-    blocks are clipped at exp(-10) and exp(5), beyond which segments tie. A step sorts the
-    segments once.
+    Scores are
+
+        (age + 1)^a (s_rho^2 + min(s_v, c)^2)
+
+    with the standard deviations s_rho and s_v of the observation in the reward's units and the age
+    in seconds; for a reward of density or speed alone, the variance of that. Here a = 0 and c is
+    infinite. The blocks of deviations are clipped at exp(-10) and exp(5), beyond which segments
+    tie. A step sorts the segments once.
+
+    Attributes:
+        age_power: Exponent a.
+        speed_cap: Cap c, in units of the free speed.
+        term: A reward's term that takes the place of the environment's; None for that.
     """
 
-    def __init__(
-        self, interface: QueryInterface, seed: int | None = None, *, term: str | None = None
-    ) -> None:
-        """Bind the schedule; a ``term`` of None is that of the reward."""
-        super().__init__(interface, seed)
-        term = interface.reward.term if term is None else term
-        if term not in _BLOCKS:
-            raise ValueError(f"schedule.term must be one of {', '.join(_BLOCKS)}, got {term!r}")
-        self._names = _BLOCKS[term]
+    age_power: ClassVar[float] = 0.0
+    speed_cap: ClassVar[float] = np.inf
+    term: ClassVar[str | None] = None
 
     def select(self, step: IntArray, observation: Observation) -> BoolArray:
         """See `Schedule.select`."""
-        n = self.n_mainline
-        logs = np.stack([self.block(observation, name)[:, :n] for name in self._names])
-        return self.highest(np.exp(2.0 * logs.astype(np.float64)).sum(axis=0), step)
-
-
-_BLOCKS = {
-    "joint": ("density_log_std", "speed_log_std"),
-    "density": ("density_log_std",),
-    "speed": ("speed_log_std",),
-}
-
-
-class StaleVariance(Schedule):
-    """The segments of the largest variance times the square of the time since the last measurement.
-
-    Scores are ``(age + 1)^2 (s_rho^2 + min(s_v, 0.1)^2)`` with the age in seconds and deviations in
-    the reward's units; for a reward of one term, that term alone. The age compensates for an
-    estimator that is overconfident about segments without recent measurements, the cap of a tenth
-    of the free speed for one that is underconfident about speeds on nearly empty segments. Both
-    were selected on validation traffic. A step sorts the segments once.
-    """
-
-    age_power: ClassVar[float] = 2.0
-    speed_cap: ClassVar[float] = 0.1
-
-    def select(self, step: IntArray, observation: Observation) -> BoolArray:
-        """See `Schedule.select`."""
-        n, term = self.n_mainline, self.interface.reward.term
+        n, term = self.n_mainline, self.term or self.interface.reward.term
         age, density_log, speed_log = (
             self.block(observation, name)[:, :n].astype(np.float64)
             for name in ("age", "density_log_std", "speed_log_std")
@@ -163,15 +154,31 @@ class StaleVariance(Schedule):
         return self.highest((AGE_CAP * age + 1.0) ** self.age_power * variance, step)
 
 
-class LargestDeviation(StaleVariance):
-    """The segments of the largest deviation times the square root of the time without measurement.
+class LargestDensityVariance(LargestVariance):
+    """The segments of the largest variance of density, whatever the reward."""
 
-    Scores are ``(age + 1) (s_rho^2 + s_v^2)``, as those of `StaleVariance`, for estimators whose
-    deviations are honest, such as `recurrent`.
+    term = "density"
+
+
+class StaleVariance(LargestVariance):
+    """`LargestVariance` times the square of the time since the last measurement: a = 2, c = 0.1.
+
+    The age compensates for an estimator that is overconfident about segments without recent
+    measurements, the cap of a tenth of the free speed for one that is underconfident about speeds
+    on nearly empty segments. Both were selected on validation traffic.
     """
 
-    age_power: ClassVar[float] = 1.0
-    speed_cap: ClassVar[float] = np.inf
+    age_power = 2.0
+    speed_cap = 0.1
+
+
+class LargestDeviation(LargestVariance):
+    """`LargestVariance` times the time since the last measurement: a = 1, c infinite.
+
+    It suits estimators whose deviations are honest, such as `recurrent`.
+    """
+
+    age_power = 1.0
 
 
 class FrontState(NamedTuple):

@@ -83,7 +83,8 @@ class ObservationBlock(Protocol):
 class Block:
     """A block that ships with the package: its values over a unit, or the logarithms of these.
 
-    See `ObservationBlock`.
+    See `ObservationBlock`. ``is_default(task, picks_one_by_one)`` says whether the default
+    observation has it.
     """
 
     name: str
@@ -93,6 +94,7 @@ class Block:
     values: Callable[[PublicState, Task], AnyArray | float]
     unit: Callable[[Task], float] = lambda task: 1.0
     is_log: bool = False
+    is_default: Callable[[Task, bool], bool] = lambda task, one_by_one: True
 
     def __reduce__(self) -> tuple[Callable[[str], Block], tuple[str]]:
         """Pickle as the name, since lambda functions cannot be pickled."""
@@ -156,8 +158,10 @@ SHIPPED_BLOCKS = (
     Block("speed_log_std", _segments, -10, 5,
           lambda state, _: state.estimate.speed_std, _speed_scale, is_log=True),
     Block("released_density", _options, -5, 5, _released(0), _density_scale),
-    Block("released_speed", _options, -5, 5, _released(1), _speed_scale),
-    Block("released_flow", _options, -5, 5, _released(1), _flow_scale),
+    Block("released_speed", _options, -5, 5, _released(1), _speed_scale,
+          is_default=lambda task, _: not task.releases_flow),
+    Block("released_flow", _options, -5, 5, _released(1), _flow_scale,
+          is_default=lambda task, _: task.releases_flow),
     Block("density_innovation", _options, -10, 10, _innovation(0)),
     Block("speed_innovation", _options, -10, 10, _innovation(1)),
     Block("age", _mainline, 0, 1, lambda state, _: state.age, lambda _: AGE_CAP),
@@ -167,12 +171,15 @@ SHIPPED_BLOCKS = (
     Block("bandwidth", lambda _: 1, 0, 1,
           lambda _, task: task.queries.bandwidth, lambda task: task.corridor.n_mainline),
     Block("epsilon", lambda _: 1, -6, 6, lambda _, task: float(np.log10(task.settings.epsilon))),
-    Block("picked", _options, 0, 1, lambda state, _: state.picked),
-    Block("last_price", _options, -5, 5, _log_prices, lambda _: PRICE_UNIT),
+    Block("picked", _options, 0, 1, lambda state, _: state.picked,
+          is_default=lambda _, one_by_one: one_by_one),
+    Block("last_price", _options, -5, 5, _log_prices, lambda _: PRICE_UNIT,
+          is_default=lambda task, _: task.model.has_prices),
     Block("tracer", _mainline, 0, 1,
-          lambda state, _: 0.0 if state.tracer is None else state.tracer),
+          lambda state, _: 0.0 if state.tracer is None else state.tracer,
+          is_default=lambda task, _: task.model.has_prices),
 )  # fmt: skip
-"""The shipped blocks, in the order of the default observation."""
+"""The shipped blocks; the default observation has those that are in it, in this order."""
 
 
 def _shipped_block(name: str) -> Block:
@@ -192,12 +199,7 @@ BLOCKS = Registry("observation", {block.name: block for block in SHIPPED_BLOCKS}
 
 def default_blocks(task: Task, *, picks_one_by_one: bool = False) -> list[str]:
     """Return the names of the default blocks."""
-    left_out = {"released_speed" if task.releases_flow else "released_flow"}
-    if not picks_one_by_one:
-        left_out.add("picked")
-    if not task.model.has_prices:
-        left_out |= {"last_price", "tracer"}
-    return [block.name for block in SHIPPED_BLOCKS if block.name not in left_out]
+    return [block.name for block in SHIPPED_BLOCKS if block.is_default(task, picks_one_by_one)]
 
 
 class ObservationEncoding:

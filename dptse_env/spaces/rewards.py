@@ -7,7 +7,7 @@ import numpy as np
 from dptse_env.estimators import Estimate
 from dptse_env.traffic import Corridor
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
-from dptse_env.utils.registry import Registry, is_foreign, name_of_class
+from dptse_env.utils.registry import Registry, name_of_class
 
 REWARD_TERMS = ("joint", "density", "speed")
 """Terms of the rewards that ship with the package."""
@@ -102,7 +102,7 @@ class ErrorReward:
 
 
 class _CheckedReward:
-    """A reward of another package whose values are checked."""
+    """Another reward, whose values are checked, with a ``term``."""
 
     def __init__(self, reward: Reward) -> None:
         self.reward = reward
@@ -141,4 +141,4 @@ def make_reward(value: Any) -> Any:
         if not callable(made):
             raise ValueError(f"reward {name_of_class(reward)} must be callable with a ScoredSecond")
         reward = made
-    return _CheckedReward(reward) if is_foreign(reward) else reward
+    return reward if isinstance(reward, ErrorReward) else _CheckedReward(reward)

@@ -104,7 +104,8 @@ def _record_until_death(
 ) -> tuple[list[int], str]:
     """Record until all is done or a worker dies; return what was in progress then, and why."""
     waiting, running, cause = iter(paths), dict[Future[None], int](), ""
-    with _worker_processes(min(workers, len(paths))) as (pool, n_workers):
+    n_workers = min(workers, len(paths))
+    with _worker_processes(n_workers) as pool:
         while not cause:
             try:
                 # No more than there are workers: all of them are in progress.
@@ -126,7 +127,7 @@ def _record_until_death(
 
 
 @contextlib.contextmanager
-def _worker_processes(n_workers: int) -> Iterator[tuple[ProcessPoolExecutor, int]]:
+def _worker_processes(n_workers: int) -> Iterator[ProcessPoolExecutor]:
     """Start processes that end with this one, and remove what they leave in their folder."""
     this = multiprocessing.current_process()
     # Daemonic processes, such as those of vectorised environments, may have no children since these
@@ -143,7 +144,7 @@ def _worker_processes(n_workers: int) -> Iterator[tuple[ProcessPoolExecutor, int
                 env={"TMPDIR": folder, "PYTHONSAFEPATH": "1"},
             ) as pool,
         ):
-            yield pool, n_workers
+            yield pool
     finally:
         this.daemon = was_daemon
 

@@ -1,7 +1,8 @@
 """What SUMO reads for a corridor: a network with one edge per segment, and vehicles with routes.
 
 The networks of the package's corridors come with it; any other geometry is compiled by netconvert
-on demand, which needs `eclipse-sumo` (extra ``corridors``).
+on demand, which needs `eclipse-sumo` (extra ``corridors``). ``networks/NAME.net.xml`` is
+``compile_network(Geometry.from_corridor(CORRIDORS[NAME]))``.
 
 Every edge declares the nominal length of its segment, and the recording runs with SUMO's internal
 links switched off: every vehicle is then on exactly one segment.

@@ -180,8 +180,8 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _text(card: Mapping[str, Any]) -> str:
-    """Return a card as text that does not depend on the order of keys; it has finite numbers."""
-    return json.dumps(card, sort_keys=True, allow_nan=False)
+    """Return a card as text. Keys keep their order, which can mean something."""
+    return json.dumps(card, allow_nan=False)
 
 
 def _depth(node: Any) -> int:

@@ -13,7 +13,7 @@ import polars as pl
 from agents.executors import LocalProcesses, RayCluster
 from agents.play import Cell
 from agents.study import Place, Study, run
-from dptse_env.schedules import OldestFirst
+from dptse_env.schedules.rules import OldestFirst
 
 SHORT = "dptse_env:dptse/ShortHighway-v0"
 TRACES = "DPTSE_TEST_TRACES"

@@ -156,8 +156,9 @@ def test_a_saved_model_goes_to_workers_without_what_it_loaded(tmp_path, monkeypa
 
 def test_a_schedule_of_a_module_is_told_apart_by_its_code(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
-    (tmp_path / "mine_a.py").write_text("from dptse_env.schedules import OldestFirst as Mine\n")
-    (tmp_path / "mine_b.py").write_text("from dptse_env.schedules import Random as Mine\n")
+    for letter, rule in (("a", "OldestFirst"), ("b", "Random")):
+        text = f"from dptse_env.schedules.rules import {rule} as Mine\n"
+        (tmp_path / f"mine_{letter}.py").write_text(text)
     one, other = (find_policy(f"mine_{letter}:Mine").identity for letter in "ab")
     assert one.split()[0] == "mine_a:Mine"
     assert one.split()[1] != other.split()[1]

@@ -3,6 +3,7 @@
 import dataclasses
 import gzip
 import json
+import shutil
 import sys
 
 import numpy as np
@@ -16,6 +17,7 @@ from dptse_env.traffic.sumo_input import edge_ids
 from tests.importers.data import PLAIN, first_file, plain, run, stream, write_csv
 
 FOOT = 0.3048
+TRAINING = [Split("training", 1.0, range(1000))]
 EPOCH = 1118846979700  # NGSIM's clocks do not begin at a whole second
 
 
@@ -232,6 +234,7 @@ def test_tables_may_be_parquet_compressed_or_by_other_delimiters(tmp_path, expec
         (b"t,id,s,v\n0,1,2,3\n\n1,1,,3\n", "row 4: s must be a finite number, got nothing"),
         (b"t,id,x,v\n0,1,2,3\n", r"source\.columns\.x must be .*'s'; found t, id, x, v"),
         (b"t,id,s,v\n0,\xff,2,3\n", "utf-8"),
+        (b"t,\rid,s,v\n0,1,2,3\n", "the file cannot be read: new-line character"),
     ],
 )
 def test_bad_tables_are_named_by_row_and_field(content, message, tmp_path):
@@ -262,6 +265,45 @@ def test_rows_of_another_length_are_refused_with_their_number(change, got, kind,
     told = got.format(more=n + 1, fewer=n - 1)
     with pytest.raises(TrajectoryError, match=rf"row 4001: it must have {n} fields, got {told}$"):
         run(path, Source("ngsim") if blanks else PLAIN)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["csv", "csv.gz", "parquet", "json", "xml"])
+def test_damaged_files_are_imported_or_refused(kind, fcd, tmp_path, monkeypatch):
+    monkeypatch.setattr("dptse_env.importers.folder.write_report", lambda *_: {})
+    points, path, source = stream(seconds=45.0, period=0.5), tmp_path / f"a.{kind}", PLAIN
+    content = plain(tmp_path / "a.txt", points).read_bytes()
+    if kind == "parquet":
+        pl.read_csv(tmp_path / "a.txt").write_parquet(path)
+        content = path.read_bytes()
+    elif kind == "json":
+        source = Source("i24", layout=Layout(origin=310000.0))
+        content = json.dumps(i24(points)).encode()
+    elif kind == "xml":
+        source, content = Source("fcd"), (fcd[0] / "fcd.xml").read_bytes()[:200_000]
+    if kind == "csv.gz":
+        content = gzip.compress(content)
+    (tmp_path / "a.txt").unlink()
+    rng = np.random.default_rng(0)
+    pieces = (b'"', b",", b"\n", b"\r", b"\0", b"nan", b"1e999", b"-1e9", b"[", b"<", b"\xff")
+    told = []
+    for case in range(60):
+        damaged, place = bytearray(content), int(rng.integers(len(content)))
+        if case % 3 == 0:
+            damaged[place] = rng.integers(256)
+        elif case % 3 == 1:
+            damaged[place : place + rng.integers(3)] = rng.choice(pieces)
+        else:
+            damaged = damaged[:place]
+        path.write_bytes(damaged)
+        try:
+            run(path, source, splits=TRAINING)
+        except ValueError as problem:
+            told.append(str(problem))
+        shutil.rmtree(tmp_path / "imported", ignore_errors=True)
+        assert list(tmp_path.iterdir()) == [path]
+    assert len(told) > 20
+    assert all(str(path) in each and len(each) < 600 for each in told)
 
 
 def test_messages_show_little_of_a_file(tmp_path):
@@ -302,8 +344,6 @@ def test_missing_polars_is_named_with_its_extra(monkeypatch):
 
 
 # -- SUMO ------------------------------------------------------------------------------------------
-
-TRAINING = [Split("training", 1.0, range(1000))]
 
 
 def import_fcd(path, folder, road=SHORT_HIGHWAY, **fields):

@@ -24,6 +24,9 @@ def test_card_and_weights_are_read_without_torch(monkeypatch):
     monkeypatch.setitem(sys.modules, "torch", None)
     file = read_policy("private-highway")
     assert file.card["training"]["seed"] == 3
+    # By this order the weights of the rule belong to its blocks.
+    rule = file.card["policy"]["arguments"]["rule"]
+    assert list(rule) == ["density_log_std", "speed_log_std", "age"]
     assert len(file.weights) == 7
     assert {array.dtype for array in file.weights.values()} == {np.dtype(np.float32)}
 
@@ -54,6 +57,14 @@ def test_a_card_that_lacks_a_field_is_refused(change, message, tmp_path):
     path = tmp_path / "some.safetensors"
     path.write_bytes(edited(SHIPPED, lambda card, weights: change(card)))
     with pytest.raises(ValueError, match=rf"some.* is not a saved policy: .*{message}"):
+        read_policy(path)
+
+
+def test_a_card_imports_no_code(tmp_path):
+    path = tmp_path / "some.safetensors"
+    change = {"action": "own:Part"}
+    path.write_bytes(edited(SHIPPED, lambda card, weights: card["fits"].update(change)))
+    with pytest.raises(ValueError, match=r"fits\.action must be a registered name, got 'own:Part'"):
         read_policy(path)
 
 

@@ -59,6 +59,10 @@ def test_a_loaded_policy_acts_as_the_saved_one(path, action, net_arch):
     both, state = loaded.predict(batch, None, np.ones(2, bool), True)
     np.testing.assert_allclose(both, [expected, expected], atol=1e-6)
     assert state is None
+    if action == "slots":
+        # Weights of the rule belong to its blocks by their order.
+        scores = (each.scores(torch.tensor(batch)) for each in (loaded._policy, policy))
+        torch.testing.assert_close(*scores, rtol=0, atol=0)
     draws = []
     for acting in (policy, loaded):
         torch.manual_seed(5)

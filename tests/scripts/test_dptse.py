@@ -122,10 +122,8 @@ def test_records_for_programs(tmp_path, capsys):
     dptse.main(["record", *corridor, "--seeds", "0:2", "--workers", "1", "--json"])
     found = json.loads(capsys.readouterr().out)
     assert found["seeds"] == [0, 1]
-    assert sorted(path.name for path in Path(found["folder"]).glob("0*")) == [
-        "00000000",
-        "00000001",
-    ]
+    names = sorted(path.name for path in Path(found["folder"]).glob("0*"))
+    assert names == ["00000000.safetensors", "00000001.safetensors"]
 
 
 def test_scripts_are_named_as_commands():

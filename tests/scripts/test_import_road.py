@@ -91,8 +91,9 @@ def test_the_page_on_own_data_has_commands_that_run(tmp_path):
     files = dict(re.findall(r"```toml\n# (\S+)\n(.*?)```", page, re.DOTALL))
     for name, content in files.items():
         (tmp_path / name).write_text(content)
-    points = stream(seconds=1300.0, length=640.0)
-    write_csv(tmp_path / "0750.csv", ngsim(points))
+    points = stream(seconds=723.0, headway=8.0, length=640.0)
+    for name in ("0750", "0805", "0820"):
+        write_csv(tmp_path / f"{name}.csv", ngsim(points))
     (command,) = re.findall(r"python scripts/import_road.py (.*?--mapping.*?)\n```", page,
                             re.DOTALL)  # fmt: skip
     words = command.replace("\\\n", " ").split()
@@ -101,3 +102,6 @@ def test_the_page_on_own_data_has_commands_that_run(tmp_path):
     result = run_script("import_road.py", *here)
     assert result.returncode == 0, result.stderr
     assert Path(tmp_path / "us-101" / "road.toml").is_file()
+    # The page goes on with these seeds.
+    assert "training: 5 window(s), traffic seeds 0..4" in result.stdout
+    assert "validation: 2 window(s), traffic seeds 1000..1001" in result.stdout

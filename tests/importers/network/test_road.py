@@ -23,7 +23,7 @@ from dptse_env.traffic import (
 )
 from dptse_env.traffic.sumo import running, seconds
 from dptse_env.traffic.sumo_input import packaged_network
-from tests.importers.network.conftest import PATH, motorway
+from tests.importers.network.conftest import FLOWS, PATH, motorway
 
 
 def imported(files, **options):
@@ -125,6 +125,14 @@ def test_the_record_is_that_of_the_generated_network_if_the_files_are_the_same(t
     same = ("n_mainline", "on_ramps", "off_ramps", "fixed_sensors", "lanes", "ramp_lanes")
     for name in (*same, "segment_length", "speed_limit", "density_scale", "speed_scale"):
         assert getattr(road.corridor, name) == getattr(calm, name), name
+
+
+def test_an_incident_makes_no_vehicle_faster(files, tmp_path):
+    slow = tmp_path / "slow.rou.xml"
+    slow.write_text(FLOWS.replace('id="car"', 'id="car" maxSpeed="10"'))
+    corridor = imported(dataclasses.replace(files, routes=(slow,))).corridor
+    limited = dataclasses.replace(corridor, incident=Incident(2, ((30, 200, 90.0),)))
+    assert 30.0 < simulate(limited, 0).speed.max() <= 36.01
 
 
 def _vehicles(corridor, scenario):
