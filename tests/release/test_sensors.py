@@ -13,6 +13,7 @@ from dptse_env.parts import make_interface, make_parts, make_release, privacy_re
 from dptse_env.privacy import mu_of
 from dptse_env.process import QueryProcess
 from dptse_env.release import Detectors, Group, PacedSettings, make_groups
+from dptse_env.release.noise import BLOCK
 from dptse_env.traffic import Penetration
 from tests.cases import pairwise
 
@@ -276,7 +277,7 @@ def test_an_error_of_a_detector_changes_what_it_measures_alone_and_no_release():
                       {"budget_share": 0.4, "absolute": 1.0}):  # fmt: skip
         process = make(privacy={"preset": "corrected"}, detectors=detectors, estimator="open_loop")
         begin(process)
-        found.append(play(process, 5))
+        found.append(play(process, BLOCK + 2))  # the second block of noise as well
     for (one, *_), (two, *_), (three, *_) in zip(*found, strict=True):
         np.testing.assert_array_equal(one.values, two.values)
         np.testing.assert_array_equal(one.values, three.values)
