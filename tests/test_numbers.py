@@ -7,8 +7,8 @@ from tests import numbers
 
 pytestmark = pytest.mark.slow
 
-# Shares by which numbers may differ. Chaotic filters and iterative solvers magnify rounding, and the
-# network computes in single precision, in an order that depends on the processor.
+# Shares by which numbers may differ: a chaotic filter or an iterative solver magnifies rounding,
+# and the network computes in single precision, in an order that depends on the processor.
 CHAOTIC = {"ukf": 1e-6, "enkf": 1e-6, "mhe": 1e-6, "recurrent": 1e-6}
 MEANS = {"ukf": 0.01, "enkf": 0.01, "mhe": 0.01}
 
