@@ -84,17 +84,17 @@ def test_another_row_is_another_difference(recorded):
 
 
 def test_sensors_alone_have_the_budget_that_they_are_said_to_have():
-    def release(labels):
+    def mu_by_group(labels):
         cell = study.sensed_cell(labels)
-        return gym.make(cell.env, **cell.keywords).unwrapped.process.release
+        report = gym.make(cell.env, **cell.keywords).unwrapped.privacy()
+        return {group["group"]: group["mu"] for group in report["groups"]}
 
     whole = mu_of(study.EPSILON, 0.05)
     part = whole / np.sqrt(1.0 + 3.0 * np.sqrt(study.BASE_SHARE))
-    assert release(study.alone("paced", "ekf")).sensors.report().mu == pytest.approx(whole)
-    sensors = release(study.alone("paced", "ekf", study.PART)).sensors
-    assert sensors.report().mu == pytest.approx(part)
-    queries = release(sensed("paced", "ekf", sensors=study.QUERIES)).queries
-    assert queries.report().mu == pytest.approx(whole)
+    assert mu_by_group(study.alone("paced", "ekf"))["sensors"] == pytest.approx(whole)
+    assert mu_by_group(study.alone("paced", "ekf", study.PART))["sensors"] == pytest.approx(part)
+    queries = sensed("paced", "ekf", sensors=study.QUERIES)
+    assert mu_by_group(queries) == {"queries": pytest.approx(whole)}
     assert study.alone("paper", "ekf") == study.alone("paper", "ekf", study.PART)
 
 

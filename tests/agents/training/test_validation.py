@@ -61,5 +61,5 @@ def test_other_traffic_is_refused(seeds, got):
 def test_an_episode_within_the_warm_up_says_nothing():
     validation = Validation(SHORT, {"action": "slots", "horizon": 60}, SEEDS)
     policy = Drawn(validation.env.single_action_space)
-    with pytest.raises(ValueError, match="longer than the warm-up of 60 s"):
+    with pytest.raises(ValueError, match="warm_up must be shorter than an episode, got 60"):
         validation.errors(policy, deterministic=True)
