@@ -29,7 +29,9 @@ BESIDE_THEM = {
     "LICENSE", "Makefile", "README.md", "constraints.txt", "hatch_build.py", "mkdocs.yml",
     "pyproject.toml",
 }  # fmt: skip
-IN_A_SOURCE_ARCHIVE = IN_A_WHEEL | {".css", ".ipynb", ".md", ".png", ".toml", ".yaml", ".yml"}
+IN_A_SOURCE_ARCHIVE = IN_A_WHEEL | {
+    ".css", ".ipynb", ".md", ".npz", ".png", ".toml", ".yaml", ".yml"
+}  # fmt: skip
 
 LARGEST = 4_000_000
 """Most bytes of an archive."""
