@@ -103,7 +103,8 @@ class QueryProcess:
         """Return a copy that can be stepped to look ahead, with the same streams of noise.
 
         A fork that is stepped like its origin gives the same bits, and the origin is not affected.
-        It shares traffic and model, cannot be reset, and takes some 40 us an episode to make.
+        It shares traffic and model and cannot be reset. One of a single episode takes some 0.6 ms
+        to make, one of 64 some 70 us an episode.
         """
         shared = (
             self.config, self.interface, self.model, self.traffic, self._threads,
