@@ -1,7 +1,7 @@
 """One file of trajectories: its points become vehicles at whole seconds, cut into windows.
 
-Points wait on disk in buckets, each with all points of some vehicles, so that memory does not grow
-with the file.
+Points wait on disk in buckets, each with all points of some vehicles, and are read one bucket at a
+time. What grows in memory is a row for each vehicle and for each second.
 """
 
 from __future__ import annotations
