@@ -103,8 +103,8 @@ def test_nodes_make_the_records_that_they_lack(cluster, tmp_path, expected):
     run(study(), Place(tmp_path, RayCluster(cluster.address)), progress=False)
     assert rows_of(tmp_path).equals(expected)
     for k in (1, 2):
-        records = (tmp_path / f"cache-{k}").glob("*/*/0*")
-        assert sorted(path.name for path in records) == ["00002000", "00002001"]
+        records = (tmp_path / f"cache-{k}").glob("*/*/0*.safetensors")
+        assert sorted(path.stem for path in records) == ["00002000", "00002001"]
 
 
 def test_a_killed_worker(cluster, traces, tmp_path, expected):
