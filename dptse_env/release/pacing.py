@@ -17,10 +17,8 @@ from dptse_env.model.parameters import SECONDS_PER_HOUR
 from dptse_env.release.base import Task
 from dptse_env.release.queries import QueryOptions
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
-from dptse_env.utils.kernels import copy_vector, kernel, kernel_part
+from dptse_env.utils.kernels import Bundle, copy_vector, kernel, kernel_part
 from dptse_env.utils.registry import Registry
-
-Packed = tuple[Any, ...]
 
 MEAN_SQUARE = 0.15
 """Expected value of d^2 / D^2, by which a contribution costs more than its price."""
@@ -159,7 +157,7 @@ class TracerPacing(Pacing):
     def __init__(self, task: Task, budget: FloatArray) -> None:
         """Prepare for episodes without any charge so far."""
         super().__init__(task, budget)
-        self._packed = tuple(PacedRoad.make(task)), tuple(PacedColumns.make(task))
+        self._bundle = Bundle(PacedRoad.make(task), PacedColumns.make(task))
         self._first_rates = np.zeros((len(task.groups), task.n_places))
         self._first_rates[task.group[task.always], task.first[task.always]] = 1.0
         mainline = self._first_rates[0, : task.corridor.n_mainline]
@@ -180,7 +178,7 @@ class TracerPacing(Pacing):
         prices = np.empty(observed.shape)
         charge = 1.0 + MEAN_SQUARE * self.task.settings.ratio
         _pace(
-            *self._packed, episodes, observed, density, speed, *self._offer, charge,
+            self._bundle, episodes, observed, density, speed, *self._offer, charge,
             self._rates, self._tracer, prices,
         )  # fmt: skip
         return prices
@@ -219,14 +217,14 @@ class EventPacing(Pacing):
         """Work out the price of a query that has a second's budget to itself."""
         super().__init__(task, budget)
         self._whole: FloatArray = budget / (1.0 + task.settings.ratio)
-        self._columns = tuple(PacedColumns.make(task))
+        self._bundle = Bundle(PacedColumns.make(task))
 
     def prices(
         self, episodes: IntArray, observed: BoolArray, density: FloatArray, speed: FloatArray
     ) -> FloatArray:
         """See `Pacing.prices`."""
         prices = np.empty(observed.shape)
-        _divide(self._columns, self.task.n_places, observed, self._whole, prices)
+        _divide(self._bundle, self.task.n_places, observed, self._whole, prices)
         return prices
 
     def expected_prices(self, speed: FloatArray) -> FloatArray:
@@ -265,8 +263,7 @@ def check_prices(prices: Any, shape: tuple[int, ...]) -> FloatArray:
 
 @kernel
 def _pace(
-    road_: Packed,
-    columns_: Packed,
+    bundle: Bundle,
     episodes: IntArray,
     observed: BoolArray,
     density: FloatArray,
@@ -281,8 +278,7 @@ def _pace(
     """Move the tracers along, set prices, and charge the tracers for the queries.
 
     Args:
-        road_: The `PacedRoad`.
-        columns_: The `PacedColumns`.
+        bundle: `PacedRoad` and `PacedColumns`.
         episodes: Shape (k,).
         observed: Columns that are observed, shape (k, C).
         density: Predicted densities [veh/km], shape (k, S).
@@ -294,7 +290,7 @@ def _pace(
         tracer: Expected payments so far, shape (n, groups, places), updated.
         prices: Output, shape (k, C).
     """
-    road, columns = PacedRoad(*road_), PacedColumns(*columns_)
+    road, columns = bundle.parts
     n_groups, places = tracer.shape[1], tracer.shape[2]
     rest, before, charged = np.empty(places), np.empty(places), np.empty(places)
     inflow = np.empty((2, road.n_segments))
@@ -395,10 +391,10 @@ def _seconds(length: float, speed: float) -> float:
 
 @kernel
 def _divide(
-    columns_: Packed, n_places: int, observed: BoolArray, whole: FloatArray, prices: FloatArray
+    bundle: Bundle, n_places: int, observed: BoolArray, whole: FloatArray, prices: FloatArray
 ) -> None:
     """Divide a second's budgets among a group's queries that cover a place, by their levels."""
-    columns = PacedColumns(*columns_)
+    (columns,) = bundle.parts
     total = np.empty((whole.size, n_places))
     for k in range(observed.shape[0]):
         total[:] = 0.0
