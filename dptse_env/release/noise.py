@@ -66,8 +66,8 @@ class Noise:
     def give(self, noise: FloatArray) -> None:
         """Set the next step's noise of all episodes, shape (n, C, 2) in standard deviations.
 
-        The noise drawn for that step is skipped. It serves what-if trials in forks, which have no
-        guarantee.
+        It takes the place of the noise drawn for that step. It serves what-if trials in forks,
+        which have no guarantee.
 
         Raises:
             ValueError: ``noise`` has another shape.
@@ -102,11 +102,11 @@ class Noise:
         if self._sure <= 0:
             self._refill(episodes)
         self._sure -= 1
+        if self._given is not None:
+            self._noise[episodes, self._next[episodes]] = self._given[episodes]
+            self._given = None
         released = np.empty(values.shape)
-        noise, given, self._given = self._noise, self._given, None
-        if given is not None:
-            noise = np.repeat(given[:, None], BLOCK, axis=1)
-        _add(noise, self._next, episodes, values, sigma, unit, released)
+        _add(self._noise, self._next, episodes, values, sigma, unit, released)
         return released
 
     def _refill(self, episodes: IntArray) -> None:
