@@ -83,7 +83,13 @@ class GaussianRelease(ReleaseModel):
         self._centre = np.full((n, task.n_places), v_0)
         self._price, self._zero = np.ones((n, task.n_columns)), np.zeros((n, task.n_places))
         self.noise = Noise(n, task.n_columns)
-        self.ledgers = Ledgers(task.columns, n, np.full(len(groups), math.inf))
+        self.ledgers = self._ledgers()
+
+    def _ledgers(self) -> Ledgers:
+        """Return ledgers of the vehicles, by which they may count without end."""
+        return Ledgers(
+            self.task.columns, self.task.n_episodes, np.full(len(self.task.groups), math.inf)
+        )
 
     @abstractmethod
     def _sensitivity(self, group: int) -> Sensitivity:
@@ -330,13 +336,12 @@ class Capped(GaussianRelease):
         """Return half of the largest speed limit, the centre of the speeds clipped to it."""
         return 0.5 * corridor.largest_speed_limit if settings.speed_release == "flow" else None
 
-    def __init__(self, task: Task, traffic: Traffic) -> None:
-        """See `GaussianRelease`."""
-        super().__init__(task, traffic)
-        cap = task.settings.contribution_cap
+    def _ledgers(self) -> Ledgers:
+        """Return ledgers by which a vehicle counts as often as the cap allows in each group."""
+        task, cap = self.task, self.task.settings.contribution_cap
         budget = np.full(len(task.groups), math.inf if cap is None else float(cap))
         fastest = task.corridor.largest_speed_limit
-        self.ledgers = Ledgers(task.columns, task.n_episodes, budget, fastest=fastest)
+        return Ledgers(task.columns, task.n_episodes, budget, fastest=fastest)
 
     def _sensitivity(self, group: int) -> Sensitivity:
         corridor, settings = self.task.corridor, self.task.settings
