@@ -117,21 +117,15 @@ def make_interface(config: EnvConfig) -> QueryInterface:
     )
 
 
-def flow_centre(config: EnvConfig) -> float | None:
-    """Return the speed [km/h] that released flows are centred on; None for mean speeds."""
-    model = RELEASE_MODELS.find(config.privacy.preset)
-    centre: float | None = model.flow_centre(config.corridor, config.privacy)
-    return centre
-
-
 def make_model(config: EnvConfig) -> ARZModel:
     """Make the traffic model of the estimator, with a time step of one second."""
+    task = make_task(config)
     return ARZModel(
         config.corridor,
         config.arz_parameters,
         TIME_STEP,
-        reference_speed=flow_centre(config),
-        rows=config.queries.rows(config.corridor),
+        reference_speed=task.flow_centre,
+        rows=task.rows,
     )
 
 

@@ -319,8 +319,7 @@ class QueryProcess:
         The keys in `TRUTH_INFO` come from the true traffic. They serve training and evaluation, as
         the reward does, and are not covered by the guarantee. The others are public.
         """
-        elapsed = self.config.horizon_steps - self.end[episodes] + self.time[episodes]
-        mu, epsilon = self.release.spent(episodes, elapsed)
+        mu, epsilon = self.release.spent(episodes, self.elapsed[episodes])
         infos: Rows = {
             "rmse_density": self.error.density[episodes],
             "rmse_speed": self.error.speed[episodes],

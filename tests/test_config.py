@@ -15,7 +15,7 @@ from dptse_env.config import (
 )
 from dptse_env.estimators import EstimatorSettings, HorizonSettings
 from dptse_env.estimators.settings import available_settings, load_settings
-from dptse_env.parts import flow_centre, make_release, privacy_report, warn_where_void
+from dptse_env.parts import make_release, make_task, privacy_report, warn_where_void
 from dptse_env.release import MOST_OPTIONS, CappedSettings, PrivacySettings
 from dptse_env.traffic import PAPER_HIGHWAY, SHORT_HIGHWAY, DemandDistribution, IncidentDistribution
 
@@ -156,7 +156,7 @@ def test_seed_ranges():
 def test_a_preset_by_name_keeps_the_other_fields_of_privacy():
     config = resolve("private-highway", {"privacy": "corrected"})
     assert config.privacy == PrivacySettings("corrected", epsilon=5.0)
-    assert flow_centre(config) is None
+    assert make_task(config).flow_centre is None
     config = resolve("paper-highway", {"privacy": "capped", "epsilon": 2})
     assert config.privacy == CappedSettings(epsilon=2.0)
     assert config.privacy.boundary == "nominal"

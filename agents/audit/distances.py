@@ -9,7 +9,7 @@ import numpy as np
 
 from agents.audit.worlds import Trajectory
 from dptse_env.config import EnvConfig
-from dptse_env.parts import flow_centre, make_release
+from dptse_env.parts import make_release, make_task
 from dptse_env.release import CappedSettings, SpeedRelease
 from dptse_env.traffic import Record
 from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray, IntArray
@@ -39,7 +39,7 @@ class ReleaseDistances:
     def from_config(cls, config: EnvConfig) -> ReleaseDistances:
         """Return the distances under a configuration, at the noise that it declares."""
         corridor = config.corridor
-        speed: SpeedRelease = "mean" if flow_centre(config) is None else "flow"
+        speed: SpeedRelease = "flow" if make_task(config).releases_flow else "mean"
         sigma = make_release(config).sigma
         shortest = min(corridor.segment_lengths)
         return cls(

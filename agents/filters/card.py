@@ -9,7 +9,7 @@ from agents.environments import make_config, parse_env
 from agents.filters.plan import FilterPlan
 from dptse_env.estimators.recurrent import FORMAT
 from dptse_env.estimators.recurrent_kernels import CHANNELS
-from dptse_env.parts import flow_centre
+from dptse_env.parts import make_task
 
 
 def make_card(plan: FilterPlan, done: int, name: str) -> dict[str, Any]:
@@ -28,7 +28,7 @@ def make_card(plan: FilterPlan, done: int, name: str) -> dict[str, Any]:
         "speed_limit": [limit for road in roads for limit in road.speed_limits],
         "lanes": [float(count) for count in lanes],
         "span": [1.0, *(float(span) for spans in ranges.spans for span in spans)],
-        "flows": [float(flow_centre(config) is not None) for config in configs],
+        "flows": [float(make_task(config).releases_flow) for config in configs],
     }
     return {
         "name": name,
