@@ -1,4 +1,4 @@
-"""What the scalar and the vectorised environment share; their episodes are those of a process."""
+"""The base of the scalar and the vectorised environment, which play episodes of a process."""
 
 from __future__ import annotations
 

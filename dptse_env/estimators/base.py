@@ -185,9 +185,9 @@ class BatchEstimator(ABC):
 
     is_compiled: ClassVar[bool] = False
     has_demand: ClassVar[bool] = True
-    """Whether its settings may ask for demand states."""
+    """True where its settings may ask for demand states."""
     steps_model: ClassVar[bool] = True
-    """Whether it steps the model, whose time step then must satisfy the CFL condition."""
+    """True where it steps the model, whose time step then must satisfy the CFL condition."""
 
     def __init__(self, model: ARZModel, n_episodes: int, settings: Any) -> None:
         """See `make_estimator`."""

@@ -1,4 +1,4 @@
-"""What a file of trajectories means: its format, columns and units, and where the road lies in it.
+"""The meaning of a file of trajectories: format, columns, units, and the road's place in it.
 
 All of it can be given in a TOML file with the fields of `Source`; ``docs/own_data.md`` has
 examples.

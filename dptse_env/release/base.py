@@ -96,7 +96,7 @@ class Group(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """What is measured of which road, in a batch of n episodes.
+    """Measurements of a road in a batch of n episodes.
 
     *Places* are the columns of a record: the S segments, then the R boundary segments where they
     are released. *Columns* are those of a release: first the M rows of the road, which estimators
@@ -240,7 +240,7 @@ class Task:
 
     @cached_property
     def covers(self) -> BoolArray:
-        """Whether each column covers each place, shape (C, S + R)."""
+        """True where a column covers a place, shape (C, S + R)."""
         return covered(self.first, self.span, self.n_places)
 
     @cached_property

@@ -37,7 +37,7 @@ def _no_rows() -> AnyArray:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Record:
-    """What is on a road at each of its seconds: a table of vehicles, or a measured field.
+    """Traffic on a road, second by second: a table of vehicles, or a measured field.
 
     Step k is the state of the road k seconds after the start. A table has at most one row for each
     vehicle and step, and within a step it lists the vehicles segment by segment. A field, as from

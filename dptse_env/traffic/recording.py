@@ -38,7 +38,7 @@ WATCH = 0.5
 """Time [s] between two looks of a worker at whether its parent is there."""
 
 Sources = Mapping[int, Mapping[str, object]]
-"""What is saved with the record of each traffic seed; see `Record.save`."""
+"""Properties saved with the record of each traffic seed; see `Record.save`."""
 
 logger = logging.getLogger(__name__)
 

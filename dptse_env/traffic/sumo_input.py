@@ -1,4 +1,4 @@
-"""What SUMO reads for a corridor: a network with one edge per segment, and vehicles with routes.
+"""SUMO's input for a corridor: a network with one edge per segment, and vehicles with routes.
 
 The networks of the package's corridors come with it; any other geometry is compiled by netconvert
 on demand, which needs `eclipse-sumo` (extra ``corridors``). ``networks/NAME.net.xml`` is

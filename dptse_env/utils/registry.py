@@ -1,4 +1,4 @@
-"""What is found by name: parts, also as ``"package.module:Name"``, plugins, optional packages."""
+"""Lookup by name: parts, also as ``"package.module:Name"``, plugins, optional packages."""
 
 from __future__ import annotations
 

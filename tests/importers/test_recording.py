@@ -1,4 +1,4 @@
-"""What becomes of points: windows, whole seconds, gaps, ids that are used again, wrong rows."""
+"""Points become windows of whole seconds: gaps, ids that are used again, wrong rows."""
 
 import dataclasses
 import subprocess

@@ -1,4 +1,4 @@
-"""What SUMO reads: networks that come with the package, and networks that are compiled."""
+"""Networks for SUMO: those that come with the package, and compiled ones."""
 
 import dataclasses
 import importlib.util

@@ -1,4 +1,4 @@
-"""What is read of files of a simulation, and what is refused in one line that names the file."""
+"""Files of a simulation are read; bad ones are refused in one line that names the file."""
 
 import re
 from dataclasses import replace
