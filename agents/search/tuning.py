@@ -25,6 +25,8 @@ from typing import Any
 
 import numpy as np
 import optuna
+from optuna.pruners import MedianPruner
+from optuna.samplers import TPESampler
 from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock, JournalStorage
 from optuna.trial import FrozenTrial, TrialState
 
@@ -185,7 +187,9 @@ def tune(search: Search, folder: Path, n_trials: int, executor: AnyExecutor) -> 
     folder.mkdir(parents=True, exist_ok=True)
     path = journal_path(search, folder)
     _mend(path)
-    study = _open(search, folder)
+    study = optuna.create_study(
+        storage=_storage(path), study_name=search.name, direction="maximize", load_if_exists=True
+    )
     identity = json.loads(json.dumps(search.identity()))
     difference = first_difference(study.user_attrs.get("identity", identity), identity)
     if difference is not None:
@@ -258,15 +262,9 @@ def write(search: Search, study: optuna.Study, path: Path) -> dict[str, Any]:
     return settings
 
 
-def _open(search: Search, folder: Path) -> optuna.Study:
-    path = str(journal_path(search, folder))
-    return optuna.create_study(
-        storage=JournalStorage(JournalFileBackend(path, JournalFileOpenLock(path))),
-        study_name=search.name,
-        direction="maximize",
-        pruner=optuna.pruners.MedianPruner(n_startup_trials=8),
-        load_if_exists=True,
-    )
+def _storage(journal: Path) -> JournalStorage:
+    path = str(journal)
+    return JournalStorage(JournalFileBackend(path, JournalFileOpenLock(path)))
 
 
 def _run_trial(
@@ -279,12 +277,18 @@ def _run_trial(
         folder: Has the journal.
         task: The number of trials before this one, and label and values of a start.
     """
-    (index, start), study = task, _open(search, folder)
+    index, start = task
+    # A new sampler for each trial: resuming must not draw the first numbers again. Without a liar:
+    # trials that were interrupted, which stay as running, must not count as bad ones.
+    seed = np.random.SeedSequence([search.seed, index]).generate_state(1)[0]
+    study = optuna.load_study(
+        study_name=search.name,
+        storage=_storage(journal_path(search, folder)),
+        sampler=TPESampler(seed=int(seed), multivariate=True, constant_liar=False),
+        pruner=MedianPruner(n_startup_trials=8),
+    )
     if start is not None:
         study.enqueue_trial(start[1], user_attrs={"label": start[0]})
-    # A new sampler for each trial: resuming must not draw the first numbers again.
-    seed = np.random.SeedSequence([search.seed, index]).generate_state(1)[0]
-    study.sampler = optuna.samplers.TPESampler(seed=int(seed), multivariate=True)
     trial = study.ask({**search.space})
     settings = from_mapping(EstimatorSettings, nested(trial.params), "estimator_settings")
     seeds, rows = search.traffic_seeds, list[Row]()
