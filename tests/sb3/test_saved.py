@@ -41,7 +41,12 @@ def observe(env):
 
 @pytest.mark.parametrize(
     ("action", "net_arch"),
-    [("slots", None), ("scores", [8, 4]), ("mask", {"pi": [8], "vf": [4, 4]}), ("sequential", [16])],
+    [
+        ("slots", None),
+        ("scores", [8, 4]),
+        ("mask", {"pi": [8], "vf": [4, 4]}),
+        ("sequential", [16]),
+    ],
 )
 def test_a_loaded_policy_acts_as_the_saved_one(path, action, net_arch):
     policy, config = untrained(action, net_arch=net_arch)
