@@ -23,9 +23,8 @@ from dptse_env.estimators import ESTIMATORS, EstimatorSettings
 from dptse_env.estimators.settings import available_settings, load_settings, read_settings
 from dptse_env.evaluation import evaluate
 from dptse_env.utils.fields import from_mapping
-from tests.agents.policies import save
+from tests.helpers import SHORT, save_untrained
 
-SHORT = "dptse_env:dptse/ShortHighway-v0"
 KEYWORDS = {"parameters": "w99-3lane", "epsilon": 1.0, "delta": 0.05, "bandwidth": 2}
 SEARCH = Search(f"{SHORT} {json.dumps(KEYWORDS)}", "ekf", "0:2")
 
@@ -215,10 +214,8 @@ def test_trials_are_scored_as_an_evaluation_with_other_noise_seeds(tmp_path):
 
 def test_settings_can_be_tuned_for_a_saved_policy(tmp_path):
     pytest.importorskip("torch")
-    one, other = (
-        dataclasses.replace(SEARCH, schedule=str(save(tmp_path / f"{seed}.safetensors", seed=seed)))
-        for seed in (1, 2)
-    )
+    files = [save_untrained(tmp_path / f"{seed}.safetensors", seed=seed) for seed in (1, 2)]
+    one, other = (dataclasses.replace(SEARCH, schedule=str(path)) for path in files)
     settings = EstimatorSettings(process_noise=(0.02, 0.03))
     env = make(one, settings)
     expected = evaluate(env, one.cell().load_policy(env), (1,), 1_000_000)

@@ -10,8 +10,8 @@ import pytest
 
 from agents.search.tuning import FINISHED
 from scripts.tune import Args, main
+from tests.helpers import SHORT
 
-SHORT = "dptse_env:dptse/ShortHighway-v0"
 ROOT = Path(__file__).parents[2]
 
 
