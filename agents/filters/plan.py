@@ -1,22 +1,31 @@
-"""Plan of the training of a recurrent network: rounds of scenarios, and passes over them."""
+"""Plan of the training of a recurrent network: rounds of scenarios, and passes over them.
+
+The plan decides all numbers of a training, and says on the card of the network what it was.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import json
 import math
-import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from importlib.metadata import version
+from itertools import product
+from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
-from agents.environments import parse_env
+from agents.environments import make_config, parse_env, quietly
 from agents.filters.scenarios import Scenario, ScenarioRanges
 from agents.play import Cell
 from agents.seeds import TUNING, require_seeds
 from dptse_env.config import TRAINING_SEEDS, VALIDATION_SEEDS
-from dptse_env.estimators.recurrent import read_network
+from dptse_env.estimators.recurrent import FORMAT, read_network
+from dptse_env.estimators.recurrent_kernels import CHANNELS
+from dptse_env.parts import make_task
 from dptse_env.utils.fields import inside, integer, positive, require
 
 
@@ -44,6 +53,12 @@ class Round:
 
 OWN = "own"
 """The network that is trained, as the estimator of a round."""
+
+
+def played_by(weights: Path) -> dict[str, Any]:
+    """Return the keywords of an environment whose estimator is a network, given as a file."""
+    settings = {"weights": str(weights.resolve()), "outside": True}
+    return {"estimator": "recurrent", "estimator_settings": {"recurrent": settings}}
 
 
 @dataclass(frozen=True)
@@ -155,26 +170,42 @@ class FilterPlan:
             plain["initial_sha256"] = read_network(self.initial).card["sha256"]
         return plain
 
-    def validation_cells(self, weights: str | None = None) -> list[Cell]:
-        """Return the cells of a validation, of a network or else of the environments' estimators.
-
-        Args:
-            weights: File of the network.
-        """
-        own: dict[str, Any] = {}
-        if weights is not None:
-            settings = {"recurrent": {"weights": weights, "outside": True}}
-            own = {"estimator": "recurrent", "estimator_settings": settings}
+    def validation_cells(self, estimator: Mapping[str, Any] = MappingProxyType({})) -> list[Cell]:
+        """Return the cells of a validation, of the environments' estimators or of another one."""
+        options: dict[str, Any] = {"noise_seed": TUNING.start, "watchers": ("honesty",)}
         return [
-            Cell(
-                env,
-                "round-robin",
-                {**keywords, **own},
-                noise_seed=TUNING.start,
-                watchers=("honesty",),
-            )
+            Cell(env, "round-robin", {**keywords, **estimator}, **options)
             for env, keywords in map(parse_env, self.validation_envs)
         ]
+
+    def card(self, done: int, name: str) -> dict[str, Any]:
+        """Return the card of a network after `done` passes: what it was trained on."""
+        ranges = self.ranges
+        configs = [
+            make_config(env, {**keywords, "privacy": mechanism})
+            for env, keywords in map(parse_env, ranges.envs)
+            for mechanism in ranges.mechanisms
+        ]
+        roads = [config.corridor for config in configs]
+        found: dict[str, list[float]] = {
+            "n_mainline": [road.n_mainline for road in roads],
+            "segment_length": [length for road in roads for length in road.segment_lengths],
+            "speed_limit": [limit for road in roads for limit in road.speed_limits],
+            "lanes": [float(count) for road in roads for count in road.segment_lanes],
+            "span": [1.0, *(float(span) for spans in ranges.spans for span in spans)],
+            "flows": [float(make_task(config).releases_flow) for config in configs],
+        }
+        return {
+            "name": name,
+            "format": FORMAT,
+            "channels": list(CHANNELS),
+            "ranges": {key: [min(values), max(values)] for key, values in found.items()},
+            "training": {
+                "plan": self.settings(),
+                "passes": done,
+                "versions": {each: version(each) for each in ("dptse-env", "torch", "numpy")},
+            },
+        }
 
     def check(self) -> None:
         """Check environments, schedules and estimators without playing, recording or compiling.
@@ -183,16 +214,13 @@ class FilterPlan:
             ValueError: One is unknown, or does not suit a road.
         """
         estimators = [each.estimator for each in self.rounds if each.estimator != OWN]
-        with warnings.catch_warnings():
-            # They come again from the environments in which it trains.
-            warnings.simplefilter("ignore", UserWarning)
-            for text in self.ranges.envs:
-                env, keywords = parse_env(text)
-                for schedule in self.ranges.schedules:
-                    Cell(env, schedule, keywords).check()
-                for mechanism in self.ranges.mechanisms:
-                    for estimator in estimators:
-                        chosen = {"privacy": mechanism, "estimator": estimator}
-                        Cell(env, "none", {**keywords, **chosen}).check()
-            for cell in self.validation_cells():
+        cells = self.validation_cells()
+        for env, keywords in map(parse_env, self.ranges.envs):
+            cells += [Cell(env, schedule, keywords) for schedule in self.ranges.schedules]
+            cells += [
+                Cell(env, "none", {**keywords, "privacy": mechanism, "estimator": estimator})
+                for mechanism, estimator in product(self.ranges.mechanisms, estimators)
+            ]
+        with quietly():
+            for cell in cells:
                 cell.check()
