@@ -81,10 +81,9 @@ format: setup  ## Format the code.
 	$(BIN)/ruff check --fix
 	$(BIN)/ruff format
 
-benchmark: setup  ## Time the estimators and thousands of episodes beside their peers; results/throughput.
+benchmark: setup  ## Time estimators, environments and long roads beside their peers; results/benchmarks.
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[benchmark]'
-	$(BIN)/python benchmarks/bench_estimators.py
-	$(BIN)/python benchmarks/bench_throughput.py
+	$(BIN)/python -m benchmarks --output results/benchmarks/tables.md
 
 dist: setup  ## Build and check the archives of a release; dist/.
 	$(BIN)/python -m build --outdir dist
