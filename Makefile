@@ -52,7 +52,7 @@ test-tutorial: setup  ## Run the tutorial as a notebook, two to four minutes.
 	$(BIN)/python -m pytest tests/docs/test_notebook.py
 
 test-slow: setup  ## Run the slow tests: before a release, and after a change to kernels, workers or benchmarks.
-	$(BIN)/python -m pytest -m slow
+	$(BIN)/python -m pytest -m 'slow and not ray' -n 2 --dist loadfile
 
 test-gymnasium: setup  ## Run the tests of environments with the oldest Gymnasium, which RLlib needs.
 	$(BIN)/python -m pip install --quiet --no-deps --upgrade --target build/gymnasium gymnasium==1.2.2
