@@ -1,14 +1,7 @@
-"""Import recorded traffic as a road on which all tools work: trajectories, or a measured field.
+r"""Import recorded traffic as a road on which all tools work: trajectories, or a measured field.
 
-python scripts/import_road.py trajectories --files fcd.xml --corridor short-highway --format fcd \
---output my-data
-python scripts/import_road.py trajectories --files 0750.txt 0805.txt --corridor us-101.toml \
---mapping us-101-data.toml --output us-101
-python scripts/import_road.py trajectories --files points.csv --corridor road.toml --format table \
---columns time=t vehicle=id x=s speed=v lane=lane --units length=ft speed=mi/h --output my-data
-python scripts/import_road.py field --source.density density.txt --source.speed speed.txt \
---source.cell 0.02 --source.interval 5 --road.name my-field --road.segments 6 --road.lanes 5 \
---road.speed-limit 105 --output my-field
+$ dptse import trajectories --files fcd.xml --env dptse_env:dptse/ShortHighway-v0 \
+    --format fcd --output my-data
 
 The folder has the road (road.toml, to be given as the corridor) and its records; that of
 trajectories has a report, too. A field has no vehicles: the release models `paper` and `corrected`
@@ -22,25 +15,22 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from agents.environments import given_keywords
+from agents.environments import parse_env
 from dptse_env.config import TEST_SEEDS, TRAINING_SEEDS, VALIDATION_SEEDS
 from dptse_env.importers import Options, Source, Split, import_trajectories, read_source
 from dptse_env.importers.fields import FieldRoad, FieldSource, import_field
 from dptse_env.importers.folder import ROAD
 from dptse_env.importers.report import REPORT
 from dptse_env.traffic import is_road_file, ranges, read_road
-from scripts.cli import make_corridor, run
+from scripts.cli import Environment, run
 
 
-@dataclass(frozen=True)
-class Trajectories:
+@dataclass(frozen=True, kw_only=True)
+class Trajectories(Environment):
     """Import recorded trajectories as records of a road."""
 
     files: tuple[Path, ...]
     """Files of trajectories, in order of time."""
-    corridor: str
-    """The road: a road file that ends in .toml, the name of a shipped corridor, or a JSON object of
-    fields that replace those of the paper's."""
     output: Path
     """Folder to create."""
     format: str | None = None
@@ -67,12 +57,12 @@ class Trajectories:
 
     def run(self) -> None:
         """Import, and print which traffic seeds there are."""
-        environment = read_road(self.corridor).environment if is_road_file(self.corridor) else {}
-        keywords = given_keywords("{}", self.corridor)
+        road = parse_env(self.env)[1].get("corridor")
+        environment = read_road(road).environment if is_road_file(road) else {}
         imported = import_trajectories(
             self.files,
             self.source(),
-            make_corridor("dptse_env:dptse/PaperHighway-v0", keywords),
+            self.corridor(),
             self.output,
             splits(self.shares),
             Options(self.longest_gap, self.skip_start, self.skip_end, self.pause),
