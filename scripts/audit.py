@@ -25,7 +25,7 @@ from dptse_env.parts import privacy_report
 from dptse_env.privacy import mu_of
 from dptse_env.release import PrivacyReport
 from dptse_env.utils.fields import inside, integer, positive, require
-from scripts.cli import Environment, Machines, run
+from scripts.cli import Environment, Machines
 
 
 @dataclass(frozen=True)
@@ -197,7 +197,3 @@ def main(args: Args) -> None:
         return
     finding.print()
     print(f"the result is in {path}")
-
-
-if __name__ == "__main__":
-    run(main, Args, __doc__)

@@ -30,7 +30,7 @@ from dptse_env.model.parameters import write_parameters
 from dptse_env.release import Traffic
 from dptse_env.traffic import Corridor, RecordLibrary, average_dwell
 from dptse_env.utils.files import replacing
-from scripts.cli import Environment, Recording, run
+from scripts.cli import Environment, Recording
 
 logger = logging.getLogger(__name__)
 
@@ -163,7 +163,3 @@ def main(args: Args) -> None:
         print(f"at the bounds of the search: {', '.join(fit.at_bounds)}")
     print(f"mean time on a mainline segment: {dwell:.2f} s")
     print(f"written to {path}")
-
-
-if __name__ == "__main__":
-    run(main, Args, __doc__)

@@ -38,7 +38,7 @@ from agents.terminal import make_table, print_table, print_text
 from dptse_env.config import EnvConfig, parse_seeds
 from dptse_env.schedules import OBSERVATION_SCHEDULES
 from dptse_env.utils.fields import require
-from scripts.cli import Environment, Machines, run
+from scripts.cli import Environment, Machines
 
 ALL = "all"
 """The schedule that runs with a bandwidth that covers the road."""
@@ -316,7 +316,3 @@ def main(args: Args) -> None:
     if not args.json:
         page = f"; a browser opens {args.output / PAGE}" if args.html else ""
         print(f"tables and figures are in {args.output}/{page}")
-
-
-if __name__ == "__main__":
-    run(main, Args, __doc__)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from dptse_env.config import parse_seeds
 from dptse_env.traffic import average_dwell
-from scripts.cli import Environment, Recording, run
+from scripts.cli import Environment, Recording
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,3 @@ def main(args: Args) -> None:
         return
     print(f"{corridor.name}: {len(seeds)} record(s) in {library.path}")
     print(f"mean dwell on a mainline segment (T_avg): {dwell:.2f} s")
-
-
-if __name__ == "__main__":
-    run(main, Args, __doc__)

@@ -25,7 +25,7 @@ from agents.study import Follow, Study, write_report
 from agents.study import run as run_study
 from dptse_env.config import parse_seeds
 from dptse_env.utils.fields import require
-from scripts.cli import Machines, run
+from scripts.cli import Machines
 from scripts.suite import suitable
 
 STUDIES = ("paper", "guarantees", "estimators", "policies", "suite")
@@ -157,7 +157,3 @@ def main(args: Args) -> None:
     else:
         run_study(study, args.place(folder))
     print(f"tables and figures are in {folder}/")
-
-
-if __name__ == "__main__":
-    run(main, Args, __doc__)

@@ -31,7 +31,7 @@ from agents.study import read_rows
 from agents.study import run as run_study
 from agents.terminal import make_table, print_table
 from dptse_env.utils.fields import require
-from scripts.cli import Machines, run
+from scripts.cli import Machines
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,3 @@ def print_scores(scores: Scores, names: Sequence[str]) -> None:
     for line in zip(["mean", *tasks], *columns, ["", *map(best, tasks)], strict=True):
         table.add_row(*line)
     print_table(table)
-
-
-if __name__ == "__main__":
-    run(main, Args, __doc__)

@@ -27,7 +27,7 @@ from agents.training.several_seeds import train_all
 from agents.training.training import BEST, POLICY, Training
 from dptse_env.config import parse_seeds
 from dptse_env.utils.fields import integer
-from scripts.cli import Environment, Machines, run
+from scripts.cli import Environment, Machines
 from scripts.training_bar import Bar, watched
 
 AnyRecipe = (
@@ -134,7 +134,3 @@ def main(args: Args) -> None:
         )
         training.run()
     print(f"{summary(training.rows[-1])}; {args.output}/{POLICY} and {BEST}")
-
-
-if __name__ == "__main__":
-    run(main, Args, __doc__)

@@ -23,7 +23,7 @@ from agents.training.run_files import check_plan
 from dptse_env.config import parse_seeds
 from dptse_env.estimators.recurrent import read_network
 from dptse_env.utils.fields import integer
-from scripts.cli import Machines, run
+from scripts.cli import Machines
 from scripts.training_bar import Bar, watched
 
 
@@ -131,7 +131,3 @@ def main(args: Args) -> None:
         )
         training.run()
     print(f"the network is in {args.output / 'network.safetensors'}")
-
-
-if __name__ == "__main__":
-    run(main, Args, __doc__)

@@ -31,7 +31,7 @@ from agents.terminal import make_table, print_table
 from dptse_env.model import ARZParameters
 from dptse_env.model.parameters import read_parameters
 from dptse_env.utils.fields import integer
-from scripts.cli import Environment, Machines, run
+from scripts.cli import Environment, Machines
 
 
 @dataclass(frozen=True)
@@ -172,7 +172,3 @@ def main(args: Args) -> None:
         f"tuned sets are in {args.output}/: take one as estimator_settings, or name it in the "
         "table environment of a road file"
     )
-
-
-if __name__ == "__main__":
-    run(main, Args, __doc__)
