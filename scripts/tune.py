@@ -24,7 +24,7 @@ from agents.search.space import SPACE, Extra
 from agents.search.tuning import Search, chosen, journal_path, tune, write
 from agents.terminal import make_table, print_table
 from dptse_env.utils.fields import integer
-from scripts.cli import Recording, resumable, run
+from scripts.cli import Recording
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,6 @@ def make_searches(args: Args) -> dict[str, Search]:
     return searches
 
 
-@resumable()
 def main(args: Args) -> None:
     """Record what is missing, run the trials that are missing, and leave the sets."""
     searches, executor = make_searches(args), make_executor("local", args.workers)
@@ -102,7 +101,3 @@ def main(args: Args) -> None:
     print(f"sets are in {args.output}/; as keywords of the environment:")
     for keywords in found:
         print(json.dumps(keywords))
-
-
-if __name__ == "__main__":
-    run(main, Args, __doc__)
