@@ -1,7 +1,9 @@
-"""Fit the ARZ parameters to recorded traffic and compare predictions on held-out seeds.
+"""Fit the parameters of the traffic model to recorded traffic; compare them on held-out seeds.
 
-python scripts/calibrate.py --train 0:16 --held-out 1000:1008
-python scripts/calibrate.py --corridor '{"speed_limit": 90}' --name my-road
+dptse calibrate --env dptse_env:dptse/ShortHighway-v0 --train 0:2 --held-out 1000:1001
+
+The fitted set is left in <output>/<name>.json, a file that the keyword parameters takes, in Python,
+after --env or in the table environment of a road file.
 """
 
 from __future__ import annotations
