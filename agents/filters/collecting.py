@@ -110,7 +110,7 @@ class _Recorder:
 
     def __init__(self, process: QueryProcess) -> None:
         self._estimator, self._process = process.estimator, process
-        self.measured: list[Measurement] = []
+        self.measured: list[tuple[AnyArray, ...]] = []
         self.inputs: list[FloatArray] = []
 
     def __getattr__(self, name: str) -> Any:
@@ -125,7 +125,7 @@ class _Recorder:
         """Write down the measurements, and update."""
         model = self._process.model
         own = measured.on_road(model.rows.n_rows, model.n_segments)
-        self.measured.append(Measurement(*(array.copy() for array in own)))
+        self.measured.append(tuple(array.copy() for array in own))
         self._estimator.update(episodes, measured)
 
 
@@ -134,12 +134,12 @@ class _Watcher:
 
     def __init__(self, process: QueryProcess) -> None:
         self._process = process
-        self.start: AnyArray | None = None
+        self.start: AnyArray = np.empty(0)
         self.truth: list[AnyArray] = []
 
     def __call__(self) -> None:
         process = self._process
-        if self.start is None:
+        if self.start.size == 0:
             said = process.estimate
             table = said.density, said.speed, said.density_std, said.speed_std
             self.start = _single(np.stack(table, -1))

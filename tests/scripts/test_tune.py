@@ -38,8 +38,8 @@ def test_it_leaves_a_set_per_configuration(tmp_path, capsys):
 @pytest.mark.slow
 def test_a_killed_run_leaves_nobody_behind_and_goes_on(tmp_path):
     command = [
-        sys.executable, "scripts/tune.py", "--env", SHORT, "--estimators", "ekf", "--seeds", "0:2",
-        "--trials", "16", "--workers", "2", "--output", str(tmp_path),
+        sys.executable, "-m", "scripts.dptse", "tune", "--env", SHORT, "--estimators", "ekf",
+        "--seeds", "0:2", "--trials", "16", "--workers", "2", "--output", str(tmp_path),
     ]  # fmt: skip
     journal = tmp_path / "ekf-paper-paper.journal"
     with subprocess.Popen(
