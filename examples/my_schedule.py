@@ -22,10 +22,9 @@ class DenseAndOld(Schedule):
 
     def select(self, step, observation):
         """Return the segments to query in each of k episodes, as flags of shape (k, n)."""
-        density, age = (self.block(observation, name) for name in ("density", "age"))
-        # Both blocks end with the ramps, which cannot be queried.
-        score = (density + 0.05) * (age + 0.1)
-        return self.highest(score[:, : self.n_mainline], step)
+        n = self.n_mainline  # ramps follow, which cannot be queried
+        density, age = (self.block(observation, name)[:, :n] for name in ("density", "age"))
+        return self.highest((density + 0.05) * (age + 0.1), step)
 
 
 def main() -> None:
