@@ -91,7 +91,9 @@ def main(steps: int = 300_000, seed: int = 0) -> None:
             continue
         targets, scaled = gains + values, (gains - gains.mean()) / gains.std()
         batch = [each.flatten(0, 1) for each in (seen, taken, old, scaled, targets)]
-        for rows in (r for _ in range(EPOCHS) for r in torch.randperm(old.numel()).split(MINIBATCH)):
+        for rows in (
+            r for _ in range(EPOCHS) for r in torch.randperm(old.numel()).split(MINIBATCH)
+        ):
             o, a, before, gain, target = (each[rows] for each in batch)
             choices, value = agent(o)
             ratio = (choices.log_prob(a) - before).exp()
