@@ -70,12 +70,6 @@ def test_the_connected_vehicles_report_and_some_misreport_their_speed():
     assert abs((factor > 1.5).mean() - 0.25) < 0.06
 
 
-@pytest.mark.parametrize("value", [0.1, [0.1, 0.2], {"seed": 3}])
-def test_a_number_a_pair_and_a_mapping_are_taken(value):
-    config = resolve("short-highway", {"penetration": value})
-    assert config.has_separate_sensors == (value != {"seed": 3})
-
-
 IMPOSSIBLE = [
     (0.0, "share must be"),
     (1.2, "share must be"),
@@ -85,7 +79,10 @@ IMPOSSIBLE = [
 ]
 
 
-def test_what_is_impossible_is_refused_by_path():
+def test_shares_are_numbers_pairs_and_mappings_within_their_range():
     for penetration, message in IMPOSSIBLE:
         with pytest.raises(ValueError, match=rf"^penetration\.{message}"):
             resolve("short-highway", {"penetration": penetration})
+    for value in (0.1, [0.1, 0.2], {"seed": 3}):
+        config = resolve("short-highway", {"penetration": value})
+        assert config.has_separate_sensors == (value != {"seed": 3})

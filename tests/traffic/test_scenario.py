@@ -124,16 +124,3 @@ def test_incidents_are_drawn_one_by_one():
     assert third != first
     assert dataclasses.replace(both, incident=(drawn,)) == alone
     assert dataclasses.replace(both, incident=()).incident is None
-
-
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({"on_ramps": (((5.0, 1.0),), 0.0)}, r"demand\.on_ramps\[0\] must be steps \(time, rate\)"),
-        ({"exit_shares": (((0.0, 0.1),),)}, r"demand\.exit_shares must be steps for each of the 2"),
-    ],
-)
-def test_impossible_steps_are_refused_by_path(fields, message):
-    fields = {"mainline": ((0.0, 1.0),), "on_ramps": (0.0, 0.0), **fields}
-    with pytest.raises(ValueError, match=message):
-        dataclasses.replace(PAPER_HIGHWAY, demand=Demand(**fields))

@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from dptse_env.traffic import CORRIDORS, PAPER_HIGHWAY, SHORT_HIGHWAY, simulate
+from dptse_env.traffic import CORRIDORS, PAPER_HIGHWAY
 from dptse_env.traffic.sumo_input import (
     Geometry,
     compile_network,
@@ -22,8 +22,6 @@ needs_netconvert = pytest.mark.skipif(
 )
 
 
-
-
 @needs_netconvert
 @pytest.mark.parametrize("name", CORRIDORS)
 def test_packaged_networks_are_what_netconvert_makes_of_the_presets(name):
@@ -34,8 +32,6 @@ def test_a_preset_is_not_compiled(monkeypatch):
     monkeypatch.setattr("dptse_env.traffic.sumo_input.compile_network", None)
     changed = dataclasses.replace(PAPER_HIGHWAY, name="mine", incident=None, duration=60)
     assert network_xml(changed) == packaged_network("paper-highway")
-
-
 
 
 def test_a_missing_netconvert_names_the_extra(monkeypatch):
