@@ -32,8 +32,8 @@ LARGEST_HEADER = 2**20
 DEEPEST_CARD = 16
 """Largest nesting of a card."""
 
-PATIENCE = 5.0
-"""Longest wait on Windows for readers of a file that is to be replaced [s]."""
+PATIENCE = 5.0 if os.name == "nt" else 0.0
+"""Longest wait for readers of a file that is to be replaced [s]; Windows refuses it meanwhile."""
 
 _DIGEST = "sha256"
 
@@ -215,13 +215,13 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def _take_place(temporary: Path, target: Path) -> None:
-    """Give a file its name. Windows refuses that while another process reads the old file."""
+    """Give a file its name, when nobody reads the old file where that matters."""
     deadline = time.monotonic() + PATIENCE
     while True:
         try:
             temporary.replace(target)
         except PermissionError:
-            if os.name != "nt" or time.monotonic() > deadline:
+            if time.monotonic() >= deadline:
                 raise
             time.sleep(0.01)
         else:

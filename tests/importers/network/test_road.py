@@ -184,11 +184,8 @@ def test_a_warm_up_starts_the_record_with_traffic(files, road):
 def test_an_incident_makes_no_vehicle_faster(files, road, tmp_path):
     slow = tmp_path / "slow.rou.xml"
     slow.write_text(FLOWS.replace('id="car"', 'id="car" maxSpeed="10"'))
-    network = dataclasses.replace(
-        road.corridor.network,
-        routes=(str(slow),),
-        sha256=tuple(map(file_digest, (files.net, slow))),
-    )
+    digests = file_digest(files.net), file_digest(slow)
+    network = dataclasses.replace(road.corridor.network, routes=(str(slow),), sha256=digests)
     limited = dataclasses.replace(
         road.corridor, network=network, incident=Incident(2, ((30, 200, 90.0),))
     )
