@@ -147,19 +147,13 @@ def test_recorded_traffic_has_a_fixed_demand_and_no_incident(recorded):
         simulate(recorded, 0)
 
 
-def test_default_traffic_seeds_are_the_recorded_training_seeds(recorded):
-    road = f"{recorded.recordings.folder}/road.toml"
-    assert resolve("short-highway", {"corridor": road}).traffic_seeds == (0, 1)
-    given = resolve("short-highway", {"corridor": road, "traffic_seeds": [2000]})
-    assert given.traffic_seeds == (2000,)
-    with pytest.raises(ValueError, match=r"must be one that was recorded .*, got 2\.\.63"):
-        resolve("short-highway", {"corridor": road, "traffic_seeds": "0:64"})
-
-
 def test_environments_replay_recordings(recorded):
-    road = f"{recorded.recordings.folder}/road.toml"
-    keywords = {"corridor": road, "estimator": "random_walk", "truth_in_info": True}
-    env = gym.make("dptse_env:dptse/ShortHighway-v0", **keywords, traffic_seeds=[1000])
+    road = {"corridor": f"{recorded.recordings.folder}/road.toml"}
+    assert resolve("short-highway", road).traffic_seeds == (0, 1)  # those of training
+    with pytest.raises(ValueError, match=r"must be one that was recorded .*, got 2\.\.63"):
+        resolve("short-highway", {**road, "traffic_seeds": "0:64"})
+    keywords = {"estimator": "random_walk", "truth_in_info": True, "traffic_seeds": [1000]}
+    env = gym.make("dptse_env:dptse/ShortHighway-v0", **road, **keywords)
     env.reset(seed=0)
     for _ in range(3):
         info = env.step(np.zeros(6, dtype=np.int8))[4]

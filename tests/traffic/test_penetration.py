@@ -30,18 +30,14 @@ def test_connected_vehicles_at_a_share_are_connected_at_every_larger_one():
         assert abs(connected.mean() - share) < 4.0 * np.sqrt(share * (1.0 - share) / 5_000) + 1e-12
 
 
-def test_a_vehicle_is_connected_whatever_others_there_are():
-    some, more = (Penetration(0.3).connected(7, road_of(n, 1)) for n in (10, 1_000))
-    np.testing.assert_array_equal(some, more[:10])
+def test_a_vehicle_is_connected_by_its_seeds_and_number_alone():
+    def connected(seed=0, traffic_seed=7, n=1_000):
+        return Penetration(0.5, seed=seed).connected(traffic_seed, road_of(n, 1))
 
-
-@pytest.mark.parametrize("change", [{"seed": 1}, {"traffic_seed": 8}])
-def test_another_seed_connects_other_vehicles(change):
-    def connected(seed=0, traffic_seed=7):
-        return Penetration(0.5, seed=seed).connected(traffic_seed, road_of(1_000, 1))
-
-    # Two independent sets share about half of the vehicles' flags.
-    assert 0.4 < (connected() == connected(**change)).mean() < 0.6
+    np.testing.assert_array_equal(connected(n=10), connected()[:10])
+    for change in ({"seed": 1}, {"traffic_seed": 8}):
+        # Two independent sets share about half of the vehicles' flags.
+        assert 0.4 < (connected() == connected(**change)).mean() < 0.6
 
 
 def test_a_share_of_a_range_is_drawn_for_each_traffic_seed():
