@@ -1,9 +1,9 @@
-"""Fit the parameters of the traffic model to recorded traffic; compare them on held-out seeds.
+r"""Fit the parameters of the traffic model to recorded traffic.
 
-dptse calibrate --env dptse_env:dptse/ShortHighway-v0 --train 0:2 --held-out 1000:1001
+dptse calibrate --env dptse_env:dptse/ShortHighway-v0 --train 0:4 --held-out 1000:1002 \
+    --max-evaluations 40
 
-The fitted set is left in <output>/<name>.json, a file that the keyword parameters takes, in Python,
-after --env or in the table environment of a road file.
+It compares the predictions of fitted and shipped sets on the held-out seeds.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class Args(Environment, Recording):
     force: bool = False
     """Replace a set of this name in the folder."""
     json: bool = False
-    """Print the file of the fitted set as JSON, for a program, in place of tables."""
+    """Print the fitted set as JSON, for a program, in place of tables."""
 
 
 def load_series(
