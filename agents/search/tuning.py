@@ -18,7 +18,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import date
-from functools import partial
+from functools import cached_property, partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -96,7 +96,7 @@ class Search:
         """The traffic seeds one by one."""
         return parse_seeds(self.seeds)
 
-    @property
+    @cached_property
     def config(self) -> EnvConfig:
         """Configuration of the environment, with the settings that it has without a search."""
         cell = self.cell()
@@ -302,8 +302,7 @@ def _run_trial(
             study.tell(trial, state=TrialState.PRUNED)
             return
         trial.report(means["reward"], len(rows))
-        is_last = len(rows) == len(seeds)
-        if not is_last and "label" not in trial.user_attrs and trial.should_prune():
+        if len(rows) < len(seeds) and trial.should_prune():
             study.tell(trial, state=TrialState.PRUNED)
             return
     trial.set_user_attr("rmse_density", means["rmse_density"])
