@@ -14,7 +14,7 @@ from importlib.metadata import version
 from itertools import product
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from dptse_env.config import TRAINING_SEEDS, VALIDATION_SEEDS
 from dptse_env.estimators.recurrent import FORMAT, read_network
 from dptse_env.estimators.recurrent_kernels import CHANNELS
 from dptse_env.parts import make_task
-from dptse_env.utils.fields import inside, integer, positive, require
+from dptse_env.utils.fields import Interval, checked_fields, integer, require
 
 
 @dataclass(frozen=True)
@@ -42,13 +42,12 @@ class Round:
     """
 
     estimator: str
-    scenarios: int
-    passes: int
+    scenarios: Annotated[int, Interval(1, 10_000)]
+    passes: Annotated[int, Interval(1, 1_000_000)]
 
     def __post_init__(self) -> None:
         """Check values."""
-        integer("rounds.scenarios", self.scenarios, 1, 10_000)
-        integer("rounds.passes", self.passes, 1, 1_000_000)
+        checked_fields(self, "rounds")
 
 
 OWN = "own"
@@ -87,7 +86,7 @@ class FilterPlan:
         ValueError: A value is out of range.
     """
 
-    seed: int
+    seed: Annotated[int, Interval(0, 2**31)]
     traffic_seeds: tuple[int, ...]
     validation_seeds: tuple[int, ...]
     validation_envs: tuple[str, ...] = (
@@ -101,52 +100,36 @@ class FilterPlan:
         Round(OWN, 72, 300),
         Round(OWN, 72, 400),
     )
-    width: int = 64
+    width: Annotated[int, Interval(1, 512)] = 64
     episodes: int = 32
-    window: int = 50
-    learning_rate: float = 4e-3
-    likelihood: float = 0.03
-    prediction: float = 0.3
-    clip_norm: float = 1.0
-    checkpoint_every: int = 20
+    window: Annotated[int, Interval(1, 10_000)] = 50
+    learning_rate: Annotated[float, Interval(0, 1, open_low=True)] = 4e-3
+    likelihood: Annotated[float, Interval(0, 1)] = 0.03
+    prediction: Annotated[float, Interval(0, 10)] = 0.3
+    clip_norm: Annotated[float, Interval(0, 1e6, open_low=True)] = 1.0
+    checkpoint_every: Annotated[int, Interval(1, 1_000_000)] = 20
     initial: str | None = None
 
     def __post_init__(self) -> None:
         """Check values."""
-        integer("seed", self.seed, 0, 2**31)
+        checked_fields(self, "")
         require_seeds("traffic", self.traffic_seeds, TRAINING_SEEDS)
         require_seeds("validation", self.validation_seeds, VALIDATION_SEEDS)
-        integer("width", self.width, 1, 512)
         integer("episodes", self.episodes, 1, len(self.traffic_seeds))
-        integer("window", self.window, 1, 10_000)
-        positive("learning_rate", self.learning_rate)
-        inside("likelihood", self.likelihood, 0.0, 1.0)
-        inside("prediction", self.prediction, 0.0, 10.0)
-        positive("clip_norm", self.clip_norm)
-        integer("checkpoint_every", self.checkpoint_every, 1)
         if not self.rounds or (self.initial is None and self.rounds[0].estimator == OWN):
             raise ValueError(
                 "rounds must begin with one of another estimator where no initial network is "
                 "given, since the network knows nothing yet"
             )
         if self.initial is not None:
-            width = read_network(self.initial).network.hidden.shape[0]
-            require(
-                self.width == width, "width", f"that of the initial network, {width}", self.width
-            )
+            width = read_network(self.initial).network.width
+            allowed = f"that of the initial network, {width}"
+            require(self.width == width, "width", allowed, self.width)
 
     @property
     def n_passes(self) -> int:
         """Number of passes of all rounds."""
         return sum(each.passes for each in self.rounds)
-
-    def round_of(self, done: int) -> int:
-        """Return the index of the round in which the pass after `done` passes lies."""
-        for index, each in enumerate(self.rounds):
-            if done < each.passes:
-                return index
-            done -= each.passes
-        raise ValueError(f"the plan has {self.n_passes} passes")
 
     def scenarios(self, index: int) -> list[Scenario]:
         """Return the scenarios of a round; the same ones whenever it is called."""

@@ -105,13 +105,13 @@ class FilterTraining:
 
     def run(self) -> None:
         """Train to the end of the plan, and leave the network beside the checkpoint."""
-        while self.done < self.plan.n_passes:
-            index = self.plan.round_of(self.done)
-            first = sum(each.passes for each in self.plan.rounds[:index])
+        last = 0
+        for index, each in enumerate(self.plan.rounds):
+            first, last = last, last + each.passes
             if self.done == first:
                 self._save(PLAYED)
-            collected = self._collect(index)
-            while self.done < first + self.plan.rounds[index].passes:
+            collected = self._collect(index) if self.done < last else []
+            while self.done < last:
                 self._pass(index, collected)
         self._save(WEIGHTS)
 
