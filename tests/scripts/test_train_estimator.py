@@ -14,7 +14,8 @@ from scripts import train_estimator
 from scripts.train_estimator import Args, make_plan, parse_round
 from tests.helpers import SHORT
 
-PLAN = {"width": 4, "checkpoint_every": 1, "ranges": {"mechanisms": ["capped", "paced"]}}
+RANGES = {"mechanisms": ["capped", "paced"], "schedules": ["round-robin"]}
+PLAN = {"width": 4, "checkpoint_every": 2, "ranges": RANGES}
 SMALL = [
     "--env", SHORT, "--traffic", "0:2", "--validation-env", SHORT, "--validation", "1000:1001",
     "--rounds", "ekf:1:2", "own:1:1", "--plan", json.dumps(PLAN),
@@ -32,9 +33,6 @@ def test_it_trains_a_network_that_an_environment_takes(tmp_path, capsys):
     gym.make(SHORT, privacy="capped", **keywords).reset(seed=0)
     with pytest.raises(ValueError, match=r"trained on flows in \[1, 1\], .* has \[0, 0\]"):
         gym.make(SHORT, **keywords).reset(seed=0)
-    before = (tmp_path / "network.safetensors").read_bytes()
-    train_estimator.main(arguments(tmp_path))
-    assert (tmp_path / "network.safetensors").read_bytes() == before
     with pytest.raises(ValueError, match="seed is 0 there and 1 now"):
         train_estimator.main(arguments(tmp_path, "--seed", "1"))
 
