@@ -1,8 +1,9 @@
-"""Play a study and write its report, or write the report of the rows that are there.
+"""Play a study, and report on its rows.
 
-python scripts/study.py paper --report
-python scripts/study.py guarantees --quick
-python scripts/study.py my_package.my_study:STUDY
+$ dptse study paper --report
+$ dptse study examples.my_study:STUDY --quick
+
+It plays what the rows in its folder lack, and writes tables and figures of all.
 """
 
 from __future__ import annotations
@@ -38,17 +39,16 @@ class Args(Machines):
     """Play a study and write its report."""
 
     name: tyro.conf.Positional[str]
-    """paper, guarantees, estimators, policies, suite, or a study of your own as "module:NAME"."""
+    """paper, guarantees, estimators, policies, suite, or your own "module:NAME"."""
     report: bool = False
     """Write tables and figures of the rows that are there, and play nothing."""
     quick: bool = False
     """Three traffic seeds for each cell, to see whether it runs."""
     seeds: str | None = None
-    """Test traffic seeds, first:stop, in place of the study's own; needs another output. What is
-    played on validation traffic keeps its seeds."""
+    """Test traffic seeds, first:stop, in place of its own; needs another output."""
     env: tuple[str, ...] = ()
-    """Environments, 'ID {"corridor": "my-road.toml"}': the study's cells with one of these ids are
-    played with its keywords, and no others; needs another output."""
+    """Environments, 'ID {"corridor": "my-road.toml"}': only cells of these ids are played, and
+    with these keywords; needs another output."""
     policies: tuple[str, ...] = ()
     """Trained policies for the study of policies, each name=path."""
     output: Path | None = None

@@ -1,7 +1,9 @@
-"""Score policies in the tasks of the query suite, beside those that come with the package.
+"""Score policies in the tasks of the query suite.
 
-python scripts/suite.py --policies round-robin my_package:MySchedule
-python scripts/suite.py --policies results/training/best.safetensors --output results/my-suite
+$ dptse suite --policies round-robin my_package:MySchedule
+
+Scores stand beside those of the policies that come with the package. What a folder has of an
+earlier run is not played again.
 """
 
 from __future__ import annotations
@@ -39,8 +41,8 @@ class Args(Machines):
     """Score policies in the tasks of the query suite."""
 
     policies: tuple[str, ...] = ()
-    """Schedules and policies: names, files of saved ones, "module:Class", and models of
-    stable-baselines3 as "module:Class=file.zip", which are unpickled: load those that you trust."""
+    """Schedules; saved policies by file or shipped name, "module:Class", or
+    "module:Class=model.zip" of stable-baselines3, which is unpickled: load those that you trust."""
     output: Path = Path("results/my-suite")
     """Folder of rows, tables and a figure."""
 
