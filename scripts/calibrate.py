@@ -1,6 +1,6 @@
 r"""Fit the parameters of the traffic model to recorded traffic.
 
-$ dptse calibrate --env dptse_env:dptse/ShortHighway-v0 --train 0:4 --held-out 1000:1002 \
+dptse calibrate --env dptse_env:dptse/ShortHighway-v0 --train 0:4 --held-out 1000:1002 \
     --max-evaluations 40
 
 It compares the predictions of fitted and shipped sets on the held-out seeds.

@@ -120,7 +120,7 @@ def run(
     Args:
         main: The program.
         arguments: A dataclass, or a union of dataclasses for subcommands.
-        description: Text for ``--help``: a sentence, and then examples, each after a dollar sign.
+        description: Text for ``--help``: a sentence, and an example in a paragraph of its own.
         program: Name of the program in its help; that of the file if None.
         words: The command line; that of the process if None.
     """

@@ -1,6 +1,6 @@
 r"""Evaluate query schedules and policies on the same traffic and noise.
 
-$ dptse evaluate --env dptse_env:dptse/ShortHighway-v0 --schedules paper round-robin \
+dptse evaluate --env dptse_env:dptse/ShortHighway-v0 --schedules paper round-robin \
     --seeds 2000:2004
 
 The error is minus 1,000 times the reward. Differences are paired by traffic and noise.

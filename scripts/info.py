@@ -1,6 +1,6 @@
 """Print versions, machine and caches, as a bug report needs them.
 
-$ dptse info
+dptse info
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Record traffic with SUMO, so that environments only replay it.
 
-$ dptse record --env dptse_env:dptse/ShortHighway-v0 --seeds 0:4
+dptse record --env dptse_env:dptse/ShortHighway-v0 --seeds 0:4
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """Play a study, and report on its rows.
 
-$ dptse study paper --report
-$ dptse study examples.my_study:STUDY --quick
+dptse study paper --report
 
 It plays what the rows in its folder lack, and writes tables and figures of all.
 """

@@ -1,6 +1,6 @@
 """Score policies in the tasks of the query suite.
 
-$ dptse suite --policies round-robin my_package:MySchedule
+dptse suite --policies round-robin my_package:MySchedule
 
 Scores stand beside those of the policies that come with the package. What a folder has of an
 earlier run is not played again.
