@@ -49,9 +49,8 @@ def test_help_begins_with_an_example_and_fits_a_screen(name, monkeypatch):
 def write_data(folder):
     """Write the files that the examples name, short ones."""
     plain(folder / "points.csv", stream(seconds=130.0))
-    (folder / "road.toml").write_text(
-        "n_mainline = 4\nduration = 20\ndemand = { mainline = [[0, 1]] }\n"
-    )
+    road = "n_mainline = 4\nduration = 20\ndemand = { mainline = [[0, 1]] }\n"
+    (folder / "road.toml").write_text(road)
     table = "\n".join(" ".join(["30"] * 60) for _ in range(16))
     (folder / "density.txt").write_text(table)
     (folder / "speed.txt").write_text(table.replace("30", "80"))

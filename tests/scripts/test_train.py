@@ -22,8 +22,8 @@ from scripts.train import Args, make_plan
 
 ROOT = Path(__file__).parents[2]
 SMALL = [
-    "--env", 'dptse_env:dptse/ShortHighway-v0 {"horizon": 64}', "--traffic", "0:2", "--validation", "1000:1001",
-    "--no-tensorboard",
+    "--env", 'dptse_env:dptse/ShortHighway-v0 {"horizon": 64}', "--traffic", "0:2",
+    "--validation", "1000:1001", "--no-tensorboard",
 ]  # fmt: skip
 ROUNDS = [
     "recipe:plackett-luce", "--recipe.n-envs", "4", "--recipe.replicas", "2", "--recipe.width", "8",
@@ -93,7 +93,10 @@ def test_ctrl_c_leaves_a_training_to_continue(tmp_path, monkeypatch, capsys):
 def test_a_killed_program_continues_to_the_same_curve(tmp_path, how, recipe, n_rows):
     def start(output):
         return subprocess.Popen(
-            [sys.executable, "-m", "scripts.dptse", "train", "--output", str(output), *SMALL, *recipe],
+            [
+                sys.executable, "-m", "scripts.dptse", "train", "--output", str(output), *SMALL,
+                *recipe,
+            ],
             cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, stdout=subprocess.PIPE,
             stderr=subprocess.PIPE, text=True,
         )  # fmt: skip
