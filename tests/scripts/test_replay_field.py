@@ -2,14 +2,15 @@
 
 import json
 
-from tests.agents.test_measured_field import write
+from tests.agents.test_measured_field import source
 from tests.scripts.commands import refused, run_command
 
 
 def test_a_row_for_each_estimator(tmp_path):
-    density, speed = write(tmp_path, 10, 60)
+    field = source(tmp_path, columns=60)
     words = [
-        "replay-field", "--density", density, "--speed", speed, "--cell", "0.05", "--interval", "5",
+        "replay-field", "--density", field.density, "--speed", field.speed,
+        "--cell", "0.05", "--interval", "5",
         "--density-unit", "veh/ft", "--speed-unit", "ft/s", "--segments", "3", "--window", "100",
         "--repeats", "1",
     ]  # fmt: skip
