@@ -169,12 +169,6 @@ def print_scores(title: str, scores: Scores, reference: str) -> None:
         print_table(table)
 
 
-def draw_errors(path: Path, title: str, scores: Scores) -> None:
-    """Save a figure of the errors of all policies, in the order of the first estimator."""
-    series = {name: {each.policy: each.means for each in own} for name, own in scores.items()}
-    save_errors(path, list(next(iter(series.values()))), series, title)
-
-
 def draw_traffic(args: Args, title: str, scores: Scores, cells: Sequence[Cell]) -> None:
     """Draw the first traffic seed under some policies, and write the page if it is wanted.
 
@@ -231,7 +225,8 @@ def main(args: Args) -> None:
 
     def report(rows: pl.DataFrame, folder: Path) -> str:
         scores = summarise(rows)
-        draw_errors(folder / ERRORS, title, scores)
+        series = {name: {each.policy: each.means for each in own} for name, own in scores.items()}
+        save_errors(folder / ERRORS, list(next(iter(series.values()))), series, title)
         draw_traffic(args, title, scores, cells)
         return write_markdown(title, scores, args.reference)
 

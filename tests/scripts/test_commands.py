@@ -106,7 +106,7 @@ def test_without_the_extra_it_says_what_to_install(monkeypatch, capsys):
     assert "pip install 'dptse-env[train]'" in capsys.readouterr().err
 
 
-def test_information_names_all_that_is_required():
+def test_information_has_what_a_bug_report_needs():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     extras = [project["optional-dependencies"][name] for name in EXTRAS]
     wanted = {re.split(r"[^\w-]", each)[0] for each in sum(extras, project["dependencies"])}

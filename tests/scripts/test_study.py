@@ -13,7 +13,8 @@ MINE, SHORT = "examples.my_study:STUDY", STUDY.cells[0].env
 FIRST = replace(STUDY.cells[0], keywords={**STUDY.cells[0].keywords, "corridor": "paper-highway"})
 MANY = replace(STUDY.cells[0], keywords={**STUDY.cells[0].keywords, "bandwidth": 15})
 WIDE = replace(STUDY, cells=(MANY, *STUDY.cells[1:]), measures={"trips.parquet": lambda _: None})
-ROADS = replace(STUDY, cells=(FIRST, *STUDY.cells[1:]))
+MIXED = (FIRST, *STUDY.cells[1:])
+ROADS = replace(STUDY, cells=MIXED, follow=lambda rows, folder: MIXED)
 
 
 @pytest.mark.parametrize("name", STUDIES)
@@ -49,7 +50,7 @@ def test_a_report_without_rows_is_refused(tmp_path):
 
 
 def test_the_cells_of_an_environment_are_played_with_its_keywords_and_others_are_told(capsys):
-    env = f'{SHORT} {{"corridor": {{"n_mainline": 6}}}}'
+    env = 'dptse/ShortHighway-v0 {"corridor": {"n_mainline": 6}}'
     study = find_study(Args(name=f"{__name__}:WIDE", env=(env,)))
     assert [cell.keywords["bandwidth"] for cell in study.cells] == [2, 3, 1, 2, 3]
     assert all(cell.keywords["corridor"] == {"n_mainline": 6} for cell in study.cells)
@@ -58,9 +59,10 @@ def test_the_cells_of_an_environment_are_played_with_its_keywords_and_others_are
     # A label would not say what was played.
     study = find_study(Args(name=f"{__name__}:ROADS", env=(env,)))
     assert [cell.labels["bandwidth"] for cell in study.cells] == [2, 3, 1, 2, 3]
-    assert "1 of 6 cells" in capsys.readouterr().err
+    assert "5 of 6 cells" in capsys.readouterr().err
+    assert study.follow(None, None) == list(study.cells)
     for other in (f'{SHORT} {{"bandwidth": 1}}', "dptse_env:dptse/LongHighway-v0"):
-        with pytest.raises(ValueError, match=r"^env must be one of"):
+        with pytest.raises(ValueError, match=r"^env must be of"):
             find_study(Args(name=MINE, env=(other,)))
 
 
