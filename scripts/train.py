@@ -1,6 +1,6 @@
-"""Train a query policy in a folder, and go on there after an interruption.
+r"""Train a query policy in a folder, and go on there after an interruption.
 
-dptse train --traffic 0:8 --validation 1000:1004 --algorithm 'ppo {"steps": 40000}' \\
+dptse train --traffic 0:8 --validation 1000:1004 --algorithm 'ppo {"steps": 40000}' \
     --env 'dptse_env:dptse/ShortHighway-v0 {"bandwidth": 1}' --output results/mine
 
 The folder gets best.safetensors and policy.safetensors (the policy best in validation, and the

@@ -169,7 +169,7 @@ class SwapRounds:
 
 
 @dataclass(frozen=True)
-class PlackettLuce(Algorithm):
+class PlackettLuceSettings(Algorithm):
     """`dptse_env.sb3.PlackettLucePolicy`: a regression of errors, then rounds of swaps.
 
     One network can learn from several environments.
@@ -242,7 +242,7 @@ def first_second(horizon: int) -> int:
 
 
 @dataclass(frozen=True)
-class PPO(Algorithm):
+class PPOSettings(Algorithm):
     """PPO (Schulman et al., 2017) of stable-baselines3 with a multi-layer perceptron."""
 
     name: ClassVar[str] = "ppo"
@@ -292,7 +292,7 @@ class PPO(Algorithm):
 
 
 @dataclass(frozen=True)
-class MaskablePPO(PPO):
+class MaskablePPOSettings(PPOSettings):
     """MaskablePPO of sb3-contrib: segments are picked one by one, each at most once."""
 
     name: ClassVar[str] = "maskable-ppo"
@@ -300,7 +300,7 @@ class MaskablePPO(PPO):
 
 
 ALGORITHMS: dict[str, Algorithm] = {
-    each.name: each for each in (PlackettLuce(), PPO(), MaskablePPO())
+    each.name: each for each in (PlackettLuceSettings(), PPOSettings(), MaskablePPOSettings())
 }
 """Algorithms by name, with their tuned settings."""
 
@@ -351,15 +351,10 @@ class TrainingPlan:
                 if key in keywords:
                     raise ValueError(f"env: {key} is chosen by the training, leave it out")
 
-    @property
-    def config(self) -> EnvConfig:
-        """The configuration of the first environment, which the policy is saved for."""
-        return self.worlds[0].config
-
     @cached_property
     def actions_per_step(self) -> int:
         """Actions that make one decision."""
-        return make_interface(self.config).actions.actions_per_step
+        return make_interface(self.worlds[0].config).actions.actions_per_step
 
     @cached_property
     def worlds(self) -> tuple[World, ...]:

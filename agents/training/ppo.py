@@ -11,8 +11,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.vec_env import VecMonitor
 
-from agents.training import plan as settings
 from agents.training.episodes import make_episodes, recentre
+from agents.training.plan import PPOSettings
 from agents.training.run import POLICY, Run
 
 CLASSES: dict[str, Any] = {"ppo": PPO, "maskable-ppo": MaskablePPO}
@@ -37,7 +37,7 @@ def train_by_ppo(run: Run) -> None:
     """
     plan, kept = run.plan, run.checkpoint or {"update": 0}
     ppo = plan.algorithm
-    assert isinstance(ppo, settings.PPO)
+    assert isinstance(ppo, PPOSettings)
     done: int = kept["update"]
     episodes = make_episodes(plan, plan.worlds[0], run.keywords, done)
     per_second, first, last = plan.actions_per_step, ppo.learning_rate, ppo.final_learning_rate
@@ -66,13 +66,13 @@ def train_by_ppo(run: Run) -> None:
         model.set_logger(Logger(None, [follow]))
         steps = (ppo.n_updates - done) * model.n_steps * model.n_envs
         model.learn(steps, callback=follow, reset_num_timesteps=False)
-    run.save(POLICY, model.policy, int(run.rows[-1]["steps"]), run.rows[-1])
+    run.save(POLICY, model.policy, run.rows[-1])
 
 
 class _Follow(BaseCallback, KVWriter):
     """Compares replicas, validates, keeps checkpoints, and adds what is logged to the curve."""
 
-    def __init__(self, run: Run, ppo: settings.PPO, done: int) -> None:
+    def __init__(self, run: Run, ppo: PPOSettings, done: int) -> None:
         super().__init__()
         self._run, self._ppo, self._update = run, ppo, done - 1
 

@@ -98,7 +98,7 @@ class Run:
         normalised RMSE of density and speed together. Several environments count alike. Draws of
         torch are seeded, and its generator is left as found.
         """
-        row: Row = {}
+        row: Row = {"steps": steps}
         for column, deterministic in (("validation", True), ("validation_drawn", False)):
             errors = [
                 self._error(env, policy, deterministic)
@@ -110,7 +110,7 @@ class Run:
                 row |= dict(zip(names, errors, strict=True))
         if row["validation"] < self._best:
             self._best = row["validation"]
-            self.save(BEST, policies[0], steps, row)
+            self.save(BEST, policies[0], row)
         return row
 
     def keep(self, **content: Any) -> None:
@@ -122,8 +122,8 @@ class Run:
         write_checkpoint(self._folder, {"rows": self.rows, **content})
         write_progress(self._folder, self.rows)
 
-    def save(self, name: str, policy: BasePolicy, steps: int, row: Row) -> None:
-        """Write a policy after ``steps`` seconds of traffic, with the errors in a row."""
+    def save(self, name: str, policy: BasePolicy, row: Row) -> None:
+        """Write a policy with the seconds of traffic and the errors of its row of the curve."""
         plan, world = self.plan, self.plan.worlds[0]
         save_policy(
             self._folder / name,
@@ -135,7 +135,7 @@ class Run:
                 "learner": plan.algorithm.name,
                 "seed": plan.seed,
                 "also": list(plan.envs[1:]),
-                "steps": steps,
+                "steps": int(row["steps"]),
                 "traffic seeds": _range(plan.traffic_seeds),
                 "validation seeds": _range(plan.validation_seeds),
             },

@@ -21,7 +21,7 @@ exp(step g)); then gains are measured anew, under the new policy.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -88,7 +88,7 @@ class Swaps:
         )
 
 
-def collect_swaps(
+def try_swaps(
     policy: Policy,
     env: SensorQueryVectorEnv,
     settings: SwapRounds,
@@ -96,55 +96,36 @@ def collect_swaps(
     seed: int,
     progress: Callable[[float], None] = lambda fraction: None,
 ) -> Swaps:
-    """Return the swaps of a round, tried under ``policy``.
+    """Run the episodes of a round, and try swaps in states along the way.
 
     Args:
         policy: Acts by drawing.
-        env: Episodes with actions ``slots``, autoreset disabled.
+        env: n episodes, actions ``slots``, autoreset disabled.
         settings: Of rounds.
         index: Number of the round, counted from 0.
         seed: Training seed. Draws depend on it and on ``index`` alone, but for those of torch.
-        progress: Called with the fraction of an episode that is done.
+        progress: Called with the fraction of the episodes that is done.
+
+    Returns:
+        The swaps of every ``settings.seconds``, in states of the same second in all episodes.
     """
-    first = training_seed(seed) + SEED_STRIDE * (index + 1)
-    seeds, parts = list(range(first, first + env.num_envs)), []
-    for part in try_swaps(env, policy, seeds, np.random.default_rng([seed, index]), settings):
-        parts.append(part)
-        progress(len(parts) * settings.seconds / env.config.horizon_steps)
-    return Swaps.from_parts(parts)
-
-
-def try_swaps(
-    env: SensorQueryVectorEnv,
-    policy: Policy,
-    seeds: Sequence[int],
-    generator: np.random.Generator,
-    settings: SwapRounds,
-) -> Iterator[Swaps]:
-    """Run an episode of ``policy`` for each seed, and try swaps in states along the way.
-
-    Args:
-        env: One episode for each seed, actions ``slots``, autoreset disabled.
-        policy: Acts by drawing.
-        seeds: Of the episodes, n of them.
-        generator: Draws the swaps, a queried segment for one of the rest, and the signs of noise.
-        settings: Seconds over which gains are measured, and swaps in each state.
-
-    Yields:
-        The swaps of n states, of the same second in all episodes.
-    """
+    first_episode = training_seed(seed) + SEED_STRIDE * (index + 1)
+    generator = np.random.default_rng([seed, index])
     horizon, seconds = env.config.horizon_steps, settings.seconds
     # The states of every round are at other seconds.
     first = first_second(horizon) + int(generator.integers(seconds))
-    observation, _ = env.reset(seed=seeds)
+    observation, _ = env.reset(seed=list(range(first_episode, first_episode + env.num_envs)))
     for _ in range(first):
         observation = env.advance(_drawn(policy, observation)).observation
-    for _ in range((horizon - first) // seconds):
+    parts: list[Swaps] = []
+    for second in range(first, horizon - seconds + 1, seconds):
         before, shown, actions = env.process.fork(), observation, []
         for _ in range(seconds):
             actions.append(_drawn(policy, observation))
             observation = env.advance(actions[-1]).observation
-        yield _tried(before, shown, actions, generator, settings.trials)
+        parts.append(_tried(before, shown, actions, generator, settings.trials))
+        progress((second + seconds) / horizon)
+    return Swaps.from_parts(parts)
 
 
 def _drawn(policy: Policy, observation: Observation) -> Action:
@@ -217,7 +198,8 @@ class _Gains:
         self._targets = torch.from_numpy(gains.astype(np.float32))
         self._swapped = tuple(map(torch.from_numpy, (swaps.state, swaps.added, swaps.dropped)))
         with torch.no_grad():
-            self._before = torch.cat([policy.scores(part) for part in self._seen.split(PART)])
+            parts = range(0, len(self._seen), PART)
+            self._before = torch.cat([policy.scores(self._seen[i : i + PART]) for i in parts])
 
     def loss(self, step: float) -> Tensor:
         """Return the squared error of a random minibatch of expected gains."""

@@ -13,12 +13,19 @@ from agents.executors import AnyExecutor, ExecutorError, run_shown
 from agents.play import record
 from agents.seeds import training_seed
 from agents.training.episodes import make_episodes
-from agents.training.plan import PPO, Algorithm, MaskablePPO, PlackettLuce, TrainingPlan
+from agents.training.plan import (
+    Algorithm,
+    MaskablePPOSettings,
+    PlackettLuceSettings,
+    PPOSettings,
+    Regression,
+    TrainingPlan,
+)
 from agents.training.ppo import train_by_ppo
 from agents.training.regression import Practice, regress
 from agents.training.run import POLICY, Progress, Run, Watcher
 from agents.training.run_files import Row, check_plan, read_checkpoint
-from agents.training.swaps import collect_swaps, raise_scores
+from agents.training.swaps import raise_scores, try_swaps
 from dptse_env.sb3 import PlackettLucePolicy
 from dptse_env.traffic import Records
 
@@ -63,7 +70,7 @@ def train_in_rounds(run: Run) -> None:
     threads, and repeats at most the round that it was in.
     """
     plan, algorithm, kept = run.plan, run.plan.algorithm, run.checkpoint
-    assert isinstance(algorithm, PlackettLuce)
+    assert isinstance(algorithm, PlackettLuceSettings)
     torch.manual_seed(plan.seed)
     policies = algorithm.make_policies(plan.worlds)
     # Draws of the training must not depend on how many weights were drawn before them.
@@ -78,7 +85,7 @@ def train_in_rounds(run: Run) -> None:
         run.keep(update=update, policy=policies[0].state_dict(), torch=torch.get_rng_state())
 
     if kept is None:
-        end(0, _regress(run, algorithm, policies), {})
+        end(0, _regress(run, algorithm.regression, policies), {})
     done, settings = len(run.rows) - 1, algorithm.swaps
     environments = [
         make_vector(world.env, world.part(settings.episodes), {**world.keywords, **run.keywords})
@@ -90,20 +97,18 @@ def train_in_rounds(run: Run) -> None:
     seconds *= 1 + 2 * (1 + settings.trials)
     for index in range(done, settings.rounds):
         tried = [
-            collect_swaps(policy, env, settings, index, plan.seed, partial(run.progress, "swaps"))
+            try_swaps(policy, env, settings, index, plan.seed, partial(run.progress, "swaps"))
             for policy, env in zip(policies, environments, strict=True)
         ]
         step = settings.step_of(index)
         raise_scores(policies, tried, settings, step, partial(run.progress, "fit"))
         error = sum(float(swaps.error.mean()) for swaps in tried) / len(tried)
         end(index + 1, int(run.rows[-1]["steps"]) + seconds, {"error": error})
-    last = run.rows[-1]
-    run.save(POLICY, policies[0], int(last["steps"]), last)
+    run.save(POLICY, policies[0], run.rows[-1])
 
 
-def _regress(run: Run, algorithm: PlackettLuce, policies: Sequence[PlackettLucePolicy]) -> int:
+def _regress(run: Run, settings: Regression, policies: Sequence[PlackettLucePolicy]) -> int:
     """Do the regression; return the seconds of traffic that it took. Its memory is freed then."""
-    settings = algorithm.regression
     if not settings.rounds:
         return 0
     practice, seconds = [], 0
@@ -116,9 +121,9 @@ def _regress(run: Run, algorithm: PlackettLuce, policies: Sequence[PlackettLuceP
 
 
 TRAINERS: dict[type[Algorithm], Callable[[Run], None]] = {
-    PlackettLuce: train_in_rounds,
-    PPO: train_by_ppo,
-    MaskablePPO: train_by_ppo,
+    PlackettLuceSettings: train_in_rounds,
+    PPOSettings: train_by_ppo,
+    MaskablePPOSettings: train_by_ppo,
 }
 """Functions that train, by the type of the algorithm's settings."""
 
