@@ -4,7 +4,6 @@ import pytest
 
 pytest.importorskip("sb3_contrib")
 
-from agents.seeds import training_seed
 from agents.training.episodes import TrainingEpisodes, make_episodes, recentre
 from dptse_env.sb3 import SB3VecEnv
 from tests.agents.training.plans import make_plan
@@ -68,14 +67,17 @@ def test_recentred_advantages_are_compared_with_the_replicas():
 
 
 def test_trainings_and_their_continuations_have_episodes_of_their_own():
-    first = [
-        make_episodes(plan, plan.worlds[0], {"action": "slots"}, update).reset()
-        for plan, update in ((make_plan(), 0), (make_plan(seed=2), 0), (make_plan(), 1))
-    ]
-    again = make_episodes(make_plan(), make_plan().worlds[0], {"action": "slots"}).reset()
-    np.testing.assert_array_equal(first[0], again)
-    assert len({each[0].tobytes() for each in first}) == 3
-    assert training_seed(1) + 10**6 == training_seed(2)
+    def seen(seed, update):
+        plan = make_plan(seed=seed)
+        keywords = {"action": "slots", "traffic_seeds": [0, 1, 2]}
+        episodes = make_episodes(plan, plan.worlds[0], keywords, update)
+        episodes.reset()
+        for _ in range(5):
+            observation = episodes.step(np.tile([[0, 3]], (4, 1)))[0]
+        return observation[0].tobytes()
+
+    assert seen(1, 0) == seen(1, 0)
+    assert len({seen(1, 0), seen(2, 0), seen(1, 1)}) == 3
 
 
 def test_a_number_of_episodes_that_replicas_do_not_divide_is_refused():
