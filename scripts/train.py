@@ -21,7 +21,7 @@ from agents.training.run_files import Row, check_plan, read_progress
 from agents.training.training import train, train_all
 from dptse_env.config import parse_seeds
 from dptse_env.utils.fields import integer
-from scripts.cli import Machines, resumable, run
+from scripts.cli import Machines
 from scripts.training_bar import Bar, watched
 
 
@@ -64,7 +64,6 @@ def make_plans(args: Args) -> dict[Path, TrainingPlan]:
     }
 
 
-@resumable()
 def main(args: Args) -> None:
     """Record missing traffic, train, and print the errors of the last policies in validation."""
     torch.set_num_threads(integer("threads", args.threads, 1))
@@ -93,7 +92,3 @@ def summary(rows: list[Row]) -> str:
         f"error x 1000 in validation {1000 * last['validation']:.1f}, drawn "
         f"{1000 * last['validation_drawn']:.1f}, best {1000 * least:.1f}"
     )
-
-
-if __name__ == "__main__":
-    run(main, Args, __doc__)

@@ -30,14 +30,12 @@ def subfolder(tmp_path, name):
 
 
 def test_windows_follow_one_another_and_are_split_by_time(tmp_path):
-    imported = run(plain(tmp_path / "a.csv", stream(seconds=124.0)))
+    path = plain(tmp_path / "a.csv", stream(seconds=124.0))
+    imported = run(path)
     assert imported.seeds == {"training": (0, 1, 2), "validation": (1000,), "test": (2000,)}
     assert starts(imported) == [0.0, 21.0, 42.0, 63.0, 84.0]  # 20 s and second 0: they share none
     assert [window["seed"] for window in imported.report["windows"]] == [0, 1, 2, 1000, 2000]
-
-
-def test_a_pause_between_windows_and_skipped_ends(tmp_path):
-    path = plain(tmp_path / "a.csv", stream(seconds=125.0))
+    (tmp_path / "imported").rename(tmp_path / "without pauses")
     assert starts(run(path, pause=9, skip_start=5.0, skip_end=20.0)) == [5.0, 35.0, 65.0]
 
 
@@ -239,14 +237,6 @@ def test_wrong_units_directions_and_numbers_are_refused(factors, offset, message
         run(path)
     assert str(refused.value).startswith(str(path))
     assert [each.name for each in tmp_path.iterdir()] == ["a.csv"]
-
-
-def test_both_directions_in_one_file_need_a_choice(tmp_path):
-    points = stream()
-    back = points[:, 0] % 2 == 1
-    points[back, 2] = 400.0 - points[back, 2]
-    with pytest.raises(TrajectoryError, match=r"one direction must be chosen .* \d+ % of the veh"):
-        run(plain(tmp_path / "a.csv", points))
 
 
 @pytest.mark.slow

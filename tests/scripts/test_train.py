@@ -56,7 +56,7 @@ def test_several_seeds_are_trained_in_folders_of_their_own(tmp_path):
 def test_a_killed_program_goes_on(tmp_path, how, algorithm):
     def start(output):
         return subprocess.Popen(
-            [sys.executable, "scripts/train.py", *words(output, algorithm)],
+            [sys.executable, "-m", "scripts.dptse", "train", *words(output, algorithm)],
             cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, stdout=subprocess.PIPE,
             stderr=subprocess.PIPE, text=True,
         )  # fmt: skip

@@ -63,16 +63,6 @@ def test_arrivals_are_poisson_with_the_declared_rates():
     assert np.all(np.abs(ratio - 1) < 4 * np.sqrt(2 / len(SEEDS)))
 
 
-def test_each_diverge_loses_its_share_of_those_who_pass_it():
-    scenarios = [draw_scenario(PAPER_HIGHWAY, seed) for seed in SEEDS]
-    origins = np.concatenate([scenario.origins for scenario in scenarios])
-    exits = np.concatenate([scenario.exits for scenario in scenarios])
-    passed_first = origins != 1
-    passed_second = exits != 0
-    assert np.mean(exits[passed_first] == 0) == pytest.approx(0.1, abs=0.004)
-    assert np.mean(exits[passed_second] == 1) == pytest.approx(0.1, abs=0.004)
-
-
 def test_the_streams_are_independent_of_one_another():
     corridor = randomised(PAPER_HIGHWAY)
     fixed = dataclasses.replace(corridor, incident=Incident(2, ((10, 20, 10),)))
@@ -124,16 +114,3 @@ def test_incidents_are_drawn_one_by_one():
     assert third != first
     assert dataclasses.replace(both, incident=(drawn,)) == alone
     assert dataclasses.replace(both, incident=()).incident is None
-
-
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({"on_ramps": (((5.0, 1.0),), 0.0)}, r"demand\.on_ramps\[0\] must be steps \(time, rate\)"),
-        ({"exit_shares": (((0.0, 0.1),),)}, r"demand\.exit_shares must be steps for each of the 2"),
-    ],
-)
-def test_impossible_steps_are_refused_by_path(fields, message):
-    fields = {"mainline": ((0.0, 1.0),), "on_ramps": (0.0, 0.0), **fields}
-    with pytest.raises(ValueError, match=message):
-        dataclasses.replace(PAPER_HIGHWAY, demand=Demand(**fields))
