@@ -22,10 +22,10 @@ $(READY): pyproject.toml constraints.txt
 	touch $@
 
 demo: setup  ## Train a small query policy and evaluate it beside the schedules on held-out traffic; results/demo.
-	$(BIN)/python scripts/train.py --env 'dptse_env:dptse/PaperHighway-v0 {"parameters": "w99-3lane"}' \
+	$(BIN)/dptse train --env 'dptse_env:dptse/PaperHighway-v0 {"parameters": "w99-3lane"}' \
 		--traffic 0:32 --validation 1000:1008 --output results/demo/training \
 		--algorithm 'plackett-luce {"regression": {"rounds": 2, "batches": 600}, "swaps": {"rounds": 1, "episodes": 96, "batches": 300}}'
-	$(BIN)/python scripts/evaluate.py --policies results/demo/training/policy.safetensors --output results/demo --force
+	$(BIN)/dptse evaluate --policies results/demo/training/policy.safetensors --output results/demo --force
 
 reproduce: setup  ## Write the reports of all studies anew, after playing what their rows lack; results/.
 	$(BIN)/python scripts/study.py paper

@@ -1,7 +1,6 @@
-r"""Train a query policy in a folder, and go on there after an interruption.
+"""Train a query policy in a folder, and go on there after an interruption.
 
-dptse train --traffic 0:8 --validation 1000:1004 --algorithm 'ppo {"steps": 40000}' \
-    --env 'dptse_env:dptse/ShortHighway-v0 {"bandwidth": 1}' --output results/mine
+dptse train --env dptse_env:dptse/ShortHighway-v0 --algorithm 'ppo {"steps": 40000}' --traffic 0:8
 
 The folder gets best.safetensors and policy.safetensors (the policy best in validation, and the
 last), progress.csv (the learning curve), plan.json (the settings) and checkpoint.pt. The same
