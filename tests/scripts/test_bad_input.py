@@ -150,7 +150,11 @@ FOLDERS = {
     "foreign": ("train", None, "is not empty and has no plan.json: choose another --output"),
     "several": ("train", '{"format": 4, "envs": 1}', "envs is 1 there and ['dptse_env:"),
     "no plan": ("train_estimator", "[]", "plan.json is damaged: it has no plan"),
-    "another estimator": ("train_estimator", '{"format": 4, "seed": 7}', "seed is 7 there and 0 now"),
+    "another estimator": (
+        "train_estimator",
+        '{"format": 4, "seed": 7}',
+        "seed is 7 there and 0 now",
+    ),
 }
 
 
