@@ -121,26 +121,34 @@ def test_a_finished_training_is_left_alone(whole, tmp_path):
 
 @pytest.mark.parametrize("name", fast_and_slow(["ppo", "maskable-ppo"], ["ppo"]))
 def test_ppo_goes_on_from_its_last_checkpoint(name, tmp_path):
-    plan = make_plan(name)
+    plan, before = make_plan(name), []
     with pytest.raises(StopError):
-        train(plan, tmp_path, watchers=(stop_at(3),))
+        train(plan, tmp_path, watchers=(before.append, stop_at(3)))
     kept = read_checkpoint(tmp_path)
-    assert kept["update"] == 2
-    seen = []
-
-    def look(row):
-        seen.append(row)
-        if row["update"] == 2:  # the policy of the checkpoint is the one that is validated first
-            now = load_policy(tmp_path / BEST, make_env(plan)).card["figures"]
-            assert row["validation"] >= now["validation"]
-
-    rows = train(plan, tmp_path, watchers=(look,))
-    assert [row["update"] for row in rows] == list(range(7)) == [row["update"] for row in seen]
-    assert rows[:2] == kept["rows"]
+    assert (kept["update"], kept["rows"]) == (2, before[:2])
+    after = []
+    rows = train(plan, tmp_path, watchers=(after.append,))
+    assert [row["update"] for row in rows] == list(range(7))
+    assert rows == after
+    assert rows[:2] == before[:2]
+    # The same policy, but in new episodes.
+    assert rows[2]["validation_drawn"] == before[2]["validation_drawn"]
+    assert rows[3]["error"] != before[3]["error"]
     rates = [row["learning_rate"] for row in rows[3:]]
-    assert rates == sorted(rates, reverse=True)
-    assert rates[-1] == pytest.approx(plan.algorithm.final_learning_rate)
-    assert rates[0] == pytest.approx(5e-4 - 4.5e-4 * 3 / 6)
+    assert rates == pytest.approx([5e-4 - 4.5e-4 * update / 6 for update in (3, 4, 5, 6)])
+
+
+@pytest.mark.parametrize(
+    ("name", "steps"), fast_and_slow([("ppo", 10), ("maskable-ppo", 20)], [("maskable-ppo", 20)])
+)
+def test_every_update_of_ppo_compares_replicas(name, steps, tmp_path, monkeypatch):
+    seen = []
+    monkeypatch.setattr(
+        "agents.training.ppo.recentre",
+        lambda advantages, replicas: seen.append((advantages.shape, replicas)),
+    )
+    train(make_plan(name), tmp_path)
+    assert seen == [((steps, 4), 2)] * 6
 
 
 # --- what a training leaves -----------------------------------------------------------------------
