@@ -45,24 +45,20 @@ def test_a_distribution_scales_every_rate_by_one_factor_within_its_range():
 
 
 def test_drawn_incidents_stay_in_the_declared_ranges_and_fill_them():
-    distribution = IncidentDistribution(
-        segments=(2, 5),
-        start=(0, 100),
-        duration=(10, 20),
-        speed_limit=(5, 6),
-        recovery_duration=(30, 40),
-        recovery_speed_limit=(50, 60),
-    )
+    low, high = np.array([(0, 100), (10, 20), (5, 6), (30, 40), (50, 60)]).T
+    names = "start", "duration", "speed_limit", "recovery_duration", "recovery_speed_limit"
+    ranges = dict(zip(names, zip(low, high, strict=True), strict=True))
+    distribution = IncidentDistribution(segments=(2, 5), **ranges)
     drawn = [distribution.draw(np.random.default_rng(seed)) for seed in range(300)]
     assert {incident.segment for incident in drawn} == {2, 5}
-    ranges = [(0, 100), (10, 20), (5, 6), (30, 40), (50, 60)]
     values = np.array(
         [
             (start, middle - start, limit, end - middle, recovery)
             for (start, middle, limit), (_, end, recovery) in (each.phases for each in drawn)
         ]
     )
-    for (low, high), column in zip(ranges, values.T, strict=True):
-        margin = 0.05 * (high - low)
-        assert low - 1e-9 <= column.min() < low + margin
-        assert high - margin < column.max() <= high + 1e-9
+    margin = 0.05 * (high - low)
+    assert (low - 1e-9 <= values.min(axis=0)).all()
+    assert (values.min(axis=0) < low + margin).all()
+    assert (high - margin < values.max(axis=0)).all()
+    assert (values.max(axis=0) <= high + 1e-9).all()

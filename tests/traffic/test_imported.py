@@ -124,6 +124,10 @@ def test_a_damaged_manifest_is_an_error(change, message, recorded):
     manifest.write_text(change(manifest.read_text()))
     with pytest.raises(InvalidRecordError, match=message):
         recorded_seeds(recorded.recordings)
+    folder = recorded.recordings.folder
+    digest = write_manifest(Path(folder), FREE.record_layout, {"x" * 1000: ""}, [])
+    with pytest.raises(InvalidRecordError, match=r"manifest\.json: records must have .{1,150}$"):
+        recorded_seeds(Recordings(folder, digest))
     manifest.unlink()
     with pytest.raises(InvalidRecordError, match="recordings cannot be read"):
         recorded_seeds(recorded.recordings)

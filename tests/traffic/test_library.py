@@ -171,7 +171,7 @@ def test_a_library_that_cannot_grow_says_what_it_holds_and_why(tmp_path, monkeyp
     pattern = rf"{held} .* seed 3 failed: .*{os.strerror(errno.EROFS)}"
     for workers in (1, 2):
         with pytest.raises(RecordingError, match=pattern):
-            records.ensure(SHORT_HIGHWAY, range(5), workers=workers)
+            records.ensure(SHORT_HIGHWAY, [*range(5), 4], workers=workers)
     with pytest.raises(RecordingError, match=r"holds 0 of the 1 .*seed 4 failed"):
         records.get(SHORT_HIGHWAY, 4)
     records.ensure(SHORT_HIGHWAY, range(3))
