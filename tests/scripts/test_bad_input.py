@@ -113,7 +113,7 @@ REFUSED = {
         ["tune", "--env", SHORT, "--schedule", "{policy}"], "bandwidth is 3 for the policy and 2",
     ),
     "refused estimator": (
-        ["train", "--env", f"{SHORT} {recurrent('highway-flows')}", "--traffic", "0:1"],
+        ["train", "--env", SHORT, "--keywords", recurrent("highway-flows"), "--traffic", "0:1"],
         "were trained on flows in",
     ),
     "unknown estimator of a round": (
@@ -145,16 +145,12 @@ def test_what_does_not_fit_is_found_before_anything_is_recorded(case, tmp_path):
 
 
 FOLDERS = {
-    "another plan": ("train", '{"format": 4, "envs": 1}', "envs is 1 there and ['dptse_env:"),
+    "another plan": ("train", '{"env": "mine"}', "env is 'mine' there and 'dptse_env:"),
     "damaged": ("train", '{"env": ', "plan.json is damaged"),
     "foreign": ("train", None, "is not empty and has no plan.json: choose another --output"),
-    "several": ("train", '{"format": 4, "envs": 1}', "envs is 1 there and ['dptse_env:"),
+    "several": ("train", '{"env": "mine"}', "env is 'mine' there and 'dptse_env:"),
     "no plan": ("train_estimator", "[]", "plan.json is damaged: it has no plan"),
-    "another estimator": (
-        "train_estimator",
-        '{"format": 4, "seed": 7}',
-        "seed is 7 there and 0 now",
-    ),
+    "another estimator": ("train_estimator", '{"seed": 7}', "seed is 7 there and 0 now"),
 }
 
 

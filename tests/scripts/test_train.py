@@ -17,7 +17,7 @@ from agents.training.run_files import read_progress
 from scripts.training_bar import Bar, watched
 from tests.agents.training.plans import SMALL, without_time
 from tests.helpers import SHORT
-from tests.scripts.commands import refused, run_script
+from tests.scripts.commands import refused, run_command
 
 ROOT = Path(__file__).parents[2]
 
@@ -31,18 +31,18 @@ def words(output, algorithm="plackett-luce", *more):
 
 
 def test_it_trains_and_goes_on(tmp_path):
-    done = run_script("train", *words(tmp_path / "one"))
+    done = run_command("train", *words(tmp_path / "one"))
     assert done.returncode == 0, done.stderr
     assert f"{tmp_path / 'one'}: error x 1000 in validation" in done.stdout
     before = (tmp_path / "one" / "policy.safetensors").read_bytes()
-    assert run_script("train", *words(tmp_path / "one")).stdout == done.stdout
+    assert run_command("train", *words(tmp_path / "one")).stdout == done.stdout
     assert (tmp_path / "one" / "policy.safetensors").read_bytes() == before
     assert "seed is 0 there and 1 now" in refused("train", *words(tmp_path / "one"), "--seeds", "1")
 
 
 def test_several_seeds_are_trained_in_folders_of_their_own(tmp_path):
     given = words(tmp_path, "plackett-luce", "--seeds", "0:2", "--workers", "1")
-    done = run_script("train", *given)
+    done = run_command("train", *given)
     assert [line.partition(":")[0] for line in done.stdout.splitlines()] == [
         str(tmp_path / seed) for seed in "01"
     ]
