@@ -81,14 +81,19 @@ def test_a_killed_program_goes_on(tmp_path, how, algorithm):
         assert curves[0] == curves[1]
 
 
-def test_the_bar_and_tensorboard_follow_the_curve(tmp_path):
-    rows = [{"update": k, "steps": 40 * k, "error": 0.5} for k in range(3)]
-    with watched(Bar("update", ("error", "validation"), 2), tmp_path, tensorboard=False) as only:
-        for row in rows:
-            only[0](row)
-    assert only[0].bar.n == 2
+ROWS = [{"update": k, "steps": 40 * k, "error": 0.5} for k in range(3)]
+
+
+def test_the_bar_follows_the_curve(tmp_path):
+    with watched(Bar("update", ("error", "validation"), 2), tmp_path, tensorboard=False) as (bar,):
+        for row in ROWS:
+            bar(row)
+    assert bar.bar.n == 2
     assert list(tmp_path.iterdir()) == []
+
+
+def test_tensorboard_follows_the_curve_where_it_is_installed(tmp_path):
     pytest.importorskip("tensorboard")
-    with watched(Bar("update", ("error",), 2), tmp_path) as both:
-        both[1](rows[1])
+    with watched(Bar("update", ("error",), 2), tmp_path) as (_, write):
+        write(ROWS[1])
     assert list(tmp_path.glob("tensorboard/events*"))

@@ -60,7 +60,7 @@ def env(**keywords):
         ({"validation_seeds": (0,)}, r"validation must be .* 1000\.\.1999, got 0"),
         ({"envs": ()}, r"env must be one or more environments, got \(\)"),
         ({"envs": env(action="mask")}, "env: action is chosen by the training"),
-        ({"envs": (f"{SHORT} 3",)}, "must be a JSON object, got '3'"),
+        ({"envs": (f"{SHORT} 3",)}, "env must be an id and a JSON object, got"),
         ({"envs": env(estimatr="ukf")}, "estimatr is unknown"),
         ({"envs": env(horizon=60)}, "horizon must be above 60 s, .*, got 60"),
         ({"envs": (ENV, *env(privacy="paced"))}, "env: .*paced.*: .* the same channels"),

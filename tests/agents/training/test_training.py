@@ -133,7 +133,7 @@ def test_ppo_goes_on_from_its_last_checkpoint(name, tmp_path):
     assert rows[:2] == before[:2]
     # The same policy, but in new episodes.
     assert rows[2]["validation_drawn"] == before[2]["validation_drawn"]
-    assert rows[3]["error"] != before[3]["error"]
+    assert rows[3]["value_loss"] != before[3]["value_loss"]
     rates = [row["learning_rate"] for row in rows[3:]]
     assert rates == pytest.approx([5e-4 - 4.5e-4 * update / 6 for update in (3, 4, 5, 6)])
 
