@@ -25,9 +25,8 @@ DEMO = --env 'dptse_env:dptse/PaperHighway-v0 {"parameters": "w99-3lane"}'
 
 demo: setup  ## Train a small query policy and evaluate it beside the schedules on held-out traffic; results/demo.
 	$(BIN)/dptse train $(DEMO) \
-		--traffic 0:32 --validation 1000:1008 --no-tensorboard --output results/demo/training \
-		recipe:plackett-luce --recipe.regression.rounds 2 --recipe.regression.batches 600 \
-		--recipe.swaps.rounds 1 --recipe.swaps.episodes 96 --recipe.swaps.batches 300
+		--traffic 0:32 --validation 1000:1008 --output results/demo/training \
+		--algorithm 'plackett-luce {"regression": {"rounds": 2, "batches": 600}, "swaps": {"rounds": 1, "episodes": 96, "batches": 300}}'
 	$(BIN)/dptse evaluate $(DEMO) --estimators ekf random_walk \
 		--policies results/demo/training/policy.safetensors --output results/demo --force
 

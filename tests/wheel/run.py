@@ -27,10 +27,9 @@ COMMANDS = [
     ["record", *SHORT, "--seeds", "0:2", "--json"],
     [
         "train", "--env", BRIEFLY, "--traffic", "0:2",
-        "--validation", "1000:1002", "--output", "trained", "recipe:plackett-luce",
-        "--recipe.n-envs", "4", "--recipe.replicas", "2", "--recipe.regression.rounds", "1",
-        "--recipe.regression.batches", "2", "--recipe.swaps.rounds", "1",
-        "--recipe.swaps.episodes", "2", "--recipe.swaps.batches", "2",
+        "--validation", "1000:1002", "--output", "trained", "--algorithm",
+        'plackett-luce {"n_envs": 4, "regression": {"rounds": 1, "batches": 2}, '
+        '"swaps": {"rounds": 1, "episodes": 2, "batches": 2}}',
     ],
     [
         "evaluate", "--env", BRIEFLY, "--seeds", "2000:2002",
