@@ -1,4 +1,4 @@
-"""Sensitivities: the paper's, and those of bounded contributions beside a search over neighbours."""
+"""Sensitivities: the paper's, and those of bounded contributions beside a search for the worst."""
 
 import itertools
 import math

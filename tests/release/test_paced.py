@@ -27,7 +27,6 @@ from dptse_env.release.pacing import TracerPacing
 from tests.cases import pairwise
 from tests.model.roads import UNEVEN
 
-from .test_noise import residual_faults
 from .worlds import (
     AWAY,
     BOTH,
@@ -52,6 +51,7 @@ from .worlds import (
     predicting,
     record,
     request,
+    residual_faults,
     square,
     stays,
     streams,

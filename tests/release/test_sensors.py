@@ -18,8 +18,7 @@ from dptse_env.traffic import Penetration
 from tests.cases import pairwise
 
 from .sums import SumRelease
-from .test_noise import residual_faults
-from .worlds import LENGTH, ONE, Worlds, crowd, predicting, request
+from .worlds import LENGTH, ONE, Worlds, crowd, predicting, request, residual_faults
 
 SHARE = 0.3
 N, SENSORS = 6, (3, 5, 7)
