@@ -14,6 +14,7 @@ from dptse_env.release.vehicles import Ledgers
 from dptse_env.traffic import SHORT_HIGHWAY, Demand, Record
 
 WHOLE = (Group("queries"),)
+TWO_GROUPS = Group("queries", 0.7), Group("sensors", 0.3)
 AWAY = -1
 """Place of a vehicle that is not on the road."""
 
