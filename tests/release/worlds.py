@@ -77,12 +77,12 @@ class Worlds:
     def ensure(self, corridor, seeds):
         """All records are there."""
 
-    def release(self, settings, kind=None, groups=WHOLE, bandwidth=2):
+    def release(self, settings, kind=None, groups=WHOLE, bandwidth=2, spans=(1,)):
         """A release model of all record columns, of another class than the settings' if given."""
         n = len(self.records)
         settings = dataclasses.replace(settings, boundary_inputs="private")
         queries = QueryOptions.make(
-            self.road.n_mainline, bandwidth, separate_sensors=len(groups) > 1
+            self.road.n_mainline, bandwidth, spans, separate_sensors=len(groups) > 1
         )
         task = Task(
             settings.preset, kind or RELEASE_MODELS[settings.preset], settings, self.road, queries,
@@ -251,6 +251,16 @@ class PlainLedgers(Ledgers):
                     else:
                         refused[k, g] += 1
         return sums, refused
+
+
+class ReleasedUnclipped(PlainLedgers):
+    """Charged at the clipped deviation: audits must find it, too."""
+
+    def cost(self, price, raw, column, nth):
+        return super().cost(price, super().told(raw), column, nth)
+
+    def told(self, raw):
+        return raw
 
 
 class Keeping(NamedTuple):
