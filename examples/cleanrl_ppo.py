@@ -2,7 +2,7 @@
 
 pip install -e '.[train]'
 python examples/cleanrl_ppo.py
-python scripts/evaluate.py --env dptse_env:dptse/ShortHighway-v0 --parameters paper \
+dptse evaluate --env dptse_env:dptse/ShortHighway-v0 \
     --policies examples.slots_policy:SlotsPolicy=results/cleanrl/policy.zip
 
 It needs torch and no learning library. ``gym.make_vec`` makes a batch of episodes that steps as

@@ -1,6 +1,6 @@
-"""A module of RLlib as a query policy, which scripts/evaluate.py puts beside schedules.
+"""A module of RLlib as a query policy, which dptse evaluate puts beside schedules.
 
-python scripts/evaluate.py --policies examples.rllib_policy:RLlibPolicy=results/rllib/policy.zip
+dptse evaluate --policies examples.rllib_policy:RLlibPolicy=results/rllib/policy.zip
 """
 
 from __future__ import annotations

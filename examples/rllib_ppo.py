@@ -4,7 +4,7 @@ pip install -e '.[train]' 'ray[rllib]==2.60.0'
 python examples/rllib_ppo.py
 python examples/rllib_ppo.py --lstm
 python examples/rllib_ppo.py --vectorize sync --envs 4
-python scripts/evaluate.py --env dptse_env:dptse/ShortHighway-v0 --parameters paper \
+dptse evaluate --env dptse_env:dptse/ShortHighway-v0 \
     --policies examples.rllib_policy:RLlibPolicy=results/rllib/policy.zip
 
 RLlib makes its environments with ``gym.make_vec``, and ``gym_env_vectorize_mode`` says how. Its

@@ -1,6 +1,6 @@
-"""An actor of plain torch as a query policy, which scripts/evaluate.py puts beside schedules.
+"""An actor of plain torch as a query policy, which dptse evaluate puts beside schedules.
 
-python scripts/evaluate.py --policies examples.slots_policy:SlotsPolicy=results/cleanrl/policy.zip
+dptse evaluate --policies examples.slots_policy:SlotsPolicy=results/cleanrl/policy.zip
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 pip install -e '.[train]' tianshou
 python examples/tianshou_ppo.py
-python scripts/evaluate.py --env dptse_env:dptse/ShortHighway-v0 --parameters paper \
+dptse evaluate --env dptse_env:dptse/ShortHighway-v0 \
     --policies examples.slots_policy:SlotsPolicy=results/tianshou/policy.zip
 
 Tianshou has batches of its own, made of scalar environments, and takes no vector environment of

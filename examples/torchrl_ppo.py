@@ -2,7 +2,7 @@
 
 pip install -e '.[train]' torchrl
 python examples/torchrl_ppo.py
-python scripts/evaluate.py --env dptse_env:dptse/ShortHighway-v0 --parameters paper \
+dptse evaluate --env dptse_env:dptse/ShortHighway-v0 \
     --policies examples.slots_policy:SlotsPolicy=results/torchrl/policy.zip
 
 `GymWrapper` takes our vector environment where it is made with ``autoreset_mode="Disabled"``:

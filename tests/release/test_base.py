@@ -9,9 +9,8 @@ import pytest
 from dptse_env.config import resolve
 from dptse_env.parts import make_model, make_task
 from dptse_env.release import Corrected, PrivacySettings, QueryOptions, Task, check_released
-from tests.model.roads import UNEVEN
+from tests.helpers import UNEVEN, MeanRelease, PricedRelease, SumRelease
 
-from .sums import MeanRelease, PricedRelease, SumRelease
 from .worlds import COLUMNS, ONE, Worlds, request, stays
 
 

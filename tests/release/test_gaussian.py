@@ -20,11 +20,9 @@ from dptse_env.privacy import epsilon_of, mu_of
 from dptse_env.release import RELEASE_MODELS, CappedSettings, Group, PrivacySettings
 from dptse_env.release.report import STRICT_DELTA
 from dptse_env.traffic import Penetration
-from tests.cases import pairwise
-from tests.model.roads import UNEVEN
+from tests.helpers import AWAY, UNEVEN, pairwise, record, short_road
 
 from .worlds import (
-    AWAY,
     BOTH,
     COLUMNS,
     LENGTH,
@@ -35,9 +33,7 @@ from .worlds import (
     T,
     Worlds,
     adjacent_trips,
-    corridor,
     crowd,
-    record,
     request,
     stays,
     streams,
@@ -113,7 +109,7 @@ def test_a_mean_is_over_those_that_count():
     "groups", [WHOLE, (Group("queries", 0.5, Penetration(0.3)), Group("sensors", 0.5))]
 )
 def test_an_empty_segment_or_sensor_has_its_own_speed_limit(preset, groups):
-    road = dataclasses.replace(corridor(1), fixed_sensors=(3, 5, 7), ramp_speed_limit=60.0)
+    road = dataclasses.replace(short_road(1), fixed_sensors=(3, 5, 7), ramp_speed_limit=60.0)
     means = {"speed_release": "mean"} if preset == "capped" else {}
     asked = RELEASE_MODELS[preset].settings_type(preset=preset, **means)
     release = Worlds(stays(0, 0.0, 1, present=False), road=road).started(asked, groups=groups)
@@ -201,7 +197,7 @@ def wishes(draw):
     )
 
 
-@settings(max_examples=100)
+@settings(max_examples=80)
 @given(st.data())
 def test_no_policy_exceeds_mu(data):
     """Neither one that asks at random nor one that follows the vehicle that differs."""

@@ -9,7 +9,7 @@ from dptse_env.model.network import make_layout
 from dptse_env.release import PACINGS, Group, Paced, PacedSettings, QueryOptions, Task
 from dptse_env.release.pacing import EventPacing, TracerPacing, check_prices
 from dptse_env.traffic import SHORT_HIGHWAY
-from tests.model.roads import UNEVEN
+from tests.helpers import UNEVEN
 
 from .worlds import ONE, WHOLE
 

@@ -15,9 +15,8 @@ from dptse_env.process import QueryProcess
 from dptse_env.release import Detectors, Group, make_groups
 from dptse_env.release.noise import BLOCK
 from dptse_env.traffic import Penetration
-from tests.cases import pairwise
+from tests.helpers import SumRelease, pairwise
 
-from .sums import SumRelease
 from .worlds import LENGTH, ONE
 
 SHARE = 0.3

@@ -5,26 +5,24 @@ import dataclasses
 import numpy as np
 import pytest
 
-from dptse_env.release import Traffic
+from dptse_env.release import Group, PacedSettings, Traffic
+from dptse_env.release.vehicles import Ledgers
 from dptse_env.traffic import SHORT_HIGHWAY, Penetration, RecordLibrary
-from tests.cases import pairwise
-from tests.model.roads import UNEVEN
+from tests.helpers import UNEVEN, pairwise
 
 from .worlds import (
-    GROUPED,
+    BOTH,
+    COLUMNS,
     LIMIT,
     ONE,
-    OVERLAPPING,
-    PLACES,
-    SINGLE,
+    TWO_GROUPS,
+    WHOLE,
     PlainLedgers,
     Public,
     T,
     Worlds,
-    constant,
+    collected,
     crowd,
-    keep,
-    stays,
 )
 
 # --- traffic ----------------------------------------------------------------------------------
@@ -80,53 +78,46 @@ def test_missing_records_are_made_together_and_loaded_once(monkeypatch):
 # --- ledgers ----------------------------------------------------------------------------------
 
 
+SOME_CONNECTED = Group("queries", 0.6, Penetration(0.5)), Group("sensors", 0.4)
+
+
 @pytest.mark.parametrize(
-    ("columns", "seed", "ratio"),
-    pairwise([SINGLE, OVERLAPPING, GROUPED], range(4), [0.0, 0.3, 1.0], rest=False),
+    ("spans", "groups", "ratio"),
+    pairwise([(1,), (1, 2, 3)], [WHOLE, TWO_GROUPS, SOME_CONNECTED], [0.3, 1.0], rest=False),
 )
-def test_ledgers_count_as_they_do_when_written_out(columns, seed, ratio):
+def test_ledgers_count_as_they_do_when_written_out(spans, groups, ratio):
     """Three episodes at random prices and centres; some contributions are refused."""
-    records = [crowd(30, 10 * seed + k, last=PLACES + 2) for k in range(3)]
-    given = {"ratio": ratio, "clip": 25.0 if ratio else np.inf}
-    budget = np.array([0.3, 0.2])[: columns[2].max() + 1]
-    made = keep(records, columns, budget, **given)
-    plain = keep(records, columns, budget, PlainLedgers, **given)
-    generator, shape = np.random.default_rng(seed), (T, len(columns[0]))
+    worlds = Worlds(*(crowd(30, seed) for seed in range(3)))
+    given = {"groups": groups, "spans": spans, "bandwidth": 6}
+    made, plain = (
+        worlds.started(PacedSettings(ratio=ratio, clip=25.0), ledgers=kind, **given)
+        for kind in (None, PlainLedgers)
+    )
+    budget, generator, shape = made.budget, np.random.default_rng(0), (T, made.task.n_columns)
     public = Public(
         generator.random(shape) < 0.6,
-        generator.uniform(0.0, 0.09, shape),
-        generator.uniform(0.0, LIMIT, (T, PLACES)),
+        generator.uniform(0.0, 0.3, shape) * budget[made.task.group],
+        generator.uniform(0.0, LIMIT, (T, COLUMNS)),
     )
-    for found, expected in zip(made.seconds(public), plain.seconds(public), strict=True):
-        for values, wanted in zip(found, expected, strict=True):
-            np.testing.assert_array_equal(values, wanted)
+    seconds = zip(collected(made, public), collected(plain, public), strict=True)
+    for (found, refused), (expected, expected_refused) in seconds:
+        np.testing.assert_array_equal(found, expected)
+        np.testing.assert_array_equal(refused, expected_refused)
     paid = made.ledgers.paid
     np.testing.assert_array_equal(paid, plain.ledgers.paid)
     assert (paid <= budget[:, None]).all()
     assert (paid > 0.5 * budget[:, None]).any(axis=(0, 2)).all()
-
-
-def test_a_price_of_one_and_no_ratio_is_a_cap():
-    """A vehicle counts in its first steps that are observed, at any speed, and in no later one."""
-    keeping = keep([stays(0, 50.0)], SINGLE, 3.0)
-    observed = np.ones((T, 4), dtype=bool)
-    observed[1] = False  # not asked, not charged
-    seconds = keeping.seconds(constant(SINGLE, 1.0, 0.0, observed))
-    assert [sums[0, 0].tolist() for sums, _ in seconds] == [
-        [1.0, 50.0], [0.0, 0.0], [1.0, 50.0], [1.0, 50.0], *[[0.0, 0.0]] * 4,
-    ]  # fmt: skip
+    assert refused.any()
 
 
 def test_a_reset_begins_new_budgets_in_its_episodes_alone_and_a_wider_record_keeps_the_others():
-    keeping = keep([crowd(20, k, last=PLACES) for k in range(2)], SINGLE, 1.0)
-    ledgers = keeping.ledgers
-    for _ in keeping.seconds(constant(SINGLE, 0.01)):
-        pass
+    ledgers = Ledgers((ONE, ONE + 1, ONE), 2, np.ones(1))
+    ledgers.reset(BOTH, np.array([20, 10]))
+    ledgers.paid += np.arange(1.0, 41.0).reshape(2, 1, 20)
     kept = ledgers.paid[0].copy()
     ledgers.reset(np.array([1]), np.array([20, 50]))
     assert ledgers.paid.shape == (2, 1, 50)
-    np.testing.assert_array_equal(ledgers.paid[0, :, :20], kept)
-    assert kept.any()
+    np.testing.assert_array_equal(ledgers.paid[0], np.pad(kept, [(0, 0), (0, 30)]))
     assert not ledgers.paid[1].any()
     (told,) = ledgers.of(ONE, np.array([20]))
     np.testing.assert_array_equal(told, kept)
