@@ -1,4 +1,4 @@
-"""An episode's noise follows its seed alone, and its score the record's second."""
+"""An episode follows its seed alone, whatever was before it, and its score the record's second."""
 
 import numpy as np
 import pytest
@@ -8,6 +8,7 @@ from dptse_env.parts import make_parts
 from dptse_env.process import QueryProcess
 from dptse_env.release.noise import grid_of
 from dptse_env.traffic import RecordLibrary
+from tests.helpers import assert_same, make_env, play
 
 TWO = np.arange(2)
 EVERYWHERE = {"traffic_seed": 0, "start": 0}
@@ -61,6 +62,27 @@ def test_the_noise_depends_neither_on_the_estimator_nor_on_what_is_queried(estim
     expected = noise(begin((1, 2), EVERYWHERE, estimator="ekf"))
     found = noise(begin((1, 2), EVERYWHERE, estimator=estimator), queried=[1, 4])
     np.testing.assert_array_equal(found, expected[:, :, [1, 4]])
+
+
+PARTLY = {"penetration": 0.3, "detectors": {"dropout": 0.2, "absolute": 0.5}}
+
+
+@pytest.mark.parametrize(
+    ("estimator", "privacy", "keywords"),
+    [
+        ("ekf", {"preset": "paced", "boundary_inputs": "private"}, {}),
+        ("mhe", {"preset": "capped", "cap": 5, "boundary_inputs": "private"}, {}),
+        ("recurrent", "paced", PARTLY),
+        ("blend", "paper", PARTLY),
+    ],
+)
+def test_an_episode_is_as_in_a_fresh_environment(estimator, privacy, keywords):
+    """No ledger, stream, release, innovation or price of an episode outlasts a reset."""
+    keywords = {"estimator": estimator, "privacy": privacy, "horizon": 40, **keywords}
+    fresh, used = (make_env(random_start=True, truth_in_info=True, **keywords) for _ in range(2))
+    for seed in (8, 9):
+        play(used, 25, seed)
+    assert_same(play(used, 40), play(fresh, 40))
 
 
 @pytest.mark.parametrize("start", [0, 17])
