@@ -3,10 +3,8 @@
 import dataclasses
 import math
 
-import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 
 from dptse_env.config import resolve
 from dptse_env.parts import make_interface, make_parts, make_release, privacy_report
@@ -15,7 +13,7 @@ from dptse_env.process import QueryProcess
 from dptse_env.release import Detectors, Group, make_groups
 from dptse_env.release.noise import BLOCK
 from dptse_env.traffic import Penetration
-from tests.helpers import SumRelease, pairwise
+from tests.helpers import SumRelease, lock_step, pairwise
 
 from .worlds import LENGTH, ONE
 
@@ -215,11 +213,9 @@ def test_given_noise_reaches_both_groups():
     np.testing.assert_allclose(counts, np.append(some[:2], every[2:]), atol=0.05)
 
 
-def test_the_environment_keeps_gymnasiums_rules():
-    given = {"penetration": 0.2, "privacy": "paced", "detectors": {"dropout": 0.1}}
-    env = gym.make("dptse_env:dptse/ShortHighway-v0", **given)
-    check_env(env.unwrapped, skip_render_check=True)
-    env.close()
+def test_a_batch_is_so_many_scalar_environments():
+    detectors = {"dropout": 0.3, "absolute": 0.5}
+    lock_step({"penetration": SHARE, "privacy": "paced", "detectors": detectors}, 8)
 
 
 # --- detectors ---------------------------------------------------------------------------------
