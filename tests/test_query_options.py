@@ -166,12 +166,3 @@ def test_masks_show_what_the_rest_of_the_bandwidth_pays_for():
     assert masks[1].all()  # the second has begun the next second
     *_, infos = env.step(np.array([0, 11]))
     assert np.flatnonzero(infos["queried"][0]).tolist() == [0, 6]
-
-
-def test_a_fork_goes_on_alike():
-    process = make_process(query_spans=(2, 3))
-    query(process, 3)
-    query(process.fork(), 1)
-    first, second = process.fork(), process.fork()
-    np.testing.assert_array_equal(query(first, 7, 2), query(second, 7, 2))
-    assert np.flatnonzero(process.release.prices[0]).tolist() == [3]

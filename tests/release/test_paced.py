@@ -19,7 +19,6 @@ from dptse_env.parts import privacy_report
 from dptse_env.privacy import epsilon_of, mu_of
 from dptse_env.release import Paced, PacedSettings, Pacing
 from dptse_env.release.noise import Noise
-from dptse_env.release.pacing import TracerPacing
 from tests.helpers import AWAY, record
 
 from .worlds import (
@@ -109,21 +108,6 @@ def test_noise_is_that_of_the_prices_on_a_grid_that_is_as_public():
         np.testing.assert_allclose(steps, np.rint(steps), rtol=1e-12, atol=0.0)
 
 
-def test_policies_meet_the_same_noise():
-    """In units of its deviation, but for the rounding: the deviation depends on the policy."""
-    everything, few, *twins = (started(Worlds(crowd())) for _ in range(4))
-    for second in ROUNDS.tolist():
-        told = []
-        asked = np.isin(np.arange(COLUMNS), [second % SEGMENTS, 5, 7])
-        for release, twin, flags in ((everything, twins[0], True), (few, twins[1], asked)):
-            found = release.release(request(second, flags))
-            sums, _ = twin.collect(request(second, flags), release.prices, found.centre)
-            told.append(((found.values - sums / LENGTH) / found.sigma, found.sigma))
-        (first, sigma), (second_, other) = told
-        np.testing.assert_allclose(first, second_, rtol=0.0, atol=2.0**-10)
-    assert not np.allclose(sigma, other)
-
-
 def test_a_second_episode_is_released_like_the_first():
     """No ledger, price or account outlasts a reset."""
     release = started(Worlds(crowd()), epsilon=0.5)
@@ -208,17 +192,6 @@ def test_for_an_event_each_second_has_a_budget_and_nobody_is_refused(ratio):
             assert info["n_refused"] == [0]
         if most:
             assert max(info["ledgers"][0]) == pytest.approx(1.0)
-
-
-def test_fixed_sensors_and_boundaries_charge_without_a_query():
-    """Segments 5 and 7 have sensors, and 8 to 11 are boundary segments, which are released."""
-    charged = []
-    for place in range(COLUMNS):
-        release = started(Worlds(stays(place, 10.0)))
-        nothing = release.task.observed(np.zeros((1, 6), dtype=bool))[0]
-        release.release(request(1, nothing))
-        charged.append(release.private(ONE, ONE)["ledgers"][0][0] > 0.0)
-    assert np.flatnonzero(charged).tolist() == [5, 7, 8, 9, 10, 11]
 
 
 def test_refusals_and_ledgers_are_told_as_private_lists():
@@ -328,11 +301,6 @@ def test_the_report_says_what_is_guaranteed(unit, adjacency):
 def test_bad_settings_are_named_with_their_path(fields, message):
     with pytest.raises(ValueError, match=rf"^privacy\.{message}"):
         PacedSettings(**fields)
-
-
-def test_a_pacing_is_a_name_or_a_class():
-    for pacing in ("tracer", TracerPacing, "dptse_env.release.pacing:TracerPacing"):
-        assert PacedSettings(pacing=pacing).pacing == pacing
 
 
 # --- nothing public exceeds mu -------------------------------------------------------------------

@@ -248,7 +248,8 @@ def test_good_prices_pass_and_bad_ones_are_named():
 
 
 def test_pacings_are_found_by_name():
-    assert PACINGS.find("tracer") is TracerPacing
+    for good in ("tracer", TracerPacing, "dptse_env.release.pacing:TracerPacing"):
+        assert PACINGS.find(good) is TracerPacing
     for bad, message in (("greedy", "must be one of tracer"), (dict, ".*subclass of .*Pacing")):
         with pytest.raises(ValueError, match=rf"^privacy\.pacing {message}"):
             PACINGS.find(bad)
