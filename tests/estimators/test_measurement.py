@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from dptse_env.estimators import ESTIMATORS, Measurement
-from tests.model.roads import Road, model_of
+from dptse_env.model import ARZModel
+from tests.model.roads import PAPER, Road
 
 from .episodes import random_streams, simulate, started
 
@@ -27,18 +28,18 @@ def test_bad_measurements_are_named(changes, message):
         "sigma": np.ones(2),
         "centre": np.ones(5),
     }
-    model = model_of(Road(n_mainline=5), reference_speed=50.0)
+    model = ARZModel(Road(n_mainline=5), PAPER, reference_speed=50.0)
     with pytest.raises(ValueError, match=message):
         Measurement.of(model, **{**good, **changes})
 
 
 def test_what_a_measurement_leaves_out_is_filled_in():
     observed, values, sigma = np.ones((2, 5), bool), np.zeros((2, 5, 2)), np.array([3.0, 4.0])
-    flows = model_of(Road(n_mainline=5), reference_speed=50.0)
+    flows = ARZModel(Road(n_mainline=5), PAPER, reference_speed=50.0)
     given = Measurement.of(flows, observed, values, sigma)
     np.testing.assert_array_equal(given.sigma, np.broadcast_to(sigma, (2, 5, 2)))
     np.testing.assert_array_equal(given.centre, np.full((2, 5), 50.0))
-    speeds = model_of(Road(n_mainline=5))
+    speeds = ARZModel(Road(n_mainline=5), PAPER)
     given = Measurement.of(speeds, observed, values, sigma, np.full(5, 7.0))
     assert np.isnan(given.centre).all()  # speeds have no centre
 

@@ -1,19 +1,31 @@
-"""Roads, models and random states that the tests of the model share."""
+"""Roads and random states of the tests of the model, and its oracle in plain numpy."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
-from dptse_env.model import ARZModel, ARZParameters, load_parameters
-from dptse_env.model.parameters import VACUUM
+from dptse_env.model import ARZModel, MeasurementRows, load_parameters
+from dptse_env.model.parameters import STANDING, VACUUM
 from dptse_env.traffic import Corridor, Demand
 from dptse_env.utils.arrays import FloatArray
+from dptse_env.utils.kernels import kernel
 
 PAPER = load_parameters("paper")
 W99 = load_parameters("w99-3lane")
 NO_RELAXATION = replace(PAPER, name="no relaxation", relaxation_time=float("inf"))
+
+
+def compiled(part):
+    """Return a kernel that does nothing but call a part; its machine code is kept as any other."""
+    # The part is a global name and not one of a closure, which the fingerprint does not look into.
+    names = {"part": part, "__name__": part.__module__}
+    exec("def call(*args): return part(*args)", names)
+    call = names["call"]
+    call.__qualname__ = f"call_{part.__name__}"
+    return kernel(call)
 
 
 @dataclass(frozen=True)
@@ -80,6 +92,9 @@ UNEVEN = Corridor(
 )
 """A road with segments and ramps of many kinds."""
 
+ROWS = MeasurementRows(np.array([0, 3, 4, 13, 16]), np.array([1, 2, 3, 2, 1]), 19)
+"""Rows of the highway, of one to three segments."""
+
 HIGHWAY = Road(on_ramps=(3, 9), off_ramps=(6, 12), exit_shares=(0.1, 0.1))
 STRAIGHT = Road()
 # Every kind of face beside every other, an off-ramp that nobody takes, and wider roads outside.
@@ -125,7 +140,136 @@ def random_inputs(model: ARZModel, n: int, rng: np.random.Generator) -> FloatArr
     return model.boundary_inputs(density, rng.uniform(0.0, model.speed_scale, density.shape))
 
 
-def model_of(
-    road: Road | Corridor, parameters: ARZParameters = PAPER, time_step: float = 1.0, **keywords
-) -> ARZModel:
-    return ARZModel(road, parameters, time_step, **keywords)
+# The oracle ---------------------------------------------------------------------------------------
+
+
+def positive(x, kink=0.0):
+    """max(x, 0), with the derivative of x down to -kink."""
+    value = np.maximum(x.real, 0.0)
+    return value + 1j * np.where(x.real > -kink, x.imag, 0.0) if np.iscomplexobj(x) else value
+
+
+def least(a, b):
+    """min(a, b), with the derivative of a where they are equal."""
+    return np.where(a.real <= b.real, a, b)
+
+
+class Oracle:
+    """The model of a road, face by face, in plain numpy: the oracle of the compiled one.
+
+    It shares no code with that. Cells are rows of its arrays, and states of a batch their columns.
+    States may be complex: all choices look at real parts alone, so that a step of 1e-30 along the
+    imaginary axis gives derivatives without rounding.
+    """
+
+    def __init__(self, network, parameters, time_step=1.0):
+        per_lane = parameters.jam_density / parameters.lanes
+        self.network, self.v_f, self.gamma = network, parameters.free_flow_speed, parameters.gamma
+        self.jam = per_lane * np.array(network.segment_lanes)
+        self.outer_jam = per_lane * np.array(network.boundary_lanes)
+        self.ratio = time_step / 3600.0 / np.array(network.segment_lengths)
+        self.pull = time_step / parameters.relaxation_time
+
+    # Relations: p, sigma, q_max, D and S.
+
+    def pressure(self, rho, jam):
+        return self.v_f * (rho / jam) ** self.gamma
+
+    def critical_density(self, w, jam):
+        return jam * (w / ((1.0 + self.gamma) * self.v_f)) ** (1.0 / self.gamma)
+
+    def capacity(self, w, jam):
+        return self.critical_density(w, jam) * w * self.gamma / (1.0 + self.gamma)
+
+    def demand(self, rho, w, jam):
+        p = self.pressure(rho, jam)
+        free = rho.real <= self.critical_density(w, jam).real
+        return np.where(free, rho * (w - p), self.capacity(w, jam))
+
+    def supply(self, w, v, jam):
+        settled = jam * (positive(w - v) / self.v_f) ** (1.0 / self.gamma)  # rho_M
+        free = v.real >= w.real * self.gamma / (1.0 + self.gamma)
+        return np.where(free, self.capacity(w, jam), settled * v)
+
+    # Faces.
+
+    def cells(self, states):
+        """w, v and D of all cells, (S, n) each."""
+        n = 2 * self.jam.size
+        jam, rho, psi = self.jam[:, None], positive(states.T[0:n:2]), positive(states.T[1:n:2])
+        empty = rho.real <= VACUUM * jam
+        rho = np.where(empty, rho.real, rho)  # nothing depends on what a vacuum holds
+        w = np.where(empty, self.v_f, psi / np.where(empty, 1.0, rho))
+        v = positive(w - self.pressure(rho, jam), STANDING * self.v_f)
+        return w, v, np.where(empty, 0.0, self.demand(rho, w, jam))
+
+    def flows(self, states, inputs):
+        """w and q [veh/h] of all cells, q from a cell to another, and q and w into each entry."""
+        road, jam, outer, u = self.network, self.jam, self.outer_jam, inputs.T
+        w, v, D = self.cells(states)
+        q, passing, source, n_on = np.empty_like(D), {}, {}, len(road.on_ramps)
+        junctions = {*road.on_ramps, *road.off_ramps}
+
+        links = [(j - 1, j) for j in range(1, road.n_mainline) if j not in junctions]
+        for ramp in (*road.on_ramp_segments, *road.off_ramp_segments):
+            links += pairwise(ramp)
+        for a, b in links:
+            q[a] = passing[a, b] = least(D[a], self.supply(w[a], v[b], jam[b]))
+
+        for b, ramp in zip(road.on_ramps, road.on_ramp_segments, strict=True):
+            total = D[b - 1] + D[ramp[-1]]
+            some = np.where(total.real > 0.0, total, 1.0)
+            mixed = (D[b - 1] * w[b - 1] + D[ramp[-1]] * w[ramp[-1]]) / some
+            k = least(np.ones_like(total), self.supply(mixed, v[b], jam[b]) / some)
+            for a in (b - 1, ramp[-1]):
+                q[a] = passing[a, b] = np.where(total.real > 0.0, k * D[a], D[a])
+
+        ramps = zip(road.off_ramps, road.off_ramp_segments, road.exit_shares, strict=True)
+        for b, ramp, share in ramps:
+            a, off = b - 1, ramp[0]
+            limit = self.supply(w[a], v[b], jam[b]) / (1.0 - share)
+            if share > 0.0:
+                branch = self.supply(w[a], v[off], jam[off]) / share
+                tie = STANDING * jam[b] * self.v_f  # two blocked branches: that of the mainline
+                held = np.where(branch.real < limit.real - tie, branch, limit)
+                limit = held + np.minimum(branch.real, limit.real) - held.real
+            q[a] = least(D[a], limit)
+            passing[a, b], passing[a, off] = (1.0 - share) * q[a], share * q[a]
+
+        # Inputs are D_in, w_in, rho_out, then D and w of each on-ramp, then rho of each off-ramp.
+        exits = [road.n_mainline - 1, *(ramp[-1] for ramp in road.off_ramp_segments)]
+        outside = [(u[2], outer[1]), *zip(u[2 * n_on + 3 :], outer[n_on + 2 :], strict=True)]
+        for a, (density, jam_out) in zip(exits, outside, strict=True):
+            speed = positive(w[a] - self.pressure(density, jam_out))
+            q[a] = least(D[a], self.supply(w[a], speed, jam_out))
+
+        entries = [0, *(ramp[0] for ramp in road.on_ramp_segments)]
+        for i, c in enumerate(entries):
+            offered, w_in = u[[0, 1]] if i == 0 else u[[2 * i + 1, 2 * i + 2]]
+            if states.shape[1] > 2 * jam.size:
+                offered = offered * states[:, 2 * jam.size + i]
+            source[c] = least(offered, self.supply(w_in, v[c], jam[c])), w_in
+        return w, q, passing, source
+
+    # The update.
+
+    def step(self, states, inputs):
+        w, q, passing, source = self.flows(states, inputs)
+        rho, psi = -q, -q * w
+        for (a, b), flow in passing.items():
+            rho[b] += flow
+            psi[b] += flow * w[a]
+        for c, (flow, w_in) in source.items():
+            rho[c] += flow
+            psi[c] += flow * w_in
+        after, n, ratio = states.T.copy(), 2 * self.jam.size, self.ratio[:, None]
+        before = states.T[0:n:2]
+        after[0:n:2] += ratio * rho
+        after[1:n:2] += ratio * psi + self.pull * (self.v_f * before - after[1:n:2])
+        return after.T
+
+    def jacobian(self, states, inputs):
+        n, size = states.shape
+        moved = (states[:, None] + 1e-30j * np.eye(size)).reshape(-1, size)
+        after = self.step(moved, np.repeat(inputs, size, axis=0))
+        return after.imag.reshape(n, size, size).swapaxes(1, 2) / 1e-30
