@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from filterpy.kalman import MerweScaledSigmaPoints
 
 from dptse_env.estimators import (
     BACKENDS,
@@ -13,7 +12,6 @@ from dptse_env.estimators import (
     SigmaPointSettings,
 )
 from dptse_env.estimators.simple import estimated_traffic
-from dptse_env.estimators.ukf import UKF
 from dptse_env.model.parameters import VACUUM
 from tests.cases import pairwise
 
@@ -22,7 +20,6 @@ from .helpers import (
     RELEASES,
     RICH,
     SPEEDS,
-    model_of,
     recorded,
     run,
     simulate,
@@ -115,17 +112,6 @@ def test_the_ekfs_agree_over_a_recorded_episode_and_beat_walk_and_model(release)
         errors[name] = np.sqrt(np.mean(squares[60:]))
     assert errors["ekf"] < errors["random_walk"]
     assert errors["ekf"] < 0.7 * errors["open_loop"]
-
-
-def test_weights_of_the_ukf_are_the_papers():
-    points = UKF(model_of("paper", "speed"), 1, PLAIN)._points
-    peer = MerweScaledSigmaPoints(38, alpha=0.1, beta=2.0, kappa=-4.0)
-    assert peer.Wm[0] == pytest.approx(-110.765, abs=1e-3)
-    assert peer.Wc[0] == pytest.approx(-107.775, abs=1e-3)
-    assert points.weight == pytest.approx(peer.Wm[1], rel=1e-12)
-    assert points.weight == pytest.approx(1.4706, abs=1e-4)
-    # Sum d d' of all weights, written around the first point instead of the mean.
-    assert points.surplus == pytest.approx(peer.Wc[0] - peer.Wm[0] - 1.0, rel=1e-12)
 
 
 # Beside a Kalman filter in plain numpy ------------------------------------------------------------
