@@ -52,7 +52,7 @@ test-tutorial: setup  ## Run the tutorial as a notebook, two to four minutes.
 	$(BIN)/python -m pytest tests/docs/test_notebook.py
 
 test-slow: setup  ## Run the slow tests: before a release, and after a change to kernels, workers or benchmarks.
-	$(BIN)/python -m pytest -m slow
+	$(BIN)/python -m pytest -m 'slow and not ray' -n 2 --dist loadfile
 
 test-gymnasium: setup  ## Run the tests of environments with the oldest Gymnasium, which RLlib needs.
 	$(BIN)/python -m pip install --quiet --no-deps --upgrade --target build/gymnasium gymnasium==1.2.2
@@ -81,10 +81,9 @@ format: setup  ## Format the code.
 	$(BIN)/ruff check --fix
 	$(BIN)/ruff format
 
-benchmark: setup  ## Time the estimators and thousands of episodes beside their peers; results/throughput.
+benchmark: setup  ## Time estimators, environments and long roads beside their peers; results/benchmarks.
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[benchmark]'
-	$(BIN)/python benchmarks/bench_estimators.py
-	$(BIN)/python benchmarks/bench_throughput.py
+	$(BIN)/python -m benchmarks --output results/benchmarks/tables.md
 
 dist: setup  ## Build and check the archives of a release; dist/.
 	$(BIN)/python -m build --outdir dist

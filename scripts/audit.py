@@ -17,7 +17,7 @@ from agents.audit.planner import TARGET_KINDS, choose_target, make_planner, make
 from agents.audit.report import Finding
 from agents.audit.statistics import Claim, audit
 from agents.audit.strategies import STRATEGIES
-from agents.environments import make_config
+from agents.environments import make_config, parse_env
 from agents.files import refuse_to_replace
 from agents.play import Cell
 from dptse_env.config import EnvConfig
@@ -25,11 +25,11 @@ from dptse_env.parts import privacy_report
 from dptse_env.privacy import mu_of
 from dptse_env.release import PrivacyReport
 from dptse_env.utils.fields import inside, integer, positive, require
-from scripts.cli import Machines, Road, run
+from scripts.cli import Environment, Machines
 
 
 @dataclass(frozen=True)
-class Args(Road, Machines):
+class Args(Environment, Machines):
     """Audit the privacy of an environment."""
 
     env: str = "dptse_env:dptse/PrivateHighway-v1"
@@ -97,7 +97,7 @@ def attacked_config(args: Args) -> EnvConfig:
         ValueError: A setting of the release model is given twice, another value is bad, or the
             estimator does not suit the road.
     """
-    keywords = args.given_keywords()
+    env, keywords = parse_env(args.env)
     privacy = {name: getattr(args, name) for name in PRIVACY} | {"preset": args.privacy}
     privacy = {name: value for name, value in privacy.items() if value is not None}
     if privacy:
@@ -110,8 +110,8 @@ def attacked_config(args: Args) -> EnvConfig:
     for name in ("bandwidth", "estimator"):
         if getattr(args, name) is not None:
             keywords[name] = getattr(args, name)
-    Cell(args.env, "none", keywords).check()
-    return make_config(args.env, keywords)
+    Cell(env, "none", keywords).check()
+    return make_config(env, keywords)
 
 
 def make_claim(report: PrivacyReport) -> Claim:
@@ -141,7 +141,7 @@ def make_title(args: Args, config: EnvConfig) -> str:
     """Return the environment and its claim in words."""
     privacy = config.privacy
     claim = f"({privacy.epsilon:g}, {privacy.delta:g})"
-    return f"{args.env.rpartition('/')[2]}, preset {privacy.preset} at {claim}"
+    return f"{parse_env(args.env)[0].rpartition('/')[2]}, preset {privacy.preset} at {claim}"
 
 
 def run_audit(args: Args, config: EnvConfig) -> Finding:
@@ -197,7 +197,3 @@ def main(args: Args) -> None:
         return
     finding.print()
     print(f"the result is in {path}")
-
-
-if __name__ == "__main__":
-    run(main, Args, __doc__)

@@ -13,7 +13,7 @@ from dptse_env.estimators import (
 )
 from dptse_env.estimators.simple import estimated_traffic
 from dptse_env.model.parameters import VACUUM
-from tests.cases import pairwise
+from tests.helpers import pairwise
 
 from .helpers import (
     PLAIN,

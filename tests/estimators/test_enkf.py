@@ -12,8 +12,8 @@ from dptse_env.estimators import (
 from dptse_env.estimators.enkf import gaspari_cohn, make_tapers, positions
 from dptse_env.model import ARZModel, MeasurementRows
 from dptse_env.traffic import PAPER_HIGHWAY, SHORT_HIGHWAY
-from tests.cases import pairwise
-from tests.model.roads import W99
+from tests.helpers import pairwise
+from tests.model.oracle import W99
 
 from .helpers import RELEASES, RICH, run, simulate, started, step, update
 

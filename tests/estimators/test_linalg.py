@@ -6,7 +6,8 @@ import pytest
 from dptse_env.estimators import linalg
 from dptse_env.model import ARZModel
 from dptse_env.traffic import PAPER_HIGHWAY
-from tests.model.roads import PAPER, compiled
+from tests.helpers import compiled
+from tests.model.oracle import PAPER
 
 add_product, factor, forward, is_covariance, mirror, move, move_back = (
     compiled(getattr(linalg, part))

@@ -16,8 +16,8 @@ from dptse_env.estimators import (
     make_estimator,
 )
 from dptse_env.model import ARZModel
-from tests.cases import pairwise
-from tests.model.roads import PAPER, Road
+from tests.helpers import Road, pairwise
+from tests.model.oracle import PAPER
 
 from .helpers import random_streams
 

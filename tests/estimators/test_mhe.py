@@ -17,8 +17,7 @@ from dptse_env.estimators.mhe import (
 )
 from dptse_env.estimators.mhe import update as solve_and_update
 from dptse_env.estimators.window import ACTIVE_SET, NEWTON, UNSOLVED
-from tests.cases import fast_and_slow, pairwise
-from tests.model.roads import UNEVEN
+from tests.helpers import UNEVEN, fast_and_slow, pairwise
 
 from .helpers import PLAIN, RICH, random_streams, recorded, run, simulate, started, step, update
 

@@ -18,8 +18,8 @@ from dptse_env.estimators import (
     make_estimator,
 )
 from dptse_env.model import ARZModel
-from tests.cases import fast_and_slow
-from tests.model.roads import PAPER, Road
+from tests.helpers import Road, fast_and_slow
+from tests.model.oracle import PAPER
 
 from .helpers import (
     EVERY,

@@ -10,7 +10,7 @@ from dptse_env.estimators import with_demand
 from dptse_env.estimators.linalg import padded
 from dptse_env.estimators.mhe import natural_residual, solve
 from dptse_env.estimators.window import ACTIVE_SET, NEWTON, REFINED, Point, Window
-from tests.model.roads import UNEVEN, compiled
+from tests.helpers import UNEVEN, compiled
 
 from .helpers import RICH, model_of
 

@@ -14,7 +14,7 @@ from dptse_env.model.calibration import (
     starting_parameters,
 )
 
-from .roads import HIGHWAY, PAPER
+from .oracle import HIGHWAY, PAPER
 
 TRUTH = replace(PAPER, name="truth", free_flow_speed=110.0, gamma=1.2, relaxation_time=30.0)
 

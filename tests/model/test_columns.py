@@ -11,16 +11,14 @@ from dptse_env.model.columns import (
     project_states,
 )
 from dptse_env.model.step import project
-from tests.cases import pairwise
+from tests.helpers import UNEVEN, compiled, pairwise
 
-from .roads import (
+from .oracle import (
     HIGHWAY,
     PAPER,
     ROADS,
-    UNEVEN,
     W99,
     Oracle,
-    compiled,
     random_inputs,
     random_states,
     scattered_states,

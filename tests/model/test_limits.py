@@ -8,17 +8,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dptse_env.model import ARZModel
-from tests.cases import pairwise
+from tests.helpers import UNEVEN, Road, pairwise
 
-from .roads import (
+from .oracle import (
     HIGHWAY,
     NO_RELAXATION,
     PAPER,
     STRAIGHT,
-    UNEVEN,
     W99,
     Oracle,
-    Road,
     random_inputs,
     random_states,
 )

@@ -5,9 +5,9 @@ import pytest
 
 from dptse_env.model import ARZModel
 from dptse_env.model.parameters import MEASUREMENT_FLOOR
-from tests.cases import pairwise
+from tests.helpers import pairwise
 
-from .roads import HIGHWAY, PAPER, ROWS, W99, random_states
+from .oracle import HIGHWAY, PAPER, ROWS, W99, random_states
 
 both_sets = pytest.mark.parametrize("parameters", [PAPER, W99], ids=lambda p: p.name)
 

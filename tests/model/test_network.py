@@ -7,8 +7,9 @@ import pytest
 
 from dptse_env.model import MeasurementRows
 from dptse_env.model.network import DIVERGE, EXIT, LINK, MERGE, make_layout
+from tests.helpers import Road
 
-from .roads import HIGHWAY, ROWS, Road
+from .oracle import HIGHWAY, ROWS
 
 
 def test_the_papers_highway_has_the_orders_of_state_and_input():

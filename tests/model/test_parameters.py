@@ -11,8 +11,9 @@ from dptse_env.model.parameters import (
     read_parameters,
     write_parameters,
 )
+from tests.helpers import UNEVEN
 
-from .roads import HIGHWAY, PAPER, UNEVEN
+from .oracle import HIGHWAY, PAPER
 
 GOOD = {
     "name": "x",

@@ -10,19 +10,17 @@ from hypothesis import strategies as st
 
 from dptse_env.model import ARZModel, MeasurementRows
 from dptse_env.model.step import advance, make_scratch, write_row
-from tests.cases import pairwise
+from tests.helpers import UNEVEN, compiled, pairwise
 
-from .roads import (
+from .oracle import (
     HIGHWAY,
     NO_RELAXATION,
     PAPER,
     ROADS,
     ROWS,
     STRAIGHT,
-    UNEVEN,
     W99,
     Oracle,
-    compiled,
     random_inputs,
     random_states,
     scattered_states,

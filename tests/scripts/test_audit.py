@@ -7,7 +7,7 @@ import pytest
 from dptse_env.privacy import mu_of
 from dptse_env.traffic import SHORT_HIGHWAY, write_corridor
 from scripts.audit import Args, attacked_config, main
-from tests.cases import fast_and_slow
+from tests.helpers import fast_and_slow
 
 SHORT = "dptse_env:dptse/ShortHighway-v0"
 
@@ -121,16 +121,16 @@ def test_a_road_file_is_attacked(tmp_path):
     road = tmp_path / "mine.toml"
     write_corridor(road, replace(SHORT_HIGHWAY, name="mine", lanes=3), {"bandwidth": 3})
     with pytest.warns(UserWarning, match="parameters"):
-        config = attacked_config(Args(env=SHORT, corridor=str(road)))
+        config = attacked_config(Args(env=f'{SHORT} {{"corridor": "{road}"}}'))
     assert (config.corridor.name, config.corridor.lanes, config.bandwidth) == ("mine", 3, 3)
     assert config.privacy == attacked_config(Args(env=SHORT)).privacy
 
 
 def test_settings_of_the_release_are_given_once():
-    keywords = '{"privacy": {"epsilon": 2.0}}'
-    assert attacked_config(Args(env=SHORT, keywords=keywords)).privacy.epsilon == 2.0
+    env = f'{SHORT} {{"privacy": {{"epsilon": 2.0}}}}'
+    assert attacked_config(Args(env=env)).privacy.epsilon == 2.0
     with pytest.raises(ValueError, match=r"^privacy must be given once, .* got \{'cap': 3\}"):
-        attacked_config(Args(env=SHORT, keywords=keywords, cap=3))
+        attacked_config(Args(env=env, cap=3))
 
 
 def test_two_audits_agree(tmp_path):
