@@ -137,23 +137,27 @@ def test_joseph_form_makes_up_for_a_rounded_gain():
     covariance = np.eye(N, WIDTH)
     assert pair_update(covariance, 4, np.eye(2), noise, np.empty((4, WIDTH)))
     np.testing.assert_allclose(np.diag(covariance)[4:6], expected, rtol=1e-12)
+    covariance = np.eye(N, WIDTH)  # the second number of what the first has told precisely
+    assert pair_update(covariance, 4, np.ones((2, 1)), noise, np.empty((4, WIDTH)))
+    both = 1.0 / (1.0 + 1.0 / noise[0] + 1.0 / noise[1])
+    np.testing.assert_allclose(covariance[4, 4], both, rtol=1e-12)
     covariance = np.eye(N, WIDTH)
     for i, (r, left) in enumerate(zip(noise, expected, strict=True)):
         scalar_update(covariance, i, np.ones(1), r, np.empty(WIDTH), np.empty(WIDTH))
         np.testing.assert_allclose(covariance[i, i], left, rtol=1e-12)
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -1.0])
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -1.0, -1e-4])  # noise makes up for the last
 def test_what_is_no_variance_is_reported(bad):
     covariance = random_covariance(np.random.default_rng(3))
     covariance[4, 4] = bad
     assert not is_covariance(covariance, np.empty(WIDTH))
     assert not factor(covariance[:, :N].copy())
     before = covariance.copy()
-    total = scalar_update(before, 4, np.ones(2), 1e-3, np.empty(WIDTH), np.empty(WIDTH))
+    total = scalar_update(before, 4, np.ones(1), 1e-3, np.empty(WIDTH), np.empty(WIDTH))
     assert np.isnan(total)
     np.testing.assert_array_equal(before, covariance)
-    assert not pair_update(covariance, 4, np.ones((2, 2)), np.full(2, 1e-3), np.empty((4, WIDTH)))
+    assert not pair_update(covariance, 4, np.eye(2), np.full(2, 1e-3), np.empty((4, WIDTH)))
 
 
 def test_a_correlation_above_one_is_no_covariance():
