@@ -1,0 +1,92 @@
+import itertools
+import json
+import re
+
+import pytest
+
+from dptse_env.estimators import ESTIMATORS, EstimatorSettings, HorizonSettings
+from dptse_env.estimators.settings import (
+    available_settings,
+    load_settings,
+    read_settings,
+    settings_name,
+    tuned_estimator,
+    write_settings,
+)
+from dptse_env.model import available_parameters
+from dptse_env.release import RELEASE_MODELS
+from dptse_env.traffic import CORRIDORS
+
+GOOD = {
+    "estimator": "mhe",
+    "parameters": "paper",
+    "privacy": "corrected",
+    "settings": {"process_noise": [0.01, 0.02], "mhe": {"arrival_noise": [0.1, 0.2]}},
+    "provenance": {"source": "a test"},
+}
+ENTRY = {key: GOOD[key] for key in ("estimator", "settings", "provenance")}
+FILE = {"mhe-paper-corrected": ENTRY}
+
+
+def test_shipped_sets_are_named_after_what_they_are_for():
+    cells = itertools.product(ESTIMATORS, available_parameters(), RELEASE_MODELS)
+    names = {settings_name(*cell, v) for cell in cells for v in ("", "demand", *CORRIDORS)}
+    assert "ekf-w99-3lane-paper" in available_settings()
+    assert set(available_settings()) <= names
+    for name in available_settings():
+        assert load_settings(name) != EstimatorSettings()
+
+
+def test_an_unknown_set_names_those_there_are():
+    with pytest.raises(
+        ValueError, match=r"^estimator_settings must be one of .*ekf-paper-paper.*, got 'ekf'$"
+    ):
+        load_settings("ekf")
+
+
+def test_a_written_set_reads_back_over_the_defaults(tmp_path):
+    path = tmp_path / "x.json"
+    write_settings(path, **GOOD)
+    assert read_settings(path) == EstimatorSettings(
+        process_noise=(0.01, 0.02), mhe=HorizonSettings(arrival_noise=(0.1, 0.2))
+    )
+    assert json.loads(path.read_text()) == FILE
+    assert tuned_estimator(path) == "mhe"
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (
+            {"process_noise": [-1.0, 0.1]},
+            r"estimator_settings\.process_noise\[0\] must be a number in ",
+        ),
+        ({"mhe": {"horizons": 3}}, r"estimator_settings\.mhe\.horizons is unknown; allowed: "),
+    ],
+)
+def test_bad_settings_are_neither_written_nor_read(settings, message, tmp_path):
+    path = tmp_path / "x.json"
+    with pytest.raises(ValueError, match=rf"^{re.escape(str(path))}: {message}"):
+        write_settings(path, **{**GOOD, "settings": settings})
+    assert not path.exists()
+    path.write_text(json.dumps({"mhe-paper-corrected": {**ENTRY, "settings": settings}}))
+    with pytest.raises(ValueError, match=rf"^{re.escape(str(path))}: {message}"):
+        read_settings(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", " must be JSON: "),
+        ("[" * 100_000, " must be JSON: "),
+        ("[]", r" must be a mapping with one name of settings, got \[\]"),
+        (json.dumps({**FILE, "x": ENTRY}), " must be a mapping with one name of settings, got {"),
+        ('{"x": 1}', ": x must be a mapping with the keys estimator, settings, provenance, got 1"),
+        (json.dumps({"x": {**ENTRY, "settings": 1}}), ": x: settings must be of type dict, got 1"),
+    ],
+)
+def test_a_file_of_another_shape_is_refused_by_its_path(text, message, tmp_path):
+    path = tmp_path / "x.json"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=rf"^{re.escape(str(path))}{message}"):
+        read_settings(path)
