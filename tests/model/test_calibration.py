@@ -51,10 +51,11 @@ def test_the_true_model_predicts_without_error_and_a_wrong_one_errs_the_more_the
 
 
 def test_persistence_is_the_root_mean_square_of_the_change(data):
-    error = persistence_error(data[:1], 15, horizons=(20,), stride=1)
-    rho, v = data[0].density[:, :15], data[0].speed[:, :15]
-    assert error.density[0] == pytest.approx(np.sqrt(np.mean((rho[20:] - rho[:-20]) ** 2)))
-    assert error.speed[0] == pytest.approx(np.sqrt(np.mean((v[20:] - v[:-20]) ** 2)))
+    error = persistence_error(data, 15, horizons=(20,), stride=1)
+    for found, field in ((error.density, "density"), (error.speed, "speed")):
+        traffic = np.stack([getattr(series, field)[:, :15] for series in data])
+        change = traffic[:, 20:] - traffic[:, :-20]
+        assert found[0] == pytest.approx(np.sqrt(np.mean(change**2)))
 
 
 def test_empty_segments_have_no_speed_and_do_no_harm():
