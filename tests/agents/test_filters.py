@@ -18,7 +18,7 @@ from dptse_env.estimators.recurrent import read_network, write_network  # noqa: 
 from dptse_env.estimators.recurrent_kernels import LONGEST_AGE  # noqa: E402
 from dptse_env.evaluation import evaluate  # noqa: E402
 from tests.agents.elsewhere import Elsewhere  # noqa: E402
-from tests.estimators.networks import card  # noqa: E402
+from tests.estimators.helpers import card  # noqa: E402
 from tests.helpers import SHORT  # noqa: E402
 
 RANGES = ScenarioRanges(envs=(SHORT,), spans=((1,), (1, 2)))
