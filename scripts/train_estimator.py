@@ -108,7 +108,7 @@ def main(args: Args) -> None:
         for env in envs:
             args.library(make_config(*parse_env(env)).corridor, seeds)
     bar = Bar("update", ("error", "validation", "chi2"), plan.n_passes, unit="pass")
-    with watched(bar, args.output, True) as watchers:
+    with watched(bar, args.output) as watchers:
         FilterTraining(
             plan,
             args.output,
