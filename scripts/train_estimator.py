@@ -1,7 +1,7 @@
 r"""Train a recurrent network as an estimator in a folder, and go on there after an interruption.
 
 dptse train-estimator --env dptse_env:dptse/ShortHighway-v0 --traffic 0:4 --validation 1000:1001 \
-    --validation-env dptse_env:dptse/ShortHighway-v0 --rounds ekf:2:10 own:2:10 --output results/net
+    --validation-env dptse_env:dptse/ShortHighway-v0 --rounds ekf:2:4 own:2:4 --output results/net
 
 The folder gets network.safetensors, which the environment takes with the keywords that the command
 prints, progress.csv (the learning curve), plan.json (the settings) and checkpoint.pt. The same
