@@ -49,6 +49,8 @@ def test_a_seed_fixes_the_episodes_and_no_seed_goes_on():
     again = [env.reset(seed=5)[0], env.reset()[0], env.reset()[0]]
     assert_same(first, again)
     assert_same(play(env, 30, seed=5), play(env, 30, seed=5))
+    env.step(np.ones(6, dtype=np.int8))
+    assert_same(play(env, 5, seed=5), play(make_env(), 5, seed=5))  # nothing is left of an episode
     assert len({tuple(step[1] for step in play(env, 30, seed=s)[1:]) for s in range(5)}) == 5
 
 
