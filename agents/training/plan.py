@@ -243,7 +243,7 @@ def first_second(horizon: int) -> int:
 
 @dataclass(frozen=True)
 class PPOSettings(Algorithm):
-    """PPO (Schulman et al., 2017) of stable-baselines3 with a multi-layer perceptron."""
+    """PPO (Schulman et al., 2017) of stable-baselines3, whose defaults hold for the rest."""
 
     name: ClassVar[str] = "ppo"
     action: ClassVar[str] = "slots"
@@ -267,14 +267,8 @@ class PPOSettings(Algorithm):
     """Discount of one second; where a decision takes several actions, its root is that of one."""
     gae_lambda: Discount = 0.9
     """Parameter lambda of generalised advantage estimation, in the same way."""
-    clip_range: Positive = 0.2
-    """Range around 1 to which probability ratios are clipped."""
     ent_coef: NonNegative = 0.005
     """Weight of the entropy."""
-    vf_coef: NonNegative = 0.5
-    """Weight of the value's loss."""
-    max_grad_norm: Positive = 0.5
-    """Norm to which longer gradients are clipped."""
     hidden: tuple[Count, ...] = (64, 64)
     """Units of the hidden layers, in separate networks for actions and value."""
     validate_every: Count = 20

@@ -15,10 +15,11 @@ pytest.importorskip("sb3_contrib")
 import gymnasium as gym
 import torch
 
+from agents.environments import make_vector
 from agents.executors import THIS_PROCESS, ExecutorError, ThisProcess
 from agents.seeds import TRAINING_VALIDATION
 from agents.training.plan import ALGORITHMS
-from agents.training.run import BEST, POLICY
+from agents.training.run import BEST, POLICY, Run
 from agents.training.run_files import CHECKPOINT, PLAN, PROGRESS, read_checkpoint, read_progress
 from agents.training.training import train, train_all
 from dptse_env.evaluation import evaluate
@@ -201,6 +202,21 @@ def test_the_best_policy_is_the_best_in_validation(name, whole):
 
 def actions(plan):
     return plan.algorithm.name == "plackett-luce"
+
+
+def test_a_validation_is_seeded_and_leaves_the_draws_of_the_training_alone(whole, tmp_path):
+    plan = make_plan()
+    run = Run(plan, shutil.copytree(whole()[0], tmp_path / "run"), None, (), print)
+    policies, state = plan.algorithm.make_policies(plan.worlds), torch.get_rng_state()
+    row = run.validate(policies, 0)
+    assert torch.equal(torch.get_rng_state(), state)
+    torch.manual_seed(99)
+    assert run.validate(policies, 0) == row
+    env = make_vector(SHORT, 2, {**KEYWORDS, "action": "slots", "traffic_seeds": [1000, 1001]})
+    noise = TRAINING_VALIDATION.start
+    torch.manual_seed(noise)
+    rows = evaluate(env, policies[0], (1000, 1001), noise, deterministic=False)
+    assert row["validation_drawn"] == pytest.approx(-np.mean([each["reward"] for each in rows]))
 
 
 def test_several_environments_teach_one_network(whole):
