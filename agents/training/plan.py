@@ -216,24 +216,14 @@ class PlackettLuceSettings(Algorithm):
             self.make_policies(worlds)
         for world in worlds if self.swaps.rounds else ():
             queries, horizon = world.config.queries, world.config.horizon_steps
-            preset = world.config.privacy.preset
-            takes_noise, name = (
-                RELEASE_MODELS.find(preset).takes_noise,
-                RELEASE_MODELS.name_of(preset),
-            )
+            preset, n = world.config.privacy.preset, queries.n_options
             least = first_second(horizon) + 2 * self.swaps.seconds - 1
-            for path, is_met, allowed, value in (
-                ("privacy.preset", takes_noise, "one whose noise can be set", name),
-                (
-                    "bandwidth",
-                    queries.most_queries < queries.n_options,
-                    f"below {queries.n_options}",
-                    queries.bandwidth,
-                ),
-                ("horizon", horizon >= least, f"{least} s or more", horizon),
-            ):
-                wanted = f"{allowed} where algorithm.swaps.rounds is {self.swaps.rounds}"
-                require(is_met, path, wanted, value)
+            where = f"where algorithm.swaps.rounds is {self.swaps.rounds}"
+            name, model = RELEASE_MODELS.name_of(preset), RELEASE_MODELS.find(preset)
+            noise = f"one whose noise can be set {where}"
+            require(model.takes_noise, "privacy.preset", noise, name)
+            require(queries.most_queries < n, "bandwidth", f"below {n} {where}", queries.bandwidth)
+            require(horizon >= least, "horizon", f"{least} s or more {where}", horizon)
 
 
 def first_second(horizon: int) -> int:
