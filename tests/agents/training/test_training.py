@@ -4,6 +4,7 @@ import json
 import multiprocessing
 import shutil
 import signal
+import sys
 from concurrent.futures import Future
 from pathlib import Path
 
@@ -72,6 +73,7 @@ def killed(folder, update, **changes):
 
 
 @pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such signal for a process")
 @pytest.mark.parametrize(("update", "more"), [(0, ()), (1, ()), (2, ()), (2, (OTHER,))])
 def test_a_training_that_is_killed_goes_on_to_the_same_bits(update, more, whole, tmp_path):
     changes = {"envs": (ENV, *more)} if more else {}
