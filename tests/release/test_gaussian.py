@@ -243,18 +243,6 @@ def test_the_extremes_of_the_proof_are_met_and_no_more(share, cap):
     assert squared_distance(same, ALL) == found[0]
 
 
-@pytest.mark.parametrize(("unit", "counted"), [("trip", 3), ("horizon", T), ("event", 1)])
-def test_one_vehicle_more_costs_what_its_unit_says(unit, counted):
-    asked = CappedSettings(unit=unit, cap=3, adjacency="add_remove", share=0.3)
-    a, f = bounds(asked)
-    gone = np.full(T + 1, 2)
-    gone[4 if unit == "event" else slice(None)] = AWAY
-    other = record(gone[None], np.full((1, T + 1), LIMIT))
-    found = squared_distance(Worlds(stays(2, LIMIT), other).release(asked), ALL)
-    assert found == pytest.approx(counted * (a + f), rel=1e-12)
-    assert found == pytest.approx(mu_of(asked.epsilon, asked.delta) ** 2, rel=1e-9)
-
-
 def test_the_sensitivity_of_the_paper_is_exceeded():
     """By a vehicle that stands in view for 300 s, in density alone."""
     steps = 300
