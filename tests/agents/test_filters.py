@@ -212,6 +212,8 @@ def test_a_training_that_was_killed_comes_out_as_one_that_was_not(whole, tmp_pat
     """Wherever its scenarios are played."""
     assert whole.done == 4
     assert [row["round"] for row in whole.rows] == [1, 2, 2, 2]
+    played = read_network(str(whole.folder / "played.safetensors"))
+    assert played.card["training"]["passes"] == 1  # as it stood when the second round began
 
     def kill(row):
         if row["update"] == 3:
