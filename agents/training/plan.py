@@ -216,24 +216,14 @@ class PlackettLuceSettings(Algorithm):
             self.make_policies(worlds)
         for world in worlds if self.swaps.rounds else ():
             queries, horizon = world.config.queries, world.config.horizon_steps
-            preset = world.config.privacy.preset
-            takes_noise, name = (
-                RELEASE_MODELS.find(preset).takes_noise,
-                RELEASE_MODELS.name_of(preset),
-            )
+            preset, n = world.config.privacy.preset, queries.n_options
             least = first_second(horizon) + 2 * self.swaps.seconds - 1
-            for path, is_met, allowed, value in (
-                ("privacy.preset", takes_noise, "one whose noise can be set", name),
-                (
-                    "bandwidth",
-                    queries.most_queries < queries.n_options,
-                    f"below {queries.n_options}",
-                    queries.bandwidth,
-                ),
-                ("horizon", horizon >= least, f"{least} s or more", horizon),
-            ):
-                wanted = f"{allowed} where algorithm.swaps.rounds is {self.swaps.rounds}"
-                require(is_met, path, wanted, value)
+            where = f"where algorithm.swaps.rounds is {self.swaps.rounds}"
+            name, model = RELEASE_MODELS.name_of(preset), RELEASE_MODELS.find(preset)
+            noise = f"one whose noise can be set {where}"
+            require(model.takes_noise, "privacy.preset", noise, name)
+            require(queries.most_queries < n, "bandwidth", f"below {n} {where}", queries.bandwidth)
+            require(horizon >= least, "horizon", f"{least} s or more {where}", horizon)
 
 
 def first_second(horizon: int) -> int:
@@ -243,7 +233,7 @@ def first_second(horizon: int) -> int:
 
 @dataclass(frozen=True)
 class PPOSettings(Algorithm):
-    """PPO (Schulman et al., 2017) of stable-baselines3 with a multi-layer perceptron."""
+    """PPO (Schulman et al., 2017) of stable-baselines3, whose defaults hold for the rest."""
 
     name: ClassVar[str] = "ppo"
     action: ClassVar[str] = "slots"
@@ -267,14 +257,8 @@ class PPOSettings(Algorithm):
     """Discount of one second; where a decision takes several actions, its root is that of one."""
     gae_lambda: Discount = 0.9
     """Parameter lambda of generalised advantage estimation, in the same way."""
-    clip_range: Positive = 0.2
-    """Range around 1 to which probability ratios are clipped."""
     ent_coef: NonNegative = 0.005
     """Weight of the entropy."""
-    vf_coef: NonNegative = 0.5
-    """Weight of the value's loss."""
-    max_grad_norm: Positive = 0.5
-    """Norm to which longer gradients are clipped."""
     hidden: tuple[Count, ...] = (64, 64)
     """Units of the hidden layers, in separate networks for actions and value."""
     validate_every: Count = 20

@@ -72,21 +72,6 @@ class Swaps:
     gain: FloatArray
     spent: FloatArray
 
-    @classmethod
-    def from_parts(cls, parts: Sequence[Swaps]) -> Swaps:
-        """Return the swaps of all parts."""
-
-        def joined(name: str) -> AnyArray:
-            return np.concatenate([getattr(part, name) for part in parts])
-
-        first = np.cumsum([0] + [len(part.observations) for part in parts[:-1]])
-        return cls(
-            joined("observations"),
-            joined("error"),
-            np.concatenate([n + part.state for n, part in zip(first, parts, strict=True)]),
-            *(joined(name) for name in ("added", "dropped", "gain", "spent")),
-        )
-
 
 def try_swaps(
     policy: Policy,
@@ -117,15 +102,15 @@ def try_swaps(
     observation, _ = env.reset(seed=list(range(first_episode, first_episode + env.num_envs)))
     for _ in range(first):
         observation = env.advance(_drawn(policy, observation)).observation
-    parts: list[Swaps] = []
+    parts: list[tuple[AnyArray, ...]] = []
     for second in range(first, horizon - seconds + 1, seconds):
         before, shown, actions = env.process.fork(), observation, []
         for _ in range(seconds):
             actions.append(_drawn(policy, observation))
             observation = env.advance(actions[-1]).observation
-        parts.append(_tried(before, shown, actions, generator, settings.trials))
+        parts.append(_tried(before, shown, actions, generator, settings.trials, len(parts)))
         progress((second + seconds) / horizon)
-    return Swaps.from_parts(parts)
+    return Swaps(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
 def _drawn(policy: Policy, observation: Observation) -> Action:
@@ -139,8 +124,12 @@ def _tried(
     actions: Sequence[Action],
     generator: np.random.Generator,
     trials: int,
-) -> Swaps:
-    """Try swaps in the first of ``actions``, in every episode of ``before``."""
+    n_before: int,
+) -> tuple[AnyArray, ...]:
+    """Try swaps in the first of ``actions``, in every episode of ``before``.
+
+    Returns columns of `Swaps`; ``n_before`` times as many states came before.
+    """
     n, every = len(shown), np.arange(len(shown))
     columns = before.release.task.n_columns
     noise = generator.choice([-1.0, 1.0], size=(n, columns, 2))
@@ -156,9 +145,9 @@ def _tried(
         swapped_reward, swapped_spent = _replayed(before, [query, *actions[1:]], noise)
         dropped = actions[0][every, place]
         gain, increase = swapped_reward - reward, swapped_spent - spent
-        parts.append((every, added, dropped, gain, increase))
-    state, *columns_of_swaps = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return Swaps(shown, -reward / len(actions), state, *columns_of_swaps)
+        parts.append((n * n_before + every, added, dropped, gain, increase))
+    swaps = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return shown, -reward / len(actions), *swaps
 
 
 def _replayed(

@@ -4,6 +4,7 @@ import json
 import multiprocessing
 import shutil
 import signal
+import sys
 from concurrent.futures import Future
 from pathlib import Path
 
@@ -15,10 +16,11 @@ pytest.importorskip("sb3_contrib")
 import gymnasium as gym
 import torch
 
+from agents.environments import make_vector
 from agents.executors import THIS_PROCESS, ExecutorError, ThisProcess
 from agents.seeds import TRAINING_VALIDATION
 from agents.training.plan import ALGORITHMS
-from agents.training.run import BEST, POLICY
+from agents.training.run import BEST, POLICY, Run
 from agents.training.run_files import CHECKPOINT, PLAN, PROGRESS, read_checkpoint, read_progress
 from agents.training.training import train, train_all
 from dptse_env.evaluation import evaluate
@@ -35,7 +37,7 @@ from tests.agents.training.plans import (
     without_time,
 )
 from tests.helpers import SHORT, fast_and_slow
-from tests.test_non_interference import START, blind, make_private, public, same
+from tests.test_non_interference import blind, make_private, unlike
 
 KEYWORDS = {"horizon": 80, "privacy": "capped"}
 POLICIES = (POLICY, BEST)
@@ -71,6 +73,7 @@ def killed(folder, update, **changes):
 
 
 @pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such signal for a process")
 @pytest.mark.parametrize(("update", "more"), [(0, ()), (1, ()), (2, ()), (2, (OTHER,))])
 def test_a_training_that_is_killed_goes_on_to_the_same_bits(update, more, whole, tmp_path):
     changes = {"envs": (ENV, *more)} if more else {}
@@ -203,6 +206,21 @@ def actions(plan):
     return plan.algorithm.name == "plackett-luce"
 
 
+def test_a_validation_is_seeded_and_leaves_the_draws_of_the_training_alone(whole, tmp_path):
+    plan = make_plan()
+    run = Run(plan, shutil.copytree(whole()[0], tmp_path / "run"), None, (), print)
+    policies, state = plan.algorithm.make_policies(plan.worlds), torch.get_rng_state()
+    row = run.validate(policies, 0)
+    assert torch.equal(torch.get_rng_state(), state)
+    torch.manual_seed(99)
+    assert run.validate(policies, 0) == row
+    env = make_vector(SHORT, 2, {**KEYWORDS, "action": "slots", "traffic_seeds": [1000, 1001]})
+    noise = TRAINING_VALIDATION.start
+    torch.manual_seed(noise)
+    rows = evaluate(env, policies[0], (1000, 1001), noise, deterministic=False)
+    assert row["validation_drawn"] == pytest.approx(-np.mean([each["reward"] for each in rows]))
+
+
 def test_several_environments_teach_one_network(whole):
     folder, rows = whole(envs=(ENV, OTHER))
     regression, forks = 9 * (4 + 2), 1 + 2 * (1 + 2)
@@ -308,16 +326,16 @@ def private(request, tmp_path_factory):
     return plan.algorithm.action, folder / POLICY
 
 
-def transcript(env, traffic_seed, policy, deterministic):
-    options = {"traffic_seed": traffic_seed, "start": START}
-    observation, info = env.reset(seed=7, options=options)
-    torch.manual_seed(7)
-    seen, truncated = [{"observation": observation, **public(env, info)}], False
-    while not truncated:
-        action, _ = policy.predict(observation, deterministic=deterministic)
-        observation, _, _, truncated, info = env.step(action)
-        seen.append({"observation": observation, "action": action, **public(env, info)})
-    return seen
+class Acting:
+    """A policy whose draws begin alike in every episode."""
+
+    def __init__(self, act):
+        self.act = act
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        if state is None:
+            torch.manual_seed(7)
+        return self.act(observation), True
 
 
 @pytest.mark.parametrize("deterministic", [True, False])
@@ -325,21 +343,18 @@ def test_traffic_does_not_show_through_a_trained_policy(private, deterministic):
     action, path = private
     env = blind(make_private(action=action))
     policy = load_policy(path, env)
-    first, second = (transcript(env, seed, policy, deterministic) for seed in (0, 1))
-    assert same(first, second)
-    assert not np.array_equal(first[1]["observation"], first[-1]["observation"])
+    act = Acting(lambda observation: policy.predict(observation, deterministic=deterministic)[0])
+    assert not unlike(env, act)
 
 
-def test_a_policy_that_sees_the_truth_would_show(private):
-    action, path = private
+@pytest.mark.parametrize("action", ["slots", "sequential"])
+def test_a_policy_that_sees_the_truth_would_show(action):
     env = blind(make_private(action=action))
-    policy = load_policy(path, env)
-    interface = env.unwrapped.interface
+    process, interface = env.unwrapped.process, env.unwrapped.interface
 
-    def knowing(observation, deterministic):
-        density = env.unwrapped.process.truth(np.array([0]))[:, :15, 0]
-        crowded = density.argsort(axis=1).argsort(axis=1) >= 15 - interface.bandwidth
-        return interface.actions.encode(crowded, env.unwrapped.process.pending.picked)[0], None
+    def crowded(observation):
+        density = process.truth(np.array([0]))[:, :15, 0]
+        wanted = density.argsort(axis=1).argsort(axis=1) >= 15 - interface.bandwidth
+        return interface.actions.encode(wanted, process.pending.picked)[0]
 
-    policy.predict = knowing
-    assert not same(transcript(env, 0, policy, False), transcript(env, 1, policy, False))
+    assert unlike(env, Acting(crowded))
