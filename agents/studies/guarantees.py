@@ -40,7 +40,6 @@ from agents.tables import (
     METRICS,
     UnmeasuredError,
     cell,
-    compared_header,
     difference,
     error_label,
     format_interval,
@@ -307,7 +306,8 @@ def compared(ask: Ask, reference: str, lines: Mapping[str, tuple[Cell, Cell]], *
         for metric in METRICS:
             line += [ask(metric, own), "-" if own == base else ask(metric, own, base)]
         found.append([*line, *(ask(column, own) for column in more)])
-    return markdown(["", *compared_header(reference), *more], found)
+    header = chain.from_iterable((name, f"against {reference}") for name in ERRORS.values())
+    return markdown(["", *header, *more], found)
 
 
 def price_tables(ask: Ask) -> Iterator[str]:
