@@ -1,16 +1,17 @@
-"""Train a recurrent network as an estimator, in a folder.
+r"""Train a recurrent network as an estimator in a folder, and go on there after an interruption.
 
-python scripts/train_estimator.py --seed 0 --output results/filters/0
+dptse train-estimator --env dptse_env:dptse/ShortHighway-v0 --traffic 0:4 --validation 1000:1001 \
+    --validation-env dptse_env:dptse/ShortHighway-v0 --rounds ekf:2:4 own:2:4 --output results/net
 
-The folder gets plan.json, progress.csv (the learning curve), checkpoint.pt and the file of weights
-that ``estimator_settings={"recurrent": {"weights": "<folder>/network.safetensors"}}`` takes.
-After an interruption, or a kill, the same command continues from the last checkpoint to the same
-numbers; other arguments need another folder.
+The folder gets network.safetensors, which the environment takes with the keywords that the command
+prints, progress.csv (the learning curve), plan.json (the settings) and checkpoint.pt. The same
+command goes on from the last checkpoint to the same numbers.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import json
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -18,11 +19,11 @@ import torch
 from agents.environments import make_config, parse_env
 from agents.filters.plan import FilterPlan, Round
 from agents.filters.scenarios import ScenarioRanges
-from agents.filters.training import FilterTraining
+from agents.filters.training import WEIGHTS, FilterTraining
 from agents.training.run_files import check_plan
 from dptse_env.config import parse_seeds
 from dptse_env.estimators.recurrent import read_network
-from dptse_env.utils.fields import integer
+from dptse_env.utils.fields import from_mapping, integer
 from scripts.cli import Machines
 from scripts.training_bar import Bar, watched
 
@@ -31,39 +32,26 @@ from scripts.training_bar import Bar, watched
 class Args(Machines):
     """Train a recurrent network as an estimator."""
 
-    seed: int = 0
-    """Training seed."""
+    env: tuple[str, ...] = ()
+    """Environments to train on, each an id or 'id {keywords as JSON}', with privacy, bandwidth and
+    query policy drawn at random; eight roads if not given."""
     traffic: str = "0:96"
-    """Traffic seeds to train on, first:stop; training seeds only."""
-    validation: str = "1000:1016"
-    """Traffic seeds to validate on, first:stop; validation seeds only."""
-    validation_envs: tuple[str, ...] = FilterPlan.validation_envs
+    """Traffic seeds to train on, first:stop, of 0 to 999."""
+    validation_env: tuple[str, ...] = FilterPlan.validation_envs
     """Environments to validate in, with a round robin."""
-    width: int | None = None
-    """Width of the hidden state of a cell; that of the initial network, or 64, if not given."""
-    initial: str | None = None
-    """Network to begin with in place of random weights: the name of one that ships, such as
-    highway-flows, or a file. Rounds may then begin with 'own'."""
-    episodes: int | None = None
-    """Episodes of a scenario, each on another traffic seed, and of a batch; 32, or as many as there
-    are traffic seeds to train on, if not given."""
-    learning_rate: float = FilterPlan.learning_rate
-    """Learning rate at the beginning."""
-    likelihood: float = FilterPlan.likelihood
-    """Weight of the likelihood in the loss."""
+    validation: str = "1000:1016"
+    """Traffic seeds to validate on, first:stop, of 1000 to 1999."""
     rounds: tuple[str, ...] = ("ekf:72:200", "own:72:300", "own:72:400")
     """Rounds as estimator:scenarios:passes; 'own' is the network that is trained."""
-    ranges: ScenarioRanges = field(default_factory=ScenarioRanges)
-    """Ranges that scenarios are drawn from."""
-    checkpoint_every: int = 20
-    """Passes between two checkpoints, each with a validation."""
+    initial: str | None = None
+    """Network to begin with, a name such as highway-flows or a file; rounds may then all be own."""
+    plan: str = "{}"
+    """Further fields of the plan as JSON, such as '{"ranges": {"mechanisms": ["paced"]}}'; see
+    agents/filters/plan.py."""
+    seed: int = 0
+    """Training seed."""
     threads: int = 1
     """Threads of torch; numbers depend on it in the last digits."""
-    compiled: bool = False
-    """Compile the step, which takes a C++ compiler and makes passes some 1.6 times as fast; numbers
-    depend on it in the last digits."""
-    tensorboard: bool = True
-    """Write the learning curve for TensorBoard, too, where that is installed."""
     output: Path = Path("results/filters/0")
     """Folder of the training."""
 
@@ -86,28 +74,29 @@ def make_plan(args: Args) -> FilterPlan:
     Raises:
         ValueError: An argument is out of range.
     """
-    traffic, width = parse_seeds(args.traffic, "traffic"), args.width
-    if width is None:
-        network = read_network(args.initial).network if args.initial else None
-        width = FilterPlan.width if network is None else network.hidden.shape[0]
-    return FilterPlan(
+    traffic, width = parse_seeds(args.traffic, "traffic"), FilterPlan.width
+    if args.initial is not None:
+        width = read_network(args.initial).network.width
+    plan = FilterPlan(
         seed=args.seed,
         traffic_seeds=traffic,
         validation_seeds=parse_seeds(args.validation, "validation"),
-        validation_envs=args.validation_envs,
-        ranges=args.ranges,
+        validation_envs=args.validation_env,
+        ranges=ScenarioRanges(envs=args.env) if args.env else ScenarioRanges(),
         rounds=tuple(parse_round(each) for each in args.rounds),
         width=width,
         initial=args.initial,
-        episodes=min(FilterPlan.episodes, len(traffic)) if args.episodes is None else args.episodes,
-        learning_rate=args.learning_rate,
-        likelihood=args.likelihood,
-        checkpoint_every=args.checkpoint_every,
+        episodes=min(FilterPlan.episodes, len(traffic)),
     )
+    try:
+        further = json.loads(args.plan)
+    except json.JSONDecodeError as problem:
+        raise ValueError(f"plan must be a JSON object, got {args.plan!r}: {problem}") from None
+    return from_mapping(FilterPlan, further, "plan", plan)
 
 
 def main(args: Args) -> None:
-    """Record missing traffic, train, and leave the network."""
+    """Record missing traffic, train, and print the keywords that take the network."""
     plan = make_plan(args)
     torch.set_num_threads(integer("threads", args.threads, 1))
     plan.check()
@@ -119,15 +108,15 @@ def main(args: Args) -> None:
         for env in envs:
             args.library(make_config(*parse_env(env)).corridor, seeds)
     bar = Bar("update", ("error", "validation", "chi2"), plan.n_passes, unit="pass")
-    with watched(bar, args.output, args.tensorboard) as watchers:
-        training = FilterTraining(
+    with watched(bar, args.output) as watchers:
+        FilterTraining(
             plan,
             args.output,
             records=args.records,
             watchers=watchers,
             progress=bar.show,
-            compiled=args.compiled,
             executor=executor,
-        )
-        training.run()
-    print(f"the network is in {args.output / 'network.safetensors'}")
+        ).run()
+    settings = {"recurrent": {"weights": str(args.output / WEIGHTS)}}
+    print("as keywords of an environment:")
+    print(json.dumps({"estimator": "recurrent", "estimator_settings": settings}))

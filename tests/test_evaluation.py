@@ -52,6 +52,7 @@ class Learned:
         self.weights = np.random.default_rng(0).standard_normal(shape)
 
     def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        assert np.all(episode_start) == np.any(episode_start) == (state is None)
         batch, interface = np.atleast_2d(observation), self.interface
         before = 0.0 if state is None else np.where(episode_start[:, None], 0.0, 0.9 * state)
         state = before + np.tanh(batch @ self.weights)

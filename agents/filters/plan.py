@@ -1,23 +1,32 @@
-"""Plan of the training of a recurrent network: rounds of scenarios, and passes over them."""
+"""Plan of the training of a recurrent network: rounds of scenarios, and passes over them.
+
+The plan decides all numbers of a training, and says on the card of the network what it was.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import json
 import math
-import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from importlib.metadata import version
+from itertools import product
+from pathlib import Path
+from types import MappingProxyType
+from typing import Annotated, Any
 
 import numpy as np
 
-from agents.environments import parse_env
+from agents.environments import make_config, parse_env, quietly
 from agents.filters.scenarios import Scenario, ScenarioRanges
 from agents.play import Cell
 from agents.seeds import TUNING, require_seeds
 from dptse_env.config import TRAINING_SEEDS, VALIDATION_SEEDS
-from dptse_env.estimators.recurrent import read_network
-from dptse_env.utils.fields import inside, integer, positive, require
+from dptse_env.estimators.recurrent import FORMAT, read_network
+from dptse_env.estimators.recurrent_kernels import CHANNELS
+from dptse_env.parts import make_task
+from dptse_env.utils.fields import Interval, checked_fields, integer, require
 
 
 @dataclass(frozen=True)
@@ -33,17 +42,22 @@ class Round:
     """
 
     estimator: str
-    scenarios: int
-    passes: int
+    scenarios: Annotated[int, Interval(1, 10_000)]
+    passes: Annotated[int, Interval(1, 1_000_000)]
 
     def __post_init__(self) -> None:
         """Check values."""
-        integer("rounds.scenarios", self.scenarios, 1, 10_000)
-        integer("rounds.passes", self.passes, 1, 1_000_000)
+        checked_fields(self, "rounds")
 
 
 OWN = "own"
 """The network that is trained, as the estimator of a round."""
+
+
+def played_by(weights: Path) -> dict[str, Any]:
+    """Return the keywords of an environment whose estimator is a network, given as a file."""
+    settings = {"weights": str(weights.resolve()), "outside": True}
+    return {"estimator": "recurrent", "estimator_settings": {"recurrent": settings}}
 
 
 @dataclass(frozen=True)
@@ -72,7 +86,7 @@ class FilterPlan:
         ValueError: A value is out of range.
     """
 
-    seed: int
+    seed: Annotated[int, Interval(0, 2**31)]
     traffic_seeds: tuple[int, ...]
     validation_seeds: tuple[int, ...]
     validation_envs: tuple[str, ...] = (
@@ -86,52 +100,36 @@ class FilterPlan:
         Round(OWN, 72, 300),
         Round(OWN, 72, 400),
     )
-    width: int = 64
+    width: Annotated[int, Interval(1, 512)] = 64
     episodes: int = 32
-    window: int = 50
-    learning_rate: float = 4e-3
-    likelihood: float = 0.03
-    prediction: float = 0.3
-    clip_norm: float = 1.0
-    checkpoint_every: int = 20
+    window: Annotated[int, Interval(1, 10_000)] = 50
+    learning_rate: Annotated[float, Interval(0, 1, open_low=True)] = 4e-3
+    likelihood: Annotated[float, Interval(0, 1)] = 0.03
+    prediction: Annotated[float, Interval(0, 10)] = 0.3
+    clip_norm: Annotated[float, Interval(0, 1e6, open_low=True)] = 1.0
+    checkpoint_every: Annotated[int, Interval(1, 1_000_000)] = 20
     initial: str | None = None
 
     def __post_init__(self) -> None:
         """Check values."""
-        integer("seed", self.seed, 0, 2**31)
+        checked_fields(self, "")
         require_seeds("traffic", self.traffic_seeds, TRAINING_SEEDS)
         require_seeds("validation", self.validation_seeds, VALIDATION_SEEDS)
-        integer("width", self.width, 1, 512)
         integer("episodes", self.episodes, 1, len(self.traffic_seeds))
-        integer("window", self.window, 1, 10_000)
-        positive("learning_rate", self.learning_rate)
-        inside("likelihood", self.likelihood, 0.0, 1.0)
-        inside("prediction", self.prediction, 0.0, 10.0)
-        positive("clip_norm", self.clip_norm)
-        integer("checkpoint_every", self.checkpoint_every, 1)
         if not self.rounds or (self.initial is None and self.rounds[0].estimator == OWN):
             raise ValueError(
                 "rounds must begin with one of another estimator where no initial network is "
                 "given, since the network knows nothing yet"
             )
         if self.initial is not None:
-            width = read_network(self.initial).network.hidden.shape[0]
-            require(
-                self.width == width, "width", f"that of the initial network, {width}", self.width
-            )
+            width = read_network(self.initial).network.width
+            allowed = f"that of the initial network, {width}"
+            require(self.width == width, "width", allowed, self.width)
 
     @property
     def n_passes(self) -> int:
         """Number of passes of all rounds."""
         return sum(each.passes for each in self.rounds)
-
-    def round_of(self, done: int) -> int:
-        """Return the index of the round in which the pass after `done` passes lies."""
-        for index, each in enumerate(self.rounds):
-            if done < each.passes:
-                return index
-            done -= each.passes
-        raise ValueError(f"the plan has {self.n_passes} passes")
 
     def scenarios(self, index: int) -> list[Scenario]:
         """Return the scenarios of a round; the same ones whenever it is called."""
@@ -155,26 +153,42 @@ class FilterPlan:
             plain["initial_sha256"] = read_network(self.initial).card["sha256"]
         return plain
 
-    def validation_cells(self, weights: str | None = None) -> list[Cell]:
-        """Return the cells of a validation, of a network or else of the environments' estimators.
-
-        Args:
-            weights: File of the network.
-        """
-        own: dict[str, Any] = {}
-        if weights is not None:
-            settings = {"recurrent": {"weights": weights, "outside": True}}
-            own = {"estimator": "recurrent", "estimator_settings": settings}
+    def validation_cells(self, estimator: Mapping[str, Any] = MappingProxyType({})) -> list[Cell]:
+        """Return the cells of a validation, of the environments' estimators or of another one."""
+        options: dict[str, Any] = {"noise_seed": TUNING.start, "watchers": ("honesty",)}
         return [
-            Cell(
-                env,
-                "round-robin",
-                {**keywords, **own},
-                noise_seed=TUNING.start,
-                watchers=("honesty",),
-            )
+            Cell(env, "round-robin", {**keywords, **estimator}, **options)
             for env, keywords in map(parse_env, self.validation_envs)
         ]
+
+    def card(self, done: int, name: str) -> dict[str, Any]:
+        """Return the card of a network after `done` passes: what it was trained on."""
+        ranges = self.ranges
+        configs = [
+            make_config(env, {**keywords, "privacy": mechanism})
+            for env, keywords in map(parse_env, ranges.envs)
+            for mechanism in ranges.mechanisms
+        ]
+        roads = [config.corridor for config in configs]
+        found: dict[str, list[float]] = {
+            "n_mainline": [road.n_mainline for road in roads],
+            "segment_length": [length for road in roads for length in road.segment_lengths],
+            "speed_limit": [limit for road in roads for limit in road.speed_limits],
+            "lanes": [float(count) for road in roads for count in road.segment_lanes],
+            "span": [1.0, *(float(span) for spans in ranges.spans for span in spans)],
+            "flows": [float(make_task(config).releases_flow) for config in configs],
+        }
+        return {
+            "name": name,
+            "format": FORMAT,
+            "channels": list(CHANNELS),
+            "ranges": {key: [min(values), max(values)] for key, values in found.items()},
+            "training": {
+                "plan": self.settings(),
+                "passes": done,
+                "versions": {each: version(each) for each in ("dptse-env", "torch", "numpy")},
+            },
+        }
 
     def check(self) -> None:
         """Check environments, schedules and estimators without playing, recording or compiling.
@@ -183,16 +197,13 @@ class FilterPlan:
             ValueError: One is unknown, or does not suit a road.
         """
         estimators = [each.estimator for each in self.rounds if each.estimator != OWN]
-        with warnings.catch_warnings():
-            # They come again from the environments in which it trains.
-            warnings.simplefilter("ignore", UserWarning)
-            for text in self.ranges.envs:
-                env, keywords = parse_env(text)
-                for schedule in self.ranges.schedules:
-                    Cell(env, schedule, keywords).check()
-                for mechanism in self.ranges.mechanisms:
-                    for estimator in estimators:
-                        chosen = {"privacy": mechanism, "estimator": estimator}
-                        Cell(env, "none", {**keywords, **chosen}).check()
-            for cell in self.validation_cells():
+        cells = self.validation_cells()
+        for env, keywords in map(parse_env, self.ranges.envs):
+            cells += [Cell(env, schedule, keywords) for schedule in self.ranges.schedules]
+            cells += [
+                Cell(env, "none", {**keywords, "privacy": mechanism, "estimator": estimator})
+                for mechanism, estimator in product(self.ranges.mechanisms, estimators)
+            ]
+        with quietly():
+            for cell in cells:
                 cell.check()

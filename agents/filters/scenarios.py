@@ -1,7 +1,11 @@
-"""Scenarios to learn an estimator from: environments, query policies and seeds, drawn at random."""
+"""Scenarios to learn an estimator from: environments, query policies and seeds, drawn at random.
+
+A training takes its scenarios from `ScenarioRanges.draw` alone: other roads are other ``envs``.
+"""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -9,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from agents.environments import make_config, parse_env
-from agents.filters.roads import ROADS
 from dptse_env.utils.fields import require
 
 MECHANISMS = ("capped", "paced", "paper", "corrected")
@@ -19,6 +22,58 @@ SCHEDULES = (
     "largest-variance", "largest-deviation",
 )  # fmt: skip
 """Query policies that scenarios draw from; the last three follow the estimator's own deviations."""
+
+
+_PRIVATE = "dptse_env:dptse/PrivateHighway-v1"
+
+
+def _road(**keywords: Any) -> str:
+    return f"{_PRIVATE} {json.dumps(keywords)}"
+
+
+def _other_road(n_mainline: int, lanes: int, flows: Any, at_ramps: Any, **fields: Any) -> str:
+    return _road(
+        corridor={
+            "n_mainline": n_mainline,
+            "lanes": lanes,
+            "average_dwell": 10.0,
+            "demand": {"base": {"mainline": flows, "on_ramps": at_ramps}},
+            "incident": {"segments": tuple(range(n_mainline - 1))},
+            **fields,
+        }
+    )
+
+
+ROADS = (
+    _PRIVATE,
+    "dptse_env:dptse/PaperHighway-v0",
+    "dptse_env:dptse/ShortHighway-v0",
+    _road(
+        demand={
+            "base": {
+                "mainline": ((0.0, 4500.0), (250.0, 3000.0), (450.0, 5500.0)),
+                "on_ramps": (500.0, 200.0),
+            }
+        }
+    ),
+    _road(
+        corridor={
+            "drivers": {"model": "IDM", "headway": 1.3, "speed_deviation": 0.1},
+            "average_dwell": 10.25,
+        }
+    ),
+    _road(corridor={"drivers": {"headway": 0.9, "speed_deviation": 0.15}, "average_dwell": 10.25}),
+    _other_road(
+        10, 2, ((0.0, 1500.0), (150.0, 3600.0), (500.0, 2000.0)), (400.0,),
+        on_ramps=(2,), off_ramps=(7,), exit_shares=(0.15,), fixed_sensors=(9, 11),
+    ),
+    _other_road(
+        20, 4, ((0.0, 3500.0), (150.0, 7600.0), (450.0, 4000.0)), (350.0, 350.0),
+        on_ramps=(4, 12), off_ramps=(8, 16), fixed_sensors=(19, 22, 23),
+    ),
+)  # fmt: skip
+"""The three roads of the package; the paper's with random incidents and another demand or
+other drivers; a road of 1 km with two lanes, and one of 2 km with four."""
 
 
 @dataclass(frozen=True)

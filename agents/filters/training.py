@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from agents.executors import THIS_PROCESS, AnyExecutor, run_in_order
-from agents.filters.batches import Batch, draw_batch
-from agents.filters.card import make_card
-from agents.filters.collecting import Collected, CollectTask, run_collect
-from agents.filters.plan import OWN, FilterPlan
-from agents.filters.torch_network import RecurrentNetwork, State, second_loss
+from agents.filters.collecting import Batch, Episodes, collect, draw_batch
+from agents.filters.network import RecurrentNetwork, second_loss
+from agents.filters.plan import OWN, FilterPlan, played_by
 from agents.play import play
 from agents.training.run_files import (
     Row,
@@ -26,12 +26,22 @@ from agents.training.run_files import (
     write_progress,
 )
 from dptse_env.estimators.recurrent import read_network, write_network
+from dptse_env.estimators.recurrent_kernels import LONGEST_AGE
 from dptse_env.traffic import Records
+from dptse_env.utils.arrays import FloatArray
 
 WEIGHTS, PLAYED = "network.safetensors", "played.safetensors"
 """The trained network, and the network that the scenarios of a round are collected with."""
 COLUMNS = ("update", "steps", "seconds", "round", "loss", "error", "rate", "validation", "chi2")
 Watcher = Callable[[Row], None]
+
+
+class State(NamedTuple):
+    """What is known after a second of k episodes."""
+
+    hidden: Tensor  # (k, S, H)
+    predicted: FloatArray  # of the next second, with deviations, (k, S, 4)
+    age: FloatArray  # seconds since the last measurement of each cell, (k, S)
 
 
 class FilterTraining:
@@ -57,7 +67,6 @@ class FilterTraining:
         records: Records = None,
         watchers: Sequence[Watcher] = (),
         progress: Callable[[str, float], None] = lambda stage, fraction: None,
-        compiled: bool = False,
         executor: AnyExecutor = THIS_PROCESS,
     ) -> None:
         """Take the folder and restore its state.
@@ -68,8 +77,6 @@ class FilterTraining:
             records: Library of records, or its folder; None for the user's cache.
             watchers: Receive every row of the learning curve, those read from the folder first.
             progress: Called with the name of a stage and the fraction of it that is done.
-            compiled: Whether torch compiles the step, which takes a C++ compiler and half a minute
-                and makes passes some 1.6 times as fast; the last digits of numbers depend on it.
             executor: Plays the scenarios.
 
         Raises:
@@ -85,7 +92,6 @@ class FilterTraining:
         self.network = RecurrentNetwork(plan.width)
         if plan.initial is not None:
             self.network.take(read_network(plan.initial).network)
-        self._step = torch.compile(self.network) if compiled else self.network
         self._optimiser = torch.optim.Adam(self.network.parameters(), plan.learning_rate)
         self.done, self._seconds = 0, 0.0
         self.rows: list[Row] = []
@@ -99,28 +105,25 @@ class FilterTraining:
 
     def run(self) -> None:
         """Train to the end of the plan, and leave the network beside the checkpoint."""
-        while self.done < self.plan.n_passes:
-            index = self.plan.round_of(self.done)
-            first = sum(each.passes for each in self.plan.rounds[:index])
+        last = 0
+        for index, each in enumerate(self.plan.rounds):
+            first, last = last, last + each.passes
             if self.done == first:
                 self._save(PLAYED)
-            collected = self._collect(index)
-            while self.done < first + self.plan.rounds[index].passes:
+            collected = self._collect(index) if self.done < last else []
+            while self.done < last:
                 self._pass(index, collected)
         self._save(WEIGHTS)
 
-    def _collect(self, index: int) -> list[Collected]:
-        estimator, network = self.plan.rounds[index].estimator, None
-        if estimator == OWN:
-            estimator, network = "recurrent", (self.folder / PLAYED).read_bytes()
-        tasks = [
-            CollectTask(scenario, estimator, network, self._records)
-            for scenario in self.plan.scenarios(index)
-        ]
+    def _collect(self, index: int) -> list[Episodes]:
+        name = self.plan.rounds[index].estimator
+        estimator = played_by(self.folder / PLAYED) if name == OWN else {"estimator": name}
+        work = partial(collect, estimator=estimator, records=self._records)
         on_done = partial(self._progress, f"round {index + 1}, collecting")
-        return run_in_order(self._executor, run_collect, tasks, on_done, progress=False)
+        scenarios = self.plan.scenarios(index)
+        return run_in_order(self._executor, work, scenarios, on_done, progress=False)
 
-    def _pass(self, index: int, collected: Sequence[Collected]) -> None:
+    def _pass(self, index: int, collected: Sequence[Episodes]) -> None:
         """Pass over some episodes, drawn from all scenarios on a road."""
         started = time.perf_counter()
         plan, rate = self.plan, self.plan.rate(self.done)
@@ -128,7 +131,8 @@ class FilterTraining:
             group["lr"] = rate
         rng = np.random.default_rng([plan.seed, 2**31, self.done])
         batch = draw_batch(rng, collected, plan.episodes)
-        state = self.network.begin(batch.start)
+        age = np.full(batch.start.shape[:2], LONGEST_AGE)
+        state = State(torch.zeros(*age.shape, plan.width), batch.start, age)
         losses, errors = [], []
         for first in range(0, len(batch.truth), plan.window):
             state, loss, error = self._window(batch, first, state)
@@ -151,15 +155,15 @@ class FilterTraining:
 
     def _window(self, batch: Batch, first: int, state: State) -> tuple[State, float, float]:
         """Update the weights by some seconds; return the state after them, loss and error."""
-        plan, road, last = self.plan, batch.road, len(batch.truth)
-        seconds = range(first, min(first + plan.window, last))
-        # A leaf with gradients, like what follows: the step is then compiled once, not twice.
-        state = state._replace(hidden=state.hidden.detach().requires_grad_())
-        kept = []
+        plan, network, road = self.plan, self.network, batch.road
+        seconds = range(first, min(first + plan.window, len(batch.truth)))
+        (hidden, predicted, age), kept = state, []
+        hidden = hidden.detach()
         for t in seconds:
-            state = self._step(road, batch.second(t), batch.outside[t], state)
-            kept.append(state.hidden)
-        present, ahead = self.network.read(road, torch.stack(kept))
+            hidden = network(road, batch.channels(t, predicted, age), hidden)
+            predicted = network.read(road, hidden.detach())[1].detach().numpy().astype(float)
+            kept.append(hidden)
+        present, ahead = network.read(road, torch.stack(kept))
         truth, after = (batch.truth[seconds.start + k : seconds.stop + k] for k in (0, 1))
         loss = second_loss(road, present, truth, plan.likelihood)
         error = float(second_loss(road, present.detach(), truth, 0.0))
@@ -168,22 +172,22 @@ class FilterTraining:
             loss = loss + plan.prediction * of_next
         self._optimiser.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
-        torch.nn.utils.clip_grad_norm_(self.network.parameters(), plan.clip_norm)
+        torch.nn.utils.clip_grad_norm_(network.parameters(), plan.clip_norm)
         self._optimiser.step()
-        return state, float(loss.detach()), error
+        return State(hidden, predicted, age), float(loss.detach()), error
 
     def _validate(self) -> Row:
         self._save(WEIGHTS)
-        plan, cells = self.plan, self.plan.validation_cells(str(self.folder / WEIGHTS))
-        played = [play(cell, plan.validation_seeds, self._records, threads=None) for cell in cells]
-        rows = [row for each in played for row in each]
+        seeds, rows = self.plan.validation_seeds, list[Mapping[str, Any]]()
+        for cell in self.plan.validation_cells(played_by(self.folder / WEIGHTS)):
+            rows += play(cell, seeds, self._records, threads=None)
         return {
             "validation": -float(np.mean([row["reward"] for row in rows])),
             "chi2": float(np.mean([row["chi2_density"] for row in rows])),
         }
 
     def _save(self, name: str) -> None:
-        card = make_card(self.plan, self.done, self.folder.name)
+        card = self.plan.card(self.done, self.folder.name)
         write_network(self.folder / name, self.network.weights(), card)
 
     def _keep(self) -> None:

@@ -1,15 +1,16 @@
-"""Search space of the settings of each estimator."""
+"""Search space of each estimator: paths into `EstimatorSettings`, and where values are searched."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from functools import reduce
-from typing import Any
+from typing import Any, Literal, get_args
 
 from optuna.distributions import CategoricalDistribution, FloatDistribution
 
 from dptse_env.estimators import DemandSettings, EstimatorSettings
+from dptse_env.utils.fields import require_name
 
 Knob = FloatDistribution | CategoricalDistribution
 """The values that the search can give a setting."""
@@ -20,69 +21,16 @@ def evenly(low: float, high: float) -> FloatDistribution:
     return FloatDistribution(low, high, log=True)
 
 
-def holds(knob: Knob, value: Any) -> bool:
-    """Return true if the search can reach ``value``."""
-    if isinstance(knob, CategoricalDistribution):
-        return value in knob.choices
-    return bool(knob.low <= value <= knob.high)
-
-
-def at_bound(knob: Knob, value: Any) -> bool:
-    """Return true if ``value`` lies within a fiftieth of a range of one of its ends."""
-    if isinstance(knob, CategoricalDistribution):
-        return False
-    scale = math.log if knob.log else float
-    share = (scale(value) - scale(knob.low)) / (scale(knob.high) - scale(knob.low))
-    return not 0.02 < share < 0.98
-
-
-def rounded(value: Any) -> Any:
-    """Return a suggested value, numbers rounded to four digits."""
-    return float(f"{value:.4g}") if isinstance(value, float) else value
-
-
-_PROCESS_NOISE: Mapping[str, Knob] = {
+_PROCESS_NOISE: dict[str, Knob] = {
     "process_noise.0": evenly(1e-3, 5e-2),
     "process_noise.1": evenly(1e-3, 5e-2),
 }
-
-_WALK_NOISE: Mapping[str, Knob] = {
+_WALK_NOISE: dict[str, Knob] = {
     "walk_noise.0": evenly(1e-3, 0.1),
     "walk_noise.1": evenly(1e-3, 0.1),
 }
 
-# Demand states explain what constant process noise stands for otherwise, so that its best values
-# are smaller.
-DEMAND: Mapping[str, Knob] = {
-    "process_noise.0": evenly(1e-4, 5e-2),
-    "process_noise.1": evenly(1e-5, 5e-2),
-    "density_growth": evenly(1e-4, 0.1),
-    "count_noise": evenly(3e-3, 3.0),
-    "demand.deviation": evenly(0.02, 0.6),
-    "demand.walk": evenly(1e-3, 0.3),
-}
-"""Settings that are searched where demand states are."""
-
-DEMAND_START = EstimatorSettings(
-    process_noise=(0.0061, 0.001),
-    density_growth=0.0115,
-    count_noise=0.09,
-    noise_scale=(1.0, 1.2),
-    demand=DemandSettings(),
-)
-"""The settings with demand states from which a search begins."""
-
-# Q and R times one factor leave the estimates of all but the UKF as they are, and there alpha does
-# what the factor would: R is known from the mechanism, so it stays and Q is searched. What may be
-# searched is the weight of flows or speeds beside densities.
-NOISE_SCALE: Mapping[str, Knob] = {
-    "noise_scale.0": CategoricalDistribution((1.0,)),
-    "noise_scale.1": evenly(0.5, 5.0),
-}
-
-SPEED_CAP: Mapping[str, Knob] = {"speed_cap": CategoricalDistribution((None, 0.95, 1.0, 1.05))}
-
-SPACE: dict[str, Mapping[str, Knob]] = {
+SPACE: dict[str, dict[str, Knob]] = {
     "ekf": _PROCESS_NOISE,
     "ukf": {**_PROCESS_NOISE, "ukf.alpha": evenly(0.1, 1.0)},
     "enkf": {
@@ -105,58 +53,89 @@ SPACE: dict[str, Mapping[str, Knob]] = {
         "blend.speed_weight": FloatDistribution(0.0, 1.0),
     },
 }
-"""By estimator: paths into `EstimatorSettings` and where their values are searched."""
+"""By estimator."""
 
+Extra = Literal["noise-scale", "demand", "speed-cap"]
 
-NOT_TUNED = {
-    "open_loop": "it takes no measurements and follows the model alone",
-    "recurrent": "its weights are trained by scripts/train_estimator.py",
+EXTRAS: dict[Extra, dict[str, Knob]] = {
+    # Q and R times one factor leave the estimates of all but the UKF as they are, and there alpha
+    # does what the factor would: R is known from the mechanism, so it stays and Q is searched. What
+    # may be searched is the weight of flows or speeds beside densities.
+    "noise-scale": {
+        "noise_scale.0": CategoricalDistribution((1.0,)),
+        "noise_scale.1": evenly(0.5, 5.0),
+    },
+    # Demand states explain what constant process noise stands for otherwise, so that its best
+    # values are smaller.
+    "demand": {
+        "process_noise.0": evenly(1e-4, 5e-2),
+        "process_noise.1": evenly(1e-5, 5e-2),
+        "density_growth": evenly(1e-4, 0.1),
+        "count_noise": evenly(3e-3, 3.0),
+        "demand.deviation": evenly(0.02, 0.6),
+        "demand.walk": evenly(1e-3, 0.3),
+    },
+    "speed-cap": {"speed_cap": CategoricalDistribution((None, 0.95, 1.0, 1.05))},
 }
-"""Estimators that have nothing to tune, with the reason."""
+"""Settings of every estimator that are searched where that is asked for."""
+
+DEMAND_START = EstimatorSettings(
+    process_noise=(0.0061, 0.001),
+    density_growth=0.0115,
+    count_noise=0.09,
+    noise_scale=(1.0, 1.2),
+    demand=DemandSettings(),
+)
+"""The settings with demand states from which a search begins."""
 
 
-def search_space(
-    estimator: str,
-    with_noise_scale: bool = False,
-    with_demand: bool = False,
-    with_speed_cap: bool = False,
-) -> dict[str, Knob]:
-    """Return the search space of an estimator.
+def search_space(estimator: str, extras: Collection[Extra] = ()) -> dict[str, Knob]:
+    """Return the search space of an estimator, by path into `EstimatorSettings`.
 
     Args:
-        estimator: Its name.
-        with_noise_scale: Whether to search the scale of the noise of flows or speeds.
-        with_demand: Whether to search demand states and the noise that goes with them.
-        with_speed_cap: Whether to search the cap of reported speeds.
+        estimator: A name in `SPACE`.
+        extras: Names in `EXTRAS`.
 
     Raises:
-        ValueError: There is nothing to tune, no such estimator, or it has no demand states.
+        ValueError: A name is unknown, there is nothing to tune, or the estimator has no demand
+            states.
     """
-    if estimator in NOT_TUNED:
-        raise ValueError(
-            f"estimator {estimator!r} has nothing to tune: {NOT_TUNED[estimator]}; tunable are "
-            f"{', '.join(SPACE)}"
-        )
-    if estimator not in SPACE:
-        raise ValueError(f"estimator must be one of {', '.join(SPACE)}, got {estimator!r}")
-    if with_demand and estimator == "random_walk":
-        raise ValueError("demand must be left out for 'random_walk', which has no traffic model")
-    return {
-        **SPACE[estimator],
-        **(NOISE_SCALE if with_noise_scale else {}),
-        **(DEMAND if with_demand else {}),
-        **(SPEED_CAP if with_speed_cap else {}),
-    }
+    require_name("estimators", estimator, SPACE)
+    for name in extras:
+        require_name("also", name, get_args(Extra))
+    if "demand" in extras and estimator == "random_walk":
+        raise ValueError("also must leave out demand for 'random_walk', which has no traffic model")
+    space = dict(SPACE[estimator])
+    for name, knobs in EXTRAS.items():
+        space |= knobs if name in extras else {}
+    return space
+
+
+def holds(knob: Knob, value: Any) -> bool:
+    """Return true if the search can reach ``value``."""
+    if isinstance(knob, CategoricalDistribution):
+        return value in knob.choices
+    return bool(knob.low <= value <= knob.high)
+
+
+def at_bound(knob: Knob, value: Any) -> bool:
+    """Return true if ``value`` lies within a fiftieth of a range of one of its ends."""
+    if isinstance(knob, CategoricalDistribution):
+        return False
+    scale = math.log if knob.log else float
+    share = (scale(value) - scale(knob.low)) / (scale(knob.high) - scale(knob.low))
+    return not 0.02 < share < 0.98
 
 
 def nested(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return values by path as a mapping for `EstimatorSettings`.
+    """Return values by path as a mapping for `EstimatorSettings`, numbers rounded to four digits.
 
-    Both items of a pair must be there: ``{"process_noise.0": 1, "process_noise.1": 2}`` becomes
-    ``{"process_noise": [1, 2]}``.
+    Both items of a pair must be there: ``{"process_noise.0": 1.0, "process_noise.1": 2.0}`` becomes
+    ``{"process_noise": [1.0, 2.0]}``.
     """
     settings: dict[str, Any] = {}
-    for path, value in values.items():
+    for path, given in values.items():
+        value = float(f"{given:.4g}") if isinstance(given, float) else given
         *parents, name = path.split(".")
         is_item = name.isdecimal()
         if is_item:

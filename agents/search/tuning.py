@@ -1,311 +1,322 @@
-"""Tune an estimator's settings on training traffic with Optuna, in a journal that can be resumed.
+"""Tune an estimator's settings on training traffic by Optuna, in a journal that several may share.
 
-One process proposes trials and writes the journal; episodes run on an executor.
+The score is the mean reward of a second after the warm-up, as the environment gives it. Trials are
+Optuna's own, in its journal; one that was interrupted stays there as running, and does not count.
+
+With one worker, the same seed gives the same trials, however often the search was interrupted.
+With several, each proposes by what has ended when it asks: the first trials, the defaults and those
+drawn at random, are the same ones, and later ones depend on the order in which trials end.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import logging
 import math
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, wait
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
 from datetime import date
+from functools import cached_property, partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import optuna
-from filelock import FileLock, Timeout
+from optuna.pruners import MedianPruner
+from optuna.samplers import TPESampler
 from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock, JournalStorage
 from optuna.trial import FrozenTrial, TrialState
 
-from agents.executors import AnyExecutor
+from agents.environments import make_config, parse_env, quietly
+from agents.executors import AnyExecutor, run_shown
 from agents.files import first_difference
-from agents.search.space import DEMAND_START, at_bound, holds, nested, rounded, values_of
-from agents.search.tuning_task import TuningTask, score_episodes
+from agents.play import Cell, play
+from agents.search.space import (
+    DEMAND_START,
+    Extra,
+    Knob,
+    at_bound,
+    holds,
+    nested,
+    search_space,
+    values_of,
+)
+from agents.seeds import TUNING, require_seeds
+from dptse_env.config import TRAINING_SEEDS, EnvConfig, parse_seeds
 from dptse_env.estimators import EstimatorSettings
-from dptse_env.estimators.settings import write_settings
+from dptse_env.estimators.settings import settings_name, write_settings
 from dptse_env.evaluation import Row
-from dptse_env.utils.fields import from_mapping
+from dptse_env.traffic import Records
+from dptse_env.utils.fields import from_mapping, require
 from dptse_env.utils.files import replacing
-
-_FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
-_COUNTED = (*_FINISHED, TrialState.RUNNING)
 
 logger = logging.getLogger(__name__)
 
-Score = Callable[[TuningTask, EstimatorSettings, Sequence[int]], list[Row]]
-"""Plays settings on traffic seeds; a function of a module, so that workers can import it."""
+FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
+"""States of trials that ran to their end, or were stopped early."""
 
 BATCH = 8
-"""Episodes that run at once; a trial may stop early after each batch."""
+"""Episodes that are played at once; a trial may stop early after each batch."""
 
 
-@dataclass
-class _Running:
-    """A trial under way over the traffic seeds."""
-
-    trial: optuna.Trial
-    settings: EstimatorSettings
-    rows: list[Row] = field(default_factory=list)
-
-
-class TuningStudy:
-    """The trials of one task, kept in ``<folder>/<name>.journal``.
-
-    The first trials are the defaults and the set that the environment takes by default; both run
-    to the end. Later trials stop early once they fall behind the median.
+@dataclass(frozen=True)
+class Search:
+    """What one set of settings is tuned for.
 
     Attributes:
-        task: The task.
-        study: Optuna's study; its values are mean rewards, to be maximised.
+        env: The environment, an id or an id and keywords as JSON (`agents.environments.parse_env`).
+        estimator: Name of the estimator.
+        seeds: Traffic seeds, ``"first:stop"``, within `TRAINING_SEEDS`.
+        schedule: Query schedule, or a saved policy: its ``.safetensors`` file or shipped name.
+        also: Further settings to search, names in `agents.search.space.EXTRAS`.
+        variant: Ending of the set's name; empty for one that is the default of its privacy preset.
+        seed: Seeds the proposals.
+        records: Library of records, or its folder; None for the user's cache.
     """
 
-    def __init__(
-        self, task: TuningTask, folder: Path, seed: int = 0, score: Score = score_episodes
-    ) -> None:
-        """Begin or go on; use `locked_study`, which keeps other processes out."""
-        self.task, self.seed, self._score = task, seed, score
-        self.space = task.space
-        self.path = journal_path(task, folder)
-        backend = JournalFileBackend(str(self.path), JournalFileOpenLock(str(self.path)))
-        self.study = optuna.create_study(
-            storage=JournalStorage(backend),
-            study_name=task.name,
-            direction="maximize",
-            pruner=optuna.pruners.MedianPruner(n_startup_trials=8, n_warmup_steps=1),
-            load_if_exists=True,
-        )
-        self._identify({**task.identity(), "sampler_seed": seed, "batch": BATCH})
-        # No other process has the journal, so running trials belong to a run that was killed.
-        for trial in self.study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
-            self.study.tell(trial.number, state=TrialState.FAIL)
-        self._enqueue("defaults", DEMAND_START if task.with_demand else EstimatorSettings())
-        self._enqueue("shipped", task.config().settings())
+    env: str
+    estimator: str
+    seeds: str
+    schedule: str = "paper"
+    also: tuple[Extra, ...] = ()
+    variant: str = ""
+    seed: int = 0
+    records: Records = None
 
-    def _identify(self, identity: dict[str, Any]) -> None:
-        identity = json.loads(json.dumps(identity))
-        kept = self.study.user_attrs.get("identity")
-        if kept is None:
-            self.study.set_user_attr("identity", identity)
-            return
-        difference = first_difference(kept, identity)
-        if difference is not None:
-            raise ValueError(
-                f"{self.path} has the trials of another search: {difference}. Choose another "
-                "--output"
-            )
+    @property
+    def space(self) -> dict[str, Knob]:
+        """The search space, by path into the settings."""
+        return search_space(self.estimator, self.also)
 
-    def _enqueue(self, label: str, settings: EstimatorSettings) -> None:
-        """Queue a labelled trial, unless one with its label was run or waits."""
-        if self.task.with_demand and settings.demand is None:
-            return
-        values = values_of(settings, self.space)
-        states = (*_FINISHED, TrialState.WAITING)
-        for trial in self.study.get_trials(deepcopy=False, states=states):
-            if label == trial.user_attrs.get("label"):
-                return
-        if label == "shipped" and settings == EstimatorSettings():
-            return
-        if not all(holds(knob, values[path]) for path, knob in self.space.items()):
-            logger.warning("the %s settings lie outside of the search: %s", label, values)
-            return
-        self.study.enqueue_trial(values, user_attrs={"label": label})
+    @property
+    def traffic_seeds(self) -> tuple[int, ...]:
+        """The traffic seeds one by one."""
+        return parse_seeds(self.seeds)
 
-    def n_finished(self) -> int:
-        """Return the number of trials that ran to their end or were stopped early."""
-        return len(self.study.get_trials(deepcopy=False, states=_FINISHED))
+    @cached_property
+    def config(self) -> EnvConfig:
+        """Configuration of the environment, with the settings that it has without a search."""
+        cell = self.cell()
+        with quietly():
+            return make_config(cell.env, cell.all_keywords)
 
-    def labelled(self, label: str) -> FrozenTrial | None:
-        """Return the finished trial of the ``defaults`` or of the ``shipped`` set, if any."""
-        for trial in self.study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)):
-            if trial.user_attrs.get("label") == label:
-                return trial
-        return None
+    @property
+    def name(self) -> str:
+        """Name of the set."""
+        config = self.config
+        parameters, preset = config.arz_parameters.name, str(config.privacy.preset)
+        return settings_name(self.estimator, parameters, preset, self.variant)
 
-    def best(self) -> FrozenTrial | None:
-        """Return the best trial that ran to its end, if any."""
-        trials = self.study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
-        return max(trials, key=_value, default=None)
+    def cell(self, settings: EstimatorSettings | None = None) -> Cell:
+        """Return what a trial plays; with the environment's own settings if None."""
+        env, keywords = parse_env(self.env)
+        keywords["estimator"] = self.estimator
+        if settings is not None:
+            keywords["estimator_settings"] = dataclasses.asdict(settings)
+        return Cell(env, self.schedule, keywords, noise_seed=TUNING.start)
 
-    def run(
-        self,
-        n_trials: int,
-        executor: AnyExecutor,
-        n_parallel: int = 1,
-        on_trial: Callable[[], None] | None = None,
-    ) -> None:
-        """Run trials until ``n_trials`` are finished, those of earlier runs included.
-
-        With one trial at a time, a study that was interrupted comes out as one that was not.
-        ``on_trial`` is called after every finished trial.
-        """
-        running: dict[Future[list[Row]], _Running] = {}
-        try:
-            while True:
-                while len(running) < n_parallel and self._n_counted() < n_trials:
-                    self._submit(self._propose(), executor, running)
-                if not running:
-                    return
-                for future in wait(running, return_when=FIRST_COMPLETED).done:
-                    trial = running[future]
-                    trial.rows.extend(future.result())
-                    finished = self._tell(trial)
-                    del running[future]
-                    if not finished:
-                        self._submit(trial, executor, running)
-                    elif on_trial is not None:
-                        on_trial()
-        except BaseException:
-            executor.shutdown(cancel_futures=True)
-            for trial in running.values():
-                self.study.tell(trial.trial, state=TrialState.FAIL, skip_if_finished=True)
-            raise
-
-    def _n_counted(self) -> int:
-        return len(self.study.get_trials(deepcopy=False, states=_COUNTED))
-
-    def _propose(self) -> _Running:
-        # A new sampler for each trial: resuming must not draw the first numbers again.
-        seed = np.random.SeedSequence([self.seed, self._n_counted()]).generate_state(1)[0]
-        self.study.sampler = optuna.samplers.TPESampler(seed=int(seed), multivariate=True)
-        trial = self.study.ask({**self.space})
-        settings = nested({path: rounded(trial.params[path]) for path in self.space})
-        trial.set_user_attr("settings", settings)
-        return _Running(trial, from_mapping(EstimatorSettings, settings, "estimator_settings"))
-
-    def _submit(
-        self,
-        trial: _Running,
-        executor: AnyExecutor,
-        running: dict[Future[list[Row]], _Running],
-    ) -> None:
-        done = len(trial.rows)
-        seeds = self.task.traffic_seeds[done : done + BATCH]
-        running[executor.submit(self._score, self.task, trial.settings, seeds)] = trial
-
-    def _tell(self, running: _Running) -> bool:
-        """Report the latest batch; return whether the trial is finished."""
-        trial, rows = running.trial, running.rows
-        reward = float(np.mean([row["reward"] for row in rows]))
-        if not math.isfinite(reward):
-            bad = [row["traffic_seed"] for row in rows if not math.isfinite(row["reward"])]
-            trial.set_user_attr("not_finite", bad)
-            self.study.tell(trial, state=TrialState.PRUNED)
-            return True
-        trial.report(reward, len(rows))
-        if len(rows) == len(self.task.traffic_seeds):
-            for key, value in _summary(rows).items():
-                trial.set_user_attr(key, value)
-            self.study.tell(trial, reward)
-            return True
-        if "label" not in trial.user_attrs and trial.should_prune():
-            self.study.tell(trial, state=TrialState.PRUNED)
-            return True
-        return False
-
-    def write(self, path: Path) -> None:
-        """Write the best settings with their provenance.
+    def check(self) -> None:
+        """Check everything without playing or recording.
 
         Raises:
-            ValueError: No trial ran to its end.
+            FileNotFoundError: There is no such saved policy.
+            ValueError: A value is out of range, or there is nothing to tune.
         """
-        best = self.best()
-        if best is None:
-            raise ValueError(f"{self.task.name}: no trial ran to its end with a finite score")
-        with replacing(path) as temporary:
-            write_settings(
-                temporary,
-                estimator=self.task.estimator,
-                parameters=self.task.parameters_name,
-                privacy=self.task.privacy,
-                settings=best.user_attrs["settings"],
-                provenance=self._provenance(best),
-                variant=self.task.variant,
-            )
+        _ = self.space
+        require_seeds("seeds", self.traffic_seeds, TRAINING_SEEDS)
+        keywords = parse_env(self.env)[1]
+        for key in ("estimator", "traffic_seeds", "records", "action"):
+            require(key not in keywords, f"env.{key}", "left out", keywords.get(key))
+        self.cell().check()
+        name = self.name
+        require(Path(name).name == name, "name of the set", "part of the name of a file", name)
 
-    def _provenance(self, best: FrozenTrial) -> dict[str, Any]:
-        task, config = self.task, self.task.config()
-        settings = from_mapping(EstimatorSettings, best.user_attrs["settings"], "settings")
-        values = values_of(settings, self.space)
+    def starts(self) -> dict[str, dict[str, Any]]:
+        """Return the values from which the search begins: ``defaults`` and ``present`` ones."""
+        has_demand = "demand" in self.also
+        found: dict[str, dict[str, Any]] = {}
+        for label, settings in (
+            ("defaults", DEMAND_START if has_demand else EstimatorSettings()),
+            ("present", self.config.settings()),
+        ):
+            if has_demand and settings.demand is None:
+                continue
+            values = values_of(settings, self.space)
+            if not all(holds(knob, values[path]) for path, knob in self.space.items()):
+                logger.warning("the %s settings lie outside of the search: %s", label, values)
+            elif values not in found.values():
+                found[label] = values
+        return found
+
+    def play(self, settings: EstimatorSettings, seeds: Sequence[int]) -> list[Row]:
+        """Play an episode on each traffic seed with given settings, as one batch."""
+        return play(self.cell(settings), seeds, self.records)
+
+    def identity(self) -> dict[str, Any]:
+        """Return everything that two searches must share for their scores to be comparable."""
+        config = self.config
         return {
-            "corridor": config.corridor.name,
-            "schedule": task.schedule,
-            "bandwidth": config.bandwidth,
-            "epsilon": config.privacy.epsilon,
-            "delta": config.privacy.delta,
-            "seeds": task.seeds,
-            "n_trials": self.n_finished(),
-            "rmse_density": round(best.user_attrs["rmse_density"], 2),
-            "rmse_speed": round(best.user_attrs["rmse_speed"], 2),
-            "at_bounds": [
-                path for path, knob in self.space.items() if at_bound(knob, values[path])
-            ],
-            "date": date.today().isoformat(),
-            "version": version("dptse-env"),
+            **json.loads(self.cell().id),
+            "corridor": config.corridor.digest,
+            "parameters": dataclasses.asdict(config.arz_parameters),
+            "seeds": self.seeds,
+            "seed": self.seed,
+            "dptse-env": version("dptse-env"),
+            "also": self.also,
         }
 
 
-@contextmanager
-def locked_study(
-    task: TuningTask, folder: Path, seed: int = 0, score: Score = score_episodes
-) -> Iterator[TuningStudy]:
-    """Begin a study or go on with it, and keep other processes out of it meanwhile.
+def tune(search: Search, folder: Path, n_trials: int, executor: AnyExecutor) -> optuna.Study:
+    """Run trials until ``n_trials`` are finished, those of earlier runs included.
+
+    The first ones are the defaults and the settings that the environment has without a search;
+    both run to the end. Later ones stop early once they fall behind the median.
+
+    Args:
+        search: What is tuned.
+        folder: Gets the journal; made if it is missing.
+        n_trials: Number of trials.
+        executor: Its workers run whole trials, and share the journal.
 
     Raises:
-        ValueError: The journal is of a study with other arguments.
-        BlockingIOError: Another process has the study open.
+        ValueError: The journal is of another search.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    path = journal_path(task, folder)
-    lock = FileLock(folder / f".{path.name}.lock")
-    try:
-        lock.acquire(timeout=0.0)
-    except Timeout as problem:
-        raise BlockingIOError(f"another run is writing {path}") from problem
-    try:
-        path.touch()
-        _mend(path)
-        yield TuningStudy(task, folder, seed, score)
-    finally:
-        lock.release()
+    path = journal_path(search, folder)
+    _mend(path)
+    study = optuna.create_study(
+        storage=_storage(path), study_name=search.name, direction="maximize", load_if_exists=True
+    )
+    identity = json.loads(json.dumps(search.identity()))
+    difference = first_difference(study.user_attrs.get("identity", identity), identity)
+    if difference is not None:
+        raise ValueError(
+            f"{path} has the trials of another search: {difference}. Choose another --output"
+        )
+    study.set_user_attr("identity", identity)
+    starts = dict(enumerate(search.starts().items()))
+    tasks = [(index, starts.get(index)) for index in range(n_finished(study), n_trials)]
+    work = partial(_run_trial, search, folder)
+    run_shown(executor, work, tasks, lambda task, _: None, desc=search.name, unit="trial")
+    return study
 
 
-def journal_path(task: TuningTask, folder: Path) -> Path:
-    """Return the path of the journal of a task."""
-    return folder / f"{task.name}.journal"
+def journal_path(search: Search, folder: Path) -> Path:
+    """Return the path of the journal of a search."""
+    return folder / f"{search.name}.journal"
 
 
-def scores_of(trial: FrozenTrial) -> dict[str, float]:
-    """Return the mean reward (``score``), errors and divergences of a finished trial."""
-    keys = ("rmse_density", "rmse_speed", "n_diverged")
-    return {"score": _value(trial), **{key: trial.user_attrs[key] for key in keys}}
+def n_finished(study: optuna.Study) -> int:
+    """Return the number of trials that ran to their end or were stopped early."""
+    return len(study.get_trials(deepcopy=False, states=FINISHED))
 
 
-def _value(trial: FrozenTrial) -> float:
-    if trial.value is None:
-        raise ValueError(f"trial {trial.number} has no score")
-    return trial.value
+def chosen(study: optuna.Study) -> dict[str, FrozenTrial]:
+    """Return the trials of the ``defaults`` and the ``present`` settings, if any, and the best.
+
+    Raises:
+        ValueError: No trial ran to its end.
+    """
+    trials = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+    if not trials:
+        raise ValueError(f"{study.study_name}: no trial ran to its end with a finite score")
+    found = {t.user_attrs["label"]: t for t in trials if "label" in t.user_attrs}
+    return {**found, "tuned": study.best_trial}
 
 
-def _summary(rows: list[Row]) -> dict[str, float]:
-    """Return errors as means over traffic seeds, divergences as sums."""
-    return {
-        "rmse_density": float(np.mean([row["rmse_density"] for row in rows])),
-        "rmse_speed": float(np.mean([row["rmse_speed"] for row in rows])),
-        "n_diverged": float(sum(row["n_diverged"] for row in rows)),
+def write(search: Search, study: optuna.Study, path: Path) -> dict[str, Any]:
+    """Write the best settings with their provenance, and return them.
+
+    Raises:
+        ValueError: No trial ran to its end.
+    """
+    best, config, space = chosen(study)["tuned"], search.config, search.space
+    provenance = {
+        "corridor": config.corridor.name,
+        "schedule": search.schedule,
+        "bandwidth": config.bandwidth,
+        "epsilon": config.privacy.epsilon,
+        "delta": config.privacy.delta,
+        "seeds": search.seeds,
+        "n_trials": n_finished(study),
+        "rmse_density": round(best.user_attrs["rmse_density"], 2),
+        "rmse_speed": round(best.user_attrs["rmse_speed"], 2),
+        "at_bounds": [path for path, knob in space.items() if at_bound(knob, best.params[path])],
+        "date": date.today().isoformat(),
+        "version": version("dptse-env"),
     }
+    settings = nested(best.params)
+    with replacing(path) as temporary:
+        write_settings(
+            temporary,
+            estimator=search.estimator,
+            parameters=config.arz_parameters.name,
+            privacy=str(config.privacy.preset),
+            settings=settings,
+            provenance=provenance,
+            variant=search.variant,
+        )
+    return settings
+
+
+def _storage(journal: Path) -> JournalStorage:
+    path = str(journal)
+    return JournalStorage(JournalFileBackend(path, JournalFileOpenLock(path)))
+
+
+def _run_trial(
+    search: Search, folder: Path, task: tuple[int, tuple[str, dict[str, Any]] | None]
+) -> None:
+    """Run a trial to its end, or until it falls behind.
+
+    Args:
+        search: The search.
+        folder: Has the journal.
+        task: The number of trials before this one, and label and values of a start.
+    """
+    index, start = task
+    # A new sampler for each trial: resuming must not draw the first numbers again. Without a liar:
+    # trials that were interrupted, which stay as running, must not count as bad ones.
+    seed = np.random.SeedSequence([search.seed, index]).generate_state(1)[0]
+    study = optuna.load_study(
+        study_name=search.name,
+        storage=_storage(journal_path(search, folder)),
+        sampler=TPESampler(seed=int(seed), multivariate=True, constant_liar=False),
+        pruner=MedianPruner(n_startup_trials=8),
+    )
+    if start is not None:
+        study.enqueue_trial(start[1], user_attrs={"label": start[0]})
+    trial = study.ask({**search.space})
+    settings = from_mapping(EstimatorSettings, nested(trial.params), "estimator_settings")
+    seeds, rows = search.traffic_seeds, list[Row]()
+    for first in range(0, len(seeds), BATCH):
+        rows += search.play(settings, seeds[first : first + BATCH])
+        means = {
+            key: float(np.mean([row[key] for row in rows]))
+            for key in ("reward", "rmse_density", "rmse_speed")
+        }
+        if not math.isfinite(means["reward"]):
+            study.tell(trial, state=TrialState.PRUNED)
+            return
+        trial.report(means["reward"], len(rows))
+        if len(rows) < len(seeds) and trial.should_prune():
+            study.tell(trial, state=TrialState.PRUNED)
+            return
+    trial.set_user_attr("rmse_density", means["rmse_density"])
+    trial.set_user_attr("rmse_speed", means["rmse_speed"])
+    study.tell(trial, means["reward"])
 
 
 def _mend(path: Path) -> None:
-    """Undo the incomplete write of a killed run, half a line and a lock that Optuna cannot read."""
-    content = path.read_bytes()
-    complete = content.rfind(b"\n") + 1
-    if complete < len(content):
-        with path.open("r+b") as file:
-            file.truncate(complete)
-    Path(f"{path}.lock").unlink(missing_ok=True)
+    """Cut off half a line that a killed run left, after which Optuna could not read on."""
+    lock = JournalFileOpenLock(str(path))
+    lock.acquire()
+    try:
+        content = path.read_bytes() if path.exists() else b""
+        if content and not content.endswith(b"\n"):
+            os.truncate(path, content.rfind(b"\n") + 1)
+    finally:
+        lock.release()

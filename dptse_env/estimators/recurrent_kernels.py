@@ -269,7 +269,7 @@ def _write(
     age: float,
     row: Float32Array,
 ) -> None:
-    """Write the channels of a cell that `channels.read_rows` gives."""
+    """Write the channels of a cell, by what the rows that cover it say."""
     unit, limit, flows = cells.unit[s], cells.limit, 1.0 if cells.flows else 0.0
     by_speed, slip = second[2], second[3]
     density_variance, speed_variance = prior[2] ** 2, prior[3] ** 2

@@ -147,6 +147,18 @@ def test_crossed_t_knows_how_few_runs_there_are():
     assert p_value == pytest.approx(stats.ttest_1samp(runs, 0.0).pvalue, rel=1e-6)
 
 
+def test_crossed_t_takes_the_mean_squares_of_what_is_crossed():
+    rng = np.random.default_rng(7)
+    table = rng.standard_normal((5, 1)) + rng.standard_normal(64) + rng.standard_normal((5, 64))
+    rows, columns = 64 * table.mean(axis=1).var(ddof=1), 5 * table.mean(axis=0).var(ddof=1)
+    rest = ((table.var(ddof=1) * 319) - 4 * rows - 63 * columns) / 252
+    square = rows + columns - rest
+    freedom = square**2 / (rows**2 / 4 + columns**2 / 63 + rest**2 / 252)
+    expected = stats.t.interval(0.95, freedom, loc=table.mean(), scale=np.sqrt(square / 320))
+    interval, _ = crossed_t(table)
+    assert (interval.low, interval.high) == pytest.approx(expected)
+
+
 def test_crossed_t_of_equal_values():
     assert crossed_t(np.zeros((3, 4))) == (Interval(0.0, 0.0, 0.0, 4), 1.0)
     assert crossed_t(np.ones((3, 4)))[1] == 0.0

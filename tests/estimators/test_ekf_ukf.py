@@ -1,6 +1,7 @@
 """Extended and unscented Kalman filters beside their references, and both beside textbooks."""
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from dptse_env.estimators import (
 )
 from dptse_env.estimators.simple import estimated_traffic
 from dptse_env.model.parameters import VACUUM
-from tests.helpers import pairwise
+from tests.helpers import fast_and_slow, pairwise
 
 from .helpers import (
     PLAIN,
@@ -74,9 +75,16 @@ def take_steps(name, episodes, settings, tolerance=1e-9, anew=True, again=0):
         np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6)
 
 
+FAST = [
+    (name, *case)
+    for name in ("ekf", "ukf")
+    for case in (("rows", "cone", RICH), ("flow", "cone", PLAIN), ("speed", "box", PLAIN))
+]
+
+
 @pytest.mark.parametrize(
     ("name", "release", "bounds", "settings"),
-    pairwise(["ekf", "ukf"], RELEASES, ["cone", "box"], [PLAIN, RICH]),
+    fast_and_slow(product(["ekf", "ukf"], RELEASES, ["cone", "box"], [PLAIN, RICH]), FAST),
 )
 def test_backends_take_the_same_steps(name, release, bounds, settings):
     """In the box w has no bound: there states break the CFL condition and blow up rounding.

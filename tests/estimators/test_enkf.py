@@ -18,16 +18,16 @@ from tests.model.oracle import W99
 from .helpers import RELEASES, RICH, run, simulate, started, step, update
 
 OPTIONS = {
-    "plain": {},
-    "inflation": {"enkf": EnsembleSettings(inflation=1.1)},
-    "taper": {"enkf": EnsembleSettings(inflation=1.02, taper=0.35, n_members=31)},
     "rich": {name: getattr(RICH, name) for name in ("demand", "density_growth", "count_noise")},
+    "taper": {"enkf": EnsembleSettings(inflation=1.02, taper=0.35, n_members=31)},
+    "inflation": {"enkf": EnsembleSettings(inflation=1.1)},
+    "plain": {},
 }
 both_backends = pytest.mark.parametrize("backend", BACKENDS)
 
 
 @pytest.mark.parametrize(
-    ("release", "bounds", "options"), pairwise(RELEASES, ["cone", "box"], OPTIONS)
+    ("release", "bounds", "options"), pairwise(RELEASES[::-1], ["cone", "box"], OPTIONS)
 )
 def test_it_takes_the_steps_of_its_reference(release, bounds, options):
     """Both draw the same numbers."""

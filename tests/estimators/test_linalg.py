@@ -137,9 +137,9 @@ def test_joseph_form_makes_up_for_a_rounded_gain():
     covariance = np.eye(N, WIDTH)
     assert pair_update(covariance, 4, np.eye(2), noise, np.empty((4, WIDTH)))
     np.testing.assert_allclose(np.diag(covariance)[4:6], expected, rtol=1e-12)
-    covariance = np.eye(N, WIDTH)  # the second number of what the first has told precisely
+    covariance = 3.0 * np.eye(N, WIDTH)  # the second number of what the first has told precisely
     assert pair_update(covariance, 4, np.ones((2, 1)), noise, np.empty((4, WIDTH)))
-    both = 1.0 / (1.0 + 1.0 / noise[0] + 1.0 / noise[1])
+    both = 1.0 / (1.0 / 3.0 + 1.0 / noise[0] + 1.0 / noise[1])
     np.testing.assert_allclose(covariance[4, 4], both, rtol=1e-12)
     covariance = np.eye(N, WIDTH)
     for i, (r, left) in enumerate(zip(noise, expected, strict=True)):

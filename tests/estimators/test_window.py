@@ -192,11 +192,3 @@ def test_a_minimum_within_bounds_is_that_of_a_general_solver(spread, n_stages, h
     np.testing.assert_allclose(x, right, atol=1e-9)
     n_held = int(((x == lower) | (x == upper)).sum())
     assert n_held > 10 or spread == 0.0
-
-
-def test_a_program_that_is_no_number_is_unsolved():
-    program = random_program()
-    factor = factor_of(program, np.zeros((4, N), np.int64))
-    program.window.targets[2] = np.nan
-    z, side = np.full((4, WIDTH), 0.5), np.zeros((4, WIDTH), np.int64)
-    assert minimise(ROAD, program.window, factor, side, z) == parts.UNSOLVED

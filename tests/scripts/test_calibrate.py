@@ -1,10 +1,14 @@
 """Calibration by the command."""
 
+import dataclasses
 import json
 
 import pytest
 
+from dptse_env.model.calibration import persistence_error
 from dptse_env.model.parameters import read_parameters
+from dptse_env.traffic import SHORT_HIGHWAY, RecordLibrary
+from scripts.calibrate import load_series
 from scripts.cli import Environment
 from tests.helpers import SHORT
 from tests.scripts.commands import refused, run_command
@@ -29,12 +33,17 @@ def test_it_fits_on_some_seeds_and_reports_on_others(tmp_path):
         assert len(errors[name]["density"]) == len(errors[name]["horizons"])
     assert errors["fitted"]["density"][-1] < errors["persistence"]["density"][-1]
     assert (provenance["corridor"], provenance["train"]) == ("mine", "0:2")
+    road = dataclasses.replace(SHORT_HIGHWAY, name="mine")
+    held_out = persistence_error(load_series(road, (1000,), RecordLibrary()), road.n_mainline)
+    assert errors["persistence"]["density"] == pytest.approx(held_out.density)
 
 
-@pytest.mark.parametrize("length", [0.05, 0.04])
-def test_a_road_may_have_segments_too_short_for_the_default_parameters(length):
-    road = Environment(f'{PAPER} {{"corridor": {{"segment_length": {length}}}}}').corridor()
-    assert road.segment_lengths[0] == length
+def test_a_road_may_suit_neither_parameters_nor_bandwidth_of_its_environment():
+    straight = {"on_ramps": [], "off_ramps": [], "exit_shares": [], "fixed_sensors": []}
+    straight |= {"demand": {"mainline": [[0, 1000]], "on_ramps": []}, "incident": None}
+    fields = {"segment_length": 0.04, "n_mainline": 4, **straight}
+    road = Environment(f"{PAPER} {json.dumps({'corridor': fields})}").corridor()
+    assert (road.segment_lengths[0], road.n_mainline) == (0.04, 4)
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """All commands: their help and its examples, the status of a run, and bad input in one line."""
 
 import errno
+import io
 import json
 import re
 import shlex
@@ -38,7 +39,7 @@ def help_of(name, monkeypatch):
     return done.stdout
 
 
-LONG = ["train", "train-estimator", "tune", "audit"]
+LONG = ["train", "audit"]
 WITH_EXAMPLE = [name for name in COMMANDS if name not in LONG]
 
 
@@ -104,6 +105,16 @@ def test_without_the_extra_it_says_what_to_install(monkeypatch, capsys):
         command_line.main()
     assert ended.value.code == 1
     assert "pip install 'dptse-env[train]'" in capsys.readouterr().err
+
+
+def test_a_pipe_may_lack_letters(monkeypatch):
+    pipe = io.TextIOWrapper(io.BytesIO(), encoding="ascii")  # as on Windows
+    monkeypatch.setattr(sys, "stdout", pipe)
+    monkeypatch.setattr(sys, "argv", ["dptse", "--version"])
+    command_line.main()
+    print("ε")
+    pipe.flush()
+    assert pipe.buffer.getvalue().endswith(b"?\n")
 
 
 def test_information_has_what_a_bug_report_needs():

@@ -29,6 +29,9 @@ def test_policies_are_scored_in_the_tasks_that_they_suit(small, tmp_path):
     (line,) = (line for line in done.stdout.splitlines() if line.strip().startswith("paced"))
     assert line.split()[1] == "-"
     assert "±" in line
+    done = run_command("suite", *words, "--tasks", "paced")
+    assert done.returncode == 2  # the saved policy suits the other task alone
+    assert "tasks must be one of" in refused("suite", *words, "--tasks", "none")
 
 
 @pytest.mark.parametrize(

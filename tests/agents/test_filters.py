@@ -1,0 +1,283 @@
+"""Scenarios, what is collected of them, the network with gradients, and its training."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from agents.environments import make_config, make_vector, parse_env  # noqa: E402
+from agents.filters.collecting import Batch, collect, draw_batch  # noqa: E402
+from agents.filters.network import RecurrentNetwork, second_loss  # noqa: E402
+from agents.filters.plan import OWN, FilterPlan, Round, played_by  # noqa: E402
+from agents.filters.scenarios import MECHANISMS, ROADS, SCHEDULES, ScenarioRanges  # noqa: E402
+from agents.filters.training import FilterTraining  # noqa: E402
+from agents.training.run_files import read_progress  # noqa: E402
+from dptse_env.estimators.recurrent import read_network, write_network  # noqa: E402
+from dptse_env.estimators.recurrent_kernels import LONGEST_AGE  # noqa: E402
+from dptse_env.evaluation import evaluate  # noqa: E402
+from tests.agents.elsewhere import Elsewhere  # noqa: E402
+from tests.estimators.helpers import card  # noqa: E402
+from tests.helpers import SHORT  # noqa: E402
+
+RANGES = ScenarioRanges(envs=(SHORT,), spans=((1,), (1, 2)))
+PLAN = FilterPlan(
+    seed=3,
+    traffic_seeds=(0, 1, 2),
+    validation_seeds=(1000, 1001),
+    validation_envs=(SHORT,),
+    ranges=RANGES,
+    rounds=(Round("ekf", 1, 1), Round(OWN, 2, 3)),
+    width=4,
+    episodes=2,
+    checkpoint_every=2,
+)
+WALK = {"estimator": "random_walk"}
+
+
+@pytest.fixture(autouse=True)
+def _one_thread():
+    torch.set_num_threads(1)
+
+
+# Scenarios ----------------------------------------------------------------------------------------
+
+
+def drawn(ranges=RANGES, n=60, seed=0):
+    rng = np.random.default_rng(seed)
+    return [ranges.draw(rng, range(20), 4) for _ in range(n)]
+
+
+def test_scenarios_cover_their_ranges():
+    scenarios = drawn(n=200)
+    privacy = [each.keywords["privacy"] for each in scenarios]
+    assert {each["preset"] for each in privacy} == set(MECHANISMS)
+    assert {each.schedule for each in scenarios} == set(SCHEDULES)
+    epsilons = np.array([each["epsilon"] for each in privacy])
+    assert 0.5 <= epsilons.min() < 0.7
+    assert 14.0 < epsilons.max() <= 20.0
+    assert 0.3 < np.mean(epsilons < np.sqrt(0.5 * 20.0)) < 0.7  # even in the logarithm
+    assert {each.keywords["bandwidth"] for each in scenarios} == set(range(1, 7))
+    assert any("query_spans" in each.keywords for each in scenarios)
+    for each in scenarios:
+        assert len(set(each.traffic_seeds)) == 4
+        assert set(each.traffic_seeds) <= set(range(20))
+    few = dataclasses.replace(RANGES, largest_share=0.35, mechanisms=("capped",))
+    assert {each.keywords["bandwidth"] for each in drawn(few)} == {1, 2}
+    assert {each.keywords["privacy"]["preset"] for each in drawn(few)} == {"capped"}
+    assert drawn(n=5) == drawn(n=5) != drawn(n=5, seed=1)
+
+
+@pytest.mark.filterwarnings("ignore:.*values measured or tuned on")
+def test_every_scenario_is_an_environment_and_every_road_another_one():
+    for env in ROADS:
+        for scenario in drawn(dataclasses.replace(RANGES, envs=(env,)), n=4):
+            config = make_config(scenario.env, scenario.keywords)
+            assert config.bandwidth <= config.corridor.n_mainline
+            assert config.privacy.preset == scenario.keywords["privacy"]["preset"]
+    digests = {make_config(*parse_env(each)).corridor.digest for each in ROADS}
+    assert len(digests) == len(ROADS)
+
+
+# Episodes -----------------------------------------------------------------------------------------
+
+
+class Seen:
+    """A watcher that keeps estimate and truth of every second, the reset first."""
+
+    def __init__(self):
+        self.estimates, self.truth = [], []
+
+    def begin(self, process):
+        self.process = process
+        return self
+
+    def __call__(self):
+        self.estimates.append(self.process.estimate)
+        self.truth.append(self.process.truth(np.arange(self.process.n_episodes)))
+
+    def rows(self):
+        return [{}] * self.process.n_episodes
+
+
+def steps(network, batch, n):
+    """Yield hidden states and what the network says of the second, for `n` seconds."""
+    age, predicted = np.full(batch.start.shape[:2], LONGEST_AGE), batch.start
+    hidden = torch.zeros(*age.shape, network.width)
+    for t in range(n):
+        with torch.no_grad():
+            hidden = network(batch.road, batch.channels(t, predicted, age), hidden)
+            present, ahead = network.read(batch.road, hidden)
+        predicted = ahead.numpy().astype(float)
+        yield hidden.numpy(), present.numpy()
+
+
+def mixed(mechanisms, index):
+    ranges = dataclasses.replace(PLAN.ranges, mechanisms=mechanisms, spans=((1, 2),))
+    return dataclasses.replace(PLAN, ranges=ranges, rounds=(Round("ekf", 2, 1),)).scenarios(0)[
+        index
+    ]
+
+
+@pytest.mark.parametrize("mechanism", ["paper", "paced"])
+def test_the_network_with_gradients_is_the_estimator(mechanism, tmp_path):
+    """Torch makes of collected releases the estimates that the environment reported."""
+    torch.manual_seed(0)
+    network = RecurrentNetwork(5)
+    with torch.no_grad():
+        network.heads.normal_(0.0, 0.5)
+    write_network(tmp_path / "network.safetensors", network.weights(), card())
+    own, scenario = played_by(tmp_path / "network.safetensors"), mixed((mechanism,), 0)
+    collected = collect(scenario, own, None)
+    keywords = {**scenario.keywords, **own, "traffic_seeds": list(scenario.traffic_seeds)}
+    env, seen = make_vector(SHORT, 2, {**keywords, "action": "scores"}), Seen()
+    seeds, noise = scenario.traffic_seeds, scenario.noise_seed
+    evaluate(env, scenario.schedule, seeds, noise, watchers=[seen.begin])
+    batch, T = Batch([collected.pick(np.arange(2))]), collected.corridor.duration
+    for (_, present), estimate in zip(steps(network, batch, T), seen.estimates[1:], strict=True):
+        np.testing.assert_allclose(present[..., 0], estimate.density, rtol=2e-4, atol=2e-3)
+        np.testing.assert_allclose(present[..., 3], estimate.speed_std, rtol=2e-3)
+    np.testing.assert_allclose(collected.truth, np.array(seen.truth[1:]), rtol=1e-6)
+
+
+def test_a_batch_mixes_the_scenarios_of_a_road():
+    """Releases of speeds and of flows, of single cells and of sums."""
+    singles, sums = (
+        collect(mixed((mechanism,), k), WALK, None)
+        for k, mechanism in enumerate(("paper", "paced"))
+    )
+    assert singles.observed.shape[2] < sums.observed.shape[2]
+    batch = Batch([singles.pick(np.array([1])), sums.pick(np.array([0, 1]))])
+    np.testing.assert_array_equal(batch.truth[:, 0], singles.truth[:, 1])
+    network = RecurrentNetwork(4)
+    alone = [steps(network, Batch([each.pick(np.arange(2))]), 20) for each in (singles, sums)]
+    for (together, _), (one, _), (two, _) in zip(steps(network, batch, 20), *alone, strict=True):
+        np.testing.assert_allclose(together, np.stack([one[1], *two]), atol=1e-5)
+
+
+def test_batches_are_drawn_from_all_scenarios_of_a_road():
+    collected = [collect(mixed(("paper",), k), WALK, None) for k in range(2)]
+    starts = {float(each.truth[:, k].sum()): 0 for each in collected for k in range(2)}
+    rng, n_drawn = np.random.default_rng(0), 0
+    for _ in range(30):
+        batch = draw_batch(rng, collected, 3)
+        for episode in batch.truth.swapaxes(0, 1).numpy():
+            starts[min(starts, key=lambda total: abs(total - float(episode.sum())))] += 1
+            n_drawn += 1
+        assert len(batch.start) == 3
+    assert n_drawn == 90
+    assert min(starts.values()) > 0
+
+
+def test_the_loss_is_the_environments_error():
+    collected = collect(mixed(("paced",), 0), WALK, None)
+    batch, corridor = Batch([collected.pick(np.arange(2))]), collected.corridor
+    road, truth = batch.road, batch.truth
+    estimated = torch.cat([truth, torch.ones_like(truth)], -1)
+    assert float(second_loss(road, estimated, truth, 0.0)) == pytest.approx(1e-4)
+    off = estimated + torch.tensor([corridor.density_scale * 0.1, 0.0, 0.0, 0.0])
+    occupied = (truth[:, :, : corridor.n_mainline, 0] > 0).float()
+    share = corridor.n_mainline / (corridor.n_mainline + occupied.sum(-1))
+    expected = float((0.1 * share.sqrt()).mean())
+    assert float(second_loss(road, off, truth, 0.0)) == pytest.approx(expected, 1e-3)
+    wide = estimated * torch.tensor([1.0, 1.0, 50.0, 50.0])
+    assert second_loss(road, wide, truth, 1.0) > second_loss(road, estimated, truth, 1.0)
+
+
+# Training -----------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A training to the end of `PLAN`; leave it alone."""
+    training = FilterTraining(PLAN, tmp_path_factory.mktemp("whole"))
+    training.run()
+    return training
+
+
+def assert_same(training, whole):
+    for name, value in training.network.state_dict().items():
+        assert torch.equal(value, whole.network.state_dict()[name])
+    one, other = ([{**row, "seconds": 0.0} for row in each.rows] for each in (training, whole))
+    assert one == other
+
+
+class KilledError(Exception):
+    pass
+
+
+@pytest.mark.slow
+def test_a_training_that_was_killed_comes_out_as_one_that_was_not(whole, tmp_path):
+    """Wherever its scenarios are played."""
+    assert whole.done == 4
+    assert [row["round"] for row in whole.rows] == [1, 2, 2, 2]
+    played = read_network(str(whole.folder / "played.safetensors"))
+    assert played.card["training"]["passes"] == 1  # as it stood when the second round began
+
+    def kill(row):
+        if row["update"] == 3:
+            raise KilledError
+
+    with pytest.raises(KilledError):
+        FilterTraining(PLAN, tmp_path, watchers=[kill]).run()
+    resumed = FilterTraining(PLAN, tmp_path, executor=Elsewhere())
+    assert resumed.done == 2
+    resumed.run()
+    assert_same(resumed, whole)
+    assert len(read_progress(tmp_path)) == 4
+    again = FilterTraining(PLAN, tmp_path)
+    again.run()
+    assert_same(again, whole)
+
+
+def test_a_training_may_begin_with_another_network_and_says_so_on_the_card(tmp_path):
+    path = tmp_path / "a" / "network.safetensors"
+    first = FilterTraining(dataclasses.replace(PLAN, rounds=(Round("ekf", 1, 1),)), path.parent)
+    first.run()
+    ranges = read_network(str(path)).card["ranges"]
+    assert ranges["span"] == [1.0, 2.0]
+    assert ranges["flows"] == [0.0, 1.0]
+    assert ranges["n_mainline"] == [6, 6]
+    plan = dataclasses.replace(PLAN, initial=str(path), rounds=(Round(OWN, 1, 1),), seed=5)
+    second = FilterTraining(plan, tmp_path / "b")
+    for taken, given in zip(second.network.weights(), first.network.weights(), strict=True):
+        np.testing.assert_array_equal(taken, given)
+    second.run()
+    assert not np.array_equal(second.network.weights().hidden, first.network.weights().hidden)
+    about = read_network(str(tmp_path / "b" / "network.safetensors")).card["training"]
+    assert (about["plan"]["seed"], about["passes"]) == (5, 1)
+    assert about["plan"]["initial_sha256"] == read_network(str(path)).card["sha256"]
+    with pytest.raises(ValueError, match="width must be that of the initial network, 4, got 8"):
+        dataclasses.replace(plan, width=8)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"traffic_seeds": (1000,)}, r"traffic must be traffic seeds in 0\.\.999, got 1000"),
+        ({"validation_seeds": (5,)}, r"validation must be traffic seeds in 1000\.\.1999, got 5"),
+        ({"rounds": (Round(OWN, 1, 1),)}, "rounds must begin with one of another estimator"),
+        ({"rounds": ()}, "rounds must begin"),
+        ({"episodes": 4}, r"episodes must be an integer in 1\.\.3, got 4"),
+        ({"initial": "nowhere"}, r"weights must be a file or one of highway, .*, got 'nowhere'"),
+    ],
+)
+def test_bad_plans_are_named(changes, message):
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(PLAN, **changes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"rounds": (Round("kalman", 1, 1),)}, "kalman"),
+        ({"ranges": dataclasses.replace(RANGES, schedules=("best",))}, "best"),
+        ({"ranges": dataclasses.replace(RANGES, mechanisms=("none",))}, "none"),
+        ({"validation_envs": (f'{SHORT} {{"bandwidth": 99}}',)}, "bandwidth"),
+    ],
+)
+def test_what_does_not_suit_a_road_is_found_before_the_first_episode(changes, message):
+    PLAN.check()
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(PLAN, **changes).check()

@@ -1,0 +1,239 @@
+import dataclasses
+import json
+import math
+
+import gymnasium as gym
+import pytest
+from optuna.distributions import CategoricalDistribution, FloatDistribution
+
+from agents.executors import THIS_PROCESS, LocalProcesses
+from agents.search.space import (
+    DEMAND_START,
+    EXTRAS,
+    SPACE,
+    at_bound,
+    evenly,
+    holds,
+    nested,
+    search_space,
+    values_of,
+)
+from agents.search.tuning import BATCH, Search, chosen, journal_path, n_finished, tune, write
+from dptse_env.estimators import ESTIMATORS, EstimatorSettings
+from dptse_env.estimators.settings import available_settings, load_settings, read_settings
+from dptse_env.evaluation import evaluate
+from dptse_env.utils.fields import from_mapping
+from tests.helpers import SHORT, save_untrained
+
+KEYWORDS = {"parameters": "w99-3lane", "epsilon": 1.0, "delta": 0.05, "bandwidth": 2}
+SEARCH = Search(f"{SHORT} {json.dumps(KEYWORDS)}", "ekf", "0:2")
+
+
+# The space ----------------------------------------------------------------------------------------
+
+
+def test_every_estimator_that_has_settings_can_be_tuned():
+    assert {*SPACE, "open_loop", "recurrent"} == set(ESTIMATORS)
+
+
+@pytest.mark.parametrize("estimator", SPACE)
+def test_the_search_holds_the_defaults_and_the_shipped_sets(estimator):
+    names = [name for name in available_settings() if name.startswith(f"{estimator}-")]
+    starts = [DEMAND_START] if estimator != "random_walk" else []
+    for settings in (EstimatorSettings(), *map(load_settings, names), *starts):
+        extras = ("noise-scale", "demand") if settings.demand else ()
+        space = search_space(estimator, (*extras, "speed-cap"))
+        assert set(space) >= set(EXTRAS["speed-cap"]) | set(SPACE[estimator])
+        values = values_of(settings, space)
+        assert all(holds(knob, values[path]) for path, knob in space.items())
+        assert from_mapping(EstimatorSettings, nested(values), "settings").process_noise == (
+            settings.process_noise
+        )
+        if settings != DEMAND_START:
+            assert from_mapping(EstimatorSettings, nested(values), "settings") == settings
+
+
+def test_values_become_nested_settings_of_four_digits():
+    values = {"process_noise.0": 0.0123456, "process_noise.1": 0.2, "mhe.bounds": "cone"}
+    settings = {"process_noise": [0.01235, 0.2], "mhe": {"bounds": "cone"}}
+    assert nested({**values, "speed_cap": None}) == {**settings, "speed_cap": None}
+
+
+def test_bounds_of_the_search_are_seen():
+    knob, options = evenly(1e-3, 1e-1), CategoricalDistribution((1, 2))
+    values = (1e-3, 1.09e-3, 1.2e-3, 8e-2, 9.2e-2, 1e-1)
+    assert [at_bound(knob, value) for value in values] == [True, True, False, False, True, True]
+    assert at_bound(FloatDistribution(1.0, 1.1), 1.001)
+    assert not at_bound(FloatDistribution(1.0, 1.1), 1.05)
+    assert [holds(knob, value) for value in (9e-4, 1e-2, 0.2)] == [False, True, False]
+    assert [holds(options, value) for value in (1, 3)] == [True, False]
+    assert not at_bound(options, 1)
+
+
+# The trials ---------------------------------------------------------------------------------------
+
+
+class MadeUp(Search):
+    """Scores that are best at a process noise of (0.02, 0.005)."""
+
+    def play(self, settings, seeds):
+        pairs = zip(settings.process_noise, (0.02, 0.005), strict=True)
+        far = sum(math.log(value / best) ** 2 for value, best in pairs)
+        errors = {"rmse_density": 10 + far, "rmse_speed": 5 + far}
+        return [{**errors, "reward": -0.1 * far - seed} for seed in seeds]
+
+
+class Broken(MadeUp):
+    """Its rewards are not finite where density's process noise is above the default."""
+
+    def play(self, settings, seeds):
+        is_bad = settings.process_noise[0] > float(self.variant)
+        first, *rest = super().play(settings, seeds)
+        return [{**first, "reward": math.nan if is_bad else first["reward"]}, *rest]
+
+
+def made_up(kind=MadeUp, **changes):
+    fields = {**dataclasses.asdict(SEARCH), "seeds": f"0:{3 * BATCH}", **changes}
+    return kind(**fields)
+
+
+def run(folder, n_trials, search=None, executor=THIS_PROCESS):
+    return tune(search or made_up(), folder, n_trials, executor)
+
+
+def finished(study):
+    trials = [t for t in study.get_trials() if t.state.name in ("COMPLETE", "PRUNED")]
+    return [(t.state, t.params, t.intermediate_values, t.user_attrs) for t in trials]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A study of 60 trials of one worker; leave it alone."""
+    return run(tmp_path_factory.mktemp("whole"), 60)
+
+
+def test_it_finds_the_best_settings(whole, tmp_path):
+    path = tmp_path / "x.json"
+    write(made_up(), whole, path)
+    assert read_settings(path).process_noise == pytest.approx((0.02, 0.005), rel=0.5)
+    assert whole.best_value > chosen(whole)["defaults"].value
+    provenance = json.loads(path.read_text())[made_up().name]["provenance"]
+    assert provenance["n_trials"] == n_finished(whole) == 60
+    assert (provenance["bandwidth"], provenance["at_bounds"]) == (2, [])
+    assert len({tuple(t.params.values()) for t in whole.get_trials()}) == 60
+
+
+def test_the_defaults_and_the_present_set_come_first_and_bad_trials_stop_early(whole):
+    first, second, *others = whole.get_trials()
+    present = load_settings("ekf-w99-3lane-paper")
+    for trial, settings in ((first, EstimatorSettings()), (second, present)):
+        assert nested(trial.params)["process_noise"] == list(settings.process_noise)
+        assert len(trial.intermediate_values) == 3
+    stopped = [t for t in others if t.state.name == "PRUNED"]
+    assert stopped
+    assert all(len(t.intermediate_values) < 3 for t in stopped)
+    assert not any("label" in t.user_attrs for t in others)
+
+
+@pytest.mark.parametrize("batch", [1, 13])
+def test_a_search_that_was_interrupted_comes_out_as_one_that_was_not(
+    batch, whole, tmp_path, monkeypatch
+):
+    played, play = [], MadeUp.play
+
+    def interrupted(search, settings, seeds):
+        if len(played) == batch:
+            raise KeyboardInterrupt
+        played.append(seeds)
+        return play(search, settings, seeds)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(MadeUp, "play", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            run(tmp_path, 20)
+    path = journal_path(made_up(), tmp_path)
+    with path.open("a") as file:
+        file.write('{"op_code": 4, "wor')
+    assert n_finished(run(tmp_path, 12)) == 12
+    study = run(tmp_path, 20)
+    assert finished(study) == finished(whole)[:20]
+    n_trials = len(study.get_trials())
+    assert len(run(tmp_path, 20).get_trials()) == n_trials
+
+
+@pytest.mark.slow
+def test_several_workers_share_a_journal(tmp_path):
+    study = run(tmp_path, 30, executor=LocalProcesses(2))
+    assert n_finished(study) == len(study.get_trials()) == 30
+    assert len({tuple(t.params.values()) for t in study.get_trials()}) == 30
+    assert set(chosen(study)) == {"defaults", "present", "tuned"}
+
+
+def test_a_score_that_is_not_finite_is_never_the_best(tmp_path):
+    study = run(tmp_path, 20, made_up(Broken, variant="0.01"))
+    assert study.best_params["process_noise.0"] <= 0.01
+    search = made_up(Broken, variant="0")
+    study = run(tmp_path, 3, search)
+    with pytest.raises(ValueError, match="ekf-w99-3lane-paper-0: no trial ran to its end"):
+        write(search, study, tmp_path / "x.json")
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"seeds": "0:3"}, "seeds is '0:24' there and '0:3' now"),
+        ({"seed": 1}, "seed is 0 there and 1 now"),
+        ({"env": SEARCH.env.replace("2}", "3}")}, "keywords.bandwidth is 2 there and 3 now"),
+    ],
+)
+def test_a_journal_of_another_search_is_refused(changes, named, tmp_path):
+    run(tmp_path, 1)
+    with pytest.raises(ValueError, match=f"ekf-w99-3lane-paper.journal .*: {named}"):
+        run(tmp_path, 2, made_up(**changes))
+
+
+# What a trial plays -------------------------------------------------------------------------------
+
+
+def make(search, settings):
+    cell = search.cell(settings)
+    return gym.make(cell.env, traffic_seeds="0:3", **cell.all_keywords)
+
+
+def test_trials_are_scored_as_an_evaluation_with_other_noise_seeds(tmp_path):
+    settings = EstimatorSettings(process_noise=(0.02, 0.03))
+    expected = evaluate(make(SEARCH, settings), "paper", (0, 1), 1_000_000)
+    assert SEARCH.play(settings, (0, 1)) == expected
+    first = run(tmp_path, 1, SEARCH).get_trials()[0]
+    rows = SEARCH.play(EstimatorSettings(), (0, 1))
+    assert rows != expected
+    for key, value in {**first.user_attrs, "reward": first.value}.items():
+        if key != "label":
+            assert value == pytest.approx(sum(row[key] for row in rows) / 2, rel=1e-12)
+
+
+def test_settings_can_be_tuned_for_a_saved_policy(tmp_path):
+    pytest.importorskip("torch")
+    files = [save_untrained(tmp_path / f"{seed}.safetensors", seed=seed) for seed in (1, 2)]
+    one, other = (dataclasses.replace(SEARCH, schedule=str(path)) for path in files)
+    settings = EstimatorSettings(process_noise=(0.02, 0.03))
+    env = make(one, settings)
+    expected = evaluate(env, one.cell().load_policy(env), (1,), 1_000_000)
+    assert one.play(settings, (1,)) == expected != SEARCH.play(settings, (1,))
+    assert one.identity()["policy"] != other.identity()["policy"]  # by content, not by name
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"seeds": "998:1002"}, r"seeds must be traffic seeds in 0\.\.999, got 1000"),
+        ({"estimator": "open_loop"}, r"estimators must be one of ekf, .*, got 'open_loop'"),
+        ({"estimator": "random_walk", "also": ("demand",)}, "also must leave out demand"),
+        ({"env": f'{SHORT} {{"estimator": "ukf"}}'}, r"env\.estimator must be left out"),
+        ({"env": f'{SHORT} {{"cargo": 1}}'}, "cargo"),
+        ({"variant": "a/b"}, "name of the set must be part of the name of a file"),
+    ],
+)
+def test_bad_searches_are_named(changes, message):
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(SEARCH, **changes).check()
