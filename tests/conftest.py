@@ -1,15 +1,13 @@
 import gc
 import os
 
-# Before anything imports numpy: threads of its libraries would count as CPU time of a test.
+# Before anything imports numpy or torch: their threads would fight over the cores of the tests.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
-
-pytest_plugins = ["tests.cpu_limit"]
 
 # The first example of a compiled test compiles it: no time limit on a single example. What gates a
 # change draws the same examples each time; at a developer's desk they are new ones.

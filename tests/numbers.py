@@ -30,7 +30,7 @@ from dptse_env.policies import TRANSFERABLE
 from dptse_env.schedules import make_schedule
 from dptse_env.traffic import write_corridor
 from dptse_env.utils.arrays import FloatArray
-from tests.model.roads import UNEVEN
+from tests.helpers import UNEVEN
 
 FILE = Path(__file__).with_suffix(".npz")
 ID = "dptse_env:dptse/{}"

@@ -18,8 +18,7 @@ from dptse_env.estimators.settings import available_settings, load_settings
 from dptse_env.parts import make_release, make_task, privacy_report, warn_where_void
 from dptse_env.release import MOST_OPTIONS, CappedSettings, PrivacySettings
 from dptse_env.traffic import PAPER_HIGHWAY, SHORT_HIGHWAY, DemandDistribution, IncidentDistribution
-
-from .release.sums import MeanRelease, SumRelease
+from tests.helpers import MeanRelease, SumRelease
 
 
 def test_seeds_of_training_validation_and_test_are_disjoint():
@@ -245,7 +244,7 @@ def test_no_warning_where_no_guarantee_is_requested_or_it_holds(privacy):
 # --- queries: query_spans, price_levels, bandwidth_unit -------------------------------------------
 
 
-SUMS = "tests.release.sums:SumRelease"
+SUMS = "tests.helpers:SumRelease"
 KEYWORDS = {"privacy": SUMS, "query_spans": [1, 2, 4], "price_levels": [0.5, 1, 2]}
 
 

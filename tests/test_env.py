@@ -14,30 +14,9 @@ from dptse_env.process import TRUTH_INFO
 from dptse_env.registration import ENVIRONMENTS
 from dptse_env.spaces.actions import ACTION_ENCODINGS
 from dptse_env.utils.fields import field_hints
-from tests.cases import fast_and_slow
-
-from .vectors import SHORT, briefly
-from .vectors import assert_same as assert_close
+from tests.helpers import SHORT, assert_same, briefly, fast_and_slow, make_env, play
 
 IDS = [f"dptse_env:{env_id}" for env_id in ENVIRONMENTS]
-
-
-def short(**keywords):
-    return gym.make(SHORT, **{"traffic_seeds": "0:3", **keywords})
-
-
-def play(env, n_steps, seed=0):
-    """Reset and act at random; return everything that came back."""
-    env.action_space.seed(seed)
-    seen = [env.reset(seed=seed)]
-    seen += [env.step(env.action_space.sample()) for _ in range(n_steps)]
-    return seen
-
-
-def assert_same(first, second):
-    assert_close(first, second, tolerance=0)
-
-
 EVERY = sorted({(each, "mask") for each in IDS} | {(SHORT, name) for name in ACTION_ENCODINGS})
 CHECKED = [(SHORT, "mask"), (SHORT, "sequential"), ("dptse_env:dptse/PrivateHighway-v1", "mask")]
 
@@ -63,7 +42,7 @@ assert not {"libsumo", "torch", "stable_baselines3"} & set(sys.modules)
 
 
 def test_a_seed_fixes_the_episodes_and_no_seed_goes_on():
-    env = short()
+    env = make_env()
     first = [env.reset(seed=5)[0], env.reset()[0], env.reset()[0]]
     again = [env.reset(seed=5)[0], env.reset()[0], env.reset()[0]]
     assert_same(first, again)
@@ -73,7 +52,7 @@ def test_a_seed_fixes_the_episodes_and_no_seed_goes_on():
 
 
 def test_an_episode_ends_by_truncation_at_the_horizon():
-    env = short(horizon=20)
+    env = make_env(horizon=20)
     *_, before_last, last = play(env, 20)
     assert before_last[2:4] == (False, False)
     assert last[2:4] == (False, True)
@@ -85,7 +64,7 @@ def test_an_episode_ends_by_truncation_at_the_horizon():
 
 
 def test_sequential_actions_move_the_traffic_on_their_last_pick():
-    env = short(action="sequential", bandwidth=3, horizon=5, truth_in_info=True)
+    env = make_env(action="sequential", bandwidth=3, horizon=5, truth_in_info=True)
     env.reset(seed=0)
     times, rewards, masks = [], [], []
     truncated = False
@@ -101,7 +80,7 @@ def test_sequential_actions_move_the_traffic_on_their_last_pick():
 
 
 def test_info_has_the_same_finite_numbers_at_every_step():
-    env = short()
+    env = make_env()
     (_, at_reset), *steps = play(env, 30)
     assert at_reset.pop("privacy")["guarantee"] == "none"
     assert at_reset.pop("inherited") == []
@@ -117,14 +96,14 @@ def test_info_has_the_same_finite_numbers_at_every_step():
 
 
 def test_truth_is_shown_only_on_request():
-    assert "truth" not in short().reset(seed=0)[1]
-    info = short(truth_in_info=True).reset(seed=0)[1]
+    assert "truth" not in make_env().reset(seed=0)[1]
+    info = make_env(truth_in_info=True).reset(seed=0)[1]
     assert set(info["truth"]) == {"density", "speed", "traffic_seed", "time"}
     assert set(TRUTH_INFO) <= set(info)
 
 
 def test_reset_options_choose_the_traffic_and_the_start():
-    env = short(horizon=50, random_start=True, truth_in_info=True)
+    env = make_env(horizon=50, random_start=True, truth_in_info=True)
     truth = env.reset(seed=0, options={"traffic_seed": 2, "start": 100})[1]["truth"]
     assert (truth["traffic_seed"], truth["time"]) == (2, 100)
     starts = {env.reset()[1]["truth"]["time"] for _ in range(30)}
@@ -133,7 +112,7 @@ def test_reset_options_choose_the_traffic_and_the_start():
 
 
 def test_fixing_the_traffic_leaves_the_noise_as_it_was():
-    env = short(traffic_seeds=[0])
+    env = make_env(traffic_seeds=[0])
     free = play(env, 10, seed=9)
     env.action_space.seed(9)
     fixed = [env.reset(seed=9, options={"traffic_seed": 0})]
@@ -151,7 +130,7 @@ def test_fixing_the_traffic_leaves_the_noise_as_it_was():
     ],
 )
 def test_bad_reset_options_are_refused_and_the_episode_goes_on(options, message):
-    env, undisturbed = short(horizon=50), short(horizon=50)
+    env, undisturbed = make_env(horizon=50), make_env(horizon=50)
     play(env, 3), play(undisturbed, 3)
     with pytest.raises(ValueError, match=message):
         env.reset(options=options)
@@ -160,7 +139,7 @@ def test_bad_reset_options_are_refused_and_the_episode_goes_on(options, message)
 
 
 def test_a_pickled_environment_goes_on_where_it_was():
-    env = short(render_mode="rgb_array")
+    env = make_env(render_mode="rgb_array")
     play(env, 10)
     copy = pickle.loads(pickle.dumps(env))
     for _ in range(10):
@@ -170,7 +149,7 @@ def test_a_pickled_environment_goes_on_where_it_was():
 
 
 def test_a_spec_survives_json():
-    env = short(
+    env = make_env(
         action="slots",
         privacy={"preset": "corrected", "epsilon": 5.0},
         corridor={"demand": {"mainline": [[0.0, 1500.0]], "on_ramps": [200.0]}},

@@ -11,7 +11,7 @@ from dptse_env.schedules import (
     make_schedule,
 )
 from dptse_env.spaces.actions import ACTION_ENCODINGS
-from tests.cases import fast_and_slow
+from tests.helpers import fast_and_slow
 
 SHORT = "dptse_env:dptse/ShortHighway-v0"
 

@@ -6,11 +6,11 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from .test_env import assert_same, play, short
+from tests.helpers import assert_same, make_env, play
 
 
 def guaranteed(**keywords):
-    return short(**{"privacy": {"preset": "capped", "cap": 5}, **keywords})
+    return make_env(**{"privacy": {"preset": "capped", "cap": 5}, **keywords})
 
 
 def test_the_account_of_a_guarantee_is_in_info():
@@ -84,7 +84,7 @@ def _n_vehicles(env, slot):
 
 
 def paced(**keywords):
-    return short(**{"privacy": {"preset": "paced", "epsilon": 0.5}, **keywords})
+    return make_env(**{"privacy": {"preset": "paced", "epsilon": 0.5}, **keywords})
 
 
 def test_the_account_of_paced_ledgers_grows_up_to_the_guarantee():

@@ -23,7 +23,7 @@ from dptse_env.schedules import (
     make_schedule,
 )
 from dptse_env.spaces.actions import ACTION_ENCODINGS
-from tests.cases import fast_and_slow
+from tests.helpers import fast_and_slow
 
 SEEDS = (0, 1)
 START, STEPS = 250, 30

@@ -15,8 +15,7 @@ from dptse_env.model import ARZModel, load_parameters
 from dptse_env.release import RELEASE_MODELS
 from dptse_env.schedules import make_schedule
 from dptse_env.traffic import write_corridor
-from tests.cases import fast_and_slow
-from tests.model.roads import UNEVEN
+from tests.helpers import UNEVEN, fast_and_slow
 
 ID = "dptse_env:dptse/PrivateHighway-v1"
 ROAD = dataclasses.replace(UNEVEN, duration=120)

@@ -13,7 +13,7 @@ import pytest
 
 from dptse_env.estimators import ESTIMATORS
 from dptse_env.release import Fusion, Paced, Pacing
-from tests.cases import fast_and_slow
+from tests.helpers import fast_and_slow
 
 from .test_non_interference import (
     EVERY_PAIR,

@@ -10,7 +10,7 @@ from dptse_env.estimators import ESTIMATORS, REFERENCES
 from dptse_env.parts import make_parts
 from dptse_env.process import QueryProcess
 from dptse_env.spaces.actions import ACTION_ENCODINGS
-from tests.cases import fast_and_slow
+from tests.helpers import COUNTED, fast_and_slow
 
 from .estimators.test_mhe import lying, missing, silent, unsolved
 
@@ -35,7 +35,6 @@ def sampled(process, n_steps):
     return [np.array([space.sample() for _ in SEEDS]) for _ in range(n_steps)]
 
 
-COUNTED = {"preset": "capped", "cap": 5, "boundary_inputs": "private"}
 PAID = {"preset": "paced", "boundary_inputs": "private"}
 
 

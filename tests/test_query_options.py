@@ -11,10 +11,15 @@ from dptse_env.config import resolve
 from dptse_env.parts import make_parts
 from dptse_env.process import QueryProcess
 from dptse_env.spaces.actions import ACTION_ENCODINGS
-from tests.cases import fast_and_slow
-
-from .release.sums import PricedRelease, SumRelease
-from .vectors import EPISODES, SHORT, lock_step, short
+from tests.helpers import (
+    EPISODES,
+    SHORT,
+    PricedRelease,
+    SumRelease,
+    fast_and_slow,
+    lock_step,
+    make_batch,
+)
 
 ONE = np.zeros(1, dtype=np.int64)
 CONFIGURATIONS = {
@@ -139,7 +144,7 @@ def test_queries_bring_the_estimate_nearer(estimator, spans):
 
     def error(**keywords):
         fixed = {"privacy": SumRelease, "horizon": 60, "action": "scores", "estimator": estimator}
-        env = short(8, **fixed, **keywords)
+        env = make_batch(8, **fixed, **keywords)
         env.reset(seed=3)
         scores = np.zeros(env.action_space.shape, dtype=np.float32)
         rewards = [env.step(scores)[1] for _ in range(59)]
@@ -174,7 +179,7 @@ def test_masks_show_what_the_rest_of_the_bandwidth_pays_for():
     assert np.flatnonzero(env.unwrapped.action_masks()).tolist() == [0, 1, 2, 3, 4, 5]
     *_, info = env.step(0)
     assert np.flatnonzero(info["queried"]).tolist() == [0, 6]
-    batch = short(2, privacy=SumRelease, **keywords)
+    batch = make_batch(2, privacy=SumRelease, **keywords)
     batch.reset(seed=0)
     batch.step(np.array([0, 11]))
     masks = batch.action_masks()

@@ -14,19 +14,19 @@ from dptse_env import sb3
 from dptse_env.evaluation import evaluate
 from dptse_env.policies import TRANSFERABLE
 from dptse_env.schedules import make_schedule
-from tests.agents.policies import SHORT, save
+from tests.helpers import SHORT, save_untrained
 from tests.hostile import edited
 
 
 def test_the_card_says_what_it_is(tmp_path):
-    path = save(tmp_path / "policy.safetensors", seed=3)
+    path = save_untrained(tmp_path / "policy.safetensors", seed=3)
     saved = read_saved_policy(path)
     assert (saved.recipe, saved.training_seed, saved.action) == ("plackett-luce", 3, "slots")
     assert saved.identity == saved.card["sha256"]
 
 
 def test_it_acts_as_the_policy_that_was_saved(tmp_path):
-    path = save(tmp_path / "policy.safetensors")
+    path = save_untrained(tmp_path / "policy.safetensors")
     env = gym.make(SHORT, action="slots")
     observation, _ = env.reset(seed=0)
     action, _ = (
@@ -37,7 +37,7 @@ def test_it_acts_as_the_policy_that_was_saved(tmp_path):
 
 
 def test_another_bandwidth_is_refused_unless_it_is_meant(tmp_path):
-    saved = read_saved_policy(save(tmp_path / "policy.safetensors"))
+    saved = read_saved_policy(save_untrained(tmp_path / "policy.safetensors"))
     env = gym.make(SHORT, action="slots", bandwidth=3)
     with pytest.raises(ValueError, match="bandwidth is 2 for the policy and 3 for the environment"):
         saved.load(env)
@@ -45,9 +45,9 @@ def test_another_bandwidth_is_refused_unless_it_is_meant(tmp_path):
 
 
 def test_a_file_that_has_changed_is_refused(tmp_path):
-    path = save(tmp_path / "policy.safetensors", seed=0)
+    path = save_untrained(tmp_path / "policy.safetensors", seed=0)
     saved = read_saved_policy(path)
-    save(path, seed=1)
+    save_untrained(path, seed=1)
     with pytest.raises(ValueError, match="has changed"):
         saved.load(gym.make(SHORT, action="slots"))
 
@@ -62,7 +62,7 @@ def test_what_is_no_policy_is_refused(tmp_path):
 
 
 def test_a_name_is_a_saved_policy_or_a_schedule(tmp_path):
-    path = save(tmp_path / "policy.safetensors", seed=2)
+    path = save_untrained(tmp_path / "policy.safetensors", seed=2)
     saved, schedule = find_policy(str(path)), find_policy("paper")
     assert saved == read_saved_policy(path)
     assert saved.keywords == {"action": "slots"}
@@ -81,7 +81,7 @@ def test_a_name_is_a_saved_policy_or_a_schedule(tmp_path):
 
 @pytest.mark.parametrize("training", [{"seed": 1}, {"learner": "mask", "seed": "first"}])
 def test_a_card_without_recipe_or_training_seed_is_refused(tmp_path, training):
-    path = save(tmp_path / "policy.safetensors")
+    path = save_untrained(tmp_path / "policy.safetensors")
     path.write_bytes(edited(path, lambda card, weights: card.update(training=training)))
     with pytest.raises(ValueError, match="not a saved policy"):
         read_saved_policy(path)
@@ -96,7 +96,7 @@ def test_a_converted_policy_keeps_its_identity_in_recorded_results():
 
 @pytest.mark.slow
 def test_a_card_is_read_without_torch(tmp_path):
-    path = save(tmp_path / "policy.safetensors")
+    path = save_untrained(tmp_path / "policy.safetensors")
     code = (
         "import sys; import scripts.evaluate; from agents.policies import find_policy; "
         f"assert find_policy({str(path)!r}).action == 'slots'; assert 'torch' not in sys.modules"

@@ -12,7 +12,7 @@ from agents.play import Cell, play
 from agents.study import Place, Study, read_rows, run, write_report, write_table
 from agents.tables import UnmeasuredError, below, difference, grid, mean, pick, values
 from tests.agents.faults import SHORT, TRACES, rows_of, study
-from tests.agents.policies import save
+from tests.helpers import save_untrained
 
 ROOT = Path(__file__).parents[2]
 KEYWORDS = {"estimator": "random_walk", "horizon": 80}
@@ -125,10 +125,10 @@ def test_an_id_says_all_that_rows_depend_on(tmp_path):
     assert len(ids) == len(changes) + 1
     assert replace(cell, labels={}, seeds=(1,)).id == cell.id
     # A policy that was trained again is another cell, and so is a road that was edited.
-    path = save(tmp_path / "policy.safetensors", seed=0)
+    path = save_untrained(tmp_path / "policy.safetensors", seed=0)
     trained = replace(cell, policy=str(path))
     before = trained.id
-    save(path, seed=1)
+    save_untrained(path, seed=1)
     assert trained.id != before
     road = tmp_path / "road.toml"
     road.write_text("a = 1")

@@ -14,7 +14,7 @@ import pytest
 import tyro
 
 from scripts.dptse import COMMANDS, split
-from tests.cases import fast_and_slow
+from tests.helpers import fast_and_slow
 
 from .blocks import BLOCKS, PAGES, ROOT
 

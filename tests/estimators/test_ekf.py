@@ -6,7 +6,7 @@ import pytest
 from dptse_env.estimators import EstimatorSettings
 from dptse_env.estimators.simple import estimated_traffic
 from dptse_env.model.parameters import VACUUM
-from tests.cases import pairwise
+from tests.helpers import pairwise
 
 from .episodes import RELEASES, SIGMA, run, scale_of, simulate, started, tell
 

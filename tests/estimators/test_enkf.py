@@ -15,8 +15,7 @@ from dptse_env.estimators import (
 from dptse_env.estimators.enkf import gaspari_cohn, make_tapers, positions
 from dptse_env.model import ARZModel, MeasurementRows, load_parameters
 from dptse_env.traffic import PAPER_HIGHWAY, SHORT_HIGHWAY
-from tests.cases import pairwise
-from tests.model.roads import Road
+from tests.helpers import Road, pairwise
 
 from .episodes import SIGMA, random_streams, run, simulate, started, tell
 from .rows import averaged, every_row, update, with_rows

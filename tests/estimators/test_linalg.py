@@ -7,7 +7,7 @@ from dptse_env.estimators import linalg
 from dptse_env.model import ARZModel
 from dptse_env.model.parameters import load_parameters
 from dptse_env.traffic import PAPER_HIGHWAY
-from tests.estimators.parts import compiled
+from tests.helpers import compiled
 
 add_product = compiled(linalg.add_product)
 factor = compiled(linalg.factor)

@@ -14,8 +14,7 @@ from dptse_env.estimators import (
     make_estimator,
 )
 from dptse_env.model import ARZModel, load_parameters
-from tests.cases import pairwise
-from tests.model.roads import Road
+from tests.helpers import Road, pairwise
 
 from .episodes import random_streams, tell
 

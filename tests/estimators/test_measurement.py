@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from dptse_env.estimators import ESTIMATORS, Measurement
-from tests.model.roads import Road, model_of
+from tests.helpers import Road
+from tests.model.roads import model_of
 
 from .episodes import random_streams, simulate, started
 

@@ -24,8 +24,7 @@ from dptse_env.estimators.mhe import (
 from dptse_env.estimators.mhe import update as solve_and_update
 from dptse_env.estimators.window import ACTIVE_SET, NEWTON, UNSOLVED
 from dptse_env.model import ARZModel, load_parameters
-from tests.cases import fast_and_slow, pairwise
-from tests.model.roads import UNEVEN
+from tests.helpers import UNEVEN, fast_and_slow, pairwise
 
 from .episodes import RELEASES, SIGMA, SIGMAS, random_streams, run, simulate, started, tell
 from .rows import PLAIN, RICH, averaged, update

@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from dptse_env.estimators.normals import STREAM_WIDTH, draw, draw_bits, make_stream
-from tests.estimators.parts import compiled
+from tests.helpers import compiled
 
 draw_bits = compiled(draw_bits)
 

@@ -12,8 +12,7 @@ from dptse_env.estimators import (
     make_estimator,
 )
 from dptse_env.model import ARZModel, Bounds
-from tests.cases import fast_and_slow
-from tests.model.roads import Road
+from tests.helpers import Road, fast_and_slow
 
 from .episodes import (
     EVERY,

@@ -8,7 +8,7 @@ import pytest
 
 from dptse_env.estimators import BlendSettings, DemandSettings, EstimatorSettings
 from dptse_env.model.network import MeasurementRows
-from tests.cases import pairwise
+from tests.helpers import pairwise
 
 from .episodes import RELEASES, assert_same, run, show, simulate, tell
 from .episodes import started as started_as

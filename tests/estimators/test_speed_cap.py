@@ -7,8 +7,7 @@ import pytest
 
 from dptse_env.estimators import EstimatorSettings
 from dptse_env.traffic import PAPER_HIGHWAY
-from tests.cases import fast_and_slow
-from tests.model.roads import Road
+from tests.helpers import Road, fast_and_slow
 
 from .episodes import EVERY, assert_same, model_of, run, show, simulate, started
 

@@ -8,7 +8,7 @@ from dptse_env.estimators import EstimatorSettings, SigmaPointSettings
 from dptse_env.estimators.ukf import UKF
 from dptse_env.model import ARZModel, load_parameters
 from dptse_env.traffic import PAPER_HIGHWAY
-from tests.cases import pairwise
+from tests.helpers import pairwise
 
 from .episodes import RELEASES, SIGMA, run, scale_of, simulate, started, tell
 

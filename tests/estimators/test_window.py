@@ -10,9 +10,8 @@ from dptse_env.estimators.linalg import padded
 from dptse_env.estimators.mhe import natural_residual, solve
 from dptse_env.estimators.window import ACTIVE_SET, NEWTON, REFINED, Point, Window
 from dptse_env.model import ARZModel, load_parameters
-from tests.model.roads import UNEVEN
+from tests.helpers import UNEVEN, compiled
 
-from .parts import compiled
 from .rows import every_row
 
 factorise, sweep = compiled(parts.factorise), compiled(parts.sweep)

@@ -2,83 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from dptse_env.model import ARZModel, ARZParameters, load_parameters
 from dptse_env.model.parameters import VACUUM
-from dptse_env.traffic import Corridor, Demand
+from dptse_env.traffic import Corridor
 from dptse_env.utils.arrays import FloatArray
+from tests.helpers import UNEVEN, Road
 
 PAPER = load_parameters("paper")
 W99 = load_parameters("w99-3lane")
 NO_RELAXATION = replace(PAPER, name="no relaxation", relaxation_time=float("inf"))
 
-
-@dataclass(frozen=True)
-class Road:
-    """A road network with the fields that the model asks for."""
-
-    n_mainline: int = 15
-    on_ramps: tuple[int, ...] = ()
-    off_ramps: tuple[int, ...] = ()
-    exit_shares: tuple[float, ...] = ()
-    segment_length: float = 0.1
-    speed_limit: float = 102.0
-    lanes: int = 3
-    ramp_lanes: int = 1
-    more_outside: int = 0
-
-    @property
-    def n_ramps(self) -> int:
-        return len(self.on_ramps) + len(self.off_ramps)
-
-    @property
-    def on_ramp_segments(self) -> tuple[tuple[int, ...], ...]:
-        return tuple((self.n_mainline + i,) for i in range(len(self.on_ramps)))
-
-    @property
-    def off_ramp_segments(self) -> tuple[tuple[int, ...], ...]:
-        first = self.n_mainline + len(self.on_ramps)
-        return tuple((first + o,) for o in range(len(self.off_ramps)))
-
-    @property
-    def segment_lanes(self) -> tuple[int, ...]:
-        return (self.lanes,) * self.n_mainline + (self.ramp_lanes,) * self.n_ramps
-
-    @property
-    def segment_lengths(self) -> tuple[float, ...]:
-        return (self.segment_length,) * (self.n_mainline + self.n_ramps)
-
-    @property
-    def speed_limits(self) -> tuple[float, ...]:
-        return (self.speed_limit,) * (self.n_mainline + self.n_ramps)
-
-    @property
-    def boundary_lanes(self) -> tuple[int, ...]:
-        lanes = (self.lanes,) * 2 + (self.ramp_lanes,) * self.n_ramps
-        return tuple(each + self.more_outside for each in lanes)
-
-
-UNEVEN = Corridor(
-    name="uneven",
-    n_mainline=8,
-    on_ramps=(2, 3),
-    off_ramps=(4, 6),
-    exit_shares=(0.2, 0.1),
-    demand=Demand(mainline=((0.0, 2000.0),), on_ramps=(300.0, 200.0)),
-    incident=None,
-    fixed_sensors=(7,),
-    duration=200,
-    lanes=(3, 3, 4, 4, 4, 3, 2, 2),
-    ramp_lanes=(1, 2, 2, 1),
-    segment_length=(0.1, 0.12, 0.2, 0.1, 0.35, 0.09, 0.1, 0.15),
-    speed_limit=(102.0, 102.0, 102.0, 120.0, 120.0, 80.0, 80.0, 80.0),
-    ramp_segments=(1, 3, 2, 1),
-    ramp_length=(0.1, 0.08, 0.2, 0.15),
-)
-"""A road with segments and ramps of many kinds."""
 
 HIGHWAY = Road(on_ramps=(3, 9), off_ramps=(6, 12), exit_shares=(0.1, 0.1))
 STRAIGHT = Road()

@@ -14,20 +14,10 @@ from dptse_env.model.columns import (
     project_states,
 )
 from dptse_env.model.step import project
-from tests.cases import pairwise
-from tests.estimators.parts import compiled
+from tests.helpers import UNEVEN, compiled, pairwise
 
 from .oracle import Oracle
-from .roads import (
-    HIGHWAY,
-    PAPER,
-    ROADS,
-    UNEVEN,
-    W99,
-    random_inputs,
-    random_states,
-    scattered_states,
-)
+from .roads import HIGHWAY, PAPER, ROADS, W99, random_inputs, random_states, scattered_states
 
 advance_states = compiled(advance_states)
 make_batch_scratch = compiled(make_batch_scratch)

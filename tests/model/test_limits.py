@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dptse_env.model import ARZModel, ARZParameters
-from tests.cases import pairwise
+from tests.helpers import UNEVEN, Road, pairwise
 
 from .oracle import Oracle
 from .roads import (
@@ -17,9 +17,7 @@ from .roads import (
     NO_RELAXATION,
     PAPER,
     STRAIGHT,
-    UNEVEN,
     W99,
-    Road,
     model_of,
     random_inputs,
     random_states,

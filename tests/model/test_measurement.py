@@ -6,10 +6,9 @@ import pytest
 from dptse_env.model import ARZModel, MeasurementRows
 from dptse_env.model.parameters import MEASUREMENT_FLOOR
 from dptse_env.model.step import write_row
-from tests.cases import pairwise
-from tests.estimators.parts import compiled
+from tests.helpers import UNEVEN, compiled, pairwise
 
-from .roads import HIGHWAY, PAPER, UNEVEN, W99, model_of, random_states, scattered_states
+from .roads import HIGHWAY, PAPER, W99, model_of, random_states, scattered_states
 
 write_row = compiled(write_row)
 

@@ -7,8 +7,9 @@ import pytest
 
 from dptse_env.model import MeasurementRows
 from dptse_env.model.network import DIVERGE, EXIT, LINK, MERGE, make_layout
+from tests.helpers import Road
 
-from .roads import HIGHWAY, Road
+from .roads import HIGHWAY
 
 ROWS = MeasurementRows(np.array([0, 3, 4, 13, 16]), np.array([1, 2, 3, 2, 1]), 19)
 

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from dptse_env.model import ARZModel
+from tests.helpers import Road
 
 from .oracle import Oracle
-from .roads import NO_RELAXATION, Road
+from .roads import NO_RELAXATION
 
 V_F, JAM, GAMMA = 102.0, 333.0, 2.0
 ROAD_LENGTH, MINUTES = 4.0, 1.2

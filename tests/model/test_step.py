@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 
 from dptse_env.model import ARZModel
 from dptse_env.model.step import advance, make_scratch, normalise
-from tests.cases import pairwise
-from tests.estimators.parts import compiled
+from tests.helpers import compiled, pairwise
 
 from .oracle import Oracle
 from .roads import HIGHWAY, NO_RELAXATION, PAPER, ROADS, STRAIGHT, W99, random_inputs, random_states

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dptse_env.privacy.sensitivity import contribution_sensitivity, paper_sensitivity
-from tests.cases import pairwise
+from tests.helpers import pairwise
 
 NOMINAL = {
     "n_sensors": 8,

@@ -17,9 +17,8 @@ from dptse_env.release import (
     Task,
     check_released,
 )
-from tests.model.roads import UNEVEN
+from tests.helpers import UNEVEN, MeanRelease, PricedRelease, SumRelease
 
-from .sums import MeanRelease, PricedRelease, SumRelease
 from .worlds import ONE, Worlds, stays
 
 

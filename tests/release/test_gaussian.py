@@ -21,11 +21,9 @@ from dptse_env.privacy import epsilon_of, mu_of
 from dptse_env.release import RELEASE_MODELS, CappedSettings, Group, PrivacySettings, Request
 from dptse_env.release.report import STRICT_DELTA
 from dptse_env.traffic import Penetration
-from tests.cases import pairwise
-from tests.model.roads import UNEVEN
+from tests.helpers import AWAY, UNEVEN, pairwise, record, short_road
 
 from .worlds import (
-    AWAY,
     BOTH,
     COLUMNS,
     LENGTH,
@@ -33,9 +31,7 @@ from .worlds import (
     ONE,
     Worlds,
     adjacent_trips,
-    corridor,
     crowd,
-    record,
     request,
     stays,
 )
@@ -123,7 +119,7 @@ def test_a_mean_is_over_those_that_count():
 @pytest.mark.parametrize("preset", ["paper", "capped"])
 @pytest.mark.parametrize("groups", [1, 2])
 def test_an_empty_segment_or_sensor_has_its_own_speed_limit(preset, groups):
-    road = dataclasses.replace(corridor(1), fixed_sensors=(3, 5, 7), ramp_speed_limit=60.0)
+    road = dataclasses.replace(short_road(1), fixed_sensors=(3, 5, 7), ramp_speed_limit=60.0)
     means = {"speed_release": "mean"} if preset == "capped" else {}
     asked = RELEASE_MODELS[preset].settings_type(preset=preset, **means)
     parts = Group("queries", 0.5, Penetration(0.3)), Group("sensors", 0.5)

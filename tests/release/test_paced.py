@@ -24,12 +24,10 @@ from dptse_env.privacy import epsilon_of, mu_of
 from dptse_env.release import Group, Paced, PacedSettings, Pacing, QueryOptions, Task, Traffic
 from dptse_env.release.noise import Noise
 from dptse_env.release.pacing import TracerPacing
-from tests.cases import pairwise
-from tests.model.roads import UNEVEN
+from tests.helpers import AWAY, UNEVEN, pairwise, record
 
 from .test_noise import residual_faults
 from .worlds import (
-    AWAY,
     BOTH,
     COLUMNS,
     LENGTH,
@@ -50,7 +48,6 @@ from .worlds import (
     exhausting,
     keep_for,
     predicting,
-    record,
     request,
     square,
     stays,

@@ -15,7 +15,7 @@ from dptse_env.release import (
 )
 from dptse_env.release.pacing import EventPacing, TracerPacing, check_prices
 from dptse_env.traffic import SHORT_HIGHWAY
-from tests.cases import pairwise
+from tests.helpers import pairwise
 
 from .worlds import ONE, WHOLE
 

@@ -15,9 +15,8 @@ from dptse_env.process import QueryProcess
 from dptse_env.release import Detectors, Group, PacedSettings, make_groups
 from dptse_env.release.noise import BLOCK
 from dptse_env.traffic import Penetration
-from tests.cases import pairwise
+from tests.helpers import SumRelease, pairwise
 
-from .sums import SumRelease
 from .test_noise import residual_faults
 from .worlds import LENGTH, ONE, Worlds, crowd, predicting, request
 

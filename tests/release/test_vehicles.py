@@ -7,11 +7,9 @@ import pytest
 
 from dptse_env.release import Traffic
 from dptse_env.traffic import SHORT_HIGHWAY, Penetration, RecordLibrary
-from tests.cases import pairwise
-from tests.model.roads import UNEVEN
+from tests.helpers import AWAY, UNEVEN, pairwise
 
 from .worlds import (
-    AWAY,
     GROUPED,
     LIMIT,
     ONE,

@@ -10,34 +10,15 @@ from hypothesis.extra.numpy import arrays
 from dptse_env.estimators import Estimate
 from dptse_env.release import RELEASE_MODELS, Group, QueryOptions, Request, Task, Traffic
 from dptse_env.release.vehicles import Ledgers
-from dptse_env.traffic import SHORT_HIGHWAY, Demand, Record
+from dptse_env.traffic import SHORT_HIGHWAY
+from tests.helpers import AWAY, record, short_road
 
 WHOLE = (Group("queries"),)
-AWAY = -1
-"""Place of a vehicle that is not on the road."""
-
 ONE, BOTH = np.arange(1), np.arange(2)
 T, COLUMNS, SEGMENTS, PLACES = 8, 12, 8, 4
 """Seconds, record columns and segments of the short road, and places of columns made up below."""
 
-
-def corridor(duration=T):
-    """The short road, with a record of `duration` seconds."""
-    demand = Demand(((0.0, 1000.0),), (100.0,))
-    return dataclasses.replace(SHORT_HIGHWAY, duration=duration, demand=demand, incident=None)
-
-
 LIMIT, LENGTH = SHORT_HIGHWAY.speed_limit, SHORT_HIGHWAY.segment_length
-
-
-def record(places, speeds, n_columns=COLUMNS):
-    """A record of places (V, T + 1) of V vehicles, `AWAY` where there is none, and their speeds."""
-    step, vehicle = np.nonzero(np.asarray(places).T != AWAY)
-    place, speed = (np.asarray(table)[vehicle, step] for table in (places, speeds))
-    return Record(
-        step=step, vehicle=vehicle, segment=place, speed=speed,
-        n_steps=np.shape(places)[1], n_columns=n_columns,
-    )  # fmt: skip
 
 
 def drives(places, speed):
@@ -67,7 +48,7 @@ class Worlds:
 
     def __init__(self, *records, road=None):
         self.records = records
-        self.road = road or corridor(records[0].n_steps - 1)
+        self.road = road or short_road(records[0].n_steps - 1)
 
     def get(self, corridor, seed):
         return self.records[seed]

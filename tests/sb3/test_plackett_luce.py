@@ -15,7 +15,7 @@ from dptse_env.config import PRESETS, resolve
 from dptse_env.parts import make_interface
 from dptse_env.sb3 import PlackettLuce, PlackettLucePolicy, RoadChannels
 from dptse_env.sb3.plackett_luce import RoadFeatures
-from tests.release.sums import PricedRelease, SumRelease
+from tests.helpers import PricedRelease, SumRelease
 
 # The distribution.
 

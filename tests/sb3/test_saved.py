@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 
 from dptse_env.policies import read_policy
 from dptse_env.sb3 import SB3VecEnv, load_policy, save_policy, shipped_policies
+from tests.helpers import ABOUT, SHORT, SumRelease, save_untrained, untrained
 from tests.hostile import check_hostile, check_refusals, edited
-from tests.release.sums import SumRelease
-from tests.sb3.saved_files import ABOUT, SHORT, make_policy, save
 
 SPANS = {"privacy": SumRelease, "query_spans": (1, 2), "bandwidth": 3}
 
@@ -25,7 +24,7 @@ def path(tmp_path):
 
 @pytest.fixture
 def stored(path):
-    return save(path)
+    return save_untrained(path, seed=3)
 
 
 def make_env(**keywords):
@@ -42,10 +41,15 @@ def observe(env):
 
 @pytest.mark.parametrize(
     ("action", "net_arch"),
-    [("slots", ()), ("scores", (8, 4)), ("mask", {"pi": [8], "vf": [4, 4]}), ("sequential", (16,))],
+    [
+        ("slots", None),
+        ("scores", [8, 4]),
+        ("mask", {"pi": [8], "vf": [4, 4]}),
+        ("sequential", [16]),
+    ],
 )
 def test_a_loaded_policy_acts_as_the_saved_one(path, action, net_arch):
-    policy, config = make_policy(action, net_arch=net_arch)
+    policy, config = untrained(action, net_arch=net_arch)
     save_policy(path, policy, config, **ABOUT)
     env = make_env(action=action)
     loaded = load_policy(path, env)
@@ -85,7 +89,7 @@ def test_it_is_loaded_for_any_form_of_the_environment(stored):
 
 
 def test_the_card_describes_the_policy(stored):
-    policy, config = make_policy()
+    policy, config = untrained()
     file = read_policy(stored)
     assert file.card["fits"]["corridor"] == config.corridor.digest
     assert file.card["fits"]["bandwidth"] == 2
@@ -134,7 +138,7 @@ def test_transfer_on_purpose(stored):
 
 
 def test_a_shared_network_moves_to_a_road_of_another_size(path):
-    policy, config = make_policy(preset="paper-highway")
+    policy, config = untrained(preset="paper-highway")
     save_policy(path, policy, config, **ABOUT)
     env = make_env(bandwidth=5)
     both = r"'paper-highway \(15 mainline .* and 'short-highway \(6 mainline .*allow corridor$"
@@ -142,7 +146,7 @@ def test_a_shared_network_moves_to_a_road_of_another_size(path):
         load_policy(path, env)
     loaded = load_policy(path, env, allow=("corridor",))
     # The same weights, made for the short road.
-    direct, _ = make_policy(bandwidth=5)
+    direct, _ = untrained(bandwidth=5)
     direct.load_state_dict(policy.state_dict())
     observation = observe(env)
     np.testing.assert_array_equal(
@@ -153,7 +157,7 @@ def test_a_shared_network_moves_to_a_road_of_another_size(path):
 
 @pytest.mark.parametrize("allow", [(), ("corridor", "bandwidth")])
 def test_a_perceptron_stays_on_its_road(path, allow):
-    save(path, "scores", preset="paper-highway", bandwidth=2)
+    save_untrained(path, "scores", preset="paper-highway", bandwidth=2)
     with pytest.raises(ValueError, match=r"observation is 'density:19 ") as refused:
         load_policy(path, make_env(action="scores"), allow=allow)
     assert "on purpose" not in str(refused.value)  # there is no way to do it
@@ -161,7 +165,7 @@ def test_a_perceptron_stays_on_its_road(path, allow):
 
 @pytest.mark.parametrize("action", ["mask", "scores", "sequential"])
 def test_a_perceptron_queries_several_segments_at_once(path, action):
-    save(path, action, **SPANS)
+    save_untrained(path, action, **SPANS)
     env = make_env(action=action, **SPANS)
     policy = load_policy(path, env)
     observation, _ = env.reset(seed=0)
@@ -206,7 +210,7 @@ def test_a_shipped_policy_acts_where_it_was_trained(name):
 @pytest.mark.parametrize("action", ["slots", "mask"])
 def test_damaged_files_are_refused(tmp_path, action):
     env = make_env(action=action)
-    good = save(tmp_path / "good.safetensors", action)
+    good = save_untrained(tmp_path / "good.safetensors", action)
     check_hostile(lambda path: load_policy(path, env), good, tmp_path / "bad.safetensors")
 
 
@@ -247,7 +251,7 @@ WRONG = {
 
 @pytest.mark.parametrize("action", WRONG)
 def test_cards_and_weights_that_do_not_agree_are_refused(tmp_path, action):
-    env, good = make_env(action=action), save(tmp_path / "good.safetensors", action)
+    env, good = make_env(action=action), save_untrained(tmp_path / "good.safetensors", action)
     load_policy(good, env)
     for k, (change, message) in enumerate(WRONG[action]):
         path = tmp_path / f"bad-{k}.safetensors"
@@ -267,7 +271,7 @@ json_values = st.recursive(
 def acting(tmp_path_factory):
     folder = tmp_path_factory.mktemp("saved")
     return {
-        action: (save(folder / f"{action}.safetensors", action), make_env(action=action))
+        action: (save_untrained(folder / f"{action}.safetensors", action), make_env(action=action))
         for action in ("slots", "scores", "sequential")
     }
 
@@ -299,13 +303,13 @@ def test_edited_cards_are_refused_or_act(acting, data):
 
 def test_what_cannot_be_saved(stored):
     before = stored.read_bytes()
-    policy, config = make_policy()
+    policy, config = untrained()
     with pytest.raises(ValueError, match=r"path must end in \.safetensors"):
         save_policy(stored.with_suffix(".pt"), policy, config, **ABOUT)
     with pytest.raises(ValueError, match="policy must be one of PlackettLucePolicy"):
         save_policy(stored, torch.nn.Linear(1, 1), config, **ABOUT)
     with pytest.raises(ValueError, match="weights must be of float32 alone"):
-        save_policy(stored, make_policy()[0].double(), config, **ABOUT)
+        save_policy(stored, untrained()[0].double(), config, **ABOUT)
     long = {**ABOUT, "figures": {"notes": "x" * 2**21}}
     with pytest.raises(ValueError, match=r"cannot be written: its header must have at most"):
         save_policy(stored, policy, config, **long)
@@ -313,7 +317,7 @@ def test_what_cannot_be_saved(stored):
         policy.scorer.rule[0] = torch.nan
     with pytest.raises(ValueError, match=r"cannot be written: scorer.rule must be finite"):
         save_policy(stored, policy, config, **ABOUT)
-    perceptron, masked = make_policy("mask")
+    perceptron, masked = untrained("mask")
     perceptron.extra = torch.nn.Linear(1, 1)
     with pytest.raises(ValueError, match=r"cannot be saved: .*Unexpected key\(s\).*extra.weight"):
         save_policy(stored, perceptron, masked, **ABOUT)

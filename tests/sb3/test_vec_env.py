@@ -14,7 +14,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
 from dptse_env.sb3 import SB3VecEnv
-from tests.release.sums import SumRelease
+from tests.helpers import SumRelease
 
 SHORT = "dptse_env:dptse/ShortHighway-v0"
 EPISODES = {"traffic_seeds": "0:3", "horizon": 6, "random_start": True}

@@ -13,9 +13,8 @@ from dptse_env.schedules import (
     make_schedule,
 )
 from dptse_env.spaces.actions import ACTION_ENCODINGS
-from tests.cases import fast_and_slow
+from tests.helpers import SumRelease, fast_and_slow
 
-from ..release.sums import SumRelease
 from .playing import begin, make_batch, make_single, play
 
 BOUND = [*PROCESS_SCHEDULES, *ORACLES]

@@ -10,8 +10,8 @@ from dptse_env.estimators import Estimate
 from dptse_env.parts import make_interface
 from dptse_env.release import QueryOptions
 from dptse_env.schedules import best_options, make_schedule, option_values
+from tests.helpers import SumRelease
 
-from ..release.sums import SumRelease
 from .playing import begin, make_batch
 
 

@@ -7,7 +7,7 @@ import pytest
 from dptse_env.privacy import mu_of
 from dptse_env.traffic import SHORT_HIGHWAY, write_corridor
 from scripts.audit import Args, attacked_config, main
-from tests.cases import fast_and_slow
+from tests.helpers import fast_and_slow
 
 SHORT = "dptse_env:dptse/ShortHighway-v0"
 

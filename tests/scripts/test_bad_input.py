@@ -11,7 +11,7 @@ pytest.importorskip("tyro")
 
 from dptse_env.traffic import RecordingError
 from scripts import dptse, info
-from tests.cases import fast_and_slow
+from tests.helpers import fast_and_slow
 from tests.scripts.commands import ROOT, refused, run_script
 
 SHORT = "dptse_env:dptse/ShortHighway-v0"
@@ -134,9 +134,9 @@ REFUSED = {
 @pytest.mark.parametrize("case", REFUSED)
 def test_what_does_not_fit_is_found_before_anything_is_recorded(case, tmp_path):
     pytest.importorskip("sb3_contrib")
-    from tests.agents.policies import save
+    from tests.helpers import save_untrained
 
-    policy = save(tmp_path / "policy.safetensors", bandwidth=3)
+    policy = save_untrained(tmp_path / "policy.safetensors", bandwidth=3)
     (script, *words), message = REFUSED[case]
     given = [word.replace("{policy}", str(policy)) for word in words]
     folders = "--output", tmp_path / "out", "--records", tmp_path / "cache"

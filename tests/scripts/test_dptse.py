@@ -16,7 +16,7 @@ from dptse_env import command_line
 from dptse_env.utils.registry import EXTRAS
 from scripts import dptse
 from scripts.dptse import COMMANDS, as_commands
-from tests.cases import fast_and_slow
+from tests.helpers import fast_and_slow
 
 SCRIPTS = Path(dptse.__file__).parent
 LIBRARIES = {"cli", "dptse", "document_configuration", "training_bar", "__init__"}

@@ -11,7 +11,7 @@ from agents.study import read_rows, write_table
 from dptse_env.evaluation import evaluate
 from dptse_env.sb3 import load_policy
 from scripts.evaluate import Args, main, reference_config
-from tests.agents.policies import SHORT, save
+from tests.helpers import SHORT, save_untrained
 
 
 def rows_of(folder, policy=None):
@@ -101,7 +101,7 @@ def test_bad_arguments_are_named_and_nothing_is_written(changes, message, tmp_pa
 
 
 def test_a_saved_policy_stands_beside_schedules(tmp_path, capsys):
-    path = save(tmp_path / "run-0" / "best.safetensors")
+    path = save_untrained(tmp_path / "run-0" / "best.safetensors")
     main(
         Args(
             env=SHORT, schedules=(), policies=(str(path),),
@@ -161,7 +161,7 @@ def test_seeds_are_called_what_they_are(tmp_path, capsys):
 
 
 def test_policies_that_do_not_fit_or_share_a_name_are_refused(tmp_path):
-    path = str(save(tmp_path / "run" / "best.safetensors", bandwidth=3))
+    path = str(save_untrained(tmp_path / "run" / "best.safetensors", bandwidth=3))
     arguments = Args(env=SHORT, policies=(path,), seeds="2000:2002", output=tmp_path / "out")
     with pytest.raises(ValueError, match="bandwidth is 3 for the policy and 2 for the environment"):
         main(arguments)

@@ -5,8 +5,8 @@ from agents.study import read_rows
 from scripts import suite
 from scripts.cli import run
 from scripts.suite import Args, main
-from tests.agents.policies import SHORT, save
 from tests.agents.studies.test_suite import HERE, KEYWORDS, SMALL, Task
+from tests.helpers import SHORT, save_untrained
 
 
 @pytest.fixture
@@ -17,7 +17,7 @@ def small(monkeypatch):
 
 
 def test_policies_are_scored_in_the_tasks_that_they_suit(small, tmp_path, capsys):
-    saved = str(save(tmp_path / "run" / "best.safetensors", estimator="random_walk"))
+    saved = str(save_untrained(tmp_path / "run" / "best.safetensors", estimator="random_walk"))
     main(Args(policies=(saved, "round-robin"), output=tmp_path / "out", workers=1))
     printed = capsys.readouterr()
     assert f"1 of 2 cells do not suit {saved}" in printed.err

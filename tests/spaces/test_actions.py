@@ -14,7 +14,7 @@ from dptse_env.spaces.actions import (
     SlotsAction,
     first_that_fit,
 )
-from tests.release.sums import SumRelease
+from tests.helpers import SumRelease
 
 FIRST = np.zeros(1, dtype=np.int64)
 EQUAL = np.ones(6, dtype=np.int64)

@@ -9,7 +9,7 @@ from dptse_env.spaces.observations import (
     PublicState,
 )
 from dptse_env.traffic import Corridor, Demand
-from tests.release.sums import SumRelease
+from tests.helpers import SumRelease
 
 N, S = 4, 6
 ROAD = Corridor(

@@ -21,7 +21,7 @@ from dptse_env.traffic import (
     simulate,
 )
 from dptse_env.traffic.sumo import limit_changes, running, seconds
-from tests.model.roads import UNEVEN
+from tests.helpers import UNEVEN
 from tests.traffic.test_record import assert_same
 
 N = PAPER_HIGHWAY.n_mainline

@@ -15,7 +15,7 @@ from dptse_env.traffic.sumo_input import (
     packaged_network,
 )
 from dptse_env.utils.registry import MissingExtraError
-from tests.model.roads import UNEVEN
+from tests.helpers import UNEVEN
 
 needs_netconvert = pytest.mark.skipif(
     importlib.util.find_spec("sumo") is None, reason="eclipse-sumo (extra corridors) is missing"

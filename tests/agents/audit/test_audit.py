@@ -20,7 +20,7 @@ from dptse_env.parts import make_release, privacy_report
 from dptse_env.privacy import epsilon_of
 from dptse_env.release import CappedSettings
 from tests.agents.elsewhere import Elsewhere
-from tests.cases import fast_and_slow
+from tests.helpers import fast_and_slow
 
 from .small import HORIZON, ROAD, assert_runs_do_not_depend_on_the_batch, config
 

@@ -21,7 +21,7 @@ from dptse_env.config import resolve
 from dptse_env.estimators import Measurement
 from dptse_env.parts import make_release, make_traffic, privacy_report
 from dptse_env.release import ReleaseModel, Request
-from tests.cases import fast_and_slow
+from tests.helpers import fast_and_slow
 
 from .small import (
     HORIZON,

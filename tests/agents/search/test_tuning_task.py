@@ -8,8 +8,8 @@ from dptse_env.estimators import EstimatorSettings
 from dptse_env.estimators.settings import load_settings
 from dptse_env.evaluation import evaluate
 from dptse_env.model import ARZParameters
-from tests.agents.policies import save
 from tests.agents.search.tasks import TASK
+from tests.helpers import save_untrained
 
 
 def make(cell):
@@ -67,7 +67,7 @@ def test_a_task_takes_parameters_of_its_own():
 
 def test_settings_can_be_tuned_for_a_saved_policy(tmp_path):
     pytest.importorskip("torch")
-    path = save(tmp_path / "policy.safetensors", seed=1)
+    path = save_untrained(tmp_path / "policy.safetensors", seed=1)
     task = dataclasses.replace(TASK, schedule=str(path))
     settings = EstimatorSettings(process_noise=(0.02, 0.03))
     env = make(task.cell(settings))
@@ -75,7 +75,9 @@ def test_settings_can_be_tuned_for_a_saved_policy(tmp_path):
     expected = evaluate(env, task.cell().load_policy(env), (1,), 1_000_000)
     assert score_episodes(task, settings, (1,)) == expected
     assert score_episodes(TASK, settings, (1,)) != expected
-    other = dataclasses.replace(TASK, schedule=str(save(tmp_path / "other.safetensors", seed=2)))
+    other = dataclasses.replace(
+        TASK, schedule=str(save_untrained(tmp_path / "other.safetensors", seed=2))
+    )
     assert task.identity()["policy"] != other.identity()["policy"]  # by content, not by name
     with pytest.raises(ValueError, match="bandwidth is 2 for the policy and 3"):
         dataclasses.replace(task, keywords={"bandwidth": 3}).cell().check()

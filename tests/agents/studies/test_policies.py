@@ -11,7 +11,7 @@ from agents.studies import policies
 from agents.study import Place, read_rows, run, write_report, write_table
 from agents.tables import UnmeasuredError
 from dptse_env.config import VALIDATION_SEEDS
-from tests.agents.policies import SHORT, save
+from tests.helpers import SHORT, save_untrained
 
 RECORDED = Path(__file__).parents[3] / "results" / "policies"
 VALIDATION, TEST, PRIMARY = policies.VALIDATION, policies.TEST, policies.PRIMARY
@@ -145,7 +145,7 @@ def test_a_small_study_plays_validation_then_test_traffic(tmp_path, monkeypatch)
         monkeypatch.setattr(policies, name, value)
     runs = tmp_path / "runs"
     for seed in range(2):
-        save(runs / f"pl-{seed}" / "best.safetensors", seed=seed)
+        save_untrained(runs / f"pl-{seed}" / "best.safetensors", seed=seed)
     with pytest.raises(ValueError, match="both plackett-luce of training seed 0"):
         policies.study([f"primary={runs}", f"primary={runs}/pl-0"])
     study = policies.study([f"primary={runs}", f"paced={runs}"])

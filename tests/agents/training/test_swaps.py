@@ -5,7 +5,7 @@ import pytest
 pytest.importorskip("sb3_contrib")
 
 from agents.training.swaps import Swaps, try_swaps
-from tests.release.sums import SumRelease
+from tests.helpers import SumRelease
 
 SHORT = "dptse_env:dptse/ShortHighway-v0"
 SEEDS = [5, 6, 7]

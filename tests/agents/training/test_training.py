@@ -24,7 +24,7 @@ from tests.agents.training.plans import (
     stop_at,
     without_time,
 )
-from tests.cases import fast_and_slow
+from tests.helpers import fast_and_slow
 
 PPO_LEARNERS = fast_and_slow(["scores", "mask", "maskable"], ["mask"])
 
@@ -232,7 +232,7 @@ def test_plans_that_are_refused(changes, message):
 
 
 def test_swaps_under_a_release_whose_noise_cannot_be_set_are_refused_at_once(tmp_path):
-    plan = make_plan(keywords={"horizon": 80, "privacy": "tests.release.sums:SumRelease"})
+    plan = make_plan(keywords={"horizon": 80, "privacy": "tests.helpers:SumRelease"})
     message = r"^recipe.swaps.rounds must be 0 under '.*SumRelease', .*, got 2; recipe:maskable"
     with pytest.raises(ValueError, match=message):
         Training(plan, tmp_path / "x")
