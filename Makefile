@@ -36,14 +36,14 @@ reproduce: setup  ## Write the reports of all studies anew, after playing what t
 	$(BIN)/python scripts/study.py suite
 
 audit: setup  ## Attack the privacy presets, 5,000 runs in each of two worlds; results/audit.
-	$(BIN)/python scripts/audit.py --force --env dptse_env:dptse/PaperHighway-v0 --target replaced
-	$(BIN)/python scripts/audit.py --force --env dptse_env:dptse/PaperHighway-v0 --privacy corrected --target replaced
-	$(BIN)/python scripts/audit.py --force --env dptse_env:dptse/PrivateHighway-v0 --noise-factor 0.709
-	$(BIN)/python scripts/audit.py --force --env dptse_env:dptse/PrivateHighway-v0
-	$(BIN)/python scripts/audit.py --force --noise-factor 0.709
-	$(BIN)/python scripts/audit.py --force
-	$(BIN)/python scripts/audit.py --force --target replaced
-	$(BIN)/python scripts/audit.py --force --target opposite
+	$(BIN)/dptse audit --force --env dptse_env:dptse/PaperHighway-v0 --target replaced
+	$(BIN)/dptse audit --force --env 'dptse_env:dptse/PaperHighway-v0 {"privacy": "corrected"}' --target replaced
+	$(BIN)/dptse audit --force --env dptse_env:dptse/PrivateHighway-v0 --noise-factor 0.709
+	$(BIN)/dptse audit --force --env dptse_env:dptse/PrivateHighway-v0
+	$(BIN)/dptse audit --force --noise-factor 0.709
+	$(BIN)/dptse audit --force
+	$(BIN)/dptse audit --force --target replaced
+	$(BIN)/dptse audit --force --target opposite
 
 test: setup  ## Run the tests, without the slow ones.
 	$(BIN)/python -m pytest -m 'not slow' -n 2 --dist loadfile
@@ -52,7 +52,7 @@ test-tutorial: setup  ## Run the tutorial as a notebook, two to four minutes.
 	$(BIN)/python -m pytest tests/docs/test_notebook.py
 
 test-slow: setup  ## Run the slow tests: before a release, and after a change to kernels, workers or benchmarks.
-	$(BIN)/python -m pytest -m slow
+	$(BIN)/python -m pytest -m 'slow and not ray' -n 2 --dist loadfile
 
 test-gymnasium: setup  ## Run the tests of environments with the oldest Gymnasium, which RLlib needs.
 	$(BIN)/python -m pip install --quiet --no-deps --upgrade --target build/gymnasium gymnasium==1.2.2
@@ -81,10 +81,9 @@ format: setup  ## Format the code.
 	$(BIN)/ruff check --fix
 	$(BIN)/ruff format
 
-benchmark: setup  ## Time the estimators and thousands of episodes beside their peers; results/throughput.
+benchmark: setup  ## Time estimators, environments and long roads beside their peers; results/benchmarks.
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[benchmark]'
-	$(BIN)/python benchmarks/bench_estimators.py
-	$(BIN)/python benchmarks/bench_throughput.py
+	$(BIN)/python -m benchmarks --output results/benchmarks/tables.md
 
 dist: setup  ## Build and check the archives of a release; dist/.
 	$(BIN)/python -m build --outdir dist

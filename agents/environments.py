@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import json
 import warnings
 from collections.abc import Iterator, Mapping
@@ -14,7 +15,6 @@ from gymnasium.vector import AutoresetMode
 from dptse_env.config import EnvConfig
 from dptse_env.env import SensorQueryEnv
 from dptse_env.evaluation import require_in_step
-from dptse_env.traffic import CORRIDORS, is_road_file
 from dptse_env.vector_env import SensorQueryVectorEnv
 
 OTHER_DRIVERS: dict[str, Any] = {
@@ -41,56 +41,29 @@ def unwrap(env: gym.Env[Any, Any]) -> SensorQueryEnv:
     return bare
 
 
-def parse_keywords(text: str) -> dict[str, Any]:
-    """Return keywords of an environment that are given as a JSON object.
-
-    Raises:
-        ValueError: The text is no JSON object.
-    """
-    keywords: Any = None
-    with contextlib.suppress(json.JSONDecodeError):
-        keywords = json.loads(text)
-    if not isinstance(keywords, dict):
-        raise ValueError(f"keywords must be a JSON object, got {text!r}")
-    return keywords
-
-
 def parse_env(text: str) -> tuple[str, dict[str, Any]]:
-    """Return the id and the keywords of an environment given as ``id`` or ``id {JSON}``.
+    """Return the id and the keywords of an environment given as ``ID`` or ``ID {JSON}``.
 
     Raises:
-        ValueError: What follows the id is no JSON object.
+        ValueError: There is no such environment, or what follows its id is no JSON object.
     """
-    env, _, rest = text.partition(" ")
-    return env, parse_keywords(rest) if rest.strip() else {}
-
-
-def given_keywords(keywords: str, corridor: str | None) -> dict[str, Any]:
-    """Return the keywords of an environment that a command line gives.
-
-    Args:
-        keywords: A JSON object.
-        corridor: Name of a shipped corridor, a road file, or a JSON object of corridor fields;
-            None for the corridor of the keywords or the environment.
-
-    Raises:
-        ValueError: The keywords are no JSON object, the corridor is unknown, or both name one.
-    """
-    given = parse_keywords(keywords)
-    if corridor is None:
-        return given
-    if "corridor" in given:
-        raise ValueError("corridor must be given once, as an argument or among the keywords")
-    value: Any = corridor
-    if corridor not in CORRIDORS and not is_road_file(corridor):
-        with contextlib.suppress(json.JSONDecodeError):
-            value = json.loads(corridor)
-        if not isinstance(value, dict):
-            raise ValueError(
-                f"corridor must be one of {', '.join(CORRIDORS)}, a road file that ends in "
-                f".toml, or a JSON object of corridor fields, got {corridor!r}"
-            )
-    return {"corridor": value, **given}
+    env, _, rest = text.strip().partition(" ")
+    module, _, name = env.rpartition(":")
+    try:
+        if module:
+            importlib.import_module(module)
+        spec = gym.spec(name)
+    except (gym.error.Error, ModuleNotFoundError) as problem:
+        raise ValueError(f"env must be the id of an environment, got {env!r}: {problem}") from None
+    if "preset" not in spec.kwargs:
+        raise ValueError(f"env must be the id of an environment of dptse_env, got {env!r}")
+    try:
+        keywords = json.loads(rest or "{}")
+    except json.JSONDecodeError as problem:
+        raise ValueError(f"env must be an id and a JSON object, got {rest!r}: {problem}") from None
+    if not isinstance(keywords, dict):
+        raise ValueError(f"env must be an id and a JSON object, got {rest!r}")
+    return env, keywords
 
 
 def make_config(env: str, keywords: Mapping[str, Any]) -> EnvConfig:

@@ -1,1 +1,1 @@
-"""Speed, as ratios within one run."""
+"""Times of a step beside those of its peers: `python -m benchmarks`."""

@@ -1,11 +1,27 @@
-"""Roads of any length with a ramp about every 700 m, and their recorded traffic."""
+"""Time of an estimator's step on roads of growing length.
+
+The roads have a ramp about every 700 m. All lengths of an estimator take turns, a step as in
+`benchmarks.estimators`, a third of the mainline segments queried. A ratio of 4 on a road four times
+as long is linear growth.
+"""
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import partial
+
+import gymnasium as gym
+
+from agents.environments import quietly
+from agents.figures import LABELS
+from benchmarks.estimators import Replay, tapped_calls
+from benchmarks.turns import Line, compare, take_turns
 from dptse_env.traffic import Corridor, Demand, Incident
+from dptse_env.vector_env import SensorQueryVectorEnv
 
 DURATION = 1200  # [s], in which a vehicle passes 200 segments and a jam ends
 EVERY = 15  # segments from one on-ramp to the next, and from one off-ramp to the next
+ESTIMATORS = ("ekf", "ukf", "enkf", "mhe", "recurrent")
 
 
 def long_road(n_mainline: int) -> Corridor:
@@ -32,3 +48,28 @@ def long_road(n_mainline: int) -> Corridor:
         duration=DURATION,
         average_dwell=5.0,
     )
+
+
+def measure(*, quick: bool = False) -> list[Line]:
+    """Return the lines of all estimators; the ratios are to the shortest road."""
+    lengths, n_steps, block, rounds = ((16, 21), 6, 3, 2) if quick else ((30, 60, 120), 60, 10, 12)
+    work, bases = {}, {}
+    for n in lengths:
+        with quietly():
+            env = gym.make_vec(
+                "dptse_env:dptse/PaperHighway-v0", num_envs=1, threads=1, corridor=long_road(n),
+                parameters="w99-3lane", bandwidth=n // 3, traffic_seeds=[0],
+            )  # fmt: skip
+        assert isinstance(env, SensorQueryVectorEnv)
+        config, calls = env.config, tapped_calls(env, n_steps)
+        for name in ESTIMATORS:
+            settings = replace(config, estimator=name).settings()
+            # The network is asked for on roads that it was not trained on.
+            recurrent = replace(settings.recurrent, outside=True)
+            settings = replace(settings, recurrent=recurrent)
+            replay = Replay(name, "compiled", env, calls, settings)
+            what, base = (f"{LABELS[name]}, {each} segments" for each in (n, lengths[0]))
+            work[what] = partial(replay.turn, block)
+            if what != base:
+                bases[what] = base
+    return compare(take_turns(work, rounds), bases)

@@ -1,1 +1,1 @@
-"""Short programs that train on the environments with libraries other than stable-baselines3."""
+"""Short programs: training with several libraries, a schedule and a study of one's own."""

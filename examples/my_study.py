@@ -4,8 +4,8 @@ It plays two rules with three bandwidths on eight traffic seeds, in half a minut
 ``rows.parquet`` (an episode a line), ``tables.md`` and a figure. An interrupted run goes on, and
 ``--report`` writes tables and figure again from the rows alone.
 
-python scripts/study.py examples.my_study:STUDY --output results/my-study
-python scripts/study.py examples.my_study:STUDY --output results/my-study --report
+dptse study examples.my_study:STUDY --output results/my-study
+dptse study examples.my_study:STUDY --output results/my-study --report
 """
 
 from pathlib import Path

@@ -1,119 +1,99 @@
-"""PPO of Ray RLlib (new API stack), on single episodes or on a batch that steps as one.
+"""PPO of Ray RLlib (new API stack) on a batch of episodes that steps as one.
 
 pip install -e '.[train]' 'ray[rllib]==2.60.0'
-python examples/rllib_ppo.py
-python examples/rllib_ppo.py --lstm
-python examples/rllib_ppo.py --vectorize sync --envs 4
-python scripts/evaluate.py --env dptse_env:dptse/ShortHighway-v0 --parameters paper \
-    --policies examples.rllib_policy:RLlibPolicy=results/rllib/policy.zip
+python examples/rllib_ppo.py --steps 300000
 
 RLlib makes its environments with ``gym.make_vec``, and ``gym_env_vectorize_mode`` says how. Its
 default, ``sync``, steps scalar environments in turn; ``vector_entry_point`` asks for
 `dptse_env.vector_env.SensorQueryVectorEnv`, which steps them at once. RLlib expects the autoreset
-of the next step, our default.
-
-RLlib cannot act in `MultiBinary`, the space of the default encoding. ``slots`` suits it best: one
-categorical choice for each query. ``--lstm`` adds a memory. The new API stack has no model with
-attention; one would be a module of one's own (``RLModuleSpec(module_class=...)``).
+of the next step, our default. It cannot act in `MultiBinary`, the space of the default encoding;
+``slots`` suits it best, one categorical choice for each query.
 """
 
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
+import gymnasium as gym
+import numpy as np
 import ray
 import torch
 import tyro
 from ray.rllib.algorithms.ppo import PPOConfig
+from ray.rllib.core.columns import Columns
 from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
 
-from dptse_env.schedules import make_schedule
-from examples.held_out import make_held_out, mean_error
-from examples.rllib_policy import RLlibPolicy
+import dptse_env
+
+ENV, KEYWORDS = "dptse_env:dptse/ShortHighway-v0", {"bandwidth": 1, "action": "slots"}
+N_ENVS, BATCH = 64, 4096
+HELD_OUT = range(1000, 1008)
 
 
-@dataclass(frozen=True)
-class Args:
-    """Train with PPO of RLlib."""
+class Policy:
+    """A module of RLlib as a policy: what `dptse_env.evaluate` asks for."""
 
-    env: str = "dptse_env:dptse/ShortHighway-v0"
-    """Environment id."""
-    action: Literal["slots", "scores", "sequential"] = "slots"
-    """Action encoding."""
-    vectorize: Literal["sync", "vector_entry_point"] = "vector_entry_point"
-    """How RLlib steps its environments: one by one, or as a batch."""
-    envs: int = 64
-    """Episodes at once in each env runner."""
-    runners: int = 0
-    """Processes that collect episodes; with 0 the main process does."""
-    lstm: bool = False
-    """Whether the network has a memory."""
-    steps: int = 300_000
-    """Steps to train for, at least."""
-    batch: int = 4096
-    """Steps of one iteration."""
-    seed: int = 0
-    """Seeds the environments, the actions and the weights."""
-    output: Path = Path("results/rllib")
-    """Folder for the checkpoint of the algorithm and for policy.zip."""
+    def __init__(self, module: Any) -> None:
+        """Take the module of an algorithm, ``algorithm.get_module()``."""
+        self.module = module
+
+    @torch.no_grad()
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        """Return actions and no state."""
+        outputs = self.module.forward_inference({Columns.OBS: torch.as_tensor(observation)})
+        # Heads of several choices come as a tuple, others as one array.
+        logits = outputs[Columns.ACTION_DIST_INPUTS].reshape(len(observation), -1)
+        choices = self.module.get_inference_action_dist_cls().from_logits(logits)
+        return (choices.to_deterministic() if deterministic else choices).sample().numpy(), None
+
+
+def error(policy) -> float:
+    """Return the error x 1000 on held-out traffic of a policy, or of a schedule by its name."""
+    env = gym.make_vec(ENV, num_envs=len(HELD_OUT), traffic_seeds=list(HELD_OUT), **KEYWORDS)
+    return -1000 * np.mean([row["reward"] for row in dptse_env.evaluate(env, policy, HELD_OUT)])
 
 
 def one_thread(**_: Any) -> None:
-    """Keep each env runner to one core: the networks are small, and there may be many runners."""
+    """Keep an env runner to one core: the networks are small."""
     torch.set_num_threads(1)
 
 
-def make_config(args: Args, keywords: dict[str, Any]) -> PPOConfig:
-    """Return the configuration of the algorithm."""
-    if args.vectorize == "vector_entry_point":
-        keywords = {**keywords, "threads": 1}  # the estimator's; only the batch has this keyword
-    model = DefaultModelConfig(
-        fcnet_hiddens=[64, 64], use_lstm=args.lstm, lstm_cell_size=64, max_seq_len=20
-    )
-    return (
-        PPOConfig()
-        .environment(args.env, env_config=keywords)
-        .env_runners(
-            num_env_runners=args.runners,
-            num_envs_per_env_runner=args.envs,
-            gym_env_vectorize_mode=args.vectorize,
-        )
-        .callbacks(on_environment_created=one_thread)
-        .rl_module(model_config=model)
-        .training(train_batch_size_per_learner=args.batch, minibatch_size=256, num_epochs=4)
-        .training(lr=3e-4, gamma=0.9, entropy_coeff=0.003)
-        .debugging(seed=args.seed)
-    )
+def main(steps: int = 300_000, seed: int = 0, runners: int = 0) -> None:
+    """Train, and compare the policy with its untrained self and a rule on held-out traffic.
 
-
-def main(args: Args) -> None:
-    """Train, and compare the policy with its untrained self and a schedule on held-out traffic."""
-    keywords = {"action": args.action, "horizon": 120, "random_start": True}
-    held_out = make_held_out(args.env, keywords)
+    Args:
+        steps: Steps to train for, at least.
+        seed: Seeds the environments, the actions and the weights.
+        runners: Processes that collect episodes; with 0 the main process does.
+    """
+    keywords = {**KEYWORDS, "horizon": 120, "random_start": True, "threads": 1}
     ray.init(
         address="local", include_dashboard=False, log_to_driver=False,
         runtime_env={"env_vars": {"OMP_NUM_THREADS": "1"}},
     )  # fmt: skip
-    algorithm = make_config(args, keywords).build_algo()
-    untrained = mean_error(held_out, RLlibPolicy(algorithm.get_module()))
-    steps = 0
-    while steps < args.steps:
-        collected = algorithm.train()["env_runners"]
-        steps = int(collected["num_env_steps_sampled_lifetime"])
-        print(
-            f"{steps} steps, mean return {collected.get('episode_return_mean', float('nan')):.2f}"
+    algorithm = (
+        PPOConfig()
+        .environment(ENV, env_config=keywords)
+        .env_runners(
+            num_env_runners=runners,
+            num_envs_per_env_runner=N_ENVS,
+            gym_env_vectorize_mode="vector_entry_point",
         )
-    folder = args.output.resolve()
-    algorithm.save_to_path(folder / "checkpoint")
-    policy = RLlibPolicy(algorithm.get_module())
-    policy.save(folder / "policy.zip")
-    trained = mean_error(held_out, policy)
+        .callbacks(on_environment_created=one_thread)
+        .rl_module(model_config=DefaultModelConfig(fcnet_hiddens=[64, 64]))
+        .training(train_batch_size_per_learner=BATCH, minibatch_size=256, num_epochs=4)
+        .training(lr=3e-4, gamma=0.9, entropy_coeff=0.003)
+        .debugging(seed=seed)
+        .build_algo()
+    )
+    untrained, done = error(Policy(algorithm.get_module())), 0
+    while done < steps:
+        collected = algorithm.train()["env_runners"]
+        done = int(collected["num_env_steps_sampled_lifetime"])
+        print(f"{done} steps, mean return {collected.get('episode_return_mean', np.nan):.2f}")
+    trained, rule = error(Policy(algorithm.get_module())), error("speed-front")
     algorithm.stop()
     ray.shutdown()
-    rule = mean_error(held_out, make_schedule("round-robin", held_out))
-    print(f"mean error: untrained {untrained:.1f}, trained {trained:.1f}, round robin {rule:.1f}")
-    print(f"the policy is in {args.output}/policy.zip")
+    print(f"error x 1000: untrained {untrained:.1f}, trained {trained:.1f}, rule {rule:.1f}")
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args, description=__doc__))
+    tyro.cli(main)

@@ -17,15 +17,15 @@ from agents.files import refuse_to_replace
 from agents.play import Cell
 from dptse_env.parts import privacy_report
 from dptse_env.utils.fields import inside, integer, positive
-from scripts.cli import Machines, run
+from scripts.cli import Environment, Machines
 
 
 @dataclass(frozen=True)
-class Args(Machines):
+class Args(Environment, Machines):
     """Audit the privacy of an environment."""
 
     env: str = "dptse_env:dptse/PrivateHighway-v1"
-    """Environment: an id, or an id and keywords of gym.make as JSON, 'ID {"bandwidth": 3}'."""
+    """Environment: an id, or an id and keywords as JSON, 'ID {"privacy": {"cap": 16}}'."""
     target: str = "worst-case"
     """Vehicle that differs: worst-case or opposite, made up; replaced, deleted, runs-out, jam or
     late, of the record."""
@@ -86,7 +86,3 @@ def main(args: Args) -> None:
         return
     finding.print()
     print(f"the result is in {path}")
-
-
-if __name__ == "__main__":
-    run(main, Args, __doc__)

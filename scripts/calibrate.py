@@ -30,13 +30,13 @@ from dptse_env.model.parameters import write_parameters
 from dptse_env.release import Traffic
 from dptse_env.traffic import Corridor, RecordLibrary, average_dwell
 from dptse_env.utils.files import replacing
-from scripts.cli import Recording, Road, make_corridor, run
+from scripts.cli import Environment, Recording
 
 logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Args(Road, Recording):
+class Args(Environment, Recording):
     """Fit the ARZ parameters."""
 
     train: str = "0:16"
@@ -128,7 +128,7 @@ def main(args: Args) -> None:
         raise ValueError(f"held_out must not share seeds with train, both have {shared}")
     path = args.output / f"{args.name}.json"
     refuse_to_replace([path], args.force)
-    corridor = make_corridor(args.env, args.given_keywords())
+    corridor = args.corridor()
     library = args.library(corridor, (*train, *held_out))
     dwell = average_dwell(corridor, (library.get(corridor, seed) for seed in train))
     fit = calibrate(
@@ -163,7 +163,3 @@ def main(args: Args) -> None:
         print(f"at the bounds of the search: {', '.join(fit.at_bounds)}")
     print(f"mean time on a mainline segment: {dwell:.2f} s")
     print(f"written to {path}")
-
-
-if __name__ == "__main__":
-    run(main, Args, __doc__)

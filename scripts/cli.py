@@ -1,15 +1,10 @@
-"""Shared parts of all scripts: arguments, logging, and one line on bad input."""
+"""Shared parts of all commands: arguments, logging, and one line on bad input."""
 
 from __future__ import annotations
 
-import contextlib
-import dataclasses
 import logging
-import re
-import shlex
 import sys
-import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,9 +12,9 @@ from typing import Any
 import gymnasium as gym
 import tyro
 
-from agents.environments import given_keywords
+from agents.environments import parse_env, quietly
 from agents.executors import AnyExecutor, ExecutorError, ExecutorName, make_executor
-from agents.play import Cell, PlayError, record
+from agents.play import PlayError, record
 from agents.study import Place
 from dptse_env.config import resolve
 from dptse_env.traffic import (
@@ -31,6 +26,27 @@ from dptse_env.traffic import (
 )
 from dptse_env.utils.registry import MissingExtraError
 from dptse_env.utils.threads import n_cores
+
+
+@dataclass(frozen=True)
+class Environment:
+    """One environment."""
+
+    env: str = "dptse_env:dptse/PaperHighway-v0"
+    """Environment: an id, or an id and keywords of gym.make as JSON, 'ID {"bandwidth": 3}'."""
+
+    def corridor(self) -> Corridor:
+        """Return its road.
+
+        Raises:
+            ValueError: The environment is unknown, or a keyword is unknown or out of range.
+        """
+        env, keywords = parse_env(self.env)
+        # Traffic does not depend on queries, and a short road may have fewer segments.
+        queries = {"bandwidth": 1, "query_spans": [1]} if "corridor" in keywords else {}
+        preset = gym.spec(env.rpartition(":")[2]).kwargs["preset"]
+        with quietly():
+            return resolve(preset, {**queries, **keywords}).corridor
 
 
 @dataclass(frozen=True)
@@ -54,10 +70,9 @@ class Machines(Recording):
     """Machines that run tasks. Results do not depend on them."""
 
     executor: ExecutorName = "local"
-    """Where tasks run: in processes of this machine (local), or on a Ray cluster (ray)."""
+    """Where tasks run: in processes of this machine, or on a Ray cluster."""
     address: str | None = None
-    """Address of the Ray cluster, host:port of its head node, or auto for the one on this machine;
-    RAY_ADDRESS if not given, or else a new one on this machine."""
+    """Address of the Ray cluster, or auto; RAY_ADDRESS, or else a new one here, if not given."""
 
     def start_executor(self) -> AnyExecutor:
         """Return what runs the tasks.
@@ -75,23 +90,6 @@ class Machines(Recording):
         return Place(folder, self.start_executor(), self.records)
 
 
-@dataclass(frozen=True)
-class Road:
-    """An environment and its road."""
-
-    corridor: str | None = None
-    """Corridor: the name of a shipped one, a road file that ends in .toml, or a JSON object of
-    fields that replace those of the environment's corridor; the environment's own if not given."""
-    env: str = "dptse_env:dptse/PaperHighway-v0"
-    """Environment id."""
-    keywords: str = "{}"
-    """Keywords of the environment as JSON, such as '{"incident": "random"}'."""
-
-    def given_keywords(self) -> dict[str, Any]:
-        """Return the keywords of the environment, with the corridor if one is given."""
-        return given_keywords(self.keywords, self.corridor)
-
-
 BAD_INPUT = (
     ValueError, FileNotFoundError, FileExistsError, IsADirectoryError, NotADirectoryError,
     PermissionError,
@@ -103,9 +101,6 @@ FAILURES = (
     PlayError,
 )  # fmt: skip
 """Errors of a run, which end a program with status 1 and their message alone."""
-
-NOT_RESULTS = ("executor", "address", "workers", "records", "output", "json", "force")
-"""Arguments that results do not depend on."""
 
 
 def run(
@@ -125,20 +120,19 @@ def run(
     Args:
         main: The program.
         arguments: A dataclass, or a union of dataclasses for subcommands.
-        description: Text for ``--help``.
+        description: Text for ``--help``: a sentence, and then examples, each after a dollar sign.
         program: Name of the program in its help; that of the file if None.
         words: The command line; that of the process if None.
     """
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(message)s")
-    # Examples stand in lines of their own; the help would run them together.
-    description = re.sub(r"\n(?=python |dptse )", "\n\n", description or "")
+    config = (tyro.conf.FlagCreatePairsOff,)
     try:
-        main(tyro.cli(arguments, prog=program, args=words, description=description))
+        main(tyro.cli(arguments, prog=program, args=words, description=description, config=config))
     except (*BAD_INPUT, *FAILURES) as problem:
         print(f"error: {_in_words(problem)}", file=sys.stderr)
         raise SystemExit(2 if isinstance(problem, BAD_INPUT) else 1) from problem
     except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
+        print("interrupted: the same command goes on from what is finished", file=sys.stderr)
         raise SystemExit(130) from None
 
 
@@ -147,74 +141,3 @@ def _in_words(problem: BaseException) -> str:
     if isinstance(problem, OSError) and problem.strerror and problem.filename:
         return f"{problem.filename}: {problem.strerror}"
     return str(problem)
-
-
-@contextlib.contextmanager
-def resumable() -> Iterator[None]:
-    """End with status 130 on Ctrl-C in the body, and print how to resume the program."""
-    try:
-        yield
-    except KeyboardInterrupt:
-        print("interrupted: the same command goes on from here", file=sys.stderr)
-        raise SystemExit(130) from None
-
-
-def command(script: str, args: Any) -> str:
-    """Return the command that makes the same results, whatever the machine and the folder.
-
-    Args:
-        script: Name of the script, with its subcommands.
-        args: Its arguments, a dataclass; fields may be dataclasses of more arguments.
-    """
-    return " ".join([f"python scripts/{script}", *_words(args)])
-
-
-def _words(args: Any) -> Iterator[str]:
-    """Yield the arguments that are not at their default."""
-    for field in dataclasses.fields(args):
-        value = getattr(args, field.name)
-        if dataclasses.is_dataclass(value):
-            yield from _words(value)
-        elif value != field.default and field.name not in NOT_RESULTS:
-            yield "--" + field.name.replace("_", "-")
-            if value is not True:
-                values = value if isinstance(value, tuple) else (value,)
-                yield from (shlex.quote(str(each)) for each in values)
-
-
-def make_corridor(env: str, keywords: Mapping[str, Any]) -> Corridor:
-    """Return the corridor of an environment with some keywords.
-
-    Raises:
-        ValueError: A field or keyword is unknown or out of range.
-    """
-    # Traffic does not depend on queries, and a short road may have fewer segments.
-    queries = {"bandwidth": 1, "query_spans": [1]} if "corridor" in keywords else {}
-    given = {**queries, **keywords}
-    with warnings.catch_warnings():
-        # They are about the guarantee and the estimator; only the corridor is wanted.
-        warnings.simplefilter("ignore", UserWarning)
-        return resolve(gym.spec(env.rpartition(":")[2]).kwargs["preset"], given).corridor
-
-
-def suitable(cells: Sequence[Cell], what: str) -> tuple[Cell, ...]:
-    """Return the cells that can be played, and say how many do not suit what was given, and why.
-
-    Raises:
-        FileNotFoundError: There is no such policy.
-        ValueError: None can be played.
-    """
-    taken, refused = [], []
-    for cell in cells:
-        try:
-            cell.check()
-        except ValueError as problem:
-            refused.append(problem)
-        else:
-            taken.append(cell)
-    if not taken:
-        raise refused[0]
-    if refused:
-        n = f"{len(refused)} of {len(cells)} cells"
-        print(f"{n} do not suit {what} and are left out: {refused[0]}", file=sys.stderr)
-    return tuple(taken)

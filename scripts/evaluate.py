@@ -16,7 +16,7 @@ from typing import Any
 
 import polars as pl
 
-from agents.environments import make_config
+from agents.environments import make_config, parse_env
 from agents.figures import RoadMap, draw_maps, estimate_map, save_errors, save_figure
 from agents.files import refuse_to_replace
 from agents.page import watch, write_page
@@ -37,9 +37,8 @@ from agents.tables import (
 from agents.terminal import make_table, print_table, print_text
 from dptse_env.config import EnvConfig, parse_seeds
 from dptse_env.schedules import OBSERVATION_SCHEDULES
-from dptse_env.traffic import is_road_file
 from dptse_env.utils.fields import require
-from scripts.cli import Machines, Road, resumable, run
+from scripts.cli import Environment, Machines
 
 ALL = "all"
 """The schedule that runs with a bandwidth that covers the road."""
@@ -49,7 +48,7 @@ ERRORS, MAPS, PAGE = "schedules.png", "space_time.png", "page.html"
 
 
 @dataclass(frozen=True)
-class Args(Road, Machines):
+class Args(Environment, Machines):
     """Evaluate query schedules and trained policies."""
 
     schedules: tuple[str, ...] = tuple(OBSERVATION_SCHEDULES)
@@ -68,17 +67,6 @@ class Args(Road, Machines):
     """Traffic seeds, first:stop; keep them apart from those used to train or calibrate."""
     reference: str = "paper"
     """Schedule that the others are compared with; added if not among them."""
-    bandwidth: int | None = None
-    """Most segments to query a second; the environment's own if not given."""
-    parameters: str | None = None
-    """ARZ parameters: the name of a set, or a JSON file as scripts/calibrate.py writes it; if not
-    given those of the keywords or of the road file, and else w99-3lane."""
-    privacy: str | None = None
-    """Privacy preset; the environment's own if not given."""
-    epsilon: float | None = None
-    """Privacy parameter epsilon; the environment's own if not given."""
-    delta: float | None = None
-    """Privacy parameter delta; the environment's own if not given."""
     noise_seed: int = 0
     """Seeds noise and estimators; one stream per traffic seed, the same for every schedule."""
     output: Path = Path("results/evaluation")
@@ -98,16 +86,12 @@ def make_cell(args: Args, estimator: str, name: str, policy: str) -> Cell:
         FileNotFoundError: There is no such saved policy.
         ValueError: An argument is no JSON object or no file of parameters.
     """
-    keywords: dict[str, Any] = {**args.given_keywords(), "estimator": estimator}
-    for key in ("privacy", "epsilon", "delta", "bandwidth", "parameters"):
-        if getattr(args, key) is not None:
-            keywords[key] = getattr(args, key)
-    if not is_road_file(keywords.get("corridor")):
-        keywords.setdefault("parameters", "w99-3lane")
+    env, keywords = parse_env(args.env)
+    keywords["estimator"] = estimator
     if policy == ALL:
-        keywords["bandwidth"] = make_config(args.env, keywords).corridor.n_mainline
+        keywords["bandwidth"] = make_config(env, keywords).corridor.n_mainline
     return Cell(
-        env=args.env,
+        env=env,
         policy=policy,
         keywords=keywords,
         labels={"estimator": estimator, "policy": name},
@@ -290,7 +274,6 @@ def draw_traffic(
         write_page(args.output / PAGE, found.title, errors, episodes, seed)
 
 
-@resumable()
 def main(args: Args) -> None:
     """Record what is missing, evaluate, and write tables, rows and figures."""
     names = (ROWS, TABLES, ERRORS, MAPS, *([PAGE] if args.html else []))
@@ -303,7 +286,7 @@ def main(args: Args) -> None:
     privacy, parameters = config.privacy, config.arz_parameters.name
     noise = f"{privacy.preset} noise at ({privacy.epsilon:g}, {privacy.delta:g})"
     traffic = f"{len(seeds)} episodes on {seed_kind(seeds)} traffic"
-    title = f"{args.env.rpartition('/')[2]}, {parameters}, {noise}, {traffic}"
+    title = f"{parse_env(args.env)[0].rpartition('/')[2]}, {parameters}, {noise}, {traffic}"
     ids = {cell.id for cell in cells.values()}
 
     def summarise(rows: pl.DataFrame) -> Evaluation:
@@ -333,7 +316,3 @@ def main(args: Args) -> None:
     if not args.json:
         page = f"; a browser opens {args.output / PAGE}" if args.html else ""
         print(f"tables and figures are in {args.output}/{page}")
-
-
-if __name__ == "__main__":
-    run(main, Args, __doc__)

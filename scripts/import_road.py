@@ -1,46 +1,55 @@
-"""Import recorded traffic as a road on which all tools work: trajectories, or a measured field.
+"""Import recorded trajectories, a SUMO network or a measured field as a road.
 
-python scripts/import_road.py trajectories --files fcd.xml --corridor short-highway --format fcd \
---output my-data
-python scripts/import_road.py trajectories --files 0750.txt 0805.txt --corridor us-101.toml \
---mapping us-101-data.toml --output us-101
-python scripts/import_road.py trajectories --files points.csv --corridor road.toml --format table \
---columns time=t vehicle=id x=s speed=v lane=lane --units length=ft speed=mi/h --output my-data
-python scripts/import_road.py field --source.density density.txt --source.speed speed.txt \
---source.cell 0.02 --source.interval 5 --road.name my-field --road.segments 6 --road.lanes 5 \
---road.speed-limit 105 --output my-field
-
-The folder has the road (road.toml, to be given as the corridor) and its records; that of
-trajectories has a report, too. A field has no vehicles: the release models `paper` and `corrected`
-work on it, those with a guarantee need the vehicles and say so.
+$ dptse import trajectories --help
 """
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+import dataclasses
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
-from agents.environments import given_keywords
+from tyro.conf import arg
+
+from agents.environments import parse_env
+from agents.files import refuse_to_replace
 from dptse_env.config import TEST_SEEDS, TRAINING_SEEDS, VALIDATION_SEEDS
 from dptse_env.importers import Options, Source, Split, import_trajectories, read_source
 from dptse_env.importers.fields import FieldRoad, FieldSource, import_field
 from dptse_env.importers.folder import ROAD
+from dptse_env.importers.network import (
+    Files,
+    ImportedRoad,
+    find_layout,
+    import_road,
+    read_configuration,
+)
 from dptse_env.importers.report import REPORT
-from dptse_env.traffic import is_road_file, ranges, read_road
-from scripts.cli import make_corridor, run
+from dptse_env.traffic import is_road_file, ranges, read_road, write_corridor
+from dptse_env.utils.files import replacing
+from scripts.cli import Environment
+
+Shares = tuple[float, float, float]
+SHARES: Shares = (0.6, 0.2, 0.2)
 
 
-@dataclass(frozen=True)
-class Trajectories:
-    """Import recorded trajectories as records of a road."""
+@dataclass(frozen=True, kw_only=True)
+class Trajectories(Environment):
+    r"""Import recorded trajectories as records of a road.
+
+    $ dptse import trajectories --files points.csv --format table --output my-data \
+        --columns time=t vehicle=id x=s speed=v \
+        --env 'dptse_env:dptse/ShortHighway-v0 {"corridor": {"duration": 60}}'
+
+    The folder has the road, road.toml, which an environment takes as its corridor, the records and
+    a report. The road of --env is where the data was recorded.
+    """
 
     files: tuple[Path, ...]
     """Files of trajectories, in order of time."""
-    corridor: str
-    """The road: a road file that ends in .toml, the name of a shipped corridor, or a JSON object of
-    fields that replace those of the paper's."""
     output: Path
     """Folder to create."""
     format: str | None = None
@@ -48,13 +57,12 @@ class Trajectories:
     mapping: Path | None = None
     """TOML file that says what the data means and where the road lies in it."""
     columns: tuple[str, ...] = ()
-    """Columns of the file by role, as role=column (time, vehicle, x, y, speed, lane, edge,
-    group)."""
+    """Columns by role, role=column: time, vehicle, x, y, speed, lane, edge, group."""
     units: tuple[str, ...] = ()
     """Units by quantity, as quantity=unit: time, length, speed."""
     where: tuple[str, ...] = ()
     """Values that columns must have, as column=value."""
-    shares: tuple[float, float, float] = (0.6, 0.2, 0.2)
+    shares: Shares = SHARES
     """Shares of the windows for training, validation and test, in this order of time."""
     longest_gap: float = Options.longest_gap
     """Longest time without points of a vehicle that is filled by interpolation [s]."""
@@ -67,12 +75,12 @@ class Trajectories:
 
     def run(self) -> None:
         """Import, and print which traffic seeds there are."""
-        environment = read_road(self.corridor).environment if is_road_file(self.corridor) else {}
-        keywords = given_keywords("{}", self.corridor)
+        road = parse_env(self.env)[1].get("corridor")
+        environment = read_road(road).environment if is_road_file(road) else {}
         imported = import_trajectories(
             self.files,
             self.source(),
-            make_corridor("dptse_env:dptse/PaperHighway-v0", keywords),
+            self.corridor(),
             self.output,
             splits(self.shares),
             Options(self.longest_gap, self.skip_start, self.skip_end, self.pause),
@@ -86,7 +94,7 @@ class Trajectories:
         if self.mapping is None and self.format is None:
             raise ValueError("format must be given where no mapping is")
         base = read_source(self.mapping) if self.mapping else Source(str(self.format))
-        return replace(
+        return dataclasses.replace(
             base,
             format=self.format or base.format,
             columns=base.columns | _pairs("columns", self.columns),
@@ -97,17 +105,23 @@ class Trajectories:
 
 @dataclass(frozen=True)
 class Field:
-    """Import a measured field of density and speed, or flow."""
+    r"""Import a measured field of density and speed, or flow.
 
-    source: FieldSource
-    """Files and their units."""
-    road: FieldRoad
-    """The road."""
+    $ dptse import field --density density.txt --speed speed.txt \
+        --cell 0.1 --interval 5 --name my-field --segments 6 --lanes 3 --speed-limit 100 \
+        --duration 90 --output my-field
+
+    A field has no vehicles: the release models paper and corrected work on it, those with a
+    guarantee need the vehicles and say so.
+    """
+
+    source: Annotated[FieldSource, arg(name="")]
+    road: Annotated[FieldRoad, arg(name="")]
     output: Path
     """Folder to create."""
     duration: int = 450
     """Seconds of each of the windows that the field is cut into."""
-    shares: tuple[float, float, float] = (0.6, 0.2, 0.2)
+    shares: Shares = SHARES
     """Shares of the windows for training, validation and test, in this order of time."""
 
     def run(self) -> None:
@@ -119,16 +133,105 @@ class Field:
         print(f"road: {self.output / ROAD}, segments of {corridor.segment_lengths[0]:g} km")
 
 
-Args = Trajectories | Field
+@dataclass(frozen=True)
+class Network:
+    r"""Make a road of a SUMO network, as a TOML file that an environment takes as its corridor.
+
+    $ dptse import network --configuration town.sumocfg --path "west ... east" \
+        --duration 120 --output my-road.toml
+    """
+
+    output: Path = Path("road.toml")
+    """The road file to write; the name of the road is that of the file."""
+    configuration: Path | None = None
+    """SUMO's configuration, a .sumocfg, with network, routes, additional files and options."""
+    net: Path | None = None
+    """Network file, in place of the configuration's; so below."""
+    routes: tuple[Path, ...] = ()
+    """Route files."""
+    additional: tuple[Path, ...] = ()
+    """Additional files."""
+    path: str = ""
+    """Edges in the direction of travel, as in --path="e1 -e2 e3"; "e1 ... e9" is the shortest path
+    between two. The ends become the boundary segments."""
+    first_position: float = 0.0
+    """Position on the first edge at which the road begins [m]."""
+    last_position: float | None = None
+    """Position on the last edge at which the road ends [m]; its end if not given."""
+    leave_out: str = ""
+    """Edges that join or leave the path and are to be no ramps, with blanks between them."""
+    segment_length: float = 100.0
+    """Wanted length of a segment [m]."""
+    begin: int | None = None
+    """Second of SUMO's clock at which a record starts; the configuration's after the warm-up."""
+    duration: int = 600
+    """Length of a record [s]."""
+    warm_up: int = 0
+    """Seconds that are simulated before a record starts."""
+    speed_limit: float | None = None
+    """Speed limit of all segments [km/h]; that of the edges if not given."""
+    step_length: float | None = None
+    """SUMO's time step [s]; that of the configuration, or else 1, if not given."""
+    options: str = ""
+    """Further options of SUMO, as in --options="--time-to-teleport=-1 --eager-insert=true"."""
+    force: bool = False
+    """Replace the road file if it is there."""
+
+    def run(self) -> None:
+        """Import, write the road and print what it is."""
+        if self.output.suffix != ".toml":
+            raise ValueError(f"output must be a .toml file, got {self.output}")
+        refuse_to_replace([self.output], self.force)
+        edges = self.path.split()
+        between = "..." in edges
+        if not edges or (between and (len(edges) != 3 or edges[1] != "...")):
+            raise ValueError(f"path must be edges, or two with ... between them, got {self.path!r}")
+        files, ends = self._files(), (self.first_position, self.last_position)
+        layout = find_layout(
+            files,
+            edges[::2] if between else edges,
+            self.segment_length,
+            between,
+            self.leave_out.split(),
+            ends,
+        )
+        road = import_road(
+            files,
+            layout,
+            re.sub(r"[^a-z0-9]+", "-", self.output.stem.lower()).strip("-"),
+            self.duration,
+            begin=self.begin,
+            warm_up=self.warm_up,
+            speed_limit=self.speed_limit,
+        )
+        with replacing(self.output) as temporary:
+            write_corridor(temporary, road.corridor, comment=describe(road))
+        print(describe(road))
+        print(f"written: {self.output}")
+
+    def _files(self) -> Files:
+        if self.configuration is not None:
+            files = read_configuration(self.configuration)
+        elif self.net is not None:
+            files = Files(self.net, ())
+        else:
+            raise ValueError("net must be given, or a configuration")
+        return dataclasses.replace(
+            files,
+            net=self.net or files.net,
+            routes=self.routes or files.routes,
+            additional=self.additional or files.additional,
+            step_length=self.step_length or files.step_length,
+            options=(*files.options, *self.options.split()),
+        )
+
+
+Args = Trajectories | Network | Field
 
 
 def main(args: Args) -> None:
-    """Import; an interruption leaves nothing."""
-    try:
-        args.run()
-    except KeyboardInterrupt:
-        print("interrupted: nothing was written", file=sys.stderr)
-        raise SystemExit(130) from None
+    """Import."""
+    args.run()
 
 
 def splits(shares: Iterable[float]) -> list[Split]:
@@ -145,6 +248,34 @@ def print_seeds(seeds: Mapping[str, tuple[int, ...]]) -> None:
         print(f"{name}: {len(given)} window(s), traffic seeds {ranges(given)}")
 
 
+def describe(road: ImportedRoad) -> str:
+    """Describe a road of a network in a few lines."""
+    corridor, layout, network = road.corridor, road.layout, road.corridor.network
+    assert network is not None
+    on, off = layout.names[: corridor.n_on_ramps], layout.names[corridor.n_on_ramps :]
+    lengths = layout.lengths
+    demand = corridor.published_demand
+    lines = [
+        f"{corridor.name}: from {Path(network.net).name}, seconds {network.begin} to "
+        f"{network.begin + corridor.duration}",
+        f"{corridor.n_mainline} segments of {min(lengths):.0f} to {max(lengths):.0f} m, "
+        f"{min(layout.lanes)} to {max(layout.lanes)} lanes, "
+        f"{min(layout.limits):.0f} to {max(layout.limits):.0f} km/h",
+        f"mainline: {_range(demand.mainline)}",
+    ]
+    for face, name, rates in zip(corridor.on_ramps, on, demand.ramp_profiles, strict=True):
+        lines.append(f"on-ramp at face {face}: {name}, {_range(rates)}")
+    for face, name, share in zip(corridor.off_ramps, off, corridor.exit_shares, strict=True):
+        lines.append(f"off-ramp at face {face}: {name}, {100 * share:.1f} % leave")
+    lines += [f"note: {remark}" for remark in road.remarks]
+    return "\n".join(lines)
+
+
+def _range(profile: Sequence[tuple[float, float]]) -> str:
+    rates = [rate for _, rate in profile]
+    return f"{min(rates):.0f} to {max(rates):.0f} veh/h"
+
+
 def _pairs(path: str, words: Iterable[str]) -> dict[str, str]:
     pairs = {}
     for word in words:
@@ -153,7 +284,3 @@ def _pairs(path: str, words: Iterable[str]) -> dict[str, str]:
             raise ValueError(f"{path} must be key=value, got {word!r}")
         pairs[key] = value
     return pairs
-
-
-if __name__ == "__main__":
-    run(main, Args, __doc__)

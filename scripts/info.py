@@ -19,7 +19,6 @@ import dptse_env
 from dptse_env.registration import ENVIRONMENTS
 from dptse_env.traffic import RecordLibrary
 from dptse_env.utils.threads import n_cores
-from scripts.cli import run
 
 PACKAGES = (
     "gymnasium", "libsumo", "sumolib", "eclipse-sumo", "numpy", "scipy", "numba", "filterpy",
@@ -84,7 +83,3 @@ def main(args: Args) -> None:
     print(f"{'environments':<18} {', '.join(ids)}")
     for name, version in packages.items():
         print(f"{name:<18} {version or 'not installed'}")
-
-
-if __name__ == "__main__":
-    run(main, Args, __doc__)

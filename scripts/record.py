@@ -1,8 +1,7 @@
-"""Record traffic with SUMO into the library, so that environments only replay it.
+"""Record traffic with SUMO, so that environments only replay it.
 
-python scripts/record.py --seeds 0:64
-python scripts/record.py --corridor short-highway --seeds 0:16
-python scripts/record.py --env dptse_env:dptse/PrivateHighway-v0 --keywords '{"incident": "none"}'
+dptse record --env dptse_env:dptse/ShortHighway-v0 --seeds 0:4
+dptse record --env 'dptse_env:dptse/PaperHighway-v0 {"corridor": "my-road.toml"}' --seeds 0:64
 """
 
 from __future__ import annotations
@@ -12,27 +11,22 @@ from dataclasses import dataclass
 
 from dptse_env.config import parse_seeds
 from dptse_env.traffic import average_dwell
-from scripts.cli import Recording, Road, make_corridor, run
+from scripts.cli import Environment, Recording
 
 
 @dataclass(frozen=True)
-class Args(Road, Recording):
+class Args(Environment, Recording):
     """Record traffic."""
 
     seeds: str = "0:16"
     """Traffic seeds, first:stop."""
-    random: bool = False
-    """Draw demand level and incident anew for every seed instead of taking the corridor's own."""
     json: bool = False
     """Print the result as JSON, for a program, in place of a table."""
 
 
 def main(args: Args) -> None:
     """Record, and print the number of records and their mean dwell."""
-    keywords = args.given_keywords()
-    if args.random:
-        keywords |= {"demand": "random", "incident": "random"}
-    corridor, seeds = make_corridor(args.env, keywords), parse_seeds(args.seeds)
+    corridor, seeds = args.corridor(), parse_seeds(args.seeds)
     library = args.library(corridor, seeds)
     dwell = average_dwell(corridor, (library.get(corridor, seed) for seed in seeds))
     if args.json:
@@ -42,7 +36,3 @@ def main(args: Args) -> None:
         return
     print(f"{corridor.name}: {len(seeds)} record(s) in {library.path}")
     print(f"mean dwell on a mainline segment (T_avg): {dwell:.2f} s")
-
-
-if __name__ == "__main__":
-    run(main, Args, __doc__)

@@ -21,7 +21,6 @@ from agents.terminal import make_table, print_table
 from dptse_env.estimators import EstimatorSettings
 from dptse_env.importers.fields import FieldSource
 from dptse_env.utils.fields import integer
-from scripts.cli import run
 
 PAPER = "dptse_env:dptse/PaperHighway-v0"
 
@@ -91,7 +90,3 @@ def settings(args: Args, estimator: str) -> EstimatorSettings:
         keywords["estimator_settings"] = {"recurrent": recurrent}
     found: EstimatorSettings = make_config(PAPER, keywords).settings()
     return found
-
-
-if __name__ == "__main__":
-    run(main, Args, __doc__)

@@ -11,20 +11,22 @@ import dataclasses
 import importlib
 import pkgutil
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import tyro
 
-from agents.environments import given_keywords
+from agents.environments import parse_env
 from agents.play import Cell
 from agents.seeds import seed_kind
 from agents.study import Follow, Study, write_report
 from agents.study import run as run_study
 from dptse_env.config import parse_seeds
 from dptse_env.utils.fields import require
-from scripts.cli import Machines, resumable, run, suitable
+from scripts.cli import Machines
+from scripts.suite import suitable
 
 STUDIES = ("paper", "guarantees", "estimators", "policies", "suite")
 RESULTS = Path("results")
@@ -44,9 +46,9 @@ class Args(Machines):
     seeds: str | None = None
     """Test traffic seeds, first:stop, in place of the study's own; needs another output. What is
     played on validation traffic keeps its seeds."""
-    corridor: str | None = None
-    """Road in place of the study's own: the name of a shipped corridor, a road file that ends in
-    .toml, or a JSON object of corridor fields; needs another output."""
+    env: tuple[str, ...] = ()
+    """Environments, 'ID {"corridor": "my-road.toml"}': the study's cells with one of these ids are
+    played with its keywords, and no others; needs another output."""
     policies: tuple[str, ...] = ()
     """Trained policies for the study of policies, each name=path."""
     output: Path | None = None
@@ -72,42 +74,50 @@ def find_study(args: Args) -> Study:
     else:
         raise ValueError(f"study must be one of {', '.join(STUDIES)}, got {args.name!r}")
     seeds = found.seeds if args.seeds is None else parse_seeds(args.seeds)
-    road, most = given_keywords("{}", args.corridor), QUICK_SEEDS if args.quick else None
+    given, most = dict(map(parse_env, args.env)), QUICK_SEEDS if args.quick else None
 
     def changed(cell: Cell) -> Cell:
         own = cell.seeds
         if own is not None and args.seeds is not None and seed_kind(own) != "validation":
             own = None
         own = None if own is None else own[:most]
-        return dataclasses.replace(cell, keywords={**cell.keywords, **road}, seeds=own)
+        keywords = {**cell.keywords, **given.get(cell.env, {})}
+        return dataclasses.replace(cell, keywords=keywords, seeds=own)
 
     follow = found.follow
     if follow is not None:
         follow = _changed_too(follow, changed)
-    cells = tuple(map(changed, _without_roads(found.cells) if road else found.cells))
-    if road:
-        cells = suitable(cells, "the road")
-    # Further tables are measured on the study's own road.
-    measures = {} if road else found.measures
+    cells = tuple(map(changed, _of(found.cells, given) if given else found.cells))
+    if given:
+        cells = suitable(cells, "what was given")
+    # Further tables are measured in the study's own environments.
+    measures = {} if given else found.measures
     return dataclasses.replace(
         found, cells=cells, seeds=seeds[:most], follow=follow, measures=measures
     )
 
 
-def _without_roads(cells: Sequence[Cell]) -> tuple[Cell, ...]:
-    """Return the cells that have no road of their own, and say how many have one.
+def _of(cells: Sequence[Cell], given: Mapping[str, Mapping[str, Any]]) -> tuple[Cell, ...]:
+    """Return the cells of the given environments, and say how many are left out.
 
-    On another road these would not be what their labels say.
+    So are cells with a value of their own for a given keyword: with another one they would not be
+    what their labels say.
 
     Raises:
-        ValueError: All have one.
+        ValueError: All are.
     """
-    taken = tuple(cell for cell in cells if "corridor" not in cell.keywords)
+    taken = tuple(
+        cell for cell in cells if cell.env in given and not given[cell.env].keys() & cell.keywords
+    )
     if not taken:
-        raise ValueError("corridor must be left out: every cell of the study has a road of its own")
+        ids = sorted({cell.env for cell in cells})
+        raise ValueError(
+            f"env must be one of {ids} with keywords that cells of the study leave open, "
+            f"got {list(given)}"
+        )
     if len(taken) < len(cells):
         n = f"{len(cells) - len(taken)} of {len(cells)} cells"
-        print(f"{n} have a road of their own and are left out", file=sys.stderr)
+        print(f"{n} are of other environments and are left out", file=sys.stderr)
     return taken
 
 
@@ -131,14 +141,13 @@ def _own(name: str) -> Study:
     return found
 
 
-@resumable()
 def main(args: Args) -> None:
     """Play what is missing, and report."""
     study = find_study(args)
     folder = args.output or RESULTS / f"{study.name}{'-quick' if args.quick else ''}"
-    for name in ("seeds", "corridor"):
+    for name in ("seeds", "env"):
         require(
-            getattr(args, name) is None or args.output is not None,
+            not getattr(args, name) or args.output is not None,
             name,
             "given with an output of its own, since the rows are others",
             getattr(args, name),
@@ -148,7 +157,3 @@ def main(args: Args) -> None:
     else:
         run_study(study, args.place(folder))
     print(f"tables and figures are in {folder}/")
-
-
-if __name__ == "__main__":
-    run(main, Args, __doc__)

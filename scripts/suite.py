@@ -6,10 +6,12 @@ python scripts/suite.py --policies results/training/best.safetensors --output re
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from agents.play import Cell
 from agents.policies import policy_name
 from agents.studies.suite import (
     LEARNED,
@@ -29,7 +31,7 @@ from agents.study import read_rows
 from agents.study import run as run_study
 from agents.terminal import make_table, print_table
 from dptse_env.utils.fields import require
-from scripts.cli import Machines, resumable, run, suitable
+from scripts.cli import Machines
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,6 @@ class Args(Machines):
     """Folder of rows, tables and a figure."""
 
 
-@resumable()
 def main(args: Args) -> None:
     """Play the policies in the tasks that they suit, and report."""
     named = {policy_name(source): source for source in args.policies}
@@ -59,6 +60,29 @@ def main(args: Args) -> None:
     rows = beside_recorded(read_rows(study.name, args.output), study.cells)
     print_scores(score_all(rows, TASKS), list(named))
     print(f"tables and the figure are in {args.output}/")
+
+
+def suitable(cells: Sequence[Cell], what: str) -> tuple[Cell, ...]:
+    """Return the cells that can be played, and say how many do not suit what was given, and why.
+
+    Raises:
+        FileNotFoundError: There is no such policy.
+        ValueError: None can be played.
+    """
+    taken, refused = [], []
+    for cell in cells:
+        try:
+            cell.check()
+        except ValueError as problem:
+            refused.append(problem)
+        else:
+            taken.append(cell)
+    if not taken:
+        raise refused[0]
+    if refused:
+        n = f"{len(refused)} of {len(cells)} cells"
+        print(f"{n} do not suit {what} and are left out: {refused[0]}", file=sys.stderr)
+    return tuple(taken)
 
 
 def print_scores(scores: Scores, names: Sequence[str]) -> None:
@@ -78,7 +102,3 @@ def print_scores(scores: Scores, names: Sequence[str]) -> None:
     for line in zip(["mean", *tasks], *columns, ["", *map(best, tasks)], strict=True):
         table.add_row(*line)
     print_table(table)
-
-
-if __name__ == "__main__":
-    run(main, Args, __doc__)

@@ -19,6 +19,7 @@ from typing import Annotated
 import torch
 import tyro
 
+from agents.environments import parse_env
 from agents.training.plan import TrainingPlan
 from agents.training.recipes import MaskablePPORecipe, MaskRecipe, PlackettLuceRecipe, ScoresRecipe
 from agents.training.run_files import Row, check_plan, read_progress
@@ -26,7 +27,7 @@ from agents.training.several_seeds import train_all
 from agents.training.training import BEST, POLICY, Training
 from dptse_env.config import parse_seeds
 from dptse_env.utils.fields import integer
-from scripts.cli import Machines, Road, resumable, run
+from scripts.cli import Environment, Machines
 from scripts.training_bar import Bar, watched
 
 AnyRecipe = (
@@ -38,7 +39,7 @@ AnyRecipe = (
 
 
 @dataclass(frozen=True)
-class Args(Road, Machines):
+class Args(Environment, Machines):
     """Train a query policy."""
 
     env: str = "dptse_env:dptse/PrivateHighway-v0"
@@ -77,16 +78,17 @@ def make_plan(args: Args, seed: int) -> TrainingPlan:
     """Return the plan that the arguments describe, with a training seed.
 
     Raises:
-        ValueError: An argument is out of range, or ``keywords`` is no JSON object.
+        ValueError: An argument is out of range.
     """
+    env, keywords = parse_env(args.env)
     return TrainingPlan(
-        env=args.env,
+        env=env,
         recipe=args.recipe,
         seed=seed,
         steps=args.recipe.default_steps if args.steps is None else args.steps,
         traffic_seeds=parse_seeds(args.traffic, "traffic"),
         validation_seeds=parse_seeds(args.validation, "validation"),
-        keywords=args.given_keywords(),
+        keywords=keywords,
         also=args.also,
         validate_every=args.validate_every,
         checkpoint_every=args.checkpoint_every,
@@ -99,7 +101,6 @@ def summary(row: Row) -> str:
     return "error in validation {:.4f} deterministic, {:.4f} drawn".format(*errors)
 
 
-@resumable()
 def main(args: Args) -> None:
     """Record missing traffic, train, and leave the policy."""
     torch.set_num_threads(integer("threads", args.threads, 1))
@@ -133,7 +134,3 @@ def main(args: Args) -> None:
         )
         training.run()
     print(f"{summary(training.rows[-1])}; {args.output}/{POLICY} and {BEST}")
-
-
-if __name__ == "__main__":
-    run(main, Args, __doc__)

@@ -23,7 +23,7 @@ from agents.training.run_files import check_plan
 from dptse_env.config import parse_seeds
 from dptse_env.estimators.recurrent import read_network
 from dptse_env.utils.fields import integer
-from scripts.cli import Machines, resumable, run
+from scripts.cli import Machines
 from scripts.training_bar import Bar, watched
 
 
@@ -106,7 +106,6 @@ def make_plan(args: Args) -> FilterPlan:
     )
 
 
-@resumable()
 def main(args: Args) -> None:
     """Record missing traffic, train, and leave the network."""
     plan = make_plan(args)
@@ -132,7 +131,3 @@ def main(args: Args) -> None:
         )
         training.run()
     print(f"the network is in {args.output / 'network.safetensors'}")
-
-
-if __name__ == "__main__":
-    run(main, Args, __doc__)

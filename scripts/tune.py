@@ -20,7 +20,7 @@ import optuna
 from rich.table import Table
 from tqdm import tqdm
 
-from agents.environments import given_keywords
+from agents.environments import parse_env
 from agents.executors import AnyExecutor
 from agents.files import refuse_to_replace
 from agents.search.space import SPACE
@@ -31,21 +31,13 @@ from agents.terminal import make_table, print_table
 from dptse_env.model import ARZParameters
 from dptse_env.model.parameters import read_parameters
 from dptse_env.utils.fields import integer
-from scripts.cli import Machines, resumable, run
+from scripts.cli import Environment, Machines
 
 
 @dataclass(frozen=True)
-class Args(Machines):
+class Args(Environment, Machines):
     """Tune the estimators' settings."""
 
-    env: str = "dptse_env:dptse/PaperHighway-v0"
-    """Environment id."""
-    corridor: str | None = None
-    """Corridor: the name of a shipped one, a road file that ends in .toml, or a JSON object of
-    fields; the environment's own if not given."""
-    keywords: str = "{}"
-    """Keywords of the environment as JSON, such as '{"privacy": {"cap": 16}}'; arguments below come
-    before them."""
     estimators: tuple[str, ...] = tuple(SPACE)
     """State estimators."""
     parameters: tuple[str, ...] = ("w99-3lane", "paper")
@@ -91,11 +83,8 @@ def make_tasks(args: Args) -> list[TuningTask]:
         FileNotFoundError: There is no such saved policy.
         ValueError: An argument is out of range.
     """
-    keywords = {
-        **given_keywords(args.keywords, args.corridor),
-        "epsilon": args.epsilon,
-        "delta": args.delta,
-    }
+    env, keywords = parse_env(args.env)
+    keywords |= {"epsilon": args.epsilon, "delta": args.delta}
     if args.bandwidth is not None:
         keywords["bandwidth"] = args.bandwidth
     integer("trials", args.trials, 1)
@@ -108,7 +97,7 @@ def make_tasks(args: Args) -> list[TuningTask]:
         if source.endswith(".json"):
             parameters = read_parameters(source)
         task = TuningTask(
-            env=args.env,
+            env=env,
             estimator=estimator,
             parameters=parameters,
             privacy=privacy,
@@ -162,7 +151,6 @@ def add_rows(table: Table, study: TuningStudy) -> None:
     table.add_section()
 
 
-@resumable()
 def main(args: Args) -> None:
     """Record what is missing, tune every configuration, and leave the sets."""
     tasks = make_tasks(args)
@@ -184,7 +172,3 @@ def main(args: Args) -> None:
         f"tuned sets are in {args.output}/: take one as estimator_settings, or name it in the "
         "table environment of a road file"
     )
-
-
-if __name__ == "__main__":
-    run(main, Args, __doc__)

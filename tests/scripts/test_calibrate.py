@@ -4,13 +4,15 @@ import pytest
 
 from dptse_env.model.parameters import read_parameters
 from scripts.calibrate import Args, main
-from scripts.cli import make_corridor
+from scripts.cli import Environment
+
+PAPER, SHORT = "dptse_env:dptse/PaperHighway-v0", "dptse_env:dptse/ShortHighway-v0"
 
 
 def test_it_fits_on_some_seeds_and_reports_on_others(tmp_path, capsys):
     main(
         Args(
-            corridor="short-highway", train="0:2", held_out="1000:1001", max_evaluations=20,
+            env=SHORT, train="0:2", held_out="1000:1001", max_evaluations=20,
             workers=1, output=tmp_path,
         )
     )  # fmt: skip
@@ -28,17 +30,14 @@ def test_it_fits_on_some_seeds_and_reports_on_others(tmp_path, capsys):
 
 def test_a_road_is_recorded_whose_segments_are_too_short_for_the_default_parameters():
     for length in (0.05, 0.04):
-        road = make_corridor(
-            "dptse_env:dptse/PaperHighway-v0", {"corridor": {"segment_length": length}}
-        )
+        road = Environment(f'{PAPER} {{"corridor": {{"segment_length": {length}}}}}').corridor()
         assert road.segment_lengths[0] == length
 
 
 def test_a_corridor_of_other_fields_is_calibrated(tmp_path):
     main(
         Args(
-            corridor='{"name": "slow-road", "speed_limit": 80.0, "duration": 120}',
-            env="dptse_env:dptse/ShortHighway-v0", train="0:1", held_out="1000:1001",
+            env=f'{SHORT} {{"corridor": {{"name": "slow-road", "speed_limit": 80.0, "duration": 120}}}}', train="0:1", held_out="1000:1001",
             max_evaluations=5, workers=1, name="slow", output=tmp_path / "deep" / "out",
         )
     )  # fmt: skip
@@ -50,8 +49,7 @@ def test_a_corridor_of_other_fields_is_calibrated(tmp_path):
     ("changes", "message"),
     [
         ({"held_out": "1:3"}, r"held_out must not share seeds with train, both have \[1\]"),
-        ({"corridor": "long"}, "corridor must be one of paper-highway, .*, a road file"),
-        ({"keywords": '{"corridor": {"length": 1}}'}, r"corridor\.length"),
+        ({"env": f'{PAPER} {{"corridor": {{"length": 1}}}}'}, r"corridor\.length"),
         ({"train": "x"}, "train must be 'first:stop' or one seed, got 'x'"),
     ],
 )

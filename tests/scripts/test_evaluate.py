@@ -81,14 +81,13 @@ def test_an_interrupted_run_goes_on_and_a_forced_one_begins_anew(tmp_path):
         ({"schedules": ("best",)}, "schedule must be one of .*, got 'best'"),
         ({"estimators": ("kf",)}, "estimator must be one of"),
         ({"seeds": "all"}, "must be 'first:stop' or one seed, got 'all'"),
-        ({"privacy": "none"}, r"privacy\.preset must be one of"),
-        ({"keywords": "[]"}, r"keywords must be a JSON object, got '\[\]'"),
-        ({"keywords": "{"}, "keywords must be a JSON object, got '{'"),
-        ({"keywords": '{"cargo": 1}'}, "cargo"),
+        ({"env": f'{SHORT} {{"privacy": "none"}}'}, r"privacy\.preset must be one of"),
+        ({"env": f"{SHORT} []"}, r"env must be an id and a JSON object, got '\[\]'"),
+        ({"env": f'{SHORT} {{"cargo": 1}}'}, "cargo"),
         (
             {
                 "estimators": ("ekf", "recurrent"),
-                "keywords": '{"estimator_settings": {"recurrent": {"weights": "none"}}}',
+                "env": f'{SHORT} {{"estimator_settings": {{"recurrent": {{"weights": "none"}}}}}}',
             },
             r"estimator_settings\.recurrent\.weights must be a file or one of .*, got 'none'",
         ),
@@ -111,7 +110,6 @@ def test_a_saved_policy_stands_beside_schedules(tmp_path, capsys):
     assert "run-0/best" in capsys.readouterr().out
     env = gym.make(
         SHORT, action="slots", estimator="random_walk", traffic_seeds="2000:2002",
-        parameters="w99-3lane",
     )  # fmt: skip
     expected = evaluate(env, load_policy(path, env), (2000, 2001))
     assert rows_of(tmp_path / "out", "run-0/best")["rmse_density"].to_list() == pytest.approx(
@@ -126,7 +124,7 @@ def test_noise_seeds_are_those_of_evaluate(tmp_path):
             noise_seed=5, output=tmp_path / "out", workers=1,
         )
     )  # fmt: skip
-    env = gym.make(SHORT, traffic_seeds="2000:2002", parameters="w99-3lane")
+    env = gym.make(SHORT, traffic_seeds="2000:2002")
     rows = rows_of(tmp_path / "out", "oldest-first").to_dicts()
     for row, expected in zip(rows, evaluate(env, "oldest-first", (2000, 2001), 5), strict=True):
         assert {key: row[key] for key in expected} == pytest.approx(expected, abs=1e-9)
@@ -136,18 +134,17 @@ def test_privacy_is_the_environments_own_unless_given():
     private = Args(env="dptse_env:dptse/PrivateHighway-v0")
     privacy = reference_config(private).privacy
     assert (privacy.preset, privacy.epsilon) == ("capped", 5.0)
-    given = reference_config(dataclasses.replace(private, epsilon=2.0)).privacy
+    given = reference_config(Args(env=f'{private.env} {{"epsilon": 2.0}}')).privacy
     assert (given.preset, given.epsilon) == ("capped", 2.0)
 
 
 def test_keywords_reach_the_environment():
     args = Args(
-        env=SHORT,
-        keywords='{"reward": "speed", "privacy": {"preset": "capped", "cap": 9}, "bandwidth": 1}',
+        env=SHORT
+        + ' {"reward": "speed", "privacy": {"preset": "capped", "cap": 9}, "bandwidth": 1}'
     )
     config = reference_config(args)
     assert (config.reward, config.privacy.cap, config.bandwidth) == ("speed", 9, 1)
-    assert reference_config(dataclasses.replace(args, bandwidth=3)).bandwidth == 3
 
 
 def test_seeds_are_called_what_they_are(tmp_path, capsys):

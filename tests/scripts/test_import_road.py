@@ -13,15 +13,21 @@ from tests.importers.data import STRAIGHT, plain, stream, write_csv
 from tests.importers.test_tables import ngsim
 from tests.scripts.commands import ROOT, run_script
 
-ROAD = '{"n_mainline": 4, "on_ramps": [], "off_ramps": [], "exit_shares": [], "duration": 20,'
-ROAD += ' "demand": {"mainline": [[0, 1]], "on_ramps": []}, "incident": null, "fixed_sensors": []}'
+ROAD = 'dptse_env:dptse/PaperHighway-v0 {"corridor": {"n_mainline": 4, "on_ramps": [], "off_ramps": [], "exit_shares": [], "duration": 20,'
+ROAD += ' "demand": {"mainline": [[0, 1]], "on_ramps": []}, "incident": null, "fixed_sensors": []}}'
+
+
+def on(road):
+    return f'dptse_env:dptse/PaperHighway-v0 {{"corridor": "{road}"}}'
+
+
 COLUMNS = ("time=t", "vehicle=id", "x=s", "speed=v")
 
 
 def test_one_command_makes_a_road_that_the_other_scripts_take(tmp_path, capsys):
     path = plain(tmp_path / "a.csv", stream(seconds=125.0))
     result = run_script(
-        "import_road.py", "trajectories", "--files", str(path), "--corridor", ROAD,
+        "import_road.py", "trajectories", "--files", str(path), "--env", ROAD,
         "--format", "table", "--columns", *COLUMNS, "--output", str(tmp_path / "my-data"),
     )  # fmt: skip
     assert result.returncode == 0, result.stderr
@@ -31,10 +37,10 @@ def test_one_command_makes_a_road_that_the_other_scripts_take(tmp_path, capsys):
     assert {each.name for each in road.parent.iterdir()} == {
         "manifest.json", "records", "report.json", "report.md", "report.png", "road.toml"
     }  # fmt: skip
-    record(RecordArgs(corridor=str(road), seeds="0:4"))
+    record(RecordArgs(env=on(road), seeds="0:4"))
     assert "T_avg" in capsys.readouterr().out
     with pytest.raises(ValueError, match=r"must be one that was recorded \(0\.\.3, 1000, 2000"):
-        record(RecordArgs(corridor=str(road), seeds="0:16"))
+        record(RecordArgs(env=on(road), seeds="0:16"))
 
 
 def test_a_mapping_file_and_a_road_file_describe_the_data(tmp_path):
@@ -49,7 +55,7 @@ def test_a_mapping_file_and_a_road_file_describe_the_data(tmp_path):
     columns["Location"] = ["us-101"] * len(columns["Vehicle_ID"])
     path = write_csv(tmp_path / "a.csv", columns)
     given = Trajectories(
-        (path,), str(tmp_path / "road.toml"), tmp_path / "new", mapping=tmp_path / "data.toml",
+        files=(path,), env=on(tmp_path / "road.toml"), output=tmp_path / "new", mapping=tmp_path / "data.toml",
         shares=(1.0, 0.0, 0.0),
     )  # fmt: skip
     main(given)
@@ -76,7 +82,7 @@ def test_mistakes_end_in_one_line_on_stderr(arguments, message, tmp_path, monkey
     from scripts.cli import run
 
     path = plain(tmp_path / "a.csv", stream(seconds=30.0))
-    common = ["--files", str(path), "--corridor", ROAD, "--output", str(tmp_path / "new")]
+    common = ["--files", str(path), "--env", ROAD, "--output", str(tmp_path / "new")]
     monkeypatch.setattr(sys, "argv", ["import_road.py", "trajectories", *common, *arguments])
     with pytest.raises(SystemExit) as ended:
         run(main, Args, None)

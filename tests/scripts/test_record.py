@@ -8,10 +8,12 @@ from scripts.cli import run
 from scripts.record import Args, main
 from tests.scripts.commands import run_script
 
+SHORT = "dptse_env:dptse/ShortHighway-v0"
+
 
 def test_the_command_records_into_the_library_and_reports_the_dwell(tmp_path):
     arguments = (
-        "--corridor", "short-highway", "--seeds", "3:5", "--workers", "1",
+        "--env", SHORT, "--seeds", "3:5", "--workers", "1",
         "--records", str(tmp_path),
     )  # fmt: skip
     result = run_script("record.py", *arguments)
@@ -24,7 +26,14 @@ def test_the_command_records_into_the_library_and_reports_the_dwell(tmp_path):
 
 
 def test_random_traffic_is_recorded_on_request(tmp_path, capsys):
-    main(Args(corridor="short-highway", seeds="0:1", random=True, workers=1, records=tmp_path))
+    main(
+        Args(
+            env=f'{SHORT} {{"demand": "random", "incident": "random"}}',
+            seeds="0:1",
+            workers=1,
+            records=tmp_path,
+        )
+    )
     assert RecordLibrary(tmp_path).record_path(randomised(SHORT_HIGHWAY), 0).is_file()
     assert "1 record(s)" in capsys.readouterr().out
 
@@ -32,12 +41,12 @@ def test_random_traffic_is_recorded_on_request(tmp_path, capsys):
 def test_fields_of_a_corridor_and_keywords_are_recorded(tmp_path):
     calm = dataclasses.replace(SHORT_HIGHWAY, duration=60, incident=None)
     given = Args(
-        corridor='{"duration": 60, "incident": null}', seeds="0:1",
-        env="dptse_env:dptse/ShortHighway-v0", workers=1, records=tmp_path,
+        env=f'{SHORT} {{"corridor": {{"duration": 60, "incident": null}}}}', seeds="0:1",
+        workers=1, records=tmp_path,
     )  # fmt: skip
     main(given)
     assert RecordLibrary(tmp_path).record_path(calm, 0).is_file()
-    main(dataclasses.replace(given, corridor=None, keywords='{"incident": "none"}', seeds="1:2"))
+    main(dataclasses.replace(given, env=f'{SHORT} {{"incident": "none"}}', seeds="1:2"))
     full = resolve("short-highway", {"incident": "none"}).corridor
     assert RecordLibrary(tmp_path).record_path(full, 1).is_file()
 
@@ -46,11 +55,10 @@ def test_fields_of_a_corridor_and_keywords_are_recorded(tmp_path):
     ("arguments", "message"),
     [
         (("--seeds", "x"), "error: seeds must be 'first:stop'"),
-        (("--corridor", "nowhere"), "error: corridor must be one of"),
-        (("--corridor", '{"length": 3}'), "error: corridor.length"),
-        (("--corridor", '{"duration": -3}'), "error: corridor.duration must be"),
-        (("--corridor", "3"), "error: corridor must be one of"),
-        (("--keywords", "3"), "error: keywords must be a JSON object"),
+        (("--env", f'{SHORT} {{"corridor": {{"length": 3}}}}'), "error: corridor.length"),
+        (("--env", f'{SHORT} {{"corridor": {{"duration": -3}}}}'), "error: corridor.duration must"),
+        (("--env", f"{SHORT} 3"), "error: env must be"),
+        (("--env", "dptse_env:dptse/Nowhere-v0"), "error: env must be"),
     ],
 )
 def test_mistakes_end_in_one_line_on_stderr(arguments, message, monkeypatch, capsys):

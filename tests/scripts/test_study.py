@@ -9,11 +9,11 @@ from examples.my_study import STUDY
 from scripts.study import STUDIES, Args, find_study, main
 from tests.scripts.commands import run_script
 
-MINE = "examples.my_study:STUDY"
+MINE, SHORT = "examples.my_study:STUDY", STUDY.cells[0].env
 FIRST = replace(STUDY.cells[0], keywords={**STUDY.cells[0].keywords, "corridor": "paper-highway"})
 MANY = replace(STUDY.cells[0], keywords={**STUDY.cells[0].keywords, "bandwidth": 15})
-WIDE = replace(STUDY, cells=(MANY, *STUDY.cells[1:]))
-ROADS, OWN_ROAD = (replace(STUDY, cells=(FIRST, *more)) for more in (STUDY.cells[1:], ()))
+WIDE = replace(STUDY, cells=(MANY, *STUDY.cells[1:]), measures={"trips.parquet": lambda _: None})
+ROADS = replace(STUDY, cells=(FIRST, *STUDY.cells[1:]))
 
 
 @pytest.mark.parametrize("name", STUDIES)
@@ -48,30 +48,29 @@ def test_a_report_without_rows_is_refused(tmp_path):
         main(Args(name=MINE, report=True, output=tmp_path))
 
 
-def test_cells_that_do_not_suit_a_road_are_left_out_and_told(capsys):
-    study = find_study(Args(name=f"{__name__}:WIDE", corridor='{"n_mainline": 6}'))
+def test_the_cells_of_an_environment_are_played_with_its_keywords_and_others_are_told(capsys):
+    env = f'{SHORT} {{"corridor": {{"n_mainline": 6}}}}'
+    study = find_study(Args(name=f"{__name__}:WIDE", env=(env,)))
     assert [cell.keywords["bandwidth"] for cell in study.cells] == [2, 3, 1, 2, 3]
-    assert "1 of 6 cells do not suit the road" in capsys.readouterr().err
-
-
-def test_cells_with_a_road_of_their_own_are_left_out_and_told(capsys):
-    road = '{"n_mainline": 6}'
-    study = find_study(Args(name=f"{__name__}:ROADS", corridor=road))
+    assert all(cell.keywords["corridor"] == {"n_mainline": 6} for cell in study.cells)
+    assert {cell.id for cell in study.cells}.isdisjoint(cell.id for cell in STUDY.cells)
+    assert "1 of 6 cells do not suit" in capsys.readouterr().err
+    # A label would not say what was played.
+    study = find_study(Args(name=f"{__name__}:ROADS", env=(env,)))
     assert [cell.labels["bandwidth"] for cell in study.cells] == [2, 3, 1, 2, 3]
-    assert "1 of 6 cells have a road of their own" in capsys.readouterr().err
-    with pytest.raises(ValueError, match="every cell of the study has a road of its own"):
-        find_study(Args(name=f"{__name__}:OWN_ROAD", corridor=road))
+    assert "1 of 6 cells" in capsys.readouterr().err
+    for other in (f'{SHORT} {{"bandwidth": 1}}', "dptse_env:dptse/LongHighway-v0"):
+        with pytest.raises(ValueError, match="^env must be one of"):
+            find_study(Args(name=MINE, env=(other,)))
 
 
-def test_seeds_and_road_can_be_others_with_an_output_of_their_own():
-    for changes in ({"seeds": "2900:2902"}, {"corridor": "paper-highway"}):
+def test_seeds_and_environments_can_be_others_with_an_output_of_their_own():
+    for changes in ({"seeds": "2900:2902"}, {"env": (SHORT,)}):
         with pytest.raises(ValueError, match="given with an output of its own"):
             main(Args(name=MINE, **changes))
-    study = find_study(Args(name=MINE, seeds="2900:2902", corridor="paper-highway"))
-    assert study.seeds == (2900, 2901)
-    assert not find_study(Args(name="paper", corridor='{"lanes": 2}')).measures
-    assert {cell.keywords["corridor"] for cell in study.cells} == {"paper-highway"}
-    assert {cell.id for cell in study.cells}.isdisjoint(cell.id for cell in STUDY.cells)
+    assert find_study(Args(name=f"{__name__}:WIDE")).measures
+    study = find_study(Args(name=f"{__name__}:WIDE", seeds="2900:2902", env=(SHORT,)))
+    assert (study.seeds, study.measures) == ((2900, 2901), {})
 
 
 def test_choices_keep_their_validation_traffic_on_other_seeds():

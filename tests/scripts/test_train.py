@@ -17,12 +17,13 @@ from agents.training.recipes import RECIPES, MaskablePPORecipe
 from agents.training.run_files import read_progress
 from agents.training.tensorboard_writer import make_tensorboard_writer
 from scripts import train
+from scripts.cli import run
 from scripts.train import Args, make_plan
 
 ROOT = Path(__file__).parents[2]
 SMALL = [
-    "--env", "dptse_env:dptse/ShortHighway-v0", "--traffic", "0:2", "--validation", "1000:1001",
-    "--keywords", '{"horizon": 64}', "--no-tensorboard",
+    "--env", 'dptse_env:dptse/ShortHighway-v0 {"horizon": 64}', "--traffic", "0:2", "--validation", "1000:1001",
+    "--no-tensorboard",
 ]  # fmt: skip
 ROUNDS = [
     "recipe:plackett-luce", "--recipe.n-envs", "4", "--recipe.replicas", "2", "--recipe.width", "8",
@@ -79,7 +80,7 @@ def test_ctrl_c_leaves_a_training_to_continue(tmp_path, monkeypatch, capsys):
     with monkeypatch.context() as patch:
         patch.setattr("pathlib.Path.replace", interrupted)
         with pytest.raises(SystemExit) as ended:
-            train.main(args)
+            run(lambda _: train.main(args), Args, None, words=[])
     assert ended.value.code == 130
     assert "the same command goes on" in capsys.readouterr().err
     train.main(args)
@@ -92,7 +93,7 @@ def test_ctrl_c_leaves_a_training_to_continue(tmp_path, monkeypatch, capsys):
 def test_a_killed_program_continues_to_the_same_curve(tmp_path, how, recipe, n_rows):
     def start(output):
         return subprocess.Popen(
-            [sys.executable, "scripts/train.py", "--output", str(output), *SMALL, *recipe],
+            [sys.executable, "-m", "scripts.dptse", "train", "--output", str(output), *SMALL, *recipe],
             cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, stdout=subprocess.PIPE,
             stderr=subprocess.PIPE, text=True,
         )  # fmt: skip
@@ -106,13 +107,13 @@ def test_a_killed_program_continues_to_the_same_curve(tmp_path, how, recipe, n_r
     _, err = process.communicate(timeout=120)
     assert process.returncode == (130 if how == signal.SIGINT else -how)
     assert how == signal.SIGKILL or "the same command goes on" in err
-    for run in ("killed", "whole"):
-        process = start(tmp_path / run)
+    for name in ("killed", "whole"):
+        process = start(tmp_path / name)
         process.communicate(timeout=300)
         assert process.returncode == 0
     curves = [
-        [{k: v for k, v in row.items() if k != "seconds"} for row in read_progress(tmp_path / run)]
-        for run in ("killed", "whole")
+        [{k: v for k, v in row.items() if k != "seconds"} for row in read_progress(tmp_path / name)]
+        for name in ("killed", "whole")
     ]
     assert curves[0] == curves[1]
     assert len(curves[0]) == n_rows
@@ -127,7 +128,12 @@ def test_every_recipe_is_on_the_command_line():
 
 
 def test_arguments_become_the_plan():
-    args = Args(seed=3, traffic="4:6", validation="1000", keywords='{"bandwidth": 3}')
+    args = Args(
+        seed=3,
+        traffic="4:6",
+        validation="1000",
+        env='dptse_env:dptse/PrivateHighway-v0 {"bandwidth": 3}',
+    )
     plan = make_plan(args, 3)
     assert (plan.seed, plan.traffic_seeds, plan.validation_seeds) == (3, (4, 5), (1000,))
     assert plan.config.bandwidth == 3
@@ -135,12 +141,6 @@ def test_arguments_become_the_plan():
     assert (plan.steps, plan.n_updates) == (0, 8)  # rounds of swaps alone
     sequential = make_plan(Args(recipe=MaskablePPORecipe()), 0)
     assert sequential.n_updates == 313  # 2 million decisions of five picks, 32,000 an update
-
-
-@pytest.mark.parametrize("text", ["{", "[1]", "3"])
-def test_keywords_must_be_an_object(text):
-    with pytest.raises(ValueError, match="keywords must be a JSON object, got"):
-        make_plan(Args(keywords=text), 0)
 
 
 def test_tensorboard_is_optional_and_its_absence_is_logged(tmp_path, monkeypatch, caplog):

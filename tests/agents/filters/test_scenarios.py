@@ -1,4 +1,5 @@
 import dataclasses
+import json
 
 import numpy as np
 import pytest
@@ -55,10 +56,13 @@ def test_mechanisms_can_be_left_out():
 
 
 def test_environments_are_ids_with_keywords():
-    assert parse_env("a:b/C-v0") == ("a:b/C-v0", {})
-    assert parse_env('a:b/C-v0 {"bandwidth": 3}') == ("a:b/C-v0", {"bandwidth": 3})
-    with pytest.raises(ValueError, match=r"keywords must be a JSON object, got '\[3\]'"):
-        parse_env("a:b/C-v0 [3]")
+    assert parse_env("dptse_env:dptse/LongHighway-v0") == ("dptse_env:dptse/LongHighway-v0", {})
+    keywords = {"bandwidth": 3}
+    given = f"dptse_env:dptse/LongHighway-v0 {json.dumps(keywords)}"
+    assert parse_env(given) == ("dptse_env:dptse/LongHighway-v0", keywords)
+    for text in ("[3]", "{"):
+        with pytest.raises(ValueError, match="^env must be an id and a JSON object, got"):
+            parse_env(f"dptse_env:dptse/LongHighway-v0 {text}")
 
 
 @pytest.mark.filterwarnings("ignore:.*values measured or tuned on")

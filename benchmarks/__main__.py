@@ -1,0 +1,56 @@
+"""Times of a step: estimators, environments and long roads beside their peers.
+
+python -m benchmarks --parts estimators
+
+Each part runs in a process of its own, and what it compares takes turns there. Nothing else should
+run beside them.
+"""
+
+from __future__ import annotations
+
+import platform
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from importlib.metadata import version
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Literal, get_args
+
+from agents.tables import markdown
+from benchmarks.turns import HEADER, Line, as_cells, measure, show
+from dptse_env.utils.threads import n_cores
+from scripts.cli import run
+
+Part = Literal["estimators", "environment", "long_roads"]
+PACKAGES = ("dptse-env", "libsumo", "gymnasium", "numba", "numpy", "stable-baselines3")
+
+
+@dataclass(frozen=True)
+class Args:
+    """Measure and print one table."""
+
+    parts: tuple[Part, ...] = get_args(Part)
+    """Parts to measure."""
+    output: Path | None = None
+    """File for the table, as Markdown."""
+    quick: bool = False
+    """Smallest sizes: whether it runs, not how fast it is."""
+
+
+def main(args: Args) -> None:
+    """Measure and print."""
+    lines: list[Line] = []
+    for part in args.parts:
+        with ProcessPoolExecutor(1, get_context("spawn")) as alone:
+            lines += alone.submit(measure, part, args.quick).result()
+    versions = ", ".join(f"{name} {version(name)}" for name in PACKAGES)
+    title = f"Python {platform.python_version()}, {n_cores()} cores; {versions}"
+    show(title, lines)
+    if args.output is not None:
+        table = markdown(HEADER, map(as_cells, lines), ":--", "--:")
+        args.output.parent.mkdir(parents=True, exist_ok=True)
+        args.output.write_text(f"# Time of a step\n\n{title}\n\n{table}\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    run(main, Args, __doc__)
