@@ -27,14 +27,13 @@ class Args(Environment, Machines):
     env: str = "dptse_env:dptse/PrivateHighway-v1"
     """Environment: an id, or an id and keywords as JSON, 'ID {"privacy": {"cap": 16}}'."""
     target: str = "worst-case"
-    """Vehicle that differs: worst-case or opposite, made up; replaced, deleted, runs-out, jam or
-    late, of the record."""
+    """Vehicle that differs: worst-case, opposite, replaced, deleted, runs-out, jam or late."""
     policy: str = "hunter"
-    """Queries: hunter, adaptive, or a public schedule: paper, static, round-robin."""
+    """Queries: hunter, adaptive, or a public schedule (paper, static, round-robin)."""
     runs: int = 5000
     """Runs in each of the two worlds."""
     noise_factor: float = 1.0
-    """Multiplies the real noise, not the declared one; below 1 shows that the audit can reject."""
+    """Factor on the real noise, not the declared one; below 1 is to be rejected."""
     traffic_seed: int = 0
     """Traffic seed of the record."""
     confidence: float = 0.95

@@ -18,8 +18,10 @@ from dptse_env.traffic import Record
 from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from dptse_env.utils.fields import require
 
-KINDS = ("worst-case", "opposite", "replaced", "deleted", "runs-out", "jam", "late")
-"""Kinds of targets; see `choose_target`."""
+KINDS: tuple[str, ...] = (
+    "worst-case", "opposite", "replaced", "deleted", "runs-out", "jam", "late",
+)  # fmt: skip
+"""Kinds of targets; see `Planner.choose`."""
 
 PUBLIC_SCHEDULES = ("paper", "static", "round-robin")
 """Schedules that ignore observations: their queries are known beforehand."""
@@ -109,7 +111,7 @@ class Planner:
             ValueError: It is none of `KINDS`, or does not go with the adjacency or with two groups
                 of columns.
         """
-        kinds = KINDS if self._is_whole else KINDS[:1]
+        kinds = KINDS if self._is_whole else ("worst-case",)
         if not self.replaces:
             kinds = tuple(each for each in kinds if each not in ("opposite", "replaced"))
         require(kind in kinds, "target", f"one of {list(kinds)} here", kind)

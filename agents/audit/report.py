@@ -172,7 +172,7 @@ def audit_environment(
         n_runs=n_runs,
         noise_factor=noise_factor,
         distance=float(runs.distances.max()),
-        result=audit(*runs.scores, Claim(mu, epsilon, delta), confidence),
+        result=audit(runs.scores[0], runs.scores[1], Claim(mu, epsilon, delta), confidence),
         privacy=report,
         seconds=time.perf_counter() - start,
     )

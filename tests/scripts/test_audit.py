@@ -1,10 +1,12 @@
 import json
+import sys
 
 import pytest
 
 from dptse_env.privacy import mu_of
 from scripts.audit import Args, main
 from tests.helpers import SHORT
+from tests.scripts.commands import refused
 
 CAPPED = {"preset": "capped", "epsilon": 5.0, "cap": 16}
 
@@ -87,4 +89,19 @@ def test_every_argument_arrives(tmp_path):
 def test_bad_arguments_are_named_and_nothing_is_recorded_or_written(changes, path, tmp_path):
     with pytest.raises(ValueError, match=rf"^{path} (must be|is unknown)"):
         run(tmp_path, **{"records": tmp_path / "cache", **changes})
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "said"),
+    [
+        (("--executor", "ray"), 1, "pip install 'dptse-env[ray]'"),
+        (("--address", "auto"), 2, "address must be given with the executor ray, got 'auto'"),
+    ],
+)
+def test_machines_that_are_not_there_are_one_line(words, status, said, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    where = ("--output", tmp_path / "out", "--records", tmp_path / "cache")
+    line = refused("audit", "--env", SHORT, *where, *words, status=status)
+    assert said in line
     assert list(tmp_path.iterdir()) == []

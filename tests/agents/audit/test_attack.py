@@ -92,7 +92,9 @@ def test_the_score_is_the_log_likelihood_ratio_of_the_transcript(setting, factor
     for queried in public_plan(setting, "paper"):
         process.step(np.arange(2), np.tile(queried, (2, 1)).astype(np.int8))
         heard.append(tuple(np.array(each) for each in release.last))
-    observed, values, sigma, centre = (np.stack(column, axis=1) for column in zip(*heard, strict=True))
+    observed, values, sigma, centre = (
+        np.stack(column, axis=1) for column in zip(*heard, strict=True)
+    )
     for run in (0, 1):
         seen, noise = observed[run], factor * sigma[run][observed[run]]
         told = values[run][seen]

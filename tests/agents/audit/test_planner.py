@@ -260,7 +260,9 @@ def test_the_hunter_of_ledgers_follows_both_vehicles_every_second(bandwidth, rec
     assert (plan.sum(axis=1) == bandwidth).all()
     assert bandwidth < 5 or (plan.sum(axis=0) > 0).all()
     sensor = AdjacentWorlds(record, (staying(ROAD.fixed_sensors[0]), Trajectory.absent()))
-    np.testing.assert_array_equal(Planner(setting).plan(sensor), public_plan(setting, "round-robin"))
+    np.testing.assert_array_equal(
+        Planner(setting).plan(sensor), public_plan(setting, "round-robin")
+    )
 
 
 def test_contributions_are_spent_where_they_tell_most():
