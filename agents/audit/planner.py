@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-from functools import cached_property
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 
@@ -53,19 +51,6 @@ def public_plan(config: EnvConfig, name: str) -> BoolArray:
     return queried
 
 
-class Terms(NamedTuple):
-    """Public numbers of an episode of T steps, which say how far a vehicle moves its releases.
-
-    Attributes:
-        scale: What one vehicle more, and 1 km/h more in the sum or mean of speeds, moves a release
-            of each place, in units of the noise, shape (T, places, 2).
-        centre: Centres of speeds [km/h], shape (T, places); NaN where mean speeds are released.
-    """
-
-    scale: FloatArray
-    centre: FloatArray
-
-
 class Planner:
     """Plans an attack by what vehicles would tell in a typical episode.
 
@@ -94,13 +79,15 @@ class Planner:
         self._clip = getattr(ledgers, "clip", math.inf)
         self._fastest = float(getattr(ledgers, "fastest", math.inf))
         self._budget = math.inf if ledgers is None else float(ledgers.budget[0])
+        # Where all seconds cost the same, the number of those that count.
+        self._cap = int(min(self._budget, config.horizon_steps))
         self._limits = np.array(corridor.with_boundaries(corridor.speed_limits))
         # Record columns that are observed without a query.
         boundaries = range(corridor.n_segments, corridor.n_segments + corridor.n_boundaries)
         is_private = config.privacy.boundary == "private"
         self._always = [*corridor.fixed_sensors, *(boundaries if is_private else ())]
         self._seconds = np.arange(1, config.horizon_steps + 1)
-        self._terms: Terms | None = None
+        self._terms: tuple[FloatArray, FloatArray] | None = None
 
     # Targets ------------------------------------------------------------------------------------
 
@@ -208,7 +195,7 @@ class Planner:
             return float(squares.max())
         if self._release.has_prices:
             return min(float(squares.sum()), self._budget)
-        return plan_contributions(squares, always, self._cap).reach
+        return plan_contributions(squares, always, self._cap)[0]
 
     def _places(self, record: Record) -> list[int]:
         """Return the segments on which a made-up vehicle stands, the best first.
@@ -232,7 +219,8 @@ class Planner:
         limit, both are below it or at it.
         """
         limit, places = self.config.corridor.largest_speed_limit, np.array(self._places(record))
-        centres = self._typical(record).centre[self._seconds - 1][:, places]
+        _, centre = self._typical(record)
+        centres = centre[self._seconds - 1][:, places]
         centres = np.nan_to_num(centres, nan=0.5 * limit)
         products = np.minimum(limit - centres, self._clip) * np.minimum(centres, self._clip)
         seen = self._observable(record)[self._seconds][:, places]
@@ -313,10 +301,9 @@ class Planner:
             costs, n_queries = ((chosen.step - 1 + world) % 2).astype(float), len(chosen.step)
         else:
             squares, seen_always = self._squares_in(worlds, world)[seen], always[seen]
-            best = plan_contributions(squares, seen_always, self._cap)
-            counts = ~seen_always & (np.arange(len(squares)) < best.stop)
-            chosen = vehicle.only(seen).only(counts)
-            costs, n_queries = -squares[counts], best.n_queries
+            _, n_queries, stop = plan_contributions(squares, seen_always, self._cap)
+            counts = ~seen_always & (np.arange(len(squares)) < stop)
+            chosen, costs = vehicle.only(seen).only(counts), -squares[counts]
         columns = costs.tolist(), (chosen.step - 1).tolist(), chosen.segment.tolist()
         return [(*second, world) for second in zip(*columns, strict=True)], n_queries
 
@@ -348,11 +335,11 @@ class Planner:
             vehicle: The vehicle; or rows of several, each of which is looked at by itself.
             is_in_record: Whether the record holds it already.
         """
-        terms, moves = self._typical(record), np.zeros((len(vehicle.step), 2))
+        (scale, centre), moves = self._typical(record), np.zeros((len(vehicle.step), 2))
         seen = self._observable(record)[vehicle.step, vehicle.segment]
         step, segment, speed = vehicle.step[seen], vehicle.segment[seen], vehicle.speed[seen]
         if self._release.task.releases_flow:
-            change = np.clip(speed, 0.0, self._fastest) - terms.centre[step - 1, segment]
+            change = np.clip(speed, 0.0, self._fastest) - centre[step - 1, segment]
             change = np.clip(change, -self._clip, self._clip)
         else:
             others = record.counts[step, segment] - is_in_record
@@ -361,21 +348,16 @@ class Planner:
             limit = self._limits[segment]
             without = np.where(others > 0, total / np.maximum(others, 1), limit)
             change = (total + speed) / (others + 1) - without
-        moves[seen] = terms.scale[step - 1, segment]
+        moves[seen] = scale[step - 1, segment]
         moves[seen, 1] *= change
         return moves
 
-    def _typical(self, record: Record) -> Terms:
-        """Return public numbers of an episode over the first record that was asked for."""
+    def _typical(self, record: Record) -> tuple[FloatArray, FloatArray]:
+        """Return `public_terms` of an episode over the first record that was asked for."""
         if self._terms is None:
             schedule = self.policy if self.policy in PUBLIC_SCHEDULES else "round-robin"
             self._terms = public_terms(self.config, record, public_plan(self.config, schedule))
         return self._terms
-
-    @cached_property
-    def _cap(self) -> int:
-        """Number of seconds in which a vehicle counts at most, where all cost the same."""
-        return int(min(self._budget, self.config.horizon_steps))
 
     def _observable(self, record: Record) -> BoolArray:
         """Return flags of record columns the policy may observe, (n_steps, n_columns)."""
@@ -388,14 +370,21 @@ class Planner:
         return observed
 
 
-def public_terms(config: EnvConfig, record: Record, plan: BoolArray, seed: int = 0) -> Terms:
-    """Play an episode over a record, and return its public terms.
+def public_terms(
+    config: EnvConfig, record: Record, plan: BoolArray, seed: int = 0
+) -> tuple[FloatArray, FloatArray]:
+    """Play an episode over a record, and return how far vehicles would move its releases.
 
     Args:
         config: The configuration.
         record: The traffic.
         plan: Queries, shape (T, n_mainline).
         seed: Seeds noise and estimator.
+
+    Returns:
+        By how much one vehicle more, and 1 km/h more in the sum or mean of speeds, moves the
+        release of each place, in units of the noise, shape (T, places, 2); and the centres of
+        speeds [km/h], shape (T, places), NaN where mean speeds are released.
     """
     alike = AdjacentWorlds(record, (Trajectory.absent(), Trajectory.absent()))
     process, release = make_overheard(attacked_form(config), alike, 1)
@@ -414,40 +403,28 @@ def public_terms(config: EnvConfig, record: Record, plan: BoolArray, seed: int =
     alike_columns = task.group[:, None] == task.group
     share = task.covers / np.maximum(alike_columns.astype(float) @ task.covers, 1.0)
     squares = np.einsum("tcq,cp->tpq", sigma**-2.0, share)
-    return Terms(np.sqrt(squares), centre)
+    return np.sqrt(squares), centre
 
 
-class ContributionPlan(NamedTuple):
-    """The seconds in which a vehicle's contributions reveal most.
-
-    Attributes:
-        reach: Sum of the squared distances of the seconds that count.
-        n_queries: Number of other seconds to query, beside those observed at every step.
-        stop: Index before which all chosen queries must lie; later seconds would be counted only
-            after contributions that were not chosen.
-    """
-
-    reach: float
-    n_queries: int
-    stop: int
-
-
-def plan_contributions(gains: FloatArray, always: BoolArray, cap: int) -> ContributionPlan:
-    """Return the plan of a vehicle that counts in its first `cap` observed seconds.
+def plan_contributions(squares: FloatArray, always: BoolArray, cap: int) -> tuple[float, int, int]:
+    """Return how a vehicle that counts in its first `cap` observed seconds tells most.
 
     Args:
-        gains: Squared distances of its seconds in order, shape (m,).
+        squares: Squared distances of its seconds in order, shape (m,).
         always: Flags of seconds that are observed without a query, shape (m,).
         cap: Most seconds that count.
+
+    Returns:
+        The sum of the squares that count; the number of other seconds to query; and the index
+        before which these must lie: later ones would be counted only after seconds that tell less.
     """
-    if cap >= len(gains):
-        return ContributionPlan(float(gains.sum()), cap, len(gains))
+    if cap >= len(squares):
+        return float(squares.sum()), cap, len(squares)
     fixed = np.flatnonzero(always)
     options = []
     # With the first n such seconds counted, all queries have to come before the next of them.
     for n in range(min(len(fixed), cap) + 1):
-        stop = int(fixed[n]) if n < len(fixed) else len(gains)
-        free = np.sort(gains[:stop][~always[:stop]])[::-1][: cap - n]
-        reach = float(gains[fixed[:n]].sum() + free.sum())
-        options.append(ContributionPlan(reach, cap - n, stop))
+        stop = int(fixed[n]) if n < len(fixed) else len(squares)
+        free = np.sort(squares[:stop][~always[:stop]])[::-1][: cap - n]
+        options.append((float(squares[fixed[:n]].sum() + free.sum()), cap - n, stop))
     return max(options)

@@ -270,15 +270,15 @@ def test_contributions_are_spent_where_they_tell_most():
     for cap in (1, 2, 3, 5, 8):
         for _ in range(20):
             gains, always = generator.random(7), generator.random(7) < 0.4
-            plan = plan_contributions(gains, always, cap)
+            reach, n_queries, stop = plan_contributions(gains, always, cap)
             # Every set of seconds to query; the first that are observed count.
             options = []
             for queried in range(2**7):
                 observed = always | (queried >> np.arange(7) & 1).astype(bool)
                 options.append(gains[np.flatnonzero(observed)[:cap]].sum())
-            assert plan.reach == pytest.approx(max(options))
-            best = np.flatnonzero(~always[: plan.stop])
-            best = best[np.argsort(-gains[best])][: plan.n_queries]
+            assert reach == pytest.approx(max(options))
+            best = np.flatnonzero(~always[:stop])
+            best = best[np.argsort(-gains[best])][:n_queries]
             observed = always.copy()
             observed[best] = True
             assert gains[np.flatnonzero(observed)[:cap]].sum() == pytest.approx(max(options))
