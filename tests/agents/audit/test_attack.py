@@ -85,13 +85,16 @@ def test_the_score_is_the_log_likelihood_ratio_of_the_transcript(setting, factor
     setting = attacked_form(setting)
     worlds = Planner(setting, "paper").choose(record, "replaced")
     process, release = make_overheard(setting, worlds, 2, factor)
-    for world in (0, 1):
-        stream = [np.random.default_rng(world)]
-        process.reset(np.array([world]), stream, {"traffic_seed": world, "start": 0})
-    heard = []
-    for queried in public_plan(setting, "paper"):
-        process.step(np.arange(2), np.tile(queried, (2, 1)).astype(np.int8))
-        heard.append(tuple(np.array(each) for each in release.last))
+    plan, heard = public_plan(setting, "paper"), []
+    # What is left of runs before must not matter.
+    for steps in (plan[:7], plan):
+        heard.clear()
+        for world in (0, 1):
+            stream = [np.random.default_rng(world)]
+            process.reset(np.array([world]), stream, {"traffic_seed": world, "start": 0})
+        for queried in steps:
+            process.step(np.arange(2), np.tile(queried, (2, 1)).astype(np.int8))
+            heard.append(tuple(np.array(each) for each in release.last))
     observed, values, sigma, centre = (
         np.stack(column, axis=1) for column in zip(*heard, strict=True)
     )
