@@ -49,7 +49,7 @@ test: setup  ## Run the tests, without the slow ones.
 	$(BIN)/python -m pytest -m 'not slow' -n 2 --dist loadfile
 
 test-tutorial: setup  ## Run the tutorial as a notebook, two to four minutes.
-	$(BIN)/python -m pytest tests/docs/test_notebook.py
+	$(BIN)/python -m pytest tests/docs/test_tutorial.py -m slow
 
 test-slow: setup  ## Run the slow tests: before a release, and after a change to kernels, workers or benchmarks.
 	$(BIN)/python -m pytest -m 'slow and not ray' -n 2 --dist loadfile

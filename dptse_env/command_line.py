@@ -6,6 +6,7 @@ folder is put on the path when a tool runs.
 """
 
 import importlib
+import io
 import sys
 from pathlib import Path
 
@@ -24,6 +25,9 @@ def add_tools_path() -> None:
 def main() -> None:
     """Run the command that the arguments name."""
     add_tools_path()
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        # A pipe on Windows takes fewer letters than a terminal does.
+        sys.stdout.reconfigure(errors="replace")
     # Policies and parts of one's own, "module:Class", are found as by ``python -m``.
     here = str(Path.cwd())
     if here not in sys.path:

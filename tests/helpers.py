@@ -66,6 +66,7 @@ def _parameter(case: Any, slow: bool) -> Any:
 
 EPISODES = {"traffic_seeds": "0:3", "horizon": 6, "random_start": True}
 COUNTED = {"preset": "capped", "cap": 5, "boundary_inputs": "private"}
+PAID = {"preset": "paced", "boundary_inputs": "private"}
 
 
 def make_env(**keywords):
@@ -115,23 +116,39 @@ def assert_same(first: Any, second: Any, tolerance: float = 0.0) -> None:
         assert first == (pytest.approx(second, abs=tolerance) if type(first) is float else second)
 
 
-def lock_step(keywords: dict[str, Any], n_steps: int, env_id: str = SHORT, **more: Any) -> None:
-    """Compare a batch with three scalar environments of the same seeds, at every step."""
-    keywords = {**EPISODES, **keywords}
-    batch = gym.make_vec(env_id, num_envs=3, **more, **keywords)
-    vectorise = {"autoreset_mode": more["autoreset_mode"]} if more else None
+def lock_step(
+    keywords: dict[str, Any], n_steps: int, env_id: str = SHORT, autoreset_mode: str = "NextStep"
+) -> None:
+    """Compare a batch with three scalar environments of the same seeds, at every step.
+
+    Two of the three episodes begin again after two steps, so that ends are not all at one step.
+    """
+    keywords, mode = {**EPISODES, **keywords}, {"autoreset_mode": autoreset_mode}
+    batch = gym.make_vec(env_id, num_envs=3, **mode, **keywords)
     singles = gym.make_vec(
-        env_id, num_envs=3, vectorization_mode="sync", vector_kwargs=vectorise, **keywords
+        env_id, num_envs=3, vectorization_mode="sync", vector_kwargs=mode, **keywords
     )
     assert batch.action_space == singles.action_space
     assert batch.observation_space == singles.observation_space
-    assert_same(batch.reset(seed=7), singles.reset(seed=7), 1e-10)
+
+    def reset(seed: int | None, mask: Any) -> None:
+        came_back = [
+            env.reset(seed=seed, options=None if mask is None else {"reset_mask": np.array(mask)})
+            for env in (batch, singles)
+        ]
+        assert_same(*came_back, 1e-10)
+
+    reset(7, None)
     batch.action_space.seed(1)
-    for _ in range(n_steps):
+    for step in range(n_steps):
         actions = batch.action_space.sample()
         came_back = batch.step(actions)
         assert came_back[0] in batch.observation_space
         assert_same(came_back, singles.step(actions), 1e-10)
+        if step == 1:
+            reset(40, [True, False, True])
+        if autoreset_mode == "Disabled" and came_back[3].any():
+            reset(None, came_back[3])
     assert_same(batch.np_random_seed, singles.np_random_seed)
     draws = [[g.integers(2**63) for g in env.np_random] for env in (batch, singles)]
     assert draws[0] == draws[1]

@@ -1,3 +1,5 @@
+"""`SensorQueryEnv` in Gymnasium's terms: seeds, options, infos, specs, and bad keywords."""
+
 import pickle
 import subprocess
 import sys
@@ -47,8 +49,7 @@ def test_a_seed_fixes_the_episodes_and_no_seed_goes_on():
     again = [env.reset(seed=5)[0], env.reset()[0], env.reset()[0]]
     assert_same(first, again)
     assert_same(play(env, 30, seed=5), play(env, 30, seed=5))
-    rewards = {tuple(step[1] for step in play(env, 30, seed=s)[1:]) for s in range(5)}
-    assert len(rewards) == 5
+    assert len({tuple(step[1] for step in play(env, 30, seed=s)[1:]) for s in range(5)}) == 5
 
 
 def test_an_episode_ends_by_truncation_at_the_horizon():
@@ -56,9 +57,7 @@ def test_an_episode_ends_by_truncation_at_the_horizon():
     *_, before_last, last = play(env, 20)
     assert before_last[2:4] == (False, False)
     assert last[2:4] == (False, True)
-    assert type(last[1]) is float
-    assert type(last[2]) is bool
-    assert type(last[3]) is bool
+    assert [type(value) for value in last[1:4]] == [float, bool, bool]
     with pytest.raises(gym.error.ResetNeeded, match="call reset"):
         env.step(env.action_space.sample())
 
@@ -66,8 +65,7 @@ def test_an_episode_ends_by_truncation_at_the_horizon():
 def test_sequential_actions_move_the_traffic_on_their_last_pick():
     env = make_env(action="sequential", bandwidth=3, horizon=5, truth_in_info=True)
     env.reset(seed=0)
-    times, rewards, masks = [], [], []
-    truncated = False
+    times, rewards, masks, truncated = [], [], [], False
     while not truncated:
         free = env.unwrapped.action_masks()
         _, reward, _, truncated, info = env.step(np.flatnonzero(free)[0])
@@ -80,19 +78,15 @@ def test_sequential_actions_move_the_traffic_on_their_last_pick():
 
 
 def test_info_has_the_same_finite_numbers_at_every_step():
-    env = make_env()
-    (_, at_reset), *steps = play(env, 30)
+    (_, at_reset), *steps = play(make_env(), 30)
     assert at_reset.pop("privacy")["guarantee"] == "none"
     assert at_reset.pop("inherited") == []
     for info in [at_reset, *(step[4] for step in steps)]:
+        numbers = {**info}
+        flags = numbers.pop("queried")
+        assert (flags.dtype, flags.sum() <= 2) == (bool, True)
         assert info.keys() == at_reset.keys()
-        flags = info.pop("queried")
-        assert flags.dtype == bool
-        assert flags.sum() <= 2
-        for key, value in info.items():
-            assert type(value) is float, key
-            assert np.isfinite(value), key
-        info["queried"] = flags
+        assert all(type(value) is float and np.isfinite(value) for value in numbers.values())
 
 
 def test_truth_is_shown_only_on_request():
@@ -102,37 +96,33 @@ def test_truth_is_shown_only_on_request():
     assert set(TRUTH_INFO) <= set(info)
 
 
-def test_reset_options_choose_the_traffic_and_the_start():
+def test_reset_options_choose_the_traffic_and_the_start_and_leave_the_noise():
     env = make_env(horizon=50, random_start=True, truth_in_info=True)
     truth = env.reset(seed=0, options={"traffic_seed": 2, "start": 100})[1]["truth"]
     assert (truth["traffic_seed"], truth["time"]) == (2, 100)
     starts = {env.reset()[1]["truth"]["time"] for _ in range(30)}
     assert len(starts) > 10
     assert max(starts) <= 190
-
-
-def test_fixing_the_traffic_leaves_the_noise_as_it_was():
     env = make_env(traffic_seeds=[0])
     free = play(env, 10, seed=9)
     env.action_space.seed(9)
     fixed = [env.reset(seed=9, options={"traffic_seed": 0})]
-    fixed += [env.step(env.action_space.sample()) for _ in range(10)]
-    assert_same(free, fixed)
+    assert_same(free, fixed + [env.step(env.action_space.sample()) for _ in range(10)])
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"seed": 1}, r"options\.seed is unknown; allowed: traffic_seed, start"),
-        ({"traffic_seed": 7}, r"options\.traffic_seed must be one of .* 3 traffic_seeds, got 7"),
-        ({"start": 191}, r"options\.start must be an integer in 0\.\.190, got 191"),
-        ({"start": 1.5}, r"options\.start must be an integer in 0\.\.190, got 1\.5"),
+        ({"seed": 1}, "seed is unknown; allowed: traffic_seed, start"),
+        ({"traffic_seed": 7}, "traffic_seed must .*, got 7"),
+        ({"start": 191}, r"start must .* 0\.\.190, got 191"),
+        ({"start": 1.5}, r"start must .* 0\.\.190, got 1\.5"),
     ],
 )
 def test_bad_reset_options_are_refused_and_the_episode_goes_on(options, message):
     env, undisturbed = make_env(horizon=50), make_env(horizon=50)
     play(env, 3), play(undisturbed, 3)
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=rf"options\.{message}"):
         env.reset(options=options)
     action = np.zeros(6, dtype=np.int8)
     assert_same(env.step(action), undisturbed.step(action))
@@ -165,59 +155,57 @@ def test_a_spec_survives_json():
     assert_same(play(env, 5), play(again, 5))
 
 
-BAD = [
-    ({"bandwith": 2}, "bandwith is unknown"),
-    ({"bandwidth": 7}, "bandwidth must be"),
-    ({"bandwidth": 2.5}, "bandwidth must be"),
-    ({"estimator": "kf"}, "estimator must be one of"),
-    ({"estimator": 3}, "estimator must be a class"),
-    ({"backend": "gpu"}, "backend must be one of"),
-    ({"action": "flags"}, "action must be one of"),
-    ({"reward": 3}, "reward must be callable"),
-    ({"observation": 3}, "observation must be"),
-    ({"privacy": "none"}, r"privacy\.preset must be one of"),
-    ({"privacy": {"sigma": 1.0}}, r"privacy\.sigma is unknown"),
-    ({"privacy": {"preset": "capped", "cap": 2**63}}, r"privacy\.cap must be"),
-    ({"privacy": 3}, "privacy must be"),
-    ({"privacy": {"preset": [1]}}, r"privacy\.preset must be"),
-    ({"epsilon": 1e-320}, r"privacy\.epsilon must be"),
-    ({"epsilon": np.ones(2)}, r"privacy\.epsilon must be"),
-    ({"corridor": 3}, "corridor must be"),
-    ({"corridor": "long"}, "corridor must be one of"),
-    ({"corridor": {"n_mainline": 2**63}}, r"corridor\.n_mainline must be"),
-    ({"incident": "fog"}, "incident must be one of"),
-    ({"render_every": 0}, "render_every must be"),
-    ({"records": 1}, "records must be"),
-    ({"estimator_settings": 3}, "estimator_settings must be"),
-    ({"traffic_seeds": [-1]}, r"traffic_seeds\[0\] must be"),
-    ({"traffic_seeds": "0:99999999999999"}, "traffic_seeds must be"),
-    ({"traffic_seeds": []}, "traffic_seeds must be"),
-    ({"traffic_seeds": "3:1"}, "traffic_seeds must be a range of seeds that is not empty"),
-    ({"traffic_seeds": [1, 1]}, "traffic_seeds must be distinct"),
-    ({"truth_in_info": 1}, "truth_in_info must be"),
-    ({"penetration": 5e-324, "privacy": "paced"}, r"penetration\.share must be"),
-    ({"horizon": 241}, "horizon must be"),
-    ({"random_start": True}, "horizon must be below the record"),
-    ({"parameters": 3}, "parameters must be"),
-    ({"parameters": "fast"}, "parameters must be one of"),
-    ({"estimator_settings": {},
-      "parameters": {"name": "f", "free_flow_speed": 400.0, "jam_density": 300.0, "gamma": 1.0,
-                     "relaxation_time": 50.0}}, r"corridor\.segment_length must be longer for"),
-    ({"preset": "none"}, "preset must be one of"),
-    ({"render_mode": "ansi"}, "render_mode must be"),
-]  # fmt: skip
+BAD = {
+    "bandwith is unknown": {"bandwith": 2},
+    "bandwidth must be": {"bandwidth": 2.5},
+    "estimator must be one of": {"estimator": "kf"},
+    "estimator must be a class": {"estimator": 3},
+    "backend must be one of": {"backend": "gpu"},
+    "action must be one of": {"action": "flags"},
+    "reward must be callable": {"reward": 3},
+    "observation must be": {"observation": 3},
+    r"privacy\.preset must be one of": {"privacy": "none"},
+    r"privacy\.sigma is unknown": {"privacy": {"sigma": 1.0}},
+    r"privacy\.cap must be": {"privacy": {"preset": "capped", "cap": 2**63}},
+    "privacy must be": {"privacy": 3},
+    r"privacy\.preset must be": {"privacy": {"preset": [1]}},
+    r"privacy\.epsilon must be": {"epsilon": 1e-320},
+    "corridor must be": {"corridor": 3},
+    "corridor must be one of": {"corridor": "long"},
+    r"corridor\.n_mainline must be": {"corridor": {"n_mainline": 2**63}},
+    "incident must be one of": {"incident": "fog"},
+    "render_every must be": {"render_every": 0},
+    "render_mode must be": {"render_mode": "ansi"},
+    "records must be": {"records": 1},
+    "estimator_settings must be": {"estimator_settings": 3},
+    r"traffic_seeds\[0\] must be": {"traffic_seeds": [-1]},
+    r"traffic_seeds must be 1 to \d+ seeds": {"traffic_seeds": []},
+    "traffic_seeds must be a range of seeds that is not empty": {"traffic_seeds": "3:1"},
+    "traffic_seeds must be distinct": {"traffic_seeds": [1, 1]},
+    "truth_in_info must be": {"truth_in_info": 1},
+    r"penetration\.share must be": {"penetration": 5e-324, "privacy": "paced"},
+    "horizon must be": {"horizon": 241},
+    "horizon must be below the record": {"random_start": True},
+    "parameters must be one of": {"parameters": "fast"},
+    r"corridor\.segment_length must be longer for": {
+        "estimator_settings": {},
+        "parameters": {"name": "f", "free_flow_speed": 400.0, "jam_density": 300.0, "gamma": 1.0,
+                       "relaxation_time": 50.0},
+    },
+    "preset must be one of": {"preset": "none"},
+}  # fmt: skip
 
 
-def nested(depth=100_000):
-    """Return a list in a list in a list ..."""
-    value = []
-    for _ in range(depth):
-        value = [value]
-    return value
+def test_bad_keywords_name_themselves():
+    for message, keywords in BAD.items():
+        with pytest.raises(ValueError, match=f"^{message}"):
+            SensorQueryEnv(**{"preset": "short-highway", **keywords})
 
 
 def test_values_that_are_nested_deeply_are_refused_by_their_path():
-    deep = nested()
+    deep = []
+    for _ in range(100_000):
+        deep = [deep]
     values = dict.fromkeys(field_hints(EnvConfig), deep) | {
         "estimator_settings": {"mhe": {"solver": deep}},
         "privacy": {"preset": deep},
@@ -227,9 +215,3 @@ def test_values_that_are_nested_deeply_are_refused_by_their_path():
     for key, value in values.items():
         with pytest.raises(ValueError, match=rf"^{key}\S* must .*\[\[\.\.\.\]\]"):
             gym.make(SHORT, **{key: value})
-
-
-def test_bad_keywords_name_themselves():
-    for keywords, message in BAD:
-        with pytest.raises(ValueError, match=f"^{message}"):
-            SensorQueryEnv(**{"preset": "short-highway", **keywords})

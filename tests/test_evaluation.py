@@ -1,3 +1,5 @@
+"""`evaluate`: rows of a batch are those of single episodes, on the same traffic and noise."""
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -10,51 +12,92 @@ from dptse_env.schedules import (
     PROCESS_SCHEDULES,
     make_schedule,
 )
-from dptse_env.spaces.actions import ACTION_ENCODINGS
-from tests.helpers import fast_and_slow
+from tests.helpers import SHORT, assert_same, fast_and_slow, make_env
 
-SHORT = "dptse_env:dptse/ShortHighway-v0"
-
-
-def make(**keywords):
-    return gym.make(SHORT, traffic_seeds="0:2", **keywords)
+FAST_ONES = {"horizon": 100, "estimator": "random_walk"}
 
 
-def make_batch(n=2, **keywords):
-    return gym.make_vec(SHORT, num_envs=n, traffic_seeds="0:2", **keywords)
+def make_vector(num_envs=2, **keywords):
+    return gym.make_vec(SHORT, num_envs=num_envs, **{"traffic_seeds": "0:3", **keywords})
+
+
+def assert_same_rows(policy, seeds, keywords, **more):
+    """Compare a batch's rows with those of one episode after another."""
+    envs = make_vector(**keywords), make_env(**keywords)
+    one, other = (evaluate(env, policy(env), seeds, 3, **more) for env in envs)
+    assert_same(one, other, tolerance=1e-9)
+    assert [row["traffic_seed"] for row in one] == list(seeds)
+    assert len({row["rmse_density"] for row in one}) == len(one)
+
+
+SCHEDULES = {*OBSERVATION_SCHEDULES, *PROCESS_SCHEDULES, *ORACLES} - {"random", "all"}
+FAST = ("paper", "speed-front", "greedy-trace", "oracle-error")
+
+
+@pytest.mark.parametrize("name", fast_and_slow(sorted(SCHEDULES), FAST))
+def test_a_batch_gives_the_rows_of_one_episode_after_another(name):
+    assert_same_rows(lambda env: name, (1, 0), {"horizon": 100, "estimator": "ekf"})
+
+
+def test_seeds_need_not_fill_the_last_batch_and_episodes_may_start_late():
+    assert_same_rows(lambda env: "paper", (0, 1, 2), {**FAST_ONES, "random_start": True})
+
+
+class Learned:
+    """Stands in for a learned policy: its picks follow the observation and its own memory."""
+
+    def __init__(self, env):
+        self.interface = env.unwrapped.interface
+        shape = self.interface.observations.space.shape[0], self.interface.n_mainline
+        self.weights = np.random.default_rng(0).standard_normal(shape)
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        batch, interface = np.atleast_2d(observation), self.interface
+        before = 0.0 if state is None else np.where(episode_start[:, None], 0.0, 0.9 * state)
+        state = before + np.tanh(batch @ self.weights)
+        picked = np.zeros(state.shape, dtype=bool)
+        if "picked" in interface.observations.slices:
+            picked = interface.observations.block(batch, "picked") > 0
+        scores = np.where(picked, -np.inf, state if deterministic else -state)
+        wanted = np.zeros(state.shape, dtype=bool)
+        best = np.argsort(-scores, axis=1)[:, : interface.bandwidth]
+        np.put_along_axis(wanted, best, True, axis=1)
+        action = interface.actions.encode(wanted, np.zeros_like(wanted))
+        return (action[0] if np.ndim(observation) == 1 else action), state
+
+
+@pytest.mark.parametrize(("action", "deterministic"), [("mask", True), ("sequential", False)])
+def test_a_batch_gives_the_rows_of_a_learned_policy(action, deterministic):
+    keywords = {**FAST_ONES, "action": action, "privacy": "capped"}
+    assert_same_rows(Learned, (1, 0), keywords, deterministic=deterministic)
+
+
+def test_the_baseline_is_evaluated_by_its_name():
+    rows = dptse_env.evaluate(make_env(), "paper", seeds=range(2))
+    assert rows == evaluate(make_env(), make_schedule("paper", make_env()), [0, 1])
+    assert 0 < rows[0]["rmse_density"] < 60
 
 
 class Noting:
     """Keeps truth and estimates of every second."""
 
-    def __init__(self, process):
-        self.process, self.seconds = process, []
+    def __init__(self, process, seconds):
+        self.process, self.seconds = process, seconds
 
     def __call__(self):
-        process = self.process
-        truth = process.truth(np.arange(process.n_episodes))[:, :6]
-        estimate = process.estimate
+        estimate = self.process.estimate
+        truth = self.process.truth(np.arange(1))[:, :6]
         self.seconds.append((truth, estimate.density[:, :6].copy(), estimate.speed[:, :6].copy()))
 
     def rows(self):
-        return [{"n_seconds": len(self.seconds)}] * self.process.n_episodes
-
-
-def test_the_baseline_is_evaluated_by_its_name():
-    rows = dptse_env.evaluate(make(), "paper", seeds=range(2))
-    assert [row["traffic_seed"] for row in rows] == [0, 1]
-    assert rows == evaluate(make(), make_schedule("paper", make()), [0, 1])
-    assert 0 < rows[0]["rmse_density"] < 60
+        return [{"n_seconds": len(self.seconds)}]
 
 
 def test_errors_are_pooled_over_segments_and_seconds():
     noted = []
-    env = make()
-    (row,) = evaluate(
-        env, "paper", [1], 2, watchers=[lambda process: noted.append(Noting(process)) or noted[-1]]
-    )
+    (row,) = evaluate(make_env(), "paper", [1], 2, watchers=[lambda p: Noting(p, noted)])
     assert row["n_seconds"] == 241
-    counted = noted[0].seconds[61:]  # the first is the state at the reset
+    counted = noted[61:]  # the first is the state at the reset
     truth, density, speed = (np.array(part)[:, 0] for part in zip(*counted, strict=True))
     occupied = truth[..., 0] > 0
     expected_density = np.sqrt(np.mean((density - truth[..., 0]) ** 2))
@@ -63,115 +106,31 @@ def test_errors_are_pooled_over_segments_and_seconds():
     assert row["rmse_speed"] == pytest.approx(expected_speed)
 
 
-def watched(release, values):
-    """Return a function that releases, and keeps the values of all columns, queried or not."""
-
-    def release_and_keep(request):
-        measured = release(request)
-        values.append(measured.values.copy())
-        return measured
-
-    return release_and_keep
-
-
 def test_a_seed_gives_the_same_noise_under_every_policy_and_another_with_a_noise_seed():
     released = []
     for name, noise in (("static", 0), ("random", 0), ("static", 1)):
-        env = make()
-        release, values = env.unwrapped.process.release, []
-        release.release = watched(release.release, values)
+        env, values = make_env(), []
+        process, release = env.unwrapped.process, env.unwrapped.process.release.release
+
+        def watched(request, release=release, values=values):
+            measured = release(request)
+            values.append(measured.values.copy())  # of all columns, queried or not
+            return measured
+
+        process.release.release = watched
         evaluate(env, make_schedule(name, env, seed=0), [0], noise)
         released.append(np.array(values))
     np.testing.assert_array_equal(released[0], released[1])
     assert (released[0] != released[2]).any()
 
 
-def assert_same(batch, singles):
-    assert [row["traffic_seed"] for row in batch] == [row["traffic_seed"] for row in singles]
-    for one, other in zip(batch, singles, strict=True):
-        assert one == pytest.approx(other, rel=0, abs=1e-9)
-    assert len({row["rmse_density"] for row in batch}) == len(batch)
-
-
-SCHEDULES = [*OBSERVATION_SCHEDULES, *PROCESS_SCHEDULES, *ORACLES]
-FAST = ("paper", "speed-front", "greedy-trace", "oracle-error")
-
-
-@pytest.mark.parametrize("name", fast_and_slow(sorted({*SCHEDULES} - {"random", "all"}), FAST))
-def test_a_batch_gives_the_rows_of_one_episode_after_another(name):
-    keywords = {"horizon": 100, "estimator": "ekf"}
-    seeds = (1, 0)
-    assert_same(
-        evaluate(make_batch(**keywords), name, seeds, 3),
-        evaluate(make(**keywords), name, seeds, 3),
-    )
-
-
-def test_seeds_need_not_fill_the_last_batch():
-    keywords = {"horizon": 80, "estimator": "random_walk"}
-    env = gym.make_vec(SHORT, num_envs=2, traffic_seeds="0:3", **keywords)
-    rows = evaluate(env, "paper", range(3))
-    single = gym.make(SHORT, traffic_seeds="0:3", **keywords)
-    assert_same(rows, evaluate(single, "paper", range(3)))
-
-
-class Learned:
-    """Stands in for a learned policy: its picks follow the observation and its own memory."""
-
-    def __init__(self, env):
-        self.interface = env.unwrapped.interface
-        self.weights = np.random.default_rng(0).standard_normal(
-            (self.interface.observations.space.shape[0], self.interface.n_mainline)
-        )
-
-    def predict(self, observation, state=None, episode_start=None, deterministic=False):
-        batch = np.atleast_2d(observation)
-        state = np.zeros((len(batch), self.interface.n_mainline)) if state is None else state
-        state = np.where(np.asarray(episode_start)[:, None], 0.0, 0.9 * state) + np.tanh(
-            batch @ self.weights
-        )
-        scores = state if deterministic else -state
-        picked = np.zeros(scores.shape, dtype=bool)
-        if "picked" in self.interface.observations.slices:
-            picked = self.interface.observations.block(batch, "picked") > 0
-        scores = np.where(picked, -np.inf, scores)
-        best = np.argsort(-scores, axis=1)[:, : self.interface.bandwidth]
-        wanted = np.zeros(scores.shape, dtype=bool)
-        np.put_along_axis(wanted, best, True, axis=1)
-        action = self.interface.actions.encode(wanted, np.zeros_like(wanted))
-        return (action[0] if np.ndim(observation) == 1 else action), state
-
-
-@pytest.mark.parametrize(
-    ("action", "deterministic"),
-    [(action, k % 2 == 0) for k, action in enumerate(ACTION_ENCODINGS)],
-)
-def test_a_batch_gives_the_rows_of_a_learned_policy(action, deterministic):
-    keywords = {
-        "action": action, "estimator": "random_walk", "privacy": "capped", "horizon": 100,
-    }  # fmt: skip
-    single, batch = make(**keywords), make_batch(**keywords)
-    assert_same(
-        evaluate(batch, Learned(batch), [1, 0], 4, deterministic=deterministic),
-        evaluate(single, Learned(single), [1, 0], 4, deterministic=deterministic),
-    )
-
-
-def test_late_starts_drop_the_same_seconds_of_their_episodes():
-    keywords = {"horizon": 100, "random_start": True, "estimator": "random_walk"}
-    batch = make_batch(**keywords)
-    rows = evaluate(batch, "paper", [0, 1], 3)
-    assert len(set(batch.unwrapped.process.time.tolist())) > 1
-    assert_same(rows, evaluate(make(**keywords), "paper", [0, 1], 3))
-
-
 @pytest.mark.parametrize(
     ("env", "seeds", "message"),
     [
-        (lambda: make(horizon=60), [0], "warm_up must be shorter than an episode, got 60"),
-        (make, [], "seeds must be one or more"),
-        (make, [0, 7], r"seeds must be among the environment's traffic_seeds, got \[7\]"),
-        (lambda: make_batch(autoreset_mode="SameStep"), [0], "another autoreset_mode"),
+        (lambda: make_env(horizon=60), [0], "warm_up must be shorter than an episode, got 60"),
+        (make_env, [], "seeds must be one or more"),
+        (make_env, [0, 7], r"seeds must be among the environment's traffic_seeds, got \[7\]"),
+        (lambda: make_vector(autoreset_mode="SameStep"), [0], "another autoreset_mode"),
         (lambda: gym.make("CartPole-v1"), [0], "environment of dptse_env, got CartPoleEnv"),
     ],
 )

@@ -8,8 +8,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from dptse_env.utils.registry import MissingExtraError
-
-SHORT = "dptse_env:dptse/ShortHighway-v0"
+from tests.helpers import make_env, play
 
 
 @pytest.fixture
@@ -22,14 +21,7 @@ def display(monkeypatch):
 
 def make(render_mode="human", **keywords):
     keywords = {"horizon": 30, "random_start": True, "traffic_seeds": [0], **keywords}
-    return gym.make(SHORT, render_mode=render_mode, **keywords)
-
-
-def play(env, n_steps, seed):
-    env.action_space.seed(seed)
-    env.reset(seed=seed)
-    for _ in range(n_steps):
-        env.step(env.action_space.sample())
+    return make_env(render_mode=render_mode, **keywords)
 
 
 def shown():
@@ -74,38 +66,29 @@ def test_the_checker_finds_nothing_in_any_render_mode(display):
     check_env(make("rgb_array").unwrapped)
 
 
-def test_a_window_shows_what_a_picture_would(display):
+def test_a_window_shows_what_a_picture_would_until_it_is_closed(display):
+    import pygame
+
     human, picture = make(), make("rgb_array")
     for env in (human, picture):
         env.reset(seed=3)
-        env.action_space.seed(0)
-    np.testing.assert_array_equal(shown(), picture.render())
     for _ in range(4):
         before = shown()
+        np.testing.assert_array_equal(before, picture.render())
         action = human.action_space.sample()
         human.step(action)
         picture.step(action)
-        np.testing.assert_array_equal(shown(), picture.render())
         assert (shown() != before).any()
         assert human.render() is None
+    pygame.event.post(pygame.event.Event(pygame.QUIT))  # closed by hand: the episode goes on
+    for _ in range(2):
+        human.step(human.action_space.sample())
+        assert shown() is None
+    human.reset(seed=4)
+    assert shown() is not None
+    human.close()
     human.close()
     assert shown() is None
-
-
-def test_an_episode_goes_on_when_its_window_is_closed_by_hand(display):
-    import pygame
-
-    env = make()
-    env.reset(seed=3)
-    pygame.event.post(pygame.event.Event(pygame.QUIT))
-    env.step(env.action_space.sample())
-    assert shown() is None
-    env.step(env.action_space.sample())
-    assert shown() is None
-    env.reset(seed=4)
-    assert shown() is not None
-    env.close()
-    env.close()
 
 
 def test_a_missing_pygame_names_the_extra(monkeypatch):
@@ -120,10 +103,7 @@ def test_a_video_has_a_frame_for_each_second(tmp_path):
 
     folder = tmp_path / "videos"
     env = gym.wrappers.RecordVideo(make("rgb_array"), str(folder), disable_logger=True)
-    env.reset(seed=3)
-    truncated = False
-    while not truncated:
-        *_, truncated, _ = env.step(env.action_space.sample())
+    play(env, 30)
     env.close()
     (video,) = folder.glob("*.mp4")
     frames, seconds = imageio_ffmpeg.count_frames_and_secs(str(video))

@@ -5,7 +5,6 @@ One process proposes trials and writes the journal; episodes run on an executor.
 
 from __future__ import annotations
 
-import fcntl
 import json
 import logging
 import math
@@ -20,6 +19,7 @@ from typing import Any
 
 import numpy as np
 import optuna
+from filelock import FileLock, Timeout
 from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock, JournalStorage
 from optuna.trial import FrozenTrial, TrialState
 
@@ -262,13 +262,17 @@ def locked_study(
     """
     folder.mkdir(parents=True, exist_ok=True)
     path = journal_path(task, folder)
-    with path.open("ab") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as problem:
-            raise BlockingIOError(f"another run is writing {path}") from problem
+    lock = FileLock(folder / f".{path.name}.lock")
+    try:
+        lock.acquire(timeout=0.0)
+    except Timeout as problem:
+        raise BlockingIOError(f"another run is writing {path}") from problem
+    try:
+        path.touch()
         _mend(path)
         yield TuningStudy(task, folder, seed, score)
+    finally:
+        lock.release()
 
 
 def journal_path(task: TuningTask, folder: Path) -> Path:

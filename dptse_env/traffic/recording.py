@@ -12,6 +12,7 @@ import os
 import re
 import shutil
 import signal
+import sys
 import tempfile
 import threading
 import time
@@ -158,14 +159,24 @@ def follow_parent(parent: int, folder: str | None = None) -> None:
     """
 
     def end_with_parent() -> None:
-        while os.getppid() == parent:
-            time.sleep(WATCH)
+        _wait_for_end(parent)
         if folder is not None:
             shutil.rmtree(folder, ignore_errors=True)
         os._exit(1)
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=end_with_parent, daemon=True).start()
+
+
+def _wait_for_end(parent: int) -> None:
+    """Return when the parent of this process, of a given process id, has ended."""
+    if sys.platform == "win32":  # where `os.getppid` is the same after the parent's end
+        process = multiprocessing.parent_process()
+        assert process is not None
+        process.join()
+    else:  # where workers of loky have no handle of their parent
+        while os.getppid() == parent:
+            time.sleep(WATCH)
 
 
 def _record(corridor: Corridor, seed: int, path: Path, source: dict[str, object]) -> None:

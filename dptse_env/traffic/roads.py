@@ -243,7 +243,7 @@ def write_corridor(
             continue
         folder, home = Path(given.folder).absolute(), Path(path).absolute().parent
         if folder.is_relative_to(home):  # so that the folder can be moved with the file in it
-            content[name]["folder"] = str(folder.relative_to(home))
+            content[name]["folder"] = folder.relative_to(home).as_posix()
     if environment:
         content[_ENVIRONMENT] = _plain(dict(environment))
     head = "".join(f"# {line}\n" for line in comment.splitlines())

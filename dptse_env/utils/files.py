@@ -10,6 +10,7 @@ import hashlib
 import json
 import os
 import stat
+import time
 import uuid
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -30,6 +31,9 @@ LARGEST_HEADER = 2**20
 
 DEEPEST_CARD = 16
 """Largest nesting of a card."""
+
+PATIENCE = 5.0 if os.name == "nt" else 0.0
+"""Longest wait for readers of a file that is to be replaced [s]; Windows refuses it meanwhile."""
 
 _DIGEST = "sha256"
 
@@ -205,9 +209,23 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
         yield temporary
         with temporary.open("rb+") as file:
             os.fsync(file.fileno())
-        temporary.replace(target)
+        _take_place(temporary, target)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _take_place(temporary: Path, target: Path) -> None:
+    """Give a file its name, when nobody reads the old file where that matters."""
+    deadline = time.monotonic() + PATIENCE
+    while True:
+        try:
+            temporary.replace(target)
+        except PermissionError:
+            if time.monotonic() >= deadline:
+                raise
+            time.sleep(0.01)
+        else:
+            return
 
 
 def write_atomically(path: str | os.PathLike[str], content: bytes | str) -> None:

@@ -1,3 +1,5 @@
+"""Densities and speeds that somebody measured: read as a road's, and replayed to estimators."""
+
 import numpy as np
 import pytest
 
@@ -11,15 +13,11 @@ from scripts import replay_field
 PAPER = "dptse_env:dptse/PaperHighway-v0"
 
 
-def write(folder, rows, columns, density=0.01, speed=20.0):
-    """Fields that grow from cell to cell, and from interval to interval."""
+def source(folder, rows=10, columns=20, **changes):
+    """Write fields that grow from cell to cell, and densities from interval to interval."""
     cells, times = np.arange(rows)[:, None], np.arange(columns)[None]
-    np.savetxt(folder / "density.txt", density * (1.0 + 0.1 * cells + 0.01 * times))
-    np.savetxt(folder / "speed.txt", speed * (1.0 + 0.05 * cells + 0.0 * times))
-    return folder / "density.txt", folder / "speed.txt"
-
-
-def source(folder, **changes):
+    np.savetxt(folder / "density.txt", 0.01 * (1.0 + 0.1 * cells + 0.01 * times))
+    np.savetxt(folder / "speed.txt", 20.0 * (1.0 + 0.05 * cells + 0.0 * times))
     fields = {
         "density": folder / "density.txt", "speed": folder / "speed.txt", "cell": 0.05,
         "interval": 5.0, "density_unit": "veh/ft", "speed_unit": "ft/s",
@@ -28,7 +26,6 @@ def source(folder, **changes):
 
 
 def test_cells_become_segments_and_intervals_seconds(tmp_path):
-    write(tmp_path, 10, 20)
     field = read_field(source(tmp_path), 3)
     assert field.density.shape == field.speed.shape == (100, 5)
     assert field.segment_length == pytest.approx(0.1)
@@ -41,22 +38,14 @@ def test_cells_become_segments_and_intervals_seconds(tmp_path):
     assert field.speed[0, 0] == pytest.approx(20.0 * 1.09728 * flow)
     turned = read_field(source(tmp_path, reversed=True), 3)
     np.testing.assert_allclose(turned.density, field.density[:, ::-1])
-
-
-def test_a_road_of_more_segments_than_cells_is_refused(tmp_path):
-    write(tmp_path, 10, 20)
     with pytest.raises(ValueError, match="segments must be at most 8, got 9"):
         read_field(source(tmp_path), 9)
 
 
-def steady(seconds=200):
-    density, speed = np.full((seconds, 5), 75.0), np.full((seconds, 5), 90.0)
+def test_more_noise_costs():
+    density, speed = np.full((200, 5), 75.0), np.full((200, 5), 90.0)
     density[:, 2] = 90.0
-    return Field(density, speed, 0.1)
-
-
-def test_more_noise_and_fewer_queries_cost():
-    field = steady()
+    field = Field(density, speed, 0.1)
     corridor = field_corridor(field, 3, 102.0)
     assert corridor.density_scale == 333.0
     assert corridor.average_dwell == pytest.approx(4.0)
@@ -73,9 +62,13 @@ def test_more_noise_and_fewer_queries_cost():
 
 
 def test_the_script_prints_a_row_for_each_estimator(tmp_path, capsys):
-    write(tmp_path, 10, 60)
     args = replay_field.Args(
-        source(tmp_path), 3, bandwidth=1, window=100, repeats=1, estimators=("ekf", "recurrent")
+        source(tmp_path, columns=60),
+        3,
+        bandwidth=1,
+        window=100,
+        repeats=1,
+        estimators=("ekf", "recurrent"),
     )
     replay_field.main(args)
     text = capsys.readouterr().out

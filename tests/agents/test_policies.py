@@ -1,3 +1,5 @@
+"""Policies by name: saved ones, schedules, models of stable-baselines3, and classes."""
+
 import pickle
 import subprocess
 import sys
@@ -18,38 +20,24 @@ from tests.helpers import SHORT, save_untrained
 from tests.hostile import edited
 
 
-def test_the_card_says_what_it_is(tmp_path):
+def test_a_saved_policy_acts_as_it_did_where_it_fits_and_while_its_file_stays(tmp_path):
     path = save_untrained(tmp_path / "policy.safetensors", seed=3)
     saved = read_saved_policy(path)
+    assert saved == find_policy(str(path))
     assert (saved.recipe, saved.training_seed, saved.action) == ("plackett-luce", 3, "slots")
-    assert saved.identity == saved.card["sha256"]
-
-
-def test_it_acts_as_the_policy_that_was_saved(tmp_path):
-    path = save_untrained(tmp_path / "policy.safetensors")
+    assert (saved.identity, saved.keywords) == (saved.card["sha256"], {"action": "slots"})
     env = gym.make(SHORT, action="slots")
     observation, _ = env.reset(seed=0)
-    action, _ = (
-        read_saved_policy(path).load(env).predict(observation, None, None, deterministic=True)
-    )
+    action, _ = saved.load(env).predict(observation, None, None, deterministic=True)
     expected, _ = sb3.load_policy(path, env).predict(observation, deterministic=True)
     np.testing.assert_array_equal(action, expected)
-
-
-def test_another_bandwidth_is_refused_unless_it_is_meant(tmp_path):
-    saved = read_saved_policy(save_untrained(tmp_path / "policy.safetensors"))
-    env = gym.make(SHORT, action="slots", bandwidth=3)
+    other = gym.make(SHORT, action="slots", bandwidth=3)
     with pytest.raises(ValueError, match="bandwidth is 2 for the policy and 3 for the environment"):
-        saved.load(env)
-    saved.load(env, allow=TRANSFERABLE)
-
-
-def test_a_file_that_has_changed_is_refused(tmp_path):
-    path = save_untrained(tmp_path / "policy.safetensors", seed=0)
-    saved = read_saved_policy(path)
+        saved.load(other)
+    saved.load(other, allow=TRANSFERABLE)
     save_untrained(path, seed=1)
     with pytest.raises(ValueError, match="has changed"):
-        saved.load(gym.make(SHORT, action="slots"))
+        saved.load(env)
 
 
 def test_what_is_no_policy_is_refused(tmp_path):
@@ -59,24 +47,19 @@ def test_what_is_no_policy_is_refused(tmp_path):
     text.write_text("no weights")
     with pytest.raises(ValueError, match=r"text\.zip is damaged, or no safetensors file"):
         read_saved_policy(text)
+    with pytest.raises(ValueError, match=r"schedule must be one of .*, got 'nobody'"):
+        find_policy("nobody").load(gym.make(SHORT))
+    with pytest.raises(FileNotFoundError, match=r"none\.zip"):
+        find_policy("none.zip")
 
 
-def test_a_name_is_a_saved_policy_or_a_schedule(tmp_path):
-    path = save_untrained(tmp_path / "policy.safetensors", seed=2)
-    saved, schedule = find_policy(str(path)), find_policy("paper")
-    assert saved == read_saved_policy(path)
-    assert saved.keywords == {"action": "slots"}
+def test_a_schedule_has_a_name():
+    schedule, env = find_policy("paper"), gym.make(SHORT)
     assert (schedule.keywords, schedule.identity) == ({}, "paper")
-    assert find_policy("private-highway").keywords == {"action": "slots"}
-    env = gym.make(SHORT)
     observation, _ = env.reset(seed=0)
     action, _ = schedule.load(env).predict(observation, None, None)
     expected, _ = make_schedule("paper", env).predict(observation, None, None)
     np.testing.assert_array_equal(action, expected)
-    with pytest.raises(ValueError, match=r"schedule must be one of .*, got 'nobody'"):
-        find_policy("nobody").load(env)
-    with pytest.raises(FileNotFoundError, match=r"none\.zip"):
-        find_policy("none.zip")
 
 
 @pytest.mark.parametrize("training", [{"seed": 1}, {"learner": "mask", "seed": "first"}])

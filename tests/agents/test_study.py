@@ -1,3 +1,5 @@
+"""A study plays what its rows lack, reports, and loses nothing when it is killed."""
+
 import subprocess
 import sys
 import time
@@ -20,27 +22,27 @@ KEYWORDS = {"estimator": "random_walk", "horizon": 80}
 
 def report(rows, folder):
     assert (folder / "extra.parquet").exists()
-    return grid(
-        "B",
-        [1, 2, 9],
-        ["mean"],
-        lambda row, _: f"{mean(rows, {'bandwidth': row}, 'rmse_density').mean:.6f}",
-    )
+
+    def entry(bandwidth, _):
+        return f"{mean(rows, {'bandwidth': bandwidth}, 'rmse_density').mean:.6f}"
+
+    return grid("B", [1, 2, 9], ["mean"], entry)
+
+
+def cell(bandwidth):
+    keywords = {**KEYWORDS, "bandwidth": bandwidth}
+    return Cell(SHORT, "round-robin", keywords, {"bandwidth": bandwidth})
 
 
 def small(calls=None, **changes):
-    cells = tuple(
-        Cell(SHORT, "round-robin", {**KEYWORDS, "bandwidth": b}, {"bandwidth": b}) for b in (1, 2)
-    )
-
     def measure(place):
         if calls is not None:
             calls.append(place.folder)
         return pl.DataFrame({"a": [1]})
 
-    return replace(
-        Study("small", cells, (2000, 2001), report, measures={"extra.parquet": measure}), **changes
-    )
+    measures = {"extra.parquet": measure}
+    made = Study("small", (cell(1), cell(2)), (2000, 2001), report, measures=measures)
+    return replace(made, **changes)
 
 
 def test_a_study_plays_what_its_rows_lack_and_reports(tmp_path):
@@ -60,8 +62,7 @@ def test_a_study_plays_what_its_rows_lack_and_reports(tmp_path):
     # Rows that are there are not played again, whatever their version, and the report is theirs.
     old = rows.with_columns(version=pl.lit("0.1.0"), rmse_density=pl.lit(7.0))
     write_table(tmp_path / "rows.parquet", old)
-    more = Cell(SHORT, "round-robin", {**KEYWORDS, "bandwidth": 3}, {"bandwidth": 3})
-    run(replace(first, cells=(*first.cells, more)), place, progress=False)
+    run(replace(first, cells=(*first.cells, cell(3))), place, progress=False)
     assert sorted(rows_of(tmp_path)["version"].to_list())[:4] == ["0.1.0"] * 4
     assert "| 1 | 7.000000 |" in (tmp_path / "tables.md").read_text()
     assert "0.1.0 (4 episodes)" in (tmp_path / "tables.md").read_text()
@@ -91,6 +92,9 @@ def test_bad_cells_are_refused_before_the_first_is_played(tmp_path):
         with pytest.raises(ValueError, match=message):
             run(small(cells=(good, bad)), Place(tmp_path, THIS_PROCESS), progress=False)
         assert not (tmp_path / "rows").exists()
+    bad = replace(good, labels={"reward": 1})
+    with pytest.raises(ValueError, match=r"labels must differ .* got 'reward'"):
+        run(small(cells=(bad,)), Place(tmp_path, THIS_PROCESS), progress=False)
 
 
 def test_broken_tables_and_those_of_another_study_are_refused(tmp_path):
@@ -98,45 +102,37 @@ def test_broken_tables_and_those_of_another_study_are_refused(tmp_path):
         write_report(small(), tmp_path)
     path = tmp_path / "rows.parquet"
     table = pl.DataFrame({"study": ["other"], "version": ["1"], "cell": ["x"], "traffic_seed": [1]})
-    write_table(path, table)
-    with pytest.raises(ValueError, match="rows of the study 'other', not of 'small'"):
-        read_rows("small", tmp_path)
-    write_table(path, table.drop("cell"))
-    with pytest.raises(ValueError, match="must have a column 'cell'"):
-        read_rows("small", tmp_path)
+    for content, message in (
+        (table, "rows of the study 'other', not of 'small'"),
+        (table.drop("cell"), "must have a column 'cell'"),
+    ):
+        write_table(path, content)
+        with pytest.raises(ValueError, match=message):
+            read_rows("small", tmp_path)
     path.write_bytes(path.read_bytes()[:-9])
     with pytest.raises(ValueError, match="is not a table that this program wrote"):
         read_rows("small", tmp_path)
 
 
-def test_labels_are_not_named_like_columns(tmp_path):
-    cell = replace(small().cells[0], labels={"reward": 1})
-    with pytest.raises(ValueError, match=r"labels must differ .* got 'reward'"):
-        run(small(cells=(cell,)), Place(tmp_path, THIS_PROCESS), progress=False)
-
-
 def test_an_id_says_all_that_rows_depend_on(tmp_path):
-    cell = small().cells[0]
+    first = cell(1)
     changes = [
         {"env": "dptse_env:dptse/PaperHighway-v0"}, {"policy": "paper"}, {"noise_seed": 1},
         {"keywords": {"bandwidth": 2}}, {"deterministic": False}, {"watchers": ("queries",)},
     ]  # fmt: skip
-    ids = {cell.id, *(replace(cell, **change).id for change in changes)}
+    ids = {first.id, *(replace(first, **change).id for change in changes)}
     assert len(ids) == len(changes) + 1
-    assert replace(cell, labels={}, seeds=(1,)).id == cell.id
+    assert replace(first, labels={}, seeds=(1,)).id == first.id
     # A policy that was trained again is another cell, and so is a road that was edited.
-    path = save_untrained(tmp_path / "policy.safetensors", seed=0)
-    trained = replace(cell, policy=str(path))
-    before = trained.id
-    save_untrained(path, seed=1)
-    assert trained.id != before
-    road = tmp_path / "road.toml"
-    road.write_text("a = 1")
-    edited = replace(cell, keywords={"corridor": str(road)})
-    before = edited.id
-    assert str(tmp_path) not in before
-    road.write_text("a = 2")
-    assert edited.id != before
+    path, road = tmp_path / "policy.safetensors", tmp_path / "road.toml"
+    ids = set()
+    for k in range(2):
+        save_untrained(path, seed=k)
+        road.write_text(f"a = {k}")
+        there = {"policy": str(path)}, {"keywords": {"corridor": str(road)}}
+        ids |= {replace(first, **change).id for change in there}
+    assert len(ids) == 4
+    assert not any(str(tmp_path) in each for each in ids if "corridor" in each)
 
 
 def test_pairs_are_of_one_version():

@@ -76,67 +76,42 @@ def test_environments_play_a_field_and_refuse_what_needs_vehicles(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    ("changes", "road", "duration", "message"),
     [
-        ({"speed": None}, r"speed must be given, or else flow"),
-        ({"density_unit": "cars"}, r"density_unit must be one of veh/km, .*, got 'cars'"),
-        ({"speed_unit": "m/s", "cell": 0.0}, r"cell must be"),
-    ],
-)
-def test_options_are_checked(tmp_path, changes, message):
-    source = write(tmp_path, **changes)
-    with pytest.raises(ValueError, match=message):
-        source.read()
-
-
-def test_another_unit_than_stated_is_noticed(tmp_path):
-    flow = write(tmp_path, speed=None, flow=tmp_path / "flow.txt", flow_unit="veh/s")
-    lane = dataclasses.replace(ROAD, lanes=1)
-    for source, road, message in (
-        (write(tmp_path, density_unit="veh/km"), ROAD, r"density\.txt must be .* got '0.0279 veh"),
-        (
-            dataclasses.replace(flow, flow_unit="veh/min"),
-            ROAD,
-            r"flow\.txt must be .* got '1.* km/h",
-        ),
-        (write(tmp_path), lane, r"flow must be at most 4000 veh/h on 1 lanes.* got '\d+ veh/h"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            import_field(source, road, tmp_path / "road", SPLITS, 100)
-    slow = write(tmp_path, speed_unit="ft/s")
-    np.savetxt(tmp_path / "speed.txt", 0.3048 * np.loadtxt(tmp_path / "speed.txt"))  # now in m/s
-    with pytest.warns(UserWarning, match=r"no speed of the field is above \d+ km/h, at a limit of"):
-        import_field(slow, ROAD, tmp_path / "road", SPLITS, 100)
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        ("fast slow\n", r"speed\.txt must be a table of numbers"),
-        ("1 2\n3 4\n", r"speed\.txt must be a table of .*density\.txt's shape"),
-        ("1 2\n-3 4\n", r"speed\.txt: row 2, column 1 must be finite and >= 0, got -3"),
+        ({"speed": None}, {}, 100, r"speed must be given, or else flow"),
+        ({"density_unit": "cars"}, {}, 100, r"density_unit must be one of veh/km, .*got 'cars'"),
+        ({"cell": 0.0}, {}, 100, r"cell must be"),
+        ({}, {}, 450, r"duration must be below the field's 450 s, got 450"),
+        ({}, {"segments": 9}, 100, r"segments must be at most 8, got 9"),
+        ({"density_unit": "veh/km"}, {}, 100, r"density\.txt must be .* got '0.0279 veh"),
+        ({"speed": None, "flow_unit": "veh/min"}, {}, 100, r"flow\.txt must be .* got '1.* km/h"),
+        ({}, {"lanes": 1}, 100, r"flow must be at most 4000 veh/h on 1 lanes.* got '\d+ veh/h"),
+        (b"fast slow\n", {}, 100, r"speed\.txt must be a table of numbers"),
+        (b"1 2\n3 4\n", {}, 100, r"speed\.txt must be a table of .*density\.txt's shape"),
+        (b"1 2\n-3 4\n", {}, 100, r"speed\.txt: row 2, column 1 must be finite and >= 0, got -3"),
+        (None, {}, 100, r"speed\.txt must be a file, got a directory"),
     ],
 )
 @pytest.mark.filterwarnings("ignore:loadtxt:UserWarning")
-def test_bad_files_are_named(tmp_path, content, message):
-    source = write(tmp_path)
-    (tmp_path / "speed.txt").write_text(content)
+def test_fields_of_no_use_are_refused_and_leave_nothing(changes, road, duration, message, tmp_path):
+    source, speed = write(tmp_path), tmp_path / "speed.txt"
+    if isinstance(changes, bytes):
+        speed.write_bytes(changes)
+    elif changes is None:
+        speed.unlink()
+        speed.mkdir()
+    else:
+        flow = {"flow": tmp_path / "flow.txt"} if "flow_unit" in changes else {}
+        source = dataclasses.replace(source, **changes, **flow)
     with pytest.raises(ValueError, match=message):
-        import_field(source, ROAD, tmp_path / "road", SPLITS, 100)
-    assert not (tmp_path / "road").exists()
-    assert not list(tmp_path.glob(".*"))
+        import_field(source, dataclasses.replace(ROAD, **road), tmp_path / "road", SPLITS, duration)
+    assert {each.name for each in tmp_path.iterdir()} == {"density.txt", "flow.txt", "speed.txt"}
 
 
-def test_places_that_are_taken_and_windows_that_do_not_fit(tmp_path):
+def test_slow_speeds_are_noticed_and_a_folder_is_never_replaced(tmp_path):
     source = write(tmp_path)
-    with pytest.raises(ValueError, match=r"duration must be below the field's 450 s, got 450"):
-        import_field(source, ROAD, tmp_path / "road", SPLITS, 450)
-    many = dataclasses.replace(ROAD, segments=9)
-    with pytest.raises(ValueError, match=r"segments must be at most 8, got 9"):
-        import_field(source, many, tmp_path / "road", SPLITS, 100)
-    (tmp_path / "road").mkdir()
-    with pytest.raises(ValueError, match=r"output must be a folder that does not exist yet"):
+    np.savetxt(tmp_path / "speed.txt", 0.3048 * np.loadtxt(tmp_path / "speed.txt"))  # now in m/s
+    with pytest.warns(UserWarning, match=r"no speed of the field is above \d+ km/h, at a limit of"):
         import_field(source, ROAD, tmp_path / "road", SPLITS, 100)
-    folder = dataclasses.replace(source, speed=tmp_path / "road")
-    with pytest.raises(ValueError, match=r"road must be a file, got a directory"):
-        folder.read()
+    with pytest.raises(ValueError, match=r"output must be a folder that does not exist yet"):
+        import_field(write(tmp_path), ROAD, tmp_path / "road", SPLITS, 100)

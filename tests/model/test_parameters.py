@@ -1,4 +1,5 @@
 import json
+import re
 from dataclasses import asdict
 
 import pytest
@@ -72,7 +73,6 @@ def test_written_set_reads_back_with_its_provenance(tmp_path):
 def test_file_without_parameters_is_refused(tmp_path):
     path = tmp_path / "x.json"
     path.write_text("[]")
-    with pytest.raises(
-        ValueError, match=rf"^{path} must be a mapping with the keys parameters, provenance, got"
-    ):
+    message = rf"^{re.escape(str(path))} must be a mapping with the keys parameters, provenance"
+    with pytest.raises(ValueError, match=message):
         read_parameters(path)

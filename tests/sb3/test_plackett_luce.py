@@ -1,7 +1,8 @@
+"""The Plackett-Luce distribution, channels along the road, and the policy of both."""
+
 import itertools
 import math
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
@@ -41,14 +42,14 @@ def over_all(scores, size):
     return PlackettLuce(scores.expand(len(sets), -1), size), sets
 
 
-@pytest.mark.parametrize("row", [0, 1])
 @pytest.mark.parametrize("size", [1, 2, 4])
-def test_probabilities_are_the_formula_and_sum_to_one(row, size):
-    distribution, sets = over_all(SCORES[row], size)
-    probabilities = distribution.log_prob(sets).exp().tolist()
-    expected = [by_formula(SCORES[row].tolist(), chosen.tolist()) for chosen in sets]
-    assert probabilities == pytest.approx(expected, rel=1e-12)
-    assert sum(probabilities) == pytest.approx(1.0, rel=1e-12)
+def test_probabilities_are_the_formula_and_sum_to_one(size):
+    for row in SCORES:
+        distribution, sets = over_all(row, size)
+        probabilities = distribution.log_prob(sets).exp().tolist()
+        expected = [by_formula(row.tolist(), chosen.tolist()) for chosen in sets]
+        assert probabilities == pytest.approx(expected, rel=1e-12)
+        assert sum(probabilities) == pytest.approx(1.0, rel=1e-12)
 
 
 def test_draws_follow_the_probabilities():
@@ -66,8 +67,6 @@ def test_draws_follow_the_probabilities():
 def test_the_mode_is_the_highest_scores_and_ties_go_upstream():
     assert PlackettLuce(SCORES, 3).mode().tolist() == [[2, 0, 3], [0, 1, 3]]
     assert PlackettLuce(torch.zeros(1, 70), 40).mode().tolist() == [list(range(40))]
-    distribution, sets = over_all(SCORES[0], 3)
-    assert sets[distribution.log_prob(sets).argmax()].tolist() == [2, 0, 3]
 
 
 @pytest.mark.parametrize("spread", [0.0, 1e3, 3e38])
@@ -85,35 +84,18 @@ def test_extreme_scores_stay_finite_in_single_precision(spread):
         assert torch.isfinite(gradient).all()
 
 
-def test_gradients_are_those_of_finite_differences():
-    scores = SCORES.clone().requires_grad_()
-    sets = torch.tensor([[1, 3], [0, 2]])
-    assert torch.autograd.gradcheck(lambda s: PlackettLuce(s, 2).log_prob(sets), scores)
-
-
-@pytest.mark.parametrize(
-    ("scores", "size", "message"),
-    [
-        (torch.zeros(1, 3), 4, r"size must be in 1\.\.3, got 4"),
-        (torch.tensor([[0.0, torch.inf]]), 1, "scores must be finite"),
-    ],
-)
-def test_bad_distributions(scores, size, message):
-    with pytest.raises(ValueError, match=message):
-        PlackettLuce(scores, size)
-
-
-@pytest.mark.parametrize(
-    ("chosen", "message"),
-    [
+def test_bad_scores_and_sets_are_refused():
+    with pytest.raises(ValueError, match=r"size must be in 1\.\.3, got 4"):
+        PlackettLuce(torch.zeros(1, 3), 4)
+    with pytest.raises(ValueError, match="scores must be finite"):
+        PlackettLuce(torch.tensor([[0.0, torch.inf]]), 1)
+    for chosen, message in (
         ([[1, 1], [0, 2]], "distinct"),
         ([[1, 4], [0, 2]], r"in \[0, 3\]"),
         ([[1, 2, 3], [0, 1, 2]], r"shape \(2, 2\), got \(2, 3\)"),
-    ],
-)
-def test_bad_sets(chosen, message):
-    with pytest.raises(ValueError, match=message):
-        PlackettLuce(SCORES, 2).log_prob(torch.tensor(chosen))
+    ):
+        with pytest.raises(ValueError, match=message):
+            PlackettLuce(SCORES, 2).log_prob(torch.tensor(chosen))
 
 
 # The observation as channels along the road.
@@ -134,18 +116,16 @@ def raw(road, name, observation):
     return [x if at is not None else None for x, at in zip(shown, channel.source, strict=True)]
 
 
-@pytest.mark.parametrize("preset", PRESETS)
-def test_mainline_blocks_stand_at_their_segments(preset):
-    config = PRESETS[preset]
-    road, n = RoadChannels.from_config(config), config.corridor.n_mainline
-    observation, starts = numbered(config)
-    released = (
-        "released_flow" if preset.startswith(("private-highway", "long")) else "released_speed"
-    )
-    for name in ("density", "speed_log_std", "released_density", released, "age", "queried"):
-        expected = starts[name] + np.arange(n)
-        np.testing.assert_allclose(raw(road, f"mainline {name}", observation), expected, rtol=1e-5)
-    assert RoadFeatures(road)(observation).shape == (1, road.n_channels, n)
+def test_mainline_blocks_stand_at_their_segments():
+    for preset, flow in (("paper-highway", False), ("long-highway", True)):
+        config = PRESETS[preset]
+        road, n = RoadChannels.from_config(config), config.corridor.n_mainline
+        observation, starts = numbered(config)
+        released = "released_flow" if flow else "released_speed"
+        for name in ("density", "speed_log_std", "released_density", released, "age", "queried"):
+            found = raw(road, f"mainline {name}", observation)
+            np.testing.assert_allclose(found, starts[name] + np.arange(n), rtol=1e-5)
+        assert RoadFeatures(road)(observation).shape == (1, road.n_channels, n)
 
 
 def test_ramps_stand_where_they_join_and_fixed_sensors_with_them():
@@ -163,18 +143,6 @@ def test_ramps_stand_where_they_join_and_fixed_sensors_with_them():
     first = starts["fixed_density_innovation"]
     assert {i: round(x) - first for i, x in enumerate(innovation) if x is not None} == {5: 1, 11: 2}
     assert [np.flatnonzero(mark).tolist() for mark in road.marks] == [[3, 9], [5, 11], [14]]
-
-
-def test_channels_of_real_observations_are_of_order_one():
-    keywords = {"traffic_seeds": "0:2", "action": "slots"}
-    env = gym.make("dptse_env:dptse/ShortHighway-v0", privacy="capped", **keywords)
-    road = RoadFeatures(RoadChannels.from_config(env.unwrapped.config))
-    env.reset(seed=0)
-    env.action_space.seed(0)
-    seen = [env.step(env.action_space.sample())[0] for _ in range(240)]
-    shown = road(torch.tensor(np.stack(seen))).abs()
-    assert shown.mean() < 1.5
-    assert shown.amax(dim=(0, 2)).median() > 0.5
 
 
 def test_prices_and_the_tracer_are_channels_where_they_are_observed():
@@ -256,14 +224,6 @@ def test_segments_share_one_scorer():
     scores = policy.scorer(channels)
     shifted = policy.scorer(channels.roll(1, dims=2))
     torch.testing.assert_close(shifted[:, 4:12], scores[:, 3:11])
-
-
-def test_weights_fit_other_roads_of_the_same_kinds():
-    policy = make_policy("paper-highway")
-    with pytest.warns(UserWarning, match="on another road"):
-        other = make_policy("paper-highway", corridor={"n_mainline": 18}, bandwidth=7)
-    other.load_state_dict(policy.state_dict())
-    assert other.predict(observations(other).numpy())[0].max() > 14
 
 
 def test_policies_of_two_environments_share_their_weights():

@@ -1,33 +1,30 @@
-"""Environments on cached traffic and runs of a schedule, for the tests of schedules."""
+"""Environments on three seeds of traffic, and runs of a schedule on them."""
 
 import gymnasium as gym
 import numpy as np
 
 from dptse_env.schedules import make_schedule
+from tests.helpers import SHORT
 
-SHORT = "dptse_env:dptse/ShortHighway-v0"
 SEEDS = (0, 1, 2)
+EVERY = np.arange(3)
+EPISODES = {"traffic_seeds": SEEDS, "horizon": 60, "random_start": True}
 
 
 def make_batch(**keywords):
-    keywords = {"traffic_seeds": SEEDS, "horizon": 60, "random_start": True, **keywords}
-    return gym.make_vec(
-        SHORT, num_envs=len(SEEDS), autoreset_mode="Disabled", threads=1, **keywords
-    )
+    keywords = {**EPISODES, "threads": 1, **keywords}
+    return gym.make_vec(SHORT, num_envs=3, autoreset_mode="Disabled", **keywords)
 
 
 def make_single(**keywords):
-    keywords = {"traffic_seeds": SEEDS, "horizon": 60, "random_start": True, **keywords}
-    return gym.make(SHORT, **keywords)
+    return gym.make(SHORT, **{**EPISODES, **keywords})
 
 
-def begin(env, start=150, seed=5):
-    """Begin one episode per traffic seed, the scalar environment's with that of ``seed``."""
-    if hasattr(env.unwrapped, "num_envs"):
-        options = {"traffic_seed": list(SEEDS), "start": start}
-    else:
-        options = {"traffic_seed": SEEDS[seed - 5], "start": start}
-    return env.reset(seed=seed, options=options)[0]
+def begin(env, start=150, episode=0):
+    """Begin one episode per traffic seed, or the scalar environment's of one of them."""
+    is_batch = hasattr(env.unwrapped, "num_envs")
+    traffic = list(SEEDS) if is_batch else SEEDS[episode]
+    return env.reset(seed=5 + episode, options={"traffic_seed": traffic, "start": start})[0]
 
 
 def play(env, schedule, n_steps, observation=None):

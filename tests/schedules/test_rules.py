@@ -1,6 +1,5 @@
 """Rules against their definitions, on observations that are made up."""
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from stable_baselines3.common.evaluation import evaluate_policy
@@ -10,7 +9,7 @@ from dptse_env.estimators import Estimate
 from dptse_env.parts import make_interface
 from dptse_env.release import QueryOptions
 from dptse_env.schedules import best_options, make_schedule, option_values
-from tests.helpers import SumRelease
+from tests.helpers import SumRelease, make_env
 
 from .playing import begin, make_batch
 
@@ -28,7 +27,7 @@ class Bare:
         observations = self.interface.observations
         flat = np.zeros((k, observations.space.shape[0]), dtype=np.float32)
         for name, values in blocks.items():
-            flat[:, observations.slices[name]][:, : len(values)] = values
+            flat[:, observations.slices[name]][:, : np.shape(values)[-1]] = values
         return flat
 
 
@@ -101,63 +100,71 @@ def test_oldest_first_asks_the_oldest_and_breaks_ties_in_turn():
     assert counts[:14].min() > 40
 
 
-def test_a_batch_keeps_one_clock_per_episode():
-    env = Bare()
-    schedule = make_schedule("round-robin", env)
-    _, state = schedule.predict(env.observation(2))
-    action, _ = schedule.predict(env.observation(2), state, np.array([True, False]))
-    assert [np.flatnonzero(row)[0] for row in action] == [0, 1]
-
-
 def test_stable_baselines3_evaluates_a_schedule():
-    env = gym.make("dptse_env:dptse/ShortHighway-v0", horizon=20, traffic_seeds="0:1")
+    env = make_env(horizon=20, traffic_seeds="0:1")
     mean, _ = evaluate_policy(make_schedule("paper", env), env, n_eval_episodes=2, warn=False)
     assert mean < 0
 
 
+def made_up(env, k=20):
+    """Return random observations, and their blocks of the mainline by name."""
+    rng = np.random.default_rng(0)
+    blocks = {
+        "age": rng.uniform(0.0, 0.2, (k, 15)), "speed": rng.uniform(0.0, 1.2, (k, 15)),
+        "density_log_std": rng.uniform(-4.0, -1.0, (k, 15)),
+        "speed_log_std": rng.uniform(-4.0, 0.0, (k, 15)),
+    }  # fmt: skip
+    return env.observation(k, **blocks), blocks
+
+
+def assert_highest(env, action, score):
+    """Compare queries with the segments of the highest score; the last one has a fixed sensor."""
+    best = np.argsort(-score[:, :14], axis=1)[:, : env.queries.bandwidth]
+    expected = np.zeros_like(score, dtype=bool)
+    np.put_along_axis(expected, best, True, axis=1)
+    np.testing.assert_array_equal(action.astype(bool), expected)
+
+
 @pytest.mark.parametrize(
-    ("name", "expected"),
+    ("name", "power", "cap", "reward"),
     [
-        ("largest-variance", [1, 5, 12]), ("largest-density-variance", [1, 8, 12]),
-        ("stale-variance", [1, 2, 12]), ("largest-deviation", [1, 5, 12]),
+        ("largest-variance", 0.0, np.inf, "joint"), ("largest-variance", 0.0, np.inf, "speed"),
+        ("largest-density-variance", 0.0, 0.0, "joint"), ("stale-variance", 2.0, 0.1, "joint"),
+        ("largest-deviation", 1.0, np.inf, "joint"),
     ],
 )  # fmt: skip
-def test_deviations_are_weighed_by_age(name, expected):
-    """Scores are (age + 1)^a (s_rho^2 + min(s_v, cap)^2), a = 2 with a cap of 0.1, or 0 or 1."""
-    env = Bare(bandwidth=3)
-    age = np.zeros(15)
-    density, speed = np.full(15, 0.01), np.full(15, 0.01)
-    age[1], density[1] = 8 / 60, 0.3  # far ahead under all
-    age[2], density[2] = 24 / 60, 0.05  # 1.6 with the square of the age, 0.06 with the age
-    density[12], speed[12] = 0.5, 0.1
-    density[8] = 0.28  # between these two
-    speed[5] = 1.5  # held to 0.1 under a cap
-    observation = env.observation(
-        age=age, density_log_std=np.log(density), speed_log_std=np.log(speed)
-    )
-    action, _ = make_schedule(name, env).predict(observation[0])
-    assert np.flatnonzero(action).tolist() == expected
+def test_deviations_are_weighed_by_age(name, power, cap, reward):
+    """Scores are (age + 1)^a (s_rho^2 + min(s_v, cap)^2)."""
+    env = Bare(bandwidth=3, reward=reward)
+    observation, blocks = made_up(env)
+    variance = np.minimum(np.exp(blocks["speed_log_std"]), cap) ** 2
+    if reward == "joint":
+        variance += np.exp(2.0 * blocks["density_log_std"])
+    action, _ = make_schedule(name, env).predict(observation)
+    assert_highest(env, action, (60.0 * blocks["age"] + 1.0) ** power * variance)
 
 
 def test_fronts_are_queried_where_answers_surprised():
     """Scores are (age + 1)^1.5 (|v_before - v_after| + 0.02) q (v + 0.3) (2 - x)."""
     env = Bare(bandwidth=2)
-    speed = np.full(15, 1.0)
-    speed[8:] = 0.4  # a front at 7 and 8, faster and upstream at 7
-    blocks = {"speed": speed, "age": np.full(15, 0.1)}
-    flags, surprise = np.zeros(15), np.zeros(15)
-    flags[[2, 8]], surprise[2] = 1.0, 10.0
-    answers = {"queried": flags, "density_innovation": surprise, "speed_innovation": surprise}
-    schedule = make_schedule("speed-front", env)
-    action, state = schedule.predict(env.observation(**blocks)[0])
-    assert np.flatnonzero(action).tolist() == [7, 8]
-    for _ in range(3):  # surprised by 2, not by 8, of which no more is expected
-        action, state = schedule.predict(env.observation(**blocks, **answers)[0], state)
-    np.testing.assert_allclose(state.surprise[0, [2, 7, 8]], [0.512 + 48.8, 1.0, 0.512])
-    assert np.flatnonzero(action).tolist() == [2, 7]
-    action, state = schedule.predict(env.observation(**blocks)[0], state, episode_start=[True])
-    assert (state.surprise == 1.0).all()
-    assert np.flatnonzero(action).tolist() == [7, 8]
+    schedule, rng = make_schedule("speed-front", env), np.random.default_rng(1)
+    state, surprise = None, np.ones((20, 15))
+    for step in range(4):
+        observation, blocks = made_up(env)
+        flags = rng.random((20, 15)) < 0.3
+        squares, slices = np.zeros((20, 15)), env.interface.observations.slices
+        for name in ("density_innovation", "speed_innovation"):
+            given = rng.normal(0.0, 2.0, (20, 15))
+            observation[:, slices[name]], squares = given, squares + 0.5 * given**2
+        observation[:, slices["queried"]] = flags
+        starts = np.arange(20) < (5 if step == 2 else 0)
+        surprise[starts] = 1.0
+        surprise = np.where(flags, 0.8 * surprise + 0.2 * squares, surprise)
+        action, state = schedule.predict(observation, state, starts)
+        v = np.pad(blocks["speed"], ((0, 0), (1, 1)), mode="edge")
+        score = (60.0 * blocks["age"] + 1.0) ** 1.5 * (np.abs(v[:, :-2] - v[:, 2:]) + 0.02)
+        score *= surprise * (v[:, 1:-1] + 0.3) * (2.0 - np.arange(15) / 14)
+        assert_highest(env, action, score)
 
 
 @pytest.mark.parametrize("privacy", ["paper", "capped"])

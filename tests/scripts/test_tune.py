@@ -35,6 +35,7 @@ def test_it_leaves_a_set_per_configuration(tmp_path, capsys):
 
 
 @pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no groups of processes")
 def test_a_killed_run_leaves_nobody_behind_and_goes_on(tmp_path):
     command = [
         sys.executable, "scripts/tune.py", "--env", SHORT, "--estimators", "ekf", "--parameters",

@@ -1,3 +1,5 @@
+"""Errors of estimates, and rewards of them."""
+
 import dataclasses
 
 import numpy as np
@@ -6,17 +8,15 @@ import pytest
 from dptse_env.spaces.rewards import ErrorReward, ScoredSecond, estimation_error
 from dptse_env.traffic import SHORT_HIGHWAY, Demand
 
-ROAD = dataclasses.replace(SHORT_HIGHWAY, density_scale=100.0, speed_scale=50.0)
+ROAD = dataclasses.replace(
+    SHORT_HIGHWAY, n_mainline=2, on_ramps=(), off_ramps=(), exit_shares=(), fixed_sensors=(),
+    demand=Demand(((0.0, 1000.0),)), incident=None, density_scale=100.0, speed_scale=50.0,
+)  # fmt: skip
 
 
 def reward_of(term, error):
-    """The reward of an error on a road of two segments."""
-    road = dataclasses.replace(
-        ROAD, n_mainline=2, on_ramps=(), off_ramps=(), exit_shares=(), fixed_sensors=(),
-        demand=Demand(((0.0, 1000.0),)), incident=None,
-    )  # fmt: skip
     nothing = np.zeros((1, 2))
-    return ErrorReward(term)(ScoredSecond(error, nothing, nothing, None, nothing > 0, road))
+    return ErrorReward(term)(ScoredSecond(error, nothing, nothing, None, nothing > 0, ROAD))
 
 
 def error_of(density_error, speed_error, occupied=(True, True)):
@@ -32,12 +32,9 @@ def test_errors_are_root_mean_squares_over_the_mainline():
     assert error.density[0] == pytest.approx(np.sqrt(12.5))
     assert error.speed[0] == pytest.approx(np.sqrt(50.0))
     assert error.n_occupied.tolist() == [2]
-
-
-def test_an_empty_segment_has_no_speed_to_get_wrong():
     error = error_of((3.0, 4.0), (6.0, 1000.0), occupied=(True, False))
     assert error.density[0] == pytest.approx(np.sqrt(12.5))
-    assert error.speed[0] == pytest.approx(6.0)
+    assert error.speed[0] == pytest.approx(6.0)  # an empty segment has none to get wrong
 
 
 def test_an_empty_road_gives_finite_numbers():

@@ -10,7 +10,6 @@ from dptse_env.traffic import (
     Demand,
     Drivers,
     Incident,
-    IncidentDistribution,
     SumoScenario,
     VehicleClass,
 )
@@ -25,12 +24,10 @@ IMPOSSIBLE = [
     ({"duration": 0}, "duration"),
     ({"on_ramps": (0, 9)}, r"on_ramps\[0\]"),
     ({"off_ramps": (6, 15)}, r"off_ramps\[1\]"),
-    ({"on_ramps": (9, 3)}, "on_ramps"),
     ({"on_ramps": (3, 3)}, "on_ramps"),
     ({"off_ramps": (3, 12)}, "off_ramps"),
     ({"exit_shares": (0.1,)}, "exit_shares"),
     ({"exit_shares": (0.1, 1.0)}, r"exit_shares\[1\]"),
-    ({"ramp_lanes": 4}, "ramp_lanes"),
     ({"ramp_lanes": (1, 2, 2, 4)}, "ramp_lanes"),
     ({"ramp_lanes": (1, 1)}, "ramp_lanes"),
     ({"lanes": (3, 3)}, "lanes"),
@@ -42,7 +39,6 @@ IMPOSSIBLE = [
     ({"demand": 2000}, "demand"),
     ({"incident": Incident(15, ((0, 1, 1),))}, r"incident\.segment"),
     ({"incident": Incident(3, ((700, 800, 1),))}, r"incident\.start"),
-    ({"incident": IncidentDistribution((0, 15))}, r"incident\.segment"),
     ({"vehicle_classes": (VehicleClass("car", 0.5),)}, "vehicle_classes"),
     ({"vehicle_classes": (VehicleClass("car", 0.5),) * 2}, "vehicle_classes"),
 ]
@@ -52,16 +48,6 @@ def test_impossible_corridors_are_refused_by_path():
     for fields, path in IMPOSSIBLE:
         with pytest.raises(ValueError, match=rf"corridor\.{path} must be"):
             changed(**fields)
-
-
-def test_lists_become_tuples_so_that_a_corridor_from_json_is_equal_and_hashable():
-    fields = json.loads(json.dumps(dataclasses.asdict(PAPER_HIGHWAY)))
-    fields["demand"] = Demand(**fields["demand"])
-    fields["incident"] = Incident(**fields["incident"])
-    rebuilt = type(PAPER_HIGHWAY)(**fields)
-    assert rebuilt == PAPER_HIGHWAY
-    assert hash(rebuilt) == hash(PAPER_HIGHWAY)
-    assert rebuilt.digest == PAPER_HIGHWAY.digest
 
 
 def test_the_digest_covers_what_shapes_the_traffic_and_nothing_else():
@@ -105,20 +91,15 @@ def test_the_digest_covers_what_shapes_the_traffic_and_nothing_else():
     assert len({PAPER_HIGHWAY.digest, *digests}) == 1 + len(changes)
     for field, value in observed.items():
         assert changed(**{field: value}).digest == PAPER_HIGHWAY.digest
+    assert PAPER_HIGHWAY.digest.startswith("2324ff6dffb73fb3"), "recorded libraries are lost"
 
 
-def test_records_from_before_drivers_could_be_chosen_keep_their_digests():
-    assert PAPER_HIGHWAY.digest.startswith("2324ff6dffb73fb3")
-
-
-def test_equal_values_are_the_same_road_as_one_value():
-    same = dataclasses.replace(
-        PAPER_HIGHWAY,
-        lanes=(3,) * 15,
-        segment_length=(0.1,) * 15,
-        speed_limit=(102.0,) * 15,
-        ramp_lanes=(1,) * 4,
-        ramp_segments=(1,) * 4,
-    )
-    assert same == PAPER_HIGHWAY
-    assert same.digest == PAPER_HIGHWAY.digest
+def test_values_from_json_and_one_for_each_segment_make_an_equal_road():
+    fields = json.loads(json.dumps(dataclasses.asdict(PAPER_HIGHWAY)))
+    fields["demand"] = Demand(**fields["demand"])
+    fields["incident"] = Incident(**fields["incident"])
+    fields |= {"lanes": [3] * 15, "segment_length": [0.1] * 15, "ramp_segments": [1] * 4}
+    rebuilt = type(PAPER_HIGHWAY)(**fields)
+    assert rebuilt == PAPER_HIGHWAY
+    assert hash(rebuilt) == hash(PAPER_HIGHWAY)
+    assert rebuilt.digest == PAPER_HIGHWAY.digest

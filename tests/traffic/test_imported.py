@@ -87,18 +87,13 @@ def test_a_seed_that_was_not_recorded_is_refused_with_those_that_are(recorded):
         library.get(recorded, -1)
 
 
-def test_a_damaged_record_is_an_error(recorded):
-    path = record_path(recorded.recordings.folder, 1)
-    content = bytearray(path.read_bytes())
-    content[-1] ^= 1
-    path.write_bytes(content)
-    with pytest.raises(InvalidRecordError, match="another digest"):
-        RecordLibrary().get(recorded, 1)
-    assert path.read_bytes() == content, "it must not be made again"
-
-
-def test_an_exchanged_or_missing_record_is_an_error(recorded, tmp_path):
+def test_a_damaged_exchanged_or_missing_record_is_an_error(recorded, tmp_path):
     paths = [record_path(recorded.recordings.folder, seed) for seed in (0, 1)]
+    content = paths[0].read_bytes()
+    paths[0].write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+    with pytest.raises(InvalidRecordError, match="another digest"):
+        RecordLibrary().get(recorded, 0)
+    assert paths[0].read_bytes() != content, "it must not be made again"
     other = write(tmp_path / "other", (7, 8, 9, 10))
     paths[0].unlink()
     RecordLibrary().ensure(recorded, [0])  # it must not be made
@@ -129,15 +124,13 @@ def test_a_damaged_manifest_is_an_error(change, message, recorded):
     manifest.write_text(change(manifest.read_text()))
     with pytest.raises(InvalidRecordError, match=message):
         recorded_seeds(recorded.recordings)
+    folder = recorded.recordings.folder
+    digest = write_manifest(Path(folder), FREE.record_layout, {"x" * 1000: ""}, [])
+    with pytest.raises(InvalidRecordError, match=r"manifest\.json: records must have .{1,150}$"):
+        recorded_seeds(Recordings(folder, digest))
     manifest.unlink()
     with pytest.raises(InvalidRecordError, match="recordings cannot be read"):
         recorded_seeds(recorded.recordings)
-
-
-def test_a_manifest_of_other_keys_than_seeds_is_an_error(tmp_path):
-    digest = write_manifest(tmp_path, FREE.record_layout, {"x" * 1000: ""}, [])
-    with pytest.raises(InvalidRecordError, match=r"manifest\.json: records must have .{1,150}$"):
-        recorded_seeds(Recordings(str(tmp_path), digest))
 
 
 def test_the_digest_covers_the_content_and_not_the_folder(original, recorded, tmp_path):
@@ -158,19 +151,13 @@ def test_recorded_traffic_has_a_fixed_demand_and_no_incident(recorded):
         simulate(recorded, 0)
 
 
-def test_default_traffic_seeds_are_the_recorded_training_seeds(recorded):
-    road = f"{recorded.recordings.folder}/road.toml"
-    assert resolve("short-highway", {"corridor": road}).traffic_seeds == (0, 1)
-    given = resolve("short-highway", {"corridor": road, "traffic_seeds": [2000]})
-    assert given.traffic_seeds == (2000,)
-    with pytest.raises(ValueError, match=r"must be one that was recorded .*, got 2\.\.63"):
-        resolve("short-highway", {"corridor": road, "traffic_seeds": "0:64"})
-
-
 def test_environments_replay_recordings(recorded):
-    road = f"{recorded.recordings.folder}/road.toml"
-    keywords = {"corridor": road, "estimator": "random_walk", "truth_in_info": True}
-    env = gym.make("dptse_env:dptse/ShortHighway-v0", **keywords, traffic_seeds=[1000])
+    road = {"corridor": f"{recorded.recordings.folder}/road.toml"}
+    assert resolve("short-highway", road).traffic_seeds == (0, 1)  # those of training
+    with pytest.raises(ValueError, match=r"must be one that was recorded .*, got 2\.\.63"):
+        resolve("short-highway", {**road, "traffic_seeds": "0:64"})
+    keywords = {"estimator": "random_walk", "truth_in_info": True, "traffic_seeds": [1000]}
+    env = gym.make("dptse_env:dptse/ShortHighway-v0", **road, **keywords)
     env.reset(seed=0)
     for _ in range(3):
         info = env.step(np.zeros(6, dtype=np.int8))[4]

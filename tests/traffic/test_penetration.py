@@ -30,18 +30,14 @@ def test_connected_vehicles_at_a_share_are_connected_at_every_larger_one():
         assert abs(connected.mean() - share) < 4.0 * np.sqrt(share * (1.0 - share) / 5_000) + 1e-12
 
 
-def test_a_vehicle_is_connected_whatever_others_there_are():
-    some, more = (Penetration(0.3).connected(7, road_of(n, 1)) for n in (10, 1_000))
-    np.testing.assert_array_equal(some, more[:10])
+def test_a_vehicle_is_connected_by_its_seeds_and_number_alone():
+    def connected(seed=0, traffic_seed=7, n=1_000):
+        return Penetration(0.5, seed=seed).connected(traffic_seed, road_of(n, 1))
 
-
-@pytest.mark.parametrize("change", [{"seed": 1}, {"traffic_seed": 8}])
-def test_another_seed_connects_other_vehicles(change):
-    def connected(seed=0, traffic_seed=7):
-        return Penetration(0.5, seed=seed).connected(traffic_seed, road_of(1_000, 1))
-
-    # Two independent sets share about half of the vehicles' flags.
-    assert 0.4 < (connected() == connected(**change)).mean() < 0.6
+    np.testing.assert_array_equal(connected(n=10), connected()[:10])
+    for change in ({"seed": 1}, {"traffic_seed": 8}):
+        # Two independent sets share about half of the vehicles' flags.
+        assert 0.4 < (connected() == connected(**change)).mean() < 0.6
 
 
 def test_a_share_of_a_range_is_drawn_for_each_traffic_seed():
@@ -70,12 +66,6 @@ def test_the_connected_vehicles_report_and_some_misreport_their_speed():
     assert abs((factor > 1.5).mean() - 0.25) < 0.06
 
 
-@pytest.mark.parametrize("value", [0.1, [0.1, 0.2], {"seed": 3}])
-def test_a_number_a_pair_and_a_mapping_are_taken(value):
-    config = resolve("short-highway", {"penetration": value})
-    assert config.has_separate_sensors == (value != {"seed": 3})
-
-
 IMPOSSIBLE = [
     (0.0, "share must be"),
     (1.2, "share must be"),
@@ -85,7 +75,10 @@ IMPOSSIBLE = [
 ]
 
 
-def test_what_is_impossible_is_refused_by_path():
+def test_shares_are_numbers_pairs_and_mappings_within_their_range():
     for penetration, message in IMPOSSIBLE:
         with pytest.raises(ValueError, match=rf"^penetration\.{message}"):
             resolve("short-highway", {"penetration": penetration})
+    for value in (0.1, [0.1, 0.2], {"seed": 3}):
+        config = resolve("short-highway", {"penetration": value})
+        assert config.has_separate_sensors == (value != {"seed": 3})

@@ -1,7 +1,5 @@
 """Roads by name and as TOML files."""
 
-import dataclasses
-
 import pytest
 
 from dptse_env.config import resolve
@@ -46,18 +44,9 @@ def road(tmp_path):
     return path
 
 
-@pytest.mark.parametrize("corridor", [randomised(PAPER_HIGHWAY)], ids=lambda c: c.name)
-def test_a_corridor_survives_a_file(corridor, tmp_path):
-    write_corridor(tmp_path / "road.toml", corridor, comment="a road\nin two lines")
-    assert read_corridor(tmp_path / "road.toml") == corridor
-    assert find_corridor(str(tmp_path / "road.toml")).digest == corridor.digest
-
-
-def test_several_incidents_and_rates_that_vary(road):
+def test_a_corridor_survives_a_file(road, tmp_path):
     text = ROAD.replace("on_ramps = [300]", "on_ramps = [[[0, 100], [60, 900]]]")
-    road.write_text(
-        text
-        + """
+    several = """
 [[incident]]
 segment = 2
 phases = [[50, 90, 20]]
@@ -66,14 +55,15 @@ phases = [[50, 90, 20]]
 segments = [4, 5]
 start = [100, 120]
 """
-    )
+    road.write_text(text + several)
     corridor = read_corridor(road)
     assert corridor.demand.ramp_profiles == (((0.0, 100.0), (60.0, 900.0)),)
-    assert [type(each).__name__ for each in corridor.incidents] == [
-        "Incident", "IncidentDistribution",
-    ]  # fmt: skip
-    write_corridor(road, corridor)
-    assert read_corridor(road) == corridor
+    kinds = [type(each).__name__ for each in corridor.incidents]
+    assert kinds == ["Incident", "IncidentDistribution"]
+    for each in (corridor, randomised(PAPER_HIGHWAY)):
+        write_corridor(tmp_path / "road.toml", each, comment="a road\nin two lines")
+        assert read_corridor(tmp_path / "road.toml") == each
+        assert find_corridor(str(tmp_path / "road.toml")).digest == each.digest
 
 
 def test_what_a_file_leaves_out_is_derived_from_the_road(road):
@@ -118,6 +108,7 @@ def test_bad_files_are_refused_by_file_and_field(road, old, new, message):
     ],
 )
 def test_a_file_imports_no_code(road, keyword, value, monkeypatch):
+    assert {*REGISTRIES} - {"corridor", "pacing", "schedule"} == {*PARTS}  # each of them is here
     (road.parent / "own.py").write_text("raise SystemExit('code of the current folder has run')")
     monkeypatch.syspath_prepend(road.parent)
     road.write_text(ROAD.replace("bandwidth = 3", f"{keyword} = {value}"))
@@ -126,22 +117,18 @@ def test_a_file_imports_no_code(road, keyword, value, monkeypatch):
         resolve("private-highway-v1", {"corridor": str(road)})
 
 
-def test_every_keyword_for_parts_is_among_those_that_import_no_code():
-    assert {*REGISTRIES} - {"corridor", "pacing", "schedule"} == {*PARTS}
-
-
 def test_files_that_cannot_be_read(tmp_path):
-    with pytest.raises(ValueError, match=r"none\.toml: the road file cannot be read"):
-        read_road(tmp_path / "none.toml")
     (tmp_path / "folder.toml").mkdir()
-    with pytest.raises(ValueError, match=r"folder\.toml: the road file cannot be read"):
-        read_road(tmp_path / "folder.toml")
     (tmp_path / "binary.toml").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(ValueError, match="must be TOML"):
-        read_road(tmp_path / "binary.toml")
     (tmp_path / "deep.toml").write_text("a = " + "[" * 100_000)
-    with pytest.raises(ValueError, match="must be TOML"):
-        read_road(tmp_path / "deep.toml")
+    for name, message in (
+        ("none", "the road file cannot be read"),
+        ("folder", "the road file cannot be read"),
+        ("binary", "a road file must be TOML"),
+        ("deep", "a road file must be TOML"),
+    ):
+        with pytest.raises(ValueError, match=rf"{name}\.toml: {message}"):
+            read_road(tmp_path / f"{name}.toml")
 
 
 def test_the_keywords_of_a_file_come_after_the_callers(road):
@@ -155,30 +142,6 @@ def test_the_keywords_of_a_file_come_after_the_callers(road):
     with pytest.warns(UserWarning, match=r"corridor\.average_dwell"):
         config = resolve("private-highway-v1", {"corridor": str(road), "bandwidth": 1})
     assert config.bandwidth == 1
-
-
-def test_a_complete_file_warns_of_nothing(road):
-    from dptse_env.estimators.settings import load_settings, write_settings
-    from dptse_env.model import load_parameters
-    from dptse_env.model.parameters import write_parameters
-
-    arz = dataclasses.replace(load_parameters("w99-3lane"), name="mine")
-    write_parameters(road.parent / "arz.json", arz, {})
-    tuned = dataclasses.asdict(load_settings("ekf-w99-3lane-paced"))
-    write_settings(
-        road.parent / "ekf.json",
-        estimator="ekf",
-        parameters="mine",
-        privacy="paced",
-        settings=tuned,
-        provenance={},
-    )
-    text = "average_dwell = 9.5\n" + ROAD + 'estimator_settings = "ekf.json"\n'
-    road.write_text(text)
-    config = resolve("private-highway-v1", {"corridor": str(road)})
-    assert config.inherited == ()
-    assert config.arz_parameters == arz
-    assert config.settings() == load_settings("ekf-w99-3lane-paced")
 
 
 @pytest.mark.parametrize("corridor", CORRIDORS.values(), ids=CORRIDORS)

@@ -41,36 +41,17 @@ def test_departures_are_ordered_and_every_exit_lies_ahead_of_its_origin(seed):
 
 
 def test_arrivals_are_poisson_with_the_declared_rates():
-    counts = np.array(
-        [
-            [
-                np.sum((scenario.origins == MAINLINE) & (scenario.departures < 200)),
-                np.sum(
-                    (scenario.origins == MAINLINE)
-                    & (scenario.departures >= 200)
-                    & (scenario.departures < 400)
-                ),
-                np.sum(scenario.origins == 0),
-                np.sum(scenario.origins == 1),
-            ]
-            for scenario in (draw_scenario(PAPER_HIGHWAY, seed) for seed in SEEDS)
-        ]
-    )
+    counts = []
+    for scenario in (draw_scenario(PAPER_HIGHWAY, seed) for seed in SEEDS):
+        times = [scenario.departures[scenario.origins == origin] for origin in (MAINLINE, 0, 1)]
+        early, late = np.histogram(times[0], [0, 200, 400])[0]
+        counts.append([early, late, len(times[1]), len(times[2])])
     expected = np.array([2050 * 200, 6050 * 200, 320 * 700, 300 * 700]) / 3600
     # Mean and variance of a Poisson count agree; the bounds are four standard errors.
-    assert np.all(np.abs(counts.mean(0) - expected) < 4 * np.sqrt(expected / len(SEEDS)))
-    ratio = counts.var(0, ddof=1) / expected
+    error = np.abs(np.mean(counts, axis=0) - expected)
+    assert np.all(error < 4 * np.sqrt(expected / len(SEEDS)))
+    ratio = np.var(counts, axis=0, ddof=1) / expected
     assert np.all(np.abs(ratio - 1) < 4 * np.sqrt(2 / len(SEEDS)))
-
-
-def test_each_diverge_loses_its_share_of_those_who_pass_it():
-    scenarios = [draw_scenario(PAPER_HIGHWAY, seed) for seed in SEEDS]
-    origins = np.concatenate([scenario.origins for scenario in scenarios])
-    exits = np.concatenate([scenario.exits for scenario in scenarios])
-    passed_first = origins != 1
-    passed_second = exits != 0
-    assert np.mean(exits[passed_first] == 0) == pytest.approx(0.1, abs=0.004)
-    assert np.mean(exits[passed_second] == 1) == pytest.approx(0.1, abs=0.004)
 
 
 def test_the_streams_are_independent_of_one_another():
@@ -124,16 +105,3 @@ def test_incidents_are_drawn_one_by_one():
     assert third != first
     assert dataclasses.replace(both, incident=(drawn,)) == alone
     assert dataclasses.replace(both, incident=()).incident is None
-
-
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({"on_ramps": (((5.0, 1.0),), 0.0)}, r"demand\.on_ramps\[0\] must be steps \(time, rate\)"),
-        ({"exit_shares": (((0.0, 0.1),),)}, r"demand\.exit_shares must be steps for each of the 2"),
-    ],
-)
-def test_impossible_steps_are_refused_by_path(fields, message):
-    fields = {"mainline": ((0.0, 1.0),), "on_ramps": (0.0, 0.0), **fields}
-    with pytest.raises(ValueError, match=message):
-        dataclasses.replace(PAPER_HIGHWAY, demand=Demand(**fields))

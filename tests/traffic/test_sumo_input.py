@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from dptse_env.traffic import CORRIDORS, PAPER_HIGHWAY, SHORT_HIGHWAY, simulate
+from dptse_env.traffic import CORRIDORS, PAPER_HIGHWAY
 from dptse_env.traffic.sumo_input import (
     Geometry,
     compile_network,
@@ -22,18 +22,6 @@ needs_netconvert = pytest.mark.skipif(
 )
 
 
-@pytest.mark.parametrize("name", CORRIDORS)
-def test_packaged_networks_have_one_edge_per_column_of_nominal_length(name):
-    corridor = CORRIDORS[name]
-    network = packaged_network(name)
-    edges = re.findall(r'<edge id="([^":]+)"', network)
-    assert sorted(edges) == sorted(edge_ids(corridor))
-    assert len(edges) == corridor.n_segments + corridor.n_boundaries
-    lanes = re.findall(r'<lane id="[^":]+".*? speed="([\d.]+)" length="([\d.]+)"', network)
-    assert {float(length) for _, length in lanes} == {1000 * corridor.segment_length}
-    assert {float(speed) for speed, _ in lanes} == {round(corridor.speed_limit / 3.6, 2)}
-
-
 @needs_netconvert
 @pytest.mark.parametrize("name", CORRIDORS)
 def test_packaged_networks_are_what_netconvert_makes_of_the_presets(name):
@@ -44,25 +32,6 @@ def test_a_preset_is_not_compiled(monkeypatch):
     monkeypatch.setattr("dptse_env.traffic.sumo_input.compile_network", None)
     changed = dataclasses.replace(PAPER_HIGHWAY, name="mine", incident=None, duration=60)
     assert network_xml(changed) == packaged_network("paper-highway")
-
-
-@needs_netconvert
-def test_a_geometry_of_ones_own_is_compiled_and_drives():
-    corridor = dataclasses.replace(
-        SHORT_HIGHWAY,
-        n_mainline=4,
-        on_ramps=(1,),
-        off_ramps=(2,),
-        lanes=3,
-        ramp_lanes=2,
-        segment_length=0.15,
-        speed_limit=90.0,
-        incident=None,
-        duration=60,
-        fixed_sensors=(),
-    )
-    record = simulate(corridor, 0)
-    assert record.counts[:, : corridor.n_segments].any(axis=0).all()
 
 
 def test_a_missing_netconvert_names_the_extra(monkeypatch):

@@ -6,6 +6,7 @@ import dataclasses
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -118,7 +119,8 @@ def _draft(
     """Return the corridor without what is counted."""
     folder = files.net.parent.resolve()
     paths = (files.net, *files.routes, *files.additional)
-    names = tuple(os.path.relpath(path.resolve(), folder) for path in paths)
+    # With slashes everywhere, so that a road file can be read on another system.
+    names = tuple(Path(os.path.relpath(path.resolve(), folder)).as_posix() for path in paths)
     n_routes = len(files.routes)
     network = SumoScenario(
         net=names[0],

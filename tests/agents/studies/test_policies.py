@@ -1,7 +1,6 @@
 import json
 from pathlib import Path
 
-import numpy as np
 import polars as pl
 import pytest
 
@@ -9,7 +8,6 @@ from agents.executors import THIS_PROCESS
 from agents.statistics import bootstrap, percent_below
 from agents.studies import policies
 from agents.study import Place, read_rows, run, write_report, write_table
-from agents.tables import UnmeasuredError
 from dptse_env.config import VALIDATION_SEEDS
 from tests.helpers import SHORT, save_untrained
 
@@ -58,24 +56,6 @@ def test_the_report_is_that_of_the_rows_and_dashes_stand_for_what_is_missing(rec
     assert set(line(text, "5 (33 %)")[1:]) == {"-"}
 
 
-@pytest.mark.slow
-def test_the_recorded_report_is_that_of_its_rows_and_every_figure_is_drawn(recorded, tmp_path):
-    write_table(tmp_path / "rows.parquet", recorded)
-    write_report(policies.STUDY, tmp_path)
-    assert (tmp_path / "tables.md").read_text() == (RECORDED / "tables.md").read_text()
-    drawn = {path.name: path.stat().st_size for path in tmp_path.glob("*.png")}
-    assert drawn.keys() == {path.name for path in RECORDED.glob("*.png")}
-    assert max(drawn.values()) < 200_000
-
-
-def test_no_cell_of_a_schedule_is_missing_in_the_recorded_rows(recorded, tmp_path):
-    cells = [*policies.STUDY.cells, *policies.STUDY.follow(recorded, tmp_path)]
-    grouped = recorded.group_by("cell").agg("traffic_seed")
-    played = {cell: set(seeds) for cell, seeds in grouped.iter_rows()}
-    assert all(set(policies.STUDY.seeds_of(cell)) <= played[cell.id] for cell in cells)
-    assert (tmp_path / "chosen.json").read_text() == (RECORDED / "chosen.json").read_text()
-
-
 def test_validation_traffic_alone_decides(recorded):
     rows = recorded.filter(setting="paper")
 
@@ -102,27 +82,12 @@ def test_the_recipe_that_was_chosen_is_moved_in_the_mode_that_was(recorded):
     assert {(each.policy, each.deterministic) for each in moved} == {("b.zip", False)}
 
 
-def test_tables_are_paired_within_one_version(recorded):
-    rows = recorded.filter(setting="paper", part=TEST)
-    halved = rows.filter(policy="paper").with_columns(
-        pl.col("reward") / 2, version=pl.lit("0.10.0")
-    )
-    own, other = policies.group("paper", "paper"), policies.group("paper", "static")
-    (newest,) = policies.tables(pl.concat([rows, halved]), "error", own)
-    np.testing.assert_array_equal(2 * newest, errors(rows, policy="paper"))
-    paired, _ = policies.tables(pl.concat([rows, halved]), "error", own, other)
-    np.testing.assert_array_equal(paired, errors(rows, policy="paper"))
-    with pytest.raises(UnmeasuredError):
-        policies.tables(halved, "error", own, other)
-
-
-@pytest.mark.parametrize(
-    ("given", "error"),
-    [("nowhere=a.zip", ValueError), ("paper", ValueError), ("paper=missing", FileNotFoundError)],
-)
-def test_policies_that_cannot_be_found_are_refused(given, error):
-    with pytest.raises(error, match=given.partition("=")[2] or given):
-        policies.study([given])
+def test_policies_that_cannot_be_found_are_refused():
+    for given, error in (
+        ("nowhere=a.zip", ValueError), ("paper", ValueError), ("paper=missing", FileNotFoundError),
+    ):  # fmt: skip
+        with pytest.raises(error, match=given.partition("=")[2] or given):
+            policies.study([given])
 
 
 @pytest.mark.slow

@@ -23,7 +23,8 @@ from dptse_env.traffic import (
 )
 from dptse_env.traffic.sumo import running, seconds
 from dptse_env.traffic.sumo_input import packaged_network
-from tests.importers.network.conftest import FLOWS, PATH, motorway
+from dptse_env.utils.files import file_digest
+from tests.importers.network.conftest import FLOWS, PATH
 
 
 def imported(files, **options):
@@ -127,14 +128,6 @@ def test_the_record_is_that_of_the_generated_network_if_the_files_are_the_same(t
         assert getattr(road.corridor, name) == getattr(calm, name), name
 
 
-def test_an_incident_makes_no_vehicle_faster(files, tmp_path):
-    slow = tmp_path / "slow.rou.xml"
-    slow.write_text(FLOWS.replace('id="car"', 'id="car" maxSpeed="10"'))
-    corridor = imported(dataclasses.replace(files, routes=(slow,))).corridor
-    limited = dataclasses.replace(corridor, incident=Incident(2, ((30, 200, 90.0),)))
-    assert 30.0 < simulate(limited, 0).speed.max() <= 36.01
-
-
 def _vehicles(corridor, scenario):
     """Write a scenario of a generated network as SUMO's routes."""
     root = ElementTree.Element("routes")
@@ -166,14 +159,6 @@ def test_demand_exit_shares_and_dwell_are_counted(road):
     assert road.remarks == ()
 
 
-def test_a_warm_up_starts_the_record_with_traffic(files):
-    warm = imported(files, warm_up=120)
-    cold = imported(files)
-    assert warm.corridor.network.begin == 120
-    assert cold.record.counts[0].sum() == 0
-    np.testing.assert_array_equal(warm.record.counts[0], cold.record.counts[120])
-
-
 def test_an_incident_slows_the_vehicles_on_its_segment_alone(road):
     segment = road.corridor.n_mainline - 2
     incident = Incident(segment=segment, phases=((60.0, 120.0, 10.0),))
@@ -189,71 +174,64 @@ def test_an_incident_slows_the_vehicles_on_its_segment_alone(road):
     np.testing.assert_array_equal(slow.speed[before], road.record.speed[road.record.step <= 60])
 
 
-def test_digests_are_of_the_content_of_files(files, road, tmp_path):
-    for path in (files.net, *files.routes):
-        shutil.copy(path, tmp_path / f"copy-{path.name}")
-    copies = Files(
-        tmp_path / f"copy-{files.net.name}",
-        tuple(tmp_path / f"copy-{path.name}" for path in files.routes),
-        step_length=files.step_length,
+def test_a_warm_up_starts_the_record_with_traffic(files, road):
+    warm = imported(files, warm_up=120)
+    assert warm.corridor.network.begin == 120
+    assert road.record.counts[0].sum() == 0
+    np.testing.assert_array_equal(warm.record.counts[0], road.record.counts[120])
+
+
+def test_an_incident_makes_no_vehicle_faster(files, road, tmp_path):
+    slow = tmp_path / "slow.rou.xml"
+    slow.write_text(FLOWS.replace('id="car"', 'id="car" maxSpeed="10"'))
+    digests = file_digest(files.net), file_digest(slow)
+    network = dataclasses.replace(road.corridor.network, routes=(str(slow),), sha256=digests)
+    limited = dataclasses.replace(
+        road.corridor, network=network, incident=Incident(2, ((30, 200, 90.0),))
     )
-    assert imported(copies).corridor.digest == road.corridor.digest
-    published = dataclasses.replace(road.corridor, demand=road.corridor.demand.scaled(2.0), lanes=4)
+    assert 30.0 < simulate(limited, 0).speed.max() <= 36.01
+
+
+def test_a_road_file_moves_with_its_files_which_are_told_by_their_content(road, files, tmp_path):
+    folder, there = tmp_path / "here", tmp_path / "there"
+    folder.mkdir()
+    for path in (files.net, *files.routes):
+        shutil.copy(path, folder)
+    network = dataclasses.replace(road.corridor.network, folder=str(folder))
+    corridor = dataclasses.replace(road.corridor, network=network)
+    write_corridor(folder / "road.toml", corridor)
+    assert str(tmp_path) not in (folder / "road.toml").read_text()
+    assert read_corridor(folder / "road.toml") == corridor
+    moved = read_corridor(folder.rename(there) / "road.toml")
+    assert Path(moved.network.folder) == there
+    assert moved.digest == road.corridor.digest
+    np.testing.assert_array_equal(simulate(moved, 0).counts, road.record.counts)
+    published = dataclasses.replace(moved, demand=moved.demand.scaled(2.0), lanes=4)
     assert published.digest == road.corridor.digest  # the vehicles are those of the files
-    longer = dataclasses.replace(road.corridor, duration=241)
-    assert longer.digest != road.corridor.digest
-
-
-def test_changed_and_missing_files_are_named(tmp_path):
-    corridor = imported(motorway(tmp_path)).corridor
-    routes = tmp_path / "road.rou.xml"
+    assert dataclasses.replace(moved, duration=241).digest != road.corridor.digest
+    routes = there / "road.rou.xml"
     routes.write_text(routes.read_text().replace("1500", "1600"))
     with pytest.raises(RecordingError, match=r"road\.rou\.xml: is not the file that the road was"):
-        simulate(corridor, 0)
+        simulate(moved, 0)
     routes.unlink()
     with pytest.raises(RecordingError, match=r"road\.rou\.xml: cannot be read: No such file"):
-        simulate(corridor, 0)
+        simulate(moved, 0)
 
 
-def test_a_road_file_moves_with_its_files(tmp_path):
-    here = tmp_path / "here"
-    here.mkdir()
-    corridor = imported(motorway(here)).corridor
-    write_corridor(here / "road.toml", corridor)
-    assert str(tmp_path) not in (here / "road.toml").read_text()
-    assert read_corridor(here / "road.toml") == corridor
-    there = here.rename(tmp_path / "there")
-    moved = read_corridor(there / "road.toml")
-    assert Path(moved.network.folder) == there
-    assert moved.digest == corridor.digest
-    assert simulate(moved, 0).n_rows == simulate(moved, 0).n_rows > 0
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"options": ("--fcd-output=all.xml",)}, "network.options must be free of outputs"),
-        ({"options": ("-v",)}, "network.options must be --name=value each"),
-        ({"step_length": 0.3}, "network.step_length must be a whole part of a second"),
-        ({"sha256": ()}, "network.sha256 must be one for each of 2 files"),
-        ({"columns": ((("in", 5.0, 5.0),),)}, r"network.columns\[0\] must be stretches that end"),
+def test_scenarios_and_corridors_of_no_use_are_refused(road):
+    network = road.corridor.network
+    for change, message in (
+        ({"options": ("--fcd-output=all.xml",)}, "options must be free of outputs"),
+        ({"options": ("-v",)}, "options must be --name=value each"),
+        ({"step_length": 0.3}, "step_length must be a whole part of a second"),
+        ({"sha256": ()}, "sha256 must be one for each of 2 files"),
+        ({"columns": ((("in", 5.0, 5.0),),)}, r"columns\[0\] must be stretches that end"),
         ({"columns": ((("in", 0.0, 5.0),), (("in", 4.0, 9.0),))}, "without overlap on edge 'in'"),
-    ],
-)
-def test_scenarios_of_no_use_are_refused(road, change, message):
-    with pytest.raises(ValueError, match=message):
-        dataclasses.replace(road.corridor.network, **change)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"n_mainline": 5}, "corridor.network.columns must be one for each of the 11"),
-        ({"drivers": Drivers("IDM")}, "corridor.drivers must be left out"),
-    ],
-)
-def test_corridors_that_do_not_fit_their_files_are_refused(road, change, message):
-    plain = {"on_ramps": (2,), "off_ramps": (3,), "fixed_sensors": (), "lanes": 2,
-             "ramp_lanes": 1, "segment_length": 0.1, "speed_limit": 100.0}  # fmt: skip
-    with pytest.raises(ValueError, match=message):
-        dataclasses.replace(road.corridor, **{**plain, **change})
+    ):
+        with pytest.raises(ValueError, match=rf"network\..*{message}"):
+            dataclasses.replace(network, **change)
+    columns = network.columns[:-1]
+    with pytest.raises(ValueError, match=r"corridor\.network\.columns must be one for each of the"):
+        dataclasses.replace(road.corridor, network=dataclasses.replace(network, columns=columns))
+    with pytest.raises(ValueError, match=r"corridor\.drivers must be left out"):
+        dataclasses.replace(road.corridor, drivers=Drivers("IDM"))

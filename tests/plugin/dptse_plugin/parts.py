@@ -26,7 +26,6 @@ class SmoothedSettings:
     weight: Annotated[float, Interval(0, 1)] = 0.3
 
     def __post_init__(self) -> None:
-        """Check values."""
         checked_fields(self, "estimator_settings")
 
 
@@ -36,7 +35,6 @@ class Smoothed(BatchEstimator):
     settings_type = SmoothedSettings
 
     def __init__(self, model: Any, n_episodes: int, settings: SmoothedSettings) -> None:
-        """See `BatchEstimator`."""
         super().__init__(model, n_episodes, settings)
         self.traffic = np.zeros((n_episodes, model.n_segments, 2))
 
@@ -53,7 +51,6 @@ class Smoothed(BatchEstimator):
         self.traffic[episodes] = np.where(measured.observed[:, :, None], after, before)
 
     def estimate(self) -> Estimate:
-        """See `BatchEstimator`."""
         density, speed = self.traffic[..., 0].copy(), self.traffic[..., 1].copy()
         return Estimate(density, speed, np.full_like(density, 20.0), np.full_like(speed, 10.0))
 
@@ -71,21 +68,17 @@ class LaplaceRelease(ReleaseModel):
     settings_type = LaplaceSettings
 
     def __init__(self, task: Any, traffic: Any) -> None:
-        """See `ReleaseModel`."""
         super().__init__(task, traffic)
         self.streams: dict[int, np.random.Generator] = {}
 
     @property
     def sigma(self) -> Any:
-        """See `ReleaseModel.sigma`."""
         return 2**0.5 * self.task.settings.scale * np.array([1.0, 0.3])
 
     def reset(self, episodes: Any, generators: Any) -> None:
-        """See `ReleaseModel.reset`."""
         self.streams.update(zip(episodes.tolist(), generators, strict=True))
 
     def release(self, request: Any) -> Measurement:
-        """See `ReleaseModel.release`."""
         values = self.traffic.aggregates(request.traffic, request.times, self.task.n_columns)
         for k, episode in enumerate(request.episodes.tolist()):
             values[k] += self.streams[episode].laplace(0.0, self.sigma / 2**0.5, values[k].shape)
@@ -108,11 +101,9 @@ class MeanDensity:
     name, low, high = "mean_density", 0.0, 4.0
 
     def size(self, task: Any) -> int:
-        """See `ObservationBlock.size`."""
         return 1
 
     def values(self, state: Any, task: Any) -> Any:
-        """See `ObservationBlock.values`."""
         return state.estimate.density.mean(axis=1, keepdims=True) / task.corridor.density_scale
 
 
@@ -120,18 +111,15 @@ class Neighbours(ActionEncoding):
     """``Discrete(n - 1)``: a segment and the next one downstream."""
 
     def make_space(self) -> Any:
-        """See `ActionEncoding.make_space`."""
         return spaces.Discrete(self.n_options - 1)
 
     def decode(self, episodes: Any, actions: Any, pending: Any) -> Decision:
-        """See `ActionEncoding.decode`."""
         ahead = np.arange(self.n_options) - np.asarray(actions)[:, None]
         k = len(ahead)
         queried = (ahead == 0) | (ahead == 1)
         return Decision(queried, np.zeros(k, dtype=np.int64), np.ones(k, dtype=bool))
 
     def encode(self, queried: Any, picked: Any) -> Any:
-        """See `ActionEncoding.encode`."""
         return queried.argmax(axis=1)
 
 
@@ -139,5 +127,4 @@ class MostJammed(Schedule):
     """The segments of highest estimated density."""
 
     def select(self, step: Any, observation: Any) -> Any:
-        """See `Schedule.select`."""
         return self.highest(self.block(observation, "density")[:, : self.n_mainline], step)

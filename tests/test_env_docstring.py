@@ -16,9 +16,9 @@ from dptse_env.registration import ENVIRONMENTS
 from dptse_env.spaces.actions import ACTION_ENCODINGS
 from dptse_env.spaces.observations import BLOCKS
 from dptse_env.utils.fields import field_hints
+from tests.helpers import SHORT
 
 PAPER = "dptse_env:dptse/PaperHighway-v0"
-SHORT = "dptse_env:dptse/ShortHighway-v0"
 
 
 def table(heading):

@@ -1,0 +1,45 @@
+"""Recorded studies: nothing is left to play, and their tables and figures are those of their rows.
+
+What a study makes of its rows is tested beside this, study by study.
+"""
+
+import importlib
+import shutil
+from pathlib import Path
+
+import pytest
+
+from agents.study import read_rows, write_report
+
+RESULTS = Path(__file__).parents[3] / "results"
+NAMES = ["estimators", "guarantees", "paper", "policies", "suite"]
+
+pytestmark = pytest.mark.skipif(not RESULTS.is_dir(), reason="a source archive has no results")
+
+
+def study(name):
+    return importlib.import_module(f"agents.studies.{name}").STUDY
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_nothing_is_left_to_play(name, tmp_path):
+    rows = read_rows(name, RESULTS / name)
+    follow = study(name).follow
+    cells = [*study(name).cells, *(follow(rows, tmp_path) if follow else ())]
+    played = dict(rows.group_by("cell").agg("traffic_seed").iter_rows())
+    assert all(set(study(name).seeds_of(cell)) <= set(played[cell.id]) for cell in cells)
+    for file in tmp_path.iterdir():
+        assert file.read_bytes() == (RESULTS / name / file.name).read_bytes()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NAMES)
+def test_tables_and_figures_are_those_of_the_rows(name, tmp_path):
+    for path in (RESULTS / name).glob("*.parquet"):
+        shutil.copy(path, tmp_path)
+    write_report(study(name), tmp_path)
+    tables = (tmp_path / "tables.md").read_text(encoding="utf-8")
+    assert tables == (RESULTS / name / "tables.md").read_text(encoding="utf-8")
+    drawn = {path.name: path.stat().st_size for path in tmp_path.glob("*.png")}
+    assert drawn.keys() == {path.name for path in (RESULTS / name).glob("*.png")}
+    assert max(drawn.values()) < 200_000

@@ -1,0 +1,76 @@
+"""Links of the documentation lead somewhere; a release is the same in all that state it."""
+
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+import dptse_env
+from hatch_build import for_package_page
+
+ROOT = Path(__file__).parents[1]
+PAGES = [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("results/*/*.md")]
+LINK = re.compile(r"\]\(([^)\s]+)\)")
+CODE = re.compile(r"```.*?```|`[^`\n]*`", re.DOTALL)
+
+
+def anchors(page):
+    """Return the anchors of a page's headings, as GitHub makes them."""
+    headings = re.findall(r"^#+ (.+)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    plain = (re.sub(r"[^\w\- ]", "", heading.lower()) for heading in headings)
+    return {text.replace(" ", "-") for text in plain}
+
+
+def broken(page):
+    """Yield the links of a page that lead nowhere."""
+    for link in LINK.findall(CODE.sub("", page.read_text(encoding="utf-8"))):
+        if "://" in link or link.startswith("mailto:"):
+            continue
+        path, _, anchor = link.partition("#")
+        target = (page.parent / path).resolve() if path else page
+        if not target.exists() or (anchor and anchor not in anchors(target)):
+            yield link
+
+
+@pytest.mark.skipif(not (ROOT / "results").is_dir(), reason="a source archive has no results")
+def test_links_lead_somewhere(tmp_path):
+    found = {page.relative_to(ROOT).as_posix(): list(broken(page)) for page in PAGES}
+    assert {page: links for page, links in found.items() if links} == {}
+    page = tmp_path / "page.md"
+    page.write_text("# A b: c\n[a](#a-b-c) [b](#no) [c](page.md#a-b-c) [d](no.md) `[e](code.md)`\n")
+    assert list(broken(page)) == ["#no", "no.md"]
+
+
+PAGE = """![a road](docs/road.png) [`env`](a/env.py), [there](docs/a.md#b), [far](https://far.example).
+[below](#below)
+```python
+tools["a"](b)
+```
+"""
+
+
+def test_links_of_the_package_page_lead_to_the_repository_at_a_tag_or_are_words():
+    _, rest = PAGE.split("\n", 1)
+    assert for_package_page(PAGE, "https://forge.example/a/b/", "v1.2") == (
+        "![a road](https://forge.example/a/b/raw/v1.2/docs/road.png) "
+        "[`env`](https://forge.example/a/b/blob/v1.2/a/env.py), "
+        "[there](https://forge.example/a/b/blob/v1.2/docs/a.md#b), [far](https://far.example).\n"
+        + rest
+    )
+    words = " `env`, there, [far](https://far.example).\n"
+    assert for_package_page(PAGE, None, "v1.2") == words + rest
+
+
+def test_every_file_states_the_same_version_and_repository():
+    project, changelog, citation = (
+        (ROOT / name).read_text(encoding="utf-8")
+        for name in ("pyproject.toml", "CHANGELOG.md", "CITATION.cff")
+    )
+    latest = re.search(r"^## \[(\d.*)\] - (.*)$", changelog, re.MULTILINE)
+    assert latest is not None
+    stated = tomllib.loads(project)["project"]
+    assert stated["version"] == dptse_env.__version__ == latest[1]
+    assert f"\nversion: {latest[1]}\ndate-released: {latest[2]}\n" in citation
+    repository = re.search(r"^repository-code: \"?([^\s\"]*)", citation, re.MULTILINE)
+    assert stated.get("urls", {}).get("Repository") == (repository and repository[1])
