@@ -53,6 +53,12 @@ def test_where_paths_meet_speeds_alone_tell(preset, record):
     assert distance > 0.0
 
 
+def test_a_vehicle_that_pays_deviates_by_the_clip_at_most(record):
+    setting = paced(clip=20.0)
+    count, flow = Planner(setting).moves(record, staying(1)).T
+    np.testing.assert_allclose((flow / count) ** 2, setting.privacy.ratio)
+
+
 # --- targets --------------------------------------------------------------------------------------
 
 CAPPED = [
