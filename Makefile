@@ -21,19 +21,21 @@ $(READY): pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
 	touch $@
 
+DEMO = --env 'dptse_env:dptse/PaperHighway-v0 {"parameters": "w99-3lane"}'
+
 demo: setup  ## Train a small query policy and evaluate it beside the schedules on held-out traffic; results/demo.
-	$(BIN)/python scripts/train.py --env dptse_env:dptse/PaperHighway-v0 --keywords '{"parameters": "w99-3lane"}' \
-		--traffic 0:32 --validation 1000:1008 --no-tensorboard --output results/demo/training \
-		recipe:plackett-luce --recipe.regression.rounds 2 --recipe.regression.batches 600 \
-		--recipe.swaps.rounds 1 --recipe.swaps.episodes 96 --recipe.swaps.batches 300
-	$(BIN)/python scripts/evaluate.py --policies results/demo/training/policy.safetensors --output results/demo --force
+	$(BIN)/dptse train $(DEMO) \
+		--traffic 0:32 --validation 1000:1008 --output results/demo/training \
+		--algorithm 'plackett-luce {"regression": {"rounds": 2, "batches": 600}, "swaps": {"rounds": 1, "episodes": 96, "batches": 300}}'
+	$(BIN)/dptse evaluate $(DEMO) --estimators ekf random_walk \
+		--policies results/demo/training/policy.safetensors --output results/demo --force
 
 reproduce: setup  ## Write the reports of all studies anew, after playing what their rows lack; results/.
-	$(BIN)/python scripts/study.py paper
-	$(BIN)/python scripts/study.py guarantees
-	$(BIN)/python scripts/study.py estimators
-	$(BIN)/python scripts/study.py policies
-	$(BIN)/python scripts/study.py suite
+	$(BIN)/dptse study paper
+	$(BIN)/dptse study guarantees
+	$(BIN)/dptse study estimators
+	$(BIN)/dptse study policies
+	$(BIN)/dptse study suite
 
 audit: setup  ## Attack the privacy presets, 5,000 runs in each of two worlds; results/audit.
 	$(BIN)/dptse audit --force --env dptse_env:dptse/PaperHighway-v0 --target replaced
@@ -67,8 +69,7 @@ site: setup  ## Build the documentation site, warnings as errors; build/site.
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[docs]'
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
-docs: setup  ## Write the generated page of keywords and the notebook of the tutorial anew.
-	$(BIN)/python scripts/document_configuration.py
+docs: setup  ## Write the notebook of the tutorial anew.
 	$(BIN)/python docs/_site/notebook.py
 
 lint: setup  ## Check style, types and import rules.

@@ -17,14 +17,14 @@ from matplotlib.ticker import FixedLocator, NullLocator
 from numpy.typing import ArrayLike, NDArray
 
 from agents.statistics import Interval
-from agents.tables import METRICS, UnmeasuredError
+from agents.tables import UnmeasuredError, error_label
 from dptse_env.rendering import DENSITY_MAP, QUERY_COLOUR, History
 from dptse_env.utils.arrays import FloatArray
 from dptse_env.utils.files import replacing
 
 COLOURS = ("#1b4f72", "#c1272d", "#5d8233", "#7d5ba6", "#b9770e")
 GRID_COLOUR = "#e3e6ea"
-ERROR_TICKS = (1, 1.5, 2, 3, 5, 7, 10, 15, 20, 30, 40, 50, 70, 100, 150, 200, 300, 500)
+ERROR_TICKS = (1, 1.5, 2, 3, 5, 7, 10, 15, 20, 30, 40, 50, 70, 100, 150, 200, 300, 500, 700, 1000)
 
 
 def make_figure(width: float, height: float, dpi: int = 140) -> Figure:
@@ -119,19 +119,19 @@ def save_errors(
     series: Mapping[str, Mapping[str, Mapping[str, Interval]]],
     title: str,
 ) -> None:
-    """Save the errors of every policy as dots with 95 % intervals, density beside speed.
+    """Save the errors of every policy as dots with 95 % intervals, a panel for each error.
 
     Args:
         path: Where to save the PNG.
         rows: Policies, from top to bottom.
-        series: By estimator, policy and column of the rows: intervals.
+        series: By estimator, policy and error, the same errors for all: intervals.
         title: Title of the figure.
     """
-    figure = make_figure(8.4, 1.6 + 0.42 * len(rows), dpi=150)
-    axes = figure.subplots(1, 2, sharey=True)
+    metrics = list(next(iter(series.values()))[rows[0]])
+    figure = make_figure(2.4 + 3.0 * len(metrics), 1.6 + 0.42 * len(rows), dpi=150)
+    axes = figure.subplots(1, len(metrics), sharey=True)
     places = np.arange(len(rows))[::-1]
-    labels = {"rmse_density": "density RMSE [veh/km]", "rmse_speed": "speed RMSE [km/h]"}
-    for axis, (metric, axis_label) in zip(axes, labels.items(), strict=True):
+    for axis, metric in zip(axes, metrics, strict=True):
         for k, (name, intervals) in enumerate(series.items()):
             shift = ((len(series) - 1) / 2 - k) * 0.3
             for place, row in zip(places, rows, strict=True):
@@ -141,7 +141,7 @@ def save_errors(
         axis.set_xscale("log")
         set_log_ticks(axis.xaxis, ERROR_TICKS)
         axis.margins(x=0.12)
-        axis.set_xlabel(axis_label)
+        axis.set_xlabel(error_label(metric))
         add_frame(axis, "x")
     axes[0].set_yticks(places, rows)
     add_legend(figure, axes[:1])
@@ -282,12 +282,6 @@ def draw_level(axis: Axes, interval: Interval, line: Any = ":", label: str | Non
     """Draw a mean that no place changes as a line with a band."""
     axis.axhline(interval.mean, color=GREY, linestyle=line, linewidth=1.3, label=label)
     axis.axhspan(interval.low, interval.high, color=GREY, alpha=0.11, linewidth=0)
-
-
-def error_label(metric: str) -> str:
-    """Return the label of an axis of an error, with its unit."""
-    name, unit = METRICS[metric]
-    return f"{name} RMSE [{unit}]"
 
 
 def set_log_axes(axis: Axes, ticks: Sequence[float]) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 
 from agents.environments import quietly, unwrap
 from agents.play import Cell
-from agents.tables import DENSITY, SPEED
+from agents.tables import error_label
 from dptse_env.evaluation import Row, evaluate
 from dptse_env.process import QueryProcess
 from dptse_env.rendering import DENSITY_MAP, History
@@ -90,7 +90,7 @@ def write_page(
     Args:
         path: The file.
         title: What was evaluated.
-        errors: For each policy its name, and mean and half width of the interval by metric.
+        errors: For each policy its name, and mean and half width of the interval by error.
         episodes: Episodes of some policies on one traffic.
         seed: Their traffic seed.
 
@@ -114,13 +114,13 @@ def write_page(
         row_heights=[0.8, *[1.0] * (1 + len(episodes)), 1.4],
         vertical_spacing=0.36 / n_rows,
     )
-    for metric, unit, colour in ((DENSITY, "veh/km", COLOURS[0]), (SPEED, "km/h", COLOURS[1])):
+    for metric, colour in zip(errors[0][1], COLOURS, strict=False):
         spread = {"type": "data", "array": [each[metric][1] for _, each in errors]}
         figure.add_bar(
             x=[name for name, _ in errors],
             y=[each[metric][0] for _, each in errors],
             error_y=spread,
-            name=f"{'density' if metric == DENSITY else 'speed'} RMSE [{unit}]",
+            name=error_label(metric),
             marker_color=colour,
             row=1,
             col=1,

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dptse_env.config import TEST_SEEDS, TRAINING_SEEDS, VALIDATION_SEEDS
 
 EVALUATION = range(1_000_000)
-"""``scripts/evaluate.py``, and the studies of estimators, of privacy and of ledgers."""
+"""``dptse evaluate``, and the studies of estimators, of privacy and of ledgers."""
 TUNING = range(1_000_000, 2_000_000)
 """The search of estimator settings."""
 TRAINING_VALIDATION = range(4_000_000, 5_000_000)

@@ -15,6 +15,15 @@ DENSITY, SPEED, ERROR = "rmse_density", "rmse_speed", "error"
 METRICS = {DENSITY: ("density", "veh/km"), SPEED: ("speed", "km/h")}
 """Name and unit of each error of an estimate; `ERROR` is minus the mean reward, x 1000."""
 
+
+def error_label(metric: str) -> str:
+    """Return the name of an error with its unit, for a column or an axis."""
+    if metric == ERROR:
+        return "error x 1000"
+    name, unit = METRICS[metric]
+    return f"{name} RMSE [{unit}]"
+
+
 Labels = Mapping[str, Any]
 
 
@@ -168,7 +177,7 @@ def format_range(values: Sequence[int]) -> str:
 
 def compared_header(reference: str) -> list[str]:
     """Return the headers of the columns of `compared_errors`."""
-    columns = [(f"{name} RMSE [{unit}]", f"against {reference}") for name, unit in METRICS.values()]
+    columns = [(error_label(metric), f"against {reference}") for metric in METRICS]
     return [column for pair in columns for column in pair]
 
 

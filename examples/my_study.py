@@ -15,7 +15,6 @@ import polars as pl
 from agents.figures import (
     ESTIMATOR_LOOKS,
     draw_curve,
-    error_label,
     finish_figure,
     make_figure,
     save_figure,
@@ -23,7 +22,16 @@ from agents.figures import (
 from agents.play import Cell
 from agents.statistics import Interval
 from agents.study import Study
-from agents.tables import DENSITY, METRICS, UnmeasuredError, below, format_interval, grid, mean
+from agents.tables import (
+    DENSITY,
+    METRICS,
+    UnmeasuredError,
+    below,
+    error_label,
+    format_interval,
+    grid,
+    mean,
+)
 
 ENV = "dptse_env:dptse/ShortHighway-v0"
 RULES = ("round-robin", "speed-front")

@@ -1,7 +1,9 @@
-"""Fit the ARZ parameters to recorded traffic and compare predictions on held-out seeds.
+r"""Fit the parameters of the traffic model to recorded traffic.
 
-python scripts/calibrate.py --train 0:16 --held-out 1000:1008
-python scripts/calibrate.py --corridor '{"speed_limit": 90}' --name my-road
+dptse calibrate --env dptse_env:dptse/ShortHighway-v0 --train 0:4 --held-out 1000:1002 \
+    --max-evaluations 40
+
+It compares the predictions of fitted and shipped sets on the held-out seeds.
 """
 
 from __future__ import annotations
@@ -52,7 +54,7 @@ class Args(Environment, Recording):
     force: bool = False
     """Replace a set of this name in the folder."""
     json: bool = False
-    """Print the file of the fitted set as JSON, for a program, in place of tables."""
+    """Print the fitted set as JSON, for a program, in place of tables."""
 
 
 def load_series(

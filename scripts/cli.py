@@ -33,7 +33,7 @@ class Environment:
     """One environment."""
 
     env: str = "dptse_env:dptse/PaperHighway-v0"
-    """Environment: an id, or an id and keywords of gym.make as JSON, 'ID {"bandwidth": 3}'."""
+    """Environment: an id, or an id and keywords as JSON, 'ID {"bandwidth": 3}'."""
 
     def corridor(self) -> Corridor:
         """Return its road.
@@ -54,9 +54,9 @@ class Recording:
     """Processes of this machine, and the folder of records. Results depend on neither."""
 
     workers: int | None = None
-    """Processes of this machine; one for each core if not given."""
+    """Processes on this machine; one for each core if not given."""
     records: Path | None = None
-    """Folder of the record cache; the user's cache if not given."""
+    """Folder of the record cache; the user's if not given."""
 
     def library(self, corridor: Corridor, seeds: Sequence[int]) -> RecordLibrary:
         """Return the library of records, after recording what is missing."""
@@ -70,9 +70,9 @@ class Machines(Recording):
     """Machines that run tasks. Results do not depend on them."""
 
     executor: ExecutorName = "local"
-    """Where tasks run: in processes of this machine, or on a Ray cluster."""
+    """Where tasks run: on this machine, or on a Ray cluster."""
     address: str | None = None
-    """Address of the Ray cluster, or auto; RAY_ADDRESS, or else a new one here, if not given."""
+    """Address of the Ray cluster, or auto; see RAY_ADDRESS, too."""
 
     def start_executor(self) -> AnyExecutor:
         """Return what runs the tasks.
@@ -120,7 +120,7 @@ def run(
     Args:
         main: The program.
         arguments: A dataclass, or a union of dataclasses for subcommands.
-        description: Text for ``--help``: a sentence, and then examples, each after a dollar sign.
+        description: Text for ``--help``: a sentence, and an example in a paragraph of its own.
         program: Name of the program in its help; that of the file if None.
         words: The command line; that of the process if None.
     """

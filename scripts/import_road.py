@@ -1,6 +1,6 @@
 """Import recorded trajectories, a SUMO network or a measured field as a road.
 
-$ dptse import trajectories --help
+dptse import trajectories --help
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ SHARES: Shares = (0.6, 0.2, 0.2)
 class Trajectories(Environment):
     r"""Import recorded trajectories as records of a road.
 
-    $ dptse import trajectories --files points.csv --format table --output my-data \
+    dptse import trajectories --files points.csv --format table --output my-data \
         --columns time=t vehicle=id x=s speed=v \
-        --env 'dptse_env:dptse/ShortHighway-v0 {"corridor": {"duration": 60}}'
+        --env 'dptse_env:dptse/PaperHighway-v0 {"corridor": "road.toml"}'
 
     The folder has the road, road.toml, which an environment takes as its corridor, the records and
     a report. The road of --env is where the data was recorded.
@@ -107,7 +107,7 @@ class Trajectories(Environment):
 class Field:
     r"""Import a measured field of density and speed, or flow.
 
-    $ dptse import field --density density.txt --speed speed.txt \
+    dptse import field --density density.txt --speed speed.txt \
         --cell 0.1 --interval 5 --name my-field --segments 6 --lanes 3 --speed-limit 100 \
         --duration 90 --output my-field
 
@@ -137,7 +137,7 @@ class Field:
 class Network:
     r"""Make a road of a SUMO network, as a TOML file that an environment takes as its corridor.
 
-    $ dptse import network --configuration town.sumocfg --path "west ... east" \
+    dptse import network --configuration town.sumocfg --path "in ... out" \
         --duration 120 --output my-road.toml
     """
 

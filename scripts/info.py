@@ -1,7 +1,6 @@
 """Print versions, machine and caches, as a bug report needs them.
 
-python scripts/info.py
-python scripts/info.py --json
+dptse info
 """
 
 from __future__ import annotations

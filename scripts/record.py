@@ -1,7 +1,6 @@
 """Record traffic with SUMO, so that environments only replay it.
 
 dptse record --env dptse_env:dptse/ShortHighway-v0 --seeds 0:4
-dptse record --env 'dptse_env:dptse/PaperHighway-v0 {"corridor": "my-road.toml"}' --seeds 0:64
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ class Args(Environment, Recording):
     seeds: str = "0:16"
     """Traffic seeds, first:stop."""
     json: bool = False
-    """Print the result as JSON, for a program, in place of a table."""
+    """Print JSON, for a program, in place of text."""
 
 
 def main(args: Args) -> None:

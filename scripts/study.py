@@ -1,8 +1,8 @@
-"""Play a study and write its report, or write the report of the rows that are there.
+"""Play a study, and report on its rows.
 
-python scripts/study.py paper --report
-python scripts/study.py guarantees --quick
-python scripts/study.py my_package.my_study:STUDY
+dptse study paper --report
+
+It plays what the rows in its folder lack, and writes tables and figures of all.
 """
 
 from __future__ import annotations
@@ -11,17 +11,16 @@ import dataclasses
 import importlib
 import pkgutil
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import tyro
 
 from agents.environments import parse_env
 from agents.play import Cell
 from agents.seeds import seed_kind
-from agents.study import Follow, Study, write_report
+from agents.study import Study, write_report
 from agents.study import run as run_study
 from dptse_env.config import parse_seeds
 from dptse_env.utils.fields import require
@@ -38,17 +37,16 @@ class Args(Machines):
     """Play a study and write its report."""
 
     name: tyro.conf.Positional[str]
-    """paper, guarantees, estimators, policies, suite, or a study of your own as "module:NAME"."""
+    """paper, guarantees, estimators, policies, suite, or your own "module:NAME"."""
     report: bool = False
     """Write tables and figures of the rows that are there, and play nothing."""
     quick: bool = False
     """Three traffic seeds for each cell, to see whether it runs."""
     seeds: str | None = None
-    """Test traffic seeds, first:stop, in place of the study's own; needs another output. What is
-    played on validation traffic keeps its seeds."""
+    """Test traffic seeds, first:stop, in place of its own; needs another output."""
     env: tuple[str, ...] = ()
-    """Environments, 'ID {"corridor": "my-road.toml"}': the study's cells with one of these ids are
-    played with its keywords, and no others; needs another output."""
+    """Environments, 'ID {"corridor": "my-road.toml"}': only cells of these ids are played, and
+    with these keywords; needs another output."""
     policies: tuple[str, ...] = ()
     """Trained policies for the study of policies, each name=path."""
     output: Path | None = None
@@ -73,57 +71,38 @@ def find_study(args: Args) -> Study:
         found = _own(args.name)
     else:
         raise ValueError(f"study must be one of {', '.join(STUDIES)}, got {args.name!r}")
+    given = {env.rpartition(":")[2]: keywords for env, keywords in map(parse_env, args.env)}
+    require(len(given) == len(args.env), "env", "of different ids", args.env)
     seeds = found.seeds if args.seeds is None else parse_seeds(args.seeds)
-    given, most = dict(map(parse_env, args.env)), QUICK_SEEDS if args.quick else None
+    most = QUICK_SEEDS if args.quick else None
 
-    def changed(cell: Cell) -> Cell:
-        own = cell.seeds
-        if own is not None and args.seeds is not None and seed_kind(own) != "validation":
-            own = None
-        own = None if own is None else own[:most]
-        keywords = {**cell.keywords, **given.get(cell.env, {})}
-        return dataclasses.replace(cell, keywords=keywords, seeds=own)
+    def changed(cells: Sequence[Cell]) -> list[Cell]:
+        taken = []
+        for cell in cells:
+            more = given.get(cell.env.rpartition(":")[2]) if given else {}
+            # With another value for a keyword of its own it would not be what its labels say.
+            if more is not None and not more.keys() & cell.keywords.keys():
+                own = cell.seeds
+                if own is not None and args.seeds is not None and seed_kind(own) != "validation":
+                    own = None
+                keywords = {**cell.keywords, **more}
+                taken.append(dataclasses.replace(cell, keywords=keywords, seeds=own and own[:most]))
+        return taken
 
-    follow = found.follow
-    if follow is not None:
-        follow = _changed_too(follow, changed)
-    cells = tuple(map(changed, _of(found.cells, given) if given else found.cells))
+    cells, follow = changed(found.cells), found.follow
+    ids = sorted({cell.env for cell in found.cells})
+    require(bool(cells), "env", f"of {ids}, with keywords that its cells leave open", [*given])
     if given:
-        cells = suitable(cells, "what was given")
-    # Further tables are measured in the study's own environments.
-    measures = {} if given else found.measures
+        n = f"{len(cells)} of {len(found.cells)} cells"
+        print(f"{n} are of the given environments", file=sys.stderr)
     return dataclasses.replace(
-        found, cells=cells, seeds=seeds[:most], follow=follow, measures=measures
+        found,
+        cells=suitable(cells, "what was given") if given else tuple(cells),
+        seeds=seeds[:most],
+        follow=follow and (lambda rows, folder: changed(follow(rows, folder))),
+        # Further tables are measured in the study's own environments.
+        measures={} if given else found.measures,
     )
-
-
-def _of(cells: Sequence[Cell], given: Mapping[str, Mapping[str, Any]]) -> tuple[Cell, ...]:
-    """Return the cells of the given environments, and say how many are left out.
-
-    So are cells with a value of their own for a given keyword: with another one they would not be
-    what their labels say.
-
-    Raises:
-        ValueError: All are.
-    """
-    taken = tuple(
-        cell for cell in cells if cell.env in given and not given[cell.env].keys() & cell.keywords
-    )
-    if not taken:
-        ids = sorted({cell.env for cell in cells})
-        raise ValueError(
-            f"env must be one of {ids} with keywords that cells of the study leave open, "
-            f"got {list(given)}"
-        )
-    if len(taken) < len(cells):
-        n = f"{len(cells) - len(taken)} of {len(cells)} cells"
-        print(f"{n} are of other environments and are left out", file=sys.stderr)
-    return taken
-
-
-def _changed_too(follow: Follow, changed: Callable[[Cell], Cell]) -> Follow:
-    """Return a function whose cells are changed as those that are played first."""
-    return lambda rows, folder: [changed(cell) for cell in follow(rows, folder)]
 
 
 def _own(name: str) -> Study:

@@ -1,7 +1,9 @@
-"""Score policies in the tasks of the query suite, beside those that come with the package.
+"""Score policies in the tasks of the query suite.
 
-python scripts/suite.py --policies round-robin my_package:MySchedule
-python scripts/suite.py --policies results/training/best.safetensors --output results/my-suite
+dptse suite --policies round-robin --tasks short
+
+Scores stand beside those of the policies that come with the package. What a folder has of an
+earlier run is not played again.
 """
 
 from __future__ import annotations
@@ -21,6 +23,7 @@ from agents.studies.suite import (
     TASKS,
     ZERO,
     Scores,
+    Task,
     beside_recorded,
     entry,
     format_scores,
@@ -30,7 +33,7 @@ from agents.studies.suite import (
 from agents.study import read_rows
 from agents.study import run as run_study
 from agents.terminal import make_table, print_table
-from dptse_env.utils.fields import require
+from dptse_env.utils.fields import require, require_name
 from scripts.cli import Machines
 
 
@@ -39,8 +42,10 @@ class Args(Machines):
     """Score policies in the tasks of the query suite."""
 
     policies: tuple[str, ...] = ()
-    """Schedules and policies: names, files of saved ones, "module:Class", and models of
-    stable-baselines3 as "module:Class=file.zip", which are unpickled: load those that you trust."""
+    """Schedules; saved policies by file or shipped name, "module:Class", or
+    "module:Class=model.zip" of stable-baselines3, which is unpickled: load those that you trust."""
+    tasks: tuple[str, ...] = ()
+    """Tasks by name; all of them if none is given."""
     output: Path = Path("results/my-suite")
     """Folder of rows, tables and a figure."""
 
@@ -50,15 +55,18 @@ def main(args: Args) -> None:
     named = {policy_name(source): source for source in args.policies}
     require(bool(named), "policies", "one or more", args.policies)
     require(len(named) == len(args.policies), "policies", "of different names", args.policies)
+    for name in args.tasks:
+        require_name("tasks", name, [task.name for task in TASKS])
+    tasks = [task for task in TASKS if not args.tasks or task.name in args.tasks]
     cells = [
         cell
         for name, source in named.items()
-        for cell in suitable([make_cell(task, name, source) for task in TASKS], source)
+        for cell in suitable([make_cell(task, name, source) for task in tasks], source)
     ]
-    study = entry(cells, TASKS)
+    study = entry(cells, tasks)
     run_study(study, args.place(args.output))
     rows = beside_recorded(read_rows(study.name, args.output), study.cells)
-    print_scores(score_all(rows, TASKS), list(named))
+    print_scores(score_all(rows, tasks), list(named), tasks)
     print(f"tables and the figure are in {args.output}/")
 
 
@@ -85,7 +93,7 @@ def suitable(cells: Sequence[Cell], what: str) -> tuple[Cell, ...]:
     return tuple(taken)
 
 
-def print_scores(scores: Scores, names: Sequence[str]) -> None:
+def print_scores(scores: Scores, names: Sequence[str], tasks: Sequence[Task]) -> None:
     """Print the scores of policies by task, beside the best of those that come with the package."""
     others = [name for name in (*RULES, *LEARNED) if name not in (*names, ZERO, ONE)]
 
@@ -96,9 +104,9 @@ def print_scores(scores: Scores, names: Sequence[str]) -> None:
         name = max(known, key=lambda name: known[name].mean)
         return f"{name} {known[name].mean:.2f} ± {known[name].half_width:.2f}"
 
-    tasks = [task.name for task in TASKS]
+    titles = [task.name for task in tasks]
     table = make_table(f"{NAME}: scores", "task", *names, "best that comes with it")
-    columns = [format_scores(scores[name], TASKS) for name in names]
-    for line in zip(["mean", *tasks], *columns, ["", *map(best, tasks)], strict=True):
+    columns = [format_scores(scores[name], tasks) for name in names]
+    for line in zip(["mean", *titles], *columns, ["", *map(best, titles)], strict=True):
         table.add_row(*line)
     print_table(table)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,6 @@ from typing import Any
 from tqdm import tqdm
 
 from agents.training.run_files import Row
-from agents.training.tensorboard_writer import make_tensorboard_writer
 
 
 class Bar:
@@ -42,9 +42,22 @@ class Bar:
 
 @contextlib.contextmanager
 def watched(
-    bar: Bar, output: Path, tensorboard: bool
+    bar: Bar, output: Path, tensorboard: bool = True
 ) -> Iterator[tuple[Callable[[Row], None], ...]]:
-    """Yield the watchers of a training: a bar and, where asked for, TensorBoard."""
-    writer = make_tensorboard_writer(output / "tensorboard") if tensorboard else None
-    with bar.bar, contextlib.closing(writer) if writer else contextlib.nullcontext():
-        yield (bar,) if writer is None else (bar, writer)
+    """Yield the watchers of a training: a bar and, where it is wanted and installed, TensorBoard.
+
+    All rows come again when a training goes on, so those that TensorBoard has count no more.
+    """
+    with bar.bar:
+        if not tensorboard or importlib.util.find_spec("tensorboard") is None:
+            yield (bar,)
+            return
+        from torch.utils.tensorboard import SummaryWriter  # noqa: PLC0415  not always there
+
+        with SummaryWriter(str(output / "tensorboard"), purge_step=0) as writer:
+
+            def write(row: Row) -> None:
+                for name, value in row.items():
+                    writer.add_scalar(name, value, int(row["steps"]))
+
+            yield bar, write

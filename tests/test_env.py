@@ -49,6 +49,8 @@ def test_a_seed_fixes_the_episodes_and_no_seed_goes_on():
     again = [env.reset(seed=5)[0], env.reset()[0], env.reset()[0]]
     assert_same(first, again)
     assert_same(play(env, 30, seed=5), play(env, 30, seed=5))
+    env.step(np.ones(6, dtype=np.int8))
+    assert_same(play(env, 5, seed=5), play(make_env(), 5, seed=5))  # nothing is left of an episode
     assert len({tuple(step[1] for step in play(env, 30, seed=s)[1:]) for s in range(5)}) == 5
 
 
@@ -96,17 +98,17 @@ def test_truth_is_shown_only_on_request():
     assert set(TRUTH_INFO) <= set(info)
 
 
-def test_reset_options_choose_the_traffic_and_the_start_and_leave_the_noise():
+def test_reset_options_choose_the_traffic_and_the_start_and_leave_the_rest():
     env = make_env(horizon=50, random_start=True, truth_in_info=True)
     truth = env.reset(seed=0, options={"traffic_seed": 2, "start": 100})[1]["truth"]
     assert (truth["traffic_seed"], truth["time"]) == (2, 100)
     starts = {env.reset()[1]["truth"]["time"] for _ in range(30)}
     assert len(starts) > 10
     assert max(starts) <= 190
-    env = make_env(traffic_seeds=[0])
     free = play(env, 10, seed=9)
-    env.action_space.seed(9)
-    fixed = [env.reset(seed=9, options={"traffic_seed": 0})]
+    env.action_space.seed(9)  # and with the traffic chosen, start and noise are as they were
+    chosen = {"traffic_seed": int(free[0][1]["truth"]["traffic_seed"])}
+    fixed = [env.reset(seed=9, options=chosen)]
     assert_same(free, fixed + [env.step(env.action_space.sample()) for _ in range(10)])
 
 

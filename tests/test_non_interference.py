@@ -1,9 +1,11 @@
-"""Nothing of the true traffic may reach a policy except through the mechanism.
+"""Nothing of the true traffic may reach a policy except through what is released.
 
-With a mechanism that answers the same whatever the traffic, two episodes over different traffic
-must look the same, bit by bit. The presets `paper` and `corrected` feed the estimator true boundary
-inputs. That is their declared exception, so their test replaces them, and one test shows that it is
-one. Each way for the truth to slip through is kept as a mutation that the comparison must catch.
+No error would show it if it did, and the proofs would be void. With a release model that publishes
+the same values whatever the traffic, two episodes over different traffic must look the same, bit by
+bit: observations, estimates and ``info``, and prices, centres and deviations, which depend on what
+was released before alone. The paper's presets feed the estimator true boundary inputs. That is
+their declared exception, so they are tested without it, and one test shows that it is one. Each way
+for the truth to slip through is kept as a mutation that the comparison must catch.
 """
 
 import itertools
@@ -14,39 +16,52 @@ import pytest
 
 from dptse_env.estimators import ESTIMATORS
 from dptse_env.process import TRUTH_INFO
-from dptse_env.release.boundary import NominalBoundary
-from dptse_env.release.noise import Noise
-from dptse_env.schedules import (
-    OBSERVATION_SCHEDULES,
-    ORACLES,
-    PROCESS_SCHEDULES,
-    make_schedule,
-)
+from dptse_env.release import Fusion, Paced, Pacing
+from dptse_env.schedules import OBSERVATION_SCHEDULES, ORACLES, PROCESS_SCHEDULES, make_schedule
 from dptse_env.spaces.actions import ACTION_ENCODINGS
 from tests.helpers import fast_and_slow
 
 SEEDS = (0, 1)
 START, STEPS = 250, 30
-BLIND_SCHEDULES = sorted({*OBSERVATION_SCHEDULES, *PROCESS_SCHEDULES} - {"all"})
+IDS = {"paper": "ShortHighway-v0", "capped": "PrivateHighway-v0", "paced": "PrivateHighway-v1"}
 
 
-class ConstantNoise(Noise):
-    """Releases the same values whatever the traffic: others for every second and segment."""
+def make_private(preset="capped", **keywords):
+    """An environment on two seeds of traffic, with nominal boundary inputs unless others are given.
 
-    def __init__(self, releases_flow):
-        self._largest = 2000.0 if releases_flow else 80.0
-        self._step = 0
+    Args:
+        preset: One of `IDS`.
+        keywords: Of the environment; ``privacy`` may name a release model of another class.
+    """
+    keywords = {"horizon": STEPS, "random_start": True, **keywords}
+    keywords["privacy"] = {"boundary_inputs": "nominal", **keywords.get("privacy", {})}
+    return gym.make(f"dptse_env:dptse/{IDS[preset]}", traffic_seeds=SEEDS, **keywords)
 
-    def reset(self, episodes, generators):
-        self._step = 0
 
-    def give(self, noise):
-        pass  # its answers have no noise
+def blind(env):
+    """Have an environment publish values that depend on the second and the column alone.
 
-    def added(self, episodes, values, sigma, unit):
-        self._step += 1
-        answer = np.random.default_rng(self._step).uniform(-0.2, 1.0, values.shape)
-        return answer * [60.0, self._largest]
+    Ledgers and everything else of its release model stay as they are; its last centres and
+    deviations are kept beside them, to be compared.
+    """
+    release = env.unwrapped.process.release
+
+    class Blind(type(release)):
+        centre = sigmas = np.empty(0)
+
+        def reset(self, episodes, generators):
+            super().reset(episodes, generators)
+            self.centre = self.sigmas = np.empty(0)
+
+        def release(self, request):
+            released = super().release(request)
+            self.centre, self.sigmas = np.nan_to_num(released.centre), released.sigma
+            shape, largest = released.values.shape, 2000.0 if self.task.releases_flow else 80.0
+            answer = np.random.default_rng(request.times[0]).uniform(-0.2, 1.0, shape)
+            return released._replace(values=answer * [60.0, largest])
+
+    release.__class__ = Blind
+    return env
 
 
 def transcript(env, traffic_seed, schedule=None):
@@ -89,172 +104,247 @@ def same(first, second):
     )
 
 
-def blind(env):
-    """Cut the path through the mechanism; load both traffics first."""
-    for seed in SEEDS:
-        env.reset(seed=0, options={"traffic_seed": seed})
-    process = env.unwrapped.process
-    release = process.release
-    release.noise = ConstantNoise(release.task.releases_flow)
-    return env
+def unlike(env, schedule=None):
+    return not same(*(transcript(env, seed, schedule) for seed in SEEDS))
 
 
-def make_private(**keywords):
-    keywords = {"horizon": STEPS, "random_start": True, **keywords}
-    return gym.make("dptse_env:dptse/PrivateHighway-v0", traffic_seeds=SEEDS, **keywords)
+# --- as they are ----------------------------------------------------------------------------------
 
 
-def make_paper(**keywords):
-    return gym.make("dptse_env:dptse/ShortHighway-v0", traffic_seeds=SEEDS, horizon=60, **keywords)
-
-
-def with_nominal_boundary(env):
-    """Take the declared exception of the paper's presets away."""
-    process = env.unwrapped.process
-    process.boundary = NominalBoundary(process.release.task, process.traffic, process.model)
-    return env
-
-
-def unlike(env):
-    return not same(transcript(env, 0), transcript(env, 1))
-
-
-# --- the guaranteed preset, as it is ------------------------------------------------------------
-
-
-PAIRS = [
-    ("mask", "ekf"), ("scores", "ukf"), ("slots", "enkf"), ("sequential", "mhe"),
-    ("mask", "blend"), ("slots", "recurrent"),
+WAYS = [
+    ("capped", "ekf", "mask"), ("capped", "mhe", "sequential"), ("paced", "ukf", "scores"),
+    ("paced", "enkf", "slots"), ("paced", "recurrent", "slots"), ("paper", "blend", "mask"),
 ]  # fmt: skip
-EVERY_PAIR = list(itertools.product(ACTION_ENCODINGS, ESTIMATORS))
+EVERY_WAY = list(itertools.product(IDS, ESTIMATORS, ACTION_ENCODINGS))
 
 
-@pytest.mark.parametrize(("action", "estimator"), fast_and_slow(EVERY_PAIR, PAIRS))
-def test_traffic_does_not_show(estimator, action):
-    env = blind(make_private(estimator=estimator, action=action))
-    first, second = transcript(env, 0), transcript(env, 1)
+@pytest.mark.parametrize(("preset", "estimator", "action"), fast_and_slow(EVERY_WAY, WAYS))
+def test_traffic_does_not_show(preset, estimator, action):
+    """Where boundary segments are released and where they are not, for trips and for seconds."""
+    privacy, alive = {}, ["observation", "queried"]
+    if preset != "paper":
+        privacy["unit"] = ("trip", "event")[EVERY_WAY.index((preset, estimator, action)) % 2]
+    if preset == "paced":
+        alive += ["centre"] if privacy["unit"] == "event" else ["centre", "prices", "sigmas"]
+    for boundary in ("nominal", "private"):
+        privacy["boundary_inputs"] = boundary
+        env = blind(make_private(preset, estimator=estimator, action=action, privacy=privacy))
+        first, second = (transcript(env, seed) for seed in SEEDS)
+        assert same(first, second)
+        for name in alive:  # what is held equal moves
+            assert not all(np.array_equal(first[1][name], each[name]) for each in first[2:])
+
+
+BLIND_SCHEDULES = sorted({*OBSERVATION_SCHEDULES, *PROCESS_SCHEDULES} - {"all"})
+SCHEDULES = [
+    ("capped", "round-robin"), ("paced", "stale-variance"), ("capped", "speed-front"),
+    ("paced", "expected-reduction"), ("capped", "greedy-trace"), ("paced", "greedy-trace"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("preset", "schedule"), fast_and_slow(itertools.product(IDS, BLIND_SCHEDULES), SCHEDULES)
+)
+def test_traffic_does_not_show_through_a_schedule(preset, schedule):
+    boundary = "nominal" if schedule in BLIND_SCHEDULES[::2] else "private"
+    assert not unlike(blind(make_private(preset, privacy={"boundary_inputs": boundary})), schedule)
+
+
+PARTLY = {"penetration": [0.05, 0.4], "detectors": {"dropout": 0.2, "absolute": 0.5}}
+"""A share of connected vehicles that is drawn for each seed, and sensors with errors."""
+
+
+@pytest.mark.parametrize(
+    ("preset", "estimator"),
+    fast_and_slow(
+        itertools.product(IDS, ESTIMATORS),
+        [("paced", "ekf"), ("capped", "mhe"), ("paced", "ukf"), ("paper", "random_walk")],
+    ),
+)
+def test_neither_traffic_nor_who_is_connected_shows(preset, estimator):
+    boundary = "private" if estimator in ("ekf", "mhe") else "nominal"
+    privacy = {"boundary_inputs": boundary}
+    env = make_private(preset, estimator=estimator, privacy=privacy, **PARTLY)
+    first, second = (transcript(blind(env), seed) for seed in SEEDS)
     assert same(first, second)
     assert not np.array_equal(first[1]["observation"], first[-1]["observation"])
 
 
-SCHEDULES = [
-    ("round-robin", "private"), ("stale-variance", "nominal"), ("speed-front", "private"),
-    ("expected-reduction", "nominal"), ("greedy-trace", "private"),
-]  # fmt: skip
-EVERY_SCHEDULE = list(itertools.product(BLIND_SCHEDULES, ["nominal", "private"]))
+@pytest.mark.parametrize(("preset", "what"), [("capped", "exposures"), ("paced", "ledgers")])
+def test_vehicles_do_count_and_run_out_meanwhile(preset, what):
+    """The ledgers of both traffics differ, and that is what must not show."""
+    env = blind(make_private(preset, privacy={"epsilon": 0.5}))
+    told = []
+    for seed in SEEDS:
+        transcript(env, seed)
+        process = env.unwrapped.process
+        private = process.release.private(np.array([0]), process.traffic_index)
+        told.append(np.array(private[what][0]))
+    assert max(each.max() for each in told) > 0.8
+    assert len(told[0]) != len(told[1]) or not np.array_equal(*told)
 
 
-@pytest.mark.parametrize(("schedule", "boundary"), fast_and_slow(EVERY_SCHEDULE, SCHEDULES))
-def test_traffic_does_not_show_through_a_schedule(schedule, boundary):
-    env = blind(make_private(privacy={"boundary_inputs": boundary}))
-    assert same(transcript(env, 0, schedule), transcript(env, 1, schedule))
+def test_what_is_released_of_traffics_does_differ():
+    assert unlike(make_private())
 
 
-UNITS = [("ekf", "trip"), ("enkf", "horizon"), ("mhe", "event"), ("random_walk", "trip")]
+# --- mutations that must be caught: of the process ----------------------------------------------
 
 
 @pytest.mark.parametrize(
-    ("estimator", "unit"),
-    fast_and_slow(itertools.product(ESTIMATORS, ["trip", "horizon", "event"]), UNITS),
+    ("preset", "estimator", "shows"),
+    [("paper", "ekf", True), ("capped", "mhe", True), ("paced", "random_walk", False)],
 )
-def test_traffic_does_not_show_where_boundaries_are_released(estimator, unit):
-    privacy = {"boundary_inputs": "private", "unit": unit, "cap": 3}
-    env = blind(make_private(estimator=estimator, privacy=privacy))
-    assert same(transcript(env, 0), transcript(env, 1))
-
-
-def test_the_traffics_do_differ():
-    env = make_private(truth_in_info=True)
-    first, second = transcript(env, 0), transcript(env, 1)
-    assert not same(first, second)
-    process = env.unwrapped.process
-    truths = [process.traffic.aggregates(np.array([s]), np.array([START])) for s in (0, 1)]
-    assert not np.array_equal(*truths)
-
-
-# --- mutations that must be caught --------------------------------------------------------------
-
-
-def test_true_boundary_inputs_would_show():
-    with pytest.warns(UserWarning, match="boundary_inputs"):
-        env = make_private(privacy={"boundary_inputs": "true"})
-    assert unlike(blind(env))
-
-
-def test_an_emptiness_mask_would_show(monkeypatch):
-    env = blind(make_private())
-    process = env.unwrapped.process
-    update = process.estimator.update
-
-    def update_occupied(episodes, measured):
-        occupied = process.truth(episodes)[..., 0] > 0
-        update(episodes, measured._replace(observed=measured.observed & occupied))
-
-    monkeypatch.setattr(process.estimator, "update", update_occupied)
-    assert unlike(env)
-
-
-def test_a_marker_for_empty_segments_would_show(monkeypatch):
-    env = blind(make_private())
-    noise = env.unwrapped.process.release.noise
-    added = noise.added
-
-    def marked(episodes, values, *declared):
-        return np.where(values[..., :1] > 0, added(episodes, values, *declared), 0.0)
-
-    monkeypatch.setattr(noise, "added", marked)
-    assert unlike(env)
-
-
-def test_an_initial_state_from_the_truth_would_show(monkeypatch):
-    env = blind(make_private())
-    process = env.unwrapped.process
-    reset = process.estimator.reset
-
-    def reset_to_truth(episodes, states, generators):
-        truth = process.truth(episodes)
-        reset(episodes, process.model.states(truth[..., 0] + 1.0, truth[..., 1]), generators)
-
-    monkeypatch.setattr(process.estimator, "reset", reset_to_truth)
-    assert unlike(env)
-
-
-def test_realised_exposures_in_info_would_show(monkeypatch):
-    """An account of what vehicles really spent is no public number."""
-    env = blind(make_private())
-    process = env.unwrapped.process
-    info = process.info
-
-    def telling(episode):
-        paid = process.release.ledgers.paid[episode]
-        return info(episode) | {"mu": float(paid.max(initial=0))}
-
-    monkeypatch.setattr(process, "info", telling)
-    assert unlike(env)
+@pytest.mark.filterwarnings("ignore:.*no privacy is guaranteed:UserWarning")
+def test_true_boundary_inputs_would_show(preset, estimator, shows):
+    env = make_private(preset, estimator=estimator, privacy={"boundary_inputs": "true"})
+    assert unlike(blind(env)) == shows
 
 
 @pytest.mark.parametrize("oracle", sorted(ORACLES))
 def test_an_oracle_shows(oracle):
-    env = blind(make_private())
-    assert not same(transcript(env, 0, oracle), transcript(env, 1, oracle))
+    assert unlike(blind(make_private()), oracle)
 
 
-# --- the presets of the paper, but for their declared exception ---------------------------------
+def leave_out_empty_segments(process):
+    update = process.estimator.update
+
+    def mutant(episodes, measured):
+        occupied = process.truth(episodes)[..., 0] > 0
+        update(episodes, measured._replace(observed=measured.observed & occupied))
+
+    process.estimator.update = mutant
 
 
-@pytest.mark.parametrize(("action", "estimator"), fast_and_slow(EVERY_PAIR, PAIRS))
-def test_the_papers_presets_show_traffic_through_their_boundary_only(estimator, action):
-    env = with_nominal_boundary(blind(make_paper(estimator=estimator, action=action)))
-    assert same(transcript(env, 0), transcript(env, 1))
+def mark_empty_segments(process):
+    measure = process.measure
+
+    def mutant(request):
+        measured = measure(request)
+        occupied = process.truth(request.episodes)[..., :1] > 0
+        return measured._replace(values=np.where(occupied, measured.values, 0.0))
+
+    process.measure = mutant
+
+
+def begin_at_the_truth(process):
+    reset = process.estimator.reset
+
+    def mutant(episodes, states, generators):
+        truth = process.truth(episodes)
+        reset(episodes, process.model.states(truth[..., 0] + 1.0, truth[..., 1]), generators)
+
+    process.estimator.reset = mutant
+
+
+def tell_realised_exposures(process):
+    """An account of what vehicles really spent is no public number."""
+    info = process.info
+
+    def mutant(episode):
+        paid = process.release.ledgers.paid[episode]
+        return info(episode) | {"mu": float(paid.max(initial=0))}
+
+    process.info = mutant
 
 
 @pytest.mark.parametrize(
-    "schedule", fast_and_slow(BLIND_SCHEDULES, [name for name, _ in SCHEDULES])
+    "mutation",
+    [leave_out_empty_segments, mark_empty_segments, begin_at_the_truth, tell_realised_exposures],
 )
-def test_the_papers_presets_show_nothing_through_a_schedule(schedule):
-    env = with_nominal_boundary(blind(make_paper()))
-    assert same(transcript(env, 0, schedule), transcript(env, 1, schedule))
+def test_a_process_that_looks_at_the_truth_would_show(mutation):
+    env = blind(make_private())
+    mutation(env.unwrapped.process)
+    assert unlike(env)
 
 
-def test_the_papers_boundary_inputs_show():
-    assert unlike(blind(make_paper()))
+def test_a_share_that_only_the_truth_shows_would_be_noticed(monkeypatch):
+    env = blind(make_private("paced", **PARTLY))
+    process, read = env.unwrapped.process, Fusion.read
+
+    def knowing(self, measured, prediction):
+        share = process.config.penetration.share_of(SEEDS[process.traffic_index[0]])
+        return read(self, measured._replace(values=measured.values / share), prediction)
+
+    monkeypatch.setattr(Fusion, "read", knowing)
+    assert unlike(env)
+
+
+# --- mutations that must be caught: of the paced ledger -----------------------------------------
+
+
+class Looking(Paced):
+    """Changes the prediction that prices and centres are taken from, by the truth."""
+
+    def release(self, request):
+        density, speed = np.moveaxis(self.traffic.aggregates(request.traffic, request.times), -1, 0)
+        seen = request.prediction()._replace(**self.look(request, density, speed))
+        return super().release(request._replace(prediction=lambda: seen))
+
+
+class CentreOfTheTruth(Looking):
+    def look(self, request, density, speed):
+        return {"speed": speed}
+
+
+class PriceOfTrueCounts(Looking):
+    def look(self, request, density, speed):
+        return {"density": density}
+
+
+class FallsBackWhereNobodyIs(Looking):
+    """Takes a segment that is empty for one without a prediction."""
+
+    def look(self, request, density, speed):
+        return {"speed": np.where(density == 0.0, np.nan, request.prediction().speed)}
+
+
+class CentreOfTheSameSecond(Looking):
+    """Centred on speeds that this second's own noisy sums have corrected."""
+
+    def look(self, request, density, speed):
+        predicted = request.prediction().speed
+        n = predicted.shape[1]
+        values = Paced.release(self, request).values[:, :n]
+        told = predicted + values[..., 1] / np.maximum(values[..., 0], 10.0)
+        return {"speed": np.where(request.observed[:, :n], told, predicted)}
+
+
+class PriceOfTrueLedgers(Paced):
+    """Prices by what the vehicles have really left."""
+
+    def __init__(self, task, traffic):
+        super().__init__(task, traffic)
+        ledgers = self.ledgers
+
+        class FromLedgers(Pacing):
+            def prices(self, episodes, observed, density, speed):
+                left = ledgers.budget - ledgers.paid[episodes].max(axis=2, initial=0.0)
+                return np.broadcast_to(np.maximum(0.05 * left, 1e-3), observed.shape).copy()
+
+        self.pacing = FromLedgers(task, self.pacing.budget)
+
+
+class AccountOfTrueLedgers(Paced):
+    def spent(self, episodes, steps):
+        most = self.ledgers.paid[episodes, 0].max(axis=1, initial=0.0)
+        return np.sqrt(2.0 * most), np.sqrt(2.0 * most)
+
+
+class RefusalsInPublic(Paced):
+    def public(self, episodes):
+        refused = self.private(episodes, np.zeros_like(episodes))["n_refused"]
+        return super().public(episodes) | {"n_refused": refused}
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        CentreOfTheTruth, PriceOfTrueCounts, FallsBackWhereNobodyIs, CentreOfTheSameSecond,
+        PriceOfTrueLedgers, AccountOfTrueLedgers, RefusalsInPublic,
+    ],
+)  # fmt: skip
+def test_a_ledger_that_looks_at_the_truth_would_show(kind):
+    """Little privacy is left, so that some vehicles run out within the episode."""
+    little = {"preset": kind, "epsilon": 0.5, "pace": 1.0}
+    assert unlike(blind(make_private("paced", privacy=little)))

@@ -1,4 +1,4 @@
-"""An episode's noise follows its seed alone, and its score the record's second."""
+"""An episode follows its seed alone, whatever was before it, and its score the record's second."""
 
 import numpy as np
 import pytest
@@ -8,14 +8,10 @@ from dptse_env.parts import make_parts
 from dptse_env.process import QueryProcess
 from dptse_env.release.noise import grid_of
 from dptse_env.traffic import RecordLibrary
+from tests.helpers import assert_same, make_env, play
 
 TWO = np.arange(2)
-QUERY_ALL = np.ones((2, 6), dtype=np.int8)
-
-
-def grid(process):
-    """Spacing of the grid of both released quantities."""
-    return np.array([grid_of(sigma) for sigma in process.release.sigma.tolist()])
+EVERYWHERE = {"traffic_seed": 0, "start": 0}
 
 
 def begin(seeds, options, **keywords):
@@ -26,23 +22,28 @@ def begin(seeds, options, **keywords):
     return process
 
 
-def play(process, n_steps=80):
-    """Return the released values and their noise, (n_steps, 2, 6, 2) each."""
-    released, noise = [], []
-    for _ in range(n_steps):
-        process.step(TWO, QUERY_ALL)
-        released.append(process.released[:, :6].copy())
-        noise.append(released[-1] - process.truth(TWO)[:, :6])
-    return np.array(released), np.array(noise)
+def noise(process, queried=range(6)):
+    """Return the noise of some segments over 80 steps, (80, 2, queried, 2)."""
+    actions = np.tile(np.isin(np.arange(6), queried).astype(np.int8), (2, 1))
+    found = []
+    for _ in range(80):
+        process.step(TWO, actions)
+        found.append((process.released - process.truth(TWO))[:, queried])
+    return np.array(found)
+
+
+def grid(process):
+    """Spacing of the grid of both released quantities."""
+    return np.array([grid_of(sigma) for sigma in process.release.sigma.tolist()])
 
 
 def test_two_seeds_share_no_noise_on_one_record():
-    process = begin((1, 2), {"traffic_seed": 0, "start": 0})
-    _, noise = play(process)
-    assert (np.abs(noise[:, 0] - noise[:, 1]) > grid(process)).mean() > 0.99
+    process = begin((1, 2), EVERYWHERE)
+    first, second = np.moveaxis(noise(process), 1, 0)
+    assert (np.abs(first - second) > grid(process)).mean() > 0.99
     for component in (0, 1):
-        first, second = noise[:, 0, :, component].ravel(), noise[:, 1, :, component].ravel()
-        assert abs(np.corrcoef(first, second)[0, 1]) < 0.2
+        pair = first[..., component].ravel(), second[..., component].ravel()
+        assert abs(np.corrcoef(*pair)[0, 1]) < 0.2
 
 
 @pytest.mark.parametrize(
@@ -50,30 +51,49 @@ def test_two_seeds_share_no_noise_on_one_record():
 )
 def test_one_seed_has_one_noise_on_any_traffic(options):
     process = begin((1, 1), options)
-    released, noise = play(process)
-    assert not np.array_equal(released[:, 0], released[:, 1])
+    first, second = np.moveaxis(noise(process), 1, 0)
+    assert not np.array_equal(first, second)
     # Sums are rounded to the grid, so their noise agrees to half its spacing on either side.
-    assert (np.abs(noise[:, 0] - noise[:, 1]) <= 1.001 * grid(process)).all()
+    assert (np.abs(first - second) <= 1.001 * grid(process)).all()
 
 
 @pytest.mark.parametrize("estimator", ["enkf", "random_walk"])
-def test_the_noise_does_not_depend_on_the_estimator(estimator):
-    same = {"traffic_seed": 0, "start": 0}
-    expected, _ = play(begin((1, 2), same, estimator="ekf"))
-    released, _ = play(begin((1, 2), same, estimator=estimator))
-    np.testing.assert_array_equal(released, expected)
+def test_the_noise_depends_neither_on_the_estimator_nor_on_what_is_queried(estimator):
+    expected = noise(begin((1, 2), EVERYWHERE, estimator="ekf"))
+    found = noise(begin((1, 2), EVERYWHERE, estimator=estimator), queried=[1, 4])
+    np.testing.assert_array_equal(found, expected[:, :, [1, 4]])
+
+
+PARTLY = {"penetration": 0.3, "detectors": {"dropout": 0.2, "absolute": 0.5}}
+
+
+@pytest.mark.parametrize(
+    ("estimator", "privacy", "keywords"),
+    [
+        ("ekf", {"preset": "paced", "boundary_inputs": "private"}, {}),
+        ("mhe", {"preset": "capped", "cap": 5, "boundary_inputs": "private"}, {}),
+        ("recurrent", "paced", PARTLY),
+        ("blend", "paper", PARTLY),
+    ],
+)
+def test_an_episode_is_as_in_a_fresh_environment(estimator, privacy, keywords):
+    """No ledger, stream, release, innovation or price of an episode outlasts a reset."""
+    keywords = {"estimator": estimator, "privacy": privacy, "horizon": 40, **keywords}
+    fresh, used = (make_env(random_start=True, truth_in_info=True, **keywords) for _ in range(2))
+    for seed in (8, 9):
+        play(used, 25, seed)
+    assert_same(play(used, 40), play(fresh, 40))
 
 
 @pytest.mark.parametrize("start", [0, 17])
 def test_an_episode_is_scored_against_the_record_at_its_second(start):
     process = begin((5, 6), {"traffic_seed": 1, "start": start}, reward="density")
     corridor, n = process.config.corridor, 6
-    record = RecordLibrary().get(corridor, 1)
-    reward = np.full(2, np.nan)
+    record, reward = RecordLibrary().get(corridor, 1), None
     for k in range(60):
         density = record.counts[start + k, :n] / corridor.segment_length
         error = np.sqrt(np.mean((process.estimate.density[:, :n] - density) ** 2, axis=1))
         np.testing.assert_allclose(process.infos(TWO)["rmse_density"], error, rtol=1e-12)
-        if k > 0:
+        if reward is not None:
             np.testing.assert_allclose(reward, -error / corridor.density_scale, rtol=1e-12)
-        reward = process.step(TWO, QUERY_ALL).reward
+        reward = process.step(TWO, np.ones((2, 6), dtype=np.int8)).reward

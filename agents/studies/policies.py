@@ -8,8 +8,8 @@ Trained policies are files, each given as ``place=path``: the place is the setti
 trained in, or, for the gains over a round robin, a release model. ``place:recipe=path`` tells apart
 policies that one recipe trained with other arguments. A path may be a folder of runs.
 
-python scripts/study.py policies --report
-python scripts/study.py policies --output results/mine --policies primary=results/training/primary \
+dptse study policies --report
+dptse study policies --output results/mine --policies primary=results/training/primary \
     primary:regression=results/training/regression paced=results/training/paced-roads
 """
 
@@ -32,7 +32,6 @@ from agents.figures import (
     Look,
     draw_curve,
     draw_dot,
-    error_label,
     finish_figure,
     make_figure,
     save_figure,
@@ -60,6 +59,7 @@ from agents.tables import (
     Labels,
     UnmeasuredError,
     cell,
+    error_label,
     format_interval,
     grid,
     pick_paired,

@@ -1,180 +1,119 @@
-"""`PPOLearner`: PPO of stable-baselines3, resumable to the same numbers."""
+"""PPO and MaskablePPO as stable-baselines3 and sb3-contrib run them, with our curve and folder."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Mapping
+import math
 from typing import Any
 
-import numpy as np
-import torch
 from sb3_contrib import MaskablePPO
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import Logger
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
-from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.logger import KVWriter, Logger
+from stable_baselines3.common.vec_env import VecMonitor
 
-from agents.training.episodes import TrainingEpisodes, make_episodes
-from agents.training.learner import Record
-from agents.training.plan import TrainingPlan
-from agents.training.recipes import MaskablePPORecipe, PPORecipe
+from agents.training.episodes import make_episodes, recentre
+from agents.training.plan import PPOSettings
+from agents.training.run import POLICY, Run
 
-_LOGGED = {
-    "learning_rate": "train/learning_rate",
-    "kl": "train/approx_kl",
-    "clipped": "train/clip_fraction",
-    "entropy": "train/entropy_loss",
-    "explained_variance": "train/explained_variance",
-    "value_loss": "train/value_loss",
-}
-"""Columns of the learning curve, and the names under which stable-baselines3 logs them."""
+CLASSES: dict[str, Any] = {"ppo": PPO, "maskable-ppo": MaskablePPO}
+"""Classes of algorithms by their names."""
 
 
-class PPOLearner:
-    """Trains a perceptron by PPO or MaskablePPO; see `agents.training.learner.Learner`.
+COLUMNS = (
+    "validation", "validation_drawn", "learning_rate", "approx_kl", "clip_fraction",
+    "entropy_loss", "explained_variance", "value_loss",
+)  # fmt: skip
+"""What of the log of stable-baselines3 is in the curve, beside the error."""
 
-    Attributes:
-        model: The algorithm of stable-baselines3.
+
+def train_by_ppo(run: Run) -> None:
+    """Train to the end of the plan, from the last checkpoint on if there is one.
+
+    A training that goes on has the weights and the optimizer of its checkpoint, and new episodes:
+    its numbers are not those of one that was never interrupted.
+
+    Raises:
+        OSError: The disk is full or cannot be written; the last checkpoint stays.
     """
-
-    def __init__(self, plan: TrainingPlan, recipe: PPORecipe, keywords: Mapping[str, Any]) -> None:
-        """Make the episodes and an untrained model.
-
-        ``keywords`` are further ones of the environment.
-        """
-        self._plan, self._recipe, self._is_begun = plan, recipe, False
-        self._episodes = make_episodes(
-            plan.env,
-            {**plan.keywords, **keywords},
-            recipe,
-            plan.seed,
-            reward_scale=recipe.reward_scale,
-        )
-        self.model = _make_model(recipe, self._episodes, plan.seed)
-
-    @property
-    def policy(self) -> BasePolicy:
-        """The policy of the model."""
-        policy: BasePolicy = self.model.policy
-        return policy
-
-    @property
-    def policies(self) -> tuple[BasePolicy, ...]:
-        """The policy alone: a perceptron is tied to its environment."""
-        return (self.policy,)
-
-    @property
-    def update(self) -> int:
-        """Number of updates that are done."""
-        return self.model.num_timesteps // self._recipe.steps_per_update
-
-    def train(self, record: Record) -> None:
-        """See `Learner`."""
-        if not self._is_begun:
-            record(0.0, {})
-        left = self._plan.n_updates - self.update
-        if left > 0:
-            callback = _Updates(self, record)
-            steps = left * self._recipe.steps_per_update
-            never = left + 1  # the learning curve takes the place of the log
-            self.model.learn(
-                steps, callback=callback, log_interval=never, reset_num_timesteps=False
-            )
-
-    def state(self) -> dict[str, Any]:
-        """See `Learner`."""
-        model = self.model
-        name, keys, *position = np.random.get_state()  # noqa: NPY002  stable-baselines3 draws there
-        assert isinstance(name, str)
-        # The first update begins the episodes; ahead of it there is nothing to keep of them.
-        episodes = self._episodes.state() if model.num_timesteps else {}
-        starts = model._last_episode_starts if model.num_timesteps else None
-        return {
-            "steps": model.num_timesteps,
-            "n_updates": model._n_updates,
-            "policy": model.policy.state_dict(),
-            "optimizer": model.policy.optimizer.state_dict(),
-            "numpy": [torch.from_numpy(np.asarray(keys).astype(np.int64)), *position],
-            "starts": torch.from_numpy(np.ones(0, dtype=bool) if starts is None else starts),
-            "episodes": {key: torch.from_numpy(value) for key, value in episodes.items()},
-        }
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """See `Learner`."""
-        model, self._is_begun = self.model, True
-        model.policy.load_state_dict(state["policy"])
-        model.policy.optimizer.load_state_dict(state["optimizer"])
-        model.num_timesteps, model._n_updates = state["steps"], state["n_updates"]
-        if state["steps"]:
-            episodes = {key: value.numpy() for key, value in state["episodes"].items()}
-            model._last_obs = self._episodes.restore(episodes)
-            model._last_episode_starts = state["starts"].numpy()
-        keys, *position = state["numpy"]
-        np.random.set_state(("MT19937", keys.numpy().astype(np.uint32), *position))  # noqa: NPY002
-
-    def recentre(self, advantages: Any) -> None:
-        """Compare the advantages of a rollout (steps, n), in place, between replicas."""
-        self._episodes.recentre(advantages)
-
-    def values(self) -> dict[str, float]:
-        """Return the values of the last update for the learning curve."""
-        logged = self.model.logger.name_to_value
-        values = {name: float(logged[key]) for name, key in _LOGGED.items()}
-        return {"error": -self._episodes.take_mean_reward(), **values}
+    plan, kept = run.plan, run.checkpoint or {"update": 0}
+    ppo = plan.algorithm
+    assert isinstance(ppo, PPOSettings)
+    done: int = kept["update"]
+    episodes = make_episodes(plan, plan.worlds[0], run.keywords, done)
+    per_second, first, last = plan.actions_per_step, ppo.learning_rate, ppo.final_learning_rate
+    model = CLASSES[ppo.name](
+        "MlpPolicy",
+        VecMonitor(episodes),
+        n_steps=ppo.n_steps * per_second,
+        batch_size=ppo.batch_size,
+        n_epochs=ppo.n_epochs,
+        learning_rate=lambda left: last + (first - last) * left,
+        gamma=ppo.gamma ** (1 / per_second),
+        gae_lambda=ppo.gae_lambda ** (1 / per_second),
+        ent_coef=ppo.ent_coef,
+        policy_kwargs={"net_arch": list(ppo.hidden)},
+        seed=plan.seed + 1000 * done,
+        device="cpu",
+    )
+    if "parameters" in kept:
+        model.set_parameters(kept["parameters"])
+        model.num_timesteps = done * model.n_steps * model.n_envs
+    if done < ppo.n_updates:
+        follow = _Follow(run, ppo, done)
+        model.set_logger(Logger(None, [follow]))
+        steps = (ppo.n_updates - done) * model.n_steps * model.n_envs
+        model.learn(steps, callback=follow, reset_num_timesteps=False)
+    run.save(POLICY, model.policy, run.rows[-1])
 
 
-class _Updates(BaseCallback):
-    """Records every update, between two of them, when all episodes stand still."""
+class _Follow(BaseCallback, KVWriter):
+    """Compares replicas, validates, keeps checkpoints, and adds what is logged to the curve."""
 
-    def __init__(self, learner: PPOLearner, record: Record) -> None:
+    def __init__(self, run: Run, ppo: PPOSettings, done: int) -> None:
         super().__init__()
-        self._learner, self._record, self._since = learner, record, time.perf_counter()
-        self._is_first = True
+        self._run, self._ppo, self._update = run, ppo, done - 1
+
+    def write(
+        self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0
+    ) -> None:
+        """Add a row: what the last update left, the errors of its policy, the next episodes."""
+        del key_excluded, step
+        logged = {key.partition("/")[2] or key: float(value) for key, value in key_values.items()}
+        row = {key: logged[key] for key in COLUMNS if math.isfinite(logged.get(key, math.nan))}
+        if "ep_rew_mean" in logged:
+            mean = logged["ep_rew_mean"] / logged["ep_len_mean"]
+            row["error"] = -mean * self._run.plan.actions_per_step
+        self._run.add(self._update, self._steps, row)
+
+    def close(self) -> None:
+        """Do nothing; see `KVWriter`."""
+
+    @property
+    def _steps(self) -> int:
+        return self._update * self._ppo.n_envs * self._ppo.n_steps
 
     def _on_rollout_start(self) -> None:
-        # The first rollout follows no update of this call.
-        if not self._is_first:
-            self._note()
-        self._is_first = False
+        # Another update is done, but ahead of the first rollout.
+        self._update += 1
+        if self._update % self._ppo.validate_every == 0:
+            self._validate()
+            self._keep()
 
     def _on_rollout_end(self) -> None:
-        self._learner.recentre(self.locals["rollout_buffer"].advantages)
+        recentre(self.locals["rollout_buffer"].advantages, self._ppo.replicas)
 
     def _on_training_end(self) -> None:
-        self._note()
+        self._update += 1
+        self._validate()
+        self.logger.dump()
+        self._keep()
 
     def _on_step(self) -> bool:
         return True
 
-    def _note(self) -> None:
-        now = time.perf_counter()
-        self._record(now - self._since, self._learner.values())
-        self._since = time.perf_counter()
+    def _validate(self) -> None:
+        for name, error in self._run.validate([self.model.policy], self._steps).items():
+            self.logger.record(name, error)
 
-
-def _make_model(recipe: PPORecipe, episodes: TrainingEpisodes, seed: int) -> OnPolicyAlgorithm:
-    """Make the model; draws and initial weights follow ``seed``."""
-    per_step = episodes.env.interface.actions.actions_per_step
-    algorithm: type[OnPolicyAlgorithm] = PPO
-    if isinstance(recipe, MaskablePPORecipe):
-        algorithm = MaskablePPO
-    keywords: dict[str, Any] = {
-        "n_steps": recipe.n_steps,
-        "batch_size": recipe.batch_size,
-        "n_epochs": recipe.n_epochs,
-        "learning_rate": recipe.schedule(),
-        "gamma": recipe.gamma ** (1 / per_step),
-        "gae_lambda": recipe.gae_lambda ** (1 / per_step),
-        "clip_range": recipe.clip_range,
-        "target_kl": recipe.target_kl,
-        "ent_coef": recipe.ent_coef,
-        "vf_coef": recipe.vf_coef,
-        "max_grad_norm": recipe.max_grad_norm,
-        "policy_kwargs": {"net_arch": list(recipe.hidden)},
-        "seed": seed,
-        "device": "cpu",
-    }
-    model = algorithm("MlpPolicy", episodes, **keywords)
-    model.set_logger(Logger(None, []))
-    return model
+    def _keep(self) -> None:
+        self._run.keep(update=self._update, parameters=self.model.get_parameters())

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from agents.training.episodes import TrainingEpisodes
-from agents.training.recipes import RegressionRounds
+from agents.training.plan import Regression
 from dptse_env.process import QueryProcess
 from dptse_env.sb3 import PlackettLucePolicy
 from dptse_env.utils.arrays import FloatArray, Observation
@@ -57,6 +57,8 @@ class Practice:
     Attributes:
         policy: The policy.
         batch_size: Samples in a minibatch.
+        seen: Observations so far, each (n, size).
+        errors: Squared errors of the same seconds, each (n, n_mainline).
     """
 
     def __init__(
@@ -64,32 +66,31 @@ class Practice:
     ) -> None:
         """Begin the episodes."""
         self.policy, self.batch_size = policy, batch_size
+        self.seen: list[Tensor] = []
+        self.errors: list[Tensor] = []
         self._episodes, self._observation = episodes, episodes.reset()
-        self._seen: list[Tensor] = []
-        self._errors: list[Tensor] = []
 
-    def collect(
-        self, settings: RegressionRounds, targets: Callable[[QueryProcess], Observation]
-    ) -> None:
+    def collect(self, settings: Regression, targets: Callable[[QueryProcess], Observation]) -> None:
         """Act for a round, and keep what is seen and the targets."""
         for second in range(settings.seconds):
             if second % settings.interval == 0:
-                self._seen.append(torch.from_numpy(self._observation.copy()))
-                self._errors.append(torch.from_numpy(targets(self._episodes.env.process)))
+                self.seen.append(torch.from_numpy(self._observation.copy()))
+                self.errors.append(torch.from_numpy(targets(self._episodes.env.process)))
             actions, _ = self.policy.predict(self._observation, deterministic=False)
             stepped, *_ = self._episodes.step(actions)
-            assert isinstance(stepped, np.ndarray)
-            self._observation = stepped
+            self._observation = np.asarray(stepped)
 
-    def samples(self) -> tuple[Tensor, Tensor]:
-        """Return all observations (k, size) and targets (k, n) so far."""
-        return torch.cat(self._seen), torch.cat(self._errors)
+    def loss(self, seen: Tensor, errors: Tensor, level: Tensor, sharpness: float) -> Tensor:
+        """Return the loss of a random minibatch of samples (k, size) and (k, n)."""
+        rows = torch.randint(len(seen), (self.batch_size,))
+        logs = self.policy.scores(seen[rows]) / sharpness + level
+        return ((errors[rows] + FLOOR) * torch.exp(-logs) + logs).mean()
 
 
 def regress(
     practice: Sequence[Practice],
-    settings: RegressionRounds,
-    progress: Callable[[float], None] | None = None,
+    settings: Regression,
+    progress: Callable[[float], None] = lambda fraction: None,
     targets: Callable[[QueryProcess], Observation] = squared_errors,
 ) -> None:
     """Let policies act, and fit their common scores in place to the squared errors that follow.
@@ -109,6 +110,7 @@ def regress(
     policy, bonus = practice[0].policy, {"age": settings.age_bonus}
     levels = torch.full((len(practice),), LEVEL, requires_grad=True)
     optimizer = torch.optim.Adam([*policy.scorer.parameters(), levels], lr=settings.rate)
+    batches = settings.batches * len(practice)
     for index in range(settings.rounds):
         for each in practice:
             each.collect(settings, targets)
@@ -117,14 +119,17 @@ def regress(
         else:
             _add(policy, policy.rule, -1.0)
             _add(policy, VARIANCE, settings.sharpness)
-        samples = [each.samples() for each in practice]
-        batches = settings.batches * len(practice)
+        samples = [(torch.cat(each.seen), torch.cat(each.errors)) for each in practice]
         for batch in range(batches):
             done = (index + batch / batches) / settings.rounds
             optimizer.param_groups[0]["lr"] = settings.rate * (1.0 - DECAY * done)
             k = batch % len(practice)
-            _fit(practice[k], levels[k], optimizer, settings, *samples[k])
-            if progress is not None and batch % REPORT_INTERVAL == 0:
+            loss = practice[k].loss(*samples[k], levels[k], settings.sharpness)
+            optimizer.zero_grad()
+            torch.autograd.backward(loss)
+            torch.nn.utils.clip_grad_norm_(policy.scorer.parameters(), settings.max_grad_norm)
+            optimizer.step()
+            if batch % REPORT_INTERVAL == 0:
                 progress(done)
         _add(policy, bonus, settings.sharpness)
     policy.scorer.zero_grad()
@@ -135,22 +140,3 @@ def _add(policy: PlackettLucePolicy, weights: Mapping[str, float], factor: float
     with torch.no_grad():
         for k, name in enumerate(policy.rule):
             policy.scorer.rule[k] += factor * weights.get(name, 0.0)
-
-
-def _fit(
-    practice: Practice,
-    level: Tensor,
-    optimizer: torch.optim.Optimizer,
-    settings: RegressionRounds,
-    seen: Tensor,
-    errors: Tensor,
-) -> None:
-    """Take a step of the optimizer on a random minibatch."""
-    policy = practice.policy
-    rows = torch.randint(len(seen), (practice.batch_size,))
-    logs = policy.scores(seen[rows]) / settings.sharpness + level
-    loss = ((errors[rows] + FLOOR) * torch.exp(-logs) + logs).mean()
-    optimizer.zero_grad()
-    torch.autograd.backward(loss)
-    torch.nn.utils.clip_grad_norm_(policy.scorer.parameters(), settings.max_grad_norm)
-    optimizer.step()

@@ -16,15 +16,8 @@ from dptse_env.utils.files import write_atomically
 
 PLAN, CHECKPOINT, PROGRESS = "plan.json", "checkpoint.pt", "progress.csv"
 
-FORMAT = 3
-"""Format of checkpoints; raise it whenever their content changes its meaning."""
-
-COLUMNS = (
-    "update", "steps", "seconds", "error", "validation", "validation_drawn", "learning_rate",
-    "kl", "clipped", "entropy", "explained_variance", "value_loss",
-)  # fmt: skip
-"""Columns of `PROGRESS`. Errors are minus the mean reward of a second: of the actions trained on,
-and on validation traffic with deterministic and with drawn actions."""
+FORMAT = 4
+"""Format of the files; raise it whenever their content changes its meaning."""
 
 Row = dict[str, float]
 
@@ -38,7 +31,7 @@ def keep_plan(folder: Path, plan: Mapping[str, Any]) -> None:
     """
     check_plan(folder, plan)
     folder.mkdir(parents=True, exist_ok=True)
-    write_json(folder / PLAN, plan)
+    write_json(folder / PLAN, {"format": FORMAT, **plan})
 
 
 def check_plan(folder: Path, plan: Mapping[str, Any]) -> None:
@@ -58,7 +51,7 @@ def check_plan(folder: Path, plan: Mapping[str, Any]) -> None:
         raise ValueError(f"{path} is damaged: {problem}") from problem
     if not isinstance(kept, dict):
         raise ValueError(f"{path} is damaged: it has no plan")
-    difference = first_difference(kept, plan)
+    difference = first_difference(kept, {"format": FORMAT, **plan})
     if difference is not None:
         raise ValueError(
             f"{folder} has the training of another plan: {difference}. Choose another --output, "
@@ -66,8 +59,9 @@ def check_plan(folder: Path, plan: Mapping[str, Any]) -> None:
         )
 
 
-def write_progress(folder: Path, rows: Sequence[Row], columns: Sequence[str] = COLUMNS) -> None:
-    """Write the learning curve; missing values stay empty."""
+def write_progress(folder: Path, rows: Sequence[Row], columns: Sequence[str] = ()) -> None:
+    """Write the learning curve; missing values stay empty. Columns are those of rows by default."""
+    columns = columns or list(dict.fromkeys(name for row in rows for name in row))
     text = io.StringIO()
     writer = csv.DictWriter(text, columns, lineterminator="\n")
     writer.writeheader()
@@ -99,7 +93,7 @@ def read_progress(folder: Path) -> list[Row]:
 def write_checkpoint(folder: Path, content: dict[str, Any]) -> None:
     """Write a checkpoint of tensors, numbers and strings."""
     buffer = io.BytesIO()
-    torch.save({"format": FORMAT, **content}, buffer)
+    torch.save(content, buffer)
     write_atomically(folder / CHECKPOINT, buffer.getvalue())
 
 
@@ -107,7 +101,7 @@ def read_checkpoint(folder: Path) -> dict[str, Any] | None:
     """Return the checkpoint of a folder; None where no training has begun.
 
     Raises:
-        ValueError: It is damaged, of another format, or missing although there is a learning curve.
+        ValueError: It is damaged, or missing although there is a learning curve.
     """
     path = folder / CHECKPOINT
     if not path.exists():
@@ -122,10 +116,4 @@ def read_checkpoint(folder: Path) -> dict[str, Any] | None:
     except Exception as problem:
         message = f"{path} is damaged: {problem}; remove the folder to start over"
         raise ValueError(message) from problem
-    found = content.get("format", 1)
-    if found != FORMAT:
-        raise ValueError(
-            f"{path} has format {found}, and this version continues from format {FORMAT} only: "
-            "finish the training with the version that began it, or remove the folder to start over"
-        )
     return content

@@ -1,28 +1,52 @@
-"""Gains of swaps: how much an episode's error falls when a queried segment is swapped for another.
+"""Policy iteration with measured swaps: scores move in proportion to the gains of swaps.
 
-Each gain is measured on paired forks of an episode: they start in the same second with the same
-estimator and the same traffic, and make the same queries, except that a segment of the first query
-is swapped in one of them. The difference of their errors over the next seconds therefore comes from
-that swap alone. The policy does not react to a swap: near an optimum, its reaction is worth little.
+**Measured.** The gain of a swap is by how much an episode's error falls when a queried segment is
+swapped for another. It is measured on paired forks of an episode: they start in the same second
+with the same estimator and the same traffic, and make the same queries, except that a segment of
+the first query is swapped in one of them. The difference of their errors over the next seconds
+therefore comes from that swap alone. The policy does not react to a swap: near an optimum, its
+reaction is worth little.
 
 Noise would drown the difference. In the first query it is therefore plus or minus sigma, which
 matches the moments of the Gaussian up to the third, and every fork is run with either sign
 (antithetic noise), which cancels all that is odd in it; in later seconds the noise is that of the
 episode. The standard deviation of a measured gain is a third of that with Gaussian noise of one
 sign.
+
+**Learned.** The gain of swapping segment j for segment i is learned as a difference g_i - g_j of a
+number per segment, by least squares. Scores move by a small multiple of g, which is a step of
+mirror descent on the distribution over sets (its weights exp(score) are multiplied by
+exp(step g)); then gains are measured anew, under the new policy.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import torch
+from torch import Tensor
 
-from dptse_env.evaluation import WARM_UP, Policy
+from agents.seeds import training_seed
+from agents.training.plan import SwapRounds, first_second
+from dptse_env.evaluation import Policy
 from dptse_env.process import QueryProcess
+from dptse_env.sb3 import PlackettLucePolicy
 from dptse_env.utils.arrays import Action, AnyArray, FloatArray, IntArray, Observation
 from dptse_env.vector_env import SensorQueryVectorEnv
+
+LARGEST_GAIN = 0.6
+"""Clips gains [mean one-second errors]: outliers would dominate the least-squares fit."""
+
+PART = 4096
+"""Observations scored at a time."""
+
+SEED_STRIDE = 10_000
+"""Between the seeds of two rounds; the first begins a stride after those of the regression."""
+
+REPORT_INTERVAL = 50
+"""Minibatches between two reports of progress."""
 
 
 @dataclass(frozen=True)
@@ -48,70 +72,45 @@ class Swaps:
     gain: FloatArray
     spent: FloatArray
 
-    @classmethod
-    def from_parts(cls, parts: Sequence[Swaps]) -> Swaps:
-        """Return the swaps of all parts."""
-
-        def joined(name: str) -> AnyArray:
-            return np.concatenate([getattr(part, name) for part in parts])
-
-        first = np.cumsum([0] + [len(part.observations) for part in parts[:-1]])
-        return cls(
-            joined("observations"),
-            joined("error"),
-            np.concatenate([n + part.state for n, part in zip(first, parts, strict=True)]),
-            *(joined(name) for name in ("added", "dropped", "gain", "spent")),
-        )
-
 
 def try_swaps(
-    env: SensorQueryVectorEnv,
     policy: Policy,
-    seeds: Sequence[int],
-    generator: np.random.Generator,
-    *,
-    seconds: int,
-    trials: int,
-) -> Iterator[Swaps]:
-    """Run an episode of ``policy`` for each seed, and try swaps in states along the way.
+    env: SensorQueryVectorEnv,
+    settings: SwapRounds,
+    index: int,
+    seed: int,
+    progress: Callable[[float], None] = lambda fraction: None,
+) -> Swaps:
+    """Run the episodes of a round, and try swaps in states along the way.
 
     Args:
-        env: One episode for each seed, actions ``slots``, autoreset disabled.
         policy: Acts by drawing.
-        seeds: Of the episodes, n of them.
-        generator: Draws the swaps, a queried segment for one of the rest, and the signs of noise.
-        seconds: Seconds over which a gain is measured, and between two states.
-        trials: Swaps in each state.
+        env: n episodes, actions ``slots``, autoreset disabled.
+        settings: Of rounds.
+        index: Number of the round, counted from 0.
+        seed: Training seed. Draws depend on it and on ``index`` alone, but for those of torch.
+        progress: Called with the fraction of the episodes that is done.
 
-    Yields:
-        The swaps of n states, of the same second in all episodes.
-
-    Raises:
-        ValueError: All options are queried, so that there is nothing to swap, they cost different
-            amounts, or episodes end before a gain could be measured.
+    Returns:
+        The swaps of every ``settings.seconds``, in states of the same second in all episodes.
     """
-    horizon, queries = env.config.horizon_steps, env.config.queries
-    if queries.most_queries >= queries.n_options:
-        raise ValueError(
-            f"swaps need a bandwidth below {queries.n_options} segments, got {queries.bandwidth}"
-        )
-    if queries.costs_differ:
-        raise ValueError(f"swaps need queries that cost the same, got {queries}")
+    first_episode = training_seed(seed) + SEED_STRIDE * (index + 1)
+    generator = np.random.default_rng([seed, index])
+    horizon, seconds = env.config.horizon_steps, settings.seconds
     # The states of every round are at other seconds.
-    first = min(WARM_UP, horizon // 4) + int(generator.integers(seconds))
-    if first + seconds > horizon:
-        raise ValueError(
-            f"swaps need a horizon that leaves {seconds} s to measure a gain, got {horizon} s"
-        )
-    observation, _ = env.reset(seed=seeds)
+    first = first_second(horizon) + int(generator.integers(seconds))
+    observation, _ = env.reset(seed=list(range(first_episode, first_episode + env.num_envs)))
     for _ in range(first):
         observation = env.advance(_drawn(policy, observation)).observation
-    for _ in range((horizon - first) // seconds):
+    parts: list[tuple[AnyArray, ...]] = []
+    for second in range(first, horizon - seconds + 1, seconds):
         before, shown, actions = env.process.fork(), observation, []
         for _ in range(seconds):
             actions.append(_drawn(policy, observation))
             observation = env.advance(actions[-1]).observation
-        yield _tried(before, shown, actions, generator, trials)
+        parts.append(_tried(before, shown, actions, generator, settings.trials, len(parts)))
+        progress((second + seconds) / horizon)
+    return Swaps(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
 def _drawn(policy: Policy, observation: Observation) -> Action:
@@ -125,8 +124,12 @@ def _tried(
     actions: Sequence[Action],
     generator: np.random.Generator,
     trials: int,
-) -> Swaps:
-    """Try swaps in the first of ``actions``, in every episode of ``before``."""
+    n_before: int,
+) -> tuple[AnyArray, ...]:
+    """Try swaps in the first of ``actions``, in every episode of ``before``.
+
+    Returns columns of `Swaps`; ``n_before`` times as many states came before.
+    """
     n, every = len(shown), np.arange(len(shown))
     columns = before.release.task.n_columns
     noise = generator.choice([-1.0, 1.0], size=(n, columns, 2))
@@ -142,9 +145,9 @@ def _tried(
         swapped_reward, swapped_spent = _replayed(before, [query, *actions[1:]], noise)
         dropped = actions[0][every, place]
         gain, increase = swapped_reward - reward, swapped_spent - spent
-        parts.append((every, added, dropped, gain, increase))
-    state, *columns_of_swaps = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return Swaps(shown, -reward / len(actions), state, *columns_of_swaps)
+        parts.append((n * n_before + every, added, dropped, gain, increase))
+    swaps = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return shown, -reward / len(actions), *swaps
 
 
 def _replayed(
@@ -163,3 +166,71 @@ def _replayed(
             reward += 0.5 * fork.step(every, action).reward
         spent += 0.5 * fork.release.budgets_spent(every)
     return reward, spent
+
+
+class _Gains:
+    """Swaps of an environment as targets of the fit.
+
+    Gains are in units of the policy's mean one-second error, so that settings carry over to other
+    environments. The price of the budgets that vehicles spend is subtracted from each: a vehicle
+    without budget is missing from the releases for the rest of an episode, long after the seconds
+    in which a gain is measured.
+    """
+
+    def __init__(
+        self, policy: PlackettLucePolicy, swaps: Swaps, settings: SwapRounds, batch_size: int
+    ) -> None:
+        gains = np.clip(swaps.gain / swaps.error.mean(), -LARGEST_GAIN, LARGEST_GAIN)
+        gains -= settings.price * swaps.spent
+        self._policy, self._batch_size = policy, batch_size
+        self._seen = torch.from_numpy(swaps.observations)
+        self._targets = torch.from_numpy(gains.astype(np.float32))
+        self._swapped = tuple(map(torch.from_numpy, (swaps.state, swaps.added, swaps.dropped)))
+        with torch.no_grad():
+            parts = range(0, len(self._seen), PART)
+            self._before = torch.cat([policy.scores(self._seen[i : i + PART]) for i in parts])
+
+    def loss(self, step: float) -> Tensor:
+        """Return the squared error of a random minibatch of expected gains."""
+        rows = torch.randint(len(self._targets), (self._batch_size,))
+        state, added, dropped = (each[rows] for each in self._swapped)
+        shown, row = torch.unique(state, return_inverse=True)
+        moved = self._policy.scores(self._seen[shown]) - self._before[shown]
+        expected = (moved[row, added] - moved[row, dropped]) / step
+        return torch.square(expected - self._targets[rows]).mean()
+
+
+def raise_scores(
+    policies: Sequence[PlackettLucePolicy],
+    swaps: Sequence[Swaps],
+    settings: SwapRounds,
+    step: float,
+    progress: Callable[[float], None] = lambda fraction: None,
+) -> None:
+    """Raise the scores of policies in place by ``step`` times the expected gain of a query.
+
+    Args:
+        policies: Policies that share a scorer, each of an environment of its own.
+        swaps: Those tried under each of them.
+        settings: Of rounds.
+        step: Rise of a score for an expected gain of one mean one-second error.
+        progress: Called with the fraction of the fit that is done.
+    """
+    scorer = policies[0].scorer
+    n = policies[0].road.n_mainline
+    gains = [
+        _Gains(policy, each, settings, max(settings.batch_size * n // policy.road.n_mainline, 1))
+        for policy, each in zip(policies, swaps, strict=True)
+    ]
+    batches = settings.batches * len(gains)
+    optimizer = torch.optim.Adam(scorer.parameters(), lr=settings.rate)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, batches)
+    for batch in range(batches):
+        loss = gains[batch % len(gains)].loss(step)
+        optimizer.zero_grad()
+        torch.autograd.backward(loss)
+        optimizer.step()
+        schedule.step()
+        if batch % REPORT_INTERVAL == 0:
+            progress(batch / batches)
+    scorer.zero_grad()

@@ -344,7 +344,7 @@ class PlackettLucePolicy(BasePolicy):
     on another road.
 
     The policy has no critic and no optimizer: it is trained by regression and rounds of swaps
-    (``scripts/train.py``), not by PPO.
+    (``dptse train``), not by PPO.
 
     Attributes:
         bandwidth: B, queries a step.

@@ -2,8 +2,8 @@
 
 Keyword values of ``gym.make`` travel as JSON, so every configuration must be reachable from
 dictionaries, lists, strings and numbers. The annotation of a field declares its type and range,
-``Annotated[float, Interval(0, 1)]``: `checked_fields` enforces it, and ``docs/configuration.md`` is
-generated from it. An error is one line: ``<path> must be <allowed>, got <value>``.
+``Annotated[float, Interval(0, 1)]``: `checked_fields` enforces it, and ``docs/configuration.md``
+shows it. An error is one line: ``<path> must be <allowed>, got <value>``.
 """
 
 import dataclasses

@@ -3,12 +3,9 @@
 import numpy as np
 import pytest
 
-pytest.importorskip("tyro")
-
 from agents.environments import make_config
 from agents.measured_field import Field, Replay, field_corridor, read_field
 from dptse_env.importers.fields import FieldSource
-from scripts import replay_field
 
 PAPER = "dptse_env:dptse/PaperHighway-v0"
 
@@ -59,20 +56,3 @@ def test_more_noise_costs():
     assert runs[1e6].error < 0.5 * runs[1.0].error
     assert runs[1e6].density < 5.0
     assert all(value > 0.0 for score in runs.values() for value in score)
-
-
-def test_the_script_prints_a_row_for_each_estimator(tmp_path, capsys):
-    args = replay_field.Args(
-        source(tmp_path, columns=60),
-        3,
-        bandwidth=1,
-        window=100,
-        repeats=1,
-        estimators=("ekf", "recurrent"),
-    )
-    replay_field.main(args)
-    text = capsys.readouterr().out
-    assert "EKF" in text
-    assert "recurrent" in text
-    with pytest.raises(ValueError, match=r"bandwidth must be an integer in 1\.\.3, got 4"):
-        replay_field.main(replay_field.Args(source(tmp_path), 3, bandwidth=4))

@@ -8,19 +8,17 @@ import importlib
 import re
 import shlex
 import tomllib
-from pathlib import Path
 
 import pytest
 import tyro
 
-from scripts.dptse import COMMANDS, split
+from scripts.dptse import MODULES
 from tests.helpers import fast_and_slow
 
 from .blocks import BLOCKS, PAGES, ROOT
 
 RUN_ELSEWHERE = {"tutorial.md", "extending.md"}
 RUN = {block.page for block in BLOCKS if block.language == "python"} - RUN_ELSEWHERE
-NAMES = {command.module: name for name, command in COMMANDS.items()}
 
 
 def test_blocks_are_of_languages_that_are_tested_here_and_can_be_parsed():
@@ -57,43 +55,26 @@ def check(line):
         assert set(goals) <= set(targets), line
     elif words[:1] == ["dptse"]:
         parse(words[1:])
-    elif words[:1] == ["python"] and words[1].startswith("scripts/"):
-        name = Path(words[1]).stem
-        # A script with commands of its own has their names already.
-        parse(
-            ["import", *words[2:]] if name == "import_road" else [*NAMES[name].split(), *words[2:]]
-        )
     elif words[:1] == ["python"] and not words[1].startswith("-"):
         assert (ROOT / words[1]).is_file(), line
 
 
 def parse(words):
-    if words[0].startswith("-"):
-        assert words in (["--help"], ["--version"])
-        return
-    if words[-1] == "--help":
-        split(words)
-        return
-    name, rest = split(words)
-    module = importlib.import_module(f"scripts.{COMMANDS[name].module}")
-    tyro.cli(getattr(module, COMMANDS[name].arguments), args=rest)
+    if words not in (["--help"], ["--version"]):
+        arguments = importlib.import_module(MODULES[words[0]]).Args
+        tyro.cli(arguments, args=words[1:])
 
 
-def test_a_command_with_an_unknown_option_would_be_noticed(capsys):
-    for line in (
-        "python scripts/record.py --sedes 0:4",
-        "dptse trian --seed 0",
-        "dptse evaluate --seeds",
-    ):
+def test_a_command_with_an_unknown_option_would_be_noticed():
+    for line in ("dptse record --sedes 0:4", "dptse evaluate --seeds"):
         with pytest.raises(SystemExit) as ended:
             check(line)
         assert ended.value.code == 2
+    with pytest.raises(KeyError):
+        check("dptse trian --seed 0")
 
 
 def test_inline_commands_name_programs_that_exist():
     for page in PAGES:
-        text = page.read_text(encoding="utf-8")
-        for name in re.findall(r"`(?:python )?scripts/(\w+)\.py", text):
-            assert (ROOT / "scripts" / f"{name}.py").is_file(), (page, name)
-        for name in re.findall(r"`dptse ([a-z][a-z-]*)", text):
-            assert any(known.split()[0] == name for known in COMMANDS), (page, name)
+        for name in re.findall(r"`dptse ([a-z][a-z-]*)", page.read_text(encoding="utf-8")):
+            assert name in MODULES, (page, name)

@@ -8,15 +8,18 @@ import pytest
 
 from dptse_env.estimators import (
     BACKENDS,
+    EnsembleSettings,
     EstimatorSettings,
     HorizonSettings,
+    Measurement,
     SigmaPointSettings,
     make_estimator,
 )
-from dptse_env.model import ARZModel, load_parameters
+from dptse_env.model import ARZModel
 from tests.helpers import Road, pairwise
+from tests.model.oracle import PAPER
 
-from .episodes import random_streams, tell
+from .helpers import random_streams
 
 # One segment that nobody enters or leaves has linear dynamics.
 V_F, RHO_M, TAU, V_0 = 102.0, 333.0, 60.0, 51.0
@@ -24,7 +27,7 @@ FLOOR, UNIT = 0.01 * RHO_M, np.array([RHO_M, RHO_M * V_F])
 F = np.array([[1.0, 0.0], [V_F / TAU, 1.0 - 1.0 / TAU]])
 NOISE, INITIAL, START = 2e-5, 1e-9, np.array([2.0, 200.0])
 Q = np.diag((NOISE * UNIT) ** 2)
-EVERYONE, INPUTS = np.arange(1), np.array([[0.0, V_F, 1.2 * RHO_M]])
+INPUTS = np.array([0.0, V_F, 1.2 * RHO_M])
 
 
 class Sensor(NamedTuple):
@@ -36,9 +39,6 @@ class Sensor(NamedTuple):
     sigma: np.ndarray
 
 
-PAPER = load_parameters("paper")
-# Long segments, for the CFL condition; a pressure of (2 / 333)^10 is none.
-NO_PRESSURE = replace(PAPER, name="no pressure", gamma=10.0)
 SENSORS = {
     # Below the density that a measurement takes at least, the speed is linear in psi.
     "speed": Sensor(
@@ -47,8 +47,11 @@ SENSORS = {
         np.array([0.0, -V_F * 0.01**2]),
         np.array([0.4, 6.0]),
     ),
+    # Long segments, for the CFL condition; a pressure of (2 / 333)^10 is none.
     "flow": Sensor(
-        ARZModel(Road(n_mainline=1, segment_length=1.0), NO_PRESSURE, reference_speed=V_0),
+        ARZModel(
+            Road(n_mainline=1, segment_length=1.0), replace(PAPER, gamma=10.0), reference_speed=V_0
+        ),
         np.array([[1.0, 0.0], [-V_0, 1.0]]),
         np.zeros(2),
         np.array([0.4, 40.0]),
@@ -57,9 +60,9 @@ SENSORS = {
 
 
 class Step(NamedTuple):
-    mean: np.ndarray
-    covariance: np.ndarray
-    innovations: np.ndarray
+    mean: np.ndarray  # (n, 2)
+    covariance: np.ndarray  # (n, 2, 2)
+    innovations: np.ndarray  # (n, 2)
 
 
 def measurements(sensor, n_steps):
@@ -69,7 +72,7 @@ def measurements(sensor, n_steps):
     return (sensor.H @ steady + sensor.offset + noise)[:, None, None]
 
 
-def textbook(sensor, values, noise_first):
+def kalman(sensor, values, noise_first=False):
     """The Kalman filter of x' = F x + w, or of x' = F (x + w)."""
     H, R = sensor.H, np.diag(sensor.sigma**2)
     x, p, before = START, np.diag(INITIAL * UNIT**2), 0.0 * Q
@@ -85,19 +88,21 @@ def textbook(sensor, values, noise_first):
         x, p = x + gain @ residual, p - gain @ s @ gain.T
         assert 1.0 < x[0] < FLOOR
         assert x[1] < 1.1 * V_F * x[0]
-        yield Step(x, p + before, residual / np.sqrt(np.diag(s)))
+        yield Step(x[None], (p + before)[None], (residual / np.sqrt(np.diag(s)))[None])
 
 
-def of_estimator(name, backend, sensor, values, **settings):
+def of_estimator(name, backend, sensor, values, n=1, **settings):
+    """Steps of n episodes that are told the same."""
     noise = {"process_noise": (NOISE, NOISE), "initial_variance": INITIAL}
     given = EstimatorSettings(**noise, **settings)
-    estimator = make_estimator(name, backend, sensor.model, 1, given)
-    estimator.reset(EVERYONE, START[None], random_streams(1))
+    estimator, everyone = make_estimator(name, backend, sensor.model, n, given), np.arange(n)
+    estimator.reset(everyone, np.tile(START, (n, 1)), random_streams(n))
     for z in values:
-        estimator.predict(EVERYONE, INPUTS)
-        tell(estimator, EVERYONE, np.ones((1, 1), bool), z, sensor.sigma)
-        covariance = estimator.covariances[0] * np.outer(UNIT, UNIT)
-        yield Step(estimator.states[0], covariance, estimator.innovations[0, 0].copy())
+        estimator.predict(everyone, np.tile(INPUTS, (n, 1)))
+        seen, all_told = np.ones((n, 1), bool), np.tile(z, (n, 1, 1))
+        estimator.update(everyone, Measurement.of(estimator.model, seen, all_told, sensor.sigma))
+        covariances = estimator.covariances * np.outer(UNIT, UNIT)
+        yield Step(estimator.states.copy(), covariances, estimator.innovations[:, 0].copy())
 
 
 @pytest.mark.parametrize(
@@ -105,19 +110,15 @@ def of_estimator(name, backend, sensor, values, **settings):
 )
 def test_ekf_and_ukf_are_the_kalman_filter(name, sensor, backend):
     """The UKF's points are drawn once a step: they carry its noise into the next motion."""
-    sensor, settings = SENSORS[sensor], {}
-    if name == "ukf":
-        settings = {"ukf": SigmaPointSettings(kappa=1.0)}  # two states allow no -4
-    values = measurements(sensor, 300)
-    pairs = zip(
-        of_estimator(name, backend, sensor, values, **settings),
-        textbook(sensor, values, noise_first=name == "ukf"),
-        strict=True,
-    )
-    for mine, right in pairs:
-        np.testing.assert_allclose(mine.mean, right.mean, rtol=1e-9)
-        np.testing.assert_allclose(mine.covariance, right.covariance, rtol=1e-9)
-        np.testing.assert_allclose(mine.innovations, right.innovations, rtol=0.0, atol=1e-9)
+    # Two states allow no kappa of -4.
+    settings = {"ukf": SigmaPointSettings(kappa=1.0)} if name == "ukf" else {}
+    values = measurements(SENSORS[sensor], 200)
+    found = of_estimator(name, backend, SENSORS[sensor], values, **settings)
+    right = kalman(SENSORS[sensor], values, noise_first=name == "ukf")
+    for mine, its in zip(found, right, strict=True):
+        np.testing.assert_allclose(mine.mean, its.mean, rtol=1e-9)
+        np.testing.assert_allclose(mine.covariance, its.covariance, rtol=1e-9)
+        np.testing.assert_allclose(mine.innovations, its.innovations, rtol=0.0, atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -128,13 +129,27 @@ def test_the_mhe_ends_where_the_kalman_filter_does_while_its_window_grows(
     backend, sensor, linearisation
 ):
     """Full information ends at the filter's mean; a window that moves has another arrival."""
-    sensor = SENSORS[sensor]
-    values = measurements(sensor, 41)
-    own = HorizonSettings(horizon=40, linearisation=linearisation)
-    steps = list(of_estimator("mhe", backend, sensor, values, mhe=own))
-    oracle = list(textbook(sensor, values, noise_first=False))
-    for mine, right in zip(steps[:40], oracle[:40], strict=True):
+    values = measurements(SENSORS[sensor], 31)
+    own = HorizonSettings(horizon=30, linearisation=linearisation)
+    steps = list(of_estimator("mhe", backend, SENSORS[sensor], values, mhe=own))
+    oracle = list(kalman(SENSORS[sensor], values))
+    for mine, right in zip(steps[:30], oracle[:30], strict=True):
         np.testing.assert_allclose(mine.mean / UNIT, right.mean / UNIT, rtol=0.0, atol=1e-9)
         np.testing.assert_allclose(mine.covariance, right.covariance, rtol=1e-6)
         np.testing.assert_allclose(mine.innovations, right.innovations, rtol=0.0, atol=1e-7)
-    assert not np.allclose(steps[40].covariance, oracle[40].covariance, rtol=1e-3)
+    assert not np.allclose(steps[30].covariance, oracle[30].covariance, rtol=1e-3)
+
+
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_the_mean_of_the_enkf_over_seeds_is_the_kalman_filters(sensor):
+    values, n = measurements(SENSORS[sensor], 20), 200
+    enkf = EnsembleSettings(n_members=400)
+    *_, found = of_estimator("enkf", "compiled", SENSORS[sensor], values, n, enkf=enkf)
+    *_, right = kalman(SENSORS[sensor], values)
+    deviation = np.sqrt(np.diag(right.covariance[0]))
+    off = (found.covariance - right.covariance) / np.outer(deviation, deviation)
+    for errors in ((found.mean - right.mean) / deviation, off.reshape(n, 4)):
+        standard_error = errors.std(axis=0) / np.sqrt(n)
+        # A mean of M independent draws is off by 1 / sqrt(M) deviations; its bias falls as 1 / M.
+        assert (np.abs(errors.mean(axis=0)) < 4.0 * standard_error + 3.0 / 400).all()
+        assert (errors.std(axis=0) < 3.0 / np.sqrt(400)).all()

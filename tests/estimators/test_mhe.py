@@ -1,4 +1,4 @@
-"""The moving horizon estimator beside the reference, and what it leaves to other solvers."""
+"""The moving horizon estimator beside its reference, and what it leaves to other solvers."""
 
 from dataclasses import replace
 from itertools import product
@@ -7,13 +7,7 @@ import numpy as np
 import pytest
 import qpsolvers
 
-from dptse_env.estimators import (
-    BACKENDS,
-    DemandSettings,
-    EstimatorSettings,
-    HorizonSettings,
-    make_estimator,
-)
+from dptse_env.estimators import BACKENDS, EstimatorSettings, HorizonSettings
 from dptse_env.estimators import mhe as mhe_module
 from dptse_env.estimators.mhe import (
     GENERAL_SOLVER,
@@ -23,11 +17,9 @@ from dptse_env.estimators.mhe import (
 )
 from dptse_env.estimators.mhe import update as solve_and_update
 from dptse_env.estimators.window import ACTIVE_SET, NEWTON, UNSOLVED
-from dptse_env.model import ARZModel, load_parameters
 from tests.helpers import UNEVEN, fast_and_slow, pairwise
 
-from .episodes import RELEASES, SIGMA, SIGMAS, random_streams, run, simulate, started, tell
-from .rows import PLAIN, RICH, averaged, update
+from .helpers import PLAIN, RICH, random_streams, recorded, run, simulate, started, step, update
 
 both_backends = pytest.mark.parametrize("backend", BACKENDS)
 
@@ -36,24 +28,17 @@ def mhe_of(backend, episodes, start=None, settings=PLAIN, **own):
     return started("mhe", backend, episodes, replace(settings, mhe=HorizonSettings(**own)), start)
 
 
-def minimum(mhe, episode=0):
-    """The last state of a program's minimum by the general solver."""
-    H, q = mhe.program(episode)
-    n = mhe.model.n_states
-    bounds = (np.tile(b, len(q) // n) for b in normalised_bounds(mhe.model, mhe.settings.bounds))
-    return solve(H, q, *bounds, "piqp")[-n:]
-
-
 def assert_minimal(mhe, tolerance=1e-9):
     """Every episode's estimate ends its program's minimum, brought into the cone where it is so."""
-    solved = mhe.solved
-    assert np.isin(solved, (ACTIVE_SET, NEWTON)).all(), solved
+    assert np.isin(mhe.solved, (ACTIVE_SET, NEWTON)).all(), mhe.solved
     assert not np.any(mhe.diverged | mhe.fallback)
+    bounds, n, unit = mhe.settings.bounds, mhe.model.n_states, mhe.model.state_scale
     for e, state in enumerate(mhe.states):
-        end = mhe.model.project(
-            (minimum(mhe, e) * mhe.model.state_scale)[None], mhe.settings.bounds
-        )
-        assert np.abs((end[0] - state) / mhe.model.state_scale).max() <= tolerance
+        H, q = mhe.program(e)
+        limits = (np.tile(b, len(q) // n) for b in normalised_bounds(mhe.model, bounds))
+        end = solve(H, q, *limits, "piqp")[-n:]  # the general solver's
+        projected = mhe.model.project((end * unit)[None], bounds)[0]
+        assert np.abs((projected - state) / unit).max() <= tolerance
 
 
 # Beside the reference -----------------------------------------------------------------------------
@@ -76,21 +61,32 @@ def agree(compiled, reference, tolerance):
 
 
 @pytest.mark.parametrize(
-    ("bounds", "linearisation", "release", "horizon"),
-    pairwise(["cone", "box"], ["paper", "trajectory"], RELEASES, [1, 5], n=4),
-)
-def test_backends_agree(bounds, linearisation, release, horizon):
-    """Over the growth of the window, and while it moves on; rounding feeds back by trajectories."""
-    episodes = simulate(n_steps=horizon + 8, noise=2.0, release=release)
+    ("release", "bounds", "linearisation", "settings", "horizon"),
+    pairwise(
+        ["speed", "flow", "rows", "uneven"], ["cone", "box"], ["paper", "trajectory"],
+        [PLAIN, RICH], [1, 4],
+    ),
+)  # fmt: skip
+def test_backends_agree(release, bounds, linearisation, settings, horizon):
+    """Over the growth of the window, and while it moves on; predictions may come in pairs.
+
+    On rows that overlap with centres of their own, the rich ones with demand states, and on a road
+    of segments of many kinds. Rounding feeds back by trajectories.
+    """
+    if release == "uneven":
+        episodes = simulate(n_steps=horizon + 7, noise=2.0, road=UNEVEN)
+    else:
+        episodes = simulate(n_steps=horizon + 7, noise=2.0, release=release)
     own = {"bounds": bounds, "linearisation": linearisation, "horizon": horizon}
-    compiled, reference = (mhe_of(backend, episodes, **own) for backend in BACKENDS)
+    both = [mhe_of(backend, episodes, settings=settings, **own) for backend in BACKENDS]
     for k in range(len(episodes.inputs)):
-        run(compiled, episodes, [k])
-        run(reference, episodes, [k])
-        agree(compiled, reference, 1e-9 if linearisation == "paper" else 1e-8)
-    a, b = compiled.estimate(), reference.estimate()
-    for field in ("density", "speed", "density_std", "speed_std"):
-        np.testing.assert_allclose(getattr(a, field), getattr(b, field), rtol=1e-5, atol=1e-5)
+        for mhe in both:
+            if k % 5 == 2:
+                mhe.predict(episodes.everyone, episodes.inputs[k])
+            step(mhe, episodes, k)
+        agree(*both, 1e-7 if settings is RICH else 1e-8)
+    for a, b in zip(*(mhe.estimate() for mhe in both), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.slow
@@ -98,52 +94,42 @@ def test_backends_agree(bounds, linearisation, release, horizon):
     ("release", "linearisation", "tolerance"),
     [("speed", "paper", 1e-9), ("speed", "trajectory", 1e-8), ("flow", "paper", 1e-9)],
 )
-def test_backends_agree_over_a_recorded_episode(release, linearisation, tolerance, recordings):
+def test_backends_agree_over_a_recorded_episode(release, linearisation, tolerance):
     """Rounding is all: H has a condition of 1e7, and along the trajectory it feeds back."""
-    episodes = recordings[release]
-    compiled, reference = (mhe_of(b, episodes, linearisation=linearisation) for b in BACKENDS)
+    episodes = recorded(release)
+    both = [mhe_of(backend, episodes, linearisation=linearisation) for backend in BACKENDS]
     for k in range(len(episodes.inputs)):
-        run(compiled, episodes, [k])
-        run(reference, episodes, [k])
-        agree(compiled, reference, tolerance)
-
-
-@pytest.mark.parametrize(
-    ("settings", "linearisation", "bounds"),
-    pairwise([PLAIN, RICH], ["paper", "trajectory"], ["box", "cone"], n=4),
-)
-def test_backends_agree_on_rows_that_overlap(settings, linearisation, bounds):
-    """Rows of one to three segments, with centres of their own; the rich ones with demand."""
-    episodes = averaged(10)
-    own = {"bounds": bounds, "linearisation": linearisation, "horizon": 4}
-    compiled, reference = (mhe_of(b, episodes, settings=settings, **own) for b in BACKENDS)
-    for k in range(10):
-        for mhe in (compiled, reference):
-            mhe.predict(episodes.everyone, episodes.inputs[k])
-            update(mhe, episodes, k)
-        agree(compiled, reference, 1e-7)
-
-
-def test_a_road_of_segments_of_many_kinds_is_estimated_alike():
-    """Lengths, lanes and limits vary, ramps have several segments; predictions come in pairs."""
-    model, one = ARZModel(UNEVEN, load_parameters("w99-3lane")), np.array([0])
-    rng, s, v_f = np.random.default_rng(0), model.n_segments, model.speed_scale
-    start = model.states(0.2 * model.jam_density[None], np.full((1, s), 0.5 * v_f))
-    settings = EstimatorSettings(mhe=HorizonSettings(horizon=4))
-    both = [make_estimator("mhe", backend, model, 1, settings) for backend in BACKENDS]
-    boundary = np.full((1, model.n_boundaries), 10.0)
-    inputs = model.boundary_inputs(boundary, np.full_like(boundary, 0.6 * v_f))
-    for mhe in both:
-        mhe.reset(one, start, random_streams(1))
-    truth = model.measure(start)
-    for k in range(10):
-        observed, noise = rng.random((1, s)) < 0.4, rng.normal(size=(1, s, 2))
-        values = truth + 3.0 * SIGMAS["speed"] * noise
         for mhe in both:
-            for _ in range(1 + k % 2):
-                mhe.predict(one, inputs)
-            tell(mhe, one, observed, values, SIGMAS["speed"])
-        agree(*both, 1e-8)
+            step(mhe, episodes, k)
+        agree(*both, tolerance)
+
+
+@pytest.mark.parametrize("linearisation", ["paper", "trajectory"])
+def test_the_references_program_is_the_papers_objective(linearisation):
+    """z' H z + q' z is the sum of eq. 14 but for a constant, over stages with rows and counts."""
+    episodes, rng = simulate(n_steps=6, release="rows"), np.random.default_rng(1)
+    own = {"horizon": 3, "linearisation": linearisation, "arrival_noise": (0.1, 0.2)}
+    mhe = mhe_of("reference", episodes, settings=RICH, **own)
+    run(mhe, episodes, range(6))
+    (window,), n = mhe.filters, mhe.model.n_states
+    assert len(window.stages) == 4
+    arrival = np.array([0.1, 0.2] * 19 + [RICH.demand.deviation] * 3)
+
+    def objective(x):
+        total = np.sum(((x[0] - window.stages[0].predicted) / arrival) ** 2)
+        for stage, one in zip(window.stages, x, strict=True):
+            gap = window.problem.z(stage.seen) - stage.C @ one - stage.e
+            total += np.sum(gap**2 / stage.R)
+        for stage, one, after in zip(window.stages, x, x[1:], strict=False):
+            total += np.sum((after - stage.A @ one - stage.c) ** 2 / stage.Q)
+        return total
+
+    H, q = mhe.program(0)
+    np.testing.assert_allclose(H, H.T, rtol=1e-9)
+    constant = objective(np.zeros((4, n)))
+    for x in rng.normal(size=(3, 4, n)):
+        z = x.ravel()
+        assert z @ H @ z + q @ z == pytest.approx(objective(x) - constant, rel=1e-9)
 
 
 # Alone --------------------------------------------------------------------------------------------
@@ -160,7 +146,10 @@ POOR = [
 @pytest.mark.parametrize(
     ("linearisation", "bounds", "filling", "release", "horizon"),
     fast_and_slow(
-        product(["paper", "trajectory"], ["box", "cone"], [0.0, 1.0], RELEASES, [1, 5, 20]), POOR
+        product(
+            ["paper", "trajectory"], ["box", "cone"], [0.0, 1.0], ["speed", "flow"], [1, 5, 20]
+        ),
+        POOR,
     ),
 )
 def test_poor_starts_under_ten_times_the_noise_are_solved(
@@ -171,9 +160,8 @@ def test_poor_starts_under_ten_times_the_noise_are_solved(
     density = np.full((3, 19), filling) * episodes.model.jam_density
     density[2] = 0.5 * episodes.model.jam_density
     start = episodes.model.states(density, np.zeros((3, 19)))
-    settings = EstimatorSettings(demand=DemandSettings())
     own = {"bounds": bounds, "linearisation": linearisation, "horizon": horizon}
-    mhe = mhe_of("compiled", episodes, start, settings, **own)
+    mhe = mhe_of("compiled", episodes, start, EstimatorSettings(demand=RICH.demand), **own)
 
     def check(k):
         if k in (2, 9, 20, 39):
@@ -197,7 +185,7 @@ def test_an_exact_measurement_is_weighed_as_a_very_good_one(backend):
 def test_a_perfect_model_has_no_weight(backend):
     settings = EstimatorSettings(process_noise=(0.0, 0.01))
     with pytest.raises(ValueError, match=r"process_noise\[0\] must be a finite number > 0"):
-        started("mhe", backend, simulate(n_steps=1), settings)
+        mhe_of(backend, simulate(n_steps=1), settings=settings)
 
 
 # Solvers that fail --------------------------------------------------------------------------------
@@ -240,14 +228,14 @@ def test_what_is_not_solved_leaves_the_prediction_and_a_flag(backend, solver, mo
     monkeypatch.setattr(mhe_module, "update", unsolved)
     mhe.predict(episodes.everyone, episodes.inputs[8])
     predicted = mhe.states
-    tell(mhe, episodes.everyone, episodes.observed[8], episodes.values[8], SIGMA)
+    update(mhe, episodes, 8)
     assert mhe.fallback.tolist() == [True, True]
     assert mhe.diverged.tolist() == [False, False]
     np.testing.assert_array_equal(mhe.states, predicted)
     mhe.reset(np.array([1]), episodes.start[[1]], random_streams(1))
     assert mhe.fallback.tolist() == [True, False]
     monkeypatch.undo()
-    run(mhe, episodes, [9])
+    step(mhe, episodes, 9)
     assert not mhe.fallback.any()
 
 
@@ -257,10 +245,10 @@ def test_what_is_not_solved_goes_to_the_general_solver(monkeypatch):
     run(alone, episodes, range(12))
     run(helped, episodes, range(10))
     monkeypatch.setattr(mhe_module, "update", unsolved)
-    run(helped, episodes, [10])
+    step(helped, episodes, 10)
     assert helped.solved.tolist() == [GENERAL_SOLVER]
     monkeypatch.undo()
-    run(helped, episodes, [11])
+    step(helped, episodes, 11)
     np.testing.assert_allclose(helped.states, alone.states, rtol=1e-9, atol=1e-6)
 
 
@@ -275,52 +263,34 @@ def test_a_solver_that_is_not_installed_is_named_when_the_estimator_is_made(back
     assert mhe.fallback.any() == (backend == "reference")
 
 
-# The general solver -------------------------------------------------------------------------------
-
-
-def random_program(n=30):
-    """H, q and bounds of which many bind."""
-    rng = np.random.default_rng(0)
-    root = rng.normal(size=(n, n))
-    return root @ root.T + np.eye(n), 10.0 * rng.normal(size=n), np.zeros(n), np.full(n, 0.3)
-
-
 def test_what_lacks_digits_is_polished_and_what_is_false_is_refused(monkeypatch):
-    H, q, lower, upper = random_program()
+    rng, n = np.random.default_rng(0), 30
+    root = rng.normal(size=(n, n))
+    H, q = root @ root.T + np.eye(n), 10.0 * rng.normal(size=n)
+    lower, upper = np.zeros(n), np.full(n, 0.3)
     right = solve(H, q, lower, upper, "piqp")
     assert natural_residual(H, q, lower, upper, right) < 1e-12
     assert ((right == lower) | (right == upper)).sum() >= 5
-    answers = {"rough": right + 1e-4, "false": 0.5 * upper, "corner": upper}
-    for name, answer in answers.items():
+
+    def solved(answer):
         solution = qpsolvers.Solution(None, x=answer, found=True)
-        monkeypatch.setattr(qpsolvers, "solve_problem", lambda *_, s=solution, **__: s)
-        z = solve(H, q, lower, upper, "piqp")
-        if name == "rough":
-            np.testing.assert_allclose(z, right, atol=1e-12)
-            monkeypatch.setattr(mhe_module, "POLISHES", 0)
-            assert solve(H, q, lower, upper, "piqp") is None
-            monkeypatch.setattr(mhe_module, "POLISHES", 10)
-        else:
-            assert z is None
+        monkeypatch.setattr(qpsolvers, "solve_problem", lambda *_, **__: solution)
+        return solve(H, q, lower, upper, "piqp")
 
-
-def test_half_of_twice_h_is_minimised():
-    """qpsolvers takes z' P z / 2 + q' z, the paper has z' H z + q' z: P = H would halve z."""
-    H, q = np.array([[2.0, 1.0], [1.0, 3.0]]), np.array([-4.0, -6.0])
-    z = solve(H, q, np.full(2, -10.0), np.full(2, 10.0), "piqp")
-    np.testing.assert_allclose(z, np.linalg.solve(2.0 * H, -q), atol=1e-9)
+    np.testing.assert_allclose(solved(right + 1e-4), right, atol=1e-12)
+    for false in (0.5 * upper, upper):
+        assert solved(false) is None
+    monkeypatch.setattr(mhe_module, "POLISHES", 0)
+    assert solved(right + 1e-4) is None
 
 
 def test_the_residual_tells_an_optimum_from_a_corner():
     H, q = np.diag([1.0, 2.0]), np.array([-4.0, 4.0])
     lower, upper = np.zeros(2), np.ones(2)
-    assert natural_residual(H, q, lower, upper, np.array([1.0, 0.0])) == 0.0
-    assert natural_residual(H, q, lower, upper, np.array([0.0, 0.0])) == 1.0
-    assert np.isnan(natural_residual(H, q, lower, upper, np.array([np.nan, 0.0])))
-
-
-def test_a_program_without_a_single_optimum_is_solved_or_refused_and_never_raises():
-    H, q = np.ones((2, 2)), np.array([-2.0, -2.0])  # z_0 + z_1 = 1 is optimal everywhere
-    lower, upper = np.full(2, -10.0), np.full(2, 10.0)
+    for z, residual in (([1.0, 0.0], 0.0), ([0.0, 0.0], 1.0), ([np.nan, 0.0], np.nan)):
+        found = natural_residual(H, q, lower, upper, np.array(z))
+        np.testing.assert_equal(found, residual)
+    # z_0 + z_1 = 1 is optimal everywhere: solved or refused, and never raises.
+    H, q, lower, upper = np.ones((2, 2)), np.full(2, -2.0), np.full(2, -10.0), np.full(2, 10.0)
     z = solve(H, q, lower, upper, "piqp")
     assert z is None or natural_residual(H, q, lower, upper, z) < 1e-8

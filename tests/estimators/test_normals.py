@@ -10,13 +10,17 @@ from tests.helpers import compiled
 draw_bits = compiled(draw_bits)
 
 
+def stream_of(seed=0):
+    return make_stream(np.random.default_rng(seed))
+
+
 def drawn(n, seed=0):
-    return draw(make_stream(np.random.default_rng(seed)), n).astype(float)
+    return draw(stream_of(seed), n).astype(float)
 
 
 def test_bits_are_those_of_xoshiro256_plus_plus():
     """Against the recurrence in Python's integers, lane by lane."""
-    stream = make_stream(np.random.default_rng(0))
+    stream = stream_of()
     states, out = stream.T.tolist(), np.empty(3 * STREAM_WIDTH, dtype=np.uint64)
     draw_bits(stream, out)
 
@@ -26,10 +30,8 @@ def test_bits_are_those_of_xoshiro256_plus_plus():
     for lane in (0, 7, STREAM_WIDTH - 1):
         s = states[lane]
         for block in range(3):
-            assert (
-                out[block * STREAM_WIDTH + lane]
-                == (rotated((s[0] + s[3]) % 2**64, 23) + s[0]) % 2**64
-            )
+            expected = (rotated((s[0] + s[3]) % 2**64, 23) + s[0]) % 2**64
+            assert out[block * STREAM_WIDTH + lane] == expected
             t = (s[1] << 17) % 2**64
             s[2] ^= s[0]
             s[3] ^= s[1]
@@ -43,7 +45,7 @@ def test_numbers_are_the_transform_of_the_bits():
     """Box and Muller's in double precision: a radius of the upper half, an angle of the lower."""
     n = 64 * STREAM_WIDTH
     bits = np.empty(n, dtype=np.uint64)
-    draw_bits(make_stream(np.random.default_rng(0)), bits)
+    draw_bits(stream_of(), bits)
     single = np.float32
     u = (bits >> np.uint64(32)).astype(single) * single(2.0**-32) + single(2.0**-33)
     turn = (bits & np.uint64(2**32 - 1)).astype(float) / 2**32  # the circle from -pi / 2 on
@@ -53,48 +55,34 @@ def test_numbers_are_the_transform_of_the_bits():
     np.testing.assert_allclose(drawn(2 * n), np.concatenate([first, second]), atol=1e-5)
 
 
-def test_numbers_are_standard_normal():
-    x = drawn(2_000_000)
+def test_numbers_are_standard_normal_and_independent():
+    x = drawn(1_000_000)
+    n, half = x.size, x.size // 2
     assert stats.kstest(x, "norm").pvalue > 1e-3
-    n = x.size
     for power, moment, variance in ((1, 0, 1), (2, 1, 2), (3, 0, 15), (4, 3, 96)):
         assert abs((x**power).mean() - moment) < 4.0 * np.sqrt(variance / n)
     for limit in (3.0, 4.0, 4.5):
         expected = 2.0 * n * stats.norm.sf(limit)
         for count in (2 * np.sum(x > limit), 2 * np.sum(x < -limit)):
             assert abs(count - expected) < 5.0 * np.sqrt(2.0 * expected)
-
-
-def test_pairs_and_neighbours_are_independent():
-    x = drawn(1_000_000)
-    half = x.size // 2
-    first, second = x[:half], x[half:]  # two of one uniform pair stand so far apart
-    for a, b in (
-        (first, second),
-        (x[:-1], x[1:]),
-        (x[:-STREAM_WIDTH], x[STREAM_WIDTH:]),
-    ):
+    # Two of one uniform pair stand half of the numbers apart.
+    for a, b in ((x[:half], x[half:]), (x[:-1], x[1:]), (x[:-STREAM_WIDTH], x[STREAM_WIDTH:])):
         for g in (np.asarray, np.abs, np.square):
             assert abs(np.corrcoef(g(a), g(b))[0, 1]) < 4.5 / np.sqrt(a.size)
+    assert abs(np.corrcoef(x[:200_000], drawn(200_000, seed=1))[0, 1]) < 0.01
 
 
-def test_seeds_decide_and_streams_differ():
-    np.testing.assert_array_equal(drawn(3800), drawn(3800))
-    assert abs(np.corrcoef(drawn(200_000), drawn(200_000, seed=1))[0, 1]) < 0.01
+def test_a_generator_seeds_different_streams():
     generator = np.random.default_rng(0)
     first, second = make_stream(generator), make_stream(generator)
     assert not (first == second).any()
 
 
-def test_a_stream_goes_on_where_it_stopped():
-    stream = make_stream(np.random.default_rng(0))
-    assert len(np.unique([draw(stream, 100) for _ in range(4)])) == 400
-
-
 @pytest.mark.parametrize("n", [1, 2, 63, 64, 66, 2801])
 def test_any_number_is_drawn_and_what_follows_does_not_repeat_it(n):
-    stream = make_stream(np.random.default_rng(0))
+    stream = stream_of()
     first, second = draw(stream, n), draw(stream, n)
+    np.testing.assert_array_equal(first, draw(stream_of(), n))
     assert first.shape == second.shape == (n,)
     assert np.abs(first).max() < 7.0
     assert not np.isin(first, second).any()

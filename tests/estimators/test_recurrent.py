@@ -1,45 +1,31 @@
-"""The recurrent network beside the one that is trained; what it is told, and what it gives."""
+"""The recurrent network beside the one that is trained, and what it gives."""
 
-import dataclasses
 import hashlib
 
 import numpy as np
 import pytest
 
-from dptse_env.estimators import Measurement, make_estimator
+from dptse_env.estimators import Measurement
 from dptse_env.estimators.recurrent import (
     member_for,
     read_network,
     shipped_networks,
     write_network,
 )
-from dptse_env.estimators.recurrent_kernels import (
-    CHANNELS,
-    LARGEST_CORRECTION,
-    LARGEST_INNOVATION,
-    LOWEST_SPREAD,
-    make_cells,
-    read,
-)
-from dptse_env.model.network import MeasurementRows
+from dptse_env.estimators.recurrent_kernels import LARGEST_INNOVATION, LOWEST_SPREAD
 from tests.hostile import check_hostile, edited
 
-from .episodes import random_streams, run, simulate, tell
-from .networks import card, random_network, settings
-from .rows import averaged, with_rows
+from .helpers import card, network_settings, random_network, run, simulate, started, step, update
 
 torch = pytest.importorskip("torch")
-collecting = pytest.importorskip("agents.filters.collecting")
-torch_network = pytest.importorskip("agents.filters.torch_network")
 
-AT = {name: k for k, name in enumerate(CHANNELS)}
+from agents.filters import collecting, torch_network  # noqa: E402
 
 
-def started(episodes, given):
-    n = len(episodes.start)
-    estimator = make_estimator("recurrent", "compiled", episodes.model, n, given)
-    estimator.reset(episodes.everyone, episodes.start, random_streams(n))
-    return estimator
+def of_network(episodes, folder, network=None, **ranges):
+    """The estimator of a network that is written into a folder."""
+    settings = network_settings(folder, network, **ranges)
+    return started("recurrent", "compiled", episodes, settings)
 
 
 # Beside the network that is trained ---------------------------------------------------------------
@@ -69,9 +55,8 @@ class Twin:
         start = [said.density, said.speed, said.density_std, said.speed_std]
         self.state = self.network.begin(torch.from_numpy(np.stack(start, -1)))
 
-    def step(self, inputs, *measured):
+    def step(self, inputs, given):
         """Return the estimates and deviations after a step, and before the next `(n, S, 4)`."""
-        given = Measurement.of(self.model, *measured)
         tensors = (torch.from_numpy(part) for part in collecting.make_released(given))
         outside = torch.from_numpy(collecting.input_channels(self.cells, inputs))
         released = collecting.Released(*tensors)
@@ -91,129 +76,51 @@ def _double():
     torch.set_num_threads(n_threads)
 
 
+def innovations_of(model, prior, given):
+    """Those of a Kalman filter that takes all errors of a prediction as independent."""
+    rho, v, rho_std, v_std = prior
+    second, variance = v, v_std**2
+    if model.reference_speed is not None:
+        slip = v - given.centre
+        second, variance = rho * slip, (rho * v_std) ** 2 + (slip * rho_std) ** 2
+    weights, found = model.rows.weights, np.zeros(given.values.shape)
+    for q, (mean, spread) in enumerate(((rho, rho_std**2), (second, variance))):
+        total = spread @ np.square(weights).T + given.sigma[..., q] ** 2
+        found[..., q] = (given.values[..., q] - mean @ weights.T) / np.sqrt(total)
+    return np.where(given.observed[..., None], found, 0.0)
+
+
 @pytest.mark.usefixtures("_double")
 @pytest.mark.parametrize(
-    ("kind", "width"), [("speed", 8), ("flow", 20), ("rows", 8)], ids=["speed", "flow", "rows"]
+    ("release", "width", "noise"), [("speed", 8, 1.0), ("flow", 20, 10.0), ("rows", 8, 1.0)]
 )
-def test_it_is_the_network_that_is_trained(kind, width, tmp_path):
-    """Messages are all of the hidden state, or a part of it, in single precision."""
-    episodes = averaged(40) if kind == "rows" else simulate(n=3, n_steps=40, release=kind)
-    estimator = started(episodes, settings(tmp_path, random_network(width)))
-    twin = Twin(estimator)
+def test_it_is_the_network_that_is_trained(release, width, noise, tmp_path):
+    """Messages are all of the hidden state, or a part of it, in single precision.
+
+    What is far off is held to a range.
+    """
+    episodes = simulate(n=3, n_steps=40, noise=noise, release=release)
+    estimator = of_network(episodes, tmp_path, random_network(width))
+    twin, far = Twin(estimator), []
     for k in range(40):
-        own = episodes.sigma if kind != "rows" else episodes.sigma[k]
-        centre = (episodes.centre[k],) if kind == "rows" else (None,)
-        measured = episodes.observed[k], episodes.values[k], own, *centre
         estimator.predict(episodes.everyone, episodes.inputs[k])
-        tell(estimator, episodes.everyone, *measured)
-        present, ahead = twin.step(episodes.inputs[k], *measured)
+        prior = estimator.estimate()
+        update(estimator, episodes, k)
+        given = Measurement.of(episodes.model, **episodes.released(k, episodes.everyone))
+        present, ahead = twin.step(episodes.inputs[k], given)
         np.testing.assert_allclose(estimator.hidden, twin.state.hidden, atol=1e-5)
         np.testing.assert_allclose(estimator.means, present[..., :2], rtol=1e-5, atol=1e-3)
         said = estimator.estimate()
         np.testing.assert_allclose(said.density_std, present[..., 2], rtol=1e-4)
         np.testing.assert_allclose(said.speed_std, present[..., 3], rtol=1e-4)
+        expected = innovations_of(episodes.model, prior, given)
+        np.testing.assert_allclose(estimator.innovations, expected, rtol=1e-9)
+        far.append(np.abs(expected).max())
+    assert max(far) > LARGEST_INNOVATION or noise == 1.0
     estimator.predict(episodes.everyone, episodes.inputs[0])
     np.testing.assert_allclose(estimator.means, ahead[..., :2], rtol=1e-5, atol=1e-3)
     assert np.abs(estimator.hidden).max() > 0.5
     assert not estimator.diverged.any()
-
-
-# What it is told ----------------------------------------------------------------------------------
-
-
-def told(episodes, row, values, sigma, prior, centre=0.0, age=7.0):
-    """Return the channels of each cell, the row's innovations, and the cells."""
-    model, S = episodes.model, episodes.model.n_segments
-    cells, shape = make_cells(model), (1, model.rows.n_rows, 2)
-    observed, innovations = np.zeros(shape[:2], bool), np.zeros(shape)
-    observed[0, row] = True
-    x = np.zeros((1, S, len(CHANNELS)), dtype=np.float32)
-    read(
-        cells, np.arange(1), observed, np.broadcast_to(values, shape).astype(float),
-        np.broadcast_to(sigma, shape).astype(float), np.full((1, S), centre),
-        np.ones((1, model.n_inputs)), prior, np.full((1, S), age), innovations, x,
-    )  # fmt: skip
-    return x[0], innovations[0, row], cells
-
-
-def prior_of(episodes, density=40.0, speed=80.0, density_std=10.0, speed_std=6.0):
-    numbers = np.array([density, speed, density_std, speed_std])
-    return np.broadcast_to(numbers, (1, episodes.model.n_segments, 4)).copy()
-
-
-def kalman(mean, variances, H, value, noise):
-    """The scalar update of independent states: gain and correction of each."""
-    total = float(H**2 @ variances + noise**2)
-    gain = variances * H / total
-    return gain * (value - float(H @ mean)), gain * H
-
-
-def test_a_speed_is_corrected_as_a_kalman_filter_would():
-    episodes = simulate(n_steps=1)
-    x, innovations, cells = told(episodes, 4, (60.0, 95.0), (8.0, 3.0), prior_of(episodes))
-    change, gain = kalman(np.array([40.0]), np.array([100.0]), np.ones(1), 60.0, 8.0)
-    assert x[4, AT["density_correction"]] == pytest.approx(4.0 * change[0] / cells.unit[4])
-    assert x[4, AT["density_gain"]] == pytest.approx(gain[0])
-    change, gain = kalman(np.array([80.0]), np.array([36.0]), np.ones(1), 95.0, 3.0)
-    assert x[4, AT["speed_correction"]] == pytest.approx(4.0 * change[0] / cells.limit)
-    assert x[4, AT["speed_gain"]] == pytest.approx(gain[0])
-    assert x[4, AT["density_correction_by_flow"]] == 0.0
-    expected = [20.0 / np.hypot(10.0, 8.0), 15.0 / np.hypot(6.0, 3.0)]
-    np.testing.assert_allclose(innovations, expected)
-    both = [AT["density_innovation"], AT["second_innovation"]]
-    np.testing.assert_allclose(x[4, both], 0.5 * np.array(expected), rtol=1e-6)
-    others = np.delete(x, 4, axis=0)
-    assert not others[:, [AT["queried"], AT["density_gain"], AT["speed_correction"]]].any()
-    assert x[4, AT["queried"]] == 1.0
-
-
-def test_a_flow_over_two_cells_is_corrected_as_a_kalman_filter_would():
-    episodes = averaged(1)
-    rows, prior, value = episodes.model.rows, prior_of(episodes), 1500.0
-    m = int(np.flatnonzero(rows.span == 2)[0])
-    cover = np.arange(rows.first[m], rows.first[m] + 2)
-    prior[0, cover[1]] = 70.0, 50.0, 12.0, 9.0
-    x, innovations, cells = told(episodes, m, (60.0, value), (8.0, 200.0), prior, centre=60.0)
-    rho, v = prior[0, cover, 0], prior[0, cover, 1]
-    variances = prior[0, cover, 2] ** 2, prior[0, cover, 3] ** 2
-    change, _ = kalman(rho, variances[0], np.full(2, 0.5), 60.0, 8.0)
-    close = {"rtol": 1e-6}
-    expected = 4 * change / cells.unit[cover]
-    np.testing.assert_allclose(x[cover, AT["density_correction"]], expected, **close)
-    # The row as a function of both densities and both speeds, linear at the prediction.
-    H, joint = 0.5 * np.concatenate([v - 60.0, rho]), np.concatenate(variances)
-    total = float(H**2 @ joint + 200.0**2)
-    error = value - 0.5 * float(rho @ (v - 60.0))
-    change = joint * H / total * error
-    by_flow = 4 * change[:2] / cells.unit[cover]
-    np.testing.assert_allclose(x[cover, AT["density_correction_by_flow"]], by_flow, **close)
-    by_speed = 4 * change[2:] / cells.limit
-    np.testing.assert_allclose(x[cover, AT["speed_correction"]], by_speed, **close)
-    assert innovations[1] == pytest.approx(error / np.sqrt(total))
-    assert x[cover, AT["share"]].tolist() == [0.5, 0.5]
-
-
-def test_what_is_far_off_is_held_to_a_range():
-    episodes = simulate(n_steps=1)
-    certain = prior_of(episodes, density_std=1e-3, speed_std=50.0)
-    x, innovations, _ = told(episodes, 2, (900.0, 9e5), (1e-3, 1e-3), certain)
-    assert x[2, AT["density_innovation"]] == 0.5 * LARGEST_INNOVATION
-    assert x[2, AT["speed_correction"]] == 4.0 * LARGEST_CORRECTION
-    assert innovations[0] > 1e3
-    assert np.isfinite(x).all()
-
-
-def test_noise_and_age_are_told():
-    episodes, some = simulate(n_steps=1), (60.0, 95.0)
-    quiet, _, cells = told(episodes, 2, some, (5.0, 5.0), prior_of(episodes))
-    loud, _, _ = told(episodes, 2, some, (50.0, 50.0), prior_of(episodes))
-    for name in ("log_density_sigma", "log_second_sigma"):
-        gap = loud[2, AT[name]] - quiet[2, AT[name]]
-        assert gap == pytest.approx(0.2 * np.log(10.0), rel=1e-5)
-    expected = 0.2 * np.log(5.0 / cells.unit[2])
-    assert quiet[2, AT["log_density_sigma"]] == pytest.approx(expected, rel=1e-5)
-    assert quiet[5, AT["log_age"]] == pytest.approx(0.25 * np.log(8.0))
-    assert loud[2, AT["density_gain"]] < quiet[2, AT["density_gain"]]
 
 
 # What it gives ------------------------------------------------------------------------------------
@@ -222,7 +129,7 @@ def test_noise_and_age_are_told():
 def test_news_travel_from_cell_to_cell(tmp_path):
     """One cell a second, in both directions and along ramps."""
     episodes = simulate(n_steps=1)
-    pair = [started(episodes, settings(tmp_path)) for _ in range(2)]
+    pair = [of_network(episodes, tmp_path) for _ in range(2)]
     n = episodes.model.n_segments
     sparsity = np.eye(n, dtype=bool)
     for start, end in episodes.model.layout.edges:
@@ -232,41 +139,17 @@ def test_news_travel_from_cell_to_cell(tmp_path):
     for second in range(4):
         observed[0, 8] = second == 0
         for estimator, shift in zip(pair, (0.0, 30.0), strict=True):
-            estimator.predict(episodes.everyone, episodes.inputs[0])
-            values = episodes.values[0] + shift
-            tell(estimator, episodes.everyone, observed, values, episodes.sigma)
+            step(estimator, episodes, 0, observed=observed, values=episodes.values[0] + shift)
         a, b = (estimator.estimate().density[0] for estimator in pair)
         np.testing.assert_array_equal(np.abs(a - b) > 1e-9, reached)
         reached = sparsity @ reached
-
-
-@pytest.mark.parametrize(("bad", "what"), [(np.nan, "values"), (np.inf, "values"), (-np.inf, "u")])
-def test_what_is_not_finite_resets_its_episode_alone(bad, what, tmp_path):
-    episodes = simulate(n=2, n_steps=6)
-    estimator, healthy = (started(episodes, settings(tmp_path)) for _ in range(2))
-    for each in (estimator, healthy):
-        run(each, episodes, range(5))
-    values, inputs = episodes.values[5].copy(), episodes.inputs[5].copy()
-    if what == "values":
-        values[1, 14, 0] = bad
-    else:
-        inputs[1, 0] = bad
-    estimator.predict(episodes.everyone, inputs)
-    tell(estimator, episodes.everyone, episodes.observed[5], values, episodes.sigma)
-    run(healthy, episodes, [5])
-    assert estimator.diverged.tolist() == [False, True]
-    np.testing.assert_array_equal(estimator.hidden[0], healthy.hidden[0])
-    for emptied in (estimator.hidden[1], estimator.innovations[1]):
-        assert not emptied.any()
-    fresh = started(episodes, settings(tmp_path))
-    np.testing.assert_array_equal(estimator.estimate().density[1], fresh.estimate().density[1])
 
 
 def test_deviations_and_estimates_stay_in_their_range(tmp_path):
     episodes = simulate(n_steps=30)
     network = random_network()
     network = network._replace(heads_bias=np.array([90, 90, -90, 90] * 2, dtype=np.float32))
-    estimator = started(episodes, settings(tmp_path, network))
+    estimator = of_network(episodes, tmp_path, network)
     run(estimator, episodes, range(30))
     estimate, unit = estimator.estimate(), estimator.cells.unit
     np.testing.assert_allclose(estimate.density[0], 4.0 * unit)
@@ -275,20 +158,15 @@ def test_deviations_and_estimates_stay_in_their_range(tmp_path):
 
 
 def test_a_road_outside_of_the_card_is_refused_unless_asked(tmp_path):
-    episodes = simulate(n_steps=1)
-    given = settings(tmp_path, n_mainline=[3, 9])
-    with pytest.raises(ValueError, match=r"trained on n_mainline in \[3, 9\].* has \[15, 15\]"):
-        started(episodes, given)
-    asked = dataclasses.replace(given.recurrent, outside=True)
-    started(episodes, dataclasses.replace(given, recurrent=asked))
-    model = with_rows(
-        simulate(n_steps=1, release="flow").model,
-        MeasurementRows(np.array([0]), np.array([4]), episodes.model.n_segments),
-    )
-    with pytest.raises(ValueError, match=r"trained on span in \[1, 3\], .* has \[4, 4\]"):
-        make_estimator("recurrent", "compiled", model, 1, settings(tmp_path))
-    with pytest.raises(ValueError, match=r"trained on flows in \[1, 1\]"):
-        started(episodes, settings(tmp_path, flows=[1, 1]))
+    episodes, rows = simulate(n_steps=1), simulate(n_steps=1, release="rows")
+    for given, ranges, message in (
+        (episodes, {"n_mainline": [3, 9]}, r"trained on n_mainline in \[3, 9\].* has \[15, 15\]"),
+        (rows, {"span": [1, 2]}, r"trained on span in \[1, 2\], .* has \[1, 3\]"),
+        (episodes, {"flows": [1, 1]}, r"trained on flows in \[1, 1\]"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            of_network(given, tmp_path, **ranges)
+        of_network(given, tmp_path, outside=True, **ranges)
 
 
 # Files of networks --------------------------------------------------------------------------------

@@ -1,26 +1,51 @@
+"""Settings, the tuned sets that ship, and files of them."""
+
+import itertools
 import json
+import re
 from dataclasses import asdict
 
 import pytest
 
+from dptse_env.estimators import ESTIMATORS
 from dptse_env.estimators.settings import (
-    REFUSED_SOLVERS,
     BlendSettings,
+    DemandSettings,
     EnsembleSettings,
     EstimatorSettings,
     HorizonSettings,
     SigmaPointSettings,
+    available_settings,
+    load_settings,
+    read_settings,
+    settings_name,
+    tuned_estimator,
+    write_settings,
 )
+from dptse_env.model import available_parameters
+from dptse_env.release import RELEASE_MODELS
+from dptse_env.traffic import CORRIDORS
+
+GOOD = {
+    "estimator": "mhe",
+    "parameters": "paper",
+    "privacy": "corrected",
+    "settings": {"process_noise": [0.01, 0.02], "mhe": {"arrival_noise": [0.1, 0.2]}},
+    "provenance": {"source": "a test"},
+}
+ENTRY = {key: GOOD[key] for key in ("estimator", "settings", "provenance")}
+FILE = {"mhe-paper-corrected": ENTRY}
 
 
 @pytest.mark.parametrize(
     ("field", "value", "message"),
     [
         ("process_noise", (-1.0, 0.0), r"process_noise\[0\] must be .*, got -1\.0"),
-        ("process_noise", (0.1,), r"process_noise must have 2 items, got 1: \(0\.1,\)"),
         ("walk_noise", (float("nan"), 0.0), r"walk_noise\[0\] must be .*, got nan"),
         ("bounds", "ball", r"bounds must be one of 'cone', 'box', got 'ball'"),
         ("mhe", {"arrival_noise": [0.1, 0.0]}, r"mhe\.arrival_noise\[1\] must be .*, got 0\.0"),
+        ("mhe", {"solver": "highs"}, r"mhe\.solver must not be 'highs'"),  # finds false optima
+        ("enkf", {"n_member": 50}, r"enkf\.n_member is unknown; allowed: n_members"),
     ],
 )
 def test_a_bad_setting_is_named(field, value, message):
@@ -28,35 +53,82 @@ def test_a_bad_setting_is_named(field, value, message):
         EstimatorSettings(**{field: value})
 
 
-def test_solvers_that_return_false_optima_are_refused():
-    for solver in ("highs", *REFUSED_SOLVERS):
-        with pytest.raises(ValueError, match=rf"mhe\.solver must not be '{solver}'"):
-            EstimatorSettings(mhe={"solver": solver})
-
-
-def test_nested_settings_may_be_given_as_dicts():
-    settings = EstimatorSettings(
-        ukf={"kappa": 1.0}, enkf={"n_members": 50, "taper": 2.0}, mhe={"arrival_noise": [0.1, 0.2]}
-    )
-    assert settings.ukf == SigmaPointSettings(kappa=1.0)
-    assert settings.enkf == EnsembleSettings(n_members=50, taper=2.0)
-    assert settings.mhe == HorizonSettings(arrival_noise=(0.1, 0.2))
-    with pytest.raises(ValueError, match=r"enkf\.n_member is unknown; allowed: n_members"):
-        EstimatorSettings(enkf={"n_member": 50})
-
-
 def test_settings_survive_json():
+    """Nested ones may be given as mappings."""
     settings = EstimatorSettings(
         process_noise=(0.1, 0.2),
         walk_noise=(0.3, 0.4),
         speed_cap=1.05,
         noise_scale=(1.5, 2.5),
         bounds="box",
+        demand=DemandSettings(walk=0.1),
         ukf=SigmaPointSettings(alpha=0.5),
-        enkf=EnsembleSettings(inflation=1.1),
+        enkf=EnsembleSettings(inflation=1.1, taper=2.0),
         mhe=HorizonSettings(horizon=4, arrival_noise=(0.1, 0.2), solver="quadprog"),
         blend=BlendSettings(density_weight=0.3, speed_weight=0.9),
     )
     again = EstimatorSettings(**json.loads(json.dumps(asdict(settings))))
     assert again == settings
     assert hash(again) == hash(settings)
+
+
+def test_shipped_sets_are_named_after_what_they_are_for():
+    cells = itertools.product(ESTIMATORS, available_parameters(), RELEASE_MODELS)
+    names = {settings_name(*cell, v) for cell in cells for v in ("", "demand", *CORRIDORS)}
+    assert "ekf-w99-3lane-paper" in available_settings()
+    assert set(available_settings()) <= names
+    for name in available_settings():
+        assert load_settings(name) != EstimatorSettings()
+    with pytest.raises(
+        ValueError, match=r"^estimator_settings must be one of .*ekf-paper-paper.*, got 'ekf'$"
+    ):
+        load_settings("ekf")
+
+
+def test_a_written_set_reads_back_over_the_defaults(tmp_path):
+    path = tmp_path / "x.json"
+    write_settings(path, **GOOD)
+    assert read_settings(path) == EstimatorSettings(
+        process_noise=(0.01, 0.02), mhe=HorizonSettings(arrival_noise=(0.1, 0.2))
+    )
+    assert json.loads(path.read_text()) == FILE
+    assert tuned_estimator(path) == "mhe"
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"process_noise": [-1.0, 0.1]}, r"process_noise\[0\] must be a number in "),
+        ({"mhe": {"horizons": 3}}, r"mhe\.horizons is unknown; allowed: "),
+    ],
+)
+def test_bad_settings_are_neither_written_nor_read(settings, message, tmp_path):
+    path = tmp_path / "x.json"
+    with pytest.raises(
+        ValueError, match=rf"^{re.escape(str(path))}: estimator_settings\.{message}"
+    ):
+        write_settings(path, **{**GOOD, "settings": settings})
+    assert not path.exists()
+    path.write_text(json.dumps({"mhe-paper-corrected": {**ENTRY, "settings": settings}}))
+    with pytest.raises(
+        ValueError, match=rf"^{re.escape(str(path))}: estimator_settings\.{message}"
+    ):
+        read_settings(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", " must be JSON: "),
+        ("[" * 100_000, " must be JSON: "),
+        ("[]", r" must be a mapping with one name of settings, got \[\]"),
+        (json.dumps({**FILE, "x": ENTRY}), " must be a mapping with one name of settings, got {"),
+        ('{"x": 1}', ": x must be a mapping with the keys estimator, settings, provenance, got 1"),
+        (json.dumps({"x": {**ENTRY, "settings": 1}}), ": x: settings must be of type dict, got 1"),
+    ],
+)
+def test_a_file_of_another_shape_is_refused_by_its_path(text, message, tmp_path):
+    path = tmp_path / "x.json"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=rf"^{re.escape(str(path))}{message}"):
+        read_settings(path)

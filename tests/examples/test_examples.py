@@ -37,6 +37,7 @@ def run(*arguments):
 @pytest.mark.parametrize(
     ("name", "library"),
     [
+        ("sb3_ppo", "stable_baselines3"),
         ("cleanrl_ppo", "torch"),
         ("torchrl_ppo", "torchrl"),
         pytest.param("rllib_ppo", "ray.rllib.algorithms.ppo", marks=pytest.mark.ray),

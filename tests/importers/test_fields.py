@@ -57,6 +57,14 @@ def test_a_field_becomes_a_road_with_records_of_its_own(tmp_path):
     assert demand == pytest.approx(np.mean(flows), rel=1e-3)
 
 
+def test_tables_may_lie_the_other_way(tmp_path):
+    source = write(tmp_path, transposed=True, reversed=True)
+    expected = write(tmp_path).read()
+    for name in ("density", "speed"):
+        np.savetxt(tmp_path / f"{name}.txt", np.loadtxt(tmp_path / f"{name}.txt")[::-1].T)
+    np.testing.assert_array_equal(source.read(), expected)
+
+
 def test_environments_play_a_field_and_refuse_what_needs_vehicles(tmp_path):
     import_field(write(tmp_path), ROAD, tmp_path / "road", SPLITS, 100)
     path = str(tmp_path / "road" / "road.toml")

@@ -5,6 +5,7 @@ import dataclasses
 import pytest
 
 from dptse_env.importers import Layout, Part, Source
+from dptse_env.importers.folder import assign_seeds
 from tests.importers.data import PLAIN, SPLITS, plain, run, stream
 
 
@@ -16,6 +17,14 @@ def test_several_files_are_several_recordings(tmp_path):
     assert {name: len(each) for name, each in imported.seeds.items()} == {
         "training": 4, "validation": 1, "test": 1
     }  # fmt: skip
+
+
+def test_every_split_has_a_window_if_it_can():
+    splits = [
+        split._replace(share=share) for split, share in zip(SPLITS, (0.8, 0.1, 0.1), strict=True)
+    ]
+    assert assign_seeds(splits, 3) == {"training": (0,), "validation": (1000,), "test": (2000,)}
+    assert assign_seeds(splits, 1) == {"training": (0,), "validation": (), "test": ()}
 
 
 def test_other_errors_name_the_option(tmp_path):

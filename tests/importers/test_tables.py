@@ -170,25 +170,6 @@ def test_i24_is_an_array_of_documents_by_vehicle_without_speeds(tmp_path, expect
     np.testing.assert_array_equal(counts(run(path, west)), expected)
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        (json.dumps(i24(stream()))[:-2000], r"row 34: it is no complete JSON array"),
-        ("[" * 100_000, "row 1: it is no complete JSON array"),
-        ("[]", "must be a JSON array of documents, got none"),
-        (json.dumps([{**dict.fromkeys(LISTS, ()), "_id": 1, "direction": 1}]), "got none"),
-        ("[3]", "row 1: a document must be an object, got 3"),
-        ('[{"_id": 1}]', "row 1: fields timestamp, x_position, y_position, .* are missing"),
-        (json.dumps([{**i24(stream())[0], "x_position": [1.0]}]), "row 1: lists must"),
-    ],
-)
-def test_bad_json_is_named_by_document_and_field(text, message, tmp_path):
-    path = tmp_path / "i24.json"
-    path.write_text(text)
-    with pytest.raises(TrajectoryError, match=message):
-        run(path, Source("i24", layout=Layout(origin=310000.0)))
-
-
 @pytest.mark.parametrize("sign", ["-", "_"])
 def test_tgsim_has_runs_and_two_spellings(sign, tmp_path, expected):
     vehicle, time, x, speed = stream().T
@@ -219,24 +200,58 @@ def test_tables_may_be_parquet_compressed_or_by_other_delimiters(tmp_path, expec
         np.testing.assert_array_equal(counts(imported), expected, name)
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (b"", "the file is empty"),
-        (b"t,id,s,v\n", "must have rows of vehicles, got none"),
-        (b"t,id,s,v\n0,1,2,3\n1,1,here,3\n", "row 3: s must be a finite number, got 'here'"),
-        (b"t,id,s,v\n0,1,2,3\n\n1,1,,3\n", "row 4: s must be a finite number, got nothing"),
-        (b"t,id,x,v\n0,1,2,3\n", r"source\.columns\.x must be .*'s'; found t, id, x, v"),
+LONG = "x" * 100_000
+DOCUMENT = i24(stream())[0]
+BAD = {
+    "a.csv": [
+        ("", "the file is empty"),
+        ("t,id,s,v\n", "must have rows of vehicles, got none"),
+        ("t,id,s,v\n0,1,2,3\n1,1,here,3\n", "row 3: s must be a finite number, got 'here'"),
+        ("t,id,s,v\n0,1,2,3\n\n1,1,,3\n", "row 4: s must be a finite number, got nothing"),
+        ("t,id,x,v\n0,1,2,3\n", r"source\.columns\.x must be .*'s'; found t, id, x, v"),
         (b"t,id,s,v\n0,\xff,2,3\n", "utf-8"),
-        (b"t,\rid,s,v\n0,1,2,3\n", "the file cannot be read: new-line character"),
+        ("t,\rid,s,v\n0,1,2,3\n", "the file cannot be read: new-line character"),
+        (f"t,id,s,v\n0,1,{LONG},3\n", "row 2: s must be"),
+        (f"t,id,{LONG},v\n", "row 1: it must have 3 fields, got 4"),
+        (",".join(f"c{i}" for i in range(10_000)), "source.columns.time must be"),
+        (None, "the file cannot be read: No such file"),
     ],
-)
-def test_bad_tables_are_named_by_row_and_field(content, message, tmp_path):
-    path = tmp_path / "a.csv"
-    path.write_bytes(content)
-    with pytest.raises(TrajectoryError, match=message) as refused:
-        run(path, PLAIN)
-    assert str(refused.value).startswith(str(path))
+    "a.csv.gz": [("not compressed", "the file cannot be read: Not a gzipped file")],
+    "a.parquet": [("PAR1 and no more", "it is no complete Parquet file")],
+    "a.json": [
+        (json.dumps(i24(stream()))[:-2000], "row 34: it is no complete JSON array"),
+        ("[" * 100_000, "row 1: it is no complete JSON array"),
+        ("[]", "must be a JSON array of documents, got none"),
+        (json.dumps([{**dict.fromkeys(LISTS, ()), "_id": 1, "direction": 1}]), "got none"),
+        ("[3]", "row 1: a document must be an object, got 3"),
+        ('[{"_id": 1}]', "row 1: fields timestamp, x_position, y_position, .* are missing"),
+        (json.dumps([{**DOCUMENT, "x_position": [1.0]}]), "row 1: lists must"),
+        (None, "the file cannot be read: No such file"),
+    ],
+    "..": [(None, "must be a file, got a directory")],
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_files_are_named_by_row_and_field_in_few_words(name, tmp_path):
+    path = tmp_path / name
+    source = Source("i24", layout=Layout(origin=310000.0)) if name == "a.json" else PLAIN
+    for content, message in BAD[name]:
+        if content is None:
+            path.unlink() if path.is_file() else None
+        else:
+            path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        with pytest.raises(TrajectoryError, match=message) as refused:
+            run(path, source)
+        assert str(refused.value).startswith(str(path))
+        assert len(str(refused.value)) < 500 + len(str(path))
+
+
+def test_times_that_are_no_numbers_are_refused(tmp_path):
+    dates = pl.DataFrame({"t": [0], "id": 1, "s": 2, "v": 3}).cast({"t": pl.Date})
+    dates.write_parquet(tmp_path / "a.parquet")
+    with pytest.raises(TrajectoryError, match="t must be numbers, got Date"):
+        run(tmp_path / "a.parquet")
 
 
 @pytest.mark.parametrize(
@@ -302,35 +317,6 @@ def test_damaged_files_are_imported_or_refused(kind, fcd, tmp_path, monkeypatch)
         assert list(tmp_path.iterdir()) == [path]
     assert len(told) > 20
     assert all(str(path) in each and len(each) < 600 for each in told)
-
-
-def test_messages_show_little_of_a_file(tmp_path):
-    long = "x" * 100_000
-    path = tmp_path / "a.csv"
-    for content in (
-        f"t,id,s,v\n0,1,{long},3\n", f"t,id,{long},v\n", ",".join(f"c{i}" for i in range(10_000)),
-    ):  # fmt: skip
-        path.write_text(content)
-        with pytest.raises(TrajectoryError) as refused:
-            run(path, PLAIN)
-        assert len(str(refused.value)) < 500 + len(str(path))
-
-
-def test_what_is_no_file_of_its_kind_is_refused(tmp_path):
-    for path, source, message in (
-        ("..", PLAIN, "must be a file, got a directory"),
-        ("none.csv", PLAIN, "the file cannot be read: No such file"),
-        ("none.json", Source("i24"), "the file cannot be read: No such file"),
-        ("a.parquet", PLAIN, "it is no complete Parquet file"),
-        ("a.csv.gz", PLAIN, "the file cannot be read: Not a gzipped file"),
-        ("dates.parquet", PLAIN, "t must be numbers, got Date"),
-    ):
-        (tmp_path / "a.parquet").write_bytes(b"PAR1 and no more")
-        (tmp_path / "a.csv.gz").write_bytes(b"not compressed")
-        dates = pl.DataFrame({"t": [0], "id": 1, "s": 2, "v": 3}).cast({"t": pl.Date})
-        dates.write_parquet(tmp_path / "dates.parquet")
-        with pytest.raises(TrajectoryError, match=message):
-            run(tmp_path / path, source)
 
 
 # -- SUMO ------------------------------------------------------------------------------------------

@@ -1,7 +1,5 @@
 """The model of many states at once beside the oracle, and beside `ARZModel`."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -10,21 +8,25 @@ from dptse_env.model.columns import (
     advance_states,
     make_batch_scratch,
     measure_row,
-    measured_speeds,
     project_states,
 )
 from dptse_env.model.step import project
 from tests.helpers import UNEVEN, compiled, pairwise
 
-from .oracle import Oracle
-from .roads import HIGHWAY, PAPER, ROADS, W99, random_inputs, random_states, scattered_states
+from .oracle import (
+    HIGHWAY,
+    PAPER,
+    ROADS,
+    W99,
+    Oracle,
+    random_inputs,
+    random_states,
+    scattered_states,
+)
 
-advance_states = compiled(advance_states)
-make_batch_scratch = compiled(make_batch_scratch)
-measured_speeds = compiled(measured_speeds)
-measure_row = compiled(measure_row)
-project = compiled(project)
-project_states = compiled(project_states)
+advance_states, make_batch_scratch, measure_row, project, project_states = map(
+    compiled, (advance_states, make_batch_scratch, measure_row, project, project_states)
+)
 
 WIDTH = 104
 everywhere = pytest.mark.parametrize(
@@ -42,17 +44,14 @@ def advanced(model, states, inputs):
     ("road", "parameters", "demand"), pairwise(ROADS, [PAPER, W99], [False, True])
 )
 def test_advances_as_the_oracle(road, parameters, demand):
+    """Also where the states fill no whole vectors."""
     model = ARZModel(ROADS[road], parameters, demand_states=demand)
-    oracle, rng, scale = (
-        Oracle(model.network, parameters),
-        np.random.default_rng(0),
-        model.state_scale,
-    )
-    for _ in range(50):
-        states, inputs = random_states(model, WIDTH, rng), random_inputs(model, 1, rng)
-        expected = oracle.step(states, np.repeat(inputs, WIDTH, axis=0))
-        actual = advanced(model, states, inputs[0])
-        np.testing.assert_allclose(actual / scale, expected / scale, atol=1e-12)
+    oracle, rng = Oracle(model.network, parameters), np.random.default_rng(0)
+    for width in (WIDTH, 1, 3, 77) * 10:
+        states, inputs = random_states(model, width, rng), random_inputs(model, 1, rng)
+        expected = oracle.step(states, np.repeat(inputs, width, axis=0)) / model.state_scale
+        found = advanced(model, states, inputs[0]) / model.state_scale
+        np.testing.assert_allclose(found, expected, atol=1e-12)
 
 
 @everywhere
@@ -81,28 +80,17 @@ def test_a_row_of_many_states_is_what_the_model_measures(road, parameters, refer
     model = ARZModel(road, parameters, reference_speed=reference_speed, rows=rows)
     rng, width = np.random.default_rng(0), np.empty((3, WIDTH))
     states = scattered_states(model, WIDTH, rng)
-    centre = rng.uniform(0.0, 100.0, n)
-    expected = model.measure(states, centre)
-    nowhere = np.full(n, np.nan)
+    centre = np.full(n, np.nan) if reference_speed is None else rng.uniform(0.0, 100.0, n)
+    expected = model.measure(states, centre) / model.measurement_scale
     for m in range(3):
-        given = nowhere if reference_speed is None else centre
-        measure_row(model.road, m, states.T.copy(), given, *width)
+        measure_row(model.road, m, states.T.copy(), centre, *width)
         found = width[:2].T / model.measurement_scale
-        np.testing.assert_allclose(found, expected[:, m] / model.measurement_scale, atol=1e-9)
+        np.testing.assert_allclose(found, expected[:, m], atol=1e-9)
     assert (states[:, 0::2] < 0.0).any()
 
 
-def test_measured_speeds_are_the_models():
-    model, rng = ARZModel(HIGHWAY, W99), np.random.default_rng(0)
-    states, out = scattered_states(model, WIDTH, rng), np.empty(WIDTH)
-    for s, jam in enumerate(model.jam_density):
-        rho, psi = states[:, 2 * s].copy(), states[:, 2 * s + 1].copy()
-        measured_speeds(rho, psi, jam, W99.free_flow_speed, W99.gamma, out)
-        np.testing.assert_allclose(out, model.traffic(states)[:, s, 1], rtol=1e-12, atol=1e-7)
-
-
 @everywhere
-def test_what_is_not_finite_stays_so_in_its_column(road, parameters):
+def test_what_is_not_finite_stays_so_in_its_column_or_reaches_all_as_an_input(road, parameters):
     model, rng = ARZModel(road, parameters), np.random.default_rng(0)
     states, inputs = random_states(model, WIDTH, rng), random_inputs(model, 1, rng)[0]
     clean, rows = advanced(model, states, inputs), np.arange(model.n_states)
@@ -114,24 +102,8 @@ def test_what_is_not_finite_stays_so_in_its_column(road, parameters):
         columns = states.T.copy()
         project_states(model.road, columns, is_box)
         assert np.isnan(columns[rows, rows]).all()
-
-
-@everywhere
-def test_inputs_that_are_not_finite_reach_every_column(road, parameters):
-    """Demand, w, the density behind the exit, and an on-ramp's: NaN in, NaN out."""
-    model, rng = ARZModel(road, parameters), np.random.default_rng(0)
-    for column in range(5):
+    for column in range(5):  # demand, w, the density behind the exit, and an on-ramp's two
         inputs = random_inputs(model, 1, rng)[0]
         inputs[column] = np.nan
         after = advanced(model, random_states(model, WIDTH, rng), inputs)
         assert np.isnan(after).any(axis=1).mean() > 0.5
-
-
-def test_widths_that_are_no_whole_vector_agree():
-    model = ARZModel(HIGHWAY, replace(PAPER, name="other", gamma=1.7))
-    rng, scale = np.random.default_rng(0), model.state_scale
-    states, inputs = random_states(model, WIDTH, rng), random_inputs(model, 1, rng)[0]
-    whole = advanced(model, states, inputs)
-    for width in (1, 3, 7, 77):
-        part = advanced(model, states[:width], inputs)
-        np.testing.assert_allclose(part / scale, whole[:width] / scale, atol=1e-13)

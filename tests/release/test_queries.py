@@ -1,3 +1,5 @@
+"""Query options, and the rows of a release that answer them."""
+
 import dataclasses
 
 import numpy as np
@@ -21,7 +23,7 @@ def test_options_are_in_order_of_span_level_and_place():
     assert options.cost.tolist() == [1] * 8 + [3] * 4
     assert options.covers.shape == (options.n_options, 4) == (12, 4)
     assert np.flatnonzero(options.covers[9]).tolist() == [1, 2, 3]
-    assert (options.covers.sum(axis=1) == options.span).all()
+    assert np.flatnonzero(options.covered(flags(12, 0, 9))).tolist() == [0, 1, 2, 3]
     assert str(options) == "query_spans (1, 3) and price_levels (2.0, 0.5)"
 
 
@@ -29,7 +31,6 @@ def test_options_are_in_order_of_span_level_and_place():
     ("bandwidth", "spans", "unit", "most"),
     [
         (4, (1,), "segments", 4),
-        (4, (2,), "segments", 2),
         (5, (2, 3), "segments", 2),
         (6, (6,), "sums", 1),  # there is one option
         (4, (2, 3), "sums", 4),
@@ -37,14 +38,10 @@ def test_options_are_in_order_of_span_level_and_place():
     ],
 )
 def test_the_bandwidth_pays_for_so_many_queries(bandwidth, spans, unit, most):
-    assert QueryOptions.make(6, bandwidth, spans, unit=unit).most_queries == most
-
-
-def test_sums_cost_one_each():
-    options = QueryOptions.make(6, 4, (1, 4), unit="sums")
-    assert not options.costs_differ
-    assert (options.cost == 1).all()
-    assert QueryOptions.make(6, 4, (1, 4)).costs_differ
+    options = QueryOptions.make(6, bandwidth, spans, unit=unit)
+    assert options.most_queries == most
+    np.testing.assert_array_equal(options.cost, options.span if unit == "segments" else 1)
+    assert options.costs_differ == (unit == "segments" and len(spans) > 1)
 
 
 @pytest.mark.parametrize(
@@ -56,36 +53,33 @@ def test_the_standard_level_is_nearest_to_one(levels, standard):
 
 
 def test_plain_options_are_the_segments():
-    options = QueryOptions.make(6, 3)
+    options, queried = QueryOptions.make(6, 3), flags(6, 1, 4)
     assert options.are_plain
     assert options.rows(ROAD).are_single
     assert options.sensor_rows(ROAD) == ROAD.fixed_sensors
-    queried = flags(6, 1, 4)
-    covered = options.covered(queried)
-    np.testing.assert_array_equal(covered, queried)
-    assert not np.shares_memory(covered, queried)
+    np.testing.assert_array_equal(options.covered(queried), queried)
+    assert not np.shares_memory(options.covered(queried), queried)
     for changed in ({"levels": (2.0,)}, {"spans": (2,)}, {"levels": (1.0, 2.0)}):
         assert not QueryOptions.make(6, 3, **changed).are_plain
 
 
-def test_rows_are_options_then_ramps_then_sensors_without_an_option():
-    options = QueryOptions.make(6, 4, (2,))
-    rows = options.rows(ROAD)
-    assert rows.first.tolist() == [0, 1, 2, 3, 4, 6, 7, 5, 2]
-    assert rows.span.tolist() == [2] * 5 + [1] * 4
+@pytest.mark.parametrize(
+    ("spans", "levels", "separate", "sensors"),
+    [
+        ((2,), (1.0,), False, [7, 6, 8]),
+        ((1, 2), (0.5, 1.0), False, [11, 23, 8]),  # options of span and level one
+        ((1, 2), (1.0,), True, [13, 12, 14]),
+    ],
+)
+def test_rows_are_options_then_ramps_then_sensors_without_an_option(
+    spans, levels, separate, sensors
+):
+    options = QueryOptions.make(6, 4, spans, levels, separate_sensors=separate)
+    rows, found, n = options.rows(ROAD), list(options.sensor_rows(ROAD)), options.n_options
+    assert found == sensors
+    assert rows.first[found].tolist() == [5, 7, 2]
+    assert rows.span[found].tolist() == [1, 1, 1]
+    assert rows.first[n : n + 2].tolist() == [6, 7]
+    assert rows.n_rows == max(n + 2, *(row + 1 for row in sensors))
     assert rows.n_segments == 8
-    assert options.sensor_rows(ROAD) == (7, 6, 8)
-
-
-def test_sensors_share_the_option_of_span_and_level_one():
-    options = QueryOptions.make(6, 4, (1, 2), (0.5, 1.0))
-    rows, sensors = options.rows(ROAD), options.sensor_rows(ROAD)
-    assert rows.n_rows == options.n_options + 2
-    assert rows.first[list(sensors)].tolist() == [5, 7, 2]
-    assert (rows.span[list(sensors)] == 1).all()
-    assert [options.level[row] for row in sensors if row < options.n_options] == [1.0, 1.0]
-
-
-def test_covered_is_what_queries_cover():
-    options = QueryOptions.make(6, 4, (1, 3))
-    assert np.flatnonzero(options.covered(flags(10, 0, 7, 8))).tolist() == [0, 1, 2, 3, 4]
+    np.testing.assert_array_equal(rows.span[:n], options.span)

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from scipy import stats
 
 from dptse_env.estimators import Estimate
 from dptse_env.release import RELEASE_MODELS, Group, QueryOptions, Request, Task, Traffic
@@ -14,9 +15,10 @@ from dptse_env.traffic import SHORT_HIGHWAY
 from tests.helpers import AWAY, record, short_road
 
 WHOLE = (Group("queries"),)
+TWO_GROUPS = Group("queries", 0.7), Group("sensors", 0.3)
 ONE, BOTH = np.arange(1), np.arange(2)
-T, COLUMNS, SEGMENTS, PLACES = 8, 12, 8, 4
-"""Seconds, record columns and segments of the short road, and places of columns made up below."""
+T, COLUMNS, SEGMENTS = 8, 12, 8
+"""Seconds, record columns and segments of the short road."""
 
 LIMIT, LENGTH = SHORT_HIGHWAY.speed_limit, SHORT_HIGHWAY.segment_length
 
@@ -56,12 +58,12 @@ class Worlds:
     def ensure(self, corridor, seeds):
         """All records are there."""
 
-    def release(self, settings, kind=None, groups=WHOLE, bandwidth=2):
+    def release(self, settings, kind=None, groups=WHOLE, bandwidth=2, spans=(1,)):
         """A release model of all record columns, of another class than the settings' if given."""
         n = len(self.records)
         settings = dataclasses.replace(settings, boundary_inputs="private")
         queries = QueryOptions.make(
-            self.road.n_mainline, bandwidth, separate_sensors=len(groups) > 1
+            self.road.n_mainline, bandwidth, spans, separate_sensors=len(groups) > 1
         )
         task = Task(
             settings.preset, kind or RELEASE_MODELS[settings.preset], settings, self.road, queries,
@@ -72,9 +74,13 @@ class Worlds:
         traffic.load(np.arange(n))
         return task.model(task, traffic)
 
-    def started(self, settings, seed=0, **keywords):
-        """A release model whose episodes have begun."""
+    def started(self, settings, seed=0, ledgers=None, **keywords):
+        """A release model whose episodes have begun, with other ledgers if a class is given."""
         release, n = self.release(settings, **keywords), len(self.records)
+        if ledgers is not None:
+            own = release.ledgers
+            numbers = {name: getattr(own, name) for name in ("ratio", "clip", "fastest")}
+            release.ledgers = ledgers(release.task.columns, n, own.budget, **numbers)
         release.reset(np.arange(n), streams(*range(seed, seed + n)))
         return release
 
@@ -95,6 +101,30 @@ def request(time, observed=True, prediction=None, episodes=(0,), n_columns=COLUM
         episodes, episodes, np.full(len(episodes), time), flags,
         prediction or predicting(n_episodes=len(episodes)),
     )  # fmt: skip
+
+
+def residual_faults(true, released, sigma, max_lag=100):
+    """Name each way in which (released - true) / sigma, (steps, S, 2), is not white and normal.
+
+    Two-sided, at a total level of about 1e-4: chi-square for the variance of each quantity, and
+    normal bounds on the mean, and on the mean product of residuals at each lag, of neighbouring
+    segments and of the two quantities.
+    """
+    residuals = (released - true) / np.asarray(sigma)
+    faults = []
+    for quantity, values in (("density", residuals[..., 0]), ("speed", residuals[..., 1])):
+        tail = stats.chi2(values.size).cdf((values**2).sum())
+        if not 1e-5 < tail < 1.0 - 1e-5:
+            faults.append(f"variance of {quantity}")
+        if not abs(values.sum()) < 5.0 * np.sqrt(values.size):
+            faults.append(f"mean of {quantity}")
+    pairs = {f"lag {k}": (residuals[k:], residuals[:-k]) for k in range(1, max_lag + 1)}
+    pairs["neighbours"] = (residuals[:, 1:], residuals[:, :-1])
+    pairs["density and speed"] = (residuals[..., 0], residuals[..., 1])
+    for name, (left, right) in pairs.items():
+        if not abs((left * right).sum()) < 5.0 * np.sqrt(left.size):
+            faults.append(f"correlation: {name}")
+    return faults
 
 
 # --- trips that differ in one vehicle -----------------------------------------------------------
@@ -124,20 +154,7 @@ def adjacent_trips(draw, asked, most_vehicles, n_steps, last_place):
     return places, speeds, other_places, other_speeds
 
 
-# --- ledgers by themselves ----------------------------------------------------------------------
-
-
-def columns_of(first, span, group=None):
-    """First places, spans and groups of columns."""
-    first = np.asarray(first)
-    return first, np.asarray(span), np.zeros_like(first) if group is None else np.asarray(group)
-
-
-SINGLE = columns_of(range(PLACES), [1] * PLACES)
-OVERLAPPING = columns_of([0, 1, 2, 3, 0, 1, 2, 0, 1], [1, 1, 1, 1, 2, 2, 2, 3, 3])
-"""Each segment, neighbouring pairs, and three in a row."""
-GROUPED = columns_of([0, 1, 2, 3, 1, 3], [1, 1, 2, 1, 1, 1], [0, 0, 0, 0, 1, 1])
-"""Queries, and sensors on two of their segments."""
+# --- ledgers under any public numbers -----------------------------------------------------------
 
 
 class Public(NamedTuple):
@@ -147,12 +164,32 @@ class Public(NamedTuple):
     prices: np.ndarray
     centres: np.ndarray
 
+    @classmethod
+    def constant(cls, release, price, centre=LIMIT / 2):
+        """All columns at the same price around the same centre, at every second."""
+        shape = T, release.task.n_columns
+        return cls(np.ones(shape, bool), np.full(shape, price), np.full((T, COLUMNS), centre))
 
-def constant(columns, price, centre=LIMIT / 2, observed=True):
-    """The same price of every column, centre of every segment and query at every second."""
-    shape = T, len(columns[0])
-    queried = np.broadcast_to(np.asarray(observed, dtype=bool), shape)
-    return Public(queried, np.full(shape, price), np.full((T, PLACES), centre))
+
+def collected(release, public):
+    """Yield the true sums and the refusals of every second of all episodes of a paced release."""
+    episodes, n_columns = np.arange(release.task.n_episodes), release.task.n_columns
+    for second, numbers in enumerate(zip(*public, strict=True), 1):
+        observed, prices, centre = (np.tile(each, (episodes.size, 1)) for each in numbers)
+        asked = request(second, observed, episodes=episodes, n_columns=n_columns)
+        yield release.collect(asked, prices, centre)
+
+
+def squared_distance(release, public):
+    """Squared distance of episodes 0 and 1 in units of the declared noise."""
+    settings, total = release.task.settings, 0.0
+    for (sums, _), observed, prices in zip(
+        collected(release, public), public.observed, public.prices, strict=True
+    ):
+        count, deviation = np.moveaxis((sums[0] - sums[1]) ** 2, -1, 0)
+        deviation = deviation * settings.ratio / settings.clip**2
+        total += float(((count + deviation) * prices)[observed].sum())
+    return total
 
 
 class PlainLedgers(Ledgers):
@@ -206,59 +243,3 @@ class PlainLedgers(Ledgers):
                     else:
                         refused[k, g] += 1
         return sums, refused
-
-
-class Keeping(NamedTuple):
-    """Ledgers of some records, each an episode, and their vehicles."""
-
-    ledgers: Ledgers
-    traffic: Traffic
-
-    def seconds(self, public):
-        """Yield the sums and refusals of every second of all episodes."""
-        episodes = np.arange(len(self.ledgers.paid))
-        for t in range(len(public.observed)):
-            at = np.full(len(episodes), t)
-            rows = self.traffic.vehicles(episodes, at + 1)
-            observed, prices, centres = (array[at] for array in public)
-            yield self.ledgers.collect(episodes, observed, rows, prices, centres)
-
-
-def keep(records, columns, budget, kind=Ledgers, **settings):
-    """Ledgers of a budget, one for all groups or one for each."""
-    n_groups, worlds = int(columns[2].max()) + 1, Worlds(*records)
-    traffic = Traffic(worlds.road, tuple(range(len(records))), worlds, [None] * n_groups)
-    traffic.load(np.arange(len(records)))
-    budget = np.broadcast_to(np.float64(budget), n_groups).copy()
-    ledgers = kind(columns, len(records), budget, fastest=LIMIT, **settings)
-    ledgers.reset(np.arange(len(records)), traffic.n_vehicles)
-    return Keeping(ledgers, traffic)
-
-
-def keep_for(records, settings, columns=SINGLE, kind=Ledgers):
-    """Ledgers as the paced release of these settings has them, for other columns."""
-    own = Worlds(stays(0, 0.0)).release(settings).ledgers
-    return keep(records, columns, own.budget[0], kind, ratio=own.ratio, clip=own.clip)
-
-
-def exhausting(records, settings, columns=SINGLE, within=T):
-    """The price at which a vehicle that pays most has a millionth of its budget left.
-
-    It pays in all seconds, or in as many in a row as are given.
-    """
-    keeping, least = keep_for(records, settings, columns), 1e-9
-    ledgers, public = keeping.ledgers, constant(columns, least)
-    paid = [np.zeros_like(ledgers.paid)]
-    paid += [ledgers.paid.copy() for _ in keeping.seconds(public)]
-    most = max((paid[t + within] - paid[t]).max() for t in range(T + 1 - within))
-    return (1.0 - 1e-6) * ledgers.budget[0] * least / most
-
-
-def square(seconds, public, settings):
-    """Squared distance of episodes 0 and 1 in units of the noise that the settings declare."""
-    total = 0.0
-    for t, (sums, _) in enumerate(seconds):
-        count, deviation = np.moveaxis((sums[0] - sums[1]) ** 2, -1, 0)
-        deviation = deviation * settings.ratio / settings.clip**2
-        total += float(((count + deviation) * public.prices[t])[public.observed[t]].sum())
-    return total

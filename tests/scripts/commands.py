@@ -8,7 +8,6 @@ from typing import NamedTuple
 from scripts import dptse
 
 ROOT = Path(__file__).parents[2]
-SHORT = "dptse_env:dptse/ShortHighway-v0"
 
 
 class Done(NamedTuple):

@@ -1,70 +1,34 @@
+"""Records by the command."""
+
 import dataclasses
+import json
+from pathlib import Path
 
-import pytest
-
-from dptse_env.config import resolve
 from dptse_env.traffic import SHORT_HIGHWAY, RecordLibrary, randomised
-from scripts.cli import run
-from scripts.record import Args, main
-from tests.scripts.commands import run_script
-
-SHORT = "dptse_env:dptse/ShortHighway-v0"
+from tests.helpers import SHORT
+from tests.scripts.commands import run_command
 
 
-def test_the_command_records_into_the_library_and_reports_the_dwell(tmp_path):
-    arguments = (
-        "--env", SHORT, "--seeds", "3:5", "--workers", "1",
-        "--records", str(tmp_path),
-    )  # fmt: skip
-    result = run_script("record.py", *arguments)
-    assert result.returncode == 0, result.stderr
-    assert f"short-highway: 2 record(s) in {tmp_path}" in result.stdout
-    assert "T_avg" in result.stdout
-    records = RecordLibrary(tmp_path)
-    made = [seed for seed in range(10) if records.record_path(SHORT_HIGHWAY, seed).is_file()]
-    assert made == [3, 4]
-
-
-def test_random_traffic_is_recorded_on_request(tmp_path, capsys):
-    main(
-        Args(
-            env=f'{SHORT} {{"demand": "random", "incident": "random"}}',
-            seeds="0:1",
-            workers=1,
-            records=tmp_path,
-        )
-    )
-    assert RecordLibrary(tmp_path).record_path(randomised(SHORT_HIGHWAY), 0).is_file()
-    assert "1 record(s)" in capsys.readouterr().out
-
-
-def test_fields_of_a_corridor_and_keywords_are_recorded(tmp_path):
+def test_what_an_environment_replays_is_recorded(tmp_path):
     calm = dataclasses.replace(SHORT_HIGHWAY, duration=60, incident=None)
-    given = Args(
-        env=f'{SHORT} {{"corridor": {{"duration": 60, "incident": null}}}}', seeds="0:1",
-        workers=1, records=tmp_path,
-    )  # fmt: skip
-    main(given)
-    assert RecordLibrary(tmp_path).record_path(calm, 0).is_file()
-    main(dataclasses.replace(given, env=f'{SHORT} {{"incident": "none"}}', seeds="1:2"))
-    full = resolve("short-highway", {"incident": "none"}).corridor
-    assert RecordLibrary(tmp_path).record_path(full, 1).is_file()
+    library = RecordLibrary(tmp_path)
+    for keywords, corridor, seeds in (
+        ("", SHORT_HIGHWAY, (3, 4)),
+        (' {"demand": "random", "incident": "random"}', randomised(SHORT_HIGHWAY), (0,)),
+        (' {"corridor": {"duration": 60, "incident": null}}', calm, (1,)),
+    ):
+        words = "--env", SHORT + keywords, "--seeds", f"{seeds[0]}:{seeds[-1] + 1}"
+        done = run_command("record", *words, "--workers", "1", "--records", tmp_path)
+        assert done.returncode == 0, done.stderr
+        assert f"short-highway: {len(seeds)} record(s) in {tmp_path}" in done.stdout
+        there = [n for n in range(9) if library.record_path(corridor, n).is_file()]
+        assert there == list(seeds)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("--seeds", "x"), "error: seeds must be 'first:stop'"),
-        (("--env", f'{SHORT} {{"corridor": {{"length": 3}}}}'), "error: corridor.length"),
-        (("--env", f'{SHORT} {{"corridor": {{"duration": -3}}}}'), "error: corridor.duration must"),
-        (("--env", f"{SHORT} 3"), "error: env must be"),
-        (("--env", "dptse_env:dptse/Nowhere-v0"), "error: env must be"),
-    ],
-)
-def test_mistakes_end_in_one_line_on_stderr(arguments, message, monkeypatch, capsys):
-    monkeypatch.setattr("sys.argv", ["record.py", *arguments])
-    with pytest.raises(SystemExit) as ended:
-        run(main, Args, None)
-    assert ended.value.code == 2
-    (line,) = capsys.readouterr().err.strip().splitlines()
-    assert line.startswith(message)
+def test_records_for_programs(tmp_path):
+    words = "--env", SHORT, "--records", tmp_path, "--seeds", "0:2", "--workers", "1"
+    found = json.loads(run_command("record", *words, "--json").stdout)
+    assert found["seeds"] == [0, 1]
+    names = sorted(path.name for path in Path(found["folder"]).glob("0*"))
+    assert names == ["00000000.safetensors", "00000001.safetensors"]
+    assert found["dwell"] > 0.0

@@ -23,7 +23,7 @@ WITHOUT_EXTRAS = {
 }
 WITH_TRAIN = {
     "corridors": [
-        ["record", *SHORT, "--corridor", json.dumps(LONGER), "--seeds", "0:1"],
+        ["record", "--env", f"{SHORT[1]} {json.dumps({'corridor': LONGER})}", "--seeds", "0:1"],
     ],
     "ray": [
         ["suite", "--policies", "static", "--executor", "ray"],

@@ -20,19 +20,19 @@ from archives import check_source, check_wheel
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
 SHORT = ["--env", "dptse_env:dptse/ShortHighway-v0"]
+BRIEFLY = 'dptse_env:dptse/ShortHighway-v0 {"horizon": 64}'
 COMMANDS = [
     ["--version"],
     ["info"],
-    ["record", "--corridor", "short-highway", "--seeds", "0:2", "--json"],
+    ["record", *SHORT, "--seeds", "0:2", "--json"],
     [
-        "train", *SHORT, "--keywords", '{"horizon": 64}', "--traffic", "0:2",
-        "--validation", "1000:1002", "--output", "trained", "recipe:plackett-luce",
-        "--recipe.n-envs", "4", "--recipe.replicas", "2", "--recipe.regression.rounds", "1",
-        "--recipe.regression.batches", "2", "--recipe.swaps.rounds", "1",
-        "--recipe.swaps.episodes", "2", "--recipe.swaps.batches", "2",
+        "train", "--env", BRIEFLY, "--traffic", "0:2",
+        "--validation", "1000:1002", "--output", "trained", "--algorithm",
+        'plackett-luce {"n_envs": 4, "regression": {"rounds": 1, "batches": 2}, '
+        '"swaps": {"rounds": 1, "episodes": 2, "batches": 2}}',
     ],
     [
-        "evaluate", *SHORT, "--keywords", '{"horizon": 64}', "--seeds", "2000:2002",
+        "evaluate", "--env", BRIEFLY, "--seeds", "2000:2002",
         "--schedules", "round-robin", "--policies", "trained/policy.safetensors",
         "--estimators", "random_walk", "--output", "ladder",
     ],

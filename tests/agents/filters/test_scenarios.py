@@ -61,7 +61,7 @@ def test_environments_are_ids_with_keywords():
     given = f"dptse_env:dptse/LongHighway-v0 {json.dumps(keywords)}"
     assert parse_env(given) == ("dptse_env:dptse/LongHighway-v0", keywords)
     for text in ("[3]", "{"):
-        with pytest.raises(ValueError, match="^env must be an id and a JSON object, got"):
+        with pytest.raises(ValueError, match=r"^env must be an id and a JSON object, got"):
             parse_env(f"dptse_env:dptse/LongHighway-v0 {text}")
 
 

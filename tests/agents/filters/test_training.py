@@ -17,7 +17,7 @@ from agents.training.run_files import read_progress  # noqa: E402
 from dptse_env.estimators.recurrent import read_network, write_network  # noqa: E402
 from dptse_env.evaluation import evaluate  # noqa: E402
 from tests.agents.elsewhere import Elsewhere  # noqa: E402
-from tests.estimators.networks import card  # noqa: E402
+from tests.estimators.helpers import card  # noqa: E402
 
 from .plans import PLAN, SHORT  # noqa: E402
 

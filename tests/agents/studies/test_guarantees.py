@@ -23,9 +23,9 @@ from dptse_env.parts import make_task, privacy_report
 from dptse_env.privacy import epsilon_of
 from dptse_env.release.pacing import TracerPacing
 from dptse_env.schedules import make_schedule
+from tests.helpers import SHORT
 
 FOLDER = Path(__file__).parents[3] / "results" / "guarantees"
-SHORT = "dptse_env:dptse/ShortHighway-v0"
 PAPER, BOTH = "`paper` noise", "`paced` − `capped`"
 
 

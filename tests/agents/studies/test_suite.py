@@ -26,9 +26,9 @@ from agents.study import Place, read_rows, run
 from agents.tables import UnmeasuredError
 from dptse_env.config import TEST_SEEDS
 from dptse_env.schedules import Schedule
+from tests.helpers import SHORT
 
 HERE = "tests.agents.studies.test_suite"
-SHORT = "dptse_env:dptse/ShortHighway-v0"
 KEYWORDS = {"estimator": "random_walk", "bandwidth": 2, "horizon": 80}
 SMALL = (
     Task("plain", "printed noise", SHORT, KEYWORDS, (2000, 2001)),

@@ -1,34 +1,46 @@
-"""Trainings of a few seconds, and a watcher that stops them."""
+"""Trainings of a few seconds, and watchers that end them."""
 
-from agents.training.plan import TrainingPlan
-from agents.training.recipes import RECIPES, PlackettLuceRecipe, RegressionRounds, SwapRounds
+import json
+import os
+import signal
 
-SMALL = {"n_envs": 4, "replicas": 2}
-SMALL_PPO = {**SMALL, "n_steps": 10, "batch_size": 20, "n_epochs": 2, "hidden": (8,)}
-REGRESSION = RegressionRounds(rounds=1, seconds=9, batches=3)
+from agents.training.plan import TrainingPlan, parse_algorithm
+from tests.helpers import SHORT
+
+ENV = f'{SHORT} {{"horizon": 80, "privacy": "capped"}}'
+OTHER = 'dptse_env:dptse/PrivateHighway-v0 {"horizon": 80, "bandwidth": 3}'
+"""A road of 15 segments beside one of 6; both have the same kinds of channels."""
+
 # Steps and rates are large, so that every round acts otherwise than the one before.
-FEW_SWAPS = SwapRounds(
-    rounds=2, episodes=3, seconds=5, trials=2, batches=20, batch_size=16, rate=0.05
-)
+SMALL = {
+    "plackett-luce": {
+        "n_envs": 4, "replicas": 2, "width": 8,
+        "regression": {"rounds": 1, "seconds": 9, "batches": 3},
+        "swaps": {
+            "rounds": 2, "episodes": 3, "seconds": 5, "trials": 2, "batches": 20,
+            "batch_size": 16, "rate": 0.05,
+        },
+    },
+    "ppo": {
+        "n_envs": 4, "replicas": 2, "steps": 240, "n_steps": 10, "batch_size": 20, "n_epochs": 2,
+        "hidden": [8], "validate_every": 2,
+    },
+}  # fmt: skip
+SMALL["maskable-ppo"] = SMALL["ppo"]
 
 
-def make_recipe(learner):
-    if learner == "plackett-luce":
-        return PlackettLuceRecipe(**SMALL, regression=REGRESSION, swaps=FEW_SWAPS, width=8)
-    return RECIPES[learner](**SMALL_PPO)
+def make_algorithm(name="plackett-luce", **changes):
+    return parse_algorithm(f"{name} {json.dumps({**SMALL[name], **changes})}")
 
 
-def make_plan(learner="plackett-luce", **changes):
+def make_plan(algorithm="plackett-luce", **changes):
+    """A plan with an algorithm, or the small settings of one by its name."""
     values = {
-        "env": "dptse_env:dptse/ShortHighway-v0",
-        "recipe": make_recipe(learner),
+        "envs": (ENV,),
+        "algorithm": make_algorithm(algorithm) if isinstance(algorithm, str) else algorithm,
         "seed": 1,
-        "steps": 0 if learner == "plackett-luce" else 240,
         "traffic_seeds": (0, 1, 2),
         "validation_seeds": (1000, 1001),
-        "keywords": {"horizon": 80, "privacy": "capped"},
-        "validate_every": 3,
-        "checkpoint_every": 2,
     }
     return TrainingPlan(**{**values, **changes})
 
@@ -42,8 +54,20 @@ class StopError(Exception):
 
 
 def stop_at(update):
+    """Return a watcher that ends a training as a row comes, ahead of its checkpoint."""
+
     def watcher(row):
         if row["update"] == update:
             raise StopError
+
+    return watcher
+
+
+def kill_at(update):
+    """Return a watcher that kills this process as a row comes, ahead of its checkpoint."""
+
+    def watcher(row):
+        if row["update"] == update:
+            os.kill(os.getpid(), signal.SIGKILL)
 
     return watcher

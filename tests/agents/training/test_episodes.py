@@ -4,92 +4,46 @@ import pytest
 
 pytest.importorskip("sb3_contrib")
 
-from agents.training.episodes import TrainingEpisodes
+from agents.training.episodes import TrainingEpisodes, make_episodes, recentre
 from dptse_env.sb3 import SB3VecEnv
-from dptse_env.spaces.actions import ACTION_ENCODINGS
+from tests.agents.training.plans import make_plan
+from tests.helpers import SHORT
 
 HORIZON = 20
 
 
-def make(num_envs=4, seed=3, replicas=1, reward_scale=1.0, **keywords):
+def make(num_envs=4, replicas=1, **keywords):
     keywords = {"traffic_seeds": "0:3", "horizon": HORIZON, "random_start": True, **keywords}
     env = gym.make_vec(
-        "dptse_env:dptse/ShortHighway-v0",
-        num_envs=num_envs,
-        autoreset_mode="SameStep",
-        privacy="capped",
-        **keywords,
+        SHORT, num_envs=num_envs, autoreset_mode="SameStep", privacy="capped", **keywords
     )
-    return TrainingEpisodes(SB3VecEnv(env), seed, replicas=replicas, reward_scale=reward_scale)
-
-
-def play(episodes, steps, generator):
-    """Random actions; return everything that came back."""
-    space, n = episodes.action_space, episodes.num_envs
-    space.seed(int(generator.integers(2**31)))
-    return [episodes.step(np.array([space.sample() for _ in range(n)])) for _ in range(steps)]
-
-
-def assert_same(first, second):
-    for one, other in zip(first, second, strict=True):
-        for value, wanted in zip(one[:3], other[:3], strict=True):
-            np.testing.assert_array_equal(value, wanted)
-        for info, expected in zip(one[3], other[3], strict=True):
-            assert info.keys() == expected.keys()
-            if "terminal_observation" in info:
-                np.testing.assert_array_equal(
-                    info["terminal_observation"], expected["terminal_observation"]
-                )
-
-
-def test_episodes_are_spread_over_time_and_then_complete():
-    episodes = make()
+    episodes = TrainingEpisodes(SB3VecEnv(env), 3, replicas)
     episodes.reset()
-    transitions = play(episodes, 3 * HORIZON, np.random.default_rng(0))
-    ends = np.array([dones for _, _, dones, _ in transitions])
-    after = [np.flatnonzero(ends[:, e]) + 1 for e in range(4)]
-    assert [times.tolist() for times in after] == [
-        [20, 40, 60], [5, 25, 45], [10, 30, 50], [15, 35, 55],
-    ]  # fmt: skip
-    for observation, _, dones, infos in transitions:
+    return episodes
+
+
+@pytest.mark.parametrize(("action", "per_second"), [("slots", 1), ("sequential", 2)])
+def test_episodes_are_spread_over_time_and_then_complete(action, per_second):
+    episodes = make(action=action)
+    space = episodes.action_space
+    space.seed(0)
+    ends = []
+    for _ in range(3 * HORIZON * per_second):
+        observation, _, dones, infos = episodes.step(np.array([space.sample() for _ in range(4)]))
+        ends.append(dones)
         for e, info in enumerate(infos):
             assert ("terminal_observation" in info) == dones[e]
             if dones[e]:
                 assert info["TimeLimit.truncated"]
                 assert (info["terminal_observation"] != observation[e]).any()
-
-
-@pytest.mark.parametrize("steps", [0, 1, 7, 20, 33, 60, 65])
-@pytest.mark.parametrize("action", ACTION_ENCODINGS)
-def test_a_kept_state_is_continued_to_the_same_bits(action, steps):
-    episodes = make(action=action)
-    episodes.reset()
-    seen = play(episodes, steps, np.random.default_rng(0))
-    state = {key: value.copy() for key, value in episodes.state().items()}
-    other = make(action=action)
-    observation = other.restore(state)
-    if seen:
-        np.testing.assert_array_equal(observation, seen[-1][0])
-    first, second = (play(e, 45, np.random.default_rng(1)) for e in (episodes, other))
-    assert_same(first, second)
-    for key, value in episodes.state().items():
-        np.testing.assert_array_equal(other.state()[key], value)
-
-
-def test_another_seed_gives_other_traffic_and_noise():
-    first, second = (play(make_reset(seed), 5, np.random.default_rng(0)) for seed in (3, 30))
-    assert all((a[0] != b[0]).any() for a, b in zip(first, second, strict=True))
-
-
-def make_reset(seed, **keywords):
-    episodes = make(seed=seed, **keywords)
-    episodes.reset()
-    return episodes
+    after = [np.flatnonzero(of_one) + 1 for of_one in np.transpose(ends)]
+    assert [(times / per_second).tolist() for times in after] == [
+        [20, 40, 60], [5, 25, 45], [10, 30, 50], [15, 35, 55],
+    ]  # fmt: skip
 
 
 def test_replicas_meet_the_same_traffic_and_noise():
     episodes = make(num_envs=6, replicas=3, action="slots")
-    episodes.reset()
     same = np.tile([[0, 3]], (6, 1))
     for _ in range(2 * HORIZON + 3):
         observation, rewards, dones, _ = episodes.step(same)
@@ -104,32 +58,26 @@ def test_replicas_meet_the_same_traffic_and_noise():
 
 
 def test_recentred_advantages_are_compared_with_the_replicas():
-    episodes = make(num_envs=4, replicas=2)
     advantages = np.arange(8, dtype=np.float32).reshape(2, 4) ** 2
-    episodes.recentre(advantages)
+    alone = advantages.copy()
+    recentre(alone, 1)
+    assert (alone == advantages).all()
+    recentre(advantages, 2)
     assert advantages.tolist() == [[-1, 1, -5, 5], [-9, 9, -13, 13]]
-    alone = np.ones((2, 4), dtype=np.float32)
-    make(num_envs=4).recentre(alone)
-    assert (alone == 1).all()
 
 
-def test_rewards_are_scaled_and_their_mean_is_not():
-    scaled, plain = make(reward_scale=0.25, action="slots"), make(action="slots")
-    rewards = []
-    for episodes in (scaled, plain):
+def test_trainings_and_their_continuations_have_episodes_of_their_own():
+    def seen(seed, update):
+        plan = make_plan(seed=seed)
+        keywords = {"action": "slots", "traffic_seeds": [0, 1, 2]}
+        episodes = make_episodes(plan, plan.worlds[0], keywords, update)
         episodes.reset()
-        rewards.append(np.array([row[1] for row in play(episodes, 9, np.random.default_rng(0))]))
-    np.testing.assert_allclose(rewards[0], 0.25 * rewards[1], rtol=1e-6)
-    assert scaled.take_mean_reward() == pytest.approx(rewards[1].mean(), rel=1e-5)
-    assert np.isnan(scaled.take_mean_reward())
+        for _ in range(5):
+            observation = episodes.step(np.tile([[0, 3]], (4, 1)))[0]
+        return observation[0].tobytes()
 
-
-def test_the_mean_is_that_of_a_second_where_a_decision_takes_several_actions():
-    episodes = make(action="sequential", bandwidth=3)
-    episodes.reset()
-    rewards = np.array([row[1] for row in play(episodes, 9, np.random.default_rng(0))])
-    assert (rewards[[0, 1, 3, 4]] == 0).all()
-    assert episodes.take_mean_reward() == pytest.approx(rewards[2::3].mean(), rel=1e-5)
+    assert seen(1, 0) == seen(1, 0)
+    assert len({seen(1, 0), seen(2, 0), seen(1, 1)}) == 3
 
 
 def test_a_number_of_episodes_that_replicas_do_not_divide_is_refused():

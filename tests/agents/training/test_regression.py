@@ -7,21 +7,21 @@ pytest.importorskip("sb3_contrib")
 import torch
 
 from agents.training.episodes import make_episodes
-from agents.training.recipes import PlackettLuceRecipe, RegressionRounds
 from agents.training.regression import Practice, regress, squared_errors
 from dptse_env.sb3 import PlackettLucePolicy
-
-SHORT = "dptse_env:dptse/ShortHighway-v0"
-SETTINGS = {"rounds": 1, "seconds": 100, "batches": 200, "batch_size": 64, "rate": 3e-3}
+from tests.agents.training.plans import make_algorithm, make_plan
+from tests.helpers import SHORT
 
 
 def make(**changes):
-    settings = RegressionRounds(**{**SETTINGS, **changes})
-    recipe = PlackettLuceRecipe(n_envs=8, replicas=1, regression=settings)
-    episodes = make_episodes(SHORT, {"traffic_seeds": "0:3", "privacy": "capped"}, recipe, 0)
+    settings = {"rounds": 1, "seconds": 119, "interval": 1, "batches": 200, "batch_size": 64}
+    algorithm = make_algorithm(n_envs=8, replicas=1, regression={**settings, **changes})
+    plan = make_plan(algorithm=algorithm, envs=(f'{SHORT} {{"privacy": "capped"}}',))
+    keywords = {"traffic_seeds": "0:3", "action": "slots"}
+    episodes = make_episodes(plan, plan.worlds[0], keywords)
     torch.manual_seed(0)
     policy = PlackettLucePolicy.from_config(episodes.env.config, width=8)
-    return settings, episodes, policy
+    return algorithm.regression, Practice(policy, episodes, 64)
 
 
 def queried_variance(process):
@@ -29,46 +29,37 @@ def queried_variance(process):
 
 
 def test_scores_become_the_logarithms_of_expected_squared_errors():
-    settings, episodes, policy = make(
-        age_bonus=0.0, seconds=119, interval=1, batches=200, rate=2e-2
-    )
+    settings, practice = make(age_bonus=0.0, rate=2e-2)
     generator = np.random.default_rng(0)
+    seen = []
 
     def planted(process):
         variance = queried_variance(process)
+        seen.append(np.log(variance))
         return (variance * generator.exponential(size=variance.shape)).astype(np.float32)
 
-    regress([Practice(policy, episodes, settings.batch_size)], settings, targets=planted)
-    seen = episodes.reset()
-    for _ in range(60):
-        seen = episodes.step(policy.predict(seen)[0])[0]
-    scores = policy.scores(torch.tensor(seen)).detach().numpy()
-    expected = np.log(queried_variance(episodes.env.process))
-    difference = scores / settings.sharpness - expected
+    regress([practice], settings, targets=planted)
+    scores = practice.policy.scores(practice.seen[60]).detach().numpy()
+    difference = scores / settings.sharpness - seen[60]
     # But for a constant, which no choice depends on.
     difference -= difference.mean()
-    assert expected.std() > 0.9
+    assert seen[60].std() > 0.9
     assert difference.std() < 0.4
+    assert all(p.grad is None for p in practice.policy.scorer.parameters())
 
 
 def test_the_bonus_for_age_is_added_once_after_any_number_of_rounds():
-    weights = []
-    for rounds, bonus in ((3, 0.5), (3, 0.0)):
-        settings, episodes, policy = make(
-            rounds=rounds, age_bonus=bonus, seconds=2, batches=1, rate=1e-9
-        )
-        regress([Practice(policy, episodes, settings.batch_size)], settings)
+    weights, fractions = [], []
+    for bonus in (0.5, 0.0):
+        settings, practice = make(rounds=3, age_bonus=bonus, seconds=2, batches=1, rate=1e-9)
+        regress([practice], settings, fractions.append)
+        assert [len(each) for each in (practice.seen, practice.errors)] == [6, 6]
+        policy = practice.policy
         weights.append(dict(zip(policy.rule, policy.scorer.rule.tolist(), strict=True)))
+    assert fractions[:3] == pytest.approx([0.0, 1 / 3, 2 / 3])
     assert weights[0]["age"] - weights[1]["age"] == pytest.approx(0.5 * 4.0, rel=1e-4)
+    # The rule is gone; half of a log deviation is a quarter of a log variance.
     assert weights[0]["speed_log_std"] == pytest.approx(0.5 * 4.0, rel=1e-4)
-
-
-def test_it_reports_its_progress_and_leaves_no_gradients():
-    fractions = []
-    settings, episodes, policy = make(rounds=2, seconds=3, batches=100)
-    regress([Practice(policy, episodes, settings.batch_size)], settings, fractions.append)
-    assert fractions == [0.0, 0.25, 0.5, 0.75]
-    assert all(p.grad is None for p in policy.scorer.parameters())
 
 
 def test_squared_errors_are_those_of_density_and_speed_in_units_of_their_scales():

@@ -1,17 +1,26 @@
+"""Gains of swaps beside episodes that are run apart, and the moves of scores that they make."""
+
 import gymnasium as gym
 import numpy as np
 import pytest
 
 pytest.importorskip("sb3_contrib")
 
-from agents.training.swaps import Swaps, try_swaps
-from tests.helpers import SumRelease
+import torch
 
-SHORT = "dptse_env:dptse/ShortHighway-v0"
-SEEDS = [5, 6, 7]
-COUNTED = {"preset": "capped", "cap": 20, "boundary_inputs": "private"}
-PRIVACIES = [COUNTED, {"preset": "paced", "boundary_inputs": "private"}]
-SECONDS, TRIALS, HORIZON = 6, 2, 40
+from agents.seeds import training_seed
+from agents.training.plan import SwapRounds
+from agents.training.swaps import LARGEST_GAIN, Swaps, raise_scores, try_swaps
+from dptse_env.config import resolve
+from dptse_env.sb3 import PlackettLucePolicy
+from tests.helpers import SHORT
+
+SECONDS, TRIALS, HORIZON, SEED = 6, 2, 40, 1
+FEW = SwapRounds(seconds=SECONDS, trials=TRIALS)
+PRIVACIES = {
+    "capped": {"preset": "capped", "cap": 20, "boundary_inputs": "private"},
+    "paced": {"preset": "paced", "boundary_inputs": "private"},
+}
 
 
 class Wandering:
@@ -28,141 +37,201 @@ class Wandering:
         return self.queried[-1], state
 
 
-def make(**keywords):
-    keywords = {"traffic_seeds": "0:3", "privacy": COUNTED, "horizon": HORIZON, **keywords}
-    return gym.make_vec(
-        SHORT, num_envs=3, action="slots", bandwidth=2, autoreset_mode="Disabled", **keywords
-    )
+class Seeded:
+    """An environment that remembers the seeds of its episodes."""
+
+    def __init__(self, privacy):
+        self.env = gym.make_vec(
+            SHORT, num_envs=3, action="slots", bandwidth=2, autoreset_mode="Disabled",
+            traffic_seeds="0:3", privacy=privacy, horizon=HORIZON,
+        )  # fmt: skip
+        self.seeds = None
+
+    def __getattr__(self, name):
+        return getattr(self.env, name)
+
+    def reset(self, *, seed):
+        self.seeds = seed
+        return self.env.reset(seed=seed)
 
 
-def tried(env, policy, seed=0):
-    generator = np.random.default_rng(seed)
-    return list(try_swaps(env, policy, SEEDS, generator, seconds=SECONDS, trials=TRIALS))
+def tried(privacy, index=0):
+    policy, env = Wandering(), Seeded(privacy)
+    return policy, try_swaps(policy, env, FEW, index, SEED), env.seeds
 
 
-@pytest.fixture(scope="module", params=PRIVACIES, ids=lambda privacy: privacy["preset"])
-def privacy(request):
-    return request.param
+@pytest.fixture(scope="module", params=PRIVACIES)
+def round_of_swaps(request):
+    return PRIVACIES[request.param], *tried(PRIVACIES[request.param])
 
 
-@pytest.fixture(scope="module")
-def pass_of_swaps(privacy):
-    policy = Wandering()
-    return policy, tried(make(privacy=privacy), policy)
+def first_of(policy, swaps):
+    """Return the second of the first states."""
+    return next(k for k, seen in enumerate(policy.seen) if (seen == swaps.observations[:3]).all())
 
 
-def test_swaps_are_tried_all_along_and_the_episodes_go_on_as_without(pass_of_swaps, privacy):
-    policy, parts = pass_of_swaps
-    first = next(k for k, seen in enumerate(policy.seen) if (seen == parts[0].observations).all())
+def test_swaps_are_tried_all_along_and_the_episodes_go_on_as_without(round_of_swaps):
+    privacy, policy, swaps, seeds = round_of_swaps
+    first = first_of(policy, swaps)
     assert HORIZON // 4 <= first < HORIZON // 4 + SECONDS
-    assert len(parts) == (HORIZON - first) // SECONDS
-    for k, part in enumerate(parts):
-        np.testing.assert_array_equal(part.observations, policy.seen[first + k * SECONDS])
-    env = make(privacy=privacy)
-    observation, _ = env.reset(seed=SEEDS)
+    times = range(first, HORIZON - SECONDS + 1, SECONDS)
+    np.testing.assert_array_equal(
+        swaps.observations, np.concatenate([policy.seen[t] for t in times])
+    )
+    env = Seeded(privacy)
+    observation, _ = env.reset(seed=seeds)
     for seen, action in zip(policy.seen, policy.queried, strict=True):
         np.testing.assert_array_equal(seen, observation)
         observation, *_ = env.step(action)
 
 
-def test_a_swap_replaces_a_queried_segment_by_one_that_was_not(pass_of_swaps):
-    policy, parts = pass_of_swaps
-    for part in parts:
-        first = next(k for k, seen in enumerate(policy.seen) if (seen == part.observations).all())
-        queried = policy.queried[first]
-        assert part.state.tolist() == [0, 1, 2] * TRIALS
-        for episode, added, dropped in zip(part.state, part.added, part.dropped, strict=True):
-            assert dropped in queried[episode]
-            assert added not in queried[episode]
-    joined = Swaps.from_parts(parts)
-    assert set(joined.added) == set(joined.dropped) == set(range(6))
+def test_a_swap_replaces_a_queried_segment_by_one_that_was_not(round_of_swaps):
+    _, policy, swaps, _ = round_of_swaps
+    first = first_of(policy, swaps)
+    assert np.bincount(swaps.state).tolist() == [TRIALS] * len(swaps.observations)
+    for state, added, dropped in zip(swaps.state, swaps.added, swaps.dropped, strict=True):
+        queried = policy.queried[first + SECONDS * (state // 3)][state % 3]
+        assert dropped in queried
+        assert added not in queried
+    assert set(swaps.added) == set(swaps.dropped) == set(range(6))
 
 
-def signs(env):
-    """Signs as the first state's, drawn like the swaps: they come after the choice of seconds."""
-    generator = np.random.default_rng(0)
+def test_gains_are_those_of_episodes_run_apart(round_of_swaps):
+    privacy, policy, swaps, seeds = round_of_swaps
+    first = first_of(policy, swaps)
+    # Signs of noise are drawn as the round draws them: after the choice of seconds.
+    generator = np.random.default_rng([SEED, 0])
     generator.integers(SECONDS)
-    return generator.choice([-1.0, 1.0], size=(3, env.process.release.task.n_columns, 2))
 
-
-def test_gains_are_those_of_episodes_run_apart(pass_of_swaps, privacy):
-    policy, parts = pass_of_swaps
-    part = parts[0]
-    first = next(k for k, seen in enumerate(policy.seen) if (seen == part.observations).all())
-
-    def run(swapped, sign):
-        """Return rewards and spent budgets of an episode from its reset on; no forks."""
-        env = make(privacy=privacy)
-        env.reset(seed=SEEDS)
+    def run(swapped, sign, signs):
+        """Return rewards and spent budgets of episodes from their reset on; no forks."""
+        env = Seeded(privacy)
+        env.reset(seed=seeds)
         for action in policy.queried[:first]:
             env.step(action)
-        env.process.release.give_noise(sign * signs(env))
+        if signs is None:
+            shape = (3, env.process.release.task.n_columns, 2)
+            signs = generator.choice([-1.0, 1.0], size=shape)
+        env.process.release.give_noise(sign * signs)
         query = policy.queried[first].copy()
         for episode, added, dropped in swapped:
             query[episode][query[episode] == dropped] = added
         total = np.zeros(3)
         for action in [query, *policy.queried[first + 1 : first + SECONDS]]:
             total += env.step(action)[1]
-        return np.array([total, env.process.release.budgets_spent(np.arange(3))])
+        return np.array([total, env.process.release.budgets_spent(np.arange(3))]), signs
 
-    def mean(swapped):
-        return (run(swapped, 1.0) + run(swapped, -1.0)) / 2.0
+    signs = run((), 1.0, None)[1]
 
-    plain = mean([])
-    np.testing.assert_allclose(part.error, -plain[0] / SECONDS, atol=1e-12)
+    def mean(swapped=()):
+        return (run(swapped, 1.0, signs)[0] + run(swapped, -1.0, signs)[0]) / 2.0
+
+    plain = mean()
+    np.testing.assert_allclose(swaps.error[:3], -plain[0] / SECONDS, atol=1e-12)
     for trial in range(TRIALS):
         rows = slice(3 * trial, 3 * trial + 3)
-        swapped = zip(part.state[rows], part.added[rows], part.dropped[rows], strict=True)
+        swapped = zip(swaps.state[rows], swaps.added[rows], swaps.dropped[rows], strict=True)
         expected = mean(list(swapped)) - plain
-        np.testing.assert_allclose(part.gain[rows], expected[0], atol=1e-12)
-        np.testing.assert_allclose(part.spent[rows], expected[1], atol=1e-12)
-    assert np.abs(part.gain).min() > 1e-6
-    assert np.abs(part.spent).max() > 0
+        np.testing.assert_allclose(swaps.gain[rows], expected[0], atol=1e-12)
+        np.testing.assert_allclose(swaps.spent[rows], expected[1], atol=1e-12)
+    assert np.abs(swaps.gain[: 3 * TRIALS]).min() > 1e-6
+    assert np.abs(swaps.spent).max() > 0
 
 
-def test_other_draws_try_other_swaps(pass_of_swaps, privacy):
-    again = Swaps.from_parts(tried(make(privacy=privacy), Wandering()))
-    other = Swaps.from_parts(tried(make(privacy=privacy), Wandering(), seed=1))
-    joined = Swaps.from_parts(pass_of_swaps[1])
-    np.testing.assert_array_equal(joined.gain, again.gain)
-    assert not np.array_equal(joined.added[:50], other.added[:50])
-
-
-def test_states_of_later_parts_are_counted_on():
-    part = tried(make(), Wandering())[0]
-    joined = Swaps.from_parts([part, part])
-    assert joined.state.tolist() == [0, 1, 2, 0, 1, 2, 3, 4, 5, 3, 4, 5]
-    assert joined.observations.shape == (6, part.observations.shape[1])
-    np.testing.assert_array_equal(joined.gain, np.tile(part.gain, 2))
+def test_every_round_tries_other_swaps_in_other_episodes(round_of_swaps):
+    privacy, _, swaps, seeds = round_of_swaps
+    np.testing.assert_array_equal(tried(privacy)[1].gain, swaps.gain)
+    _, other, other_seeds = tried(privacy, index=1)
+    assert not np.array_equal(other.added[:30], swaps.added[:30])
+    assert len({*seeds, *other_seeds}) == 6
+    # Neither those of the regression nor those of another training.
+    assert training_seed(SEED) + 1000 < min(seeds + other_seeds)
+    assert max(seeds + other_seeds) < training_seed(SEED + 1)
 
 
 def test_without_budgets_nothing_is_spent():
-    joined = Swaps.from_parts(tried(make(privacy="paper"), Wandering()))
-    assert not joined.spent.any()
-    assert joined.gain.any()
+    swaps = tried("paper")[1]
+    assert not swaps.spent.any()
+    assert swaps.gain.any()
 
 
-@pytest.mark.parametrize(
-    ("keywords", "message"),
-    [
-        ({"bandwidth": 6}, "bandwidth below 6 segments, got 6"),
-        ({"horizon": 6}, "leaves 6 s to measure a gain, got 6 s"),
-    ],
-)
-def test_environments_without_swaps_are_refused(keywords, message):
-    keywords = {"traffic_seeds": "0:3", "bandwidth": 2, **keywords}
-    env = gym.make_vec(SHORT, num_envs=3, action="slots", autoreset_mode="Disabled", **keywords)
-    with pytest.raises(ValueError, match=message):
-        tried(env, Wandering())
+# --- the fit --------------------------------------------------------------------------------------
+
+STEP = 3.0
+FIT = SwapRounds(price=0.01, batches=400, batch_size=256, rate=1e-2)
 
 
-def test_swaps_need_queries_of_equal_cost():
-    with pytest.raises(
-        ValueError, match=r"^swaps need queries that cost the same, got query_spans"
-    ):
-        tried(make(privacy=SumRelease, query_spans=(1, 2)), Wandering())
+@pytest.fixture
+def policy():
+    torch.manual_seed(0)
+    config = resolve("short-highway", {"action": "slots", "bandwidth": 2})
+    return PlackettLucePolicy.from_config(config, width=16)
 
 
-def test_swaps_need_a_release_model_whose_noise_can_be_set():
-    with pytest.raises(ValueError, match=r"^noise of the release model '.*SumRelease' cannot be"):
-        tried(make(privacy=SumRelease), Wandering())
+def planted(policy, gain=None, spent=None, n_states=300, trials=20):
+    """Swaps whose gain is that of their segments, ``gain(channels)`` of shape (m, 6), and noise."""
+    generator = np.random.default_rng(0)
+    size = policy.observation_space.shape[0]
+    seen = generator.uniform(0.0, 0.3, size=(n_states, size)).astype(np.float32)
+    state = np.repeat(np.arange(n_states), trials)
+    pairs = generator.permuted(np.tile(np.arange(6), (len(state), 1)), axis=1)
+    added, dropped = pairs[:, 0], pairs[:, 1]
+
+    def difference(of):
+        if of is None:
+            return np.zeros(len(state))
+        values = of(policy.features(torch.from_numpy(seen)).numpy())
+        return values[state, added] - values[state, dropped]
+
+    noise = generator.normal(0.0, 0.02, len(state))
+    error = np.full(n_states, 0.1)
+    gains = 0.1 * (difference(gain) + noise)
+    return Swaps(seen, error, state, added, dropped, gains, difference(spent))
+
+
+def moved(policy, swaps):
+    """The moves of the scores, but for a constant of each state, which no choice depends on."""
+    seen = torch.from_numpy(swaps.observations)
+    with torch.no_grad():
+        before = policy.scores(seen).numpy()
+        with torch.enable_grad():
+            raise_scores([policy], [swaps], FIT, STEP)
+        change = policy.scores(seen).numpy() - before
+    assert all(p.grad is None for p in policy.scorer.parameters())
+    return centred(change) / STEP
+
+
+def centred(values):
+    return values - values.mean(axis=1, keepdims=True)
+
+
+def test_scores_move_by_a_step_of_the_expected_gain(policy):
+    def gain(channels):
+        return 0.1 * np.tanh(channels[:, 0])
+
+    swaps = planted(policy, gain)
+    expected = centred(gain(policy.features(torch.from_numpy(swaps.observations)).numpy()))
+    assert expected.std() > 0.04
+    assert (moved(policy, swaps) - expected).std() < 0.2 * expected.std()
+
+
+def test_budgets_have_their_price(policy):
+    def spent(channels):
+        return 8.0 * (channels[:, 0] > 0.0)
+
+    swaps = planted(policy, None, spent)
+    expected = -0.01 * centred(spent(policy.features(torch.from_numpy(swaps.observations)).numpy()))
+    change = moved(policy, swaps)
+    assert np.corrcoef(change.ravel(), expected.ravel())[0, 1] > 0.9
+    assert np.polyfit(expected.ravel(), change.ravel(), 1)[0] == pytest.approx(1.0, abs=0.3)
+
+
+def test_a_few_huge_gains_do_not_dominate(policy):
+    swaps = planted(policy)
+    swaps.gain[:] = 0.0
+    swaps.gain[(swaps.added == 2) & (swaps.state % 20 == 0)] = 1e6
+    assert 0.0 < moved(policy, swaps)[:, 2].mean() < LARGEST_GAIN
+
+
+def test_no_gain_moves_nothing_but_noise(policy):
+    assert np.abs(moved(policy, planted(policy))).mean() < 0.01

@@ -1,245 +1,360 @@
-import dataclasses
+"""Trainings in their folders: killed and gone on with, validated, refused, several at once."""
+
 import json
-import pathlib
+import multiprocessing
 import shutil
+import signal
+import sys
+from concurrent.futures import Future
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from dptse_env.utils.files import write_atomically
-
 pytest.importorskip("sb3_contrib")
 
+import gymnasium as gym
 import torch
 
-import dptse_env
-from agents.training.recipes import RECIPES, RegressionRounds
-from agents.training.run_files import CHECKPOINT, PLAN, PROGRESS, read_progress
-from agents.training.training import BEST, POLICY, Training
+from agents.environments import make_vector
+from agents.executors import THIS_PROCESS, ExecutorError, ThisProcess
+from agents.seeds import TRAINING_VALIDATION
+from agents.training.plan import ALGORITHMS
+from agents.training.run import BEST, POLICY, Run
+from agents.training.run_files import CHECKPOINT, PLAN, PROGRESS, read_checkpoint, read_progress
+from agents.training.training import train, train_all
+from dptse_env.evaluation import evaluate
 from dptse_env.sb3 import load_policy
+from tests.agents.elsewhere import Elsewhere
 from tests.agents.training.plans import (
+    ENV,
+    OTHER,
     StopError,
+    kill_at,
+    make_algorithm,
     make_plan,
-    make_recipe,
     stop_at,
     without_time,
 )
-from tests.helpers import fast_and_slow
+from tests.helpers import SHORT, fast_and_slow
+from tests.test_non_interference import blind, make_private, unlike
 
-PPO_LEARNERS = fast_and_slow(["scores", "mask", "maskable"], ["mask"])
+KEYWORDS = {"horizon": 80, "privacy": "capped"}
+POLICIES = (POLICY, BEST)
 
 
-@pytest.mark.parametrize("learner", PPO_LEARNERS)
-def test_a_killed_training_continues_to_the_same_curve(learner, trained, tmp_path):
-    plan, complete = make_plan(learner), trained(learner)
-    assert complete.is_finished
-    # Updates 0, 2, 4 are kept: the fifth is lost and done again. At the fourth, after 40 s, the
-    # second group of episodes is just begun anew.
-    broken = Training(plan, tmp_path / "broken", watchers=(stop_at(5),))
-    with pytest.raises(StopError):
-        broken.run()
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A function that returns the folder and the curve of a finished training; leave it alone."""
+    done = {}
+
+    def get(name="plackett-luce", **changes):
+        if (name, *changes) not in done:
+            folder = tmp_path_factory.mktemp(name)
+            done[name, *changes] = folder, train(make_plan(name, **changes), folder)
+        return done[name, *changes]
+
+    return get
+
+
+def assert_alike(folder, other):
+    for name in (*POLICIES, PLAN):
+        assert (folder / name).read_bytes() == (other / name).read_bytes(), name
+    curves = [without_time(read_progress(each)) for each in (folder, other)]
+    assert curves[0] == curves[1]
+
+
+def killed(folder, update, **changes):
+    """Train in a child that is killed as the row of an update comes."""
+    train(make_plan(**changes), folder, watchers=(kill_at(update),))
+
+
+# --- going on -------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such signal for a process")
+@pytest.mark.parametrize(("update", "more"), [(0, ()), (1, ()), (2, ()), (2, (OTHER,))])
+def test_a_training_that_is_killed_goes_on_to_the_same_bits(update, more, whole, tmp_path):
+    changes = {"envs": (ENV, *more)} if more else {}
+    child = multiprocessing.get_context("spawn").Process(
+        target=killed, args=(tmp_path / "killed", update), kwargs=changes
+    )
+    child.start()
+    child.join(300)
+    assert child.exitcode == -signal.SIGKILL
+    kept = read_checkpoint(tmp_path / "killed") if update else None
+    # What was done before the round in which it died is not done again.
+    assert update == 0 or [row["update"] for row in kept["rows"]] == list(range(update))
     torch.manual_seed(99)
-    np.random.seed(99)  # noqa: NPY002  the generator that stable-baselines3 draws from
-    seen = []
-    again = Training(plan, tmp_path / "broken", watchers=(seen.append,))
-    assert [row["update"] for row in again.rows] == [0, 1, 2, 3, 4]
-    again.run()
-    assert without_time(again.rows) == without_time(complete.rows)
-    assert without_time(seen) == without_time(complete.rows)
-    for name in (POLICY, BEST):
-        assert (again.folder / name).read_bytes() == (complete.folder / name).read_bytes()
-    for name, value in complete.learner.policy.state_dict().items():
-        assert torch.equal(again.learner.policy.state_dict()[name], value), name
+    train(make_plan(**changes), tmp_path / "killed")
+    assert_alike(tmp_path / "killed", whole(**changes)[0])
 
 
-def test_the_curve_of_ppo(trained):
-    training = trained("scores")
-    rows = read_progress(training.folder)
-    assert [row["update"] for row in rows] == list(range(7))
-    assert [row["steps"] for row in rows] == [40 * u for u in range(7)]
-    assert [row["update"] for row in rows if "validation" in row] == [0, 3, 6]
-    assert all(0.01 < row["error"] < 1 for row in rows[1:])
-    assert all(0.01 < row["validation_drawn"] < 1 for row in rows[::3])
-    rates = [row["learning_rate"] for row in rows[1:]]
-    assert rates == sorted(rates, reverse=True)
-    assert rates[-1] == pytest.approx(training.plan.recipe.final_learning_rate)
-
-
-def test_steps_are_decisions_whatever_the_encoding(trained):
-    training = trained("maskable")
-    assert training.plan.actions_per_step == 2
-    assert training.rows[-1]["steps"] == 240
-    assert training.learner.model.num_timesteps == 480
-
-
-def test_every_update_compares_replicas(trained):
-    training = trained("scores")
-    # Episode by episode, as the minibatches are drawn from. Of two replicas each is compared with
-    # the other, so that their advantages are opposite.
-    advantages = training.learner.model.rollout_buffer.advantages.reshape(2, 2, 10)
-    np.testing.assert_allclose(advantages[:, 0], -advantages[:, 1], atol=1e-6)
-    assert np.abs(advantages).max() > 0.01
-
-
-def test_a_finished_training_is_left_alone(trained, tmp_path):
-    folder = shutil.copytree(trained().folder, tmp_path / "run")
-    before = {path.name: path.read_bytes() for path in folder.iterdir()}
-    again = Training(make_plan(), folder)
-    again.run()
-    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
-
-
-def test_the_folder_describes_the_training(trained):
-    folder = trained().folder
-    assert {path.name for path in folder.iterdir()} == {
-        PLAN, PROGRESS, CHECKPOINT, POLICY, BEST,
-    }  # fmt: skip
-    plan = json.loads((folder / PLAN).read_text())
-    assert plan["seed"] == 1
-    assert plan["traffic_seeds"] == [0, 1, 2]
-    assert plan["recipe"]["n_envs"] == 4
-    assert plan["learner"] == "plackett-luce"
-    policy = load_policy(folder / POLICY, _env())
-    assert policy.card["training"]["steps"] == 36 + 2 * 3 * 80 * 7
-    assert policy.card["training"]["traffic seeds"] == "0..2"
-    assert policy.card["versions"]["dptse-env"] == dptse_env.__version__
-
-
-def _env():
-    import gymnasium as gym
-
-    return gym.make("dptse_env:dptse/ShortHighway-v0", action="slots", privacy="capped", horizon=80)
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"seed": 2}, "seed is 1 there and 2 now"),
-        ({"steps": 480}, "steps is 240 there and 480 now"),
-        ({"keywords": {"horizon": 81, "privacy": "capped"}}, "keywords.horizon is 80 there"),
-        ({"traffic_seeds": (0, 1)}, r"traffic_seeds is \[0, 1, 2\] there and \[0, 1\] now"),
-        ({"validation_seeds": (1000,)}, "validation_seeds is"),
-    ],
-)
-def test_another_plan_is_refused(tmp_path, changes, message):
-    Training(make_plan("mask"), tmp_path)
-    with pytest.raises(ValueError, match=message):
-        Training(make_plan("mask", **changes), tmp_path)
-
-
-def test_another_recipe_or_learner_is_refused(tmp_path):
-    Training(make_plan("scores"), tmp_path)
-    recipe = dataclasses.replace(make_recipe("scores"), gamma=0.9)
-    with pytest.raises(ValueError, match=r"recipe\.gamma is 0\.95 there and 0\.9 now"):
-        Training(make_plan("scores", recipe=recipe), tmp_path)
-    with pytest.raises(ValueError, match="learner is 'scores' there and 'mask' now"):
-        Training(make_plan("mask"), tmp_path)
-
-
-def test_a_missing_or_damaged_checkpoint_is_named(trained, tmp_path):
-    folder = shutil.copytree(trained().folder, tmp_path / "run")
-    path = folder / CHECKPOINT
-    path.write_bytes(path.read_bytes()[:1000])
-    with pytest.raises(ValueError, match=r"checkpoint\.pt is damaged"):
-        Training(make_plan(), folder)
-    path.unlink()
-    with pytest.raises(ValueError, match=r"checkpoint\.pt is missing, although progress\.csv"):
-        Training(make_plan(), folder)
-
-
-def test_a_checkpoint_of_a_former_version_is_refused(tmp_path):
-    Training(make_plan("mask"), tmp_path)
-    torch.save({"update": 3, "rounds": 0}, tmp_path / CHECKPOINT)
-    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
-    with pytest.raises(ValueError, match=r"checkpoint\.pt has format 1, and this version"):
-        Training(make_plan("mask", validate_every=1), tmp_path)
-    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
-
-
-def test_a_folder_with_other_things_is_refused(tmp_path):
-    (tmp_path / "thesis.tex").write_text("")
-    with pytest.raises(ValueError, match=r"is not empty and has no plan\.json"):
-        Training(make_plan(), tmp_path)
-
-
-@pytest.mark.parametrize("name", [PROGRESS, CHECKPOINT])
-def test_a_full_disk_leaves_a_folder_to_continue_in(trained, tmp_path, monkeypatch, name):
-    plan, complete = make_plan("scores"), trained("scores")
-    training = Training(plan, tmp_path / "full")
-    replace, written = pathlib.Path.replace, []
+def test_a_full_disk_leaves_a_folder_to_go_on_in(whole, tmp_path, monkeypatch):
+    replace, written = Path.replace, []
 
     def full(path, target):
         written.append(target.name)
-        if target.name == name and written.count(name) == 3:
+        if target.name == CHECKPOINT and written.count(CHECKPOINT) == 2:
             raise OSError(28, "No space left on device")
         return replace(path, target)
 
     with monkeypatch.context() as patch:
         patch.setattr("pathlib.Path.replace", full)
         with pytest.raises(OSError, match="No space left"):
-            training.run()
-    again = Training(plan, tmp_path / "full")
-    assert again.update == 2
-    again.run()
-    expected, resumed = read_progress(complete.folder), read_progress(tmp_path / "full")
-    assert without_time(expected) == without_time(resumed)
+            train(make_plan(), tmp_path / "full")
+    stages, seen = [], []
+    rows = train(
+        make_plan(), tmp_path / "full", watchers=(seen.append,),
+        progress=lambda stage, fraction: stages.append((stage, 0.0 <= fraction <= 1.0)),
+    )  # fmt: skip
+    assert set(stages) == {("swaps", True), ("fit", True)}  # the regression is not done again
+    assert seen == rows
+    assert_alike(tmp_path / "full", whole()[0])
 
 
-def test_nothing_half_written_stays(tmp_path, monkeypatch):
-    (tmp_path / "file").write_bytes(b"old")
-
-    def full(descriptor):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("os.fsync", full)
-    with pytest.raises(OSError, match="No space left"):
-        write_atomically(tmp_path / "file", b"new")
-    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == {"file": b"old"}
+def test_a_finished_training_is_left_alone(whole, tmp_path):
+    folder = shutil.copytree(whole()[0], tmp_path / "run")
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    assert set(before) == {PLAN, PROGRESS, CHECKPOINT, *POLICIES}
+    train(make_plan(), folder)
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
 
 
-def test_the_regression_moves_the_scorer_and_counts_as_no_update(trained, tmp_path):
+@pytest.mark.parametrize("name", fast_and_slow(["ppo", "maskable-ppo"], ["ppo"]))
+def test_ppo_goes_on_from_its_last_checkpoint(name, tmp_path):
+    plan, before = make_plan(name), []
+    with pytest.raises(StopError):
+        train(plan, tmp_path, watchers=(before.append, stop_at(3)))
+    kept = read_checkpoint(tmp_path)
+    assert (kept["update"], kept["rows"]) == (2, before[:2])
+    after = []
+    rows = train(plan, tmp_path, watchers=(after.append,))
+    assert [row["update"] for row in rows] == list(range(7))
+    assert rows == after
+    assert rows[:2] == before[:2]
+    # The same policy, but in new episodes.
+    assert rows[2]["validation_drawn"] == before[2]["validation_drawn"]
+    assert rows[3]["value_loss"] != before[3]["value_loss"]
+    rates = [row["learning_rate"] for row in rows[3:]]
+    assert rates == pytest.approx([5e-4 - 4.5e-4 * update / 6 for update in (3, 4, 5, 6)])
+
+
+@pytest.mark.parametrize(
+    ("name", "steps"), fast_and_slow([("ppo", 10), ("maskable-ppo", 20)], [("maskable-ppo", 20)])
+)
+def test_every_update_of_ppo_compares_replicas(name, steps, tmp_path, monkeypatch):
+    seen = []
+    monkeypatch.setattr(
+        "agents.training.ppo.recentre",
+        lambda advantages, replicas: seen.append((advantages.shape, replicas)),
+    )
+    train(make_plan(name), tmp_path)
+    assert seen == [((steps, 4), 2)] * 6
+
+
+# --- what a training leaves -----------------------------------------------------------------------
+
+
+def make_env(plan, **keywords):
+    return gym.make(SHORT, action=plan.algorithm.action, **{**KEYWORDS, **keywords})
+
+
+def test_the_curve_of_rounds(whole):
+    folder, rows = whole()
+    assert rows == read_progress(folder)
+    # Four episodes are simulated for nine seconds ahead of the rounds; in a round three of 80 s,
+    # each with 1 + 2 forks under noise and its opposite.
+    assert [row["steps"] for row in rows] == [36, 36 + 1680, 36 + 2 * 1680]
+    assert len({row["validation_drawn"] for row in rows}) == 3
+    assert all(0.01 < row["error"] < 1 for row in rows[1:])
+
+
+@pytest.mark.parametrize(
+    ("name", "actions"), fast_and_slow([("ppo", 1), ("maskable-ppo", 2)], [("maskable-ppo", 2)])
+)
+def test_the_curve_of_ppo_counts_seconds_whatever_the_encoding(name, actions, whole):
+    folder, rows = whole(name)
+    assert make_plan(name).actions_per_step == actions
+    assert [row["steps"] for row in rows] == [40 * update for update in range(7)]
+    assert [row["update"] for row in rows if "validation" in row] == [0, 2, 4, 6]
+    assert all(0.05 < row["error"] < 0.5 for row in rows if "error" in row)
+    assert rows == read_progress(folder)
+
+
+@pytest.mark.parametrize("name", ["plackett-luce", "ppo"])
+def test_the_best_policy_is_the_best_in_validation(name, whole):
+    folder, rows = whole(name)
+    plan, seeds = make_plan(name), (1000, 1001)
+    errors = [row["validation"] for row in rows if "validation" in row]
+    env = make_env(plan, traffic_seeds=list(seeds))
+    for file, expected in ((BEST, min(errors)), (POLICY, errors[-1])):
+        policy = load_policy(folder / file, env)
+        played = evaluate(env, policy, seeds, TRAINING_VALIDATION.start)
+        assert -np.mean([row["reward"] for row in played]) == pytest.approx(expected, rel=1e-6)
+        assert policy.card["figures"]["validation"] == expected
+    training = load_policy(folder / BEST, env).card["training"]
+    assert (
+        training["steps"] == rows[errors.index(min(errors)) * (1 if actions(plan) else 2)]["steps"]
+    )
+    assert (training["learner"], training["seed"]) == (name, 1)
+    assert training["traffic seeds"] == "0..2"
+
+
+def actions(plan):
+    return plan.algorithm.name == "plackett-luce"
+
+
+def test_a_validation_is_seeded_and_leaves_the_draws_of_the_training_alone(whole, tmp_path):
     plan = make_plan()
-    first = trained()
-    before = Training(plan, tmp_path / "one").learner.policy.state_dict()
-    recipe = dataclasses.replace(plan.recipe, regression=RegressionRounds(rounds=0))
-    second = Training(make_plan(recipe=recipe), tmp_path / "two")
-    second.run()
-    rows = [training.rows[0] for training in (first, second)]
-    assert [row["steps"] for row in rows] == [36, 0]
-    assert [row["update"] for row in rows] == [0, 0]
-    assert rows[0]["validation_drawn"] != rows[1]["validation_drawn"]
-    after = first.learner.policy.state_dict()
-    assert all((after[name] != before[name]).any() for name in before)
+    run = Run(plan, shutil.copytree(whole()[0], tmp_path / "run"), None, (), print)
+    policies, state = plan.algorithm.make_policies(plan.worlds), torch.get_rng_state()
+    row = run.validate(policies, 0)
+    assert torch.equal(torch.get_rng_state(), state)
+    torch.manual_seed(99)
+    assert run.validate(policies, 0) == row
+    env = make_vector(SHORT, 2, {**KEYWORDS, "action": "slots", "traffic_seeds": [1000, 1001]})
+    noise = TRAINING_VALIDATION.start
+    torch.manual_seed(noise)
+    rows = evaluate(env, policies[0], (1000, 1001), noise, deterministic=False)
+    assert row["validation_drawn"] == pytest.approx(-np.mean([each["reward"] for each in rows]))
+
+
+def test_several_environments_teach_one_network(whole):
+    folder, rows = whole(envs=(ENV, OTHER))
+    regression, forks = 9 * (4 + 2), 1 + 2 * (1 + 2)
+    assert rows[-1]["steps"] == regression + 2 * (3 + 1) * 80 * forks
+    for column in ("validation", "validation_drawn"):
+        each = [row for name, row in rows[-1].items() if name.startswith(f"{column} in dptse_env")]
+        assert len(each) == 2
+        assert rows[-1][column] == pytest.approx(sum(each) / 2)
+    policy = load_policy(folder / POLICY, make_env(make_plan()))
+    assert policy.card["training"]["also"] == [OTHER]
+    env = gym.make("dptse_env:dptse/PrivateHighway-v0", action="slots", bandwidth=3)
+    elsewhere = load_policy(folder / BEST, env, allow=("corridor", "bandwidth"))
+    assert env.action_space.contains(elsewhere.predict(env.reset(seed=0)[0])[0])
+    one, two = (read_checkpoint(each)["policy"] for each in (folder, whole()[0]))
+    assert not any(torch.equal(one[key], two[key]) for key in one)
+
+
+# --- folders that are refused ---------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"traffic_seeds": (0, 2000)}, r"traffic must be traffic seeds in 0\.\.999, got 2000"),
-        (
-            {"validation_seeds": (2000,)},
-            r"validation must be .* 1000\.\.1999, got 2000",
-        ),
-        ({"seed": -1}, r"seed must be an integer in 0\.\.999"),
-        ({"steps": 0, "recipe": RECIPES["mask"]()}, "steps must be an integer >= 1"),
-        ({"steps": 240}, "steps must be 0 for plackett-luce, which is trained in rounds, got 240"),
-        ({"keywords": {"action": "mask"}}, r"keywords\.action is chosen by the training"),
+        ({"seed": 2}, "seed is 1 there and 2 now"),
+        ({"envs": (ENV.replace("80", "81"),)}, r"envs is \[.*80.*\] there and \[.*81.*\] now"),
+        ({"traffic_seeds": (0, 1)}, r"traffic_seeds is \[0, 1, 2\] there and \[0, 1\] now"),
+        ({"algorithm": make_algorithm(width=9)}, r"algorithm\.width is 8 there and 9 now"),
+        ({"algorithm": make_algorithm("ppo")}, "algorithm.name is 'plackett-luce' there and 'ppo'"),
     ],
 )
-def test_plans_that_are_refused(changes, message):
+def test_the_folder_of_another_plan_is_refused(changes, message, whole):
+    folder = whole()[0]
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
     with pytest.raises(ValueError, match=message):
-        make_plan(**changes)
+        train(make_plan(**changes), folder)
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
 
 
-def test_swaps_under_a_release_whose_noise_cannot_be_set_are_refused_at_once(tmp_path):
-    plan = make_plan(keywords={"horizon": 80, "privacy": "tests.helpers:SumRelease"})
-    message = r"^recipe.swaps.rounds must be 0 under '.*SumRelease', .*, got 2; recipe:maskable"
-    with pytest.raises(ValueError, match=message):
-        Training(plan, tmp_path / "x")
-    assert not (tmp_path / "x").exists()
+def test_damaged_and_foreign_files_are_refused(whole, tmp_path):
+    def refused(name, content, message):
+        folder = shutil.copytree(whole()[0], tmp_path / "run", dirs_exist_ok=True)
+        (folder / name).unlink()
+        if content is not None:
+            (folder / name).write_bytes(content)
+        with pytest.raises(ValueError, match=message):
+            train(make_plan(), folder)
+
+    checkpoint = (whole()[0] / CHECKPOINT).read_bytes()
+    refused(CHECKPOINT, checkpoint[:1000], r"checkpoint\.pt is damaged")
+    refused(CHECKPOINT, None, r"checkpoint\.pt is missing, although progress\.csv")
+    refused(PLAN, b'{"env', r"plan\.json is damaged")
+    refused(PLAN, None, r"is not empty and has no plan\.json")
+    older = json.loads((whole()[0] / PLAN).read_text()) | {"format": 3}
+    refused(PLAN, json.dumps(older).encode(), "format is 3 there and 4 now")
 
 
-def test_a_bad_keyword_is_refused_before_anything_is_written(tmp_path):
-    with pytest.raises(ValueError, match="estimatr is unknown"):
-        Training(make_plan(keywords={"estimatr": "ukf"}), tmp_path / "run")
-    assert not (tmp_path / "run").exists()
+# --- several trainings ----------------------------------------------------------------------------
+
+
+def test_trainings_at_once_come_out_as_alone(whole, tmp_path):
+    """One of them goes on where a worker was lost, whose task is run again."""
+    with pytest.raises(StopError):
+        train(make_plan(seed=2), tmp_path / "2", watchers=(stop_at(1),))
+    rows = read_progress(tmp_path / "2")
+    plans = {tmp_path / str(seed): make_plan(seed=seed) for seed in (1, 2)}
+    train_all(plans, Elsewhere(), progress=False)
+    assert_alike(tmp_path / "1", whole()[0])
+    assert read_progress(tmp_path / "2")[: len(rows)] == rows
+    first, second = (read_checkpoint(folder)["policy"] for folder in plans)
+    assert not any(torch.equal(first[key], second[key]) for key in first)
+
+
+def test_a_folder_of_another_plan_is_refused_before_anything_runs(whole, tmp_path):
+    plans = {tmp_path / "9": make_plan(), whole()[0]: make_plan(seed=9)}
+    with pytest.raises(ValueError, match="seed is 1 there and 9 now"):
+        train_all(plans, THIS_PROCESS, progress=False)
+    assert not (tmp_path / "9").exists()
+
+
+def test_a_folder_that_workers_do_not_share_is_an_error(tmp_path):
+    class Apart(ThisProcess):
+        """Trains on the disk of another machine."""
+
+        def submit(self, fn, /, *args, **kwargs):
+            future = Future()
+            future.set_result(None)
+            return future
+
+    with pytest.raises(ExecutorError, match="choose an --output that all nodes have"):
+        train_all({tmp_path / "0": make_plan()}, Apart(), progress=False)
+
+
+# --- non-interference; see `tests.test_non_interference` ------------------------------------------
+
+
+@pytest.fixture(scope="module", params=ALGORITHMS)
+def private(request, tmp_path_factory):
+    """A policy of every algorithm, trained a little with the truth at hand."""
+    env = 'dptse_env:dptse/PrivateHighway-v0 {"horizon": 70}'
+    plan = make_plan(request.param, envs=(env,), traffic_seeds=(0, 1), validation_seeds=(1000,))
+    folder = tmp_path_factory.mktemp(request.param)
+    train(plan, folder)
+    return plan.algorithm.action, folder / POLICY
+
+
+class Acting:
+    """A policy whose draws begin alike in every episode."""
+
+    def __init__(self, act):
+        self.act = act
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        if state is None:
+            torch.manual_seed(7)
+        return self.act(observation), True
+
+
+@pytest.mark.parametrize("deterministic", [True, False])
+def test_traffic_does_not_show_through_a_trained_policy(private, deterministic):
+    action, path = private
+    env = blind(make_private(action=action))
+    policy = load_policy(path, env)
+    act = Acting(lambda observation: policy.predict(observation, deterministic=deterministic)[0])
+    assert not unlike(env, act)
+
+
+@pytest.mark.parametrize("action", ["slots", "sequential"])
+def test_a_policy_that_sees_the_truth_would_show(action):
+    env = blind(make_private(action=action))
+    process, interface = env.unwrapped.process, env.unwrapped.interface
+
+    def crowded(observation):
+        density = process.truth(np.array([0]))[:, :15, 0]
+        wanted = density.argsort(axis=1).argsort(axis=1) >= 15 - interface.bandwidth
+        return interface.actions.encode(wanted, process.pending.picked)[0]
+
+    assert unlike(env, Acting(crowded))

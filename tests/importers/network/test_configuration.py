@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from functools import partial
 
 import pytest
 
@@ -55,29 +56,22 @@ def test_a_configuration_gives_files_and_options_of_the_traffic(tmp_path):
         (("<processing>", '<processing><mesosim value="true"/>'), ": mesosim must be left out"),
         (("</configuration>", ""), " must be XML"),
         (("configuration>", "net>"), " must be a <configuration> of SUMO, got <net>"),
+        ("routes <routes/>", " must have vehicles, got an empty file"),
+        ("routes no xml", " must be XML"),
+        ("routes <net><edge/></net>", " must hold routes, got <net>"),
+        ('routes <routes><include href="b.xml"/></routes>', ": <include> must not read another"),
+        ('additional <a><vss file="s.xml"/></a>', ": <vss> must not read another file, got 's."),
+        ("additional <a><b/>", " must be XML"),
     ],
 )
-def test_configurations_of_no_use_are_refused(tmp_path, change, message):
-    expected = re.escape(f"configuration: {tmp_path / 'town.sumocfg'}{message}")
-    with pytest.raises(ValueError, match=f"^{expected}"):
-        read(tmp_path, *change)
-
-
-@pytest.mark.parametrize(
-    ("kind", "content", "message"),
-    [
-        ("routes", "<routes/>", " must have vehicles, got an empty file"),
-        ("routes", "no xml", " must be XML"),
-        ("routes", "<net><edge/></net>", " must hold routes, got <net>"),
-        ("routes", '<routes><include href="b.xml"/></routes>', ": <include> must not read another"),
-        ("additional", '<a><vss file="s.xml"/></a>', ": <vss> must not read another file, got 's."),
-        ("additional", "<a><b/>", " must be XML"),
-    ],
-)
-def test_routes_and_additional_files_of_no_use_are_refused(tmp_path, kind, content, message):
-    routes, path = tmp_path / "all.rou.xml", tmp_path / "own.xml"
-    routes.write_text("<routes><vehicle/></routes>")
-    path.write_text(content)
-    files = replace(Files(tmp_path / "net.xml", (routes,)), **{kind: (path,)})
-    with pytest.raises(ValueError, match=re.escape(f"{kind}: {path}{message}")):
-        files.check()
+def test_files_of_no_use_are_refused(tmp_path, change, message):
+    if isinstance(change, tuple):
+        kind, path, check = "configuration", tmp_path / "town.sumocfg", partial(read, tmp_path)
+    else:
+        kind, _, content = change.partition(" ")
+        routes, path, change = tmp_path / "all.rou.xml", tmp_path / "own.xml", ()
+        routes.write_text("<routes><vehicle/></routes>")
+        path.write_text(content)
+        check = replace(Files(tmp_path / "net.xml", (routes,)), **{kind: (path,)}).check
+    with pytest.raises(ValueError, match=f"^{re.escape(f'{kind}: {path}{message}')}"):
+        check(*change)

@@ -34,8 +34,8 @@ def test_segments_cover_the_path_without_gaps(files):
     assert total == pytest.approx(sum(edges[name] for name in PATH) + crossings, rel=0.02)
 
 
-def test_ramps_lie_at_faces_with_equal_segments_between_them(files):
-    layout = find_layout(files, PATH, 100.0)
+def test_ramps_lie_at_faces_and_acceleration_lanes_count_as_lanes_of_the_mainline(files):
+    layout, longer = (find_layout(files, PATH, length) for length in (100.0, 150.0))
     (on,), (off,) = layout.on_ramps, layout.off_ramps
     assert on == 3  # 400 m before the junction are four parts, the first of them the boundary
     assert layout.names == ("ramp-b", "exit-a")
@@ -43,32 +43,18 @@ def test_ramps_lie_at_faces_with_equal_segments_between_them(files):
     assert between == pytest.approx([between[0]] * len(between))
     assert 90.0 < between[0] < 110.0
     assert layout.ramp_lengths == pytest.approx((100.0, 100.0))
-
-
-def test_acceleration_lanes_count_as_lanes_of_the_mainline(files):
-    layout = find_layout(files, PATH, 100.0)
-    on = layout.on_ramps[0]
     assert layout.lanes[:on] == (2,) * on
     assert layout.lanes[on : on + 2] == (3, 3)  # 250 m: two segments, and less than half of one
     assert set(layout.lanes[on + 3 :]) == {2}
-    longer = find_layout(files, PATH, 150.0)
     assert longer.lanes[longer.on_ramps[0] + 1] == 3  # two thirds of it
     assert layout.limits[0] == pytest.approx(108.0)
     assert layout.limits[-1] == pytest.approx(90.0)
-
-
-def test_ramps_of_several_edges_go_on_behind_a_boundary_inside_an_edge(files):
-    columns = find_layout(files, PATH, 150.0).columns
-    N = len(columns) - 6
-    ramp, before = columns[N], columns[-2]
+    # Ramps of several edges go on behind a boundary inside an edge.
+    ramp, before = longer.columns[len(longer.lengths)], longer.columns[-2]
     assert {edge for edge, _, _ in ramp if not edge.startswith(":")} == {"ramp-b"}
     assert {edge for edge, _, _ in before if not edge.startswith(":")} == {"ramp-b", "ramp-a"}
-
-
-def test_the_ends_may_lie_inside_edges(files):
-    whole = find_layout(files, PATH, 100.0)
     part = find_layout(files, PATH, 100.0, ends=(150.0, 300.0))
-    assert len(part.lengths) < len(whole.lengths)
+    assert len(part.lengths) < len(layout.lengths)
     (upstream,) = part.columns[len(part.lengths) + 2]
     assert upstream[:2] == ("in", 150.0)
     assert part.columns[len(part.lengths) + 3][-1] == ("out", pytest.approx(200.0, abs=5.0), 300.0)

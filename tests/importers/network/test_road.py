@@ -235,3 +235,12 @@ def test_scenarios_and_corridors_of_no_use_are_refused(road):
         dataclasses.replace(road.corridor, network=dataclasses.replace(network, columns=columns))
     with pytest.raises(ValueError, match=r"corridor\.drivers must be left out"):
         dataclasses.replace(road.corridor, drivers=Drivers("IDM"))
+
+
+def test_additional_files_write_nothing(files, tmp_path):
+    extra, written = tmp_path / "own.add.xml", tmp_path / "out.xml"
+    loop = f'<inductionLoop id="d" lane="narrow_0" pos="5" period="10" file="{written}"/>'
+    extra.write_text(f"<additional>{loop}</additional>")
+    more = dataclasses.replace(files, additional=(extra,))
+    import_road(more, find_layout(files, PATH, 100.0), "road", 60)
+    assert not written.exists()

@@ -1,0 +1,277 @@
+"""Episodes for the tests of estimators, simulated and recorded, what runs them, and networks."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from dptse_env.estimators import (
+    ESTIMATORS,
+    REFERENCES,
+    DemandSettings,
+    EstimatorSettings,
+    Measurement,
+    RecurrentSettings,
+    make_estimator,
+)
+from dptse_env.estimators.base import Estimator
+from dptse_env.estimators.recurrent import FORMAT, write_network
+from dptse_env.estimators.recurrent_kernels import CHANNELS, Network, shapes
+from dptse_env.model import ARZModel, MeasurementRows, load_parameters
+from dptse_env.traffic import PAPER_HIGHWAY, Corridor, RecordLibrary
+from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+
+EVERY = [(name, "compiled") for name in ESTIMATORS] + [(name, "reference") for name in REFERENCES]
+RELEASES = ("speed", "flow", "rows")
+"""What sensors release beside the density: the mean speed, or the flow rho (v - v_0); or flows and
+densities of rows of several segments, each with noise and speeds v_0 of its own."""
+FIELDS = ("density", "speed", "density_std", "speed_std")
+REFERENCE_SPEED = 51.0
+# The noise of a flow is v_0 times the density's where both get the same share of the privacy.
+SPEEDS, FLOWS = np.array([15.0, 6.0]), np.array([15.0, 15.0 * REFERENCE_SPEED])
+PLAIN = EstimatorSettings(recurrent=RecurrentSettings(outside=True))  # rows of three segments
+RICH = EstimatorSettings(density_growth=0.03, count_noise=0.5, demand=DemandSettings())
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """n episodes of K steps: what drives a filter and what it should find."""
+
+    model: ARZModel
+    start: FloatArray  # (n, 2 S) prior means
+    inputs: FloatArray  # (K, n, n_u)
+    truth: FloatArray  # (K, n, 2 S)
+    observed: BoolArray  # (K, n, M)
+    values: FloatArray  # (K, n, M, 2)
+    sigma: FloatArray  # (K, n, M, 2)
+    centre: FloatArray | None = None  # (K, n, S) speeds that flows are centred on [km/h]
+
+    @property
+    def everyone(self) -> IntArray:
+        return np.arange(len(self.start))
+
+    def released(self, k: int, which: Any) -> dict[str, Any]:
+        """What is released of episodes in a step, as arguments of `Measurement.of`."""
+        names = ("observed", "values", "sigma", *(() if self.centre is None else ("centre",)))
+        return {name: getattr(self, name)[k, which] for name in names}
+
+
+def model_of(parameters: str, release: str, road: Corridor = PAPER_HIGHWAY) -> ARZModel:
+    """A road as its sensors release it."""
+    speed = None if release == "speed" else REFERENCE_SPEED
+    rows = None
+    if release == "rows":
+        rows = every_row(len(road.segment_lengths), road.n_mainline)
+    return ARZModel(road, load_parameters(parameters), reference_speed=speed, rows=rows)
+
+
+def every_row(n_segments: int, n_mainline: int) -> MeasurementRows:
+    """All segments singly, then all pairs and triples of the mainline, which overlap."""
+    pairs = [(first, 1) for first in range(n_segments)]
+    pairs += [(first, span) for span in (2, 3) for first in range(n_mainline + 1 - span)]
+    first, span = np.array(pairs, dtype=np.int64).T
+    return MeasurementRows(first.copy(), span.copy(), n_segments)
+
+
+def simulate(
+    parameters: str = "w99-3lane",
+    n: int = 1,
+    n_steps: int = 700,
+    noise: float = 1.0,
+    release: str = "speed",
+    road: Corridor = PAPER_HIGHWAY,
+) -> Episodes:
+    """Demand that swells and a queue from the exit, disturbed, roaming sensors, noise."""
+    model, rng = model_of(parameters, release, road), np.random.default_rng(0)
+    s, jam, v_f = model.n_segments, model.jam_density, model.parameters.free_flow_speed
+    per_lane = model.parameters.jam_density / model.parameters.lanes
+
+    t = np.arange(n_steps)[:, None, None]
+    phase = rng.uniform(0.0, 2.0 * np.pi, (n, model.n_boundaries))
+    filling = 0.06 + 0.04 * np.sin(2.0 * np.pi * t / 90.0 + phase)
+    filling[200:400, :, 0] += 0.06
+    filling[200:400, :, 1] += 0.25
+    rho = filling * per_lane * np.array(road.boundary_lanes)
+    v = v_f * (1.0 - filling**model.parameters.gamma)
+    inputs = np.stack([model.boundary_inputs(a, b) for a, b in zip(rho, v, strict=True)])
+
+    truth = np.empty((n_steps, n, model.n_states))
+    state = model.states(np.full((n, s), 0.06) * jam, np.full((n, s), 0.6 * v_f))
+    for k in range(n_steps):
+        state = model.step(state, inputs[k])
+        swerve = 1.0 + 0.01 * rng.normal(size=state.shape)
+        truth[k] = state = model.project(state * swerve)
+
+    shape, centre = (n_steps, n, model.rows.n_rows), None
+    sigma = np.broadcast_to(SPEEDS if release == "speed" else FLOWS, (*shape, 2))
+    if release == "rows":
+        observed = rng.random(shape) < 0.3
+        observed[::10] = True
+        sigma = sigma * rng.uniform(0.2, 2.0, sigma.shape)
+        centre = rng.uniform(20.0, 90.0, (n_steps, n, s))
+    else:
+        observed = rng.random(shape).argsort(axis=-1) < 5
+        observed[..., model.layout.exits] = True
+    start = model.states(np.full((n, s), 0.1) * jam, np.full((n, s), 0.5 * v_f))
+    values = _measured(model, truth, centre) + noise * sigma * rng.normal(size=sigma.shape)
+    return Episodes(model, start, inputs, truth, observed, values, sigma, centre)
+
+
+def _measured(model: ARZModel, truth: FloatArray, centre: FloatArray | None) -> FloatArray:
+    around = [None] * len(truth) if centre is None else centre
+    return np.stack([model.measure(x, v_0) for x, v_0 in zip(truth, around, strict=True)])
+
+
+@functools.cache
+def recorded(release: str) -> Episodes:
+    """A simulated rush hour on the paper's highway, 700 steps, five sensors going round."""
+    record = RecordLibrary().get(PAPER_HIGHWAY, 3)
+    model, sigma = model_of("w99-3lane", release), SPEEDS if release == "speed" else FLOWS
+    s, v_f = model.n_segments, model.parameters.free_flow_speed
+    density = record.counts / PAPER_HIGHWAY.segment_length
+    sums, counts = record.speed_sums, record.counts
+    speed = np.divide(sums, counts, out=np.full(sums.shape, np.nan), where=counts > 0)
+    inputs = model.boundary_inputs(density[:-1, s:], speed[:-1, s:])
+    traffic = np.stack([density[1:, :s], np.nan_to_num(speed[1:, :s], nan=102.0)], axis=-1)
+    values = traffic.copy()
+    if release == "flow":
+        values[..., 1] = traffic[..., 0] * (traffic[..., 1] - REFERENCE_SPEED)
+    values += sigma * np.random.default_rng(0).normal(size=traffic.shape)
+    observed = np.zeros((len(traffic), s), bool)
+    for k, row in enumerate(observed):
+        row[[*((3 * np.arange(5) + k) % 15), *model.layout.exits]] = True
+    start = model.states(0.05 * model.jam_density[None], np.full((1, s), 0.64 * v_f))
+    truth = model.states(traffic[..., 0], traffic[..., 1])
+    each = (array[:, None] for array in (inputs, truth, observed, values))
+    return Episodes(model, start, *each, np.broadcast_to(sigma, values[:, None].shape))
+
+
+def with_rows(episodes: Episodes, rows: MeasurementRows, places: IntArray) -> Episodes:
+    """The same episodes where more rows than are measured could be, those among them at places."""
+    old = episodes.model
+    model = ARZModel(old.network, old.parameters, reference_speed=old.reference_speed, rows=rows)
+    shape = (*episodes.observed.shape[:2], rows.n_rows)
+    observed, values, sigma = np.zeros(shape, bool), np.zeros((*shape, 2)), np.ones((*shape, 2))
+    observed[..., places], values[..., places, :] = episodes.observed, episodes.values
+    sigma[..., places, :] = episodes.sigma
+    return replace(episodes, model=model, observed=observed, values=values, sigma=sigma)
+
+
+# Running ------------------------------------------------------------------------------------------
+
+
+def random_streams(n: int, seed: int = 0) -> list[np.random.Generator]:
+    return [np.random.default_rng([seed, i]) for i in range(n)]
+
+
+def started(
+    name: str,
+    backend: str,
+    episodes: Episodes,
+    settings: EstimatorSettings = PLAIN,
+    start: FloatArray | None = None,
+    seed: int = 0,
+) -> Estimator:
+    """An estimator that is reset to the episodes' prior, or to another one."""
+    n = len(episodes.start)
+    estimator = make_estimator(name, backend, episodes.model, n, settings)
+    start = episodes.start if start is None else start
+    estimator.reset(episodes.everyone, start, random_streams(n, seed))
+    return estimator
+
+
+def update(
+    estimator: Estimator, episodes: Episodes, k: int, which: Any = None, **changes: Any
+) -> None:
+    """Update an estimator by what is released in a step, of all episodes or of some."""
+    which = episodes.everyone if which is None else np.asarray(which)
+    given = episodes.released(k, which) | changes
+    estimator.update(which, Measurement.of(estimator.model, **given))
+
+
+def step(
+    estimator: Estimator, episodes: Episodes, k: int, which: Any = None, **changes: Any
+) -> None:
+    """Predict an estimator one step ahead, and update it."""
+    which = episodes.everyone if which is None else np.asarray(which)
+    inputs = changes.pop("inputs", episodes.inputs[k, which])
+    estimator.predict(which, inputs)
+    update(estimator, episodes, k, which, **changes)
+
+
+def run(
+    estimator: Estimator,
+    episodes: Episodes,
+    steps: Iterable[int],
+    watch: Callable[[int], None] = lambda _: None,
+    **changes: Any,
+) -> None:
+    """Take the steps k of all episodes."""
+    for k in steps:
+        step(estimator, episodes, k, **changes)
+        watch(k)
+
+
+class Snapshot(NamedTuple):
+    """Everything that an estimator exposes."""
+
+    density: np.ndarray
+    speed: np.ndarray
+    density_std: np.ndarray
+    speed_std: np.ndarray
+    innovations: np.ndarray
+    diverged: np.ndarray
+    fallback: np.ndarray
+    states: np.ndarray
+
+
+def show(estimator: Estimator) -> Snapshot:
+    inner = estimator.means if hasattr(estimator, "means") else estimator.states
+    others = estimator.innovations, estimator.diverged, estimator.fallback, inner
+    return Snapshot(*estimator.estimate(), *(array.copy() for array in others))
+
+
+def assert_same(one: Snapshot, other: Snapshot, episodes=slice(None), of=slice(None)) -> None:
+    for field in Snapshot._fields:
+        a, b = getattr(one, field)[episodes], getattr(other, field)[of]
+        np.testing.assert_array_equal(a, b, err_msg=field)
+
+
+# Networks -----------------------------------------------------------------------------------------
+
+RANGES = {
+    "n_mainline": [2, 30],
+    "segment_length": [0.05, 0.2],
+    "speed_limit": [80.0, 130.0],
+    "lanes": [1, 4],
+    "span": [1, 3],
+    "flows": [0, 1],
+}
+
+
+def random_network(width=8):
+    """Weights of the size that training gives, so that gates work and outputs move."""
+    rng, size = np.random.default_rng(0), 0.4 * (8 / width) ** 0.5
+    arrays = {name: rng.normal(0.0, size, shape) for name, shape in shapes(width).items()}
+    return Network(**{name: array.astype(np.float32) for name, array in arrays.items()})
+
+
+def card(**ranges):
+    return {
+        "name": "random",
+        "format": FORMAT,
+        "channels": list(CHANNELS),
+        "ranges": {**RANGES, **ranges},
+        "training": {"seed": 0},
+    }
+
+
+def network_settings(folder, network=None, outside=False, **ranges):
+    """Settings of a network that is written into a folder."""
+    path = folder / "network.safetensors"
+    write_network(path, network or random_network(), card(**ranges))
+    return EstimatorSettings(recurrent=RecurrentSettings(weights=str(path), outside=outside))

@@ -1,0 +1,301 @@
+"""All commands: their help and its examples, the status of a run, and bad input in one line."""
+
+import errno
+import io
+import json
+import re
+import shlex
+import shutil
+import socket
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("tyro")
+
+import dptse_env
+from dptse_env import command_line
+from dptse_env.traffic import RecordingError
+from dptse_env.utils.registry import EXTRAS
+from scripts import info
+from scripts.dptse import MODULES
+from tests.helpers import SHORT, fast_and_slow, save_untrained
+from tests.importers.data import plain, stream
+from tests.importers.network.conftest import motorway
+from tests.scripts.commands import ROOT, refused, run_command
+
+COMMANDS = [*MODULES, "import trajectories", "import network", "import field"]
+SCREEN = 48
+"""Lines of a screen, of 100 columns."""
+
+
+def help_of(name, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "100")
+    done = run_command(*name.split(), "--help")
+    assert (done.returncode, done.stderr) == (0, "")
+    return done.stdout
+
+
+LONG = ["train", "train-estimator", "tune", "audit"]
+WITH_EXAMPLE = [name for name in COMMANDS if name not in LONG]
+
+
+@pytest.mark.parametrize("name", WITH_EXAMPLE)
+def test_help_begins_with_an_example_and_fits_a_screen(name, monkeypatch):
+    page = help_of(name, monkeypatch)
+    head = page.partition("╭")[0]
+    assert re.search(rf"^dptse {name}\b", head, re.MULTILINE)
+    assert len(page.splitlines()) <= SCREEN
+
+
+def write_data(folder):
+    """Write the files that the examples name, short ones."""
+    plain(folder / "points.csv", stream(seconds=130.0))
+    road = "n_mainline = 4\nduration = 20\ndemand = { mainline = [[0, 1]] }\n"
+    (folder / "road.toml").write_text(road)
+    table = "\n".join(" ".join(["30"] * 60) for _ in range(16))
+    (folder / "density.txt").write_text(table)
+    (folder / "speed.txt").write_text(table.replace("30", "80"))
+    motorway(folder)
+    (folder / "town.sumocfg").write_text(
+        '<configuration><net-file value="road.net.xml"/><route-files value="road.rou.xml"/>'
+        "</configuration>"
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name in WITH_EXAMPLE if name != "import"])
+def test_the_example_of_the_help_runs_as_it_is_printed(name, tmp_path, monkeypatch):
+    page = help_of(name, monkeypatch)
+    line = re.search(r"^dptse ((?:.*\\\n)*.*)", page, re.MULTILINE)[1].replace("\\\n", " ")
+    write_data(tmp_path)
+    if "--report" in line:
+        shutil.copytree(ROOT / "results" / "paper", tmp_path / "results" / "paper")
+    monkeypatch.chdir(tmp_path)
+    done = run_command(*shlex.split(line))
+    assert done.returncode == 0, done.stderr
+    assert done.stdout
+
+
+def test_the_overview_has_every_command_and_so_has_the_page():
+    page = (ROOT / "docs" / "commands.md").read_text(encoding="utf-8")
+    overview = run_command("--help").stdout
+    for name in MODULES:
+        assert f"\n  {name} " in overview
+        assert f"| `{name}" in page
+    assert run_command().stdout == overview
+    assert run_command("--version").stdout == f"dptse {dptse_env.__version__}\n"
+
+
+def test_an_unknown_command_or_option_is_told():
+    assert all(name in refused("recrod") for name in ("recrod", *MODULES))
+    done = run_command("record", "--sed", "0:1")
+    assert done.returncode == 2
+    assert "--seeds" in done.stderr
+
+
+def test_without_the_extra_it_says_what_to_install(monkeypatch, capsys):
+    for name in ("scripts", "scripts.dptse"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    monkeypatch.setitem(sys.modules, "tyro", None)
+    with pytest.raises(SystemExit) as ended:
+        command_line.main()
+    assert ended.value.code == 1
+    assert "pip install 'dptse-env[train]'" in capsys.readouterr().err
+
+
+def test_a_pipe_may_lack_letters(monkeypatch):
+    pipe = io.TextIOWrapper(io.BytesIO(), encoding="ascii")  # as on Windows
+    monkeypatch.setattr(sys, "stdout", pipe)
+    monkeypatch.setattr(sys, "argv", ["dptse", "--version"])
+    command_line.main()
+    print("ε")
+    pipe.flush()
+    assert pipe.buffer.getvalue().endswith(b"?\n")
+
+
+def test_information_has_what_a_bug_report_needs():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    extras = [project["optional-dependencies"][name] for name in EXTRAS]
+    wanted = {re.split(r"[^\w-]", each)[0] for each in sum(extras, project["dependencies"])}
+    found = json.loads(run_command("info", "--json").stdout)
+    assert wanted <= set(found["packages"])
+    page = run_command("info").stdout
+    for value in (dptse_env.__version__, found["digest"], found["packages"]["numpy"]):
+        assert value in page
+
+
+@pytest.mark.parametrize(
+    ("problem", "status", "said"),
+    [
+        (ValueError("seeds must be"), 2, "error: seeds must be"),
+        (FileNotFoundError(errno.ENOENT, "No such file", "a.toml"), 2, "error: a.toml: No such"),
+        (OSError(errno.ENOSPC, "No space left on device", "a"), 1, "error: a: No space left"),
+        (RecordingError("seed 3: SUMO"), 1, "error: seed 3: SUMO"),
+        (KeyboardInterrupt(), 130, "interrupted"),
+    ],
+    ids=lambda value: type(value).__name__ if isinstance(value, BaseException) else "",
+)
+def test_the_status_says_what_happened(problem, status, said, monkeypatch):
+    def collect():
+        raise problem
+
+    monkeypatch.setattr(info, "collect", collect)
+    done = run_command("info")
+    assert (done.returncode, done.stdout) == (status, "")
+    (line,) = done.stderr.splitlines()
+    assert line.startswith(said)
+
+
+def test_a_mistake_of_the_program_keeps_its_traceback(monkeypatch):
+    monkeypatch.setattr(info, "collect", lambda: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        run_command("info")
+
+
+def test_a_program_of_its_own_ends_with_the_status():
+    words = [sys.executable, "-m", "scripts.dptse", "record", "--seeds", "3:1"]
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("error: seeds")
+
+
+ENVIRONMENTS = {
+    "dptse_env:dptse/Nowhere-v0": "env must be",
+    "no_such_module:dptse/PaperHighway-v0": "env must be",
+    "CartPole-v1": "env must be",
+    f"{SHORT} 3": "env must be",
+    f'{SHORT} {{"cargo": 1}}': "cargo",
+    f'{SHORT} {{"corridor": {{"duration": -3}}}}': "corridor.duration must be",
+}
+
+
+@pytest.mark.parametrize("command", ["record", "evaluate", "audit"])
+def test_what_is_wrong_with_an_environment_is_said_by_its_path(command, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for env, message in ENVIRONMENTS.items():
+        assert refused(command, "--env", env).startswith(f"error: {message}")
+    assert not list(tmp_path.iterdir())
+
+
+def content(pattern):
+    """Return the content of the first file of the checkout that a pattern fits."""
+    return min(ROOT.glob(pattern)).read_bytes()
+
+
+def with_keyword(keyword):
+    return ["--env", f'{SHORT} {{{{"{keyword}": "{{path}}"}}}}']
+
+
+SETTINGS = b'{"x": {"estimator": "ekf", "settings": {"count_noise": 1}, "provenance": {}}}'
+FIELD = ["--cell", "0.1", "--interval", "5", "--segments", "6"]
+FIELD_ROAD = ["--name", "x", "--lanes", "2", "--speed-limit", "100"]
+NETWORK = b"<configuration><input><net-file value='n.net.xml'/></input></configuration>"
+POINTS = ["import", "trajectories", "--env", SHORT]
+FILES = {
+    "road": ("r.toml", b"n_mainline = 'six'\n", ["record", *with_keyword("corridor")]),
+    "parameters": (
+        "p.json", content("dptse_env/model/sets/*.json"), ["record", *with_keyword("parameters")],
+    ),
+    "settings": ("s.json", SETTINGS, ["evaluate", *with_keyword("estimator_settings")]),
+    "policy": (
+        "p.safetensors", content("dptse_env/policies/*.safetensors"),
+        ["evaluate", "--policies", "{path}"],
+    ),
+    "model": ("m.zip", SETTINGS, ["evaluate", "--policies", "stable_baselines3:PPO={path}"]),
+    "network": (
+        "n.safetensors", content("dptse_env/estimators/networks/*.safetensors"),
+        ["train-estimator", "--initial", "{path}"],
+    ),
+    "trajectories": (
+        "t.xml", b"<fcd-export><timestep time='0'><vehicle id='a' x='0' y='0' speed='3' lane='e_0'",
+        [*POINTS, "--format", "fcd", "--files", "{path}"],
+    ),
+    "mapping": ("m.toml", b'format = "fcd"\n', [*POINTS, "--files", "x", "--mapping", "{path}"]),
+    "field": (
+        "d.txt", b"1 2 3\n4 5 6\n",
+        ["import", "field", *FIELD, *FIELD_ROAD, "--density", "{path}", "--speed", "{path}"],
+    ),
+    "replayed field": (
+        "d.txt", b"1 2 3\n4 5 6\n",
+        ["replay-field", *FIELD, "--density", "{path}", "--speed", "{path}"],
+    ),
+    "configuration": (
+        "a.sumocfg", NETWORK, ["import", "network", "--path", "a b", "--configuration", "{path}"],
+    ),
+    "net": (
+        "a.net.xml", b"<net version='1.9'></net>",
+        ["import", "network", "--path", "a b", "--net", "{path}"],
+    ),
+}  # fmt: skip
+"""Files that commands read: a name, a content, and the command."""
+
+FAST = [
+    ("road", "missing"), ("policy", "truncated"), ("network", "noise"), ("net", "folder"),
+    ("trajectories", "truncated"), ("replayed field", "folder"),
+]  # fmt: skip
+ALL = [(kind, how) for kind in FILES for how in ("missing", "folder", "noise", "truncated")]
+OUTPUTS = {"replay-field": [], "record": ["--records", "cache"], "network": ["--output", "o.toml"]}
+
+
+@pytest.mark.parametrize(("kind", "how"), fast_and_slow(ALL, FAST))
+def test_a_file_that_cannot_be_read_is_named(kind, how, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    name, whole, words = FILES[kind]
+    path = tmp_path / name
+    if how == "folder":
+        path.mkdir()
+    elif how != "missing":
+        path.write_bytes(bytes(range(256)) if how == "noise" else whole[: len(whole) * 2 // 3])
+    key = words[1] if words[0] == "import" else words[0]
+    given = [word.format(path=path) for word in words]
+    line = refused(*given, *OUTPUTS.get(key, ["--output", "out"]))
+    assert name in line
+    assert "[Errno" not in line
+    assert {entry.name for entry in tmp_path.iterdir()} <= {name}
+
+
+REPLACED = {
+    "evaluate": ["--env", SHORT, "rows.parquet"],
+    "calibrate": ["fitted.json"],
+    "audit": ["paced-worst-case-hunter.json"],
+    "import network": ["--path", "a b", "road.toml"],
+}
+
+
+@pytest.mark.parametrize("name", REPLACED)
+def test_results_are_not_replaced_without_force(name, tmp_path):
+    *words, file = REPLACED[name]
+    path = tmp_path / file
+    path.write_text("mine")
+    line = refused(*name.split(), *words, "--output", path if "import" in name else tmp_path)
+    assert str(path) in line
+    assert "--force" in line
+    assert path.read_text() == "mine"
+
+
+def test_an_unfit_policy_is_found_before_anything_is_recorded(tmp_path):
+    pytest.importorskip("sb3_contrib")
+    policy = save_untrained(tmp_path / "policy.safetensors", bandwidth=3)
+    folders = "--output", tmp_path / "out", "--records", tmp_path / "cache"
+    line = refused("evaluate", "--env", SHORT, "--policies", policy, *folders)
+    assert "bandwidth is 3 for the policy and 2 for the environment" in line
+    assert list(tmp_path.iterdir()) == [policy]
+
+
+def test_a_cluster_that_does_not_answer_is_one_line(tmp_path, monkeypatch):
+    words = ["evaluate", "--env", SHORT, "--output", tmp_path / "out"]
+    assert "executor ray" in refused(*words, "--address", "auto")
+    with monkeypatch.context() as patch:
+        patch.setitem(sys.modules, "ray", None)
+        assert "dptse-env[ray]" in refused(*words, "--executor", "ray", status=1)
+    pytest.importorskip("ray")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+    line = refused(*words, "--executor", "ray", "--address", address, status=1)
+    assert line.startswith(f"error: no cluster answers at {address}")
+    assert not Path(tmp_path / "out").exists()
