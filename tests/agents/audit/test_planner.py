@@ -186,7 +186,13 @@ def test_targets_of_the_record_are_what_they_are_called(record):
     first = [record.step[record.vehicle == v].min() for v in range(record.n_vehicles)]
     late = [v for v in whole["late"] if first[v] > HORIZON / 2]
     assert whole["late"][: len(late)] == late != []
-    # With the largest unpaid demand: it would pay on if its ledger held more.
+    # With the largest unpaid demand: more seconds than the two that count.
+    road = dataclasses.replace(ROAD, fixed_sensors=())
+    capped = Planner(dataclasses.replace(config(cap=2), corridor=road))
+    paths = [Trajectory.from_record(record, v) for v in capped.rank(record, "runs-out")]
+    squares = [np.sort(np.sum(capped.moves(record, path) ** 2, axis=1)) for path in paths]
+    assert np.diff([each[:-2].sum() for each in squares]).max() <= 1e-9
+    # It would pay on if its ledger held more.
     worlds = planner.choose(record, "runs-out")
     rich = paced(epsilon=1e4)
     assert reached(rich, worlds) * privacy_report(rich).mu > 1.2 * privacy_report(paced()).mu
@@ -240,10 +246,10 @@ def test_the_hunter_queries_the_seconds_that_reveal_most(record):
 
 def test_the_hunter_queries_where_the_two_trajectories_part(record):
     seconds = np.arange(1, 21)
-    # Side by side at a standstill, then apart and a little slower to tell.
+    # One stands where the other drives by; then they are apart, and both a little slower to tell.
     together = np.where(seconds <= 10, 1, 2), np.where(seconds <= 10, 1, 3)
-    speed = np.where(seconds <= 10, 0.0, 20.0)
-    paths = tuple(Trajectory(seconds, segment, speed) for segment in together)
+    speeds = (np.where(seconds <= 10, first, 20.0) for first in (0.0, 80.0))
+    paths = tuple(map(Trajectory, (seconds, seconds), together, speeds))
     plan = Planner(config(bandwidth=2, cap=4)).plan(AdjacentWorlds(record, paths))
     assert plan[:10].sum() == 0
     assert plan[10:20, [2, 3]].sum() == plan.sum() == 8
