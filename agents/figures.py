@@ -278,9 +278,9 @@ def draw_curve(
     )  # fmt: skip
 
 
-def draw_level(axis: Axes, interval: Interval, line: Any = ":", label: str | None = None) -> None:
+def draw_level(axis: Axes, interval: Interval, label: str) -> None:
     """Draw a mean that no place changes as a line with a band."""
-    axis.axhline(interval.mean, color=GREY, linestyle=line, linewidth=1.3, label=label)
+    axis.axhline(interval.mean, color=GREY, linestyle=":", linewidth=1.3, label=label)
     axis.axhspan(interval.low, interval.high, color=GREY, alpha=0.11, linewidth=0)
 
 

@@ -1,11 +1,9 @@
-"""CSV and JSON files, complete or not there, and refusals to write over others."""
+"""JSON files, complete or not there, and refusals to write over others."""
 
 from __future__ import annotations
 
-import csv
-import io
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -31,29 +29,14 @@ def refuse_to_replace(paths: Iterable[Path], force: bool) -> None:
         )
 
 
-def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    """Write a CSV file in one piece.
-
-    Raises:
-        OSError: It cannot be written; the old one stays.
-    """
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows(rows)
-    write_atomically(path, text.getvalue())
-
-
-def write_json(path: Path, content: Any, sort_keys: bool = False) -> None:
+def write_json(path: Path, content: Any) -> None:
     """Write plain values as indented JSON in one piece.
 
     Raises:
         OSError: The file cannot be written; the old one stays.
         ValueError: A number is not finite.
     """
-    write_atomically(
-        path, json.dumps(content, indent=2, sort_keys=sort_keys, allow_nan=False) + "\n"
-    )
+    write_atomically(path, json.dumps(content, indent=2, allow_nan=False) + "\n")
 
 
 def first_difference(kept: Any, now: Any, path: str = "") -> str | None:

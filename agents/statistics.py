@@ -31,12 +31,11 @@ class Interval:
         return (self.high - self.low) / 2
 
 
-def mean_interval(values: ArrayLike, confidence: float = 0.95) -> Interval:
-    """Return the mean of independent values with Student's t interval.
+def mean_interval(values: ArrayLike) -> Interval:
+    """Return the mean of independent values with Student's 95 % interval.
 
     Args:
         values: One value per traffic seed, shape (n,), n >= 2.
-        confidence: Coverage of the interval, in (0, 1).
 
     Raises:
         ValueError: There are fewer than two values or one is not finite.
@@ -49,7 +48,7 @@ def mean_interval(values: ArrayLike, confidence: float = 0.95) -> Interval:
     mean, error = float(array.mean()), float(stats.sem(array))
     if error == 0.0:
         return Interval(mean, mean, mean, len(array))
-    low, high = stats.t.interval(confidence, len(array) - 1, loc=mean, scale=error)
+    low, high = stats.t.interval(0.95, len(array) - 1, loc=mean, scale=error)
     return Interval(mean, float(low), float(high), len(array))
 
 
@@ -104,11 +103,10 @@ def percent_of_way(table: FloatArray, start: FloatArray, end: FloatArray) -> Flo
 def bootstrap(
     statistic: Callable[..., FloatArray],
     *tables: ArrayLike,
-    confidence: float = 0.95,
     n_resamples: int = 10_000,
     seed: int = 0,
 ) -> Interval:
-    """Return a statistic of paired tables with its two-level percentile bootstrap interval.
+    """Return a statistic of paired tables with its two-level 95 % bootstrap interval.
 
     Training seeds and traffic seeds are crossed: every run meets all traffic. Each resample draws
     traffic seeds with replacement, the same for all tables, which keeps them paired, and training
@@ -122,7 +120,6 @@ def bootstrap(
         statistic: Takes arrays (r, S, T), one for each table, and returns (r,).
         *tables: Values by training seed and traffic seed, shape (S, T); (T,) for a policy that
             was not trained. T is the same for all tables, S may differ.
-        confidence: Coverage of the interval, in (0, 1).
         n_resamples: Number of resamples.
         seed: Seeds the resampling.
 
@@ -147,8 +144,7 @@ def bootstrap(
     estimate = float(statistic(*(table[None] for table in checked))[0])
     if not (np.isfinite(values).all() and np.isfinite(estimate)):
         raise ValueError("the statistic must be finite on every resample")
-    tail = 50.0 * (1.0 - confidence)
-    low, high = np.percentile(values, [tail, 100.0 - tail])
+    low, high = np.percentile(values, [2.5, 97.5])
     return Interval(estimate, float(low), float(high), n_columns)
 
 
@@ -156,8 +152,8 @@ _CHUNK = 500
 """Resamples drawn at once, which bounds the memory."""
 
 
-def crossed_t(table: ArrayLike, confidence: float = 0.95) -> tuple[Interval, float]:
-    """Return the mean of crossed values with Student's interval, and the p-value of a zero mean.
+def crossed_t(table: ArrayLike) -> tuple[Interval, float]:
+    """Return the mean of crossed values with its 95 % interval, and the p-value of a zero mean.
 
     A two-way random-effects model with one value in each cell: training seed, traffic seed and
     their interaction. The mean squares of the rows plus those of the columns minus those of the
@@ -166,7 +162,6 @@ def crossed_t(table: ArrayLike, confidence: float = 0.95) -> tuple[Interval, flo
 
     Args:
         table: Paired differences by training seed and traffic seed, shape (S, T) or (T,).
-        confidence: Coverage of the interval, in (0, 1).
 
     Raises:
         ValueError: The table is too small or not finite.
@@ -188,7 +183,7 @@ def crossed_t(table: ArrayLike, confidence: float = 0.95) -> tuple[Interval, flo
         return Interval(point, point, point, n_columns), float(point == 0.0)
     freedom = variance**2 / sum(square**2 / df for square, df in terms)
     spread = np.sqrt(variance / values.size)
-    low, high = stats.t.interval(confidence, freedom, loc=centre, scale=spread)
+    low, high = stats.t.interval(0.95, freedom, loc=centre, scale=spread)
     p_value = 2.0 * stats.t.sf(abs(centre) / spread, freedom)
     return Interval(float(centre), float(low), float(high), n_columns), float(p_value)
 

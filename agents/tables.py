@@ -163,6 +163,16 @@ def format_interval(interval: Interval) -> str:
     return f"{digits(interval.mean)} [{digits(interval.low)}, {digits(interval.high)}]"
 
 
+def tenths(interval: Interval) -> str:
+    """Return a mean with the ends of its interval, a decimal each."""
+    return f"{interval.mean:.1f} [{interval.low:.1f}, {interval.high:.1f}]"
+
+
+def give_or_take(interval: Interval) -> str:
+    """Return a mean and half the length of its interval, a decimal each."""
+    return f"{interval.mean:.1f} ± {interval.half_width:.1f}"
+
+
 def format_number(value: float) -> str:
     """Return three significant digits without an exponent."""
     return f"{float(f'{value:.3g}'):g}" if abs(value) < 1e5 else f"{value:,.0f}"
@@ -173,23 +183,3 @@ def format_range(values: Sequence[int]) -> str:
     if list(values) == list(range(values[0], values[-1] + 1)):
         return f"{values[0]} to {values[-1]}"
     return ", ".join(map(str, values))
-
-
-def compared_header(reference: str) -> list[str]:
-    """Return the headers of the columns of `compared_errors`."""
-    columns = [(error_label(metric), f"against {reference}") for metric in METRICS]
-    return [column for pair in columns for column in pair]
-
-
-def compared_errors(rows: pl.DataFrame, labels: Labels, reference: Labels | None) -> list[str]:
-    """Return both errors of a cell, each with its paired difference to a reference, if any."""
-    row = []
-    for metric in METRICS:
-        row.append(cell(lambda m: format_interval(mean(rows, labels, m)), metric))
-        if reference is None or labels == reference:
-            row.append("-")
-        else:
-            row.append(
-                cell(lambda m: format_interval(difference(rows, labels, reference, m)), metric)
-            )
-    return row

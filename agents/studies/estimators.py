@@ -8,7 +8,6 @@ queries, beside three detectors on the mainline that count every vehicle.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from itertools import product
@@ -20,7 +19,7 @@ import polars as pl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from agents.environments import make_vector
+from agents.environments import OTHER_DRIVERS
 from agents.figures import (
     ESTIMATOR_LOOKS,
     LABELS,
@@ -34,9 +33,9 @@ from agents.figures import (
     save_measured,
     set_log_axes,
 )
-from agents.play import Cell, corridor_of, record
-from agents.statistics import Interval, geometric_mean_interval, mean_interval
-from agents.study import Place, Study, read_table
+from agents.play import Cell
+from agents.statistics import Interval, mean_interval
+from agents.study import Study
 from agents.tables import (
     DENSITY,
     ERROR,
@@ -45,9 +44,11 @@ from agents.tables import (
     below,
     format_interval,
     format_range,
+    give_or_take,
     grid,
     mean,
     pick_paired,
+    tenths,
     values,
     values_of,
 )
@@ -96,12 +97,6 @@ _LONG_ROAD = {
     },
     "incident": {"segments": list(range(59))},
 }
-_TWO_PEAKS = {
-    "base": {
-        "mainline": [[0.0, 5000.0], [120.0, 2000.0], [300.0, 5600.0], [420.0, 3000.0]],
-        "on_ramps": [150.0, 600.0],
-    }
-}
 _INCIDENT = {"segment": 10, "phases": [[200.0, 400.0, 10.08], [400.0, 500.0, 50.95]]}
 _DRIVERS = {
     "drivers by Krauss": {"model": "Krauss"},
@@ -113,7 +108,7 @@ ELSEWHERE: dict[str, World] = {
     **{name: (PACED, {"corridor": {"drivers": drivers}}) for name, drivers in _DRIVERS.items()},
     "no incident": (PACED, {"incident": "none"}),
     "the paper's incident": (PACED, {"incident": _INCIDENT}),
-    "demand with two peaks": (PACED, {"demand": _TWO_PEAKS}),
+    "demand with two peaks": (PACED, {"demand": OTHER_DRIVERS["demand"]}),
     "a road of 6 km, B = 20": (PACED, {"corridor": _LONG_ROAD, "bandwidth": 20}),
     "ShortHighway-v0": (SHORT, {}),
     **{f"ε = {epsilon:g}": (PACED, {"epsilon": epsilon}) for epsilon in (0.5, 2.0, 10.0, 20.0)},
@@ -256,43 +251,6 @@ SENSED_CELLS = [
     )
 ]
 
-# ---- Times of a step. ----
-
-TIMES = "times.parquet"
-N_EPISODES, TURNS, STEPS = 1024, 15, 5
-
-
-def measure_times(place: Place) -> pl.DataFrame:
-    """Return the time of a step with each quick estimator over that with the EKF.
-
-    They take turns, so that all meet the same state of the machine. A step is one of a batch of
-    `N_EPISODES` on one core; ratios are geometric means over turns with 95 % intervals.
-    """
-    envs = {}
-    for estimator in QUICK:
-        cell, seeds = world_cell(CAPPED, estimator), SEEDS[:32]
-        record(corridor_of(cell), seeds, place.records)
-        more = {"records": place.records, "traffic_seeds": list(seeds), "threads": 1}
-        keywords = {**cell.keywords, **more, "action": "scores"}
-        envs[estimator] = make_vector(cell.env, N_EPISODES, keywords)
-        envs[estimator].reset(seed=0)
-    shape = (N_EPISODES, envs[EKF].interface.n_mainline)
-    scores = np.random.default_rng(0).random(shape, dtype=np.float32)
-    seconds: dict[str, list[float]] = {estimator: [] for estimator in envs}
-    for turn in range(TURNS + 1):
-        for estimator, env in envs.items():
-            started = time.perf_counter()
-            for _ in range(STEPS):
-                env.step(scores)
-            if turn > 0:  # the first turn compiles
-                seconds[estimator].append(time.perf_counter() - started)
-    found = []
-    for name, own in seconds.items():
-        ratio = geometric_mean_interval(np.array(own) / np.array(seconds[EKF]))
-        found.append({"estimator": name, "ratio": ratio.mean, "low": ratio.low, "high": ratio.high})
-    return pl.DataFrame(found)
-
-
 # ---- Tables. ----
 
 
@@ -310,16 +268,6 @@ def lines_of(
     return {
         f"{each}, {LABELS[name]}": make(each, name) for each, name in product(groups, estimators)
     }
-
-
-def tenths(interval: Interval) -> str:
-    """Return a mean with the ends of its interval, a decimal each."""
-    return f"{interval.mean:.1f} [{interval.low:.1f}, {interval.high:.1f}]"
-
-
-def give_or_take(interval: Interval) -> str:
-    """Return a mean and half the length of its interval, a decimal each."""
-    return f"{interval.mean:.1f} ± {interval.half_width:.1f}"
 
 
 def below_ekf(rows: pl.DataFrame, labels: Labels) -> Interval:
@@ -355,7 +303,7 @@ of a segment and of a neighbour differ by more than {JUMP:g} km/h. *Jam*: any ot
 MOVED_NOTES = f"Error x 1000, traffic seeds {format_range(MOVED_SEEDS)}."
 
 
-def world_tables(rows: pl.DataFrame, times: pl.DataFrame) -> list[str]:
+def world_tables(rows: pl.DataFrame) -> list[str]:
     """Return the tables of the first part."""
 
     def error(labels: Labels, **changes: Any) -> str:
@@ -398,11 +346,7 @@ def world_tables(rows: pl.DataFrame, times: pl.DataFrame) -> list[str]:
     columns = {str(k): partial(network, network=k) for k in range(N_NETWORKS)}
     worlds = {world: in_world(world) for world in WORLDS}
     parts += ["## Training seeds of the network", "Error x 1000 (χ²). Only 0 is in the package."]
-    parts.append(table("", worlds, columns))
-    measured = {LABELS[each["estimator"]]: each for each in times.iter_rows(named=True)}
-    columns = {"over the EKF": lambda each: "{ratio:.2f} [{low:.2f}, {high:.2f}]".format(**each)}
-    parts += ["## Time", f"A step of {CAPPED}, {N_EPISODES:,} episodes on one core."]
-    return [*parts, table("estimator", measured, columns)]
+    return [*parts, table("", worlds, columns)]
 
 
 def loss(rows: pl.DataFrame, cells: Sequence[Labels], reference: Labels) -> Interval:
@@ -560,14 +504,7 @@ def report(rows: pl.DataFrame, folder: Path) -> str:
     """Return the tables of both parts, and draw their figures."""
     for name, (draw, title) in FIGURES.items():
         save_measured(folder / name, f"{title}, 95 % intervals", draw, rows)
-    times = read_table(folder / TIMES, ("estimator", "ratio", "low", "high"))
-    return "\n\n".join([*world_tables(rows, times), *sensed_tables(rows)])
+    return "\n\n".join([*world_tables(rows), *sensed_tables(rows)])
 
 
-STUDY = Study(
-    "estimators",
-    (*WORLD_CELLS, *SENSED_CELLS),
-    SEEDS,
-    report,
-    measures={TIMES: measure_times},
-)
+STUDY = Study("estimators", (*WORLD_CELLS, *SENSED_CELLS), SEEDS, report)

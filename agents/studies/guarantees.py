@@ -40,7 +40,6 @@ from agents.tables import (
     METRICS,
     UnmeasuredError,
     cell,
-    compared_header,
     difference,
     error_label,
     format_interval,
@@ -55,14 +54,13 @@ from dptse_env.config import EnvConfig
 from dptse_env.parts import privacy_report
 from dptse_env.privacy import epsilon_of
 from dptse_env.release import Paced, Pacing, ReleaseModel, Task, Traffic
-from dptse_env.release.pacing import TracerPacing
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 
 ENV = "dptse_env:dptse/PrivateHighway-v0"
 SEEDS = tuple(range(2000, 2020))
 DELTA, STRICT, CAP = 0.05, 0.001, 64
 
-# What the ledgers are held against: no noise, and prices that do not follow the queries
+# What the ledgers are held against: no noise
 
 
 class AnyPrice(Pacing):
@@ -96,22 +94,6 @@ class Exact(Paced):
         super().__init__(task, traffic)
         self.ledgers.budget[:] = math.inf
         self.pacing = AnyPrice(task, self.pacing.budget)
-
-
-class EqualRates(TracerPacing):
-    """`TracerPacing` with equal rates of querying for all mainline segments, whatever is queried.
-
-    A policy that keeps querying the same place is priced as if its queries were spread over the
-    road.
-    """
-
-    def prices(
-        self, episodes: IntArray, observed: BoolArray, density: FloatArray, speed: FloatArray
-    ) -> FloatArray:
-        """See `Pacing.prices`."""
-        prices = super().prices(episodes, observed, density, speed)
-        self._rates[episodes] = self._first_rates
-        return prices
 
 
 # Cells of the part "privacy"
@@ -160,8 +142,6 @@ LACKS = {
     "exact": ("epsilon", "delta", "adjacency", "unit", "pace", "ratio", "pacing"),
 }
 """Value of a setting that a release model does not have."""
-OWN = {"exact": f"{__name__}:Exact", "equal-rates": f"{__name__}:EqualRates"}
-"""Classes of this file by their labels."""
 QUERIES: dict[str, dict[str, Any]] = {
     "5 segments": {"bandwidth": 5},
     "10 segments": {"bandwidth": 10},
@@ -192,7 +172,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "private boundary inputs": {"boundary": "private"},
 }
 GUARANTEES = ((5.0, DELTA), (1.0, DELTA), (5.0, STRICT))
-CAPPED, EQUAL = {"release": "capped"}, {"pacing": "equal-rates"}
+CAPPED = {"release": "capped"}
 LADDER: tuple[tuple[str, dict[str, Any], int], ...] = (
     ("1. `capped`, EKF, `paper`", {"estimator": "ekf", "schedule": "paper", **CAPPED}, 1),
     ("2. `capped`, demand states, `paper`", {"schedule": "paper", **CAPPED}, 1),
@@ -220,8 +200,9 @@ def paid(**changes: Any) -> Cell:
     estimator, _, demand = name.partition("-")
     settings = "capped" if release == "capped" or name == "ekf" else "paced"
     settings += "-demand" if release == "capped" and demand else ""
-    privacy = {key: OWN.get(value, value) for key, value in given.items() if key in SETTINGS}
-    privacy |= {"preset": OWN.get(release, release), "boundary_inputs": given["boundary"]}
+    preset = f"{__name__}:Exact" if release == "exact" else release
+    privacy = {key: value for key, value in given.items() if key in SETTINGS}
+    privacy |= {"preset": preset, "boundary_inputs": given["boundary"]}
     keywords = {
         "estimator": estimator,
         "estimator_settings": f"{estimator}-w99-3lane-{settings}",
@@ -307,7 +288,8 @@ def compared(ask: Ask, reference: str, lines: Mapping[str, tuple[Cell, Cell]], *
         for metric in METRICS:
             line += [ask(metric, own), "-" if own == base else ask(metric, own, base)]
         found.append([*line, *(ask(column, own) for column in more)])
-    return markdown(["", *compared_header(reference), *more], found)
+    header = chain.from_iterable((name, f"against {reference}") for name in ERRORS.values())
+    return markdown(["", *header, *more], found)
 
 
 def price_tables(ask: Ask) -> Iterator[str]:
@@ -361,7 +343,7 @@ def ledger_tables(ask: Ask) -> Iterator[str]:
         for value in values
     }
     yield compared(ask, "base", settings, REFUSED)
-    capped, equal = partial(paid, **CAPPED), partial(paid, **EQUAL)
+    capped = partial(paid, **CAPPED)
     lines: dict[str, Line] = {}
     for column, name in (ERRORS | {REFUSED: REFUSED}).items():
         lines[f"{name}: `capped`"] = column, capped
@@ -373,7 +355,6 @@ def ledger_tables(ask: Ask) -> Iterator[str]:
     yield "## What is protected"
     yield sweep(ask, "", VARIANTS, lines)
     yield "## Schedules"
-    lines[f"{ERRORS[DENSITY]}: equal rates − `paced`"] = DENSITY, equal, paid
     yield sweep(ask, "", {f"`{name}`": {"schedule": name} for name in SCHEDULES}, lines)
 
 

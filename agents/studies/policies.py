@@ -61,8 +61,10 @@ from agents.tables import (
     cell,
     error_label,
     format_interval,
+    give_or_take,
     grid,
     pick_paired,
+    tenths,
     values_of,
 )
 from agents.tables import mean as mean_of
@@ -539,15 +541,10 @@ def gain_table(rows: pl.DataFrame, corner: str, places: Mapping[str, tuple[World
             names = LEARNED, ROUND_ROBIN
             errors, base = tables(rows, ERROR, *(at(*places[name], each) for each in names))
             return f"{percent_below(errors[:, None], base).min():.1f}"
-        return percent(gain(rows, *places[name], column))
+        return tenths(gain(rows, *places[name], column))
 
     columns = [REFERENCE, ROUND_ROBIN, world.rule, LEARNED, WORST, *world.bounds]
     return grid(corner, list(places), columns, entry)
-
-
-def percent(interval: Interval) -> str:
-    """Return a percentage with its interval."""
-    return f"{interval.mean:.1f} [{interval.low:.1f}, {interval.high:.1f}]"
 
 
 def world_tables(rows: pl.DataFrame, world: World) -> Iterator[str]:
@@ -564,7 +561,7 @@ def world_tables(rows: pl.DataFrame, world: World) -> Iterator[str]:
         "B",
         world.bandwidths[:-1],
         [world.rule, LEARNED],
-        lambda bandwidth, policy: percent(saved_bandwidth(rows, world, bandwidth, policy)),
+        lambda bandwidth, policy: tenths(saved_bandwidth(rows, world, bandwidth, policy)),
     )
     if world.varied:
         yield f"B = {VARIED_BANDWIDTH}, by ε and under other traffic:"
@@ -577,8 +574,7 @@ def joint_table(rows: pl.DataFrame) -> str:
 
     def entry(name: str, column: str) -> str:
         policy = worlds[name].rule if column == "rule" else column
-        error = mean_of(rows, at(worlds[name], JOINT_BANDWIDTH, policy), ERROR)
-        return f"{error.mean:.1f} ± {error.half_width:.1f}"
+        return give_or_take(mean_of(rows, at(worlds[name], JOINT_BANDWIDTH, policy), ERROR))
 
     sums = {1: "", 2: ", sums over two neighbours"}
     worlds = {f"{each.name}, ε = {each.epsilon:g}{sums[each.span]}": each for each in TOGETHER}

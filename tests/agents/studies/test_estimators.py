@@ -1,4 +1,3 @@
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -31,8 +30,7 @@ def some(recorded):
 
 
 def test_tables_have_the_numbers_of_the_rows_and_dashes_for_the_rest(some):
-    times = pl.read_parquet(RECORDED / study.TIMES)
-    lines = "\n".join([*study.world_tables(some, times), *study.sensed_tables(some)]).splitlines()
+    lines = "\n".join([*study.world_tables(some), *study.sensed_tables(some)]).splitlines()
     world = some.filter(world="PrivateHighway-v1", policy="round-robin", network=0)
     ekf, network = (world.filter(estimator=name) for name in ("ekf", "recurrent"))
     reward = network["reward"].mean()
@@ -49,7 +47,6 @@ def test_tables_have_the_numbers_of_the_rows_and_dashes_for_the_rest(some):
 
 
 def test_figures_are_there_where_all_that_they_show_was_played(some, tmp_path):
-    shutil.copy(RECORDED / study.TIMES, tmp_path)
     for name in study.FIGURES:
         (tmp_path / name).write_bytes(b"old")
     study.report(some, tmp_path)
@@ -95,12 +92,10 @@ def test_faults_are_those_of_one_detector():
 
 
 @pytest.mark.slow
-def test_it_plays_and_times_and_reports(tmp_path, monkeypatch):
-    for name, value in {"SEEDS": (2000, 2001), "N_EPISODES": 2, "TURNS": 2, "STEPS": 1}.items():
-        monkeypatch.setattr(study, name, value)
+def test_it_plays_and_reports(tmp_path):
     found = (study.world_cell("ShortHighway-v0", name) for name in study.MOVED[:2])
     cells = [replace(each, keywords={**each.keywords, "horizon": 90}, seeds=None) for each in found]
-    small = replace(STUDY, cells=tuple(cells), seeds=study.SEEDS)
+    small = replace(STUDY, cells=tuple(cells), seeds=(2000, 2001))
     run(small, Place(tmp_path, THIS_PROCESS), progress=False)
     rows = read_rows("estimators", tmp_path)
     assert len(rows) == 4
@@ -110,8 +105,5 @@ def test_it_plays_and_times_and_reports(tmp_path, monkeypatch):
     )
     errors = (squares / n).sqrt().to_list()
     assert errors == pytest.approx(rows["rmse_speed"].to_list(), rel=1e-4)
-    times = pl.read_parquet(tmp_path / study.TIMES)
-    assert times["estimator"].to_list() == list(study.QUICK)
-    assert times.row(0) == ("ekf", 1.0, 1.0, 1.0)
     error = -1000.0 * rows.filter(estimator="ekf")["reward"].mean()
     assert f"| ShortHighway-v0 | {error:.1f} [" in (tmp_path / "tables.md").read_text()

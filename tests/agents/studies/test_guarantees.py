@@ -9,19 +9,11 @@ import pytest
 from agents.environments import make_config
 from agents.statistics import mean_interval
 from agents.studies import guarantees
-from agents.studies.guarantees import (
-    EqualRates,
-    crossing,
-    met_epsilon,
-    paid,
-    priced,
-    report,
-)
+from agents.studies.guarantees import crossing, met_epsilon, paid, priced, report
 from agents.study import read_rows
 from agents.tables import DENSITY, format_interval, values
-from dptse_env.parts import make_task, privacy_report
+from dptse_env.parts import privacy_report
 from dptse_env.privacy import epsilon_of
-from dptse_env.release.pacing import TracerPacing
 from dptse_env.schedules import make_schedule
 from tests.helpers import SHORT
 
@@ -109,18 +101,3 @@ def test_exact_releases_the_true_densities_of_what_is_queried_and_claims_nothing
     assert math.isinf(info["epsilon"])
     report = privacy_report(make_config(SHORT, paid(release="exact").keywords))
     assert (report.guarantee, report.void_reasons) == ("none", ("not_stated",))
-
-
-def test_equal_rates_do_not_follow_the_queries():
-    """The last segment's price depends on its rate of querying alone, where nothing moves."""
-    bare = {"privacy": {"preset": "paced"}, "corridor": {"fixed_sensors": []}}
-    task = make_task(make_config(SHORT, bare))
-    last, still = task.corridor.n_mainline - 1, np.zeros((1, task.corridor.n_segments))
-    observed = np.arange(task.n_columns)[None] == 0
-    given = np.arange(1), observed, still + 20.0, still
-    pacings = TracerPacing(task, np.array([2.0])), EqualRates(task, np.array([2.0]))
-    for pacing in pacings:
-        pacing.reset(np.arange(1))
-    followed, equal = ([each.prices(*given)[0, last] for _ in range(60)] for each in pacings)
-    assert followed[0] == equal[0] == equal[-1]
-    assert followed[-1] > 1.3 * followed[0]
